@@ -1,0 +1,47 @@
+"""What can go wrong, and how to mend it: every error is one line that says where, what was possible and what to do next."""
+
+
+class VapError(Exception):
+    """Base of every error the user can mend; the command line prints it as one line and exits with status 2."""
+
+
+class BadPhoto(VapError):
+    """A reference photo that cannot be read, is empty, is not an image, or is too large to decode safely."""
+
+
+class BadInstruction(VapError):
+    """An instruction that names no personal object, or more than the prompt palette has colours."""
+
+
+class UnknownName(VapError):
+    """A suite, task, object, category, robot, method, policy or stack that no registry holds."""
+
+
+class BadMemory(VapError):
+    """A memory file that is damaged, of another version, or made with another encoder."""
+
+
+class BadOutput(VapError):
+    """An output folder that cannot be written, or already holds a different run."""
+
+
+class BadRecording(VapError):
+    """A recording that cannot be parsed."""
+
+
+class MissingGL(VapError):
+    """No OpenGL back end can render without a display."""
+
+
+class MissingWeights(VapError):
+    """Weights that are not on this machine, or whose checksum differs from the manifest."""
+
+
+class OutOfReach(VapError):
+    """A pose that inverse kinematics cannot reach."""
+
+
+def one_of(what: str, name: str, known: object) -> UnknownName:
+    """The error for a name that a registry lacks: `one_of("make_env: task", "x", TASKS)` lists what it holds."""
+    names = ", ".join(sorted(str(key) for key in known))  # type: ignore[attr-defined]
+    return UnknownName(f"{what} {name!r} is unknown; known: {names}.")

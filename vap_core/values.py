@@ -1,0 +1,300 @@
+"""The values that walk through the house: frozen, and checked against their shapes when they are built.
+
+Conventions, everywhere inside the house: images are RGB, height x width x 3, uint8. Boxes are `x0 y0 x1 y1` in pixels,
+x to the right and y down, the far corner exclusive. Lengths are metres, angles radians, times seconds. A pose is
+`x y z qw qx qy qz` in the world frame (z up). Cameras follow OpenCV: x right, y down, z into the scene.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, dataclass_transform
+
+import numpy as np
+from beartype import beartype
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8, jaxtyped
+
+Rgb = UInt8[np.ndarray, "h w 3"]
+Mask = Bool[np.ndarray, "h w"]
+Pose = Float64[np.ndarray, "7"]
+Chunk = Float32[np.ndarray, "t 7"]
+"""Actions to come, one row per control step: `dx dy dz` metres and `drx dry drz` rotation vector in the robot base frame, `gripper` 0 closed .. 1 open."""
+
+Views = Mapping[str, Rgb]
+"""One image per camera, keyed by the camera's name."""
+
+
+@dataclass_transform(frozen_default=True, eq_default=False)
+def value[T](cls: type[T]) -> type[T]:
+    """Make `cls` a frozen dataclass whose fields are checked against their annotated types and shapes when built."""
+    return jaxtyped(typechecker=beartype)(dataclass(frozen=True, slots=True, eq=False)(cls))
+
+
+@value
+class Boxes:
+    """Category-level proposals of one view (P 3.3): n may be 0, which is a result and not an error."""
+
+    xyxy: Float32[np.ndarray, "n 4"]
+    score: Float32[np.ndarray, " n"]
+    phrase: str
+
+    def __post_init__(self) -> None:
+        if len(self.xyxy) and not (self.xyxy[:, 2:] > self.xyxy[:, :2]).all():
+            raise ValueError(f"Boxes: far corner must exceed near corner, got {self.xyxy.tolist()}")
+
+    def __len__(self) -> int:
+        return len(self.xyxy)
+
+    @staticmethod
+    def empty(phrase: str) -> "Boxes":
+        return Boxes(np.zeros((0, 4), np.float32), np.zeros(0, np.float32), phrase)
+
+
+@value
+class PersonalObject:
+    """One remembered object: K reference crops and their embeddings Z_o (P 3.3), rows L2-normalised."""
+
+    name: str
+    category: str
+    embeddings: Float32[np.ndarray, "k d"]
+    crops: tuple[Rgb, ...]
+    encoder: str
+
+    def __post_init__(self) -> None:
+        if len(self.crops) != len(self.embeddings) or not self.crops:
+            raise ValueError(f"PersonalObject {self.name!r}: {len(self.crops)} crops for {len(self.embeddings)} embeddings; one each, and at least one")
+        norm = np.linalg.norm(self.embeddings, axis=1)
+        if not np.allclose(norm, 1.0, atol=1e-3):
+            raise ValueError(f"PersonalObject {self.name!r}: embeddings must be L2-normalised, got norms {norm.tolist()}")
+
+
+@value
+class Target:
+    """One personalised span of an instruction: `text[start:stop]` is e.g. "my cup", owner "my", category "cup"."""
+
+    start: int
+    stop: int
+    owner: str
+    category: str
+
+
+@value
+class Instruction:
+    """A parsed instruction: its text and its personalised spans, left to right and disjoint."""
+
+    text: str
+    targets: tuple[Target, ...]
+
+
+@value
+class Colour:
+    """A nameable tint."""
+
+    name: str
+    rgb: tuple[int, int, int]
+
+
+@value
+class Grounding:
+    """Why a view's box won, or that none did: everything the vote saw at t = 0 (P 3.3).
+
+    `similarity[i, k]` is cos(e_i, z_k); `votes[i]` counts references whose best candidate is i; `tied` marks the
+    candidates that shared the most votes; `margin` is (votes of the winner - most votes of any other) / K, in [0, 1],
+    and `cosine_margin` the same difference of mean cosines (winner - best other; 2 when there is no other candidate).
+    `winner` is None exactly when there is no candidate.
+    """
+
+    camera: str
+    object: str
+    candidates: Boxes
+    similarity: Float32[np.ndarray, "n k"]
+    votes: Int64[np.ndarray, " n"]
+    tied: Bool[np.ndarray, " n"]
+    winner: int | None
+    margin: float
+    cosine_margin: float
+    masks: Bool[np.ndarray, "n h w"]
+
+    def __post_init__(self) -> None:
+        if (self.winner is None) != (len(self.candidates) == 0):
+            raise ValueError(f"Grounding {self.camera}: winner {self.winner} with {len(self.candidates)} candidates")
+
+    @property
+    def mask(self) -> Mask | None:
+        return None if self.winner is None else self.masks[self.winner]
+
+
+@value
+class Event:
+    """Something a researcher wants to find afterwards, at one control step."""
+
+    frame_index: int
+    level: Literal["INFO", "WARN", "ERROR"]
+    text: str
+
+
+@value
+class Track:
+    """One target in one view now: its mask, or None while it is not visible, and the tracker's confidence in [0, 1]."""
+
+    mask: Mask | None
+    score: float
+
+
+@value
+class Attended:
+    """What the method hands to the policy at one control step, and the evidence for it.
+
+    `images` are the prompted views, `text` the rewritten instruction; `tracks[camera][j]` is target j in that view.
+    `groundings[camera][j]` is constant through an episode. `colours[j]` tints target j.
+    """
+
+    images: Views
+    text: str
+    colours: tuple[Colour, ...]
+    tracks: Mapping[str, tuple[Track, ...]]
+    groundings: Mapping[str, tuple[Grounding, ...]]
+    events: tuple[Event, ...]
+
+
+@value
+class Camera:
+    """A calibrated pinhole camera: `k` in pixels; `pose_world` maps camera (OpenCV axes) to world, 4 x 4."""
+
+    name: str
+    width: int
+    height: int
+    k: Float64[np.ndarray, "3 3"]
+    pose_world: Float64[np.ndarray, "4 4"]
+
+
+@value
+class PolicyInput:
+    """All that a policy may read: images, text and proprioception. Never simulator state.
+
+    `state` is `x y z` (m) and `rx ry rz` (rotation vector, rad) of the gripper in the robot base frame, gripper opening
+    0..1, then the arm's joint angles (rad).
+    """
+
+    images: Views
+    text: str
+    state: Float32[np.ndarray, " s"]
+
+
+@value
+class Truth:
+    """Simulator ground truth after one control step; read by metrics, recordings and tests, never by a policy."""
+
+    objects_world: Mapping[str, Pose]
+    links_world: Mapping[str, Pose]
+    touched: frozenset[str]
+    """Names of objects that the robot touched during this control step."""
+    held: frozenset[str]
+    """Names of objects whose every contact during the step's last physics step was with the robot, and that touch it."""
+    masks: Mapping[str, Mapping[str, Mask]] = field(default_factory=dict)
+    """`masks[camera][object]`: visible pixels; empty when masks were not asked for."""
+
+
+@value
+class Placement:
+    """An object of an episode: `model` names it in the object registry; it starts at (x, y) metres, turned by yaw radians."""
+
+    model: str
+    x: float
+    y: float
+    yaw: float
+
+
+@value
+class EpisodeRow:
+    """One row of an episode list: everything that decides how an episode starts. `placements[0]` is the target."""
+
+    suite: str
+    task: str
+    episode: int
+    seed: int
+    instruction: str
+    category: str
+    placements: tuple[Placement, ...]
+    max_steps: int
+
+    @property
+    def target(self) -> str:
+        return self.placements[0].model
+
+    @property
+    def key(self) -> str:
+        return f"{self.suite}.{self.task}.{self.episode:03d}"
+
+
+@value
+class Opening:
+    """What is known before the first action: written once at the head of a recording."""
+
+    row: EpisodeRow
+    method: str
+    policy: str
+    hz: float
+    cameras: tuple[Camera, ...]
+    instruction: str
+    rewritten: str
+    groundings: Mapping[str, tuple[Grounding, ...]]
+    target_sizes_m: Mapping[str, tuple[float, float, float]]
+    """Full extents of every object's bounding box, by model name."""
+
+
+@value
+class Frame:
+    """One control step: what was seen, what the policy was shown, what it did. `action` was decided from `images`."""
+
+    frame_index: int
+    timestamp_s: float
+    images: Views
+    prompted: Views
+    tracks: Mapping[str, tuple[Track, ...]]
+    cameras: tuple[Camera, ...]
+    state: Float32[np.ndarray, " s"]
+    action: Float32[np.ndarray, "7"]
+    truth: Truth
+    events: tuple[Event, ...]
+
+    def light(self) -> "Frame":
+        """The same step without its pictures, to keep in memory."""
+        return replace(self, images={}, prompted={}, tracks={}, truth=replace(self.truth, masks={}))
+
+
+@value
+class Outcome:
+    """How an episode ended (P 5.1). `success` is read at the end; `success_once` at any step; `held` is its longest run in steps."""
+
+    status: Literal["success", "failure", "error"]
+    success: bool
+    success_once: bool
+    held_steps: int
+    cmr: bool
+    wrong_object: bool
+    first_object_correct: bool
+    steps: int
+    detail: str = ""
+
+
+@value
+class Episode:
+    """A finished episode. `seconds` sums wall time by part: physics, render, attend, policy, record, ..."""
+
+    opening: Opening
+    frames: tuple[Frame, ...]
+    outcome: Outcome
+    seconds: Mapping[str, float]
+
+    def summary(self) -> dict[str, Any]:
+        """One flat row for a results table."""
+        row, out = self.opening.row, self.outcome
+        margins = [g.margin for per_view in self.opening.groundings.values() for g in per_view]
+        return {
+            "suite": row.suite, "task": row.task, "episode": row.episode, "seed": row.seed,
+            "method": self.opening.method, "policy": self.opening.policy,
+            "outcome": out.status, "success": out.success, "success_once": out.success_once, "held_steps": out.held_steps,
+            "cmr": out.cmr, "wrong_object": out.wrong_object, "first_object_correct": out.first_object_correct,
+            "steps": out.steps, "margin": min(margins) if margins else None, "detail": out.detail,
+            **{f"seconds_{part}": seconds for part, seconds in self.seconds.items()},
+        }
