@@ -1,0 +1,150 @@
+"""How a recording looks when it is opened: what the policy saw, why that box won, what happened.
+
+Layouts are values that rerun stores inside the recording. `/vap/...` paths are explained in `record.py`.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from vap_core.values import Grounding, Opening
+
+TARGET = (255, 150, 40)
+"""The winner, the track and the target object: one orange everywhere."""
+QUIET = (126, 160, 205)
+"""Every other candidate and object."""
+TRUTH = (60, 230, 150)
+"""Simulator ground truth."""
+SERIES = [(88, 166, 255), (255, 150, 40), (60, 210, 140), (240, 100, 110), (190, 140, 255), (235, 205, 90), (120, 215, 235), (200, 200, 200)]
+"""Curves on a dark plot: no dark colour among them."""
+BACKGROUND = (24, 28, 36)
+
+type Part = rrb.Container | rrb.View
+
+
+def evidence_line(grounding: Grounding) -> str:
+    """One view's verdict in a few words: `margin 0.60`, `tie`, or `no candidate`."""
+    if grounding.winner is None:
+        return "no candidate, view unmodified"
+    tie = " · TIE" if int(grounding.tied.sum()) > 1 else ""
+    return f"#{grounding.winner} wins {grounding.votes[grounding.winner]}/{grounding.similarity.shape[1]} · margin {grounding.margin:.2f}{tie}"
+
+
+def _image(cam: str, title: str, contents: Sequence[str]) -> rrb.Spatial2DView:
+    root = f"/observation.images.{cam}"
+    return rrb.Spatial2DView(origin=root, contents=[f"{root}{tail}" for tail in contents], name=f"{cam} · {title}", background=BACKGROUND)
+
+
+def policy_view(cam: str) -> Part:
+    return _image(cam, "policy input", ["/prompted"])
+
+
+def track_view(cam: str) -> Part:
+    return _image(cam, "track (orange) vs truth (green)", ["", "/mask/**"])
+
+
+def vote_view(cam: str, targets: int = 1) -> Part:
+    return _image(cam, "vote at t = 0", ["/candidates", *(f"/candidates_{j}" for j in range(1, targets))])
+
+
+def bars_view(cam: str, groundings: Sequence[Grounding]) -> Part:
+    title = evidence_line(groundings[0]) if groundings else "no personal object"
+    return rrb.BarChartView(origin=f"/vap/votes/{cam}", name=f"{cam} · {title}", plot_legend=rrb.PlotLegend(visible=False))
+
+
+def _cameras(opening: Opening) -> tuple[Part, float]:
+    """Every camera's three pictures, and the share of the width they deserve: squares in a box of about 10 : 7."""
+    names = [camera.name for camera in opening.cameras]
+    trios = [(policy_view(cam), track_view(cam), vote_view(cam, len(opening.groundings.get(cam, ())))) for cam in names]
+    if len(names) <= 2:
+        columns = [rrb.Vertical(saw, rrb.Horizontal(track, vote), row_shares=[5, 3]) for saw, track, vote in trios]
+        return rrb.Horizontal(*columns), 0.4 if len(names) == 1 else 0.54
+    return rrb.Vertical(*(rrb.Horizontal(*trio, column_shares=[1, 1, 1]) for trio in trios)), 0.47
+
+
+def _eye(opening: Opening) -> rrb.EyeControls3D:
+    """Look at the middle of the objects from beside the first camera, a little above the table."""
+    xy = np.array([[p.x, p.y] for p in opening.row.placements]).mean(axis=0)
+    centre = np.array([*xy, 0.12])
+    away = opening.cameras[0].pose_world[:2, 3] - xy if opening.cameras else np.array([1.0, 0.0])
+    away = away / max(float(np.linalg.norm(away)), 1e-6)
+    turn = np.deg2rad(50.0)
+    side = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ away
+    return rrb.EyeControls3D(position=centre + np.array([*side, 0.6]), look_target=centre, eye_up=(0, 0, 1), kind=rrb.Eye3DKind.Orbital)
+
+
+def _curves(origin: str, name: str, contents: Sequence[str] = ("$origin/**",), limits: tuple[float, float] | None = None) -> rrb.TimeSeriesView:
+    axis = rrb.ScalarAxis(range=limits) if limits else None
+    return rrb.TimeSeriesView(origin=origin, name=name, contents=list(contents), axis_y=axis, plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop))
+
+
+def _panels(root: Part) -> rrb.Blueprint:
+    return rrb.Blueprint(
+        root,
+        rrb.TimePanel(state="collapsed", timeline="frame_index", play_state="paused"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+        rrb.TopPanel(state="hidden"),
+        auto_layout=False,
+        auto_views=False,
+    )
+
+
+def episode_blueprint(opening: Opening) -> rrb.Blueprint:
+    """Big pictures first; beside them the scene and the votes; below, the words, the curves and the course of events."""
+    names = [camera.name for camera in opening.cameras]
+    pictures, share = _cameras(opening)
+    scene = rrb.Spatial3DView(
+        origin="/",
+        contents=["/world/**", *(f"/observation.images.{cam}" for cam in names)],
+        name="scene (simulator truth)",
+        background=BACKGROUND,
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=_eye(opening),
+    )
+    votes = rrb.Horizontal(*(bars_view(cam, opening.groundings.get(cam, ())) for cam in names))
+    evidence = _curves("/vap", "vote margin, track score", ["/vap/vote_margin/**", "/vap/track_score/**"], (-0.05, 1.05))
+    course = rrb.Vertical(
+        rrb.StateTimelineView(origin="/vap/status", name="course"), rrb.TextLogView(origin="/vap/events", name="events"), row_shares=[1, 1]
+    )
+    bottom = rrb.Horizontal(
+        rrb.TextDocumentView(origin="/vap/instruction", name="instruction"),
+        rrb.Tabs(_curves("/action", "action"), _curves("/observation.state", "state"), active_tab=0),
+        evidence,
+        course,
+        column_shares=[1.15, 1, 1, 1.35],
+    )
+    right = rrb.Vertical(scene, votes, row_shares=[2.4, 1])
+    return _panels(rrb.Vertical(rrb.Horizontal(pictures, right, column_shares=[share, 1 - share]), bottom, row_shares=[0.72, 0.28]))
+
+
+def grounding_blueprint(cam: str, grounding: Grounding) -> rrb.Blueprint:
+    """One image, and why that box won."""
+    words = rrb.TextDocumentView(origin="/vap/instruction", name="instruction")
+    references = rrb.Spatial2DView(origin="/vap/references", name="reference views #0, #1, ...", background=BACKGROUND)
+    cosine = rrb.TensorView(
+        origin=f"/vap/similarity/{cam}",
+        name="cosine: candidate (down) x reference (across)",
+        scalar_mapping=rrb.TensorScalarMapping(mag_filter=rr.components.MagnificationFilter.Nearest, colormap=rr.components.Colormap.Viridis),
+        view_fit=rrb.components.ViewFit.Fill,
+    )
+    top = rrb.Horizontal(vote_view(cam), _image(cam, "mask", ["", "/mask/**"]), policy_view(cam))
+    why = rrb.Horizontal(words, references, bars_view(cam, [grounding]), cosine, column_shares=[1, 1.2, 1, 1])
+    return _panels(rrb.Vertical(top, why, row_shares=[1.5, 1]))
+
+
+def series_style(names: Sequence[str]) -> rr.SeriesLines:
+    """Names, widths and visible colours for the curves of one entity."""
+    return rr.SeriesLines(names=list(names), colors=[SERIES[i % len(SERIES)] for i in range(len(names))], widths=[1.5] * len(names))
+
+
+def packed(rgb: tuple[int, int, int]) -> np.uint32:
+    """0xRRGGBBAA, opaque."""
+    return np.uint32(rgb[0] << 24 | rgb[1] << 16 | rgb[2] << 8 | 0xFF)
+
+
+def state_style(colours: Mapping[str, tuple[int, int, int]]) -> rr.StateConfiguration:
+    """One colour for each state of a lane."""
+    return rr.StateConfiguration(values=list(colours), labels=list(colours), colors=[packed(rgb) for rgb in colours.values()])

@@ -1,0 +1,290 @@
+"""Episode -> .rrd: one Rerun recording per rollout, streamed to disk while it happens.
+
+Entities (lerobot's feature keys; timelines `frame_index` and `timestamp`):
+`/observation.images.<cam>` with `/prompted`, `/candidates`, `/mask/{target,gt}` beneath; `/observation.state`, `/action`,
+`/next.reward`, `/next.success`; `/vap/{votes,candidates,vote_margin,track_score}/<cam>`, `/vap/{instruction,events}`,
+`/vap/status/{outcome,grasp}`; `/world/{table,robot/link*,objects/*}`. Evidence of a further target j ends in `_j`.
+Recording properties: `rollout` and `outcome`. Pictures are JPEG; everything that changes travels in columns.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import rerun as rr
+from scipy.spatial.transform import Rotation
+
+from vap_core.blueprint import SERIES, episode_blueprint, evidence_line, grounding_blueprint, packed, series_style, state_style
+from vap_core.errors import BadOutput
+from vap_core.evidence import CLASSES, classes, contact_sheet, jpeg, log_vote, suffix, words
+from vap_core.recording_file import code_version, finish_stream, open_stream
+from vap_core.recording_file import read_summary as read_summary
+from vap_core.recording_file import recording_name as recording_name
+from vap_core.recording_file import recover as recover
+from vap_core.scene3d import log_cameras, log_links, log_objects, log_table, send_poses, send_truth
+from vap_core.values import Event, Frame, Grounding, Mask, Opening, Outcome, PersonalObject, Rgb
+from vap_core.viewer import screenshot as screenshot
+
+ACTION_NAMES = ("dx", "dy", "dz", "drx", "dry", "drz", "gripper")
+STATE_NAMES = ("x", "y", "z", "rx", "ry", "rz", "gripper")
+PROMPTED_QUALITY_DROP = 5
+"""Prompted pictures repeat the raw ones outside the mask: they may be a little coarser."""
+OUTCOMES = {"success": (40, 140, 85), "failure": (190, 120, 30), "error": (190, 60, 60)}
+GRASPS = {
+    "free": (70, 78, 92),
+    "touches target": (130, 100, 50),
+    "holds target": (210, 125, 30),
+    "touches other": (80, 95, 150),
+    "holds other": (85, 120, 220),
+}
+LEVEL_COLOURS = {"INFO": (150, 200, 255), "WARN": (255, 190, 60), "ERROR": (255, 95, 95)}
+
+
+def grasp_state(frame: Frame, target: str) -> str:
+    """What the gripper has to do with the objects at one step."""
+    held, touched = frame.truth.held, frame.truth.touched
+    for verb, names in (("holds", held), ("touches", touched)):
+        if names:
+            return f"{verb} target" if target in names else f"{verb} other"
+    return "free"
+
+
+class Recorder:
+    """Streams one episode to disk; what was flushed outlives the process (`recover`).
+
+    `frame` buffers; every `flush_every` frames the buffered columns go to the file. `close` writes the ending and renames
+    the file. Left through an exception, the context manager keeps the unfinished file under its temporary name.
+
+    Raises: BadOutput, when `path` exists or its folder cannot be written.
+    """
+
+    def __init__(self, path: Path, opening: Opening, *, flush_every: int = 10, jpeg_quality: int = 90) -> None:
+        row = opening.row
+        self.path = Path(path)
+        self._opening, self._flush_every, self._quality = opening, flush_every, jpeg_quality
+        self._steps: list[int] = []
+        self._times: list[float] = []
+        self._frames: list[Frame] = []
+        self._jpegs: list[dict[str, tuple[np.ndarray, np.ndarray]]] = []
+        self._grasp: str | None = None
+        self._rec: rr.RecordingStream | None = open_stream(self.path, f"{row.key}.s{row.seed}.{opening.method}.{opening.policy}")
+        self._rec.send_recording_name(f"{row.key} · {opening.method}")
+        self._rec.send_property(
+            "rollout",
+            rr.AnyValues(
+                suite=row.suite, task=row.task, episode=row.episode, method=opening.method, policy=opening.policy, seed=row.seed, git=code_version(),
+                hz=opening.hz, instruction=opening.instruction, rewritten=opening.rewritten,
+            ),
+        )  # fmt: skip
+        self._rec.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, rr.AnnotationContext(CLASSES), static=True)
+        self._rec.log("/vap/instruction", words(opening), static=True)
+        log_table(self._rec, row)
+        log_objects(self._rec, opening)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, err: BaseException | None, trace: TracebackType | None) -> None:
+        if self._rec is not None:
+            self._flush()
+            self._rec.flush()
+            self._rec.disconnect()
+            self._rec = None
+
+    def frame(self, frame: Frame) -> None:
+        """Take one control step; pictures are compressed at once."""
+        pictures = {}
+        for cam, raw in frame.images.items():
+            seen, shown = jpeg(raw, self._quality), frame.prompted.get(cam, raw)
+            same = shown is raw or np.array_equal(shown, raw)
+            pictures[cam] = (seen, seen if same else jpeg(shown, self._quality - PROMPTED_QUALITY_DROP))
+        if not self._steps:
+            self._first(frame, {cam: seen for cam, (seen, _) in pictures.items()})
+        self._steps.append(frame.frame_index)
+        self._times.append(frame.timestamp_s)
+        self._frames.append(frame)
+        self._jpegs.append(pictures)
+        if len(self._frames) >= self._flush_every:
+            self._flush()
+
+    def close(self, outcome: Outcome, failure_case: str = "") -> None:
+        """Flush, write outcome and footer, and give the recording its name.
+
+        Raises: BadOutput, when a file of that name appeared meanwhile.
+        """
+        rec = self._stream()
+        self._flush()
+        verdict = self._verdict(outcome, failure_case)
+        if self._steps:
+            n = len(self._steps)
+            done = np.zeros(n)
+            done[-1] = float(outcome.success)
+            index = self._index(self._steps, self._times)
+            rec.send_columns("/next.reward", index, rr.Scalars.columns(scalars=done))
+            rec.send_columns("/next.success", index, rr.Scalars.columns(scalars=done))
+            # The whole lane wears the ending: a state that starts on the last step would have no width.
+            rec.send_columns("/vap/status/outcome", self._index(self._steps[:1], self._times[:1]), rr.StateChange.columns(state=[outcome.status]))
+            level = {"success": "INFO", "failure": "WARN", "error": "ERROR"}[outcome.status]
+            self._send_events([Event(self._steps[-1], level, f"episode ends: {verdict}")])  # type: ignore[arg-type]
+        rec.log("/vap/instruction", words(self._opening, verdict), static=True)
+        rec.send_property(
+            "outcome",
+            rr.AnyValues(
+                status=outcome.status, success=outcome.success, cmr=outcome.cmr, failure_case=failure_case, length=outcome.steps,
+                success_once=outcome.success_once, held_steps=outcome.held_steps, wrong_object=outcome.wrong_object,
+                first_object_correct=outcome.first_object_correct, detail=outcome.detail,
+            ),
+        )  # fmt: skip
+        self._rec = None
+        finish_stream(rec, self.path)
+
+    @staticmethod
+    def _verdict(outcome: Outcome, failure_case: str) -> str:
+        parts = [outcome.status, f"{outcome.steps} steps", failure_case, "moved a wrong object" if outcome.wrong_object else "", outcome.detail]
+        return ", ".join(part for part in parts if part)
+
+    def _stream(self) -> rr.RecordingStream:
+        if self._rec is None:
+            raise BadOutput(f"record: {self.path} is closed; open another Recorder for another episode.")
+        return self._rec
+
+    @staticmethod
+    def _index(steps: Sequence[int], times: Sequence[float]) -> list[rr.TimeColumn]:
+        return [rr.TimeColumn("frame_index", sequence=steps), rr.TimeColumn("timestamp", duration=np.asarray(times, np.float64))]
+
+    def _first(self, frame: Frame, pictures: dict[str, np.ndarray]) -> None:
+        """What only the first step can tell: shapes, links, and the pictures the vote was held on."""
+        rec, opening = self._stream(), self._opening
+        names = (*STATE_NAMES, *(f"joint{i}" for i in range(1, len(frame.state))))[: len(frame.state)]
+        rec.log("/action", series_style(ACTION_NAMES), static=True)
+        rec.log("/observation.state", series_style(names), static=True)
+        for entity in ("vote_margin", "track_score"):
+            for i, (cam, per_view) in enumerate(opening.groundings.items()):
+                for j in range(len(per_view)):
+                    name, width = f"{entity.split('_')[1]} {cam}{suffix(j)}", 1.5 if entity == "track_score" else 3
+                    rec.log(
+                        f"/vap/{entity}/{cam}{suffix(j)}",
+                        rr.SeriesLines(names=name, colors=SERIES[i % len(SERIES)], widths=width),
+                        static=True,
+                    )
+        log_cameras(rec, frame, SERIES)
+        rec.log("/vap/status/outcome", state_style(OUTCOMES), static=True)
+        rec.log("/vap/status/grasp", state_style(GRASPS), static=True)
+        log_links(rec, frame.truth)
+        rec.set_time("frame_index", sequence=frame.frame_index)
+        rec.set_time("timestamp", duration=frame.timestamp_s)
+        for cam, per_view in opening.groundings.items():
+            for j, grounding in enumerate(per_view):
+                log_vote(rec, grounding, j, None if j else pictures.get(cam))
+        for cam in pictures.keys() - {cam for cam, per_view in opening.groundings.items() if per_view}:
+            rec.log(f"/observation.images.{cam}/candidates", rr.EncodedImage(contents=pictures[cam].tobytes(), media_type="image/jpeg"))
+        rec.reset_time()
+        rec.send_blueprint(episode_blueprint(opening))
+
+    def _flush(self) -> None:
+        """Send the buffered steps as columns and push them to the file."""
+        rec, frames = self._stream(), self._frames
+        if not frames:
+            return
+        index = self._index(self._steps[-len(frames) :], self._times[-len(frames) :])
+        self._send_pictures(index)
+        self._send_masks(index)
+        rec.send_columns("/observation.state", index, rr.Scalars.columns(scalars=np.stack([f.state for f in frames])))
+        rec.send_columns("/action", index, rr.Scalars.columns(scalars=np.stack([f.action for f in frames])))
+        for cam, per_view in self._opening.groundings.items():
+            for j, grounding in enumerate(per_view):
+                tracks = [f.tracks.get(cam, ())[j : j + 1] for f in frames]
+                scores = np.array([track[0].score if track else 0.0 for track in tracks])
+                rec.send_columns(f"/vap/vote_margin/{cam}{suffix(j)}", index, rr.Scalars.columns(scalars=np.full(len(frames), grounding.margin)))
+                rec.send_columns(f"/vap/track_score/{cam}{suffix(j)}", index, rr.Scalars.columns(scalars=scores))
+        send_truth(rec, index, [f.truth for f in frames])
+        self._send_grasp()
+        self._send_events([event for f in frames for event in f.events])
+        rec.flush()
+        self._frames, self._jpegs = [], []
+
+    def _send_pictures(self, index: list[rr.TimeColumn]) -> None:
+        rec = self._stream()
+        for i, camera in enumerate(self._frames[0].cameras):
+            cam, root, n = camera.name, f"/observation.images.{camera.name}", len(self._frames)
+            poses = np.stack([f.cameras[i].pose_world for f in self._frames])
+            send_poses(rec, root, index, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat())
+            for entity, which in ((root, 0), (f"{root}/prompted", 1)):
+                if all(cam in pictures for pictures in self._jpegs):
+                    blobs = [pictures[cam][which] for pictures in self._jpegs]
+                    rec.send_columns(entity, index, rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * n))
+
+    def _send_masks(self, index: list[rr.TimeColumn]) -> None:
+        """The track and the truth of every target; a lost track is an empty mask."""
+        for camera in self._frames[0].cameras:
+            cam, shape = camera.name, (camera.height, camera.width)
+            targets = self._opening.groundings.get(cam, ())
+            for j in range(max(1, len(targets))):
+                model = self._opening.row.target if j == 0 else targets[j].object
+                if j < len(targets):
+                    tracks = [f.tracks.get(cam, ())[j : j + 1] for f in self._frames]
+                    self._send_classes(index, f"{cam}/mask/target{suffix(j)}", [t[0].mask if t else None for t in tracks], shape, 1)
+                if any(model in f.truth.masks.get(cam, {}) for f in self._frames):
+                    seen = [f.truth.masks.get(cam, {}).get(model) for f in self._frames]
+                    self._send_classes(index, f"{cam}/mask/gt{suffix(j)}", seen, shape, 3)
+
+    def _send_classes(self, index: list[rr.TimeColumn], tail: str, masks: Sequence[Mask | None], shape: tuple[int, int], inside: int) -> None:
+        blank = np.zeros(shape, np.uint8)
+        buffers = np.stack([blank if mask is None else classes(mask, inside) for mask in masks]).reshape(len(masks), -1)
+        kind = rr.components.ImageFormat(shape[1], shape[0], color_model="L", channel_datatype="U8")
+        columns = rr.SegmentationImage.columns(buffer=list(buffers), format=[kind] * len(masks))
+        self._stream().send_columns(f"/observation.images.{tail}", index, columns)
+
+    def _send_grasp(self) -> None:
+        """Only changes: a state lasts until the next."""
+        changes = []
+        for i, frame in enumerate(self._frames, start=len(self._steps) - len(self._frames)):
+            state = grasp_state(frame, self._opening.row.target)
+            if state != self._grasp:
+                changes.append((i, state))
+                self._grasp = state
+        if changes:
+            index = self._index([self._steps[i] for i, _ in changes], [self._times[i] for i, _ in changes])
+            self._stream().send_columns("/vap/status/grasp", index, rr.StateChange.columns(state=[state for _, state in changes]))
+
+    def _send_events(self, events: Sequence[Event]) -> None:
+        if events:
+            at = dict(zip(self._steps, self._times, strict=True))
+            index = self._index([e.frame_index for e in events], [at.get(e.frame_index, self._times[-1]) for e in events])
+            colours = np.array([packed(LEVEL_COLOURS[e.level]) for e in events], np.uint32)
+            columns = rr.TextLog.columns(text=[e.text for e in events], level=[e.level for e in events], color=colours)
+            self._stream().send_columns("/vap/events", index, columns)
+
+
+def record_grounding(path: Path, image: Rgb, grounding: Grounding, obj: PersonalObject, text: str, rewritten: str, prompted: Rgb) -> None:
+    """A one-picture recording for `vap_core ground`: the vote, its references and similarities, the mask, the prompt.
+
+    Raises: BadOutput, when `path` exists or its folder cannot be written.
+    """
+    cam, path = grounding.camera, Path(path)
+    root = f"/observation.images.{cam}"
+    rec = open_stream(path, f"ground.{grounding.object}.{cam}.{path.stem}")
+    rec.send_recording_name(f"ground · {grounding.object}")
+    rec.log("/", rr.AnnotationContext(CLASSES), static=True)
+    rec.set_time("frame_index", sequence=0)
+    rec.set_time("timestamp", duration=0.0)
+    picture = jpeg(image, 95)
+    rec.log(root, rr.EncodedImage(contents=picture.tobytes(), media_type="image/jpeg"))
+    rec.log(f"{root}/prompted", rr.EncodedImage(contents=jpeg(prompted, 95).tobytes(), media_type="image/jpeg"))
+    log_vote(rec, grounding, 0, picture)
+    if grounding.mask is not None:
+        rec.log(f"{root}/mask/target", rr.SegmentationImage(classes(grounding.mask, 1)))
+    rec.log("/vap/references", rr.EncodedImage(contents=jpeg(contact_sheet(obj.crops), 95).tobytes(), media_type="image/jpeg"))
+    rec.log(f"/vap/similarity/{cam}", rr.Tensor(grounding.similarity, dim_names=("candidate", "reference")))
+    lines = [
+        f'**said** "{text}"',
+        f'**policy reads** "{rewritten}"',
+        evidence_line(grounding),
+        f"{obj.name} · {obj.category} · {len(obj.crops)} references · {obj.encoder}",
+    ]
+    rec.log("/vap/instruction", rr.TextDocument("\n\n".join(lines), media_type=rr.MediaType.MARKDOWN))
+    rec.reset_time()
+    rec.send_blueprint(grounding_blueprint(cam, grounding))
+    finish_stream(rec, path)

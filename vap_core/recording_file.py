@@ -1,0 +1,115 @@
+"""The file of a recording: its name, its growing temporary, its rescue after a kill, its summary."""
+
+import re
+import subprocess
+import sys
+from datetime import timedelta
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import rerun as rr
+from rerun.chunk import RrdReader
+
+from vap_core.errors import BadOutput, BadRecording
+from vap_core.values import EpisodeRow
+
+
+@lru_cache(maxsize=1)
+def code_version() -> str:
+    """The commit this package runs from, with `+` when the tree differs, or the installed version outside a checkout."""
+    here = Path(__file__).resolve().parent
+    try:
+        found = subprocess.run(
+            ["git", "-C", str(here), "describe", "--always", "--dirty=+", "--abbrev=10"], capture_output=True, text=True, timeout=10, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return f"vap-core {version('vap-core')}"
+    return found.stdout.strip()
+
+
+def recording_name(row: EpisodeRow, method: str) -> str:
+    """The file name of an episode's recording, e.g. `simpler-bridge.put-owl.003.s7.vap.rrd`."""
+    return re.sub(r"[^\w.+-]+", "-", f"{row.key}.s{row.seed}.{method}").strip("-.") + ".rrd"
+
+
+def temporary(path: Path) -> Path:
+    """Where a recording grows until it is finished: same folder, leading dot, and no `.rrd` at its end."""
+    return path.with_name(f".{path.name}.tmp")
+
+
+def open_stream(path: Path, recording_id: str) -> rr.RecordingStream:
+    """A stream into `temporary(path)` that flushes only when told, so that equal runs give equal chunks.
+
+    Raises: BadOutput, when `path` exists or its folder cannot be written.
+    """
+    if path.exists():
+        raise BadOutput(f"record: {path} already exists and is never overwritten; choose another folder or remove it.")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary(path).write_bytes(b"")
+    except OSError as err:
+        raise BadOutput(f"record: cannot write in {path.parent} ({err.strerror}); choose a folder you may write to.") from err
+    config = rr.ChunkBatcherConfig(flush_tick=timedelta(days=365), flush_num_bytes=2**40, flush_num_rows=2**40)
+    rec = rr.RecordingStream("vap", recording_id=recording_id, send_properties=False, batcher_config=config)
+    rec.set_log_time_enabled(False)
+    rec.save(temporary(path))
+    return rec
+
+
+def finish_stream(rec: rr.RecordingStream, path: Path) -> None:
+    """Write the footer, then give the recording its name."""
+    rec.flush()
+    rec.disconnect()
+    if path.exists():
+        raise BadOutput(f"record: {path} appeared meanwhile; this run's recording is kept as {temporary(path)}.")
+    temporary(path).replace(path)
+
+
+def rerun_cli(*words: str | Path) -> list[str]:
+    """A command line of the rerun that this environment holds."""
+    return [sys.executable, "-m", "rerun", *map(str, words)]
+
+
+def recover(leftover: Path) -> Path:
+    """Mend the temporary file that a killed process left, and give it the name of a recording; returns that path.
+
+    It holds every step up to the last flush, and no outcome.
+
+    Raises: BadOutput, when the recording exists; BadRecording, when nothing can be saved.
+    """
+    leftover = Path(leftover)
+    path = leftover.with_name(leftover.name.removeprefix(".").removesuffix(".tmp"))
+    if path == leftover or path.exists():
+        raise BadOutput(f"recover: {path} already exists and is never overwritten; {leftover} was left as it is.")
+    mended = leftover.with_name(f".{path.name}.mended")
+    done = subprocess.run(rerun_cli("rrd", "optimize", leftover, "-o", mended), capture_output=True, text=True, check=False)
+    try:
+        if done.returncode or not mended.is_file():
+            raise unreadable(leftover, done.stderr)
+        read_summary(mended)
+        mended.replace(path)
+    finally:
+        mended.unlink(missing_ok=True)
+    leftover.unlink()
+    return path
+
+
+def read_summary(path: Path) -> dict[str, Any]:
+    """Properties as `rollout.<name>` and `outcome.<name>`, and `frames`, the number of recorded steps.
+
+    Raises: BadRecording, when the file is missing, damaged, or no recording.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise BadRecording(f"read_summary: there is no recording at {path}.")
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        del batch
+    return {}
+
+
+def unreadable(path: Path, why: object) -> BadRecording:
+    reason = " ".join(str(why).split())[-160:]
+    return BadRecording(f"{path} cannot be read as a recording ({reason}); `rerun rrd optimize {path} -o mended.rrd` saves what can be saved.")

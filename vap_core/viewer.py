@@ -1,0 +1,77 @@
+"""A still picture of a recording, drawn by rerun's own viewer without a display."""
+
+import os
+import socket
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rerun.experimental import ViewerClient
+
+from vap_core.errors import MissingGL
+from vap_core.recording_file import read_summary, rerun_cli
+
+DRIVER = "mesa-vulkan-drivers"
+"""Debian package of the software Vulkan driver (lavapipe) that draws without a GPU."""
+
+
+def free_port() -> int:
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        return int(sock.getsockname()[1])
+
+
+@contextmanager
+def headless_viewer(size: tuple[int, int], timeout_s: float = 40.0) -> Iterator[ViewerClient]:
+    """A viewer without a window, reachable on 127.0.0.1 alone and gone at the end of the block.
+
+    Raises: MissingGL, when no graphics driver can draw.
+    """
+    port = free_port()
+    window = f"{size[0]}x{size[1]}"
+    command = rerun_cli(
+        "--headless", "--window-size", window, "--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen", "--expect-data-soon"
+    )
+    with tempfile.TemporaryFile("w+") as log, subprocess.Popen(command, stdout=log, stderr=log, env={**os.environ, "RUST_LOG": "warn"}) as process:
+        try:
+            yield connect(process, port, timeout_s)
+        except (RuntimeError, ConnectionError, TimeoutError) as err:
+            log.seek(0)
+            said = " ".join(log.read().split())[-200:]
+            raise MissingGL(f"screenshot: the viewer could not draw ({err}; {said}); install a software driver: apt-get install -y {DRIVER}") from err
+        finally:
+            process.terminate()
+
+
+def connect(process: subprocess.Popen[bytes], port: int, timeout_s: float) -> ViewerClient:
+    """Wait until the viewer answers."""
+    end = time.monotonic() + timeout_s
+    while True:
+        if process.poll() is not None:
+            raise ConnectionError(f"it ended with status {process.returncode}")
+        try:
+            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            client.get_state()
+            return client
+        except (RuntimeError, ConnectionError):
+            if time.monotonic() > end:
+                raise
+            time.sleep(0.2)
+
+
+def screenshot(rrd: Path, png: Path, *, frame_index: int | None = None, size: tuple[int, int] = (1600, 1000)) -> None:
+    """Open a recording at one step and save what a researcher would see, `size` pixels wide and high.
+
+    Raises: BadRecording, when `rrd` cannot be read; MissingGL, when nothing can draw; BadOutput, when `png` cannot be written.
+    """
+    frames = read_summary(rrd)
+    with headless_viewer(size) as viewer:
+        print(viewer.open(str(Path(rrd).resolve())))
+        print(viewer.get_state())
+        if frame_index is not None:
+            viewer.set_time("frame_index", sequence=frame_index, play_state="paused")
+        time.sleep(3)
+        viewer.save_screenshot(str(png))
