@@ -17,7 +17,8 @@ Rgb = UInt8[np.ndarray, "h w 3"]
 Mask = Bool[np.ndarray, "h w"]
 Pose = Float64[np.ndarray, "7"]
 Chunk = Float32[np.ndarray, "t 7"]
-"""Actions to come, one row per control step: `dx dy dz` metres and `drx dry drz` rotation vector in the robot base frame, `gripper` 0 closed .. 1 open."""
+"""Actions to come, one row per control step: `dx dy dz` (m) and the rotation vector `drx dry drz` (rad) in the robot base
+frame, then `gripper` 0 closed .. 1 open."""
 
 Views = Mapping[str, Rgb]
 """One image per camera, keyed by the camera's name."""
@@ -61,7 +62,9 @@ class PersonalObject:
 
     def __post_init__(self) -> None:
         if len(self.crops) != len(self.embeddings) or not self.crops:
-            raise ValueError(f"PersonalObject {self.name!r}: {len(self.crops)} crops for {len(self.embeddings)} embeddings; one each, and at least one")
+            raise ValueError(
+                f"PersonalObject {self.name!r}: {len(self.crops)} crops for {len(self.embeddings)} embeddings; one each, and at least one"
+            )
         norm = np.linalg.norm(self.embeddings, axis=1)
         if not np.allclose(norm, 1.0, atol=1e-3):
             raise ValueError(f"PersonalObject {self.name!r}: embeddings must be L2-normalised, got norms {norm.tolist()}")
@@ -291,10 +294,21 @@ class Episode:
         row, out = self.opening.row, self.outcome
         margins = [g.margin for per_view in self.opening.groundings.values() for g in per_view]
         return {
-            "suite": row.suite, "task": row.task, "episode": row.episode, "seed": row.seed,
-            "method": self.opening.method, "policy": self.opening.policy,
-            "outcome": out.status, "success": out.success, "success_once": out.success_once, "held_steps": out.held_steps,
-            "cmr": out.cmr, "wrong_object": out.wrong_object, "first_object_correct": out.first_object_correct,
-            "steps": out.steps, "margin": min(margins) if margins else None, "detail": out.detail,
+            "suite": row.suite,
+            "task": row.task,
+            "episode": row.episode,
+            "seed": row.seed,
+            "method": self.opening.method,
+            "policy": self.opening.policy,
+            "outcome": out.status,
+            "success": out.success,
+            "success_once": out.success_once,
+            "held_steps": out.held_steps,
+            "cmr": out.cmr,
+            "wrong_object": out.wrong_object,
+            "first_object_correct": out.first_object_correct,
+            "steps": out.steps,
+            "margin": min(margins) if margins else None,
+            "detail": out.detail,
             **{f"seconds_{part}": seconds for part, seconds in self.seconds.items()},
         }

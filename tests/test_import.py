@@ -1,0 +1,24 @@
+"""The front door opens fast and loads nothing heavy."""
+
+import subprocess
+import sys
+
+import vap_core
+
+HEAVY = ("torch", "mujoco", "rerun", "transformers", "matplotlib", "pandas", "cv2")
+
+
+def test_import_loads_nothing_heavy() -> None:
+    code = f"import sys, vap_core; print([m for m in {HEAVY!r} if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+
+
+def test_import_is_fast() -> None:
+    code = "import time; t = time.perf_counter(); import vap_core; print(time.perf_counter() - t)"
+    took = [float(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout) for _ in range(3)]
+    assert min(took) < 0.3
+
+
+def test_every_exported_name_exists() -> None:
+    for name in vap_core.__all__:
+        assert getattr(vap_core, name) is not None

@@ -1,0 +1,90 @@
+"""Parsing and rewriting, exactly."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vap_core.errors import BadInstruction
+from vap_core.instruction import parse, rewrite
+from vap_core.prompt import PALETTE
+
+RED, BLUE = PALETTE[0], PALETTE[1]
+
+
+@pytest.mark.parametrize(
+    ("text", "category", "rewritten"),
+    [
+        ("bring my cup", "cup", "bring the red cup"),
+        ("Bring my cup.", "cup", "Bring the red cup."),
+        ("My cup, please", "cup", "The red cup, please"),
+        ("pick up my owl figurine", "owl figurine", "pick up the red owl figurine"),
+        ("put my straw cup on the plate", "straw cup", "put the red straw cup on the plate"),
+        ("take my brother's dog figurine to the table", "dog figurine", "take the red dog figurine to the table"),
+        ("move my bottle near coke can", "bottle", "move the red bottle near coke can"),
+        ("give me my  pen   holder now", "pen holder", "give me the red pen holder now"),
+        ("bring MY CUP", "cup", "bring The red cup"),
+        ("fetch my teddy-bear", "teddy-bear", "fetch the red teddy-bear"),
+    ],
+)
+def test_golden(text: str, category: str, rewritten: str) -> None:
+    instruction = parse(text, ["cup", "straw cup", "pen holder"])
+    assert [t.category for t in instruction.targets] == [category]
+    assert rewrite(instruction, [RED]) == rewritten
+
+
+def test_owner_is_kept() -> None:
+    assert parse("bring my brother's cup").targets[0].owner == "my brother's"
+
+
+def test_several_targets() -> None:
+    instruction = parse("put my pouch near my vase")
+    assert [t.category for t in instruction.targets] == ["pouch", "vase"]
+    assert rewrite(instruction, [RED, BLUE]) == "put the red pouch near the blue vase"
+    assert rewrite(instruction, [None, BLUE]) == "put my pouch near the blue vase"
+
+
+def test_longest_known_category_wins() -> None:
+    assert parse("bring my straw cup holder", ["cup", "straw cup"]).targets[0].category == "straw cup"
+    assert parse("bring my cup holder", ["cup", "cup holder"]).targets[0].category == "cup holder"
+
+
+def test_plural_counts_as_the_category() -> None:
+    assert rewrite(parse("bring my cups", ["cup"]), [RED]) == "bring the red cup"
+
+
+@pytest.mark.parametrize("text", ["", "bring the cup", "bring my", "mystery of the cup", "bring my and"])
+def test_no_possessive_is_an_error_that_says_how(text: str) -> None:
+    with pytest.raises(BadInstruction, match='name one as "my <category>"'):
+        parse(text)
+
+
+def test_colours_must_match_targets() -> None:
+    with pytest.raises(BadInstruction, match="1 targets|one each"):
+        rewrite(parse("bring my cup"), [RED, BLUE])
+
+
+nouns = st.sampled_from(["cup", "vase", "owl figurine", "leather bag", "shoe"])
+
+
+@given(nouns, nouns)
+def test_renaming_an_object_rewrites_only_its_noun(one: str, other: str) -> None:
+    first, second = (rewrite(parse(f"put my {noun} on the plate"), [RED]) for noun in (one, other))
+    assert first.replace(one, other) == second
+
+
+@given(st.text(alphabet=st.characters(codec="ascii", exclude_characters="\n"), max_size=30), nouns)
+def test_the_rest_of_the_text_is_untouched(before: str, noun: str) -> None:
+    text = f"{before} | my {noun}."
+    try:
+        instruction = parse(text)
+    except BadInstruction:
+        return
+    if len(instruction.targets) == 1 and instruction.targets[0].category == noun:
+        out = rewrite(instruction, [RED])
+        assert out == f"{before} | the red {noun}."
+
+
+@given(nouns)
+def test_a_rewritten_instruction_has_nothing_left_to_rewrite(noun: str) -> None:
+    with pytest.raises(BadInstruction):
+        parse(rewrite(parse(f"bring my {noun}"), [RED]))

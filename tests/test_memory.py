@@ -1,0 +1,138 @@
+"""Photos in, objects out and back; every damaged input is one clear line and loses nothing."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from tests.toys import TOYS, personal, scene
+from vap_core.errors import BadMemory, BadOutput, BadPhoto
+from vap_core.memory import load, load_bank, load_photo, register, save
+
+TEAL = (40, 120, 110)
+
+
+@given(st.lists(st.tuples(*[st.integers(1, 255)] * 3), min_size=1, max_size=6), st.sampled_from(["mug", "my owl.2", "a_b-c"]))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=20)
+def test_save_then_load_is_the_same_object(tmp_path: Path, colours: list[tuple[int, int, int]], name: str) -> None:
+    obj = personal(name, "cup", *colours)
+    back = load(save(tmp_path, obj, replace=True), obj.encoder)
+    assert (back.name, back.category, back.encoder) == (obj.name, obj.category, obj.encoder)
+    assert (back.embeddings == obj.embeddings).all()
+    assert all((a == b).all() for a, b in zip(back.crops, obj.crops, strict=True))
+
+
+def test_register_crops_with_the_detector() -> None:
+    obj, whole = register("mug", " Cup ", [scene([(4, 8, TEAL)]), scene([(30, 30, TEAL)])], TOYS.detector, TOYS.encoder)
+    assert (obj.category, len(obj.crops), whole) == ("cup", 2, ())
+    assert all(crop.shape[0] < 40 for crop in obj.crops)
+
+
+def test_register_uses_the_whole_photo_where_nothing_is_found() -> None:
+    photo = scene([(4, 8, TEAL)])
+    obj, whole = register("mug", "nothing", [photo], TOYS.detector, TOYS.encoder)
+    assert whole == (0,)
+    assert (obj.crops[0] == photo).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "category", "photos", "error"),
+    [
+        ("../escape", "cup", 1, "cannot name an object"),
+        ("mug", " ", 1, "has no category"),
+        ("mug", "cup", 0, "has no photos; give at least one"),
+    ],
+)
+def test_register_says_what_is_missing(name: str, category: str, photos: int, error: str) -> None:
+    with pytest.raises((BadMemory, BadPhoto), match=error):
+        register(name, category, [scene([(4, 8, TEAL)])] * photos, TOYS.detector, TOYS.encoder)
+
+
+def test_an_object_is_never_overwritten_unasked(tmp_path: Path) -> None:
+    save(tmp_path, personal("mug", "cup", TEAL))
+    with pytest.raises(BadOutput, match="--replace"):
+        save(tmp_path, personal("mug", "cup", (9, 9, 9)))
+    assert (load_bank(tmp_path)["mug"].crops[0] == TEAL).all()
+
+
+def test_a_bank_in_a_file_is_no_bank(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BadOutput, match="choose another folder"):
+        save(tmp_path / "file", personal("mug", "cup", TEAL))
+
+
+def test_empty_bank_is_empty(tmp_path: Path) -> None:
+    assert load_bank(tmp_path / "none") == {}
+
+
+@pytest.mark.parametrize("cut", [0, 4, 30, -1])
+def test_a_damaged_memory_is_said(tmp_path: Path, cut: int) -> None:
+    path = save(tmp_path, personal("mug", "cup", TEAL))
+    path.write_bytes(path.read_bytes()[:cut])
+    with pytest.raises(BadMemory, match="damaged.*register the object again"):
+        load(path)
+
+
+def test_another_version_is_said(tmp_path: Path) -> None:
+    path = save(tmp_path, personal("mug", "cup", TEAL))
+    path.write_bytes(path.read_bytes().replace(b'"version":"1"', b'"version":"9"'))
+    with pytest.raises(BadMemory, match="version 9, this program reads version 1"):
+        load(path)
+
+
+def test_a_lying_header_is_damage(tmp_path: Path) -> None:
+    path = tmp_path / "x.object.safetensors"
+    path.write_bytes(struct.pack("<Q", 2**60) + b"{}")
+    with pytest.raises(BadMemory, match="damaged"):
+        load(path)
+
+
+def test_another_encoder_is_said(tmp_path: Path) -> None:
+    path = save(tmp_path, personal("mug", "cup", TEAL))
+    with pytest.raises(BadMemory, match="mean-colour.*register the object again with this stack"):
+        load(path, "dinov2")
+
+
+def write(path: Path, kind: str) -> Path:
+    if kind == "missing":
+        return path
+    if kind == "huge":
+        Image.new("1", (9000, 9000)).save(path)
+    else:
+        path.write_bytes({"empty": b"", "text": b"hello", "cut": b"\x89PNG\r\n\x1a\n" + b"\0" * 30}[kind])
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("missing", "is not a file"),
+        ("empty", "is empty"),
+        ("text", "cannot be read as an image"),
+        ("cut", "cannot be read"),
+        ("huge", "scale it down"),
+    ],
+)
+def test_bad_photos(tmp_path: Path, kind: str, message: str) -> None:
+    with pytest.raises(BadPhoto, match=message):
+        load_photo(write(tmp_path / "photo.png", kind))
+
+
+def test_photos_are_turned_upright_and_shrunk(tmp_path: Path) -> None:
+    image = Image.fromarray(np.zeros((20, 4000, 3), np.uint8))
+    exif = image.getexif()
+    exif[0x0112] = 6
+    image.save(tmp_path / "a.jpg", exif=exif)
+    assert load_photo(tmp_path / "a.jpg").shape == (1024, 5, 3)
+    assert load_photo(tmp_path / "a.jpg", long_side=None).shape == (4000, 20, 3)
+
+
+@pytest.mark.parametrize("mode", ["L", "RGBA", "P", "CMYK"])
+def test_every_colour_mode_becomes_rgb(tmp_path: Path, mode: str) -> None:
+    path = tmp_path / ("a.jpg" if mode == "CMYK" else "a.png")
+    Image.new(mode, (8, 6)).save(path)
+    assert load_photo(path).shape == (6, 8, 3)

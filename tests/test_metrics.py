@@ -1,0 +1,56 @@
+"""Rates against SciPy, and tables with a fixed denominator."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import binomtest
+
+from vap_core.metrics import rate, score, step_times
+
+
+@given(st.integers(1, 400).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
+def test_interval_is_scipys_wilson(kn: tuple[int, int]) -> None:
+    k, n = kn
+    ours, theirs = rate(k, n), binomtest(k, n).proportion_ci(method="wilson")
+    assert (ours.low, ours.high) == (pytest.approx(theirs.low, abs=1e-9), pytest.approx(theirs.high, abs=1e-9))
+
+
+def test_sixteen_of_twenty() -> None:
+    assert str(rate(16, 20)) == "80 % [58, 92]"
+
+
+def test_nothing_is_not_a_number() -> None:
+    assert math.isnan(rate(0, 0).value)
+
+
+def test_apart() -> None:
+    assert rate(20, 20).apart_from(rate(5, 20))
+    assert not rate(12, 20).apart_from(rate(10, 20))
+
+
+def episode(**changes: object) -> dict[str, object]:
+    base = {
+        "suite": "s", "task": "t", "method": "vap", "policy": "scripted", "outcome": "success", "success": True, "cmr": True,
+        "wrong_object": False, "first_object_correct": True, "steps": 10, "seconds_render": 0.1,
+    }  # fmt: skip
+    return {**base, **changes}
+
+
+def test_an_error_stays_in_the_denominator_and_wins_nothing() -> None:
+    (line,) = score([episode(), episode(outcome="error", success=False, cmr=True)])
+    assert (line.n, line.errors, line.sr.k, line.cmr.k) == (2, 1, 1, 1)
+
+
+def test_groups_by_method() -> None:
+    lines = score([episode(), episode(method="generic", success=False, outcome="failure"), episode()])
+    assert [(s.method, s.n, s.sr.k) for s in lines] == [("vap", 2, 2), ("generic", 1, 0)]
+
+
+def test_json_has_the_promised_fields() -> None:
+    assert {"suite", "task", "method", "n", "sr", "cmr", "wrong_object", "intervals"} <= score([episode()])[0].to_json().keys()
+
+
+def test_step_times_are_weighted_by_steps() -> None:
+    assert step_times([episode(), episode(steps=30, seconds_render=0.7)]) == {"render": pytest.approx(20.0)}

@@ -1,0 +1,80 @@
+"""The tint, pixel by pixel, and the choice of colours."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from jaxtyping import TypeCheckError
+
+from vap_core.errors import BadInstruction
+from vap_core.prompt import PALETTE, choose_colours, looks_like, tint
+
+RED = PALETTE[0]
+images = arrays(np.uint8, (7, 9, 3))
+masks = arrays(bool, (7, 9))
+
+
+@given(images, masks, st.floats(0, 1))
+def test_outside_is_bit_identical_and_inside_is_the_blend(rgb: np.ndarray, mask: np.ndarray, alpha: float) -> None:
+    before = rgb.copy()
+    out = tint(rgb, mask, RED, alpha)
+    assert (out[~mask] == rgb[~mask]).all()
+    assert (out[mask] == np.rint((1 - alpha) * rgb[mask] + alpha * np.array(RED.rgb))).all()
+    assert (rgb == before).all()
+
+
+def test_golden_pixel() -> None:
+    rgb = np.full((1, 1, 3), (100, 50, 201), np.uint8)
+    assert tint(rgb, np.ones((1, 1), bool), RED).tolist() == [[[178, 25, 100]]]
+
+
+@given(images, masks)
+def test_alpha_zero_is_identity(rgb: np.ndarray, mask: np.ndarray) -> None:
+    assert (tint(rgb, mask, RED, 0.0) == rgb).all()
+
+
+@given(images, masks)
+def test_commutes_with_mirroring(rgb: np.ndarray, mask: np.ndarray) -> None:
+    assert (tint(rgb[:, ::-1].copy(), mask[:, ::-1].copy(), RED) == tint(rgb, mask, RED)[:, ::-1]).all()
+
+
+def test_sizes_and_opacity_are_checked() -> None:
+    rgb = np.zeros((4, 4, 3), np.uint8)
+    with pytest.raises((ValueError, TypeCheckError), match="differ in size|mask"):
+        tint(rgb, np.zeros((3, 4), bool), RED)
+    with pytest.raises(ValueError, match="outside"):
+        tint(rgb, np.zeros((4, 4), bool), RED, 1.5)
+
+
+@pytest.mark.parametrize("colour", PALETTE, ids=lambda c: c.name)
+def test_every_colour_looks_like_itself_alone_even_tinted_over_grey(colour: object) -> None:
+    tinted = tint(np.full((2, 2, 3), 128, np.uint8), np.ones((2, 2), bool), colour)  # type: ignore[arg-type]
+    assert [c.name for c in PALETTE if looks_like(tinted, c).all()] == [colour.name]  # type: ignore[attr-defined]
+
+
+def test_nobody_calls_grey_a_colour() -> None:
+    grey = np.repeat(np.arange(256, dtype=np.uint8)[:, None], 3, axis=1)
+    assert not any(looks_like(grey, colour).any() for colour in PALETTE)
+
+
+def test_a_colour_in_view_is_not_chosen() -> None:
+    rgb = np.zeros((8, 8, 3), np.uint8)
+    rgb[:4] = (220, 10, 10)
+    top = np.zeros((8, 8), bool)
+    top[:4] = True
+    assert choose_colours(1, [(rgb, [top])])[0].name == "blue"
+    assert choose_colours(1, [(rgb, [~top])])[0].name == "red"
+    assert choose_colours(1, [])[0].name == "red"
+
+
+def test_several_targets_get_different_colours() -> None:
+    assert len({c.name for c in choose_colours(len(PALETTE), [])}) == len(PALETTE)
+    with pytest.raises(BadInstruction, match="name fewer objects"):
+        choose_colours(len(PALETTE) + 1, [])
+
+
+def test_when_every_colour_is_taken_the_least_present_is_used() -> None:
+    rgb = np.concatenate([np.full((1, 100 + 10 * i, 3), c.rgb, np.uint8) for i, c in enumerate(reversed(PALETTE))], axis=1)
+    chosen = choose_colours(1, [(rgb, [np.ones(rgb.shape[:2], bool)])])
+    assert chosen[0].name == PALETTE[-1].name

@@ -1,0 +1,55 @@
+"""Results are appended, never mixed and never overwritten."""
+
+from pathlib import Path
+
+import pytest
+
+from vap_core.errors import BadOutput
+from vap_core.store import KEY, append, digest, open_run, read
+
+ROW = {"suite": "s", "task": "t", "method": "vap", "episode": 0, "success": True}
+
+
+def test_digest_ignores_order_and_sees_change() -> None:
+    assert digest({"a": 1, "b": 2}) == digest({"b": 2, "a": 1}) != digest({"a": 1, "b": 3})
+
+
+def test_a_run_is_resumed_by_the_same_configuration_only(tmp_path: Path) -> None:
+    run = open_run(tmp_path / "run", {"seed": 0})
+    append(run, [ROW, {**ROW, "episode": 1}])
+    assert open_run(run, {"seed": 0}) == run
+    with pytest.raises(BadOutput, match="holds another run .* choose another folder"):
+        open_run(run, {"seed": 1})
+    assert len(read(run)) == 2
+
+
+def test_the_same_episode_counts_once(tmp_path: Path) -> None:
+    run = open_run(tmp_path / "run", {})
+    append(run, [ROW])
+    append(run, [ROW])
+    assert read(run)[KEY].to_records(index=False).tolist() == [("s", "t", "vap", 0)]
+
+
+def test_a_part_cut_short_is_not_seen(tmp_path: Path) -> None:
+    run = open_run(tmp_path / "run", {})
+    append(run, [ROW])
+    (run / "parts" / ".half.parquet.tmp").write_bytes(b"PAR1")
+    assert len(read(run)) == 1
+
+
+def test_an_empty_run_is_an_empty_table(tmp_path: Path) -> None:
+    assert read(open_run(tmp_path / "run", {})).empty
+
+
+def test_foreign_folders_and_files_are_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "precious.txt").write_text("keep")
+    with pytest.raises(BadOutput, match="is not empty and holds no run"):
+        open_run(tmp_path, {})
+    with pytest.raises(BadOutput, match="is a file"):
+        open_run(tmp_path / "precious.txt", {})
+    with pytest.raises(BadOutput, match="cannot be written"):
+        open_run(Path("/proc/nowhere"), {})
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "run.json").write_text("{")
+    with pytest.raises(BadOutput, match="damaged"):
+        open_run(tmp_path / "run", {})

@@ -1,0 +1,93 @@
+"""The vote against a slow readable reference, exact cases and properties."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from vap_core.vote import similarity, vote
+
+cosines = st.integers(0, 2**31).flatmap(
+    lambda seed: st.tuples(st.integers(1, 6), st.integers(1, 7)).map(
+        lambda shape: np.random.default_rng(seed).uniform(-1, 1, shape).astype(np.float32),
+    )
+)
+
+
+def slow_vote(cosine: np.ndarray) -> int:
+    """The paper's rule, written out."""
+    votes = [0] * len(cosine)
+    for k in range(cosine.shape[1]):
+        votes[max(range(len(cosine)), key=lambda i: cosine[i, k])] += 1
+    tied = [i for i in range(len(cosine)) if votes[i] == max(votes)]
+    return max(tied, key=lambda i: np.mean(cosine[i].astype(np.float64)))
+
+
+@given(cosines)
+def test_equals_the_readable_reference(cosine: np.ndarray) -> None:
+    assert vote(cosine).winner == slow_vote(cosine)
+
+
+@given(cosines, st.randoms(use_true_random=False))
+def test_candidate_order_does_not_matter(cosine: np.ndarray, random: object) -> None:
+    order = np.random.default_rng(random.randint(0, 99)).permutation(len(cosine))  # type: ignore[attr-defined]
+    before, after = vote(cosine), vote(cosine[order])
+    assert order[after.winner] == before.winner
+    assert (after.votes == before.votes[order]).all()
+    assert after.margin == before.margin
+
+
+@given(cosines)
+def test_reference_order_does_not_matter(cosine: np.ndarray) -> None:
+    assert vote(cosine[:, ::-1].copy()).winner == vote(cosine).winner
+
+
+@given(cosines)
+def test_every_reference_votes_once(cosine: np.ndarray) -> None:
+    ballot = vote(cosine)
+    assert ballot.votes.sum() == cosine.shape[1]
+    assert 0 <= ballot.margin <= 1
+
+
+@given(arrays(np.float32, st.tuples(st.integers(1, 5), st.integers(1, 5)), elements=st.sampled_from([0.25, 0.5, 1.0])))
+def test_margin_and_ties_are_what_they_say(cosine: np.ndarray) -> None:
+    ballot = vote(cosine)
+    rest = np.delete(ballot.votes, ballot.winner)
+    assert ballot.margin == (ballot.votes[ballot.winner] - (rest.max() if len(rest) else 0)) / cosine.shape[1]
+    assert ballot.tied.any() == (np.count_nonzero(ballot.votes == ballot.votes.max()) > 1)
+
+
+def test_orthogonal_distractor_never_wins() -> None:
+    references = np.eye(4, dtype=np.float32)[:2]
+    candidates = np.array([[0, 0, 1, 0], [0.6, 0.8, 0, 0], [0, 0, 0, 1]], np.float32)
+    assert vote(similarity(candidates, references)).winner == 1
+
+
+def test_tie_goes_to_the_higher_mean_cosine() -> None:
+    ballot = vote(np.array([[0.9, 0.1], [0.2, 0.8], [0.5, 0.5]], np.float32))
+    assert ballot.votes.tolist() == [1, 1, 0]
+    assert ballot.tied.tolist() == [True, True, False]
+    assert vote(np.array([[0.9, 0.1], [0.2, 0.9]], np.float32)).winner == 1
+
+
+def test_votes_and_average_differ_where_they_should() -> None:
+    cosine = np.array([[0.6, 0.6, 0.0], [0.5, 0.5, 0.9]], np.float32)
+    assert vote(cosine, "vote").winner == 0
+    assert vote(cosine, "average").winner == 1
+
+
+def test_no_candidate_is_a_result() -> None:
+    ballot = vote(np.zeros((0, 5), np.float32))
+    assert ballot.winner is None
+    assert ballot.margin == 0.0
+
+
+def test_no_reference_is_a_mistake() -> None:
+    with pytest.raises(ValueError, match="no references"):
+        vote(np.zeros((2, 0), np.float32))
+
+
+def test_similarity_is_cosine() -> None:
+    a, b = np.array([[1, 0], [0, 1]], np.float32), np.array([[0.6, 0.8]], np.float32)
+    assert similarity(a, b).tolist() == [[pytest.approx(0.6)], [pytest.approx(0.8)]]

@@ -1,0 +1,186 @@
+"""ENTRY: turn what the user said and what the cameras saw into what a frozen policy can follow (P 3.2, 3.3).
+
+    attender = Attender(load_stack("embedded"), memory)
+    state, attended = attender.start({"front": rgb}, "bring my cup")       # t = 0: detect, vote, segment
+    state, attended = attender.step(state, {"front": rgb})                 # t > 0: track only
+    policy(attended.images, attended.text)
+
+Views are grounded independently. A view without candidates, or whose tracker lost the target, passes unmodified.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from vap_core import detect, embed, segment, track
+from vap_core.errors import BadInstruction, one_of
+from vap_core.instruction import Parser, parse, rewrite
+from vap_core.memory import recall
+from vap_core.prompt import ALPHA, PALETTE, choose_colours, tint
+from vap_core.values import Attended, Boxes, Colour, Event, Grounding, Instruction, PersonalObject, Rgb, Track, Views, value
+from vap_core.vote import Rule, similarity, vote
+
+
+@dataclass(frozen=True)
+class Stack:
+    """The four frozen models of the method. `domain` says in words what the detector was trained on."""
+
+    name: str
+    detector: detect.Detector
+    encoder: embed.Encoder
+    segmenter: segment.Segmenter
+    tracker: track.Tracker
+    domain: str
+
+
+@dataclass(frozen=True)
+class Prompting:
+    """What is changed in the policy's inputs; the defaults are the paper's method, the switches its ablations."""
+
+    alpha: float = ALPHA
+    palette: tuple[Colour, ...] = PALETTE
+    highlight: bool = True
+    rewrite: bool = True
+    rule: Rule = "vote"
+
+
+@value
+class Seen:
+    """The candidates of one phrase in one view; candidate i has identity `first_id` + i in that view's tracker."""
+
+    candidates: Boxes
+    embeddings: Float32[np.ndarray, "n d"]
+    masks: Bool[np.ndarray, "n h w"]
+    first_id: int
+
+
+@value
+class AttendState:
+    """What one episode carries from step to step. `ids[camera][j]` is target j's identity in that view's tracker."""
+
+    frame_index: int
+    instruction: Instruction
+    colours: tuple[Colour, ...]
+    text: str
+    groundings: Mapping[str, tuple[Grounding, ...]]
+    ids: Mapping[str, tuple[int | None, ...]]
+    trackers: Mapping[str, Any]
+    visible: frozenset[tuple[str, int]]
+
+
+class Attender:
+    """Grounds personal objects at t = 0, follows them after, and prompts every image; holds models, no episode state."""
+
+    def __init__(self, stack: Stack, memory: Mapping[str, PersonalObject], prompting: Prompting | None = None, parser: Parser = parse) -> None:
+        self.stack = stack
+        self.memory = memory
+        self.prompting = prompting or Prompting()
+        self.parser = parser
+
+    def start(
+        self, views: Views, instruction: str, *, objects: Sequence[str] | None = None, boxes: Mapping[str, Boxes] | None = None
+    ) -> tuple[AttendState, Attended]:
+        """Ground every target of `instruction` in every view (t = 0).
+
+        `objects` names the remembered object of each target in turn, where its category alone does not decide;
+        `boxes` replaces the detector by candidates given by hand, per camera.
+
+        Raises:
+            BadInstruction, UnknownName: what was said cannot be matched with the memory.
+        """
+        parsed = self.parser(instruction, {obj.category for obj in self.memory.values()})
+        if objects is not None and len(objects) != len(parsed.targets):
+            raise BadInstruction(f"Attender.start: {len(objects)} objects named for {len(parsed.targets)} targets in {instruction!r}; one each.")
+        names: Sequence[str | None] = objects or [None] * len(parsed.targets)
+        wanted = [recall(self.memory, target, name) for target, name in zip(parsed.targets, names, strict=True)]
+        cameras = list(views)
+
+        seen: dict[str, dict[str, Seen]] = {camera: {} for camera in cameras}
+        for phrase in dict.fromkeys(target.category for target in parsed.targets):
+            found = [boxes[c] for c in cameras] if boxes is not None else self.stack.detector([views[c] for c in cameras], phrase)
+            for camera, candidates in zip(cameras, found, strict=True):
+                first_id = sum(len(other.candidates) for other in seen[camera].values())
+                seen[camera][phrase] = self._look(views[camera], candidates, first_id)
+
+        pairs = list(zip([target.category for target in parsed.targets], wanted, strict=True))
+        groundings = {camera: tuple(self._ground(camera, obj, seen[camera][phrase]) for phrase, obj in pairs) for camera in cameras}
+        ids = {
+            camera: tuple(
+                None if g.winner is None else seen[camera][phrase].first_id + g.winner
+                for (phrase, _), g in zip(pairs, groundings[camera], strict=True)
+            )
+            for camera in cameras
+        }
+        masks = {camera: np.concatenate([part.masks for part in seen[camera].values()]) for camera in cameras}
+
+        colours = choose_colours(len(wanted), [(views[camera], list(masks[camera])) for camera in cameras], self.prompting.palette)
+        named = [colour if any(ids[camera][j] is not None for camera in cameras) else None for j, colour in enumerate(colours)]
+        text = rewrite(parsed, named) if self.prompting.rewrite else instruction
+        tracked = [camera for camera in cameras if len(masks[camera])]
+        trackers = dict(zip(tracked, self.stack.tracker.start([views[c] for c in tracked], [masks[c] for c in tracked]), strict=True))
+        tracks = {camera: tuple(Track(g.mask, 0.0 if g.mask is None else 1.0) for g in groundings[camera]) for camera in cameras}
+        state = AttendState(0, parsed, colours, text, groundings, ids, trackers, _visible(tracks))
+        events = tuple(_describe(g) for per_view in groundings.values() for g in per_view)
+        return state, self._prompt(state, views, tracks, events)
+
+    def step(self, state: AttendState, views: Views) -> tuple[AttendState, Attended]:
+        """Follow every target by the tracker alone and prompt the new images (t > 0). Consumes `state`."""
+        cameras = list(state.trackers)
+        trackers, found = self.stack.tracker.step([state.trackers[c] for c in cameras], [views[c] for c in cameras])
+        by_camera = dict(zip(cameras, found, strict=True))
+        tracks = {
+            camera: tuple(Track(None, 0.0) if i is None else by_camera[camera][i] for i in state.ids[camera]) for camera in views
+        }  # fmt: skip
+        index, visible = state.frame_index + 1, _visible(tracks)
+        lost = [Event(index, "WARN", f"{c}: target {j} not visible, the view passes unmodified") for c, j in sorted(state.visible - visible)]
+        back = [Event(index, "INFO", f"{c}: target {j} re-acquired") for c, j in sorted(visible - state.visible)]
+        state = replace(state, frame_index=index, trackers=dict(zip(cameras, trackers, strict=True)), visible=visible)
+        return state, self._prompt(state, views, tracks, (*lost, *back))
+
+    def _look(self, rgb: Rgb, candidates: Boxes, first_id: int) -> Seen:
+        """Embed and segment every candidate of one view."""
+        embeddings = self.stack.encoder([embed.crop(rgb, box) for box in candidates.xyxy])
+        return Seen(candidates, embeddings, self.stack.segmenter(rgb, candidates), first_id)
+
+    def _ground(self, camera: str, obj: PersonalObject, seen: Seen) -> Grounding:
+        cosine = similarity(seen.embeddings, obj.embeddings)
+        b = vote(cosine, self.prompting.rule)
+        return Grounding(camera, obj.name, seen.candidates, cosine, b.votes, b.tied, b.winner, b.margin, b.cosine_margin, seen.masks)
+
+    def _prompt(self, state: AttendState, views: Views, tracks: Mapping[str, tuple[Track, ...]], events: tuple[Event, ...]) -> Attended:
+        images = dict(views)
+        if self.prompting.highlight:
+            for camera, per_target in tracks.items():
+                for track, colour in zip(per_target, state.colours, strict=True):
+                    if track.mask is not None:
+                        images[camera] = tint(images[camera], track.mask, colour, self.prompting.alpha)
+        return Attended(images, state.text, state.colours, tracks, state.groundings, events)
+
+
+def embedded() -> Stack:
+    """The offline stack: frozen EfficientNet-Lite0 features and small heads trained on rendered generic objects."""
+    return Stack("embedded", detect.load(), embed.load(), segment.load(), track.load(), "rendered tabletop scenes")
+
+
+STACKS: dict[str, Callable[[], Stack]] = {"embedded": embedded}
+
+
+def load_stack(name: str) -> Stack:
+    """Build a stack by name; loading weights takes about a second."""
+    if name not in STACKS:
+        raise one_of("load_stack: stack", name, STACKS)
+    return STACKS[name]()
+
+
+def _visible(tracks: Mapping[str, tuple[Track, ...]]) -> frozenset[tuple[str, int]]:
+    return frozenset((camera, j) for camera, per_target in tracks.items() for j, track in enumerate(per_target) if track.mask is not None)
+
+
+def _describe(g: Grounding) -> Event:
+    if g.winner is None:
+        return Event(0, "WARN", f"{g.camera}: no {g.candidates.phrase} found, the view passes unmodified")
+    tie = " after a tie" if g.tied[g.winner] else ""
+    return Event(0, "INFO", f"{g.camera}: {g.object} is candidate {g.winner} with {g.votes[g.winner]}/{g.similarity.shape[1]} votes{tie}")

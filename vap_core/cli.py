@@ -1,0 +1,210 @@
+"""The commands. Each parses, calls one function of the house, and prints; errors the user can mend are one line, status 2."""
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vap_core.errors import VapError
+
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False, rich_markup_mode=None, help=__doc__)
+train_app = typer.Typer(no_args_is_help=True, help="Train shipped parts again; every training resumes after an interruption.")
+app.add_typer(train_app, name="train")
+
+Memory = Annotated[Path, typer.Option(help="Folder of remembered objects.")]
+StackName = Annotated[str, typer.Option("--stack", help="Perception stack: embedded (offline, CPU).")]
+BANK = Path("data/memory")
+NOTE = "note: the embedded detector knows {domain} only, not real photos; on a real photo trust its boxes only after a look, or give --box."
+
+
+def main() -> None:
+    """Run the command line; what the user can mend is printed as one line."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    try:
+        app()
+    except VapError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted; run the same command again and it goes on where it stopped.", file=sys.stderr)
+        sys.exit(130)
+
+
+@app.command()
+def register(
+    name: Annotated[str, typer.Argument(help="What to call the object, for example mug.")],
+    photos: Annotated[list[Path], typer.Argument(help="One to about ten photos of this very object, five are best.")],
+    category: Annotated[str, typer.Option(help="What kind of thing it is: the word you will use after 'my'.")],
+    memory: Memory = BANK,
+    stack: StackName = "embedded",
+    whole: Annotated[bool, typer.Option("--whole", help="The photos are cut out already: use them whole, without the detector.")] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Overwrite an object of this name.")] = False,
+) -> None:
+    """Remember a personal object from photos.
+
+    Example: python -m vap_core register mug --category cup photos/mug-*.jpg
+    """
+    from vap_core.attend import load_stack
+    from vap_core.memory import load_photo, remember, save
+    from vap_core.memory import register as learn
+
+    pictures = [load_photo(photo) for photo in photos]
+    models = load_stack(stack)
+    _note(models.domain, whole)
+    if whole:
+        obj = remember(name, category, pictures, models.encoder)
+    else:
+        obj, uncropped = learn(name, category, pictures, models.detector, models.encoder)
+        for index in uncropped:
+            print(f"note: no sure {obj.category} found in {photos[index]}; the whole photo is used.", file=sys.stderr)
+    path = save(memory, obj, replace=replace)
+    print(f"{obj.name}: a {obj.category} with {len(obj.crops)} references, saved to {path}")
+    print(f'next: python -m vap_core ground IMAGE "bring my {obj.category}" --memory {memory}')
+
+
+@app.command()
+def ground(
+    image: Annotated[Path, typer.Argument(help="Picture of the scene.")],
+    instruction: Annotated[str, typer.Argument(help='What you would tell the robot, for example "bring my cup".')],
+    object: Annotated[
+        list[str] | None, typer.Option("--object", help="Remembered object of each 'my ...', where the category alone does not decide.")
+    ] = None,
+    memory: Memory = BANK,
+    stack: StackName = "embedded",
+    box: Annotated[list[str] | None, typer.Option(help="A candidate x0,y0,x1,y1 in pixels, instead of the detector; repeatable.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the overlay PNG and the recording.")] = Path("data/runs/ground"),
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
+) -> None:
+    """Find a remembered object in a picture, and show why that box won.
+
+    Example: python -m vap_core ground desk.jpg "bring my cup" --box 40,60,180,220 --box 300,80,420,230
+    """
+    from vap_core.ground import ground_image, parse_boxes, to_json, write_evidence
+    from vap_core.memory import load_photo
+
+    rgb = load_photo(image, long_side=None)
+    boxes = parse_boxes(box, rgb) if box else None
+    found = ground_image(rgb, instruction, memory, stack, objects=object, boxes=boxes)
+    _note(found.domain, boxes is not None)
+    written = write_evidence(out, image.stem, found)
+    if as_json:
+        print(json.dumps(to_json(found)))
+        return
+    print(found)
+    print("wrote " + " and ".join(str(path) for path in written) + f"; look: .venv/bin/rerun {written[1]}")
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Run folder; a run found there is resumed.")] = Path("data/runs/demo"),
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes per task and method.")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the episode list.")] = 0,
+) -> None:
+    """The main job: personalise a scripted policy on two robots, generic against VAP, with recordings of every episode.
+
+    Example: python -m vap_core demo --episodes 20
+    """
+    from dataclasses import replace
+
+    from vap_core.experiments import DEMO
+
+    _run(replace(DEMO, episodes=episodes, seed=seed), out, workers, record=True)
+
+
+@app.command()
+def rollout(
+    suite: Annotated[str, typer.Option(help="widowx-pick or franka-pick.")],
+    task: Annotated[list[str], typer.Option(help="Task of the suite, for example pick-cup; repeatable.")],
+    out: Annotated[Path, typer.Option(help="Run folder; a run found there is resumed.")],
+    method: Annotated[list[str] | None, typer.Option(help="generic, vap, mask-only, rewrite-only; repeatable. Default generic and vap.")] = None,
+    policy: Annotated[str, typer.Option(help="Policy: scripted.")] = "scripted",
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes per task and method.")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the episode list.")] = 0,
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+    record: Annotated[bool, typer.Option(help="Write one .rrd per episode.")] = True,
+    stack: StackName = "embedded",
+) -> None:
+    """Run tasks of a suite in closed loop, and print the table.
+
+    Example: python -m vap_core rollout --suite widowx-pick --task pick-bottle --episodes 4 --out data/runs/bottle
+    """
+    from vap_core.experiments import Study
+
+    study = Study(tuple((suite, name) for name in task), tuple(method or ("generic", "vap")), episodes, seed, policy, stack)
+    _run(study, out, workers, record)
+
+
+@app.command()
+def show(
+    recording: Annotated[Path, typer.Argument(help="A .rrd file.")],
+    png: Annotated[Path, typer.Argument(help="Picture to write.")],
+    frame: Annotated[int | None, typer.Option(help="Control step to show; default the middle one.")] = None,
+) -> None:
+    """Take a picture of a recording as the viewer shows it, without a display.
+
+    Example: python -m vap_core show data/runs/demo/recordings/NAME.rrd shot.png --frame 20
+    """
+    from vap_core.record import screenshot
+
+    screenshot(recording, png, frame_index=frame)
+    print(f"wrote {png}")
+
+
+@app.command()
+def doctor() -> None:
+    """Say what works on this machine, and how to mend what does not; status 1 when the main job cannot run.
+
+    Example: python -m vap_core doctor
+    """
+    from vap_core.doctor import examine
+
+    findings = examine()
+    for finding in findings:
+        print(finding)
+    if any(finding.needed and not finding.works for finding in findings):
+        raise typer.Exit(1)
+
+
+@app.command()
+def bench(steps: Annotated[int, typer.Option(min=5, help="Control steps to time.")] = 60) -> None:
+    """Time a control step by part, grounding, tracking and recording, as shares and ratios within one run.
+
+    Example: python -m vap_core bench
+    """
+    from vap_core.bench import run
+
+    print(run(steps))
+
+
+@train_app.command()
+def perception(
+    out: Annotated[Path, typer.Option(help="Folder of the weights and their manifest.")] = Path("data/weights"),
+    scenes: Annotated[int, typer.Option(min=1, help="Rendered training scenes.")] = 4000,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    minutes: Annotated[float | None, typer.Option(help="Stop training after this long.")] = None,
+) -> None:
+    """Train the detector and segmenter heads on rendered generic objects, and evaluate them on unseen ones.
+
+    Example: python -m vap_core train perception --out data/runs/weights --scenes 400
+    """
+    from vap_core.training.perception import train
+
+    print(json.dumps(train(out, scenes=scenes, seed=seed, minutes=minutes), indent=1))
+
+
+def _run(study: object, out: Path, workers: int, record: bool) -> None:
+    from vap_core.engine import run
+    from vap_core.experiments import Study
+    from vap_core.report import conclude
+
+    assert isinstance(study, Study)
+    print(conclude(study, run(study, out, workers=workers, record=record), out))
+
+
+def _note(domain: str, by_hand: bool) -> None:
+    if domain and not by_hand:
+        print(NOTE.format(domain=domain), file=sys.stderr)

@@ -1,0 +1,109 @@
+"""What works on this machine, and the mend for what does not."""
+
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+from vap_core.errors import VapError
+
+FOUNDATION = {
+    "Grounding DINO": "IDEA-Research/grounding-dino-base",
+    "DINOv2": "facebook/dinov2-base",
+    "SAM 2.1": "facebook/sam2.1-hiera-small",
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the examination; `needed` when the main job cannot run without it."""
+
+    what: str
+    works: bool
+    detail: str
+    needed: bool
+
+    def __str__(self) -> str:
+        mark = "ok     " if self.works else ("MISSING" if self.needed else "absent ")
+        return f"{mark}  {self.what:<20} {self.detail}"
+
+
+def examine() -> list[Finding]:
+    """Look at everything; nothing here raises."""
+    needed = [_python, _gl, _torch, _weights, _rerun]
+    return [*(_checked(check, True) for check in needed), _gpu(), _viewer(), *_foundation()]
+
+
+def _checked(check: Callable[[], tuple[str, str]], needed: bool) -> Finding:
+    try:
+        what, detail = check()
+        return Finding(what, True, detail, needed)
+    except (VapError, ImportError, OSError) as error:
+        return Finding(check.__name__.strip("_"), False, str(error), needed)
+
+
+def _python() -> tuple[str, str]:
+    if sys.version_info[:2] != (3, 12):
+        raise VapError(f"Python {platform.python_version()}; this project needs 3.12: run make setup.")
+    return "python", f"{platform.python_version()} at {sys.executable}"
+
+
+def _gl() -> tuple[str, str]:
+    from vap_core.sim.gl import ensure_gl
+
+    backend = ensure_gl()
+    import mujoco
+
+    return "gl", f"MUJOCO_GL={backend}, mujoco {mujoco.__version__}"
+
+
+def _torch() -> tuple[str, str]:
+    import torch
+
+    threads = os.environ.get("OMP_NUM_THREADS", "unset")
+    return "torch", f"{torch.__version__}, {torch.get_num_threads()} threads of {os.cpu_count()} cores (OMP_NUM_THREADS={threads})"
+
+
+def _weights() -> tuple[str, str]:
+    from vap_core.features import weights_sha256
+
+    sums = weights_sha256()
+    return "weights", ", ".join(f"{name} {digest[:8]}" for name, digest in sums.items())
+
+
+def _rerun() -> tuple[str, str]:
+    import rerun
+
+    return "rerun", f"sdk {rerun.__version__}"
+
+
+def _gpu() -> Finding:
+    import torch
+
+    works = torch.cuda.is_available()
+    return Finding("gpu", works, torch.cuda.get_device_name() if works else "none; the embedded stack needs none", False)
+
+
+def _viewer() -> Finding:
+    binary = shutil.which("rerun", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}")
+    return Finding("rerun viewer", binary is not None, binary or "no rerun command beside this Python; run make setup", False)
+
+
+def _foundation() -> list[Finding]:
+    found = []
+    for name, repo in FOUNDATION.items():
+        folder = _hub() / f"models--{repo.replace('/', '--')}"
+        present = any(folder.glob("snapshots/*/*.safetensors"))
+        mend = f"{repo} not on this machine; get it with: .venv/bin/hf download {repo}"
+        found.append(Finding(name, present, str(folder) if present else mend, False))
+    wired = find_spec("vap_core.foundation") is not None
+    return found if wired else [*found, Finding("stack foundation", False, "not part of this version yet; use --stack embedded", False)]
+
+
+def _hub() -> Path:
+    home = Path(os.environ.get("HF_HOME", Path.home() / ".cache" / "huggingface"))
+    return Path(os.environ.get("HF_HUB_CACHE", home / "hub"))

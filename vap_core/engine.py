@@ -1,0 +1,101 @@
+"""Runs a study in local processes: batches of episodes per worker, results appended as they come, only what is missing."""
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vap_core import store
+from vap_core.experiments import Study, make_trial, register_personal
+from vap_core.values import EpisodeRow, Opening
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from vap_core.record import Recorder
+
+BATCH = 5
+"""Episodes of one job; small enough that a killed run loses little, large enough to share one policy call."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """Some rows of one task under one method, for one worker."""
+
+    study: Study
+    suite: str
+    task: str
+    method: str
+    rows: tuple[EpisodeRow, ...]
+    folder: Path
+    record: bool
+
+
+def run(study: Study, folder: Path, *, workers: int = 2, record: bool = True, progress: bool = True) -> "pd.DataFrame":
+    """Run whatever of `study` is not in `folder` yet, and return the table of all its episodes.
+
+    Killed at any time, the same call goes on where it stopped. Raises BadOutput when the folder holds another run.
+    """
+    from tqdm import tqdm
+
+    store.open_run(folder, study.configuration())
+    jobs = list(missing(study, folder, record))
+    total = len(study.tasks) * len(study.methods) * study.episodes
+    register_personal(study, folder / "memory")
+    with tqdm(total=total, initial=total - sum(len(job.rows) for job in jobs), unit="episode", disable=not progress) as bar:
+        for job, rows in _work(jobs, workers):
+            store.append(folder, rows)
+            bar.update(len(rows))
+            won = sum(row["success"] for row in rows)
+            bar.set_postfix_str(f"{job.task} {job.method} {won}/{len(rows)}")
+    return store.read(folder)
+
+
+def missing(study: Study, folder: Path, record: bool) -> Iterator[Job]:
+    """Jobs for the episodes that the run in `folder` lacks."""
+    done = set(store.read(folder)[store.KEY].itertuples(index=False, name=None))
+    for method in reversed(study.methods):  # the slower, prompted method first, so that workers finish together
+        for suite, task in study.tasks:
+            rows = [row for row in study.rows(suite, task) if (suite, task, method, row.episode) not in done]
+            for first in range(0, len(rows), BATCH):
+                yield Job(study, suite, task, method, tuple(rows[first : first + BATCH]), folder, record)
+
+
+def work(job: Job) -> list[dict[str, Any]]:
+    """Run one job in this process."""
+    from vap_core.rollout import rollout
+
+    trial = make_trial(job.study, job.suite, job.task, job.method, job.folder / "memory")
+    sink = _recorders(job.folder / "recordings") if job.record else None
+    return [episode.summary() for episode in rollout(trial, job.rows, sink, batch=BATCH)]
+
+
+def _work(jobs: list[Job], workers: int) -> Iterator[tuple[Job, list[dict[str, Any]]]]:
+    if not jobs:
+        return
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")  # inherited by the workers: two threads in each would fight over the cores
+    with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=get_context("spawn")) as pool:
+        futures = {pool.submit(work, job): job for job in jobs}
+        try:
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _recorders(folder: Path) -> Any:
+    from vap_core.record import Recorder, recording_name
+
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def begin(opening: Opening) -> "Recorder":
+        path = folder / recording_name(opening.row, opening.method)
+        path.unlink(missing_ok=True)  # left by a run that was killed after recording and before its result was stored
+        return Recorder(path, opening)
+
+    return begin

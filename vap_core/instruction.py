@@ -1,0 +1,79 @@
+"""Personalised instructions: find "my cup", and rewrite it to "the red cup" (P 3.3, appendix "Instruction Rewriting Logic").
+
+A parser is any function `(text, categories) -> Instruction`; `parse` is the deterministic rule of the paper's main results.
+"""
+
+import re
+from collections.abc import Collection, Sequence
+from typing import Protocol, runtime_checkable
+
+from vap_core.errors import BadInstruction
+from vap_core.values import Colour, Instruction, Target
+
+OWNER = re.compile(r"\b(?:my\s+\w+['’]s|my)\s+", re.IGNORECASE)
+"""A possessive trigger: "my cup", or with an owner beside the speaker, "my brother's cup"."""
+
+STOP_WORDS = """and or to into onto in on near next beside behind under over from with at by off up down left right of then before after
+please that which is it inside toward towards between against above below around away out back here there now if while for until so"""
+STOP = frozenset(STOP_WORDS.split())
+"""Words that end a category phrase when no known category matches."""
+
+
+@runtime_checkable
+class Parser(Protocol):
+    """Finds the personalised spans of an instruction."""
+
+    def __call__(self, text: str, categories: Collection[str] = ()) -> Instruction: ...
+
+
+def parse(text: str, categories: Collection[str] = ()) -> Instruction:
+    """Parse by rule: every "my <category>" or "my <person>'s <category>" becomes a target, left to right.
+
+    The longest of `categories` (a plural s allowed) that follows the trigger wins; otherwise the words up to
+    punctuation or the first preposition or conjunction are the category, so unseen nouns work too.
+
+    Raises:
+        BadInstruction: the text holds no possessive span.
+    """
+    targets: list[Target] = []
+    for trigger in OWNER.finditer(text):
+        if targets and trigger.start() < targets[-1].stop:
+            continue
+        owner = trigger.group().strip()
+        category, length = _category(text[trigger.end() :], categories)
+        if category:
+            targets.append(Target(trigger.start(), trigger.end() + length, owner, category))
+    if not targets:
+        raise BadInstruction(f'parse: no personal object in {text!r}; name one as "my <category>", for example "bring my cup".')
+    return Instruction(text, tuple(targets))
+
+
+def rewrite(instruction: Instruction, colours: Sequence[Colour | None]) -> str:
+    """Replace each target's span by "the <colour> <category>"; a None colour leaves its span as the user said it.
+
+    One colour per target. The rest of the text is untouched, character for character.
+    """
+    if len(colours) != len(instruction.targets):
+        raise BadInstruction(f"rewrite: {len(colours)} colours for {len(instruction.targets)} targets in {instruction.text!r}; one each.")
+    text = instruction.text
+    for target, colour in reversed(list(zip(instruction.targets, colours, strict=True))):
+        if colour is None:
+            continue
+        article = "The" if text[target.start].isupper() else "the"
+        text = f"{text[: target.start]}{article} {colour.name} {target.category}{text[target.stop :]}"
+    return text
+
+
+def _category(rest: str, categories: Collection[str]) -> tuple[str, int]:
+    for known in sorted(categories, key=len, reverse=True):
+        pattern = r"\s+".join(re.escape(word) for word in known.split())
+        match = re.match(rf"{pattern}s?\b", rest, re.IGNORECASE)
+        if match:
+            return known, match.end()
+    words, length = [], 0
+    for word in re.finditer(r"[\w-]+", rest):
+        if rest[length : word.start()].strip() or word.group().lower() in STOP:
+            break
+        words.append(word.group().lower())
+        length = word.end()
+    return " ".join(words), length

@@ -1,0 +1,130 @@
+"""Values in, matplotlib figures out; nothing here computes what it shows."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vap_core.metrics import Score
+from vap_core.values import Attended, Grounding, PersonalObject, Rgb
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+WINNER, OTHER, GENERIC, OURS = "#f28e2b", "#4e79a7", "#9aa0a6", "#c0392b"
+METHOD_COLOURS = {"generic": GENERIC, "vap": OURS}
+
+
+def write_png(figure: "Figure", path: Path, dpi: int = 110) -> None:
+    """Save a figure; the file depends on nothing but the figure."""
+    figure.savefig(path, dpi=dpi, metadata={"Software": None})
+
+
+def grounding_figure(rgb: Rgb, attended: Attended, objects: Sequence[PersonalObject], camera: str) -> "Figure":
+    """One row per target: the candidates, what the policy would see, the references, and the similarity matrix."""
+    figure = _figure(13.0, 3.9 * len(objects))
+    rows = figure.subfigures(len(objects), 1, squeeze=False)[:, 0]
+    for row, grounding, obj in zip(rows, attended.groundings[camera], objects, strict=True):
+        left, middle, refs, right = row.subplots(1, 4, width_ratios=[3, 3, 1.5, 2.6])
+        candidates(left, rgb, grounding)
+        left.set_title(f'candidates for "{grounding.candidates.phrase}"')
+        middle.imshow(attended.images[camera])
+        middle.set_title(f'shown to the policy\n"{attended.text}"')
+        refs.imshow(_strip(obj.crops))
+        refs.set_title(f"{obj.name}\n{len(obj.crops)} references")
+        for axes in (left, middle, refs):
+            axes.set_axis_off()
+        similarity_matrix(right, grounding)
+    return figure
+
+
+def candidates(axes: "Axes", rgb: Rgb, grounding: Grounding) -> None:
+    """Draw every candidate box over the picture, the winner in orange."""
+    from matplotlib.patches import Rectangle
+
+    axes.imshow(rgb)
+    for i, (x0, y0, x1, y1) in enumerate(grounding.candidates.xyxy):
+        colour = WINNER if i == grounding.winner else OTHER
+        axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=colour, linewidth=2.5 if i == grounding.winner else 1.5))
+        axes.text(x0, max(y0 - 2, 0), f"#{i}", color="white", fontsize=8, va="bottom", bbox={"facecolor": colour, "edgecolor": "none", "pad": 1.5})
+
+
+def similarity_matrix(axes: "Axes", grounding: Grounding) -> None:
+    """Cosines, candidates x references; a dot marks each reference's vote."""
+    n, k = grounding.similarity.shape
+    if n == 0:
+        axes.text(0.5, 0.5, f"no {grounding.candidates.phrase} found", ha="center", va="center", transform=axes.transAxes)
+        axes.set_axis_off()
+        return
+    axes.imshow(grounding.similarity, cmap="Greys", vmin=float(grounding.similarity.min()) - 0.05, vmax=1.05, aspect="auto")
+    middle = (float(grounding.similarity.min()) + 1.0) / 2
+    for i in range(n):
+        for j in range(k):
+            cosine = float(grounding.similarity[i, j])
+            axes.text(j, i, f"{cosine:.2f}", ha="center", va="center", fontsize=8, color="white" if cosine > middle else "black")
+    best = grounding.similarity.argmax(axis=0)
+    axes.scatter(np.arange(k) + 0.33, best - 0.3, s=22, color=WINNER, zorder=3)
+    axes.set_xticks(range(k), [f"ref {j}" for j in range(k)], fontsize=8)
+    axes.set_yticks(range(n), [f"#{i}: {v} votes" for i, v in enumerate(grounding.votes)], fontsize=8)
+    axes.set_title(f"cosine, dot = vote; margin {grounding.margin:.2f}")
+
+
+def scores_figure(scores: Sequence[Score]) -> "Figure":
+    """SR, CMR and wrong-object rate of every method, one panel per task, with 95 % Wilson intervals."""
+    tasks = list(dict.fromkeys((s.suite, s.task) for s in scores))
+    measures = (("sr", "success rate"), ("cmr", "correct movement\nratio (CMR)"), ("wrong_object", "wrong object\nmoved"))
+    figure = _figure(4.6 * len(tasks) + 0.8, 3.8)
+    panels = np.atleast_1d(figure.subplots(1, len(tasks), sharey=True))
+    for axes, (suite, task) in zip(panels, tasks, strict=True):
+        shown = [s for s in scores if (s.suite, s.task) == (suite, task)]
+        for i, s in enumerate(shown):
+            rates = [getattr(s, name) for name, _ in measures]
+            x = np.arange(len(measures)) + (i - (len(shown) - 1) / 2) * 0.8 / len(shown)
+            heights = np.array([100 * r.value for r in rates])
+            spread = [heights - [100 * r.low for r in rates], [100 * r.high for r in rates] - heights]
+            axes.bar(x, heights, 0.72 / len(shown), color=METHOD_COLOURS.get(s.method, f"C{i}"), label=s.method)
+            axes.errorbar(x, heights, np.maximum(spread, 0), fmt="none", ecolor="black", capsize=3, linewidth=1)
+        axes.set_xticks(range(len(measures)), [label for _, label in measures])
+        axes.set_title(f"{suite} / {task}\nn = {shown[0].n} each, {shown[0].policy} policy", fontsize=10)
+        axes.set_ylim(0, 105)
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("% of episodes, 95 % interval")
+    panels[0].legend(frameon=False, loc="upper center")
+    return figure
+
+
+def film(images: Mapping[str, Sequence[Rgb]], titles: Sequence[str]) -> "Figure":
+    """Rows of pictures, one row per label, one column per title."""
+    figure = _figure(2.1 * len(titles), 2.2 * len(images) + 0.3)
+    grid = figure.subplots(len(images), len(titles), squeeze=False)
+    for row, (label, pictures) in zip(grid, images.items(), strict=True):
+        for axes, picture in zip(row, pictures, strict=True):
+            axes.imshow(picture)
+            axes.set(xticks=[], yticks=[])
+        row[0].set_ylabel(label)
+    for axes, title in zip(grid[0], titles, strict=True):
+        axes.set_title(title, fontsize=9)
+    return figure
+
+
+def _strip(crops: Sequence[Rgb], side: int = 96) -> Rgb:
+    """Reference crops stacked in two columns, each fitted into a grey square."""
+    from PIL import Image
+
+    tiles = []
+    for crop in crops:
+        tile, small = Image.new("RGB", (side, side), (235, 235, 235)), Image.fromarray(crop)
+        small.thumbnail((side - 6, side - 6))
+        tile.paste(small, ((side - small.width) // 2, (side - small.height) // 2))
+        tiles.append(np.asarray(tile))
+    if len(tiles) % 2:
+        tiles.append(np.full((side, side, 3), 255, np.uint8))
+    return np.concatenate([np.concatenate(tiles[i : i + 2], axis=1) for i in range(0, len(tiles), 2)])
+
+
+def _figure(width: float, height: float) -> "Figure":
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")

@@ -1,0 +1,178 @@
+"""The closed loop: physics, render, attend, policy, chunked actions, for a batch of episodes at once.
+
+Nothing here records or measures success beyond what the suite's judge says; sinks and tables read the values it makes.
+"""
+
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from vap_core.attend import Attender, AttendState
+from vap_core.policies import Policy
+from vap_core.sim.env import Env
+from vap_core.sim.scenes import Scene
+from vap_core.suites import Judge
+from vap_core.values import Attended, Camera, Episode, EpisodeRow, Event, Frame, Opening, Outcome, PolicyInput
+
+REST = np.zeros(7, np.float32)
+
+
+@runtime_checkable
+class Sink(Protocol):
+    """Where the frames of one episode stream to, a recording for example."""
+
+    def frame(self, frame: Frame) -> None: ...
+
+    def close(self, outcome: Outcome) -> None: ...
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a batch of episodes shares. `attender` None is the generic policy: raw images, raw instruction."""
+
+    method: str
+    scene: Scene
+    policy: Policy[Any]
+    attender: Attender | None
+    sizes_m: Mapping[str, tuple[float, float, float]]
+
+
+@dataclass
+class Running:
+    """One episode under way; the only mutable thing in the loop."""
+
+    row: EpisodeRow
+    env: Env
+    policy_state: Any
+    judge: Judge
+    sink: Sink | None
+    masks: bool
+    opening: Opening | None = None
+    attend_state: AttendState | None = None
+    queue: deque[np.ndarray] = field(default_factory=deque)
+    frames: list[Frame] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("attend", "policy", "record"), 0.0))
+    outcome: Outcome | None = None
+
+
+def rollout(
+    trial: Trial, rows: Sequence[EpisodeRow], sink: Callable[[Opening], Sink] | None = None, *, batch: int = 4, keep_images: bool = False
+) -> Iterator[Episode]:
+    """Run every row once and yield its episode when it is over; the result does not depend on `batch`.
+
+    An exception inside an episode ends that episode with status "error" and its traceback in `detail`; the others go on.
+    Images are kept in the frames only with `keep_images`; a sink gets them all the same.
+    """
+    for first in range(0, len(rows), batch):
+        running = [_begin(trial, row, sink is not None) for row in rows[first : first + batch]]
+        while any(one.outcome is None for one in running):
+            live = [one for one in running if one.outcome is None]
+            seen = {id(one): shown for one in live if (shown := _guard(one, _see, trial, one, sink)) is not None}
+            live = [one for one in live if one.outcome is None]
+            _plan(trial, live, seen)
+            for one in live:
+                if one.outcome is None:
+                    _guard(one, _act, one, *seen[id(one)], keep_images)
+        for one in running:
+            yield _end(one)
+
+
+def _begin(trial: Trial, row: EpisodeRow, masks: bool) -> Running:
+    env = Env(trial.scene)
+    env.reset(row)
+    return Running(row, env, trial.policy.start(np.random.default_rng([row.seed, row.episode])), Judge.start(row, env.truth()), None, masks)
+
+
+def _see(trial: Trial, one: Running, sink: Callable[[Opening], Sink] | None) -> tuple[PolicyInput, Attended, PolicyInput]:
+    """Render, attend, and at t = 0 open the recording. Returns the raw input, what attending made of it, and the policy's input."""
+    raw = one.env.observe(one.row.instruction)
+    with _timed(one.seconds, "attend"):
+        if trial.attender is None:
+            attended = Attended(raw.images, raw.text, (), {}, {}, ())
+        elif one.attend_state is None:
+            one.attend_state, attended = trial.attender.start(raw.images, raw.text)
+        else:
+            one.attend_state, attended = trial.attender.step(one.attend_state, raw.images)
+    if one.opening is None:
+        sizes = {p.model: trial.sizes_m[p.model] for p in one.row.placements}
+        one.opening = Opening(
+            one.row, trial.method, trial.policy.label, one.env.hz, one.env.cameras(), one.row.instruction, attended.text, attended.groundings, sizes
+        )
+        with _timed(one.seconds, "record"):
+            one.sink = sink(one.opening) if sink is not None else None
+    return raw, attended, PolicyInput(attended.images, attended.text, raw.state)
+
+
+def _plan(trial: Trial, live: Sequence[Running], seen: Mapping[int, tuple[PolicyInput, Attended, PolicyInput]]) -> None:
+    """Ask the policy, in one batch, for every episode whose chunk is used up."""
+    asking = [one for one in live if not one.queue]
+    if not asking:
+        return
+    start = time.perf_counter()
+    try:
+        states, chunks = trial.policy.plan([one.policy_state for one in asking], [seen[id(one)][2] for one in asking])
+    except Exception:
+        for one in asking:
+            one.outcome = one.judge.outcome("error", traceback.format_exc(limit=8))
+        return
+    share = (time.perf_counter() - start) / len(asking)
+    for one, state, chunk in zip(asking, states, chunks, strict=True):
+        one.policy_state = state
+        one.queue.extend(chunk[: trial.policy.execute])
+        one.seconds["policy"] += share
+
+
+def _act(one: Running, raw: PolicyInput, attended: Attended, _shown: PolicyInput, keep_images: bool) -> None:
+    """Execute one action, or none when the episode is over, and hand the frame on."""
+    over = one.judge.done or one.judge.steps >= one.row.max_steps
+    action = REST if over else one.queue.popleft()
+    truth, cameras = one.env.truth(masks=one.masks), one.env.cameras()
+    if over:
+        one.outcome = one.judge.outcome()
+    events = (*attended.events, *one.judge.events)
+    if one.outcome is not None:
+        events = (*events, Event(one.judge.steps, "INFO" if one.outcome.success else "ERROR", f"episode end: {one.outcome.status}"))
+    frame = Frame(one.judge.steps, one.env.time_s, raw.images, attended.images, attended.tracks, cameras, raw.state, action, truth, events)
+    with _timed(one.seconds, "record"):
+        if one.sink is not None:
+            one.sink.frame(frame)
+    one.frames.append(frame if keep_images else frame.light())
+    if not over:
+        one.env.step(action)
+        one.judge = one.judge.step(one.env.truth())
+
+
+def _end(one: Running) -> Episode:
+    assert one.outcome is not None
+    if one.sink is not None:
+        with _timed(one.seconds, "record"):
+            one.sink.close(one.outcome)
+    opening = one.opening or Opening(one.row, "", "", one.env.hz, one.env.cameras(), one.row.instruction, one.row.instruction, {}, {})
+    return Episode(opening, tuple(one.frames), one.outcome, {**one.env.seconds, **one.seconds})
+
+
+def _guard[**P, R](one: Running, work: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R | None:
+    """Run one episode's share of a step; its failure ends that episode alone, as an error that keeps its traceback."""
+    try:
+        return work(*args, **kwargs)
+    except Exception:
+        one.outcome = one.judge.outcome("error", traceback.format_exc(limit=8))
+        return None
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], part: str) -> Iterator[None]:
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        seconds[part] += time.perf_counter() - start
+
+
+__all__ = ["Camera", "Sink", "Trial", "rollout"]

@@ -1,0 +1,75 @@
+"""Append-only results: parquet parts written atomically, one run per folder, only what is missing runs again."""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from uuid import uuid4
+
+from vap_core.errors import BadOutput
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+KEY = ["suite", "task", "method", "episode"]
+
+
+def digest(configuration: Mapping[str, Any]) -> str:
+    """A short hash of whatever JSON can say; equal configurations, equal digests."""
+    return hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def open_run(folder: Path, configuration: Mapping[str, Any]) -> Path:
+    """Begin a run in `folder`, or go on with the one that is there.
+
+    Raises:
+        BadOutput: the folder cannot be written, holds something else, or a run of another configuration.
+    """
+    note = folder / "run.json"
+    wanted = json.dumps({"digest": digest(configuration), "configuration": dict(configuration)}, indent=1, sort_keys=True)
+    if folder.exists() and not folder.is_dir():
+        raise BadOutput(f"open_run: {folder} is a file; choose another folder with --out.")
+    if note.exists():
+        try:
+            held = json.loads(note.read_text())["digest"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise BadOutput(f"open_run: {note} is damaged; choose another folder with --out.") from error
+        if held != digest(configuration):
+            raise BadOutput(
+                f"open_run: {folder} holds another run (configuration {held}, now {digest(configuration)}); choose another folder with --out."
+            )
+        return folder
+    if folder.exists() and any(folder.iterdir()):
+        raise BadOutput(f"open_run: {folder} is not empty and holds no run; choose another folder with --out.")
+    try:
+        (folder / "parts").mkdir(parents=True, exist_ok=True)
+        write_atomic(note, wanted.encode())
+    except OSError as error:
+        raise BadOutput(f"open_run: {folder} cannot be written ({error.strerror}); choose another folder with --out.") from error
+    return folder
+
+
+def append(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Add finished episodes as one new part."""
+    import pandas as pd
+
+    write_atomic(folder / "parts" / f"{uuid4().hex}.parquet", pd.DataFrame(list(rows)).to_parquet(index=False))
+
+
+def read(folder: Path) -> "pd.DataFrame":
+    """Every finished episode, in the order of their keys; an episode that ran twice counts once."""
+    import pandas as pd
+
+    parts = [pd.read_parquet(part) for part in sorted((folder / "parts").glob("*.parquet"))]
+    if not parts:
+        return pd.DataFrame(columns=KEY)
+    return pd.concat(parts, ignore_index=True).drop_duplicates(KEY).sort_values(KEY, ignore_index=True)
+
+
+def write_atomic(path: Path, data: bytes) -> None:
+    """Write a whole file or nothing."""
+    scratch = path.with_name(f".{path.name}.{uuid4().hex}.tmp")
+    scratch.write_bytes(data)
+    os.replace(scratch, path)
