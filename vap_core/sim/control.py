@@ -1,0 +1,142 @@
+"""From end-effector deltas to joint targets: mink's differential inverse kinematics on the bare robot, base frame = world frame."""
+
+from functools import cache
+
+import mink
+import mujoco
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from vap_core.errors import OutOfReach
+from vap_core.sim.robots import Robot
+from vap_core.values import value
+
+ROUNDS = 12
+"""Most iterations of one solution; it stops as soon as the pose is met."""
+NEAR_M, NEAR_RAD = 2e-5, 2e-4
+LEASH_M, LEASH_RAD = 0.05, 0.5
+"""Furthest that the commanded pose may lead the measured one."""
+
+
+@value
+class Command:
+    """Where the gripper is told to be: `tcp_base` (4 x 4, metres, robot base frame), the joint angles that put it there (rad), opening 0..1."""
+
+    tcp_base: Float64[np.ndarray, "4 4"]
+    joints: Float64[np.ndarray, " n"]
+    gripper: float
+
+
+@value
+class Limits:
+    """How fast an action may move the gripper: metres and radians per second."""
+
+    speed_m_s: float = 0.25
+    turn_rad_s: float = 1.5
+
+
+LIMITS = Limits()
+
+
+class Arm:
+    """The kinematics of one robot; holds mink's buffers and nothing of an episode: every answer depends on the arguments alone."""
+
+    def __init__(self, robot: Robot) -> None:
+        spec = mujoco.MjSpec.from_file(str(robot.xml))
+        for finger in robot.fingers:
+            spec.delete(spec.actuator(finger))
+        for equality in list(spec.equalities):
+            spec.delete(equality)
+        for finger in robot.fingers:
+            spec.delete(spec.joint(finger))
+        self.robot = robot
+        self.model = spec.compile()
+        self.configuration = mink.Configuration(self.model)
+        self.task = mink.FrameTask("tcp", "site", position_cost=1.0, orientation_cost=0.3, gain=1.0, lm_damping=1e-6)
+        self.posture = mink.PostureTask(self.model, cost=1e-4)
+        self.posture.set_target(robot.home)
+        speeds = dict(zip(robot.joints, robot.speed_rad_s.tolist(), strict=True))
+        self.limits = [mink.ConfigurationLimit(self.model), mink.VelocityLimit(self.model, speeds)]
+
+    def forward(self, joints: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "4 4"]:
+        """The tcp's pose in the robot base frame at `joints` (rad)."""
+        self.configuration.update(joints)
+        return np.asarray(self.configuration.get_transform_frame_to_world("tcp", "site").as_matrix())
+
+    def solve(self, joints: Float64[np.ndarray, " n"], tcp_base: Float64[np.ndarray, "4 4"], seconds: float) -> Float64[np.ndarray, " n"]:
+        """Joint angles nearest to `tcp_base` that can be reached from `joints` within `seconds` at the joints' rated speeds."""
+        self.configuration.update(joints)
+        self.task.set_target(mink.SE3.from_matrix(tcp_base))
+        for _ in range(ROUNDS):
+            error = self.task.compute_error(self.configuration)
+            if np.linalg.norm(error[:3]) < NEAR_M and np.linalg.norm(error[3:]) < NEAR_RAD:
+                break
+            dt = seconds / ROUNDS
+            velocity = mink.solve_ik(self.configuration, [self.task, self.posture], dt, "daqp", damping=1e-9, limits=self.limits)
+            self.configuration.integrate_inplace(velocity, dt)
+        return self.configuration.q.copy()
+
+    def reach(self, tcp_base: Float64[np.ndarray, "4 4"], tolerance_m: float = 1e-3) -> Float64[np.ndarray, " n"]:
+        """Joint angles for a pose, from home, taking all the time it needs. Raises: OutOfReach."""
+        joints = self.robot.home
+        for _ in range(8):
+            joints = self.solve(joints, tcp_base, 2.0)
+        off = float(np.linalg.norm(self.forward(joints)[:3, 3] - tcp_base[:3, 3]))
+        turn = float(np.linalg.norm(rotation_vector(self.forward(joints)[:3, :3] @ tcp_base[:3, :3].T)))
+        if off > tolerance_m or turn > 10 * tolerance_m:
+            raise OutOfReach(
+                f"Arm.reach: {self.robot.name} stays {1000 * off:.0f} mm and {turn:.2f} rad away from {tcp_base[:3, 3].round(3).tolist()} m; move it closer."
+            )
+        return joints
+
+
+@cache
+def arm(robot: str) -> Arm:
+    """The kinematics of the robot called `robot`, built once per process."""
+    from vap_core.sim import robots
+
+    return Arm(robots.get(robot))
+
+
+def follow(
+    arm: Arm, command: Command, measured_base: Float64[np.ndarray, "4 4"], action: Float32[np.ndarray, "7"], seconds: float, limits: Limits = LIMITS
+) -> Command:
+    """The command after one action (a row of values.Chunk) that lasts `seconds`.
+
+    The delta applies to the *commanded* pose, so that the arm's droop does not add up; the command is first pulled back to
+    within 5 cm and 0.5 rad of the measured pose, so that it cannot run away from an arm that is held up.
+    """
+    start = _leashed(command.tcp_base, measured_base)
+    delta = action.astype(np.float64)
+    goal = start.copy()
+    goal[:3, 3] += _capped(delta[:3], limits.speed_m_s * seconds)
+    goal[:3, :3] = rotation(_capped(delta[3:6], limits.turn_rad_s * seconds)) @ start[:3, :3]
+    joints = arm.solve(command.joints, goal, seconds)
+    reached = arm.forward(joints)
+    off, turn = np.linalg.norm(reached[:3, 3] - goal[:3, 3]), np.linalg.norm(rotation_vector(reached[:3, :3] @ goal[:3, :3].T))
+    return Command(goal if off < 1e-3 and turn < 1e-2 else reached, joints, float(np.clip(delta[6], 0.0, 1.0)))
+
+
+def rotation(vector: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
+    """The rotation matrix of a rotation vector, rad."""
+    return np.asarray(mink.SO3.exp(vector).as_matrix())
+
+
+def rotation_vector(matrix: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3"]:
+    """The rotation vector, rad, of a rotation matrix; its length is at most pi."""
+    return np.asarray(mink.SO3.from_matrix(np.ascontiguousarray(matrix)).log())
+
+
+def _capped(vector: Float64[np.ndarray, "3"], longest: float) -> Float64[np.ndarray, "3"]:
+    length = float(np.linalg.norm(vector))
+    return vector if length <= longest else vector * (longest / length)
+
+
+def _leashed(commanded: Float64[np.ndarray, "4 4"], measured: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
+    ahead = commanded[:3, 3] - measured[:3, 3]
+    turned = rotation_vector(commanded[:3, :3] @ measured[:3, :3].T)
+    pulled = commanded.copy()
+    pulled[:3, 3] = measured[:3, 3] + _capped(ahead, LEASH_M)
+    if np.linalg.norm(turned) > LEASH_RAD:
+        pulled[:3, :3] = rotation(_capped(turned, LEASH_RAD)) @ measured[:3, :3]
+    return pulled

@@ -1,0 +1,228 @@
+"""One running episode: reset from a row, observe, step, and the ground truth. Many may share one Scene; each has its own MjData."""
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from vap_core.errors import UnknownName, one_of
+from vap_core.sim import cameras as optics
+from vap_core.sim.control import Command, arm, follow, rotation_vector
+from vap_core.sim.scenes import FLOOR_Z_M, Scene
+from vap_core.values import Camera, EpisodeRow, PolicyInput, Truth, value
+
+import mujoco  # isort: skip  (cameras has chosen a GL back end)
+
+SETTLE_S = 0.3
+DROP_M = 0.0005
+"""Objects start this far above the table and settle."""
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+
+
+@value
+class Snapshot:
+    """Everything that decides how an episode goes on: MuJoCo's full integration state, the command, and the last step's contacts."""
+
+    state: Float64[np.ndarray, " n"]
+    command: Command
+    placed: tuple[str, ...]
+    touched: frozenset[str]
+    held: frozenset[str]
+
+
+class Env:
+    """One running episode in `scene`. The same row gives bit-identical states and images, whatever else runs in the scene.
+
+    `seconds` sums wall time by part: "physics", "ik", "render", "truth".
+    """
+
+    def __init__(self, scene: Scene, *, image_size: int = 224, cameras: Sequence[str] | None = None) -> None:
+        self.scene = scene
+        self.robot = scene.robot
+        self.hz = scene.robot.hz
+        self.image_size = image_size
+        self.camera_names = tuple(scene.cameras if cameras is None else cameras)
+        for name in self.camera_names:
+            if name not in scene.cameras:
+                raise one_of("Env: camera", name, scene.cameras)
+        self.seconds = dict.fromkeys(("physics", "ik", "render", "truth"), 0.0)
+        self._model = model = scene.model
+        self._data = mujoco.MjData(model)
+        self._arm = arm(scene.robot.name)
+        self._substeps = max(1, round(1.0 / self.hz / model.opt.timestep))
+        self._qpos = np.array([model.joint(name).qposadr[0] for name in self.robot.joints])
+        self._fingers = np.array([model.joint(name).qposadr[0] for name in self.robot.fingers])
+        self._ctrl = np.array([model.actuator(name).id for name in (*self.robot.joints, *self.robot.fingers)])
+        self._roles = _roles(scene)
+        base = np.eye(4)
+        base[:3, :3] = _matrix(self.robot.base_world[3:])
+        base[:3, 3] = self.robot.base_world[:3]
+        self._base_from_world = np.linalg.inv(base)
+        self._placed: tuple[str, ...] = ()
+        self._touched: frozenset[str] = frozenset()
+        self._held: frozenset[str] = frozenset()
+        self._command = Command(self._arm.forward(self.robot.home), self.robot.home, 1.0)
+        mujoco.mj_forward(model, self._data)
+
+    @property
+    def time_s(self) -> float:
+        """Seconds since the episode's first observation."""
+        return round(float(self._data.time) - SETTLE_S, 9)
+
+    def reset(self, row: EpisodeRow) -> None:
+        """Start the episode of `row`: objects in place, robot at home, gripper open, 0.3 s to settle.
+
+        Objects of the scene that the row does not name stand parked on the floor, weightless and undrawn.
+        Raises: UnknownName when the row places an object that the scene lacks, or one twice.
+        """
+        placed = tuple(place.model for place in row.placements)
+        for name in placed:
+            if name not in self.scene.objects:
+                raise one_of(f"Env.reset({row.key}): object", name, self.scene.objects)
+        if len(set(placed)) < len(placed):
+            raise UnknownName(f"Env.reset({row.key}): an object is placed twice in {list(placed)}; name each model once.")
+        model, data = self._model, self._data
+        mujoco.mj_resetData(model, data)
+        data.qpos[self._qpos] = self.robot.home
+        data.qpos[self._fingers] = self.robot.fingers_open
+        data.ctrl[self._ctrl] = self._targets(self.robot.home, 1.0)
+        for place in row.placements:
+            half = 0.5 * place.yaw
+            data.joint(f"{place.model}/free").qpos[:] = (place.x, place.y, DROP_M, np.cos(half), 0.0, 0.0, np.sin(half))
+        for i, name in enumerate(n for n in self.scene.objects if n not in placed):
+            body = model.body(name)
+            data.joint(f"{name}/free").qpos[:] = (-3.0, -2.0 + 0.4 * i, FLOOR_Z_M + 0.5, 1.0, 0.0, 0.0, 0.0)
+            data.xfrc_applied[body.id, :3] = -model.opt.gravity * float(body.subtreemass[0])
+        self._placed = placed
+        self._command = Command(self._arm.forward(self.robot.home), self.robot.home, 1.0)
+        self._run(round(SETTLE_S / model.opt.timestep), data.ctrl[self._ctrl].copy())
+        self._touched = frozenset()
+
+    def observe(self, text: str = "") -> PolicyInput:
+        """The raw views and the proprioception: tcp position (m) and rotation vector from straight down (rad), opening 0..1, joint angles (rad)."""
+        with self._timed("render"):
+            hidden = self._hidden()
+            images = {name: self.scene.eyes.rgb(self._data, name, self.image_size, hidden) for name in self.camera_names}
+        return PolicyInput(images, text, self.state())
+
+    def state(self) -> Float32[np.ndarray, " s"]:
+        """The proprioception alone, as in `observe`."""
+        tcp = self._tcp_base()
+        spin = rotation_vector(tcp[:3, :3] @ self.robot.down_base.T)
+        travel = self._data.qpos[self._fingers]
+        shut, wide = np.array(self.robot.fingers_closed), np.array(self.robot.fingers_open)
+        opening = float(np.clip(np.mean((travel - shut) / (wide - shut)), 0.0, 1.0))
+        return np.concatenate([tcp[:3, 3], spin, [opening], self._data.qpos[self._qpos]]).astype(np.float32)
+
+    def step(self, action: Float32[np.ndarray, "7"]) -> None:
+        """Do one action (a row of values.Chunk) for 1 / hz seconds; contacts are watched in every physics step."""
+        with self._timed("ik"):
+            before = self._targets(self._command.joints, self._command.gripper)
+            self._command = follow(self._arm, self._command, self._tcp_base(), action, 1.0 / self.hz)
+        after = self._targets(self._command.joints, self._command.gripper)
+        with self._timed("physics"):
+            ramp = np.linspace(0.0, 1.0, self._substeps + 1)[1:, None]
+            self._run(self._substeps, before + ramp * (after - before))
+
+    def truth(self, masks: bool = False) -> Truth:
+        """Ground truth after the last step; `masks` renders every camera's visible object masks as well."""
+        with self._timed("truth"):
+            poses = {name: self._pose(name) for name in self._placed}
+            links = {name: self._pose(name) for name in self.robot.links}
+            seen: Mapping[str, Mapping[str, np.ndarray]] = {}
+            if masks:
+                hidden = self._hidden()
+                seen = {name: self.scene.eyes.masks(self._data, name, self.image_size, hidden) for name in self.camera_names}
+            return Truth(poses, links, self._touched, self._held, seen)
+
+    def cameras(self) -> tuple[Camera, ...]:
+        """The calibrated cameras where they are now; a wrist camera moves."""
+        return tuple(optics.camera(self._model, self._data, name, (self.image_size, self.image_size)) for name in self.camera_names)
+
+    def snapshot(self) -> Snapshot:
+        state = np.zeros(mujoco.mj_stateSize(self._model, STATE))
+        mujoco.mj_getState(self._model, self._data, state, STATE)
+        return Snapshot(state, self._command, self._placed, self._touched, self._held)
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Go back to a snapshot of any Env of the same scene."""
+        mujoco.mj_setState(self._model, self._data, snapshot.state, STATE)
+        self._command, self._placed = snapshot.command, snapshot.placed
+        self._touched, self._held = snapshot.touched, snapshot.held
+        self._place_bodies()
+
+    def _run(self, steps: int, ctrl: Float64[np.ndarray, "..."]) -> None:
+        """Advance physics with `ctrl`, one row a step or one for all, and note what the robot touches."""
+        model, data = self._model, self._data
+        rows = np.broadcast_to(ctrl, (steps, len(self._ctrl)))
+        touched: set[int] = set()
+        roles = np.zeros((0, 2), np.int64)
+        for row in rows:
+            data.ctrl[self._ctrl] = row
+            mujoco.mj_step(model, data)
+            roles = self._roles[data.contact.geom]
+            for a, b in roles.tolist():
+                if min(a, b) == ROBOT and max(a, b) >= 0:
+                    touched.add(max(a, b))
+        self._touched = frozenset(self.scene.objects[i] for i in touched)
+        self._held = frozenset(self.scene.objects[i] for i in _held(roles))
+        self._place_bodies()
+
+    def _place_bodies(self) -> None:
+        """Bring poses up to date with the state; contacts and solver warm start stay as they are."""
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_camlight(self._model, self._data)
+
+    def _targets(self, joints: Float64[np.ndarray, " n"], gripper: float) -> Float64[np.ndarray, " m"]:
+        shut, wide = np.array(self.robot.fingers_closed), np.array(self.robot.fingers_open)
+        return np.concatenate([joints, shut + gripper * (wide - shut)])
+
+    def _tcp_base(self) -> Float64[np.ndarray, "4 4"]:
+        site = self._data.site("tcp")
+        world = np.eye(4)
+        world[:3, :3], world[:3, 3] = site.xmat.reshape(3, 3), site.xpos
+        return self._base_from_world @ world
+
+    def _pose(self, body: str) -> Float64[np.ndarray, "7"]:
+        found = self._data.body(body)
+        return np.concatenate([found.xpos, found.xquat])
+
+    def _hidden(self) -> frozenset[str]:
+        return frozenset(self.scene.objects) - frozenset(self._placed)
+
+    @contextmanager
+    def _timed(self, part: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[part] += time.perf_counter() - start
+
+
+ROBOT, REST = -1, -2
+
+
+def _roles(scene: Scene) -> Int64[np.ndarray, " g"]:
+    """Of each geom: the index of its object, or ROBOT, or REST (table, floor, walls)."""
+    model = scene.model
+    base = int(model.body(scene.robot.links[0]).rootid[0])
+    owner = {int(model.body(name).id): i for i, name in enumerate(scene.objects)} | {base: ROBOT}
+    return np.array([owner.get(int(model.body_rootid[body]), REST) for body in model.geom_bodyid], np.int64)
+
+
+def _held(roles: Int64[np.ndarray, "c 2"]) -> set[int]:
+    """Objects that touch the robot and nothing else."""
+    partners: dict[int, set[int]] = {}
+    for a, b in roles.tolist():
+        for one, other in ((a, b), (b, a)):
+            if one >= 0 and one != other:
+                partners.setdefault(one, set()).add(other)
+    return {one for one, others in partners.items() if others == {ROBOT}}
+
+
+def _matrix(quat: Float64[np.ndarray, "4"]) -> Float64[np.ndarray, "3 3"]:
+    flat = np.zeros(9)
+    mujoco.mju_quat2Mat(flat, quat)
+    return flat.reshape(3, 3)

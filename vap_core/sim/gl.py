@@ -1,0 +1,50 @@
+"""Choose an off-screen OpenGL back end before MuJoCo is imported; a missing one is a clear error, never a dead kernel."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+from functools import cache
+
+from vap_core.errors import MissingGL
+
+BACKENDS = ("egl", "osmesa")
+REMEDY = "apt-get install -y --no-install-recommends libegl1 libgl1"
+_PROBE = """
+import os
+os.environ["MUJOCO_GL"] = {backend!r}
+os.environ.pop("PYOPENGL_PLATFORM", None)
+import mujoco
+context = mujoco.GLContext(16, 16)
+context.make_current()
+mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), mujoco.mjtFontScale.mjFONTSCALE_100)
+context.free()
+os._exit(0)
+"""
+
+
+@cache
+def works(backend: str) -> bool:
+    """Whether `backend` can make a context here; asked of a child process, so that a crash in a driver cannot reach this one."""
+    if importlib.util.find_spec("mujoco") is None:
+        raise MissingGL("ensure_gl: the package mujoco is not installed. Run: pip install -r environment.txt")
+    return subprocess.run([sys.executable, "-c", _PROBE.format(backend=backend)], capture_output=True, check=False, timeout=120).returncode == 0
+
+
+def ensure_gl() -> str:
+    """Set `MUJOCO_GL` to a back end that works without a display and return its name; call it before importing mujoco.
+
+    A value that is already set is trusted and left alone; so is the back end of a mujoco that is already imported and has one.
+
+    Raises: MissingGL with the line to run.
+    """
+    chosen = os.environ.get("MUJOCO_GL", "").lower()
+    if chosen:
+        return chosen
+    if "mujoco" in sys.modules and not hasattr(sys.modules["mujoco"], "GLContext"):
+        raise MissingGL("ensure_gl: mujoco was imported before a back end was chosen. Set MUJOCO_GL=egl, or call ensure_gl() first, and start again.")
+    for backend in BACKENDS:
+        if works(backend):
+            os.environ["MUJOCO_GL"] = backend
+            return backend
+    raise MissingGL(f"ensure_gl: no OpenGL back end of {', '.join(BACKENDS)} can draw without a display. Run: {REMEDY}")

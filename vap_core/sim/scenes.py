@@ -1,0 +1,136 @@
+"""A scene: a room, a table, one robot, the objects and the cameras, compiled once and shared by every episode that uses them.
+
+The world frame stands on the table top (z = 0) at the robot's base: x away from the robot, y to its left, z up; metres.
+"""
+
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from jaxtyping import UInt8
+
+from vap_core.sim import objects, robots
+from vap_core.sim.cameras import Eyes, add_rigs
+from vap_core.sim.robots import Robot
+from vap_core.values import value
+
+import mujoco  # isort: skip  (cameras has chosen a GL back end)
+
+FLOOR_Z_M = -0.75
+Colour3 = tuple[float, float, float]
+
+
+@value
+class Look:
+    """How the room looks: linear 0..1 colours; `planks` are the table's light and dark wood, or one colour twice for a plain top.
+
+    `lamp_pos_m` and `lamp` place and dim the one lamp, `ambient` is the fill light; `shadows` are off because they triple the frame time.
+    """
+
+    planks: tuple[Colour3, Colour3] = ((0.80, 0.69, 0.55), (0.70, 0.58, 0.44))
+    wall: Colour3 = (0.73, 0.76, 0.78)
+    floor: Colour3 = (0.43, 0.42, 0.42)
+    lamp_pos_m: tuple[float, float, float] = (0.9, -0.6, 1.8)
+    lamp: float = 0.55
+    ambient: float = 0.38
+    shadows: bool = False
+
+
+LOOK = Look()
+
+
+@value
+class Scene:
+    """A compiled scene. `objects` are body names, each free to move by its joint `<name>/free`."""
+
+    robot: Robot
+    model: mujoco.MjModel
+    objects: tuple[str, ...]
+    cameras: tuple[str, ...]
+    eyes: Eyes
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give the GL contexts back; the scene may be used again and makes new ones."""
+        self.eyes.close()
+
+
+def build(robot: str, models: "Sequence[str | objects.ObjectModel]", *, look: Look = LOOK) -> Scene:
+    """Compile a scene of `robot` and `models` (names in the object registry, or models themselves).
+
+    Raises: UnknownName for a robot or an object that no registry holds.
+    """
+    arm = robots.get(robot)
+    spec = mujoco.MjSpec.from_file(str(arm.xml))
+    physics(spec)
+    spec.body(arm.links[0]).pos, spec.body(arm.links[0]).quat = arm.base_world[:3], arm.base_world[3:]
+    _room(spec, look)
+    chosen = [objects.get(model) if isinstance(model, str) else model for model in models]
+    for model in chosen:
+        objects.add_object(spec, model)
+    cameras = add_rigs(spec, robot)
+    compiled = spec.compile()
+    names = tuple(model.name for model in chosen)
+    return Scene(arm, compiled, names, cameras, Eyes(compiled, names, look.shadows))
+
+
+def physics(spec: mujoco.MjSpec) -> None:
+    """The solver settings with which grasps hold (measured: they cut the creep of a held mug to 0.2 mm)."""
+    option = spec.option
+    option.timestep = 0.002
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = 10.0
+    option.noslip_iterations = 4
+
+
+def _room(spec: mujoco.MjSpec, look: Look) -> None:
+    """Floor, back and side walls, table, and the one lamp. Only the table and the floor can be touched."""
+    world = spec.worldbody
+    spec.visual.headlight.ambient = [look.ambient] * 3
+    spec.visual.headlight.diffuse = [0.22] * 3
+    spec.visual.headlight.specular = [0.05] * 3
+    spec.visual.quality.numslices, spec.visual.quality.numstacks, spec.visual.quality.numquads = 24, 12, 4
+    spec.visual.map.znear, spec.visual.map.zfar = 0.01, 20.0
+    spec.stat.extent, spec.stat.center = 1.0, [0.3, 0.0, 0.2]
+    target = np.subtract((0.35, 0.0, 0.0), look.lamp_pos_m)
+    world.add_light(
+        name="lamp", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=look.lamp_pos_m, dir=target / np.linalg.norm(target),
+        diffuse=[look.lamp] * 3, specular=[0.25] * 3, castshadow=look.shadows,
+    )  # fmt: skip
+    side = 256
+    texture = spec.add_texture(name="planks", type=mujoco.mjtTexture.mjTEXTURE_2D, width=side, height=side, nchannel=3)
+    texture.data = planks(side, *look.planks).tobytes()
+    wood = spec.add_material(name="planks", specular=0.08, shininess=0.1, texrepeat=[1, 1])
+    wood.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "planks"
+    plain = {"wall": look.wall, "floor": look.floor, "legs": tuple(0.55 * c for c in look.planks[1])}
+    for name, rgb in plain.items():
+        spec.add_material(name=name, rgba=[*rgb, 1.0], specular=0.0, shininess=0.0)
+    box, ghost = mujoco.mjtGeom.mjGEOM_BOX, {"contype": 0, "conaffinity": 0}
+    world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[4, 4, 1], pos=[0, 0, FLOOR_Z_M], material="floor")
+    world.add_geom(name="wall_back", type=box, size=[0.05, 4, 2], pos=[-1.15, 0, FLOOR_Z_M + 2], material="wall", **ghost)
+    world.add_geom(name="wall_left", type=box, size=[4, 0.05, 2], pos=[0, 1.6, FLOOR_Z_M + 2], material="wall", **ghost)
+    world.add_geom(name="table", type=box, size=[0.55, 0.65, 0.02], pos=[0.28, 0, -0.02], material="planks", condim=4, friction=[1.0, 0.01, 0.0001])
+    for i, (x, y) in enumerate(((-0.2, -0.58), (-0.2, 0.58), (0.76, -0.58), (0.76, 0.58))):
+        world.add_geom(name=f"leg{i}", type=box, size=[0.03, 0.03, 0.355], pos=[x, y, -0.395], material="legs", **ghost)
+
+
+def planks(side: int, light: Colour3, dark: Colour3) -> UInt8[np.ndarray, "{side} {side} 3"]:
+    """A wooden table top: five boards with grain along them, the same on every machine."""
+    rng = np.random.default_rng([7, side])
+    rows, cols = np.mgrid[0:side, 0:side] / side
+    board = np.minimum((rows * 5).astype(int), 4)
+    tone, shift = rng.random(5)[board], rng.random(5)[board] * 40
+    wave = np.sin(2 * np.pi * (rows * 46 + 0.9 * np.sin(2 * np.pi * (cols * 1.5 + shift)) + shift))
+    fine = rng.standard_normal((side, 1)) * 0.5 + rng.standard_normal((side, side)) * 0.12
+    mix = np.clip(0.15 + 0.35 * tone + 0.14 * wave + 0.10 * fine, 0, 1)[..., None]
+    wood = (1 - mix) * np.array(light) + mix * np.array(dark)
+    seam = (np.abs(rows * 5 - np.rint(rows * 5)) < 0.012) & (rows > 0.1) & (rows < 0.9)
+    wood[seam] *= 0.72
+    return np.clip(wood * 255, 0, 255).astype(np.uint8)
