@@ -41,10 +41,10 @@ class Rig:
 
 
 RIGS: dict[str, tuple[Rig, ...]] = {
-    "wx250s": (Rig("front", "world", (0.80, 0.0, 0.38), (0.25, 0.0, 0.09), np.deg2rad(46.0)),),
+    "wx250s": (Rig("front", "world", (0.76, 0.0, 0.35), (0.24, 0.0, 0.105), np.deg2rad(44.0)),),
     "panda": (
-        Rig("front", "world", (1.14, 0.0, 0.46), (0.48, 0.0, 0.12), np.deg2rad(46.0)),
-        Rig("side", "world", (0.72, -0.58, 0.58), (0.47, 0.0, 0.06), np.deg2rad(46.0)),
+        Rig("front", "world", (0.98, 0.0, 0.37), (0.44, 0.0, 0.12), np.deg2rad(42.0)),
+        Rig("side", "world", (0.68, -0.46, 0.42), (0.47, -0.01, 0.05), np.deg2rad(44.0)),
         Rig("wrist", "hand", (0.09, 0.0, 0.045), (0.03, 0.0, 0.20), np.deg2rad(72.0), up=(-1.0, 0.0, 0.0)),
     ),
 }
@@ -133,7 +133,7 @@ class Eyes:
             drawn = renderer.render()
         finally:
             renderer.disable_segmentation_rendering()
-        geom = np.where(drawn[..., 1] == mujoco.mjtObj.mjOBJ_GEOM, drawn[..., 0], -1)
+        geom = np.where(drawn[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM), drawn[..., 0], -1)
         owner = np.where(geom >= 0, self._owner[geom], -1)
         return {each: owner == i for i, each in enumerate(self.objects) if each not in hidden}
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from vap_core.errors import OutOfReach
+from vap_core.sim import robots
 from vap_core.sim.robots import Robot
 from vap_core.values import value
 
@@ -84,17 +85,14 @@ class Arm:
         off = float(np.linalg.norm(self.forward(joints)[:3, 3] - tcp_base[:3, 3]))
         turn = float(np.linalg.norm(rotation_vector(self.forward(joints)[:3, :3] @ tcp_base[:3, :3].T)))
         if off > tolerance_m or turn > 10 * tolerance_m:
-            raise OutOfReach(
-                f"Arm.reach: {self.robot.name} stays {1000 * off:.0f} mm and {turn:.2f} rad away from {tcp_base[:3, 3].round(3).tolist()} m; move it closer."
-            )
+            where = tcp_base[:3, 3].round(3).tolist()
+            raise OutOfReach(f"Arm.reach: {self.robot.name} stays {1000 * off:.0f} mm and {turn:.2f} rad away from {where} m; move it closer.")
         return joints
 
 
 @cache
 def arm(robot: str) -> Arm:
     """The kinematics of the robot called `robot`, built once per process."""
-    from vap_core.sim import robots
-
     return Arm(robots.get(robot))
 
 

@@ -1,5 +1,6 @@
-"""Choose an off-screen OpenGL back end before MuJoCo is imported; a missing one is a clear error, never a dead kernel."""
+"""Choose an off-screen OpenGL back end before MuJoCo draws; a missing one is a clear error, never a dead kernel."""
 
+import importlib
 import importlib.util
 import os
 import subprocess
@@ -32,19 +33,20 @@ def works(backend: str) -> bool:
 
 
 def ensure_gl() -> str:
-    """Set `MUJOCO_GL` to a back end that works without a display and return its name; call it before importing mujoco.
+    """Make mujoco draw without a display: set `MUJOCO_GL` to a back end that works here and return its name.
 
-    A value that is already set is trusted and left alone; so is the back end of a mujoco that is already imported and has one.
+    Call it before importing mujoco where possible; a mujoco that is already imported is switched over. A value that is already
+    set is trusted and left alone.
 
     Raises: MissingGL with the line to run.
     """
-    chosen = os.environ.get("MUJOCO_GL", "").lower()
+    chosen = os.environ.get("MUJOCO_GL", "").lower().strip()
     if chosen:
         return chosen
-    if "mujoco" in sys.modules and not hasattr(sys.modules["mujoco"], "GLContext"):
-        raise MissingGL("ensure_gl: mujoco was imported before a back end was chosen. Set MUJOCO_GL=egl, or call ensure_gl() first, and start again.")
     for backend in BACKENDS:
         if works(backend):
             os.environ["MUJOCO_GL"] = backend
+            if "mujoco" in sys.modules:
+                importlib.reload(importlib.import_module("mujoco.rendering.classic.gl_context"))
             return backend
     raise MissingGL(f"ensure_gl: no OpenGL back end of {', '.join(BACKENDS)} can draw without a display. Run: {REMEDY}")

@@ -91,7 +91,7 @@ SUITES: dict[str, Suite] = {
         cameras=("front", "side", "wrist"),
         max_steps=100,
         tasks=_picks(100),
-        arrangement=Arrangement(x_m=0.48, spread_m=0.15, shift_m=0.02, jitter_m=(0.03, 0.02), clearance_m=0.11),
+        arrangement=Arrangement(x_m=0.48, spread_m=0.14, shift_m=0.015, jitter_m=(0.03, 0.015), clearance_m=0.11),
     ),
 }
 

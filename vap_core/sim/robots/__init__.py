@@ -17,7 +17,8 @@ class Robot:
     """One arm with a parallel gripper. Every joint has a position actuator of the same name and a site `tcp` lies between the fingertips.
 
     The site's z points out of the gripper and its y along the opening axis. `home` and `speed_rad_s` follow `joints`;
-    `fingers_open` and `fingers_closed` follow `fingers`, metres of travel; `opening_m` is the clear width between open pads.
+    `fingers_open` and `fingers_closed` follow `fingers`, metres of travel; `opening_m` is the clear width between open pads, and
+    `palm_m` how far an object between them may reach above the tcp before it meets the palm.
     `down_base` is the tcp's rotation in the robot base frame when the gripper points straight down, its opening axis across the table:
     the state's rotation vector is counted from it, so that a turn about the vertical reads (0, 0, yaw).
     """
@@ -31,6 +32,7 @@ class Robot:
     fingers_open: tuple[float, ...]
     fingers_closed: tuple[float, ...]
     opening_m: float
+    palm_m: float
     hz: float
     base_world: Pose
     links: tuple[str, ...]
@@ -49,11 +51,12 @@ ROBOTS: dict[str, Robot] = {
         xml=HERE / "wx250s.xml",
         joints=("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate"),
         fingers=("left_finger", "right_finger"),
-        home=np.array([0.0, -0.33612, -0.00625, 0.0, 1.91317, 0.0]),
+        home=np.array([0.0, -0.32482, -0.05009, 0.0, 1.9457, 0.0]),
         speed_rad_s=np.full(6, np.pi),
         fingers_open=(0.037, -0.037),
         fingers_closed=(0.015, -0.015),
         opening_m=0.054,
+        palm_m=0.028,
         hz=5.0,
         base_world=ORIGIN,
         links=(
@@ -74,11 +77,12 @@ ROBOTS: dict[str, Robot] = {
         xml=HERE / "panda.xml",
         joints=("joint1", "joint2", "joint3", "joint4", "joint5", "joint6", "joint7"),
         fingers=("finger_joint1", "finger_joint2"),
-        home=np.array([0.0, -0.63121, 0.0, -2.48089, 0.0, 1.84968, 0.7853982]),
+        home=np.array([0.0, -0.49901, 0.0, -2.61756, 0.0, 2.11855, 0.7853982]),
         speed_rad_s=np.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61]),
         fingers_open=(0.04, 0.04),
         fingers_closed=(0.0, 0.0),
         opening_m=0.080,
+        palm_m=0.041,
         hz=10.0,
         base_world=ORIGIN,
         links=("link0", "link1", "link2", "link3", "link4", "link5", "link6", "link7", "hand", "left_finger", "right_finger"),
