@@ -1,10 +1,24 @@
 """Recordings: what is in them, how large they are, how they survive, and that rerun's own tools accept them."""
 
 import math
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rerun.chunk import RrdReader
 
+from vap_core.errors import BadOutput, BadRecording, MissingGL
+from vap_core.evidence import apart, classes, label_spots
+from vap_core.record import Recorder, read_summary, record_grounding, recording_name, recover, screenshot
+from vap_core.recording_file import rerun_cli, temporary
 from vap_core.values import (
     Boxes,
     Camera,
@@ -15,16 +29,18 @@ from vap_core.values import (
     Mask,
     Opening,
     Outcome,
+    PersonalObject,
     Placement,
     Rgb,
     Track,
     Truth,
-)
+)  # fmt: skip
 
 SIDE, K = 224, 5
 SIZES = {"owl_a": (0.07, 0.07, 0.11), "owl_b": (0.07, 0.07, 0.10), "owl_c": (0.06, 0.08, 0.11)}
 PAINT = {"owl_a": (150, 95, 60), "owl_b": (165, 110, 70), "owl_c": (135, 90, 75)}
-ROW = EpisodeRow("tabletop", "pick-owl", 3, 7, "bring my owl", "owl", tuple(Placement(m, 0.32, y, 0.0) for m, y in zip(SIZES, (0.0, 0.14, -0.15), strict=True)), 60)
+PLACES = tuple(Placement(model, 0.32, y, 0.0) for model, y in zip(SIZES, (0.0, 0.14, -0.15), strict=True))
+ROW = EpisodeRow("tabletop", "pick-owl", 3, 7, "bring my owl", "owl", PLACES, 60)
 TINT = np.array([230, 40, 40])
 
 
@@ -85,16 +101,15 @@ def draw(camera: Camera, step: int) -> tuple[Rgb, dict[str, Mask]]:
 def ground(camera: Camera, none: bool = False) -> Grounding:
     _, masks = draw(camera, 0)
     if none:
-        empty = np.zeros((0, K), np.float32)
-        return Grounding(camera.name, "owl_a", Boxes.empty("owl"), empty, np.zeros(0, np.int64), np.zeros(0, bool), None, 0.0, 0.0, np.zeros((0, SIDE, SIDE), bool))
+        nothing = (np.zeros((0, K), np.float32), np.zeros(0, np.int64), np.zeros(0, bool))
+        return Grounding(camera.name, "owl_a", Boxes.empty("owl"), *nothing, None, 0.0, 0.0, np.zeros((0, SIDE, SIDE), bool))
     boxes = [[*np.argwhere(m).min(0)[::-1], *(np.argwhere(m).max(0)[::-1] + 1)] for m in masks.values()]
     cos = np.array([[0.83, 0.81, 0.62, 0.9, 0.85], [0.7, 0.72, 0.66, 0.71, 0.6], [0.5, 0.61, 0.6, 0.55, 0.52]], np.float32)
     votes = np.bincount(cos.argmax(0), minlength=3)
     scores = np.array([0.71, 0.83, 0.64], np.float32)
     means = cos.mean(1)
-    return Grounding(
-        camera.name, "owl_a", Boxes(np.array(boxes, np.float32), scores, "owl"), cos, votes, votes == votes.max(), 0, 0.6, float(means[0] - means[1]), np.stack(list(masks.values()))
-    )  # fmt: skip
+    boxes_found, best = Boxes(np.array(boxes, np.float32), scores, "owl"), votes == votes.max()
+    return Grounding(camera.name, "owl_a", boxes_found, cos, votes, best, 0, 0.6, float(means[0] - means[1]), np.stack(list(masks.values())))
 
 
 def opening(cameras: int = 3, none: str = "") -> Opening:
@@ -116,7 +131,7 @@ def frame(step: int, start: Opening, lost: range = range(0)) -> Frame:
             shown = image.copy()
             shown[track] = (0.5 * image[track] + 0.5 * TINT).astype(np.uint8)
         prompted[camera.name], truths[camera.name] = shown, masks
-        tracks[camera.name] = (Track(track, 0.0 if track is None else 0.9 + 0.05 * math.sin(step / 5)),)
+        tracks[camera.name] = (Track(track, 0.0 if track is None else 0.9 - 0.12 * len(tracks) + 0.05 * math.sin(step / 5 + len(tracks))),)
     touched = frozenset({"owl_a"} if step > 30 else {"owl_b"} if 20 < step < 24 else set())
     held = frozenset({"owl_a"} if step > 35 else set())
     events = (Event(0, "INFO", "grounded in every view"),) if step == 0 else (Event(step, "WARN", "front: track lost"),) if step in lost[:1] else ()
@@ -126,3 +141,303 @@ def frame(step: int, start: Opening, lost: range = range(0)) -> Frame:
 
 
 SUCCESS = Outcome("success", True, True, 20, True, False, True, 60)
+
+
+def record(path: Path, start: Opening, steps: int = 12, lost: range = range(0)) -> list[Frame]:
+    frames = [frame(step, start, lost) for step in range(steps)]
+    with Recorder(path, start, flush_every=5) as recorder:
+        for one in frames:
+            recorder.frame(one)
+        recorder.close(replace(SUCCESS, steps=steps))
+    return frames
+
+
+def columns(path: Path, entity: str, name: str) -> dict[int | None, object]:
+    """Every value of one component by frame_index; None is static."""
+    found: dict[int | None, object] = {}
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        if chunk.entity_path == entity and name in batch.schema.names:
+            timed = "frame_index" in batch.schema.names
+            steps = batch["frame_index"].to_pylist() if timed else [None] * batch.num_rows
+            found |= dict(zip(steps, batch[name].to_pylist(), strict=True))
+    return found
+
+
+def entities(path: Path) -> set[str]:
+    return {chunk.entity_path for chunk in RrdReader(path).stream()}
+
+
+def rerun(*words: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(rerun_cli(*map(str, words)), capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Opening, list[Frame]]:
+    path, start = tmp_path_factory.mktemp("three") / "three.rrd", opening(3)
+    return path, start, record(path, start)
+
+
+def test_rerun_loads_only_when_a_recording_is_asked_for() -> None:
+    subprocess.run([sys.executable, "-c", "import vap_core, vap_core.values, sys; assert 'rerun' not in sys.modules"], check=True)
+
+
+def test_every_entity_has_its_promised_name(three: tuple[Path, Opening, list[Frame]]) -> None:
+    views = [
+        f"/observation.images.{cam}{tail}"
+        for cam in ("front", "side", "wrist")
+        for tail in ("", "/prompted", "/candidates", "/mask/target", "/mask/gt")
+    ]
+    votes = [f"/vap/{part}/{cam}" for cam in ("front", "side", "wrist") for part in ("votes", "candidates", "vote_margin", "track_score")]
+    plain = ["/observation.state", "/action", "/next.reward", "/next.success", "/vap/instruction", "/vap/events"]
+    status = ["/vap/status/outcome", "/vap/status/grasp", "/__properties/rollout", "/__properties/outcome"]
+    world = ["/world/table", "/world/robot/link0", "/world/robot/link_finger1", "/world/objects/owl_a", "/world/objects/owl_c"]
+    assert {*views, *votes, *plain, *status, *world} <= entities(three[0])
+
+
+def test_numbers_come_back_at_their_step(three: tuple[Path, Opening, list[Frame]]) -> None:
+    path, start, frames = three
+    assert columns(path, "/vap/vote_margin/side", "Scalars:scalars") == {step: [0.6] for step in range(12)}
+    assert columns(path, "/next.success", "Scalars:scalars") == {step: [float(step == 11)] for step in range(12)}
+    assert columns(path, "/vap/votes/front", "counts") == {0: start.groundings["front"][0].votes.tolist()}
+    similarity = columns(path, "/vap/candidates/front", "similarity")[0]
+    np.testing.assert_allclose(np.reshape(similarity, (3, K)), start.groundings["front"][0].similarity)  # type: ignore[arg-type]
+    actions = columns(path, "/action", "Scalars:scalars")
+    np.testing.assert_allclose(np.array([actions[step] for step in range(12)]), np.stack([f.action for f in frames]))
+    lift = columns(path, "/world/objects/owl_b", "Transform3D:translation")[3]
+    np.testing.assert_allclose(lift, [frames[3].truth.objects_world["owl_b"][:3]], atol=1e-6)
+
+
+def test_pictures_and_masks_come_back_at_their_step(three: tuple[Path, Opening, list[Frame]]) -> None:
+    path, _, frames = three
+    for entity, views in (("", frames[7].images), ("/prompted", frames[7].prompted)):
+        blob = columns(path, f"/observation.images.wrist{entity}", "EncodedImage:blob")[7]
+        decoded = cv2.cvtColor(cv2.imdecode(np.frombuffer(bytes(blob[0]), np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)  # type: ignore[index]
+        assert np.abs(decoded.astype(int) - views["wrist"]).mean() < 4
+    for tail, mask in (("target", frames[7].tracks["wrist"][0].mask), ("gt", frames[7].truth.masks["wrist"]["owl_a"])):
+        buffer = columns(path, f"/observation.images.wrist/mask/{tail}", "SegmentationImage:buffer")[7]
+        np.testing.assert_array_equal(np.frombuffer(bytes(buffer[0]), np.uint8).reshape(SIDE, SIDE) > 0, mask)  # type: ignore[index]
+
+
+def test_the_catalog_server_sees_properties_and_columns(three: tuple[Path, Opening, list[Frame]]) -> None:
+    import rerun as rr
+
+    with rr.server.Server(host="127.0.0.1", datasets={"r": [three[0]]}) as server:
+        dataset = server.client().get_dataset("r")
+        table = dataset.segment_table().to_pandas()
+        assert table["property:rollout:task"][0][0] == "pick-owl"
+        assert bool(table["property:outcome:success"][0][0])
+        margins = dataset.filter_contents(["/vap/vote_margin/**"]).reader(index="frame_index").to_pandas()
+        assert len(margins) == 12
+
+
+def test_summary_tells_what_ran_and_how_it_ended(three: tuple[Path, Opening, list[Frame]]) -> None:
+    summary = read_summary(three[0])
+    expected = {"rollout.suite": "tabletop", "rollout.method": "vap", "rollout.seed": 7, "outcome.success": True, "outcome.length": 12, "frames": 12}
+    assert {name: summary[name] for name in expected} == expected
+    assert summary["rollout.git"]
+
+
+def test_a_recording_has_a_safe_name_of_its_own() -> None:
+    assert recording_name(ROW, "vap") == "tabletop.pick-owl.003.s7.vap.rrd"
+    assert recording_name(replace(ROW, task="/x y"), "a/b") == "tabletop.-x-y.003.s7.a-b.rrd"
+
+
+@pytest.mark.parametrize(("cameras", "none"), [(3, ""), (2, "side"), (1, "front")])
+def test_rerun_verifies_every_finished_recording(tmp_path: Path, cameras: int, none: str) -> None:
+    path = tmp_path / "one.rrd"
+    record(path, opening(cameras, none), lost=range(4, 7))
+    done = rerun("rrd", "verify", path)
+    assert done.returncode == 0, done.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["one.rrd"]
+
+
+def test_a_view_without_candidates_and_a_lost_track_are_results(tmp_path: Path) -> None:
+    record(tmp_path / "one.rrd", opening(2, "side"), lost=range(4, 7))
+    assert columns(tmp_path / "one.rrd", "/vap/votes/side", "counts") == {0: []}
+    assert columns(tmp_path / "one.rrd", "/vap/candidates/side", "winner") == {0: [-1]}
+    buffers = columns(tmp_path / "one.rrd", "/observation.images.front/mask/target", "SegmentationImage:buffer")
+    assert [step for step, buffer in buffers.items() if not np.any(buffer)] == [4, 5, 6]
+
+
+def test_a_method_that_grounds_nothing_records_too(tmp_path: Path) -> None:
+    start = replace(opening(1), method="generic", groundings={}, rewritten=ROW.instruction)
+    with Recorder(tmp_path / "one.rrd", start) as recorder:
+        recorder.frame(replace(frame(0, opening(1)), tracks={}))
+        recorder.close(replace(SUCCESS, status="failure", success=False, steps=1), failure_case="Case 3")
+    assert read_summary(tmp_path / "one.rrd")["outcome.failure_case"] == "Case 3"
+    assert "/vap/vote_margin/front" not in entities(tmp_path / "one.rrd")
+
+
+def test_an_episode_that_fails_before_its_first_step_records_its_error(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "one.rrd", opening(1)) as recorder:
+        recorder.close(replace(SUCCESS, status="error", success=False, steps=0, detail="no grasp pose"))
+    summary = read_summary(tmp_path / "one.rrd")
+    assert (summary["frames"], summary["outcome.detail"]) == (0, "no grasp pose")
+    assert rerun("rrd", "verify", tmp_path / "one.rrd").returncode == 0
+
+
+def test_a_second_target_wears_a_suffix(tmp_path: Path) -> None:
+    start = opening(1)
+    second = replace(start.groundings["front"][0], object="owl_b", winner=1)
+    start = replace(start, groundings={"front": (start.groundings["front"][0], second)})
+    with Recorder(tmp_path / "one.rrd", start) as recorder:
+        one = frame(0, start)
+        recorder.frame(replace(one, tracks={"front": (*one.tracks["front"], Track(one.truth.masks["front"]["owl_b"], 0.7))}))
+        recorder.close(SUCCESS)
+    names = {
+        "/vap/votes/front_1",
+        "/observation.images.front/candidates_1",
+        "/observation.images.front/mask/target_1",
+        "/observation.images.front/mask/gt_1",
+    }
+    assert names <= entities(tmp_path / "one.rrd")
+
+
+def test_equal_episodes_give_equal_recordings(tmp_path: Path) -> None:
+    start = opening(2)
+    for name in ("a", "b"):
+        record(tmp_path / f"{name}.rrd", start)
+        time.sleep(0.3)  # longer than rerun's usual batching tick
+    record(tmp_path / "c.rrd", start, lost=range(3, 5))
+    same = rerun("rrd", "compare", tmp_path / "a.rrd", tmp_path / "b.rrd")
+    assert same.returncode == 0, same.stderr[-500:]
+    assert rerun("rrd", "compare", tmp_path / "a.rrd", tmp_path / "c.rrd").returncode != 0
+
+
+def test_a_killed_episode_keeps_all_flushed_steps(tmp_path: Path) -> None:
+    path = tmp_path / "killed.rrd"
+    program = (
+        f"import sys, os, signal, pathlib; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        "import test_record as t\n"
+        "start = t.opening(1)\n"
+        f"recorder = t.Recorder(pathlib.Path({str(path)!r}), start, flush_every=5)\n"
+        "for step in range(13): recorder.frame(t.frame(step, start))\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert [p.name for p in tmp_path.iterdir()] == [".killed.rrd.tmp"]
+    with pytest.raises(BadRecording, match="rerun rrd optimize"):
+        read_summary(temporary(path))
+    assert recover(temporary(path)) == path
+    summary = read_summary(path)
+    assert (summary["frames"], summary["rollout.task"], "outcome.status" in summary) == (10, "pick-owl", False)
+    assert rerun("rrd", "verify", path).returncode == 0
+    assert [p.name for p in tmp_path.iterdir()] == ["killed.rrd"]
+
+
+def test_an_exception_keeps_every_step_under_the_temporary_name(tmp_path: Path) -> None:
+    def crash() -> None:
+        with Recorder(tmp_path / "one.rrd", opening(1)) as recorder:
+            recorder.frame(frame(0, opening(1)))
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        crash()
+    assert [p.name for p in tmp_path.iterdir()] == [".one.rrd.tmp"]
+    assert read_summary(recover(tmp_path / ".one.rrd.tmp"))["frames"] == 1
+
+
+def test_sixty_steps_of_three_cameras_stay_small_and_quick(tmp_path: Path) -> None:
+    start = opening(3)
+    frames = [frame(step, start) for step in range(60)]
+    record(tmp_path / "warm.rrd", start, steps=2)
+    recorder = Recorder(tmp_path / "one.rrd", start)
+    began = time.process_time()
+    for one in frames:
+        recorder.frame(one)
+    recorder.close(SUCCESS)
+    per_step_ms = (time.process_time() - began) / 60 * 1e3
+    assert (tmp_path / "one.rrd").stat().st_size < 5e6
+    assert per_step_ms < 8, "a rollout step costs 70-200 ms, and recording may take a tenth of it"
+
+
+def test_nothing_is_ever_overwritten(tmp_path: Path, three: tuple[Path, Opening, list[Frame]]) -> None:
+    (tmp_path / "one.rrd").write_bytes(b"precious")
+    with pytest.raises(BadOutput, match="never overwritten; choose another"):
+        Recorder(tmp_path / "one.rrd", three[1])
+    with Recorder(tmp_path / "two.rrd", three[1]) as recorder:
+        (tmp_path / "two.rrd").write_bytes(b"precious")
+        with pytest.raises(BadOutput, match="kept as"):
+            recorder.close(SUCCESS)
+    with pytest.raises(BadOutput, match="left as it is"):
+        recover(tmp_path / ".two.rrd.tmp")
+    assert {p.read_bytes() for p in tmp_path.glob("*.rrd")} == {b"precious"}
+
+
+def test_a_folder_that_cannot_be_written_says_so(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("not a folder")
+    with pytest.raises(BadOutput, match="choose a folder you may write to"):
+        Recorder(tmp_path / "file" / "one.rrd", opening(1))
+
+
+def test_a_damaged_recording_says_how_to_mend_it(tmp_path: Path, three: tuple[Path, Opening, list[Frame]]) -> None:
+    whole = three[0].read_bytes()
+    for name, data in (("noise", b"noise" * 99), ("half", whole[: len(whole) // 2]), ("empty", b"")):
+        (tmp_path / f"{name}.rrd").write_bytes(data)
+        with pytest.raises(BadRecording, match="rerun rrd optimize") as caught:
+            read_summary(tmp_path / f"{name}.rrd")
+        assert "\n" not in str(caught.value)
+    with pytest.raises(BadRecording, match="there is no recording"):
+        read_summary(tmp_path / "missing.rrd")
+    (tmp_path / ".noise2.rrd.tmp").write_bytes(b"noise" * 99)
+    with pytest.raises(BadRecording):
+        recover(tmp_path / ".noise2.rrd.tmp")
+
+
+@given(st.lists(st.tuples(st.integers(0, 200), st.integers(0, 200)), min_size=1, max_size=8))
+@settings(max_examples=60, deadline=None)
+def test_labels_never_overlap(corners: list[tuple[int, int]]) -> None:
+    xyxy = np.array([[x, y, x + 20, y + 20] for x, y in corners], np.float32)
+    labels = [f"#{i} v1" for i in range(len(corners) - 1)] + ["#7 0.71 · votes 4/5 · cos 0.80"]
+    spots = label_spots(xyxy, labels, (SIDE, SIDE))
+    unit = SIDE / 170
+    wide = {i: (6.6 * len(labels[i]) + 12) * unit for i in spots}
+    rects = [(x - wide[i] / 2, y, x + wide[i] / 2, y + 21 * unit) for i, (x, y) in spots.items()]
+    assert len(labels) - 1 in spots
+    assert all(apart(a, (b[0] + 1e-6, b[1] + 1e-6, b[2] - 1e-6, b[3] - 1e-6)) for i, a in enumerate(rects) for b in rects[:i])
+
+
+def test_class_image_marks_inside_and_rim() -> None:
+    mask = np.zeros((9, 9), bool)
+    mask[2:7, 2:7] = True
+    image = classes(mask, 3, 1)
+    assert (image[3:6, 3:6] == 3).all()
+    assert (image > 0).sum() == 25
+    assert (image == 4).sum() == 16
+
+
+def test_a_grounding_alone_records(tmp_path: Path) -> None:
+    start = opening(1)
+    image, masks = draw(start.cameras[0], 0)
+    z = np.eye(K, 16, dtype=np.float32)
+    owl = PersonalObject("owl_a", "owl", z, tuple(image[90:150, 60 + k : 120 + k].copy() for k in range(K)), "test")
+    record_grounding(
+        tmp_path / "g.rrd", image, start.groundings["front"][0], owl, ROW.instruction, start.rewritten, frame(0, start).prompted["front"]
+    )
+    assert rerun("rrd", "verify", tmp_path / "g.rrd").returncode == 0
+    assert {"/vap/references", "/vap/similarity/front", "/observation.images.front/prompted", "/observation.images.front/mask/target"} <= entities(
+        tmp_path / "g.rrd"
+    )
+    assert masks
+
+
+def test_screenshot_draws_the_recording(tmp_path: Path, three: tuple[Path, Opening, list[Frame]]) -> None:
+    try:
+        screenshot(three[0], tmp_path / "one.png", frame_index=6, size=(800, 500))
+    except MissingGL:
+        pytest.skip("no graphics driver on this machine")
+    picture = cv2.imread(str(tmp_path / "one.png"))
+    assert picture.shape == (500, 800, 3)
+    assert picture.std() > 15
+
+
+def test_screenshot_without_a_driver_names_the_package(
+    tmp_path: Path, three: tuple[Path, Opening, list[Frame]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("VK_DRIVER_FILES", "/nonexistent.json")
+    monkeypatch.setenv("VK_ICD_FILENAMES", "/nonexistent.json")
+    with pytest.raises(MissingGL, match="apt-get install -y mesa-vulkan-drivers") as caught:
+        screenshot(three[0], tmp_path / "one.png")
+    assert "\n" not in str(caught.value)

@@ -4,6 +4,7 @@ Layouts are values that rerun stores inside the recording. `/vap/...` paths are 
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -32,6 +33,13 @@ def evidence_line(grounding: Grounding) -> str:
     return f"#{grounding.winner} wins {grounding.votes[grounding.winner]}/{grounding.similarity.shape[1]} · margin {grounding.margin:.2f}{tie}"
 
 
+def short_verdict(grounding: Grounding) -> str:
+    """The same in the width of a small title."""
+    if grounding.winner is None:
+        return "no candidate"
+    return "TIE" if int(grounding.tied.sum()) > 1 else f"margin {grounding.margin:.2f}"
+
+
 def _image(cam: str, title: str, contents: Sequence[str]) -> rrb.Spatial2DView:
     root = f"/observation.images.{cam}"
     return rrb.Spatial2DView(origin=root, contents=[f"{root}{tail}" for tail in contents], name=f"{cam} · {title}", background=BACKGROUND)
@@ -42,16 +50,16 @@ def policy_view(cam: str) -> Part:
 
 
 def track_view(cam: str) -> Part:
-    return _image(cam, "track (orange) vs truth (green)", ["", "/mask/**"])
+    return _image(cam, "track, truth", ["", "/mask/**"])
 
 
 def vote_view(cam: str, targets: int = 1) -> Part:
-    return _image(cam, "vote at t = 0", ["/candidates", *(f"/candidates_{j}" for j in range(1, targets))])
+    return _image(cam, "vote at t = 0", ["/candidates/**", *(f"/candidates_{j}/**" for j in range(1, targets))])
 
 
 def bars_view(cam: str, groundings: Sequence[Grounding]) -> Part:
-    title = evidence_line(groundings[0]) if groundings else "no personal object"
-    return rrb.BarChartView(origin=f"/vap/votes/{cam}", name=f"{cam} · {title}", plot_legend=rrb.PlotLegend(visible=False))
+    title = short_verdict(groundings[0]) if groundings else "no personal object"
+    return rrb.BarChartView(origin=f"/vap/votes/{cam}", name=f"{cam} votes · {title}", plot_legend=rrb.PlotLegend(visible=False))
 
 
 def _cameras(opening: Opening) -> tuple[Part, float]:
@@ -60,8 +68,8 @@ def _cameras(opening: Opening) -> tuple[Part, float]:
     trios = [(policy_view(cam), track_view(cam), vote_view(cam, len(opening.groundings.get(cam, ())))) for cam in names]
     if len(names) <= 2:
         columns = [rrb.Vertical(saw, rrb.Horizontal(track, vote), row_shares=[5, 3]) for saw, track, vote in trios]
-        return rrb.Horizontal(*columns), 0.4 if len(names) == 1 else 0.54
-    return rrb.Vertical(*(rrb.Horizontal(*trio, column_shares=[1, 1, 1]) for trio in trios)), 0.47
+        return rrb.Horizontal(*columns), 0.4 if len(names) == 1 else 0.52
+    return rrb.Vertical(*(rrb.Horizontal(*trio, column_shares=[1, 1, 1]) for trio in trios)), 0.44
 
 
 def _eye(opening: Opening) -> rrb.EyeControls3D:
@@ -72,18 +80,22 @@ def _eye(opening: Opening) -> rrb.EyeControls3D:
     away = away / max(float(np.linalg.norm(away)), 1e-6)
     turn = np.deg2rad(50.0)
     side = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ away
-    return rrb.EyeControls3D(position=centre + np.array([*side, 0.6]), look_target=centre, eye_up=(0, 0, 1), kind=rrb.Eye3DKind.Orbital)
+    return rrb.EyeControls3D(position=centre + np.array([*(0.75 * side), 0.45]), look_target=centre, eye_up=(0, 0, 1), kind=rrb.Eye3DKind.Orbital)
 
 
-def _curves(origin: str, name: str, contents: Sequence[str] = ("$origin/**",), limits: tuple[float, float] | None = None) -> rrb.TimeSeriesView:
+def _curves(
+    origin: str, name: str, contents: Sequence[str] = ("$origin/**",), limits: tuple[float, float] | None = None, shown: Sequence[bool] | None = None
+) -> rrb.TimeSeriesView:
     axis = rrb.ScalarAxis(range=limits) if limits else None
-    return rrb.TimeSeriesView(origin=origin, name=name, contents=list(contents), axis_y=axis, plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop))
+    legend = rrb.PlotLegend(rrb.Corner2D.RightBottom if limits else rrb.Corner2D.LeftTop)
+    overrides: Any = {origin: rr.SeriesLines(visible_series=list(shown))} if shown else None
+    return rrb.TimeSeriesView(origin=origin, name=name, contents=list(contents), axis_y=axis, plot_legend=legend, overrides=overrides)
 
 
-def _panels(root: Part) -> rrb.Blueprint:
+def _panels(root: Part, fps: float = 1.0) -> rrb.Blueprint:
     return rrb.Blueprint(
         root,
-        rrb.TimePanel(state="collapsed", timeline="frame_index", play_state="paused"),
+        rrb.TimePanel(state="collapsed", timeline="frame_index", play_state="paused", fps=fps),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.TopPanel(state="hidden"),
@@ -106,18 +118,27 @@ def episode_blueprint(opening: Opening) -> rrb.Blueprint:
     )
     votes = rrb.Horizontal(*(bars_view(cam, opening.groundings.get(cam, ())) for cam in names))
     evidence = _curves("/vap", "vote margin, track score", ["/vap/vote_margin/**", "/vap/track_score/**"], (-0.05, 1.05))
-    course = rrb.Vertical(
-        rrb.StateTimelineView(origin="/vap/status", name="course"), rrb.TextLogView(origin="/vap/events", name="events"), row_shares=[1, 1]
+    columns = rrb.archetypes.TextLogColumns(
+        timeline_columns=[rrb.encodings.TimelineColumn("frame_index")],
+        text_log_columns=[rrb.encodings.TextLogColumn("loglevel"), rrb.encodings.TextLogColumn("body")],
     )
+    events = rrb.TextLogView(origin="/vap/events", name="events", columns=columns)
+    course = rrb.StateTimelineView(origin="/vap/status", name="course")
     bottom = rrb.Horizontal(
         rrb.TextDocumentView(origin="/vap/instruction", name="instruction"),
-        rrb.Tabs(_curves("/action", "action"), _curves("/observation.state", "state"), active_tab=0),
+        rrb.Tabs(
+            _curves("/action", "action", shown=[True] * 6 + [False]),
+            _curves("/action", "gripper", shown=[False] * 6 + [True]),
+            _curves("/observation.state", "state"),
+            active_tab=0,
+        ),
         evidence,
         course,
-        column_shares=[1.15, 1, 1, 1.35],
+        events,
+        column_shares=[1.15, 1, 1, 0.95, 1.15],
     )
     right = rrb.Vertical(scene, votes, row_shares=[2.4, 1])
-    return _panels(rrb.Vertical(rrb.Horizontal(pictures, right, column_shares=[share, 1 - share]), bottom, row_shares=[0.72, 0.28]))
+    return _panels(rrb.Vertical(rrb.Horizontal(pictures, right, column_shares=[share, 1 - share]), bottom, row_shares=[0.745, 0.255]), opening.hz)
 
 
 def grounding_blueprint(cam: str, grounding: Grounding) -> rrb.Blueprint:

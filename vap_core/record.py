@@ -10,7 +10,6 @@ Recording properties: `rollout` and `outcome`. Pictures are JPEG; everything tha
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Self
 
 import numpy as np
 import rerun as rr
@@ -18,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from vap_core.blueprint import SERIES, episode_blueprint, evidence_line, grounding_blueprint, packed, series_style, state_style
 from vap_core.errors import BadOutput
-from vap_core.evidence import CLASSES, classes, contact_sheet, jpeg, log_vote, suffix, words
-from vap_core.recording_file import code_version, finish_stream, open_stream
+from vap_core.evidence import CLASSES, classes, contact_sheet, jpeg, log_vote, picture, suffix, words
+from vap_core.recording_file import code_version, finish_stream, open_stream, put, put_property
 from vap_core.recording_file import read_summary as read_summary
 from vap_core.recording_file import recording_name as recording_name
 from vap_core.recording_file import recover as recover
@@ -71,19 +70,18 @@ class Recorder:
         self._grasp: str | None = None
         self._rec: rr.RecordingStream | None = open_stream(self.path, f"{row.key}.s{row.seed}.{opening.method}.{opening.policy}")
         self._rec.send_recording_name(f"{row.key} · {opening.method}")
-        self._rec.send_property(
-            "rollout",
+        put_property(self._rec, "rollout",
             rr.AnyValues(
                 suite=row.suite, task=row.task, episode=row.episode, method=opening.method, policy=opening.policy, seed=row.seed, git=code_version(),
                 hz=opening.hz, instruction=opening.instruction, rewritten=opening.rewritten,
             ),
         )  # fmt: skip
-        self._rec.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, rr.AnnotationContext(CLASSES), static=True)
-        self._rec.log("/vap/instruction", words(opening), static=True)
+        put(self._rec, "/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, rr.AnnotationContext(CLASSES))
+        put(self._rec, "/vap/instruction", words(opening))
         log_table(self._rec, row)
         log_objects(self._rec, opening)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Recorder":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, err: BaseException | None, trace: TracebackType | None) -> None:
@@ -128,9 +126,8 @@ class Recorder:
             rec.send_columns("/vap/status/outcome", self._index(self._steps[:1], self._times[:1]), rr.StateChange.columns(state=[outcome.status]))
             level = {"success": "INFO", "failure": "WARN", "error": "ERROR"}[outcome.status]
             self._send_events([Event(self._steps[-1], level, f"episode ends: {verdict}")])  # type: ignore[arg-type]
-        rec.log("/vap/instruction", words(self._opening, verdict), static=True)
-        rec.send_property(
-            "outcome",
+        put(rec, "/vap/instruction", words(self._opening, verdict))
+        put_property(rec, "outcome",
             rr.AnyValues(
                 status=outcome.status, success=outcome.success, cmr=outcome.cmr, failure_case=failure_case, length=outcome.steps,
                 success_once=outcome.success_once, held_steps=outcome.held_steps, wrong_object=outcome.wrong_object,
@@ -158,29 +155,24 @@ class Recorder:
         """What only the first step can tell: shapes, links, and the pictures the vote was held on."""
         rec, opening = self._stream(), self._opening
         names = (*STATE_NAMES, *(f"joint{i}" for i in range(1, len(frame.state))))[: len(frame.state)]
-        rec.log("/action", series_style(ACTION_NAMES), static=True)
-        rec.log("/observation.state", series_style(names), static=True)
-        for entity in ("vote_margin", "track_score"):
+        put(rec, "/action", series_style(ACTION_NAMES))
+        put(rec, "/observation.state", series_style(names))
+        for entity, label, width in (("vote_margin", "margin", 3.0), ("track_score", "score", 1.5)):
             for i, (cam, per_view) in enumerate(opening.groundings.items()):
                 for j in range(len(per_view)):
-                    name, width = f"{entity.split('_')[1]} {cam}{suffix(j)}", 1.5 if entity == "track_score" else 3
-                    rec.log(
-                        f"/vap/{entity}/{cam}{suffix(j)}",
-                        rr.SeriesLines(names=name, colors=SERIES[i % len(SERIES)], widths=width),
-                        static=True,
-                    )
+                    style = rr.SeriesLines(names=f"{label} {cam}{suffix(j)}", colors=SERIES[i % len(SERIES)], widths=width)
+                    put(rec, f"/vap/{entity}/{cam}{suffix(j)}", style)
         log_cameras(rec, frame, SERIES)
-        rec.log("/vap/status/outcome", state_style(OUTCOMES), static=True)
-        rec.log("/vap/status/grasp", state_style(GRASPS), static=True)
+        put(rec, "/vap/status/outcome", state_style(OUTCOMES))
+        put(rec, "/vap/status/grasp", state_style(GRASPS))
         log_links(rec, frame.truth)
-        rec.set_time("frame_index", sequence=frame.frame_index)
-        rec.set_time("timestamp", duration=frame.timestamp_s)
-        for cam, per_view in opening.groundings.items():
+        at = self._index([frame.frame_index], [frame.timestamp_s])
+        for cam in pictures:
+            per_view = opening.groundings.get(cam, ())
             for j, grounding in enumerate(per_view):
-                log_vote(rec, grounding, j, None if j else pictures.get(cam))
-        for cam in pictures.keys() - {cam for cam, per_view in opening.groundings.items() if per_view}:
-            rec.log(f"/observation.images.{cam}/candidates", rr.EncodedImage(contents=pictures[cam].tobytes(), media_type="image/jpeg"))
-        rec.reset_time()
+                log_vote(rec, grounding, j, None if j else pictures[cam], at)
+            if not per_view:
+                put(rec, f"/observation.images.{cam}/candidates", picture(pictures[cam]), at=at)
         rec.send_blueprint(episode_blueprint(opening))
 
     def _flush(self) -> None:
@@ -232,9 +224,11 @@ class Recorder:
 
     def _send_classes(self, index: list[rr.TimeColumn], tail: str, masks: Sequence[Mask | None], shape: tuple[int, int], inside: int) -> None:
         blank = np.zeros(shape, np.uint8)
-        buffers = np.stack([blank if mask is None else classes(mask, inside) for mask in masks]).reshape(len(masks), -1)
+        buffers = np.stack([blank if mask is None else classes(mask, inside, 2 if inside == 1 else 1) for mask in masks]).reshape(len(masks), -1)
         kind = rr.components.ImageFormat(shape[1], shape[0], color_model="L", channel_datatype="U8")
-        columns = rr.SegmentationImage.columns(buffer=list(buffers), format=[kind] * len(masks))
+        columns = rr.SegmentationImage.columns(
+            buffer=list(buffers), format=[kind] * len(masks), opacity=[1.0] * len(masks), draw_order=[float(inside)] * len(masks)
+        )
         self._stream().send_columns(f"/observation.images.{tail}", index, columns)
 
     def _send_grasp(self) -> None:
@@ -267,24 +261,18 @@ def record_grounding(path: Path, image: Rgb, grounding: Grounding, obj: Personal
     root = f"/observation.images.{cam}"
     rec = open_stream(path, f"ground.{grounding.object}.{cam}.{path.stem}")
     rec.send_recording_name(f"ground · {grounding.object}")
-    rec.log("/", rr.AnnotationContext(CLASSES), static=True)
-    rec.set_time("frame_index", sequence=0)
-    rec.set_time("timestamp", duration=0.0)
-    picture = jpeg(image, 95)
-    rec.log(root, rr.EncodedImage(contents=picture.tobytes(), media_type="image/jpeg"))
-    rec.log(f"{root}/prompted", rr.EncodedImage(contents=jpeg(prompted, 95).tobytes(), media_type="image/jpeg"))
-    log_vote(rec, grounding, 0, picture)
+    put(rec, "/", rr.AnnotationContext(CLASSES))
+    at = [rr.TimeColumn("frame_index", sequence=[0]), rr.TimeColumn("timestamp", duration=[0.0])]
+    seen = jpeg(image, 95)
+    put(rec, root, picture(seen), at=at)
+    put(rec, f"{root}/prompted", picture(jpeg(prompted, 95)), at=at)
+    log_vote(rec, grounding, 0, seen, at)
     if grounding.mask is not None:
-        rec.log(f"{root}/mask/target", rr.SegmentationImage(classes(grounding.mask, 1)))
-    rec.log("/vap/references", rr.EncodedImage(contents=jpeg(contact_sheet(obj.crops), 95).tobytes(), media_type="image/jpeg"))
-    rec.log(f"/vap/similarity/{cam}", rr.Tensor(grounding.similarity, dim_names=("candidate", "reference")))
-    lines = [
-        f'**said** "{text}"',
-        f'**policy reads** "{rewritten}"',
-        evidence_line(grounding),
-        f"{obj.name} · {obj.category} · {len(obj.crops)} references · {obj.encoder}",
-    ]
-    rec.log("/vap/instruction", rr.TextDocument("\n\n".join(lines), media_type=rr.MediaType.MARKDOWN))
-    rec.reset_time()
+        put(rec, f"{root}/mask/target", rr.SegmentationImage(classes(grounding.mask, 1, 2), opacity=1.0), at=at)
+    put(rec, "/vap/references", picture(jpeg(contact_sheet(obj.crops), 95)), at=at)
+    put(rec, f"/vap/similarity/{cam}", rr.Tensor(grounding.similarity, dim_names=("candidate", "reference")), at=at)
+    lines = [f'**said** "{text}"', f'**policy reads** "{rewritten}"', evidence_line(grounding)]
+    lines.append(f"{obj.name} · {obj.category} · {len(obj.crops)} references · {obj.encoder}")
+    put(rec, "/vap/instruction", rr.TextDocument("\n\n".join(lines), media_type=rr.MediaType.MARKDOWN), at=at)
     rec.send_blueprint(grounding_blueprint(cam, grounding))
     finish_stream(rec, path)

@@ -3,6 +3,8 @@
 import re
 import subprocess
 import sys
+import warnings
+from collections.abc import Sequence
 from datetime import timedelta
 from functools import lru_cache
 from importlib.metadata import version
@@ -58,6 +60,17 @@ def open_stream(path: Path, recording_id: str) -> rr.RecordingStream:
     return rec
 
 
+def put(rec: rr.RecordingStream, entity: str, *parts: rr.AsComponents, at: Sequence[rr.TimeColumn] = ()) -> None:
+    """Write one row, static without `at`. As a column of its own it keeps its place in the file; `rec.log` would shuffle."""
+    batches = [batch for part in parts for batch in part.as_component_batches()]
+    rec.send_columns(entity, at, [batch.partition([len(batch.as_arrow_array())]) for batch in batches])
+
+
+def put_property(rec: rr.RecordingStream, name: str, values: rr.AnyValues) -> None:
+    """Recording properties are static components of a reserved entity."""
+    put(rec, f"/__properties/{name}", values)
+
+
 def finish_stream(rec: rr.RecordingStream, path: Path) -> None:
     """Write the footer, then give the recording its name."""
     rec.flush()
@@ -104,10 +117,21 @@ def read_summary(path: Path) -> dict[str, Any]:
     path = Path(path)
     if not path.is_file():
         raise BadRecording(f"read_summary: there is no recording at {path}.")
-    for chunk in RrdReader(path).stream():
-        batch = chunk.to_record_batch()
-        del batch
-    return {}
+    summary: dict[str, Any] = {}
+    steps: set[int] = set()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # rerun only warns when a footer is missing: such a file was never finished
+            for chunk in RrdReader(path).stream():
+                batch = chunk.to_record_batch()
+                group = chunk.entity_path.removeprefix("/__properties/")
+                if group in ("rollout", "outcome"):
+                    summary |= {f"{group}.{name}": batch[name][0].as_py()[0] for name in batch.schema.names if not name.startswith("rerun.")}
+                elif "frame_index" in batch.schema.names:
+                    steps.update(batch["frame_index"].to_pylist())
+    except (RuntimeError, ValueError, OSError, Warning) as err:
+        raise unreadable(path, err) from err
+    return {**summary, "frames": len(steps)}
 
 
 def unreadable(path: Path, why: object) -> BadRecording:

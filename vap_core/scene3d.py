@@ -7,6 +7,7 @@ import rerun as rr
 from scipy.spatial.transform import Rotation
 
 from vap_core.blueprint import QUIET, TARGET
+from vap_core.recording_file import put
 from vap_core.values import EpisodeRow, Frame, Opening, Pose, Truth
 
 ROBOT = (170, 178, 196)
@@ -25,7 +26,7 @@ def log_table(rec: rr.RecordingStream, row: EpisodeRow) -> None:
     """The table's top is z = 0."""
     xy = np.array([[p.x, p.y] for p in row.placements]).mean(axis=0)
     box = rr.Boxes3D(centers=[[*xy, -0.01]], half_sizes=[[0.45, 0.55, 0.01]], colors=[TABLE], fill_mode="solid")
-    rec.log("/world/table", box, static=True)
+    put(rec, "/world/table", box)
 
 
 def log_objects(rec: rr.RecordingStream, opening: Opening) -> None:
@@ -41,7 +42,7 @@ def log_objects(rec: rr.RecordingStream, opening: Opening) -> None:
             labels=[f"target: {name}" if target else name],
             show_labels=target,
         )
-        rec.log(f"/world/objects/{name}", box, static=True)
+        put(rec, f"/world/objects/{name}", box)
 
 
 def parents(names: Sequence[str]) -> dict[str, str]:
@@ -67,12 +68,12 @@ def log_links(rec: rr.RecordingStream, truth: Truth) -> None:
         lengths = np.linalg.norm(bones, axis=1)
         bones, lengths = bones[lengths > 5e-3], lengths[lengths > 5e-3]
         entity = link_entity(name)
-        rec.log(f"{entity}/joint", rr.Boxes3D(half_sizes=[[0.016] * 3], colors=[ROBOT], fill_mode="solid"), static=True)
+        put(rec, f"{entity}/joint", rr.Boxes3D(half_sizes=[[0.016] * 3], colors=[ROBOT], fill_mode="solid"))
         if len(bones):
             turns = [Rotation.align_vectors([bone], [[0.0, 0.0, 1.0]])[0].as_quat() for bone in bones]
             radii = np.clip(lengths / 6, 0.008, 0.035)
             shape = rr.Capsules3D(lengths=lengths, radii=radii, quaternions=turns, colors=[ROBOT] * len(bones), fill_mode="solid")
-            rec.log(entity, shape, static=True)
+            put(rec, entity, shape)
 
 
 def send_poses(rec: rr.RecordingStream, entity: str, index: Sequence[rr.TimeColumn], xyz: np.ndarray, quaternion_xyzw: np.ndarray) -> None:
@@ -101,4 +102,4 @@ def log_cameras(rec: rr.RecordingStream, frame: Frame, colours: Sequence[tuple[i
             image_plane_distance=FRUSTUM_M,
             color=colours[i % len(colours)],
         )
-        rec.log(f"/observation.images.{camera.name}", pinhole, static=True)
+        put(rec, f"/observation.images.{camera.name}", pinhole)

@@ -67,11 +67,26 @@ def screenshot(rrd: Path, png: Path, *, frame_index: int | None = None, size: tu
 
     Raises: BadRecording, when `rrd` cannot be read; MissingGL, when nothing can draw; BadOutput, when `png` cannot be written.
     """
-    frames = read_summary(rrd)
+    rrd, png = Path(rrd).resolve(), Path(png)
+    if not read_summary(rrd)["frames"]:
+        raise BadRecording(f"screenshot: {rrd} holds no step to show; record the episode again.")
     with headless_viewer(size) as viewer:
-        print(viewer.open(str(Path(rrd).resolve())))
-        print(viewer.get_state())
+        viewer.open(str(rrd))
         if frame_index is not None:
             viewer.set_time("frame_index", sequence=frame_index, play_state="paused")
-        time.sleep(3)
-        viewer.save_screenshot(str(png))
+        picture = settled(viewer)
+    try:
+        png.parent.mkdir(parents=True, exist_ok=True)
+        png.write_bytes(picture)
+    except OSError as err:
+        raise BadOutput(f"screenshot: cannot write {png} ({err.strerror}); choose a folder you may write to.") from err
+
+
+def settled(viewer: ViewerClient, patience_s: float = 20.0) -> bytes:
+    """The viewer loads and decodes in the background: its picture is done when it no longer changes."""
+    end = time.monotonic() + patience_s
+    before, now = b"", viewer.take_screenshot()
+    while now != before and time.monotonic() < end:
+        time.sleep(0.7)
+        before, now = now, viewer.take_screenshot()
+    return now
