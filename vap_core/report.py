@@ -36,7 +36,7 @@ def results_table(scores: list[Score]) -> str:
     """Aligned text; every rate with its 95 % Wilson interval."""
     head = ["suite", "task", "method", "policy", "n", "errors", "SR % [95 %]", "CMR % [95 %]", "wrong object % [95 %]"]
     body = [[s.suite, s.task, s.method, s.policy, str(s.n), str(s.errors), str(s.sr), str(s.cmr), str(s.wrong_object)] for s in scores]
-    return _align([head, *body])
+    return align([head, *body])
 
 
 def times_table(times: dict[tuple[str, str], dict[str, float]]) -> str:
@@ -44,10 +44,10 @@ def times_table(times: dict[tuple[str, str], dict[str, float]]) -> str:
     parts = list(dict.fromkeys(part for row in times.values() for part in row))
     head = ["suite", "method", *parts, "total"]
     body = [[*key, *(f"{row.get(part, 0.0):.1f}" for part in parts), f"{sum(row.values()):.1f}"] for key, row in times.items()]
-    return _align([head, *body])
+    return align([head, *body])
 
 
-def _align(rows: list[list[str]]) -> str:
+def align(rows: list[list[str]]) -> str:
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     ruled = [rows[0], ["-" * width for width in widths], *rows[1:]]
     return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in ruled)

@@ -15,7 +15,7 @@ from jaxtyping import Float32, Float64
 
 from vap_core.detect import Detector
 from vap_core.prompt import PALETTE, looks_like
-from vap_core.values import Boxes, Camera, Chunk, Colour, PolicyInput, Rgb, value
+from vap_core.values import Boxes, Camera, Chunk, Colour, PolicyInput, Pose, Rgb, value
 
 SPAN = re.compile(rf"\b(?:the\s+(?P<colour>{'|'.join(c.name for c in PALETTE)})|my|the|a|an)\s+(?P<category>[a-z][a-z -]*)", re.IGNORECASE)
 COLOURED = 0.25
@@ -24,6 +24,7 @@ STEP_M = 0.030
 """Furthest travel of one action, metres."""
 GAIN = 0.7
 """Share of the remaining way that one action asks for; below 1 so that a lagging arm does not overshoot."""
+RING = np.stack([np.cos(np.linspace(0, 2 * np.pi, 24, endpoint=False)), np.sin(np.linspace(0, 2 * np.pi, 24, endpoint=False))], axis=1)
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,10 @@ class Manner:
     close_steps: int = 4
     grasp_share: float = 0.62
     """Grasp height as a share of the object's height."""
+    radius_m: float = 0.021
+    """What it can grasp is no thicker than this around its axis; a wider box has a handle."""
+    empty: float = 0.08
+    """A closed gripper that reads less than this holds nothing: try again."""
 
 
 @value
@@ -53,13 +58,11 @@ class Scripted:
 
     label = "scripted"
 
-    def __init__(
-        self, detector: Detector, camera: Camera, base_world: Float64[np.ndarray, "4 4"], manner: Manner | None = None, execute: int = 2
-    ) -> None:
+    def __init__(self, detector: Detector, camera: Camera, base_world: Pose, manner: Manner | None = None, execute: int = 2) -> None:
         self.detector = detector
         self.camera = camera
-        self.base_from_camera = np.linalg.inv(base_world) @ camera.pose_world
-        self.table_z = -base_world[2, 3]
+        self.base_from_camera = np.linalg.inv(_matrix(base_world)) @ camera.pose_world
+        self.table_z = -float(base_world[2])
         self.manner = manner or Manner()
         self.execute = execute
 
@@ -75,7 +78,7 @@ class Scripted:
             goal = self._look(state, seen)
             state = ScriptedState(state.draw, state.goal if goal is None else goal, state.phase, state.wait)
         hand = seen.state[:3].astype(np.float64)
-        state = self._advance(state, hand)
+        state = self._advance(state, hand, float(seen.state[6]))
         if state.goal is None:
             still = np.zeros((self.execute, 7), np.float32)
             still[:, 6] = 1.0
@@ -89,7 +92,7 @@ class Scripted:
             rows.append([*delta, 0.0, 0.0, 0.0, open_])
         return state, np.asarray(rows, np.float32)
 
-    def _advance(self, state: ScriptedState, hand: np.ndarray) -> ScriptedState:
+    def _advance(self, state: ScriptedState, hand: Float64[np.ndarray, "3"], opening: float) -> ScriptedState:
         """Move on to the next phase when this one's aim is reached."""
         if state.goal is None:
             return state
@@ -104,6 +107,8 @@ class Scripted:
             return ScriptedState(state.draw, state.goal, "close", 0)
         if state.phase == "close" and state.wait >= self.manner.close_steps:
             return ScriptedState(state.draw, state.goal, "lift", 0)
+        if state.phase == "lift" and opening < self.manner.empty:
+            return ScriptedState(state.draw, state.goal, "seek", 0)
         return ScriptedState(state.draw, state.goal, state.phase, state.wait + self.execute)
 
     def _aim(self, state: ScriptedState) -> tuple[np.ndarray, float]:
@@ -137,17 +142,26 @@ class Scripted:
         return sure[int(state.draw * len(sure))]
 
     def _place(self, box: Float32[np.ndarray, "4"]) -> Float64[np.ndarray, "3"]:
-        """Base-frame x, y of an upright object's axis and its height, metres, from its box: its foot stands on the table."""
-        x0, y0, x1, y1 = (float(v) for v in box)
+        """Base-frame x, y of an upright object's axis and its height, metres: the cylinder on the table whose outline fills the box."""
+        from scipy.optimize import least_squares
+
+        x0, _, x1, y1 = box.astype(np.float64)
         eye, foot = self.base_from_camera[:3, 3], self._ray((x0 + x1) / 2, y1)
-        near = eye + foot * (self.table_z - eye[2]) / foot[2]
-        away = near[:2] - eye[:2]
-        distance = float(np.linalg.norm(near - eye))
-        radius = (x1 - x0) / 2 / self.camera.k[0, 0] * distance
-        axis = near[:2] + radius * away / np.linalg.norm(away)
-        top = self._ray((x0 + x1) / 2, y0)
-        reach = float(np.hypot(*(axis - eye[:2]))) / float(np.hypot(*top[:2]))
-        return np.array([*axis, eye[2] + top[2] * reach - self.table_z])
+        near = eye + foot * (self.table_z - eye[2]) / min(foot[2], -0.05)
+        thick = self.manner.radius_m
+        guess = np.array([near[0], near[1], 0.8 * thick, 0.08])
+        low, high = np.array([-2.0, -2.0, 0.5 * thick, 0.02]), np.array([2.0, 2.0, thick, 0.25])
+        fit = least_squares(lambda v: self._outline(v) - box, np.clip(guess, low + 1e-6, high - 1e-6), bounds=(low, high), max_nfev=20)
+        return fit.x[[0, 1, 3]]
+
+    def _outline(self, cylinder: Float64[np.ndarray, "4"]) -> Float64[np.ndarray, "4"]:
+        """The box around the picture of a cylinder on the table: x, y of its axis, radius and height, metres."""
+        x, y, radius, height = cylinder
+        rim = radius * RING + (x, y)
+        points = np.concatenate([np.c_[rim, np.full(len(rim), self.table_z + z)] for z in (0.0, height)])
+        local = (points - self.base_from_camera[:3, 3]) @ self.base_from_camera[:3, :3]
+        pixels = (local[:, :2] / local[:, 2:]) * (self.camera.k[0, 0], self.camera.k[1, 1]) + self.camera.k[:2, 2]
+        return np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
 
     def _ray(self, u: float, v: float) -> Float64[np.ndarray, "3"]:
         return self.base_from_camera[:3, :3] @ np.linalg.inv(self.camera.k) @ np.array([u, v, 1.0])
@@ -170,3 +184,12 @@ def coloured(rgb: Rgb, boxes: Boxes, colour: Colour) -> Float64[np.ndarray, " n"
         inside = rgb[max(y0, 0) : y1, max(x0, 0) : x1]
         shares[i] = looks_like(inside, colour).mean() if inside.size else 0.0
     return shares
+
+
+def _matrix(pose: Pose) -> Float64[np.ndarray, "4 4"]:
+    from scipy.spatial.transform import Rotation
+
+    out = np.eye(4)
+    out[:3, :3] = Rotation.from_quat(pose[3:], scalar_first=True).as_matrix()
+    out[:3, 3] = pose[:3]
+    return out
