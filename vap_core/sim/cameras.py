@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from types import TracebackType
-from typing import Self
 
 import numpy as np
 from jaxtyping import Float64
@@ -43,7 +42,7 @@ class Rig:
 RIGS: dict[str, tuple[Rig, ...]] = {
     "wx250s": (Rig("front", "world", (0.76, 0.0, 0.35), (0.24, 0.0, 0.105), np.deg2rad(44.0)),),
     "panda": (
-        Rig("front", "world", (0.98, 0.0, 0.37), (0.44, 0.0, 0.12), np.deg2rad(42.0)),
+        Rig("front", "world", (0.98, 0.0, 0.37), (0.44, 0.0, 0.12), np.deg2rad(44.0)),
         Rig("side", "world", (0.68, -0.46, 0.42), (0.47, -0.01, 0.05), np.deg2rad(44.0)),
         Rig("wrist", "hand", (0.09, 0.0, 0.045), (0.03, 0.0, 0.20), np.deg2rad(72.0), up=(-1.0, 0.0, 0.0)),
     ),
@@ -109,7 +108,7 @@ class Eyes:
         self._owner = np.array([body_of.get(int(model.body_rootid[body]), -1) for body in model.geom_bodyid], np.int64)
         """Index into `objects` of each geom's object, -1 for the rest of the scene."""
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Eyes":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:

@@ -5,7 +5,6 @@ The world frame stands on the table top (z = 0) at the robot's base: x away from
 
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Self
 
 import numpy as np
 from jaxtyping import UInt8
@@ -50,7 +49,7 @@ class Scene:
     cameras: tuple[str, ...]
     eyes: Eyes
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Scene":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:

@@ -1,0 +1,178 @@
+"""The authored robots: forward kinematics, limits and strokes against the Menagerie models, and inverse kinematics that reaches."""
+
+import io
+import os
+import tarfile
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vap_core.errors import OutOfReach, UnknownName
+from vap_core.sim import robots
+from vap_core.sim.control import Command, Limits, arm, follow, rotation, rotation_vector
+from vap_core.sim.gl import REMEDY, ensure_gl
+from vap_core.sim.robots import ROBOTS
+
+ensure_gl()
+import mujoco  # noqa: E402
+
+MENAGERIE = Path(os.environ.get("VAP_MENAGERIE", Path(__file__).parents[2] / "shared" / "menagerie"))
+PEERS = {
+    "wx250s": ("trossen_wx250s", "wx250s.xml", "wx250s/gripper_link", "gripper_link", ("left_finger", "right_finger")),
+    "panda": ("franka_emika_panda", "panda.xml", "hand", "hand", ("finger_joint1", "finger_joint2")),
+}
+
+
+def menagerie(name: str) -> mujoco.MjModel:
+    """The kinematics of a Menagerie model, its meshes left out."""
+    folder, file, *_ = PEERS[name]
+    archive, unpacked = MENAGERIE / f"{folder}.tar.xz", MENAGERIE / folder / file
+    if unpacked.exists():
+        text = unpacked.read_bytes()
+    elif archive.exists():
+        with tarfile.open(archive) as tar:
+            member = next(m for m in tar.getmembers() if m.name.endswith(f"/{file}"))
+            found = tar.extractfile(member)
+            assert found is not None
+            text = found.read()
+    else:
+        pytest.skip(f"no Menagerie models in {MENAGERIE}; set VAP_MENAGERIE to a folder that holds {folder}")
+    root = ElementTree.parse(io.BytesIO(text)).getroot()
+    for parent in list(root.iter()):
+        for child in list(parent):
+            if child.tag in ("geom", "mesh", "material", "texture", "light", "exclude"):
+                parent.remove(child)
+    return mujoco.MjModel.from_xml_string(ElementTree.tostring(root, encoding="unicode"))
+
+
+@pytest.fixture(params=sorted(ROBOTS))
+def robot(request):
+    return ROBOTS[request.param]
+
+
+def test_forward_kinematics_match_menagerie_within_a_tenth_of_a_millimetre(robot):
+    ours, theirs = mujoco.MjModel.from_xml_path(str(robot.xml)), menagerie(robot.name)
+    *_, their_hand, our_hand, _ = PEERS[robot.name]
+    rng = np.random.default_rng(3)
+    for _ in range(200):
+        low, high = np.array([ours.joint(name).range for name in robot.joints]).T
+        joints = rng.uniform(low, high)
+        poses = []
+        for model, hand in ((ours, our_hand), (theirs, their_hand)):
+            data = mujoco.MjData(model)
+            for joint, angle in zip(robot.joints, joints, strict=True):
+                data.joint(joint).qpos[0] = angle
+            mujoco.mj_kinematics(model, data)
+            poses.append((data.body(hand).xpos.copy(), data.body(hand).xmat.copy()))
+        (p, r), (q, s) = poses
+        assert np.abs(p - q).max() < 1e-4
+        assert np.abs(r - s).max() < 1e-4
+
+
+def test_limits_and_strokes_match_menagerie(robot):
+    ours, theirs = mujoco.MjModel.from_xml_path(str(robot.xml)), menagerie(robot.name)
+    for joint in (*robot.joints, *PEERS[robot.name][-1]):
+        assert ours.joint(joint).range == pytest.approx(theirs.joint(joint).range, abs=1e-6), joint
+
+
+def test_opening_and_palm_are_what_the_registry_says(robot):
+    """Clear width between the open pads, and from the tcp back to the palm."""
+    model = mujoco.MjModel.from_xml_path(str(robot.xml))
+    data = mujoco.MjData(model)
+    for joint, travel in zip(robot.fingers, robot.fingers_open, strict=True):
+        data.joint(joint).qpos[0] = travel
+    mujoco.mj_kinematics(model, data)
+    tcp, axes = data.site("tcp").xpos, data.site("tcp").xmat.reshape(3, 3)
+    pads = {side: (data.geom(f"{side}_pad").xpos - tcp) @ axes for side in ("left", "right")}
+    half = model.geom("left_pad").size[1]
+    assert abs(pads["left"][1] - pads["right"][1]) - 2 * half == pytest.approx(robot.opening_m, abs=5e-4)
+    assert pads["left"][1] == pytest.approx(-pads["right"][1], abs=1e-6)
+    assert all(abs(pad[2]) < 0.02 for pad in pads.values())
+
+
+def test_home_points_straight_down(robot):
+    tcp = arm(robot.name).forward(robot.home)
+    assert tcp[:3, :3] == pytest.approx(robot.down_base, abs=1e-4)
+
+
+def test_inverse_kinematics_reach_known_poses(robot):
+    solver, rng = arm(robot.name), np.random.default_rng(5)
+    for _ in range(20):
+        pose = np.eye(4)
+        centre = (0.27, 0.0, 0.14) if robot.name == "wx250s" else (0.48, 0.0, 0.2)
+        pose[:3, 3] = centre + rng.uniform(-1, 1, 3) * (0.04, 0.15, 0.10)
+        pose[:3, :3] = rotation(np.array([0.0, 0.0, rng.uniform(-1.2, 1.2)])) @ robot.down_base
+        found = solver.forward(solver.reach(pose))
+        assert np.abs(found[:3, 3] - pose[:3, 3]).max() < 1e-3
+        assert np.linalg.norm(rotation_vector(found[:3, :3] @ pose[:3, :3].T)) < 1e-2
+
+
+def test_unreachable_pose_is_an_error_that_says_so(robot):
+    far = np.eye(4)
+    far[:3, :3], far[:3, 3] = robot.down_base, (2.0, 0.0, 0.2)
+    with pytest.raises(OutOfReach, match=r"mm and .* rad away"):
+        arm(robot.name).reach(far)
+
+
+def test_unreachable_action_gives_a_bounded_step_and_never_runs_away(robot):
+    solver, seconds = arm(robot.name), 1 / robot.hz
+    command = Command(solver.forward(robot.home), robot.home, 1.0)
+    outward = np.array([9.0, 0, 0, 0, 0, 0, 1], np.float32)
+    for _ in range(40):
+        after = follow(solver, command, solver.forward(command.joints), outward, seconds)
+        assert (np.abs(after.joints - command.joints) <= robot.speed_rad_s * seconds + 1e-6).all()
+        command = after
+    assert np.linalg.norm(command.tcp_base[:3, 3]) < 1.2
+
+
+def test_command_never_leads_an_arm_that_is_held_up_by_more_than_the_leash(robot):
+    solver, seconds = arm(robot.name), 1 / robot.hz
+    stuck = solver.forward(robot.home)
+    command = Command(stuck, robot.home, 1.0)
+    for _ in range(30):
+        command = follow(solver, command, stuck, np.array([0, 0, -0.02, 0, 0, 0.2, 1], np.float32), seconds)
+        assert np.linalg.norm(command.tcp_base[:3, 3] - stuck[:3, 3]) < 0.05 + 0.02 + 1e-3
+        assert np.linalg.norm(rotation_vector(command.tcp_base[:3, :3] @ stuck[:3, :3].T)) < 0.5 + 0.2 + 1e-2
+
+
+def test_small_actions_add_up_exactly_in_the_base_frame(robot):
+    """Ten centimetres out in ten steps and back, with a turn: the command returns to where it was."""
+    solver = arm(robot.name)
+    start = command = Command(solver.forward(robot.home), robot.home, 1.0)
+    for sign in (1, -1):
+        for _ in range(10):
+            action = np.array([0, sign * 0.01, 0, 0, 0, sign * 0.05, 0.25], np.float32)
+            command = follow(solver, command, command.tcp_base, action, 1 / robot.hz)
+        if sign == 1:
+            assert command.tcp_base[:3, 3] - start.tcp_base[:3, 3] == pytest.approx([0, 0.1, 0], abs=1e-4)
+            assert rotation_vector(command.tcp_base[:3, :3] @ start.tcp_base[:3, :3].T) == pytest.approx([0, 0, 0.5], abs=1e-3)
+    assert command.tcp_base == pytest.approx(start.tcp_base, abs=1e-4)
+    assert command.gripper == 0.25
+
+
+def test_actions_are_rate_limited(robot):
+    solver = arm(robot.name)
+    command = Command(solver.forward(robot.home), robot.home, 1.0)
+    limits = Limits(speed_m_s=0.1)
+    after = follow(solver, command, command.tcp_base, np.array([0, 0, -1, 0, 0, 0, 2], np.float32), 0.1, limits)
+    assert after.tcp_base[2, 3] - command.tcp_base[2, 3] == pytest.approx(-0.01, abs=1e-4)
+    assert after.gripper == 1.0
+
+
+def test_unknown_robot_lists_the_known_ones():
+    with pytest.raises(UnknownName, match="known: panda, wx250s"):
+        robots.get("pr2")
+
+
+def test_missing_gl_names_the_line_to_run(monkeypatch):
+    from vap_core.errors import MissingGL
+    from vap_core.sim import gl
+
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr(gl, "works", lambda backend: False)
+    with pytest.raises(MissingGL, match=REMEDY):
+        ensure_gl()
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    assert ensure_gl() == "osmesa"
