@@ -49,12 +49,12 @@ def policy_view(cam: str) -> Part:
     return _image(cam, "policy input", ["/prompted"])
 
 
-def track_view(cam: str) -> Part:
-    return _image(cam, "track, truth", ["", "/mask/**"])
+def track_view(cam: str, narrow: bool = False) -> Part:
+    return _image(cam, "track" if narrow else "track, truth", ["", "/mask/**"])
 
 
-def vote_view(cam: str, targets: int = 1) -> Part:
-    return _image(cam, "vote at t = 0", ["/candidates/**", *(f"/candidates_{j}/**" for j in range(1, targets))])
+def vote_view(cam: str, targets: int = 1, narrow: bool = False) -> Part:
+    return _image(cam, "vote" if narrow else "vote at t = 0", ["/candidates/**", *(f"/candidates_{j}/**" for j in range(1, targets))])
 
 
 def bars_view(cam: str, groundings: Sequence[Grounding]) -> Part:
@@ -65,7 +65,8 @@ def bars_view(cam: str, groundings: Sequence[Grounding]) -> Part:
 def _cameras(opening: Opening) -> tuple[Part, float]:
     """Every camera's three pictures, and the share of the width they deserve: squares in a box of about 10 : 7."""
     names = [camera.name for camera in opening.cameras]
-    trios = [(policy_view(cam), track_view(cam), vote_view(cam, len(opening.groundings.get(cam, ())))) for cam in names]
+    narrow = len(names) == 2
+    trios = [(policy_view(cam), track_view(cam, narrow), vote_view(cam, len(opening.groundings.get(cam, ())), narrow)) for cam in names]
     if len(names) <= 2:
         columns = [rrb.Vertical(saw, rrb.Horizontal(track, vote), row_shares=[5, 3]) for saw, track, vote in trios]
         return rrb.Horizontal(*columns), 0.4 if len(names) == 1 else 0.52
@@ -80,7 +81,7 @@ def _eye(opening: Opening) -> rrb.EyeControls3D:
     away = away / max(float(np.linalg.norm(away)), 1e-6)
     turn = np.deg2rad(50.0)
     side = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ away
-    return rrb.EyeControls3D(position=centre + np.array([*(0.75 * side), 0.45]), look_target=centre, eye_up=(0, 0, 1), kind=rrb.Eye3DKind.Orbital)
+    return rrb.EyeControls3D(position=centre + np.array([*(0.9 * side), 0.5]), look_target=centre, eye_up=(0, 0, 1), kind=rrb.Eye3DKind.Orbital)
 
 
 def _curves(
@@ -117,7 +118,10 @@ def episode_blueprint(opening: Opening) -> rrb.Blueprint:
         eye_controls=_eye(opening),
     )
     votes = rrb.Horizontal(*(bars_view(cam, opening.groundings.get(cam, ())) for cam in names))
-    evidence = _curves("/vap", "vote margin, track score", ["/vap/vote_margin/**", "/vap/track_score/**"], (-0.05, 1.05))
+    unit = (-0.05, 1.05)
+    evidence = rrb.Tabs(
+        _curves("/vap/track_score", "track score", limits=unit), _curves("/vap/vote_margin", "vote margin", limits=unit), active_tab=0
+    )
     columns = rrb.archetypes.TextLogColumns(
         timeline_columns=[rrb.encodings.TimelineColumn("frame_index")],
         text_log_columns=[rrb.encodings.TextLogColumn("loglevel"), rrb.encodings.TextLogColumn("body")],
@@ -147,7 +151,7 @@ def grounding_blueprint(cam: str, grounding: Grounding) -> rrb.Blueprint:
     references = rrb.Spatial2DView(origin="/vap/references", name="reference views #0, #1, ...", background=BACKGROUND)
     cosine = rrb.TensorView(
         origin=f"/vap/similarity/{cam}",
-        name="cosine: candidate (down) x reference (across)",
+        name="cosine (candidate x reference)",
         scalar_mapping=rrb.TensorScalarMapping(mag_filter=rr.components.MagnificationFilter.Nearest, colormap=rr.components.Colormap.Viridis),
         view_fit=rrb.components.ViewFit.Fill,
     )

@@ -130,8 +130,8 @@ def words(opening: Opening, ending: str = "") -> rr.TextDocument:
     return rr.TextDocument("\n\n".join(["  \n".join([*head, origin]), "\n".join(table)]), media_type=rr.MediaType.MARKDOWN)
 
 
-def contact_sheet(crops: Sequence[Rgb], side: int = 128) -> Rgb:
-    """The reference views side by side, each fitted into a square of `side` pixels."""
+def contact_sheet(crops: Sequence[np.ndarray], side: int = 128) -> Rgb:
+    """The reference views (RGB, of any sizes) side by side, each fitted into a square of `side` pixels."""
     cells = []
     for crop in crops:
         scale = side / max(crop.shape[:2])

@@ -3,7 +3,8 @@
 Entities (lerobot's feature keys; timelines `frame_index` and `timestamp`):
 `/observation.images.<cam>` with `/prompted`, `/candidates`, `/mask/{target,gt}` beneath; `/observation.state`, `/action`,
 `/next.reward`, `/next.success`; `/vap/{votes,candidates,vote_margin,track_score}/<cam>`, `/vap/{instruction,events}`,
-`/vap/status/{outcome,grasp}`; `/world/{table,robot/link*,objects/*}`. Evidence of a further target j ends in `_j`.
+`/vap/status/{outcome,grasp}`; `/world/{table,robot/link*,objects/*}`. Evidence of a further target j ends in `_j`;
+`/candidates` carries the picture the vote was held on, `/vap/votes/<cam>` its `counts`, with `/winner` and `/others` as bars.
 Recording properties: `rollout` and `outcome`. Pictures are JPEG; everything that changes travels in columns.
 """
 
@@ -157,10 +158,10 @@ class Recorder:
         names = (*STATE_NAMES, *(f"joint{i}" for i in range(1, len(frame.state))))[: len(frame.state)]
         put(rec, "/action", series_style(ACTION_NAMES))
         put(rec, "/observation.state", series_style(names))
-        for entity, label, width in (("vote_margin", "margin", 3.0), ("track_score", "score", 1.5)):
+        for entity, width in (("vote_margin", 2.5), ("track_score", 2.0)):
             for i, (cam, per_view) in enumerate(opening.groundings.items()):
                 for j in range(len(per_view)):
-                    style = rr.SeriesLines(names=f"{label} {cam}{suffix(j)}", colors=SERIES[i % len(SERIES)], widths=width)
+                    style = rr.SeriesLines(names=f"{cam}{suffix(j)}", colors=SERIES[i % len(SERIES)], widths=width)
                     put(rec, f"/vap/{entity}/{cam}{suffix(j)}", style)
         log_cameras(rec, frame, SERIES)
         put(rec, "/vap/status/outcome", state_style(OUTCOMES))

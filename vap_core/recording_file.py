@@ -94,7 +94,9 @@ def recover(leftover: Path) -> Path:
     """
     leftover = Path(leftover)
     path = leftover.with_name(leftover.name.removeprefix(".").removesuffix(".tmp"))
-    if path == leftover or path.exists():
+    if leftover != temporary(path) or not leftover.is_file():
+        raise BadRecording(f"recover: {leftover} is no leftover of a recording; expected an existing file named like {temporary(path).name}.")
+    if path.exists():
         raise BadOutput(f"recover: {path} already exists and is never overwritten; {leftover} was left as it is.")
     mended = leftover.with_name(f".{path.name}.mended")
     done = subprocess.run(rerun_cli("rrd", "optimize", leftover, "-o", mended), capture_output=True, text=True, check=False)

@@ -35,7 +35,7 @@ def headless_viewer(size: tuple[int, int], timeout_s: float = 40.0) -> Iterator[
     command = rerun_cli(
         "--headless", "--window-size", window, "--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen", "--expect-data-soon"
     )
-    with tempfile.TemporaryFile("w+") as log, subprocess.Popen(command, stdout=log, stderr=log, env={**os.environ, "RUST_LOG": "warn"}) as process:
+    with tempfile.TemporaryFile("w+") as log, subprocess.Popen(command, stdout=log, stderr=log, env={**os.environ, "RUST_LOG": "off"}) as process:
         try:
             yield connect(process, port, timeout_s)
         except (RuntimeError, ConnectionError, TimeoutError) as err:
