@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from jaxtyping import TypeCheckError
 
 from vap_core.errors import BadInstruction
 from vap_core.prompt import PALETTE, choose_colours, looks_like, tint
@@ -41,7 +40,7 @@ def test_commutes_with_mirroring(rgb: np.ndarray, mask: np.ndarray) -> None:
 
 def test_sizes_and_opacity_are_checked() -> None:
     rgb = np.zeros((4, 4, 3), np.uint8)
-    with pytest.raises((ValueError, TypeCheckError), match="differ in size|mask"):
+    with pytest.raises(ValueError, match="differ in size"):
         tint(rgb, np.zeros((3, 4), bool), RED)
     with pytest.raises(ValueError, match="outside"):
         tint(rgb, np.zeros((4, 4), bool), RED, 1.5)

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
 from vap_core.errors import BadOutput, BadRecording, MissingGL
-from vap_core.evidence import apart, classes, label_spots
 from vap_core.record import Recorder, read_summary, record_grounding, recording_name, recover, screenshot
-from vap_core.recording_file import rerun_cli, temporary
+from vap_core.record.evidence import apart, classes, label_spots
+from vap_core.record.file import rerun_cli, temporary
 from vap_core.values import (
     Boxes,
     Camera,

@@ -69,7 +69,7 @@ def _torch() -> tuple[str, str]:
 
 
 def _weights() -> tuple[str, str]:
-    from vap_core.features import weights_sha256
+    from vap_core.weights import weights_sha256
 
     sums = weights_sha256()
     return "weights", ", ".join(f"{name} {digest[:8]}" for name, digest in sums.items())

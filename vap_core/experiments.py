@@ -55,7 +55,7 @@ class Study:
     def configuration(self) -> dict[str, Any]:
         """What the results depend on, as JSON; weights by their checksums."""
         from vap_core import __version__
-        from vap_core.features import weights_sha256
+        from vap_core.weights import weights_sha256
 
         return {**asdict(self), "version": __version__, "weights": weights_sha256()}
 
@@ -80,8 +80,10 @@ def register_personal(study: Study, bank: Path) -> None:
 
 def _scripted(scene: "Scene", stack: Stack) -> "Policy[Any]":
     from vap_core.policies.scripted import Scripted
+    from vap_core.sim.env import Env
 
-    return Scripted(stack.detector, scene.camera("front"), scene.robot.base_world)
+    fixed = next(camera for camera in Env(scene).cameras() if camera.name == "front")
+    return Scripted(stack.detector, fixed, scene.robot.base_world)
 
 
 POLICIES: "dict[str, Callable[[Scene, Stack], Policy[Any]]]" = {"scripted": _scripted}

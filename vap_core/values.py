@@ -13,8 +13,8 @@ import numpy as np
 from beartype import beartype
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8, jaxtyped
 
-Rgb = UInt8[np.ndarray, "h w 3"]
-Mask = Bool[np.ndarray, "h w"]
+Rgb = UInt8[np.ndarray, "_ _ 3"]
+Mask = Bool[np.ndarray, "_ _"]
 Pose = Float64[np.ndarray, "7"]
 Chunk = Float32[np.ndarray, "t 7"]
 """Actions to come, one row per control step: `dx dy dz` (m) and the rotation vector `drx dry drz` (rad) in the robot base

@@ -16,16 +16,12 @@ import numpy as np
 import rerun as rr
 from scipy.spatial.transform import Rotation
 
-from vap_core.blueprint import SERIES, episode_blueprint, evidence_line, grounding_blueprint, packed, series_style, state_style
 from vap_core.errors import BadOutput
-from vap_core.evidence import CLASSES, classes, contact_sheet, jpeg, log_vote, picture, suffix, words
-from vap_core.recording_file import code_version, finish_stream, open_stream, put, put_property
-from vap_core.recording_file import read_summary as read_summary
-from vap_core.recording_file import recording_name as recording_name
-from vap_core.recording_file import recover as recover
-from vap_core.scene3d import log_cameras, log_links, log_objects, log_table, send_poses, send_truth
+from vap_core.record.blueprint import SERIES, episode_blueprint, evidence_line, grounding_blueprint, packed, series_style, state_style
+from vap_core.record.evidence import CLASSES, classes, contact_sheet, jpeg, log_vote, picture, suffix, words
+from vap_core.record.file import code_version, finish_stream, open_stream, put, put_property
+from vap_core.record.scene import log_cameras, log_links, log_objects, log_table, send_poses, send_truth
 from vap_core.values import Event, Frame, Grounding, Mask, Opening, Outcome, PersonalObject, Rgb
-from vap_core.viewer import screenshot as screenshot
 
 ACTION_NAMES = ("dx", "dy", "dz", "drx", "dry", "drz", "gripper")
 STATE_NAMES = ("x", "y", "z", "rx", "ry", "rz", "gripper")

@@ -6,8 +6,8 @@ import numpy as np
 import rerun as rr
 from scipy.spatial.transform import Rotation
 
-from vap_core.blueprint import QUIET, TARGET
-from vap_core.recording_file import put
+from vap_core.record.blueprint import QUIET, TARGET
+from vap_core.record.file import put
 from vap_core.values import EpisodeRow, Frame, Opening, Pose, Truth
 
 ROBOT = (170, 178, 196)

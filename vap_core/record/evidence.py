@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import rerun as rr
 
-from vap_core.blueprint import QUIET, TARGET, TRUTH, evidence_line
-from vap_core.recording_file import put
+from vap_core.record.blueprint import QUIET, TARGET, TRUTH, evidence_line
+from vap_core.record.file import put
 from vap_core.values import Grounding, Mask, Opening, Rgb
 
 CLASSES = [

@@ -8,11 +8,15 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rerun.experimental import ViewerClient
 
-from vap_core.errors import MissingGL
-from vap_core.recording_file import read_summary, rerun_cli
+from vap_core.errors import BadOutput, BadRecording, MissingGL
+from vap_core.record.file import read_summary, rerun_cli
+
+if TYPE_CHECKING:
+    from rerun.notebook import Viewer
 
 DRIVER = "mesa-vulkan-drivers"
 """Debian package of the software Vulkan driver (lavapipe) that draws without a GPU."""
@@ -90,3 +94,16 @@ def settled(viewer: ViewerClient, patience_s: float = 20.0) -> bytes:
         time.sleep(0.7)
         before, now = now, viewer.take_screenshot()
     return now
+
+
+def view(rrd: Path, *, width: int = 1100, height: int = 680) -> "Viewer":
+    """The live viewer as a notebook widget, showing a finished recording; offline with RERUN_NOTEBOOK_ASSET=serve-local.
+
+    A saved notebook keeps no widget: show a `screenshot` beside it. Raises: BadRecording, when `rrd` cannot be read.
+    """
+    from rerun.notebook import Viewer
+
+    read_summary(rrd)
+    viewer = Viewer(width=width, height=height, use_global_recording=False)
+    viewer._flush_hook(rrd.read_bytes())
+    return viewer
