@@ -189,7 +189,8 @@ def pick(env: Env, row: EpisodeRow) -> tuple[Judge, float]:
     model = objects.get(row.target)
     spot = env.truth().objects_world[row.target][:3].copy()
     height = objects.extent_m(model)[2]
-    spot[2] = max(0.62 * height, height - env.robot.palm_m + 0.003)
+    wide = height * (0.72 if model.category == "straw cup" else 1.0)  # the straw fits between the rails of the palm
+    spot[2] = max(0.62 * height, wide - env.robot.palm_m + 0.003)
     yaw, slow = turn(model, row.placements[0].yaw), env.hz / 5
     rest = 0.0
     for rise, grip, steps in ((0.07, 1, 12), (0, 1, 8), (0, 0, 3), (0.1, 0, 7), (0.1, 0, 10)):

@@ -18,7 +18,7 @@ class Robot:
 
     The site's z points out of the gripper and its y along the opening axis. `home` and `speed_rad_s` follow `joints`;
     `fingers_open` and `fingers_closed` follow `fingers`, metres of travel; `opening_m` is the clear width between open pads, and
-    `palm_m` how far an object between them may reach above the tcp before it meets the palm.
+    `palm_m` how far an object between them may reach above the tcp before it meets the palm (narrow necks and straws may go deeper).
     `down_base` is the tcp's rotation in the robot base frame when the gripper points straight down, its opening axis across the table:
     the state's rotation vector is counted from it, so that a turn about the vertical reads (0, 0, yaw).
     """
