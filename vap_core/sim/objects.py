@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from vap_core.errors import one_of
-from vap_core.sim.bodies import Bottle, CameraBody, Can, Cup, Owl, PenHolder, Shaver, StrawCup, Vase
+from vap_core.sim.bodies import Bottle, Cup, Owl, PenHolder, StrawCup, Vase
+from vap_core.sim.gadgets import CameraBody, Can, Shaver
 from vap_core.sim.shapes import Mesh, Number
 from vap_core.sim.textures import ATLAS_PX, GENERIC_FILLS, GENERIC_GLYPHS, GENERIC_LAYOUTS, Ink, Texture, atlas
 from vap_core.values import value
@@ -107,10 +108,22 @@ _EVALUATION: dict[str, tuple[tuple[Shape, Texture], ...]] = {
         (Shaver(0.0185, 0.114, "rotary", 0.0015), Texture(TEAL, CREAM, MUSTARD, "word", "band", 2, "TRIM")),
     ),
 }
-_MASS_KG = {"cup": 0.10, "bottle": 0.12, "pen holder": 0.10, "straw cup": 0.09, "owl figurine": 0.11, "vase": 0.12, "camera": 0.14, "shaver": 0.11, "coke can": 0.10}
+_MASS_KG = {
+    "cup": 0.10,
+    "bottle": 0.12,
+    "pen holder": 0.10,
+    "straw cup": 0.09,
+    "owl figurine": 0.11,
+    "vase": 0.12,
+    "camera": 0.14,
+    "shaver": 0.11,
+    "coke can": 0.10,
+}
 
 OBJECTS: dict[str, ObjectModel] = {
-    f"{_slug(category)}-{ending}": ObjectModel(f"{_slug(category)}-{ending}", category, "lookalike" if i else "personal", shape, texture, _MASS_KG[category])
+    f"{_slug(category)}-{ending}": ObjectModel(
+        f"{_slug(category)}-{ending}", category, "lookalike" if i else "personal", shape, texture, _MASS_KG[category]
+    )
     for category, pairs in _EVALUATION.items()
     for i, (shape, texture) in enumerate(pairs)
     for ending in [f"lookalike-{i}" if i else "personal"]
@@ -132,9 +145,9 @@ def lookalikes(category: str) -> tuple[ObjectModel, ...]:
 
 
 def _vase(rng: np.random.Generator) -> Vase:
-    low, mid, neck, lip = rng.uniform((0.0150, 0.0190, 0.0080, 0.0110), (0.0185, 0.0220, 0.0150, 0.0185))
+    low, mid, neck, lip = rng.uniform((0.0150, 0.0190, 0.0080, 0.0110), (0.0185, 0.0220, 0.0150, 0.0185)).tolist()
     waist = float(rng.uniform(0.35, 0.6))
-    return Vase(float(rng.uniform(0.098, 0.118)), ((float(low), 0.0), (float(mid), waist), (float(0.92 * mid), 0.74), (float(neck), 0.89), (float(lip), 1.0)),
+    return Vase(float(rng.uniform(0.098, 0.118)), ((low, 0.0), (mid, waist), (0.92 * mid, 0.74), (neck, 0.89), (lip, 1.0)),
                 bool(rng.random() < 0.25))  # fmt: skip
 
 
@@ -242,5 +255,5 @@ def add_object(spec: "mujoco.MjSpec", model: ObjectModel, pos: tuple[Number, Num
     for i, (solid, mass_kg) in enumerate(zip(solids, model.mass_kg * volume / volume.sum(), strict=True)):
         quat = (np.sqrt(0.5), np.sqrt(0.5), 0, 0) if solid.axis == "y" else (1, 0, 0, 0)
         body.add_geom(name=f"{name}/solid{i}", type=kinds[solid.kind], size=(*solid.size, 0.0)[:3], pos=solid.pos, quat=quat, group=COLLISION_GROUP,
-                      mass=float(mass_kg), condim=4, friction=(1, 0.01, 0.001), solref=(0.004, 1), solimp=(0.95, 0.99, 0.001, 0.5, 2), rgba=(0.6, 0.6, 0.6, 0.3))  # fmt: skip
+                      mass=float(mass_kg), condim=4, friction=(1, 0.01, 0.001), solref=(0.004, 1), solimp=(0.95, 0.99, 0.001, 0.5, 2))  # fmt: skip
     return body

@@ -40,9 +40,11 @@ def photograph(model: ObjectModel, shots: Sequence[Shot], size: int = 320) -> li
         spec.visual.map.znear, spec.visual.map.zfar = 0.01, 20.0
         spec.visual.map.shadowclip = 0.3
         spec.stat.extent, spec.stat.center = 1.0, (0, 0, 0)
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(3, 3, 0.1), rgba=(*shot.table, 1))
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(8, 8, 0.1), rgba=(*shot.table, 1))
         lamp = np.array([np.sin(shot.lamp), -np.cos(shot.lamp), 1.6])
-        spec.worldbody.add_light(pos=0.8 * lamp, dir=-lamp, type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, diffuse=[shot.bright] * 3, specular=[0.2] * 3, castshadow=True)
+        spec.worldbody.add_light(
+            pos=0.8 * lamp, dir=-lamp, type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, diffuse=[shot.bright] * 3, specular=[0.2] * 3, castshadow=True
+        )
         add_object(spec, model)
         compiled = spec.compile()
         data = mujoco.MjData(compiled)
@@ -62,10 +64,11 @@ def reference_views(model: ObjectModel, n: int = 5, seed: int = 0, size: int = 3
     """K reference photos (P 3.1): azimuths spread around the front, elevations 15 to 50 degrees, lamp, table and framing differ from view to view."""
     rng = np.random.default_rng([seed, n, *model.name.encode()])
     around = np.linspace(-1.2, 1.2, n) if n > 1 else np.zeros(1)
+    tints = rng.uniform(0.45, 0.75, (n, 1)) + rng.uniform(-0.04, 0.04, (n, 3))
     shots = [
-        Shot(float(a + rng.uniform(-0.2, 0.2)), float(np.radians(rng.uniform(15, 50))), float(rng.uniform(0.45, 0.6)), float(rng.uniform(-1.2, 1.2)),
-             float(rng.uniform(0.5, 0.75)), tuple(float(c) for c in rng.uniform(0.45, 0.75) + rng.uniform(-0.04, 0.04, 3)))
-        for a in rng.permutation(around)
+        Shot(float(a + rng.uniform(-0.2, 0.2)), float(np.radians(rng.uniform(18, 50))), float(rng.uniform(0.52, 0.66)), float(rng.uniform(-1.2, 1.2)),
+             float(rng.uniform(0.5, 0.75)), (float(red), float(green), float(blue)))
+        for a, (red, green, blue) in zip(rng.permutation(around), tints, strict=True)
     ]  # fmt: skip
     return photograph(model, shots, size)
 

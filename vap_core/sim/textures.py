@@ -20,12 +20,13 @@ DECOR = 0.75
 BASE, ACCENT, INK, DARK, LIGHT, METAL, WARM, GLASS = range(8)
 FIXED: tuple[Ink, ...] = ((44, 43, 47), (240, 236, 226), (158, 160, 164), (206, 150, 66), (66, 82, 98))
 
+Layout = Literal["row", "brick", "band", "full", "half", "grid", "scatter", "column", "middle", "whole"]
 EVALUATION_GLYPHS = ("heart", "star", "flower", "leaf", "moon", "paw", "smile", "word", "fish", "bolt")
 EVALUATION_FILLS = ("stripes", "hoops", "checks", "dots", "chevron", "plaid")
 EVALUATION_LAYOUTS = ("row", "brick", "band", "full", "half")
 GENERIC_GLYPHS = ("triangle", "square", "ring", "diamond", "cross", "drop", "hexagon", "digit")
 GENERIC_FILLS = ("gradient", "waves", "speckle", "tiles", "diagonal", "plain")
-GENERIC_LAYOUTS = ("grid", "scatter", "column", "middle", "whole")
+GENERIC_LAYOUTS: tuple[Layout, ...] = ("grid", "scatter", "column", "middle", "whole")
 
 
 @value
@@ -36,7 +37,7 @@ class Texture:
     ink: Ink
     accent: Ink
     motif: str
-    layout: Literal["row", "brick", "band", "full", "half", "grid", "scatter", "column", "middle", "whole"]
+    layout: Layout
     repeats: int = 4
     word: str = ""
     seed: int = 0
@@ -84,7 +85,7 @@ def glyph(draw: ImageDraw.ImageDraw, texture: Texture, x: float, y: float, r: fl
     """Stamp the motif at pixel (x, y), r pixels from centre to rim, on a ground of colour `paper`."""
     ink, accent = texture.ink, texture.accent
 
-    def disc(dx: float, dy: float, rx: float, ry: float, colour: Ink) -> None:
+    def disc(dx: float | int, dy: float | int, rx: float | int, ry: float | int, colour: Ink) -> None:
         draw.ellipse((x + r * (dx - rx), y + r * (dy - ry), x + r * (dx + rx), y + r * (dy + ry)), fill=colour)
 
     match texture.motif:

@@ -1,0 +1,149 @@
+"""The object registry: complete, split cleanly, true to its sizes, and at rest where it is put."""
+
+import numpy as np
+import pytest
+
+from vap_core.errors import UnknownName
+from vap_core.sim.gl import ensure_gl
+from vap_core.sim.objects import CATEGORIES, CLUTTER, OBJECTS, add_object, extent_m, generic, get, lookalikes, mesh, personal
+from vap_core.sim.studio import contact_sheet, reference_views
+from vap_core.sim.textures import atlas
+
+ensure_gl()
+import mujoco  # noqa: E402
+
+GENERICS = [generic(kind, i) for kind in CATEGORIES + CLUTTER for i in range(3)]
+EVERYTHING = [*OBJECTS.values(), *GENERICS]
+TABLE = """<mujoco><option timestep="0.002" integrator="implicitfast" cone="elliptic" impratio="10"/>
+<worldbody><geom name="table" type="box" size=".5 .5 .05" pos="0 0 -.05" condim="4" rgba=".4 .4 .4 1"/>
+<camera name="side" fovy="20" pos="0 -2 0.05" xyaxes="1 0 0 0 0 1"/></worldbody></mujoco>"""
+
+
+def on_table(model, height=0.0, yaw=0.0):
+    spec = mujoco.MjSpec.from_string(TABLE)
+    add_object(spec, model, (0, 0, height), yaw)
+    return spec.compile()
+
+
+def test_every_category_has_a_personal_instance_and_look_alikes():
+    for category in CATEGORIES:
+        assert personal(category).split == "personal"
+        assert len(lookalikes(category)) >= 2
+        assert all(model.category == category for model in lookalikes(category))
+    assert all(name == model.name for name, model in OBJECTS.items())
+    names = [model.name for model in EVERYTHING]
+    assert len(set(names)) == len(names)
+
+
+def test_look_alikes_differ_in_motif_and_in_shape():
+    for category in CATEGORIES:
+        models = (personal(category), *lookalikes(category))
+        assert len({(m.texture.motif, m.texture.layout) for m in models}) == len(models)
+        assert len({repr(m.shape) for m in models}) == len(models)
+        assert all({m.texture.base, m.texture.ink, m.texture.accent} & {models[0].texture.base, models[0].texture.accent} for m in models)
+
+
+def test_generic_is_deterministic_and_deaf_to_global_seeds():
+    first = generic("cup", 7)
+    generic.cache_clear()
+    np.random.seed(3)  # noqa: NPY002
+    again = generic("cup", 7)
+    assert repr(again) == repr(first)
+    assert again.name == "cup-generic-0007"
+    assert repr(get("pen-holder-generic-0012")) == repr(generic("pen holder", 12))
+    assert len({repr(generic("vase", i)) for i in range(50)}) == 50
+
+
+def test_generic_and_evaluation_parameters_are_disjoint():
+    trained = [generic(kind, i).texture for kind in CATEGORIES + CLUTTER for i in range(300)]
+    held_out = [model.texture for model in OBJECTS.values()]
+    for read in (lambda t: t.motif, lambda t: t.layout, lambda t: (t.base, t.ink, t.accent)):
+        assert not {read(t) for t in trained} & {read(t) for t in held_out}
+
+
+@pytest.mark.parametrize("name", ["cup-mine", "cup-generic-7", "mug-generic-0001", "cup-generic-"])
+def test_unknown_name_lists_what_exists(name):
+    with pytest.raises(UnknownName, match=r"get: object .* is unknown; known: .*cup-generic-NNNN.*cup-personal"):
+        get(name)
+
+
+@pytest.mark.parametrize("find", [personal, lookalikes, lambda c: generic(c, 0)])
+def test_unknown_category_lists_what_exists(find):
+    with pytest.raises(UnknownName, match="known: bottle, camera, .*cup"):
+        find("spaceship")
+
+
+@pytest.mark.parametrize("model", EVERYTHING, ids=lambda m: m.name)
+def test_object_compiles_fits_its_extent_and_rests_upright(model):
+    compiled = on_table(model, height=0.001, yaw=0.3)
+    geom, form = compiled.geom(f"{model.name}/visual"), mesh(model)
+    assert len(form.face) <= 1500
+    assert np.isclose(form.vertex[:, 2].min(), 0, atol=1e-6)
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, geom.quat)
+    vertex = compiled.mesh_vert @ turn.reshape(3, 3).T + geom.pos
+    assert np.allclose(np.ptp(vertex, axis=0), extent_m(model), atol=1e-3)
+    assert np.isclose(compiled.body(model.name).mass[0], model.mass_kg)
+    assert 0.05 <= model.mass_kg <= 0.16
+    assert 0.060 <= extent_m(model)[2] <= 0.122
+
+    data = mujoco.MjData(compiled)
+    mujoco.mj_step(compiled, data, 250)
+    settled = data.qpos.copy()
+    assert np.abs(data.qvel).max() < 1e-2
+    mujoco.mj_step(compiled, data, 500)
+    assert 1 - 2 * (data.qpos[4] ** 2 + data.qpos[5] ** 2) > 0.9999
+    assert np.linalg.norm(data.qpos[:2]) < 1e-3
+    assert abs(data.qpos[2]) < 5e-4
+    assert np.allclose(data.qpos, settled, atol=5e-4)
+
+
+@pytest.mark.parametrize("model", EVERYTHING, ids=lambda m: m.name)
+def test_two_fingers_fit_around_it(model):
+    form = mesh(model)
+    z = form.vertex[:, 2]
+    solids = [
+        s for s in model.shape.solids() if s.pos[2] - s.size[-1] < 0.6 * z.max() < s.pos[2] + s.size[-1] and s.kind == "cylinder" and s.axis == "z"
+    ]
+    if model.category == "camera":
+        assert 0.036 <= extent_m(model)[1] <= 0.042
+    for solid in solids:
+        assert 0.030 <= 2 * solid.size[0] <= 0.045
+
+
+def test_visible_mask_has_the_size_of_the_can():
+    model = generic("coke can", 0)
+    compiled = on_table(model)
+    data = mujoco.MjData(compiled)
+    mujoco.mj_forward(compiled, data)
+    with mujoco.Renderer(compiled, 400, 400) as renderer:
+        renderer.enable_segmentation_rendering()
+        renderer.update_scene(data, "side")
+        mask = renderer.render()[..., 0] == compiled.geom(f"{model.name}/visual").id
+    px_per_m = 200 / np.tan(np.radians(10)) / 2
+    ys, xs = np.nonzero(mask)
+    width, _, height = extent_m(model)
+    assert np.ptp(xs) + 1 == pytest.approx(width * px_per_m, abs=2.5)
+    assert np.ptp(ys) + 1 == pytest.approx(height * px_per_m, abs=2.5)
+    assert mask.sum() == pytest.approx(width * height * px_per_m**2, rel=0.08)
+
+
+def test_atlas_is_read_upright_from_outside():
+    picture = atlas(personal("cup").texture, personal("cup").shape.aspect())
+    assert picture.shape == (512, 512, 3)
+    assert tuple(picture[-1, 0]) == personal("cup").texture.base
+
+
+def test_reference_views_are_seeded_varied_and_framed():
+    model = personal("cup")
+    views = reference_views(model, n=5, size=160)
+    again = reference_views(model, n=5, size=160)
+    other = reference_views(model, n=5, seed=1, size=160)
+    assert all(np.array_equal(a, b) for a, b in zip(views, again, strict=True))
+    assert not any(np.array_equal(a, b) for a, b in zip(views, other, strict=True))
+    assert len({view.tobytes() for view in views}) == 5
+    assert all(view.shape == (160, 160, 3) and view.std() > 10 for view in views)
+
+
+def test_contact_sheet_has_one_cell_per_model():
+    assert contact_sheet(list(OBJECTS.values())[:3], columns=2, size=64).shape == (128, 128, 3)
