@@ -128,7 +128,7 @@ def test_visible_mask_has_the_size_of_the_can():
     assert mask.sum() == pytest.approx(width * height * px_per_m**2, rel=0.08)
 
 
-def test_atlas_is_read_upright_from_outside():
+def test_atlas_keeps_its_swatches_below_the_decoration():
     picture = atlas(personal("cup").texture, personal("cup").shape.aspect())
     assert picture.shape == (512, 512, 3)
     assert tuple(picture[-1, 0]) == personal("cup").texture.base
