@@ -175,4 +175,15 @@ def test_missing_gl_names_the_line_to_run(monkeypatch):
     with pytest.raises(MissingGL, match=REMEDY):
         ensure_gl()
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
-    assert ensure_gl() == "osmesa"
+    with pytest.raises(MissingGL, match="MUJOCO_GL=osmesa cannot draw.*Unset it"):
+        ensure_gl()
+
+
+def test_a_back_end_that_works_is_kept_and_probed_once(monkeypatch):
+    from vap_core.sim import gl
+
+    asked = []
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    monkeypatch.delenv(gl.PROVEN, raising=False)
+    monkeypatch.setattr(gl, "works", lambda backend: not asked.append(backend))
+    assert (ensure_gl(), ensure_gl(), asked) == ("osmesa", "osmesa", ["osmesa"])

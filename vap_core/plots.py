@@ -10,6 +10,7 @@ from vap_core.metrics import Score
 from vap_core.values import Attended, Grounding, PersonalObject, Rgb
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -92,6 +93,19 @@ def scores_figure(scores: Sequence[Score]) -> "Figure":
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("% of episodes, 95 % interval")
     panels[0].legend(frameon=False, loc="upper center")
+    return figure
+
+
+def track_figure(track: "pd.DataFrame") -> "Figure":
+    """IoU with ground truth and the tracker's own score over the control steps, one line per camera (columns of `inspection.follow`)."""
+    figure = _figure(8.0, 3.0)
+    axes = figure.subplots()
+    for i, (camera, part) in enumerate(track.groupby("camera", sort=False)):
+        axes.plot(part.step, part.iou, color=f"C{i}", label=f"{camera}: IoU with ground truth")
+        axes.plot(part.step, part.score, color=f"C{i}", alpha=0.45, linestyle=":", label=f"{camera}: tracker's score")
+    axes.set(xlabel="control step", ylim=(0, 1.05))
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=8, loc="lower left")
     return figure
 
 

@@ -174,8 +174,8 @@ class Camera:
 class PolicyInput:
     """All that a policy may read: images, text and proprioception. Never simulator state.
 
-    `state` is `x y z` (m) and `rx ry rz` (rotation vector, rad) of the gripper in the robot base frame, gripper opening
-    0..1, then the arm's joint angles (rad).
+    `state` is `x y z` (m) of the gripper in the robot base frame, its rotation vector `rx ry rz` (rad) counted from straight
+    down, so that a turn about the vertical reads (0, 0, yaw), gripper opening 0..1, then the arm's joint angles (rad).
     """
 
     images: Views

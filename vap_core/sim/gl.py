@@ -10,6 +10,8 @@ from functools import cache
 from vap_core.errors import MissingGL
 
 BACKENDS = ("egl", "osmesa")
+PROVEN = "VAP_CORE_GL"
+"""Environment variable that hands the probe's answer down to worker processes."""
 REMEDY = "apt-get install -y --no-install-recommends libegl1 libgl1"
 _PROBE = """
 import os
@@ -35,18 +37,25 @@ def works(backend: str) -> bool:
 def ensure_gl() -> str:
     """Make mujoco draw without a display: set `MUJOCO_GL` to a back end that works here and return its name.
 
-    Call it before importing mujoco where possible; a mujoco that is already imported is switched over. A value that is already
-    set is trusted and left alone.
+    Call it before importing mujoco where possible; a mujoco that is already imported is switched over. A back end that the user
+    set is probed and kept; one that this process or its parent found to work is not probed again.
 
     Raises: MissingGL with the line to run.
     """
     chosen = os.environ.get("MUJOCO_GL", "").lower().strip()
-    if chosen:
+    if chosen and (os.environ.get(PROVEN) == chosen or works(chosen)):
+        os.environ[PROVEN] = chosen
         return chosen
+    if chosen:
+        raise MissingGL(f"ensure_gl: MUJOCO_GL={chosen} cannot draw on this machine. Unset it, or run: {REMEDY}")
     for backend in BACKENDS:
         if works(backend):
-            os.environ["MUJOCO_GL"] = backend
+            os.environ["MUJOCO_GL"] = os.environ[PROVEN] = backend
             if "mujoco" in sys.modules:
                 importlib.reload(importlib.import_module("mujoco.rendering.classic.gl_context"))
             return backend
     raise MissingGL(f"ensure_gl: no OpenGL back end of {', '.join(BACKENDS)} can draw without a display. Run: {REMEDY}")
+
+
+if __name__ == "__main__":
+    print(ensure_gl())
