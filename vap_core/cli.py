@@ -10,7 +10,11 @@ import typer
 
 from vap_core.errors import VapError
 
-app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False, rich_markup_mode=None, help=__doc__)
+HELP = """Visual Attentive Prompting: steer a frozen policy to your own object, and see why it worked or failed.
+
+Start with: python -m vap_core doctor, then python -m vap_core demo."""
+
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False, rich_markup_mode=None, help=HELP)
 train_app = typer.Typer(no_args_is_help=True, help="Train shipped parts again; every training resumes after an interruption.")
 app.add_typer(train_app, name="train")
 
