@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from vap_core.errors import MissingWeights
 from vap_core.values import Rgb
+from vap_core.weights import weights_sha256 as weights_sha256
 
 CHANNELS = {"b0": 16, "b2": 24, "b4": 40, "b10": 112, "b14": 192, "head": 1280}
 STRIDE = {"b0": 2, "b2": 4, "b4": 8, "b10": 16, "b14": 32, "head": 32}

@@ -1,0 +1,118 @@
+"""Training the segmenter's head: windows around rendered objects, prompted by a box or by a coarse guess of the mask."""
+
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, UInt8
+from torch import Tensor
+from torch.nn import functional as F
+from tqdm import tqdm
+
+from vap_core.features import backbone, normalise
+from vap_core.segment import SIDE, TAPS, MaskHead, box_plane, cut, window
+from vap_core.training.detector import disturb
+from vap_core.training.scenes import Shots, boxes_of
+
+BATCH, RATE = 16, 2e-3
+GRID = 28
+"""Cells of the tracker's grid along the longer side."""
+
+
+def crops_of(shots: Shots, least_px: int = 80) -> list[tuple[int, int]]:
+    """(view, object) of everything worth a mask."""
+    return [(v, i) for v, ids in enumerate(shots.ids) for i, _ in boxes_of(ids, len(shots.names), least_px)]
+
+
+def jitter(rng: np.random.Generator, box: Float[np.ndarray, "4"], amount: float = 0.08) -> Float[np.ndarray, "4"]:
+    """Each edge moved by up to `amount` of the box's extent along it."""
+    size = np.array([box[2] - box[0], box[3] - box[1]] * 2)
+    return box + rng.uniform(-amount, amount, 4) * size
+
+
+def coarsen(rng: np.random.Generator, mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """What a tracker at stride 8 would know of a mask: shifted by up to half a cell, averaged over cells, noisy, smooth."""
+    h, w = mask.shape
+    cell = max(h, w) / GRID
+    dx, dy = rng.uniform(-0.5, 0.5, 2) * cell
+    moved = cv2.warpAffine(mask.astype(np.float32), np.array([[1, 0, dx], [0, 1, dy]], np.float32), (w, h))
+    cells = cv2.resize(moved, (round(w / cell), round(h / cell)), interpolation=cv2.INTER_AREA)
+    cells = cells * rng.uniform(0.7, 1.2) + rng.normal(0, 0.08, cells.shape) * (cv2.dilate(cells, np.ones((3, 3))) > 0.05)
+    return cv2.resize(np.clip(cells, 0, 1).astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR)
+
+
+def bounds(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "4"] | None:
+    """The box of a mask, far corner exclusive; None when it is empty."""
+    rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    return np.array([cols[0], rows[0], cols[-1] + 1, rows[-1] + 1], np.float32) if len(rows) else None
+
+
+def sample(rng: np.random.Generator, rgb: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One training window: pixels, prompt planes, wanted mask."""
+    box, coarse = bounds(mask), None
+    assert box is not None
+    if rng.random() < 0.5:
+        coarse = coarsen(rng, mask)
+        box = bounds(coarse > 0.4) if (coarse > 0.4).any() else box
+    assert box is not None
+    if rng.random() < 0.6:
+        box = jitter(rng, box)
+    win = window(box)
+    planes = np.zeros((2, SIDE, SIDE), np.uint8)
+    planes[0] = cut(box_plane(box, mask.shape), win, 0)
+    if coarse is not None:
+        planes[1] = cut((coarse * 255).astype(np.uint8), win, 0)
+    pixels, wanted = disturb(rng, cut(rgb, win)), cut(mask.astype(np.uint8) * 255, win, 0)
+    if rng.random() < 0.5:
+        return pixels[:, ::-1].copy(), planes[:, :, ::-1].copy(), wanted[:, ::-1].copy()
+    return pixels, planes, wanted
+
+
+def mask_loss(logits: Float[Tensor, "n h w"], wanted: Float[Tensor, "n h w"]) -> Tensor:
+    """Cross-entropy plus a soft Dice loss, which does not care how much of the window the object fills."""
+    chance = logits.sigmoid()
+    dice = 1 - (2 * (chance * wanted).sum((1, 2)) + 1) / (chance.sum((1, 2)) + wanted.sum((1, 2)) + 1)
+    return F.binary_cross_entropy_with_logits(logits, wanted) + dice.mean()
+
+
+def fit_segmenter(
+    stages: list[Shots], *, seed: int, epochs: int, crops_per_epoch: int,
+    state: dict[str, Any], save: Callable[[dict[str, Any]], None], expired: Callable[[], bool],
+) -> MaskHead:  # fmt: skip
+    """Train the head; `state` holds what an earlier run saved, `save` keeps each epoch."""
+    torch.manual_seed(seed)  # initial weights only; every other draw comes from rng
+    head = MaskHead()
+    optimiser = torch.optim.AdamW(head.parameters(), RATE, weight_decay=1e-4)
+    start = 0
+    if state:
+        head.load_state_dict(state["head"])
+        optimiser.load_state_dict(state["optimiser"])
+        start = state["epoch"]
+    pool = [(s, v, i) for s, shots in enumerate(stages) for v, i in crops_of(shots)]
+    per_epoch = min(crops_per_epoch, len(pool)) // BATCH
+    for epoch in range(start, epochs):
+        if expired():
+            break
+        rng = np.random.default_rng([seed, 2, epoch])
+        total, order = 0.0, rng.permutation(len(pool))
+        bar = tqdm(range(per_epoch), desc=f"segmenter {epoch + 1}/{epochs}", mininterval=10)
+        for batch in bar:
+            done = (epoch * per_epoch + batch) / (epochs * per_epoch)
+            for group in optimiser.param_groups:
+                group["lr"] = RATE * min(1.0, done * 50 + 0.05) * 0.5 * (1 + np.cos(np.pi * done))
+            picked = [pool[i] for i in order[batch * BATCH : (batch + 1) * BATCH]]
+            parts = [sample(rng, stages[s].rgb[v], stages[s].ids[v] == i + 1) for s, v, i in picked]
+            rgb, planes, masks = (torch.from_numpy(np.stack(part)) for part in zip(*parts, strict=True))
+            pixels = normalise(rgb)
+            with torch.no_grad():
+                taps = backbone()(pixels, TAPS)
+            loss = mask_loss(head(pixels, taps, planes.float() / 255), masks.float() / 255)
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            total += loss.item()
+            bar.set_postfix(loss=f"{total / (batch + 1):.3f}", refresh=False)
+        save({"head": head.state_dict(), "optimiser": optimiser.state_dict(), "epoch": epoch + 1, "loss": total / max(per_epoch, 1)})
+    return head
