@@ -48,9 +48,10 @@ def run(steps: int = 60) -> str:
         recorded = _record(trial, row, folder / "bench.rrd")
         limits = [*_attend_limits(trial, row, unit), *_record_limits(recorded), _import_limit(unit)]
     head = ["what", "measured", "budget", "", "ratio"]
+    steps_run, views = recorded.episode.outcome.steps, len(trial.scene.cameras)
     return "\n".join(
         [
-            f"{suite}/{task}, {len(trial.scene.cameras)} cameras, {recorded.episode.outcome.steps} steps, one thread; a backbone pass takes {unit:.1f} ms",
+            f"{suite}/{task}, {views} cameras, {steps_run} steps, one thread; one backbone pass takes {unit:.1f} ms",
             "",
             align([["part of a control step", "ms", "share"], *_shares(recorded.episode)]),
             "",
