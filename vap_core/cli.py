@@ -4,11 +4,14 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from vap_core.errors import VapError
+
+if TYPE_CHECKING:
+    from vap_core.experiments import Study
 
 HELP = """Visual Attentive Prompting: steer a frozen policy to your own object, and see why it worked or failed.
 
@@ -200,12 +203,10 @@ def perception(
     print(json.dumps(train(out, scenes=scenes, seed=seed, minutes=minutes), indent=1))
 
 
-def _run(study: object, out: Path, workers: int, record: bool) -> None:
+def _run(study: "Study", out: Path, workers: int, record: bool) -> None:
     from vap_core.engine import run
-    from vap_core.experiments import Study
     from vap_core.report import conclude
 
-    assert isinstance(study, Study)
     print(conclude(study, run(study, out, workers=workers, record=record), out))
 
 

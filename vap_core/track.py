@@ -9,7 +9,7 @@ whole view, and taken back only if it looks like itself, and more so than like a
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -20,7 +20,7 @@ from torch.nn import functional as F
 from vap_core.embed import Encoder, crop
 from vap_core.embed import load as load_encoder
 from vap_core.features import CHANNELS, features, fit
-from vap_core.segment import LiteSegmenter
+from vap_core.segment import LiteSegmenter, bounds
 from vap_core.segment import load as load_segmenter
 from vap_core.values import Mask, Rgb, Track, value
 
@@ -32,12 +32,19 @@ RADIUS = 5
 """Cells that an object may move between two remembered frames."""
 LEAST_AREA = 0.12
 """A mask below this share of the identity's usual area is not visible."""
+GROWTH = 3.0
+"""A mask that many times larger than usual is something else."""
+TONE = 0.65
+"""Colour agreement (Bhattacharyya) with the first or the running histogram below which a mask is something else, such as the arm in front."""
 SAME = 0.72
 """Cosine at which a re-found object counts as itself."""
+BINS = (6, 12, 12)
+"""Colour histogram over lightness, green-red and blue-yellow."""
 Labels = Float32[np.ndarray, "i p"]
 """Per grid cell, how much of it belongs to the background (row 0) and to each identity."""
 
 
+@runtime_checkable
 class Tracker(Protocol):
     """Follows every identity of each view; state is argument and result, and may be consumed."""
 
@@ -68,6 +75,8 @@ class TrackState:
     last: Float32[np.ndarray, "n 4"]
     area: Float32[np.ndarray, " n"]
     lost: Int64[np.ndarray, " n"]
+    tones: Float32[np.ndarray, "2 n b"]
+    """Colour histograms: of t = 0, and running."""
     crops: tuple[Rgb, ...]
     looks: Float32[np.ndarray, "n d"] | None
     """Embeddings of `crops`, computed when an identity is lost for the first time."""
@@ -96,7 +105,8 @@ class LiteTracker:
         area = masks.reshape(len(masks), -1).sum(axis=1).astype(np.float32)
         crops = tuple(crop(image, box) for box in last)
         lost = np.where(area > 0, 0, 1).astype(np.int64)
-        return TrackState(hw, Memory(keys, to_cells(masks, grid)), (), last, area, lost, crops, None)
+        tone = np.stack([tone_of(image, mask) for mask in masks]) if len(masks) else np.zeros((0, int(np.prod(BINS))), np.float32)
+        return TrackState(hw, Memory(keys, to_cells(masks, grid)), (), last, area, lost, np.stack([tone, tone]), crops, None)
 
     def _step(self, state: TrackState, image: Rgb) -> tuple[TrackState, tuple[Track, ...]]:
         n = len(state.area)
@@ -114,7 +124,7 @@ class LiteTracker:
         if (state.lost > 0).any():
             state = self._search(state, image, keys, grid, chance)
         masks = (chance > 0.5) & (chance.argmax(axis=0) == np.arange(n)[:, None, None])
-        return self._conclude(state, keys, grid, masks, chance)
+        return self._conclude(state, image, keys, grid, masks, chance)
 
     def _draw(self, image: Rgb, soft: Float32[np.ndarray, "i h w"], guesses: Sequence[Mask | None], chance: Float32[np.ndarray, "n h w"]) -> None:
         """Sharpen every guess with the segmenter, into `chance`."""
@@ -145,25 +155,28 @@ class LiteTracker:
         return replace(state, looks=looks)
 
     def _conclude(
-        self, state: TrackState, keys: np.ndarray, grid: tuple[int, int], masks: Bool[np.ndarray, "n h w"], chance: Float32[np.ndarray, "n h w"]
+        self, state: TrackState, image: Rgb, keys: np.ndarray, grid: tuple[int, int], masks: Bool[np.ndarray, "n h w"], chance: Float32[np.ndarray, "n h w"]
     ) -> tuple[TrackState, tuple[Track, ...]]:
         """Decide who is visible, remember this frame, and report."""
-        last, area, lost = state.last.copy(), state.area.copy(), state.lost.copy()
+        last, area, lost, tones = state.last.copy(), state.area.copy(), state.lost.copy(), state.tones.copy()
         tracks: list[Track] = []
         for i, mask in enumerate(masks):
             pixels = int(mask.sum())
-            score = float(chance[i][mask].mean()) if pixels else 0.0
             box = bounds(mask)
-            if box is None or pixels < max(8.0, LEAST_AREA * area[i]):
+            tone = tone_of(image, mask)
+            agreement = float((tones[:, i] @ tone).max())
+            if box is None or agreement < TONE or not max(8.0, LEAST_AREA * area[i]) <= pixels <= GROWTH * area[i]:
                 masks[i] = False
                 lost[i] += 1
                 tracks.append(Track(None, 0.0))
                 continue
             lost[i], last[i] = 0, box
             area[i] = 0.9 * area[i] + 0.1 * pixels
-            tracks.append(Track(mask.copy(), score))
+            mixed = 0.9 * tones[1, i] + 0.1 * tone
+            tones[1, i] = mixed / np.linalg.norm(mixed)
+            tracks.append(Track(mask.copy(), float(chance[i][mask].mean()) * min(1.0, agreement)))
         recent = (*state.recent, Memory(keys, to_cells(masks, grid)))[-RECENT:]
-        return replace(state, recent=recent, last=last, area=area, lost=lost), tuple(tracks)
+        return replace(state, recent=recent, last=last, area=area, lost=lost, tones=tones), tuple(tracks)
 
 
 def embed_cells(image: Rgb) -> tuple[Float32[np.ndarray, "p c"], tuple[int, int]]:
@@ -212,6 +225,18 @@ def to_pixels(labels: Labels, grid: tuple[int, int], hw: tuple[int, int]) -> Flo
     return np.stack([cv2.resize(row.reshape(grid), whole, interpolation=cv2.INTER_LINEAR)[: hw[0], : hw[1]] for row in labels])
 
 
+def tone_of(image: Rgb, mask: Mask) -> Float32[np.ndarray, " b"]:
+    """Square-rooted, unit-length Lab histogram of the masked pixels; zeros for an empty mask."""
+    box = bounds(mask)
+    if box is None:
+        return np.zeros(int(np.prod(BINS)), np.float32)
+    x0, y0, x1, y1 = box.astype(int)
+    lab = cv2.cvtColor(image[y0:y1, x0:x1], cv2.COLOR_RGB2LAB)
+    count = cv2.calcHist([lab], [0, 1, 2], mask[y0:y1, x0:x1].astype(np.uint8), BINS, [0, 256, 64, 192, 64, 192])
+    root = np.sqrt(count.ravel())
+    return (root / max(float(np.linalg.norm(root)), 1e-9)).astype(np.float32)
+
+
 def nearest(mine: Mask, soft: Float32[np.ndarray, "h w"], box: Float32[np.ndarray, "4"]) -> Mask | None:
     """The component that best joins mass and nearness to where the identity was; None when there is none."""
     count, parts, stats, centres = cv2.connectedComponentsWithStats(mine.astype(np.uint8))
@@ -229,12 +254,6 @@ def largest(mine: Mask, soft: Float32[np.ndarray, "h w"]) -> Mask | None:
     if count < 2:
         return None
     return parts == 1 + int(np.bincount(parts.ravel(), soft.ravel(), minlength=count)[1:].argmax())
-
-
-def bounds(mask: Mask) -> Float32[np.ndarray, "4"] | None:
-    """The box of a mask, pixels, far corner exclusive; None when it is empty."""
-    rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    return np.array([cols[0], rows[0], cols[-1] + 1, rows[-1] + 1], np.float32) if len(rows) else None
 
 
 @cache

@@ -1,0 +1,59 @@
+"""Figures show what they were given; tables against ground truth are exact."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from tests.toys import TOYS, personal, scene
+
+from vap_core.attend import Attender
+from vap_core.inspection import grounding_table, iou
+from vap_core.metrics import score
+from vap_core.plots import candidates, film, grounding_figure, scores_figure, track_figure, write_png
+
+TEAL, GREY = (40, 120, 110), (90, 90, 90)
+LINE = scene([(4, 20, GREY), (24, 20, TEAL)])
+
+
+def test_iou_is_exact() -> None:
+    one, other = np.zeros((4, 4), bool), np.zeros((4, 4), bool)
+    one[:2], other[1:3] = True, True
+    assert iou(one, other) == pytest.approx(1 / 3)
+    assert iou(one & False, other & False) == 1.0
+    assert iou(one, one) == 1.0
+
+
+def test_grounding_table_names_what_is_under_each_candidate() -> None:
+    _, attended = Attender(TOYS, {"mug": personal("mug", "cup", TEAL)}).start({"front": LINE}, "bring my cup")
+    truth = {"mug": (LINE == TEAL).all(axis=2), "other": (LINE == GREY).all(axis=2)}
+    table = grounding_table(attended.groundings["front"][0], truth)
+    assert table["is"].tolist() == ["other", "mug"]
+    assert table.winner.tolist() == [False, True]
+    assert table.iou.tolist() == [1.0, 1.0]
+
+
+def test_grounding_figure_has_a_row_per_target_and_survives_no_candidate(tmp_path) -> None:
+    objects = (personal("mug", "cup", TEAL), personal("ming", "nothing", GREY))
+    _, attended = Attender(TOYS, {o.name: o for o in objects}).start({"front": LINE}, "put my cup near my nothing")
+    figure = grounding_figure(LINE, attended, objects, "front")
+    assert len(figure.subfigs) == 2
+    write_png(figure, tmp_path / "a.png")
+    write_png(grounding_figure(LINE, attended, objects, "front"), tmp_path / "b.png")
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_the_winner_is_drawn_apart() -> None:
+    from matplotlib.figure import Figure
+
+    _, attended = Attender(TOYS, {"mug": personal("mug", "cup", TEAL)}).start({"front": LINE}, "bring my cup")
+    axes = Figure().subplots()
+    candidates(axes, LINE, attended.groundings["front"][0])
+    assert len({patch.get_edgecolor() for patch in axes.patches}) == 2
+
+
+def test_scores_film_and_track_draw() -> None:
+    row = {"suite": "s", "task": "t", "policy": "scripted", "outcome": "success", "success": True, "cmr": True, "wrong_object": False}
+    rows = [{**row, "method": m, "first_object_correct": True, "steps": 3} for m in ("generic", "vap")]
+    assert len(scores_figure(score(rows)).axes) == 1
+    assert len(film({"raw": [LINE, LINE]}, ["a", "b"]).axes) == 2
+    track = pd.DataFrame({"step": [0, 1], "camera": ["front"] * 2, "iou": [1.0, 0.5], "score": [1.0, 0.9]})
+    assert len(track_figure(track).axes[0].lines) == 2
