@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32
 from torch import Tensor, nn
-from torch.nn import functional as F
+from torch.nn import functional as F  # noqa: N812
 
 from vap_core.features import CHANNELS, features, fit
 from vap_core.text import WIDTH as TEXT_WIDTH
@@ -50,21 +50,21 @@ class DetectHead(nn.Module):
         self.register_buffer("known", torch.zeros(n_names, TEXT_WIDTH))
         self.lateral = nn.ModuleDict({tap: nn.Conv2d(CHANNELS[tap], width, 1) for tap in TAPS})
         self.mix = nn.ModuleList(nn.Conv2d(width, width, 3, padding=1) for _ in range(2))
-        self.norm = nn.ModuleList(nn.GroupNorm(8, width) for _ in range(2))
+        self.norm = nn.ModuleList(nn.GroupNorm(8, width) for _ in range(3))
         self.see = nn.Conv2d(width, width, 1)
         self.edges = nn.Conv2d(width, 4, 1)
         self.read = nn.Sequential(nn.Linear(TEXT_WIDTH, 128), nn.ReLU(), nn.Linear(128, width))
         self.bias = nn.Parameter(torch.tensor(-4.0))
-        nn.init.constant_(self.edges.bias, 1.0)  # type: ignore[arg-type]
 
     def forward(self, taps: Mapping[str, Tensor], text: Float[Tensor, "p 384"]) -> tuple[Float[Tensor, "n p h w"], Float[Tensor, "n 4 h w"]]:
         """Logits per phrase, and distances from the cell's centre to the left, top, right and bottom edge in cells."""
         size = taps["b4"].shape[-2:]
         x = sum((F.interpolate(self.lateral[tap](taps[tap]), size, mode="nearest") for tap in TAPS), start=torch.zeros(()))
-        for mix, norm in zip(self.mix, self.norm, strict=True):
+        x = self.norm[0](x)
+        for mix, norm in zip(self.mix, list(self.norm)[1:], strict=True):
             x = x + F.relu(norm(mix(F.relu(x))))
         logits = torch.einsum("nchw,pc->nphw", self.see(x), self.read(text)) / x.shape[1] ** 0.5 + self.bias
-        return logits, self.edges(x).clamp(-3, 4).exp()
+        return logits, 4 * F.softplus(self.edges(x))
 
 
 class LiteDetector:

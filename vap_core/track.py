@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Int64
-from torch.nn import functional as F
+from torch.nn import functional as F  # noqa: N812
 
 from vap_core.embed import Encoder, crop
 from vap_core.embed import load as load_encoder
@@ -28,6 +28,8 @@ TAP, STRIDE, SIDE = "b4", 8, 224
 RECENT = 4
 """Frames remembered besides the first."""
 TOP, TEMPERATURE = 5, 0.07
+ANCHOR = 0.4
+"""Weight of the first frame against the recent ones."""
 RADIUS = 5
 """Cells that an object may move between two remembered frames."""
 LEAST_AREA = 0.12
@@ -36,7 +38,9 @@ GROWTH = 3.0
 """A mask that many times larger than usual is something else."""
 TONE = 0.65
 """Colour agreement (Bhattacharyya) with the first or the running histogram below which a mask is something else, such as the arm in front."""
-SAME = 0.72
+SEED = 0.3
+"""Share of a cell that must be an identity's for a search to start there."""
+SAME = 0.62
 """Cosine at which a re-found object counts as itself."""
 BINS = (6, 12, 12)
 """Colour histogram over lightness, green-red and blue-yellow."""
@@ -72,6 +76,8 @@ class TrackState:
     hw: tuple[int, int]
     first: Memory
     recent: tuple[Memory, ...]
+    sights: tuple[Memory, ...]
+    """Per identity, the frame in which it was seen last."""
     last: Float32[np.ndarray, "n 4"]
     area: Float32[np.ndarray, " n"]
     lost: Int64[np.ndarray, " n"]
@@ -106,14 +112,17 @@ class LiteTracker:
         crops = tuple(crop(image, box) for box in last)
         lost = np.where(area > 0, 0, 1).astype(np.int64)
         tone = np.stack([tone_of(image, mask) for mask in masks]) if len(masks) else np.zeros((0, int(np.prod(BINS))), np.float32)
-        return TrackState(hw, Memory(keys, to_cells(masks, grid)), (), last, area, lost, np.stack([tone, tone]), crops, None)
+        first = Memory(keys, to_cells(masks, grid))
+        return TrackState(hw, first, (), (first,) * len(masks), last, area, lost, np.stack([tone, tone]), crops, None)
 
     def _step(self, state: TrackState, image: Rgb) -> tuple[TrackState, tuple[Track, ...]]:
         n = len(state.area)
         if n == 0:
             return state, ()
         keys, grid = embed_cells(image)
-        labels = propagate(keys, [state.first, *state.recent], grid, local=(False, *[True] * len(state.recent)))
+        labels = propagate(keys, [state.first], grid, local=False)
+        if state.recent:
+            labels = ANCHOR * labels + (1 - ANCHOR) * propagate(keys, state.recent, grid, local=True)
         guesses: list[Mask | None] = [None] * n
         soft = to_pixels(labels, grid, state.hw)
         owner = soft.argmax(axis=0)
@@ -135,27 +144,34 @@ class LiteTracker:
                 chance[i] = self.segmenter.chance(image, box[None], hint[None].astype(np.float32))[0]
 
     def _search(self, state: TrackState, image: Rgb, keys: np.ndarray, grid: tuple[int, int], chance: Float32[np.ndarray, "n h w"]) -> TrackState:
-        """Look for lost identities in the whole view, with the first frame as the only guide (P tab:occlusion_sweep)."""
+        """Look for lost identities in the whole view, guided by the first frame and the one that showed it last (P tab:occlusion_sweep)."""
         looks = self.encoder(state.crops) if state.looks is None else state.looks
-        soft = to_pixels(propagate(keys, [state.first], grid, local=(False,)), grid, state.hw)
-        taken = (chance > 0.5).any(axis=0)
-        owner = np.where(taken, 0, soft.argmax(axis=0))
         for i in np.flatnonzero(state.lost > 0):
-            guess = largest(owner == i + 1, soft[i + 1])
-            box = None if guess is None else bounds(guess)
-            if guess is None or box is None or guess.sum() < LEAST_AREA * state.area[i]:
-                continue
-            here = self.segmenter.chance(image, box[None], np.where(guess, soft[i + 1], 0).astype(np.float32)[None])[0]
-            found = bounds((here > 0.5) & ~taken)
-            if found is None:
+            soft = to_pixels(propagate(keys, [state.first, state.sights[i]], grid, local=False), grid, state.hw)
+            mine = soft.argmax(axis=0) == i + 1
+            taken = (chance > 0.5).any(axis=0) & ~mine  # another may have swallowed this one while it was hidden
+            guess = largest((soft[i + 1] > SEED) & ~taken, soft[i + 1])
+            found = None if guess is None else bounds(guess)
+            for _ in range(2):  # the first mask shows how far the object reaches, the second is drawn from its whole box
+                if found is not None:
+                    here = self.segmenter.chance(image, found[None], np.where(taken, 0, soft[i + 1])[None].astype(np.float32))[0]
+                    found = bounds((here > 0.5) & ~taken)
+            if found is None or float((state.tones[:, i] @ tone_of(image, (here > 0.5) & ~taken)).max()) < TONE:
                 continue
             cosine = looks @ self.encoder([crop(image, found)])[0]
             if cosine[i] >= SAME and cosine[i] >= cosine.max():
+                chance[:, mine & (here > 0.5)] = 0
                 chance[i] = np.where(taken, 0, here)
         return replace(state, looks=looks)
 
     def _conclude(
-        self, state: TrackState, image: Rgb, keys: np.ndarray, grid: tuple[int, int], masks: Bool[np.ndarray, "n h w"], chance: Float32[np.ndarray, "n h w"]
+        self,
+        state: TrackState,
+        image: Rgb,
+        keys: np.ndarray,
+        grid: tuple[int, int],
+        masks: Bool[np.ndarray, "n h w"],
+        chance: Float32[np.ndarray, "n h w"],
     ) -> tuple[TrackState, tuple[Track, ...]]:
         """Decide who is visible, remember this frame, and report."""
         last, area, lost, tones = state.last.copy(), state.area.copy(), state.lost.copy(), state.tones.copy()
@@ -175,8 +191,9 @@ class LiteTracker:
             mixed = 0.9 * tones[1, i] + 0.1 * tone
             tones[1, i] = mixed / np.linalg.norm(mixed)
             tracks.append(Track(mask.copy(), float(chance[i][mask].mean()) * min(1.0, agreement)))
-        recent = (*state.recent, Memory(keys, to_cells(masks, grid)))[-RECENT:]
-        return replace(state, recent=recent, last=last, area=area, lost=lost, tones=tones), tuple(tracks)
+        now = Memory(keys, to_cells(masks, grid))
+        sights = tuple(old if gone else now for old, gone in zip(state.sights, lost, strict=True))
+        return replace(state, recent=(*state.recent, now)[-RECENT:], sights=sights, last=last, area=area, lost=lost, tones=tones), tuple(tracks)
 
 
 def embed_cells(image: Rgb) -> tuple[Float32[np.ndarray, "p c"], tuple[int, int]]:
@@ -186,11 +203,10 @@ def embed_cells(image: Rgb) -> tuple[Float32[np.ndarray, "p c"], tuple[int, int]
     return F.normalize(maps.reshape(CHANNELS[TAP], -1).T, dim=1).contiguous().numpy(), (rows, cols)
 
 
-def propagate(keys: Float32[np.ndarray, "p c"], memory: Sequence[Memory], grid: tuple[int, int], local: Sequence[bool]) -> Labels:
-    """Each cell's labels: the mean over its `TOP` most similar remembered cells, weighted by exp(cosine / temperature)."""
+def propagate(keys: Float32[np.ndarray, "p c"], memory: Sequence[Memory], grid: tuple[int, int], local: bool) -> Labels:
+    """Each cell's labels: the mean over its `TOP` most similar remembered cells (near it, if `local`), weighted by exp(cosine / temperature)."""
     query = torch.from_numpy(keys)
-    near = _near(grid)
-    cosine = torch.cat([(query @ torch.from_numpy(m.keys).T) + (near if here else 0.0) for m, here in zip(memory, local, strict=True)], dim=1)
+    cosine = torch.cat([query @ torch.from_numpy(m.keys).T + (_near(grid) if local else 0.0) for m in memory], dim=1)
     best, at = cosine.topk(TOP, dim=1)
     weight = torch.softmax(best / TEMPERATURE, dim=1)
     labels = torch.from_numpy(np.concatenate([m.labels for m in memory], axis=1))
@@ -239,7 +255,7 @@ def tone_of(image: Rgb, mask: Mask) -> Float32[np.ndarray, " b"]:
 
 def nearest(mine: Mask, soft: Float32[np.ndarray, "h w"], box: Float32[np.ndarray, "4"]) -> Mask | None:
     """The component that best joins mass and nearness to where the identity was; None when there is none."""
-    count, parts, stats, centres = cv2.connectedComponentsWithStats(mine.astype(np.uint8))
+    count, parts, _, centres = cv2.connectedComponentsWithStats(mine.astype(np.uint8))
     if count < 2:
         return None
     was, reach = (box[:2] + box[2:]) / 2, max(float((box[2:] - box[:2]).max()), 0.05 * max(mine.shape))

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
-from torch.nn import functional as F
+from torch.nn import functional as F  # noqa: N812
 from tqdm import tqdm
 
 from vap_core.detect import SIDE, STRIDE, TAPS, DetectHead
@@ -27,7 +27,7 @@ Objects = list[tuple[str, np.ndarray]]
 
 def disturb(rng: np.random.Generator, rgb: Rgb) -> Rgb:
     """Exposure, tint, blur and sensor noise, so that no renderer's look is learned."""
-    x = rgb.astype(np.float32)
+    x: np.ndarray = rgb.astype(np.float32)
     x = (x - 127) * rng.uniform(0.75, 1.25) + 127 + rng.uniform(-25, 25) + rng.normal(0, 6, 3)
     if rng.random() < 0.3:
         x = cv2.GaussianBlur(x, (0, 0), float(rng.uniform(0.3, 1.0)))
@@ -47,7 +47,7 @@ def featurise(folder: Path, name: str, shots: Shots, rng: np.random.Generator) -
     if not path.exists():
         found = features([fit(view, SIDE)[0] for view in rgb], TAPS)
         part = path.with_suffix(".part.npz")
-        np.savez(part, **{tap: value.numpy().astype(np.float16) for tap, value in found.items()})
+        np.savez(part, **{tap: value.numpy().astype(np.float16) for tap, value in found.items()})  # type: ignore[arg-type]
         os.replace(part, path)
     with np.load(path) as file:
         return {tap: file[tap] for tap in TAPS}, [objects_of(view, shots) for view in ids]
@@ -139,7 +139,7 @@ def fit_detector(
         for batch in bar:
             done = (epoch * per_epoch + batch) / (epochs * per_epoch)
             for group in optimiser.param_groups:
-                group["lr"] = RATE * min(1.0, done * 50 + 0.05) * 0.5 * (1 + np.cos(np.pi * done))
+                group["lr"] = float(RATE * min(1.0, done * 50 + 0.05) * 0.5 * (1 + np.cos(np.pi * done)))
             chosen = [views[i] for i in order[batch * BATCH : (batch + 1) * BATCH]]
             taps = {tap: torch.from_numpy(np.stack([view[0][tap] for view in chosen])).float() for tap in TAPS}
             asked, rows = ask(rng, categories)

@@ -56,6 +56,7 @@ def cast(rng: Generator, held_out: bool) -> list[ObjectModel]:
 
 def look(rng: Generator) -> scenes.Look:
     """A room in random colours; one table in three is plain."""
+
     def tint(low: float, high: float) -> tuple[float, float, float]:
         r, g, b = np.clip(rng.uniform(low, high) + rng.uniform(-0.12, 0.12, 3), 0.02, 1)
         return float(r), float(g), float(b)
@@ -87,7 +88,9 @@ def owners(scene: scenes.Scene) -> Int64[np.ndarray, " g"]:
     return np.array([roots.get(int(scene.model.body_rootid[body]), 0) for body in scene.model.geom_bodyid], np.int64)
 
 
-def draw(scene: scenes.Scene, data: mujoco.MjData, renderer: mujoco.Renderer, camera: "mujoco.MjvCamera | str", shadows: bool) -> tuple[np.ndarray, np.ndarray]:
+def draw(
+    scene: scenes.Scene, data: mujoco.MjData, renderer: mujoco.Renderer, camera: "mujoco.MjvCamera | str", shadows: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """Colour and object ids of one picture."""
     renderer.update_scene(data, camera=camera)
     for flag in (mujoco.mjtRndFlag.mjRND_REFLECTION, mujoco.mjtRndFlag.mjRND_SKYBOX, mujoco.mjtRndFlag.mjRND_HAZE):
@@ -156,7 +159,7 @@ def _view(rng: Generator, scene: scenes.Scene, data: mujoco.MjData, renderer: mu
     else:
         camera = mujoco.MjvCamera()
         target = data.body(scene.objects[shown[0]]).xpos
-        camera.lookat[:] = target + (*rng.normal(0, 0.01 if close else 0.06, 2), rng.uniform(0.03, 0.05))
+        camera.lookat[:] = target + np.array([*rng.normal(0, 0.01 if close else 0.06, 2), rng.uniform(0.03, 0.05)])
         camera.azimuth, camera.elevation = rng.uniform(-180, 180), -rng.uniform(15, 65)
         model.vis.global_.fovy = rng.uniform(30, 60)
         pixels = rng.uniform(90, 150) if close else rng.uniform(25, 90)

