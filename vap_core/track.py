@@ -52,7 +52,7 @@ Labels = Float32[np.ndarray, "i p"]
 class Tracker(Protocol):
     """Follows every identity of each view; state is argument and result, and may be consumed."""
 
-    def start(self, images: Sequence[Rgb], masks: Sequence[Bool[np.ndarray, "n h w"]]) -> list[Any]:
+    def start(self, images: Sequence[Rgb], masks: Sequence[Bool[np.ndarray, "_n _h _w"]]) -> list[Any]:
         """One state per view (t = 0); row i of a view's masks is identity i."""
         ...
 
@@ -95,7 +95,7 @@ class LiteTracker:
         self.segmenter = segmenter
         self.encoder = encoder
 
-    def start(self, images: Sequence[Rgb], masks: Sequence[Bool[np.ndarray, "n h w"]]) -> list[TrackState]:
+    def start(self, images: Sequence[Rgb], masks: Sequence[Bool[np.ndarray, "_n _h _w"]]) -> list[TrackState]:
         return [self._start(image, of_view) for image, of_view in zip(images, masks, strict=True)]
 
     def step(self, states: Sequence[TrackState], images: Sequence[Rgb]) -> tuple[list[TrackState], list[tuple[Track, ...]]]:
@@ -108,7 +108,7 @@ class LiteTracker:
             raise ValueError(f"LiteTracker.start: masks of {masks.shape[1:]} pixels for an image of {hw}; they must agree")
         keys, grid = embed_cells(image)
         last = np.array([(0, 0, 1, 1) if (box := bounds(mask)) is None else box for mask in masks], np.float32).reshape(-1, 4)
-        area = masks.reshape(len(masks), -1).sum(axis=1).astype(np.float32)
+        area = masks.sum(axis=(1, 2)).astype(np.float32)
         crops = tuple(crop(image, box) for box in last)
         lost = np.where(area > 0, 0, 1).astype(np.int64)
         tone = np.stack([tone_of(image, mask) for mask in masks]) if len(masks) else np.zeros((0, int(np.prod(BINS))), np.float32)
