@@ -33,10 +33,10 @@ ANCHOR = 0.4
 RADIUS = 5
 """Cells that an object may move between two remembered frames."""
 LEAST_AREA = 0.12
-"""A mask below this share of the identity's usual area is not visible."""
-GROWTH = 3.0
-"""A mask that many times larger than usual is something else."""
-TONE = 0.65
+"""A mask below this share of the identity's recent largest area is not visible."""
+GROWTH = 2.0
+"""A mask that many times larger than the identity's recent largest is something else; twice that much when it was lost."""
+TONE = 0.75
 """Colour agreement (Bhattacharyya) with the first or the running histogram below which a mask is something else, such as the arm in front."""
 SEED = 0.3
 """Share of a cell that must be an identity's for a search to start there."""
@@ -71,7 +71,7 @@ class Memory:
 
 @value
 class TrackState:
-    """Everything known about one view: `last` boxes (pixels) and `area` (pixels) of each identity when it was seen last, frames `lost` since."""
+    """Everything known about one view: each identity's `last` box (pixels), recent largest `area` (pixels), frames `lost` since."""
 
     hw: tuple[int, int]
     first: Memory
@@ -181,13 +181,13 @@ class LiteTracker:
             box = bounds(mask)
             tone = tone_of(image, mask)
             agreement = float((tones[:, i] @ tone).max())
-            if box is None or agreement < TONE or not max(8.0, LEAST_AREA * area[i]) <= pixels <= GROWTH * area[i]:
+            if box is None or agreement < TONE or not max(8.0, LEAST_AREA * area[i]) <= pixels <= GROWTH * (1 + bool(lost[i])) * area[i]:
                 masks[i] = False
                 lost[i] += 1
                 tracks.append(Track(None, 0.0))
                 continue
             lost[i], last[i] = 0, box
-            area[i] = 0.9 * area[i] + 0.1 * pixels
+            area[i] = max(float(pixels), 0.95 * area[i])
             mixed = 0.9 * tones[1, i] + 0.1 * tone
             tones[1, i] = mixed / np.linalg.norm(mixed)
             tracks.append(Track(mask.copy(), float(chance[i][mask].mean()) * min(1.0, agreement)))

@@ -36,11 +36,10 @@ def openings(detector: Detector, encoder: Encoder, segmenter: Segmenter, *, epis
         whole += len(uncropped)
     figures: Figures = {"references_cropped": share(k * len(memory) - whole, k * len(memory)), "image_size": size}
     for name, suite in suites.SUITES.items():
-        models = [model for task in suite.tasks for model in task.models]
-        with scenes.build(suite.robot, models) as scene:
-            env = Env(scene, image_size=size)
-            views: dict[str, dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))
-            for task in suite.tasks:
+        views: dict[str, dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))
+        for task in suite.tasks:
+            with scenes.build(suite.robot, task.models) as scene:
+                env = Env(scene, image_size=size)
                 for row in suites.rows(name, task.name, episodes, seed):
                     env.reset(row)
                     images, masks = env.observe().images, env.truth(masks=True).masks
