@@ -23,9 +23,10 @@ from vap_core.weights import load_weights
 
 TAPS = ("b4", "b10", "b14")
 STRIDE = 8
-SIDE = 384
-"""The longer side, pixels, at which a view is searched."""
-THRESHOLD, TOP, NMS_IOU = 0.3, 10, 0.5
+TRAINED_SIDE, SIDE = 224, 384
+"""The longer side, pixels, of the training views, and to which they are enlarged to be searched. Sharper pictures are found less
+well (recall .90 against .96 at 448 pixels, cropped references 75 % against 98 %), so larger ones are reduced to the first beforehand."""
+THRESHOLD, TOP, NMS_IOU = 0.2, 10, 0.5
 SNAP = 0.55
 """A phrase whose cosine to a known name exceeds this is searched for as that name."""
 
@@ -34,8 +35,8 @@ SNAP = 0.55
 class Detector(Protocol):
     """Finds every box that matches an open-vocabulary phrase."""
 
-    def __call__(self, images: Sequence[Rgb], phrase: str) -> list[Boxes]:
-        """One `Boxes` per image, best first, in that image's pixels; empty when nothing matches."""
+    def __call__(self, images: Sequence[Rgb], phrase: str, threshold: float | None = None) -> list[Boxes]:
+        """One `Boxes` per image, best first, in that image's pixels; empty when nothing scores `threshold` (None: the detector's own)."""
         ...
 
 
@@ -85,18 +86,27 @@ class LiteDetector:
         return known[[cosine.argmax()]] if cosine.max() >= self.snap else row
 
     @torch.inference_mode()
-    def __call__(self, images: Sequence[Rgb], phrase: str) -> list[Boxes]:
+    def __call__(self, images: Sequence[Rgb], phrase: str, threshold: float | None = None) -> list[Boxes]:
         text = torch.from_numpy(self.read(phrase))
         found = []
         for image in images:
-            small, scale = fit(image, SIDE)
+            small, scale = enlarge(image)
             logits, edges = self.head(features([small], TAPS), text)
-            xyxy, score = decode(logits[0, 0], edges[0], self.threshold)
+            xyxy, score = decode(logits[0, 0], edges[0], self.threshold if threshold is None else threshold)
             h, w = image.shape[:2]
             xyxy = np.clip(xyxy / scale, 0, (w, h, w, h)).astype(np.float32)
             real = (xyxy[:, 2:] - xyxy[:, :2] >= 1).all(axis=1)
             found.append(Boxes(xyxy[real], score[real], phrase))
         return found
+
+
+def enlarge(image: Rgb) -> tuple[Rgb, float]:
+    """The view as the head was trained to see it, and its scale."""
+    scale = 1.0
+    if max(image.shape[:2]) > TRAINED_SIDE:
+        image, scale = fit(image, TRAINED_SIDE, multiple=1)
+    small, enlarged = fit(image, SIDE)
+    return small, scale * enlarged
 
 
 def decode(

@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 from tqdm import tqdm
 
-from vap_core.detect import SIDE, STRIDE, TAPS, DetectHead
-from vap_core.features import features, fit
+from vap_core.detect import SIDE, STRIDE, TAPS, DetectHead, enlarge
+from vap_core.features import features
 from vap_core.text import embed_text
 from vap_core.training.phrases import AMBIGUOUS, NEGATIVES, phrases
 from vap_core.training.scenes import Shots, boxes_of
@@ -45,7 +45,7 @@ def featurise(folder: Path, name: str, shots: Shots, rng: np.random.Generator) -
         ids.append(index[:, ::-1] if mirrored else index)
     path = folder / f"{name}.features.npz"
     if not path.exists():
-        found = features([fit(view, SIDE)[0] for view in rgb], TAPS)
+        found = features([enlarge(view)[0] for view in rgb], TAPS)
         part = path.with_suffix(".part.npz")
         np.savez(part, **{tap: value.numpy().astype(np.float16) for tap, value in found.items()})  # type: ignore[arg-type]
         os.replace(part, path)

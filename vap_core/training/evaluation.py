@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from vap_core.detect import SIDE, TAPS, DetectHead, LiteDetector, box_iou, decode
-from vap_core.features import features, fit
+from vap_core.detect import TAPS, DetectHead, LiteDetector, box_iou, decode, enlarge
+from vap_core.features import features
 from vap_core.metrics import rate
 from vap_core.segment import LiteSegmenter, MaskHead
 from vap_core.sim import objects
@@ -145,7 +145,7 @@ def _present(truth: Mapping[str, np.ndarray], kind: str) -> bool:
 @torch.inference_mode()
 def _detect(detector: LiteDetector, image: np.ndarray, rows: Mapping[str, np.ndarray]) -> dict[str, Found]:
     """Every phrase at once, down to `FLOOR`."""
-    small, scale = fit(image, SIDE)
+    small, scale = enlarge(image)
     logits, edges = detector.head(features([small], TAPS), torch.from_numpy(np.concatenate(list(rows.values()))))
     found = {}
     for phrase, scores in zip(rows, logits[0], strict=True):

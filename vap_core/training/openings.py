@@ -1,6 +1,6 @@
 """The embedded stack on the suites' opening frames, with evaluation objects that nothing was trained on.
 
-    python -m vap_core.training.openings data/weights --episodes 6
+python -m vap_core.training.openings data/weights --episodes 6
 """
 
 from collections import defaultdict
@@ -101,8 +101,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("weights", type=Path)
     parser.add_argument("--episodes", type=int, default=6)
+    parser.add_argument("--sizes", type=int, nargs="+", default=[224, 448])
     chosen = parser.parse_args(arguments)
-    figures = openings(detect.load(), embed.load(), segment.load(), episodes=chosen.episodes)
+    stack = detect.load(), embed.load(), segment.load()
+    figures = {f"{size}px": openings(*stack, episodes=chosen.episodes, size=size) for size in chosen.sizes}
     entries = manifest(chosen.weights)
     entries["perception.safetensors"]["measured"]["openings"] = figures
     (chosen.weights / MANIFEST).write_text(json.dumps(entries, indent=1, sort_keys=True) + "\n")
