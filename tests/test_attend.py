@@ -31,7 +31,7 @@ def test_the_right_one_is_tinted_and_named() -> None:
 def test_tracking_follows_and_never_detects_again() -> None:
     calls: list[str] = []
 
-    def counting(images: object, phrase: str) -> list[Boxes]:
+    def counting(images: object, phrase: str, threshold: float | None = None) -> list[Boxes]:
         calls.append(phrase)
         return TOYS.detector(images, phrase)  # type: ignore[arg-type]
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vap_core.policies.scripted import STEP_M, Scripted, coloured, read
+from vap_core.policies.scripted import STEP_M, Scripted, ScriptedState, coloured, read
 from vap_core.prompt import PALETTE
 from vap_core.values import Boxes, Camera, PolicyInput, Rgb
 
@@ -36,7 +36,7 @@ def box_of(x: float, y: float, radius: float, height: float) -> np.ndarray:
 
 def policy(boxes: Sequence[np.ndarray]) -> Scripted:
     found = Boxes(np.array(boxes, np.float32).reshape(-1, 4), np.ones(len(boxes), np.float32), "cup")
-    return Scripted(lambda images, phrase: [found for _ in images], camera(), BASE)
+    return Scripted(lambda images, phrase, threshold=None: [found for _ in images], camera(), BASE)
 
 
 def look(rgb: Rgb, text: str) -> PolicyInput:
@@ -91,6 +91,16 @@ def test_without_a_colour_any_of_the_category_is_taken_and_kept() -> None:
         chosen.append(round(float(states[0].goal[1]) / 0.15))
     assert {-1, 0, 1} == set(chosen)
     assert max(chosen.count(i) for i in (-1, 0, 1)) < 35
+
+
+def test_an_empty_gripper_after_lifting_means_try_again() -> None:
+    p, boxes = policy([box_of(0.3, 0.1, 0.02, 0.08)]), np.array([0.3, 0.1, 0.08])
+    lifting = ScriptedState(0.5, boxes, "lift", 0)
+    held, empty = look(np.zeros((224, 224, 3), np.uint8), "pick up my cup"), look(np.zeros((224, 224, 3), np.uint8), "pick up my cup")
+    held.state[6], empty.state[6] = 0.5, 0.0
+    (kept, again), (_, chunk) = p.plan([lifting, lifting], [held, empty])
+    assert (kept.phase, again.phase) == ("lift", "above")
+    assert (chunk[:, 6] == 1.0).all()
 
 
 def test_nothing_seen_means_stand_still() -> None:

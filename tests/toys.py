@@ -18,7 +18,7 @@ def scene(squares: Sequence[tuple[int, int, tuple[int, int, int]]], size: int = 
     return rgb
 
 
-def detector(images: Sequence[Rgb], phrase: str) -> list[Boxes]:
+def detector(images: Sequence[Rgb], phrase: str, threshold: float | None = None) -> list[Boxes]:
     """Every connected square, left to right; "nothing" finds nothing."""
     return [Boxes.empty(phrase) if phrase == "nothing" else _squares(rgb, phrase) for rgb in images]
 

@@ -15,8 +15,8 @@ from jaxtyping import Float, Float32
 from vap_core.features import CHANNELS, features, fit
 from vap_core.values import Rgb
 
-MARGIN = 0.15
-"""Context kept around a box on each side, as a fraction of its longer side."""
+MARGIN = 0.03
+"""Context kept around a box on each side, as a fraction of its longer side: background is what look-alikes share."""
 
 
 @runtime_checkable
@@ -31,13 +31,12 @@ class Encoder(Protocol):
 
 
 def crop(image: Rgb, box_xyxy: Float[np.ndarray, "4"], margin: float = MARGIN) -> Rgb:
-    """The square around a box with `margin` context, clipped to the image: references and candidates are cut alike."""
+    """The box with `margin` context, clipped to the image: references and candidates are cut alike."""
     x0, y0, x1, y1 = (float(v) for v in box_xyxy)
-    half = max(x1 - x0, y1 - y0) * (0.5 + margin)
-    cx, cy = (x0 + x1) / 2, (y0 + y1) / 2
+    extra = margin * max(x1 - x0, y1 - y0)
     h, w = image.shape[:2]
-    left, top = int(np.clip(np.floor(cx - half), 0, w - 1)), int(np.clip(np.floor(cy - half), 0, h - 1))
-    right, bottom = int(np.clip(np.ceil(cx + half), left + 1, w)), int(np.clip(np.ceil(cy + half), top + 1, h))
+    left, top = int(np.clip(np.floor(x0 - extra), 0, w - 1)), int(np.clip(np.floor(y0 - extra), 0, h - 1))
+    right, bottom = int(np.clip(np.ceil(x1 + extra), left + 1, w)), int(np.clip(np.ceil(y1 + extra), top + 1, h))
     return image[top:bottom, left:right].copy()
 
 

@@ -80,7 +80,7 @@ POLICIES: dict[str, Callable[[Scene, Stack], Policy[Any]]] = {"scripted": _scrip
 """Policies by name; each is built for one scene."""
 
 
-DEMO = Study(tasks=(("widowx-pick", "pick-owl-figurine"), ("franka-pick", "pick-cup")), methods=("generic", "vap"))
+DEMO = Study(tasks=(("widowx-pick", "pick-straw-cup"), ("franka-pick", "pick-cup")), methods=("generic", "vap"))
 """The main job: one task on each robot, generic against VAP."""
 
 

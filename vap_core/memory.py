@@ -20,6 +20,8 @@ SUFFIX = ".object.safetensors"
 MAX_PIXELS = 50_000_000
 MAX_BYTES = 200_000_000
 LONG_SIDE = 1024
+KNOWN_PRESENT = 0.15
+"""A photo of the object holds one of its category, so a reference's box needs less of a score than a proposal does."""
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,63}")
 
 
@@ -60,12 +62,12 @@ def load_photo(path: Path, long_side: int | None = LONG_SIDE) -> Rgb:
 
 
 def register(
-    name: str, category: str, photos: Sequence[Rgb], detector: Detector, encoder: Encoder, *, confident: float = 0.5
+    name: str, category: str, photos: Sequence[Rgb], detector: Detector, encoder: Encoder, *, threshold: float = KNOWN_PRESENT
 ) -> tuple[PersonalObject, tuple[int, ...]]:
     """Remember one object from its reference photos.
 
-    Each photo is cropped by the same category detector that is used at test time (P 3.3); where no box reaches the score
-    `confident`, the whole photo is the crop. Also returns the indices of those photos.
+    Each photo is cropped by the same category detector that is used at test time (P 3.3), to its best box; where none scores
+    `threshold`, the whole photo is the crop. Also returns the indices of those photos.
     """
     if not NAME.fullmatch(name):
         raise BadMemory(f"register: {name!r} cannot name an object; use letters, digits, space, dot, dash or underscore.")
@@ -73,8 +75,8 @@ def register(
         raise BadMemory(f"register: {name!r} has no category; name one, for example --category cup.")
     if not photos:
         raise BadPhoto(f"register: {name!r} has no photos; give at least one, five are best.")
-    found: list[Boxes] = [detector([photo], category)[0] for photo in photos]
-    whole = tuple(i for i, boxes in enumerate(found) if not len(boxes) or boxes.score[0] < confident)
+    found: list[Boxes] = [detector([photo], category, threshold)[0] for photo in photos]
+    whole = tuple(i for i, boxes in enumerate(found) if not len(boxes))
     crops = tuple(photo if i in whole else crop(photo, boxes.xyxy[0]) for i, (photo, boxes) in enumerate(zip(photos, found, strict=True)))
     return remember(name, category, crops, encoder), whole
 

@@ -108,7 +108,7 @@ class Scripted:
         if state.phase == "close" and state.wait >= self.manner.close_steps:
             return ScriptedState(state.draw, state.goal, "lift", 0)
         if state.phase == "lift" and opening < self.manner.empty:
-            return ScriptedState(state.draw, state.goal, "seek", 0)
+            return ScriptedState(state.draw, state.goal, "above", 0)
         return ScriptedState(state.draw, state.goal, state.phase, state.wait + self.execute)
 
     def _aim(self, state: ScriptedState) -> tuple[np.ndarray, float]:

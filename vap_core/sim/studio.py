@@ -61,9 +61,9 @@ def photograph(model: ObjectModel, shots: Sequence[Shot], size: int = 320) -> li
 
 
 def reference_views(model: ObjectModel, n: int = 5, seed: int = 0, size: int = 320) -> list[Rgb]:
-    """K reference photos (P 3.1): azimuths spread around the front, elevations 15 to 50 degrees, lamp, table and framing differ from view to view."""
+    """K reference photos (P 3.1), as one walks around the object: azimuths evenly apart, elevations 18 to 50 degrees, lamp, table and framing differ from view to view."""
     rng = np.random.default_rng([seed, n, *model.name.encode()])
-    around = np.linspace(-1.2, 1.2, n) if n > 1 else np.zeros(1)
+    around = 2 * np.pi * np.arange(n) / n
     tints = rng.uniform(0.45, 0.75, (n, 1)) + rng.uniform(-0.04, 0.04, (n, 3))
     shots = [
         Shot(float(a + rng.uniform(-0.2, 0.2)), float(np.radians(rng.uniform(18, 50))), float(rng.uniform(0.52, 0.66)), float(rng.uniform(-1.2, 1.2)),
