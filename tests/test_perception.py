@@ -209,10 +209,10 @@ def test_text_is_minilm() -> None:
     assert text.embed_text([]).shape == (0, 384)
 
 
-def test_crop_is_square_with_margin_and_clipped() -> None:
+def test_crop_is_the_box_with_margin_and_clipped() -> None:
     image = noise(0, 100, 100)
-    assert np.array_equal(embed.crop(image, np.array([40.0, 30, 60, 70]), margin=0.25), image[20:80, 20:80])
-    assert embed.crop(image, np.array([90.0, 90, 100, 100])).shape == (12, 12, 3)
+    assert np.array_equal(embed.crop(image, np.array([40.0, 30, 60, 70]), margin=0.25), image[20:80, 30:70])
+    assert np.array_equal(embed.crop(image, np.array([90.0, 90, 100, 100]), margin=0.2), image[88:, 88:])
 
 
 def test_gem_lies_between_mean_and_maximum() -> None:
@@ -257,6 +257,11 @@ def test_labels_of_the_same_frame_come_back() -> None:
     found = track.propagate(keys, [track.Memory(keys, labels)], grid, local=False)
     assert (np.abs(found - labels) < 0.5).mean() > 0.98
     assert track.to_pixels(labels, grid, (224, 224)).shape == (3, 224, 224)
+
+
+@given(hnp.arrays(np.float32, (3, 4, 5), elements=st.floats(0, 1, width=16)))
+def test_strongest_is_argmax(planes: np.ndarray) -> None:
+    assert np.array_equal(track.strongest(planes), planes.argmax(axis=0))
 
 
 def test_tracker_memory_is_bounded(scene: tuple) -> None:

@@ -6,6 +6,8 @@ from jaxtyping import Bool, UInt8
 
 from vap_core.sim import objects, robots, scenes
 from vap_core.sim.objects import ObjectModel
+from vap_core.track import Tracker
+from vap_core.training.evaluation import Figures, share
 from vap_core.training.scenes import HELD_OUT, SIZE, draw, look, only_generic, scatter
 from vap_core.values import value
 
@@ -62,6 +64,39 @@ def clip(seed: int, number: int, *, frames: int = 34, hide: int = 4, jump_m: flo
             rgb.append(picture)
             masks.append(ids[None] == np.arange(1, len(models) + 1)[:, None, None])
     return Clip(np.stack(rgb), np.stack(masks), hidden, category)
+
+
+def measure(tracker: Tracker, n: int = 30, seed: int = 0) -> Figures:
+    """J (mask IoU) of the moving object before it is hidden and over the last 8 frames, identities kept, false pixels while hidden.
+
+    Clip k is hidden for k mod 7 frames; every third one also jumps 12 cm meanwhile. `kept` is IoU > 0.5 in the last frame.
+    """
+    before, after, others, kept, false_px = [], [], [], [], []
+    for number in range(n):
+        film = clip(seed, number, hide=number % 7, jump_m=0.12 if number % 3 == 2 else 0.0)
+        if not film.masks[0].any(axis=(1, 2)).all():
+            continue
+        states = tracker.start([film.rgb[0]], [film.masks[0]])
+        rows = []
+        for rgb, masks, hidden in zip(film.rgb[1:], film.masks[1:], film.hidden[1:], strict=True):
+            states, (tracks,) = tracker.step(states, [rgb])
+            found = np.stack([np.zeros_like(true) if t.mask is None else t.mask for t, true in zip(tracks, masks, strict=True)])
+            union = (found | masks).sum(axis=(1, 2))
+            rows.append(np.where(union > 0, (found & masks).sum(axis=(1, 2)) / np.maximum(union, 1), 1.0))
+            if hidden:
+                false_px.append(int(found[0].sum()))
+        score = np.array(rows)
+        before.append(score[: len(film.rgb) // 3 - 1, 0].mean())
+        after.append(score[-8:, 0].mean())
+        others.append(score[:, 1:].mean())
+        kept.append(score[-1, 0] > 0.5)
+    return {
+        "j_before": round(float(np.mean(before)), 4),
+        "j_last_8": round(float(np.mean(after)), 4),
+        "j_others": round(float(np.mean(others)), 4),
+        "identity_kept": share(int(np.sum(kept)), len(kept)),
+        "false_px_while_hidden": round(float(np.mean(false_px)), 1),
+    }
 
 
 def _cover(ids: np.ndarray, picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -95,7 +95,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     import argparse
     import json
 
-    from vap_core import detect, embed, segment
+    from vap_core import detect, embed, segment, track
+    from vap_core.training.clips import measure
     from vap_core.weights import MANIFEST, manifest
 
     parser = argparse.ArgumentParser(description=__doc__)
@@ -104,7 +105,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[224, 448])
     chosen = parser.parse_args(arguments)
     stack = detect.load(), embed.load(), segment.load()
-    figures = {f"{size}px": openings(*stack, episodes=chosen.episodes, size=size) for size in chosen.sizes}
+    figures: Figures = {f"{size}px": openings(*stack, episodes=chosen.episodes, size=size) for size in chosen.sizes}
+    figures["tracking"] = measure(track.load())
     entries = manifest(chosen.weights)
     entries["perception.safetensors"]["measured"]["openings"] = figures
     (chosen.weights / MANIFEST).write_text(json.dumps(entries, indent=1, sort_keys=True) + "\n")
