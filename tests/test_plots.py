@@ -3,8 +3,8 @@
 import numpy as np
 import pandas as pd
 import pytest
-from tests.toys import TOYS, personal, scene
 
+from tests.toys import TOYS, personal, scene
 from vap_core.attend import Attender
 from vap_core.inspection import grounding_table, iou
 from vap_core.metrics import score

@@ -18,7 +18,7 @@ from vap_core.policies import Policy
 from vap_core.sim.env import Env
 from vap_core.sim.scenes import Scene
 from vap_core.suites import Judge
-from vap_core.values import Attended, Camera, Episode, EpisodeRow, Event, Frame, Opening, Outcome, PolicyInput
+from vap_core.values import Attended, Camera, Episode, EpisodeRow, Frame, Opening, Outcome, PolicyInput
 
 REST = np.zeros(7, np.float32)
 
@@ -136,8 +136,6 @@ def _act(one: Running, raw: PolicyInput, attended: Attended, _shown: PolicyInput
     if over:
         one.outcome = one.judge.outcome()
     events = (*attended.events, *one.judge.events)
-    if one.outcome is not None:
-        events = (*events, Event(one.judge.steps, "INFO" if one.outcome.success else "ERROR", f"episode end: {one.outcome.status}"))
     frame = Frame(one.judge.steps, one.env.time_s, raw.images, attended.images, attended.tracks, cameras, raw.state, action, truth, events)
     with _timed(one.seconds, "record"):
         if one.sink is not None:

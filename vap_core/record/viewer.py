@@ -1,6 +1,7 @@
 """A still picture of a recording, drawn by rerun's own viewer without a display."""
 
 import os
+import signal
 import socket
 import subprocess
 import tempfile
@@ -39,7 +40,10 @@ def headless_viewer(size: tuple[int, int], timeout_s: float = 40.0) -> Iterator[
     command = rerun_cli(
         "--headless", "--window-size", window, "--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen", "--expect-data-soon"
     )
-    with tempfile.TemporaryFile("w+") as log, subprocess.Popen(command, stdout=log, stderr=log, env={**os.environ, "RUST_LOG": "off"}) as process:
+    with (
+        tempfile.TemporaryFile("w+") as log,
+        subprocess.Popen(command, stdout=log, stderr=log, env={**os.environ, "RUST_LOG": "off"}, start_new_session=True) as process,
+    ):
         try:
             yield connect(process, port, timeout_s)
         except (RuntimeError, ConnectionError, TimeoutError) as err:
@@ -47,7 +51,7 @@ def headless_viewer(size: tuple[int, int], timeout_s: float = 40.0) -> Iterator[
             said = " ".join(log.read().split())[-200:]
             raise MissingGL(f"screenshot: the viewer could not draw ({err}; {said}); install a software driver: apt-get install -y {DRIVER}") from err
         finally:
-            process.terminate()
+            os.killpg(process.pid, signal.SIGTERM)  # the command is a launcher: its child is the viewer
 
 
 def connect(process: subprocess.Popen[bytes], port: int, timeout_s: float) -> ViewerClient:

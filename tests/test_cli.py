@@ -1,0 +1,153 @@
+"""The real commands, in processes of their own: what they print, what they refuse, and how they mend."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from vap_core.sim.objects import get
+from vap_core.sim.studio import reference_views
+
+
+def vap(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "vap_core", *map(str, words)], capture_output=True, text=True, timeout=300)
+
+
+def refused(*words: str | Path) -> str:
+    """Run a command that must fail with one line the user can act on."""
+    done = vap(*words)
+    assert done.returncode == 2, done.stdout + done.stderr
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith("error: ")
+    assert "Traceback" not in done.stderr
+    return last
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Reference views of the personal cup as picture files, and one more of it and of two look-alikes."""
+    folder, paths = tmp_path_factory.mktemp("photos"), []
+    for i, rgb in enumerate(reference_views(get("cup-personal"), n=5)):
+        paths.append(folder / f"mug-{i}.png")
+        Image.fromarray(rgb).save(paths[-1])
+    return paths
+
+
+@pytest.fixture(scope="module")
+def line(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
+    """One picture of a look-alike, the personal cup and another look-alike side by side, and the three boxes."""
+    names = ("cup-lookalike-1", "cup-personal", "cup-lookalike-2")
+    tiles = [reference_views(get(name), n=1, seed=9)[0] for name in names]
+    path = tmp_path_factory.mktemp("line") / "line.png"
+    Image.fromarray(np.concatenate(tiles, axis=1)).save(path)
+    height, width = tiles[0].shape[:2]
+    return path, [f"{i * width},0,{(i + 1) * width},{height}" for i in range(3)]
+
+
+@pytest.fixture(scope="module")
+def bank(photos: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bank")
+    done = vap("register", "mug", "--category", "cup", "--memory", folder, *photos)
+    assert done.returncode == 0, done.stderr
+    assert "mug: a cup with 5 references" in done.stdout
+    return folder
+
+
+@pytest.mark.parametrize("command", [[], ["register"], ["ground"], ["demo"], ["rollout"], ["show"], ["doctor"], ["bench"], ["train", "perception"]])
+def test_help_has_an_example(command: list[str]) -> None:
+    done = vap(*command, "--help")
+    assert done.returncode == 0
+    assert not command or f"Example: python -m vap_core {' '.join(command)}" in " ".join(done.stdout.split())
+
+
+def test_ground_answers_in_json_with_a_picture_and_a_recording(line: tuple[Path, list[str]], bank: Path, tmp_path: Path) -> None:
+    image, boxes = line
+    hand = [word for box in boxes for word in ("--box", box)]
+    done = vap("ground", image, "bring my cup", "--object", "mug", "--memory", bank, "--out", tmp_path, "--json", *hand)
+    assert done.returncode == 0, done.stderr
+    answer = json.loads(done.stdout)
+    assert (answer["winner"], answer["instruction"], sum(answer["votes"])) == (1, "bring the red cup", 5)
+    assert np.array(answer["similarity"]).shape == (3, 5)
+    assert 0 <= answer["margin"] <= 1
+    assert (tmp_path / "line.png").stat().st_size > 20_000
+    assert subprocess.run([sys.executable, "-m", "rerun", "rrd", "verify", str(tmp_path / "line.rrd")], capture_output=True).returncode == 0
+    again = vap("ground", image, "bring my cup", "--memory", bank, "--out", tmp_path, *hand)
+    assert "-> #1" in again.stdout
+    assert (tmp_path / "line-2.rrd").exists()
+    assert not again.stderr
+
+
+def test_ground_without_boxes_warns_that_the_detector_knows_renders_only(photos: list[Path], bank: Path, tmp_path: Path) -> None:
+    done = vap("ground", photos[0], "bring my cup", "--memory", bank, "--out", tmp_path, "--json")
+    assert "not real photos" in done.stderr
+    assert json.loads(done.stdout)["winner"] == 0
+
+
+def test_nothing_found_is_an_answer_and_not_an_error(bank: Path, tmp_path: Path) -> None:
+    Image.new("RGB", (224, 224), (120, 130, 140)).save(tmp_path / "empty.png")
+    done = vap("ground", tmp_path / "empty.png", "bring my cup", "--memory", bank, "--out", tmp_path / "out", "--json")
+    assert done.returncode == 0, done.stderr
+    answer = json.loads(done.stdout)
+    assert (answer["winner"], answer["votes"], answer["instruction"]) == (None, [], "bring my cup")
+    assert (tmp_path / "out" / "empty.png").exists()
+
+
+def test_register_refuses_bad_photos_and_loses_nothing(bank: Path, photos: list[Path], tmp_path: Path) -> None:
+    (tmp_path / "note.txt").write_text("not a picture")
+    assert "cannot be read as an image" in refused("register", "x", "--category", "cup", "--memory", bank, photos[0], tmp_path / "note.txt")
+    assert "is not a file" in refused("register", "x", "--category", "cup", "--memory", bank, tmp_path / "missing.jpg")
+    assert "--replace" in refused("register", "mug", "--category", "cup", "--memory", bank, photos[0])
+    assert [path.name for path in bank.iterdir()] == ["mug.object.safetensors"]
+    assert vap("register", "x", "--category", "cup", "--memory", bank).returncode == 2
+
+
+def test_ground_refuses_what_it_cannot_match(line: tuple[Path, list[str]], bank: Path, tmp_path: Path) -> None:
+    image, boxes = line
+    common = ("--memory", bank, "--out", tmp_path, "--box", boxes[0])
+    assert 'name one as "my <category>"' in refused("ground", image, "bring the cup", *common)
+    assert "no 'shoe' is remembered" in refused("ground", image, "bring my shoe", *common)
+    assert "known: mug" in refused("ground", image, "bring my cup", "--object", "jug", *common)
+    assert "x0,y0,x1,y1" in refused("ground", image, "bring my cup", "--box", "1,2,3", "--memory", bank, "--out", tmp_path)
+    assert "no area" in refused("ground", image, "bring my cup", "--box", "9,9,3,3", "--memory", bank, "--out", tmp_path)
+    assert "known: embedded" in refused("ground", image, "bring my cup", "--stack", "psychic", *common)
+
+
+def test_ground_refuses_a_damaged_memory(line: tuple[Path, list[str]], bank: Path, tmp_path: Path) -> None:
+    whole = next(bank.iterdir()).read_bytes()
+    (tmp_path / "mug.object.safetensors").write_bytes(whole[: len(whole) // 2])
+    assert "register the object again" in refused("ground", line[0], "bring my cup", "--memory", tmp_path, "--box", line[1][0])
+
+
+def test_rollout_refuses_unknown_names_and_foreign_folders(tmp_path: Path) -> None:
+    out = ("--out", tmp_path / "run")
+    assert "known: franka-pick, widowx-pick" in refused("rollout", "--suite", "simpler", "--task", "pick-cup", *out)
+    assert "pick-bottle" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-moon", *out)
+    assert "known: generic" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--method", "magic", *out)
+    assert "known: scripted" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--policy", "pi9", *out)
+    assert not (tmp_path / "run").exists()
+    (tmp_path / "thesis.txt").write_text("dear")
+    assert "choose another folder" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--out", tmp_path)
+    assert "cannot be written" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--out", "/proc/run")
+
+
+def test_show_refuses_what_is_no_recording(tmp_path: Path) -> None:
+    (tmp_path / "x.rrd").write_bytes(b"RRF2garbage")
+    assert "x.rrd" in refused("show", tmp_path / "x.rrd", tmp_path / "x.png")
+
+
+def test_doctor_finds_this_machine_able() -> None:
+    done = vap("doctor")
+    assert done.returncode == 0, done.stdout
+    assert "MISSING" not in done.stdout
+    assert "Grounding DINO" in done.stdout
+
+
+def test_doctor_fails_where_nothing_can_be_rendered() -> None:
+    code = "import os, sys; os.environ['MUJOCO_GL'] = 'nonsense'; sys.argv = ['vap_core', 'doctor']; from vap_core.cli import main; main()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "MISSING" in done.stdout

@@ -1,0 +1,152 @@
+"""The main job from end to end: killed, resumed, and read back; the closed loop's determinism."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vap_core.experiments import DEMO, Study, make_trial, register_personal
+from vap_core.record import Recorder, read_summary, recording_name
+from vap_core.rollout import rollout
+from vap_core.store import read
+from vap_core.values import Episode, PolicyInput
+
+ENV = {**os.environ, "OMP_NUM_THREADS": "1"}
+
+
+def command(out: Path, episodes: int) -> list[str]:
+    return [sys.executable, "-m", "vap_core", "demo", "--out", str(out), "--episodes", str(episodes), "--workers", "2"]
+
+
+@pytest.mark.slow
+def test_killed_then_resumed_it_ends_with_the_whole_table(tmp_path: Path) -> None:
+    out = tmp_path / "demo"
+    with subprocess.Popen(command(out, 6), env=ENV, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True) as first:
+        deadline = time.monotonic() + 240
+        while not list(out.glob("parts/*.parquet")) and time.monotonic() < deadline:
+            time.sleep(0.3)
+        os.killpg(first.pid, signal.SIGKILL)
+    before = {p.name for p in out.glob("parts/*.parquet")}
+    assert before, "killed before anything was stored"
+    assert len(read(out)) < 24
+    done = subprocess.run(command(out, 6), env=ENV, capture_output=True, text=True, timeout=400)
+    assert done.returncode == 0, done.stderr
+    assert before <= {p.name for p in out.glob("parts/*.parquet")}
+    _complete(out, done.stdout)
+    again = subprocess.run(command(out, 6), env=ENV, capture_output=True, text=True, timeout=120)
+    assert again.stdout == done.stdout
+    other = subprocess.run(command(out, 2), env=ENV, capture_output=True, text=True, timeout=120)
+    assert other.returncode == 2
+    assert "holds another run" in other.stderr
+
+
+def _complete(out: Path, printed: str) -> None:
+    lines = json.loads((out / "summary.json").read_text())
+    assert [(s["suite"], s["method"], s["n"]) for s in lines] == [(suite, m, 6) for suite, _ in DEMO.tasks for m in ("generic", "vap")]
+    assert all({"task", "sr", "cmr", "wrong_object", "intervals", "errors"} <= s.keys() for s in lines)
+    assert all(s["errors"] == 0 for s in lines)
+    assert "CMR % [95 %]" in printed
+    assert "scripted" in printed
+    assert (out / "figure.png").stat().st_size > 10_000
+    recordings = sorted((out / "recordings").glob("*.rrd"))
+    assert len(recordings) == 24
+    for recording in recordings[::5]:
+        done = subprocess.run([sys.executable, "-m", "rerun", "rrd", "verify", str(recording)], capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout + done.stderr
+    told = {(r["suite"], r["episode"], r["method"]): r["success"] for r in read(out).to_dict("records")}
+    for recording in recordings[::6]:
+        said = read_summary(recording)
+        assert said["outcome.success"] == told[said["rollout.suite"], said["rollout.episode"], said["rollout.method"]]
+
+
+@pytest.fixture(scope="module")
+def bank(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("memory")
+    register_personal(DEMO, folder)
+    return folder
+
+
+STUDY = replace(DEMO, episodes=3)
+SUITE, TASK = DEMO.tasks[0]
+
+
+def same(one: Episode, other: Episode) -> None:
+    assert one.outcome.steps == other.outcome.steps
+    assert one.summary().items() >= {k: v for k, v in other.summary().items() if not k.startswith("seconds")}.items()
+    for a, b in zip(one.frames, other.frames, strict=True):
+        assert (a.action == b.action).all()
+        assert (a.state == b.state).all()
+
+
+def test_batched_equals_one_by_one_and_global_seeds_change_nothing(bank: Path) -> None:
+    trial = make_trial(STUDY, SUITE, TASK, "vap", bank)
+    rows = STUDY.rows(SUITE, TASK)
+    together = list(rollout(trial, rows, batch=3))
+    np.random.seed(123)  # noqa: NPY002
+    alone = list(rollout(trial, rows, batch=1))
+    for one, other in zip(together, alone, strict=True):
+        same(one, other)
+
+
+def test_the_prompt_reaches_the_policy_and_only_the_prompt(bank: Path) -> None:
+    seen: list[PolicyInput] = []
+    trial = make_trial(STUDY, SUITE, TASK, "vap", bank)
+
+    class Witness:
+        label, execute = trial.policy.label, trial.policy.execute
+        start = trial.policy.start
+
+        def plan(self, states, inputs):  # type: ignore[no-untyped-def]
+            seen.extend(inputs)
+            return trial.policy.plan(states, inputs)
+
+    row = replace(STUDY.rows(SUITE, TASK)[0], max_steps=2)
+    (episode,) = rollout(replace(trial, policy=Witness()), [row], keep_images=True)
+    frame = episode.frames[0]
+    assert seen[0].text == episode.opening.rewritten == f"pick up the red {row.category}"
+    assert seen[0].images["front"] is frame.prompted["front"]
+    changed = (frame.images["front"] != frame.prompted["front"]).any(axis=2)
+    assert changed.any()
+    assert (changed <= frame.tracks["front"][0].mask).all()
+
+
+def test_generic_sees_raw_images_and_raw_words(bank: Path) -> None:
+    trial = make_trial(STUDY, SUITE, TASK, "generic", bank)
+    (episode,) = rollout(trial, [replace(STUDY.rows(SUITE, TASK)[0], max_steps=2)], keep_images=True)
+    assert episode.opening.rewritten == episode.opening.instruction
+    assert all((f.images["front"] == f.prompted["front"]).all() for f in episode.frames)
+
+
+def test_an_episode_that_breaks_is_an_error_with_its_traceback_and_its_recording(bank: Path, tmp_path: Path) -> None:
+    trial = make_trial(STUDY, SUITE, TASK, "generic", bank)
+
+    class Breaks:
+        label, execute = "scripted", trial.policy.execute
+        start = trial.policy.start
+        asked = 0
+
+        def plan(self, states, inputs):  # type: ignore[no-untyped-def]
+            self.asked += 1
+            if self.asked == 3:
+                raise RuntimeError("the policy fell over")
+            return trial.policy.plan(states, inputs)
+
+    rows = STUDY.rows(SUITE, TASK)[:1]
+    path = tmp_path / recording_name(rows[0], "generic")
+    (episode,) = rollout(replace(trial, policy=Breaks()), rows, lambda opening: Recorder(path, opening))
+    assert (episode.outcome.status, episode.outcome.success) == ("error", False)
+    assert "the policy fell over" in episode.outcome.detail
+    assert len(episode.frames) == 4
+    assert read_summary(path)["frames"] == 4
+
+
+def test_study_refuses_unknown_names() -> None:
+    with pytest.raises(Exception, match="known: embedded|known: franka"):
+        Study((("nowhere", "pick-cup"),), ("vap",))
