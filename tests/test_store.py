@@ -30,6 +30,13 @@ def test_the_same_episode_counts_once(tmp_path: Path) -> None:
     assert read(run)[KEY].to_records(index=False).tolist() == [("s", "t", "vap", 0)]
 
 
+def test_parts_of_methods_with_and_without_a_margin_join(tmp_path: Path) -> None:
+    run = open_run(tmp_path / "run", {})
+    append(run, [{**ROW, "margin": 0.6, "detail": ""}])
+    append(run, [{**ROW, "method": "generic", "margin": float("nan"), "detail": ""}])
+    assert read(run).margin.tolist()[1] == 0.6
+
+
 def test_a_part_cut_short_is_not_seen(tmp_path: Path) -> None:
     run = open_run(tmp_path / "run", {})
     append(run, [ROW])

@@ -61,11 +61,13 @@ def append(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 def read(folder: Path) -> "pd.DataFrame":
     """Every finished episode, in the order of their keys; an episode that ran twice counts once."""
     import pandas as pd
+    from pyarrow import concat_tables
+    from pyarrow.parquet import read_table
 
-    parts = [pd.read_parquet(part) for part in sorted((folder / "parts").glob("*.parquet"))]
+    parts = [read_table(part) for part in sorted((folder / "parts").glob("*.parquet"))]
     if not parts:
         return pd.DataFrame(columns=KEY)
-    return pd.concat(parts, ignore_index=True).drop_duplicates(KEY).sort_values(KEY, ignore_index=True)
+    return concat_tables(parts, promote_options="permissive").to_pandas().drop_duplicates(KEY).sort_values(KEY, ignore_index=True)
 
 
 def write_atomic(path: Path, data: bytes) -> None:

@@ -61,7 +61,10 @@ def photograph(model: ObjectModel, shots: Sequence[Shot], size: int = 320) -> li
 
 
 def reference_views(model: ObjectModel, n: int = 5, seed: int = 0, size: int = 320) -> list[Rgb]:
-    """K reference photos (P 3.1), as one walks around the object: azimuths evenly apart, elevations 18 to 50 degrees, lamp, table and framing differ from view to view."""
+    """K reference photos (P 3.1), as one walks around the object: azimuths evenly apart, elevations 18 to 50 degrees.
+
+    Lamp, table and framing differ from view to view.
+    """
     rng = np.random.default_rng([seed, n, *model.name.encode()])
     around = 2 * np.pi * np.arange(n) / n
     tints = rng.uniform(0.45, 0.75, (n, 1)) + rng.uniform(-0.04, 0.04, (n, 3))
