@@ -92,7 +92,7 @@ def scores_figure(scores: Sequence[Score]) -> "Figure":
         axes.set_ylim(0, 105)
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("% of episodes, 95 % interval")
-    panels[0].legend(frameon=False, loc="upper center")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     return figure
 
 

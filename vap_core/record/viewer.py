@@ -7,7 +7,8 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -108,6 +109,7 @@ def view(rrd: Path, *, width: int = 1100, height: int = 680) -> "Viewer":
     from rerun.notebook import Viewer
 
     read_summary(rrd)
-    viewer = Viewer(width=width, height=height, use_global_recording=False)
-    viewer._flush_hook(rrd.read_bytes())
+    with redirect_stdout(StringIO()):  # the widget announces the port of its asset server
+        viewer = Viewer(width=width, height=height, use_global_recording=False)
+        viewer._flush_hook(rrd.read_bytes())
     return viewer
