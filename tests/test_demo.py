@@ -147,6 +147,21 @@ def test_an_episode_that_breaks_is_an_error_with_its_traceback_and_its_recording
     assert read_summary(path)["frames"] == 4
 
 
+def test_a_dead_worker_is_said_and_what_was_done_stays(tmp_path: Path) -> None:
+    out = tmp_path / "demo"
+    code = (
+        "import os, vap_core.engine as e, vap_core.experiments as x\n"
+        "from dataclasses import replace; from pathlib import Path\n"
+        "def work(job): os.kill(os.getpid(), 9)\n"
+        "e.work = work\n"
+        f"\nif __name__ == '__main__': e.run(replace(x.DEMO, episodes=1), Path({str(out)!r}), progress=False)\n"
+    )
+    (tmp_path / "die.py").write_text(code)
+    done = subprocess.run([sys.executable, str(tmp_path / "die.py")], env=ENV, capture_output=True, text=True, timeout=200)
+    assert "WorkerDied: engine: a worker process died" in done.stderr.strip().splitlines()[-1]
+    assert (out / "run.json").exists()
+
+
 def test_study_refuses_unknown_names() -> None:
     with pytest.raises(Exception, match="known: embedded|known: franka"):
         Study((("nowhere", "pick-cup"),), ("vap",))

@@ -3,12 +3,14 @@
 import os
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vap_core import store
+from vap_core.errors import WorkerDied
 from vap_core.experiments import Study, make_trial, register_personal
 from vap_core.values import EpisodeRow, Opening
 
@@ -83,9 +85,12 @@ def _work(jobs: list[Job], workers: int) -> Iterator[tuple[Job, list[dict[str, A
         try:
             for future in as_completed(futures):
                 yield futures[future], future.result()
-        except BaseException:
+        except BrokenProcessPool as error:
+            raise WorkerDied(
+                "engine: a worker process died, perhaps for lack of memory; run the same command again, with fewer --workers."
+            ) from error
+        finally:
             pool.shutdown(wait=False, cancel_futures=True)
-            raise
 
 
 def _recorders(folder: Path) -> Any:

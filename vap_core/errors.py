@@ -41,6 +41,10 @@ class OutOfReach(VapError):
     """A pose that inverse kinematics cannot reach."""
 
 
+class WorkerDied(VapError):
+    """A worker process that was killed; what it had not finished runs again."""
+
+
 def one_of(what: str, name: str, known: object) -> UnknownName:
     """The error for a name that a registry lacks: `one_of("make_env: task", "x", TASKS)` lists what it holds."""
     names = ", ".join(sorted(str(key) for key in known))  # type: ignore[attr-defined]

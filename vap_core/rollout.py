@@ -14,11 +14,12 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from vap_core.attend import Attender, AttendState
+from vap_core.errors import VapError
 from vap_core.policies import Policy
 from vap_core.sim.env import Env
 from vap_core.sim.scenes import Scene
 from vap_core.suites import Judge
-from vap_core.values import Attended, Camera, Episode, EpisodeRow, Frame, Opening, Outcome, PolicyInput
+from vap_core.values import Attended, Episode, EpisodeRow, Frame, Opening, Outcome, PolicyInput
 
 REST = np.zeros(7, np.float32)
 
@@ -156,9 +157,14 @@ def _end(one: Running) -> Episode:
 
 
 def _guard[**P, R](one: Running, work: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R | None:
-    """Run one episode's share of a step; its failure ends that episode alone, as an error that keeps its traceback."""
+    """Run one episode's share of a step; its failure ends that episode alone, as an error that keeps its traceback.
+
+    What the user can mend (a full disk, an absent weight) is no episode's fault and ends the run instead.
+    """
     try:
         return work(*args, **kwargs)
+    except VapError:
+        raise
     except Exception:
         one.outcome = one.judge.outcome("error", traceback.format_exc(limit=8))
         return None
@@ -171,6 +177,3 @@ def _timed(seconds: dict[str, float], part: str) -> Iterator[None]:
         yield
     finally:
         seconds[part] += time.perf_counter() - start
-
-
-__all__ = ["Camera", "Sink", "Trial", "rollout"]

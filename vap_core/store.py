@@ -52,10 +52,13 @@ def open_run(folder: Path, configuration: Mapping[str, Any]) -> Path:
 
 
 def append(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Add finished episodes as one new part."""
+    """Add finished episodes as one new part. Raises BadOutput when the disk is full."""
     import pandas as pd
 
-    write_atomic(folder / "parts" / f"{uuid4().hex}.parquet", pd.DataFrame(list(rows)).to_parquet(index=False))
+    try:
+        write_atomic(folder / "parts" / f"{uuid4().hex}.parquet", pd.DataFrame(list(rows)).to_parquet(index=False))
+    except OSError as error:
+        raise BadOutput(f"append: {folder} cannot be written ({error.strerror}); make room and run the same command again.") from error
 
 
 def read(folder: Path) -> "pd.DataFrame":
