@@ -106,10 +106,10 @@ def view(rrd: Path, *, width: int = 1100, height: int = 680) -> "Viewer":
 
     A saved notebook keeps no widget: show a `screenshot` beside it. Raises: BadRecording, when `rrd` cannot be read.
     """
-    from rerun.notebook import Viewer
-
     read_summary(rrd)
-    with redirect_stdout(StringIO()):  # the widget announces the port of its asset server
+    with redirect_stdout(StringIO()):  # rerun announces the port of its asset server
+        from rerun.notebook import Viewer
+
         viewer = Viewer(width=width, height=height, use_global_recording=False)
         viewer._flush_hook(rrd.read_bytes())
     return viewer
