@@ -1,9 +1,11 @@
 """The whole method on a world whose every answer is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from tests.toys import TOYS, personal, scene
+from tests.toys import TOYS, SameColour, personal, scene
 from vap_core.attend import Attender, Prompting, load_stack
 from vap_core.errors import BadInstruction, UnknownName
 from vap_core.prompt import PALETTE, tint
@@ -84,6 +86,29 @@ def test_two_targets_two_colours() -> None:
     moved = scene([(4, 20, GREY), (24, 40, TEAL), (44, 5, SAND)])
     _, attended = attender.step(state, {"front": moved})
     assert (attended.images["front"] == tint(tint(moved, where(moved, TEAL), RED), where(moved, SAND), BLUE)).all()
+
+
+def test_one_object_proposed_for_two_phrases_is_tracked_once() -> None:
+    """Two phrases that find the same boxes must not make rival identities of one object."""
+    started: list[int] = []
+
+    class Counting(SameColour):
+        def start(self, images, masks):  # type: ignore[no-untyped-def]
+            started.extend(len(of_view) for of_view in masks)
+            return super().start(images, masks)
+
+    attender = Attender(replace(TOYS, tracker=Counting()), MEMORY)
+    state, attended = attender.start({"front": LINE}, "put my cup near my vase")
+    assert started == [3]
+    assert state.ids == {"front": (1, 2)}
+    assert not any("share one object" in e.text for e in attended.events)
+
+
+def test_two_targets_on_one_object_is_a_warning_and_tints_once() -> None:
+    memory = {"one": CUP, "two": personal("two", "cup", TEAL)}
+    _, attended = Attender(TOYS, memory).start({"front": LINE}, "put my cup near my cup", objects=["one", "two"])
+    assert any(e.level == "WARN" and "two targets share one object" in e.text for e in attended.events)
+    assert (attended.images["front"] == tint(LINE, where(LINE, TEAL), attended.colours[0])).all()
 
 
 def test_mirrored_views_mirror_the_answer() -> None:

@@ -93,6 +93,7 @@ def test_nothing_found_is_an_answer_and_not_an_error(bank: Path, tmp_path: Path)
     assert done.returncode == 0, done.stderr
     answer = json.loads(done.stdout)
     assert (answer["winner"], answer["votes"], answer["instruction"]) == (None, [], "bring my cup")
+    assert [line for line in done.stderr.splitlines() if not line.startswith("note:")] == []
     assert (tmp_path / "out" / "empty.png").exists()
 
 
@@ -103,6 +104,8 @@ def test_register_refuses_bad_photos_and_loses_nothing(bank: Path, photos: list[
     assert "--replace" in refused("register", "mug", "--category", "cup", "--memory", bank, photos[0])
     assert [path.name for path in bank.iterdir()] == ["mug.object.safetensors"]
     assert vap("register", "x", "--category", "cup", "--memory", bank).returncode == 2
+    assert "cannot name an object" in refused("register", "../x", "--whole", "--category", "cup", "--memory", bank, photos[0])
+    assert "cannot be a category" in refused("register", "x", "--whole", "--category", "cup!", "--memory", bank, photos[0])
 
 
 def test_ground_refuses_what_it_cannot_match(line: tuple[Path, list[str]], bank: Path, tmp_path: Path) -> None:
@@ -132,6 +135,16 @@ def test_rollout_refuses_unknown_names_and_foreign_folders(tmp_path: Path) -> No
     (tmp_path / "thesis.txt").write_text("dear")
     assert "choose another folder" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--out", tmp_path)
     assert "cannot be written" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--out", "/proc/run")
+
+
+def test_a_picture_in_the_output_folder_is_never_overwritten(line: tuple[Path, list[str]], bank: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "mine.png"
+    mine.write_bytes(line[0].read_bytes())
+    done = vap("ground", mine, "bring my cup", "--memory", bank, "--out", tmp_path, "--box", line[1][0])
+    assert done.returncode == 0, done.stderr
+    assert "the only candidate" in done.stdout
+    assert mine.read_bytes() == line[0].read_bytes()
+    assert (tmp_path / "mine-2.png").exists()
 
 
 def test_show_refuses_what_is_no_recording(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -12,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vap_core.errors import BadOutput, UnknownName
 from vap_core.experiments import DEMO, Study, make_trial, register_personal
 from vap_core.record import Recorder, read_summary, recording_name
 from vap_core.rollout import rollout
-from vap_core.store import read
+from vap_core.store import locked, open_run, read
 from vap_core.values import Episode, PolicyInput
 
 ENV = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -32,7 +32,7 @@ def test_killed_then_resumed_it_ends_with_the_whole_table(tmp_path: Path) -> Non
         deadline = time.monotonic() + 240
         while not list(out.glob("parts/*.parquet")) and time.monotonic() < deadline:
             time.sleep(0.3)
-        os.killpg(first.pid, signal.SIGKILL)
+        first.kill()  # the parent alone: its workers must notice and end
     before = {p.name for p in out.glob("parts/*.parquet")}
     assert before, "killed before anything was stored"
     assert len(read(out)) < 24
@@ -147,6 +147,25 @@ def test_an_episode_that_breaks_is_an_error_with_its_traceback_and_its_recording
     assert read_summary(path)["frames"] == 4
 
 
+def test_an_error_before_the_first_step_keeps_its_method_and_its_place(bank: Path) -> None:
+    trial = make_trial(STUDY, SUITE, TASK, "vap", bank)
+
+    class Blind:
+        def start(self, views, instruction):  # type: ignore[no-untyped-def]
+            raise RuntimeError("the detector fell over")
+
+    rows = STUDY.rows(SUITE, TASK)[:2]
+    episodes = list(rollout(replace(trial, attender=Blind()), rows))
+    assert [(e.outcome.status, e.summary()["method"], e.summary()["policy"]) for e in episodes] == [("error", "vap", "scripted")] * 2
+    assert "the detector fell over" in episodes[0].outcome.detail
+
+
+def test_a_run_in_use_is_left_alone(tmp_path: Path) -> None:
+    run = open_run(tmp_path / "run", {})
+    with locked(run), pytest.raises(BadOutput, match="another process is working"), locked(run):
+        pass
+
+
 def test_a_dead_worker_is_said_and_what_was_done_stays(tmp_path: Path) -> None:
     out = tmp_path / "demo"
     code = (
@@ -163,5 +182,5 @@ def test_a_dead_worker_is_said_and_what_was_done_stays(tmp_path: Path) -> None:
 
 
 def test_study_refuses_unknown_names() -> None:
-    with pytest.raises(Exception, match="known: embedded|known: franka"):
+    with pytest.raises(UnknownName, match="known: franka-pick, widowx-pick"):
         Study((("nowhere", "pick-cup"),), ("vap",))

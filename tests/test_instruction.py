@@ -34,6 +34,8 @@ def test_golden(text: str, category: str, rewritten: str) -> None:
 
 def test_owner_is_kept() -> None:
     assert parse("bring my brother's cup").targets[0].owner == "my brother's"
+    assert parse("bring my old brother's cup").targets[0].category == "cup"
+    assert rewrite(parse("bring my friends' cup"), [RED]) == "bring the red cup"
 
 
 def test_several_targets() -> None:

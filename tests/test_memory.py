@@ -11,7 +11,7 @@ from PIL import Image
 
 from tests.toys import TOYS, personal, scene
 from vap_core.errors import BadMemory, BadOutput, BadPhoto
-from vap_core.memory import load, load_bank, load_photo, register, save
+from vap_core.memory import load, load_bank, load_photo, register, remember, save
 
 TEAL = (40, 120, 110)
 
@@ -43,13 +43,16 @@ def test_register_uses_the_whole_photo_where_nothing_is_found() -> None:
     ("name", "category", "photos", "error"),
     [
         ("../escape", "cup", 1, "cannot name an object"),
-        ("mug", " ", 1, "has no category"),
+        ("mug", " ", 1, "cannot be a category"),
         ("mug", "cup", 0, "has no photos; give at least one"),
     ],
 )
 def test_register_says_what_is_missing(name: str, category: str, photos: int, error: str) -> None:
+    pictures = [scene([(4, 8, TEAL)])] * photos
     with pytest.raises((BadMemory, BadPhoto), match=error):
-        register(name, category, [scene([(4, 8, TEAL)])] * photos, TOYS.detector, TOYS.encoder)
+        register(name, category, pictures, TOYS.detector, TOYS.encoder)
+    with pytest.raises((BadMemory, BadPhoto), match=error):
+        remember(name, category, pictures, TOYS.encoder)
 
 
 def test_an_object_is_never_overwritten_unasked(tmp_path: Path) -> None:
@@ -93,7 +96,7 @@ def test_a_lying_header_is_damage(tmp_path: Path) -> None:
 
 def test_another_encoder_is_said(tmp_path: Path) -> None:
     path = save(tmp_path, personal("mug", "cup", TEAL))
-    with pytest.raises(BadMemory, match="mean-colour.*register the object again with this stack"):
+    with pytest.raises(BadMemory, match="mean-colour.*register the object again"):
         load(path, "dinov2")
 
 

@@ -63,7 +63,8 @@ def test_a_colour_in_view_is_not_chosen() -> None:
     top = np.zeros((8, 8), bool)
     top[:4] = True
     assert choose_colours(1, [(rgb, [top])])[0].name == "blue"
-    assert choose_colours(1, [(rgb, [~top])])[0].name == "red"
+    assert choose_colours(1, [(rgb, [~top])])[0].name == "blue"
+    assert choose_colours(1, [(rgb * np.uint8(0), [top])])[0].name == "red"
     assert choose_colours(1, [])[0].name == "red"
 
 

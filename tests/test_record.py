@@ -254,7 +254,8 @@ def test_rerun_verifies_every_finished_recording(tmp_path: Path, cameras: int, n
 
 def test_a_view_without_candidates_and_a_lost_track_are_results(tmp_path: Path) -> None:
     record(tmp_path / "one.rrd", opening(2, "side"), lost=range(4, 7))
-    assert columns(tmp_path / "one.rrd", "/vap/votes/side", "counts") == {0: []}
+    assert columns(tmp_path / "one.rrd", "/vap/votes/side", "counts") == {}
+    assert columns(tmp_path / "one.rrd", "/vap/candidates/side", "winner") == {0: [-1]}
     assert columns(tmp_path / "one.rrd", "/vap/candidates/side", "winner") == {0: [-1]}
     buffers = columns(tmp_path / "one.rrd", "/observation.images.front/mask/target", "SegmentationImage:buffer")
     assert [step for step, buffer in buffers.items() if not np.any(buffer)] == [4, 5, 6]

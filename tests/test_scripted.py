@@ -51,6 +51,8 @@ def look(rgb: Rgb, text: str) -> PolicyInput:
         ("pick up the cup", None, "cup"),
         ("put the blue owl figurine", "blue", "owl figurine"),
         ("cup", None, "cup"),
+        ("put the red cup on the table", "red", "cup"),
+        ("take the blue pen holder and lift it", "blue", "pen holder"),
     ],
 )
 def test_reads_colour_and_category(text: str, colour: str | None, category: str) -> None:

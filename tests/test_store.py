@@ -44,6 +44,14 @@ def test_a_part_cut_short_is_not_seen(tmp_path: Path) -> None:
     assert len(read(run)) == 1
 
 
+def test_a_damaged_part_is_named(tmp_path: Path) -> None:
+    run = open_run(tmp_path / "run", {})
+    append(run, [ROW])
+    next((run / "parts").glob("*.parquet")).write_bytes(b"PAR1garbage")
+    with pytest.raises(BadOutput, match=r"\.parquet is damaged; delete it"):
+        read(run)
+
+
 def test_an_empty_run_is_an_empty_table(tmp_path: Path) -> None:
     assert read(open_run(tmp_path / "run", {})).empty
 

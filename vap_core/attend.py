@@ -6,6 +6,9 @@
     policy(attended.images, attended.text)
 
 Views are grounded independently. A view without candidates, or whose tracker lost the target, passes unmodified.
+
+Arrays: images are RGB, h x w x 3, uint8; boxes are n x 4 `x0 y0 x1 y1` in that image's pixels, far corner exclusive; masks are
+n x h x w, bool; embeddings are n (candidates) or k (references) rows of d numbers, each row of length 1; cosines are n x k.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -22,6 +25,9 @@ from vap_core.memory import recall
 from vap_core.prompt import ALPHA, PALETTE, choose_colours, tint
 from vap_core.values import Attended, Boxes, Colour, Event, Grounding, Instruction, PersonalObject, Rgb, Track, Views, value
 from vap_core.vote import Rule, similarity, vote
+
+SAME_BOX = 0.7
+"""Boxes of two phrases that overlap by more than this IoU are the same object."""
 
 
 @dataclass(frozen=True)
@@ -49,12 +55,12 @@ class Prompting:
 
 @value
 class Seen:
-    """The candidates of one phrase in one view; candidate i has identity `first_id` + i in that view's tracker."""
+    """The candidates of one phrase in one view; candidate i has identity `ids[i]` in that view's tracker."""
 
     candidates: Boxes
     embeddings: Float32[np.ndarray, "n d"]
     masks: Bool[np.ndarray, "n h w"]
-    first_id: int
+    ids: tuple[int, ...]
 
 
 @value
@@ -102,19 +108,17 @@ class Attender:
         for phrase in dict.fromkeys(target.category for target in parsed.targets):
             found = [boxes[c] for c in cameras] if boxes is not None else self.stack.detector([views[c] for c in cameras], phrase)
             for camera, candidates in zip(cameras, found, strict=True):
-                first_id = sum(len(other.candidates) for other in seen[camera].values())
-                seen[camera][phrase] = self._look(views[camera], candidates, first_id)
+                seen[camera][phrase] = self._look(views[camera], candidates, tuple(seen[camera].values()))
 
         pairs = list(zip([target.category for target in parsed.targets], wanted, strict=True))
         groundings = {camera: tuple(self._ground(camera, obj, seen[camera][phrase]) for phrase, obj in pairs) for camera in cameras}
         ids = {
             camera: tuple(
-                None if g.winner is None else seen[camera][phrase].first_id + g.winner
-                for (phrase, _), g in zip(pairs, groundings[camera], strict=True)
+                None if g.winner is None else seen[camera][phrase].ids[g.winner] for (phrase, _), g in zip(pairs, groundings[camera], strict=True)
             )
             for camera in cameras
         }
-        masks = {camera: np.concatenate([part.masks for part in seen[camera].values()]) for camera in cameras}
+        masks = {camera: _masks_by_id(tuple(seen[camera].values())) for camera in cameras}
 
         colours = choose_colours(len(wanted), [(views[camera], list(masks[camera])) for camera in cameras], self.prompting.palette)
         named = [colour if any(ids[camera][j] is not None for camera in cameras) else None for j, colour in enumerate(colours)]
@@ -123,11 +127,19 @@ class Attender:
         trackers = dict(zip(tracked, self.stack.tracker.start([views[c] for c in tracked], [masks[c] for c in tracked]), strict=True))
         tracks = {camera: tuple(Track(g.mask, 0.0 if g.mask is None else 1.0) for g in groundings[camera]) for camera in cameras}
         state = AttendState(0, parsed, colours, text, groundings, ids, trackers, _visible(tracks))
-        events = tuple(_describe(g) for per_view in groundings.values() for g in per_view)
+        events = (*(_describe(g) for per_view in groundings.values() for g in per_view), *_shared(ids))
         return state, self._prompt(state, views, tracks, events)
 
     def step(self, state: AttendState, views: Views) -> tuple[AttendState, Attended]:
-        """Follow every target by the tracker alone and prompt the new images (t > 0). Consumes `state`."""
+        """Follow every target by the tracker alone and prompt the new images (t > 0). Consumes `state`.
+
+        Raises:
+            ValueError: `views` are not of the cameras that the episode started with.
+        """
+        if set(views) != set(state.groundings):
+            raise ValueError(
+                f"Attender.step: views of {sorted(views)}, but the episode started with {sorted(state.groundings)}; give the same cameras."
+            )
         cameras = list(state.trackers)
         trackers, found = self.stack.tracker.step([state.trackers[c] for c in cameras], [views[c] for c in cameras])
         by_camera = dict(zip(cameras, found, strict=True))
@@ -140,10 +152,19 @@ class Attender:
         state = replace(state, frame_index=index, trackers=dict(zip(cameras, trackers, strict=True)), visible=visible)
         return state, self._prompt(state, views, tracks, (*lost, *back))
 
-    def _look(self, rgb: Rgb, candidates: Boxes, first_id: int) -> Seen:
-        """Embed and segment every candidate of one view."""
+    def _look(self, rgb: Rgb, candidates: Boxes, before: tuple[Seen, ...]) -> Seen:
+        """Embed and segment every candidate of one view; what an earlier phrase proposed too keeps its identity."""
         embeddings = self.stack.encoder([embed.crop(rgb, box) for box in candidates.xyxy])
-        return Seen(candidates, embeddings, self.stack.segmenter(rgb, candidates), first_id)
+        known = np.concatenate([np.zeros((0, 4), np.float32), *(part.candidates.xyxy for part in before)])
+        known_ids = [i for part in before for i in part.ids]
+        ids, fresh = [], 1 + max(known_ids, default=-1)
+        for overlap in detect.box_iou(candidates.xyxy, known):
+            if len(known) and overlap.max() > SAME_BOX:
+                ids.append(known_ids[int(overlap.argmax())])
+            else:
+                ids.append(fresh)
+                fresh += 1
+        return Seen(candidates, embeddings, self.stack.segmenter(rgb, candidates), tuple(ids))
 
     def _ground(self, camera: str, obj: PersonalObject, seen: Seen) -> Grounding:
         cosine = similarity(seen.embeddings, obj.embeddings)
@@ -154,9 +175,11 @@ class Attender:
         images = dict(views)
         if self.prompting.highlight:
             for camera, per_target in tracks.items():
+                free = np.ones(views[camera].shape[:2], bool)  # a pixel that two targets claim is tinted once
                 for track, colour in zip(per_target, state.colours, strict=True):
                     if track.mask is not None:
-                        images[camera] = tint(images[camera], track.mask, colour, self.prompting.alpha)
+                        images[camera] = tint(images[camera], track.mask & free, colour, self.prompting.alpha)
+                        free &= ~track.mask
         return Attended(images, state.text, state.colours, tracks, state.groundings, events)
 
 
@@ -177,6 +200,19 @@ def load_stack(name: str) -> Stack:
 
 def _visible(tracks: Mapping[str, tuple[Track, ...]]) -> frozenset[tuple[str, int]]:
     return frozenset((camera, j) for camera, per_target in tracks.items() for j, track in enumerate(per_target) if track.mask is not None)
+
+
+def _masks_by_id(parts: tuple[Seen, ...]) -> Bool[np.ndarray, "n h w"]:
+    """One mask per identity, in the order of identities."""
+    masks, ids = np.concatenate([part.masks for part in parts]), [i for part in parts for i in part.ids]
+    return masks[[ids.index(i) for i in range(1 + max(ids, default=-1))]]
+
+
+def _shared(ids: Mapping[str, tuple[int | None, ...]]) -> list[Event]:
+    """A warning for every view in which two targets were matched with the same object."""
+    found = {camera: [i for i in per_target if i is not None] for camera, per_target in ids.items()}
+    doubled = [camera for camera, of_view in found.items() if len(set(of_view)) < len(of_view)]
+    return [Event(0, "WARN", f"{camera}: two targets share one object, at most one is right") for camera in doubled]
 
 
 def _describe(g: Grounding) -> Event:

@@ -24,7 +24,8 @@ app.add_typer(train_app, name="train")
 Memory = Annotated[Path, typer.Option(help="Folder of remembered objects.")]
 StackName = Annotated[str, typer.Option("--stack", help="Perception stack: embedded (offline, CPU).")]
 BANK = Path("data/memory")
-NOTE = "note: the embedded detector knows {domain} only, not real photos; on a real photo trust its boxes only after a look, or give --box."
+INTERRUPTED = 130
+NOTE = "note: the embedded detector knows {domain} only, not real photos; {mend}."
 
 
 def main() -> None:
@@ -35,9 +36,10 @@ def main() -> None:
     except VapError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
-    except KeyboardInterrupt:
-        print("interrupted; run the same command again and it goes on where it stopped.", file=sys.stderr)
-        sys.exit(130)
+    except SystemExit as stop:
+        if stop.code == INTERRUPTED:
+            print("interrupted; run the same command again, it goes on where it stopped.", file=sys.stderr)
+        raise
 
 
 @app.command()
@@ -60,7 +62,7 @@ def register(
 
     pictures = [load_photo(photo) for photo in photos]
     models = load_stack(stack)
-    _note(models.domain, whole)
+    _note(models.domain, whole, "look at what it cropped, or cut the photos out yourself and pass --whole")
     if whole:
         obj = remember(name, category, pictures, models.encoder)
     else:
@@ -95,13 +97,13 @@ def ground(
     rgb = load_photo(image, long_side=None)
     boxes = parse_boxes(box, rgb) if box else None
     found = ground_image(rgb, instruction, memory, stack, objects=object, boxes=boxes)
-    _note(found.domain, boxes is not None)
+    _note(found.domain, boxes is not None, "on a real photo give the candidates with --box")
     written = write_evidence(out, image.stem, found)
     if as_json:
         print(json.dumps(to_json(found)))
         return
     print(found)
-    print("wrote " + " and ".join(str(path) for path in written) + f"; look: .venv/bin/rerun {written[1]}")
+    print("wrote " + " and ".join(str(path) for path in written) + f"; look: .venv/bin/rerun --bind 127.0.0.1 {written[1]}")
 
 
 @app.command()
@@ -141,7 +143,8 @@ def rollout(
     """
     from vap_core.experiments import Study
 
-    study = Study(tuple((suite, name) for name in task), tuple(method or ("generic", "vap")), episodes, seed, policy, stack)
+    tasks, methods = tuple((suite, name) for name in dict.fromkeys(task)), tuple(dict.fromkeys(method or ("generic", "vap")))
+    study = Study(tasks, methods, episodes, seed, policy, stack)
     _run(study, out, workers, record)
 
 
@@ -210,6 +213,6 @@ def _run(study: "Study", out: Path, workers: int, record: bool) -> None:
     print(conclude(study, run(study, out, workers=workers, record=record), out))
 
 
-def _note(domain: str, by_hand: bool) -> None:
+def _note(domain: str, by_hand: bool, mend: str) -> None:
     if domain and not by_hand:
-        print(NOTE.format(domain=domain), file=sys.stderr)
+        print(NOTE.format(domain=domain, mend=mend), file=sys.stderr)

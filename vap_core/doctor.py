@@ -35,15 +35,15 @@ class Finding:
 def examine() -> list[Finding]:
     """Look at everything; nothing here raises."""
     needed = [_python, _gl, _torch, _weights, _rerun]
-    return [*(_checked(check, True) for check in needed), _gpu(), _viewer(), *_foundation()]
+    return [*(_checked(check, True) for check in needed), _checked(_gpu, False), _viewer(), *_foundation()]
 
 
 def _checked(check: Callable[[], tuple[str, str]], needed: bool) -> Finding:
     try:
         what, detail = check()
         return Finding(what, True, detail, needed)
-    except (VapError, ImportError, OSError) as error:
-        return Finding(check.__name__.strip("_"), False, str(error), needed)
+    except Exception as error:  # whatever is broken is the finding
+        return Finding(check.__name__.strip("_"), False, f"{error}" or type(error).__name__, needed)
 
 
 def _python() -> tuple[str, str]:
@@ -81,11 +81,12 @@ def _rerun() -> tuple[str, str]:
     return "rerun", f"sdk {rerun.__version__}"
 
 
-def _gpu() -> Finding:
+def _gpu() -> tuple[str, str]:
     import torch
 
-    works = torch.cuda.is_available()
-    return Finding("gpu", works, torch.cuda.get_device_name() if works else "none; the embedded stack needs none", False)
+    if not torch.cuda.is_available():
+        raise VapError("none; the embedded stack needs none")
+    return "gpu", torch.cuda.get_device_name()
 
 
 def _viewer() -> Finding:

@@ -5,8 +5,9 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 from vap_core import store
@@ -39,11 +40,17 @@ class Job:
 def run(study: Study, folder: Path, *, workers: int = 2, record: bool = True, progress: bool = True) -> "pd.DataFrame":
     """Run whatever of `study` is not in `folder` yet, and return the table of all its episodes.
 
-    Killed at any time, the same call goes on where it stopped. Raises BadOutput when the folder holds another run.
+    Killed at any time, the same call goes on where it stopped. Raises BadOutput when the folder holds another run, or is in use.
     """
+    store.open_run(folder, study.configuration())
+    with store.locked(folder):
+        _run(study, folder, workers, record, progress)
+    return store.read(folder)
+
+
+def _run(study: Study, folder: Path, workers: int, record: bool, progress: bool) -> None:
     from tqdm import tqdm
 
-    store.open_run(folder, study.configuration())
     jobs = list(missing(study, folder, record))
     total = len(study.tasks) * len(study.methods) * study.episodes
     register_personal(study, folder / "memory")
@@ -53,7 +60,6 @@ def run(study: Study, folder: Path, *, workers: int = 2, record: bool = True, pr
             bar.update(len(rows))
             won = sum(row["success"] for row in rows)
             bar.set_postfix_str(f"{job.task} {job.method} {won}/{len(rows)}")
-    return store.read(folder)
 
 
 def missing(study: Study, folder: Path, record: bool) -> Iterator[Job]:
@@ -75,12 +81,24 @@ def work(job: Job) -> list[dict[str, Any]]:
     return [episode.summary() for episode in rollout(trial, job.rows, sink, batch=BATCH)]
 
 
+def end_with_parent() -> None:
+    """Let this worker process end when its parent does, however that ended: an orphan would write into a resumed run."""
+    parent = parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    Thread(target=watch, daemon=True).start()
+
+
 def _work(jobs: list[Job], workers: int) -> Iterator[tuple[Job, list[dict[str, Any]]]]:
     if not jobs:
         return
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")  # inherited by the workers: two threads in each would fight over the cores
-    with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=get_context("spawn"), initializer=end_with_parent) as pool:
         futures = {pool.submit(work, job): job for job in jobs}
         try:
             for future in as_completed(futures):

@@ -66,7 +66,7 @@ def to_json(found: Found) -> dict[str, Any]:
             "votes": g.votes.tolist(),
             "similarity": np.round(g.similarity, 6).tolist(),
             "margin": g.margin,
-            "cosine_margin": g.cosine_margin,
+            "cosine_margin": g.cosine_margin if len(g.candidates) > 1 else None,
             "tied": g.tied.tolist(),
             "candidates": np.round(g.candidates.xyxy, 2).tolist(),
             "scores": np.round(g.candidates.score, 4).tolist(),
@@ -77,13 +77,13 @@ def to_json(found: Found) -> dict[str, Any]:
 
 
 def write_evidence(folder: Path, stem: str, found: Found) -> tuple[Path, Path]:
-    """Write the overlay PNG and the .rrd beside each other; an earlier answer is kept, the new one gets a number."""
+    """Write the overlay PNG (every target) and the .rrd (the first one); an earlier answer is kept, the new one gets a number."""
     from vap_core.plots import grounding_figure, write_png
     from vap_core.record import record_grounding
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        number = next(n for n in range(1, 100_000) if not (folder / f"{_numbered(stem, n)}.rrd").exists())
+        number = next(n for n in range(1, 100_000) if not any((folder / f"{_numbered(stem, n)}.{kind}").exists() for kind in ("png", "rrd")))
         png, rrd = (folder / f"{_numbered(stem, number)}.{suffix}" for suffix in ("png", "rrd"))
         write_png(grounding_figure(found.rgb, found.attended, found.objects, CAMERA), png)
     except OSError as error:
@@ -106,5 +106,7 @@ def _lines(g: Any) -> list[str]:
         mark = "->" if i == g.winner else "  "
         corner = " ".join(f"{v:4.0f}" for v in box)
         rows.append(f" {mark} #{i}  box {corner}  score {score:.2f}  votes {g.votes[i]}/{k}  mean cosine {g.similarity[i].mean():.3f}")
+    if len(g.candidates) == 1:
+        return [*rows, f"winner #{g.winner}, the only candidate: no margin, it wins however unlike it is"]
     tie = ", tie broken by mean cosine" if g.tied[g.winner] else ""
     return [*rows, f"winner #{g.winner}, margin {g.margin:.2f} of the votes, {g.cosine_margin:.3f} in cosine{tie}"]

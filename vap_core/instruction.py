@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 from vap_core.errors import BadInstruction
 from vap_core.values import Colour, Instruction, Target
 
-OWNER = re.compile(r"\b(?:my\s+\w+['’]s|my)\s+", re.IGNORECASE)
+OWNER = re.compile(r"\bmy\s+(?:(?:[\w-]+\s+){0,2}?[\w-]+(?:['’]s|s['’])\s+)?", re.IGNORECASE)
 """A possessive trigger: "my cup", or with an owner beside the speaker, "my brother's cup"."""
 
 STOP_WORDS = """and or to into onto in on near next beside behind under over from with at by off up down left right of then before after
@@ -40,7 +40,7 @@ def parse(text: str, categories: Collection[str] = ()) -> Instruction:
         if targets and trigger.start() < targets[-1].stop:
             continue
         owner = trigger.group().strip()
-        category, length = _category(text[trigger.end() :], categories)
+        category, length = leading_category(text[trigger.end() :], categories)
         if category:
             targets.append(Target(trigger.start(), trigger.end() + length, owner, category))
     if not targets:
@@ -64,7 +64,8 @@ def rewrite(instruction: Instruction, colours: Sequence[Colour | None]) -> str:
     return text
 
 
-def _category(rest: str, categories: Collection[str]) -> tuple[str, int]:
+def leading_category(rest: str, categories: Collection[str] = ()) -> tuple[str, int]:
+    """The category phrase that `rest` begins with, lower case, and how many characters of `rest` it spans."""
     for known in sorted(categories, key=len, reverse=True):
         pattern = r"\s+".join(re.escape(word) for word in known.split())
         match = re.match(rf"{pattern}s?\b", rest, re.IGNORECASE)

@@ -22,10 +22,11 @@ MAX_BYTES = 200_000_000
 LONG_SIDE = 1024
 KNOWN_PRESENT = 0.15
 """A photo of the object holds one of its category, so a reference's box needs less of a score than a proposal does."""
+CATEGORY = re.compile(r"[^\W\d_][\w -]*")
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,63}")
 
 
-def load_photo(path: Path, long_side: int | None = LONG_SIDE) -> Rgb:
+def load_photo(path: Path | str, long_side: int | None = LONG_SIDE) -> Rgb:
     """Read a picture file upright and shrink its longer side to `long_side` pixels (None keeps its size).
 
     Raises:
@@ -33,6 +34,7 @@ def load_photo(path: Path, long_side: int | None = LONG_SIDE) -> Rgb:
     """
     from PIL import Image, ImageOps, UnidentifiedImageError
 
+    path = Path(path)
     if not path.is_file():
         raise BadPhoto(f"load_photo: {path} is not a file; check the path.")
     if not path.stat().st_size:
@@ -43,6 +45,8 @@ def load_photo(path: Path, long_side: int | None = LONG_SIDE) -> Rgb:
         with path.open("rb") as file, Image.open(file) as image:
             if image.width * image.height > MAX_PIXELS:
                 raise BadPhoto(f"load_photo: {path} has {image.width}x{image.height} pixels, over {MAX_PIXELS / 1e6:.0f} million; scale it down.")
+            if image.mode.startswith(("I", "F")):
+                raise BadPhoto(f"load_photo: {path} has {image.mode} pixels, more than 8 bits each; save it as an 8-bit JPEG or PNG.")
             upright = ImageOps.exif_transpose(image).convert("RGB")
             if long_side is not None:
                 upright.thumbnail((long_side, long_side))
@@ -69,12 +73,6 @@ def register(
     Each photo is cropped by the same category detector that is used at test time (P 3.3), to its best box; where none scores
     `threshold`, the whole photo is the crop. Also returns the indices of those photos.
     """
-    if not NAME.fullmatch(name):
-        raise BadMemory(f"register: {name!r} cannot name an object; use letters, digits, space, dot, dash or underscore.")
-    if not category.strip():
-        raise BadMemory(f"register: {name!r} has no category; name one, for example --category cup.")
-    if not photos:
-        raise BadPhoto(f"register: {name!r} has no photos; give at least one, five are best.")
     found: list[Boxes] = [detector([photo], category, threshold)[0] for photo in photos]
     whole = tuple(i for i, boxes in enumerate(found) if not len(boxes))
     crops = tuple(photo if i in whole else crop(photo, boxes.xyxy[0]) for i, (photo, boxes) in enumerate(zip(photos, found, strict=True)))
@@ -82,8 +80,18 @@ def register(
 
 
 def remember(name: str, category: str, crops: Sequence[Rgb], encoder: Encoder) -> PersonalObject:
-    """Embed reference crops that are cut out already."""
-    return PersonalObject(name, category.strip().lower(), encoder(crops), tuple(crops), encoder.name)
+    """Embed reference crops that are cut out already.
+
+    Raises:
+        BadMemory: no usable name or category; BadPhoto: no crops.
+    """
+    if not NAME.fullmatch(name):
+        raise BadMemory(f"remember: {name!r} cannot name an object; use letters, digits, space, dot, dash or underscore.")
+    if not CATEGORY.fullmatch(category.strip()):
+        raise BadMemory(f"remember: {category!r} cannot be a category; name the kind of thing in words, for example --category cup.")
+    if not crops:
+        raise BadPhoto(f"remember: {name!r} has no photos; give at least one, five are best.")
+    return PersonalObject(name, " ".join(category.lower().split()), encoder(crops), tuple(crops), encoder.name)
 
 
 def save(bank: Path, obj: PersonalObject, *, replace: bool = False) -> Path:
@@ -118,7 +126,7 @@ def load(path: Path, encoder: str | None = None) -> PersonalObject:
     from safetensors import SafetensorError
     from safetensors.numpy import load as decode
 
-    again = "register the object again"
+    again = "register the object again with --replace, or delete the file"
     if not path.is_file():
         raise BadMemory(f"load: {path} is not a file; {again}.")
     data = path.read_bytes()
@@ -128,10 +136,10 @@ def load(path: Path, encoder: str | None = None) -> PersonalObject:
         tensors = decode(data)
     except (SafetensorError, struct.error, ValueError, MemoryError, OverflowError, AttributeError) as error:
         raise BadMemory(f"load: {path} is damaged ({type(error).__name__}); {again}.") from error
-    if about.get("format") != "vap-personal-object" or about.get("version") != str(VERSION):
+    if not isinstance(about, dict) or about.get("format") != "vap-personal-object" or about.get("version") != str(VERSION):
         raise BadMemory(f"load: {path} is version {about.get('version', 'unknown')}, this program reads version {VERSION}; {again}.")
-    if encoder is not None and about["encoder"] != encoder:
-        raise BadMemory(f"load: {path} was embedded by {about['encoder']!r}, this stack uses {encoder!r}; {again} with this stack.")
+    if encoder is not None and about.get("encoder") != encoder:
+        raise BadMemory(f"load: {path} was embedded by {about.get('encoder')!r}, this stack uses {encoder!r}; {again}.")
     try:
         crops = tuple(tensors[key] for key in sorted(tensors) if key.startswith("crop."))
         return PersonalObject(about["name"], about["category"], tensors["embeddings"], crops, about["encoder"])
@@ -159,7 +167,7 @@ def recall(memory: Mapping[str, PersonalObject], target: Target, name: str | Non
         return fitting[0]
     if not fitting:
         known = ", ".join(sorted(f"{obj.name} ({obj.category})" for obj in memory.values())) or "nothing yet"
-        raise UnknownName(f"recall: no {target.category!r} is remembered; the memory holds {known}. Register one, or choose with --object.")
+        raise UnknownName(f"recall: no {target.category!r} is remembered; the memory holds {known}. Register one, or point --memory at its folder.")
     raise UnknownName(
         f"recall: {len(fitting)} objects are a {target.category!r}: {', '.join(sorted(o.name for o in fitting))}; choose with --object."
     )

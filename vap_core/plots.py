@@ -30,7 +30,7 @@ def grounding_figure(rgb: Rgb, attended: Attended, objects: Sequence[PersonalObj
     for row, grounding, obj in zip(rows, attended.groundings[camera], objects, strict=True):
         left, middle, refs, right = row.subplots(1, 4, width_ratios=[3, 3, 1.5, 2.6])
         candidates(left, rgb, grounding)
-        left.set_title(f'candidates for "{grounding.candidates.phrase}"')
+        left.set_title(f'candidates for "{obj.category}"', pad=14)
         middle.imshow(attended.images[camera])
         middle.set_title(f'shown to the policy\n"{attended.text}"')
         refs.imshow(_strip(obj.crops))
@@ -103,7 +103,7 @@ def track_figure(track: "pd.DataFrame") -> "Figure":
     for i, (camera, part) in enumerate(track.groupby("camera", sort=False)):
         axes.plot(part.step, part.iou, color=f"C{i}", label=f"{camera}: IoU with ground truth")
         axes.plot(part.step, part.score, color=f"C{i}", alpha=0.45, linestyle=":", label=f"{camera}: tracker's score")
-    axes.set(xlabel="control step", ylim=(0, 1.05))
+    axes.set(xlabel="control step", ylabel="0 .. 1", ylim=(0, 1.05))
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8, loc="lower left")
     return figure

@@ -21,7 +21,9 @@ ALPHA = 0.5
 """Opacity of the tint (P appendix: the default of the opacity ablation)."""
 
 OBVIOUS = 0.12
-"""A colour is free when fewer than this share of an object's pixels already look like it."""
+"""A colour is free when fewer than this share of every object's pixels, ..."""
+SCENERY = 0.01
+"""... and of every view's pixels, already look like it."""
 
 
 def tint(rgb: Rgb, mask: Mask, colour: Colour, alpha: float = ALPHA) -> Rgb:
@@ -45,10 +47,11 @@ def looks_like(rgb: np.ndarray, colour: Colour) -> np.ndarray:
 
 
 def choose_colours(count: int, scenes: Iterable[tuple[Rgb, Sequence[Mask]]], palette: Sequence[Colour] = PALETTE) -> tuple[Colour, ...]:
-    """The first `count` colours that no object in view already has (SPEC section 3).
+    """The first `count` colours that nothing in view already has (P 3.3: the tint must stand out).
 
-    `scenes` pairs every view with the masks of the objects in it. A colour is taken when it covers more than `OBVIOUS`
-    of any object's pixels. Free colours come first, in the palette's order; when too few are free, the least present follow.
+    `scenes` pairs every view with the masks of the candidates in it. A colour is taken when it covers more than `OBVIOUS` of
+    any candidate, or more than `SCENERY` of any view. Free colours come first, in the palette's order; when too few are free,
+    the least present follow.
 
     Raises:
         BadInstruction: more targets than the palette has colours.
@@ -59,9 +62,9 @@ def choose_colours(count: int, scenes: Iterable[tuple[Rgb, Sequence[Mask]]], pal
     for rgb, masks in scenes:
         pixels = [rgb[mask] for mask in masks if mask.any()]
         for index, colour in enumerate(palette):
-            shares = [float(looks_like(inside, colour).mean()) for inside in pixels]
-            presence[index] = max([presence[index], *shares])
-    ranked = sorted(range(len(palette)), key=lambda i: (presence[i] > OBVIOUS, presence[i] if presence[i] > OBVIOUS else 0.0, i))
+            shares = [float(looks_like(inside, colour).mean()) / OBVIOUS for inside in pixels]
+            presence[index] = max([presence[index], float(looks_like(rgb, colour).mean()) / SCENERY, *shares])
+    ranked = sorted(range(len(palette)), key=lambda i: (max(presence[i], 1.0), i))
     return tuple(palette[i] for i in ranked[:count])
 
 

@@ -22,13 +22,13 @@ def conclude(study: Study, table: "pd.DataFrame", folder: Path) -> str:
     figure = folder / "figure.png"
     write_png(scores_figure(scores), figure)
     times = {
-        (s.suite, s.method): step_times(r for r in rows if (r["suite"], r["task"], r["method"]) == (s.suite, s.task, s.method)) for s in scores
+        (s.suite, s.method): step_times(r for r in rows if (r["suite"], r["method"]) == (s.suite, s.method)) for s in scores
     }  # fmt: skip
     lines = [results_table(scores), "", "time per control step, ms by part:", times_table(times)]
     recordings = sorted((folder / "recordings").glob("*.rrd")) if (folder / "recordings").is_dir() else []
     lines += ["", f"wrote {folder / 'summary.json'}, {figure}" + (f", {len(recordings)} recordings in {folder / 'recordings'}" if recordings else "")]
     if recordings:
-        lines.append(f"look at one: .venv/bin/rerun {next((r for r in recordings if '.vap.' in r.name), recordings[0])}")
+        lines.append(f"look at one: .venv/bin/rerun --bind 127.0.0.1 {next((r for r in recordings if '.vap.' in r.name), recordings[0])}")
     return "\n".join(lines)
 
 

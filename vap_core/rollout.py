@@ -81,13 +81,15 @@ def rollout(
                 if one.outcome is None:
                     _guard(one, _act, one, *seen[id(one)], keep_images)
         for one in running:
-            yield _end(one)
+            yield _end(trial, one)
 
 
 def _begin(trial: Trial, row: EpisodeRow, masks: bool) -> Running:
     env = Env(trial.scene)
     env.reset(row)
-    return Running(row, env, trial.policy.start(np.random.default_rng([row.seed, row.episode])), Judge.start(row, env.truth()), None, masks)
+    one = Running(row, env, None, Judge.start(row, env.truth()), None, masks)
+    one.policy_state = _guard(one, trial.policy.start, np.random.default_rng([row.seed, row.episode]))
+    return one
 
 
 def _see(trial: Trial, one: Running, sink: Callable[[Opening], Sink] | None) -> tuple[PolicyInput, Attended, PolicyInput]:
@@ -147,12 +149,14 @@ def _act(one: Running, raw: PolicyInput, attended: Attended, _shown: PolicyInput
         one.judge = one.judge.step(one.env.truth())
 
 
-def _end(one: Running) -> Episode:
+def _end(trial: Trial, one: Running) -> Episode:
+    with _timed(one.seconds, "record"):
+        if one.sink is not None:
+            assert one.outcome is not None
+            _guard(one, one.sink.close, one.outcome)
     assert one.outcome is not None
-    if one.sink is not None:
-        with _timed(one.seconds, "record"):
-            one.sink.close(one.outcome)
-    opening = one.opening or Opening(one.row, "", "", one.env.hz, one.env.cameras(), one.row.instruction, one.row.instruction, {}, {})
+    said = one.row.instruction
+    opening = one.opening or Opening(one.row, trial.method, trial.policy.label, one.env.hz, one.env.cameras(), said, said, {}, {})
     return Episode(opening, tuple(one.frames), one.outcome, {**one.env.seconds, **one.seconds})
 
 

@@ -1,9 +1,11 @@
 """Append-only results: parquet parts written atomically, one run per folder, only what is missing runs again."""
 
+import fcntl
 import hashlib
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
@@ -12,6 +14,7 @@ from vap_core.errors import BadOutput
 
 if TYPE_CHECKING:
     import pandas as pd
+    import pyarrow as pa
 
 KEY = ["suite", "task", "method", "episode"]
 
@@ -41,14 +44,25 @@ def open_run(folder: Path, configuration: Mapping[str, Any]) -> Path:
                 f"open_run: {folder} holds another run (configuration {held}, now {digest(configuration)}); choose another folder with --out."
             )
         return folder
-    if folder.exists() and any(folder.iterdir()):
+    if folder.exists() and any(not path.name.startswith(".run.json") for path in folder.iterdir()):
         raise BadOutput(f"open_run: {folder} is not empty and holds no run; choose another folder with --out.")
     try:
-        (folder / "parts").mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         write_atomic(note, wanted.encode())
     except OSError as error:
         raise BadOutput(f"open_run: {folder} cannot be written ({error.strerror}); choose another folder with --out.") from error
     return folder
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keep other processes out of a run while this one works on it. Raises BadOutput when one is in already."""
+    with (folder / "run.json").open() as note:
+        try:
+            fcntl.flock(note, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise BadOutput(f"locked: another process is working in {folder}; wait for it, or choose another folder with --out.") from error
+        yield
 
 
 def append(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -56,6 +70,7 @@ def append(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     import pandas as pd
 
     try:
+        (folder / "parts").mkdir(exist_ok=True)
         write_atomic(folder / "parts" / f"{uuid4().hex}.parquet", pd.DataFrame(list(rows)).to_parquet(index=False))
     except OSError as error:
         raise BadOutput(f"append: {folder} cannot be written ({error.strerror}); make room and run the same command again.") from error
@@ -65,12 +80,21 @@ def read(folder: Path) -> "pd.DataFrame":
     """Every finished episode, in the order of their keys; an episode that ran twice counts once."""
     import pandas as pd
     from pyarrow import concat_tables
-    from pyarrow.parquet import read_table
 
-    parts = [read_table(part) for part in sorted((folder / "parts").glob("*.parquet"))]
+    parts = [_part(part) for part in sorted((folder / "parts").glob("*.parquet"))]
     if not parts:
         return pd.DataFrame(columns=KEY)
     return concat_tables(parts, promote_options="permissive").to_pandas().drop_duplicates(KEY).sort_values(KEY, ignore_index=True)
+
+
+def _part(path: Path) -> "pa.Table":
+    from pyarrow import ArrowException
+    from pyarrow.parquet import read_table
+
+    try:
+        return read_table(path)
+    except (ArrowException, OSError) as error:
+        raise BadOutput(f"read: {path} is damaged; delete it and run the same command again, its episodes run anew.") from error
 
 
 def write_atomic(path: Path, data: bytes) -> None:

@@ -101,7 +101,7 @@ class Grounding:
     """Why a view's box won, or that none did: everything the vote saw at t = 0 (P 3.3).
 
     `similarity[i, k]` is cos(e_i, z_k); `votes[i]` counts references whose best candidate is i; `tied` marks the
-    candidates that shared the most votes; `margin` is (votes of the winner - most votes of any other) / K, in [0, 1],
+    candidates that shared the most votes; `margin` is (votes of the winner - most votes of any other) / K, in [0, 1] when votes decide,
     and `cosine_margin` the same difference of mean cosines (winner - best other; 2 when there is no other candidate).
     `winner` is None exactly when there is no candidate.
     """

@@ -14,10 +14,11 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from vap_core.detect import Detector
+from vap_core.instruction import leading_category
 from vap_core.prompt import PALETTE, looks_like
 from vap_core.values import Boxes, Camera, Chunk, Colour, PolicyInput, Pose, Rgb, value
 
-SPAN = re.compile(rf"\b(?:the\s+(?P<colour>{'|'.join(c.name for c in PALETTE)})|my|the|a|an)\s+(?P<category>[a-z][a-z -]*)", re.IGNORECASE)
+SPAN = re.compile(rf"\b(?:the\s+(?P<colour>{'|'.join(c.name for c in PALETTE)})|my|the|a|an)\s+", re.IGNORECASE)
 COLOURED = 0.25
 """A candidate carries a colour when at least this share of its box looks like it."""
 STEP_M = 0.030
@@ -174,7 +175,7 @@ def read(text: str) -> tuple[Colour | None, str]:
     if best is None:
         return None, text.strip().lower()
     colour = next((c for c in PALETTE if best["colour"] and c.name == best["colour"].lower()), None)
-    return colour, best["category"].strip().lower()
+    return colour, leading_category(text[best.end() :])[0]
 
 
 def coloured(rgb: Rgb, boxes: Boxes, colour: Colour) -> Float64[np.ndarray, " n"]:

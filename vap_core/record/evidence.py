@@ -1,6 +1,7 @@
 """The method's evidence, drawn into a recording: votes with their boxes, masks, and the words of an episode."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -84,39 +85,34 @@ def log_vote(rec: rr.RecordingStream, grounding: Grounding, j: int, opening_imag
     labels = [f"#{i} {boxes.score[i]:.2f} · votes {grounding.votes[i]}/{k} · cos {cosine[i]:.2f}" for i in order]
     if opening_image is not None:
         put(rec, entity, picture(opening_image), at=at)
-    put(
-        rec,
-        entity,
-        rr.Boxes2D(
+    if n:
+        drawn = rr.Boxes2D(
             array=boxes.xyxy[order].reshape(-1, 4),
             array_format=rr.Box2DFormat.XYXY,
             labels=labels,
             colors=colours,
             radii=rr.components.Radius.ui_points([2.5 if i == winner else 1.2 for i in order]),
             show_labels=False,
-        ),
-        at=at,
-    )
-    if n:
+        )
+        put(rec, entity, drawn, at=at)
         shown = [labels[-1] if i == winner else f"#{i} v{grounding.votes[i]}" for i in order]
         spots = label_spots(boxes.xyxy[order], shown, grounding.masks.shape[1:])
         points = rr.Points2D(list(spots.values()), radii=0, labels=[shown[i] for i in spots], colors=[colours[i] for i in spots], show_labels=True)
         put(rec, f"{entity}/labels", points, at=at)
-    put(rec, f"/vap/votes/{cam}{tail}", rr.AnyValues(counts=grounding.votes), at=at)
+        put(rec, f"/vap/votes/{cam}{tail}", rr.AnyValues(counts=grounding.votes), at=at)
     for name, chosen, colour in (("others", order[:-1], QUIET), ("winner", order[-1:], TARGET)):
         if chosen:
             bars = rr.BarChart(grounding.votes[chosen].astype(np.float64), abscissa=np.asarray(chosen, np.float64), color=colour)
             put(rec, f"/vap/votes/{cam}{tail}/{name}", bars, at=at)
-    put(
-        rec,
-        f"/vap/candidates/{cam}{tail}",
-        rr.AnyValues(
-            phrase=boxes.phrase, object=grounding.object, winner=np.int64(winner), references=np.int64(k), margin=grounding.margin,
-            cosine_margin=grounding.cosine_margin, score=boxes.score, xyxy=boxes.xyxy.reshape(-1), votes=grounding.votes, tied=grounding.tied,
-            mean_cosine=cosine, similarity=grounding.similarity.reshape(-1),
-        ),
-        at=at,
+    per_candidate: dict[str, Any] = {
+        "score": boxes.score, "xyxy": boxes.xyxy.reshape(-1), "votes": grounding.votes, "tied": grounding.tied,
+        "mean_cosine": cosine, "similarity": grounding.similarity.reshape(-1),
+    }  # fmt: skip
+    numbers = rr.AnyValues(
+        phrase=boxes.phrase, object=grounding.object, winner=np.int64(winner), references=np.int64(k), margin=grounding.margin,
+        cosine_margin=grounding.cosine_margin, **(per_candidate if n else {}),
     )  # fmt: skip
+    put(rec, f"/vap/candidates/{cam}{tail}", numbers, at=at)
 
 
 def words(opening: Opening, ending: str = "") -> rr.TextDocument:

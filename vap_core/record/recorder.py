@@ -267,7 +267,8 @@ def record_grounding(path: Path, image: Rgb, grounding: Grounding, obj: Personal
     if grounding.mask is not None:
         put(rec, f"{root}/mask/target", rr.SegmentationImage(classes(grounding.mask, 1, 2), opacity=1.0), at=at)
     put(rec, "/vap/references", picture(jpeg(contact_sheet(obj.crops), 95)), at=at)
-    put(rec, f"/vap/similarity/{cam}", rr.Tensor(grounding.similarity, dim_names=("candidate", "reference")), at=at)
+    if len(grounding.candidates):
+        put(rec, f"/vap/similarity/{cam}", rr.Tensor(grounding.similarity, dim_names=("candidate", "reference")), at=at)
     lines = [f'**said** "{text}"', f'**policy reads** "{rewritten}"', evidence_line(grounding)]
     lines.append(f"{obj.name} · {obj.category} · {len(obj.crops)} references · {obj.encoder}")
     put(rec, "/vap/instruction", rr.TextDocument("\n\n".join(lines), media_type=rr.MediaType.MARKDOWN), at=at)

@@ -7,7 +7,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stdout, suppress
 from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -52,7 +52,8 @@ def headless_viewer(size: tuple[int, int], timeout_s: float = 40.0) -> Iterator[
             said = " ".join(log.read().split())[-200:]
             raise MissingGL(f"screenshot: the viewer could not draw ({err}; {said}); install a software driver: apt-get install -y {DRIVER}") from err
         finally:
-            os.killpg(process.pid, signal.SIGTERM)  # the command is a launcher: its child is the viewer
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)  # the command is a launcher: its child is the viewer
 
 
 def connect(process: subprocess.Popen[bytes], port: int, timeout_s: float) -> ViewerClient:
@@ -72,17 +73,20 @@ def connect(process: subprocess.Popen[bytes], port: int, timeout_s: float) -> Vi
 
 
 def screenshot(rrd: Path, png: Path, *, frame_index: int | None = None, size: tuple[int, int] = (1600, 1000)) -> None:
-    """Open a recording at one step and save what a researcher would see, `size` pixels wide and high.
+    """Open a recording at one step, by default its middle one, and save what a researcher would see, `size` pixels wide and high.
 
     Raises: BadRecording, when `rrd` cannot be read; MissingGL, when nothing can draw; BadOutput, when `png` cannot be written.
     """
     rrd, png = Path(rrd).resolve(), Path(png)
-    if not read_summary(rrd)["frames"]:
+    frames = read_summary(rrd)["frames"]
+    if not frames:
         raise BadRecording(f"screenshot: {rrd} holds no step to show; record the episode again.")
+    step = frames // 2 if frame_index is None else frame_index
+    if not 0 <= step < frames:
+        raise BadRecording(f"screenshot: {rrd.name} has no step {step}; choose one of 0 to {frames - 1}.")
     with headless_viewer(size) as viewer:
         viewer.open(str(rrd))
-        if frame_index is not None:
-            viewer.set_time("frame_index", sequence=frame_index, play_state="paused")
+        viewer.set_time("frame_index", sequence=step, play_state="paused")
         picture = settled(viewer)
     try:
         png.parent.mkdir(parents=True, exist_ok=True)
