@@ -69,9 +69,12 @@ def _torch() -> tuple[str, str]:
 
 
 def _weights() -> tuple[str, str]:
-    from vap_core.weights import weights_sha256
+    from vap_core.weights import PACKAGED, load_weights, weights_sha256
 
+    load_weights("perception.safetensors")
     sums = weights_sha256()
+    if len(sums) < len(PACKAGED) + 1:
+        raise VapError(f"only {', '.join(sums)} found; run: pip install -r environment.txt")
     return "weights", ", ".join(f"{name} {digest[:8]}" for name, digest in sums.items())
 
 
