@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vap_core.attend import Attender
 from vap_core.errors import BadOutput, UnknownName
 from vap_core.experiments import DEMO, Study, make_trial, register_personal
 from vap_core.record import Recorder, read_summary, recording_name
@@ -147,15 +148,38 @@ def test_an_episode_that_breaks_is_an_error_with_its_traceback_and_its_recording
     assert read_summary(path)["frames"] == 4
 
 
+def test_a_policy_that_chokes_on_one_episode_spares_the_others(bank: Path) -> None:
+    trial = make_trial(STUDY, SUITE, TASK, "generic", bank)
+    rows = [replace(row, max_steps=4) for row in STUDY.rows(SUITE, TASK)]
+    bad = replace(rows[1], instruction="poison")
+
+    class Chokes:
+        label, execute = "scripted", trial.policy.execute
+        start = trial.policy.start
+
+        def plan(self, states, inputs):  # type: ignore[no-untyped-def]
+            if any(seen.text == "poison" for seen in inputs):
+                raise RuntimeError("cannot read this")
+            return trial.policy.plan(states, inputs)
+
+    episodes = list(rollout(replace(trial, policy=Chokes()), [rows[0], bad, rows[2]], batch=3))
+    assert [e.outcome.status for e in episodes] == ["failure", "error", "failure"]
+    assert [e.outcome.steps for e in episodes] == [4, 0, 4]
+
+
 def test_an_error_before_the_first_step_keeps_its_method_and_its_place(bank: Path) -> None:
     trial = make_trial(STUDY, SUITE, TASK, "vap", bank)
 
-    class Blind:
-        def start(self, views, instruction):  # type: ignore[no-untyped-def]
+    assert trial.attender is not None
+
+    class Blind(Attender):
+        def start(self, views, instruction, **options):  # type: ignore[no-untyped-def]
             raise RuntimeError("the detector fell over")
 
+    blind = Blind(trial.attender.stack, trial.attender.memory)
+
     rows = STUDY.rows(SUITE, TASK)[:2]
-    episodes = list(rollout(replace(trial, attender=Blind()), rows))
+    episodes = list(rollout(replace(trial, attender=blind), rows))
     assert [(e.outcome.status, e.summary()["method"], e.summary()["policy"]) for e in episodes] == [("error", "vap", "scripted")] * 2
     assert "the detector fell over" in episodes[0].outcome.detail
 

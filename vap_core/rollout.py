@@ -120,9 +120,14 @@ def _plan(trial: Trial, live: Sequence[Running], seen: Mapping[int, tuple[Policy
     start = time.perf_counter()
     try:
         states, chunks = trial.policy.plan([one.policy_state for one in asking], [seen[id(one)][2] for one in asking])
+    except VapError:
+        raise
     except Exception:
-        for one in asking:
-            one.outcome = one.judge.outcome("error", traceback.format_exc(limit=8))
+        if len(asking) == 1:
+            asking[0].outcome = asking[0].judge.outcome("error", traceback.format_exc(limit=8))
+        else:  # find out whose fault it is
+            for one in asking:
+                _plan(trial, [one], seen)
         return
     share = (time.perf_counter() - start) / len(asking)
     for one, state, chunk in zip(asking, states, chunks, strict=True):
