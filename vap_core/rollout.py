@@ -92,8 +92,8 @@ def _begin(trial: Trial, row: EpisodeRow, masks: bool) -> Running:
     return one
 
 
-def _see(trial: Trial, one: Running, sink: Callable[[Opening], Sink] | None) -> tuple[PolicyInput, Attended, PolicyInput]:
-    """Render, attend, and at t = 0 open the recording. Returns the raw input, what attending made of it, and the policy's input."""
+def _see(trial: Trial, one: Running, sink: Callable[[Opening], Sink] | None) -> tuple[PolicyInput, Attended]:
+    """Render, attend, and at t = 0 open the recording. Returns the raw input and what attending made of it."""
     raw = one.env.observe(one.row.instruction)
     with _timed(one.seconds, "attend"):
         if trial.attender is None:
@@ -109,17 +109,18 @@ def _see(trial: Trial, one: Running, sink: Callable[[Opening], Sink] | None) -> 
         )
         with _timed(one.seconds, "record"):
             one.sink = sink(one.opening) if sink is not None else None
-    return raw, attended, PolicyInput(attended.images, attended.text, raw.state)
+    return raw, attended
 
 
-def _plan(trial: Trial, live: Sequence[Running], seen: Mapping[int, tuple[PolicyInput, Attended, PolicyInput]]) -> None:
+def _plan(trial: Trial, live: Sequence[Running], seen: Mapping[int, tuple[PolicyInput, Attended]]) -> None:
     """Ask the policy, in one batch, for every episode whose chunk is used up."""
     asking = [one for one in live if not one.queue]
     if not asking:
         return
+    shown = [PolicyInput(attended.images, attended.text, raw.state) for raw, attended in (seen[id(one)] for one in asking)]
     start = time.perf_counter()
     try:
-        states, chunks = trial.policy.plan([one.policy_state for one in asking], [seen[id(one)][2] for one in asking])
+        states, chunks = trial.policy.plan([one.policy_state for one in asking], shown)
     except VapError:
         raise
     except Exception:
@@ -136,7 +137,7 @@ def _plan(trial: Trial, live: Sequence[Running], seen: Mapping[int, tuple[Policy
         one.seconds["policy"] += share
 
 
-def _act(one: Running, raw: PolicyInput, attended: Attended, _shown: PolicyInput, keep_images: bool) -> None:
+def _act(one: Running, raw: PolicyInput, attended: Attended, keep_images: bool) -> None:
     """Execute one action, or none when the episode is over, and hand the frame on."""
     over = one.judge.done or one.judge.steps >= one.row.max_steps
     action = REST if over else one.queue.popleft()

@@ -3,25 +3,13 @@
 At half to three quarters of its height every body is 34 to 44 mm wide across any yaw (the camera: along y), for two fingers from above.
 """
 
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
 from vap_core.sim.shapes import DECORATED, Mesh, Number, Profile, Solid, barrel, ellipsoid, foot, handle, join, lathe, pillar, tube, turn
 from vap_core.sim.textures import ACCENT, BASE, DARK, INK, LIGHT, METAL, WARM
 from vap_core.values import value
-
-
-class Body(Protocol):
-    """What can be rendered and touched."""
-
-    def mesh(self) -> Mesh: ...
-
-    def solids(self) -> tuple[Solid, ...]: ...
-
-    def aspect(self) -> float:
-        """Circumference over height of the decorated wall."""
-        ...
 
 
 def _curve(knots: Profile, rows: int) -> Profile:
