@@ -6,9 +6,10 @@ import pytest
 
 from tests.toys import TOYS, personal, scene
 from vap_core.attend import Attender
-from vap_core.inspection import grounding_table, iou
+from vap_core.inspection import grounding_table
 from vap_core.metrics import score
 from vap_core.plots import candidates, film, grounding_figure, scores_figure, track_figure, write_png
+from vap_core.segment import iou
 
 TEAL, GREY = (40, 120, 110), (90, 90, 90)
 LINE = scene([(4, 20, GREY), (24, 20, TEAL)])

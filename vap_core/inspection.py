@@ -8,6 +8,7 @@ import numpy as np
 from vap_core.attend import Attender
 from vap_core.experiments import POLICIES
 from vap_core.rollout import Trial, rollout
+from vap_core.segment import iou
 from vap_core.sim.env import Env
 from vap_core.sim.scenes import Scene
 from vap_core.values import EpisodeRow, Frame, Grounding, Mask, Opening, Outcome
@@ -17,12 +18,6 @@ if TYPE_CHECKING:
 
 SEEN = 0.5
 """A candidate shows the object whose true mask it overlaps by more than this IoU."""
-
-
-def iou(one: Mask, other: Mask) -> float:
-    """Intersection over union; two empty masks agree."""
-    union = int((one | other).sum())
-    return int((one & other).sum()) / union if union else 1.0
 
 
 def grounding_table(grounding: Grounding, truth: Mapping[str, Mask]) -> "pd.DataFrame":

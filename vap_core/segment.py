@@ -123,6 +123,12 @@ def box_plane(box_xyxy: Float[np.ndarray, "4"], hw: Sequence[int]) -> UInt8[np.n
     return plane
 
 
+def iou(one: Mask, other: Mask) -> float:
+    """Intersection over union; two empty masks agree."""
+    union = int((one | other).sum())
+    return int((one & other).sum()) / union if union else 1.0
+
+
 def bounds(mask: Mask) -> Float32[np.ndarray, "4"] | None:
     """The box of a mask, pixels, far corner exclusive; None when it is empty."""
     rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))

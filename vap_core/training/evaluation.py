@@ -10,7 +10,7 @@ from tqdm import tqdm
 from vap_core.detect import TAPS, DetectHead, LiteDetector, box_iou, decode, enlarge
 from vap_core.features import features
 from vap_core.metrics import rate
-from vap_core.segment import LiteSegmenter, MaskHead
+from vap_core.segment import LiteSegmenter, MaskHead, iou
 from vap_core.sim import objects
 from vap_core.training.phrases import AMBIGUOUS, NEGATIVES, UNSEEN, UNSEEN_NEGATIVES
 from vap_core.training.scenes import Shots, boxes_of
@@ -87,8 +87,7 @@ def segmenter_figures(segmenter: LiteSegmenter, stages: Sequence[Shots]) -> Figu
             for i, corners in boxes_of(ids, len(shots.names), LEAST_PX):
                 box = np.array(corners, np.float64)
                 for where, into in ((box, exact), (jitter(rng, box), off)):
-                    mask, true = segmenter.chance(rgb, where[None])[0] > 0.5, ids == i + 1
-                    into.append(float((mask & true).sum() / max(1, (mask | true).sum())))
+                    into.append(iou(segmenter.chance(rgb, where[None])[0] > 0.5, ids == i + 1))
     return {
         f"{name}_box": {"mean_iou": round(float(np.mean(values)), 4), "iou_at_least_0.75": share(int(np.sum(np.array(values) >= 0.75)), len(values))}
         for name, values in (("exact", exact), ("jittered", off))

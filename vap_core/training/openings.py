@@ -14,7 +14,7 @@ from vap_core import suites
 from vap_core.detect import Detector, box_iou
 from vap_core.embed import Encoder, crop
 from vap_core.memory import register
-from vap_core.segment import Segmenter, bounds
+from vap_core.segment import Segmenter, bounds, iou
 from vap_core.sim import objects, scenes
 from vap_core.sim.env import Env
 from vap_core.sim.studio import reference_views
@@ -64,8 +64,7 @@ def _view(
     for mask, box in zip(segmenter(rgb, found), found.xyxy, strict=True):
         overlap = box_iou(box[None].astype(np.float64), wanted)[0]
         if overlap.max() >= 0.5:
-            true = seen[names[int(overlap.argmax())]]
-            into["iou"].append(float((mask & true).sum() / (mask | true).sum()))
+            into["iou"].append(iou(mask, seen[names[int(overlap.argmax())]]))
     into["right"].append(_elected(rgb, found.xyxy, wanted[names.index(target)], encoder, mine))
     into["right_given_boxes"].append(_elected(rgb, wanted.astype(np.float32), wanted[names.index(target)], encoder, mine))
 
