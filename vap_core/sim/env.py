@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64, Int64
 from vap_core.errors import UnknownName, one_of
 from vap_core.sim import cameras as optics
 from vap_core.sim.control import Command, arm, follow, rotation_vector
-from vap_core.sim.scenes import FLOOR_Z_M, Scene
+from vap_core.sim.scenes import Scene
 from vap_core.values import Camera, EpisodeRow, PolicyInput, Truth, value
 
 import mujoco  # isort: skip  (cameras has chosen a GL back end)
@@ -93,7 +93,7 @@ class Env:
             data.joint(f"{place.model}/free").qpos[:] = (place.x, place.y, DROP_M, np.cos(half), 0.0, 0.0, np.sin(half))
         for i, name in enumerate(n for n in self.scene.objects if n not in placed):
             body = model.body(name)
-            data.joint(f"{name}/free").qpos[:] = (-3.0, -2.0 + 0.4 * i, FLOOR_Z_M + 0.5, 1.0, 0.0, 0.0, 0.0)
+            data.joint(f"{name}/free").qpos[:] = (-3.0, -2.0 + 0.4 * i, self.robot.floor_z_m + 0.5, 1.0, 0.0, 0.0, 0.0)
             data.xfrc_applied[body.id, :3] = -model.opt.gravity * float(body.subtreemass[0])
         self._placed = placed
         self._command = Command(self._arm.forward(self.robot.home), self.robot.home, 1.0)

@@ -1,29 +1,29 @@
-"""The object registry: every category has generic instances for training and, for evaluation, one personal instance with four look-alikes.
+"""The object registry: every category has generic instances for training and, for evaluation, one personal instance with its look-alikes.
 
-Look-alikes share colours with the personal instance and differ in motif, layout and subtle shape. Generic instances draw their motifs
-and layouts from lists that evaluation instances never use.
+Look-alikes come graded: hard ones share the personal instance's base and ink colours and differ in motif, layout and subtle shape.
+Generic instances draw their motifs and layouts from lists that evaluation instances never use.
 """
 
-from collections.abc import Callable
+from colorsys import hsv_to_rgb
 from functools import lru_cache
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from vap_core.errors import one_of
-from vap_core.sim.bodies import Bottle, Cup, Owl, PenHolder, StrawCup, Vase
-from vap_core.sim.gadgets import CameraBody, Can, Shaver
-from vap_core.sim.shapes import Mesh, Number
+from vap_core.sim.catalogue import FAMILIES, Family
+from vap_core.sim.catalogue.family import pick
+from vap_core.sim.shapes import Mesh, Number, Shape
 from vap_core.sim.textures import ATLAS_PX, GENERIC_FILLS, GENERIC_GLYPHS, GENERIC_LAYOUTS, Ink, Texture, atlas
 from vap_core.values import value
 
 if TYPE_CHECKING:
     import mujoco
 
-CATEGORIES: tuple[str, ...] = ("cup", "bottle", "pen holder", "straw cup", "owl figurine", "vase", "camera", "shaver")
-CLUTTER: tuple[str, ...] = ("coke can",)
-Shape = Cup | Bottle | PenHolder | StrawCup | Owl | Vase | CameraBody | Shaver | Can
 VISUAL_GROUP, COLLISION_GROUP = 2, 3
+_INDEX = {family.stem: i for i, family in enumerate(FAMILIES)}
+CATEGORIES: tuple[str, ...] = tuple(dict.fromkeys(family.category for family in FAMILIES if family.instances))
+CLUTTER: tuple[str, ...] = tuple(family.category for family in FAMILIES if not family.instances)
 
 
 @value
@@ -32,152 +32,56 @@ class ObjectModel:
 
     name: str
     category: str
-    split: Literal["generic", "personal", "lookalike"]
+    split: Literal["generic", "personal", "lookalike", "prop"]
     shape: Shape
     texture: Texture
     mass_kg: float
 
 
-def _slug(category: str) -> str:
-    return category.replace(" ", "-")
+def _named(family: Family) -> list[ObjectModel]:
+    named = [
+        ObjectModel(
+            f"{family.stem}-lookalike-{i}" if i else f"{family.stem}-personal", family.category, "lookalike" if i else "personal", shape, texture,
+            family.mass_kg,
+        )
+        for i, (shape, texture) in enumerate(family.instances)
+    ]  # fmt: skip
+    return named + [ObjectModel(f"{family.stem}-prop", family.category, "prop", *prop, family.mass_kg) for prop in family.prop]
 
 
-CREAM, BONE, SAND, RUST = (233, 223, 201), (219, 214, 206), (201, 176, 139), (140, 79, 62)
-SAGE, MOSS, TEAL, SLATE, NAVY = (157, 171, 146), (91, 106, 77), (71, 115, 117), (98, 112, 127), (51, 63, 86)
-PLUM, ROSE, MUSTARD, COCOA, COAL = (102, 73, 93), (198, 151, 149), (198, 158, 83), (87, 66, 55), (57, 57, 61)
-URN = ((0.0165, 0.0), (0.0185, 0.2), (0.0212, 0.55), (0.0195, 0.72), (0.011, 0.9), (0.0145, 1.0))
-GOURD = ((0.0185, 0.0), (0.0212, 0.25), (0.0185, 0.55), (0.0172, 0.75), (0.0115, 0.9), (0.0155, 1.0))
-AMPHORA = ((0.0150, 0.0), (0.0190, 0.35), (0.0215, 0.62), (0.0185, 0.76), (0.0085, 0.88), (0.0125, 1.0))
-FLUTE = ((0.0165, 0.0), (0.0172, 0.3), (0.0182, 0.6), (0.0195, 0.85), (0.0215, 1.0))
-
-_EVALUATION: dict[str, tuple[tuple[Shape, Texture], ...]] = {
-    "cup": (
-        (Cup(), Texture(CREAM, RUST, TEAL, "heart", "row", 4)),
-        (Cup(0.0205, 0.0205, 0.070, "square", 0.016), Texture(CREAM, TEAL, RUST, "hoops", "full", 8)),
-        (Cup(0.0185, 0.0215, 0.074, "ear", 0.018, "accent"), Texture(CREAM, CREAM, TEAL, "word", "band", 3, "MUG")),
-        (Cup(0.0200, 0.0210, 0.068, "round", 0.015, "ink"), Texture(CREAM, RUST, TEAL, "dots", "full", 7)),
-        (Cup(0.0195, 0.0215, 0.076, "ear", 0.016), Texture(CREAM, RUST, TEAL, "leaf", "brick", 6)),
-    ),
-    "bottle": (
-        (Bottle(), Texture(SLATE, CREAM, MUSTARD, "star", "band", 4)),
-        (Bottle(0.0205, 0.112, 0.72, 0.010, "sport"), Texture(SLATE, CREAM, MUSTARD, "stripes", "full", 7)),
-        (Bottle(0.0195, 0.118, 0.66, 0.0085, "ball"), Texture(SLATE, CREAM, MUSTARD, "fish", "brick", 4)),
-        (Bottle(0.0205, 0.114, 0.70, 0.009, "screw", 0.002), Texture(SLATE, CREAM, MUSTARD, "chevron", "half", 6)),
-        (Bottle(0.0200, 0.110, 0.74, 0.011, "sport"), Texture(SLATE, CREAM, MUSTARD, "word", "row", 3, "H2O")),
-    ),
-    "pen holder": (
-        (PenHolder(), Texture(SAGE, COCOA, CREAM, "paw", "row", 4)),
-        (PenHolder(0.0205, 0.082, 6, 3, "ink"), Texture(SAGE, COCOA, CREAM, "checks", "full", 6)),
-        (PenHolder(0.0200, 0.078, 4, 4, "base"), Texture(SAGE, COCOA, CREAM, "smile", "band", 4)),
-        (PenHolder(0.0210, 0.080, 24, 5, "ink"), Texture(SAGE, CREAM, COCOA, "bolt", "brick", 6)),
-        (PenHolder(0.0205, 0.076, 24, 3, "accent"), Texture(SAGE, COCOA, CREAM, "stripes", "half", 8)),
-    ),
-    "straw cup": (
-        (StrawCup(), Texture(ROSE, PLUM, CREAM, "moon", "brick", 4)),
-        (StrawCup(0.0170, 0.0215, 0.078, "dome", False), Texture(ROSE, PLUM, CREAM, "plaid", "full", 5)),
-        (StrawCup(0.0175, 0.0210, 0.082, "step", True), Texture(ROSE, PLUM, CREAM, "flower", "band", 4)),
-        (StrawCup(0.0165, 0.0210, 0.080, "flat", False), Texture(ROSE, PLUM, CREAM, "hoops", "half", 10)),
-        (StrawCup(0.0170, 0.0215, 0.076, "dome", True), Texture(ROSE, PLUM, CREAM, "word", "row", 3, "YUM")),
-    ),
-    "owl figurine": (
-        (Owl(), Texture(SAND, COCOA, CREAM, "heart", "brick", 8)),
-        (Owl(0.076, 0.0215, "wide", 0.0080), Texture(SAND, COCOA, CREAM, "hoops", "full", 8)),
-        (Owl(0.074, 0.0210, "none", 0.0068), Texture(SAND, COCOA, CREAM, "dots", "full", 9)),
-        (Owl(0.080, 0.0210, "tuft", 0.0062, "spread"), Texture(SAND, MOSS, CREAM, "chevron", "full", 8)),
-        (Owl(0.078, 0.0215, "wide", 0.0070, "spread"), Texture(SAND, COCOA, MUSTARD, "star", "band", 6)),
-    ),
-    "vase": (
-        (Vase(), Texture(BONE, NAVY, SLATE, "leaf", "brick", 5)),
-        (Vase(0.112, URN), Texture(BONE, NAVY, SLATE, "chevron", "full", 6)),
-        (Vase(0.108, GOURD), Texture(BONE, NAVY, SLATE, "flower", "row", 4)),
-        (Vase(0.114, AMPHORA, True), Texture(BONE, NAVY, SLATE, "hoops", "full", 10)),
-        (Vase(0.106, FLUTE), Texture(BONE, BONE, NAVY, "fish", "band", 4)),
-    ),
-    "camera": (
-        (CameraBody(), Texture(COAL, SAND, BONE, "dots", "full", 6)),
-        (CameraBody(0.072, 0.052, 0.0150, "finder"), Texture(COAL, SAND, BONE, "stripes", "full", 5)),
-        (CameraBody(0.064, 0.056, 0.0175, "flash"), Texture(COAL, BONE, SAND, "star", "brick", 5)),
-        (CameraBody(0.070, 0.054, 0.0140, "none", True), Texture(COAL, SAND, BONE, "checks", "full", 5)),
-        (CameraBody(0.066, 0.053, 0.0165, "prism", True), Texture(COAL, SAND, BONE, "chevron", "half", 5)),
-    ),
-    "shaver": (
-        (Shaver(), Texture(TEAL, CREAM, COAL, "bolt", "brick", 4)),
-        (Shaver(0.0190, 0.110, "rotary", 0.002, "bar"), Texture(TEAL, CREAM, COAL, "hoops", "half", 10)),
-        (Shaver(0.0180, 0.116, "wide", 0.001), Texture(TEAL, CREAM, COAL, "stripes", "full", 6)),
-        (Shaver(0.0190, 0.108, "foil", 0.002, "bar"), Texture(TEAL, CREAM, COAL, "checks", "full", 5)),
-        (Shaver(0.0185, 0.114, "rotary", 0.0015), Texture(TEAL, CREAM, MUSTARD, "word", "band", 2, "TRIM")),
-    ),
-}
-_MASS_KG = {
-    "cup": 0.10,
-    "bottle": 0.12,
-    "pen holder": 0.10,
-    "straw cup": 0.09,
-    "owl figurine": 0.11,
-    "vase": 0.12,
-    "camera": 0.14,
-    "shaver": 0.11,
-    "coke can": 0.10,
-}
-
-OBJECTS: dict[str, ObjectModel] = {
-    f"{_slug(category)}-{ending}": ObjectModel(
-        f"{_slug(category)}-{ending}", category, "lookalike" if i else "personal", shape, texture, _MASS_KG[category]
-    )
-    for category, pairs in _EVALUATION.items()
-    for i, (shape, texture) in enumerate(pairs)
-    for ending in [f"lookalike-{i}" if i else "personal"]
-}
+OBJECTS: dict[str, ObjectModel] = {model.name: model for family in FAMILIES for model in _named(family)}
 
 
-def personal(category: str) -> ObjectModel:
-    """The user's own instance of `category`."""
-    if category not in CATEGORIES:
-        raise one_of("personal: category", category, CATEGORIES)
-    return OBJECTS[f"{_slug(category)}-personal"]
+def family_of(kind: str) -> Family:
+    """The family of a category ("pen holder") or of a stem ("paper-cup"). Raises: UnknownName."""
+    for family in FAMILIES:
+        if kind in (family.category, family.stem):
+            return family
+    raise one_of("objects: category", kind, [*CATEGORIES, *CLUTTER])
 
 
-def lookalikes(category: str) -> tuple[ObjectModel, ...]:
-    """The instances that stand beside it."""
-    if category not in CATEGORIES:
-        raise one_of("lookalikes: category", category, CATEGORIES)
-    return tuple(model for model in OBJECTS.values() if model.category == category and model.split == "lookalike")
+def personal(kind: str) -> ObjectModel:
+    """The user's own instance of a category, or of a family by its stem."""
+    family = family_of(kind)
+    if not family.instances:
+        raise one_of("personal: category", kind, CATEGORIES)
+    return OBJECTS[f"{family.stem}-personal"]
 
 
-def _vase(rng: np.random.Generator) -> Vase:
-    low, mid, neck, lip = rng.uniform((0.0150, 0.0190, 0.0080, 0.0110), (0.0185, 0.0220, 0.0150, 0.0185)).tolist()
-    waist = float(rng.uniform(0.35, 0.6))
-    return Vase(float(rng.uniform(0.098, 0.118)), ((low, 0.0), (mid, waist), (0.92 * mid, 0.74), (neck, 0.89), (lip, 1.0)),
-                bool(rng.random() < 0.25))  # fmt: skip
+def lookalikes(kind: str) -> tuple[ObjectModel, ...]:
+    """The instances that stand beside it, hardest first."""
+    stem = personal(kind).name.removesuffix("personal")
+    return tuple(model for name, model in OBJECTS.items() if name.startswith(f"{stem}lookalike-"))
 
 
-_DRAW: dict[str, Callable[[np.random.Generator], Shape]] = {
-    "cup": lambda g: Cup(g.uniform(0.0175, 0.0210), g.uniform(0.0195, 0.0220), g.uniform(0.065, 0.080), _pick(g, ("round", "square", "ear")),
-                         g.uniform(0.014, 0.020), _pick(g, ("base", "ink", "accent"))),
-    "bottle": lambda g: Bottle(g.uniform(0.0185, 0.0215), g.uniform(0.105, 0.120), g.uniform(0.65, 0.75), g.uniform(0.0075, 0.012),
-                               _pick(g, ("screw", "sport", "ball")), g.uniform(0, 0.003)),
-    "pen holder": lambda g: PenHolder(g.uniform(0.0190, 0.0215), g.uniform(0.074, 0.084), _pick(g, (4, 6, 24, 24)), int(g.integers(3, 6)),
-                                      _pick(g, ("base", "ink", "accent"))),
-    "straw cup": lambda g: StrawCup(g.uniform(0.0155, 0.0180), g.uniform(0.0200, 0.0218), g.uniform(0.074, 0.084), _pick(g, ("flat", "dome", "step")),
-                                    bool(g.random() < 0.5)),
-    "owl figurine": lambda g: Owl(g.uniform(0.070, 0.084), g.uniform(0.0200, 0.0218), _pick(g, ("tuft", "wide", "none")), g.uniform(0.006, 0.0085),
-                                  _pick(g, ("folded", "spread"))),
-    "vase": _vase,
-    "camera": lambda g: CameraBody(g.uniform(0.060, 0.074), g.uniform(0.050, 0.058), g.uniform(0.013, 0.018),
-                                   _pick(g, ("prism", "finder", "flash", "none")), bool(g.random() < 0.3)),
-    "shaver": lambda g: Shaver(g.uniform(0.0175, 0.0195), g.uniform(0.106, 0.118), _pick(g, ("foil", "wide", "rotary")), g.uniform(0, 0.0035),
-                               _pick(g, ("round", "bar"))),
-    "coke can": lambda g: Can(g.uniform(0.0205, 0.0220), g.uniform(0.078, 0.090)),
-}  # fmt: skip
-
-
-def _pick[T](rng: np.random.Generator, choices: tuple[T, ...]) -> T:
-    return choices[int(rng.integers(len(choices)))]
+def tier(model: ObjectModel) -> Literal["hard", "medium", "easy"]:
+    """How close a look-alike's colours are to its personal instance: both base and ink shared, one of them, or neither."""
+    mine = OBJECTS[f"{model.name.partition('-lookalike-')[0]}-personal"].texture
+    shared = len({model.texture.base, model.texture.ink} & {mine.base, mine.ink})
+    return ("easy", "medium", "hard")[shared]
 
 
 def _colour(rng: np.random.Generator, bright: tuple[float, float], vivid: tuple[float, float] = (0.04, 0.4)) -> Ink:
-    from colorsys import hsv_to_rgb
-
     red, green, blue = hsv_to_rgb(float(rng.random()), float(rng.uniform(*vivid)), float(rng.uniform(*bright)))
     return round(255 * red), round(255 * green), round(255 * blue)
 
@@ -187,35 +91,32 @@ def _texture(rng: np.random.Generator) -> Texture:
     light, dark, mid = (_colour(rng, tone) for tone in tones)
     base, ink = (light, dark) if rng.random() < 0.6 else (dark, light) if rng.random() < 0.5 else (mid, light)
     accent = mid if base != mid else dark
-    motif = _pick(rng, GENERIC_GLYPHS + GENERIC_FILLS)
-    layout = _pick(rng, GENERIC_LAYOUTS[:3] if motif in GENERIC_GLYPHS else GENERIC_LAYOUTS[3:])
+    motif = pick(rng, GENERIC_GLYPHS + GENERIC_FILLS)
+    layout = pick(rng, GENERIC_LAYOUTS[:3] if motif in GENERIC_GLYPHS else GENERIC_LAYOUTS[3:])
     word = f"{rng.integers(1, 100)}" if motif == "digit" else ""
     return Texture(base, ink, accent, motif, layout, int(rng.integers(4, 9)), word, int(rng.integers(2**31)))
 
 
 @lru_cache(maxsize=4096)
-def generic(category: str, index: int) -> ObjectModel:
-    """Training instance number `index` (0 or more) of a category or clutter kind: the same call, the same object."""
-    kinds = CATEGORIES + CLUTTER
-    if category not in kinds:
-        raise one_of("generic: category", category, kinds)
-    rng = np.random.default_rng([20, kinds.index(category), index])
+def generic(kind: str, index: int) -> ObjectModel:
+    """Training instance number `index` (0 or more) of a category or stem: the same call, the same object."""
+    family = family_of(kind)
+    rng = np.random.default_rng([20, _INDEX[family.stem], index])
     texture = _texture(rng)
-    if category == "coke can":
-        texture = Texture((150, 52, 52), (232, 228, 222), (150, 52, 52), "waves", "middle", 1 + index % 3)
-    mass_kg = _MASS_KG[category] * float(rng.uniform(0.8, 1.1))
-    return ObjectModel(f"{_slug(category)}-generic-{index:04d}", category, "generic", _DRAW[category](rng), texture, mass_kg)
+    if family.paint is not None:
+        texture = family.paint(texture, index)
+    mass_kg = family.mass_kg * float(rng.uniform(0.8, 1.1))
+    return ObjectModel(f"{family.stem}-generic-{index:04d}", family.category, "generic", family.draw(rng), texture, mass_kg)
 
 
 def get(name: str) -> ObjectModel:
-    """The object of that name: one of `OBJECTS`, or `<category>-generic-<number>` with hyphens for spaces."""
+    """The object of that name: one of `OBJECTS`, or `<stem>-generic-<number>`."""
     if name in OBJECTS:
         return OBJECTS[name]
-    slug, _, digits = name.rpartition("-generic-")
-    kinds = {_slug(category): category for category in CATEGORIES + CLUTTER}
-    if slug in kinds and digits.isdecimal() and name == f"{slug}-generic-{int(digits):04d}":
-        return generic(kinds[slug], int(digits))
-    raise one_of("get: object", name, [*OBJECTS, *(f"{kind}-generic-NNNN" for kind in kinds)])
+    stem, _, digits = name.rpartition("-generic-")
+    if stem in _INDEX and digits.isdecimal() and name == f"{stem}-generic-{int(digits):04d}":
+        return generic(stem, int(digits))
+    raise one_of("get: object", name, [*OBJECTS, *(f"{kind}-generic-NNNN" for kind in _INDEX)])
 
 
 @lru_cache(maxsize=256)

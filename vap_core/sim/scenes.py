@@ -16,7 +16,6 @@ from vap_core.values import value
 
 import mujoco  # isort: skip  (cameras has chosen a GL back end)
 
-FLOOR_Z_M = -0.75
 Colour3 = tuple[float, float, float]
 
 
@@ -69,7 +68,7 @@ def build(robot: str, models: "Sequence[str | objects.ObjectModel]", *, look: Lo
     spec = mujoco.MjSpec.from_file(str(arm.xml))
     physics(spec)
     spec.body(arm.links[0]).pos, spec.body(arm.links[0]).quat = arm.base_world[:3], arm.base_world[3:]
-    _room(spec, look)
+    _room(spec, arm, look)
     chosen = [objects.get(model) if isinstance(model, str) else model for model in models]
     for model in chosen:
         objects.add_object(spec, model)
@@ -89,7 +88,7 @@ def physics(spec: mujoco.MjSpec) -> None:
     option.noslip_iterations = 4
 
 
-def _room(spec: mujoco.MjSpec, look: Look) -> None:
+def _room(spec: mujoco.MjSpec, arm: Robot, look: Look) -> None:
     """Floor, back and side walls, table, and the one lamp. Only the table and the floor can be touched."""
     world = spec.worldbody
     spec.visual.headlight.ambient = [look.ambient] * 3
@@ -112,12 +111,15 @@ def _room(spec: mujoco.MjSpec, look: Look) -> None:
     for name, rgb in plain.items():
         spec.add_material(name=name, rgba=[*rgb, 1.0], specular=0.0, shininess=0.0)
     box, ghost = mujoco.mjtGeom.mjGEOM_BOX, {"contype": 0, "conaffinity": 0}
-    world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[4, 4, 1], pos=[0, 0, FLOOR_Z_M], material="floor")
-    world.add_geom(name="wall_back", type=box, size=[0.05, 4, 2], pos=[-1.15, 0, FLOOR_Z_M + 2], material="wall", **ghost)
-    world.add_geom(name="wall_left", type=box, size=[4, 0.05, 2], pos=[0, 1.6, FLOOR_Z_M + 2], material="wall", **ghost)
-    world.add_geom(name="table", type=box, size=[0.55, 0.65, 0.02], pos=[0.28, 0, -0.02], material="planks", condim=4, friction=[1.0, 0.01, 0.0001])
-    for i, (x, y) in enumerate(((-0.2, -0.58), (-0.2, 0.58), (0.76, -0.58), (0.76, 0.58))):
-        world.add_geom(name=f"leg{i}", type=box, size=[0.03, 0.03, 0.355], pos=[x, y, -0.395], material="legs", **ghost)
+    floor, (x0, y0, x1, y1) = arm.floor_z_m, arm.table_m
+    half, centre = [(x1 - x0) / 2, (y1 - y0) / 2, 0.02], [(x0 + x1) / 2, (y0 + y1) / 2, -0.02]
+    world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[4, 4, 1], pos=[0, 0, floor], material="floor")
+    world.add_geom(name="wall_back", type=box, size=[0.05, 4, 2], pos=[-1.15, 0, floor + 2], material="wall", **ghost)
+    world.add_geom(name="wall_left", type=box, size=[4, 0.05, 2], pos=[0, 1.6, floor + 2], material="wall", **ghost)
+    world.add_geom(name="table", type=box, size=half, pos=centre, material="planks", condim=4, friction=[1.0, 0.01, 0.0001])
+    leg = [0.03, 0.03, -0.5 * (floor + 0.04)]
+    for i, (x, y) in enumerate((x, y) for x in (x0 + 0.07, x1 - 0.07) for y in (y0 + 0.07, y1 - 0.07)):
+        world.add_geom(name=f"leg{i}", type=box, size=leg, pos=[x, y, -0.04 - leg[2]], material="legs", **ghost)
 
 
 def planks(side: int, light: Colour3, dark: Colour3) -> UInt8[np.ndarray, "{side} {side} 3"]:

@@ -4,7 +4,7 @@ Every body stands on z = 0, centred on the z axis, its front towards -y. Decorat
 atlas, plain parts to a swatch (see `textures`).
 """
 
-from typing import Literal
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -40,6 +40,17 @@ class Solid:
     size: tuple[Number, ...]
     pos: tuple[Number, Number, Number]
     axis: Literal["y", "z"] = "z"
+
+
+@runtime_checkable
+class Shape(Protocol):
+    """A parametric body: a few lengths that give a mesh, its collision solids and its decorated wall's circumference over its height."""
+
+    def mesh(self) -> Mesh: ...
+
+    def solids(self) -> tuple[Solid, ...]: ...
+
+    def aspect(self) -> float: ...
 
 
 def join(parts: list[Mesh]) -> Mesh:

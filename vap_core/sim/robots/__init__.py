@@ -21,6 +21,7 @@ class Robot:
     `palm_m` how far an object between them may reach above the tcp before it meets the palm (narrow necks and straws may go deeper).
     `down_base` is the tcp's rotation in the robot base frame when the gripper points straight down, its opening axis across the table:
     the state's rotation vector is counted from it, so that a turn about the vertical reads (0, 0, yaw).
+    `table_m` is the table top's (x0, y0, x1, y1) and `floor_z_m` the floor below it, metres in the world frame.
     """
 
     name: str
@@ -37,6 +38,8 @@ class Robot:
     base_world: Pose
     links: tuple[str, ...]
     down_base: Float64[np.ndarray, "3 3"]
+    table_m: tuple[float, float, float, float] = (-0.27, -0.65, 0.83, 0.65)
+    floor_z_m: float = -0.75
 
     def __post_init__(self) -> None:
         if not len(self.joints) == len(self.home) == len(self.speed_rad_s):

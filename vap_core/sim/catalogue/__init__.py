@@ -1,0 +1,6 @@
+"""Every family of objects. The order is part of what seeds mean: new families go to the end."""
+
+from vap_core.sim.catalogue import classics
+from vap_core.sim.catalogue.family import Family as Family
+
+FAMILIES: tuple[Family, ...] = (*classics.FAMILIES,)
