@@ -150,11 +150,12 @@ def add_object(spec: "mujoco.MjSpec", model: ObjectModel, pos: tuple[Number, Num
     body.add_freejoint(name=f"{name}/free")
     body.add_geom(name=f"{name}/visual", type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, material=name, group=VISUAL_GROUP, contype=0, conaffinity=0,
                   density=0, mass=0)  # fmt: skip
-    kinds = {"box": mujoco.mjtGeom.mjGEOM_BOX, "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER}
+    kinds = {kind: getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}") for kind in ("box", "cylinder", "ellipsoid", "capsule")}
     solids = model.shape.solids()
-    volume = np.array([8 * np.prod(s.size) if s.kind == "box" else 2 * np.pi * s.size[0] ** 2 * s.size[1] for s in solids])
+    volume = np.array([solid.volume for solid in solids])
     for i, (solid, mass_kg) in enumerate(zip(solids, model.mass_kg * volume / volume.sum(), strict=True)):
-        quat = (np.sqrt(0.5), np.sqrt(0.5), 0, 0) if solid.axis == "y" else (1, 0, 0, 0)
+        quat = np.zeros(4)
+        mujoco.mju_mat2Quat(quat, solid.rotation().ravel())
         body.add_geom(name=f"{name}/solid{i}", type=kinds[solid.kind], size=(*solid.size, 0.0)[:3], pos=solid.pos, quat=quat, group=COLLISION_GROUP,
                       mass=float(mass_kg), condim=4, friction=(1, 0.01, 0.001), solref=(0.004, 1), solimp=(0.95, 0.99, 0.001, 0.5, 2))  # fmt: skip
     return body

@@ -34,12 +34,34 @@ class Mesh:
 
 @value
 class Solid:
-    """A collision primitive: box half-extents, or (radius, half-length) of a cylinder, metres; `axis` is the cylinder's."""
+    """A collision primitive, metres: half-extents of a box or an ellipsoid, or (radius, half-length) of a cylinder or a capsule along `axis`.
 
-    kind: Literal["box", "cylinder"]
+    `turn` then rotates it: radians about x, y and z, in that order.
+    """
+
+    kind: Literal["box", "cylinder", "ellipsoid", "capsule"]
     size: tuple[Number, ...]
     pos: tuple[Number, Number, Number]
-    axis: Literal["y", "z"] = "z"
+    axis: Literal["x", "y", "z"] = "z"
+    turn: tuple[Number, Number, Number] = (0, 0, 0)
+
+    @property
+    def volume(self) -> float:
+        """Cubic metres."""
+        match self.kind:
+            case "box":
+                return float(8 * np.prod(self.size))
+            case "ellipsoid":
+                return float(4 / 3 * np.pi * np.prod(self.size))
+            case "cylinder":
+                return float(2 * np.pi * self.size[0] ** 2 * self.size[1])
+            case "capsule":
+                return float(np.pi * self.size[0] ** 2 * (2 * self.size[1] + 4 / 3 * self.size[0]))
+
+    def rotation(self) -> np.ndarray:
+        """Body from solid, 3 x 3, for a primitive that lies along its own z."""
+        lay = {"x": turn(y=np.pi / 2), "y": turn(x=-np.pi / 2), "z": np.eye(3)}[self.axis]
+        return turn(*self.turn) @ lay
 
 
 @runtime_checkable
