@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from vap_core.sim.crafts import CRAFTS
 from vap_core.values import Rgb, value
 
 Ink = tuple[int, int, int]
@@ -162,6 +163,8 @@ def fill(texture: Texture, w: int, h: int) -> Image.Image:
             noise = np.random.default_rng([7, texture.seed]).random((max(8, h // 14), w // 14)) < 0.06 * n
             mask = Image.fromarray((255 * noise).astype(np.uint8)).resize((w, h), Image.Resampling.BICUBIC)
             return Image.composite(Image.new("RGB", (w, h), ink), Image.new("RGB", (w, h), base), mask)
+        case craft if craft in CRAFTS:
+            return _where(lambda x, y: CRAFTS[craft](x, y, n), w, h, ink, base)
         case _:
             return Image.new("RGB", (w, h), base)
 
@@ -196,7 +199,7 @@ def decoration(texture: Texture, aspect: float) -> Image.Image:
     """The decorated wall unrolled; `aspect` is its circumference over its height."""
     w = 2 * ATLAS_PX
     h = int(np.clip(round(w / aspect), 128, 2048))
-    if texture.motif in EVALUATION_FILLS + GENERIC_FILLS:
+    if texture.motif in (*EVALUATION_FILLS, *GENERIC_FILLS, *CRAFTS):
         picture = fill(texture, w, h)
         draw = ImageDraw.Draw(picture)
         if texture.layout == "half":
