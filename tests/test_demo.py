@@ -87,7 +87,7 @@ def same(one: Episode, other: Episode) -> None:
 
 
 def test_batched_equals_one_by_one_and_global_seeds_change_nothing(bank: Path) -> None:
-    trial = make_trial(STUDY, SUITE, TASK, "vap", bank)
+    trial = make_trial(STUDY, STUDY.rows(SUITE, TASK), "vap", bank)
     rows = STUDY.rows(SUITE, TASK)
     together = list(rollout(trial, rows, batch=3))
     np.random.seed(123)  # noqa: NPY002
@@ -98,7 +98,7 @@ def test_batched_equals_one_by_one_and_global_seeds_change_nothing(bank: Path) -
 
 def test_the_prompt_reaches_the_policy_and_only_the_prompt(bank: Path) -> None:
     seen: list[PolicyInput] = []
-    trial = make_trial(STUDY, SUITE, TASK, "vap", bank)
+    trial = make_trial(STUDY, STUDY.rows(SUITE, TASK), "vap", bank)
 
     class Witness:
         label, execute = trial.policy.label, trial.policy.execute
@@ -119,14 +119,14 @@ def test_the_prompt_reaches_the_policy_and_only_the_prompt(bank: Path) -> None:
 
 
 def test_generic_sees_raw_images_and_raw_words(bank: Path) -> None:
-    trial = make_trial(STUDY, SUITE, TASK, "generic", bank)
+    trial = make_trial(STUDY, STUDY.rows(SUITE, TASK), "generic", bank)
     (episode,) = rollout(trial, [replace(STUDY.rows(SUITE, TASK)[0], max_steps=2)], keep_images=True)
     assert episode.opening.rewritten == episode.opening.instruction
     assert all((f.images["front"] == f.prompted["front"]).all() for f in episode.frames)
 
 
 def test_an_episode_that_breaks_is_an_error_with_its_traceback_and_its_recording(bank: Path, tmp_path: Path) -> None:
-    trial = make_trial(STUDY, SUITE, TASK, "generic", bank)
+    trial = make_trial(STUDY, STUDY.rows(SUITE, TASK), "generic", bank)
 
     class Breaks:
         label, execute = "scripted", trial.policy.execute
@@ -149,7 +149,7 @@ def test_an_episode_that_breaks_is_an_error_with_its_traceback_and_its_recording
 
 
 def test_a_policy_that_chokes_on_one_episode_spares_the_others(bank: Path) -> None:
-    trial = make_trial(STUDY, SUITE, TASK, "generic", bank)
+    trial = make_trial(STUDY, STUDY.rows(SUITE, TASK), "generic", bank)
     rows = [replace(row, max_steps=4) for row in STUDY.rows(SUITE, TASK)]
     bad = replace(rows[1], instruction="poison")
 
@@ -168,7 +168,7 @@ def test_a_policy_that_chokes_on_one_episode_spares_the_others(bank: Path) -> No
 
 
 def test_an_error_before_the_first_step_keeps_its_method_and_its_place(bank: Path) -> None:
-    trial = make_trial(STUDY, SUITE, TASK, "vap", bank)
+    trial = make_trial(STUDY, STUDY.rows(SUITE, TASK), "vap", bank)
 
     assert trial.attender is not None
 
@@ -206,5 +206,5 @@ def test_a_dead_worker_is_said_and_what_was_done_stays(tmp_path: Path) -> None:
 
 
 def test_study_refuses_unknown_names() -> None:
-    with pytest.raises(UnknownName, match="known: franka-pick, widowx-pick"):
+    with pytest.raises(UnknownName, match="known: franka-pick, simpler-bridge, simpler-fractal, tabletop, vlabench, widowx-pick"):
         Study((("nowhere", "pick-cup"),), ("vap",))

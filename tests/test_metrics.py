@@ -32,7 +32,7 @@ def test_apart() -> None:
 
 def episode(**changes: object) -> dict[str, object]:
     base = {
-        "suite": "s", "task": "t", "method": "vap", "policy": "scripted", "outcome": "success", "success": True, "cmr": True,
+        "suite": "s", "task": "t", "split": "", "method": "vap", "policy": "scripted", "outcome": "success", "success": True, "cmr": True,
         "wrong_object": False, "first_object_correct": True, "steps": 10, "seconds_render": 0.1,
     }  # fmt: skip
     return {**base, **changes}

@@ -52,7 +52,7 @@ def test_the_winner_is_drawn_apart() -> None:
 
 
 def test_scores_film_and_track_draw() -> None:
-    row = {"suite": "s", "task": "t", "policy": "scripted", "outcome": "success", "success": True, "cmr": True, "wrong_object": False}
+    row = {"suite": "s", "task": "t", "split": "", "policy": "scripted", "outcome": "success", "success": True, "cmr": True, "wrong_object": False}
     rows = [{**row, "method": m, "first_object_correct": True, "steps": 3} for m in ("generic", "vap")]
     assert len(scores_figure(score(rows)).axes) == 1
     assert len(film({"raw": [LINE, LINE]}, ["a", "b"]).axes) == 2

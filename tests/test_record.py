@@ -20,6 +20,7 @@ from vap_core.record import Recorder, read_summary, record_grounding, recording_
 from vap_core.record.evidence import apart, classes, label_spots
 from vap_core.record.file import rerun_cli, temporary
 from vap_core.values import (
+    ROBOT,
     Boxes,
     Camera,
     EpisodeRow,
@@ -132,12 +133,14 @@ def frame(step: int, start: Opening, lost: range = range(0)) -> Frame:
             shown[track] = (0.5 * image[track] + 0.5 * TINT).astype(np.uint8)
         prompted[camera.name], truths[camera.name] = shown, masks
         tracks[camera.name] = (Track(track, 0.0 if track is None else 0.9 - 0.12 * len(tracks) + 0.05 * math.sin(step / 5 + len(tracks))),)
-    touched = frozenset({"owl_a"} if step > 30 else {"owl_b"} if 20 < step < 24 else set())
-    held = frozenset({"owl_a"} if step > 35 else set())
+    touched = ("owl_a",) if step > 30 else ("owl_b",) if 20 < step < 24 else ()
+    contacts = {"owl_a": frozenset({ROBOT})} if step > 35 else {}
     events = (Event(0, "INFO", "grounded in every view"),) if step == 0 else (Event(step, "WARN", "front: track lost"),) if step in lost[:1] else ()
     state = np.array([0.3, 0, 0.3, 0, 0, 0, step < 33, *np.sin(np.arange(6) + step / 20)], np.float32)
     action = np.array([*0.02 * np.sin(np.arange(6) + step / 9), step < 33], np.float32)
-    return Frame(step, step / 10, images, prompted, tracks, cameras, state, action, Truth(poses(step), links(step), touched, held, truths), events)
+    return Frame(
+        step, step / 10, images, prompted, tracks, cameras, state, action, Truth(poses(step), links(step), touched, {}, contacts, truths), events
+    )
 
 
 SUCCESS = Outcome("success", True, True, 20, True, False, True, 60)

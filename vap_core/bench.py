@@ -43,7 +43,8 @@ def run(steps: int = 60) -> str:
         bank = folder / "memory"
         register_personal(DEMO, bank)
         suite, task = DEMO.tasks[-1]
-        trial, row = make_trial(DEMO, suite, task, "vap", bank), replace(DEMO.rows(suite, task)[0], max_steps=steps)
+        rows = DEMO.rows(suite, task)
+        trial, row = make_trial(DEMO, rows, "vap", bank), replace(rows[0], max_steps=steps)
         unit = _pass_ms(trial)
         recorded = _record(trial, row, folder / "bench.rrd")
         limits = [*_attend_limits(trial, row, unit), *_record_limits(recorded), _import_limit(unit)]

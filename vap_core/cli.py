@@ -23,6 +23,14 @@ app.add_typer(train_app, name="train")
 
 Memory = Annotated[Path, typer.Option(help="Folder of remembered objects.")]
 StackName = Annotated[str, typer.Option("--stack", help="Perception stack: embedded (offline, CPU).")]
+Methods = Annotated[
+    list[str] | None,
+    typer.Option("--method", help="generic, vap, mask-only, rewrite-only; repeatable. Default: the first two."),
+]
+PolicyName = Annotated[str, typer.Option("--policy", help="scripted (picks only), or the bounds: expert (reads the simulator), random.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the policy and the sensors; of a warm-up suite's episode list, too.")]
+Workers = Annotated[int, typer.Option(min=1, help="Processes.")]
+Meshes = Annotated[str, typer.Option("--robots", help="plain, or menagerie: MuJoCo Menagerie's meshes, downloaded or found in MENAGERIE_ROOT.")]
 BANK = Path("data/memory")
 INTERRUPTED = 130
 NOTE = "note: the embedded detector knows {domain} only, not real photos; {mend}."
@@ -125,27 +133,73 @@ def demo(
 
 
 @app.command()
+def suites() -> None:
+    """List the benchmarks: robots, cameras, tasks, episodes, and the hashes of their episode lists.
+
+    Example: python -m vap_core suites
+    """
+    from vap_core.report import suites_table
+
+    print(suites_table())
+
+
+@app.command()
 def rollout(
-    suite: Annotated[str, typer.Option(help="widowx-pick or franka-pick.")],
+    suite: Annotated[str, typer.Option(help="A suite: see python -m vap_core suites.")],
     task: Annotated[list[str], typer.Option(help="Task of the suite, for example pick-cup; repeatable.")],
     out: Annotated[Path, typer.Option(help="Run folder; a run found there is resumed.")],
-    method: Annotated[list[str] | None, typer.Option(help="generic, vap, mask-only, rewrite-only; repeatable. Default generic and vap.")] = None,
-    policy: Annotated[str, typer.Option(help="Policy: scripted.")] = "scripted",
+    method: Methods = None,
+    policy: PolicyName = "scripted",
     episodes: Annotated[int, typer.Option(min=1, help="Episodes per task and method.")] = 20,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the episode list.")] = 0,
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+    seed: Seed = 0,
+    workers: Workers = 2,
     record: Annotated[bool, typer.Option(help="Write one .rrd per episode.")] = True,
+    robots: Meshes = "plain",
     stack: StackName = "embedded",
 ) -> None:
-    """Run tasks of a suite in closed loop, and print the table.
+    """Run tasks of a suite in closed loop, record every episode, and print the table.
 
     Example: python -m vap_core rollout --suite widowx-pick --task pick-bottle --episodes 4 --out data/runs/bottle
     """
-    from vap_core.experiments import Study
+    tasks = tuple((suite, name) for name in dict.fromkeys(task))
+    _run(_study(tasks, method, policy, episodes, seed, robots, stack), out, workers, record)
 
-    tasks, methods = tuple((suite, name) for name in dict.fromkeys(task)), tuple(dict.fromkeys(method or ("generic", "vap")))
-    study = Study(tasks, methods, episodes, seed, policy, stack)
-    _run(study, out, workers, record)
+
+@app.command("eval")
+def evaluate(
+    suite: Annotated[list[str], typer.Option(help="A suite, or all four benchmarks: all; repeatable.")],
+    out: Annotated[Path | None, typer.Option(help="Run folder; a run found there is resumed. Default data/runs/POLICY-SUITE.")] = None,
+    method: Methods = None,
+    policy: PolicyName = "scripted",
+    episodes: Annotated[int | None, typer.Option(min=1, help="Episodes per task, spread evenly over its list. Default the whole list.")] = None,
+    seed: Seed = 0,
+    workers: Workers = 2,
+    record: Annotated[bool, typer.Option(help="Write one .rrd per episode.")] = False,
+    images_every: Annotated[int, typer.Option(min=0, help="Expert and random: render all cameras every so many steps; 0 never.")] = 0,
+    robots: Meshes = "plain",
+    stack: StackName = "embedded",
+) -> None:
+    """Run whole suites, and print the table with 95 % intervals. Interrupted, the same command goes on.
+
+    Example: python -m vap_core eval --suite simpler-bridge --policy expert
+    """
+    from vap_core import suites as known
+
+    names = [name for each in suite for name in (known.BENCHMARKS if each == "all" else [each])]
+    tasks = tuple((name, task.name) for name in dict.fromkeys(names) for task in known.suite(name).tasks)
+    study = _study(tasks, method, policy, episodes, seed, robots, stack, images_every)
+    _run(study, out or Path(f"data/runs/{policy}-{'-'.join(dict.fromkeys(suite))}"), workers, record)
+
+
+@app.command()
+def rescore(run: Annotated[Path, typer.Argument(help="Run folder of eval, rollout or demo.")]) -> None:
+    """Judge a finished run again from its saved states, without a simulator, and say what changed.
+
+    Example: python -m vap_core rescore data/runs/expert-simpler-bridge
+    """
+    from vap_core.report import rescore as judge_again
+
+    print(judge_again(run))
 
 
 @app.command()
@@ -204,6 +258,22 @@ def perception(
     from vap_core.training.perception import train
 
     print(json.dumps(train(out, scenes=scenes, seed=seed, minutes=minutes), indent=1))
+
+
+def _study(
+    tasks: tuple[tuple[str, str], ...],
+    methods: list[str] | None,
+    policy: str,
+    episodes: int | None,
+    seed: int,
+    robots: str,
+    stack: str,
+    images_every: int = 0,
+) -> "Study":
+    from vap_core.experiments import INSIDERS, Study
+
+    usual = ("generic",) if policy in INSIDERS else ("generic", "vap")
+    return Study(tasks, tuple(dict.fromkeys(methods or usual)), episodes, seed, policy, stack, robots, images_every)
 
 
 def _run(study: "Study", out: Path, workers: int, record: bool) -> None:

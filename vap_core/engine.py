@@ -10,7 +10,7 @@ from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, Any
 
-from vap_core import store
+from vap_core import store, traces
 from vap_core.errors import WorkerDied
 from vap_core.experiments import Study, make_trial, register_personal
 from vap_core.values import EpisodeRow, Opening
@@ -26,11 +26,9 @@ BATCH = 5
 
 @dataclass(frozen=True)
 class Job:
-    """Some rows of one task under one method, for one worker."""
+    """Some rows of one task and variant under one method, for one worker."""
 
     study: Study
-    suite: str
-    task: str
     method: str
     rows: tuple[EpisodeRow, ...]
     folder: Path
@@ -52,14 +50,14 @@ def _run(study: Study, folder: Path, workers: int, record: bool, progress: bool)
     from tqdm import tqdm
 
     jobs = list(missing(study, folder, record))
-    total = len(study.tasks) * len(study.methods) * study.episodes
+    total = len(study.methods) * sum(len(study.rows(suite, task)) for suite, task in study.tasks)
     register_personal(study, folder / "memory")
     with tqdm(total=total, initial=total - sum(len(job.rows) for job in jobs), unit="episode", disable=not progress) as bar:
         for job, rows in _work(jobs, workers):
             store.append(folder, rows)
             bar.update(len(rows))
             won = sum(row["success"] for row in rows)
-            bar.set_postfix_str(f"{job.task} {job.method} {won}/{len(rows)}")
+            bar.set_postfix_str(f"{job.rows[0].task} {job.method} {won}/{len(rows)}")
 
 
 def missing(study: Study, folder: Path, record: bool) -> Iterator[Job]:
@@ -68,17 +66,21 @@ def missing(study: Study, folder: Path, record: bool) -> Iterator[Job]:
     for method in reversed(study.methods):  # the slower, prompted method first, so that workers finish together
         for suite, task in study.tasks:
             rows = [row for row in study.rows(suite, task) if (suite, task, method, row.episode) not in done]
-            for first in range(0, len(rows), BATCH):
-                yield Job(study, suite, task, method, tuple(rows[first : first + BATCH]), folder, record)
+            for variant in dict.fromkeys(row.variant for row in rows):
+                alike = [row for row in rows if row.variant == variant]
+                for first in range(0, len(alike), BATCH):
+                    yield Job(study, method, tuple(alike[first : first + BATCH]), folder, record)
 
 
 def work(job: Job) -> list[dict[str, Any]]:
     """Run one job in this process."""
     from vap_core.rollout import rollout
 
-    trial = make_trial(job.study, job.suite, job.task, job.method, job.folder / "memory")
+    trial = make_trial(job.study, job.rows, job.method, job.folder / "memory")
     sink = _recorders(job.folder / "recordings") if job.record else None
-    return [episode.summary() for episode in rollout(trial, job.rows, sink, batch=BATCH)]
+    episodes = list(rollout(trial, job.rows, sink, batch=BATCH))
+    traces.write(job.folder, episodes)
+    return [episode.summary() for episode in episodes]
 
 
 def end_with_parent() -> None:

@@ -21,6 +21,10 @@ class BadMemory(VapError):
     """A memory file that is damaged, of another version, or made with another encoder."""
 
 
+class BadObject(VapError):
+    """A 3-D file that cannot become an object, or the damaged folder of one."""
+
+
 class BadOutput(VapError):
     """An output folder that cannot be written, or already holds a different run."""
 
@@ -35,6 +39,18 @@ class MissingGL(VapError):
 
 class MissingWeights(VapError):
     """Weights that are not on this machine, or whose checksum differs from the manifest."""
+
+
+class BadAction(VapError):
+    """An action of the wrong length."""
+
+
+class BadSuite(VapError):
+    """An episode list with a malformed row, or one that changed since it was hashed."""
+
+
+class BadStudy(VapError):
+    """A combination of tasks, methods and policy that makes no sense."""
 
 
 class OutOfReach(VapError):

@@ -1,23 +1,26 @@
 """Every named study: which tasks, methods and policy, how many episodes; and the parts that one batch of it needs."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
-from vap_core import __version__
-from vap_core.attend import STACKS, Attender, Prompting, Stack, load_stack
-from vap_core.errors import one_of
+from vap_core import __version__, suites
+from vap_core.attend import STACKS, Attender, Prompting, load_stack
+from vap_core.detect import Detector
+from vap_core.errors import BadStudy, one_of
 from vap_core.memory import load_bank, register, save
-from vap_core.policies import Policy
+from vap_core.policies import Insider, Policy
+from vap_core.policies.expert import Expert
+from vap_core.policies.random import Random
 from vap_core.policies.scripted import Scripted
 from vap_core.rollout import Trial
 from vap_core.sim.env import Env
 from vap_core.sim.objects import extent_m, get
 from vap_core.sim.scenes import Scene, build
 from vap_core.sim.studio import reference_views
-from vap_core.suites import SUITES, rows
+from vap_core.suites import SUITES, VARIANTS, Suite, Task, lists, rows
 from vap_core.values import EpisodeRow
 from vap_core.weights import weights_sha256
 
@@ -32,14 +35,16 @@ METHODS: dict[str, Prompting | None] = {
 
 @dataclass(frozen=True)
 class Study:
-    """The same episodes of every task, once per method."""
+    """The same episodes of every task, once per method. `episodes` None takes whole lists; `images_every` is rollout.Trial's."""
 
     tasks: tuple[tuple[str, str], ...]
     methods: tuple[str, ...]
-    episodes: int = 20
+    episodes: int | None = None
     seed: int = 0
     policy: str = "scripted"
     stack: str = "embedded"
+    robots: str = "plain"
+    images_every: int = 0
 
     def __post_init__(self) -> None:
         for method in self.methods:
@@ -47,21 +52,39 @@ class Study:
                 raise one_of("Study: method", method, METHODS)
         if self.policy not in POLICIES:
             raise one_of("Study: policy", self.policy, POLICIES)
+        if self.robots not in ("plain", "menagerie"):
+            raise one_of("Study: robots", self.robots, ("plain", "menagerie"))
         if self.stack not in STACKS:
             raise one_of("Study: stack", self.stack, STACKS)
         for suite, task in self.tasks:
             rows(suite, task, n=1)
+            self._can(suites.suite(suite), suites.suite(suite).task(task))
+        if self.policy in INSIDERS and self.methods != ("generic",):
+            raise BadStudy(f"Study: policy {self.policy!r} reads the simulator, not pictures; no method can prompt it. Use --method generic.")
+
+    def _can(self, suite: Suite, task: Task) -> None:
+        if self.policy == "scripted" and (task.rule != "picked" or suite.control != "ee"):
+            raise BadStudy(
+                f"Study: policy 'scripted' only picks things up, in end-effector control; {suite.name}/{task.name} is {task.rule!r} in "
+                f"{suite.control} control. Use --policy expert, or a suite of picks: {', '.join(suites.WARM_UPS)}."
+            )
 
     def rows(self, suite: str, task: str) -> tuple[EpisodeRow, ...]:
         return rows(suite, task, n=self.episodes, seed=self.seed)
 
     def configuration(self) -> dict[str, Any]:
-        """What the results depend on, as JSON; weights by their checksums."""
-        return {**asdict(self), "version": __version__, "weights": weights_sha256()}
+        """What the results depend on, as JSON; weights and episode lists by their checksums."""
+        listed = {suite: lists.digest(suite) for suite, _ in self.tasks if suite in suites.BENCHMARKS}
+        return {**asdict(self), "version": __version__, "weights": weights_sha256(), "lists": listed}
 
 
 def register_personal(study: Study, bank: Path) -> None:
-    """Remember the personal object of every task from five rendered reference views; what the bank holds already stays."""
+    """Remember the personal object of every task from five rendered reference views; what the bank holds already stays.
+
+    A study that prompts nothing needs no memory.
+    """
+    if all(METHODS[method] is None for method in study.methods):
+        return
     stack, held = load_stack(study.stack), load_bank(bank)
     for suite, task in study.tasks:
         row = study.rows(suite, task)[0]
@@ -71,33 +94,42 @@ def register_personal(study: Study, bank: Path) -> None:
             held[row.target] = obj
 
 
-def _scripted(scene: Scene, stack: Stack) -> Policy[Any]:
-    fixed = next(camera for camera in Env(scene).cameras() if camera.name == "front")
-    return Scripted(stack.detector, fixed, scene.robot.base_world)
-
-
-POLICIES: dict[str, Callable[[Scene, Stack], Policy[Any]]] = {"scripted": _scripted}
-"""Policies by name; each is built for one scene."""
-
-
-DEMO = Study(tasks=(("widowx-pick", "pick-straw-cup"), ("franka-pick", "pick-cup")), methods=("generic", "vap"))
-"""The main job: one task on each robot, generic against VAP."""
-
-
-def make_trial(study: Study, suite: str, task: str, method: str, bank: Path) -> Trial:
-    """Build, or take from this process's cache, the scene, the models and the policy of one task and method."""
-    stack, scene = _stack(study.stack), _scene(study, suite, task)
-    prompting, memory = METHODS[method], load_bank(bank, _stack(study.stack).encoder.name)
-    target = study.rows(suite, task)[0].target
-    attender = None if prompting is None else Attender(stack, {target: memory[target]}, prompting)
-    sizes: Mapping[str, tuple[float, float, float]] = {name: extent_m(get(name)) for name in scene.objects}
-    return Trial(method, scene, POLICIES[study.policy](scene, stack), attender, sizes)
-
-
 _stack = cache(load_stack)
 
 
-@cache
-def _scene(study: Study, suite: str, task: str) -> Scene:
-    names = dict.fromkeys(p.model for row in study.rows(suite, task) for p in row.placements)
-    return build(SUITES[suite].robot, tuple(names))
+def scripted(detector: Detector, scene: Scene) -> Scripted:
+    """The scripted policy, calibrated to the first camera of `scene`."""
+    return Scripted(detector, Env(scene).cameras()[0], scene.robot.base_world)
+
+
+POLICIES: dict[str, Callable[[Study, Scene], Policy[Any] | Insider[Any]]] = {
+    "scripted": lambda study, scene: scripted(_stack(study.stack).detector, scene),
+    "expert": lambda study, scene: Expert(),
+    "random": lambda study, scene: Random(),
+}
+"""Policies by name; each is built for one scene."""
+INSIDERS = ("expert", "random")
+"""Policies that read the simulator, or nothing at all: bounds on what a task allows, never results."""
+
+
+DEMO = Study(tasks=(("widowx-pick", "pick-straw-cup"), ("franka-pick", "pick-cup")), methods=("generic", "vap"), episodes=20)
+"""The main job: one task on each robot, generic against VAP."""
+
+
+def make_trial(study: Study, rows: Sequence[EpisodeRow], method: str, bank: Path) -> Trial:
+    """Build, or take from this process's cache, what some rows of one task and one variant need: scene, models, policy."""
+    first, prompting = rows[0], METHODS[method]
+    suite = suites.suite(first.suite)
+    scene = _scene(study, first.suite, first.task, first.variant)
+    attender = None
+    if prompting is not None:
+        stack = _stack(study.stack)
+        attender = Attender(stack, {first.target: load_bank(bank, stack.encoder.name)[first.target]}, prompting)
+    sizes: Mapping[str, tuple[float, float, float]] = {name: extent_m(get(name)) for name in scene.objects}
+    return Trial(method, scene, POLICIES[study.policy](study, scene), attender, sizes, suite.control, suite.sensor, study.images_every)
+
+
+@lru_cache(maxsize=4)
+def _scene(study: Study, suite: str, task: str, variant: str) -> Scene:
+    names = dict.fromkeys(p.model for row in study.rows(suite, task) if row.variant == variant for p in row.placements)
+    return build(SUITES[suite].robot, tuple(names), look=VARIANTS[variant].look, meshes="menagerie" if study.robots == "menagerie" else "plain")

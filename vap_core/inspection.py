@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vap_core.attend import Attender
-from vap_core.experiments import POLICIES
+from vap_core.experiments import scripted
 from vap_core.rollout import Trial, rollout
 from vap_core.segment import iou
 from vap_core.sim.env import Env
+from vap_core.sim.objects import extent_m, get
 from vap_core.sim.scenes import Scene
 from vap_core.values import EpisodeRow, Frame, Grounding, Mask, Opening, Outcome
 
@@ -59,8 +60,8 @@ def survey(attender: Attender, scene: Scene, rows: Sequence[EpisodeRow]) -> "pd.
     return pd.DataFrame(lines)
 
 
-def follow(attender: Attender, scene: Scene, row: EpisodeRow, policy: str = "scripted") -> "pd.DataFrame":
-    """Run one prompted episode; one line per control step and camera: the target track's IoU with ground truth and its score."""
+def follow(attender: Attender, scene: Scene, row: EpisodeRow) -> "pd.DataFrame":
+    """Run one prompted episode of the scripted policy; a line per step and camera: the target track's IoU with ground truth and its score."""
     import pandas as pd
 
     lines: list[dict[str, object]] = []
@@ -78,5 +79,6 @@ def follow(attender: Attender, scene: Scene, row: EpisodeRow, policy: str = "scr
     def watch(opening: Opening) -> Watch:
         return Watch()
 
-    list(rollout(Trial("vap", scene, POLICIES[policy](scene, attender.stack), attender, dict.fromkeys(scene.objects, (0.0, 0.0, 0.0))), [row], watch))
+    policy = scripted(attender.stack.detector, scene)
+    list(rollout(Trial("vap", scene, policy, attender, {name: extent_m(get(name)) for name in scene.objects}), [row], watch))
     return pd.DataFrame(lines)

@@ -3,6 +3,8 @@
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import numpy as np
+
 from vap_core.values import value
 
 
@@ -17,7 +19,7 @@ class Rate:
     high: float
 
     def __str__(self) -> str:
-        return f"{100 * self.value:.0f} % [{100 * self.low:.0f}, {100 * self.high:.0f}]"
+        return f"{100 * self.value:.0f} % [{100 * self.low:.0f}, {100 * self.high:.0f}]" if self.n else "-"
 
     def apart_from(self, other: "Rate") -> bool:
         """Whether the two intervals do not overlap."""
@@ -40,6 +42,7 @@ class Score:
 
     suite: str
     task: str
+    split: str
     method: str
     policy: str
     n: int
@@ -53,23 +56,25 @@ class Score:
     def to_json(self) -> dict[str, Any]:
         rates = {name: getattr(self, name) for name in ("sr", "cmr", "wrong_object", "first_object_correct")}
         return {
-            "suite": self.suite, "task": self.task, "method": self.method, "policy": self.policy, "n": self.n, "errors": self.errors,
-            **{name: r.value for name, r in rates.items()},
-            "intervals": {name: [r.low, r.high] for name, r in rates.items()},
+            "suite": self.suite, "task": self.task, "split": self.split, "method": self.method, "policy": self.policy,
+            "n": self.n, "errors": self.errors,
+            **{name: r.value if r.n else None for name, r in rates.items()},
+            "intervals": {name: [r.low, r.high] if r.n else None for name, r in rates.items()},
         }  # fmt: skip
 
 
 def score(episodes: Iterable[Mapping[str, Any]]) -> list[Score]:
-    """Group flat episode rows (`Episode.summary`) by suite, task, method and policy, in order of appearance."""
-    groups: dict[tuple[str, str, str, str], list[Mapping[str, Any]]] = {}
+    """Group flat episode rows (`Episode.summary`) by suite, task, split, method and policy, in order of appearance."""
+    groups: dict[tuple[str, str, str, str, str], list[Mapping[str, Any]]] = {}
     for row in episodes:
-        groups.setdefault((row["suite"], row["task"], row["method"], row["policy"]), []).append(row)
+        groups.setdefault((row["suite"], row["task"], row["split"], row["method"], row["policy"]), []).append(row)
     return [_score(key, rows) for key, rows in groups.items()]
 
 
-def _score(key: tuple[str, str, str, str], rows: list[Mapping[str, Any]]) -> Score:
+def _score(key: tuple[str, str, str, str, str], rows: list[Mapping[str, Any]]) -> Score:
     def share(column: str) -> Rate:
-        return rate(sum(bool(row[column]) and row["outcome"] != "error" for row in rows), len(rows))
+        defined = [row for row in rows if isinstance(row[column], bool | np.bool_)]  # a selection has no CMR
+        return rate(sum(bool(row[column]) and row["outcome"] != "error" for row in defined), len(defined))
 
     return Score(
         *key,

@@ -73,26 +73,31 @@ def similarity_matrix(axes: "Axes", grounding: Grounding) -> None:
 
 
 def scores_figure(scores: Sequence[Score]) -> "Figure":
-    """SR, CMR and wrong-object rate of every method, one panel per task, with 95 % Wilson intervals."""
-    tasks = list(dict.fromkeys((s.suite, s.task) for s in scores))
+    """SR, CMR and wrong-object rate of every method, one panel per task and track, four in a row, with 95 % Wilson intervals."""
+    panels = list(dict.fromkeys((s.suite, s.task, s.split) for s in scores))
     measures = (("sr", "success rate"), ("cmr", "correct movement\nratio (CMR)"), ("wrong_object", "wrong object\nmoved"))
-    figure = _figure(4.6 * len(tasks) + 0.8, 3.8)
-    panels = np.atleast_1d(figure.subplots(1, len(tasks), sharey=True))
-    for axes, (suite, task) in zip(panels, tasks, strict=True):
-        shown = [s for s in scores if (s.suite, s.task) == (suite, task)]
+    columns = min(4, len(panels))
+    rows = -(-len(panels) // columns)
+    figure = _figure(4.6 * columns + 0.8, 3.4 * rows + 0.4)
+    grid = np.atleast_2d(figure.subplots(rows, columns, sharey=True, squeeze=False))
+    for axes in grid.ravel()[len(panels) :]:
+        axes.set_axis_off()
+    for axes, (suite, task, split) in zip(grid.ravel(), panels, strict=False):
+        shown = [s for s in scores if (s.suite, s.task, s.split) == (suite, task, split)]
         for i, s in enumerate(shown):
-            rates = [getattr(s, name) for name, _ in measures]
-            x = np.arange(len(measures)) + (i - (len(shown) - 1) / 2) * 0.8 / len(shown)
-            heights = np.array([100 * r.value for r in rates])
-            spread = [heights - [100 * r.low for r in rates], [100 * r.high for r in rates] - heights]
+            rates = [(j, getattr(s, name)) for j, (name, _) in enumerate(measures) if getattr(s, name).n]
+            x = np.array([j for j, _ in rates]) + (i - (len(shown) - 1) / 2) * 0.8 / len(shown)
+            heights = np.array([100 * r.value for _, r in rates])
+            spread = [heights - [100 * r.low for _, r in rates], [100 * r.high for _, r in rates] - heights]
             axes.bar(x, heights, 0.72 / len(shown), color=METHOD_COLOURS.get(s.method, f"C{i}"), label=s.method)
             axes.errorbar(x, heights, np.maximum(spread, 0), fmt="none", ecolor="black", capsize=3, linewidth=1)
         axes.set_xticks(range(len(measures)), [label for _, label in measures])
-        axes.set_title(f"{suite} / {task}\nn = {shown[0].n} each, {shown[0].policy} policy", fontsize=10)
+        axes.set_title(f"{suite} / {task}{f', {split}' if split else ''}\nn = {shown[0].n} each, {shown[0].policy} policy", fontsize=9)
         axes.set_ylim(0, 105)
         axes.spines[["top", "right"]].set_visible(False)
-    panels[0].set_ylabel("% of episodes, 95 % interval")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    for axes in grid[:, 0]:
+        axes.set_ylabel("% of episodes, 95 % interval")
+    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     return figure
 
 

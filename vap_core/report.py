@@ -4,13 +4,21 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vap_core import suites, traces
+from vap_core.errors import BadOutput
 from vap_core.experiments import Study
-from vap_core.metrics import Score, score, step_times
+from vap_core.metrics import Score, rate, score, step_times
 from vap_core.plots import scores_figure, write_png
-from vap_core.store import write_atomic
+from vap_core.sim.objects import extent_m, get
+from vap_core.store import KEY, read, write_atomic
+from vap_core.suites.rules import rejudge
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+RULED = ("success", "success_once", "held_steps", "cmr", "wrong_object", "first_object_correct", "steps")
+"""What the rules decide of an episode."""
 
 
 def conclude(study: Study, table: "pd.DataFrame", folder: Path) -> str:
@@ -24,7 +32,7 @@ def conclude(study: Study, table: "pd.DataFrame", folder: Path) -> str:
     times = {
         (s.suite, s.method): step_times(r for r in rows if (r["suite"], r["method"]) == (s.suite, s.method)) for s in scores
     }  # fmt: skip
-    lines = [results_table(scores), "", "time per control step, ms by part:", times_table(times)]
+    lines = [results_table(scores), *_overall(scores), "", "time per control step, ms by part:", times_table(times)]
     recordings = sorted((folder / "recordings").glob("*.rrd")) if (folder / "recordings").is_dir() else []
     lines += ["", f"wrote {folder / 'summary.json'}, {figure}" + (f", {len(recordings)} recordings in {folder / 'recordings'}" if recordings else "")]
     if recordings:
@@ -35,8 +43,75 @@ def conclude(study: Study, table: "pd.DataFrame", folder: Path) -> str:
 def results_table(scores: list[Score]) -> str:
     """Aligned text; every rate with its 95 % Wilson interval."""
     head = ["suite", "task", "method", "policy", "n", "errors", "SR % [95 %]", "CMR % [95 %]", "wrong object % [95 %]"]
-    body = [[s.suite, s.task, s.method, s.policy, str(s.n), str(s.errors), str(s.sr), str(s.cmr), str(s.wrong_object)] for s in scores]
+    body = [
+        [
+            s.suite,
+            f"{s.task} ({s.split})" if s.split else s.task,
+            s.method,
+            s.policy,
+            str(s.n),
+            str(s.errors),
+            str(s.sr),
+            str(s.cmr),
+            str(s.wrong_object),
+        ]
+        for s in scores
+    ]
     return align([head, *body])
+
+
+def _overall(scores: list[Score]) -> list[str]:
+    """Success of all tasks of a suite together, per method, where there is more than one."""
+    lines = []
+    for suite, method in dict.fromkeys((s.suite, s.method) for s in scores):
+        part = [s for s in scores if (s.suite, s.method) == (suite, method)]
+        if len(part) > 1:
+            total = rate(sum(s.sr.k for s in part), sum(s.n for s in part))
+            worst = min(part, key=lambda s: s.sr.value)
+            lines.append(f"{suite} {method}: {total.k} of {total.n} succeed, SR {total}; worst {worst.task} {worst.sr}")
+    return ["", *lines] if lines else []
+
+
+def suites_table() -> str:
+    """The benchmarks as their hashed lists hold them, one row per track; then the warm-up suites."""
+    head = ["suite", "robot", "cameras", "Hz", "control", "track", "tasks (episodes, max steps)", "episodes", "sha256"]
+    body = []
+    for name, suite in suites.BENCHMARKS.items():
+        listed = suites.lists.read(name)
+        for split in dict.fromkeys(row.split for row in listed):
+            track = [row for row in listed if row.split == split]
+            counts = {task.name: sum(row.task == task.name for row in track) for task in suite.tasks}
+            tasks = ", ".join(f"{task.name} ({counts[task.name]}, {task.max_steps})" for task in suite.tasks)
+            about = [name, suite.robot, " ".join(suite.cameras), f"{suite.hz:g}", suite.control]
+            body.append([*about, split or "-", tasks, str(len(track)), suites.lists.digest(name)[:12]])
+    lines = [align([head, *body]), "", "protocol-matched in MuJoCo: other physics, renderings and objects than SIMPLER's and VLABench's own."]
+    for name, suite in suites.WARM_UPS.items():
+        lines.append(f"warm-up {name}: {suite.robot}, {len(suite.tasks)} picks of {suite.tasks[0].max_steps} steps, any number of episodes")
+    return "\n".join(lines)
+
+
+def rescore(folder: Path) -> str:
+    """Judge a run again from its saved states, and say whose outcome differs from the stored one. Raises: BadOutput, BadSuite."""
+    table = read(folder)
+    if table.empty:
+        raise BadOutput(f"rescore: {folder} holds no results; name the folder that eval or rollout wrote.")
+    stored = {tuple(row[name] for name in KEY): row for row in table.to_dict("records")}
+    study = json.loads((folder / "run.json").read_text())["configuration"]
+    again, changed = [], []
+    rows = {(r.suite, r.task, r.episode): r for suite, task in study["tasks"] for r in suites.rows(suite, task, study["episodes"], study["seed"])}
+    for key, truths in traces.read(folder):
+        if key not in stored or stored[key]["outcome"] == "error":
+            continue
+        suite, task, _, episode = key
+        row = rows[suite, task, episode]
+        sizes = {place.model: extent_m(get(place.model)) for place in row.placements}
+        outcome = rejudge(row, sizes, truths).outcome()
+        again.append(stored[key] | {"outcome": outcome.status} | {name: getattr(outcome, name) for name in RULED})
+        if any(stored[key][name] is not getattr(outcome, name) and stored[key][name] != getattr(outcome, name) for name in RULED):
+            changed.append(" ".join(str(part) for part in key))
+    scores = score({str(name): cell for name, cell in row.items()} for row in again)
+    verdict = f"{len(changed)} of {len(again)} episodes judged differently" + (": " + "; ".join(changed[:10]) if changed else "")
+    return "\n".join([results_table(scores), "", verdict + f"; {len(stored) - len(again)} without a saved state or in error left out."])
 
 
 def times_table(times: dict[tuple[str, str], dict[str, float]]) -> str:

@@ -15,13 +15,12 @@ import numpy as np
 
 from vap_core.attend import Attender, AttendState
 from vap_core.errors import VapError
-from vap_core.policies import Policy
-from vap_core.sim.env import Env
+from vap_core.policies import Insider, Policy
+from vap_core.sim.env import Control, Env
 from vap_core.sim.scenes import Scene
+from vap_core.sim.sensor import PERFECT, Sensor
 from vap_core.suites import Judge
-from vap_core.values import Attended, Episode, EpisodeRow, Frame, Opening, Outcome, PolicyInput
-
-REST = np.zeros(7, np.float32)
+from vap_core.values import Attended, Chunk, Episode, EpisodeRow, Frame, Opening, Outcome, PolicyInput
 
 
 @runtime_checkable
@@ -35,13 +34,19 @@ class Sink(Protocol):
 
 @dataclass(frozen=True)
 class Trial:
-    """What a batch of episodes shares. `attender` None is the generic policy: raw images, raw instruction."""
+    """What a batch of episodes shares. `attender` None is the generic policy: raw images, raw instruction.
+
+    An Insider needs no pictures; it gets them every `images_every` control steps all the same (0: never), for their cost or their look.
+    """
 
     method: str
     scene: Scene
-    policy: Policy[Any]
+    policy: Policy[Any] | Insider[Any]
     attender: Attender | None
     sizes_m: Mapping[str, tuple[float, float, float]]
+    control: Control = "ee"
+    sensor: Sensor = PERFECT
+    images_every: int = 0
 
 
 @dataclass
@@ -53,7 +58,7 @@ class Running:
     policy_state: Any
     judge: Judge
     sink: Sink | None
-    masks: bool
+    watched: bool
     opening: Opening | None = None
     attend_state: AttendState | None = None
     queue: deque[np.ndarray] = field(default_factory=deque)
@@ -71,7 +76,7 @@ def rollout(
     Images are kept in the frames only with `keep_images`; a sink gets them all the same.
     """
     for first in range(0, len(rows), batch):
-        running = [_begin(trial, row, sink is not None) for row in rows[first : first + batch]]
+        running = [_begin(trial, row, sink is not None or keep_images) for row in rows[first : first + batch]]
         while any(one.outcome is None for one in running):
             live = [one for one in running if one.outcome is None]
             seen = {id(one): shown for one in live if (shown := _guard(one, _see, trial, one, sink)) is not None}
@@ -84,17 +89,18 @@ def rollout(
             yield _end(trial, one)
 
 
-def _begin(trial: Trial, row: EpisodeRow, masks: bool) -> Running:
-    env = Env(trial.scene)
+def _begin(trial: Trial, row: EpisodeRow, watched: bool) -> Running:
+    env = Env(trial.scene, cameras=row.cameras or None, control=trial.control, sensor=trial.sensor)
     env.reset(row)
-    one = Running(row, env, None, Judge.start(row, env.truth()), None, masks)
+    one = Running(row, env, None, Judge.start(row, trial.sizes_m, env.truth()), None, watched)
     one.policy_state = _guard(one, trial.policy.start, np.random.default_rng([row.seed, row.episode]))
     return one
 
 
 def _see(trial: Trial, one: Running, sink: Callable[[Opening], Sink] | None) -> tuple[PolicyInput, Attended]:
     """Render, attend, and at t = 0 open the recording. Returns the raw input and what attending made of it."""
-    raw = one.env.observe(one.row.instruction)
+    looks = one.watched or not isinstance(trial.policy, Insider) or (trial.images_every and one.judge.steps % trial.images_every == 0)
+    raw = one.env.observe(one.row.instruction) if looks else PolicyInput({}, one.row.instruction, one.env.state())
     with _timed(one.seconds, "attend"):
         if trial.attender is None:
             attended = Attended(raw.images, raw.text, (), {}, {}, ())
@@ -117,10 +123,9 @@ def _plan(trial: Trial, live: Sequence[Running], seen: Mapping[int, tuple[Policy
     asking = [one for one in live if not one.queue]
     if not asking:
         return
-    shown = [PolicyInput(attended.images, attended.text, raw.state) for raw, attended in (seen[id(one)] for one in asking)]
     start = time.perf_counter()
     try:
-        states, chunks = trial.policy.plan([one.policy_state for one in asking], shown)
+        states, chunks = _ask(trial.policy, asking, seen)
     except VapError:
         raise
     except Exception:
@@ -137,11 +142,20 @@ def _plan(trial: Trial, live: Sequence[Running], seen: Mapping[int, tuple[Policy
         one.seconds["policy"] += share
 
 
+def _ask(
+    policy: Policy[Any] | Insider[Any], asking: Sequence[Running], seen: Mapping[int, tuple[PolicyInput, Attended]]
+) -> tuple[list[Any], list[Chunk]]:
+    states = [one.policy_state for one in asking]
+    if isinstance(policy, Insider):
+        return policy.plan_inside(states, [one.env for one in asking])
+    return policy.plan(states, [PolicyInput(attended.images, attended.text, raw.state) for raw, attended in (seen[id(one)] for one in asking)])
+
+
 def _act(one: Running, raw: PolicyInput, attended: Attended, keep_images: bool) -> None:
     """Execute one action, or none when the episode is over, and hand the frame on."""
     over = one.judge.done or one.judge.steps >= one.row.max_steps
-    action = REST if over else one.queue.popleft()
-    truth, cameras = one.env.truth(masks=one.masks), one.env.cameras()
+    action = np.zeros(one.env.action_size, np.float32) if over else one.queue.popleft()
+    truth, cameras = one.env.truth(masks=one.sink is not None), one.env.cameras()
     if over:
         one.outcome = one.judge.outcome()
     events = (*attended.events, *one.judge.events)

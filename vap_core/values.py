@@ -16,9 +16,11 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8, jaxtyped
 Rgb = UInt8[np.ndarray, "_ _ 3"]
 Mask = Bool[np.ndarray, "_ _"]
 Pose = Float64[np.ndarray, "7"]
-Chunk = Float32[np.ndarray, "t 7"]
-"""Actions to come, one row per control step: `dx dy dz` (m) and the rotation vector `drx dry drz` (rad) in the robot base
-frame, then `gripper` 0 closed .. 1 open."""
+Action = Float32[np.ndarray, " a"]
+"""One control step. End-effector control, a = 7: `dx dy dz` (m) and the rotation vector `drx dry drz` (rad) in the robot base
+frame, then `gripper` 0 closed .. 1 open. Joint control, a = n + 1: the change of every joint angle (rad), then `gripper`."""
+Chunk = Float32[np.ndarray, "t a"]
+"""Actions to come, one row per control step."""
 
 Views = Mapping[str, Rgb]
 """One image per camera, keyed by the camera's name."""
@@ -183,18 +185,29 @@ class PolicyInput:
     state: Float32[np.ndarray, " s"]
 
 
+ROBOT, REST = "robot", "rest"
+"""Partners of a contact that are no object: the arm with its gripper, and the table, floor and walls."""
+
+
 @value
 class Truth:
-    """Simulator ground truth after one control step; read by metrics, recordings and tests, never by a policy."""
+    """Simulator ground truth after one control step; read by metrics, recordings and tests, never by a policy that is evaluated."""
 
     objects_world: Mapping[str, Pose]
     links_world: Mapping[str, Pose]
-    touched: frozenset[str]
-    """Names of objects that the robot touched during this control step."""
-    held: frozenset[str]
-    """Names of objects whose every contact during the step's last physics step was with the robot, and that touch it."""
+    touched: tuple[str, ...]
+    """Objects that the robot touched during this control step, in the order of their first contact in it."""
+    pressed_s: Mapping[str, float]
+    """Longest unbroken contact of the gripper with an object, seconds, up to now and over step borders; objects it touched in this step."""
+    contacts: Mapping[str, frozenset[str]]
+    """At the end of the step: what every touching object touches (other objects, ROBOT, REST)."""
     masks: Mapping[str, Mapping[str, Mask]] = field(default_factory=dict)
     """`masks[camera][object]`: visible pixels; empty when masks were not asked for."""
+
+    @property
+    def held(self) -> frozenset[str]:
+        """Objects that touch the robot and nothing else."""
+        return frozenset(name for name, partners in self.contacts.items() if partners == {ROBOT})
 
 
 @value
@@ -207,9 +220,17 @@ class Placement:
     yaw: float
 
 
+Rule = Literal["picked", "near", "put", "selected"]
+"""When an episode has succeeded (SPEC section 6); see suites.rules."""
+
+
 @value
 class EpisodeRow:
-    """One row of an episode list: everything that decides how an episode starts. `placements[0]` is the target."""
+    """One row of an episode list: everything that decides how an episode starts, and when it has succeeded.
+
+    `placements[0]` is the target; `goal` names the placed object that it goes to ("" when there is none). `split` is the track within
+    the suite, `variant` the look of the room (suites.VARIANTS), `cameras` the views that the policy gets.
+    """
 
     suite: str
     task: str
@@ -219,6 +240,11 @@ class EpisodeRow:
     category: str
     placements: tuple[Placement, ...]
     max_steps: int
+    rule: Rule = "picked"
+    goal: str = ""
+    split: str = ""
+    variant: str = "base"
+    cameras: tuple[str, ...] = ()
 
     @property
     def target(self) -> str:
@@ -256,7 +282,7 @@ class Frame:
     tracks: Mapping[str, tuple[Track, ...]]
     cameras: tuple[Camera, ...]
     state: Float32[np.ndarray, " s"]
-    action: Float32[np.ndarray, "7"]
+    action: Action
     truth: Truth
     events: tuple[Event, ...]
 
@@ -267,13 +293,16 @@ class Frame:
 
 @value
 class Outcome:
-    """How an episode ended (P 5.1). `success` is read at the end; `success_once` at any step; `held` is its longest run in steps."""
+    """How an episode ended (P 5.1): `success` at the end, `success_once` at any step, `held_steps` the longest run of steps in which the rule held.
+
+    `cmr` is None where the paper defines none (selection).
+    """
 
     status: Literal["success", "failure", "error"]
     success: bool
     success_once: bool
     held_steps: int
-    cmr: bool
+    cmr: bool | None
     wrong_object: bool
     first_object_correct: bool
     steps: int
@@ -296,6 +325,8 @@ class Episode:
         return {
             "suite": row.suite,
             "task": row.task,
+            "split": row.split,
+            "variant": row.variant,
             "episode": row.episode,
             "seed": row.seed,
             "method": self.opening.method,

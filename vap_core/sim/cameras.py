@@ -1,6 +1,7 @@
 """Where the cameras stand, the pinhole they are, and the eyes that see through them."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from types import TracebackType
 
 import numpy as np
@@ -46,14 +47,18 @@ RIGS: dict[str, tuple[Rig, ...]] = {
         Rig("side", "world", (0.68, -0.46, 0.42), (0.47, -0.01, 0.05), np.deg2rad(44.0)),
         Rig("wrist", "hand", (0.09, 0.0, 0.045), (0.03, 0.0, 0.20), np.deg2rad(72.0), up=(-1.0, 0.0, 0.0)),
     ),
+    "google": (Rig("head", "base_link", (0.165, 0.0, 1.195), (0.50, 0.0, 0.61), np.deg2rad(52.0)),),
 }
 
 
-def add_rigs(spec: mujoco.MjSpec, robot: str) -> tuple[str, ...]:
-    """Mount the cameras of `robot` in `spec`; returns their names."""
+def add_rigs(spec: mujoco.MjSpec, robot: str, shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> tuple[str, ...]:
+    """Mount the cameras of `robot` in `spec`, all but a wrist camera moved by `shift_m`; returns their names."""
     if robot not in RIGS:
         raise one_of("cameras.add_rigs: robot", robot, RIGS)
     for rig in RIGS[robot]:
+        if rig.name != "wrist":
+            (x, y, z), (dx, dy, dz) = rig.pos_m, shift_m
+            rig = replace(rig, pos_m=(x + dx, y + dy, z + dz))
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, rig.rotation().ravel())
         spec.body(rig.body).add_camera(name=rig.name, pos=rig.pos_m, quat=quat, fovy=np.rad2deg(rig.fovy_rad))

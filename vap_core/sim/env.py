@@ -3,15 +3,19 @@
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import field
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 
-from vap_core.errors import UnknownName, one_of
+from vap_core.errors import BadAction, UnknownName, one_of
 from vap_core.sim import cameras as optics
+from vap_core.sim import control as steering
 from vap_core.sim.control import Command, arm, follow, rotation_vector
 from vap_core.sim.scenes import Scene
-from vap_core.values import Camera, EpisodeRow, PolicyInput, Truth, value
+from vap_core.sim.sensor import PERFECT, Sensor, Stray, exposed, stray
+from vap_core.values import REST, ROBOT, Action, Camera, EpisodeRow, PolicyInput, Rgb, Truth, value
 
 import mujoco  # isort: skip  (cameras has chosen a GL back end)
 
@@ -21,28 +25,46 @@ DROP_M = 0.0005
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
+Control = Literal["ee", "joint"]
+
+
+@value
+class Touch:
+    """The contacts of the last control step, as Truth reports them."""
+
+    touched: tuple[str, ...] = ()
+    pressed_s: Mapping[str, float] = field(default_factory=dict)
+    contacts: Mapping[str, frozenset[str]] = field(default_factory=dict)
+    running_s: Mapping[str, float] = field(default_factory=dict)
+    """Of `pressed_s`, what is not over yet."""
+
+
 @value
 class Snapshot:
     """Everything that decides how an episode goes on: MuJoCo's full integration state, the command, and the last step's contacts."""
 
     state: Float64[np.ndarray, " n"]
     command: Command
-    placed: tuple[str, ...]
-    touched: frozenset[str]
-    held: frozenset[str]
+    row: EpisodeRow
+    touch: Touch
 
 
 class Env:
     """One running episode in `scene`. The same row gives bit-identical states and images, whatever else runs in the scene.
 
+    `control` says what an action is (values.Action); `sensor` what the cameras do to what they see.
     `seconds` sums wall time by part: "physics", "ik", "render", "truth".
     """
 
-    def __init__(self, scene: Scene, *, image_size: int = 224, cameras: Sequence[str] | None = None) -> None:
+    def __init__(
+        self, scene: Scene, *, image_size: int = 224, cameras: Sequence[str] | None = None, control: Control = "ee", sensor: Sensor = PERFECT
+    ) -> None:
         self.scene = scene
         self.robot = scene.robot
         self.hz = scene.robot.hz
         self.image_size = image_size
+        self.control = control
+        self.sensor = sensor
         self.camera_names = tuple(scene.cameras if cameras is None else cameras)
         for name in self.camera_names:
             if name not in scene.cameras:
@@ -55,16 +77,33 @@ class Env:
         self._qpos = np.array([model.joint(name).qposadr[0] for name in self.robot.joints])
         self._fingers = np.array([model.joint(name).qposadr[0] for name in self.robot.fingers])
         self._ctrl = np.array([model.actuator(name).id for name in (*self.robot.joints, *self.robot.fingers)])
-        self._roles = _roles(scene)
+        self._roles, self._hand = _roles(scene), _hand(scene)
         base = np.eye(4)
         base[:3, :3] = _matrix(self.robot.base_world[3:])
         base[:3, 3] = self.robot.base_world[:3]
         self._base_from_world = np.linalg.inv(base)
+        self._row: EpisodeRow | None = None
         self._placed: tuple[str, ...] = ()
-        self._touched: frozenset[str] = frozenset()
-        self._held: frozenset[str] = frozenset()
+        self._strays: Mapping[str, Stray] = {}
+        self._touch = Touch()
         self._command = Command(self._arm.forward(self.robot.home), self.robot.home, 1.0)
         mujoco.mj_forward(model, self._data)
+
+    @property
+    def row(self) -> EpisodeRow:
+        """The episode under way."""
+        assert self._row is not None, "no episode yet: call reset first"
+        return self._row
+
+    @property
+    def command(self) -> Command:
+        """Where the robot is told to be."""
+        return self._command
+
+    @property
+    def action_size(self) -> int:
+        """Numbers in one action."""
+        return 7 if self.control == "ee" else len(self.robot.joints) + 1
 
     @property
     def time_s(self) -> float:
@@ -95,36 +134,44 @@ class Env:
             body = model.body(name)
             data.joint(f"{name}/free").qpos[:] = (-3.0, -2.0 + 0.4 * i, self.robot.floor_z_m + 0.5, 1.0, 0.0, 0.0, 0.0)
             data.xfrc_applied[body.id, :3] = -model.opt.gravity * float(body.subtreemass[0])
-        self._placed = placed
+        self._begin(row)
         self._command = Command(self._arm.forward(self.robot.home), self.robot.home, 1.0)
         self._run(round(SETTLE_S / model.opt.timestep), data.ctrl[self._ctrl].copy())
-        self._touched = frozenset()
+        self._touch = Touch(contacts=self._touch.contacts)
 
     def observe(self, text: str = "") -> PolicyInput:
         """The raw views and the proprioception: tcp position (m) and rotation vector from straight down (rad), opening 0..1, joint angles (rad)."""
         with self._timed("render"):
             hidden = self._hidden()
-            images = {name: self.scene.eyes.rgb(self._data, name, self.image_size, hidden) for name in self.camera_names}
+            images = {name: self._seen(name, self.scene.eyes.rgb(self._data, name, self.image_size, hidden)) for name in self.camera_names}
         return PolicyInput(images, text, self.state())
 
     def state(self) -> Float32[np.ndarray, " s"]:
         """The proprioception alone, as in `observe`."""
-        tcp = self._tcp_base()
+        tcp = self.tcp_base()
         spin = rotation_vector(tcp[:3, :3] @ self.robot.down_base.T)
         travel = self._data.qpos[self._fingers]
         shut, wide = np.array(self.robot.fingers_closed), np.array(self.robot.fingers_open)
         opening = float(np.clip(np.mean((travel - shut) / (wide - shut)), 0.0, 1.0))
         return np.concatenate([tcp[:3, 3], spin, [opening], self._data.qpos[self._qpos]]).astype(np.float32)
 
-    def step(self, action: Float32[np.ndarray, "7"]) -> None:
-        """Do one action (a row of values.Chunk) for 1 / hz seconds; contacts are watched in every physics step."""
+    def step(self, action: Action) -> None:
+        """Do one action for 1 / hz seconds; contacts are watched in every physics step."""
+        if len(action) != self.action_size:
+            raise BadAction(f"Env.step: {len(action)} numbers, but {self.control} control of {self.robot.name} takes {self.action_size}.")
         with self._timed("ik"):
             before = self._targets(self._command.joints, self._command.gripper)
-            self._command = follow(self._arm, self._command, self._tcp_base(), action, 1.0 / self.hz)
+            self._command = self.commanded(self._command, action)
         after = self._targets(self._command.joints, self._command.gripper)
         with self._timed("physics"):
             ramp = np.linspace(0.0, 1.0, self._substeps + 1)[1:, None]
             self._run(self._substeps, before + ramp * (after - before))
+
+    def commanded(self, command: Command, action: Action) -> Command:
+        """What `action` makes of `command` now; pure."""
+        if self.control == "ee":
+            return follow(self._arm, command, self.tcp_base(), action, 1.0 / self.hz)
+        return steering.follow_joints(self._arm, command, self._data.qpos[self._qpos].copy(), action, 1.0 / self.hz)
 
     def truth(self, masks: bool = False) -> Truth:
         """Ground truth after the last step; `masks` renders every camera's visible object masks as well."""
@@ -135,7 +182,7 @@ class Env:
             if masks:
                 hidden = self._hidden()
                 seen = {name: self.scene.eyes.masks(self._data, name, self.image_size, hidden) for name in self.camera_names}
-            return Truth(poses, links, self._touched, self._held, seen)
+            return Truth(poses, links, self._touch.touched, self._touch.pressed_s, self._touch.contacts, seen)
 
     def cameras(self) -> tuple[Camera, ...]:
         """The calibrated cameras where they are now; a wrist camera moves."""
@@ -144,42 +191,72 @@ class Env:
     def snapshot(self) -> Snapshot:
         state = np.zeros(mujoco.mj_stateSize(self._model, STATE))
         mujoco.mj_getState(self._model, self._data, state, STATE)
-        return Snapshot(state, self._command, self._placed, self._touched, self._held)
+        return Snapshot(state, self._command, self.row, self._touch)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go back to a snapshot of any Env of the same scene."""
         mujoco.mj_setState(self._model, self._data, snapshot.state, STATE)
-        self._command, self._placed = snapshot.command, snapshot.placed
-        self._touched, self._held = snapshot.touched, snapshot.held
+        self._command, self._touch = snapshot.command, snapshot.touch
+        self._begin(snapshot.row)
         self._place_bodies()
+
+    def _begin(self, row: EpisodeRow) -> None:
+        self._row, self._placed = row, tuple(place.model for place in row.placements)
+        self._strays = {name: stray(self.sensor, row, name) for name in self.camera_names}
 
     def _run(self, steps: int, ctrl: Float64[np.ndarray, "..."]) -> None:
-        """Advance physics with `ctrl`, one row a step or one for all, and note what the robot touches."""
-        model, data = self._model, self._data
-        rows = np.broadcast_to(ctrl, (steps, len(self._ctrl)))
-        touched: set[int] = set()
-        roles = np.zeros((0, 2), np.int64)
-        for row in rows:
+        """Advance physics with `ctrl`, one row a step or one for all, and note what the robot touches and how long the hand presses."""
+        model, data, names = self._model, self._data, self.scene.objects
+        touched: dict[int, None] = {}
+        running = {names.index(name): seconds for name, seconds in self._touch.running_s.items()}
+        pressed: dict[int, float] = {}
+        for row in np.broadcast_to(ctrl, (steps, len(self._ctrl))):
             data.ctrl[self._ctrl] = row
             mujoco.mj_step(model, data)
-            roles = self._roles[data.contact.geom]
-            for a, b in roles.tolist():
-                if min(a, b) == ROBOT and max(a, b) >= 0:
-                    touched.add(max(a, b))
-        self._touched = frozenset(self.scene.objects[i] for i in touched)
-        self._held = frozenset(self.scene.objects[i] for i in _held(roles))
+            geoms = data.contact.geom
+            roles = self._roles[geoms]
+            by_robot = (roles.min(axis=1) == ARM) & (roles.max(axis=1) >= 0)
+            if not by_robot.any():
+                running = {}
+                continue
+            others = roles.max(axis=1)
+            touched.update(dict.fromkeys(others[by_robot].tolist()))
+            squeezed = set(others[by_robot & self._hand[geoms].any(axis=1)].tolist())
+            running = {one: running.get(one, 0.0) + model.opt.timestep for one in squeezed}
+            pressed.update({one: max(seconds, pressed.get(one, 0.0)) for one, seconds in running.items()})
+        self._touch = Touch(
+            tuple(names[i] for i in touched),
+            {names[i]: seconds for i, seconds in pressed.items()},
+            {names[i]: frozenset(self._partner(j) for j in others) for i, others in _partners(self._roles[data.contact.geom]).items()},
+            {names[i]: seconds for i, seconds in running.items()},
+        )
         self._place_bodies()
 
+    def _partner(self, role: int) -> str:
+        return ROBOT if role == ARM else REST if role == STILL else self.scene.objects[role]
+
     def _place_bodies(self) -> None:
-        """Bring poses up to date with the state; contacts and solver warm start stay as they are."""
-        mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mj_camlight(self._model, self._data)
+        """Bring poses up to date with the state, and the cameras to where they stray; contacts and solver warm start stay as they are."""
+        model, data = self._model, self._data
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_camlight(model, data)
+        for name, astray in self._strays.items():
+            camera = data.camera(name)
+            facing = camera.xmat.reshape(3, 3)
+            camera.xpos[:] += facing @ astray.shift_m
+            camera.xmat[:] = (facing @ astray.turn).ravel()
+
+    def _seen(self, camera: str, rgb: Rgb) -> Rgb:
+        if self._row is None or self.sensor is PERFECT:
+            return rgb
+        return exposed(self.sensor, rgb, self._strays[camera], self._row, camera, round(self.time_s * self.hz))
 
     def _targets(self, joints: Float64[np.ndarray, " n"], gripper: float) -> Float64[np.ndarray, " m"]:
         shut, wide = np.array(self.robot.fingers_closed), np.array(self.robot.fingers_open)
         return np.concatenate([joints, shut + gripper * (wide - shut)])
 
-    def _tcp_base(self) -> Float64[np.ndarray, "4 4"]:
+    def tcp_base(self) -> Float64[np.ndarray, "4 4"]:
+        """The gripper's measured pose in the robot base frame."""
         site = self._data.site("tcp")
         world = np.eye(4)
         world[:3, :3], world[:3, 3] = site.xmat.reshape(3, 3), site.xpos
@@ -201,25 +278,36 @@ class Env:
             self.seconds[part] += time.perf_counter() - start
 
 
-ROBOT, REST = -1, -2
+ARM, STILL = -1, -2
 
 
 def _roles(scene: Scene) -> Int64[np.ndarray, " g"]:
-    """Of each geom: the index of its object, or ROBOT, or REST (table, floor, walls)."""
+    """Of each geom: the index of its object, or ARM, or STILL (table, floor, walls)."""
     model = scene.model
     base = int(model.body(scene.robot.links[0]).rootid[0])
-    owner = {int(model.body(name).id): i for i, name in enumerate(scene.objects)} | {base: ROBOT}
-    return np.array([owner.get(int(model.body_rootid[body]), REST) for body in model.geom_bodyid], np.int64)
+    owner = {int(model.body(name).id): i for i, name in enumerate(scene.objects)} | {base: ARM}
+    return np.array([owner.get(int(model.body_rootid[body]), STILL) for body in model.geom_bodyid], np.int64)
 
 
-def _held(roles: Int64[np.ndarray, "c 2"]) -> set[int]:
-    """Objects that touch the robot and nothing else."""
+def _hand(scene: Scene) -> Bool[np.ndarray, " g"]:
+    """Of each geom: whether it belongs to the gripper, that is to the tcp's body or to a body below it."""
+    model = scene.model
+    palm = int(model.site("tcp").bodyid[0])
+    below = {palm}
+    for body in range(palm + 1, model.nbody):  # children come after their parents
+        if int(model.body_parentid[body]) in below:
+            below.add(body)
+    return np.isin(model.geom_bodyid, list(below))
+
+
+def _partners(roles: Int64[np.ndarray, "c 2"]) -> dict[int, set[int]]:
+    """Of every object that touches anything: the roles of what it touches."""
     partners: dict[int, set[int]] = {}
     for a, b in roles.tolist():
         for one, other in ((a, b), (b, a)):
             if one >= 0 and one != other:
                 partners.setdefault(one, set()).add(other)
-    return {one for one, others in partners.items() if others == {ROBOT}}
+    return partners
 
 
 def _matrix(quat: Float64[np.ndarray, "4"]) -> Float64[np.ndarray, "3 3"]:

@@ -5,37 +5,21 @@ The world frame stands on the table top (z = 0) at the robot's base: x away from
 
 from collections.abc import Sequence
 from types import TracebackType
+from typing import Literal
 
 import numpy as np
 from jaxtyping import UInt8
 
 from vap_core.sim import objects, robots
 from vap_core.sim.cameras import Eyes, add_rigs
+from vap_core.sim.look import LOOK, Colour3, Look
 from vap_core.sim.robots import Robot
 from vap_core.values import value
 
 import mujoco  # isort: skip  (cameras has chosen a GL back end)
 
-Colour3 = tuple[float, float, float]
 
-
-@value
-class Look:
-    """How the room looks: linear 0..1 colours; `planks` are the table's light and dark wood, or one colour twice for a plain top.
-
-    `lamp_pos_m` and `lamp` place and dim the one lamp, `ambient` is the fill light; `shadows` are off because they triple the frame time.
-    """
-
-    planks: tuple[Colour3, Colour3] = ((0.80, 0.69, 0.55), (0.70, 0.58, 0.44))
-    wall: Colour3 = (0.73, 0.76, 0.78)
-    floor: Colour3 = (0.43, 0.42, 0.42)
-    lamp_pos_m: tuple[float, float, float] = (0.9, -0.6, 1.8)
-    lamp: float = 0.55
-    ambient: float = 0.38
-    shadows: bool = False
-
-
-LOOK = Look()
+Meshes = Literal["plain", "menagerie"]
 
 
 @value
@@ -59,27 +43,41 @@ class Scene:
         self.eyes.close()
 
 
-def build(robot: str, models: "Sequence[str | objects.ObjectModel]", *, look: Look = LOOK) -> Scene:
+def build(robot: str, models: "Sequence[str | objects.ObjectModel]", *, look: Look = LOOK, meshes: Meshes = "plain") -> Scene:
     """Compile a scene of `robot` and `models` (names in the object registry, or models themselves).
+
+    `meshes` "menagerie" draws the robot with MuJoCo Menagerie's meshes; nothing but its look changes.
 
     Raises: UnknownName for a robot or an object that no registry holds.
     """
     arm = robots.get(robot)
     spec = mujoco.MjSpec.from_file(str(arm.xml))
     physics(spec)
+    if meshes == "menagerie":
+        from vap_core.sim.robots.menagerie import dress
+
+        dress(spec, arm)
+    _tint(spec, look.robot)
     spec.body(arm.links[0]).pos, spec.body(arm.links[0]).quat = arm.base_world[:3], arm.base_world[3:]
     _room(spec, arm, look)
     chosen = [objects.get(model) if isinstance(model, str) else model for model in models]
     for model in chosen:
         objects.add_object(spec, model)
-    cameras = add_rigs(spec, robot)
+    cameras = add_rigs(spec, robot, look.camera_shift_m)
     compiled = spec.compile()
     names = tuple(model.name for model in chosen)
     return Scene(arm, compiled, names, cameras, Eyes(compiled, names, look.shadows))
 
 
+def _tint(spec: mujoco.MjSpec, colour: Colour3) -> None:
+    """Multiply the colours of whatever the spec holds so far."""
+    for part in (*spec.materials, *(geom for geom in spec.geoms if not geom.material)):
+        part.rgba[:3] = np.asarray(part.rgba[:3]) * colour
+
+
 def physics(spec: mujoco.MjSpec) -> None:
     """The solver settings with which grasps hold (measured: they cut the creep of a held mug to 0.2 mm)."""
+    spec.memory = 64 << 20
     option = spec.option
     option.timestep = 0.002
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST

@@ -1,97 +1,75 @@
-"""When an object counts as picked, and who was moved: a pure function over the ground truth of every step (SPEC 6, SIMPLER's thresholds).
+"""The warm-up suites of the demo: pick up one of three same-category objects; any number of episodes, made on the spot from the seed."""
 
-*Picked*: raised more than 1 cm above where it settled and touching nothing but the robot, for at least 5 steps in a row.
-*CMR* (P 5.1): the target moved more than 3 cm from where it settled, at least once, whatever the outcome.
-"""
-
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import Literal
+import zlib
 
 import numpy as np
+from jaxtyping import Float64
 
-from vap_core.values import EpisodeRow, Event, Outcome, Pose, Truth, value
+from vap_core.suites.suite import Suite, Task
+from vap_core.values import EpisodeRow, Placement, value
 
-LIFT_M = 0.01
-HELD_STEPS = 5
-MOVED_M = 0.03
-LIFTED_M = 0.05
-"""A held target this high is clear of the table: the lift is done and the episode may end."""
+CATEGORIES = ("cup", "bottle", "pen holder", "straw cup", "owl figurine", "vase", "camera", "shaver")
 
 
 @value
-class Judge:
-    """What is known of one episode so far. `step` returns the next state; `events` are those of the last step alone.
+class Arrangement:
+    """Three places in a row across the table, as the front camera sees it: metres, world frame.
 
-    `run` counts the current unbroken run of held steps, `held_steps` the longest; `first` names the objects of the first
-    step in which any object was touched by the robot or moved: the target alone, or the first object was not the right one.
+    Places lie `spread_m` apart around (`x_m`, 0); the row as a whole shifts by up to `shift_m` sideways and every object by up
+    to `jitter_m` = (x, y); centres stay `clearance_m` apart, room for a gripper between them.
     """
 
-    row: EpisodeRow
-    start_world: Mapping[str, Pose]
-    steps: int = 0
-    run: int = 0
-    held_steps: int = 0
-    lift_m: float = 0.0
-    success_once: bool = False
-    first: frozenset[str] = frozenset()
-    moved: frozenset[str] = frozenset()
-    events: tuple[Event, ...] = ()
+    x_m: float
+    spread_m: float
+    shift_m: float
+    jitter_m: tuple[float, float]
+    clearance_m: float
 
-    @staticmethod
-    def start(row: EpisodeRow, truth: Truth) -> "Judge":
-        """Before the first action, with everything settled."""
-        return Judge(row, {place.model: truth.objects_world[place.model].copy() for place in row.placements})
-
-    def step(self, truth: Truth) -> "Judge":
-        """The state after one more control step."""
-        lift = float(truth.objects_world[self.row.target][2] - self.start_world[self.row.target][2])
-        run = self.run + 1 if lift > LIFT_M and self.row.target in truth.held else 0
-        moved = self.moved | {name for name, start in self.start_world.items() if _distance(truth.objects_world[name], start) > MOVED_M}
-        first = self.first or frozenset((truth.touched | moved) & set(self.start_world))
-        after = replace(
-            self, steps=self.steps + 1, run=run, held_steps=max(self.held_steps, run), lift_m=lift,
-            success_once=self.success_once or run >= HELD_STEPS, first=first, moved=moved, events=(),
-        )  # fmt: skip
-        return replace(after, events=_news(self, after))
-
-    @property
-    def success(self) -> bool:
-        """Picked now."""
-        return self.run >= HELD_STEPS
-
-    @property
-    def done(self) -> bool:
-        """Picked, and lifted clear of the table: nothing is left to do."""
-        return self.success and self.lift_m > LIFTED_M
-
-    def outcome(self, status: Literal["success", "failure", "error"] | None = None, detail: str = "") -> Outcome:
-        """How it ended; without `status` the target's being picked now decides. An error is never a success."""
-        if status is None:
-            status = "success" if self.success else "failure"
-        return Outcome(
-            status=status,
-            success=status == "success",
-            success_once=self.success_once,
-            held_steps=self.held_steps,
-            cmr=self.row.target in self.moved,
-            wrong_object=bool(self.moved - {self.row.target}),
-            first_object_correct=self.first == {self.row.target},
-            steps=self.steps,
-            detail=detail,
-        )
+    def __post_init__(self) -> None:
+        if self.spread_m - 2 * self.jitter_m[1] < self.clearance_m - 1e-9:
+            raise ValueError(
+                f"Arrangement: places {self.spread_m} m apart that jitter by {self.jitter_m[1]} m cannot keep {self.clearance_m} m clear"
+            )
 
 
-def _distance(pose: Pose, start: Pose) -> float:
-    return float(np.linalg.norm(pose[:3] - start[:3]))
+def _picks(max_steps: int) -> tuple[Task, ...]:
+    return tuple(Task(f"pick-{c.replace(' ', '-')}", c, f"pick up my {c}", max_steps) for c in CATEGORIES)
 
 
-def _news(before: Judge, after: Judge) -> tuple[Event, ...]:
-    target, at = after.row.target, after.steps
-    news: list[tuple[bool, Literal["INFO", "WARN"], str]] = [
-        (bool(after.first and not before.first), "INFO" if after.first == {target} else "WARN", f"first object: {', '.join(sorted(after.first))}"),
-        *((True, "INFO" if name == target else "WARN", f"moved: {name}") for name in sorted(after.moved - before.moved)),
-        (after.run == HELD_STEPS, "INFO", f"picked: {target}"),
-        (before.run > 0 and after.run == 0, "WARN", f"lost after {before.run} held steps: {target}"),
-    ]
-    return tuple(Event(at, level, text) for happened, level, text in news if happened)
+WIDOWX = Suite("widowx-pick", "wx250s", 5.0, ("front",), _picks(60))
+FRANKA = Suite("franka-pick", "panda", 10.0, ("front", "side", "wrist"), _picks(100))
+ARRANGEMENTS = {
+    WIDOWX.name: Arrangement(x_m=0.27, spread_m=0.13, shift_m=0.015, jitter_m=(0.025, 0.02), clearance_m=0.09),
+    FRANKA.name: Arrangement(x_m=0.48, spread_m=0.14, shift_m=0.015, jitter_m=(0.03, 0.015), clearance_m=0.11),
+}
+
+
+def rows(suite: Suite, task: Task, n: int, seed: int) -> tuple[EpisodeRow, ...]:
+    """The first `n` episodes: the target stands in each of the three places equally often, in an order drawn by `seed`.
+
+    Episode i depends on (suite, task, seed, i) alone: asking for more episodes leaves the first ones as they were.
+    """
+    return tuple(_row(suite, task, episode, seed) for episode in range(n))
+
+
+def _row(suite: Suite, task: Task, episode: int, seed: int) -> EpisodeRow:
+    name = zlib.crc32(f"{suite.name}.{task.name}".encode())
+    block = np.random.default_rng([seed, episode // 3, name, 1]).permutation(3)
+    rng = np.random.default_rng([seed, episode, name])
+    target = int(block[episode % 3])
+    others = rng.permutation([slot for slot in range(3) if slot != target])
+    places = _places(ARRANGEMENTS[suite.name], rng)
+    order = (target, *(int(slot) for slot in others))
+    models = task.personal, f"{task.stem}-lookalike-1", f"{task.stem}-lookalike-2"
+    placements = tuple(
+        Placement(model, round(float(places[slot, 0]), 4), round(float(places[slot, 1]), 4), round(float(rng.uniform(-np.pi, np.pi)), 4))
+        for model, slot in zip(models, order, strict=True)
+    )
+    return suite.row(task, episode, placements, seed=seed)
+
+
+def _places(arrangement: Arrangement, rng: np.random.Generator) -> Float64[np.ndarray, "3 2"]:
+    """The three places of one episode, from the camera's left to its right (x, y metres)."""
+    row = arrangement.spread_m * np.array([-1.0, 0.0, 1.0]) + rng.uniform(-arrangement.shift_m, arrangement.shift_m)
+    jitter = rng.uniform(-1.0, 1.0, (3, 2)) * arrangement.jitter_m
+    return np.stack([arrangement.x_m + jitter[:, 0], row + jitter[:, 1]], axis=1)

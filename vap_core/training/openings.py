@@ -31,16 +31,17 @@ def openings(detector: Detector, encoder: Encoder, segmenter: Segmenter, *, epis
     """
     memory: dict[str, PersonalObject] = {}
     whole = 0
-    for category in suites.CATEGORIES:
+    for category in suites.pick.CATEGORIES:
         memory[category], uncropped = register(category, category, reference_views(objects.personal(category), k), detector, encoder)
         whole += len(uncropped)
     figures: Figures = {"references_cropped": share(k * len(memory) - whole, k * len(memory)), "image_size": size}
-    for name, suite in suites.SUITES.items():
+    for name, suite in suites.WARM_UPS.items():
         views: dict[str, dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))
         for task in suite.tasks:
-            with scenes.build(suite.robot, task.models) as scene:
+            rows = suites.rows(name, task.name, episodes, seed)
+            with scenes.build(suite.robot, list(dict.fromkeys(place.model for row in rows for place in row.placements))) as scene:
                 env = Env(scene, image_size=size)
-                for row in suites.rows(name, task.name, episodes, seed):
+                for row in rows:
                     env.reset(row)
                     images, masks = env.observe().images, env.truth(masks=True).masks
                     for camera, rgb in images.items():

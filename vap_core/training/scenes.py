@@ -54,7 +54,7 @@ def cast(rng: Generator, held_out: bool) -> list[ObjectModel]:
     return models
 
 
-def look(rng: Generator) -> scenes.Look:
+def look(rng: Generator) -> Look:
     """A room in random colours; one table in three is plain."""
 
     def tint(low: float, high: float) -> tuple[float, float, float]:
@@ -66,8 +66,8 @@ def look(rng: Generator) -> scenes.Look:
     dark = light if rng.random() < 0.35 else (light[0] * shade, light[1] * shade, light[2] * shade)
     if rng.random() < 0.3:
         usual = scenes.LOOK
-        return scenes.Look(usual.planks, usual.wall, usual.floor, shadows=bool(rng.random() < 0.2))
-    return scenes.Look((light, dark), tint(0.3, 0.95), tint(0.15, 0.8), shadows=bool(rng.random() < 0.2))
+        return Look(usual.planks, usual.wall, usual.floor, shadows=bool(rng.random() < 0.2))
+    return Look((light, dark), tint(0.3, 0.95), tint(0.15, 0.8), shadows=bool(rng.random() < 0.2))
 
 
 def stage(seed: int, number: int, *, held_out: bool = False, views: int = VIEWS, size: int = SIZE) -> Shots:

@@ -1,0 +1,231 @@
+"""The scripted expert: it reads the simulator's state, not pictures, and proves that a task can be done; later it makes demonstrations.
+
+A plan is a list of waypoints of the gripper. It moves the commanded pose along them within the speed limits, in whichever control the
+suite has, and plans anew when a grasp came up empty.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64
+
+from vap_core.errors import OutOfReach
+from vap_core.sim.control import arm, rotation, rotation_vector
+from vap_core.sim.env import Env
+from vap_core.sim.grasps import Grasp, grasps, points_world
+from vap_core.values import Action, Chunk, Truth, value
+
+SPEED_M_S, TURN_RAD_S = 0.22, 1.4
+ABOVE_M = 0.04
+"""Clearance over whatever stands lower than the path."""
+ARRIVED_M, ARRIVED_RAD = 0.006, 0.06
+PATIENCE_S = 1.2
+"""Longest wait at a waypoint that is not quite reached."""
+BESIDE_M = 0.035
+"""How far inside the limit of the near rule a thing is set down."""
+
+
+@value
+class Waypoint:
+    """A pose of the tcp (robot base frame), the gripper on the way there (0 closed .. 1 open), and seconds to stay."""
+
+    tcp_base: Float64[np.ndarray, "4 4"]
+    gripper: float
+    stay_s: float = 0.0
+
+
+@value
+class ExpertState:
+    """What is left of the plan, seconds spent at its first waypoint, and whether the plan was to grasp or to carry."""
+
+    phase: str = "grasp"
+    plan: tuple[Waypoint, ...] = ()
+    waited_s: float = 0.0
+    attempt: int = 0
+
+
+class Expert:
+    """Solves every rule of every suite, on every robot."""
+
+    label = "expert"
+    execute = 1
+
+    def start(self, rng: np.random.Generator) -> ExpertState:
+        return ExpertState()
+
+    def plan_inside(self, states: Sequence[ExpertState], envs: Sequence[Env]) -> tuple[list[ExpertState], list[Chunk]]:
+        after = [self._advance(state, env) for state, env in zip(states, envs, strict=True)]
+        return after, [_towards(state.plan[0], env)[None] for state, env in zip(after, envs, strict=True)]
+
+    def _advance(self, state: ExpertState, env: Env) -> ExpertState:
+        """Drop the waypoints that are reached; when none is left, plan the next phase."""
+        plan, waited = state.plan, state.waited_s
+        if plan and _reached(plan[0], env, waited):
+            plan, waited = plan[1:], 0.0
+        elif plan:
+            waited += _dwell(plan[0], env)
+        if plan:
+            return ExpertState(state.phase, plan, waited, state.attempt)
+        return self._next(state, env)
+
+    def _next(self, state: ExpertState, env: Env) -> ExpertState:
+        truth, row = env.truth(), env.row
+        if row.rule == "selected":
+            return ExpertState("touch", tuple(_touch(env, truth, state.attempt)), 0.0, state.attempt + 1)
+        if state.phase == "carry" and row.target in truth.held:
+            if row.rule == "picked":
+                return ExpertState("carry", (_hold(env),), 0.0, state.attempt)
+            return ExpertState("leave", tuple(_set_down(env, truth)), 0.0, state.attempt)
+        if state.phase == "grasp":
+            return ExpertState("carry", tuple(_take(env, truth, state.attempt)), 0.0, state.attempt + 1)
+        return ExpertState("grasp", (_retreat(env),), 0.0, state.attempt)
+
+
+def _towards(waypoint: Waypoint, env: Env) -> Action:
+    """One step from the commanded pose to the waypoint, as fast as allowed, in the control that the suite has."""
+    seconds, now, goal = 1.0 / env.hz, env.command.tcp_base, waypoint.tcp_base
+    move, turn = goal[:3, 3] - now[:3, 3], rotation_vector(goal[:3, :3] @ now[:3, :3].T)
+    move *= min(1.0, SPEED_M_S * seconds / max(float(np.linalg.norm(move)), 1e-9))
+    turn *= min(1.0, TURN_RAD_S * seconds / max(float(np.linalg.norm(turn)), 1e-9))
+    if env.control == "ee":
+        return np.array([*move, *turn, waypoint.gripper], np.float32)
+    step = np.eye(4)
+    step[:3, :3], step[:3, 3] = rotation(turn) @ now[:3, :3], now[:3, 3] + move
+    joints = arm(env.robot.name).solve(env.command.joints, step, seconds)
+    return np.array([*(joints - env.command.joints), waypoint.gripper], np.float32)
+
+
+def _reached(waypoint: Waypoint, env: Env, waited_s: float) -> bool:
+    off, turned = _off(waypoint.tcp_base, env.tcp_base())
+    if waited_s > PATIENCE_S + waypoint.stay_s:
+        return True
+    return off < ARRIVED_M and turned < ARRIVED_RAD and waited_s >= waypoint.stay_s
+
+
+def _dwell(waypoint: Waypoint, env: Env) -> float:
+    """Time counts at a waypoint once the command is there."""
+    off, turned = _off(waypoint.tcp_base, env.command.tcp_base)
+    return 1.0 / env.hz if off < 0.003 and turned < 0.02 else 0.02 / env.hz
+
+
+def _off(one: Float64[np.ndarray, "4 4"], other: Float64[np.ndarray, "4 4"]) -> tuple[float, float]:
+    return float(np.linalg.norm(one[:3, 3] - other[:3, 3])), float(np.linalg.norm(rotation_vector(one[:3, :3] @ other[:3, :3].T)))
+
+
+def _take(env: Env, truth: Truth, attempt: int) -> list[Waypoint]:
+    """Over the target, down, close, and up until it is clear of everything."""
+    found = [grasp for grasp in grasps(env.robot, env.row.target, truth.objects_world)]
+    if not found:
+        raise OutOfReach(
+            f"Expert: {env.row.target} is too wide for {1000 * env.robot.opening_m:.0f} mm of {env.robot.name}; choose another object or robot."
+        )
+    over = max(_ceiling(env, truth) + ABOVE_M, float(env.tcp_base()[2, 3] + env.robot.base_world[2]) - 0.25)
+    reachable = [pose for grasp in found[attempt % len(found) :] + found if (pose := _reachable(env, grasp, over)) is not None]
+    if not reachable:
+        raise OutOfReach(f"Expert: {env.row.key}: no grasp of {env.row.target} can be reached by {env.robot.name}; move it closer.")
+    grasp, low = reachable[0]
+    lift = _raised(low, max(0.09, _ceiling(env, truth) - _foot(truth, env.row.target) + 0.015))
+    return [
+        Waypoint(_raised(low, over - grasp.tcp_world[2]), 1.0),
+        Waypoint(low, 1.0),
+        Waypoint(low, 0.0, 0.45),
+        Waypoint(lift, 0.0),
+    ]
+
+
+def _reachable(env: Env, grasp: Grasp, over: float) -> tuple[Grasp, Float64[np.ndarray, "4 4"]] | None:
+    """The tcp's pose for a grasp, the hand turned the shorter way, if the arm gets there and above it."""
+    now = env.command.tcp_base
+    poses = [_pose(env, grasp.tcp_world, grasp.axis_rad + turn) for turn in (0.0, np.pi)]
+    for pose in sorted(poses, key=lambda pose: _off(pose, now)[1]):
+        try:
+            arm(env.robot.name).reach(pose, 0.004)
+            arm(env.robot.name).reach(_raised(pose, over - grasp.tcp_world[2]), 0.01)
+        except OutOfReach:
+            continue
+        return grasp, pose
+    return None
+
+
+def _set_down(env: Env, truth: Truth) -> list[Waypoint]:
+    """Carry the held target to its goal, lower it, let go, and draw back."""
+    now, held = env.command.tcp_base, truth.objects_world[env.row.target]
+    low = points_world(env.row.target, held)
+    centre, foot = (low.min(axis=0) + low.max(axis=0))[:2] / 2, float(low[:, 2].min())
+    spot, floor = _spot(env, truth)
+    shift = np.array([*(spot - centre), 0.0])
+    across = now.copy()
+    across[:3, 3] += _into_base(env) @ shift
+    down = _raised(across, floor - foot)
+    return [Waypoint(across, 0.0, 0.1), Waypoint(down, 0.0, 0.15), Waypoint(down, 1.0, 0.3), Waypoint(_raised(down, 0.08), 1.0)]
+
+
+def _spot(env: Env, truth: Truth) -> tuple[Float64[np.ndarray, "2"], float]:
+    """Where the target's centre goes, and the height at which it is let go."""
+    row, goal = env.row, truth.objects_world[env.row.goal]
+    points = points_world(row.goal, goal)
+    if row.rule == "put":
+        return goal[:2].copy(), float(goal[2]) + 0.016
+    mine = points_world(row.target, truth.objects_world[row.target])
+    reach = 0.5 * (np.hypot(*np.ptp(points, axis=0)[:2]) + np.hypot(*np.ptp(mine, axis=0)[:2])) + 0.10 - BESIDE_M
+    others = [pose[:2] for name, pose in truth.objects_world.items() if name not in (row.target, row.goal)]
+    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    spots = goal[:2] + reach * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    room = np.array([min([float(np.hypot(*(spot - other))) for other in others], default=1.0) for spot in spots])
+    here = np.hypot(*(spots - truth.objects_world[row.target][:2]).T)
+    return spots[int(np.argmax(np.minimum(room, 0.13) - 0.1 * here))], float(goal[2]) + 0.004
+
+
+def _touch(env: Env, truth: Truth, attempt: int) -> list[Waypoint]:
+    """From straight above onto the middle of the target, with the gripper closed."""
+    points = points_world(env.row.target, truth.objects_world[env.row.target])
+    top, middle = float(points[:, 2].max()), (points.min(axis=0) + points.max(axis=0)) / 2
+    highest = points[points[:, 2] > top - 0.006].mean(axis=0)
+    x, y = (highest if attempt % 2 else middle)[:2]
+    now = env.command.tcp_base
+    pose = now.copy()
+    pose[:3, 3] = _into_base(env) @ (np.array([x, y, top - 0.025]) - env.robot.base_world[:3])
+    over = _raised(pose, _ceiling(env, truth) + ABOVE_M - (top - 0.025))
+    return [Waypoint(over, 0.0), Waypoint(pose, 0.0, 0.2), Waypoint(over, 0.0)]
+
+
+def _hold(env: Env) -> Waypoint:
+    return Waypoint(_raised(env.command.tcp_base, 0.02), 0.0, 0.5)
+
+
+def _retreat(env: Env) -> Waypoint:
+    return Waypoint(_raised(env.command.tcp_base, 0.06), 1.0, 0.1)
+
+
+def _ceiling(env: Env, truth: Truth) -> float:
+    """The height of the tallest thing on the table that is not the target or in the hand, metres in the world."""
+    names = [name for name in truth.objects_world if name != env.row.target] + [env.row.target] * (env.row.target not in truth.held)
+    return max(float(points_world(name, truth.objects_world[name])[:, 2].max()) for name in names)
+
+
+def _foot(truth: Truth, name: str) -> float:
+    return float(points_world(name, truth.objects_world[name])[:, 2].min())
+
+
+def _pose(env: Env, tcp_world: Float64[np.ndarray, "3"], axis_rad: float) -> Float64[np.ndarray, "4 4"]:
+    """The tcp's pose (base frame) pointing straight down with its opening axis at `axis_rad` in the world."""
+    base = _into_base(env)
+    opening = base.T @ env.robot.down_base[:, 1]
+    yaw = axis_rad - float(np.arctan2(opening[1], opening[0]))
+    pose = np.eye(4)
+    pose[:3, :3] = base @ rotation(np.array([0.0, 0.0, yaw])) @ base.T @ env.robot.down_base
+    pose[:3, 3] = base @ (tcp_world - env.robot.base_world[:3])
+    return pose
+
+
+def _into_base(env: Env) -> Float64[np.ndarray, "3 3"]:
+    """The rotation from world to robot base axes."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_quat(env.robot.base_world[3:], scalar_first=True).as_matrix().T
+
+
+def _raised(pose: Float64[np.ndarray, "4 4"], height_m: float) -> Float64[np.ndarray, "4 4"]:
+    up = pose.copy()
+    up[2, 3] += height_m
+    return up
