@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from vap_core.errors import OutOfReach
+from vap_core.errors import BadAction, OutOfReach
 from vap_core.sim import robots
 from vap_core.sim.robots import Robot
 from vap_core.values import value
@@ -17,6 +17,8 @@ ROUNDS = 12
 NEAR_M, NEAR_RAD = 2e-5, 2e-4
 LEASH_M, LEASH_RAD = 0.05, 0.5
 """Furthest that the commanded pose may lead the measured one."""
+LEASH = 0.25
+"""Furthest that a commanded joint may lead the measured one under joint control, rad."""
 
 
 @value
@@ -53,7 +55,7 @@ class Arm:
         self.robot = robot
         self.model = spec.compile()
         self.configuration = mink.Configuration(self.model)
-        self.task = mink.FrameTask("tcp", "site", position_cost=1.0, orientation_cost=0.3, gain=1.0, lm_damping=1e-6)
+        self.task = mink.FrameTask("tcp", "site", position_cost=1.0, orientation_cost=robot.turn_cost, gain=1.0, lm_damping=1e-6)
         self.posture = mink.PostureTask(self.model, cost=1e-4)
         self.posture.set_target(robot.home)
         speeds = dict(zip(robot.joints, robot.speed_rad_s.tolist(), strict=True))
@@ -78,13 +80,13 @@ class Arm:
         return self.configuration.q.copy()
 
     def reach(self, tcp_base: Float64[np.ndarray, "4 4"], tolerance_m: float = 1e-3) -> Float64[np.ndarray, " n"]:
-        """Joint angles for a pose, from home, taking all the time it needs. Raises: OutOfReach."""
+        """Joint angles for a pose, from home, taking all the time it needs; the hand may lean by the robot's `lean_rad`. Raises: OutOfReach."""
         joints = self.robot.home
         for _ in range(8):
             joints = self.solve(joints, tcp_base, 2.0)
         off = float(np.linalg.norm(self.forward(joints)[:3, 3] - tcp_base[:3, 3]))
         turn = float(np.linalg.norm(rotation_vector(self.forward(joints)[:3, :3] @ tcp_base[:3, :3].T)))
-        if off > tolerance_m or turn > 10 * tolerance_m:
+        if off > tolerance_m or turn > 10 * tolerance_m + self.robot.lean_rad:
             where = tcp_base[:3, 3].round(3).tolist()
             raise OutOfReach(f"Arm.reach: {self.robot.name} stays {1000 * off:.0f} mm and {turn:.2f} rad away from {where} m; move it closer.")
         return joints
@@ -113,6 +115,22 @@ def follow(
     reached = arm.forward(joints)
     off, turn = np.linalg.norm(reached[:3, 3] - goal[:3, 3]), np.linalg.norm(rotation_vector(reached[:3, :3] @ goal[:3, :3].T))
     return Command(goal if off < 1e-3 and turn < 1e-2 else reached, joints, float(np.clip(delta[6], 0.0, 1.0)))
+
+
+def follow_joints(arm: Arm, command: Command, measured: Float64[np.ndarray, " n"], action: Float32[np.ndarray, " m"], seconds: float) -> Command:
+    """The command after one action of joint deltas (rad, in the order of Robot.joints) and the gripper (0..1) that lasts `seconds`.
+
+    The deltas apply to the *commanded* joints, no faster than their rated speeds; the result stays within the joints' limits
+    and leads the `measured` joints (rad) by at most LEASH. Raises: BadAction.
+    """
+    if len(action) != len(arm.robot.joints) + 1:
+        raise BadAction(f"follow_joints: {len(action)} numbers, but {arm.robot.name} takes {len(arm.robot.joints)} joint deltas and the gripper.")
+    fastest = arm.robot.speed_rad_s * seconds
+    delta = action.astype(np.float64)
+    asked = command.joints + np.clip(delta[:-1], -fastest, fastest)
+    low, high = arm.model.jnt_range.T
+    joints = np.clip(np.clip(asked, measured - LEASH, measured + LEASH), low, high)
+    return Command(arm.forward(joints), joints, float(np.clip(delta[-1], 0.0, 1.0)))
 
 
 def rotation(vector: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:

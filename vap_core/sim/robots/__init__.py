@@ -17,8 +17,9 @@ class Robot:
     """One arm with a parallel gripper. Every joint has a position actuator of the same name and a site `tcp` lies between the fingertips.
 
     The site's z points out of the gripper and its y along the opening axis. `home` and `speed_rad_s` follow `joints`;
-    `fingers_open` and `fingers_closed` follow `fingers`, metres or radians of travel (so101: one jaw that swings); `opening_m` is the clear width between open pads, and
-    `palm_m` how far an object between them may reach above the tcp before it meets the palm (narrow necks and straws may go deeper).
+    `fingers_open` and `fingers_closed` follow `fingers`, metres or radians of travel (so101: one jaw that swings); `opening_m` is the clear width
+    between open pads, and `palm_m` how far an object between them may reach above the tcp before it meets the palm (narrow necks and
+    straws may go deeper).
     `down_base` is the tcp's rotation in the robot base frame when the gripper points straight down, its opening axis across the table:
     the state's rotation vector is counted from it, so that a turn about the vertical reads (0, 0, yaw).
     `hand_m` is half the palm's length along the opening axis and half its width across it, for what may stand beside a grasp.
@@ -103,7 +104,7 @@ ROBOTS: dict[str, Robot] = {
         xml=HERE / "so101.xml",
         joints=("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"),
         fingers=("gripper",),
-        home=np.array([0.0, -0.9, 0.9, 1.5708, -1.5221]),
+        home=np.array([0.0, -1.65, 0.75, 1.6, -1.5221]),
         speed_rad_s=np.full(5, 3.5),
         fingers_open=(1.1,),
         fingers_closed=(-0.17,),
