@@ -6,16 +6,18 @@ Generic instances draw their motifs and layouts from lists that evaluation insta
 
 from colorsys import hsv_to_rgb
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from vap_core.errors import one_of
 from vap_core.sim.catalogue import FAMILIES, Family
 from vap_core.sim.catalogue.family import pick
-from vap_core.sim.shapes import Mesh, Number, Shape
-from vap_core.sim.textures import ATLAS_PX, GENERIC_FILLS, GENERIC_GLYPHS, GENERIC_LAYOUTS, Ink, Texture, atlas
-from vap_core.values import value
+from vap_core.sim.scan import load, scans
+from vap_core.sim.shapes import Hull, Mesh, Number, Shape, Solid
+from vap_core.sim.textures import GENERIC_FILLS, GENERIC_GLYPHS, GENERIC_LAYOUTS, Ink, Texture, atlas
+from vap_core.values import Rgb, value
 
 if TYPE_CHECKING:
     import mujoco
@@ -28,13 +30,16 @@ CLUTTER: tuple[str, ...] = tuple(family.category for family in FAMILIES if not f
 
 @value
 class ObjectModel:
-    """One object: its category, the split that may see it, and everything that decides its look, shape and mass (kg)."""
+    """One object: its category, the split that may see it, and everything that decides its look, shape and mass (kg).
+
+    `texture` is a decoration to draw, or the picture itself, as scans have.
+    """
 
     name: str
     category: str
     split: Literal["generic", "personal", "lookalike", "prop"]
     shape: Shape
-    texture: Texture
+    texture: Texture | Rgb
     mass_kg: float
 
 
@@ -76,9 +81,12 @@ def lookalikes(kind: str) -> tuple[ObjectModel, ...]:
 
 def tier(model: ObjectModel) -> Literal["hard", "medium", "easy"]:
     """How close a look-alike's colours are to its personal instance: both base and ink shared, one of them, or neither."""
-    mine = OBJECTS[f"{model.name.partition('-lookalike-')[0]}-personal"].texture
-    shared = len({model.texture.base, model.texture.ink} & {mine.base, mine.ink})
-    return ("easy", "medium", "hard")[shared]
+    mine = OBJECTS[f"{model.name.partition('-lookalike-')[0]}-personal"]
+    return ("easy", "medium", "hard")[len(_inks(model) & _inks(mine))]
+
+
+def _inks(model: ObjectModel) -> set[Ink]:
+    return {model.texture.base, model.texture.ink} if isinstance(model.texture, Texture) else set()
 
 
 def _colour(rng: np.random.Generator, bright: tuple[float, float], vivid: tuple[float, float] = (0.04, 0.4)) -> Ink:
@@ -110,19 +118,31 @@ def generic(kind: str, index: int) -> ObjectModel:
 
 
 def get(name: str) -> ObjectModel:
-    """The object of that name: one of `OBJECTS`, or `<stem>-generic-<number>`."""
+    """The object of that name: one of `OBJECTS`, or `<stem>-generic-<number>`, or one of the user's own scans (see `scan`)."""
     if name in OBJECTS:
         return OBJECTS[name]
     stem, _, digits = name.rpartition("-generic-")
     if stem in _INDEX and digits.isdecimal() and name == f"{stem}-generic-{int(digits):04d}":
         return generic(stem, int(digits))
-    raise one_of("get: object", name, [*OBJECTS, *(f"{kind}-generic-NNNN" for kind in _INDEX)])
+    if name in (own := scans()):
+        return _own(own[name])
+    raise one_of("get: object", name, [*OBJECTS, *(f"{kind}-generic-NNNN" for kind in _INDEX), *own])
+
+
+def _own(place: Path) -> ObjectModel:
+    card, scan = load(place)
+    return ObjectModel(card.name, card.category, "personal", scan, scan.image, card.mass_kg)
 
 
 @lru_cache(maxsize=256)
 def mesh(model: ObjectModel) -> Mesh:
     """The visual mesh, metres, standing on z = 0."""
     return model.shape.mesh()
+
+
+def skin(model: ObjectModel) -> Rgb:
+    """The picture that its texture coordinates point into."""
+    return atlas(model.texture, model.shape.aspect()) if isinstance(model.texture, Texture) else model.texture
 
 
 def extent_m(model: ObjectModel) -> tuple[float, float, float]:
@@ -140,8 +160,10 @@ def add_object(spec: "mujoco.MjSpec", model: ObjectModel, pos: tuple[Number, Num
 
     form, name = mesh(model), model.name
     face = form.face.ravel().tolist()
-    texture = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=ATLAS_PX, height=ATLAS_PX, nchannel=3)
-    texture.data = atlas(model.texture, model.shape.aspect()).tobytes()
+    picture = skin(model)
+    height, width, _ = picture.shape
+    texture = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=width, height=height, nchannel=3)
+    texture.data = picture.tobytes()
     material = spec.add_material(name=name, specular=0.25, shininess=0.4)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
     spec.add_mesh(name=name, uservert=form.vertex.ravel(), usernormal=form.normal.ravel(), usertexcoord=form.uv.ravel(), userface=face,
@@ -150,12 +172,22 @@ def add_object(spec: "mujoco.MjSpec", model: ObjectModel, pos: tuple[Number, Num
     body.add_freejoint(name=f"{name}/free")
     body.add_geom(name=f"{name}/visual", type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, material=name, group=VISUAL_GROUP, contype=0, conaffinity=0,
                   density=0, mass=0)  # fmt: skip
-    kinds = {kind: getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}") for kind in ("box", "cylinder", "ellipsoid", "capsule")}
-    solids = model.shape.solids()
+    solids: tuple[Solid | Hull, ...] = model.shape.solids()
     volume = np.array([solid.volume for solid in solids])
     for i, (solid, mass_kg) in enumerate(zip(solids, model.mass_kg * volume / volume.sum(), strict=True)):
-        quat = np.zeros(4)
-        mujoco.mju_mat2Quat(quat, solid.rotation().ravel())
-        body.add_geom(name=f"{name}/solid{i}", type=kinds[solid.kind], size=(*solid.size, 0.0)[:3], pos=solid.pos, quat=quat, group=COLLISION_GROUP,
-                      mass=float(mass_kg), condim=4, friction=(1, 0.01, 0.001), solref=(0.004, 1), solimp=(0.95, 0.99, 0.001, 0.5, 2))  # fmt: skip
+        body.add_geom(name=f"{name}/solid{i}", **_form(spec, f"{name}/solid{i}", solid), group=COLLISION_GROUP, mass=float(mass_kg), condim=4,
+                      friction=(1, 0.01, 0.001), solref=(0.004, 1), solimp=(0.95, 0.99, 0.001, 0.5, 2))  # fmt: skip
     return body
+
+
+def _form(spec: "mujoco.MjSpec", name: str, solid: Solid | Hull) -> dict[str, Any]:
+    """What a collision geom is, and where: a primitive, or a convex mesh that the spec gets under `name`."""
+    import mujoco
+
+    if isinstance(solid, Hull):
+        spec.add_mesh(name=name, uservert=solid.vertex.ravel())
+        return {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": name}
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, solid.rotation().ravel())
+    kind = getattr(mujoco.mjtGeom, f"mjGEOM_{solid.kind.upper()}")
+    return {"type": kind, "size": (*solid.size, 0.0)[:3], "pos": solid.pos, "quat": quat}

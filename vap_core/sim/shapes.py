@@ -64,13 +64,21 @@ class Solid:
         return turn(*self.turn) @ lay
 
 
+@value
+class Hull:
+    """A convex collision solid of any form: its corners (metres) and its volume (cubic metres)."""
+
+    vertex: Float[np.ndarray, "n 3"]
+    volume: float
+
+
 @runtime_checkable
 class Shape(Protocol):
-    """A parametric body: a few lengths that give a mesh, its collision solids and its decorated wall's circumference over its height."""
+    """A body: its mesh, its collision solids and its decorated wall's circumference over its height."""
 
     def mesh(self) -> Mesh: ...
 
-    def solids(self) -> tuple[Solid, ...]: ...
+    def solids(self) -> "tuple[Solid, ...] | tuple[Hull, ...]": ...
 
     def aspect(self) -> float: ...
 
