@@ -4,7 +4,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -20,6 +20,8 @@ Start with: python -m vap_core doctor, then python -m vap_core demo."""
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False, rich_markup_mode=None, help=HELP)
 train_app = typer.Typer(no_args_is_help=True, help="Train shipped parts again; every training resumes after an interruption.")
 app.add_typer(train_app, name="train")
+objects_app = typer.Typer(no_args_is_help=True, help="The objects of the scenes: what there is, and your own 3-D scans.")
+app.add_typer(objects_app, name="objects")
 
 Memory = Annotated[Path, typer.Option(help="Folder of remembered objects.")]
 StackName = Annotated[str, typer.Option("--stack", help="Perception stack: embedded (offline, CPU).")]
@@ -258,6 +260,69 @@ def perception(
     from vap_core.training.perception import train
 
     print(json.dumps(train(out, scenes=scenes, seed=seed, minutes=minutes), indent=1))
+
+
+@objects_app.command("import")
+def import_object(
+    file: Annotated[Path, typer.Argument(help="A closed, coloured GLB, OBJ, PLY or STL file.")],
+    category: Annotated[str, typer.Option(help="What kind of thing it is: the word you will use after 'my'.")],
+    name: Annotated[str | None, typer.Option(help="What to call it; default the file's name.")] = None,
+    height_cm: Annotated[float | None, typer.Option(min=0.1, help="Its real height, where the file's units are not metres.")] = None,
+    up: Annotated[Literal["y", "z"] | None, typer.Option(help="Axis that points up in the file; default y for GLB and OBJ, z for PLY, STL.")] = None,
+    mass_kg: Annotated[float | None, typer.Option(help="Its mass; default from its volume.")] = None,
+    colour: Annotated[str | None, typer.Option(help="Paint it all over, for example '#aa3322'.")] = None,
+    licence: Annotated[str, typer.Option(help="Kept with the object, for example 'CC-BY 4.0, Jane Doe'.")] = "",
+    repair: Annotated[bool, typer.Option("--repair", help="Close holes and turn triangles alike where that is possible.")] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Overwrite an object of this name.")] = False,
+    out: Annotated[Path | None, typer.Option(help="Folder of your objects; default VAP_OBJECTS or data/objects.")] = None,
+) -> None:
+    """Make an object of your own 3-D scan; it takes about half a minute.
+
+    Example: python -m vap_core objects import mug.glb --category cup --height-cm 9
+    """
+    from vap_core.sim import imports, objects, scan
+
+    folder, name = out or scan.home(), name or imports.slug(file)
+    scan.free(folder, name, replace)
+    card, body = imports.bring(
+        file, name, category, height_cm=height_cm, up=up, mass_kg=mass_kg, colour=colour, repair=repair, licence=licence,
+        say=lambda line: print(line, file=sys.stderr),
+    )  # fmt: skip
+    place = scan.save(folder, card, body, replace=replace)
+    size = " x ".join(f"{100 * side:.1f}" for side in objects.extent_m(objects.own(place)))
+    print(f"{card.name}: a {card.category}, {size} cm, {card.mass_kg:g} kg, {len(body.hulls)} convex parts, saved to {place}")
+    setting = "" if folder == scan.home() else f"VAP_OBJECTS={folder} "
+    print(f"next: {setting}python -m vap_core objects photograph '{card.name}', or in Python scenes.build('wx250s', ['{card.name}'])")
+
+
+@objects_app.command("list")
+def list_objects() -> None:
+    """Every object there is, your own last.
+
+    Example: python -m vap_core objects list
+    """
+    from vap_core.sim.imports import table
+
+    print(table())
+
+
+@objects_app.command()
+def photograph(
+    name: Annotated[str, typer.Argument(help="An object; see python -m vap_core objects list.")],
+    out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("data/photos"),
+    views: Annotated[int, typer.Option(min=1, max=20, help="Pictures, taken all around it.")] = 5,
+) -> None:
+    """Take reference photos of an object, as one walks around it.
+
+    Example: python -m vap_core objects photograph cup-personal
+    """
+    from vap_core.sim.objects import get
+    from vap_core.sim.studio import write_views
+
+    model = get(name)
+    paths = write_views(model, out, views)
+    print(f"wrote {views} pictures to {out}")
+    print(f"next: python -m vap_core register '{name}' --category '{model.category}' {' '.join(f"'{path}'" for path in paths)}")
 
 
 def _study(

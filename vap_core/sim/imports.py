@@ -16,9 +16,10 @@ from scipy.spatial import ConvexHull, QhullError
 from vap_core import __version__
 from vap_core.errors import BadObject
 from vap_core.memory import CATEGORY, NAME
+from vap_core.sim import objects
 from vap_core.sim.bake import Paint, bake, shaded, shrink
 from vap_core.sim.decimate import Faces, Vertices, decimate, normals
-from vap_core.sim.scan import Card, Scan
+from vap_core.sim.scan import Card, Scan, scans
 from vap_core.sim.shapes import Hull
 from vap_core.sim.source import Source, read
 
@@ -43,6 +44,8 @@ def bring(
     """
     if not NAME.fullmatch(name):
         raise BadObject(f"objects: {name!r} cannot name an object; use letters, digits, space, dot, dash or underscore, for example --name my-mug.")
+    if name in objects.OBJECTS or "-generic-" in name:
+        raise BadObject(f"objects: {name!r} is one of the workspace's own objects; choose another --name, for example my-{name}.")
     if not CATEGORY.fullmatch(category.strip()):
         raise BadObject(f"objects: {category!r} cannot be a category; name the kind of thing in words, for example --category cup.")
     if mass_kg is not None and not 0 < mass_kg <= 5:
@@ -61,6 +64,17 @@ def bring(
 def slug(path: Path) -> str:
     """A name for the object in a file."""
     return re.sub(r"[^A-Za-z0-9]+", "-", path.stem).strip("-")[:64]
+
+
+def table() -> str:
+    """Every object by name, the user's own last: category, split, tier of a look-alike, size (cm), faces, mass (g)."""
+    lines = [f"{'name':28} {'category':14} {'split':10} {'tier':7} {'size, cm':>18} {'faces':>6} {'mass, g':>8}"]
+    for model in [*objects.OBJECTS.values(), *map(objects.get, scans())]:
+        grade = objects.tier(model) if model.split == "lookalike" else "-"
+        size = " x ".join(f"{100 * side:.1f}" for side in objects.extent_m(model))
+        faces = len(objects.mesh(model).face)
+        lines.append(f"{model.name:28} {model.category:14} {model.split:10} {grade:7} {size:>18} {faces:6} {1000 * model.mass_kg:8.0f}")
+    return "\n".join(lines)
 
 
 def _mended(source: Source) -> Source:

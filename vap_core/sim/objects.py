@@ -124,12 +124,13 @@ def get(name: str) -> ObjectModel:
     stem, _, digits = name.rpartition("-generic-")
     if stem in _INDEX and digits.isdecimal() and name == f"{stem}-generic-{int(digits):04d}":
         return generic(stem, int(digits))
-    if name in (own := scans()):
-        return _own(own[name])
-    raise one_of("get: object", name, [*OBJECTS, *(f"{kind}-generic-NNNN" for kind in _INDEX), *own])
+    if name in (mine := scans()):
+        return own(mine[name])
+    raise one_of("get: object", name, [*OBJECTS, *(f"{kind}-generic-NNNN" for kind in _INDEX), *mine])
 
 
-def _own(place: Path) -> ObjectModel:
+def own(place: Path) -> ObjectModel:
+    """The scan in that folder. Raises: BadObject when it is damaged."""
     card, scan = load(place)
     return ObjectModel(card.name, card.category, "personal", scan, scan.image, card.mass_kg)
 

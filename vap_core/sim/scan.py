@@ -69,15 +69,20 @@ def scans() -> dict[str, Path]:
     return {path.parent.name: path.parent for path in sorted(home().glob("[!.]*/object.json"))}
 
 
+def free(folder: Path, name: str, replace: bool) -> Path:
+    """Where a scan of that name goes. Raises: BadOutput when there is one already and `replace` is off."""
+    if (folder / name).exists() and not replace:
+        raise BadOutput(f"objects: {folder / name} exists; choose another --name or pass --replace.")
+    return folder / name
+
+
 def save(folder: Path, card: Card, scan: Scan, *, replace: bool = False) -> Path:
     """Write a scan into `folder/<name>`, whole or not at all.
 
     Raises:
         BadOutput: the folder cannot be written, or holds that name and `replace` is off.
     """
-    place = folder / card.name
-    if place.exists() and not replace:
-        raise BadOutput(f"objects: {place} exists; choose another --name or pass --replace.")
+    place = free(folder, card.name, replace)
     form, written = scan.form, {}
     written["mesh.npz"] = _npz({"vertex": form.vertex, "normal": form.normal, "uv": form.uv, "face": form.face})
     hulls = {f"{i:02d}.{key}": part for i, hull in enumerate(scan.hulls) for key, part in (("vertex", hull.vertex), ("volume", hull.volume))}

@@ -1,10 +1,12 @@
 """Photographs of single objects on a plain table: the reference views of a personal object, and contact sheets."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
+from vap_core.errors import BadOutput
 from vap_core.sim.gl import ensure_gl
 from vap_core.sim.objects import ObjectModel, add_object, extent_m
 from vap_core.values import Rgb, value
@@ -74,6 +76,18 @@ def reference_views(model: ObjectModel, n: int = 5, seed: int = 0, size: int = 3
         for a, (red, green, blue) in zip(rng.permutation(around), tints, strict=True)
     ]  # fmt: skip
     return photograph(model, shots, size)
+
+
+def write_views(model: ObjectModel, folder: Path, n: int = 5) -> list[Path]:
+    """Reference photos as `<name>-<i>.png`. Raises: BadOutput."""
+    paths = [folder / f"{model.name}-{i}.png" for i in range(n)]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for path, rgb in zip(paths, reference_views(model, n), strict=True):
+            Image.fromarray(rgb).save(path)
+    except OSError as error:
+        raise BadOutput(f"photograph: {folder} cannot be written ({error.strerror}); choose another folder with --out.") from error
+    return paths
 
 
 def contact_sheet(models: Sequence[ObjectModel], columns: int = 5, size: int = 200, shot: Shot | None = None) -> Rgb:
