@@ -43,6 +43,18 @@ def _crochet(x: np.ndarray, y: np.ndarray, n: int) -> np.ndarray:
     return np.clip(7 * (u**2 + v**2) - 0.6, 0, 1)
 
 
-EVALUATION_CRAFTS: dict[str, Craft] = {"wicker": _wicker, "knit": _knit}
+def _seeds(x: np.ndarray, y: np.ndarray, n: int) -> np.ndarray:
+    """Slim drops, every other row shifted."""
+    row = np.floor(0.9 * n * y)
+    u, v = (n * x + 0.5 * row) % 1 - 0.5, (0.9 * n * y) % 1 - 0.5
+    return ((u / (0.15 + 0.16 * v)) ** 2 + (v / 0.3) ** 2 < 1).astype(np.float64)
+
+
+def _planks(x: np.ndarray, y: np.ndarray, n: int) -> np.ndarray:
+    """Clapboards: a shadow below the edge of each."""
+    return 0.55 * np.clip(((n * y) % 1 - 0.72) / 0.28, 0, 1) + 0 * x
+
+
+EVALUATION_CRAFTS: dict[str, Craft] = {"wicker": _wicker, "knit": _knit, "seeds": _seeds, "planks": _planks}
 GENERIC_CRAFTS: dict[str, Craft] = {"rattan": _rattan, "crochet": _crochet}
 CRAFTS: dict[str, Craft] = {**EVALUATION_CRAFTS, **GENERIC_CRAFTS}
