@@ -15,6 +15,8 @@ from vap_core.values import value
 ROUNDS = 12
 """Most iterations of one solution; it stops as soon as the pose is met."""
 NEAR_M, NEAR_RAD = 2e-5, 2e-4
+TWIST_RAD = 0.05
+"""Furthest that a hand that leans may be turned about its own axis."""
 LEASH_M, LEASH_RAD = 0.05, 0.5
 """Furthest that the commanded pose may lead the measured one."""
 LEASH = 0.25
@@ -84,9 +86,12 @@ class Arm:
         joints = self.robot.home
         for _ in range(8):
             joints = self.solve(joints, tcp_base, 2.0)
-        off = float(np.linalg.norm(self.forward(joints)[:3, 3] - tcp_base[:3, 3]))
-        turn = float(np.linalg.norm(rotation_vector(self.forward(joints)[:3, :3] @ tcp_base[:3, :3].T)))
-        if off > tolerance_m or turn > 10 * tolerance_m + self.robot.lean_rad:
+        found = self.forward(joints)
+        off = float(np.linalg.norm(found[:3, 3] - tcp_base[:3, 3]))
+        turn = float(np.linalg.norm(rotation_vector(found[:3, :3] @ tcp_base[:3, :3].T)))
+        lean, twist = _lean_and_twist(tcp_base[:3, :3], found[:3, :3])
+        leans = self.robot.lean_rad > 0.0 and lean <= self.robot.lean_rad and twist <= TWIST_RAD
+        if off > tolerance_m or (turn > 10 * tolerance_m and not leans):
             where = tcp_base[:3, 3].round(3).tolist()
             raise OutOfReach(f"Arm.reach: {self.robot.name} stays {1000 * off:.0f} mm and {turn:.2f} rad away from {where} m; move it closer.")
         return joints
@@ -141,6 +146,15 @@ def rotation(vector: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
 def rotation_vector(matrix: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3"]:
     """The rotation vector, rad, of a rotation matrix; its length is at most pi."""
     return np.asarray(mink.SO3.from_matrix(np.ascontiguousarray(matrix)).log())
+
+
+def _lean_and_twist(asked: Float64[np.ndarray, "3 3"], found: Float64[np.ndarray, "3 3"]) -> tuple[float, float]:
+    """How far the hand's z axis is from the one asked for, and how far it is then turned about it, rad."""
+    axis = np.cross(asked[:, 2], found[:, 2])
+    sine = float(np.linalg.norm(axis))
+    lean = float(np.arctan2(sine, asked[:, 2] @ found[:, 2]))
+    leant = rotation(axis * (lean / sine)) @ asked if sine > 1e-9 else asked
+    return lean, float(np.linalg.norm(rotation_vector(found @ leant.T)))
 
 
 def _capped(vector: Float64[np.ndarray, "3"], longest: float) -> Float64[np.ndarray, "3"]:
