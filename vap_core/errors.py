@@ -41,6 +41,10 @@ class MissingWeights(VapError):
     """Weights that are not on this machine, or whose checksum differs from the manifest."""
 
 
+class MissingMeshes(VapError):
+    """MuJoCo Menagerie's meshes of a robot, neither on this machine nor to be downloaded."""
+
+
 class BadAction(VapError):
     """An action of the wrong length."""
 
