@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from vap_core.sim.crafts import CRAFTS
+from vap_core.sim.fabrics import FABRICS
 from vap_core.values import Rgb, value
 
 Ink = tuple[int, int, int]
@@ -165,6 +166,8 @@ def fill(texture: Texture, w: int, h: int) -> Image.Image:
             return Image.composite(Image.new("RGB", (w, h), ink), Image.new("RGB", (w, h), base), mask)
         case craft if craft in CRAFTS:
             return _where(lambda x, y: CRAFTS[craft](x, y, n), w, h, ink, base)
+        case fabric if fabric in FABRICS:
+            return _where(lambda x, y: FABRICS[fabric](x, y, n, np.random.default_rng([13, texture.seed])), w, h, ink, base)
         case _:
             return Image.new("RGB", (w, h), base)
 
@@ -199,7 +202,7 @@ def decoration(texture: Texture, aspect: float) -> Image.Image:
     """The decorated wall unrolled; `aspect` is its circumference over its height."""
     w = 2 * ATLAS_PX
     h = int(np.clip(round(w / aspect), 128, 2048))
-    if texture.motif in (*EVALUATION_FILLS, *GENERIC_FILLS, *CRAFTS):
+    if texture.motif in (*EVALUATION_FILLS, *GENERIC_FILLS, *FABRICS, *CRAFTS):
         picture = fill(texture, w, h)
         draw = ImageDraw.Draw(picture)
         if texture.layout == "half":
