@@ -177,7 +177,7 @@ def test_unknown_objects_and_cameras_list_the_known_ones(scene, row):
         Env(scene).reset(replace(row, placements=row.placements[:1] * 2))
     with pytest.raises(UnknownName, match="known: .*front"):
         Env(scene, cameras=("back",))
-    with pytest.raises(UnknownName, match="known: panda, wx250s"):
+    with pytest.raises(UnknownName, match="known: google, panda, so101, wx250s"):
         scenes.build("pr2", ())
 
 

@@ -14,7 +14,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from vap_core.attend import Attender, AttendState
-from vap_core.errors import VapError
+from vap_core.errors import OutOfReach, VapError
 from vap_core.policies import Insider, Policy
 from vap_core.sim.env import Control, Env
 from vap_core.sim.scenes import Scene
@@ -126,9 +126,9 @@ def _plan(trial: Trial, live: Sequence[Running], seen: Mapping[int, tuple[Policy
     start = time.perf_counter()
     try:
         states, chunks = _ask(trial.policy, asking, seen)
-    except VapError:
-        raise
-    except Exception:
+    except Exception as error:
+        if _ends_the_run(error):
+            raise
         if len(asking) == 1:
             asking[0].outcome = asking[0].judge.outcome("error", traceback.format_exc(limit=8))
         else:  # find out whose fault it is
@@ -187,11 +187,16 @@ def _guard[**P, R](one: Running, work: Callable[P, R], *args: P.args, **kwargs: 
     """
     try:
         return work(*args, **kwargs)
-    except VapError:
-        raise
-    except Exception:
+    except Exception as error:
+        if _ends_the_run(error):
+            raise
         one.outcome = one.judge.outcome("error", traceback.format_exc(limit=8))
         return None
+
+
+def _ends_the_run(error: Exception) -> bool:
+    """What the user can mend stops everything; an object out of reach is its own episode's misfortune."""
+    return isinstance(error, VapError) and not isinstance(error, OutOfReach)
 
 
 @contextmanager

@@ -21,6 +21,8 @@ ABOVE_M = 0.04
 ARRIVED_M, ARRIVED_RAD = 0.006, 0.06
 PATIENCE_S = 1.2
 """Longest wait at a waypoint that is not quite reached."""
+ELSEWHERE = 5
+"""After an empty grasp the next one is tried so many places down the list: its neighbours differ too little."""
 BESIDE_M = 0.035
 """How far inside the limit of the near rule a thing is set down."""
 
@@ -103,9 +105,9 @@ def _reached(waypoint: Waypoint, env: Env, waited_s: float) -> bool:
 
 
 def _dwell(waypoint: Waypoint, env: Env) -> float:
-    """Time counts at a waypoint once the command is there."""
+    """Time counts at a waypoint once the command is there, and slowly before, so that nothing waits for ever."""
     off, turned = _off(waypoint.tcp_base, env.command.tcp_base)
-    return 1.0 / env.hz if off < 0.003 and turned < 0.02 else 0.02 / env.hz
+    return (1.0 if off < 0.003 and turned < 0.02 else 0.1) / env.hz
 
 
 def _off(one: Float64[np.ndarray, "4 4"], other: Float64[np.ndarray, "4 4"]) -> tuple[float, float]:
@@ -114,50 +116,70 @@ def _off(one: Float64[np.ndarray, "4 4"], other: Float64[np.ndarray, "4 4"]) -> 
 
 def _take(env: Env, truth: Truth, attempt: int) -> list[Waypoint]:
     """Over the target, down, close, and up until it is clear of everything."""
-    found = [grasp for grasp in grasps(env.robot, env.row.target, truth.objects_world)]
+    found = grasps(env.robot, env.row.target, truth.objects_world)
     if not found:
         raise OutOfReach(
             f"Expert: {env.row.target} is too wide for {1000 * env.robot.opening_m:.0f} mm of {env.robot.name}; choose another object or robot."
         )
-    over = max(_ceiling(env, truth) + ABOVE_M, float(env.tcp_base()[2, 3] + env.robot.base_world[2]) - 0.25)
-    reachable = [pose for grasp in found[attempt % len(found) :] + found if (pose := _reachable(env, grasp, over)) is not None]
-    if not reachable:
+    over = _ceiling(env, truth) + ABOVE_M
+    order = found[ELSEWHERE * attempt % len(found) :] + found
+    low = next((pose for grasp in order if (pose := _reachable(env, grasp)) is not None), None)
+    if low is None:
         raise OutOfReach(f"Expert: {env.row.key}: no grasp of {env.row.target} can be reached by {env.robot.name}; move it closer.")
-    grasp, low = reachable[0]
-    lift = _raised(low, max(0.09, _ceiling(env, truth) - _foot(truth, env.row.target) + 0.015))
-    return [
-        Waypoint(_raised(low, over - grasp.tcp_world[2]), 1.0),
-        Waypoint(low, 1.0),
-        Waypoint(low, 0.0, 0.45),
-        Waypoint(lift, 0.0),
-    ]
+    z = float(low[2, 3] + env.robot.base_world[2])
+    above = _above(env, low, over - z)
+    lift = _above(env, low, max(0.09, _ceiling(env, truth) - _foot(truth, env.row.target) + 0.015))
+    return [Waypoint(above, 1.0), Waypoint(low, 1.0), Waypoint(low, 0.0, 0.45), Waypoint(lift, 0.0)]
 
 
-def _reachable(env: Env, grasp: Grasp, over: float) -> tuple[Grasp, Float64[np.ndarray, "4 4"]] | None:
-    """The tcp's pose for a grasp, the hand turned the shorter way, if the arm gets there and above it."""
+def _reachable(env: Env, grasp: Grasp) -> Float64[np.ndarray, "4 4"] | None:
+    """The tcp's pose for a grasp, the hand turned the shorter way, as the arm gets there; None when it does not."""
     now = env.command.tcp_base
     poses = [_pose(env, grasp.tcp_world, grasp.axis_rad + turn) for turn in (0.0, np.pi)]
     for pose in sorted(poses, key=lambda pose: _off(pose, now)[1]):
-        try:
-            arm(env.robot.name).reach(pose, 0.004)
-            arm(env.robot.name).reach(_raised(pose, over - grasp.tcp_world[2]), 0.01)
-        except OutOfReach:
-            continue
-        return grasp, pose
+        if (reached := _try(env, pose, 0.003)) is not None and _try(env, _raised(pose, 0.04), 0.006) is not None:
+            return reached
     return None
+
+
+def _try(env: Env, pose: Float64[np.ndarray, "4 4"], tolerance_m: float) -> Float64[np.ndarray, "4 4"] | None:
+    """The pose that the arm really takes for `pose` (an arm of five joints may lean a little), or None when it is out of reach."""
+    kinematics = arm(env.robot.name)
+    try:
+        return kinematics.forward(kinematics.reach(pose, tolerance_m))
+    except OutOfReach:
+        return None
+
+
+def _above(env: Env, pose: Float64[np.ndarray, "4 4"], height_m: float) -> Float64[np.ndarray, "4 4"]:
+    """`pose` raised by `height_m`, or by as much of it as the arm can do."""
+    tries = (_try(env, _raised(pose, height_m - float(less)), 0.006) for less in np.arange(0.0, max(height_m, 0.0), 0.015))
+    return next((met for met in tries if met is not None), pose)
 
 
 def _set_down(env: Env, truth: Truth) -> list[Waypoint]:
     """Carry the held target to its goal, lower it, let go, and draw back."""
-    now, held = env.command.tcp_base, truth.objects_world[env.row.target]
-    low = points_world(env.row.target, held)
+    now, low = env.tcp_base(), points_world(env.row.target, truth.objects_world[env.row.target])
     centre, foot = (low.min(axis=0) + low.max(axis=0))[:2] / 2, float(low[:, 2].min())
     spot, floor = _spot(env, truth)
-    shift = np.array([*(spot - centre), 0.0])
-    across = now.copy()
-    across[:3, 3] += _into_base(env) @ shift
-    down = _raised(across, floor - foot)
-    return [Waypoint(across, 0.0, 0.1), Waypoint(down, 0.0, 0.15), Waypoint(down, 1.0, 0.3), Waypoint(_raised(down, 0.08), 1.0)]
+    shift = _into_base(env) @ np.array([*(spot - centre), floor - foot])
+    about = _into_base(env) @ np.array([*centre, 0.0]) - _into_base(env) @ env.robot.base_world[:3]
+    turns = [_turned(now, about, shift, float(yaw)) for yaw in np.deg2rad([0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 180])]
+    down = next((met for pose in turns if (met := _try(env, pose, 0.006)) is not None), None)
+    if down is None:
+        raise OutOfReach(f"Expert: {env.row.key}: {env.robot.name} cannot reach {env.row.goal} with {env.row.target} in its hand; move it closer.")
+    over = _above(env, down, foot - floor)
+    return [Waypoint(over, 0.0, 0.1), Waypoint(down, 0.0, 0.15), Waypoint(down, 1.0, 0.3), Waypoint(_above(env, down, 0.08), 1.0)]
+
+
+def _turned(
+    pose: Float64[np.ndarray, "4 4"], about: Float64[np.ndarray, "3"], shift: Float64[np.ndarray, "3"], yaw: float
+) -> Float64[np.ndarray, "4 4"]:
+    """`pose` turned by `yaw` about the vertical through `about`, then moved by `shift` (base frame)."""
+    turn, out = rotation(np.array([0.0, 0.0, yaw])), np.eye(4)
+    out[:3, :3] = turn @ pose[:3, :3]
+    out[:3, 3] = np.array([*about[:2], 0.0]) + turn @ (pose[:3, 3] - [*about[:2], 0.0]) + shift
+    return out
 
 
 def _spot(env: Env, truth: Truth) -> tuple[Float64[np.ndarray, "2"], float]:
@@ -185,16 +207,20 @@ def _touch(env: Env, truth: Truth, attempt: int) -> list[Waypoint]:
     now = env.command.tcp_base
     pose = now.copy()
     pose[:3, 3] = _into_base(env) @ (np.array([x, y, top - 0.025]) - env.robot.base_world[:3])
-    over = _raised(pose, _ceiling(env, truth) + ABOVE_M - (top - 0.025))
+    met = _try(env, pose, 0.02)
+    if met is None:
+        raise OutOfReach(f"Expert: {env.row.key}: {env.robot.name} cannot reach {env.row.target}; move it closer.")
+    pose = met
+    over = _above(env, pose, _ceiling(env, truth) + ABOVE_M - (top - 0.025))
     return [Waypoint(over, 0.0), Waypoint(pose, 0.0, 0.2), Waypoint(over, 0.0)]
 
 
 def _hold(env: Env) -> Waypoint:
-    return Waypoint(_raised(env.command.tcp_base, 0.02), 0.0, 0.5)
+    return Waypoint(_above(env, env.command.tcp_base, 0.02), 0.0, 0.5)
 
 
 def _retreat(env: Env) -> Waypoint:
-    return Waypoint(_raised(env.command.tcp_base, 0.06), 1.0, 0.1)
+    return Waypoint(_above(env, env.command.tcp_base, 0.06), 1.0, 0.1)
 
 
 def _ceiling(env: Env, truth: Truth) -> float:

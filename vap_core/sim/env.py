@@ -13,7 +13,7 @@ from vap_core.errors import BadAction, UnknownName, one_of
 from vap_core.sim import cameras as optics
 from vap_core.sim import control as steering
 from vap_core.sim.control import Command, arm, follow, rotation_vector
-from vap_core.sim.scenes import Scene
+from vap_core.sim.scenes import Scene, parked
 from vap_core.sim.sensor import PERFECT, Sensor, Stray, exposed, stray
 from vap_core.values import REST, ROBOT, Action, Camera, EpisodeRow, PolicyInput, Rgb, Truth, value
 
@@ -132,7 +132,7 @@ class Env:
             data.joint(f"{place.model}/free").qpos[:] = (place.x, place.y, DROP_M, np.cos(half), 0.0, 0.0, np.sin(half))
         for i, name in enumerate(n for n in self.scene.objects if n not in placed):
             body = model.body(name)
-            data.joint(f"{name}/free").qpos[:] = (-3.0, -2.0 + 0.4 * i, self.robot.floor_z_m + 0.5, 1.0, 0.0, 0.0, 0.0)
+            data.joint(f"{name}/free").qpos[:] = (*parked(self.robot, i), 1.0, 0.0, 0.0, 0.0)
             data.xfrc_applied[body.id, :3] = -model.opt.gravity * float(body.subtreemass[0])
         self._begin(row)
         self._command = Command(self._arm.forward(self.robot.home), self.robot.home, 1.0)

@@ -18,19 +18,24 @@ TIGHT_M = 0.008
 """The open gripper is at least this much wider than what it takes."""
 TIP_M = 0.016
 """Lowest height of the tcp: the fingertips stay off the table."""
+ROOM_M, TAPER_M = 0.02, 0.02
+"""Clearance beyond this counts for nothing; a taper of 1 counts like so much less of it."""
+HALF_PAD_M = 0.006
+"""Half the height of a finger's pad."""
 FINGER_M, PAD_M = 0.022, 0.012
 """Outward thickness of a finger, and half its width."""
 
 
 @value
 class Grasp:
-    """One way to take an object: the tcp (metres, world), the opening axis' angle in the world, the width between the fingers, and the least
-    distance of the open fingers to anything else (all metres, radians).
+    """One way to take an object: the tcp (metres, world), the opening axis' angle in the world (radians), the width between the fingers (m),
+    how much that width changes with height (a taper slips), and the least distance of the open fingers to anything else (m).
     """
 
     tcp_world: Float64[np.ndarray, "3"]
     axis_rad: float
     width_m: float
+    taper: float
     clear_m: float
 
 
@@ -83,7 +88,7 @@ def grasps(robot: Robot, target: str, poses: Mapping[str, Pose]) -> list[Grasp]:
     foot, top = float(points[:, 2].min()), float(points[:, 2].max())
     others = {name: points_world(name, pose) for name, pose in poses.items() if name != target}
     found = list(_candidates(robot, target, poses[target], foot, top, list(others.values())))
-    return sorted(found, key=lambda grasp: (-min(grasp.clear_m, 0.03), grasp.width_m))
+    return sorted(found, key=lambda grasp: (max(ROOM_M - grasp.clear_m, 0.0) + TAPER_M * grasp.taper, grasp.width_m))
 
 
 def _candidates(robot: Robot, target: str, pose: Pose, foot: float, top: float, others: Sequence[Float64[np.ndarray, "n 3"]]) -> Iterator[Grasp]:
@@ -94,14 +99,22 @@ def _candidates(robot: Robot, target: str, pose: Pose, foot: float, top: float, 
         if round(z, 3) in tried or not len(outline):
             continue
         tried.add(round(z, 3))
+        higher, lower = cut(target, pose, z + HALF_PAD_M), cut(target, pose, z - HALF_PAD_M)
         for yaw in YAWS:
             axis = np.array([np.cos(yaw), np.sin(yaw)])
             along, across = outline @ axis, outline @ [-axis[1], axis[0]]
             width = float(np.ptp(along))
             if width > robot.opening_m - TIGHT_M:
                 continue
+            spans = [np.ptp(part @ axis) if len(part) else 0.0 for part in (higher, lower)]
             middle = axis * (along.min() + along.max()) / 2 + np.array([-axis[1], axis[0]]) * (across.min() + across.max()) / 2
-            yield Grasp(np.array([*middle, z]), float(yaw), width, _clearance(robot, middle, axis, z, others))
+            yield Grasp(
+                np.array([*middle, z]),
+                float(yaw),
+                width,
+                abs(float(spans[1] - spans[0])) / (2 * HALF_PAD_M),
+                _clearance(robot, middle, axis, z, others),
+            )
 
 
 def _clearance(robot: Robot, middle: np.ndarray, axis: np.ndarray, z: float, others: Sequence[Float64[np.ndarray, "n 3"]]) -> float:

@@ -61,8 +61,8 @@ def build(robot: str, models: "Sequence[str | objects.ObjectModel]", *, look: Lo
     spec.body(arm.links[0]).pos, spec.body(arm.links[0]).quat = arm.base_world[:3], arm.base_world[3:]
     _room(spec, arm, look)
     chosen = [objects.get(model) if isinstance(model, str) else model for model in models]
-    for model in chosen:
-        objects.add_object(spec, model)
+    for i, model in enumerate(chosen):
+        objects.add_object(spec, model, parked(arm, i))
     cameras = add_rigs(spec, robot, look.camera_shift_m)
     compiled = spec.compile()
     names = tuple(model.name for model in chosen)
@@ -75,9 +75,13 @@ def _tint(spec: mujoco.MjSpec, colour: Colour3) -> None:
         part.rgba[:3] = np.asarray(part.rgba[:3]) * colour
 
 
+def parked(arm: Robot, number: int) -> tuple[float, float, float]:
+    """Where object `number` of a scene waits while no episode uses it: above the floor, far from the robot and from the others."""
+    return -3.0, -2.0 + 0.4 * number, arm.floor_z_m + 0.5
+
+
 def physics(spec: mujoco.MjSpec) -> None:
     """The solver settings with which grasps hold (measured: they cut the creep of a held mug to 0.2 mm)."""
-    spec.memory = 64 << 20
     option = spec.option
     option.timestep = 0.002
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST

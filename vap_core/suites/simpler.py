@@ -38,7 +38,7 @@ BRIDGE = Suite(
         Task("put-straw-cup", "straw cup", "put my straw cup in the basket", 120, "put", "basket-prop"),
     ),
 )
-DESK = Area(0.44, 0.67, -0.22, 0.22)
+DESK = Area(0.40, 0.63, -0.22, 0.22)
 """The Google Robot's grid: 23 cm deep, 44 cm wide."""
 GRID, ORIENTATIONS, LAYOUTS = 5, 3, 40
 CENTRE, CORNER_M = (0.265, 0.0), 0.075
