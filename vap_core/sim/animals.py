@@ -113,7 +113,7 @@ class Cat:
         h, w = self.height, self.girth
         match self.tail:
             case "curl":
-                return arc(0, 1, 10, lambda t: (w * (0.9 + 0.75 * np.sin(2.5 * t)) - 0.006 * t**3, 0.9 * w - 0.3 * w * t,
+                return arc(0, 1, 10, lambda t: (w * (0.45 + 1.15 * np.sin(2.2 * t)) - 0.006 * t**3, 0.9 * w - 0.3 * w * t,
                                                 0.0045 + 0.62 * h * t**1.3 - 0.14 * h * np.maximum(0, t - 0.75) * 4 * t))  # fmt: skip
             case "up":
                 return arc(0, 1, 10, lambda t: (0.3 * w * np.sin(2 * np.pi * t), w * (0.8 + 0.7 * np.sin(2.0 * t)), 0.006 + 0.7 * h * t))

@@ -26,9 +26,11 @@ class LeatherBag:
     handle: Literal["arch", "flat", "twin"] = "arch"
     hardware: Literal["metal", "gold"] = "metal"
 
-    def _front(self, z: Number) -> float:
-        """The body's half-depth at a height: it narrows towards the top."""
-        return self.depth / 2 * (1 - 0.16 * float(z) / self.height)
+    def _front(self, z: Number, x: Number = 0) -> float:
+        """The body's half-depth at a height, which narrows towards the top, and at a distance x from its middle, where its corners are round."""
+        share = float(z) / self.height
+        edge = abs(float(x)) / (self.width / 2 * (1 - 0.04 * share))
+        return self.depth / 2 * (1 - 0.16 * share) * max(0.0, 1 - edge**7) ** (1 / 7)
 
     def mesh(self) -> Mesh:
         w, h = self.width / 2, self.height
@@ -44,8 +46,9 @@ class LeatherBag:
     def _seam(self) -> Mesh:
         """Piping down the front's two sides and along its foot."""
         w, h = self.width / 2, self.height
-        path = [(-0.93 * w, 0.97 * h), (-0.95 * w, 0.2 * h), (-0.93 * w, 0.06 * h), (0.93 * w, 0.06 * h), (0.95 * w, 0.2 * h), (0.93 * w, 0.97 * h)]
-        return tube(np.array([(x, -self._front(z) + 0.0004, z) for x, z in path]), 0.0011, INK, 4)
+        right = [(0.75 * w, 0.06 * h), (0.93 * w, 0.08 * h), (0.95 * w, 0.2 * h), (0.93 * w, 0.97 * h)]
+        path = [*((-x, z) for x, z in right[::-1]), *right]
+        return tube(np.array([(x, -self._front(z, x) + 0.0004, z) for x, z in path]), 0.0011, INK, 4)
 
     def _edge(self, u: np.ndarray) -> np.ndarray:
         """How far down the flap reaches (a share of `cover`) at u from -1 (left) to 1."""
@@ -64,15 +67,15 @@ class LeatherBag:
         u = np.linspace(-1, 1, 13)
         low = h - self.cover * h * self._edge(u)
         back, top, front = self._front(0.8 * h), self._front(h), self._front(h)
-        run = ((0.85, 0.8 * h, back + 0.5 * thick), (0.88, h - 0.001, top), (0.94, h + thick, 0.6 * top), (0.97, h + thick, -0.6 * front),
-               (0.985, h - 0.002, -front - thick))  # fmt: skip
+        x = 0.985 * w * u
+        run = ((0.85, 0.8 * h, back + 0.5 * thick), (0.88, h - 0.001, top), (0.94, h + thick, 0.6 * top), (0.97, h + thick, -0.6 * front))
         rows = [np.column_stack([share * w * u, np.full_like(u, y), np.full_like(u, z)]) for share, z, y in run]
-        hem = np.column_stack([0.985 * w * u, [-self._front(z) - thick for z in low], low])
+        rows.append(np.column_stack([x, [-self._front(h - 0.002, a) - thick for a in x], np.full_like(u, h - 0.002)]))
+        hem = np.column_stack([x, [-self._front(z, a) - thick for a, z in zip(x, low, strict=True)], low])
         under = hem + np.array([0, thick + 0.0005, 0])
         cloth = sheet(np.stack([under, hem, *rows[::-1]]), ACCENT)
-        inner = u / np.abs(u).max() * 0.93
-        stitch = np.column_stack([0.985 * w * inner, [-self._front(z) - thick - 0.0003 for z in low + 0.003], low + 0.0032])
-        ends = [np.array([[sign * 0.916 * w, -front - thick - 0.0002, h - 0.003]]) for sign in (-1, 1)]
+        stitch = np.column_stack([0.93 * x, [-self._front(z, 0.93 * a) - thick - 0.0003 for a, z in zip(x, low + 0.003, strict=True)], low + 0.0032])
+        ends = [np.array([[sign * 0.916 * w, -self._front(h - 0.003, 0.916 * w) - thick - 0.0002, h - 0.003]]) for sign in (-1, 1)]
         return [cloth, tube(np.concatenate([ends[0], stitch, ends[1]]), 0.0008, INK, 4)]
 
     def _clasp(self) -> list[Mesh]:
