@@ -12,7 +12,7 @@ STIFF = 1e-3
 """Weight of the edge's middle against the quadrics, which leave a flat neighbourhood undecided."""
 
 
-def decimate(vertex: Vertices, face: Faces, target: int) -> tuple[Vertices, Faces]:
+def decimate(vertex: Vertices, face: Faces, target: int) -> tuple[Float[np.ndarray, "m 3"], Int[np.ndarray, "k 3"]]:
     """Collapse edges of a welded mesh until at most `target` triangles are left, or none can go without folding the surface.
 
     An edge whose collapse would fold it is sour: it is left out until nothing else can go, then tried once more.

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from PIL import ImageColor
 
 from vap_core.errors import BadObject
@@ -69,7 +69,7 @@ def read(path: Path, colour: str | None = None) -> Source:
     return Source(vertex, face, paint)
 
 
-def _weld(corner: Float[np.ndarray, "f 3 3"]) -> tuple[Vertices, Faces, Bool[np.ndarray, " f"]]:
+def _weld(corner: Float[np.ndarray, "f 3 3"]) -> tuple[Vertices, Int[np.ndarray, "k 3"], Bool[np.ndarray, " f"]]:
     """Shared vertices where corners meet within a millionth of the whole, without triangles that vanish; and which those are not."""
     point = corner.reshape(-1, 3)
     grain = max(float(np.ptp(point, axis=0).max()), 1e-30) * 1e-6
