@@ -27,11 +27,11 @@ FAMILIES: tuple[Family, ...] = (
         (
             (PaperCup(), Texture(ESPRESSO, KRAFT, MILK, "hoops", "full", 8)),
             (PaperCup(0.0182, 0.0215, 0.078, (0.20, 0.72), "ink"), Texture(ESPRESSO, KRAFT, MILK, "chevron", "full", 9)),
-            (PaperCup(0.0178, 0.0212, 0.074, (0.30, 0.78), "light", True), Texture(ESPRESSO, KRAFT, MILK, "word", "band", 2, "CAFE")),
+            (PaperCup(0.0178, 0.0212, 0.074, (0.24, 0.74), "light"), Texture(ESPRESSO, KRAFT, MILK, "word", "row", 3, "CAFE")),
             (PaperCup(0.0180, 0.0215, 0.075, (0.22, 0.66), "base"), Texture(ESPRESSO, PINE, MILK, "stripes", "full", 12)),
             (PaperCup(0.0176, 0.0214, 0.077, (0.12, 0.86), "accent"), Texture(MILK, KRAFT, ESPRESSO, "dots", "full", 8)),
+            (PaperCup(0.0178, 0.0213, 0.073, (0.26, 0.74), "accent", True), Texture(INDIGO, MILK, ESPRESSO, "star", "brick", 5)),
             (PaperCup(0.0180, 0.0215, 0.076, (0.10, 0.88), "ink"), Texture(MILK, TOMATO, ESPRESSO, "heart", "brick", 6)),
-            (PaperCup(0.0178, 0.0213, 0.073, (0.26, 0.74), "accent", True), Texture(INDIGO, MILK, ESPRESSO, "star", "row", 4)),
         ),
         paint=_papery,
         slug="paper-cup",
