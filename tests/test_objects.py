@@ -5,7 +5,7 @@ import pytest
 
 from vap_core.errors import UnknownName
 from vap_core.sim.gl import ensure_gl
-from vap_core.sim.objects import CATEGORIES, CLUTTER, OBJECTS, add_object, extent_m, generic, get, lookalikes, mesh, personal
+from vap_core.sim.objects import CATEGORIES, CLUTTER, OBJECTS, add_object, extent_m, generic, get, lookalikes, mesh, personal, tier
 from vap_core.sim.studio import contact_sheet, reference_views
 from vap_core.sim.textures import atlas
 
@@ -44,6 +44,12 @@ def test_look_alikes_differ_in_motif_and_in_shape():
         assert len({(m.texture.motif, m.texture.layout) for m in models}) == len(models)
         assert len({repr(m.shape) for m in models}) == len(models)
         assert all({m.texture.base, m.texture.ink, m.texture.accent} & {models[0].texture.base, models[0].texture.accent} for m in models)
+
+
+@pytest.mark.parametrize("stem", STEMS)
+def test_look_alikes_come_in_three_tiers(stem):
+    assert {tier(model) for model in lookalikes(stem)} == {"hard", "medium", "easy"}
+    assert tier(lookalikes(stem)[-1]) == "easy"
 
 
 def test_generic_is_deterministic_and_deaf_to_global_seeds():

@@ -83,7 +83,9 @@ class House:
         step = float(z[1] - z[0]) / 2
         stack = [Solid("box", (float(a), float(b), step), (0, 0, float(m))) for a, b, m in zip(wide, deep, middle, strict=True)]
         plate = Solid("box", (x + 0.011, y + 0.010, self.plate / 2), (0, 0, self.plate / 2))
-        return plate, Solid("box", (x, y, h / 2), (0, 0, self.plate + h / 2)), *stack
+        walls, top = Solid("box", (x, y, h / 2), (0, 0, self.plate + h / 2)), self.rise / 2 + 0.0015
+        chimney = Solid("box", (0.005, 0.005, top), (0.55 * x, 0.35 * y, self.plate + h + top))
+        return plate, walls, *stack, *([chimney] if self.chimney else [])
 
     def aspect(self) -> float:
         return 2 * (self.wide + self.deep) / self.eaves
