@@ -224,6 +224,25 @@ def test_a_hole_is_counted_and_can_be_repaired(tmp_path, quick):
     assert np.abs(body.image.reshape(-1, 3).astype(int) - RED).max() <= 2
 
 
+def test_a_scan_without_a_bottom_and_with_crumbs_is_closed(tmp_path, quick):
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.04)
+    middle = ball.triangles_center
+    ball.update_faces((middle[:, 2] > -0.03) & (np.linalg.norm(middle - (0.04, 0, 0), axis=1) > 0.01))
+    crumb = trimesh.creation.icosphere(subdivisions=1, radius=0.002)
+    crumb.apply_translation((0.08, 0, 0))
+    for part in (ball, crumb):
+        part.visual.vertex_colors = np.tile([*RED, 255], (len(part.vertices), 1)).astype(np.uint8)
+    file = put(tmp_path, "scan.ply", trimesh.util.concatenate([ball, crumb]))
+    with pytest.raises(BadObject, match=r"\d\d+ open edges"):
+        bring(file, "scan", "ball", say=silent)
+    _, body = bring(file, "scan", "ball", repair=True, say=silent)
+    assert np.ptp(body.form.vertex, axis=0) == pytest.approx((0.079, 0.08, 0.07), abs=0.002)
+    vertex, face = np.unique(body.form.vertex, axis=0, return_inverse=True)[0], body.form.face
+    corner = body.form.vertex[face]
+    assert len(vertex) > 1000
+    assert (corner[:, 0] * np.cross(corner[:, 1], corner[:, 2])).sum() / 6 == pytest.approx(4 / 3 * np.pi * 0.04**3, rel=0.06)
+
+
 def test_triangles_that_face_both_ways_can_be_repaired(tmp_path, quick):
     turned = box(rgb=RED)
     turned.faces[3] = turned.faces[3][::-1]

@@ -18,6 +18,7 @@ from vap_core.errors import BadObject
 from vap_core.memory import CATEGORY, NAME
 from vap_core.sim import objects
 from vap_core.sim.bake import Paint, bake, shaded, shrink
+from vap_core.sim.closing import close, flaws
 from vap_core.sim.decimate import Faces, Vertices, decimate, normals
 from vap_core.sim.scan import Card, Scan, scans
 from vap_core.sim.shapes import Hull
@@ -51,7 +52,8 @@ def bring(
     if mass_kg is not None and not 0 < mass_kg <= 5:
         raise BadObject(f"objects: a mass of {mass_kg:g} kg is beyond what the arms lift; give --mass-kg between 0 and 5.")
     source = read(path, colour)
-    source = _mended(source) if repair else source
+    if repair:
+        source = Source(*close(source.vertex, source.face), source.paint)
     _check_closed(source, path, repair)
     source = _upright(source, path, up or ("y" if path.suffix.lower() in (".glb", ".obj") else "z"), height_cm)
     scan = _scan(source, say)
@@ -77,26 +79,12 @@ def table() -> str:
     return "\n".join(lines)
 
 
-def _mended(source: Source) -> Source:
-    """Holes closed and triangles turned alike as far as trimesh can; texture coordinates are painted anew."""
-    import trimesh
-
-    mesh = trimesh.Trimesh(source.vertex, source.face, process=False)
-    mesh.update_faces(mesh.unique_faces() & mesh.nondegenerate_faces())
-    mesh.remove_unreferenced_vertices()
-    trimesh.repair.fill_holes(mesh, use_fan=True)
-    trimesh.repair.fix_normals(mesh)
-    return Source(np.array(mesh.vertices), np.array(mesh.faces, np.int64), source.paint)
-
-
 def _check_closed(source: Source, path: Path, repaired: bool) -> None:
-    edge = source.face[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    base = len(source.vertex)
-    _, uses = np.unique(edge.min(axis=1) * base + edge.max(axis=1), return_counts=True)
     mend = "close the surface in your 3-D tool (--repair was not enough)" if repaired else "pass --repair, or close the surface in your 3-D tool"
-    if (loose := int((uses != 2).sum())) > 0:
+    loose, wrong = flaws(source.face)
+    if loose:
         raise BadObject(f"objects: {path} is not watertight: {loose:,} open edges (edges that do not join exactly two triangles); {mend}.")
-    if (wrong := len(edge) - len(np.unique(edge[:, 0] * base + edge[:, 1]))) > 0:
+    if wrong:
         raise BadObject(f"objects: {path} has triangles that face opposite ways along {wrong:,} edges; {mend}.")
 
 
