@@ -22,7 +22,7 @@ def _paper_cup(rng: np.random.Generator) -> PaperCup:
 FAMILIES: tuple[Family, ...] = (
     Family(
         "cup",
-        0.06,
+        0.07,
         _paper_cup,
         (
             (PaperCup(), Texture(ESPRESSO, KRAFT, MILK, "hoops", "full", 8)),

@@ -55,7 +55,7 @@ def _canvas(drawn: Texture, index: int) -> Texture:
 
 
 def _house(rng: np.random.Generator) -> House:
-    wide, deep, eaves, rise = rng.uniform((0.048, 0.040, 0.030, 0.020), (0.064, 0.050, 0.044, 0.032)).tolist()
+    wide, deep, eaves, rise = rng.uniform((0.048, 0.040, 0.032, 0.0225), (0.064, 0.050, 0.044, 0.032)).tolist()
     return House(wide, deep, eaves, rise, pick(rng, ("gable", "hip", "barn", "flat")), pick(rng, ("accent", "ink", "dark", "warm")),
                  int(rng.integers(1, 4)), 2 if eaves > 0.038 else 1, bool(rng.random() < 0.5))  # fmt: skip
 
@@ -122,7 +122,7 @@ FAMILIES: tuple[Family, ...] = (
     ),
     Family(
         "scrubber",
-        0.06,
+        0.07,
         _scrubber,
         (
             (Scrubber(), Texture(BERRY, SEED, STALK, "seeds", "full", 9)),
