@@ -205,12 +205,10 @@ def _touch(env: Env, truth: Truth, attempt: int) -> list[Waypoint]:
     highest = points[points[:, 2] > top - 0.006].mean(axis=0)
     x, y = (highest if attempt % 2 else middle)[:2]
     now = env.command.tcp_base
-    pose = now.copy()
-    pose[:3, 3] = _into_base(env) @ (np.array([x, y, top - 0.025]) - env.robot.base_world[:3])
-    met = _try(env, pose, 0.02)
-    if met is None:
+    turns = [_pose(env, np.array([x, y, top - 0.025]), yaw) for yaw in np.deg2rad(np.arange(0.0, 360.0, 30.0)).tolist()]
+    pose = next((met for turn in sorted(turns, key=lambda turn: _off(turn, now)[1]) if (met := _try(env, turn, 0.02)) is not None), None)
+    if pose is None:
         raise OutOfReach(f"Expert: {env.row.key}: {env.robot.name} cannot reach {env.row.target}; move it closer.")
-    pose = met
     over = _above(env, pose, _ceiling(env, truth) + ABOVE_M - (top - 0.025))
     return [Waypoint(over, 0.0), Waypoint(pose, 0.0, 0.2), Waypoint(over, 0.0)]
 

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Int64, UInt8
 
 from vap_core.sim import objects, robots, scenes
+from vap_core.sim.look import Look
 from vap_core.sim.objects import ObjectModel
 from vap_core.values import value
 
