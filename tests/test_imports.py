@@ -267,6 +267,11 @@ def test_a_colourless_mesh_asks_for_a_colour(tmp_path, quick):
         bring(file, "plain", "box", say=silent)
     with pytest.raises(BadObject, match="no colour; write it as"):
         bring(file, "plain", "box", colour="reddish", say=silent)
+    mug().export(tmp_path / "mug.obj")
+    for beside in ("material.mtl", "material_0.png"):
+        (tmp_path / beside).unlink()
+    with pytest.raises(BadObject, match=r"an OBJ needs its \.mtl and picture beside it"):
+        bring(tmp_path / "mug.obj", "mug", "cup", say=silent)
     _, body = bring(file, "plain", "box", colour="#aa3322", say=silent)
     assert (body.image == (0xAA, 0x33, 0x22)).all()
 

@@ -5,6 +5,7 @@ What comes out stands on z = 0, centred on the z axis, z up, metres; its collisi
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
@@ -24,8 +25,9 @@ from vap_core.sim.scan import Card, Scan, scans
 from vap_core.sim.shapes import Hull
 from vap_core.sim.source import Source, read
 
-VISUAL_FACES, TEXTURE_PX, HULLS = 3000, 1024, 16
+VISUAL_FACES, TEXTURE_PX, HULLS, HULL_CORNERS = 3000, 1024, 16, 160
 SMALLEST_M, LARGEST_M = 0.01, 0.6
+SLIVER_M3 = 1e-9
 DENSITY_KG_M3, MASS_KG = 400.0, (0.03, 0.5)
 TURN = {"z": np.eye(3), "y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])}
 """Object (z up, front towards -y) from file, by the axis that points up in the file."""
@@ -139,17 +141,16 @@ def _hulls(vertex: Vertices, face: Faces) -> tuple[Hull, ...]:
 
     coacd.set_log_level("off")
     parts = coacd.run_coacd(
-        coacd.Mesh(vertex, face), threshold=0.1, preprocess_resolution=30, mcts_iterations=60, max_convex_hull=HULLS, max_ch_vertex=64, decimate=True,
-        seed=0,
+        coacd.Mesh(vertex, face), threshold=0.1, preprocess_resolution=30, mcts_iterations=60, max_convex_hull=HULLS, decimate=True,
+        max_ch_vertex=HULL_CORNERS, seed=0,
     )  # fmt: skip
     hulls = []
     for corners, _ in parts:
         inside = np.clip(corners, vertex.min(axis=0), vertex.max(axis=0))
-        try:
+        with suppress(QhullError):  # a part as flat as paper
             convex = ConvexHull(inside)
-        except QhullError:  # a part as flat as paper
-            continue
-        hulls.append(Hull(inside[convex.vertices], float(convex.volume)))
+            if convex.volume > SLIVER_M3:
+                hulls.append(Hull(inside[convex.vertices], float(convex.volume)))
     if not hulls:
         raise BadObject("objects: no convex part of this object has a volume; give it thickness in your 3-D tool (solidify).")
     return tuple(hulls)

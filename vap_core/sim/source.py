@@ -60,7 +60,10 @@ def read(path: Path, colour: str | None = None) -> Source:
     vertex, face, alive = _weld(corner)
     looks = [_look(part, colour) for part in parts]
     if None in looks:
-        raise BadObject(f"objects: {path} has no texture, UV map or vertex colours; bake a texture in your 3-D tool, or pass --colour '#aa3322'.")
+        beside = " (an OBJ needs its .mtl and picture beside it)" if path.suffix.lower() == ".obj" else ""
+        raise BadObject(
+            f"objects: {path} has no texture, UV map or vertex colours; bake a texture in your 3-D tool{beside}, or pass --colour '#aa3322'."
+        )
     area = np.linalg.norm(normals(corner), axis=1)
     paint = _paint(corner, area, [look for look in looks if look is not None], [len(part.faces) for part in parts])
     visual: Any = parts[0].visual
