@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from vap_core.sim.bodies import Bottle, Cup, Owl, PenHolder, StrawCup, Vase
+from vap_core.sim.bodies.gadgets import CameraBody, Can, Shaver
+from vap_core.sim.bodies.vessels import Bottle, Cup, Owl, PenHolder, StrawCup, Vase
 from vap_core.sim.catalogue.family import Family, pick
-from vap_core.sim.gadgets import CameraBody, Can, Shaver
 from vap_core.sim.textures import Texture
 
 CREAM, BONE, SAND, RUST = (233, 223, 201), (219, 214, 206), (201, 176, 139), (140, 79, 62)

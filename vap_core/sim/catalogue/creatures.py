@@ -1,9 +1,9 @@
 """Cat figurines, plushies and stuffed toys."""
 
-from vap_core.sim.animals import Cat, Plushie
+from vap_core.sim.bodies.animals import Cat, Plushie
+from vap_core.sim.bodies.softtoys import StuffedToy
 from vap_core.sim.catalogue.family import Family, pick
 from vap_core.sim.catalogue.generics import beside, dressed
-from vap_core.sim.softtoys import StuffedToy
 from vap_core.sim.textures import Texture
 
 SOOT, ASH, AMBER, JADE, SNOW, GINGER, FLAX = (

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from vap_core.sim.bodies.kitchen import PaperCup
 from vap_core.sim.catalogue.family import Family, pick
-from vap_core.sim.kitchen import PaperCup
 from vap_core.sim.textures import Ink, Texture
 
 ESPRESSO, KRAFT, MILK, PINE, TOMATO, INDIGO = (74, 48, 36), (192, 150, 104), (236, 230, 220), (54, 98, 80), (196, 70, 52), (66, 74, 124)

@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from vap_core.sim.bodies.kitchen import Scrubber
+from vap_core.sim.bodies.plants import Plant
+from vap_core.sim.bodies.toys import Bus, House, Painting
 from vap_core.sim.catalogue.family import Family, pick
-from vap_core.sim.kitchen import Scrubber
-from vap_core.sim.plants import Plant
 from vap_core.sim.textures import Ink, Texture
-from vap_core.sim.toys import Bus, House, Painting
 
 BRICK, BLUE, LAWN, IVORY, GOLD, WALNUT = (190, 50, 46), (48, 100, 178), (86, 146, 72), (238, 230, 212), (226, 176, 64), (92, 64, 46)
 CLAY, JADE, BLUSH, CHALK, PLUM, OLIVE = (190, 108, 76), (104, 158, 108), (214, 122, 118), (232, 228, 220), (112, 70, 104), (128, 132, 62)

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from vap_core.sim.bodies.dishes import Basket, Dish
 from vap_core.sim.catalogue.family import Family, pick
-from vap_core.sim.dishes import Basket, Dish
 from vap_core.sim.textures import Ink, Texture
 
 CHINA, COBALT, STRAW, BARK, TURQUOISE, LAGOON = (238, 236, 230), (48, 78, 146), (205, 164, 103), (104, 68, 36), (56, 164, 170), (36, 122, 132)

@@ -1,9 +1,9 @@
 """What one carries and wears: leather bags, shoes, slippers and pouches."""
 
-from vap_core.sim.bags import LeatherBag, Pouch
+from vap_core.sim.bodies.bags import LeatherBag, Pouch
+from vap_core.sim.bodies.footwear import Shoe, Slipper
 from vap_core.sim.catalogue.family import Family, pick
 from vap_core.sim.catalogue.generics import beside, dressed
-from vap_core.sim.footwear import Shoe, Slipper
 from vap_core.sim.textures import Texture
 
 ESPRESSO, TAN, WALNUT, PARCHMENT, MARINE, STONE, ONYX = (

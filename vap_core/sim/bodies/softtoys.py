@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from vap_core.sim.lofts import disc, rings
+from vap_core.sim.bodies.lofts import disc, rings
 from vap_core.sim.shapes import DECORATED, Mesh, Number, Profile, Solid, ellipsoid, join, lathe, tube, turn
 from vap_core.sim.textures import ACCENT, BASE, DARK, INK, LIGHT
 from vap_core.values import value

@@ -4,7 +4,7 @@ from typing import Literal
 
 import numpy as np
 
-from vap_core.sim.lofts import arc, limbs, loop, reshaped, rings, sheet
+from vap_core.sim.bodies.lofts import arc, limbs, loop, reshaped, rings, sheet
 from vap_core.sim.shapes import DECORATED, Mesh, Number, Profile, Solid, barrel, block, ellipsoid, join, lathe, tube, turn
 from vap_core.sim.textures import ACCENT, BASE, DARK, INK, METAL, WARM
 from vap_core.values import value

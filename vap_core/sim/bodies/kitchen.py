@@ -4,7 +4,7 @@ from typing import Literal
 
 import numpy as np
 
-from vap_core.sim.plants import flat_leaf
+from vap_core.sim.bodies.plants import flat_leaf
 from vap_core.sim.shapes import DECORATED, Mesh, Solid, foot, join, lathe, pillar, tube
 from vap_core.sim.textures import ACCENT, BASE, INK, LIGHT
 from vap_core.values import value

@@ -4,7 +4,7 @@ from typing import Literal
 
 import numpy as np
 
-from vap_core.sim.lofts import curve, loop, sheet
+from vap_core.sim.bodies.lofts import curve, loop, sheet
 from vap_core.sim.shapes import DECORATED, Mesh, Number, Solid, ellipsoid, join, tube
 from vap_core.sim.textures import ACCENT, BASE, DARK, INK, LIGHT
 from vap_core.values import value

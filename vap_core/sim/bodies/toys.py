@@ -5,8 +5,8 @@ from typing import Literal
 
 import numpy as np
 
+from vap_core.sim.bodies.slabs import box, facet, frustum, panel
 from vap_core.sim.shapes import DECORATED, Mesh, Number, Solid, barrel, ellipsoid, join, turn
-from vap_core.sim.slabs import box, facet, frustum, panel
 from vap_core.sim.textures import ACCENT, BASE, DARK, GLASS, INK, LIGHT, METAL, WARM
 from vap_core.values import value
 
