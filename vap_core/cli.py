@@ -236,14 +236,22 @@ def doctor() -> None:
 
 
 @app.command()
-def bench(steps: Annotated[int, typer.Option(min=5, help="Control steps to time.")] = 60) -> None:
-    """Time a control step by part, grounding, tracking and recording, as shares and ratios within one run.
+def bench(
+    what: Annotated[str, typer.Argument(help="loop: the prompted control loop; suites: every benchmark's simulator.")] = "loop",
+    steps: Annotated[int, typer.Option(min=5, help="loop: control steps to time.")] = 60,
+    workers: Workers = 2,
+) -> None:
+    """Time a control step by part, as shares and ratios within one run: of the prompted loop, or of every benchmark's simulator.
 
-    Example: python -m vap_core bench
+    Example: python -m vap_core bench suites
     """
-    from vap_core.bench import run
+    from vap_core import bench as loop
+    from vap_core import bench_suites
+    from vap_core.errors import one_of
 
-    print(run(steps))
+    if what not in ("loop", "suites"):
+        raise one_of("bench:", what, ("loop", "suites"))
+    print(loop.run(steps) if what == "loop" else bench_suites.run(workers))
 
 
 @train_app.command()

@@ -20,7 +20,11 @@ SYNONYMS: dict[str, tuple[str, ...]] = {
     "miniature house": ("miniature house", "toy house", "model house"),
     "plant": ("plant", "potted plant", "houseplant"),
     "scrubber": ("scrubber", "scrub brush", "dish brush"),
-    "bowl": ("bowl", "dish", "serving bowl"),
+    "plastic bowl": ("plastic bowl", "bowl", "mixing bowl"),
+    "plate": ("plate", "dinner plate", "dish"),
+    "basket": ("basket", "wicker basket", "bread basket"),
+    "painting": ("painting", "framed picture", "picture frame"),
+    "toy bus": ("toy bus", "bus", "school bus"),
 }
 """Training phrases of each category, its own name first; a category without an entry is trained by its name alone."""
 
@@ -38,7 +42,7 @@ UNSEEN: dict[str, tuple[str, ...]] = {
 """Synonyms never trained with."""
 
 NEGATIVES: tuple[str, ...] = (
-    "laptop", "keyboard", "book", "banana", "apple", "scissors", "spoon", "fork", "plate", "phone", "dog", "car", "table", "robot arm", "gripper",
+    "laptop", "keyboard", "book", "banana", "apple", "scissors", "spoon", "fork", "phone", "dog", "car", "table", "robot arm", "gripper",
     "person", "chair", "lamp", "window", "hat", "pillow", "clock", "ball", "cardboard box", "remote control", "toothbrush", "shadow", "wall",
     "umbrella", "elephant", "screwdriver", "notebook", "candle", "glasses", "key", "wallet", "headphones", "bread", "orange", "towel",
 )  # fmt: skip
