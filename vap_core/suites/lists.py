@@ -28,6 +28,7 @@ def write(name: str, rows: Sequence[EpisodeRow], folder: Path = FOLDER) -> str:
     write_atomic(folder / f"{name}.jsonl", data)
     listed = {**_manifest(folder, missing_is_empty=True), name: {"sha256": digest, "episodes": len(rows)}}
     write_atomic(folder / "manifest.json", (json.dumps(listed, indent=1, sort_keys=True) + "\n").encode())
+    read.cache_clear()
     return digest
 
 
