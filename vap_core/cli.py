@@ -288,18 +288,19 @@ def import_object(
 
     Example: python -m vap_core objects import mug.glb --category cup --height-cm 9
     """
-    from vap_core.sim import imports, objects, scan
+    from vap_core.sim import objects
+    from vap_core.sim.scans import bring, stored
 
-    folder, name = out or scan.home(), name or imports.slug(file)
-    scan.free(folder, name, replace)
-    card, body = imports.bring(
+    folder, name = out or stored.home(), name or bring.slug(file)
+    stored.free(folder, name, replace)
+    card, body = bring.bring(
         file, name, category, height_cm=height_cm, up=up, mass_kg=mass_kg, colour=colour, repair=repair, licence=licence,
         say=lambda line: print(line, file=sys.stderr),
     )  # fmt: skip
-    place = scan.save(folder, card, body, replace=replace)
+    place = stored.save(folder, card, body, replace=replace)
     size = " x ".join(f"{100 * side:.1f}" for side in objects.extent_m(objects.own(place)))
     print(f"{card.name}: a {card.category}, {size} cm, {card.mass_kg:g} kg, {len(body.hulls)} convex parts, saved to {place}")
-    setting = "" if folder == scan.home() else f"VAP_OBJECTS={folder} "
+    setting = "" if folder == stored.home() else f"VAP_OBJECTS={folder} "
     print(f"next: {setting}python -m vap_core objects photograph '{card.name}', or in Python scenes.build('wx250s', ['{card.name}'])")
 
 
@@ -309,7 +310,7 @@ def list_objects() -> None:
 
     Example: python -m vap_core objects list
     """
-    from vap_core.sim.imports import table
+    from vap_core.sim.scans.bring import table
 
     print(table())
 

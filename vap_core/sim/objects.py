@@ -14,7 +14,7 @@ import numpy as np
 from vap_core.errors import one_of
 from vap_core.sim.catalogue import FAMILIES, Family
 from vap_core.sim.catalogue.family import pick
-from vap_core.sim.scan import load, scans
+from vap_core.sim.scans.stored import load, scans
 from vap_core.sim.shapes import Hull, Mesh, Number, Shape, Solid
 from vap_core.sim.textures import GENERIC_FILLS, GENERIC_GLYPHS, GENERIC_LAYOUTS, Ink, Texture, atlas
 from vap_core.values import Rgb, value

@@ -18,12 +18,12 @@ from vap_core import __version__
 from vap_core.errors import BadObject
 from vap_core.memory import CATEGORY, NAME
 from vap_core.sim import objects
-from vap_core.sim.bake import Paint, bake, shaded, shrink
-from vap_core.sim.closing import close, flaws
-from vap_core.sim.decimate import Faces, Vertices, decimate, normals
-from vap_core.sim.scan import Card, Scan, scans
+from vap_core.sim.scans.bake import Paint, bake, shaded, shrink
+from vap_core.sim.scans.closing import close, flaws
+from vap_core.sim.scans.source import Source, read
+from vap_core.sim.scans.stored import Card, Scan, scans
+from vap_core.sim.scans.triangles import Faces, Vertices, decimate, normals
 from vap_core.sim.shapes import Hull
-from vap_core.sim.source import Source, read
 
 VISUAL_FACES, TEXTURE_PX, HULLS, HULL_CORNERS = 3000, 1024, 16, 160
 SMALLEST_M, LARGEST_M = 0.01, 0.6

@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float, Int
 from PIL import ImageColor
 
 from vap_core.errors import BadObject
-from vap_core.sim.bake import Corners, Paint
-from vap_core.sim.decimate import Faces, Vertices, normals
+from vap_core.sim.scans.bake import Corners, Paint
+from vap_core.sim.scans.triangles import Faces, Vertices, normals
 from vap_core.values import Rgb, value
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from vap_core.sim.decimate import Faces, Vertices, normals
+from vap_core.sim.scans.triangles import Faces, Vertices, normals
 
 CRUMB = 0.02
 """A separate piece with less than this share of the area is dropped."""

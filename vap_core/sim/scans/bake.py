@@ -8,7 +8,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from vap_core.sim.decimate import Faces, Vertices, normals
+from vap_core.sim.scans.triangles import Faces, Vertices, normals
 from vap_core.sim.shapes import Mesh
 from vap_core.values import Rgb, value
 
