@@ -91,7 +91,7 @@ def grasps(robot: Robot, target: str, poses: Mapping[str, Pose]) -> list[Grasp]:
     return sorted(found, key=lambda grasp: (max(ROOM_M - grasp.clear_m, 0.0) + TAPER_M * grasp.taper, grasp.width_m))
 
 
-def _candidates(robot: Robot, target: str, pose: Pose, foot: float, top: float, others: Sequence[Float64[np.ndarray, "n 3"]]) -> Iterator[Grasp]:
+def _candidates(robot: Robot, target: str, pose: Pose, foot: float, top: float, others: Sequence[Float64[np.ndarray, "_ 3"]]) -> Iterator[Grasp]:
     tried: set[float] = set()
     for share in SHARES:
         z = float(max(foot + share * (top - foot), top - 0.9 * robot.palm_m, TIP_M))
@@ -117,7 +117,7 @@ def _candidates(robot: Robot, target: str, pose: Pose, foot: float, top: float, 
             )
 
 
-def _clearance(robot: Robot, middle: np.ndarray, axis: np.ndarray, z: float, others: Sequence[Float64[np.ndarray, "n 3"]]) -> float:
+def _clearance(robot: Robot, middle: np.ndarray, axis: np.ndarray, z: float, others: Sequence[Float64[np.ndarray, "_ 3"]]) -> float:
     """Least distance, across the table, of the open fingers (and of the palm above them) to anything that reaches their height."""
     least = 1.0
     across = np.array([-axis[1], axis[0]])
