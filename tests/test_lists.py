@@ -5,7 +5,7 @@ import json
 import math
 from collections import Counter
 from dataclasses import asdict, replace
-from functools import lru_cache
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -116,7 +116,7 @@ def test_every_lookalike_is_met(name, rows):
         assert met == {model.name for model in objects.lookalikes(task.stem)}
 
 
-@lru_cache(maxsize=None)
+@cache
 def support_m(model, yaw):
     """How far the object's collision outline reaches from its origin in every one of DIRECTIONS, metres."""
     pose = np.array([0.0, 0.0, 0.0, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
