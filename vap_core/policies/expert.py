@@ -16,6 +16,8 @@ from vap_core.sim.grasps import Grasp, grasps, points_world
 from vap_core.values import Action, Chunk, Truth, value
 
 SPEED_M_S, TURN_RAD_S = 0.22, 1.4
+GRIP_S = 3.0
+"""Share of the gripper's travel in a second: a jaw that slams knocks light things over."""
 ABOVE_M = 0.04
 """Clearance over whatever stands lower than the path."""
 ARRIVED_M, ARRIVED_RAD = 0.006, 0.06
@@ -89,25 +91,27 @@ def _towards(waypoint: Waypoint, env: Env) -> Action:
     move, turn = goal[:3, 3] - now[:3, 3], rotation_vector(goal[:3, :3] @ now[:3, :3].T)
     move *= min(1.0, SPEED_M_S * seconds / max(float(np.linalg.norm(move)), 1e-9))
     turn *= min(1.0, TURN_RAD_S * seconds / max(float(np.linalg.norm(turn)), 1e-9))
+    squeeze = env.command.gripper + float(np.clip(waypoint.gripper - env.command.gripper, -GRIP_S * seconds, GRIP_S * seconds))
     if env.control == "ee":
-        return np.array([*move, *turn, waypoint.gripper], np.float32)
+        return np.array([*move, *turn, squeeze], np.float32)
     step = np.eye(4)
     step[:3, :3], step[:3, 3] = rotation(turn) @ now[:3, :3], now[:3, 3] + move
     joints = arm(env.robot.name).solve(env.command.joints, step, seconds)
-    return np.array([*(joints - env.command.joints), waypoint.gripper], np.float32)
+    return np.array([*(joints - env.command.joints), squeeze], np.float32)
 
 
 def _reached(waypoint: Waypoint, env: Env, waited_s: float) -> bool:
     off, turned = _off(waypoint.tcp_base, env.tcp_base())
     if waited_s > PATIENCE_S + waypoint.stay_s:
         return True
-    return off < ARRIVED_M and turned < ARRIVED_RAD and waited_s >= waypoint.stay_s
+    return off < ARRIVED_M and turned < ARRIVED_RAD and waited_s >= waypoint.stay_s and abs(env.command.gripper - waypoint.gripper) < 0.01
 
 
 def _dwell(waypoint: Waypoint, env: Env) -> float:
     """Time counts at a waypoint once the command is there, and slowly before, so that nothing waits for ever."""
     off, turned = _off(waypoint.tcp_base, env.command.tcp_base)
-    return (1.0 if off < 0.003 and turned < 0.02 else 0.1) / env.hz
+    there = off < 0.003 and turned < 0.02 and abs(env.command.gripper - waypoint.gripper) < 0.01
+    return (1.0 if there else 0.1) / env.hz
 
 
 def _off(one: Float64[np.ndarray, "4 4"], other: Float64[np.ndarray, "4 4"]) -> tuple[float, float]:
@@ -129,7 +133,7 @@ def _take(env: Env, truth: Truth, attempt: int) -> list[Waypoint]:
     z = float(low[2, 3] + env.robot.base_world[2])
     above = _above(env, low, over - z)
     lift = _above(env, low, max(0.09, _ceiling(env, truth) - _foot(truth, env.row.target) + 0.015))
-    return [Waypoint(above, 1.0), Waypoint(low, 1.0), Waypoint(low, 0.0, 0.45), Waypoint(lift, 0.0)]
+    return [Waypoint(above, 1.0), Waypoint(low, 1.0), Waypoint(low, 0.0, 0.3), Waypoint(lift, 0.0)]
 
 
 def _reachable(env: Env, grasp: Grasp) -> Float64[np.ndarray, "4 4"] | None:
@@ -169,7 +173,7 @@ def _set_down(env: Env, truth: Truth) -> list[Waypoint]:
     if down is None:
         raise OutOfReach(f"Expert: {env.row.key}: {env.robot.name} cannot reach {env.row.goal} with {env.row.target} in its hand; move it closer.")
     over = _above(env, down, foot - floor)
-    return [Waypoint(over, 0.0, 0.1), Waypoint(down, 0.0, 0.15), Waypoint(down, 1.0, 0.3), Waypoint(_above(env, down, 0.08), 1.0)]
+    return [Waypoint(over, 0.0, 0.1), Waypoint(down, 0.0, 0.15), Waypoint(down, 1.0, 0.1), Waypoint(_above(env, down, 0.08), 1.0)]
 
 
 def _turned(
