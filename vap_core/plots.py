@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vap_core.metrics import Score
-from vap_core.values import Attended, Grounding, PersonalObject, Rgb
+from vap_core.values import Attended, EpisodeRow, Grounding, PersonalObject, Rgb, value
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -126,6 +126,126 @@ def film(images: Mapping[str, Sequence[Rgb]], titles: Sequence[str]) -> "Figure"
     for axes, title in zip(grid[0], titles, strict=True):
         axes.set_title(title, fontsize=9)
     return figure
+
+
+@value
+class Tile:
+    """One picture of a sheet, what is written under it, and the colour of its frame ("" for none)."""
+
+    picture: Rgb
+    title: str = ""
+    edge: str = ""
+
+
+def sheet(rows: Mapping[str, Sequence[Tile]], side_in: float = 1.0, label_in: float = 0.85, columns: int = 1) -> "Figure":
+    """A contact sheet: one labelled row of square tiles per key, the rows dealt into `columns` side by side; inches."""
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Rectangle
+
+    most, caption = max(map(len, rows.values())), 0.16 if any(tile.title for row in rows.values() for tile in row) else 0.0
+    deep, gap, width = -(-len(rows) // columns), 0.06, label_in + (side := side_in) * most
+    figure = Figure(figsize=(columns * width, deep * (side + caption + gap)))
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.set_axis_off()
+    for i, (label, tiles) in enumerate(rows.items()):
+        left, top = i // deep * width, i % deep * (side + caption + gap) + gap / 2
+        axes.text(left + label_in - 0.08, top + side / 2, label.replace(" ", "\n"), ha="right", va="center", fontsize=9)
+        for j, tile in enumerate(tiles):
+            x = left + label_in + j * side
+            axes.imshow(tile.picture, extent=(x + 0.03, x + side - 0.03, top + side - 0.03, top + 0.03), aspect="auto", interpolation="antialiased")
+            if tile.edge:
+                axes.add_patch(Rectangle((x + 0.03, top + 0.03), side - 0.06, side - 0.06, fill=False, edgecolor=tile.edge, linewidth=1.8))
+            axes.text(x + side / 2, top + side + caption / 2 - 0.02, tile.title, ha="center", va="center", fontsize=7, color=tile.edge or "black")
+    axes.set(xlim=(0, columns * width), ylim=(deep * (side + caption + gap), 0))
+    return figure
+
+
+def hardness_figure(table: "pd.DataFrame", colours: Mapping[str, str]) -> "Figure":
+    """Cosines of look-alikes by tier, one line per personal object, a diamond for its own new views (columns of `gallery.hardness`)."""
+    figure = _figure(8.5, 5.6)
+    axes = figure.subplots()
+    names = list(dict.fromkeys(table.object))
+    place = {name: i for i, name in enumerate(names)}
+    for tier, part in table.groupby("tier", sort=False):
+        axes.scatter(part.cosine, part.object.map(place), s=26, color=colours[str(tier)], alpha=0.85, label=f"look-alike, {tier}")
+    own = table.groupby("object", sort=False).own.first()
+    axes.scatter(
+        own, [place[str(name)] for name in own.index], marker="D", s=34, facecolor="white", edgecolor="black", label="the object itself, new views"
+    )
+    axes.set_yticks(range(len(names)), names)
+    axes.invert_yaxis()
+    axes.set_xlabel("mean cosine to five references of the personal object")
+    axes.grid(axis="y", color="#e6e6e6")
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=8, loc="upper left")
+    return figure
+
+
+def layouts_figure(lists: Mapping[str, Sequence[EpisodeRow]], tables_m: Mapping[str, tuple[float, float, float, float]]) -> "Figure":
+    """Where things stand at the start, seen from above with the robot at the bottom: one panel per suite; `tables_m` are its table's x0 y0 x1 y1."""
+    from matplotlib.patches import Rectangle
+
+    figure = _figure(3.4 * len(lists), 3.9)
+    grid = figure.subplots(1, len(lists), squeeze=False)[0]
+    roles = {"other objects": "#c9ccd1", "look-alike": OTHER, "goal": "#59a14f", "target": WINNER}
+    for axes, (name, rows) in zip(grid, lists.items(), strict=True):
+        spots: dict[str, set[tuple[float, float]]] = {role: set() for role in roles}
+        for row in rows:
+            for i, p in enumerate(row.placements):
+                role = "target" if i == 0 else "goal" if p.model == row.goal else "look-alike" if "-lookalike-" in p.model else "other objects"
+                spots[role].add((-p.y, p.x))
+        x0, y0, x1, y1 = tables_m[name]
+        axes.add_patch(Rectangle((-y1, x0), y1 - y0, x1 - x0, facecolor="#f3ede4", edgecolor="#cdbfa8"))
+        for role, places in spots.items():
+            axes.scatter(*np.array(sorted(places)).reshape(-1, 2).T, s=5 if role != "goal" else 12, color=roles[role], label=role, linewidths=0)
+        axes.plot(0, 0, marker="s", markersize=9, color="#444444", linestyle="none", label="robot's base")
+        axes.set(xlim=(-0.36, 0.36), ylim=(-0.06, 0.72), aspect="equal", title=f"{name}\n{len(rows)} episodes", xlabel="to the robot's right, m")
+        axes.spines[["top", "right"]].set_visible(False)
+    grid[0].set_ylabel("away from the robot, m")
+    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False, markerscale=1.6)
+    return figure
+
+
+def bounds_figure(scores: Sequence[Score]) -> "Figure":
+    """Success rates with 95 % Wilson intervals, one line per task and track, one colour per policy."""
+    lines = list(dict.fromkeys((s.suite, s.task, s.split) for s in scores))
+    policies = {policy: f"C{i}" for i, policy in enumerate(dict.fromkeys(s.policy for s in scores))}
+    figure = _figure(8.5, 0.27 * len(lines) + 1.1)
+    axes = figure.subplots()
+    for policy, colour in policies.items():
+        shown = [s for s in scores if s.policy == policy]
+        middle = np.array([100 * s.sr.value for s in shown])
+        spread = np.abs([middle - [100 * s.sr.low for s in shown], [100 * s.sr.high for s in shown] - middle])
+        at = [lines.index((s.suite, s.task, s.split)) for s in shown]
+        axes.errorbar(middle, at, xerr=spread, fmt="o", color=colour, markersize=4, capsize=2.5, linewidth=1, label=f"{policy} policy")
+    axes.set_yticks(range(len(lines)), [f"{suite} / {task}{f' ({split})' if split else ''}" for suite, task, split in lines], fontsize=8)
+    axes.invert_yaxis()
+    axes.set(xlim=(-2, 102), xlabel="% of episodes that succeed, 95 % interval")
+    axes.grid(axis="y", color="#eeeeee")
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=len(policies), frameon=False)
+    return figure
+
+
+def keep(figure: "Figure", path: Path, dpi: int = 110, limit: int = 115_000) -> bytes:
+    """Save a figure as PNG with a palette of 256 colours, and return a JPEG of it that is small enough for a notebook: at most `limit` bytes."""
+    from io import BytesIO
+
+    from PIL import Image
+
+    drawn = BytesIO()
+    figure.savefig(drawn, dpi=dpi, metadata={"Software": None})
+    full = Image.open(drawn).convert("RGB")
+    full.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
+    small = full.copy()
+    for width in (1000, 880, 760, 640, 520, 400):
+        small.thumbnail((width, 4 * width), Image.Resampling.LANCZOS)
+        encoded = BytesIO()
+        small.save(encoded, "JPEG", quality=82)
+        if len(encoded.getvalue()) <= limit:
+            break
+    return encoded.getvalue()
 
 
 def _strip(crops: Sequence[Rgb], side: int = 96) -> Rgb:

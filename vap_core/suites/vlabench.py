@@ -25,7 +25,7 @@ VLABENCH = Suite(
         _select("cup", 200, "paper-cup"),
     ),
 )
-TABLE = Area(0.38, 0.58, -0.20, 0.20)
+TABLE = Area(0.38, 0.54, -0.17, 0.17)
 EPISODES = 50
 
 
