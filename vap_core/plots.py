@@ -1,6 +1,7 @@
 """Values in, matplotlib figures out; nothing here computes what it shows."""
 
 from collections.abc import Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -149,10 +150,12 @@ def sheet(rows: Mapping[str, Sequence[Tile]], side_in: float = 1.0, label_in: fl
     axes.set_axis_off()
     for i, (label, tiles) in enumerate(rows.items()):
         left, top = i // deep * width, i % deep * (side + caption + gap) + gap / 2
-        axes.text(left + label_in - 0.08, top + side / 2, label.replace(" ", "\n"), ha="right", va="center", fontsize=9)
+        axes.text(left + label_in - 0.08, top + side / 2, label, ha="right", va="center", fontsize=9)
         for j, tile in enumerate(tiles):
             x = left + label_in + j * side
-            axes.imshow(tile.picture, extent=(x + 0.03, x + side - 0.03, top + side - 0.03, top + 0.03), aspect="auto", interpolation="antialiased")
+            tall, wide = (side - 0.06) / 2 / max(tile.picture.shape[:2]) * np.array(tile.picture.shape[:2])
+            extent = (x + side / 2 - wide, x + side / 2 + wide, top + side / 2 + tall, top + side / 2 - tall)
+            axes.imshow(tile.picture, extent=extent, aspect="auto", interpolation="antialiased")
             if tile.edge:
                 axes.add_patch(Rectangle((x + 0.03, top + 0.03), side - 0.06, side - 0.06, fill=False, edgecolor=tile.edge, linewidth=1.8))
             axes.text(x + side / 2, top + side + caption / 2 - 0.02, tile.title, ha="center", va="center", fontsize=7, color=tile.edge or "black")
@@ -188,7 +191,7 @@ def layouts_figure(lists: Mapping[str, Sequence[EpisodeRow]], tables_m: Mapping[
 
     figure = _figure(3.4 * len(lists), 3.9)
     grid = figure.subplots(1, len(lists), squeeze=False)[0]
-    roles = {"other objects": "#c9ccd1", "look-alike": OTHER, "goal": "#59a14f", "target": WINNER}
+    roles = {"other objects": "#c9ccd1", "look-alike": OTHER, "target": WINNER, "goal": "#59a14f"}
     for axes, (name, rows) in zip(grid, lists.items(), strict=True):
         spots: dict[str, set[tuple[float, float]]] = {role: set() for role in roles}
         for row in rows:
@@ -197,13 +200,17 @@ def layouts_figure(lists: Mapping[str, Sequence[EpisodeRow]], tables_m: Mapping[
                 spots[role].add((-p.y, p.x))
         x0, y0, x1, y1 = tables_m[name]
         axes.add_patch(Rectangle((-y1, x0), y1 - y0, x1 - x0, facecolor="#f3ede4", edgecolor="#cdbfa8"))
+        few = len(set().union(*spots.values())) < 10  # everything shares these places: nest the marks
         for role, places in spots.items():
-            axes.scatter(*np.array(sorted(places)).reshape(-1, 2).T, s=5 if role != "goal" else 12, color=roles[role], label=role, linewidths=0)
+            size = {"look-alike": 90, "goal": 190}.get(role, 14) if few else {"goal": 45}.get(role, 6)
+            fill, line = ("none", 1.6) if role == "goal" else (roles[role], 0.0)
+            xy = np.array(sorted(places)).reshape(-1, 2)
+            axes.scatter(xy[:, 0], xy[:, 1], s=size, facecolor=fill, edgecolor=roles[role], linewidths=line, label=role)
         axes.plot(0, 0, marker="s", markersize=9, color="#444444", linestyle="none", label="robot's base")
         axes.set(xlim=(-0.36, 0.36), ylim=(-0.06, 0.72), aspect="equal", title=f"{name}\n{len(rows)} episodes", xlabel="to the robot's right, m")
         axes.spines[["top", "right"]].set_visible(False)
     grid[0].set_ylabel("away from the robot, m")
-    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False, markerscale=1.6)
+    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
     return figure
 
 
@@ -217,7 +224,7 @@ def bounds_figure(scores: Sequence[Score]) -> "Figure":
         shown = [s for s in scores if s.policy == policy]
         middle = np.array([100 * s.sr.value for s in shown])
         spread = np.abs([middle - [100 * s.sr.low for s in shown], [100 * s.sr.high for s in shown] - middle])
-        at = [lines.index((s.suite, s.task, s.split)) for s in shown]
+        at = [lines.index((s.suite, s.task, s.split)) + 0.24 * (list(policies).index(policy) - (len(policies) - 1) / 2) for s in shown]
         axes.errorbar(middle, at, xerr=spread, fmt="o", color=colour, markersize=4, capsize=2.5, linewidth=1, label=f"{policy} policy")
     axes.set_yticks(range(len(lines)), [f"{suite} / {task}{f' ({split})' if split else ''}" for suite, task, split in lines], fontsize=8)
     axes.invert_yaxis()
@@ -228,24 +235,27 @@ def bounds_figure(scores: Sequence[Score]) -> "Figure":
     return figure
 
 
-def keep(figure: "Figure", path: Path, dpi: int = 110, limit: int = 115_000) -> bytes:
-    """Save a figure as PNG with a palette of 256 colours, and return a JPEG of it that is small enough for a notebook: at most `limit` bytes."""
-    from io import BytesIO
+def keep(figure: "Figure", path: Path, dpi: int = 110, limit: int = 480_000, small: int = 115_000) -> bytes:
+    """Save a figure as a PNG of `limit` bytes at most, and return a JPEG of it for a notebook, `small` bytes at most.
 
-    from PIL import Image
+    What is too large is saved with coarser colours (6 or 5 bits a channel), then with fewer pixels.
+    """
+    from PIL import Image, ImageOps
 
-    drawn = BytesIO()
-    figure.savefig(drawn, dpi=dpi, metadata={"Software": None})
+    figure.savefig(drawn := BytesIO(), dpi=dpi, metadata={"Software": None})
     full = Image.open(drawn).convert("RGB")
-    full.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
-    small = full.copy()
-    for width in (1000, 880, 760, 640, 520, 400):
-        small.thumbnail((width, 4 * width), Image.Resampling.LANCZOS)
-        encoded = BytesIO()
-        small.save(encoded, "JPEG", quality=82)
-        if len(encoded.getvalue()) <= limit:
+    for share, bits in ((1.0, 8), (1.0, 6), (1.0, 5), (0.8, 6), (0.8, 5), (0.6, 5)):
+        size = round(share * full.width), round(share * full.height)
+        ImageOps.posterize(full.resize(size, Image.Resampling.LANCZOS), bits).save(png := BytesIO(), "PNG", optimize=True)
+        if png.tell() <= limit:
             break
-    return encoded.getvalue()
+    path.write_bytes(png.getvalue())
+    for width in (1100, 1000, 880, 760, 640, 520, 400):
+        full.thumbnail((width, 4 * width), Image.Resampling.LANCZOS)
+        full.save(jpeg := BytesIO(), "JPEG", quality=84)
+        if jpeg.tell() <= small:
+            break
+    return jpeg.getvalue()
 
 
 def _strip(crops: Sequence[Rgb], side: int = 96) -> Rgb:

@@ -1,0 +1,155 @@
+"""Pictures of the benchmarks: the stage is the studio, sheets are complete, tables are exact."""
+
+from dataclasses import replace
+from io import BytesIO
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+from vap_core import gallery
+from vap_core.gallery import GOALS, PORTRAIT, STEMS, TIERS, Stage
+from vap_core.plots import Tile, bounds_figure, hardness_figure, keep, layouts_figure, sheet
+from vap_core.sim.objects import lookalikes, personal
+from vap_core.sim.studio import Shot, photograph
+from vap_core.suites import BENCHMARKS, VARIANTS, lists
+
+CUP, PLANT = personal("cup"), personal("plant")
+ASIDE = Shot(1.1, 0.7, 0.6, -0.9, 0.55, (0.5, 0.6, 0.7))
+FRACTAL = lists.read("simpler-fractal")
+
+
+@pytest.fixture(scope="module")
+def stage():
+    with Stage([PLANT, CUP, *lookalikes("cup")[:2]], 96) as made:
+        yield made
+
+
+class Mean:
+    """An encoder that sees the mean colour alone."""
+
+    name = "mean"
+
+    def __call__(self, crops):
+        rows = np.array([crop.reshape(-1, 3).mean(axis=0) for crop in crops], np.float32)
+        return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def test_the_stage_takes_the_studio_s_pictures(stage):
+    for shot in (PORTRAIT, ASIDE, PORTRAIT):
+        assert np.array_equal(stage.picture(CUP.name, shot), photograph(CUP, [shot], 96)[0])
+
+
+def test_a_cut_is_the_object_and_little_else(stage):
+    whole, cut = stage.picture(PLANT.name, ASIDE), stage.cut(PLANT.name, ASIDE)
+    assert cut.shape[0] < whole.shape[0]
+    assert cut.shape[1] < whole.shape[1]
+    assert any(
+        np.array_equal(whole[i : i + cut.shape[0], j : j + cut.shape[1]], cut)
+        for i in range(whole.shape[0] - cut.shape[0] + 1)
+        for j in range(whole.shape[1] - cut.shape[1] + 1)
+    )
+
+
+def test_every_personal_object_has_a_row_from_hard_to_easy():
+    assert len(STEMS) == len(set(STEMS)) == 19
+    for stem in STEMS:
+        ranks = [TIERS.index(gallery.tier(model)) for model in gallery.graded(stem)]
+        assert ranks == sorted(ranks)
+        assert {model.name for model in gallery.graded(stem)} == {model.name for model in lookalikes(stem)}
+    assert {model.name for model in GOALS} >= {row.goal for name in BENCHMARKS for row in lists.read(name) if row.goal}
+
+
+def test_generics_are_in_rows():
+    rows = gallery.generic_sheet(["cup", "toy bus"], n=2, size=48)
+    assert list(rows) == ["cup", "toy\nbus"]
+    assert [tile.picture.shape for tile in rows["cup"]] == [(48, 48, 3)] * 2
+    assert not np.array_equal(rows["cup"][0].picture, rows["cup"][1].picture)
+
+
+def test_hardness_is_the_mean_cosine(stage, monkeypatch):
+    monkeypatch.setattr(gallery, "STEMS", ("cup",))
+    monkeypatch.setattr(gallery, "graded", lambda stem: lookalikes(stem)[:2])
+    table = gallery.hardness(stage, Mean())
+    references = Mean()([stage.cut(CUP.name, shot) for shot in gallery.REFERENCES])
+    one = Mean()([stage.cut(table.lookalike[0], shot) for shot in gallery.QUERIES])
+    assert table.cosine[0] == pytest.approx(float((one @ references.T).mean()))
+    assert table.own.nunique() == 1
+    assert table.fooled.between(0, 1).all()
+
+
+def test_pairs_out_of_order_are_found():
+    table = pd.DataFrame({"object": ["cup"] * 3, "lookalike": list("abc"), "tier": ["hard", "medium", "easy"], "cosine": [0.6, 0.8, 0.7]})
+    wrong = gallery.out_of_order(table)
+    assert list(zip(wrong.lookalike, wrong.lookalike_easier, wrong.gap.round(6), strict=True)) == [("a", "b", 0.2), ("a", "c", 0.1)]
+    assert not len(gallery.out_of_order(table.assign(cosine=[0.9, 0.8, 0.7])))
+
+
+def test_the_census_counts_every_row_once():
+    counts = gallery.census({name: lists.read(name) for name in BENCHMARKS})
+    assert counts.groupby("suite").episodes.sum().to_dict() == {"simpler-bridge": 96, "simpler-fractal": 1685, "tabletop": 160, "vlabench": 250}
+    assert counts[counts.suite == "simpler-fractal"].episodes.tolist() == [300, 825, 160, 400]
+
+
+def test_all_variants_return_to_one_layout():
+    held = gallery.same_layout(FRACTAL, FRACTAL[12])
+    assert list(held) == list(VARIANTS)
+    assert all(
+        [p.model for p in row.placements[:3]] == [p.model for p in FRACTAL[12].placements] and row.variant == name for name, row in held.items()
+    )
+    assert {len(row.placements) for row in held.values()} == {3, 5, 6}
+
+
+def test_what_is_seen_moves_with_the_expert():
+    row = replace(lists.read("simpler-bridge")[0], placements=lists.read("simpler-bridge")[0].placements[:1])
+    before, again, after = gallery.seen(row, size=64), gallery.seen(row, size=64), gallery.seen(row, steps=6, size=64)
+    assert list(before) == ["front"]
+    assert np.array_equal(before["front"], again["front"])
+    assert not np.array_equal(before["front"], after["front"])
+
+
+def test_a_sheet_keeps_the_pictures_proportions():
+    tall = Tile(np.zeros((20, 10, 3), np.uint8), "tall", "#c0392b")
+    axes = sheet({"a": [tall, tall], "b": [tall]}, columns=2).axes[0]
+    assert len(axes.images) == 3
+    assert len(axes.patches) == 3
+    for image in axes.images:
+        x0, x1, y0, y1 = image.get_extent()
+        assert abs(y1 - y0) == pytest.approx(2 * abs(x1 - x0))
+
+
+def test_a_kept_figure_fits(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, (200, 200, 3), np.uint8)
+    figure = sheet({"": [Tile(noise)] * 4})
+    jpeg = keep(figure, tmp_path / "a.png", limit=60_000, small=20_000)
+    keep(figure, tmp_path / "b.png", limit=60_000, small=20_000)
+    assert (tmp_path / "a.png").stat().st_size <= 60_000
+    assert len(jpeg) <= 20_000
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    assert Image.open(BytesIO(jpeg)).format == "JPEG"
+
+
+def test_bounds_are_read_in_the_suites_order_and_pooled(tmp_path):
+    one = {"method": "generic", "outcome": "success", "cmr": None, "wrong_object": False, "first_object_correct": True, "steps": 3, "split": ""}
+    tasks = [("tabletop", "select-cup", True), ("simpler-bridge", "put-camera", False), ("simpler-bridge", "pick-shaver", True)]
+    pd.DataFrame(
+        [{**one, "suite": suite, "task": task, "policy": policy, "success": done and policy == "expert"}
+         for suite, task, done in tasks for policy in ("random", "expert")]
+    ).to_parquet(tmp_path / "bounds.parquet")  # fmt: skip
+    scores = gallery.bounds(tmp_path / "bounds.parquet")
+    assert [(s.task, s.policy) for s in scores[:3]] == [("pick-shaver", "expert"), ("pick-shaver", "random"), ("put-camera", "expert")]
+    assert scores[-1].suite == "tabletop"
+    pooled = gallery.pooled(scores)
+    assert pooled.iloc[0].tolist()[:3] == ["simpler-bridge", "expert", 2]
+    assert len(bounds_figure(scores).axes[0].containers) == 2
+
+
+def test_layouts_and_hardness_draw():
+    built = {name: lists.read(name) for name in ("simpler-bridge", "tabletop")}
+    figure = layouts_figure(built, dict.fromkeys(built, (0.0, -0.5, 0.8, 0.5)))
+    assert len(figure.axes) == 2
+    corners = {tuple(offset) for c in figure.axes[0].collections for offset in np.round(np.asarray(c.get_offsets()), 4)}
+    assert corners == {(x, y) for x in (-0.075, 0.075) for y in (0.19, 0.34)}
+    table = pd.DataFrame({"object": ["cup"] * 2, "tier": ["hard", "easy"], "cosine": [0.9, 0.5], "own": [0.95] * 2})
+    assert len(hardness_figure(table, gallery.TIER_COLOURS).axes[0].collections) == 3
