@@ -37,6 +37,9 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return paths
 
 
+COMMANDS = ("register", "ground", "demo", "suites", "rollout", "eval", "rescore", "publish", "show", "doctor", "bench")
+
+
 @pytest.fixture(scope="module")
 def line(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
     """One picture of a look-alike, the personal cup and another look-alike side by side, and the three boxes."""
@@ -57,7 +60,7 @@ def bank(photos: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("command", [[], ["register"], ["ground"], ["demo"], ["rollout"], ["show"], ["doctor"], ["bench"], ["train", "perception"]])
+@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS), ["train", "perception"]])
 def test_help_has_an_example(command: list[str]) -> None:
     done = vap(*command, "--help")
     assert done.returncode == 0

