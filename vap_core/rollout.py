@@ -20,7 +20,7 @@ from vap_core.sim.env import Control, Env
 from vap_core.sim.scenes import Scene
 from vap_core.sim.sensor import PERFECT, Sensor
 from vap_core.suites import Judge
-from vap_core.values import Attended, Chunk, Episode, EpisodeRow, Frame, Opening, Outcome, PolicyInput
+from vap_core.values import Attended, Chunk, Episode, EpisodeRow, Frame, Grounding, Opening, Outcome, PolicyInput
 
 
 @runtime_checkable
@@ -109,13 +109,19 @@ def _see(trial: Trial, one: Running, sink: Callable[[Opening], Sink] | None) -> 
         else:
             one.attend_state, attended = trial.attender.step(one.attend_state, raw.images)
     if one.opening is None:
-        sizes = {p.model: trial.sizes_m[p.model] for p in one.row.placements}
-        one.opening = Opening(
-            one.row, trial.method, trial.policy.label, one.env.hz, one.env.cameras(), one.row.instruction, attended.text, attended.groundings, sizes
-        )
+        one.opening = _open(trial, one, attended.text, attended.groundings)
         with _timed(one.seconds, "record"):
             one.sink = sink(one.opening) if sink is not None else None
     return raw, attended
+
+
+def _open(trial: Trial, one: Running, text: str, groundings: Mapping[str, tuple[Grounding, ...]]) -> Opening:
+    """What is known before the first action; `text` is the instruction as it was rewritten."""
+    row, env = one.row, one.env
+    sizes = {place.model: trial.sizes_m[place.model] for place in row.placements}
+    return Opening(
+        row, trial.method, trial.policy.label, env.hz, env.cameras(), row.instruction, text, groundings, sizes, env.action_names
+    )  # fmt: skip
 
 
 def _plan(trial: Trial, live: Sequence[Running], seen: Mapping[int, tuple[PolicyInput, Attended]]) -> None:
@@ -175,8 +181,7 @@ def _end(trial: Trial, one: Running) -> Episode:
             assert one.outcome is not None
             _guard(one, one.sink.close, one.outcome)
     assert one.outcome is not None
-    said = one.row.instruction
-    opening = one.opening or Opening(one.row, trial.method, trial.policy.label, one.env.hz, one.env.cameras(), said, said, {}, {})
+    opening = one.opening or _open(trial, one, one.row.instruction, {})
     return Episode(opening, tuple(one.frames), one.outcome, {**one.env.seconds, **one.seconds})
 
 

@@ -19,6 +19,7 @@ Pose = Float64[np.ndarray, "7"]
 Action = Float32[np.ndarray, " a"]
 """One control step. End-effector control, a = 7: `dx dy dz` (m) and the rotation vector `drx dry drz` (rad) in the robot base
 frame, then `gripper` 0 closed .. 1 open. Joint control, a = n + 1: the change of every joint angle (rad), then `gripper`."""
+EE_ACTION = ("dx", "dy", "dz", "drx", "dry", "drz", "gripper")
 Chunk = Float32[np.ndarray, "t a"]
 """Actions to come, one row per control step."""
 
@@ -269,6 +270,7 @@ class Opening:
     groundings: Mapping[str, tuple[Grounding, ...]]
     target_sizes_m: Mapping[str, tuple[float, float, float]]
     """Full extents of every object's bounding box, by model name."""
+    action_names: tuple[str, ...] = EE_ACTION
 
 
 @value

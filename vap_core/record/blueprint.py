@@ -118,7 +118,7 @@ def episode_blueprint(opening: Opening) -> rrb.Blueprint:
         eye_controls=_eye(opening),
     )
     votes = rrb.Horizontal(*(bars_view(cam, opening.groundings.get(cam, ())) for cam in names))
-    unit = (-0.05, 1.05)
+    unit, arm = (-0.05, 1.05), [True] * (len(opening.action_names) - 1)
     evidence = rrb.Tabs(
         _curves("/vap/track_score", "track score", limits=unit), _curves("/vap/vote_margin", "vote margin", limits=unit), active_tab=0
     )
@@ -131,8 +131,8 @@ def episode_blueprint(opening: Opening) -> rrb.Blueprint:
     bottom = rrb.Horizontal(
         rrb.TextDocumentView(origin="/vap/instruction", name="instruction"),
         rrb.Tabs(
-            _curves("/action", "action", shown=[True] * 6 + [False]),
-            _curves("/action", "gripper", shown=[False] * 6 + [True]),
+            _curves("/action", "action", shown=[*arm, False]),
+            _curves("/action", "gripper", shown=[*(not shown for shown in arm), True]),
             _curves("/observation.state", "state"),
             active_tab=0,
         ),

@@ -23,7 +23,6 @@ from vap_core.record.file import code_version, finish_stream, open_stream, put, 
 from vap_core.record.scene import log_cameras, log_links, log_objects, log_table, send_poses, send_truth
 from vap_core.values import Event, Frame, Grounding, Mask, Opening, Outcome, PersonalObject, Rgb
 
-ACTION_NAMES = ("dx", "dy", "dz", "drx", "dry", "drz", "gripper")
 STATE_NAMES = ("x", "y", "z", "rx", "ry", "rz", "gripper")
 PROMPTED_QUALITY_DROP = 5
 """Prompted pictures repeat the raw ones outside the mask: they may be a little coarser."""
@@ -152,7 +151,7 @@ class Recorder:
         """What only the first step can tell: shapes, links, and the pictures the vote was held on."""
         rec, opening = self._stream(), self._opening
         names = (*STATE_NAMES, *(f"joint{i}" for i in range(1, len(frame.state))))[: len(frame.state)]
-        put(rec, "/action", series_style(ACTION_NAMES))
+        put(rec, "/action", series_style(self._opening.action_names))
         put(rec, "/observation.state", series_style(names))
         for entity, width in (("vote_margin", 2.5), ("track_score", 2.0)):
             for i, (cam, per_view) in enumerate(opening.groundings.items()):

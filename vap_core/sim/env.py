@@ -15,7 +15,7 @@ from vap_core.sim import control as steering
 from vap_core.sim.control import Command, arm, follow, rotation_vector
 from vap_core.sim.scenes import Scene, parked
 from vap_core.sim.sensor import PERFECT, Sensor, Stray, exposed, stray
-from vap_core.values import REST, ROBOT, Action, Camera, EpisodeRow, PolicyInput, Rgb, Truth, value
+from vap_core.values import EE_ACTION, REST, ROBOT, Action, Camera, EpisodeRow, PolicyInput, Rgb, Truth, value
 
 import mujoco  # isort: skip  (cameras has chosen a GL back end)
 
@@ -101,9 +101,14 @@ class Env:
         return self._command
 
     @property
+    def action_names(self) -> tuple[str, ...]:
+        """What the numbers of an action are called."""
+        return EE_ACTION if self.control == "ee" else (*self.robot.joints, "gripper")
+
+    @property
     def action_size(self) -> int:
         """Numbers in one action."""
-        return 7 if self.control == "ee" else len(self.robot.joints) + 1
+        return len(self.action_names)
 
     @property
     def time_s(self) -> float:
