@@ -164,7 +164,6 @@ def test_what_is_lower_than_the_fingertips_is_no_obstacle(make):
     assert found[0].clear_m == 1.0
 
 
-@pytest.mark.xfail(strict=True, reason="_clearance measures to the corners of the neighbours, not to their faces")
 @pytest.mark.parametrize("length", [0.06, 0.2])
 def test_a_long_neighbour_is_in_the_way_although_its_corners_are_not(length, make):
     brick, wall = make(box(0.04, 0.04, 0.06)), make(box(0.02, length, 0.06))

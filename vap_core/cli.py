@@ -199,7 +199,7 @@ def rescore(run: Annotated[Path, typer.Argument(help="Run folder of eval, rollou
 
     Example: python -m vap_core rescore data/runs/expert-simpler-bridge
     """
-    from vap_core.report import rescore as judge_again
+    from vap_core.rescore import rescore as judge_again
 
     print(judge_again(run))
 

@@ -6,28 +6,21 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vap_core import suites, traces
-from vap_core.errors import BadOutput
+from vap_core import suites
 from vap_core.experiments import Study
 from vap_core.metrics import Score, rate, score, step_times
 from vap_core.plots import scores_figure, write_png
-from vap_core.sim.objects import extent_m, get
-from vap_core.store import KEY, read, write_atomic
-from vap_core.suites.rules import rejudge
+from vap_core.store import write_atomic
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-RULED = ("success", "success_once", "held_steps", "cmr", "wrong_object", "first_object_correct", "steps")
-"""What the rules decide of an episode."""
 
 
 def conclude(study: Study, table: "pd.DataFrame", folder: Path) -> str:
     """Write `summary.json` and `figure.png` into the run's folder, and return the text to print."""
     rows = table.to_dict("records")
     scores = score({str(key): cell for key, cell in row.items()} for row in rows)
-    scores = _ordered(scores, study.tasks, study.methods)
+    scores = ordered(scores, study.tasks, study.methods)
     write_atomic(folder / "summary.json", json.dumps([{**s.to_json(), "seed": study.seed} for s in scores], indent=1).encode())
     figure = folder / "figure.png"
     write_png(scores_figure(scores), figure)
@@ -50,7 +43,7 @@ def results_table(scores: list[Score]) -> str:
     return align([head, *body])
 
 
-def _ordered(scores: list[Score], tasks: Sequence[Sequence[str]], methods: Sequence[str]) -> list[Score]:
+def ordered(scores: list[Score], tasks: Sequence[Sequence[str]], methods: Sequence[str]) -> list[Score]:
     """In the order in which a study names its tasks and methods."""
     places = [tuple(task) for task in tasks]
     return sorted(scores, key=lambda s: (places.index((s.suite, s.task)), methods.index(s.method)))
@@ -90,30 +83,6 @@ def suites_table() -> str:
     for name, suite in suites.WARM_UPS.items():
         lines.append(f"warm-up {name}: {suite.robot}, {len(suite.tasks)} picks of {suite.tasks[0].max_steps} steps, any number of episodes")
     return "\n".join(lines)
-
-
-def rescore(folder: Path) -> str:
-    """Judge a run again from its saved states, and say whose outcome differs from the stored one. Raises: BadOutput, BadSuite."""
-    table = read(folder)
-    if table.empty:
-        raise BadOutput(f"rescore: {folder} holds no results; name the folder that eval or rollout wrote.")
-    stored = {tuple(row[name] for name in KEY): row for row in table.to_dict("records")}
-    study = json.loads((folder / "run.json").read_text())["configuration"]
-    again, changed = [], []
-    rows = {(r.suite, r.task, r.episode): r for suite, task in study["tasks"] for r in suites.rows(suite, task, study["episodes"], study["seed"])}
-    for key, truths in traces.read(folder):
-        if key not in stored or stored[key]["outcome"] == "error":
-            continue
-        suite, task, _, episode = key
-        row = rows[suite, task, episode]
-        sizes = {place.model: extent_m(get(place.model)) for place in row.placements}
-        outcome = rejudge(row, sizes, truths).outcome()
-        again.append(stored[key] | {"outcome": outcome.status} | {name: getattr(outcome, name) for name in RULED})
-        if any(stored[key][name] is not getattr(outcome, name) and stored[key][name] != getattr(outcome, name) for name in RULED):
-            changed.append(" ".join(str(part) for part in key))
-    scores = _ordered(score({str(name): cell for name, cell in row.items()} for row in again), study["tasks"], study["methods"])
-    verdict = f"{len(changed)} of {len(again)} episodes judged differently" + (": " + "; ".join(changed[:10]) if changed else "")
-    return "\n".join([results_table(scores), "", verdict + f"; {len(stored) - len(again)} without a saved state or in error left out."])
 
 
 def times_table(times: dict[tuple[str, str], dict[str, float]]) -> str:

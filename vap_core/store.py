@@ -30,15 +30,12 @@ def open_run(folder: Path, configuration: Mapping[str, Any]) -> Path:
     Raises:
         BadOutput: the folder cannot be written, holds something else, or a run of another configuration.
     """
-    note = folder / "run.json"
+    path = folder / "run.json"
     wanted = json.dumps({"digest": digest(configuration), "configuration": dict(configuration)}, indent=1, sort_keys=True)
     if folder.exists() and not folder.is_dir():
         raise BadOutput(f"open_run: {folder} is a file; choose another folder with --out.")
-    if note.exists():
-        try:
-            held = json.loads(note.read_text())["digest"]
-        except (ValueError, KeyError, TypeError) as error:
-            raise BadOutput(f"open_run: {note} is damaged; choose another folder with --out.") from error
+    if path.exists():
+        held = note(folder)["digest"]
         if held != digest(configuration):
             raise BadOutput(
                 f"open_run: {folder} holds another run (configuration {held}, now {digest(configuration)}); choose another folder with --out."
@@ -48,18 +45,30 @@ def open_run(folder: Path, configuration: Mapping[str, Any]) -> Path:
         raise BadOutput(f"open_run: {folder} is not empty and holds no run; choose another folder with --out.")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(note, wanted.encode())
+        write_atomic(path, wanted.encode())
     except OSError as error:
         raise BadOutput(f"open_run: {folder} cannot be written ({error.strerror}); choose another folder with --out.") from error
     return folder
 
 
+def note(folder: Path) -> dict[str, Any]:
+    """A run's `digest` and `configuration`. Raises: BadOutput when run.json is absent or damaged."""
+    path = folder / "run.json"
+    try:
+        held = json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise BadOutput(f"run: {path} is absent or damaged; choose another folder, or run again with --out.") from error
+    if not isinstance(held, dict) or not {"digest", "configuration"} <= held.keys():
+        raise BadOutput(f"run: {path} is absent or damaged; choose another folder, or run again with --out.")
+    return held
+
+
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Keep other processes out of a run while this one works on it. Raises BadOutput when one is in already."""
-    with (folder / "run.json").open() as note:
+    with (folder / "run.json").open() as held:
         try:
-            fcntl.flock(note, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise BadOutput(f"locked: another process is working in {folder}; wait for it, or choose another folder with --out.") from error
         yield
@@ -100,10 +109,10 @@ def publish(folders: Sequence[Path], target: Path) -> int:
         table = read(folder)
         if table.empty:
             raise BadOutput(f"publish: {folder} holds no results; name the folder that eval, rollout or demo wrote.")
-        note = json.loads((folder / "run.json").read_text())
+        about = note(folder)
         columns = [name for name in table.columns if name != "detail" and not name.startswith("seconds_")]
-        tables.append(pa.Table.from_pandas(table[columns].assign(configuration=note["digest"]), preserve_index=False))
-        notes.append(note)
+        tables.append(pa.Table.from_pandas(table[columns].assign(configuration=about["digest"]), preserve_index=False))
+        notes.append(about)
     whole = pa.concat_tables(tables, promote_options="permissive")
     metadata = {**(whole.schema.metadata or {}), b"runs": json.dumps(notes, sort_keys=True).encode()}
     sink = pa.BufferOutputStream()

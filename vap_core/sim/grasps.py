@@ -20,6 +20,7 @@ TIP_M = 0.016
 """Lowest height of the tcp: the fingertips stay off the table."""
 ROOM_M, TAPER_M = 0.02, 0.02
 """Clearance beyond this counts for nothing; a taper of 1 counts like so much less of it."""
+RIM_M = 0.005
 HALF_PAD_M = 0.006
 """Half the height of a finger's pad."""
 FINGER_M, PAD_M = 0.022, 0.012
@@ -86,9 +87,20 @@ def grasps(robot: Robot, target: str, poses: Mapping[str, Pose]) -> list[Grasp]:
     """Every grasp of `target` that fits the gripper and hits nothing, the clearest first; then those that hit something, should none be clear."""
     points = points_world(target, poses[target])
     foot, top = float(points[:, 2].min()), float(points[:, 2].max())
-    others = {name: points_world(name, pose) for name, pose in poses.items() if name != target}
-    found = list(_candidates(robot, target, poses[target], foot, top, list(others.values())))
-    return sorted(found, key=lambda grasp: (max(ROOM_M - grasp.clear_m, 0.0) + TAPER_M * grasp.taper, grasp.width_m))
+    others = [_rims(name, pose) for name, pose in poses.items() if name != target]
+    found = list(_candidates(robot, target, poses[target], foot, top, others))
+    return sorted(found, key=lambda grasp: (round(max(ROOM_M - grasp.clear_m, 0.0) + TAPER_M * grasp.taper, 6), round(grasp.width_m, 6)))
+
+
+def _rims(name: str, pose: Pose) -> Float64[np.ndarray, "n 3"]:
+    """Points along every edge of the object's collision solids, at most `RIM_M` apart."""
+    points = []
+    for vertex, edge in _hull_edges(name):
+        start, end = _place(vertex, pose)[edge.astype(int).T]
+        steps = 1 + int(np.linalg.norm(end - start, axis=1).max() / RIM_M)
+        share = np.linspace(0.0, 1.0, steps + 1)[:, None, None]
+        points.append((start + share * (end - start)).reshape(-1, 3))
+    return np.concatenate(points)
 
 
 def _candidates(robot: Robot, target: str, pose: Pose, foot: float, top: float, others: Sequence[Float64[np.ndarray, "_ 3"]]) -> Iterator[Grasp]:
@@ -108,13 +120,8 @@ def _candidates(robot: Robot, target: str, pose: Pose, foot: float, top: float, 
                 continue
             spans = [np.ptp(part @ axis) if len(part) else 0.0 for part in (higher, lower)]
             middle = axis * (along.min() + along.max()) / 2 + np.array([-axis[1], axis[0]]) * (across.min() + across.max()) / 2
-            yield Grasp(
-                np.array([*middle, z]),
-                float(yaw),
-                width,
-                abs(float(spans[1] - spans[0])) / (2 * HALF_PAD_M),
-                _clearance(robot, middle, axis, z, others),
-            )
+            taper = abs(float(spans[1] - spans[0])) / (2 * HALF_PAD_M)
+            yield Grasp(np.array([*middle, z]), float(yaw), width, taper, _clearance(robot, middle, axis, z, others))
 
 
 def _clearance(robot: Robot, middle: np.ndarray, axis: np.ndarray, z: float, others: Sequence[Float64[np.ndarray, "_ 3"]]) -> float:
