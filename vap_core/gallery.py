@@ -106,11 +106,11 @@ def graded(stem: str) -> tuple[ObjectModel, ...]:
 
 
 def lookalike_sheet(stage: Stage) -> dict[str, list[Tile]]:
-    """One row per personal object: itself, then its look-alikes from hard to easy, tiers as frames."""
+    """One row per personal object: itself, then its look-alikes from hard to easy: tier, and number in the name."""
     return {
         _label(stem): [
             Tile(stage.picture(personal(stem).name), "personal", TIER_COLOURS["personal"]),
-            *(Tile(stage.picture(model.name), tier(model), TIER_COLOURS[tier(model)]) for model in graded(stem)),
+            *(Tile(stage.picture(m.name), f"{tier(m)}, {m.name.rpartition('-')[2]}", TIER_COLOURS[tier(m)]) for m in graded(stem)),
         ]
         for stem in STEMS
     }

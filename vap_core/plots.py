@@ -240,13 +240,14 @@ def keep(figure: "Figure", path: Path, dpi: int = 110, limit: int = 480_000, sma
 
     What is too large is saved with coarser colours (6 or 5 bits a channel), then with fewer pixels.
     """
-    from PIL import Image, ImageOps
+    from PIL import Image
 
     figure.savefig(drawn := BytesIO(), dpi=dpi, metadata={"Software": None})
     full = Image.open(drawn).convert("RGB")
     for share, bits in ((1.0, 8), (1.0, 6), (1.0, 5), (0.8, 6), (0.8, 5), (0.6, 5)):
         size = round(share * full.width), round(share * full.height)
-        ImageOps.posterize(full.resize(size, Image.Resampling.LANCZOS), bits).save(png := BytesIO(), "PNG", optimize=True)
+        coarse = [round(round(v / 255 * (2**bits - 1)) * 255 / (2**bits - 1)) for v in range(256)]
+        full.resize(size, Image.Resampling.LANCZOS).point(coarse * 3).save(png := BytesIO(), "PNG", optimize=True)
         if png.tell() <= limit:
             break
     path.write_bytes(png.getvalue())
