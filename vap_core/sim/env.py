@@ -3,15 +3,15 @@
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import field
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Float32, Float64
 
 from vap_core.errors import BadAction, UnknownName, one_of
 from vap_core.sim import cameras as optics
 from vap_core.sim import control as steering
+from vap_core.sim.contacts import ARM, STILL, Touch, hand, partners, roles
 from vap_core.sim.control import Command, arm, follow, rotation_vector
 from vap_core.sim.scenes import Scene, parked
 from vap_core.sim.sensor import PERFECT, Sensor, Stray, exposed, stray
@@ -26,17 +26,6 @@ STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 Control = Literal["ee", "joint"]
-
-
-@value
-class Touch:
-    """The contacts of the last control step, as Truth reports them."""
-
-    touched: tuple[str, ...] = ()
-    pressed_s: Mapping[str, float] = field(default_factory=dict)
-    contacts: Mapping[str, frozenset[str]] = field(default_factory=dict)
-    running_s: Mapping[str, float] = field(default_factory=dict)
-    """Of `pressed_s`, what is not over yet."""
 
 
 @value
@@ -77,7 +66,7 @@ class Env:
         self._qpos = np.array([model.joint(name).qposadr[0] for name in self.robot.joints])
         self._fingers = np.array([model.joint(name).qposadr[0] for name in self.robot.fingers])
         self._ctrl = np.array([model.actuator(name).id for name in (*self.robot.joints, *self.robot.fingers)])
-        self._roles, self._hand = _roles(scene), _hand(scene)
+        self._roles, self._hand = roles(scene), hand(scene)
         base = np.eye(4)
         base[:3, :3] = _matrix(self.robot.base_world[3:])
         base[:3, 3] = self.robot.base_world[:3]
@@ -140,6 +129,7 @@ class Env:
             data.joint(f"{name}/free").qpos[:] = (*parked(self.robot, i), 1.0, 0.0, 0.0, 0.0)
             data.xfrc_applied[body.id, :3] = -model.opt.gravity * float(body.subtreemass[0])
         self._begin(row)
+        self._touch = Touch()
         self._command = Command(self._arm.forward(self.robot.home), self.robot.home, 1.0)
         self._run(round(SETTLE_S / model.opt.timestep), data.ctrl[self._ctrl].copy())
         self._touch = Touch(contacts=self._touch.contacts)
@@ -207,7 +197,7 @@ class Env:
 
     def _begin(self, row: EpisodeRow) -> None:
         self._row, self._placed = row, tuple(place.model for place in row.placements)
-        self._strays = {name: stray(self.sensor, row, name) for name in self.camera_names}
+        self._strays = {} if self.sensor == PERFECT else {name: stray(self.sensor, row, name) for name in self.camera_names}
 
     def _run(self, steps: int, ctrl: Float64[np.ndarray, "..."]) -> None:
         """Advance physics with `ctrl`, one row a step or one for all, and note what the robot touches and how long the hand presses."""
@@ -219,12 +209,12 @@ class Env:
             data.ctrl[self._ctrl] = row
             mujoco.mj_step(model, data)
             geoms = data.contact.geom
-            roles = self._roles[geoms]
-            by_robot = (roles.min(axis=1) == ARM) & (roles.max(axis=1) >= 0)
+            pairs = self._roles[geoms]
+            by_robot = (pairs.min(axis=1) == ARM) & (pairs.max(axis=1) >= 0)
             if not by_robot.any():
                 running = {}
                 continue
-            others = roles.max(axis=1)
+            others = pairs.max(axis=1)
             touched.update(dict.fromkeys(others[by_robot].tolist()))
             squeezed = set(others[by_robot & self._hand[geoms].any(axis=1)].tolist())
             running = {one: running.get(one, 0.0) + model.opt.timestep for one in squeezed}
@@ -232,7 +222,7 @@ class Env:
         self._touch = Touch(
             tuple(names[i] for i in touched),
             {names[i]: seconds for i, seconds in pressed.items()},
-            {names[i]: frozenset(self._partner(j) for j in others) for i, others in _partners(self._roles[data.contact.geom]).items()},
+            {names[i]: frozenset(self._partner(j) for j in others) for i, others in partners(self._roles[data.contact.geom]).items()},
             {names[i]: seconds for i, seconds in running.items()},
         )
         self._place_bodies()
@@ -252,7 +242,7 @@ class Env:
             camera.xmat[:] = (facing @ astray.turn).ravel()
 
     def _seen(self, camera: str, rgb: Rgb) -> Rgb:
-        if self._row is None or self.sensor is PERFECT:
+        if self._row is None or camera not in self._strays:
             return rgb
         return exposed(self.sensor, rgb, self._strays[camera], self._row, camera, round(self.time_s * self.hz))
 
@@ -281,38 +271,6 @@ class Env:
             yield
         finally:
             self.seconds[part] += time.perf_counter() - start
-
-
-ARM, STILL = -1, -2
-
-
-def _roles(scene: Scene) -> Int64[np.ndarray, " g"]:
-    """Of each geom: the index of its object, or ARM, or STILL (table, floor, walls)."""
-    model = scene.model
-    base = int(model.body(scene.robot.links[0]).rootid[0])
-    owner = {int(model.body(name).id): i for i, name in enumerate(scene.objects)} | {base: ARM}
-    return np.array([owner.get(int(model.body_rootid[body]), STILL) for body in model.geom_bodyid], np.int64)
-
-
-def _hand(scene: Scene) -> Bool[np.ndarray, " g"]:
-    """Of each geom: whether it belongs to the gripper, that is to the tcp's body or to a body below it."""
-    model = scene.model
-    palm = int(model.site("tcp").bodyid[0])
-    below = {palm}
-    for body in range(palm + 1, model.nbody):  # children come after their parents
-        if int(model.body_parentid[body]) in below:
-            below.add(body)
-    return np.isin(model.geom_bodyid, list(below))
-
-
-def _partners(roles: Int64[np.ndarray, "c 2"]) -> dict[int, set[int]]:
-    """Of every object that touches anything: the roles of what it touches."""
-    partners: dict[int, set[int]] = {}
-    for a, b in roles.tolist():
-        for one, other in ((a, b), (b, a)):
-            if one >= 0 and one != other:
-                partners.setdefault(one, set()).add(other)
-    return partners
 
 
 def _matrix(quat: Float64[np.ndarray, "4"]) -> Float64[np.ndarray, "3 3"]:
