@@ -30,9 +30,9 @@ TABLETOP = Suite(
     sensor=DESK,
     tasks=(*map(_select, ("vase", "plushie", "cup", "slipper")), *map(_put, ("plant", "stuffed toy", "pouch", "scrubber"))),
 )
-REACH = Area(0.175, 0.26, -0.12, 0.12)
-"""Where the SO-101 takes things straight from above; the target of a put stands here, look-alikes may stand further out."""
 TABLE = Area(0.15, 0.30, -0.19, 0.19)
+REACH = Area(0.165, 0.275, -0.145, 0.145)
+"""Where the SO-101 takes things from above: all three objects of a put stand here, so that their places tell nothing."""
 BOWLS = ((0.215, 0.16), (0.215, -0.16))
 """The bowl stands on one side or the other."""
 EPISODES = 20
@@ -48,7 +48,6 @@ def _scene(task: Task, episode: int) -> tuple[Placement, ...]:
     names = [task.personal, *rivals(rng, task.stem)]
     bowl = BOWLS[int(rng.integers(2))]
     fixed = [(bowl, radius_m(BOWL) / np.sqrt(2))] if task.goal else []
-    (mine,) = scatter(rng, REACH if task.goal else TABLE, [radius_m(task.personal)], fixed, gap_m=0.035)
-    spots = scatter(rng, TABLE, [radius_m(name) for name in names[1:]], [*fixed, (mine, radius_m(task.personal))], gap_m=0.035)
-    placed = [place(name, spot, turned(rng)) for name, spot in zip(names, (mine, *spots), strict=True)]
+    spots = scatter(rng, REACH if task.goal else TABLE, [radius_m(name) for name in names], fixed, gap_m=0.03 if task.goal else 0.035)
+    placed = [place(name, spot, turned(rng)) for name, spot in zip(names, spots, strict=True)]
     return (placed[0], *([place(BOWL, bowl, 0.0)] if task.goal else []), *placed[1:])
