@@ -9,10 +9,10 @@ import pytest
 from PIL import Image
 
 from vap_core import gallery
-from vap_core.gallery import GOALS, PORTRAIT, STEMS, TIERS, Stage
+from vap_core.gallery import GOALS, STEMS, TIERS
 from vap_core.plots import Tile, bounds_figure, hardness_figure, keep, layouts_figure, sheet
 from vap_core.sim.objects import lookalikes, personal
-from vap_core.sim.studio import Shot, photograph
+from vap_core.sim.studio import PORTRAIT, Shot, Stage, photograph
 from vap_core.suites import BENCHMARKS, VARIANTS, lists
 
 CUP, PLANT = personal("cup"), personal("plant")
@@ -42,7 +42,7 @@ def test_the_stage_takes_the_studio_s_pictures(stage):
 
 
 def test_a_cut_is_the_object_and_little_else(stage):
-    whole, cut = stage.picture(PLANT.name, ASIDE), stage.cut(PLANT.name, ASIDE)
+    whole, cut = stage.picture(PLANT.name, ASIDE), gallery.cut(stage, PLANT.name, ASIDE)
     assert cut.shape[0] < whole.shape[0]
     assert cut.shape[1] < whole.shape[1]
     assert any(
@@ -72,8 +72,8 @@ def test_hardness_is_the_mean_cosine(stage, monkeypatch):
     monkeypatch.setattr(gallery, "STEMS", ("cup",))
     monkeypatch.setattr(gallery, "graded", lambda stem: lookalikes(stem)[:2])
     table = gallery.hardness(stage, Mean())
-    references = Mean()([stage.cut(CUP.name, shot) for shot in gallery.REFERENCES])
-    one = Mean()([stage.cut(table.lookalike[0], shot) for shot in gallery.QUERIES])
+    references = Mean()([gallery.cut(stage, CUP.name, shot) for shot in gallery.REFERENCES])
+    one = Mean()([gallery.cut(stage, table.lookalike[0], shot) for shot in gallery.QUERIES])
     assert table.cosine[0] == pytest.approx(float((one @ references.T).mean()))
     assert table.own.nunique() == 1
     assert table.fooled.between(0, 1).all()

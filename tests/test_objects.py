@@ -6,7 +6,7 @@ import pytest
 from vap_core.errors import UnknownName
 from vap_core.sim.gl import ensure_gl
 from vap_core.sim.objects import CATEGORIES, CLUTTER, OBJECTS, add_object, extent_m, generic, get, lookalikes, mesh, personal, tier
-from vap_core.sim.studio import contact_sheet, reference_views
+from vap_core.sim.studio import reference_views
 from vap_core.sim.textures import atlas
 
 ensure_gl()
@@ -151,10 +151,6 @@ def test_reference_views_are_seeded_varied_and_framed():
     assert not any(np.array_equal(a, b) for a, b in zip(views, other, strict=True))
     assert len({view.tobytes() for view in views}) == 5
     assert all(view.shape == (160, 160, 3) and view.std() > 10 for view in views)
-
-
-def test_contact_sheet_has_one_cell_per_model():
-    assert contact_sheet(list(OBJECTS.values())[:3], columns=2, size=64).shape == (128, 128, 3)
 
 
 @pytest.mark.parametrize("kind", RECEPTACLES)

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,88 +11,29 @@ from vap_core.metrics import Score, rate, score
 from vap_core.plots import Tile
 from vap_core.policies.expert import Expert
 from vap_core.sim.env import Env
-from vap_core.sim.objects import OBJECTS, VISUAL_GROUP, ObjectModel, add_object, extent_m, generic, lookalikes, personal, tier
+from vap_core.sim.objects import OBJECTS, ObjectModel, generic, lookalikes, personal, tier
 from vap_core.sim.scenes import build
-from vap_core.sim.studio import FOVY_DEG, Shot
+from vap_core.sim.studio import Shot, Stage
 from vap_core.suites import BENCHMARKS, VARIANTS
 from vap_core.values import EpisodeRow, PersonalObject, Rgb
 
 if TYPE_CHECKING:
     import pandas as pd
 
-import mujoco  # isort: skip  (sim.env has chosen a GL back end)
-
 STEMS = tuple(name.removesuffix("-personal") for name in OBJECTS if name.endswith("-personal"))
 """One per personal object: "pen-holder"."""
 GOALS = tuple(model for model in OBJECTS.values() if model.split == "prop")
-PORTRAIT = Shot(0.45, 0.4, 0.85, bright=0.95, table=(0.86, 0.85, 0.83))
 TIERS = ("hard", "medium", "easy")
 TIER_COLOURS = {"personal": "#f28e2b", "hard": "#c0392b", "medium": "#b8860b", "easy": "#3a7d44"}
-HIDDEN_GROUP = 5
 REFERENCES = tuple(Shot(0.4 * np.pi * i, float(np.radians(18 + 8 * (2 * i % 5))), 0.6) for i in range(5))
 """Five views as one walks around an object, like studio.reference_views but under one lamp, so that only the object differs."""
 QUERIES = tuple(Shot(azimuth, float(np.radians(elevation)), 0.6) for azimuth, elevation in ((0.6, 40), (2.5, 30), (4.4, 35)))
 """Views from between those."""
 
 
-class Stage:
-    """Objects that take turns on the studio's plain table: studio.photograph's pictures, compiled once for all objects and shots.
-
-    A context manager, because it holds a GL context.
-    """
-
-    def __init__(self, models: Sequence[ObjectModel], size: int = 160) -> None:
-        self.models = {model.name: model for model in models}
-        spec = mujoco.MjSpec()
-        glow = spec.visual.headlight
-        glow.ambient, glow.diffuse, glow.specular = [0.38] * 3, [0.12] * 3, [0] * 3
-        spec.visual.global_.offwidth = spec.visual.global_.offheight = size
-        spec.visual.global_.fovy = FOVY_DEG
-        spec.visual.quality.shadowsize = 2048
-        spec.visual.map.znear, spec.visual.map.zfar, spec.visual.map.shadowclip = 0.01, 20.0, 0.3
-        spec.stat.extent, spec.stat.center = 1.0, (0, 0, 0)
-        spec.worldbody.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(8, 8, 0.1))
-        spec.worldbody.add_light(name="lamp", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, specular=[0.2] * 3, castshadow=True)
-        for model in self.models.values():
-            add_object(spec, model)
-        self._model = spec.compile()
-        self._data = mujoco.MjData(self._model)
-        self._renderer = mujoco.Renderer(self._model, size, size)
-
-    def __enter__(self) -> "Stage":
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._renderer.close()
-
-    def picture(self, name: str, shot: Shot = PORTRAIT) -> Rgb:
-        """One object alone on the table."""
-        self._turn_to(name, shot)
-        return np.ascontiguousarray(self._renderer.render())
-
-    def cut(self, name: str, shot: Shot) -> Rgb:
-        """The same, cut around the object as grounding cuts its candidates, but by its true outline."""
-        whole = self.picture(name, shot)
-        self._renderer.enable_segmentation_rendering()
-        drawn = self._renderer.render()
-        self._renderer.disable_segmentation_rendering()
-        rows, cols = np.nonzero((drawn[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM)) & (drawn[..., 0] == self._model.geom(f"{name}/visual").id))
-        return crop(whole, np.array([cols.min(), rows.min(), cols.max() + 1, rows.max() + 1], float))
-
-    def _turn_to(self, name: str, shot: Shot) -> None:
-        model, (x, y, z) = self._model, extent_m(self.models[name])
-        lamp = np.array([np.sin(shot.lamp), -np.cos(shot.lamp), 1.6])
-        model.geom_group[:] = HIDDEN_GROUP
-        model.geom("table").group, model.geom(f"{name}/visual").group = 0, VISUAL_GROUP
-        model.geom("table").rgba = (*shot.table, 1)
-        model.light("lamp").pos, model.light("lamp").dir, model.light("lamp").diffuse = 0.8 * lamp, -lamp / np.linalg.norm(lamp), shot.bright
-        mujoco.mj_kinematics(model, self._data)
-        mujoco.mj_camlight(model, self._data)
-        camera = mujoco.MjvCamera()
-        camera.lookat[:] = 0, 0, 0.48 * z
-        camera.azimuth, camera.elevation = 90 + np.degrees(shot.azimuth), -np.degrees(shot.elevation)
-        camera.distance = 0.5 * max(z, float(np.hypot(x, y))) / (shot.fill * np.tan(np.radians(FOVY_DEG / 2)))
-        self._renderer.update_scene(self._data, camera)
+def cut(stage: Stage, name: str, shot: Shot) -> Rgb:
+    """A picture of one object, cut around it as grounding cuts its candidates, but by its true outline."""
+    return crop(stage.picture(name, shot), stage.box(name, shot))
 
 
 def _label(stem: str) -> str:
@@ -145,10 +85,10 @@ def hardness(stage: Stage, encoder: Encoder) -> "pd.DataFrame":
     lines = []
     for stem in STEMS:
         mine = personal(stem).name
-        references = encoder([stage.cut(mine, shot) for shot in REFERENCES])
-        own = encoder([stage.cut(mine, shot) for shot in QUERIES]) @ references.T
+        references = encoder([cut(stage, mine, shot) for shot in REFERENCES])
+        own = encoder([cut(stage, mine, shot) for shot in QUERIES]) @ references.T
         for model in graded(stem):
-            theirs = encoder([stage.cut(model.name, shot) for shot in QUERIES]) @ references.T
+            theirs = encoder([cut(stage, model.name, shot) for shot in QUERIES]) @ references.T
             lines.append(
                 {
                     "object": stem.replace("-", " "), "lookalike": model.name, "tier": tier(model), "cosine": float(theirs.mean()),

@@ -1,15 +1,19 @@
-"""Photographs of single objects on a plain table: the reference views of a personal object, and contact sheets."""
+"""Photographs of single objects on a plain table, the reference views of a personal object among them."""
 
 from collections.abc import Sequence
 from pathlib import Path
+from types import TracebackType
 
 import numpy as np
+from jaxtyping import Float64
 from PIL import Image
 
 from vap_core.errors import BadOutput
-from vap_core.sim.gl import ensure_gl
-from vap_core.sim.objects import ObjectModel, add_object, extent_m
+from vap_core.sim.cameras import HIDDEN_GROUP
+from vap_core.sim.objects import VISUAL_GROUP, ObjectModel, add_object, extent_m
 from vap_core.values import Rgb, value
+
+import mujoco  # isort: skip  (cameras has chosen a GL back end)
 
 FOVY_DEG = 30.0
 
@@ -26,40 +30,73 @@ class Shot:
     table: tuple[float, float, float] = (0.62, 0.58, 0.53)
 
 
-def photograph(model: ObjectModel, shots: Sequence[Shot], size: int = 320) -> list[Rgb]:
-    """One picture, size x size, per shot; azimuth 0 looks at the object's front."""
-    ensure_gl()
-    import mujoco
+PORTRAIT = Shot(0.45, 0.4, 0.85, bright=0.95, table=(0.86, 0.85, 0.83))
 
-    x, y, z = extent_m(model)
-    radius = 0.5 * max(z, float(np.hypot(x, y)))
-    pictures = []
-    for shot in shots:
+
+class Stage:
+    """Objects that take turns on a plain table under one lamp, compiled once for all objects and shots.
+
+    A context manager, because it holds a GL context.
+    """
+
+    def __init__(self, models: Sequence[ObjectModel], size: int = 160) -> None:
+        self.models = {model.name: model for model in models}
         spec = mujoco.MjSpec()
-        spec.visual.headlight.ambient, spec.visual.headlight.diffuse, spec.visual.headlight.specular = [0.38] * 3, [0.12] * 3, [0] * 3
+        glow = spec.visual.headlight
+        glow.ambient, glow.diffuse, glow.specular = [0.38] * 3, [0.12] * 3, [0] * 3
         spec.visual.global_.offwidth = spec.visual.global_.offheight = size
+        spec.visual.global_.fovy = FOVY_DEG
         spec.visual.quality.shadowsize = 2048
-        spec.visual.map.znear, spec.visual.map.zfar = 0.01, 20.0
-        spec.visual.map.shadowclip = 0.3
+        spec.visual.map.znear, spec.visual.map.zfar, spec.visual.map.shadowclip = 0.01, 20.0, 0.3
         spec.stat.extent, spec.stat.center = 1.0, (0, 0, 0)
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(8, 8, 0.1), rgba=(*shot.table, 1))
+        spec.worldbody.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(8, 8, 0.1))
+        spec.worldbody.add_light(name="lamp", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, specular=[0.2] * 3, castshadow=True)
+        for model in self.models.values():
+            add_object(spec, model)
+        self._model = spec.compile()
+        self._data = mujoco.MjData(self._model)
+        self._renderer = mujoco.Renderer(self._model, size, size)
+
+    def __enter__(self) -> "Stage":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._renderer.close()
+
+    def picture(self, name: str, shot: Shot = PORTRAIT) -> Rgb:
+        """One object alone on the table."""
+        self._turn_to(name, shot)
+        return np.ascontiguousarray(self._renderer.render())
+
+    def box(self, name: str, shot: Shot = PORTRAIT) -> Float64[np.ndarray, "4"]:
+        """The object's true outline in that picture, x0 y0 x1 y1 in pixels."""
+        self._turn_to(name, shot)
+        self._renderer.enable_segmentation_rendering()
+        drawn = self._renderer.render()
+        self._renderer.disable_segmentation_rendering()
+        rows, cols = np.nonzero((drawn[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM)) & (drawn[..., 0] == self._model.geom(f"{name}/visual").id))
+        return np.array([cols.min(), rows.min(), cols.max() + 1, rows.max() + 1], np.float64)
+
+    def _turn_to(self, name: str, shot: Shot) -> None:
+        model, (x, y, z) = self._model, extent_m(self.models[name])
         lamp = np.array([np.sin(shot.lamp), -np.cos(shot.lamp), 1.6])
-        spec.worldbody.add_light(
-            pos=0.8 * lamp, dir=-lamp, type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, diffuse=[shot.bright] * 3, specular=[0.2] * 3, castshadow=True
-        )
-        add_object(spec, model)
-        compiled = spec.compile()
-        data = mujoco.MjData(compiled)
-        mujoco.mj_forward(compiled, data)
+        model.geom_group[:] = HIDDEN_GROUP
+        model.geom("table").group, model.geom(f"{name}/visual").group = 0, VISUAL_GROUP
+        model.geom("table").rgba = (*shot.table, 1)
+        model.light("lamp").pos, model.light("lamp").dir, model.light("lamp").diffuse = 0.8 * lamp, -lamp / np.linalg.norm(lamp), shot.bright
+        mujoco.mj_kinematics(model, self._data)
+        mujoco.mj_camlight(model, self._data)
         camera = mujoco.MjvCamera()
         camera.lookat[:] = 0, 0, 0.48 * z
         camera.azimuth, camera.elevation = 90 + np.degrees(shot.azimuth), -np.degrees(shot.elevation)
-        camera.distance = radius / (shot.fill * np.tan(np.radians(FOVY_DEG / 2)))
-        compiled.vis.global_.fovy = FOVY_DEG
-        with mujoco.Renderer(compiled, size, size) as renderer:
-            renderer.update_scene(data, camera)
-            pictures.append(renderer.render())
-    return pictures
+        camera.distance = 0.5 * max(z, float(np.hypot(x, y))) / (shot.fill * np.tan(np.radians(FOVY_DEG / 2)))
+        self._renderer.update_scene(self._data, camera)
+
+
+def photograph(model: ObjectModel, shots: Sequence[Shot], size: int = 320) -> list[Rgb]:
+    """One picture, size x size, per shot; azimuth 0 looks at the object's front."""
+    with Stage([model], size) as stage:
+        return [stage.picture(model.name, shot) for shot in shots]
 
 
 def reference_views(model: ObjectModel, n: int = 5, seed: int = 0, size: int = 320) -> list[Rgb]:
@@ -88,13 +125,3 @@ def write_views(model: ObjectModel, folder: Path, n: int = 5) -> list[Path]:
     except OSError as error:
         raise BadOutput(f"photograph: {folder} cannot be written ({error.strerror}); choose another folder with --out.") from error
     return paths
-
-
-def contact_sheet(models: Sequence[ObjectModel], columns: int = 5, size: int = 200, shot: Shot | None = None) -> Rgb:
-    """One picture per model, row by row."""
-    shot = shot or Shot(0.45, 0.4, 0.8)
-    rows = -(-len(models) // columns)
-    sheet = Image.new("RGB", (columns * size, rows * size), (255, 255, 255))
-    for i, model in enumerate(models):
-        sheet.paste(Image.fromarray(photograph(model, [shot], size)[0]), (i % columns * size, i // columns * size))
-    return np.asarray(sheet)
