@@ -96,7 +96,7 @@ def _room(spec: mujoco.MjSpec, arm: Robot, look: Look) -> None:
     spec.visual.headlight.ambient = [look.ambient] * 3
     spec.visual.headlight.diffuse = [0.22] * 3
     spec.visual.headlight.specular = [0.05] * 3
-    spec.visual.quality.numslices, spec.visual.quality.numstacks, spec.visual.quality.numquads = 24, 12, 4
+    spec.visual.quality.numslices, spec.visual.quality.numstacks, spec.visual.quality.numquads = 24, 12, 1
     spec.visual.map.znear, spec.visual.map.zfar = 0.01, 20.0
     spec.stat.extent, spec.stat.center = 1.0, [0.3, 0.0, 0.2]
     target = np.subtract((0.35, 0.0, 0.0), look.lamp_pos_m)

@@ -49,6 +49,8 @@ def exposed(sensor: Sensor, rgb: Rgb, astray: Stray, row: EpisodeRow, camera: st
     """The picture as the sensor delivers it at control step `step`."""
     if sensor == PERFECT:
         return rgb
-    rng = np.random.default_rng([row.seed, row.episode, step, zlib.crc32(f"{row.task}.{camera}".encode())])
-    grain = rng.standard_normal(rgb.shape, np.float32)
-    return np.clip(np.rint(rgb * astray.gain.astype(np.float32) + np.float32(sensor.noise) * grain), 0, 255).astype(np.uint8)
+    stream = np.random.SFC64([row.seed, row.episode, step, zlib.crc32(f"{row.task}.{camera}".encode())])
+    seen = np.random.Generator(stream).standard_normal(rgb.shape, np.float32)
+    seen *= np.float32(sensor.noise)
+    seen += rgb * astray.gain.astype(np.float32)
+    return np.clip(np.rint(seen, out=seen), 0, 255, out=seen).astype(np.uint8)
