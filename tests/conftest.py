@@ -1,6 +1,9 @@
 """Every test runs with the shapes in vap_core's signatures checked."""
 
+import os
+import tarfile
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 from hypothesis import settings
@@ -12,6 +15,13 @@ settings.register_profile("vap", deadline=None, derandomize=True)
 settings.load_profile("vap")
 
 ROOT = Path(__file__).parent.parent
+ARCHIVES = sorted((ROOT.parent / "shared" / "menagerie").glob("*.tar.xz"))
+if ARCHIVES and "MENAGERIE_ROOT" not in os.environ:  # beside a checkout that has them, the robots are compared with Menagerie's
+    UNPACKED = TemporaryDirectory(prefix="menagerie-")
+    for archive in ARCHIVES:
+        with tarfile.open(archive) as tar:
+            tar.extractall(UNPACKED.name, filter="data")
+    os.environ["MENAGERIE_ROOT"] = UNPACKED.name
 
 
 @pytest.fixture(autouse=True)

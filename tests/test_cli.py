@@ -130,10 +130,12 @@ def test_ground_refuses_a_damaged_memory(line: tuple[Path, list[str]], bank: Pat
 
 def test_rollout_refuses_unknown_names_and_foreign_folders(tmp_path: Path) -> None:
     out = ("--out", tmp_path / "run")
-    assert "known: franka-pick, widowx-pick" in refused("rollout", "--suite", "simpler", "--task", "pick-cup", *out)
+    assert "known: franka-pick, simpler-bridge, simpler-fractal, tabletop, vlabench, widowx-pick" in refused(
+        "rollout", "--suite", "simpler", "--task", "pick-cup", *out
+    )
     assert "pick-bottle" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-moon", *out)
     assert "known: generic" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--method", "magic", *out)
-    assert "known: scripted" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--policy", "pi9", *out)
+    assert "known: expert, random, scripted" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--policy", "pi9", *out)
     assert not (tmp_path / "run").exists()
     (tmp_path / "thesis.txt").write_text("dear")
     assert "choose another folder" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--out", tmp_path)

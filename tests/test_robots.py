@@ -1,8 +1,6 @@
 """The authored robots: forward kinematics, limits and strokes against the Menagerie models, and inverse kinematics that reaches."""
 
-import io
 import os
-import tarfile
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -18,7 +16,6 @@ from vap_core.sim.robots import ROBOTS
 ensure_gl()
 import mujoco  # noqa: E402
 
-MENAGERIE = Path(os.environ.get("VAP_MENAGERIE", Path(__file__).parents[2] / "shared" / "menagerie"))
 PEERS = {
     "wx250s": ("trossen_wx250s", "wx250s.xml", "wx250s/gripper_link", "gripper_link", ("left_finger", "right_finger")),
     "panda": ("franka_emika_panda", "panda.xml", "hand", "hand", ("finger_joint1", "finger_joint2")),
@@ -28,18 +25,10 @@ PEERS = {
 def menagerie(name: str) -> mujoco.MjModel:
     """The kinematics of a Menagerie model, its meshes left out."""
     folder, file, *_ = PEERS[name]
-    archive, unpacked = MENAGERIE / f"{folder}.tar.xz", MENAGERIE / folder / file
-    if unpacked.exists():
-        text = unpacked.read_bytes()
-    elif archive.exists():
-        with tarfile.open(archive) as tar:
-            member = next(m for m in tar.getmembers() if m.name.endswith(f"/{file}"))
-            found = tar.extractfile(member)
-            assert found is not None
-            text = found.read()
-    else:
-        pytest.skip(f"no Menagerie models in {MENAGERIE}; set VAP_MENAGERIE to a folder that holds {folder}")
-    root = ElementTree.parse(io.BytesIO(text)).getroot()
+    path = Path(os.environ.get("MENAGERIE_ROOT", "")) / folder / file
+    if not path.exists():
+        pytest.skip(f"no {folder}/{file}; set MENAGERIE_ROOT to a folder that holds it")
+    root = ElementTree.parse(path).getroot()
     for parent in list(root.iter()):
         for child in list(parent):
             if child.tag in ("geom", "mesh", "material", "texture", "light", "exclude"):
