@@ -66,7 +66,7 @@ def test_an_episode_may_end_once_the_lift_is_done():
 
 def beside(distance, **more):
     x, y = WHERE[GOAL]
-    return truth(at={TARGET: (x, y + distance), **more.pop("at", {})}, **more)
+    return truth(at={TARGET: (x, y + distance), **more.pop("at", {})}, contacts={TARGET: more.pop("by", (REST,))}, **more)
 
 
 @pytest.mark.parametrize(
@@ -78,8 +78,21 @@ def beside(distance, **more):
         (beside(LIMIT - 0.001, at={OTHER: (0.30, 0.5 + 0.31)}), False),
         (beside(LIMIT - 0.001, up={OTHER: -0.0201}), False),
         (beside(LIMIT - 0.001, up={OTHER: -0.0199}), True),
+        (beside(LIMIT - 0.001, up={TARGET: -0.0201}), False),
+        (beside(LIMIT - 0.001, by=(ROBOT,)), True),
+        (beside(LIMIT - 0.001, by=()), False),
     ],
-    ids=["just met", "too far", "another is nearer", "another moved more", "another fell", "another sank a little"],
+    ids=[
+        "just met",
+        "too far",
+        "another is nearer",
+        "another moved more",
+        "another fell",
+        "another sank a little",
+        "it fell off the table",
+        "in the hand",
+        "in the air",
+    ],
 )
 def test_near(step, won):
     assert judged(NEAR, step).outcome().success == won
@@ -97,6 +110,11 @@ def on(dx, by=(GOAL,), height=0.012):
     return truth(at={TARGET: (x + dx, y)}, up={TARGET: height}, contacts={TARGET: by})
 
 
+def upset(step):
+    step.objects_world[GOAL][3:] = (0, 1, 0, 0)
+    return step
+
+
 @pytest.mark.parametrize(
     ("step", "won"),
     [
@@ -108,16 +126,31 @@ def on(dx, by=(GOAL,), height=0.012):
         (on(0.0, by=(ROBOT,)), False),
         (on(0.0, height=0.012 + 0.0199), True),
         (on(0.0, height=0.012 + 0.0201), False),
+        (on(0.0, height=0.0019), False),
+        (upset(on(0.0)), False),
     ],
-    ids=["just met", "off the edge", "still in the hand", "half on the table", "on another", "above it", "on a rim", "on a tower"],
+    ids=[
+        "just met",
+        "off the edge",
+        "still in the hand",
+        "half on the table",
+        "on another",
+        "above it",
+        "on a rim",
+        "on a tower",
+        "beneath it",
+        "the plate is upside down",
+    ],
 )
 def test_put(step, won):
     assert judged(PUT, step).outcome().success == won
 
 
-def test_put_is_done_when_let_go():
-    assert not judged(PUT, on(0.0, by=(GOAL, ROBOT))).done
-    assert judged(PUT, on(0.0)).done
+def test_put_is_done_when_let_go_and_at_rest():
+    assert not judged(PUT, *[on(0.0, by=(GOAL, ROBOT))] * 9).done
+    assert judged(PUT, *[on(0.0)] * 5).done
+    assert not judged(PUT, *[on(0.0)] * 4).done
+    assert not judged(PUT, *[on(0.002 * i) for i in range(9)]).done, "it slides"
     assert not judged(PUT, on(0.0), truth()).outcome().success, "success is read at the end"
 
 
@@ -134,9 +167,19 @@ def press(name, seconds, *touched):
         ([press(TARGET, 0.5, OTHER, TARGET)], False),
         ([press(TARGET, 0.5, TARGET, OTHER)], True),
         ([press(TARGET, 0.002), press(OTHER, 0.5)], False),
+        ([press(TARGET, 0.002), press(OTHER, 0.5), press(TARGET, 0.5)], False),
         ([press(TARGET, 0.5), press(OTHER, 0.5)], True),
     ],
-    ids=["just met", "a tap", "another first", "another first in the same step", "another after", "a tap, then another", "selected stands"],
+    ids=[
+        "just met",
+        "a tap",
+        "another first",
+        "another first in the same step",
+        "another after",
+        "a tap, then another",
+        "a tap, another, then the press",
+        "selected stands",
+    ],
 )
 def test_selected(steps, won):
     out = judged(SELECT, *steps).outcome()
@@ -160,10 +203,17 @@ def test_cmr_is_three_centimetres_of_the_target_at_least_once():
     assert not judged(PICK, moved(OTHER, 0.1)).outcome().cmr
 
 
+def test_toppling_in_place_is_moving():
+    fallen = truth()
+    fallen.objects_world[TARGET][3:] = (np.sqrt(0.5), 0, np.sqrt(0.5), 0)
+    assert judged(PICK, fallen).outcome().cmr
+
+
 def test_wrong_object_is_three_centimetres_of_another_or_a_touch_when_selecting():
     assert judged(PICK, moved(OTHER, 0.0301), truth()).outcome().wrong_object
     assert not judged(PICK, moved(OTHER, 0.0299), truth(touched=(OTHER,))).outcome().wrong_object
     assert not judged(PUT, moved(GOAL, 0.1)).outcome().wrong_object, "the receptacle is no wrong object"
+    assert judged(PUT, truth(touched=(GOAL,)), truth(touched=(TARGET,))).outcome().first_object_correct, "nor a wrong first one"
     assert judged(SELECT, truth(touched=(OTHER,))).outcome().wrong_object
     assert not judged(SELECT, truth(touched=(TARGET,))).outcome().wrong_object
 

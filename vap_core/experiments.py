@@ -1,7 +1,8 @@
 """Every named study: which tasks, methods and policy, how many episodes; and the parts that one batch of it needs."""
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from vap_core.policies.expert import Expert
 from vap_core.policies.random import Random
 from vap_core.policies.scripted import Scripted
 from vap_core.rollout import Trial
+from vap_core.sim import robots
+from vap_core.sim.cameras import RIGS
 from vap_core.sim.env import Env
 from vap_core.sim.objects import extent_m, get
 from vap_core.sim.scenes import Scene, build
@@ -73,9 +76,17 @@ class Study:
         return rows(suite, task, n=self.episodes, seed=self.seed)
 
     def configuration(self) -> dict[str, Any]:
-        """What the results depend on, as JSON; weights and episode lists by their checksums."""
+        """What the results depend on, as JSON; weights, episode lists, and the world (robots, objects, looks, sensors) by their checksums."""
         listed = {suite: lists.digest(suite) for suite, _ in self.tasks if suite in suites.BENCHMARKS}
-        return {**asdict(self), "version": __version__, "weights": weights_sha256(), "lists": listed}
+        return {**asdict(self), "version": __version__, "weights": weights_sha256(), "lists": listed, "world": self._world()}
+
+    def _world(self) -> str:
+        found = hashlib.sha256(repr((RIGS, VARIANTS)).encode())
+        for suite, task in self.tasks:
+            known = suites.suite(suite)
+            arm, placed = robots.get(known.robot), {place.model for row in self.rows(suite, task) for place in row.placements}
+            found.update(repr((known, replace(arm, xml=Path(arm.xml.name)), [get(name) for name in sorted(placed)])).encode() + arm.xml.read_bytes())
+        return found.hexdigest()[:16]
 
 
 def register_personal(study: Study, bank: Path) -> None:

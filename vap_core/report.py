@@ -50,14 +50,15 @@ def ordered(scores: list[Score], tasks: Sequence[Sequence[str]], methods: Sequen
 
 
 def _overall(scores: list[Score]) -> list[str]:
-    """Success of all tasks of a suite together, per method, where there is more than one."""
+    """Success of all tasks of a track together, per method, where there is more than one."""
     lines = []
-    for suite, method in dict.fromkeys((s.suite, s.method) for s in scores):
-        part = [s for s in scores if (s.suite, s.method) == (suite, method)]
+    for suite, split, method in dict.fromkeys((s.suite, s.split, s.method) for s in scores):
+        part = [s for s in scores if (s.suite, s.split, s.method) == (suite, split, method)]
         if len(part) > 1:
             total = rate(sum(s.sr.k for s in part), sum(s.n for s in part))
-            worst = min(part, key=lambda s: s.sr.value)
-            lines.append(f"{suite} {method}: {total.k} of {total.n} succeed, SR {total}; worst {worst.task} {worst.sr}")
+            least = min(part, key=lambda s: s.sr.value)
+            track = f"{suite} ({split})" if split else suite
+            lines.append(f"{track} {method}: {total.k} of {total.n} succeed, SR {total}; least {least.task} {least.sr}")
     return ["", *lines] if lines else []
 
 

@@ -1,6 +1,7 @@
 """Judge a finished run again from its saved states, without a simulator."""
 
 from pathlib import Path
+from typing import Any
 
 from vap_core import suites, traces
 from vap_core.errors import BadOutput
@@ -23,12 +24,15 @@ def rescore(folder: Path) -> str:
     if table.empty:
         raise BadOutput(f"rescore: {folder} holds no results; name the folder that eval or rollout wrote.")
     study = note(folder)["configuration"]
+    if not {"lists", "tasks", "methods", "episodes", "seed"} <= study.keys():
+        raise BadOutput(f"rescore: {folder} was written by an older version, without the hashes of its episode lists; run it again.")
     for suite, digest in study["lists"].items():
         if suites.lists.digest(suite) != digest:
             raise BadOutput(f"rescore: the list of {suite} has changed since {folder} was run; its states fit no row of today. Run it again.")
     rows = {(r.suite, r.task, r.episode): r for suite, task in study["tasks"] for r in suites.rows(suite, task, study["episodes"], study["seed"])}
     stored = {tuple(row[name] for name in KEY): row for row in table.to_dict("records")}
-    again, changed = [], []
+    again: list[dict[str, Any]] = []
+    judged, changed = set(), []
     for key, truths in traces.read(folder):
         if key not in stored or stored[key]["outcome"] == "error":
             continue
@@ -36,9 +40,11 @@ def rescore(folder: Path) -> str:
         row = rows[suite, task, episode]
         outcome = rejudge(row, {place.model: extent_m(get(place.model)) for place in row.placements}, truths).outcome()
         ruled = {name: getattr(outcome, name) for name in RULED}
+        judged.add(key)
         again.append({str(name): cell for name, cell in stored[key].items()} | {"outcome": outcome.status} | ruled)
         if any(stored[key][name] is not cell and stored[key][name] != cell for name, cell in ruled.items()):
             changed.append(" ".join(str(part) for part in key))
-    scores = ordered(score(again), study["tasks"], study["methods"])
+    kept = [{str(name): cell for name, cell in row.items()} for key, row in stored.items() if key not in judged]
+    scores = ordered(score(again + kept), study["tasks"], study["methods"])
     verdict = f"{len(changed)} of {len(again)} episodes judged differently" + (": " + "; ".join(changed[:10]) if changed else "")
-    return "\n".join([results_table(scores), "", f"{verdict}; {len(stored) - len(again)} without a saved state or in error left out."])
+    return "\n".join([results_table(scores), "", f"{verdict}; {len(kept)} without a saved state or in error kept as they were."])

@@ -14,7 +14,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from vap_core.attend import Attender, AttendState
-from vap_core.errors import OutOfReach, VapError
+from vap_core.errors import BadAction, OutOfReach, VapError
 from vap_core.policies import Insider, Policy
 from vap_core.sim.env import Control, Env
 from vap_core.sim.scenes import Scene
@@ -125,8 +125,8 @@ def _open(trial: Trial, one: Running, text: str, groundings: Mapping[str, tuple[
 
 
 def _plan(trial: Trial, live: Sequence[Running], seen: Mapping[int, tuple[PolicyInput, Attended]]) -> None:
-    """Ask the policy, in one batch, for every episode whose chunk is used up."""
-    asking = [one for one in live if not one.queue]
+    """Ask the policy, in one batch, for every episode that goes on and whose chunk is used up."""
+    asking = [one for one in live if not one.queue and not _over(one)]
     if not asking:
         return
     start = time.perf_counter()
@@ -159,7 +159,7 @@ def _ask(
 
 def _act(one: Running, raw: PolicyInput, attended: Attended, keep_images: bool) -> None:
     """Execute one action, or none when the episode is over, and hand the frame on."""
-    over = one.judge.done or one.judge.steps >= one.row.max_steps
+    over = _over(one)
     action = np.zeros(one.env.action_size, np.float32) if over else one.queue.popleft()
     truth, cameras = one.env.truth(masks=one.sink is not None), one.env.cameras()
     if over:
@@ -173,6 +173,10 @@ def _act(one: Running, raw: PolicyInput, attended: Attended, keep_images: bool) 
     if not over:
         one.env.step(action)
         one.judge = one.judge.step(one.env.truth())
+
+
+def _over(one: Running) -> bool:
+    return one.judge.done or one.judge.steps >= one.row.max_steps
 
 
 def _end(trial: Trial, one: Running) -> Episode:
@@ -200,8 +204,8 @@ def _guard[**P, R](one: Running, work: Callable[P, R], *args: P.args, **kwargs: 
 
 
 def _ends_the_run(error: Exception) -> bool:
-    """What the user can mend stops everything; an object out of reach is its own episode's misfortune."""
-    return isinstance(error, VapError) and not isinstance(error, OutOfReach)
+    """What the user can mend stops everything; a bad action or an object out of reach is its own episode's misfortune."""
+    return isinstance(error, VapError) and not isinstance(error, OutOfReach | BadAction)
 
 
 @contextmanager

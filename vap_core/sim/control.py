@@ -134,7 +134,8 @@ def follow_joints(arm: Arm, command: Command, measured: Float64[np.ndarray, " n"
     delta = action.astype(np.float64)
     asked = command.joints + np.clip(delta[:-1], -fastest, fastest)
     low, high = arm.model.jnt_range.T
-    joints = np.clip(np.clip(asked, measured - LEASH, measured + LEASH), low, high)
+    led = np.clip(np.clip(asked, measured - LEASH, measured + LEASH), low, high)
+    joints = command.joints + np.clip(led - command.joints, -fastest, fastest)
     return Command(arm.forward(joints), joints, float(np.clip(delta[-1], 0.0, 1.0)))
 
 

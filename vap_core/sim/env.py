@@ -39,7 +39,7 @@ class Snapshot:
 
 
 class Env:
-    """One running episode in `scene`. The same row gives bit-identical states and images, whatever else runs in the scene.
+    """One running episode in `scene`. The same row in the same scene gives bit-identical states and images, whatever else runs.
 
     `control` says what an action is (values.Action); `sensor` what the cameras do to what they see.
     `seconds` sums wall time by part: "physics", "ik", "render", "truth".
@@ -63,6 +63,7 @@ class Env:
         self._data = mujoco.MjData(model)
         self._arm = arm(scene.robot.name)
         self._substeps = max(1, round(1.0 / self.hz / model.opt.timestep))
+        self._settle = round(SETTLE_S / model.opt.timestep)
         self._qpos = np.array([model.joint(name).qposadr[0] for name in self.robot.joints])
         self._fingers = np.array([model.joint(name).qposadr[0] for name in self.robot.fingers])
         self._ctrl = np.array([model.actuator(name).id for name in (*self.robot.joints, *self.robot.fingers)])
@@ -102,7 +103,7 @@ class Env:
     @property
     def time_s(self) -> float:
         """Seconds since the episode's first observation."""
-        return round(float(self._data.time) - SETTLE_S, 9)
+        return round(float(self._data.time) - self._settle * float(self._model.opt.timestep), 9)
 
     def reset(self, row: EpisodeRow) -> None:
         """Start the episode of `row`: objects in place, robot at home, gripper open, 0.3 s to settle.
@@ -131,7 +132,7 @@ class Env:
         self._begin(row)
         self._touch = Touch()
         self._command = Command(self._arm.forward(self.robot.home), self.robot.home, 1.0)
-        self._run(round(SETTLE_S / model.opt.timestep), data.ctrl[self._ctrl].copy())
+        self._run(self._settle, data.ctrl[self._ctrl].copy())
         self._touch = Touch(contacts=self._touch.contacts)
 
     def observe(self, text: str = "") -> PolicyInput:
@@ -154,6 +155,8 @@ class Env:
         """Do one action for 1 / hz seconds; contacts are watched in every physics step."""
         if len(action) != self.action_size:
             raise BadAction(f"Env.step: {len(action)} numbers, but {self.control} control of {self.robot.name} takes {self.action_size}.")
+        if not np.isfinite(action).all():
+            raise BadAction(f"Env.step: {action.tolist()} holds numbers that are not finite; mend the policy.")
         with self._timed("ik"):
             before = self._targets(self._command.joints, self._command.gripper)
             self._command = self.commanded(self._command, action)

@@ -1,10 +1,12 @@
 """Suites: the four personalised benchmarks, whose episode lists are hashed files, and the demo's warm-up suites, made on the spot."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
-from vap_core.errors import one_of
+from vap_core.errors import BadSuite, UnknownName, one_of
+from vap_core.sim import objects
 from vap_core.suites import lists, pick
 from vap_core.suites.rules import Judge as Judge
 from vap_core.suites.simpler import BRIDGE, FRACTAL
@@ -32,6 +34,25 @@ def suite(name: str) -> Suite:
     return SUITES[name]
 
 
+@cache
+def benchmark(name: str) -> tuple[EpisodeRow, ...]:
+    """The whole list of a benchmark. Raises: BadSuite, naming row and field, also for a task, camera or object that does not exist."""
+    listed, known = lists.read(name), suite(name)
+    for i, row in enumerate(listed, 1):
+        for field, odd, names in (
+            ("task", {row.task}, {task.name for task in known.tasks}),
+            ("cameras", set(row.cameras), set(known.cameras)),
+        ):
+            if odd - names:
+                raise BadSuite(f"suites: {name}.jsonl row {i}, field {field!r}: unknown {sorted(odd - names)}; known: {', '.join(sorted(names))}.")
+        for place in row.placements:
+            try:
+                objects.get(place.model)
+            except UnknownName as error:
+                raise BadSuite(f"suites: {name}.jsonl row {i}, field 'placements': no object {place.model!r}.") from error
+    return listed
+
+
 def rows(suite_name: str, task_name: str, n: int | None = None, seed: int = 0) -> tuple[EpisodeRow, ...]:
     """Episodes of a task: the whole list, or `n` of it spread evenly; of a warm-up suite the first `n` (20) of `seed`.
 
@@ -42,6 +63,6 @@ def rows(suite_name: str, task_name: str, n: int | None = None, seed: int = 0) -
     task = found.task(task_name)
     if suite_name in WARM_UPS:
         return pick.rows(found, task, 20 if n is None else n, seed)
-    listed = [row for row in lists.read(suite_name) if row.task == task_name]
+    listed = [row for row in benchmark(suite_name) if row.task == task_name]
     chosen = range(len(listed)) if n is None or n >= len(listed) else np.unique(np.linspace(0, len(listed) - 1, n).astype(int)).tolist()
     return tuple(replace(listed[i], seed=seed) for i in chosen)

@@ -33,14 +33,15 @@ def scatter(
     Raises: ValueError when the area is too small for that.
     """
     for _ in range(TRIES):
-        taken = list(fixed)
-        for radius in reach_m:
-            spot = _free(rng, area, radius, taken, gap_m)
+        taken, found = list(fixed), dict.fromkeys(range(len(reach_m)), (0.0, 0.0))
+        for i in rng.permutation(len(reach_m)).tolist():  # whoever is placed last gets the rim more often
+            spot = _free(rng, area, reach_m[i], taken, gap_m)
             if spot is None:
                 break
-            taken.append((spot, radius))
+            found[i] = spot
+            taken.append((spot, reach_m[i]))
         else:
-            return [spot for spot, _ in taken[len(fixed) :]]
+            return list(found.values())
     raise ValueError(f"layout.scatter: {len(reach_m)} objects and {len(fixed)} fixed ones do not fit {area} with {gap_m} m between them")
 
 

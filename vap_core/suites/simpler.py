@@ -11,7 +11,7 @@ from itertools import permutations
 import numpy as np
 
 from vap_core.sim import objects
-from vap_core.suites.layout import Area, place, radius_m, rivals, scatter, turned
+from vap_core.suites.layout import Area, Spot, place, radius_m, rivals, scatter, turned
 from vap_core.suites.suite import Suite, Task
 from vap_core.suites.variants import AGGREGATION, MATCHING, VARIANTS
 from vap_core.values import EpisodeRow, Placement
@@ -43,7 +43,9 @@ DESK = Area(0.40, 0.63, -0.22, 0.22)
 GRID, ORIENTATIONS, LAYOUTS = 5, 3, 40
 CENTRE, CORNER_M = (0.265, 0.0), 0.075
 APART_M = 0.22
-"""The bottle starts at least this far from the can."""
+"""Every bottle starts at least this far from the can."""
+BESIDE_M = 0.10
+"""Places of the pick grid that are in use at once are at least this far apart."""
 NOVEL = 9000
 """Distractors are generic instances from here on, which no training draws."""
 
@@ -74,22 +76,29 @@ def _tracks(task: Task, layouts: list[tuple[Placement, ...]], aggregation: tuple
 
 
 def _pick(task: Task, turn: int, cell: int) -> tuple[Placement, ...]:
-    rng = np.random.default_rng([41, turn, cell])
-    spot = DESK.at(cell // GRID / (GRID - 1), cell % GRID / (GRID - 1))
-    names = rivals(rng, task.stem)
-    spots = scatter(rng, DESK, [radius_m(name) for name in names], [(spot, radius_m(task.personal))], gap_m=0.06)
-    yaw = 2 * np.pi / ORIENTATIONS * turn
-    return place(task.personal, spot, yaw), *(place(name, at, turned(rng)) for name, at in zip(names, spots, strict=True))
+    """The look-alikes stand on other places of the grid, so that neither place nor yaw tells the target."""
+    rng, spin = np.random.default_rng([41, turn, cell]), turned(np.random.default_rng([45, cell]))
+    grid = [DESK.at(i / (GRID - 1), j / (GRID - 1)) for i in range(GRID) for j in range(GRID)]
+    others: list[Spot] = []
+    for i in rng.permutation(len(grid)).tolist():
+        if len(others) < 2 and all(np.hypot(grid[i][0] - x, grid[i][1] - y) > BESIDE_M for x, y in (grid[cell], *others)):
+            others.append(grid[i])
+    rest = (place(name, at, turned(rng)) for name, at in zip(rivals(rng, task.stem), others, strict=True))
+    return place(task.personal, grid[cell], spin + 2 * np.pi / ORIENTATIONS * turn), *rest
 
 
 def _near(task: Task, layout: int) -> tuple[Placement, ...]:
-    """The can keeps 9 cm clear all around, so that there is room beside it."""
+    """The can keeps clear all around, so that there is room beside it; the target is the nearest to it, the middle one and the farthest in turn."""
     rng = np.random.default_rng([42, layout])
     names = rivals(rng, task.stem)
+    wide = max(radius_m(name) for name in (task.personal, *names))
     while True:
-        can, mine, *others = scatter(rng, DESK, [0.06, *(radius_m(name) for name in (task.personal, *names))], gap_m=0.065)
-        if np.hypot(can[0] - mine[0], can[1] - mine[1]) > APART_M and DESK.x0 + 0.03 < can[0] < DESK.x1 - 0.03:
+        can, *bottles = scatter(rng, DESK, [0.06, wide, wide, wide], gap_m=0.065)
+        far = sorted((float(np.hypot(can[0] - x, can[1] - y)), (x, y)) for x, y in bottles)
+        if far[0][0] > APART_M and DESK.x0 + 0.03 < can[0] < DESK.x1 - 0.03:
             break
+    mine = far.pop(layout % 3)[1]
+    others = [far[i][1] for i in rng.permutation(2)]
     placed = zip((task.personal, task.goal, *names), (mine, can, *others), strict=True)
     return tuple(place(name, spot, turned(rng)) for name, spot in placed)
 
@@ -111,7 +120,7 @@ def _square(task: Task, episode: int) -> tuple[Placement, ...]:
     mine, goal = list(permutations(range(4), 2))[episode % 12]
     corners = [(CENTRE[0] + CORNER_M * i, CENTRE[1] + CORNER_M * j) for i in (-1, 1) for j in (-1, 1)]
     others = [i for i in range(4) if i not in (mine, goal)]
-    yaw = 0.5 * np.pi * (episode // 12)
+    yaw = turned(np.random.default_rng([46, *task.name.encode(), episode % 12])) + 0.5 * np.pi * (episode // 12)
     placed = [place(task.personal, corners[mine], yaw)]
     if task.goal:
         placed.append(place(task.goal, corners[goal], 0.0))
