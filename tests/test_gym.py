@@ -69,4 +69,8 @@ def test_a_row_of_your_own_is_checked_and_run():
     bad = type(row)(**{name: getattr(row, name) for name in row.__slots__} | {"variant": "disco"})
     with pytest.raises(BadSuite, match="row 1, field 'variant': 'disco' is unknown; known: base"):
         env.reset(options={"row": bad})
+    with pytest.raises(BadSuite, match="no episode -1; vap/simpler-bridge/pick-shaver-v0 has 0 .. 23"):
+        env.reset(options={"episode": -1})
+    with pytest.raises(BadSuite, match="is no EpisodeRow for wx250s"):
+        env.reset(options={"row": suites.rows("vlabench", "select-shoe", 1)[0]})
     env.close()

@@ -5,6 +5,7 @@ action is one control step in the suite's control (values.Action). The reward is
 """
 
 import re
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -13,6 +14,7 @@ from gymnasium import spaces
 from gymnasium.envs import registration
 
 from vap_core import suites
+from vap_core.errors import BadSuite
 from vap_core.sim.env import Env
 from vap_core.sim.objects import extent_m, get
 from vap_core.sim.scenes import Meshes, Scene, build
@@ -22,6 +24,8 @@ from vap_core.values import EpisodeRow, Rgb
 
 LONGEST_M, LONGEST_RAD = 0.25, 1.5
 """Bounds of the action space, per second; the robot's own limits are enforced in any case."""
+MOST_SCENES = 16
+"""Compiled scenes kept, one per variant and set of objects."""
 CHARSET = "".join(map(chr, range(32, 127)))
 
 
@@ -59,15 +63,19 @@ class VapEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         self.action_space = spaces.Box(np.append(-most, np.float32(0)), np.append(most, np.float32(1)), dtype=np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode. Raises: BadSuite for a row that cannot be run, IndexError for an episode that the list lacks."""
+        """Start an episode; a seed reaches the sensor's noise, too. Raises: BadSuite for a row that cannot be run here."""
         super().reset(seed=seed)
         options = options or {}
         row = options.get("row")
         if row is None:
-            drawn = int(self.np_random.integers(len(self.rows)))
-            row = self.rows[options.get("episode", drawn)]
+            number = options.get("episode", int(self.np_random.integers(len(self.rows))))
+            if number not in range(len(self.rows)):
+                raise BadSuite(f"reset: no episode {number!r}; {self.spec.id if self.spec else 'the list'} has 0 .. {len(self.rows) - 1}.")
+            row = self.rows[number]
+        if not isinstance(row, EpisodeRow) or suites.suite(row.suite).robot != self.suite.robot:
+            raise BadSuite(f"reset: {row!r:.80} is no EpisodeRow for {self.suite.robot}; take one of vap_core.suites.rows and replace its fields.")
         check([row])
-        self._start(row)
+        self._start(row if seed is None else replace(row, seed=seed))
         return self._observe(), self._info()
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
@@ -93,6 +101,8 @@ class VapEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         models = tuple(dict.fromkeys(place.model for known in (*self.rows, row) if known.variant == row.variant for place in known.placements))
         key = (row.variant, models)
         if key not in self._scenes:
+            if len(self._scenes) >= MOST_SCENES:
+                self._scenes.pop(next(iter(self._scenes))).close()
             self._scenes[key] = build(self.suite.robot, models, look=VARIANTS[row.variant].look, meshes=self.robots)
         self._env = Env(
             self._scenes[key], image_size=self.image_size, cameras=self.suite.cameras, control=self.suite.control, sensor=self.suite.sensor
@@ -108,7 +118,9 @@ class VapEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         assert self._judge is not None
         outcome, row = self._judge.outcome(), self._judge.row
         measured = {name: getattr(outcome, name) for name in ("success", "success_once", "held_steps", "wrong_object", "first_object_correct")}
-        return {"episode": row.episode, "variant": row.variant, "split": row.split, "steps": outcome.steps, "cmr": bool(outcome.cmr), **measured}
+        if outcome.cmr is not None:  # the paper defines none for selection
+            measured["cmr"] = outcome.cmr
+        return {"episode": row.episode, "variant": row.variant, "split": row.split, "steps": outcome.steps, **measured}
 
 
 def env_id(suite: str, task: str) -> str:
