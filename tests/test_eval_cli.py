@@ -78,7 +78,7 @@ def test_a_second_call_runs_nothing_more(run: tuple[Path, str]) -> None:
 def test_judged_again_nothing_changes(run: tuple[Path, str]) -> None:
     done = vap("rescore", run[0])
     assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1] == "0 of 8 episodes judged differently; 0 without a saved state or in error left out."
+    assert done.stdout.splitlines()[-1] == "0 of 8 episodes judged differently; 0 without a saved state or in error kept as they were."
     assert done.stdout.count("100 % [34, 100]") == 8
 
 
@@ -90,9 +90,9 @@ def test_another_number_of_episodes_is_another_run(run: tuple[Path, str]) -> Non
 
 
 @pytest.mark.slow
-def test_episodes_without_a_saved_state_are_left_out(copied: Path) -> None:
+def test_episodes_without_a_saved_state_keep_their_outcome(copied: Path) -> None:
     shutil.rmtree(copied / "traces")
-    assert rescore(copied).endswith("0 of 0 episodes judged differently; 8 without a saved state or in error left out.")
+    assert rescore(copied).endswith("0 of 0 episodes judged differently; 8 without a saved state or in error kept as they were.")
 
 
 @pytest.mark.slow

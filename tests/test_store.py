@@ -1,13 +1,11 @@
 """Results are appended, never mixed and never overwritten."""
 
-import json
 from pathlib import Path
 
-import pyarrow.parquet as pq
 import pytest
 
 from vap_core.errors import BadOutput
-from vap_core.store import KEY, append, digest, open_run, publish, read
+from vap_core.store import KEY, append, digest, open_run, read
 
 ROW = {"suite": "s", "task": "t", "method": "vap", "episode": 0, "success": True}
 
@@ -70,18 +68,3 @@ def test_foreign_folders_and_files_are_left_alone(tmp_path: Path) -> None:
     (tmp_path / "run" / "run.json").write_text("{")
     with pytest.raises(BadOutput, match="damaged"):
         open_run(tmp_path / "run", {})
-
-
-def test_published_results_keep_their_configurations_and_leave_tracebacks_behind(tmp_path: Path) -> None:
-    for name in ("one", "two"):
-        run = open_run(tmp_path / name, {"seed": name})
-        append(run, [{**ROW, "detail": "Traceback ...", "seconds_ik": 0.1, "cmr": None if name == "one" else True}])
-    target = tmp_path / "results" / "both.parquet"
-    assert publish([tmp_path / "one", tmp_path / "two"], target) == 2
-    table = pq.read_table(target)
-    assert set(table.column_names) == {*KEY, "success", "cmr", "configuration"}
-    notes = json.loads(table.schema.metadata[b"runs"])
-    assert [note["configuration"]["seed"] for note in notes] == ["one", "two"]
-    assert table["configuration"].to_pylist() == [note["digest"] for note in notes]
-    with pytest.raises(BadOutput, match="holds no results; name the folder"):
-        publish([tmp_path / "nothing"], target)

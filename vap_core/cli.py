@@ -207,15 +207,16 @@ def rescore(run: Annotated[Path, typer.Argument(help="Run folder of eval, rollou
 @app.command()
 def publish(
     runs: Annotated[list[Path], typer.Argument(help="Run folders of eval, rollout or demo.")],
-    to: Annotated[Path, typer.Option(help="The table to write, for example data/results/bounds.parquet.")],
+    to: Annotated[Path, typer.Option(help="The table to write, for example data/results/mine.parquet.")],
+    replace: Annotated[bool, typer.Option("--replace", help="Overwrite that table.")] = False,
 ) -> None:
     """Keep the results of finished runs as one small table, with their configurations.
 
-    Example: python -m vap_core publish data/runs/expert-all data/runs/random-all --to data/results/bounds.parquet
+    Example: python -m vap_core publish data/runs/expert-all data/runs/random-all --to data/results/bounds.parquet --replace
     """
-    from vap_core.store import publish as keep
+    from vap_core.publish import publish as keep
 
-    print(f"wrote {to}: {keep(runs, to)} episodes")
+    print(f"wrote {to}: {keep(runs, to, replace=replace)} episodes")
 
 
 @app.command()

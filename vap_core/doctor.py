@@ -86,7 +86,11 @@ def _lists() -> tuple[str, str]:
 
 
 def _menagerie() -> tuple[str, str]:
+    from vap_core.sim.robots.menagerie import MODELS
+
     if root := os.environ.get("MENAGERIE_ROOT"):
+        if absent := [model for model in MODELS.values() if not (Path(root) / model).is_dir()]:
+            raise VapError(f"MENAGERIE_ROOT={root} lacks {', '.join(absent)}")
         return "menagerie", f"MENAGERIE_ROOT={root}"
     raise VapError("MENAGERIE_ROOT unset; --robots menagerie downloads its meshes, the plain robots need nothing")
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 from vap_core import suites
 from vap_core.experiments import Study
+from vap_core.files import write_atomic
 from vap_core.metrics import Score, rate, score, step_times
 from vap_core.plots import scores_figure, write_png
-from vap_core.store import write_atomic
 
 if TYPE_CHECKING:
     import pandas as pd

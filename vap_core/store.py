@@ -3,7 +3,6 @@
 import fcntl
 import hashlib
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from vap_core.errors import BadOutput
+from vap_core.files import write_atomic
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -35,11 +35,9 @@ def open_run(folder: Path, configuration: Mapping[str, Any]) -> Path:
     if folder.exists() and not folder.is_dir():
         raise BadOutput(f"open_run: {folder} is a file; choose another folder with --out.")
     if path.exists():
-        held = note(folder)["digest"]
-        if held != digest(configuration):
-            raise BadOutput(
-                f"open_run: {folder} holds another run (configuration {held}, now {digest(configuration)}); choose another folder with --out."
-            )
+        held = note(folder)
+        if held["digest"] != digest(configuration):
+            raise BadOutput(f"open_run: {folder} holds another run ({_differences(held, configuration)}); choose another folder with --out.")
         return folder
     if folder.exists() and any(not path.name.startswith(".run.json") for path in folder.iterdir()):
         raise BadOutput(f"open_run: {folder} is not empty and holds no run; choose another folder with --out.")
@@ -49,6 +47,14 @@ def open_run(folder: Path, configuration: Mapping[str, Any]) -> Path:
     except OSError as error:
         raise BadOutput(f"open_run: {folder} cannot be written ({error.strerror}); choose another folder with --out.") from error
     return folder
+
+
+def _differences(held: Mapping[str, Any], configuration: Mapping[str, Any]) -> str:
+    """What a run was asked for and what is asked for now, where they differ."""
+    was, now = held["configuration"], json.loads(json.dumps(dict(configuration)))
+    odd = [name for name in {**was, **now} if was.get(name) != now.get(name)]
+    told = [f"{name} {was.get(name, 'unset')} there, {now.get(name, 'unset')} now" for name in odd if not isinstance(now.get(name), dict | list)]
+    return "; ".join(told or [f"other {', '.join(odd)}"])
 
 
 def note(folder: Path) -> dict[str, Any]:
@@ -96,32 +102,6 @@ def read(folder: Path) -> "pd.DataFrame":
     return concat_tables(parts, promote_options="permissive").to_pandas().drop_duplicates(KEY).sort_values(KEY, ignore_index=True)
 
 
-def publish(folders: Sequence[Path], target: Path) -> int:
-    """Keep the results of finished runs as one table, with each run's configuration in the file's metadata; returns the number of episodes.
-
-    Tracebacks and wall times stay behind. Raises: BadOutput for a folder that holds no finished run.
-    """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    tables, notes = [], []
-    for folder in folders:
-        table = read(folder)
-        if table.empty:
-            raise BadOutput(f"publish: {folder} holds no results; name the folder that eval, rollout or demo wrote.")
-        about = note(folder)
-        columns = [name for name in table.columns if name != "detail" and not name.startswith("seconds_")]
-        tables.append(pa.Table.from_pandas(table[columns].assign(configuration=about["digest"]), preserve_index=False))
-        notes.append(about)
-    whole = pa.concat_tables(tables, promote_options="permissive")
-    metadata = {**(whole.schema.metadata or {}), b"runs": json.dumps(notes, sort_keys=True).encode()}
-    sink = pa.BufferOutputStream()
-    pq.write_table(whole.replace_schema_metadata(metadata), sink, compression="zstd")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    write_atomic(target, sink.getvalue().to_pybytes())
-    return whole.num_rows
-
-
 def _part(path: Path) -> "pa.Table":
     from pyarrow import ArrowException
     from pyarrow.parquet import read_table
@@ -130,10 +110,3 @@ def _part(path: Path) -> "pa.Table":
         return read_table(path)
     except (ArrowException, OSError) as error:
         raise BadOutput(f"read: {path} is damaged; delete it and run the same command again, its episodes run anew.") from error
-
-
-def write_atomic(path: Path, data: bytes) -> None:
-    """Write a whole file or nothing."""
-    scratch = path.with_name(f".{path.name}.{uuid4().hex}.tmp")
-    scratch.write_bytes(data)
-    os.replace(scratch, path)

@@ -8,7 +8,8 @@ from uuid import uuid4
 import numpy as np
 
 from vap_core.errors import BadOutput
-from vap_core.store import KEY, write_atomic
+from vap_core.files import write_atomic
+from vap_core.store import KEY
 from vap_core.values import Episode, Truth
 
 

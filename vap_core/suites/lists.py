@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any, get_args
 
 from vap_core.errors import BadSuite
-from vap_core.store import write_atomic
+from vap_core.files import write_atomic
 from vap_core.suites.variants import VARIANTS
 from vap_core.values import EpisodeRow, Placement, Rule
 
 FOLDER = Path(__file__).resolve().parents[2] / "data" / "suites"
+CLOSE_M = 0.02
 FAR = 1e6
 """No honest number in a row is larger; nan and inf are not smaller either."""
 _TEXT = ("suite", "task", "instruction", "category", "rule", "goal", "split", "variant")
@@ -126,6 +127,9 @@ def _row(line: str, where: str) -> EpisodeRow:
             raise bad("placements", f"{place[0]!r} stands at {place[1:]}; x, y (m) and yaw (rad) must be finite numbers")
         if max(abs(place[1]), abs(place[2])) > 2.0:
             raise bad("placements", f"{place[0]!r} stands {max(abs(place[1]), abs(place[2])):g} m away; metres, within 2 of the robot")
+        for other in places[:i]:
+            if place[0] != other[0] and max(abs(place[1] - other[1]), abs(place[2] - other[2])) < CLOSE_M:
+                raise bad("placements", f"{place[0]!r} and {other[0]!r} stand in the same place; objects keep at least {CLOSE_M} m apart")
     names = [place[0] for place in places]
     if len(set(names)) < len(names):
         raise bad("placements", f"an object is placed twice in {names}")
