@@ -126,7 +126,7 @@ def upset(step):
         (on(0.0, by=(ROBOT,)), False),
         (on(0.0, height=0.012 + 0.0199), True),
         (on(0.0, height=0.012 + 0.0201), False),
-        (on(0.0, height=0.0019), False),
+        (on(0.0, height=-0.036), False),
         (upset(on(0.0)), False),
     ],
     ids=[

@@ -23,6 +23,8 @@ ABOVE_M = 0.04
 ARRIVED_M, ARRIVED_RAD = 0.006, 0.06
 PATIENCE_S = 1.2
 """Longest wait at a waypoint that is not quite reached."""
+JAW_GAP_M = 0.003
+"""Room between an object and the jaw that does not move."""
 ELSEWHERE = 5
 """After an empty grasp the next one is tried so many places down the list: its neighbours differ too little."""
 BESIDE_M = 0.035
@@ -141,9 +143,16 @@ def _reachable(env: Env, grasp: Grasp) -> Float64[np.ndarray, "4 4"] | None:
     now = env.command.tcp_base
     poses = [_pose(env, grasp.tcp_world, grasp.axis_rad + turn) for turn in (0.0, np.pi)]
     for pose in sorted(poses, key=lambda pose: _off(pose, now)[1]):
+        pose[:3, 3] -= pose[:3, 1] * _beside_jaw(env, grasp)
         if (reached := _try(env, pose, 0.003)) is not None and _try(env, _raised(pose, 0.04), 0.006) is not None:
             return reached
     return None
+
+
+def _beside_jaw(env: Env, grasp: Grasp) -> float:
+    """How far along the opening axis the hand moves so that a jaw that does not move stands close by: what is swept far topples."""
+    jaw = env.robot.fixed_jaw_m
+    return float(np.sign(jaw) * max(abs(jaw) - grasp.span_m / 2 - JAW_GAP_M, 0.0))
 
 
 def _try(env: Env, pose: Float64[np.ndarray, "4 4"], tolerance_m: float) -> Float64[np.ndarray, "4 4"] | None:
@@ -173,7 +182,7 @@ def _set_down(env: Env, truth: Truth) -> list[Waypoint]:
     if down is None:
         raise OutOfReach(f"Expert: {env.row.key}: {env.robot.name} cannot reach {env.row.goal} with {env.row.target} in its hand; move it closer.")
     over = _above(env, down, foot - floor)
-    return [Waypoint(over, 0.0, 0.1), Waypoint(down, 0.0, 0.15), Waypoint(down, 1.0, 0.1), Waypoint(_above(env, down, 0.08), 1.0)]
+    return [Waypoint(over, 0.0, 0.1), Waypoint(down, 0.0, 0.15), Waypoint(down, 1.0, 0.1), Waypoint(_above(env, down, 0.08), 1.0, 0.8)]
 
 
 def _turned(

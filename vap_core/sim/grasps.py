@@ -29,13 +29,15 @@ FINGER_M, PAD_M = 0.022, 0.012
 
 @value
 class Grasp:
-    """One way to take an object: the tcp (metres, world), the opening axis' angle in the world (radians), the width between the fingers (m),
-    how much that width changes with height (a taper slips), and the least distance of the open fingers to anything else (m).
+    """One way to take an object: the tcp (metres, world), the opening axis' angle in the world (radians), the width between the fingers and
+    the whole object's along that axis (m), how much the width changes with height (a taper slips), and the least distance of the open
+    fingers to anything else (m).
     """
 
     tcp_world: Float64[np.ndarray, "3"]
     axis_rad: float
     width_m: float
+    span_m: float
     taper: float
     clear_m: float
 
@@ -86,9 +88,8 @@ def cut(name: str, pose: Pose, z_world: float) -> Float64[np.ndarray, "n 2"]:
 def grasps(robot: Robot, target: str, poses: Mapping[str, Pose]) -> list[Grasp]:
     """Every grasp of `target` that fits the gripper and hits nothing, the clearest first; then those that hit something, should none be clear."""
     points = points_world(target, poses[target])
-    foot, top = float(points[:, 2].min()), float(points[:, 2].max())
     others = [_rims(name, pose) for name, pose in poses.items() if name != target]
-    found = list(_candidates(robot, target, poses[target], foot, top, others))
+    found = list(_candidates(robot, target, poses[target], points, others))
     return sorted(found, key=lambda grasp: (round(max(ROOM_M - grasp.clear_m, 0.0) + TAPER_M * grasp.taper, 6), round(grasp.width_m, 6)))
 
 
@@ -103,8 +104,11 @@ def _rims(name: str, pose: Pose) -> Float64[np.ndarray, "n 3"]:
     return np.concatenate(points)
 
 
-def _candidates(robot: Robot, target: str, pose: Pose, foot: float, top: float, others: Sequence[Float64[np.ndarray, "_ 3"]]) -> Iterator[Grasp]:
+def _candidates(
+    robot: Robot, target: str, pose: Pose, points: Float64[np.ndarray, "n 3"], others: Sequence[Float64[np.ndarray, "_ 3"]]
+) -> Iterator[Grasp]:
     tried: set[float] = set()
+    foot, top = float(points[:, 2].min()), float(points[:, 2].max())
     for share in SHARES:
         z = float(max(foot + share * (top - foot), top - 0.9 * robot.palm_m, TIP_M))
         outline = cut(target, pose, min(z, top - 0.002))
@@ -121,7 +125,9 @@ def _candidates(robot: Robot, target: str, pose: Pose, foot: float, top: float, 
             spans = [np.ptp(part @ axis) if len(part) else 0.0 for part in (higher, lower)]
             middle = axis * (along.min() + along.max()) / 2 + np.array([-axis[1], axis[0]]) * (across.min() + across.max()) / 2
             taper = abs(float(spans[1] - spans[0])) / (2 * HALF_PAD_M)
-            yield Grasp(np.array([*middle, z]), float(yaw), width, taper, _clearance(robot, middle, axis, z, others))
+            yield Grasp(
+                np.array([*middle, z]), float(yaw), width, float(np.ptp(points[:, :2] @ axis)), taper, _clearance(robot, middle, axis, z, others)
+            )
 
 
 def _clearance(robot: Robot, middle: np.ndarray, axis: np.ndarray, z: float, others: Sequence[Float64[np.ndarray, "_ 3"]]) -> float:

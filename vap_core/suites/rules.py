@@ -3,8 +3,8 @@
 *Picked*: raised more than 1 cm above where it settled and touching nothing but the robot, for at least 5 steps in a row.
 *Near*: moved more than 3 cm and more than any other object, its centre within both half-diagonals + 10 cm of the goal's, the goal its
 nearest neighbour, on the table or in the hand, and nobody dropped by 2 cm. *Put*: its centre within the receptacle's half-diagonal (+ 3 mm)
-of the receptacle's, which stands upright, its underside above the receptacle's and no more than 2 cm above the rim, touching the receptacle
-and besides it at most the robot. *Selected*: pressed by the gripper for more than 10 ms, no other object touched by the robot before.
+of the receptacle's, which stands upright, its middle above the receptacle's foot, its underside no more than 2 cm above the rim, touching
+the receptacle and besides it at most the robot. *Selected*: pressed by the gripper for more than 10 ms, no other object touched by the robot before.
 The goal of a task is no object to be confused with: touching or moving it is neither right nor wrong.
 *CMR* (P 5.1): the target moved more than 3 cm from where it settled, at least once, whatever the outcome; undefined for selection.
 """
@@ -24,7 +24,7 @@ NEAR_M = 0.10
 DROPPED_M = 0.02
 OVER_M, GAP_M = 0.003, 0.02
 PRESSED_S = 0.010
-UNDER_M, UPRIGHT = 0.002, 0.8
+UPRIGHT = 0.8
 STILL_M, STILL_STEPS = 0.001, 5
 """Let go, and moved less than this in the last of so many steps at the goal: the episode may end."""
 LIFTED_M = 0.05
@@ -144,12 +144,14 @@ def _put(judge: Judge) -> bool:
     target, goal = judge.row.target, judge.row.goal
     partners = judge.now.contacts.get(target, frozenset())
     stand = judge.now.objects_world[goal]
-    foot = float(_box(judge.now, judge.sizes_m, target)[:, 2].min() - stand[2])
+    box = _box(judge.now, judge.sizes_m, target)
+    foot = float(box[:, 2].min() - stand[2])
     return (
         goal in partners
         and partners <= {goal, ROBOT}
         and _apart_m(judge, target, goal) <= _half_diagonal_m(judge.sizes_m[goal]) + OVER_M
-        and UNDER_M < foot <= judge.sizes_m[goal][2] + GAP_M
+        and foot <= judge.sizes_m[goal][2] + GAP_M
+        and bool(box[:, 2].mean() > stand[2])
         and bool(1 - 2 * (stand[4] ** 2 + stand[5] ** 2) > UPRIGHT)
     )
 

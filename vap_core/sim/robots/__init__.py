@@ -22,6 +22,7 @@ class Robot:
     straws may go deeper).
     `down_base` is the tcp's rotation in the robot base frame when the gripper points straight down, its opening axis across the table:
     the state's rotation vector is counted from it, so that a turn about the vertical reads (0, 0, yaw).
+    `fixed_jaw_m` is where, along the tcp's y, the pad of a jaw that does not move stands; 0 when both fingers close alike.
     `hand_m` is half the palm's length along the opening axis and half its width across it, for what may stand beside a grasp.
     `turn_cost` is what one radian of error costs the inverse kinematics beside one metre: where both cannot be met, little makes the hand
     lean and keeps its place. `lean_rad` is how far the hand of an arm of five joints may lean before a pose counts as out of reach.
@@ -42,6 +43,7 @@ class Robot:
     base_world: Pose
     links: tuple[str, ...]
     down_base: Float64[np.ndarray, "3 3"]
+    fixed_jaw_m: float = 0.0
     hand_m: tuple[float, float] = (0.055, 0.035)
     table_m: tuple[float, float, float, float] = (-0.27, -0.65, 0.83, 0.65)
     floor_z_m: float = -0.75
@@ -114,6 +116,7 @@ ROBOTS: dict[str, Robot] = {
         base_world=ORIGIN,
         links=("base", "shoulder", "upper_arm", "lower_arm", "wrist", "gripper", "moving_jaw_so101_v1"),
         down_base=np.diag([1.0, -1.0, -1.0]),
+        fixed_jaw_m=-0.0335,
         hand_m=(0.06, 0.03),
         table_m=(-0.2, -0.45, 0.6, 0.45),
         turn_cost=0.01,
