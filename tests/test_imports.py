@@ -296,6 +296,13 @@ def test_up_decides_how_it_stands(tmp_path, quick):
         assert body.form.vertex.min(axis=0) == pytest.approx((-size[0] / 2, -size[1] / 2, 0), abs=1e-6)
 
 
+def test_a_body_thinner_than_a_card_is_refused(tmp_path, quick):
+    slab = trimesh.creation.box(extents=(0.07, 0.07, 0.00001))
+    slab.visual = trimesh.visual.ColorVisuals(slab, vertex_colors=np.tile([180, 40, 40, 255], (len(slab.vertices), 1)))
+    with pytest.raises(BadObject, match=r"only 0.001 cm thick, less than 0.2 cm; give it thickness"):
+        bring(put(tmp_path, "flat.ply", slab), "flat", "cup", say=silent)
+
+
 def test_a_sheet_encloses_nothing(tmp_path, quick):
     sheet = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]], [[0, 1, 2], [0, 2, 3], [0, 2, 1], [0, 3, 2]], process=False)
     with pytest.raises(BadObject, match="encloses no volume|not watertight"):

@@ -26,7 +26,7 @@ from vap_core.sim.scans.triangles import Faces, Vertices, decimate, normals
 from vap_core.sim.shapes import Hull
 
 VISUAL_FACES, TEXTURE_PX, HULLS, HULL_CORNERS = 3000, 1024, 16, 160
-SMALLEST_M, LARGEST_M = 0.01, 0.6
+SMALLEST_M, LARGEST_M, THINNEST_M = 0.01, 0.6, 0.002
 SLIVER_M3 = 1e-9
 DENSITY_KG_M3, MASS_KG = 400.0, (0.03, 0.5)
 TURN = {"z": np.eye(3), "y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])}
@@ -102,6 +102,9 @@ def _upright(source: Source, path: Path, up: Literal["y", "z"], height_cm: float
             f"objects: {path} would be {_length(size.max())} long; an object is {_length(SMALLEST_M)} to {_length(LARGEST_M)}, "
             f"so its units are most likely not metres; {mend}."
         )
+    if size.min() < THINNEST_M:
+        thin = f"{path} would be only {_length(size.min())} thick, less than {_length(THINNEST_M)}"
+        raise BadObject(f"objects: {thin}; give it thickness in your 3-D tool (solidify).")
     middle = np.array([*(low + high)[:2] / 2, low[2]])
     vertex = scale * (turned - middle)
     corner = vertex[source.face]
