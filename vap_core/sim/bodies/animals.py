@@ -39,10 +39,6 @@ def _spike(radius: Number, length: Number, paint: int, sides: int = 5) -> Mesh:
     return lathe([(radius, 0), (0, length)], paint, sides)
 
 
-FEET = ((0.55, -0.72), (0.62, 0.55))
-"""Where a plushie's feet are, in half-widths and half-lengths."""
-
-
 @value
 class Cat:
     """A cat that sits on its haunches, about half as wide as tall."""
