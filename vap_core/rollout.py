@@ -17,6 +17,7 @@ from vap_core.attend import Attender, AttendState
 from vap_core.errors import BadAction, OutOfReach, VapError
 from vap_core.policies import Insider, Policy
 from vap_core.sim.env import Control, Env
+from vap_core.sim.occluder import Occlusion
 from vap_core.sim.scenes import Scene
 from vap_core.sim.sensor import PERFECT, Sensor
 from vap_core.suites import Judge
@@ -47,6 +48,7 @@ class Trial:
     control: Control = "ee"
     sensor: Sensor = PERFECT
     images_every: int = 0
+    occlusion: Occlusion | None = None
 
 
 @dataclass
@@ -90,7 +92,7 @@ def rollout(
 
 
 def _begin(trial: Trial, row: EpisodeRow, watched: bool) -> Running:
-    env = Env(trial.scene, cameras=row.cameras or None, control=trial.control, sensor=trial.sensor)
+    env = Env(trial.scene, cameras=row.cameras or None, control=trial.control, sensor=trial.sensor, occlusion=trial.occlusion)
     env.reset(row)
     one = Running(row, env, None, Judge.start(row, trial.sizes_m, env.truth()), None, watched)
     one.policy_state = _guard(one, trial.policy.start, np.random.default_rng([row.seed, row.episode]))

@@ -14,6 +14,8 @@ from vap_core.values import Camera, Mask, Rgb, value
 ensure_gl()
 import mujoco  # noqa: E402
 
+from vap_core.sim.occluder import Screen, draw  # noqa: E402
+
 HIDDEN_GROUP = 5
 """Geom group that is never drawn."""
 _FLIP = np.diag([1.0, -1.0, -1.0])
@@ -129,14 +131,16 @@ class Eyes:
             renderer.close()
         self._renderers.clear()
 
-    def rgb(self, data: mujoco.MjData, name: str, size: int, hidden: frozenset[str] = frozenset()) -> Rgb:
-        """What camera `name` sees, `size` x `size` pixels."""
-        renderer = self._look(data, name, size, hidden)
+    def rgb(self, data: mujoco.MjData, name: str, size: int, hidden: frozenset[str] = frozenset(), before: Sequence[Screen] = ()) -> Rgb:
+        """What camera `name` sees, `size` x `size` pixels; `before` stands in its way."""
+        renderer = self._look(data, name, size, hidden, before)
         return np.ascontiguousarray(renderer.render())
 
-    def masks(self, data: mujoco.MjData, name: str, size: int, hidden: frozenset[str] = frozenset()) -> Mapping[str, Mask]:
-        """Visible pixels of every object that is not hidden, in camera `name`."""
-        renderer = self._look(data, name, size, hidden)
+    def masks(
+        self, data: mujoco.MjData, name: str, size: int, hidden: frozenset[str] = frozenset(), before: Sequence[Screen] = ()
+    ) -> Mapping[str, Mask]:
+        """Visible pixels of every object that is not hidden, in camera `name`; `before` stands in its way."""
+        renderer = self._look(data, name, size, hidden, before)
         renderer.enable_segmentation_rendering()
         try:
             drawn = renderer.render()
@@ -146,13 +150,14 @@ class Eyes:
         owner = np.where(geom >= 0, self._owner[geom], -1)
         return {each: owner == i for i, each in enumerate(self.objects) if each not in hidden}
 
-    def _look(self, data: mujoco.MjData, name: str, size: int, hidden: frozenset[str]) -> mujoco.Renderer:
+    def _look(self, data: mujoco.MjData, name: str, size: int, hidden: frozenset[str], before: Sequence[Screen]) -> mujoco.Renderer:
         renderer = self._renderers.get(size)
         if renderer is None:
             renderer = self._renderers[size] = mujoco.Renderer(self.model, size, size, max_geom=self.model.ngeom + 64)
         unseen = np.isin(self._owner, [i for i, each in enumerate(self.objects) if each in hidden])
         self.model.geom_group[:] = np.where(unseen, HIDDEN_GROUP, self._groups)
         renderer.update_scene(data, camera=name)
+        draw(renderer.scene, before)
         for flag in (mujoco.mjtRndFlag.mjRND_REFLECTION, mujoco.mjtRndFlag.mjRND_SKYBOX, mujoco.mjtRndFlag.mjRND_HAZE):
             renderer.scene.flags[flag] = 0
         renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = int(self.shadows)

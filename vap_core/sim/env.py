@@ -13,6 +13,7 @@ from vap_core.sim import cameras as optics
 from vap_core.sim import control as steering
 from vap_core.sim.contacts import ARM, STILL, Touch, hand, partners, roles
 from vap_core.sim.control import Command, arm, follow, rotation_vector
+from vap_core.sim.occluder import Occlusion, Screen, screens
 from vap_core.sim.scenes import Scene, parked
 from vap_core.sim.sensor import PERFECT, Sensor, Stray, exposed, stray
 from vap_core.values import EE_ACTION, REST, ROBOT, Action, Camera, EpisodeRow, PolicyInput, Rgb, Truth, value
@@ -41,12 +42,20 @@ class Snapshot:
 class Env:
     """One running episode in `scene`. The same row in the same scene gives bit-identical states and images, whatever else runs.
 
-    `control` says what an action is (values.Action); `sensor` what the cameras do to what they see.
+    `control` says what an action is (values.Action); `sensor` what the cameras do to what they see; `occlusion` what hides the target from
+    them, and when.
     `seconds` sums wall time by part: "physics", "ik", "render", "truth".
     """
 
     def __init__(
-        self, scene: Scene, *, image_size: int = 224, cameras: Sequence[str] | None = None, control: Control = "ee", sensor: Sensor = PERFECT
+        self,
+        scene: Scene,
+        *,
+        image_size: int = 224,
+        cameras: Sequence[str] | None = None,
+        control: Control = "ee",
+        sensor: Sensor = PERFECT,
+        occlusion: Occlusion | None = None,
     ) -> None:
         self.scene = scene
         self.robot = scene.robot
@@ -54,10 +63,14 @@ class Env:
         self.image_size = image_size
         self.control = control
         self.sensor = sensor
+        self.occlusion = occlusion
         self.camera_names = tuple(scene.cameras if cameras is None else cameras)
         for name in self.camera_names:
             if name not in scene.cameras:
                 raise one_of("Env: camera", name, scene.cameras)
+        for name in () if occlusion is None or occlusion.cameras is None else occlusion.cameras:
+            if name not in self.camera_names:
+                raise one_of("Env: camera of the occlusion", name, self.camera_names)
         self.seconds = dict.fromkeys(("physics", "ik", "render", "truth"), 0.0)
         self._model = model = scene.model
         self._data = mujoco.MjData(model)
@@ -139,7 +152,10 @@ class Env:
         """The raw views and the proprioception: tcp position (m) and rotation vector from straight down (rad), opening 0..1, joint angles (rad)."""
         with self._timed("render"):
             hidden = self._hidden()
-            images = {name: self._seen(name, self.scene.eyes.rgb(self._data, name, self.image_size, hidden)) for name in self.camera_names}
+            images = {
+                name: self._seen(name, self.scene.eyes.rgb(self._data, name, self.image_size, hidden, self._before(name)))
+                for name in self.camera_names
+            }
         return PolicyInput(images, text, self.state())
 
     def state(self) -> Float32[np.ndarray, " s"]:
@@ -179,7 +195,7 @@ class Env:
             seen: Mapping[str, Mapping[str, np.ndarray]] = {}
             if masks:
                 hidden = self._hidden()
-                seen = {name: self.scene.eyes.masks(self._data, name, self.image_size, hidden) for name in self.camera_names}
+                seen = {name: self.scene.eyes.masks(self._data, name, self.image_size, hidden, self._before(name)) for name in self.camera_names}
             return Truth(poses, links, self._touch.touched, self._touch.pressed_s, self._touch.contacts, seen)
 
     def cameras(self) -> tuple[Camera, ...]:
@@ -247,7 +263,18 @@ class Env:
     def _seen(self, camera: str, rgb: Rgb) -> Rgb:
         if self._row is None or camera not in self._strays:
             return rgb
-        return exposed(self.sensor, rgb, self._strays[camera], self._row, camera, round(self.time_s * self.hz))
+        return exposed(self.sensor, rgb, self._strays[camera], self._row, camera, self._step())
+
+    def _before(self, camera: str) -> tuple[Screen, ...]:
+        """What the occluder puts before `camera` now; the episode decides from which side an arm comes."""
+        if self._row is None or self.occlusion is None or not self.occlusion.covers(camera, self._step()):
+            return ()
+        tilt = float(np.random.default_rng([self._row.episode, self.camera_names.index(camera)]).uniform(-1.0, 1.0))
+        return screens(self.occlusion.kind, self._model, self._data, camera, self._row.target, self.robot.links, tilt)
+
+    def _step(self) -> int:
+        """Control steps since the first observation."""
+        return round(self.time_s * self.hz)
 
     def _targets(self, joints: Float64[np.ndarray, " n"], gripper: float) -> Float64[np.ndarray, " m"]:
         shut, wide = np.array(self.robot.fingers_closed), np.array(self.robot.fingers_open)
