@@ -8,17 +8,34 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vap_core.sim import objects
+from vap_core.sim import crafts, fabrics, objects, textures
 from vap_core.training import detector, evaluation, perception, phrases, scenes, segmenter
 
 
 @given(st.integers(0, 10**6), st.booleans())
 def test_no_evaluation_object_is_ever_cast(seed: int, held_out: bool) -> None:
-    models = scenes.cast(np.random.default_rng(seed), held_out)
+    models, crew = scenes.cast(np.random.default_rng(seed), held_out)
     assert {model.split for model in models} == {"generic"}
     assert not {model.name for model in models} & set(objects.OBJECTS)
-    numbers = [int(model.name.rpartition("-")[2]) for model in models]
+    numbers = [int(model.name.partition("-generic-")[2].partition("-")[0]) for model in models]
     assert all((number >= scenes.HELD_OUT) == held_out for number in numbers)
+    assert len(set(numbers[:crew])) == len({model.category for model in models[:crew]}) == 1
+    assert len({model.name for model in models[:crew]}) == crew >= 2
+
+
+@given(st.sampled_from(objects.CATEGORIES), st.integers(0, 10**6), st.integers(1, 6))
+def test_twins_are_look_alikes_and_found_by_name(kind: str, index: int, number: int) -> None:
+    first, twin = objects.generic(kind, index), objects.generic(kind, index, number)
+    assert twin.name == f"{first.name}-{number}"
+    assert repr(objects.get(twin.name)) == repr(twin)
+    assert (twin.category, twin.split) == (first.category, "generic")
+    assert repr(twin.texture) != repr(first.texture)
+    assert {twin.texture.motif, first.texture.motif} <= {
+        *textures.GENERIC_GLYPHS,
+        *textures.GENERIC_FILLS,
+        *fabrics.GENERIC_FABRICS,
+        *crafts.GENERIC_CRAFTS,
+    }
 
 
 def test_evaluation_objects_are_refused() -> None:

@@ -5,6 +5,7 @@ Generic instances draw their motifs and layouts from lists that evaluation insta
 """
 
 from colorsys import hsv_to_rgb
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -106,24 +107,51 @@ def _texture(rng: np.random.Generator) -> Texture:
 
 
 @lru_cache(maxsize=4096)
-def generic(kind: str, index: int) -> ObjectModel:
-    """Training instance number `index` (0 or more) of a category or stem: the same call, the same object."""
+def generic(kind: str, index: int, twin: int = 0) -> ObjectModel:
+    """Training instance number `index` (0 or more) of a category or stem: the same call, the same object.
+
+    `twin` 1 or more is a look-alike of it, so that telling them apart can be trained without an evaluation object: decorated anew, in
+    its colours (as often with one colour changed, now and then with all), and half the time of its very shape.
+    """
     family = family_of(kind)
     rng = np.random.default_rng([20, _INDEX[family.stem], index])
     texture = _texture(rng)
     if family.paint is not None:
         texture = family.paint(texture, index)
     mass_kg = family.mass_kg * float(rng.uniform(0.8, 1.1))
-    return ObjectModel(f"{family.stem}-generic-{index:04d}", family.category, "generic", family.draw(rng), texture, mass_kg)
+    shape, name = family.draw(rng), f"{family.stem}-generic-{index:04d}"
+    if twin:
+        shape, texture, name = *_twin(family, shape, texture, index, twin), f"{name}-{twin}"
+    return ObjectModel(name, family.category, "generic", shape, texture, mass_kg)
+
+
+def _twin(family: Family, shape: Shape, texture: Texture, index: int, twin: int) -> tuple[Shape, Texture]:
+    rng = np.random.default_rng([21, _INDEX[family.stem], index, twin])
+    kind, same_shape = rng.random(), rng.random() < 0.5
+    for _ in range(20):
+        fresh = _texture(rng)
+        if family.paint is not None:
+            fresh = family.paint(fresh, int(rng.integers(2**31)))
+        base, ink = (texture.ink, texture.base) if rng.random() < 0.2 else (texture.base, texture.ink)
+        accent = texture.accent if rng.random() < 0.6 else fresh.accent
+        if kind > 0.9:
+            base, ink, accent = fresh.base, fresh.ink, fresh.accent
+        elif kind > 0.5:
+            base, ink = (base, fresh.ink) if rng.random() < 0.5 else (fresh.base, ink)
+        other = replace(fresh, base=base, ink=ink, accent=accent)
+        if (other.motif, other.layout) != (texture.motif, texture.layout) or len({base, ink} & {texture.base, texture.ink}) < 2:
+            return shape if same_shape else family.draw(rng), other
+    return family.draw(rng), other
 
 
 def get(name: str) -> ObjectModel:
     """The object of that name: one of `OBJECTS`, or `<stem>-generic-<number>`, or one of the user's own scans (see `scan`)."""
     if name in OBJECTS:
         return OBJECTS[name]
-    stem, _, digits = name.rpartition("-generic-")
-    if stem in _INDEX and digits.isdecimal() and name == f"{stem}-generic-{int(digits):04d}":
-        return generic(stem, int(digits))
+    stem, _, rest = name.rpartition("-generic-")
+    digits, _, twin = rest.partition("-")
+    if stem in _INDEX and digits.isdecimal() and (twin.isdecimal() or not twin) and generic(stem, int(digits), int(twin or 0)).name == name:
+        return generic(stem, int(digits), int(twin or 0))
     if name in (mine := scans()):
         return own(mine[name])
     raise one_of("get: object", name, [*OBJECTS, *(f"{kind}-generic-NNNN" for kind in _INDEX), *mine])

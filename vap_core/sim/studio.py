@@ -11,7 +11,7 @@ from PIL import Image
 from vap_core.errors import BadOutput
 from vap_core.sim.cameras import HIDDEN_GROUP
 from vap_core.sim.objects import VISUAL_GROUP, ObjectModel, add_object, extent_m
-from vap_core.values import Rgb, value
+from vap_core.values import Mask, Rgb, value
 
 import mujoco  # isort: skip  (cameras has chosen a GL back end)
 
@@ -70,12 +70,16 @@ class Stage:
 
     def box(self, name: str, shot: Shot = PORTRAIT) -> Float64[np.ndarray, "4"]:
         """The object's true outline in that picture, x0 y0 x1 y1 in pixels."""
+        rows, cols = np.nonzero(self.mask(name, shot))
+        return np.array([cols.min(), rows.min(), cols.max() + 1, rows.max() + 1], np.float64)
+
+    def mask(self, name: str, shot: Shot = PORTRAIT) -> Mask:
+        """The object's pixels in that picture."""
         self._turn_to(name, shot)
         self._renderer.enable_segmentation_rendering()
         drawn = self._renderer.render()
         self._renderer.disable_segmentation_rendering()
-        rows, cols = np.nonzero((drawn[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM)) & (drawn[..., 0] == self._model.geom(f"{name}/visual").id))
-        return np.array([cols.min(), rows.min(), cols.max() + 1, rows.max() + 1], np.float64)
+        return (drawn[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM)) & (drawn[..., 0] == self._model.geom(f"{name}/visual").id)
 
     def _turn_to(self, name: str, shot: Shot) -> None:
         model, (x, y, z) = self._model, extent_m(self.models[name])

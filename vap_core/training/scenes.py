@@ -1,8 +1,9 @@
-"""Pictures to train perception on: generic objects around every robot, under random looks, lamps and cameras.
+"""Rendered training scenes of generic objects on the robots' tables, with the object behind every pixel.
 
-A *stage* is one compiled scene seen many times: objects, arm, lamp and camera move between its views. Stages are numbered;
-the same seed and number give the same pixels. Training stages draw generic instances 0..`TRAIN_INSTANCES` - 1, held-out
-stages instances from `HELD_OUT` on; personal instances and look-alikes never appear (`only_generic` refuses them).
+A stage is one compiled scene: a robot, a crew of look-alikes and some other objects, seen in `VIEWS` views; the crew also sits for portraits
+in the studio, as reference photos do. Stages are numbered; the same seed and number give the same pixels. Training stages draw generic
+instances 0..`TRAIN_INSTANCES` - 1, held-out stages instances from `HELD_OUT` on; personal instances and look-alikes never appear
+(`only_generic` refuses them).
 """
 
 import os
@@ -15,24 +16,42 @@ from jaxtyping import Int64, UInt8
 from vap_core.sim import objects, robots, scenes
 from vap_core.sim.look import Look
 from vap_core.sim.objects import ObjectModel
+from vap_core.sim.studio import Shot, Stage
 from vap_core.values import value
 
 import mujoco  # isort: skip  (scenes has chosen a GL back end)
 
-SIZE = 224
-VIEWS = 12
-"""Views of one stage."""
+SIZE, PORTRAIT = 224, 256
+"""Pixels, square, of a view and of a portrait."""
+VIEWS, POSES = 12, 3
+"""Views of one stage; portraits of each member of its crew."""
+WORK = {
+    "google": ((0.515, 0.0), (0.14, 0.25)),
+    "panda": ((0.46, 0.0), (0.13, 0.20)),
+    "so101": ((0.225, 0.0), (0.09, 0.19)),
+    "wx250s": ((0.27, 0.0), (0.15, 0.20)),
+}
+"""Where each robot works: centre and half extents of a rectangle on its table, metres."""
 TRAIN_INSTANCES, HELD_OUT = 400, 100_000
 BURIED_M = -5.0
+LEAST_PX = 60
+"""Pixels of objects that a view shows."""
+ANGLES = ((-0.3, 0.3), (0.26, 0.96), (0.45, 0.75), (-1.3, 1.3), (0.45, 0.8))
+"""Of a portrait: turn and elevation (radians), share of the frame, lamp's place and strength; see studio.Shot."""
 Generator = np.random.Generator
 
 
 @value
 class Shots:
-    """Views of one stage: `ids[v]` is 0 for the rest of the scene and i + 1 where `names[i]`, of `categories[i]`, is seen."""
+    """Views of one stage: `ids[v]` is 0 for the rest of the scene and i + 1 where `names[i]`, of `categories[i]`, is seen.
+
+    The crew are the first objects, look-alikes of each other; portrait j shows number j // `POSES` of them.
+    """
 
     rgb: UInt8[np.ndarray, "v h w 3"]
     ids: UInt8[np.ndarray, "v h w"]
+    portraits: UInt8[np.ndarray, "p s s 3"]
+    portrait_ids: UInt8[np.ndarray, "p s s"]
     names: tuple[str, ...]
     categories: tuple[str, ...]
 
@@ -44,15 +63,21 @@ def only_generic(models: Sequence[ObjectModel]) -> None:
         raise ValueError(f"training.scenes: {', '.join(wrong)} belong to evaluation and are never trained on; use objects.generic.")
 
 
-def cast(rng: Generator, held_out: bool) -> list[ObjectModel]:
-    """Two to four kinds of objects, one to three instances of each, as an episode's target, look-alikes and bystanders."""
-    kinds = rng.permutation(np.array(objects.CATEGORIES + objects.CLUTTER))[: rng.integers(2, 5)]
-    models = []
-    for kind in kinds:
-        picks = rng.choice(TRAIN_INSTANCES, size=int(rng.integers(1, 4)), replace=False)
-        models += [objects.generic(str(kind), int(i) + (HELD_OUT if held_out else 0)) for i in picks]
+def cast(rng: Generator, held_out: bool) -> tuple[list[ObjectModel], int]:
+    """A crew of two to four look-alikes, then bystanders: one to three other kinds, mostly one of each. Also the crew's number."""
+    leader = str(rng.choice(objects.CATEGORIES if rng.random() < 0.9 else objects.CLUTTER))
+    others = [str(kind) for kind in rng.permutation(np.array(objects.CATEGORIES + objects.CLUTTER)) if kind != leader]
+    stems = {"cup": ("cup", "paper-cup")}
+    first = HELD_OUT if held_out else 0
+    crew = int(rng.choice([2, 3, 4], p=[0.2, 0.6, 0.2]))
+    index = first + int(rng.integers(TRAIN_INSTANCES))
+    chief = str(rng.choice(stems.get(leader, (leader,))))
+    models = [objects.generic(chief, index, int(twin)) for twin in rng.permutation(6)[:crew]]
+    for kind in others[: int(rng.integers(1, 4))]:
+        picks = rng.choice(TRAIN_INSTANCES, size=1 + int(rng.random() < 0.3), replace=False)
+        models += [objects.generic(str(rng.choice(stems.get(kind, (kind,)))), first + int(i)) for i in picks]
     only_generic(models)
-    return models
+    return models, crew
 
 
 def look(rng: Generator) -> Look:
@@ -65,7 +90,7 @@ def look(rng: Generator) -> Look:
     light = tint(0.15, 0.95)
     shade = float(rng.uniform(0.7, 0.95))
     dark = light if rng.random() < 0.35 else (light[0] * shade, light[1] * shade, light[2] * shade)
-    if rng.random() < 0.3:
+    if rng.random() < 0.4:
         usual = scenes.LOOK
         return Look(usual.planks, usual.wall, usual.floor, shadows=bool(rng.random() < 0.2))
     return Look((light, dark), tint(0.3, 0.95), tint(0.15, 0.8), shadows=bool(rng.random() < 0.2))
@@ -74,13 +99,33 @@ def look(rng: Generator) -> Look:
 def stage(seed: int, number: int, *, held_out: bool = False, views: int = VIEWS, size: int = SIZE) -> Shots:
     """Render one stage."""
     rng = np.random.default_rng([seed, number, int(held_out)])
-    models = cast(rng, held_out)
+    models, crew = cast(rng, held_out)
     robot = sorted(robots.ROBOTS)[int(rng.integers(len(robots.ROBOTS)))]
     with scenes.build(robot, models, look=look(rng)) as scene, mujoco.Renderer(scene.model, size, size) as renderer:
         data = mujoco.MjData(scene.model)
-        pictures = [_view(rng, scene, data, renderer) for _ in range(views)]
-    rgb, ids = zip(*pictures, strict=True)
-    return Shots(np.stack(rgb), np.stack(ids), scene.objects, tuple(model.category for model in models))
+        pictures: list[tuple[np.ndarray, np.ndarray]] = []
+        while len(pictures) < views:
+            picture = _view(rng, scene, data, renderer)
+            if (picture[1] > 0).sum() >= LEAST_PX or rng.random() < 0.1:  # an empty view now and then
+                pictures.append(picture)
+    rgb, ids = (np.stack(part) for part in zip(*pictures, strict=True))
+    portraits, portrait_ids = _portraits(rng, models[:crew])
+    return Shots(rgb, ids, portraits, portrait_ids, scene.objects, tuple(model.category for model in models))
+
+
+def _portraits(rng: Generator, models: Sequence[ObjectModel]) -> tuple[np.ndarray, np.ndarray]:
+    """Every model alone in the studio, `POSES` times, from around and 15 to 55 degrees above."""
+    rgb, ids = [], []
+    with Stage(models, PORTRAIT) as studio:
+        for i, model in enumerate(models):
+            for turn in rng.uniform(0, 2 * np.pi) + 2 * np.pi / POSES * np.arange(POSES):
+                grey = rng.uniform(0.35, 0.85)
+                red, green, blue = np.clip(grey + rng.uniform(-0.06, 0.06, 3), 0, 1).tolist()
+                azimuth, elevation, fill, lamp, bright = (float(rng.uniform(*span)) for span in ANGLES)
+                shot = Shot(float(turn) + azimuth, elevation, fill, lamp, bright, (red, green, blue))
+                rgb.append(studio.picture(model.name, shot))
+                ids.append(np.where(studio.mask(model.name, shot), i + 1, 0).astype(np.uint8))
+    return np.stack(rgb), np.stack(ids)
 
 
 def owners(scene: scenes.Scene) -> Int64[np.ndarray, " g"]:
@@ -121,15 +166,15 @@ def _view(rng: Generator, scene: scenes.Scene, data: mujoco.MjData, renderer: mu
     model, robot = scene.model, scene.robot
     rigged = rng.random() < 0.6  # through the robot's own cameras, jittered; else from anywhere above the table
     close = not rigged and rng.random() < 0.5
-    aim_x = {"wx250s": 0.27}.get(robot.name, 0.48) + rng.uniform(-0.06, 0.06)
+    (x_m, y_m), half_m = WORK[robot.name]
     mujoco.mj_resetData(model, data)
-    home = robot.home + rng.normal(0, 0.25, len(robot.home)) * (rng.random() < 0.8)
+    home = robot.home + rng.normal(0, 0.18, len(robot.home)) * (rng.random() < 0.7)
     for name, angle in zip(robot.joints, home, strict=True):
         data.joint(name).qpos[:] = angle
     for name, low, high in zip(robot.fingers, robot.fingers_closed, robot.fingers_open, strict=True):
         data.joint(name).qpos[:] = low + rng.random() * (high - low)
-    shown = rng.permutation(len(scene.objects))[: 1 if close and rng.random() < 0.6 else int(rng.integers(1, len(scene.objects) + 1))]
-    spots = scatter(rng, len(shown), (float(aim_x), 0.0), (0.15, 0.2), float(rng.uniform(0.05, 0.12)))
+    shown = rng.permutation(len(scene.objects))[: 1 if close and rng.random() < 0.6 else int(rng.integers(2, len(scene.objects) + 1))]
+    spots = scatter(rng, len(shown), (x_m + float(rng.uniform(-0.03, 0.03)), y_m), half_m, float(rng.uniform(0.05, 0.12)))
     for i, name in enumerate(scene.objects):
         data.joint(f"{name}/free").qpos[:3] = (-3, 0.3 * i, BURIED_M)
     for (x, y), i in zip(spots, shown, strict=True):
@@ -168,6 +213,9 @@ def _view(rng: Generator, scene: scenes.Scene, data: mujoco.MjData, renderer: mu
     return draw(scene, data, renderer, camera, scene.eyes.shadows)
 
 
+PARTS = ("rgb", "ids", "portraits", "portrait_ids", "names", "categories")
+
+
 def cached(folder: Path, seed: int, number: int, *, held_out: bool = False) -> Shots:
     """The stage from `folder`, rendered first if it is not there."""
     path = folder / f"{'held' if held_out else 'train'}-{seed}-{number:05d}.npz"
@@ -175,10 +223,11 @@ def cached(folder: Path, seed: int, number: int, *, held_out: bool = False) -> S
         shots = stage(seed, number, held_out=held_out)
         folder.mkdir(parents=True, exist_ok=True)
         part = path.with_suffix(".part.npz")
-        np.savez(part, rgb=shots.rgb, ids=shots.ids, names=shots.names, categories=shots.categories)
+        np.savez(part, **{name: getattr(shots, name) for name in PARTS})
         os.replace(part, path)
     with np.load(path) as file:
-        return Shots(file["rgb"], file["ids"], tuple(map(str, file["names"])), tuple(map(str, file["categories"])))
+        names, categories = (tuple(map(str, file[part])) for part in ("names", "categories"))
+        return Shots(file["rgb"], file["ids"], file["portraits"], file["portrait_ids"], names, categories)
 
 
 def boxes_of(ids: UInt8[np.ndarray, "h w"], n: int, least_px: int = 40) -> Iterator[tuple[int, tuple[int, int, int, int]]]:
