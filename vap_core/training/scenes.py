@@ -162,6 +162,13 @@ def scatter(rng: Generator, n: int, centre: tuple[float, float], half: tuple[flo
     return np.array(points).reshape(-1, 2)
 
 
+def _pose(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Bring bodies, cameras and lamps where the joints say; what overlaps may overlap."""
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_camlight(model, data)
+
+
 def _view(rng: Generator, scene: scenes.Scene, data: mujoco.MjData, renderer: mujoco.Renderer) -> tuple[np.ndarray, np.ndarray]:
     model, robot = scene.model, scene.robot
     rigged = rng.random() < 0.6  # through the robot's own cameras, jittered; else from anywhere above the table
@@ -188,11 +195,11 @@ def _view(rng: Generator, scene: scenes.Scene, data: mujoco.MjData, renderer: mu
     model.light_dir[0] = lamp / np.linalg.norm(lamp)
     model.light_diffuse[0] = rng.uniform(0.3, 0.75) * np.clip(rng.normal(1, 0.06, 3), 0.8, 1.2)
     model.vis.headlight.ambient[:] = rng.uniform(0.2, 0.5)
-    mujoco.mj_forward(model, data)
+    _pose(model, data)
     if rng.random() < 0.12:  # between the fingers
         tcp = data.site("tcp").xpos + rng.normal(0, 0.006, 3)
         data.joint(f"{scene.objects[held]}/free").qpos[:3] = tcp - (0, 0, rng.uniform(0.02, 0.06))
-        mujoco.mj_forward(model, data)
+        _pose(model, data)
     camera: mujoco.MjvCamera | str
     if rigged:
         camera = scene.cameras[int(rng.integers(len(scene.cameras)))]
