@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vap_core.sim import crafts, fabrics, objects, textures
-from vap_core.training import detector, evaluation, perception, phrases, scenes, segmenter
+from vap_core.training import detector, evaluation, looks, perception, phrases, scenes, segmenter
 
 
 @given(st.integers(0, 10**6), st.booleans())
@@ -67,6 +67,14 @@ def test_targets_peak_at_centres_and_spare_the_ambiguous() -> None:
     assert box[0, :, 5, 4].tolist() == [2, 2, 6, 8]
 
 
+def test_contrast_is_the_cross_entropy_of_every_pair_against_the_others() -> None:
+    cosine, same = torch.tensor([[0.9, 0.1, -0.2], [0.0, 0.5, 0.4]]), torch.tensor([[True, False, False], [False, True, True]])
+    e = np.exp(cosine.numpy() / looks.TEMPERATURE)
+    slow = [-np.log(e[0, 0] / (e[0, 0] + e[0, 1] + e[0, 2])), -np.log(e[1, 1] / (e[1, 1] + e[1, 0])), -np.log(e[1, 2] / (e[1, 2] + e[1, 0]))]
+    assert looks.contrast(cosine, same, ~same).item() == pytest.approx(np.mean(slow), rel=1e-4)
+    assert looks.contrast(cosine, same, torch.zeros_like(same)).item() == pytest.approx(0, abs=1e-6)
+
+
 def test_losses_vanish_when_right() -> None:
     view = [("cup", np.array([2.0, 2, 6, 8]))]
     heat, weight, owns, box = detector.targets([view], ["cup"], 16)
@@ -91,10 +99,10 @@ def test_average_precision_of_known_rankings() -> None:
 
 @pytest.mark.slow
 def test_training_is_a_command_that_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in (("DETECTOR_EPOCHS", 2), ("SEGMENTER_EPOCHS", 1), ("CROPS_PER_EPOCH", 32)):
-        monkeypatch.setattr(perception, name, value)
+    monkeypatch.setattr(perception, "EPOCHS", {"detector": 2, "segmenter": 1, "looks": 2})
+    monkeypatch.setattr(perception, "CROPS_PER_EPOCH", 32)
     cache = tmp_path / "cache"
-    perception.train(tmp_path / "halted", scenes=12, seed=1, minutes=0.0, cache=cache)
+    perception.train(tmp_path / "halted", scenes=12, seed=1, minutes=0.0, cache=cache, jobs=1)
     resumed = perception.train(tmp_path / "out", scenes=12, seed=1, cache=cache)
     straight = perception.train(tmp_path / "again", scenes=12, seed=1, resume=False, cache=cache)
     assert resumed["measured"] == straight["measured"]

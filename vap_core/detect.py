@@ -28,7 +28,7 @@ TRAINED_SIDE, SIDE = 224, 384
 well (recall .90 against .96 at 448 pixels, cropped references 75 % against 98 %), so larger ones are reduced to the first beforehand."""
 THRESHOLD, TOP, NMS_IOU = 0.2, 10, 0.5
 SNAP = 0.55
-"""A phrase whose cosine to a known name exceeds this is searched for as that name."""
+"""A phrase whose cosine to a trained one exceeds this is searched for as that one, which may be one that names nothing."""
 
 
 @runtime_checkable
@@ -41,31 +41,44 @@ class Detector(Protocol):
 
 
 class DetectHead(nn.Module):
-    """Feature pyramid in, one score map per phrase and one box per cell out."""
+    """Feature pyramid in, one score map per phrase and one box per cell out: what it is, at stride 16; where its edges are, at stride 8."""
 
     known: Tensor
-    """MiniLM embeddings of the names it was trained with, kept so that loading does not compute them again."""
+    """MiniLM embeddings of the phrases it was trained with, those that name nothing too; kept so that loading does not compute them again."""
 
-    def __init__(self, n_names: int, width: int = 64) -> None:
+    def __init__(self, n_names: int, coarse: int = 96, fine: int = 64, words: int = 96) -> None:
         super().__init__()
         self.register_buffer("known", torch.zeros(n_names, TEXT_WIDTH))
-        self.lateral = nn.ModuleDict({tap: nn.Conv2d(CHANNELS[tap], width, 1) for tap in TAPS})
-        self.mix = nn.ModuleList(nn.Conv2d(width, width, 3, padding=1) for _ in range(2))
-        self.norm = nn.ModuleList(nn.GroupNorm(8, width) for _ in range(3))
-        self.see = nn.Conv2d(width, width, 1)
-        self.edges = nn.Conv2d(width, 4, 1)
-        self.read = nn.Sequential(nn.Linear(TEXT_WIDTH, 128), nn.ReLU(), nn.Linear(128, width))
+        self.lateral = nn.ModuleDict({tap: nn.Conv2d(CHANNELS[tap], fine if tap == "b4" else coarse, 1) for tap in TAPS})
+        self.coarse, self.fine = Mix(coarse), Mix(fine)
+        self.down = nn.Conv2d(coarse, fine, 1)
+        self.see = nn.Conv2d(fine, words, 1)
+        self.edges = nn.Conv2d(fine, 4, 1)
+        self.read = nn.Sequential(nn.Linear(TEXT_WIDTH, 128), nn.ReLU(), nn.Linear(128, words))
         self.bias = nn.Parameter(torch.tensor(-4.0))
 
     def forward(self, taps: Mapping[str, Tensor], text: Float[Tensor, "p 384"]) -> tuple[Float[Tensor, "n p h w"], Float[Tensor, "n 4 h w"]]:
         """Logits per phrase, and distances from the cell's centre to the left, top, right and bottom edge in cells."""
-        size = taps["b4"].shape[-2:]
-        x = sum((F.interpolate(self.lateral[tap](taps[tap]), size, mode="nearest") for tap in TAPS), start=torch.zeros(()))
+        b4, b10, b14 = (self.lateral[tap](taps[tap]) for tap in TAPS)
+        x = self.down(self.coarse(b10 + F.interpolate(b14, b10.shape[-2:], mode="nearest")))
+        x = self.fine(b4 + F.interpolate(x, b4.shape[-2:], mode="nearest"))
+        logits = torch.einsum("nchw,pc->nphw", self.see(x), self.read(text)) / self.see.out_channels**0.5 + self.bias
+        return logits, 4 * F.softplus(self.edges(x))
+
+
+class Mix(nn.Module):
+    """Two residual 3 x 3 convolutions between group norms."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.mix = nn.ModuleList(nn.Conv2d(width, width, 3, padding=1) for _ in range(2))
+        self.norm = nn.ModuleList(nn.GroupNorm(8, width) for _ in range(3))
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
         x = self.norm[0](x)
         for mix, norm in zip(self.mix, list(self.norm)[1:], strict=True):
             x = x + F.relu(norm(mix(F.relu(x))))
-        logits = torch.einsum("nchw,pc->nphw", self.see(x), self.read(text)) / x.shape[1] ** 0.5 + self.bias
-        return logits, 4 * F.softplus(self.edges(x))
+        return x
 
 
 class LiteDetector:

@@ -1,26 +1,26 @@
 """Training the detector's head: frozen features once per view, then CenterNet's focal loss and a box loss (GIoU) on them."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, UInt8, UInt16
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
-from tqdm import tqdm
 
 from vap_core.detect import SIDE, STRIDE, TAPS, DetectHead, enlarge
-from vap_core.features import features
+from vap_core.features import CHANNELS, features
+from vap_core.features import STRIDE as STRIDES
 from vap_core.text import embed_text
+from vap_core.training.fitting import Run, fit, halved
 from vap_core.training.phrases import AMBIGUOUS, NEGATIVES, phrases
-from vap_core.training.scenes import Shots, boxes_of
+from vap_core.training.scenes import POSES, Shots, boxes_of
 from vap_core.values import Rgb
 
-BATCH, RATE = 16, 2e-3
+BATCH = 16
 Objects = list[tuple[str, np.ndarray]]
 """Category and box, `x0 y0 x1 y1` in cells, of every object in a view."""
 
@@ -36,21 +36,39 @@ def disturb(rng: np.random.Generator, rgb: Rgb) -> Rgb:
     return np.clip(x, 0, 255).astype(np.uint8)
 
 
-def featurise(folder: Path, name: str, shots: Shots, rng: np.random.Generator) -> tuple[dict[str, np.ndarray], list[Objects]]:
-    """Half-precision features of one stage's views, disturbed and half of them mirrored; cached in `folder` under `name`."""
+def featurise(folder: Path, name: str, shots: Shots, rng: np.random.Generator) -> tuple[UInt16[np.ndarray, "v f"], list[Objects]]:
+    """Half-precision features (their bits) and objects of one stage's views, and of one portrait of each of its crew.
+
+    Pictures are disturbed and half of them mirrored. Features are kept in `folder` under `name` and read from there as they are needed.
+    """
+    pictures = [*zip(shots.rgb, shots.ids, strict=True), *zip(shots.portraits[::POSES], shots.portrait_ids[::POSES], strict=True)]
     rgb, ids = [], []
-    for view, index in zip(shots.rgb, shots.ids, strict=True):
+    for view, index in pictures:
         mirrored = rng.random() < 0.5
         rgb.append(disturb(rng, view[:, ::-1] if mirrored else view))
         ids.append(index[:, ::-1] if mirrored else index)
-    path = folder / f"{name}.features.npz"
+    path = folder / f"{name}.detector.npy"
     if not path.exists():
-        found = features([enlarge(view)[0] for view in rgb], TAPS)
-        part = path.with_suffix(".part.npz")
-        np.savez(part, **{tap: value.numpy().astype(np.float16) for tap, value in found.items()})  # type: ignore[arg-type]
-        os.replace(part, path)
-    with np.load(path) as file:
-        return {tap: file[tap] for tap in TAPS}, [objects_of(view, shots) for view in ids]
+        found = [features([enlarge(view)[0]], TAPS) for view in rgb]
+        keep(path, np.stack([np.concatenate([each[tap].numpy().astype(np.float16).ravel() for tap in TAPS]) for each in found]).view(np.uint16))
+    return np.load(path, mmap_mode="r"), [objects_of(view, shots) for view in ids]
+
+
+def keep(path: Path, rows: np.ndarray) -> None:
+    """Write an array so that an interrupted run never leaves half of it."""
+    part = path.with_suffix(".part.npy")
+    np.save(part, rows)
+    os.replace(part, path)
+
+
+def taps_of(rows: Sequence[UInt16[np.ndarray, " f"]]) -> dict[str, Float[Tensor, "n c h w"]]:
+    """The feature maps in rows of `featurise`."""
+    flat, start, maps = torch.from_numpy(np.stack(rows).view(np.float16)).float(), 0, {}
+    for tap in TAPS:
+        shape = (CHANNELS[tap], SIDE // STRIDES[tap], SIDE // STRIDES[tap])
+        maps[tap] = flat[:, start : start + int(np.prod(shape))].unflatten(1, shape)
+        start += int(np.prod(shape))
+    return maps
 
 
 def objects_of(ids: UInt8[np.ndarray, "h w"], shots: Shots) -> Objects:
@@ -105,7 +123,7 @@ def giou_loss(edges: Float[Tensor, "n 4 h w"], owns: Float[Tensor, "n h w"], box
     return ((1 - giou) * owns[at]).sum() / owns[at].sum().clamp(min=1)
 
 
-def ask(rng: np.random.Generator, categories: Sequence[str], negatives: int = 10) -> tuple[list[str | None], Float32[np.ndarray, "p 384"]]:
+def ask(rng: np.random.Generator, categories: Sequence[str], negatives: int = 16) -> tuple[list[str | None], Float32[np.ndarray, "p 384"]]:
     """One phrase per category and some that name nothing, with a little noise on their embeddings."""
     asked: list[str | None] = list(categories) + [None] * negatives
     words = [str(rng.choice(phrases(category))) for category in categories] + [str(word) for word in rng.choice(NEGATIVES, negatives, replace=False)]
@@ -113,44 +131,23 @@ def ask(rng: np.random.Generator, categories: Sequence[str], negatives: int = 10
     return asked, rows / np.linalg.norm(rows, axis=1, keepdims=True)
 
 
-def fit_detector(
-    views: list[tuple[dict[str, np.ndarray], Objects]], categories: Sequence[str], *, seed: int, epochs: int,
-    state: dict[str, Any], save: Callable[[dict[str, Any]], None], expired: Callable[[], bool],
-) -> DetectHead:  # fmt: skip
-    """Train the head on `views` (features and objects); `state` holds what an earlier run saved, `save` keeps each epoch."""
-    names = [phrase for category in categories for phrase in phrases(category)]
-    torch.manual_seed(seed)  # initial weights only; every other draw comes from rng
+def fit_detector(views: Sequence[tuple[UInt16[np.ndarray, " f"], Objects]], categories: Sequence[str], run: Run) -> DetectHead:
+    """Train the head on `views`: features, as `featurise` keeps them, and objects."""
+    names = [*(phrase for category in categories for phrase in phrases(category)), *NEGATIVES]
+    torch.manual_seed(run.seed)  # initial weights only; every other draw comes from the epoch's stream
     head = DetectHead(len(names))
     head.known.copy_(torch.from_numpy(embed_text(names)))
-    optimiser = torch.optim.AdamW(head.parameters(), RATE, weight_decay=1e-3)
-    start = 0
-    if state:
-        head.load_state_dict(state["head"])
-        optimiser.load_state_dict(state["optimiser"])
-        start = state["epoch"]
-    per_epoch = -(-len(views) // BATCH)
-    for epoch in range(start, epochs):
-        if expired():
-            break
-        rng = np.random.default_rng([seed, 1, epoch])
-        total = 0.0
+
+    def losses(rng: np.random.Generator) -> Iterator[Tensor]:
         order = rng.permutation(len(views))
-        bar = tqdm(range(per_epoch), desc=f"detector {epoch + 1}/{epochs}", mininterval=10)
-        for batch in bar:
-            done = (epoch * per_epoch + batch) / (epochs * per_epoch)
-            for group in optimiser.param_groups:
-                group["lr"] = float(RATE * min(1.0, done * 50 + 0.05) * 0.5 * (1 + np.cos(np.pi * done)))
-            chosen = [views[i] for i in order[batch * BATCH : (batch + 1) * BATCH]]
-            taps = {tap: torch.from_numpy(np.stack([view[0][tap] for view in chosen])).float() for tap in TAPS}
+        for batch in range(0, len(views), BATCH):
+            chosen = [views[i] for i in order[batch : batch + BATCH]]
             asked, rows = ask(rng, categories)
-            logits, edges = head(taps, torch.from_numpy(rows))
-            heat, weight, owns, box = targets([view[1] for view in chosen], asked, logits.shape[-1])
-            loss = focal(logits, heat, weight) + 2 * giou_loss(edges, owns, box)
-            optimiser.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(head.parameters(), 5.0)
-            optimiser.step()
-            total += loss.item()
-            bar.set_postfix(loss=f"{total / (batch + 1):.3f}", refresh=False)
-        save({"head": head.state_dict(), "optimiser": optimiser.state_dict(), "epoch": epoch + 1, "loss": total / per_epoch})
+            with halved():
+                found = head(taps_of([features for features, _ in chosen]), torch.from_numpy(rows))
+            logits, edges = (part.float() for part in found)
+            heat, weight, owns, box = targets([seen for _, seen in chosen], asked, logits.shape[-1])
+            yield focal(logits, heat, weight) + 2 * giou_loss(edges, owns, box)
+
+    fit(head, losses, -(-len(views) // BATCH), run)
     return head

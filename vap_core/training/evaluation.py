@@ -8,13 +8,15 @@ import torch
 from tqdm import tqdm
 
 from vap_core.detect import TAPS, DetectHead, LiteDetector, box_iou, decode, enlarge
+from vap_core.embed import LiteEncoder, LookHead, crop
 from vap_core.features import features
 from vap_core.metrics import rate
 from vap_core.segment import LiteSegmenter, MaskHead, iou
 from vap_core.sim import objects
 from vap_core.training.phrases import AMBIGUOUS, NEGATIVES, UNSEEN, UNSEEN_NEGATIVES
-from vap_core.training.scenes import Shots, boxes_of
+from vap_core.training.scenes import POSES, Shots, boxes_of
 from vap_core.training.segmenter import jitter
+from vap_core.vote import similarity, vote
 
 LEAST_PX = 100
 """Objects with fewer visible pixels are neither wanted nor counted as false."""
@@ -25,9 +27,16 @@ Found = tuple[np.ndarray, np.ndarray]
 """Boxes (image pixels) and scores, best first."""
 
 
-def evaluate(detect: DetectHead, segment: MaskHead, stages: Sequence[Shots]) -> Figures:
+def evaluate(detect: DetectHead, segment: MaskHead, look: LookHead, stages: Sequence[Shots]) -> Figures:
     """Every figure that the manifest carries."""
-    return {"detector": detector_figures(LiteDetector(detect), stages), "segmenter": segmenter_figures(LiteSegmenter(segment), stages)}
+    return {
+        "detector": detector_figures(LiteDetector(detect), stages),
+        "segmenter": segmenter_figures(LiteSegmenter(segment), stages),
+        "encoder": {
+            "with_look_head": encoder_figures(LiteEncoder(look), stages),
+            "frozen_features_alone": encoder_figures(LiteEncoder(), stages),
+        },
+    }
 
 
 def share(hits: int, n: int) -> Figures:
@@ -92,6 +101,21 @@ def segmenter_figures(segmenter: LiteSegmenter, stages: Sequence[Shots]) -> Figu
         f"{name}_box": {"mean_iou": round(float(np.mean(values)), 4), "iou_at_least_0.75": share(int(np.sum(np.array(values) >= 0.75)), len(values))}
         for name, values in (("exact", exact), ("jittered", off))
     }
+
+
+def encoder_figures(encoder: LiteEncoder, stages: Sequence[Shots]) -> Figures:
+    """How often three reference photos of an object elect its box in a view from among the boxes of its look-alikes there."""
+    right: list[bool] = []
+    for shots in tqdm(stages, desc="evaluating looks", mininterval=10):
+        portraits = [crop(rgb, np.array(box, np.float64)) for rgb, ids in zip(shots.portraits, shots.portrait_ids, strict=True)
+                     for _, box in boxes_of(ids, len(shots.names))]  # fmt: skip
+        crew, references = len(shots.portraits) // POSES, encoder(portraits)
+        for rgb, ids in zip(shots.rgb, shots.ids, strict=True):
+            seen = list(boxes_of(ids, crew, LEAST_PX))
+            if len(seen) > 1:
+                rows = encoder([crop(rgb, np.array(box, np.float64)) for _, box in seen])
+                right += [vote(similarity(rows, references[POSES * i : POSES * (i + 1)])).winner == me for me, (i, _) in enumerate(seen)]
+    return {"right_of_look_alikes": share(sum(right), len(right))}
 
 
 def average_precision(per_view: Sequence[tuple[Found, np.ndarray, np.ndarray]], iou: float) -> float | None:

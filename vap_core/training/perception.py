@@ -1,13 +1,16 @@
-"""Train the embedded detector and segmenter: render generic objects, fit both heads on frozen features, test on unseen instances.
+"""Train the embedded stack's heads: render generic objects, fit detector, segmenter and look head on frozen features, test on unseen instances.
 
-    python -m vap_core train perception --out data/runs/weights --scenes 4000 --seed 0
+    python -m vap_core train perception --out data/runs/weights --scenes 8400 --seed 0
 
-Everything lands in data/cache/perception and is found again after an interruption: stages, features, and both heads after each epoch.
+Everything lands in data/cache/perception and is found again after an interruption: stages, features, and each head after every epoch.
 """
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -16,76 +19,99 @@ import torch
 from tqdm import tqdm
 
 from vap_core.sim import objects
-from vap_core.training import detector, segmenter
+from vap_core.training import detector, looks, segmenter
+from vap_core.training.fitting import Run
 from vap_core.training.scenes import VIEWS, Shots, cached, only_generic
 from vap_core.weights import save_weights
 
 CACHE = Path(__file__).resolve().parents[2] / "data" / "cache" / "perception"
 FILE = "perception.safetensors"
 HELD_OUT_STAGES = 30
-DETECTOR_EPOCHS, SEGMENTER_EPOCHS, CROPS_PER_EPOCH = 8, 6, 8000
+EPOCHS = {"detector": 6, "segmenter": 6, "looks": 36}
+CROPS_PER_EPOCH = 8000
 
 
-def train(out: Path, *, scenes: int = 4000, seed: int = 0, minutes: float | None = None, resume: bool = True, cache: Path = CACHE) -> dict[str, Any]:
-    """Train both heads on about `scenes` rendered views, write `out`/perception.safetensors and its manifest entry, return the entry.
+def train(
+    out: Path, *, scenes: int = 8400, seed: int = 0, minutes: float | None = None, resume: bool = True, cache: Path = CACHE, jobs: int | None = None
+) -> dict[str, Any]:
+    """Train the heads on about `scenes` rendered views, write `out`/perception.safetensors and its manifest entry, return the entry.
 
-    `minutes` stops training after the epoch that runs then; `resume` off forgets earlier epochs but keeps the rendered stages.
+    `minutes` stops training after the epoch that runs then; `resume` off forgets earlier epochs but keeps the rendered stages. `jobs`
+    processes (all cores) render.
     """
     from vap_core.training.evaluation import evaluate
 
     started = time.monotonic()
 
-    def expired() -> bool:
-        return minutes is not None and time.monotonic() - started > 60 * minutes
+    def run(name: str, rate: float, decay: float) -> Run:
+        def expired() -> bool:
+            return minutes is not None and time.monotonic() - started > 60 * minutes
 
-    stages = list(load_stages(cache, seed, -(-scenes // VIEWS)))
-    detect = detector.fit_detector(
-        load_features(cache, seed, stages), objects.CATEGORIES + objects.CLUTTER, seed=seed, epochs=DETECTOR_EPOCHS, expired=expired,
-        **checkpoint(cache / f"detector-{seed}-{len(stages)}.pt", resume),
-    )  # fmt: skip
-    segment = segmenter.fit_segmenter(
-        stages, seed=seed, epochs=SEGMENTER_EPOCHS, crops_per_epoch=CROPS_PER_EPOCH, expired=expired,
-        **checkpoint(cache / f"segmenter-{seed}-{len(stages)}.pt", resume),
-    )  # fmt: skip
-    unseen = list(load_stages(cache, seed, min(HELD_OUT_STAGES, max(1, len(stages) // 10)), held_out=True))
-    tensors = {f"detect.{key}": value for key, value in detect.state_dict().items()} | {
-        f"segment.{key}": value for key, value in segment.state_dict().items()
-    }
+        return Run(name, seed, EPOCHS[name], rate, decay, *checkpoint(cache / f"{name}-{seed}-{n}.pt", resume), expired)
+
+    n = -(-scenes // VIEWS)
+    stages = prepare(cache, seed, n, jobs=jobs)
+    views = [view for number, shots in enumerate(stages) for view in detector_views(cache, seed, number, shots)]
+    kept = [looks.featurise(cache, f"train-{seed}-{number:05d}", shots, stream(seed, number, "looks")) for number, shots in enumerate(stages)]
+    detect = detector.fit_detector(views, objects.CATEGORIES + objects.CLUTTER, run("detector", 2e-3, 1e-3))
+    look = looks.fit_looks(kept, run("looks", 2e-3, 1e-2))
+    segment = segmenter.fit_segmenter(stages, CROPS_PER_EPOCH, run("segmenter", 2e-3, 1e-4))
+    unseen = prepare(cache, seed, min(HELD_OUT_STAGES, max(1, n // 10)), held_out=True, jobs=jobs)
     about = {
         "command": f"python -m vap_core train perception --scenes {scenes} --seed {seed}",
-        "trained_on": f"{sum(len(s.rgb) for s in stages)} views of generic objects in {len(stages)} rendered scenes; no evaluation object",
+        "trained_on": f"{sum(len(s.rgb) for s in stages)} views of generic objects in {n} rendered scenes, and portraits; no evaluation object",
         "seed": seed,
         "views": sum(len(s.rgb) for s in stages),
-        "measured": evaluate(detect, segment, unseen),
+        "measured": evaluate(detect, segment, look, unseen),
     }
-    save_weights(FILE, tensors, about, out)
+    heads = {"detect": detect, "look": look, "segment": segment}
+    save_weights(FILE, {f"{part}.{key}": value for part, head in heads.items() for key, value in head.state_dict().items()}, about, out)
     return about
 
 
-def load_stages(cache: Path, seed: int, n: int, *, held_out: bool = False) -> Iterator[Shots]:
-    """The first n stages, rendered where they are missing; refuses any that shows an object of the evaluation."""
-    for number in tqdm(range(n), desc="held-out scenes" if held_out else "scenes", mininterval=10):
-        shots = cached(cache, seed, number, held_out=held_out)
+def prepare(cache: Path, seed: int, n: int, *, held_out: bool = False, jobs: int | None = None) -> list[Shots]:
+    """The first n stages with their features, rendered where they are missing; refuses any that shows an object of the evaluation."""
+    todo = [number for number in range(n) if not _ready(cache, seed, number, held_out)]
+    if todo:
+        with ProcessPoolExecutor(jobs or os.cpu_count(), mp_context=get_context("spawn")) as pool:
+            work = pool.map(partial(_prepare, cache, seed, held_out), todo)
+            list(tqdm(work, "held-out scenes" if held_out else "scenes", len(todo), mininterval=10))
+    stages = [cached(cache, seed, number, held_out=held_out) for number in range(n)]
+    for shots in stages:
         only_generic([objects.get(name) for name in shots.names])
-        yield shots
+    return stages
 
 
-def load_features(cache: Path, seed: int, stages: Sequence[Shots]) -> list[tuple[dict[str, np.ndarray], detector.Objects]]:
-    """Per view, its frozen features and its objects."""
-    views = []
-    for number, shots in enumerate(tqdm(stages, desc="features", mininterval=10)):
-        taps, seen = detector.featurise(cache, f"train-{seed}-{number:05d}", shots, np.random.default_rng([seed, 3, number]))
-        views += [({tap: maps[v] for tap, maps in taps.items()}, seen[v]) for v in range(len(seen))]
-    return views
+def _ready(cache: Path, seed: int, number: int, held_out: bool) -> bool:
+    name = f"{'held' if held_out else 'train'}-{seed}-{number:05d}"
+    return all((cache / f"{name}{kind}").exists() for kind in ((".npz",) if held_out else (".npz", ".detector.npy", ".looks.npy", ".pixels.npy")))
 
 
-def checkpoint(path: Path, resume: bool) -> dict[str, Any]:
-    """`state`, what an interrupted run left at `path` or nothing, and `save`, which replaces it atomically."""
+def _prepare(cache: Path, seed: int, held_out: bool, number: int) -> None:
+    torch.set_num_threads(1)
+    shots = cached(cache, seed, number, held_out=held_out)
+    if not held_out:
+        detector_views(cache, seed, number, shots)
+        looks.featurise(cache, f"train-{seed}-{number:05d}", shots, stream(seed, number, "looks"))
+
+
+def detector_views(cache: Path, seed: int, number: int, shots: Shots) -> Sequence[tuple[np.ndarray, detector.Objects]]:
+    """Per picture of a stage, its frozen features and its objects."""
+    rows, seen = detector.featurise(cache, f"train-{seed}-{number:05d}", shots, stream(seed, number, "detector"))
+    return list(zip(rows, seen, strict=True))
+
+
+def stream(seed: int, number: int, part: str) -> np.random.Generator:
+    """The randomness of one part of one stage."""
+    return np.random.default_rng([seed, *part.encode(), number])
+
+
+def checkpoint(path: Path, resume: bool) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
+    """What an interrupted run left at `path`, or nothing; and a function that replaces it atomically."""
 
     def save(state: dict[str, Any]) -> None:
         part = path.with_suffix(".part")
         torch.save(state, part)
         os.replace(part, path)
 
-    keep: Callable[[dict[str, Any]], None] = save
-    return {"state": torch.load(path, weights_only=True) if resume and path.exists() else {}, "save": keep}
+    return torch.load(path, weights_only=True) if resume and path.exists() else {}, save

@@ -10,16 +10,16 @@ SYNONYMS: dict[str, tuple[str, ...]] = {
     "camera": ("camera", "photo camera", "digital camera", "film camera", "compact camera", "dslr camera"),
     "shaver": ("shaver", "electric shaver", "razor", "electric razor", "beard trimmer", "hair clipper"),
     "coke can": ("coke can", "soda can", "can of cola", "tin can", "drink can", "can"),
-    "plushie": ("plushie", "plush toy", "soft toy", "teddy"),
-    "stuffed toy": ("stuffed toy", "stuffed animal", "cuddly toy"),
-    "leather bag": ("leather bag", "handbag", "purse"),
-    "pouch": ("pouch", "small bag", "drawstring pouch"),
-    "shoe": ("shoe", "sneaker", "running shoe"),
-    "slipper": ("slipper", "house shoe", "slide sandal"),
-    "cat figurine": ("cat figurine", "cat statue", "ceramic cat"),
-    "miniature house": ("miniature house", "toy house", "model house"),
-    "plant": ("plant", "potted plant", "houseplant"),
-    "scrubber": ("scrubber", "scrub brush", "dish brush"),
+    "plushie": ("plushie", "plush toy", "soft toy", "teddy", "plush animal"),
+    "stuffed toy": ("stuffed toy", "stuffed animal", "cuddly toy", "rag doll", "doll"),
+    "leather bag": ("leather bag", "handbag", "purse", "leather case", "messenger bag", "bag"),
+    "pouch": ("pouch", "small bag", "drawstring pouch", "zipper bag", "small round bag"),
+    "shoe": ("shoe", "sneaker", "running shoe", "sports shoe", "lace-up shoe"),
+    "slipper": ("slipper", "house shoe", "slide sandal", "felt slipper", "moccasin"),
+    "cat figurine": ("cat figurine", "cat statue", "ceramic cat", "cat", "porcelain kitten"),
+    "miniature house": ("miniature house", "toy house", "model house", "house", "little house"),
+    "plant": ("plant", "potted plant", "houseplant", "cactus", "plant in a pot"),
+    "scrubber": ("scrubber", "scrub brush", "dish brush", "scrubbing brush", "kitchen sponge"),
     "plastic bowl": ("plastic bowl", "bowl", "mixing bowl"),
     "plate": ("plate", "dinner plate", "dish"),
     "basket": ("basket", "wicker basket", "bread basket"),
@@ -38,6 +38,17 @@ UNSEEN: dict[str, tuple[str, ...]] = {
     "camera": ("photographic camera", "mirrorless camera", "point and shoot"),
     "shaver": ("trimmer", "shaving machine", "rechargeable razor"),
     "coke can": ("cola", "beverage can", "aluminium can"),
+    "plushie": ("fluffy toy", "plush hedgehog", "plush figure"),
+    "stuffed toy": ("stuffed doll", "fabric toy", "cuddly doll"),
+    "leather bag": ("briefcase", "satchel", "leather purse"),
+    "pouch": ("coin purse", "zip pouch", "toiletry pouch"),
+    "shoe": ("trainers", "tennis shoe", "footwear"),
+    "slipper": ("house slipper", "bedroom slipper", "indoor shoe"),
+    "cat figurine": ("cat ornament", "cat sculpture", "kitten figurine"),
+    "miniature house": ("dollhouse", "tiny house", "house model"),
+    "plant": ("succulent", "pot plant", "green plant"),
+    "scrubber": ("cleaning brush", "dish scrubber", "scouring brush"),
+    "plastic bowl": ("salad bowl", "serving bowl"),
 }
 """Synonyms never trained with."""
 
@@ -45,6 +56,11 @@ NEGATIVES: tuple[str, ...] = (
     "laptop", "keyboard", "book", "banana", "apple", "scissors", "spoon", "fork", "phone", "dog", "car", "table", "robot arm", "gripper",
     "person", "chair", "lamp", "window", "hat", "pillow", "clock", "ball", "cardboard box", "remote control", "toothbrush", "shadow", "wall",
     "umbrella", "elephant", "screwdriver", "notebook", "candle", "glasses", "key", "wallet", "headphones", "bread", "orange", "towel",
+    "desk", "floor", "monitor", "mouse", "pen", "eraser", "ruler", "tape", "battery", "cable", "charger", "speaker", "microphone", "television",
+    "sofa", "bed", "door", "knife", "pan", "kettle", "toaster", "fridge", "jar", "egg", "carrot", "tomato", "lemon", "cheese", "cake", "cookie",
+    "milk carton", "shirt", "glove", "scarf", "belt", "ring", "watch", "comb", "soap", "shampoo", "tissue box", "trash can", "bucket", "broom",
+    "drill", "wrench", "nail", "rope", "toy car", "airplane", "boat", "lego brick", "dice", "puzzle", "tennis ball", "football", "horse", "tree",
+    "flower", "rock", "envelope", "magazine", "map", "coin", "credit card",
 )  # fmt: skip
 """Phrases that name nothing in a training scene: they must find nothing."""
 
@@ -57,6 +73,8 @@ AMBIGUOUS: dict[str, tuple[str, ...]] = {
     "stuffed toy": ("plushie",),
     "leather bag": ("pouch",),
     "vase": ("plant",),
+    "pouch": ("leather bag",),
+    "slipper": ("shoe",),
 }
 """`AMBIGUOUS[asked]`: kinds that one might also call so; finding them is neither rewarded nor punished."""
 

@@ -1,7 +1,6 @@
 """Training the segmenter's head: windows around rendered objects, prompted by a box or by a coarse guess of the mask."""
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -9,14 +8,14 @@ import torch
 from jaxtyping import Bool, Float, Float32, UInt8
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
-from tqdm import tqdm
 
 from vap_core.features import backbone, normalise
 from vap_core.segment import SIDE, TAPS, MaskHead, bounds, box_plane, cut, window
 from vap_core.training.detector import disturb
+from vap_core.training.fitting import Run, fit, halved
 from vap_core.training.scenes import Shots, boxes_of
 
-BATCH, RATE = 16, 2e-3
+BATCH = 16
 GRID = 28
 """Cells of the tracker's grid along the longer side."""
 
@@ -71,42 +70,25 @@ def mask_loss(logits: Float[Tensor, "n h w"], wanted: Float[Tensor, "n h w"]) ->
     return F.binary_cross_entropy_with_logits(logits, wanted) + dice.mean()
 
 
-def fit_segmenter(
-    stages: list[Shots], *, seed: int, epochs: int, crops_per_epoch: int,
-    state: dict[str, Any], save: Callable[[dict[str, Any]], None], expired: Callable[[], bool],
-) -> MaskHead:  # fmt: skip
-    """Train the head; `state` holds what an earlier run saved, `save` keeps each epoch."""
-    torch.manual_seed(seed)  # initial weights only; every other draw comes from rng
+def fit_segmenter(stages: Sequence[Shots], crops_per_epoch: int, run: Run) -> MaskHead:
+    """Train the head on windows around the objects of the stages' views."""
+    torch.manual_seed(run.seed)  # initial weights only; every other draw comes from the epoch's stream
     head = MaskHead()
-    optimiser = torch.optim.AdamW(head.parameters(), RATE, weight_decay=1e-4)
-    start = 0
-    if state:
-        head.load_state_dict(state["head"])
-        optimiser.load_state_dict(state["optimiser"])
-        start = state["epoch"]
     pool = [(s, v, i) for s, shots in enumerate(stages) for v, i in crops_of(shots)]
     per_epoch = min(crops_per_epoch, len(pool)) // BATCH
-    for epoch in range(start, epochs):
-        if expired():
-            break
-        rng = np.random.default_rng([seed, 2, epoch])
-        total, order = 0.0, rng.permutation(len(pool))
-        bar = tqdm(range(per_epoch), desc=f"segmenter {epoch + 1}/{epochs}", mininterval=10)
-        for batch in bar:
-            done = (epoch * per_epoch + batch) / (epochs * per_epoch)
-            for group in optimiser.param_groups:
-                group["lr"] = float(RATE * min(1.0, done * 50 + 0.05) * 0.5 * (1 + np.cos(np.pi * done)))
+
+    def losses(rng: np.random.Generator) -> Iterator[Tensor]:
+        order = rng.permutation(len(pool))
+        for batch in range(per_epoch):
             picked = [pool[i] for i in order[batch * BATCH : (batch + 1) * BATCH]]
             parts = [sample(rng, stages[s].rgb[v], stages[s].ids[v] == i + 1) for s, v, i in picked]
             rgb, planes, masks = (torch.from_numpy(np.stack(part)) for part in zip(*parts, strict=True))
             pixels = normalise(rgb)
-            with torch.no_grad():
-                taps = backbone()(pixels, TAPS)
-            loss = mask_loss(head(pixels, taps, planes.float() / 255), masks.float() / 255)
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-            total += loss.item()
-            bar.set_postfix(loss=f"{total / (batch + 1):.3f}", refresh=False)
-        save({"head": head.state_dict(), "optimiser": optimiser.state_dict(), "epoch": epoch + 1, "loss": total / max(per_epoch, 1)})
+            with halved():
+                with torch.no_grad():
+                    taps = backbone()(pixels, TAPS)
+                logits = head(pixels, taps, planes.float() / 255)
+            yield mask_loss(logits.float(), masks.float() / 255)
+
+    fit(head, losses, per_epoch, run)
     return head

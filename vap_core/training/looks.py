@@ -1,0 +1,143 @@
+"""Training the encoder's look head: reference photos of an object must find it among its look-alikes, as in the vote (P 3.3)."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64, UInt8
+from torch import Tensor
+from torch.nn import functional as F  # noqa: N812
+
+from vap_core.embed import LOOK_SIDE, LOOK_TAPS, LiteEncoder, LookHead, crop, gem, lab_histogram, look_taps
+from vap_core.embed import square as square_of
+from vap_core.features import CHANNELS, features, normalise
+from vap_core.training.detector import disturb, keep
+from vap_core.training.fitting import Run, fit, halved
+from vap_core.training.scenes import POSES, Shots, boxes_of
+from vap_core.training.segmenter import jitter
+from vap_core.values import Rgb, value
+
+STAGES_PER_BATCH, TEMPERATURE = 16, 0.07
+STRIDE = 100
+"""Objects are numbered by stage times this, plus their number in it."""
+MOST, FEWEST_PX = 5, 60
+"""Crops of one object that one stage gives, from its views, and the visible pixels of each."""
+GRIDS = {"b4": 14, "b10": 14, "b14": 7}
+COLOURS = int(np.prod(LiteEncoder.BINS))
+MAPS = sum(CHANNELS[tap] * GRIDS[tap] ** 2 for tap in LOOK_TAPS)
+
+
+@value
+class Looks:
+    """Crops of one stage: `rows` are features (the look head's maps, colours, GeM; half precision), `pixels` what the head sees of each.
+
+    `who` is the object, `portrait` whether the crop is from a reference photo. Arrays may lie on disk.
+    """
+
+    rows: Float[np.ndarray, "n f"]
+    pixels: UInt8[np.ndarray, "n s s 3"]
+    who: Int64[np.ndarray, " n"]
+    portrait: Int64[np.ndarray, " n"]
+
+
+def crops(shots: Shots, rng: np.random.Generator) -> tuple[list[Rgb], list[int], list[int]]:
+    """Crops of the crew's portraits and of every object in the views, from boxes that are a little off; who, and whether it is a portrait."""
+    found: list[tuple[Rgb, int, int]] = []
+    for rgb, ids in zip(shots.portraits, shots.portrait_ids, strict=True):
+        found += [(_cut(rgb, box, rng), i, 1) for i, box in boxes_of(ids, len(shots.names))]
+    seen = [(v, i, box) for v, ids in enumerate(shots.ids) for i, box in boxes_of(ids, len(shots.names), FEWEST_PX)]
+    taken = dict.fromkeys(range(len(shots.names)), 0)
+    crew = len(shots.portraits) // POSES
+    for n in rng.permutation(len(seen)):
+        v, i, box = seen[n]
+        if taken[i] < (MOST if i < crew else 2):
+            taken[i] += 1
+            found.append((_cut(shots.rgb[v], box, rng), i, 0))
+    pictures, who, portrait = zip(*found, strict=True)
+    return list(pictures), list(who), list(portrait)
+
+
+def featurise(folder: Path, name: str, shots: Shots, rng: np.random.Generator) -> Looks:
+    """The crops of a stage with their frozen features, kept in `folder` under `name`."""
+    pictures, who, portrait = crops(shots, rng)
+    path, seen = folder / f"{name}.looks.npy", folder / f"{name}.pixels.npy"
+    if not path.exists() or not seen.exists():
+        squares = [square_of(rgb, LiteEncoder.SIDE) for rgb in pictures]
+        keep(seen, np.stack([cv2.resize(picture, (LOOK_SIDE, LOOK_SIDE), interpolation=cv2.INTER_AREA) for picture in squares]))
+        keep(path, np.stack([_row(picture, whole) for picture, whole in zip(pictures, squares, strict=True)]))
+    return Looks(np.load(path, mmap_mode="r"), np.load(seen, mmap_mode="r"), np.array(who, np.int64), np.array(portrait, np.int64))
+
+
+def _row(rgb: Rgb, whole: Rgb) -> np.ndarray:
+    taps = features([whole], [*LOOK_TAPS, "head"])
+    colour = lab_histogram(rgb, LiteEncoder.SIGMA, LiteEncoder.BINS)
+    parts = [*(maps[0].numpy().ravel() for maps in look_taps(taps).values()), colour / np.linalg.norm(colour), gem(taps["head"][0].numpy())]
+    return np.concatenate(parts).astype(np.float16)
+
+
+def look(head: LookHead, rows: np.ndarray, pixels: np.ndarray) -> Float[Tensor, "n d"]:
+    """The head's answer to crops as `featurise` keeps them."""
+    flat, start, maps = torch.from_numpy(np.asarray(rows[:, : MAPS + COLOURS])).float(), 0, {}
+    for tap in LOOK_TAPS:
+        shape = (CHANNELS[tap], GRIDS[tap], GRIDS[tap])
+        maps[tap] = flat[:, start : start + int(np.prod(shape))].unflatten(1, shape)
+        start += int(np.prod(shape))
+    return head(maps, normalise(torch.from_numpy(np.asarray(pixels))), flat[:, start:])
+
+
+def contrast(cosine: Float[Tensor, "a k"], same: Bool[Tensor, "a k"], rival: Bool[Tensor, "a k"]) -> Tensor:
+    """Mean over every pair that is the same of -log exp(c/t) / (exp(c/t) + the sum of exp over the anchor's rivals)."""
+    logits = cosine / TEMPERATURE
+    others = logits.masked_fill(~rival, -1e4).logsumexp(1, keepdim=True)
+    return ((torch.logaddexp(logits, others) - logits) * same).sum() / same.sum().clamp(min=1)
+
+
+def fit_looks(stages: Sequence[Looks], run: Run) -> LookHead:
+    """Train the head: portraits find the views' crops of their object, and the crops their portraits, among all and among their own stage's."""
+    torch.manual_seed(run.seed)  # initial weights only; every other draw comes from the epoch's stream
+    head = LookHead(COLOURS)
+
+    def losses(rng: np.random.Generator) -> Iterator[Tensor]:
+        order = rng.permutation(len(stages))
+        for batch in range(0, len(order), STAGES_PER_BATCH):
+            picked = [(s, *_pick(rng, stages[s])) for s in order[batch : batch + STAGES_PER_BATCH]]
+            where = [(s, np.concatenate([portraits, views])) for s, portraits, views in picked]
+            frozen = np.concatenate([stages[s].rows[at] for s, at in where])
+            pixels = np.concatenate([_turned(rng, stages[s].pixels[at]) for s, at in where])
+            with halved():
+                rows = look(head, frozen, pixels)
+            rows = F.normalize(rows.float(), dim=1)
+            who = torch.from_numpy(np.concatenate([stages[s].who[at] + STRIDE * s for s, at in where]))
+            portrait = torch.from_numpy(np.concatenate([stages[s].portrait[at] for s, at in where])) > 0
+            photo, seen = who[portrait][:, None], who[~portrait][None]
+            cosine, same, near = rows[portrait] @ rows[~portrait].T, photo == seen, photo // STRIDE == seen // STRIDE
+            pairs = ((cosine, same, ~same), (cosine.T, same.T, ~same.T), (cosine, same, near & ~same), (cosine.T, same.T, (near & ~same).T))
+            yield torch.stack([contrast(*pair) for pair in pairs]).sum()
+
+    fit(head, losses, -(-len(stages) // STAGES_PER_BATCH), run)
+    return head
+
+
+def _pick(rng: np.random.Generator, looks: Looks) -> tuple[np.ndarray, np.ndarray]:
+    """Two portraits of every object that has some, and up to three crops of every object."""
+    portraits: list[int] = []
+    views: list[int] = []
+    for who in np.unique(looks.who):
+        for kind, most, into in ((1, 2, portraits), (0, 3, views)):
+            mine = np.flatnonzero((looks.who == who) & (looks.portrait == kind))
+            into += rng.permutation(mine)[:most].tolist()
+    return np.array(portraits, np.int64), np.array(views, np.int64)
+
+
+def _turned(rng: np.random.Generator, pixels: UInt8[np.ndarray, "n s s 3"]) -> UInt8[np.ndarray, "n s s 3"]:
+    """Exposed a little differently; the frozen features stay."""
+    gain = rng.uniform(0.85, 1.15, (len(pixels), 1, 1, 3))
+    return np.clip(np.asarray(pixels) * gain, 0, 255).astype(np.uint8)
+
+
+def _cut(rgb: Rgb, box: tuple[int, int, int, int], rng: np.random.Generator) -> Rgb:
+    off = jitter(rng, np.array(box, np.float64), 0.06)
+    low, high = np.maximum(off[:2], 0), np.maximum(off[2:], off[:2] + 2)
+    return disturb(rng, crop(rgb, np.concatenate([low, high])))
