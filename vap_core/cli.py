@@ -193,6 +193,31 @@ def evaluate(
     _run(study, out or Path(f"data/runs/{policy}-{'-'.join(dict.fromkeys(suite))}"), workers, record)
 
 
+@app.command("eval-perception")
+def eval_perception(
+    stack: StackName = "embedded",
+    suite: Annotated[list[str] | None, typer.Option(help="A benchmark; repeatable. Default all four.")] = None,
+    episodes: Annotated[int | None, typer.Option(min=1, help="Opening frames per task, as episodes spread evenly over its list.")] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+    out: Annotated[Path, typer.Option(help="Run folder; a run found there is resumed.")] = Path("data/runs/perception"),
+    quick: Annotated[bool, typer.Option("--quick", help="Two opening frames per task and one tracked episode per suite.")] = False,
+    publish: Annotated[Path | None, typer.Option(help="Keep the tables in this folder too, as perception_NAME.parquet.")] = None,
+) -> None:
+    """Measure perception against the simulator: opening frames, tracks through whole expert episodes, and time. Interrupted, it goes on.
+
+    Example: python -m vap_core eval-perception --suite simpler-bridge --quick
+    """
+    from vap_core import suites as known
+    from vap_core.survey.report import conclude
+    from vap_core.survey.run import Survey, run
+    from vap_core.survey.run import publish as keep
+
+    asked = Survey(stack, tuple(dict.fromkeys(suite or known.BENCHMARKS)), episodes, quick)
+    print(conclude(run(asked, out, jobs=jobs), asked.stack, out))
+    if publish is not None:
+        print("wrote " + ", ".join(map(str, keep(out, publish))))
+
+
 @app.command()
 def rescore(run: Annotated[Path, typer.Argument(help="Run folder of eval, rollout or demo.")]) -> None:
     """Judge a finished run again from its saved states, without a simulator, and say what changed.
