@@ -32,7 +32,7 @@ SAME_BOX = 0.7
 
 @dataclass(frozen=True)
 class Stack:
-    """The four frozen models of the method. `domain` says in words what the detector was trained on."""
+    """The four frozen models of the method. `domain` says in words what the detector was trained on; empty: photos of anything."""
 
     name: str
     detector: detect.Detector
@@ -188,7 +188,19 @@ def embedded() -> Stack:
     return Stack("embedded", detect.load(), embed.load(), segment.load(), track.load(), "rendered tabletop scenes")
 
 
-STACKS: dict[str, Callable[[], Stack]] = {"embedded": embedded}
+def foundation(kind: str = "foundation") -> Stack:
+    """Grounding DINO, DINOv2 and SAM 2.1 (P 5.1), on a GPU where there is one."""
+    from vap_core import foundation
+
+    parts = foundation.load(kind)
+    return Stack(kind, parts.detector, parts.encoder, parts.segmenter, parts.tracker, "")
+
+
+STACKS: dict[str, Callable[[], Stack]] = {
+    "embedded": embedded,
+    "foundation": foundation,
+    "foundation-small": lambda: foundation("foundation-small"),
+}
 
 
 def load_stack(name: str) -> Stack:
