@@ -154,8 +154,11 @@ def geometry(a: Sighting, b: Sighting, pairing: Pairing) -> Scores:
 
 def apart_m(a: Sighting, b: Sighting) -> Scores:
     """Metres between the rays through the middles of two boxes, where they pass each other best at one height within `HEIGHTS_M`; inf for a ray
-    that never meets the table. Measured on opening frames, this tells objects apart better than the rays' least distance at any height, whose
-    rays also meet in mid-air, and places one object better than the boxes' feet on the table (README has the figures).
+    that never meets the table.
+
+    Of 2020 candidates with their like in another view (true boxes, opening frames of vlabench, tabletop and generic scenes), the nearest was
+    that like for 2019; by the rays' least distance at any height for 1953, as rays also meet in mid-air or below the table; by the feet of the
+    boxes on the table for 2016, but those lie 2 to 4 cm apart for one and the same object, and these rays 2 to 4 mm (medians).
     """
     foot_a, lean_a = _rays(a)
     foot_b, lean_b = _rays(b)
