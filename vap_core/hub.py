@@ -16,7 +16,10 @@ from vap_core.errors import MissingWeights, one_of
 from vap_core.files import write_atomic
 
 STORE = Path(__file__).resolve().parent.parent / "data" / "weights-hub"
+HUB = "https://huggingface.co"
 VARIABLE, ENDPOINT = "VAP_WEIGHTS", "HF_ENDPOINT"
+"""Environment variables: another store, and a mirror of the hub."""
+TIMEOUT_S, PARTIAL = 30.0, 206
 TENSORS, LOCK = "model.safetensors", "lock.json"
 TOKENIZER = ("tokenizer.json", "tokenizer_config.json")
 
@@ -151,9 +154,10 @@ def pull(wanted: Sequence[str], store: Path, *, origin: Path | None = None, unpi
             continue
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            place = None if origin is None else locate(source, origin)
             (folder / LOCK).unlink(missing_ok=True)
             for file in source.files:
-                _download(source, file, folder) if origin is None else _copy(source, file, locate(source, origin), folder)
+                _download(source, file, folder) if place is None else _copy(source, file, place, folder)
             found = {file: _sha256(folder / file) for file in source.files}
             if found[TENSORS] != source.sha256 and not unpinned:
                 (folder / TENSORS).unlink()
@@ -167,7 +171,6 @@ def pull(wanted: Sequence[str], store: Path, *, origin: Path | None = None, unpi
             raise MissingWeights(
                 f"weights pull: {folder} cannot be written ({error.strerror or error}); choose another folder with {VARIABLE}."
             ) from error
-        shutil.rmtree(folder / ".cache", ignore_errors=True)
         say(f"{name}: {sum((folder / file).stat().st_size for file in source.files) / 1e6:.1f} MB in {folder}")
 
 
@@ -187,30 +190,56 @@ def locate(source: Source, origin: Path) -> Path:
 
 def table(store: Path | None = None) -> str:
     """What is there, what is missing and how to get it; checks presence, not checksums."""
-    from vap_core.report import align
-
     store = store or home()
-    rows = [["stack", "model", "hub", "state"]]
+    lines, missing = [f"weights in {store}"], []
     for kind, models in KINDS.items():
-        rows += [[kind, name, f"{MODELS[name].repo}@{MODELS[name].revision[:8]}", problem(name, store, quick=True) or "here"] for name in models]
-    missing = [kind for kind, models in KINDS.items() if any(problem(name, store, quick=True) for name in models)]
-    return "\n".join([f"weights in {store}", "", align(rows), *(f"{kind}: {mend(kind)}" for kind in missing)])
+        faults = {name: problem(name, store, quick=True) for name in models}
+        lines += [f"{kind:<17} {name:<20} {MODELS[name].repo}@{MODELS[name].revision[:8]}: {fault or 'here'}" for name, fault in faults.items()]
+        missing += [f"{kind}: {mend(kind)}"] if any(faults.values()) else []
+    return "\n".join([*lines, *missing])
 
 
 def _download(source: Source, file: str, folder: Path) -> None:
-    """One file of the pinned revision, resumed where an earlier download stopped."""
-    from httpx import HTTPError
-    from huggingface_hub import constants, hf_hub_download
+    """One file of the pinned revision; a download that breaks off, now or in an earlier run, goes on where it stopped."""
+    from urllib.error import HTTPError
 
-    endpoint = os.environ.get(ENDPOINT) or constants.ENDPOINT
+    url = f"{(os.environ.get(ENDPOINT) or HUB).rstrip('/')}/{source.repo}/resolve/{source.revision}/{file}"
+    if file == TENSORS and (folder / file).is_file() and _sha256(folder / file) == source.sha256:
+        return
+    part = folder / f".{file}.{source.revision[:8]}.part"
     try:
-        hf_hub_download(source.repo, file, revision=source.revision, local_dir=folder, endpoint=endpoint)
-    except (OSError, HTTPError, ValueError) as error:
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
-        raise MissingWeights(
-            f"weights pull: {source.repo}/{file} cannot be had from {endpoint} ({reason}); "
-            f"run it again to go on, or pull on a machine with internet and pass its folder with --from."
-        ) from error
+        have = -1
+        while have < (have := part.stat().st_size if part.is_file() else 0):  # as long as every try brings something
+            if _fetch(url, part, have):
+                os.replace(part, folder / file)
+                return
+        reason = "it breaks off"
+    except HTTPError as error:
+        reason = f"HTTP {error.code}"
+        error.close()
+    except OSError as error:
+        reason = str(error)
+    raise MissingWeights(
+        f"weights pull: {url} cannot be had ({reason}); run it again to go on, or pull on a machine with internet and pass its folder with --from."
+    )
+
+
+def _fetch(url: str, part: Path, have: int) -> bool:
+    """Append what is missing of a file, and whether that was all of it."""
+    from urllib.request import Request, urlopen
+
+    from tqdm import tqdm
+
+    wanted = Request(url, headers={"User-Agent": "vap_core", **({"Range": f"bytes={have}-"} if have else {})})
+    with urlopen(wanted, timeout=TIMEOUT_S) as answer:
+        have = have if answer.status == PARTIAL else 0
+        total = have + int(answer.headers["Content-Length"])
+        bar = tqdm(total=total, initial=have, unit="B", unit_scale=True, desc=url.rsplit("/resolve/", 1)[0].rsplit("/", 1)[1])
+        with part.open("ab" if have else "wb") as out, bar:
+            while block := answer.read(1 << 20):
+                out.write(block)
+                bar.update(len(block))
+    return part.stat().st_size == total
 
 
 def _copy(source: Source, file: str, origin: Path, folder: Path) -> None:
