@@ -128,7 +128,7 @@ def test_the_command_measures_resumes_and_publishes(tmp_path: Path) -> None:
     out = tmp_path / "run"
     small = ["--quick", "--suite", "simpler-fractal", "--episodes", "1", "--jobs", "1"]
     words = ["eval-perception", *small, "--out", str(out), "--publish", str(tmp_path / "kept")]
-    done = subprocess.run([sys.executable, "-m", "vap_core", *words], capture_output=True, text=True, timeout=300)
+    done = subprocess.run([sys.executable, "-m", "vap_core", *words], capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stderr
     for told in ("detection AP50", ">= 97", "K = 7, average", "simpler-fractal head", "x backbone pass", "left out: simpler-fractal 0 of 2"):
         assert told in done.stdout

@@ -7,6 +7,7 @@ import numpy as np
 
 from vap_core.gallery import TIER_COLOURS, TIERS
 from vap_core.plots import OTHER, WINNER
+from vap_core.suites import BENCHMARKS
 from vap_core.survey.estimates import Estimate, mean, share
 from vap_core.survey.openings import KS, RULES, USUAL_K
 
@@ -81,13 +82,13 @@ def hardness_figure(objects: "pd.DataFrame") -> "Figure":
     pairs = duels(objects)
     tiers = [tier for tier in TIERS if (pairs.tier == tier).any()]
     _bars(grid[1], tiers, [share(pairs[pairs.tier == tier].ahead < 0) for tier in tiers], [TIER_COLOURS[tier] for tier in tiers])
-    grid[1].set(ylabel="% of views in which it is nearer than the target", xlabel="look-alike")
+    grid[1].set(ylabel="% of views: nearer than the target", xlabel="look-alike beside the target")
     return figure
 
 
 def references_figure(choices: "pd.DataFrame") -> "Figure":
     """Right instance against the number of reference photos, by rule, with 95 % Wilson intervals: one panel per suite and one of all views."""
-    suites = [*dict.fromkeys(choices.suite), "all"]
+    suites = [*_suites(choices), "all"]
     figure, grid = _panels(2.7 * len(suites), 3.4, len(suites), sharey=True)
     for axes, suite in zip(grid, suites, strict=True):
         here = choices if suite == "all" else choices[choices.suite == suite]
@@ -104,12 +105,13 @@ def time_figure(tracks: "pd.DataFrame") -> "Figure":
     """Mean IoU of the targets' undisturbed tracks over the episode, start to end, one line per suite; bands are bootstrapped by episode."""
     figure, axes = _panel(7.0, 3.8)
     free = tracks[tracks.target & (tracks.hidden == 0)]
-    for i, (suite, part) in enumerate(free.groupby("suite", sort=False)):
+    for suite, colour in _suites(free).items():
+        part = free[free.suite == suite]
         bins = len(part.iou_over_time.iloc[0])
         found = [mean(part.assign(x=[curve[b] for curve in part.iou_over_time]), "x") for b in range(bins)]
         time = np.linspace(0, 100, bins)
-        axes.plot(time, [e.value for e in found], color=f"C{i}", label=f"{suite}, {len(part)} tracks")
-        axes.fill_between(time, [e.low for e in found], [e.high for e in found], color=f"C{i}", alpha=0.15, linewidth=0)
+        axes.plot(time, [e.value for e in found], color=colour, label=f"{suite}, {len(part)} tracks")
+        axes.fill_between(time, [e.low for e in found], [e.high for e in found], color=colour, alpha=0.15, linewidth=0)
     axes.axhline(0.8, color="#999999", linewidth=0.8, linestyle=":")
     axes.set(xlabel="% of the episode", ylabel="IoU with the visible target", ylim=(0, 1.02), xlim=(0, 100))
     axes.legend(frameon=False, fontsize=9, loc="lower left")
@@ -120,12 +122,14 @@ def hidden_figure(tracks: "pd.DataFrame") -> "Figure":
     """Identity of the target kept to the episode's end against the frames for which it is hidden, with 95 % Wilson intervals."""
     figure, axes = _panel(6.4, 3.8)
     target = tracks[tracks.target]
-    for i, (kind, label) in enumerate((("plate", "a plate hides it fully"), ("arm", "an arm moves in front"))):
+    kinds = {"plate": "a plate hides it fully", "arm": "an arm moves in front"}
+    for i, (kind, label) in enumerate((kind, label) for kind, label in kinds.items() if (target.kind == kind).any()):
         part = target[(target.hidden == 0) | (target.kind == kind)]
         hidden = sorted(part.hidden.unique())
         found = [share(part[part.hidden == n].kept) for n in hidden]
         _line(axes, [n + 0.12 * (i - 0.5) for n in hidden], found, (WINNER, OTHER)[i], label, counts=i == 0)
     axes.set(xlabel="frames hidden (below: tracks behind the plate)", ylabel="% of targets tracked at the end", ylim=(0, 103), xticks=range(7))
+    axes.set_xlim(-0.4, 6.4)
     axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 0.06))
     return figure
 
@@ -139,14 +143,16 @@ def size_figure(objects: "pd.DataFrame", bins: int = 7) -> "Figure":
     middles = [float(part.px.median()) for part in parts]
     for column, label, colour in (("recalled", "among the 10 best boxes", WINNER), ("proposed", "above the detector's own threshold", OTHER)):
         _line(axes, middles, [share(part[column]) for part in parts], colour, label)
-    axes.set(
-        xlabel=f"visible pixels of the object ({len(objects)} objects in view, {len(parts)} bins)",
-        ylabel="% found (IoU 0.5)",
-        xscale="log",
-        ylim=(0, 103),
-    )
-    axes.legend(frameon=False, loc="lower right")
+    axes.set(xlabel=f"visible pixels ({len(objects)} objects in view, {len(parts)} bins)", ylabel="% found (IoU 0.5)", xscale="log", ylim=(0, 103))
+    axes.xaxis.set_major_formatter("{x:.0f}")
+    axes.xaxis.set_minor_formatter("{x:.0f}")
+    axes.legend(frameon=False, loc="best")
     return figure
+
+
+def _suites(table: "pd.DataFrame") -> dict[str, str]:
+    """The suites of a table in their usual order, each with its colour."""
+    return {name: f"C{i}" for i, name in enumerate(BENCHMARKS) if (table.suite == name).any()}
 
 
 def _line(axes: "Axes", x: Sequence[float], found: Sequence[Estimate], colour: str, label: str, counts: bool = False) -> None:

@@ -103,8 +103,8 @@ def report(tables: Survey, stack: str) -> str:
     """What the command prints."""
     found = measures(tables)
     head = ["measure, %", "target", *found[0].cells, "verdict"]
-    views, references = tables["views"], tables["references"]
-    unseen = ", ".join(f"{name} {int((~part.counts).sum())} of {len(part)}" for name, part in views.groupby("suite", sort=False))
+    views, references, names = tables["views"], tables["references"], [name for name in found[0].cells if name != ALL]
+    unseen = ", ".join(f"{name} {int((~part.counts).sum())} of {len(part)}" for name in names for part in [views[views.suite == name]])
     whole = share([i >= line.whole for line in references.itertuples() for i in range(line.k)])
     return "\n".join(
         [
@@ -115,6 +115,7 @@ def report(tables: Survey, stack: str) -> str:
             "",
             align([["right instance, %", *found[0].cells], *_by_k(tables["choices"], list(found[0].cells))]),
             "",
+            *([align(_by_association(tables["agreements"])), ""] if len(tables["agreements"]) else []),
             align([["by camera, %", "views", "recall@10", "AP50", "right, standard", "right, hard", "mask IoU"], *_by_camera(tables)]),
             "",
             align(_speed(tables["speed"])),
@@ -137,6 +138,16 @@ def _by_k(choices: "pd.DataFrame", cells: list[str]) -> list[list[str]]:
         for rule in RULES:
             part = choices[(choices.k == k) & (choices.rule == rule)]
             rows.append([f"K = {k}, {rule}", *(share((part if name == ALL else part[part.suite == name]).right).told() for name in cells)])
+    return rows
+
+
+def _by_association(agreements: "pd.DataFrame") -> list[list[str]]:
+    """Head and a line per suite and way to associate: what its episodes' views show together, and how many views show the target highlighted."""
+    cases = ("right", "case 1", "case 2", "nothing")
+    rows = [["views associated, % of episodes", "by", *cases, "% of views right"]]
+    for (suite, way), part in agreements.groupby(["suite", "associate"], sort=False):
+        views = share([i < line.right for line in part.itertuples() for i in range(line.views)])
+        rows.append([str(suite), str(way), *(share(part.case == name).told() for name in cases), views.told()])
     return rows
 
 

@@ -18,7 +18,8 @@ from vap_core.errors import BadOutput, WorkerDied, one_of
 from vap_core.experiments import Study
 from vap_core.files import write_atomic
 from vap_core.survey import following
-from vap_core.survey.openings import KS, Tables, openings, remembered, survey
+from vap_core.survey.episodes import survey
+from vap_core.survey.openings import KS, Tables, openings, remembered
 from vap_core.values import EpisodeRow
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ QUICK = 2
 HIDDEN = 3
 CHUNK = 6
 """Episodes of one job: little is lost when a run is killed."""
-TABLES = ("views", "objects", "detections", "choices", "references", "tracks", "speed")
+TABLES = ("views", "objects", "detections", "choices", "agreements", "references", "tracks", "speed")
 
 
 @dataclass(frozen=True)
