@@ -1,15 +1,18 @@
 """The whole method on a world whose every answer is known."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.toys import TOYS, SameColour, personal, scene
+from vap_core.associate import PAIRINGS, case
 from vap_core.attend import Attender, Prompting, load_stack
-from vap_core.errors import BadInstruction, UnknownName
+from vap_core.errors import BadInstruction, BadViews, UnknownName
 from vap_core.prompt import PALETTE, tint
-from vap_core.values import Boxes
+from vap_core.values import Attended, Boxes, Camera, Grounding, PolicyInput
+from vap_core.vote import vote
 
 GREY, TEAL, SAND = (90, 90, 90), (40, 120, 110), (150, 130, 90)
 CUP, VASE = personal("mug", "cup", TEAL, TEAL, TEAL), personal("ming", "vase", SAND)
@@ -148,6 +151,162 @@ def test_what_cannot_be_matched_is_said() -> None:
         attender.start({"front": LINE}, "bring my cup", objects=["mug", "ming"])
     _, attended = attender.start({"front": LINE}, "bring my cup", objects=["other"])
     assert attended.groundings["front"][0].winner == 0
+
+
+def overhead(name: str, x: float) -> Camera:
+    """Looks straight down from 1 m above (x, 0), 64 x 64 pixels of 1 / 64 m."""
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[:3, 3] = x, 0.0, 1.0
+    return Camera(name, 64, 64, np.array([[64.0, 0, 32], [0, 64.0, 32], [0, 0, 1]]), pose)
+
+
+DIM, TEALISH, MOSS = (60, 80, 70), (55, 115, 100), (50, 115, 95)
+CAMERAS = {"front": overhead("front", 0.0), "side": overhead("side", 0.25), "wrist": overhead("wrist", 0.5)}
+"""Each sees the table 16 pixels further left than the one before."""
+CONTRADICTING = {
+    "front": scene([(4, 20, DIM), (36, 20, TEAL)]),
+    "side": scene([(20, 20, TEALISH), (4, 45, MOSS)]),  # the one at x = 20 is the front's at 36; the other, from beyond its edge, looks more like it
+    "wrist": scene([(24, 8, DIM)]),  # and this is neither of them
+}
+
+
+def same(one: Attended, two: Attended) -> bool:
+    """Bit for bit, but for the associations."""
+
+    def flat(g: Grounding) -> list[object]:
+        return [
+            g.candidates.xyxy.tolist(),
+            g.similarity.tolist(),
+            g.votes.tolist(),
+            g.winner,
+            g.overruled,
+            g.margin,
+            g.cosine_margin,
+            g.masks.tolist(),
+        ]
+
+    return (
+        (one.text, [e.text for e in one.events], list(one.images)) == (two.text, [e.text for e in two.events], list(two.images))
+        and all((one.images[c] == two.images[c]).all() for c in one.images)
+        and all([flat(g) for g in one.groundings[c]] == [flat(g) for g in two.groundings[c]] for c in one.groundings)
+    )
+
+
+def test_views_by_themselves_contradict_each_other_and_together_agree() -> None:
+    _, alone = Attender(TOYS, MEMORY).start(CONTRADICTING, "bring my cup", cameras=CAMERAS)
+    assert [alone.groundings[c][0].winner for c in CONTRADICTING] == [1, 0, 0]
+    assert alone.associations == ()
+    attender = Attender(TOYS, MEMORY, Prompting(associate=PAIRINGS["geometry"]))
+    state, attended = attender.start(CONTRADICTING, "bring my cup", cameras=CAMERAS)
+    front, side, wrist = (attended.groundings[c][0] for c in CONTRADICTING)
+    assert [(g.winner, g.elected, g.overruled) for g in (front, side, wrist)] == [(1, 1, None), (1, 0, 0), (None, 0, 0)]
+    assert (side.votes.tolist(), side.margin) == ([3, 0], 1.0)  # the vote's fields are the vote's
+    (found,) = attended.associations
+    assert found.chosen == {"front": 1, "side": 1, "wrist": None}
+    assert found.margin > 0
+    assert set(found.terms) == {"references", "geometry"}
+    assert (attended.images["side"] == tint(CONTRADICTING["side"], where(CONTRADICTING["side"], TEALISH), RED)).all()
+    assert attended.images["wrist"] is CONTRADICTING["wrist"]
+    assert attended.text == "bring the red cup"
+    said = [e.text for e in attended.events]
+    assert any(text.startswith("side: mug is candidate 1 with 0/3 votes by association, over candidate 0 with 3") for text in said)
+    assert any(text.startswith("wrist: mug is none of 1 candidates by association") for text in said)
+    assert any(text.startswith("mug: views associated, margin") for text in said)
+    moved = {**CONTRADICTING, "side": scene([(30, 30, TEALISH), (4, 45, MOSS)])}
+    _, followed = attender.step(state, moved)
+    assert (followed.images["side"] == tint(moved["side"], where(moved["side"], TEALISH), RED)).all()
+    assert followed.tracks["wrist"][0].mask is None
+    assert followed.associations == attended.associations
+
+
+def test_association_off_and_cameras_given_is_the_paper_bit_for_bit() -> None:
+    _, plain = Attender(TOYS, MEMORY).start(CONTRADICTING, "bring my cup")
+    _, off = Attender(TOYS, MEMORY, Prompting(associate=None)).start(CONTRADICTING, "bring my cup", cameras=CAMERAS)
+    assert same(plain, off)
+
+
+@pytest.mark.parametrize("name", sorted(PAIRINGS))
+def test_one_view_is_the_plain_vote(name: str) -> None:
+    """Also with a second view that shows nothing: one has nobody to agree with."""
+    associating = Attender(TOYS, MEMORY, Prompting(associate=PAIRINGS[name]))
+    for views in ({"front": LINE}, {"front": LINE, "side": scene([])}):
+        _, plain = Attender(TOYS, MEMORY).start(views, "bring my cup")
+        _, attended = associating.start(views, "bring my cup")
+        assert same(plain, attended)
+        assert attended.associations == (None,)
+
+
+def test_each_of_several_targets_is_associated_by_itself() -> None:
+    sandy = {camera: rgb.copy() for camera, rgb in CONTRADICTING.items()}
+    for x, view in ((40, "front"), (24, "side"), (8, "wrist")):
+        sandy[view][48:60, x : x + 12] = SAND
+    attender = Attender(TOYS, MEMORY, Prompting(associate=PAIRINGS["geometry"]))
+    _, attended = attender.start(sandy, "put my cup near my vase", cameras=CAMERAS)
+    cup, vase = attended.associations
+    assert [g.object for g in attended.groundings["front"]] == ["mug", "ming"]
+    chosen = {camera: [None if g.mask is None else tuple(sandy[camera][g.mask][0]) for g in gs] for camera, gs in attended.groundings.items()}
+    assert chosen == {"front": [TEAL, SAND], "side": [TEALISH, SAND], "wrist": [None, SAND]}
+    assert {camera: g[0].winner for camera, g in attended.groundings.items()} == cup.chosen
+    assert {camera: g[1].winner for camera, g in attended.groundings.items()} == vase.chosen
+
+
+def test_views_that_cannot_be_associated_are_said() -> None:
+    attender = Attender(TOYS, MEMORY, Prompting(associate=PAIRINGS["geometry"]))
+    with pytest.raises(BadViews, match="geometry needs calibrated cameras; give Attender.start cameras="):
+        attender.start(CONTRADICTING, "bring my cup")
+    small = {**CAMERAS, "side": replace(CAMERAS["side"], width=32)}
+    with pytest.raises(BadViews, match="camera 'side' is calibrated for 32x64 pixels, but its view has 64x64"):
+        attender.start(CONTRADICTING, "bring my cup", cameras=small)
+
+
+def test_on_a_rendered_desk_with_three_cameras_no_view_contradicts_another() -> None:
+    """From the true boxes of the real models; the mug is remembered by what the front camera sees, so that its own view is beyond doubt."""
+    from vap_core.embed import crop
+    from vap_core.experiments import METHODS
+    from vap_core.memory import remember
+    from vap_core.rollout import Trial, rollout
+    from vap_core.sim.env import Env
+    from vap_core.sim.objects import extent_m, get
+    from vap_core.sim.scenes import build
+    from vap_core.suites import rows, suite
+
+    desk, row = suite("tabletop"), rows("tabletop", "select-cup")[3]
+    stack = load_stack("embedded")
+    with build(desk.robot, [place.model for place in row.placements]) as world:
+        env = Env(world, cameras=row.cameras, control=desk.control, sensor=desk.sensor)
+        env.reset(row)
+        views, truth = env.observe().images, env.truth(masks=True).masks
+        shown = {c: [name for name, mask in masks.items() if mask.sum() > 40] for c, masks in truth.items()}
+        boxes = {c: Boxes(np.array([around(truth[c][name]) for name in shown[c]], np.float32), np.ones(len(shown[c]), np.float32), "") for c in views}
+        mine = remember("mug", "cup", [crop(views["front"], boxes["front"].xyxy[shown["front"].index(row.target)])], stack.encoder)
+        by_hand = replace(stack, detector=lambda images, phrase, threshold=None: [boxes[c] for c in row.cameras])
+        attender = Attender(by_hand, {"mug": mine}, METHODS["vap-associated"])
+        trial = Trial("vap-associated", world, Still(), attender, {name: extent_m(get(name)) for name in world.objects}, desk.control, desk.sensor)
+        (episode,) = rollout(trial, [replace(row, max_steps=1)])
+    assert episode.outcome.status == "failure", episode.outcome.detail
+    groundings = {camera: of_view[0] for camera, of_view in episode.opening.groundings.items()}
+    prompted = {camera: None if g.winner is None else shown[camera][g.winner] for camera, g in groundings.items()}
+    assert (case(prompted, row.target), set(prompted.values())) == ("right", {row.target})
+    (found,) = episode.opening.associations
+    assert found.chosen == {camera: g.winner for camera, g in groundings.items()}
+    assert [g.elected for g in groundings.values()] == [vote(g.similarity).winner for g in groundings.values()]
+
+
+class Still:
+    """A policy that never moves."""
+
+    label, execute = "still", 1
+
+    def start(self, rng: np.random.Generator) -> None:
+        return None
+
+    def plan(self, states: Sequence[None], inputs: Sequence[PolicyInput]) -> tuple[list[None], list[np.ndarray]]:
+        return list(states), [np.zeros((1, len(one.state) - 6), np.float32) for one in inputs]  # joints and gripper
+
+
+def around(mask: np.ndarray) -> list[int]:
+    rows, columns = np.nonzero(mask)
+    return [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
 
 
 def test_unknown_stack() -> None:

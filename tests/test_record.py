@@ -17,10 +17,12 @@ from rerun.chunk import RrdReader
 
 from vap_core.errors import BadOutput, BadRecording, MissingGL
 from vap_core.record import Recorder, read_summary, record_grounding, recording_name, recover, screenshot
+from vap_core.record.blueprint import evidence_line
 from vap_core.record.evidence import apart, classes, label_spots
 from vap_core.record.file import rerun_cli, temporary
 from vap_core.values import (
     ROBOT,
+    Association,
     Boxes,
     Camera,
     EpisodeRow,
@@ -262,6 +264,26 @@ def test_a_view_without_candidates_and_a_lost_track_are_results(tmp_path: Path) 
     assert columns(tmp_path / "one.rrd", "/vap/candidates/side", "winner") == {0: [-1]}
     buffers = columns(tmp_path / "one.rrd", "/observation.images.front/mask/target", "SegmentationImage:buffer")
     assert [step for step, buffer in buffers.items() if not np.any(buffer)] == [4, 5, 6]
+
+
+def test_what_the_views_agreed_on_can_be_read_back(tmp_path: Path) -> None:
+    """The vote stays as it was; beside it the choice, its scores, and a view of which the target is no part."""
+    start = opening(2)
+    front, side = (start.groundings[cam][0] for cam in ("front", "side"))
+    support = {"front": np.array([0.5, 3.25, -1.0, 0.0]), "side": np.array([1.0, 2.0, -1.0, 3.25])}
+    agreed = Association({"front": 1, "side": None}, 3.25, 1.25, {"references": 2.0, "geometry": 1.25}, support)
+    groundings = {"front": (replace(front, winner=1, overruled=0),), "side": (replace(side, winner=None, overruled=0),)}
+    record(tmp_path / "one.rrd", replace(start, groundings=groundings, associations=(agreed, None)))
+    for cam, winner in (("front", 1), ("side", -1)):
+        read = {name: columns(tmp_path / "one.rrd", f"/vap/candidates/{cam}", name) for name in ("winner", "elected")}
+        assert read == {"winner": {0: [winner]}, "elected": {0: [0]}}
+    numbers = {name: columns(tmp_path / "one.rrd", "/vap/association", name)[0] for name in ("chosen", "total", "margin", "scores", "support_side")}
+    assert numbers == {"chosen": [1, -1], "total": [3.25], "margin": [1.25], "scores": [2.0, 1.25], "support_side": [1.0, 2.0, -1.0, 3.25]}
+    assert columns(tmp_path / "one.rrd", "/vap/association", "cameras")[0] == ["front", "side"]
+    assert evidence_line(groundings["front"][0]).startswith("#1 by association · #0 wins 4/5")
+    assert evidence_line(groundings["side"][0]).startswith("none by association · #0 wins 4/5")
+    assert "/vap/votes/side/winner" not in entities(tmp_path / "one.rrd")
+    assert rerun("rrd", "verify", tmp_path / "one.rrd").returncode == 0
 
 
 def test_a_method_that_grounds_nothing_records_too(tmp_path: Path) -> None:

@@ -10,8 +10,12 @@ from hypothesis import strategies as st
 
 from tests.toys import TOYS, personal, scene
 from vap_core import suites
+from vap_core.associate import PAIRINGS
+from vap_core.attend import Stack
 from vap_core.sim import objects
-from vap_core.survey.openings import RULES, View, match, openings, remembered, survey, survey_view
+from vap_core.survey.episodes import OFF, agreements, survey
+from vap_core.survey.openings import RULES, Looked, Tables, View, look, match, openings, remembered
+from vap_core.survey.openings import survey_view as survey_one
 from vap_core.values import Boxes, EpisodeRow, PersonalObject, Placement, Rgb
 
 RED, GREEN, BLUE = (250, 5, 5), (5, 250, 5), (5, 5, 250)
@@ -32,6 +36,10 @@ def view(*names: str, hidden: Sequence[str] = ()) -> View:
 
 def memory(*colours: tuple[int, int, int]) -> dict[int, PersonalObject]:
     return {5: personal(MINE, "cup", *colours)}
+
+
+def survey_view(seen: View, stack: Stack, known: dict[int, PersonalObject]) -> Tables:
+    return survey_one(seen, stack, known, look(seen, stack))
 
 
 def test_tiers_of_the_toys() -> None:
@@ -127,6 +135,28 @@ def test_openings_show_each_row_as_its_suite_does() -> None:
         assert v.least_px == 100
 
 
+def test_agreements_tell_contradiction_and_what_geometry_makes_of_it() -> None:
+    """True boxes, and embeddings that say who is who by a hair, but for one view in which they name a look-alike."""
+    (episode,) = openings(suites.rows("vlabench", "select-shoe", 1))
+    target = episode[0].row.target
+    names = [name for name in episode[0].masks if objects.get(name).category == "shoe"]
+    assert all(name in v.visible() for v in episode for name in names)
+
+    def told(view: View, favourite: str) -> Looked:
+        side = np.array([0.45 if name == favourite else 0.40 for name in names])
+        rows = np.stack([side, np.sqrt(1 - side**2)], axis=1).astype(np.float32)
+        return Looked(Boxes(np.stack([view.boxes()[name] for name in names]), np.ones(len(names), np.float32), "shoe"), rows)
+
+    mine = replace(personal(target, "shoe", RED), embeddings=np.array([[1.0, 0.0]], np.float32))
+    honest = {line["associate"]: line for line in agreements(episode, [told(v, target) for v in episode], mine)}
+    assert list(honest) == [OFF, *PAIRINGS]
+    assert all((line["case"], line["right"], line["views"]) == ("right", 3, 3) for line in honest.values())
+    other = next(name for name in names if name != target)
+    torn = {line["associate"]: line for line in agreements(episode, [told(v, other if v.camera == "side" else target) for v in episode], mine)}
+    assert (torn[OFF]["case"], torn[OFF]["right"]) == ("case 2", 2)
+    assert (torn["geometry"]["case"], torn["geometry"]["right"]) == ("right", 3)
+
+
 def test_the_list_is_spread_over_splits_and_variants() -> None:
     rows = suites.rows("simpler-fractal", "pick-pen-holder", 60)
     assert {row.split for row in rows} == {"visual matching", "variant aggregation"}
@@ -141,6 +171,7 @@ def test_survey_fills_every_table_and_keys_every_line() -> None:
     tables = survey(episode, stack, ks=(1, 5))
     assert len(tables["views"]) == 1
     assert [(line["k"], line["rule"]) for line in tables["choices"]] == [(1, "vote"), (1, "average"), (5, "vote"), (5, "average")]
+    assert tables.pop("agreements") == []
     for name, lines in tables.items():
         assert lines, name
         assert all(line["suite"] == "simpler-bridge" and line["camera"] == "front" for line in lines)

@@ -5,7 +5,7 @@
     state, attended = attender.step(state, {"front": rgb})                 # t > 0: track only
     policy(attended.images, attended.text)
 
-Views are grounded independently. A view without candidates, or whose tracker lost the target, passes unmodified.
+Views are grounded independently, or associated (Prompting.associate). A view without candidates, or whose tracker lost the target, passes unmodified.
 
 Arrays: images are RGB, h x w x 3, uint8; boxes are n x 4 `x0 y0 x1 y1` in that image's pixels, far corner exclusive; masks are
 n x h x w, bool; embeddings are n (candidates) or k (references) rows of d numbers, each row of length 1; cosines are n x k.
@@ -19,11 +19,12 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from vap_core import detect, embed, segment, track
-from vap_core.errors import BadInstruction, one_of
+from vap_core.associate import Pairing, Sighting, associate, overrule
+from vap_core.errors import BadInstruction, BadViews, one_of
 from vap_core.instruction import Parser, parse, rewrite
 from vap_core.memory import recall
 from vap_core.prompt import ALPHA, PALETTE, choose_colours, tint
-from vap_core.values import Attended, Boxes, Colour, Event, Grounding, Instruction, PersonalObject, Rgb, Track, Views, value
+from vap_core.values import Association, Attended, Boxes, Camera, Colour, Event, Grounding, Instruction, PersonalObject, Rgb, Track, Views, value
 from vap_core.vote import Rule, similarity, vote
 
 SAME_BOX = 0.7
@@ -32,7 +33,7 @@ SAME_BOX = 0.7
 
 @dataclass(frozen=True)
 class Stack:
-    """The four frozen models of the method. `domain` says in words what the detector was trained on."""
+    """The four frozen models of the method. `domain` says in words what the detector was trained on; empty: photos of anything."""
 
     name: str
     detector: detect.Detector
@@ -44,13 +45,17 @@ class Stack:
 
 @dataclass(frozen=True)
 class Prompting:
-    """What is changed in the policy's inputs; the defaults are the paper's method, the switches its ablations."""
+    """What is changed in the policy's inputs; the defaults are the paper's method, the switches its ablations.
+
+    `associate` goes beyond it: views agree on one object each (module associate; its PAIRINGS by name); None grounds them one by one.
+    """
 
     alpha: float = ALPHA
     palette: tuple[Colour, ...] = PALETTE
     highlight: bool = True
     rewrite: bool = True
     rule: Rule = "vote"
+    associate: Pairing | None = None
 
 
 @value
@@ -72,6 +77,7 @@ class AttendState:
     colours: tuple[Colour, ...]
     text: str
     groundings: Mapping[str, tuple[Grounding, ...]]
+    associations: tuple[Association | None, ...]
     ids: Mapping[str, tuple[int | None, ...]]
     trackers: Mapping[str, Any]
     visible: frozenset[tuple[str, int]]
@@ -87,47 +93,57 @@ class Attender:
         self.parser = parser
 
     def start(
-        self, views: Views, instruction: str, *, objects: Sequence[str] | None = None, boxes: Mapping[str, Boxes] | None = None
+        self,
+        views: Views,
+        instruction: str,
+        *,
+        objects: Sequence[str] | None = None,
+        boxes: Mapping[str, Boxes] | None = None,
+        cameras: Mapping[str, Camera] | None = None,
     ) -> tuple[AttendState, Attended]:
         """Ground every target of `instruction` in every view (t = 0).
 
         `objects` names the remembered object of each target in turn, where its category alone does not decide;
-        `boxes` replaces the detector by candidates given by hand, per camera.
+        `boxes` replaces the detector by candidates given by hand, per camera; `cameras` are the calibrated cameras as they stand now,
+        which only association by geometry needs.
 
         Raises:
             BadInstruction, UnknownName: what was said cannot be matched with the memory.
+            BadViews: the views cannot be associated.
         """
         parsed = self.parser(instruction, {obj.category for obj in self.memory.values()})
         if objects is not None and len(objects) != len(parsed.targets):
             raise BadInstruction(f"Attender.start: {len(objects)} objects named for {len(parsed.targets)} targets in {instruction!r}; one each.")
         names: Sequence[str | None] = objects or [None] * len(parsed.targets)
         wanted = [recall(self.memory, target, name) for target, name in zip(parsed.targets, names, strict=True)]
-        cameras = list(views)
-
-        seen: dict[str, dict[str, Seen]] = {camera: {} for camera in cameras}
+        seen: dict[str, dict[str, Seen]] = {camera: {} for camera in views}
         for phrase in dict.fromkeys(target.category for target in parsed.targets):
-            found = [boxes[c] for c in cameras] if boxes is not None else self.stack.detector([views[c] for c in cameras], phrase)
-            for camera, candidates in zip(cameras, found, strict=True):
-                seen[camera][phrase] = self._look(views[camera], candidates, tuple(seen[camera].values()))
+            found = [boxes[camera] for camera in views] if boxes is not None else self.stack.detector(list(views.values()), phrase)
+            for (camera, rgb), candidates in zip(views.items(), found, strict=True):
+                seen[camera][phrase] = self._look(rgb, candidates, tuple(seen[camera].values()))
 
-        pairs = list(zip([target.category for target in parsed.targets], wanted, strict=True))
-        groundings = {camera: tuple(self._ground(camera, obj, seen[camera][phrase]) for phrase, obj in pairs) for camera in cameras}
+        phrases = [target.category for target in parsed.targets]
+        groundings = {
+            camera: tuple(self._ground(camera, obj, seen[camera][phrase]) for phrase, obj in zip(phrases, wanted, strict=True)) for camera in views
+        }
+        groundings, associations = self._associate(groundings, [{c: seen[c][phrase] for c in views} for phrase in phrases], views, cameras or {})
         ids = {
             camera: tuple(
-                None if g.winner is None else seen[camera][phrase].ids[g.winner] for (phrase, _), g in zip(pairs, groundings[camera], strict=True)
+                None if g.winner is None else seen[camera][phrase].ids[g.winner] for phrase, g in zip(phrases, groundings[camera], strict=True)
             )
-            for camera in cameras
+            for camera in views
         }
-        masks = {camera: _masks_by_id(tuple(seen[camera].values())) for camera in cameras}
+        masks = {camera: _masks_by_id(tuple(seen[camera].values())) for camera in views}
 
-        colours = choose_colours(len(wanted), [(views[camera], list(masks[camera])) for camera in cameras], self.prompting.palette)
-        named = [colour if any(ids[camera][j] is not None for camera in cameras) else None for j, colour in enumerate(colours)]
+        colours = choose_colours(len(wanted), [(views[camera], list(masks[camera])) for camera in views], self.prompting.palette)
+        named = [colour if any(ids[camera][j] is not None for camera in views) else None for j, colour in enumerate(colours)]
         text = rewrite(parsed, named) if self.prompting.rewrite else instruction
-        tracked = [camera for camera in cameras if len(masks[camera])]
+        tracked = [camera for camera in views if len(masks[camera])]
         trackers = dict(zip(tracked, self.stack.tracker.start([views[c] for c in tracked], [masks[c] for c in tracked]), strict=True))
-        tracks = {camera: tuple(Track(g.mask, 0.0 if g.mask is None else 1.0) for g in groundings[camera]) for camera in cameras}
-        state = AttendState(0, parsed, colours, text, groundings, ids, trackers, _visible(tracks))
-        events = (*(_describe(g) for per_view in groundings.values() for g in per_view), *_shared(ids))
+        tracks = {camera: tuple(Track(g.mask, 0.0 if g.mask is None else 1.0) for g in groundings[camera]) for camera in views}
+        state = AttendState(0, parsed, colours, text, groundings, associations, ids, trackers, _visible(tracks))
+        agreed = (_agreement(groundings, j, a) for j, a in enumerate(associations) if a is not None)
+        events = (*(_describe(g) for per_view in groundings.values() for g in per_view), *agreed, *_shared(ids))
         return state, self._prompt(state, views, tracks, events)
 
     def step(self, state: AttendState, views: Views) -> tuple[AttendState, Attended]:
@@ -171,6 +187,34 @@ class Attender:
         b = vote(cosine, self.prompting.rule)
         return Grounding(camera, obj.name, seen.candidates, cosine, b.votes, b.tied, b.winner, b.margin, b.cosine_margin, seen.masks)
 
+    def _associate(
+        self,
+        groundings: Mapping[str, tuple[Grounding, ...]],
+        seen: Sequence[Mapping[str, Seen]],
+        views: Views,
+        cameras: Mapping[str, Camera],
+    ) -> tuple[dict[str, tuple[Grounding, ...]], tuple[Association | None, ...]]:
+        """Let the views agree on each target by itself; `seen[j]` are target j's candidates by camera. Switched off, nothing changes."""
+        pairing = self.prompting.associate
+        if pairing is None:
+            return dict(groundings), ()
+        for name, rgb in views.items():
+            if name in cameras and (cameras[name].height, cameras[name].width) != rgb.shape[:2]:
+                raise BadViews(
+                    f"Attender.start: camera {name!r} is calibrated for {cameras[name].width}x{cameras[name].height} pixels, but its view has "
+                    f"{rgb.shape[1]}x{rgb.shape[0]}; scale its k, or the view."
+                )
+        found = [
+            associate(
+                {c: Sighting(groundings[c][j].similarity, s.embeddings, s.candidates.xyxy, cameras.get(c)) for c, s in by_camera.items()}, pairing
+            )
+            for j, by_camera in enumerate(seen)
+        ]
+        return {
+            camera: tuple(g if a is None else overrule(g, a.chosen[camera]) for g, a in zip(per_view, found, strict=True))
+            for camera, per_view in groundings.items()
+        }, tuple(found)
+
     def _prompt(self, state: AttendState, views: Views, tracks: Mapping[str, tuple[Track, ...]], events: tuple[Event, ...]) -> Attended:
         images = dict(views)
         if self.prompting.highlight:
@@ -180,7 +224,7 @@ class Attender:
                     if track.mask is not None:
                         images[camera] = tint(images[camera], track.mask & free, colour, self.prompting.alpha)
                         free &= ~track.mask
-        return Attended(images, state.text, state.colours, tracks, state.groundings, events)
+        return Attended(images, state.text, state.colours, tracks, state.groundings, events, state.associations)
 
 
 def embedded() -> Stack:
@@ -188,7 +232,19 @@ def embedded() -> Stack:
     return Stack("embedded", detect.load(), embed.load(), segment.load(), track.load(), "rendered tabletop scenes")
 
 
-STACKS: dict[str, Callable[[], Stack]] = {"embedded": embedded}
+def foundation(kind: str = "foundation") -> Stack:
+    """Grounding DINO, DINOv2 and SAM 2.1 (P 5.1), on a GPU where there is one."""
+    from vap_core import foundation
+
+    parts = foundation.load(kind)
+    return Stack(kind, parts.detector, parts.encoder, parts.segmenter, parts.tracker, "")
+
+
+STACKS: dict[str, Callable[[], Stack]] = {
+    "embedded": embedded,
+    "foundation": foundation,
+    "foundation-small": lambda: foundation("foundation-small"),
+}
 
 
 def load_stack(name: str) -> Stack:
@@ -216,7 +272,16 @@ def _shared(ids: Mapping[str, tuple[int | None, ...]]) -> list[Event]:
 
 
 def _describe(g: Grounding) -> Event:
-    if g.winner is None:
+    if g.elected is None:
         return Event(0, "WARN", f"{g.camera}: no {g.candidates.phrase} found, the view passes unmodified")
-    tie = " after a tie" if g.tied[g.winner] else ""
-    return Event(0, "INFO", f"{g.camera}: {g.object} is candidate {g.winner} with {g.votes[g.winner]}/{g.similarity.shape[1]} votes{tie}")
+    if g.winner is None:
+        return Event(0, "WARN", f"{g.camera}: {g.object} is none of {len(g.candidates)} candidates by association, the view passes unmodified")
+    tie = " after a tie" if g.overruled is None and g.tied[g.winner] else ""
+    by = "" if g.overruled is None else f" by association, over candidate {g.overruled} with {g.votes[g.overruled]}"
+    return Event(0, "INFO", f"{g.camera}: {g.object} is candidate {g.winner} with {g.votes[g.winner]}/{g.similarity.shape[1]} votes{tie}{by}")
+
+
+def _agreement(groundings: Mapping[str, tuple[Grounding, ...]], j: int, a: Association) -> Event:
+    """How sure the views are of target j together, and by what."""
+    name = next(iter(groundings.values()))[j].object
+    return Event(0, "INFO", f"{name}: views associated, margin {a.margin:.2f}; " + ", ".join(f"{term} {part:.2f}" for term, part in a.terms.items()))

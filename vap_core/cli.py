@@ -22,9 +22,11 @@ train_app = typer.Typer(no_args_is_help=True, help="Train shipped parts again; e
 app.add_typer(train_app, name="train")
 objects_app = typer.Typer(no_args_is_help=True, help="The objects of the scenes: what there is, and your own 3-D scans.")
 app.add_typer(objects_app, name="objects")
+weights_app = typer.Typer(no_args_is_help=True, help="The foundation stack's weights: what is there, and how to get the rest.")
+app.add_typer(weights_app, name="weights")
 
 Memory = Annotated[Path, typer.Option(help="Folder of remembered objects.")]
-StackName = Annotated[str, typer.Option("--stack", help="Perception stack: embedded (offline, CPU).")]
+StackName = Annotated[str, typer.Option("--stack", help="Perception stack: embedded (offline, CPU), foundation or foundation-small (see weights).")]
 Methods = Annotated[
     list[str] | None,
     typer.Option("--method", help="generic, vap, mask-only, rewrite-only; repeatable. Default: the first two."),
@@ -193,6 +195,31 @@ def evaluate(
     _run(study, out or Path(f"data/runs/{policy}-{'-'.join(dict.fromkeys(suite))}"), workers, record)
 
 
+@app.command("eval-perception")
+def eval_perception(
+    stack: StackName = "embedded",
+    suite: Annotated[list[str] | None, typer.Option(help="A benchmark; repeatable. Default all four.")] = None,
+    episodes: Annotated[int | None, typer.Option(min=1, help="Opening frames per task, as episodes spread evenly over its list.")] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+    out: Annotated[Path, typer.Option(help="Run folder; a run found there is resumed.")] = Path("data/runs/perception"),
+    quick: Annotated[bool, typer.Option("--quick", help="Two opening frames per task and one tracked episode per suite.")] = False,
+    publish: Annotated[Path | None, typer.Option(help="Keep the tables in this folder too, as perception_NAME.parquet.")] = None,
+) -> None:
+    """Measure perception against the simulator: opening frames, tracks through whole expert episodes, and time. Interrupted, it goes on.
+
+    Example: python -m vap_core eval-perception --suite simpler-bridge --quick
+    """
+    from vap_core import suites as known
+    from vap_core.survey.report import conclude
+    from vap_core.survey.run import Survey, run
+    from vap_core.survey.run import publish as keep
+
+    asked = Survey(stack, tuple(dict.fromkeys(suite or known.BENCHMARKS)), episodes, quick)
+    print(conclude(run(asked, out, jobs=jobs), asked.stack, out))
+    if publish is not None:
+        print("wrote " + ", ".join(map(str, keep(out, publish))))
+
+
 @app.command()
 def rescore(run: Annotated[Path, typer.Argument(help="Run folder of eval, rollout or demo.")]) -> None:
     """Judge a finished run again from its saved states, without a simulator, and say what changed.
@@ -252,21 +279,57 @@ def doctor() -> None:
 
 @app.command()
 def bench(
-    what: Annotated[str, typer.Argument(help="loop: the prompted control loop; suites: every benchmark's simulator.")] = "loop",
+    what: Annotated[
+        str, typer.Argument(help="loop: the prompted control loop; suites: every benchmark's simulator; stack: a stack's models.")
+    ] = "loop",
     steps: Annotated[int, typer.Option(min=5, help="loop: control steps to time.")] = 60,
     workers: Workers = 2,
+    stack: StackName = "foundation",
+    random_weights: Annotated[bool, typer.Option("--random-weights", help="stack: without weights; they change nothing about speed.")] = False,
+    device: Annotated[str | None, typer.Option(help="stack: cpu or cuda; default VAP_DEVICE, or a GPU where there is one.")] = None,
 ) -> None:
-    """Time a control step by part, as shares and ratios within one run: of the prompted loop, or of every benchmark's simulator.
+    """Time a control step by part, as shares and ratios within one run: of the prompted loop, every benchmark's simulator, or a stack's models.
 
     Example: python -m vap_core bench suites
     """
     from vap_core import bench as loop
-    from vap_core import bench_suites
+    from vap_core import bench_stack, bench_suites
     from vap_core.errors import one_of
 
-    if what not in ("loop", "suites"):
-        raise one_of("bench:", what, ("loop", "suites"))
-    print(loop.run(steps) if what == "loop" else bench_suites.run(workers))
+    runs = {
+        "loop": lambda: loop.run(steps),
+        "suites": lambda: bench_suites.run(workers),
+        "stack": lambda: bench_stack.run(stack, random=random_weights, device=device),
+    }
+    if what not in runs:
+        raise one_of("bench:", what, runs)
+    print(runs[what]())
+
+
+@weights_app.command("list")
+def list_weights() -> None:
+    """What is on this machine, what is missing, and how to get it.
+
+    Example: python -m vap_core weights list
+    """
+    from vap_core.hub import table
+
+    print(table())
+
+
+@weights_app.command("pull")
+def pull_weights(
+    stack: Annotated[str, typer.Option("--stack", help="foundation, or foundation-small.")] = "foundation",
+    origin: Annotated[Path | None, typer.Option("--from", help="Without internet: a folder with a copy of another machine's.")] = None,
+    unpinned: Annotated[bool, typer.Option("--unpinned", help="Take other weights of the same architecture, for example your own.")] = False,
+) -> None:
+    """Get a stack's weights at their pinned revisions and check them. Interrupted, the same command goes on.
+
+    Example: python -m vap_core weights pull --stack foundation-small
+    """
+    from vap_core import hub
+
+    hub.pull(hub.names(stack), hub.home(), origin=origin, unpinned=unpinned)
 
 
 @train_app.command()

@@ -6,16 +6,9 @@ import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 
 from vap_core.errors import VapError
-
-FOUNDATION = {
-    "Grounding DINO": "IDEA-Research/grounding-dino-base",
-    "DINOv2": "facebook/dinov2-base",
-    "SAM 2.1": "facebook/sam2.1-hiera-small",
-}
 
 
 @dataclass(frozen=True)
@@ -115,16 +108,12 @@ def _viewer() -> Finding:
 
 
 def _foundation() -> list[Finding]:
+    from vap_core import hub
+
+    store = hub.home()
     found = []
-    for name, repo in FOUNDATION.items():
-        folder = _hub() / f"models--{repo.replace('/', '--')}"
-        present = any(folder.glob("snapshots/*/*.safetensors"))
-        mend = f"{repo} not on this machine; get it with: .venv/bin/hf download {repo}"
-        found.append(Finding(name, present, str(folder) if present else mend, False))
-    wired = find_spec("vap_core.foundation") is not None
-    return found if wired else [*found, Finding("stack foundation", False, "not part of this version yet; use --stack embedded", False)]
-
-
-def _hub() -> Path:
-    home = Path(os.environ.get("HF_HOME", Path.home() / ".cache" / "huggingface"))
-    return Path(os.environ.get("HF_HUB_CACHE", home / "hub"))
+    for kind, models in hub.KINDS.items():
+        wrong = [f"{name} {fault}" for name in models if (fault := hub.problem(name, store, quick=True))]
+        detail = f"{len(wrong)} of {len(models)} models missing; {hub.mend(kind)}" if wrong else f"{', '.join(models)} in {store}"
+        found.append(Finding(f"stack {kind}", not wrong, detail, False))
+    return found

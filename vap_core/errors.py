@@ -53,6 +53,10 @@ class BadSuite(VapError):
     """An episode list with a malformed row, or one that changed since it was hashed."""
 
 
+class BadViews(VapError):
+    """Views that cannot be associated: too many of them, or cameras without calibration."""
+
+
 class BadStudy(VapError):
     """A combination of tasks, methods and policy that makes no sense."""
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from vap_core import __version__, suites
+from vap_core.associate import PAIRINGS
 from vap_core.attend import STACKS, Attender, Prompting, load_stack
 from vap_core.detect import Detector
 from vap_core.errors import BadStudy, one_of
@@ -32,8 +33,9 @@ METHODS: dict[str, Prompting | None] = {
     "vap": Prompting(),
     "mask-only": Prompting(rewrite=False),
     "rewrite-only": Prompting(highlight=False),
+    "vap-associated": Prompting(associate=PAIRINGS["geometry"]),
 }
-"""What each method changes in the policy's inputs; None changes nothing (P 5.2)."""
+"""What each method changes in the policy's inputs; None changes nothing (P 5.2). Association is not the paper's."""
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from vap_core.sim.occluder import Occlusion
 from vap_core.sim.scenes import Scene
 from vap_core.sim.sensor import PERFECT, Sensor
 from vap_core.suites import Judge
-from vap_core.values import Attended, Chunk, Episode, EpisodeRow, Frame, Grounding, Opening, Outcome, PolicyInput
+from vap_core.values import Attended, Chunk, Episode, EpisodeRow, Frame, Opening, Outcome, PolicyInput
 
 
 @runtime_checkable
@@ -107,22 +107,23 @@ def _see(trial: Trial, one: Running, sink: Callable[[Opening], Sink] | None) -> 
         if trial.attender is None:
             attended = Attended(raw.images, raw.text, (), {}, {}, ())
         elif one.attend_state is None:
-            one.attend_state, attended = trial.attender.start(raw.images, raw.text)
+            one.attend_state, attended = trial.attender.start(raw.images, raw.text, cameras={c.name: c for c in one.env.cameras()})
         else:
             one.attend_state, attended = trial.attender.step(one.attend_state, raw.images)
     if one.opening is None:
-        one.opening = _open(trial, one, attended.text, attended.groundings)
+        one.opening = _open(trial, one, attended)
         with _timed(one.seconds, "record"):
             one.sink = sink(one.opening) if sink is not None else None
     return raw, attended
 
 
-def _open(trial: Trial, one: Running, text: str, groundings: Mapping[str, tuple[Grounding, ...]]) -> Opening:
-    """What is known before the first action; `text` is the instruction as it was rewritten."""
+def _open(trial: Trial, one: Running, attended: Attended) -> Opening:
+    """What is known before the first action."""
     row, env = one.row, one.env
     sizes = {place.model: trial.sizes_m[place.model] for place in row.placements}
     return Opening(
-        row, trial.method, trial.policy.label, env.hz, env.cameras(), row.instruction, text, groundings, sizes, env.action_names
+        row, trial.method, trial.policy.label, env.hz, env.cameras(), row.instruction, attended.text, attended.groundings, sizes, env.action_names,
+        attended.associations,
     )  # fmt: skip
 
 
@@ -187,7 +188,7 @@ def _end(trial: Trial, one: Running) -> Episode:
             assert one.outcome is not None
             _guard(one, one.sink.close, one.outcome)
     assert one.outcome is not None
-    opening = one.opening or _open(trial, one, one.row.instruction, {})
+    opening = one.opening or _open(trial, one, Attended({}, one.row.instruction, (), {}, {}, ()))
     return Episode(opening, tuple(one.frames), one.outcome, {**one.env.seconds, **one.seconds})
 
 

@@ -106,7 +106,8 @@ class Grounding:
     `similarity[i, k]` is cos(e_i, z_k); `votes[i]` counts references whose best candidate is i; `tied` marks the
     candidates that shared the most votes; `margin` is (votes of the winner - most votes of any other) / K, in [0, 1] when votes decide,
     and `cosine_margin` the same difference of mean cosines (winner - best other; 2 when there is no other candidate).
-    `winner` is None exactly when there is no candidate.
+    `winner` is what the vote elected, None exactly when there is no candidate; unless cross-view association chose otherwise: then `overruled`
+    is what the vote elected, and `winner` what was chosen for it, None where the object is not visible in this view.
     """
 
     camera: str
@@ -119,14 +120,38 @@ class Grounding:
     margin: float
     cosine_margin: float
     masks: Bool[np.ndarray, "n h w"]
+    overruled: int | None = None
 
     def __post_init__(self) -> None:
-        if (self.winner is None) != (len(self.candidates) == 0):
-            raise ValueError(f"Grounding {self.camera}: winner {self.winner} with {len(self.candidates)} candidates")
+        if (self.elected is None) != (len(self.candidates) == 0):
+            raise ValueError(f"Grounding {self.camera}: elected {self.elected} of {len(self.candidates)} candidates")
+        if self.overruled is not None and self.overruled == self.winner:
+            raise ValueError(f"Grounding {self.camera}: candidate {self.winner} cannot overrule itself")
+
+    @property
+    def elected(self) -> int | None:
+        """The vote's winner, to which votes, ties and margins refer."""
+        return self.winner if self.overruled is None else self.overruled
 
     @property
     def mask(self) -> Mask | None:
         return None if self.winner is None else self.masks[self.winner]
+
+
+@value
+class Association:
+    """Why every view got the candidate it did when all views were asked together for one target (SPEC section 9; module associate).
+
+    Scores are natural logarithms. `chosen[camera]` is a candidate, or None: not visible there. `total` is the chosen combination's score,
+    `terms` its parts by name, and `margin` its lead over the best combination that differs in any view. `support[camera]` has the best total
+    of any combination with each candidate of that view, and last with none.
+    """
+
+    chosen: Mapping[str, int | None]
+    total: float
+    margin: float
+    terms: Mapping[str, float]
+    support: Mapping[str, Float64[np.ndarray, " _"]]
 
 
 @value
@@ -151,7 +176,8 @@ class Attended:
     """What the method hands to the policy at one control step, and the evidence for it.
 
     `images` are the prompted views, `text` the rewritten instruction; `tracks[camera][j]` is target j in that view.
-    `groundings[camera][j]` is constant through an episode. `colours[j]` tints target j.
+    `groundings[camera][j]` is constant through an episode, and so is `associations[j]`, of which there are none unless views are associated;
+    None where fewer than two views had candidates. `colours[j]` tints target j.
     """
 
     images: Views
@@ -160,6 +186,7 @@ class Attended:
     tracks: Mapping[str, tuple[Track, ...]]
     groundings: Mapping[str, tuple[Grounding, ...]]
     events: tuple[Event, ...]
+    associations: tuple[Association | None, ...] = ()
 
 
 @value
@@ -271,6 +298,8 @@ class Opening:
     target_sizes_m: Mapping[str, tuple[float, float, float]]
     """Full extents of every object's bounding box, by model name."""
     action_names: tuple[str, ...] = EE_ACTION
+    associations: tuple[Association | None, ...] = ()
+    """Those of `Attended`."""
 
 
 @value

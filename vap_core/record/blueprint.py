@@ -26,17 +26,22 @@ type Part = rrb.Container | rrb.View
 
 
 def evidence_line(grounding: Grounding) -> str:
-    """One view's verdict in a few words: `margin 0.60`, `tie`, or `no candidate`."""
-    if grounding.winner is None:
+    """One view's verdict in a few words: the vote with its margin, or `no candidate`; before it what association chose instead."""
+    if grounding.elected is None:
         return "no candidate, view unmodified"
     tie = " · TIE" if int(grounding.tied.sum()) > 1 else ""
-    return f"#{grounding.winner} wins {grounding.votes[grounding.winner]}/{grounding.similarity.shape[1]} · margin {grounding.margin:.2f}{tie}"
+    chosen = "" if grounding.overruled is None else f"{'none' if grounding.winner is None else f'#{grounding.winner}'} by association · "
+    return (
+        f"{chosen}#{grounding.elected} wins {grounding.votes[grounding.elected]}/{grounding.similarity.shape[1]} · margin {grounding.margin:.2f}{tie}"
+    )
 
 
 def short_verdict(grounding: Grounding) -> str:
     """The same in the width of a small title."""
-    if grounding.winner is None:
+    if grounding.elected is None:
         return "no candidate"
+    if grounding.overruled is not None:
+        return "overruled"
     return "TIE" if int(grounding.tied.sum()) > 1 else f"margin {grounding.margin:.2f}"
 
 

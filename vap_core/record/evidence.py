@@ -9,7 +9,7 @@ import rerun as rr
 
 from vap_core.record.blueprint import QUIET, TARGET, TRUTH, evidence_line
 from vap_core.record.file import put
-from vap_core.values import Grounding, Mask, Opening, Rgb
+from vap_core.values import Association, Grounding, Mask, Opening, Rgb
 
 CLASSES = [
     rr.AnnotationInfo(id=0, label="", color=(0, 0, 0, 0)),
@@ -80,7 +80,8 @@ def log_vote(rec: rr.RecordingStream, grounding: Grounding, j: int, opening_imag
     winner = -1 if grounding.winner is None else grounding.winner
     cosine = grounding.similarity.mean(axis=1) if n else np.zeros(0, np.float32)
     entity = f"/observation.images.{cam}/candidates{tail}"
-    order = [i for i in range(n) if i != winner] + ([winner] if n else [])  # the winner last: drawn on top
+    last = grounding.elected if grounding.winner is None else winner  # drawn on top, and labelled in full
+    order = [i for i in range(n) if i != last] + ([last] if last is not None else [])
     colours = [TARGET if i == winner else QUIET for i in order]
     labels = [f"#{i} {boxes.score[i]:.2f} · votes {grounding.votes[i]}/{k} · cos {cosine[i]:.2f}" for i in order]
     if opening_image is not None:
@@ -95,12 +96,13 @@ def log_vote(rec: rr.RecordingStream, grounding: Grounding, j: int, opening_imag
             show_labels=False,
         )
         put(rec, entity, drawn, at=at)
-        shown = [labels[-1] if i == winner else f"#{i} v{grounding.votes[i]}" for i in order]
+        shown = [labels[-1] if i == last else f"#{i} v{grounding.votes[i]}" for i in order]
         spots = label_spots(boxes.xyxy[order], shown, grounding.masks.shape[1:])
         points = rr.Points2D(list(spots.values()), radii=0, labels=[shown[i] for i in spots], colors=[colours[i] for i in spots], show_labels=True)
         put(rec, f"{entity}/labels", points, at=at)
         put(rec, f"/vap/votes/{cam}{tail}", rr.AnyValues(counts=grounding.votes), at=at)
-    for name, chosen, colour in (("others", order[:-1], QUIET), ("winner", order[-1:], TARGET)):
+    others = [i for i in order if i != winner]
+    for name, chosen, colour in (("others", others, QUIET), ("winner", order[len(others) :], TARGET)):
         if chosen:
             bars = rr.BarChart(grounding.votes[chosen].astype(np.float64), abscissa=np.asarray(chosen, np.float64), color=colour)
             put(rec, f"/vap/votes/{cam}{tail}/{name}", bars, at=at)
@@ -110,9 +112,21 @@ def log_vote(rec: rr.RecordingStream, grounding: Grounding, j: int, opening_imag
     }  # fmt: skip
     numbers = rr.AnyValues(
         phrase=boxes.phrase, object=grounding.object, winner=np.int64(winner), references=np.int64(k), margin=grounding.margin,
+        elected=np.int64(-1 if grounding.elected is None else grounding.elected),
         cosine_margin=grounding.cosine_margin, **(per_candidate if n else {}),
     )  # fmt: skip
     put(rec, f"/vap/candidates/{cam}{tail}", numbers, at=at)
+
+
+def log_association(rec: rr.RecordingStream, association: Association, j: int, at: Sequence[rr.TimeColumn]) -> None:
+    """What the views agreed on for target j, and by what scores; `chosen` is -1 where the target is in none of the candidates."""
+    parts: dict[str, Any] = {f"support_{cam}": scores for cam, scores in association.support.items()}
+    numbers = rr.AnyValues(
+        cameras=list(association.chosen), chosen=np.array([-1 if i is None else i for i in association.chosen.values()], np.int64),
+        total=association.total, margin=association.margin, terms=list(association.terms), scores=np.array(list(association.terms.values())),
+        **parts,
+    )  # fmt: skip
+    put(rec, f"/vap/association{suffix(j)}", numbers, at=at)
 
 
 def words(opening: Opening, ending: str = "") -> rr.TextDocument:

@@ -4,7 +4,8 @@ Entities (lerobot's feature keys; timelines `frame_index` and `timestamp`):
 `/observation.images.<cam>` with `/prompted`, `/candidates`, `/mask/{target,gt}` beneath; `/observation.state`, `/action`,
 `/next.reward`, `/next.success`; `/vap/{votes,candidates,vote_margin,track_score}/<cam>`, `/vap/{instruction,events}`,
 `/vap/status/{outcome,grasp}`; `/world/{table,robot/link*,objects/*}`. Evidence of a further target j ends in `_j`;
-`/candidates` carries the picture the vote was held on, `/vap/votes/<cam>` its `counts`, with `/winner` and `/others` as bars.
+`/candidates` carries the picture the vote was held on, `/vap/votes/<cam>` its `counts`, with `/winner` and `/others` as bars;
+`/vap/association` is what the views agreed on, when they were asked together.
 Recording properties: `rollout` and `outcome`. Pictures are JPEG; everything that changes travels in columns.
 """
 
@@ -18,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from vap_core.errors import BadOutput
 from vap_core.record.blueprint import SERIES, episode_blueprint, evidence_line, grounding_blueprint, packed, series_style, state_style
-from vap_core.record.evidence import CLASSES, classes, contact_sheet, jpeg, log_vote, picture, suffix, words
+from vap_core.record.evidence import CLASSES, classes, contact_sheet, jpeg, log_association, log_vote, picture, suffix, words
 from vap_core.record.file import code_version, finish_stream, open_stream, put, put_property
 from vap_core.record.scene import log_cameras, log_links, log_objects, log_table, send_poses, send_truth
 from vap_core.values import Event, Frame, Grounding, Mask, Opening, Outcome, PersonalObject, Rgb
@@ -169,6 +170,9 @@ class Recorder:
                 log_vote(rec, grounding, j, None if j else pictures[cam], at)
             if not per_view:
                 put(rec, f"/observation.images.{cam}/candidates", picture(pictures[cam]), at=at)
+        for j, association in enumerate(opening.associations):
+            if association is not None:
+                log_association(rec, association, j, at)
         rec.send_blueprint(episode_blueprint(opening))
 
     def _flush(self) -> None:

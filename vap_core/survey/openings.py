@@ -1,7 +1,8 @@
 """Grounding on the benchmarks' opening frames, view by view, against the simulator: what was found, who was elected, and whose mistake it was.
 
     for episode in openings(suites.rows("vlabench", "select-shoe", 12)):
-        tables = survey(episode, stack)
+        for view in episode:
+            tables = survey_view(view, stack, memory, look(view, stack))
 
 Rows are flat, one list per table: "views" (a line per view), "objects" (per visible object of the target's category), "detections" (per box
 and phrase), "choices" (per view, K references and rule). Every line carries the keys of `View.key`. Boxes that overlap by IoU 0.5 agree.
@@ -25,7 +26,7 @@ from vap_core.sim.scenes import build
 from vap_core.sim.studio import reference_views
 from vap_core.suites import VARIANTS, suite
 from vap_core.training.phrases import AMBIGUOUS, UNSEEN
-from vap_core.values import Boxes, EpisodeRow, Mask, PersonalObject, Rgb, value
+from vap_core.values import Boxes, Camera, EpisodeRow, Mask, PersonalObject, Rgb, value
 from vap_core.vote import Rule, similarity, vote
 
 LEAST_PX = 100
@@ -49,6 +50,7 @@ class View:
     camera: str
     rgb: Rgb
     masks: Mapping[str, Mask]
+    optics: Camera | None = None
 
     @property
     def key(self) -> Line:
@@ -59,6 +61,10 @@ class View:
     @property
     def least_px(self) -> float:
         return LEAST_PX * self.rgb.shape[0] * self.rgb.shape[1] / 224**2
+
+    def boxes(self) -> dict[str, Float32[np.ndarray, "4"]]:
+        """Around every object of which anything shows."""
+        return {name: _box(mask) for name, mask in self.masks.items() if mask.any()}
 
     def visible(self) -> dict[str, Mask]:
         """The masks large enough to count."""
@@ -74,8 +80,8 @@ def openings(rows: Sequence[EpisodeRow], size: int = 224) -> Iterator[list[View]
             env = Env(scene, image_size=size, cameras=known.cameras, control=known.control, sensor=known.sensor)
             for row in alike:
                 env.reset(row)
-                masks = env.truth(masks=True).masks
-                yield [View(row, camera, rgb, masks[camera]) for camera, rgb in env.observe().images.items()]
+                masks, optics = env.truth(masks=True).masks, {camera.name: camera for camera in env.cameras()}
+                yield [View(row, camera, rgb, masks[camera], optics[camera]) for camera, rgb in env.observe().images.items()]
 
 
 @cache
@@ -85,25 +91,28 @@ def remembered(stack: Stack, target: str, k: int) -> tuple[PersonalObject, tuple
     return register(target, model.category, reference_views(model, k), stack.detector, stack.encoder)
 
 
-def survey(episode: Sequence[View], stack: Stack, ks: Sequence[int] = KS) -> Tables:
-    """Every table of one episode's views; views are independent."""
-    tables: Tables = {"views": [], "objects": [], "detections": [], "choices": []}
-    for view in episode:
-        for name, lines in survey_view(view, stack, {k: remembered(stack, view.row.target, k)[0] for k in ks}).items():
-            tables[name] += [{**view.key, **line} for line in lines]
-    return tables
+@value
+class Looked:
+    """What the stack made of a view before anyone was asked for: candidates of the target's category and their embeddings."""
+
+    found: Boxes
+    rows: Float32[np.ndarray, "n d"]
 
 
-def survey_view(view: View, stack: Stack, memory: Mapping[int, PersonalObject]) -> Tables:
+def look(view: View, stack: Stack) -> Looked:
+    found = stack.detector([view.rgb], view.row.category)[0]
+    return Looked(found, stack.encoder([crop(view.rgb, box) for box in found.xyxy]))
+
+
+def survey_view(view: View, stack: Stack, memory: Mapping[int, PersonalObject], looked: Looked) -> Tables:
     """The lines of one view, without its key. `memory` holds the target as remembered from each number of photos; the usual one must be there.
 
     "choices" and the mask's figures are told of views that show the target; "detections" and "objects" of all.
     """
     seen, category = view.visible(), view.row.category
     alike = {name: mask for name, mask in seen.items() if objects.get(name).category == category}
-    boxes = {name: _box(mask) for name, mask in view.masks.items() if mask.any()}
+    boxes, found = view.boxes(), looked.found
     true = _stack([boxes[name] for name in alike])
-    found = stack.detector([view.rgb], category)[0]
     best = stack.detector([view.rgb], category, FLOOR)[0]
     detections = _detections(best, category, "category", view, boxes, alike)
     unseen = _turn(UNSEEN.get(category, ()), view.row.episode)
@@ -136,31 +145,29 @@ def survey_view(view: View, stack: Stack, memory: Mapping[int, PersonalObject]) 
         box = boxes[view.row.target]
         exact = Boxes(box[None], np.ones(1, np.float32), category)
         here |= {"proposed": _any_on(found.xyxy, box), "mask_iou_true_box": iou(stack.segmenter(view.rgb, exact)[0], goal)}
-        choices = _choices(view, stack, memory, found, rows, list(alike), boxes)
+        choices = _choices(view, stack, memory, looked, rows, list(alike))
     return {"views": [here], "objects": lines, "detections": detections, "choices": [{"tier": here["tier"], **line} for line in choices]}
 
 
 def _choices(
-    view: View, stack: Stack, memory: Mapping[int, PersonalObject], found: Boxes, true_rows: Float32[np.ndarray, "m d"], alike: Sequence[str],
-    boxes: Mapping[str, Float32[np.ndarray, "4"]],
-) -> list[Line]:  # fmt: skip
+    view: View, stack: Stack, memory: Mapping[int, PersonalObject], looked: Looked, true_rows: Float32[np.ndarray, "m d"], alike: Sequence[str]
+) -> list[Line]:
     """Who is elected of the candidates, and of the true boxes of the same objects; a line per number of references and rule."""
-    target, rows = view.row.target, stack.encoder([crop(view.rgb, box) for box in found.xyxy])
+    target, found = view.row.target, looked.found
     masks: dict[int, float] = {}
     lines = []
     for k, mine in memory.items():
-        cosine, ideal = similarity(rows, mine.embeddings), similarity(true_rows, mine.embeddings)
+        cosine, ideal = similarity(looked.rows, mine.embeddings), similarity(true_rows, mine.embeddings)
         for rule in RULES:
             b, ideal_winner = vote(cosine, rule), vote(ideal, rule).winner
             assert ideal_winner is not None, "the target's true box is among them"
             elected, mask_iou = "", None
             if (i := b.winner) is not None:
-                right = _any_on(found.xyxy[[i]], boxes[target])
-                elected = target if right else _elected(found.xyxy[i], boxes)
-                if right and i not in masks:
+                elected = under(view, found.xyxy[i])
+                if elected == target and i not in masks:
                     one = Boxes(found.xyxy[[i]], found.score[[i]], found.phrase)
                     masks[i] = iou(stack.segmenter(view.rgb, one)[0], view.masks[target])
-                mask_iou = masks[i] if right else None
+                mask_iou = masks[i] if elected == target else None
             lines.append(
                 {
                     "k": k, "rule": rule, "right": elected == target, "right_given_boxes": alike[ideal_winner] == target, "elected": elected,
@@ -170,10 +177,13 @@ def _choices(
     return lines
 
 
-def _elected(box: Float32[np.ndarray, "4"], boxes: Mapping[str, Float32[np.ndarray, "4"]]) -> str:
-    """The object that a box lies on; "nothing" when it lies on none."""
+def under(view: View, box: Float32[np.ndarray, "4"]) -> str:
+    """The object that a box lies on, the target before others; "nothing" when it lies on none."""
+    boxes = view.boxes()
+    if view.row.target in boxes and _any_on(box[None], boxes[view.row.target]):
+        return view.row.target
     overlap = box_iou(box[None].astype(np.float64), _stack(list(boxes.values())).astype(np.float64))[0]
-    return list(boxes)[int(overlap.argmax())] if overlap.max() >= SAME_BOX else "nothing"
+    return list(boxes)[int(overlap.argmax())] if overlap.max(initial=0.0) >= SAME_BOX else "nothing"
 
 
 def _detections(
