@@ -335,11 +335,11 @@ def pull_weights(
 @train_app.command()
 def perception(
     out: Annotated[Path, typer.Option(help="Folder of the weights and their manifest.")] = Path("data/weights"),
-    scenes: Annotated[int, typer.Option(min=1, help="Rendered training scenes.")] = 4000,
+    scenes: Annotated[int, typer.Option(min=1, help="Rendered training views.")] = 6480,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     minutes: Annotated[float | None, typer.Option(help="Stop training after this long.")] = None,
 ) -> None:
-    """Train the detector and segmenter heads on rendered generic objects, and evaluate them on unseen ones.
+    """Train the heads of detector, segmenter and encoder on rendered generic objects, and evaluate them on unseen ones.
 
     Example: python -m vap_core train perception --out data/runs/weights --scenes 400
     """

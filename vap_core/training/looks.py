@@ -20,8 +20,6 @@ from vap_core.training.segmenter import jitter
 from vap_core.values import Rgb, value
 
 STAGES_PER_BATCH, TEMPERATURE = 16, 0.07
-STRIDE = 100
-"""Objects are numbered by stage times this, plus their number in it."""
 MOST, FEWEST_PX = 5, 60
 """Crops of one object that one stage gives, from its views, and the visible pixels of each."""
 GRIDS = {"b4": 14, "b10": 14, "b14": 7}
@@ -87,15 +85,15 @@ def look(head: LookHead, rows: np.ndarray, pixels: np.ndarray) -> Float[Tensor, 
     return head(maps, normalise(torch.from_numpy(np.asarray(pixels))), flat[:, start:])
 
 
-def contrast(cosine: Float[Tensor, "a k"], same: Bool[Tensor, "a k"], rival: Bool[Tensor, "a k"]) -> Tensor:
-    """Mean over every pair that is the same of -log exp(c/t) / (exp(c/t) + the sum of exp over the anchor's rivals)."""
+def contrast(cosine: Float[Tensor, "a k"], same: Bool[Tensor, "a k"]) -> Tensor:
+    """Mean over every pair that is the same of -log exp(c/t) / (exp(c/t) + the sum of exp over the anchor's others)."""
     logits = cosine / TEMPERATURE
-    others = logits.masked_fill(~rival, -1e4).logsumexp(1, keepdim=True)
+    others = logits.masked_fill(same, -torch.inf).logsumexp(1, keepdim=True)
     return ((torch.logaddexp(logits, others) - logits) * same).sum() / same.sum().clamp(min=1)
 
 
 def fit_looks(stages: Sequence[Looks], run: Run) -> LookHead:
-    """Train the head: portraits find the views' crops of their object, and the crops their portraits, among all and among their own stage's."""
+    """Train the head: portraits find the views' crops of their object, and the crops their portraits."""
     torch.manual_seed(run.seed)  # initial weights only; every other draw comes from the epoch's stream
     head = LookHead(COLOURS)
 
@@ -109,12 +107,10 @@ def fit_looks(stages: Sequence[Looks], run: Run) -> LookHead:
             with halved():
                 rows = look(head, frozen, pixels)
             rows = F.normalize(rows.float(), dim=1)
-            who = torch.from_numpy(np.concatenate([stages[s].who[at] + STRIDE * s for s, at in where]))
+            who = torch.from_numpy(np.concatenate([stages[s].who[at] + 100 * s for s, at in where]))
             portrait = torch.from_numpy(np.concatenate([stages[s].portrait[at] for s, at in where])) > 0
-            photo, seen = who[portrait][:, None], who[~portrait][None]
-            cosine, same, near = rows[portrait] @ rows[~portrait].T, photo == seen, photo // STRIDE == seen // STRIDE
-            pairs = ((cosine, same, ~same), (cosine.T, same.T, ~same.T), (cosine, same, near & ~same), (cosine.T, same.T, (near & ~same).T))
-            yield torch.stack([contrast(*pair) for pair in pairs]).sum()
+            cosine, same = rows[portrait] @ rows[~portrait].T, who[portrait][:, None] == who[~portrait]
+            yield contrast(cosine, same) + contrast(cosine.T, same.T)
 
     fit(head, losses, -(-len(stages) // STAGES_PER_BATCH), run)
     return head

@@ -1,6 +1,6 @@
 """Train the embedded stack's heads: render generic objects, fit detector, segmenter and look head on frozen features, test on unseen instances.
 
-    python -m vap_core train perception --out data/runs/weights --scenes 8400 --seed 0
+    python -m vap_core train perception --out data/runs/weights --scenes 6480 --seed 0
 
 Everything lands in data/cache/perception and is found again after an interruption: stages, features, and each head after every epoch.
 """
@@ -27,12 +27,12 @@ from vap_core.weights import save_weights
 CACHE = Path(__file__).resolve().parents[2] / "data" / "cache" / "perception"
 FILE = "perception.safetensors"
 HELD_OUT_STAGES = 30
-EPOCHS = {"detector": 6, "segmenter": 6, "looks": 36}
+EPOCHS = {"detector": 6, "segmenter": 6, "looks": 20}
 CROPS_PER_EPOCH = 8000
 
 
 def train(
-    out: Path, *, scenes: int = 8400, seed: int = 0, minutes: float | None = None, resume: bool = True, cache: Path = CACHE, jobs: int | None = None
+    out: Path, *, scenes: int = 6480, seed: int = 0, minutes: float | None = None, resume: bool = True, cache: Path = CACHE, jobs: int | None = None
 ) -> dict[str, Any]:
     """Train the heads on about `scenes` rendered views, write `out`/perception.safetensors and its manifest entry, return the entry.
 
