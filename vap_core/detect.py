@@ -26,7 +26,7 @@ STRIDE = 8
 TRAINED_SIDE, SIDE = 224, 384
 """The longer side, pixels, of the training views, and to which they are enlarged to be searched. Sharper pictures are found less
 well (recall .90 against .96 at 448 pixels, cropped references 75 % against 98 %), so larger ones are reduced to the first beforehand."""
-THRESHOLD, TOP, NMS_IOU = 0.2, 10, 0.5
+THRESHOLD, TOP, NMS_IOU = 0.1, 10, 0.5
 SNAP = 0.55
 """A phrase whose cosine to a trained one exceeds this is searched for as that one, which may be one that names nothing."""
 

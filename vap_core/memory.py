@@ -20,7 +20,7 @@ SUFFIX = ".object.safetensors"
 MAX_PIXELS = 50_000_000
 MAX_BYTES = 200_000_000
 LONG_SIDE = 1024
-KNOWN_PRESENT = 0.15
+KNOWN_PRESENT = 0.05
 """A photo of the object holds one of its category, so a reference's box needs less of a score than a proposal does."""
 CATEGORY = re.compile(r"[^\W\d_][\w -]*")
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,63}")
