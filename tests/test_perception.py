@@ -268,8 +268,8 @@ def test_tracker_memory_is_bounded(scene: tuple) -> None:
     rgb, masks, _ = scene
     embedded = track.load()
     states = embedded.start([rgb], [masks[:1]])
-    for _ in range(8):
-        states, _ = embedded.step(states, [rgb])
+    for t in range(8):
+        states, _ = embedded.step(states, [np.roll(rgb, t, axis=1)])
     assert len(states[0].recent) == track.RECENT
     with pytest.raises(ValueError, match="must agree"):
         embedded.start([rgb], [masks[:, :100]])
