@@ -37,7 +37,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return paths
 
 
-COMMANDS = ("register", "ground", "demo", "suites", "rollout", "eval", "rescore", "publish", "show", "doctor", "bench")
+COMMANDS = ("register", "ground", "demo", "suites", "rollout", "eval", "rescore", "publish", "show", "doctor", "bench", "eval-perception")
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def bank(photos: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS), ["train", "perception"]])
+@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS), ["train", "perception"], ["weights", "pull"]])
 def test_help_has_an_example(command: list[str]) -> None:
     done = vap(*command, "--help")
     assert done.returncode == 0

@@ -6,6 +6,7 @@ the right way out is, against transformers' own image predictor, video session a
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -21,9 +22,9 @@ from torch.nn import functional as F  # noqa: N812
 import vap_core
 from tests import test_perception as contract
 from tests import tiny_foundation
-from vap_core import attend, foundation, hub, memory
+from vap_core import attend, bench_stack, foundation, hub, memory
 from vap_core.errors import MissingWeights, UnknownName
-from vap_core.foundation import dino, grounding, runtime, sam, video
+from vap_core.foundation import architectures, dino, grounding, runtime, sam, video
 from vap_core.values import Boxes, Rgb
 
 MEAN, STD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
@@ -455,11 +456,32 @@ def test_without_weights_both_ways_to_get_them_are_named(tmp_path: Path, monkeyp
 
 
 def test_weights_of_another_architecture_are_named(weights: Path) -> None:
-    from vap_core.foundation import architectures
-
     detector, encoder, _ = hub.ready("foundation", weights)
     with pytest.raises(MissingWeights, match="lacks .* tensors of Sam2VideoModel|cannot be read as Sam2VideoModel"):
         architectures.read(detector, encoder, encoder)
+
+
+@pytest.mark.parametrize(("part", "name", "published"), [
+    ("detector", "grounding-dino-tiny", 689_359_096), ("encoder", "dinov2-small", 88_249_960), ("sam", "sam2.1-hiera-tiny", 155_908_064),
+])  # fmt: skip
+def test_random_networks_have_the_published_sizes(part: str, name: str, published: int) -> None:
+    """Bytes of model.safetensors at the pinned revisions: four a parameter, and its header."""
+    assert name in hub.KINDS["foundation-small"]
+    net = getattr(small(), part)
+    assert 4 * sum(p.numel() for p in net.parameters()) == pytest.approx(published, rel=2e-3)
+
+
+@cache
+def small() -> architectures.Networks:
+    return architectures.invent("foundation-small")
+
+
+def test_bench_names_every_part_beside_the_papers_time(parts: foundation.Parts, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench_stack, "_parts", lambda *how: parts)
+    said = bench_stack.run("foundation", random=True, device="cpu").splitlines()
+    beside = {line.rsplit(maxsplit=3)[0].strip(): line.split()[-1] for line in said if line.split()[-1:] in (["190"], ["70"], ["20"])}
+    assert beside == {"detection": "190", "segmentation and embedding": "70", "track step": "20"}
+    assert "GPU figures were not measured" in said[-1]
 
 
 def test_transformers_is_imported_by_the_foundation_stack_alone() -> None:

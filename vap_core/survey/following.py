@@ -26,10 +26,9 @@ from vap_core.sim.objects import extent_m, get
 from vap_core.sim.occluder import Occlusion
 from vap_core.sim.scenes import Scene, build
 from vap_core.suites import VARIANTS, Judge
+from vap_core.survey.openings import LEAST_PX
 from vap_core.values import Boxes, EpisodeRow, Mask, Rgb, Track, value
 
-LEAST_PX = 100
-"""Visible pixels, of a view of 224 x 224, from which on an object counts."""
 KEPT = 0.5
 """IoU above which a track is on its object."""
 MOST_HIDDEN = 6
