@@ -25,7 +25,7 @@ from vap_core.values import EpisodeRow
 if TYPE_CHECKING:
     import pandas as pd
 
-EPISODES = {"simpler-fractal": 60, "simpler-bridge": 24, "vlabench": 12, "tabletop": 8}
+EPISODES = {"simpler-fractal": 40, "simpler-bridge": 20, "vlabench": 8, "tabletop": 6}
 """Opening frames a task, as episodes spread evenly over its list; suites with three cameras need fewer."""
 QUICK = 2
 """Episodes a task of a quick survey; it tracks one episode of each suite, and hides its target once."""
