@@ -29,7 +29,7 @@ Memory = Annotated[Path, typer.Option(help="Folder of remembered objects.")]
 StackName = Annotated[str, typer.Option("--stack", help="Perception stack: embedded (offline, CPU), foundation or foundation-small (see weights).")]
 Methods = Annotated[
     list[str] | None,
-    typer.Option("--method", help="generic, vap, mask-only, rewrite-only; repeatable. Default: the first two."),
+    typer.Option("--method", help="generic, vap, vap-associated, mask-only, rewrite-only; repeatable. Default: the first two."),
 ]
 PolicyName = Annotated[str, typer.Option("--policy", help="scripted (picks only), or the bounds: expert (reads the simulator), random.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the policy and the sensors; of a warm-up suite's episode list, too.")]
