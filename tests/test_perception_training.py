@@ -90,10 +90,10 @@ def test_average_precision_of_known_rankings() -> None:
     none = np.zeros((0, 4))
     right, one_wrong = np.stack([wanted[0], wanted[1]]), np.stack([far, wanted[0], wanted[1]])
     score = np.array([0.9, 0.8, 0.7])
-    assert evaluation.average_precision([((right, score[:2]), wanted, none)], 0.5) == 1
-    assert evaluation.average_precision([((one_wrong, score), wanted, none)], 0.5) == pytest.approx(2 / 3, abs=1e-4)
-    assert evaluation.average_precision([((one_wrong, score), wanted, far[None])], 0.5) == 1
-    assert evaluation.average_precision([((none, score[:0]), none, none)], 0.5) is None
+    assert evaluation.precision_of_views([((right, score[:2]), wanted, none)], 0.5) == 1
+    assert evaluation.precision_of_views([((one_wrong, score), wanted, none)], 0.5) == pytest.approx(2 / 3, abs=1e-4)
+    assert evaluation.precision_of_views([((one_wrong, score), wanted, far[None])], 0.5) == 1
+    assert evaluation.precision_of_views([((none, score[:0]), none, none)], 0.5) is None
 
 
 @pytest.mark.slow

@@ -34,8 +34,10 @@ KEPT = 0.5
 MOST_HIDDEN = 6
 BINS = 20
 """Points of the IoU over normalised time."""
-EPISODES = {"simpler-fractal": 12, "simpler-bridge": 6, "vlabench": 3, "tabletop": 2}
+EPISODES = {"simpler-fractal": 8, "simpler-bridge": 5, "vlabench": 2, "tabletop": 1}
 """Episodes a task in the default plan; suites with three cameras need fewer."""
+AFTER = 40
+"""Frames that are followed after the target is shown again; an undisturbed episode is followed to its end."""
 ALL_HIDDEN = 1
 """Episodes a task of the default plan that are hidden for every number of frames; the others for 3 only. One camera counts as a third."""
 Line = dict[str, Any]
@@ -144,7 +146,7 @@ def follow_film(film: Film, job: Job, stack: Stack) -> list[Line]:
     for n, after in zip(job.hidden, forked, strict=False):
         if film.start + n >= len(film.frames):
             continue  # the episode was over before the target was shown again
-        shown = (*film.covered[:n], *film.frames[film.start + n :])
+        shown = (*film.covered[:n], *film.frames[film.start + n : film.start + n + AFTER])
         found, took = [], []
         for frame in shown:
             after, tracks, ms = _step(stack, after, frame, named)

@@ -25,7 +25,7 @@ from vap_core.values import EpisodeRow
 if TYPE_CHECKING:
     import pandas as pd
 
-EPISODES = {"simpler-fractal": 40, "simpler-bridge": 20, "vlabench": 8, "tabletop": 6}
+EPISODES = {"simpler-fractal": 30, "simpler-bridge": 16, "vlabench": 8, "tabletop": 5}
 """Opening frames a task, as episodes spread evenly over its list; suites with three cameras need fewer."""
 QUICK = 2
 """Episodes a task of a quick survey; it tracks one episode of each suite, and hides its target once."""

@@ -13,6 +13,7 @@ from vap_core.features import features
 from vap_core.metrics import rate
 from vap_core.segment import LiteSegmenter, MaskHead, iou
 from vap_core.sim import objects
+from vap_core.survey.estimates import average_precision
 from vap_core.training.phrases import AMBIGUOUS, NEGATIVES, UNSEEN, UNSEEN_NEGATIVES
 from vap_core.training.scenes import POSES, Shots, boxes_of
 from vap_core.training.segmenter import jitter
@@ -56,7 +57,7 @@ def detector_figures(detector: LiteDetector, stages: Sequence[Shots]) -> Figures
         results.append((_detect(detector, image, snapped), _detect(detector, image, plain), truth, small))
 
     def ap(way: Literal[0, 1], phrase: str, kind: str, iou: float = 0.5) -> float | None:
-        return average_precision([(r[way][phrase], *_split(r[2], r[3], kind)) for r in results], iou)
+        return precision_of_views([(r[way][phrase], *_split(r[2], r[3], kind)) for r in results], iou)
 
     def mean(values: Iterator[float | None]) -> float:
         return round(float(np.mean([value for value in values if value is not None])), 4)
@@ -118,7 +119,7 @@ def encoder_figures(encoder: LiteEncoder, stages: Sequence[Shots]) -> Figures:
     return {"right_of_look_alikes": share(sum(right), len(right))}
 
 
-def average_precision(per_view: Sequence[tuple[Found, np.ndarray, np.ndarray]], iou: float) -> float | None:
+def precision_of_views(per_view: Sequence[tuple[Found, np.ndarray, np.ndarray]], iou: float) -> float | None:
     """Area under the interpolated precision-recall curve, over (found, wanted, ignored) of every view; None when nothing is wanted."""
     total = sum(len(wanted) for _, wanted, _ in per_view)
     marks: list[tuple[float, bool]] = []
@@ -133,10 +134,8 @@ def average_precision(per_view: Sequence[tuple[Found, np.ndarray, np.ndarray]], 
                 marks.append((float(value), False))
     if total == 0:
         return None
-    hit = np.array([right for _, right in sorted(marks, key=lambda mark: -mark[0])], bool)
-    precision = np.cumsum(hit) / np.maximum(np.arange(len(hit)) + 1, 1)
-    best = np.maximum.accumulate(precision[::-1])[::-1]
-    return round(float(best[hit].sum() / total), 4)
+    score, hit = np.array([score for score, _ in marks], np.float64), np.array([right for _, right in marks], bool)
+    return round(average_precision(score, hit, float(total)), 4)
 
 
 def _all_phrases(kinds: Sequence[str]) -> list[str]:
