@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
 from vap_core.embed import Encoder, crop
-from vap_core.segment import LiteSegmenter, bounds, iou
+from vap_core.segment import LiteSegmenter, bounds, box_plane, iou
 from vap_core.track.cells import Labels, Memory, around, embed_cells, largest, lead, nearest, propagate, strongest, to_cells, to_pixels
 from vap_core.track.looks import familiar, remember, spread, tone_of
 from vap_core.track.state import RECENT, TrackState, begin, stirred, thumb
@@ -39,8 +39,8 @@ TRUST, FOUND, DOUBT = 0.4, 0.6, 1.0
 """Evidence that a mask needs: one that goes on, one that was lost, one that changed suddenly."""
 SEED = 0.3
 """Share of a cell that must be an identity's for a search to start there."""
-AROUND = 17
-"""Pixels, an odd number, of the square by which such a start is widened."""
+AROUND, SWELL = 17, 1.6
+"""Pixels, an odd number, of the square by which such a start is widened; and how much larger than it was last, each way, an object is looked for."""
 EAGER = 4
 """Frames for which a lost identity is searched for in each; then in every other one."""
 
@@ -115,11 +115,12 @@ class LiteTracker:
         free = np.where(taken, 0, soft[i + 1]).astype(np.float32)
         nothing = 1 - float(np.clip(free.max(), 0, 1))
         guess = largest(free > SEED, soft[i + 1])
-        found = None if guess is None else bounds(cv2.dilate(guess.astype(np.uint8), np.ones((AROUND, AROUND))) > 0)
+        wide = None if guess is None else bounds(cv2.dilate(guess.astype(np.uint8), np.ones((AROUND, AROUND))) > 0)
+        found = limit = None if wide is None else _within(wide, state.last[i])
         here: Float32[np.ndarray, "h w"] = np.zeros(state.hw, np.float32)
         for _ in range(2):  # the first mask shows how far the object reaches, the second is drawn from its whole box
-            if found is not None:
-                here = np.where(taken, 0, self.segmenter.chance(look.image, found[None], free[None])[0])
+            if found is not None and limit is not None:
+                here = np.where(taken | ~_inside(limit, state.hw), 0, self.segmenter.chance(look.image, found[None], free[None])[0])
                 found = bounds(here > 0.5)
         if found is None or _evidence(state, look, i, here > 0.5) < FOUND:
             return state, nothing
@@ -131,6 +132,16 @@ class LiteTracker:
             look.chance[:, mine & (here > 0.5)] = 0
             look.chance[i] = here
         return state, nothing
+
+
+def _within(box: Float32[np.ndarray, "4"], last: Float32[np.ndarray, "4"]) -> Float32[np.ndarray, "4"]:
+    """The box, cut about its middle where it is `SWELL` times as wide or high as the last one: what stands behind is not the object."""
+    middle, half = (box[:2] + box[2:]) / 2, np.minimum((box[2:] - box[:2]) / 2, SWELL * (last[2:] - last[:2]) / 2)
+    return np.concatenate([middle - half, middle + half]).astype(np.float32)
+
+
+def _inside(box: Float32[np.ndarray, "4"], hw: Sequence[int]) -> Mask:
+    return box_plane(box, hw) > 0
 
 
 def _labels(state: TrackState, keys: Float32[np.ndarray, "p c"], grid: tuple[int, int], moving: Int64[np.ndarray, " k"]) -> Labels:
