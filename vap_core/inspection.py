@@ -49,7 +49,7 @@ def grounding_table(grounding: Grounding, truth: Mapping[str, Mask] | None = Non
 
     lines, columns = [], ["candidate", "score", "votes", "tied", "mean cosine", "winner", *(("is", "iou") if truth else ())]
     for i, mask in enumerate(grounding.masks):
-        line = {
+        line: dict[str, object] = {
             "candidate": i, "score": float(grounding.candidates.score[i]), "votes": int(grounding.votes[i]), "tied": bool(grounding.tied[i]),
             "mean cosine": float(grounding.similarity[i].mean()), "winner": i == grounding.winner,
         }  # fmt: skip
