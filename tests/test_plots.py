@@ -1,14 +1,13 @@
 """Figures show what they were given; tables against ground truth are exact."""
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from tests.toys import TOYS, personal, scene
 from vap_core.attend import Attender
 from vap_core.inspection import grounding_table
 from vap_core.metrics import score
-from vap_core.plots import candidates, film, grounding_figure, scores_figure, track_figure, write_png
+from vap_core.plots import candidates, film, grounding_figure, scores_figure, write_png
 from vap_core.segment import iou
 
 TEAL, GREY = (40, 120, 110), (90, 90, 90)
@@ -51,10 +50,8 @@ def test_the_winner_is_drawn_apart() -> None:
     assert len({patch.get_edgecolor() for patch in axes.patches}) == 2
 
 
-def test_scores_film_and_track_draw() -> None:
+def test_scores_and_film_draw() -> None:
     row = {"suite": "s", "task": "t", "split": "", "policy": "scripted", "outcome": "success", "success": True, "cmr": True, "wrong_object": False}
     rows = [{**row, "method": m, "first_object_correct": True, "steps": 3} for m in ("generic", "vap")]
     assert len(scores_figure(score(rows)).axes) == 1
     assert len(film({"raw": [LINE, LINE]}, ["a", "b"]).axes) == 2
-    track = pd.DataFrame({"step": [0, 1], "camera": ["front"] * 2, "iou": [1.0, 0.5], "score": [1.0, 0.9]})
-    assert len(track_figure(track).axes[0].lines) == 2

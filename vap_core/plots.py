@@ -102,19 +102,6 @@ def scores_figure(scores: Sequence[Score]) -> "Figure":
     return figure
 
 
-def track_figure(track: "pd.DataFrame") -> "Figure":
-    """IoU with ground truth and the tracker's own score over the control steps, one line per camera (columns of `inspection.follow`)."""
-    figure = _figure(8.0, 3.0)
-    axes = figure.subplots()
-    for i, (camera, part) in enumerate(track.groupby("camera", sort=False)):
-        axes.plot(part.step, part.iou, color=f"C{i}", label=f"{camera}: IoU with ground truth")
-        axes.plot(part.step, part.score, color=f"C{i}", alpha=0.45, linestyle=":", label=f"{camera}: tracker's score")
-    axes.set(xlabel="control step", ylabel="0 .. 1", ylim=(0, 1.05))
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=8, loc="lower left")
-    return figure
-
-
 def film(images: Mapping[str, Sequence[Rgb]], titles: Sequence[str]) -> "Figure":
     """Rows of pictures, one row per label, one column per title."""
     figure = _figure(2.1 * len(titles), 2.2 * len(images) + 0.3)

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MARGINS = {"margin": "margin of votes", "cosine_margin": "margin of mean cosines"}
+SUITE_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7")
+"""Told apart by colour-blind eyes, too."""
 RULE_COLOURS = {"vote": WINNER, "average": OTHER}
 
 
@@ -152,7 +154,7 @@ def size_figure(objects: "pd.DataFrame", bins: int = 7) -> "Figure":
 
 def _suites(table: "pd.DataFrame") -> dict[str, str]:
     """The suites of a table in their usual order, each with its colour."""
-    return {name: f"C{i}" for i, name in enumerate(BENCHMARKS) if (table.suite == name).any()}
+    return {name: colour for name, colour in zip(BENCHMARKS, SUITE_COLOURS, strict=True) if (table.suite == name).any()}
 
 
 def _line(axes: "Axes", x: Sequence[float], found: Sequence[Estimate], colour: str, label: str, counts: bool = False) -> None:
