@@ -54,7 +54,7 @@ RIGS: dict[str, tuple[Rig, ...]] = {
         Rig("side", "world", (0.30, -0.46, 0.33), (0.18, 0.0, 0.06), np.deg2rad(48.0)),
         Rig("wrist", "gripper", (0.0, 0.055, -0.045), (0.008, -0.006, -0.118), np.deg2rad(80.0), up=(0.0, 1.0, 0.0)),
     ),
-    "google": (Rig("head", "base_link", (0.165, 0.0, 1.195), (0.50, 0.0, 0.61), np.deg2rad(42.0)),),
+    "google": (Rig("head", "base_link", (0.165, 0.0, 1.195), (0.50, 0.0, 0.61), np.deg2rad(50.0)),),
 }
 
 
