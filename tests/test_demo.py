@@ -201,7 +201,7 @@ def test_a_dead_worker_is_said_and_what_was_done_stays(tmp_path: Path) -> None:
     )
     (tmp_path / "die.py").write_text(code)
     done = subprocess.run([sys.executable, str(tmp_path / "die.py")], env=ENV, capture_output=True, text=True, timeout=200)
-    assert "WorkerDied: engine: a worker process died" in done.stderr.strip().splitlines()[-1]
+    assert "WorkerDied: a worker process died" in done.stderr.strip().splitlines()[-1]
     assert (out / "run.json").exists()
 
 

@@ -1,18 +1,13 @@
 """Runs a study in local processes: batches of episodes per worker, results appended as they come, only what is missing."""
 
-import os
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from multiprocessing import get_context, parent_process
 from pathlib import Path
-from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 from vap_core import store, traces
-from vap_core.errors import WorkerDied
 from vap_core.experiments import Study, make_trial, register_personal
+from vap_core.processes import results
 from vap_core.values import EpisodeRow, Opening
 
 if TYPE_CHECKING:
@@ -53,7 +48,7 @@ def _run(study: Study, folder: Path, workers: int, record: bool, progress: bool)
     total = len(study.methods) * sum(len(study.rows(suite, task)) for suite, task in study.tasks)
     register_personal(study, folder / "memory")
     with tqdm(total=total, initial=total - sum(len(job.rows) for job in jobs), unit="episode", disable=not progress) as bar:
-        for job, rows in _work(jobs, workers):
+        for job, rows in results(work, jobs, workers, "--workers"):
             store.append(folder, rows)
             bar.update(len(rows))
             won = sum(row["success"] for row in rows)
@@ -81,36 +76,6 @@ def work(job: Job) -> list[dict[str, Any]]:
     episodes = list(rollout(trial, job.rows, sink, batch=BATCH))
     traces.write(job.folder, episodes)
     return [episode.summary() for episode in episodes]
-
-
-def end_with_parent() -> None:
-    """Let this worker process end when its parent does, however that ended: an orphan would write into a resumed run."""
-    parent = parent_process()
-    assert parent is not None
-
-    def watch() -> None:
-        parent.join()
-        os._exit(1)
-
-    Thread(target=watch, daemon=True).start()
-
-
-def _work(jobs: list[Job], workers: int) -> Iterator[tuple[Job, list[dict[str, Any]]]]:
-    if not jobs:
-        return
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")  # inherited by the workers: two threads in each would fight over the cores
-    with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=get_context("spawn"), initializer=end_with_parent) as pool:
-        futures = {pool.submit(work, job): job for job in jobs}
-        try:
-            for future in as_completed(futures):
-                yield futures[future], future.result()
-        except BrokenProcessPool as error:
-            raise WorkerDied(
-                "engine: a worker process died, perhaps for lack of memory; run the same command again, with fewer --workers."
-            ) from error
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _recorders(folder: Path) -> Any:

@@ -1,22 +1,18 @@
 """Runs the whole survey in local processes; what a killed run had finished is found again in its folder."""
 
 import json
-import os
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vap_core import store, suites
 from vap_core.attend import STACKS, load_stack
-from vap_core.engine import end_with_parent
-from vap_core.errors import BadOutput, WorkerDied, one_of
+from vap_core.errors import BadOutput, one_of
 from vap_core.experiments import Study
 from vap_core.files import write_atomic
+from vap_core.processes import results
 from vap_core.survey import following
 from vap_core.survey.episodes import survey
 from vap_core.survey.openings import KS, Tables, openings, remembered
@@ -162,26 +158,9 @@ def _work(left: Sequence[Job], total: int, parts: Path, jobs: int, progress: boo
     from tqdm import tqdm
 
     with tqdm(total=total, initial=total - len(left), unit="job", desc="perception", disable=not progress) as bar:
-        for job, tables in _parallel(left, jobs):
+        for job, tables in results(work, left, jobs, "--jobs"):
             _keep(parts, job.name, tables)
             bar.update()
-
-
-def _parallel(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, Tables]]:
-    """Results in the order in which they come, from processes of one thread each."""
-    if not jobs:
-        return
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
-    with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=get_context("spawn"), initializer=end_with_parent) as pool:
-        futures = {pool.submit(work, job): job for job in jobs}
-        try:
-            for future in as_completed(futures):
-                yield futures[future], future.result()
-        except BrokenProcessPool as error:
-            raise WorkerDied("survey: a worker process died, perhaps for lack of memory; run the same command again, with fewer --jobs.") from error
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _part(parts: Path, name: str) -> Path:

@@ -115,14 +115,17 @@ class LiteTracker:
         free = np.where(taken, 0, soft[i + 1]).astype(np.float32)
         nothing = 1 - float(np.clip(free.max(), 0, 1))
         guess = largest(free > SEED, soft[i + 1])
-        wide = None if guess is None else bounds(cv2.dilate(guess.astype(np.uint8), np.ones((AROUND, AROUND))) > 0)
-        found = limit = None if wide is None else _within(wide, state.last[i])
-        here: Float32[np.ndarray, "h w"] = np.zeros(state.hw, np.float32)
+        found = None if guess is None else bounds(cv2.dilate(guess.astype(np.uint8), np.ones((AROUND, AROUND))) > 0)
+        if found is None:
+            return state, nothing
+        found = _within(found, state.last[i])
+        out = taken | (box_plane(found, state.hw) == 0)
         for _ in range(2):  # the first mask shows how far the object reaches, the second is drawn from its whole box
-            if found is not None and limit is not None:
-                here = np.where(taken | ~_inside(limit, state.hw), 0, self.segmenter.chance(look.image, found[None], free[None])[0])
-                found = bounds(here > 0.5)
-        if found is None or _evidence(state, look, i, here > 0.5) < FOUND:
+            here = np.where(out, 0, self.segmenter.chance(look.image, found[None], free[None])[0])
+            found = bounds(here > 0.5)
+            if found is None:
+                return state, nothing
+        if _evidence(state, look, i, here > 0.5) < FOUND:
             return state, nothing
         if state.looks is None:
             state = replace(state, looks=remember(self.encoder, state.early, state.ground))
@@ -138,10 +141,6 @@ def _within(box: Float32[np.ndarray, "4"], last: Float32[np.ndarray, "4"]) -> Fl
     """The box, cut about its middle where it is `SWELL` times as wide or high as the last one: what stands behind is not the object."""
     middle, half = (box[:2] + box[2:]) / 2, np.minimum((box[2:] - box[:2]) / 2, SWELL * (last[2:] - last[:2]) / 2)
     return np.concatenate([middle - half, middle + half]).astype(np.float32)
-
-
-def _inside(box: Float32[np.ndarray, "4"], hw: Sequence[int]) -> Mask:
-    return box_plane(box, hw) > 0
 
 
 def _labels(state: TrackState, keys: Float32[np.ndarray, "p c"], grid: tuple[int, int], moving: Int64[np.ndarray, " k"]) -> Labels:

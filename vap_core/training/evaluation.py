@@ -14,15 +14,12 @@ from vap_core.metrics import rate
 from vap_core.segment import LiteSegmenter, MaskHead, iou
 from vap_core.sim import objects
 from vap_core.survey.estimates import average_precision
+from vap_core.survey.openings import FLOOR, LEAST_PX
 from vap_core.training.phrases import AMBIGUOUS, NEGATIVES, UNSEEN, UNSEEN_NEGATIVES
 from vap_core.training.scenes import POSES, Shots, boxes_of
 from vap_core.training.segmenter import jitter
 from vap_core.vote import similarity, vote
 
-LEAST_PX = 100
-"""Objects with fewer visible pixels are neither wanted nor counted as false."""
-FLOOR = 0.03
-"""Score above which a detection enters an average precision."""
 Figures = dict[str, Any]
 Found = tuple[np.ndarray, np.ndarray]
 """Boxes (image pixels) and scores, best first."""

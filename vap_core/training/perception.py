@@ -52,7 +52,7 @@ def train(
     n = -(-scenes // VIEWS)
     stages = prepare(cache, seed, n, jobs=jobs)
     views = [view for number, shots in enumerate(stages) for view in detector_views(cache, seed, number, shots)]
-    kept = [looks.featurise(cache, f"train-{seed}-{number:05d}", shots, stream(seed, number, "looks")) for number, shots in enumerate(stages)]
+    kept = [looks_of(cache, seed, number, shots) for number, shots in enumerate(stages)]
     detect = detector.fit_detector(views, objects.CATEGORIES + objects.CLUTTER, run("detector", 2e-3, 1e-3))
     look = looks.fit_looks(kept, run("looks", 2e-3, 1e-2))
     segment = segmenter.fit_segmenter(stages, CROPS_PER_EPOCH, run("segmenter", 2e-3, 1e-4))
@@ -92,13 +92,18 @@ def _prepare(cache: Path, seed: int, held_out: bool, number: int) -> None:
     shots = cached(cache, seed, number, held_out=held_out)
     if not held_out:
         detector_views(cache, seed, number, shots)
-        looks.featurise(cache, f"train-{seed}-{number:05d}", shots, stream(seed, number, "looks"))
+        looks_of(cache, seed, number, shots)
 
 
 def detector_views(cache: Path, seed: int, number: int, shots: Shots) -> Sequence[tuple[np.ndarray, detector.Objects]]:
     """Per picture of a stage, its frozen features and its objects."""
     rows, seen = detector.featurise(cache, f"train-{seed}-{number:05d}", shots, stream(seed, number, "detector"))
     return list(zip(rows, seen, strict=True))
+
+
+def looks_of(cache: Path, seed: int, number: int, shots: Shots) -> looks.Looks:
+    """The crops of a stage, with their frozen features."""
+    return looks.featurise(cache, f"train-{seed}-{number:05d}", shots, stream(seed, number, "looks"))
 
 
 def stream(seed: int, number: int, part: str) -> np.random.Generator:
