@@ -61,6 +61,10 @@ class BadStudy(VapError):
     """A combination of tasks, methods and policy that makes no sense."""
 
 
+class BadPolicy(VapError):
+    """A checkpoint that is not there, would execute code, is not what its files say, or does not fit the suite."""
+
+
 class OutOfReach(VapError):
     """A pose that inverse kinematics cannot reach."""
 

@@ -1,0 +1,265 @@
+"""lerobot both ways: its policies drive our rollouts, and VAP personalises its own loop. The real classes, tiny and random."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from tests import tiny_lerobot as tiny
+from vap_core import suites
+from vap_core.errors import BadPolicy
+from vap_core.policies import Policy
+from vap_core.policies.lerobot import LeRobot, compare, fingerprint, load
+from vap_core.policies.toy_pi0 import toy_sizes
+from vap_core.rollout import Trial, rollout
+from vap_core.sim.objects import extent_m, get
+from vap_core.sim.scenes import build
+from vap_core.values import PolicyInput
+
+SUITE, TASK = "simpler-bridge", "put-camera"
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    root = tmp_path_factory.mktemp("checkpoints")
+    return {"pi0": tiny.pi0(root / "pi0"), "act": tiny.act(root / "act"), "ensemble": tiny.act(
+        root / "ensemble", n_action_steps=1, temporal_ensemble_coeff=0.01)}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def policies(folders):
+    with toy_sizes(tiny.TOY):
+        return {name: load(folder) for name, folder in folders.items()}
+
+
+def look(i, text="put my camera on the plate", side=64):
+    rng = np.random.default_rng(i)
+    return PolicyInput({"front": rng.integers(0, 256, (side, side, 3), np.uint8)}, text, rng.standard_normal(tiny.STATE).astype(np.float32))
+
+
+def begin(policy, n):
+    return [policy.start(np.random.default_rng([7, i])) for i in range(n)]
+
+
+def run(policy, states, looks):
+    states, chunks = policy.plan(states, looks)
+    return np.stack(chunks)
+
+
+@pytest.mark.parametrize("name", ["pi0", "act", "ensemble"])
+def test_the_contract_of_a_policy(policies, name):
+    policy = policies[name]
+    assert isinstance(policy, Policy)
+    assert policy.label == f"{name.replace('ensemble', 'act')}:{name}"
+    before = policy.sha256()
+    states, chunks = policy.plan(begin(policy, 3), [look(i) for i in range(3)])
+    assert len(states) == len(chunks) == 3
+    for chunk in chunks:
+        assert chunk.dtype == np.float32
+        assert chunk.shape == (policy.execute, tiny.ACTION)
+    assert policy.execute == {"pi0": 2, "act": 3, "ensemble": 1}[name]
+    assert policy.sha256() == before
+    assert not policy.policy.training
+    assert not any(weight.requires_grad for weight in policy.policy.parameters())
+
+
+@pytest.mark.parametrize("name", ["pi0", "act", "ensemble"])
+def test_a_batch_equals_one_by_one_whatever_the_global_seed(policies, name):
+    policy, looks = (
+        policies[name],
+        [look(i, text) for i, text in enumerate(("put my camera on the plate", "pick up the red shaver", "select my cup"))],
+    )
+    torch.manual_seed(1)
+    together = run(policy, begin(policy, 3), looks)
+    torch.manual_seed(2)
+    drawn = torch.get_rng_state()
+    alone = np.concatenate([run(policy, [state], [seen]) for state, seen in zip(begin(policy, 3), looks, strict=True)])
+    assert np.allclose(together, alone, atol=1e-6)
+    assert np.abs(together[0] - together[1]).max() > 1e-4  # what is seen matters
+    assert torch.equal(torch.get_rng_state(), drawn)
+
+
+def test_sampling_noise_is_fixed_within_an_episode_and_differs_between_episodes(policies):
+    policy = policies["pi0"]
+    states, first = policy.plan(begin(policy, 2), [look(0), look(0)])
+    _, again = policy.plan(states, [look(0), look(0)])
+    assert all((a == b).all() for a, b in zip(first, again, strict=True))
+    assert np.abs(first[0] - first[1]).max() > 1e-4
+
+
+def test_text_and_picture_reach_the_policy(policies):
+    policy, (state,) = policies["pi0"], begin(policies["pi0"], 1)
+    seen = look(0)
+    red = PolicyInput({"front": seen.images["front"] // 2}, seen.text, seen.state)
+    plain, worded, tinted = (run(policy, [state], [one]) for one in (seen, look(0, "put the red camera on the plate"), red))
+    assert np.abs(plain - worded).max() > 1e-6
+    assert np.abs(plain - tinted).max() > 1e-6
+
+
+def test_chunks_are_those_of_lerobots_own_loop(policies):
+    """Selected one by one through lerobot's queue and postprocessor, they are the same actions."""
+    policy, seen = policies["act"], look(3)
+    chunk = run(policy, begin(policy, 1), [seen])[0]
+    policy.policy.reset()
+    pixels = torch.from_numpy(seen.images["front"]).permute(2, 0, 1)[None].float() / 255
+    for row in chunk:
+        batch = policy.preprocessor(
+            {"observation.images.front": pixels, "observation.state": torch.from_numpy(seen.state)[None], "task": [seen.text]}
+        )
+        with torch.inference_mode():
+            action = policy.postprocessor(policy.policy.select_action(batch))
+        assert np.allclose(action[0].numpy(), row, atol=1e-7)
+
+
+def test_a_policy_with_a_memory_keeps_one_per_episode(policies):
+    """Temporal ensembling averages over calls: two episodes interleaved are each as if alone."""
+    policy = policies["ensemble"]
+    assert not policy.batched
+    mixed = begin(policy, 2)
+    interleaved = [run(policy, mixed, [look(t), look(10 + t)]) for t in range(3)]
+    for i, first in enumerate((0, 10)):
+        state = begin(policy, 2)[i : i + 1]
+        alone = [run(policy, state, [look(first + t)])[0] for t in range(3)]
+        assert np.allclose(np.stack([step[i] for step in interleaved]), np.stack(alone), atol=1e-6)
+    fresh = run(policy, begin(policy, 1), [look(2)])[0]
+    assert np.abs(fresh - alone[-1]).max() > 1e-6
+
+
+def test_a_smaller_picture_is_scaled_to_the_checkpoints_size(policies):
+    policy, side = policies["act"], look(0, side=64)
+    double = PolicyInput({"front": side.images["front"].repeat(2, axis=0).repeat(2, axis=1)}, side.text, side.state)
+    assert np.allclose(run(policy, begin(policy, 1), [side]), run(policy, begin(policy, 1), [double]), atol=1e-3)
+
+
+def test_what_does_not_fit_is_one_line(policies):
+    policy, seen = policies["act"], look(0)
+    wants = r"act:act wants observation.images.front, observation.state \(13\); there is observation.images."
+    with pytest.raises(BadPolicy, match=wants + r"head, observation.state \(13\).*rename_map"):
+        policy.plan(begin(policy, 1), [replace(seen, images={"head": seen.images["front"]})])
+    with pytest.raises(BadPolicy, match=wants + r"front, observation.state \(14\)"):
+        policy.plan(begin(policy, 1), [replace(seen, state=np.zeros(14, np.float32))])
+    policy.check(["wrist", "front"], 13, 7)
+    with pytest.raises(BadPolicy, match=r"have 7 numbers, the suite takes 6"):
+        policy.check(["front"], 13, 6)
+
+
+def copy_of(folder, tmp_path):
+    return shutil.copytree(folder, tmp_path / "copy")
+
+
+def test_names_are_mapped_by_the_checkpoints_own_rename_map(folders, tmp_path):
+    folder = copy_of(folders["act"], tmp_path)
+    file = folder / "policy_preprocessor.json"
+    pipeline = json.loads(file.read_text())
+    pipeline["steps"][0]["config"]["rename_map"] = {"observation.images.head": "observation.images.front"}
+    file.write_text(json.dumps(pipeline))
+    policy, seen = load(folder), look(0)
+    assert set(policy.wanted) == {"observation.images.head", "observation.state"}
+    headed = replace(seen, images={"head": seen.images["front"]})
+    assert (run(policy, begin(policy, 1), [headed]) == run(load(folders["act"]), begin(policy, 1), [seen])).all()
+
+
+@pytest.mark.parametrize("name", ["pi0", "act"])
+@pytest.mark.parametrize("fault", ["missing", "extra", "shape"])
+def test_weights_that_are_not_the_files_are_refused(folders, tmp_path, name, fault):
+    folder = copy_of(folders[name], tmp_path)
+    tensors = load_file(folder / "model.safetensors")
+    key = next(key for key, tensor in tensors.items() if tensor.ndim == 2)
+    if fault == "missing":
+        del tensors[key]
+    elif fault == "extra":
+        tensors["model.no.such.weight"] = torch.zeros(2)
+    elif fault == "shape":
+        tensors[key] = tensors[key][:-1].contiguous()
+    save_file(tensors, folder / "model.safetensors")
+    with toy_sizes(tiny.TOY), pytest.raises(BadPolicy, match=r"load: \d+ of \d+ tensors differ|cannot become a policy"):
+        load(folder)
+
+
+def test_one_number_that_differs_is_found(folders, policies, tmp_path):
+    tensors = load_file(folders["pi0"] / "model.safetensors")
+    save_file(tensors, tmp_path / "same.safetensors")
+    compare(policies["pi0"].policy, tmp_path / "same.safetensors")
+    name = sorted(tensors)[3]
+    tensors[name].view(-1)[-1] += 1
+    save_file(tensors, tmp_path / "other.safetensors")
+    with pytest.raises(BadPolicy, match=rf"load: 1 of \d+ tensors differ from .*other.safetensors, {name} for one"):
+        compare(policies["pi0"].policy, tmp_path / "other.safetensors")
+
+
+def test_a_toy_without_its_sizes_is_refused_not_random(folders):
+    """The file's architecture is another one: lerobot prints a warning and would go on."""
+    from lerobot.policies.pi0 import modeling_pi0
+
+    with toy_sizes(replace(tiny.TOY, expert=64)), pytest.raises(BadPolicy, match=r"load: \d+ of \d+ tensors differ from .*another architecture"):
+        load(folders["pi0"])
+    assert modeling_pi0.get_gemma_config("gemma_2b").width == 2048  # nothing small is left behind
+
+
+@pytest.mark.parametrize("step", ["subprocess.Popen", "lerobot.processor.pipeline.importlib", "os.system", 3, "vap_core.policies.lerobot.load"])
+def test_files_are_parsed_never_executed(folders, tmp_path, step):
+    folder = copy_of(folders["act"], tmp_path)
+    file = folder / "policy_preprocessor.json"
+    pipeline = json.loads(file.read_text())
+    pipeline["steps"].append({"class": step, "config": {"args": ["touch", str(tmp_path / "owned")]}})
+    file.write_text(json.dumps(pipeline))
+    with pytest.raises(BadPolicy, match="which is no step of lerobot; files are parsed here, never executed"):
+        load(folder)
+    assert not (tmp_path / "owned").exists()
+
+
+def test_what_is_missing_or_damaged_is_one_line(folders, tmp_path):
+    with pytest.raises(BadPolicy, match=r"no/such-model is no folder and no model on this machine; download it with `hf download no/such-model`"):
+        load("no/such-model")
+    with pytest.raises(BadPolicy, match=r"lacks config.json, model.safetensors, policy_preprocessor.json"):
+        load(tmp_path)
+    for name, text, said in (
+        ("policy_preprocessor.json", "[", "is no processor pipeline"),
+        ("config.json", "{}", r"cannot become a policy \(ValueError: Missing 'type'"),
+        ("config.json", '{"type": "nonesuch"}', "'nonesuch'"),
+        ("model.safetensors", "x", "cannot become a policy"),
+    ):
+        folder = copy_of(folders["act"], tmp_path / f"{name}-{len(text)}")
+        (folder / name).write_text(text)
+        with pytest.raises(BadPolicy, match=said):
+            load(folder)
+
+
+def test_a_fingerprint_tells_checkpoints_apart(folders, tmp_path):
+    folder = copy_of(folders["act"], tmp_path)
+    assert fingerprint(folder) == fingerprint(folders["act"]) != fingerprint(folders["ensemble"])
+    (folder / "config.json").write_text((folder / "config.json").read_text() + " ")
+    assert fingerprint(folder) != fingerprint(folders["act"])
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return [replace(row, max_steps=3) for row in suites.rows(SUITE, TASK, 2)]
+
+
+@pytest.fixture(scope="module")
+def scene(rows):
+    models = dict.fromkeys(place.model for row in rows for place in row.placements)
+    with build(suites.suite(SUITE).robot, tuple(models)) as built:
+        yield built
+
+
+@pytest.mark.parametrize("name", ["pi0", "act", "ensemble"])
+def test_a_rollout_in_a_real_suite(policies, rows, scene, name):
+    policy: LeRobot = policies[name]
+    before = policy.sha256()
+    trial = Trial("generic", scene, policy, None, {model: extent_m(get(model)) for model in scene.objects})
+    policy.check(suites.suite(SUITE).cameras, tiny.STATE, tiny.ACTION)
+    together, alone = (list(rollout(trial, rows, batch=batch)) for batch in (2, 1))
+    assert [episode.outcome.status for episode in together] == ["failure", "failure"], together[0].outcome.detail
+    assert policy.sha256() == before
+    for a, b in zip(together, alone, strict=True):
+        assert len(a.frames) == 4
+        actions = np.stack([frame.action for frame in a.frames])
+        assert np.allclose(actions, [frame.action for frame in b.frames], atol=1e-6)
+        assert np.abs(actions[:3]).max() > 1e-4
+        assert a.opening.policy == policy.label

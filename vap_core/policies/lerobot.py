@@ -1,0 +1,267 @@
+"""Any policy that lerobot can load, as one of ours: frozen, asked for whole batches at once, deaf to every random stream but its episode's.
+
+    policy = load("path/to/checkpoint")        # or owner/name, already downloaded
+    Trial("generic", scene, policy, ...)
+
+A checkpoint is a folder as lerobot writes it: config.json, model.safetensors, and the two processor pipelines with their statistics. It comes
+from outside: it is parsed, never executed, and nothing runs with weights that are not exactly those of the file.
+"""
+
+import copy
+import hashlib
+import inspect
+import io
+import json
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from unittest.mock import patch
+
+import numpy as np
+import torch
+
+from vap_core.errors import BadPolicy
+from vap_core.values import Chunk, PolicyInput, value
+
+if TYPE_CHECKING:
+    from lerobot.policies.pretrained import PreTrainedPolicy
+
+STATE, IMAGE, EMPTY = "observation.state", "observation.images.", "observation.images.empty_camera"
+"""lerobot's feature keys; a checkpoint fills its empty cameras itself."""
+WEIGHTS, CONFIG, PIPELINES = "model.safetensors", "config.json", ("policy_preprocessor.json", "policy_postprocessor.json")
+WANTED_FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
+DRAWS_NOTHING = ("act",)
+"""Policies whose chunk is a function of what they see."""
+
+
+@value
+class LeRobotState:
+    """Memory of one episode: the seed of its sampling noise, and, of a policy that remembers what it saw, a copy that shares the weights."""
+
+    seed: int
+    own: Any
+
+
+class LeRobot:
+    """A lerobot policy between its own processors; see `load`.
+
+    One batch asks for the chunks of many episodes where the policy can be told its sampling noise or draws none; the noise of an episode is
+    the same at every call, so that it does not dither between modes. Every other policy (one that looks back, or ensembles over time) is asked
+    for one action a step through its own queues, a copy per episode, under that episode's seed.
+    """
+
+    def __init__(self, policy: "PreTrainedPolicy", preprocessor: Any, postprocessor: Any, label: str = "lerobot") -> None:
+        config: Any = policy.config
+        self.policy = policy.eval().requires_grad_(False)
+        self.preprocessor = preprocessor
+        self.postprocessor = postprocessor
+        self.label = label
+        self.noisy = "noise" in inspect.signature(getattr(getattr(policy, "model", None), "sample_actions", print)).parameters
+        plain = config.n_obs_steps == 1 and getattr(config, "temporal_ensemble_coeff", None) is None
+        self.batched = plain and (self.noisy or config.type in DRAWS_NOTHING)
+        self.execute = int(config.n_action_steps) if self.batched else 1
+        self.action_size = int(config.action_feature.shape[0])
+        renamed = {new: old for step in preprocessor.steps for old, new in getattr(step, "rename_map", {}).items()}
+        self.wanted: dict[str, tuple[int, ...]] = {
+            renamed.get(key, key): tuple(feature.shape) for key, feature in config.input_features.items() if not key.startswith(EMPTY)
+        }
+        """Shape of every feature that the checkpoint reads, under the key that its preprocessor expects."""
+
+    def start(self, rng: np.random.Generator) -> LeRobotState:
+        seed = int(rng.integers(2**63 - 1))
+        if self.batched:
+            return LeRobotState(seed, None)
+        own = copy.copy(self.policy)
+        for name, held in vars(self.policy).items():
+            if not name.startswith("_") and not isinstance(held, torch.nn.Module) and name != "config":
+                setattr(own, name, copy.deepcopy(held))
+        own.reset()
+        return LeRobotState(seed, own)
+
+    @torch.inference_mode()
+    def plan(self, states: Sequence[LeRobotState], inputs: Sequence[PolicyInput]) -> tuple[list[LeRobotState], list[Chunk]]:
+        """The next chunk of every episode, un-normalised by the checkpoint's own postprocessor. Raises: BadPolicy when the inputs do not fit."""
+        if self.batched:
+            batch = self.preprocessor(self._observation(inputs))
+            noise = {"noise": self._noise(states)} if self.noisy else {}
+            actions = self.postprocessor(self.policy.predict_action_chunk(batch, **noise)[:, : self.execute])
+            return list(states), [chunk.float().cpu().numpy() for chunk in actions]
+        return list(states), [self._step(state, seen) for state, seen in zip(states, inputs, strict=True)]
+
+    def check(self, cameras: Sequence[str], state_size: int, action_size: int) -> None:
+        """Raises: BadPolicy, unless the checkpoint reads no more than these cameras and this state, and its actions have this length."""
+        there = {**{IMAGE + name: () for name in cameras}, STATE: (state_size,)}
+        if any(key not in there or (key == STATE and shape != there[key]) for key, shape in self.wanted.items()):
+            raise BadPolicy(
+                f"LeRobot: {self.label} wants {_listed(self.wanted)}; there is {_listed(there)}. Take a policy that was trained on these, or map the "
+                f"names by rename_map in its {PIPELINES[0]}."
+            )
+        if self.action_size != action_size:
+            raise BadPolicy(
+                f"LeRobot: the actions of {self.label} have {self.action_size} numbers, the suite takes {action_size}; take a policy trained for it."
+            )
+
+    def sha256(self) -> str:
+        """Checksum of all parameters and buffers as they stand."""
+        found = hashlib.sha256()
+        for name, tensor in sorted(self.policy.state_dict().items()):
+            found.update(name.encode() + tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
+        return found.hexdigest()
+
+    def _observation(self, inputs: Sequence[PolicyInput]) -> dict[str, Any]:
+        """What lerobot's loop would hand to the preprocessor: float images in 0..1, B x C x H x W."""
+        self.check(list(inputs[0].images), len(inputs[0].state), self.action_size)
+        out: dict[str, Any] = {"task": [seen.text for seen in inputs]}
+        for key, shape in self.wanted.items():
+            if key == STATE:
+                out[key] = torch.from_numpy(np.stack([seen.state for seen in inputs]))
+            else:
+                rgb = np.stack([seen.images[key.removeprefix(IMAGE)] for seen in inputs])
+                out[key] = _sized(torch.from_numpy(rgb).permute(0, 3, 1, 2).float() / 255, shape)
+        return out
+
+    def _noise(self, states: Sequence[LeRobotState]) -> torch.Tensor:
+        config: Any = self.policy.config
+        shape = (config.chunk_size, config.max_action_dim)
+        drawn = [torch.randn(shape, generator=torch.Generator().manual_seed(state.seed)) for state in states]
+        return torch.stack(drawn).to(config.device)
+
+    def _step(self, state: LeRobotState, seen: PolicyInput) -> Chunk:
+        batch = self.preprocessor(self._observation([seen]))
+        with torch.random.fork_rng():
+            torch.manual_seed(state.seed)
+            action = self.postprocessor(state.own.select_action(batch))
+        return action.float().cpu().numpy()
+
+
+def load(checkpoint: str | Path, device: str | None = None) -> LeRobot:
+    """Load a checkpoint through lerobot's factory: a folder, or the `owner/name` of a model that was downloaded before.
+
+    Raises: BadPolicy when it is not there, would execute code, cannot be built, or does not end with exactly the file's weights.
+    """
+    from lerobot import policies
+    from lerobot.configs import PreTrainedConfig
+
+    folder = locate(checkpoint)
+    _refuse_code(folder)
+    try:
+        with _silence(), patch("transformers.dynamic_module_utils.get_class_in_module", _no_code):  # some policies trust any repository
+            config: Any = PreTrainedConfig.from_pretrained(folder)
+            config.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+            for name in ("pretrained_backbone_weights", "load_vlm_weights"):  # the file's weights replace them
+                if getattr(config, name, None):
+                    setattr(config, name, None if name.startswith("pretrained") else False)
+            policy = policies.factory.get_policy_class(config.type).from_pretrained(folder, config=config)
+            moved = {"device_processor": {"device": config.device}}
+            before, after = policies.make_pre_post_processors(config, str(folder), preprocessor_overrides=moved)
+    except Exception as error:
+        reason = str(error).strip().splitlines() or [""]
+        raise BadPolicy(
+            f"load: {folder} cannot become a policy ({type(error).__name__}: {reason[0]:.200}); check its files, or save it again with lerobot 0.6."
+        ) from error
+    compare(policy, folder / WEIGHTS)
+    return LeRobot(policy, before, after, f"{config.type}:{folder.name if Path(checkpoint).is_dir() else checkpoint}")
+
+
+def locate(checkpoint: str | Path) -> Path:
+    """The folder of a checkpoint on this machine. Raises: BadPolicy when a file is missing."""
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError
+
+    folder = Path(checkpoint).expanduser()
+    if not folder.is_dir():
+        try:
+            folder = Path(snapshot_download(str(checkpoint), allow_patterns=list(WANTED_FILES), local_files_only=True))
+        except (HFValidationError, LocalEntryNotFoundError) as error:
+            raise BadPolicy(
+                f"load: {checkpoint} is no folder and no model on this machine; download it with `hf download {checkpoint}`, or give a folder."
+            ) from error
+    missing = [name for name in (CONFIG, WEIGHTS, *PIPELINES) if not (folder / name).is_file()]
+    if missing:
+        raise BadPolicy(f"load: {folder} lacks {', '.join(missing)}; give the folder that lerobot's save_pretrained wrote, processors included.")
+    return folder
+
+
+def fingerprint(checkpoint: str | Path) -> str:
+    """SHA-256 of everything in a checkpoint that decides what it does, without loading it."""
+    found, folder = hashlib.sha256(), locate(checkpoint)
+    for file in sorted(file for file in folder.iterdir() if file.suffix in (".json", ".safetensors") and file.is_file()):
+        found.update(file.name.encode())
+        with file.open("rb") as stream:
+            found.update(hashlib.file_digest(stream, "sha256").digest())
+    return found.hexdigest()
+
+
+def compare(policy: "PreTrainedPolicy", file: Path) -> None:
+    """Tensor for tensor, the policy's weights are the file's, cast to its precision. Raises: BadPolicy.
+
+    lerobot's PI0 prints a failed load and goes on with random weights; other policies skip what they miss.
+    """
+    from safetensors import safe_open
+
+    mine = policy.state_dict()
+    with safe_open(file, "pt") as stored:
+        names = list(stored.keys())
+        rename = getattr(policy, "_fix_pytorch_state_dict_keys", lambda found, config: found)  # openpi's names
+        known = {key: names[int(i)] for key, i in rename({name: torch.tensor(i) for i, name in enumerate(names)}, policy.config).items()}
+        known = {key if key in mine else f"model.{key}": name for key, name in known.items()}
+        same = {
+            key: key in mine and torch.equal(stored.get_tensor(name).to(mine[key].dtype), mine[key].cpu())
+            for key, name in known.items()
+        }  # fmt: skip
+    tied = {mine[key].data_ptr() for key, good in same.items() if good}
+    bad = [key for key, good in same.items() if not good] + [key for key in mine if key not in same and mine[key].data_ptr() not in tied]
+    if bad:
+        raise BadPolicy(
+            f"load: {len(bad)} of {len(mine)} tensors differ from {file}, {bad[0]} for one; the file belongs to another architecture or size."
+        )
+
+
+def _refuse_code(folder: Path) -> None:
+    """A pipeline may only name lerobot's own steps: lerobot would import, and call, whatever stands there."""
+    from lerobot.processor import ProcessorStep
+
+    for file in PIPELINES:
+        try:
+            steps = json.loads((folder / file).read_text())["steps"]
+            foreign = [step["class"] for step in steps if "registry_name" not in step]
+        except (ValueError, KeyError, TypeError) as error:
+            raise BadPolicy(f"load: {folder / file} is no processor pipeline ({type(error).__name__}); save it again with lerobot 0.6.") from error
+        for name in foreign:
+            if str(name).startswith("vap_core.integrations."):
+                raise BadPolicy(
+                    f"load: {folder} has VAP attached for lerobot's own loops; here give the plain checkpoint, and the method by --method."
+                )
+            module, _, attribute = str(name).rpartition(".")
+            found = getattr(import_module(module), attribute, None) if module.startswith("lerobot.processor") else None
+            if not (isinstance(found, type) and issubclass(found, ProcessorStep)):
+                raise BadPolicy(f"load: {folder / file} asks to run {name!r}, which is no step of lerobot; files are parsed here, never executed.")
+
+
+def _sized(images: torch.Tensor, shape: tuple[int, ...]) -> torch.Tensor:
+    """Scaled to the height and width that the checkpoint was trained on."""
+    size = shape[-2:]
+    return images if images.shape[-2:] == size else torch.nn.functional.interpolate(images, size, mode="bilinear", antialias=True)
+
+
+def _listed(features: dict[str, tuple[int, ...]]) -> str:
+    return ", ".join(key + (f" ({shape[0]})" if len(shape) == 1 else "") for key, shape in sorted(features.items())) or "nothing"
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Loading prints and logs a page; what matters of it is checked afterwards."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        logging.disable(before)
+
+
+def _no_code(*args: Any, **kwargs: Any) -> Any:
+    raise BadPolicy("its tokenizer or backbone is Python from the hub, which is never executed here")
