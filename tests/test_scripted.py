@@ -7,12 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vap_core.policies.scripted import STEP_M, Scripted, ScriptedState, coloured, read
+from vap_core.policies.eye import coloured, read
+from vap_core.policies.scripted import SPEED_M_S, Scripted, ScriptedState
 from vap_core.prompt import PALETTE
+from vap_core.sim import robots
 from vap_core.values import Boxes, Camera, PolicyInput, Rgb
 
 RED = PALETTE[0]
-BASE = np.array([0, 0, 0, 1, 0, 0, 0], np.float64)
 
 
 def camera() -> Camera:
@@ -36,7 +37,7 @@ def box_of(x: float, y: float, radius: float, height: float) -> np.ndarray:
 
 def policy(boxes: Sequence[np.ndarray]) -> Scripted:
     found = Boxes(np.array(boxes, np.float32).reshape(-1, 4), np.ones(len(boxes), np.float32), "cup")
-    return Scripted(lambda images, phrase, threshold=None: [found for _ in images], camera(), BASE)
+    return Scripted(lambda images, phrase, threshold=None: [found for _ in images], camera(), robots.get("wx250s"), 5.0)
 
 
 def look(rgb: Rgb, text: str) -> PolicyInput:
@@ -44,27 +45,31 @@ def look(rgb: Rgb, text: str) -> PolicyInput:
 
 
 @pytest.mark.parametrize(
-    ("text", "colour", "category"),
+    ("text", "verb", "colour", "category", "goal"),
     [
-        ("pick up the red cup", "red", "cup"),
-        ("pick up my cup", None, "cup"),
-        ("pick up the cup", None, "cup"),
-        ("put the blue owl figurine", "blue", "owl figurine"),
-        ("cup", None, "cup"),
-        ("put the red cup on the table", "red", "cup"),
-        ("take the blue pen holder and lift it", "blue", "pen holder"),
+        ("pick up the red cup", "pick", "red", "cup", ""),
+        ("pick up my cup", "pick", None, "cup", ""),
+        ("pick up the cup", "pick", None, "cup", ""),
+        ("cup", "pick", None, "cup", ""),
+        ("put the red cup on the table", "pick", "red", "cup", ""),
+        ("take the blue pen holder and lift it", "pick", "blue", "pen holder", ""),
+        ("put the blue owl figurine on the plate", "put", "blue", "owl figurine", "plate"),
+        ("put my straw cup in the basket", "put", None, "straw cup", "basket"),
+        ("put the red pouch into the plastic bowl", "put", "red", "pouch", "plastic bowl"),
+        ("move the red bottle near coke can", "near", "red", "bottle", "coke can"),
+        ("select my leather bag", "touch", None, "leather bag", ""),
     ],
 )
-def test_reads_colour_and_category(text: str, colour: str | None, category: str) -> None:
-    found, noun = read(text)
-    assert (found.name if found else None, noun) == (colour, category)
+def test_reads_what_is_asked_for(text: str, verb: str, colour: str | None, category: str, goal: str) -> None:
+    wish = read(text)
+    assert (wish.verb, wish.colour.name if wish.colour else None, wish.category, wish.goal) == (verb, colour, category, goal)
 
 
 @given(st.floats(0.15, 0.45), st.floats(-0.2, 0.2), st.floats(0.012, 0.021), st.floats(0.05, 0.12))
 def test_places_an_upright_object_to_within_a_finger(x: float, y: float, radius: float, height: float) -> None:
-    place = policy([])._place(box_of(x, y, radius, height))
+    place = policy([]).eye.place(box_of(x, y, radius, height), 0.021)
     assert np.hypot(place[0] - x, place[1] - y) < 0.003
-    assert abs(place[2] - height) < 0.005
+    assert abs(place[3] - height) < 0.005
 
 
 def test_goes_to_the_coloured_one_and_not_by_luck() -> None:
@@ -96,8 +101,8 @@ def test_without_a_colour_any_of_the_category_is_taken_and_kept() -> None:
 
 
 def test_an_empty_gripper_after_lifting_means_try_again() -> None:
-    p, boxes = policy([box_of(0.3, 0.1, 0.02, 0.08)]), np.array([0.3, 0.1, 0.08])
-    lifting = ScriptedState(0.5, boxes, "lift", 0)
+    p, boxes = policy([box_of(0.3, 0.1, 0.02, 0.08)]), np.array([0.3, 0.1, 0.02, 0.08])
+    lifting = ScriptedState(0.5, boxes, "lift", 0.0)
     held, empty = look(np.zeros((224, 224, 3), np.uint8), "pick up my cup"), look(np.zeros((224, 224, 3), np.uint8), "pick up my cup")
     held.state[6], empty.state[6] = 0.5, 0.0
     (kept, again), (_, chunk) = p.plan([lifting, lifting], [held, empty])
@@ -115,7 +120,7 @@ def test_nothing_seen_means_stand_still() -> None:
 def test_no_action_is_longer_than_a_step() -> None:
     p = policy([box_of(0.3, 0.15, 0.02, 0.08)])
     _, (chunk,) = p.plan([p.start(np.random.default_rng(0))], [look(np.full((224, 224, 3), 128, np.uint8), "pick up my cup")])
-    assert (np.linalg.norm(chunk[:, :3], axis=1) <= STEP_M * 1.0001).all()
+    assert (np.linalg.norm(chunk[:, :3], axis=1) <= SPEED_M_S / p.hz * 1.0001).all()
     assert len(chunk) == p.execute
 
 

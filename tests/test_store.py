@@ -7,7 +7,7 @@ import pytest
 from vap_core.errors import BadOutput
 from vap_core.store import KEY, append, digest, open_run, read
 
-ROW = {"suite": "s", "task": "t", "method": "vap", "episode": 0, "success": True}
+ROW = {"suite": "s", "task": "t", "method": "vap", "seed": 0, "episode": 0, "attempt": 1, "success": True}
 
 
 def test_digest_ignores_order_and_sees_change() -> None:
@@ -27,7 +27,7 @@ def test_the_same_episode_counts_once(tmp_path: Path) -> None:
     run = open_run(tmp_path / "run", {})
     append(run, [ROW])
     append(run, [ROW])
-    assert read(run)[KEY].to_records(index=False).tolist() == [("s", "t", "vap", 0)]
+    assert read(run)[KEY].to_records(index=False).tolist() == [("s", "t", "vap", 0, 0)]
 
 
 def test_parts_of_methods_with_and_without_a_margin_join(tmp_path: Path) -> None:

@@ -61,7 +61,7 @@ def _list(workers: int) -> Limit:
     study = Study(tuple((LIST, task.name) for task in suite.tasks), ("generic",), policy="expert", images_every=4)
     with tempfile.TemporaryDirectory() as scratch:
         start = time.perf_counter()
-        table = run_study(study, Path(scratch) / "run", workers=workers, record=False, progress=False)
+        table = run_study(study, Path(scratch) / "run", workers=workers, record="none", progress=False)
         wall = time.perf_counter() - start
     simulated = float(table["steps"].sum()) / suite.hz
     what = f"{LIST}, {len(table)} episodes, images every 4 steps, {workers} processes"

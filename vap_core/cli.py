@@ -4,13 +4,14 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from vap_core.errors import VapError
 
 if TYPE_CHECKING:
+    from vap_core.engine import Record
     from vap_core.experiments import Study
 
 HELP = """Visual Attentive Prompting: steer a frozen policy to your own object, and see why it worked or failed.
@@ -29,11 +30,15 @@ Memory = Annotated[Path, typer.Option(help="Folder of remembered objects.")]
 StackName = Annotated[str, typer.Option("--stack", help="Perception stack: embedded (offline, CPU), foundation or foundation-small (see weights).")]
 Methods = Annotated[
     list[str] | None,
-    typer.Option("--method", help="generic, vap, vap-associated, mask-only, rewrite-only; repeatable. Default: the first two."),
+    typer.Option(
+        "--methods", "--method", help="generic, vap, vap-associated, mask-only, rewrite-only; with commas, or repeated. Default: generic,vap."
+    ),
 ]
-PolicyName = Annotated[str, typer.Option("--policy", help="scripted (picks only), or the bounds: expert (reads the simulator), random.")]
+PolicyName = Annotated[str, typer.Option("--policy", help="scripted, or the bounds: expert (reads the simulator), random.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the policy and the sensors; of a warm-up suite's episode list, too.")]
 Workers = Annotated[int, typer.Option(min=1, help="Processes.")]
+Recorded = Annotated[Literal["all", "failures", "none"], typer.Option("--record", help="Which episodes become a .rrd file; errors always do.")]
+Retries = Annotated[int, typer.Option(min=0, help="How often an episode that ended in an error is tried again.")]
 Meshes = Annotated[str, typer.Option("--robots", help="plain, or menagerie: MuJoCo Menagerie's meshes, downloaded or found in MENAGERIE_ROOT.")]
 BANK = Path("data/memory")
 INTERRUPTED = 130
@@ -133,7 +138,7 @@ def demo(
 
     from vap_core.experiments import DEMO
 
-    _run(replace(DEMO, episodes=episodes, seed=seed), out, workers, record=True)
+    _run(replace(DEMO, episodes=episodes, seed=seed), out, workers, "all", retries=1)
 
 
 @app.command()
@@ -157,7 +162,8 @@ def rollout(
     episodes: Annotated[int, typer.Option(min=1, help="Episodes per task and method.")] = 20,
     seed: Seed = 0,
     workers: Workers = 2,
-    record: Annotated[bool, typer.Option(help="Write one .rrd per episode.")] = True,
+    record: Recorded = "all",
+    retries: Retries = 1,
     robots: Meshes = "plain",
     stack: StackName = "embedded",
 ) -> None:
@@ -166,7 +172,7 @@ def rollout(
     Example: python -m vap_core rollout --suite widowx-pick --task pick-bottle --episodes 4 --out data/runs/bottle
     """
     tasks = tuple((suite, name) for name in dict.fromkeys(task))
-    _run(_study(tasks, method, policy, episodes, seed, robots, stack), out, workers, record)
+    _run(_study(tasks, method, policy=policy, episodes=episodes, seed=seed, robots=robots, stack=stack), out, workers, record, retries)
 
 
 @app.command("eval")
@@ -177,8 +183,10 @@ def evaluate(
     policy: PolicyName = "scripted",
     episodes: Annotated[int | None, typer.Option(min=1, help="Episodes per task, spread evenly over its list. Default the whole list.")] = None,
     seed: Seed = 0,
+    seeds: Annotated[int, typer.Option(min=1, help="Run every episode with so many seeds, from --seed on.")] = 1,
     workers: Workers = 2,
-    record: Annotated[bool, typer.Option(help="Write one .rrd per episode.")] = False,
+    record: Recorded = "none",
+    retries: Retries = 1,
     images_every: Annotated[int, typer.Option(min=0, help="Expert and random: render all cameras every so many steps; 0 never.")] = 0,
     robots: Meshes = "plain",
     stack: StackName = "embedded",
@@ -191,8 +199,10 @@ def evaluate(
 
     names = [name for each in suite for name in (known.BENCHMARKS if each == "all" else [each])]
     tasks = tuple((name, task.name) for name in dict.fromkeys(names) for task in known.suite(name).tasks)
-    study = _study(tasks, method, policy, episodes, seed, robots, stack, images_every)
-    _run(study, out or Path(f"data/runs/{policy}-{'-'.join(dict.fromkeys(suite))}"), workers, record)
+    study = _study(
+        tasks, method, policy=policy, episodes=episodes, seed=seed, seeds=seeds, robots=robots, stack=stack, images_every=images_every
+    )  # fmt: skip
+    _run(study, out or Path(f"data/runs/{policy}-{'-'.join(dict.fromkeys(suite))}"), workers, record, retries)
 
 
 @app.command("eval-perception")
@@ -229,6 +239,22 @@ def rescore(run: Annotated[Path, typer.Argument(help="Run folder of eval, rollou
     from vap_core.rescore import rescore as judge_again
 
     print(judge_again(run))
+
+
+@app.command()
+def report(
+    runs: Annotated[list[Path], typer.Argument(help="Run folders of eval, rollout or demo; several seeds of a suite make one report.")],
+    out: Annotated[Path | None, typer.Option(help="Folder for report.md, CSV and LaTeX tables and pictures. Default RUN/report.")] = None,
+) -> None:
+    """Print and write what runs found: tables with intervals beside the paper's, paired comparisons, errors, provenance, pictures.
+
+    Example: python -m vap_core report data/runs/demo
+    """
+    from vap_core.report import report as conclude
+
+    place = out or runs[0] / "report"
+    print(conclude(runs, place))
+    print(f"\nwrote {place}: report.md, tables as CSV and LaTeX, pictures")
 
 
 @app.command()
@@ -412,27 +438,19 @@ def photograph(
     print(f"next: python -m vap_core register '{name}' --category '{model.category}' {' '.join(f"'{path}'" for path in paths)}")
 
 
-def _study(
-    tasks: tuple[tuple[str, str], ...],
-    methods: list[str] | None,
-    policy: str,
-    episodes: int | None,
-    seed: int,
-    robots: str,
-    stack: str,
-    images_every: int = 0,
-) -> "Study":
+def _study(tasks: tuple[tuple[str, str], ...], methods: list[str] | None, *, policy: str, **options: Any) -> "Study":
     from vap_core.experiments import INSIDERS, Study
 
+    asked = [name for each in methods or () for name in each.split(",") if name]
     usual = ("generic",) if policy in INSIDERS else ("generic", "vap")
-    return Study(tasks, tuple(dict.fromkeys(methods or usual)), episodes, seed, policy, stack, robots, images_every)
+    return Study(tasks, tuple(dict.fromkeys(asked)) or usual, policy=policy, **options)
 
 
-def _run(study: "Study", out: Path, workers: int, record: bool) -> None:
+def _run(study: "Study", out: Path, workers: int, record: "Record", retries: int) -> None:
     from vap_core.engine import run
     from vap_core.report import conclude
 
-    print(conclude(study, run(study, out, workers=workers, record=record), out))
+    print(conclude(study, run(study, out, workers=workers, record=record, retries=retries), out))
 
 
 def _note(domain: str, by_hand: bool, mend: str) -> None:

@@ -1,11 +1,18 @@
-"""Runs a study in local processes: batches of episodes per worker, results appended as they come, only what is missing."""
+"""Runs a study: batches of episodes per process, results appended as they come, only what is missing.
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+Killed at any time, by Ctrl-C, a full disk or a lost machine, the same call goes on where it stopped. An episode that ends in an error, or whose
+worker dies, is tried again, and what it said is kept; its second try is recorded.
+"""
+
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from vap_core import store, traces
+from vap_core.errors import WorkerDied
 from vap_core.experiments import Study, make_trial, register_personal
 from vap_core.processes import results
 from vap_core.values import EpisodeRow, Opening
@@ -17,74 +24,120 @@ if TYPE_CHECKING:
 
 BATCH = 5
 """Episodes of one job; small enough that a killed run loses little, large enough to share one policy call."""
+Record = Literal["all", "failures", "none"]
+Rows = list[dict[str, Any]]
 
 
 @dataclass(frozen=True)
 class Job:
-    """Some rows of one task and variant under one method, for one worker."""
+    """Some rows of one task and variant under one method, for one worker; `attempt` 1 is the first."""
 
     study: Study
     method: str
     rows: tuple[EpisodeRow, ...]
+    keys: tuple[str, ...]
+    attempt: int
     folder: Path
-    record: bool
+    record: Record
 
 
-def run(study: Study, folder: Path, *, workers: int = 2, record: bool = True, progress: bool = True) -> "pd.DataFrame":
+Spread = Callable[[Callable[[Job], Rows], Sequence[Job], int, str], Iterator[tuple[Job, Rows]]]
+"""How jobs reach processes: processes.results, or a cluster's."""
+
+
+def run(
+    study: Study, folder: Path, *, workers: int = 2, record: Record = "all", retries: int = 1, progress: bool = True, spread: Spread = results
+) -> "pd.DataFrame":
     """Run whatever of `study` is not in `folder` yet, and return the table of all its episodes.
 
-    Killed at any time, the same call goes on where it stopped. Raises BadOutput when the folder holds another run, or is in use.
+    Raises: BadOutput when the folder holds another run, is in use or cannot be written; WorkerDied when workers died more than `retries` times.
     """
     store.open_run(folder, study.configuration())
     with store.locked(folder):
-        _run(study, folder, workers, record, progress)
+        _run(study, folder, workers, record, retries, progress, spread)
     return store.read(folder)
 
 
-def _run(study: Study, folder: Path, workers: int, record: bool, progress: bool) -> None:
+def _run(study: Study, folder: Path, workers: int, record: Record, retries: int, progress: bool, spread: Spread) -> None:
     from tqdm import tqdm
 
-    jobs = list(missing(study, folder, record))
-    total = len(study.methods) * sum(len(study.rows(suite, task)) for suite, task in study.tasks)
     register_personal(study, folder / "memory")
-    with tqdm(total=total, initial=total - sum(len(job.rows) for job in jobs), unit="episode", disable=not progress) as bar:
-        for job, rows in results(work, jobs, workers, "--workers"):
-            store.append(folder, rows)
-            bar.update(len(rows))
-            won = sum(row["success"] for row in rows)
-            bar.set_postfix_str(f"{job.rows[0].task} {job.method} {won}/{len(rows)}")
+    total, deaths = len(study.methods) * sum(len(study.rows(suite, task)) for suite, task in study.tasks), 0
+    table = store.read(folder)
+    ended = {str(method): Counter(success=int(part.success.sum()), n=len(part)) for method, part in table.groupby("method")}
+    with tqdm(total=total, initial=len(table), unit="episode", disable=not progress, smoothing=0.05) as bar:
+        while jobs := list(missing(study, folder, record, retries)):
+            try:
+                for job, rows in spread(work, jobs, workers, "--workers"):
+                    store.append(folder, rows)
+                    if job.attempt == 1:
+                        bar.update(len(rows))
+                    ended.setdefault(job.method, Counter()).update(success=sum(row["success"] for row in rows), n=len(rows) * (job.attempt == 1))
+                    bar.set_postfix_str(_running(ended))
+            except WorkerDied:
+                deaths += 1
+                if deaths > retries:
+                    raise
+                bar.write(f"note: a worker process died; what it was doing runs again ({deaths} of {retries} retries).", file=sys.stderr)
 
 
-def missing(study: Study, folder: Path, record: bool) -> Iterator[Job]:
-    """Jobs for the episodes that the run in `folder` lacks."""
-    done = set(store.read(folder)[store.KEY].itertuples(index=False, name=None))
+def _running(ended: dict[str, Counter[str]]) -> str:
+    """Success rates so far."""
+    return ", ".join(f"{method} {100 * count['success'] / count['n']:.0f} % of {count['n']}" for method, count in sorted(ended.items()) if count["n"])
+
+
+def missing(study: Study, folder: Path, record: Record = "none", retries: int = 0) -> Iterator[Job]:
+    """Jobs for the episodes that the run in `folder` lacks, and for those in error that were tried at most `retries` times; these are recorded."""
+    table = store.read(folder)
+    held = {} if table.empty else {row.key: (row.attempt, row.outcome) for row in table.itertuples()}
+    run = store.note(folder)["digest"]
     for method in reversed(study.methods):  # the slower, prompted method first, so that workers finish together
         for suite, task in study.tasks:
-            rows = [row for row in study.rows(suite, task) if (suite, task, method, row.episode) not in done]
-            for variant in dict.fromkeys(row.variant for row in rows):
-                alike = [row for row in rows if row.variant == variant]
-                for first in range(0, len(alike), BATCH):
-                    yield Job(study, method, tuple(alike[first : first + BATCH]), folder, record)
+            groups: dict[tuple[str, int], list[tuple[EpisodeRow, str]]] = {}
+            for row in study.rows(suite, task):
+                name = key(row, method, run)
+                tried, outcome = held.get(name, (0, "error"))
+                if outcome == "error" and (tried == 0 or tried <= retries):
+                    groups.setdefault((row.variant, tried + 1), []).append((row, name))
+            for (_, attempt), group in groups.items():
+                for first in range(0, len(group), BATCH):
+                    rows, keys = zip(*group[first : first + BATCH], strict=True)
+                    yield Job(study, method, rows, keys, attempt, folder, record if attempt == 1 else "all")
 
 
-def work(job: Job) -> list[dict[str, Any]]:
+def key(row: EpisodeRow, method: str, run: str) -> str:
+    """What a result belongs to: the episode's row, the method, and the digest of the run (weights, world and code that matter)."""
+    return store.digest({"row": asdict(row), "method": method, "run": run})
+
+
+def work(job: Job) -> Rows:
     """Run one job in this process."""
     from vap_core.rollout import rollout
 
     trial = make_trial(job.study, job.rows, job.method, job.folder / "memory")
-    sink = _recorders(job.folder / "recordings") if job.record else None
+    sink = None if job.record == "none" else _recorders(job.folder / "recordings")
     episodes = list(rollout(trial, job.rows, sink, batch=BATCH))
+    if job.record == "failures":
+        for episode in episodes:
+            if episode.outcome.status == "success":
+                _recording(job.folder / "recordings", episode.opening).unlink(missing_ok=True)
     traces.write(job.folder, episodes)
-    return [episode.summary() for episode in episodes]
+    return [{"key": name, "attempt": job.attempt, **episode.summary()} for name, episode in zip(job.keys, episodes, strict=True)]
 
 
-def _recorders(folder: Path) -> Any:
-    from vap_core.record import Recorder, recording_name
+def _recording(folder: Path, opening: Opening) -> Path:
+    from vap_core.record import recording_name
+
+    return folder / recording_name(opening.row, opening.method)
+
+
+def _recorders(folder: Path) -> Callable[[Opening], "Recorder"]:
+    from vap_core.record import Recorder
 
     folder.mkdir(parents=True, exist_ok=True)
 
     def begin(opening: Opening) -> "Recorder":
-        path = folder / recording_name(opening.row, opening.method)
+        path = _recording(folder, opening)
         path.unlink(missing_ok=True)  # left by a run that was killed after recording and before its result was stored
         return Recorder(path, opening)
 

@@ -24,7 +24,7 @@ from vap_core.sim.env import Env
 from vap_core.sim.objects import extent_m, get
 from vap_core.sim.scenes import Scene, build
 from vap_core.sim.studio import reference_views
-from vap_core.suites import SUITES, VARIANTS, Suite, Task, lists, rows
+from vap_core.suites import SUITES, VARIANTS, Suite, listed, lists, rows
 from vap_core.values import EpisodeRow
 from vap_core.weights import weights_sha256
 
@@ -40,12 +40,13 @@ METHODS: dict[str, Prompting | None] = {
 
 @dataclass(frozen=True)
 class Study:
-    """The same episodes of every task, once per method. `episodes` None takes whole lists; `images_every` is rollout.Trial's."""
+    """The same episodes of every task, once per method and seed. `episodes` None takes whole lists; `images_every` is rollout.Trial's."""
 
     tasks: tuple[tuple[str, str], ...]
     methods: tuple[str, ...]
     episodes: int | None = None
     seed: int = 0
+    seeds: int = 1
     policy: str = "scripted"
     stack: str = "embedded"
     robots: str = "plain"
@@ -63,19 +64,11 @@ class Study:
             raise one_of("Study: stack", self.stack, STACKS)
         for suite, task in self.tasks:
             rows(suite, task, n=1)
-            self._can(suites.suite(suite), suites.suite(suite).task(task))
         if self.policy in INSIDERS and self.methods != ("generic",):
             raise BadStudy(f"Study: policy {self.policy!r} reads the simulator, not pictures; no method can prompt it. Use --method generic.")
 
-    def _can(self, suite: Suite, task: Task) -> None:
-        if self.policy == "scripted" and (task.rule != "picked" or suite.control != "ee"):
-            raise BadStudy(
-                f"Study: policy 'scripted' only picks things up, in end-effector control; {suite.name}/{task.name} is {task.rule!r} in "
-                f"{suite.control} control. Use --policy expert, or a suite of picks: {', '.join(suites.WARM_UPS)}."
-            )
-
     def rows(self, suite: str, task: str) -> tuple[EpisodeRow, ...]:
-        return rows(suite, task, n=self.episodes, seed=self.seed)
+        return listed(suite, task, n=self.episodes, seed=self.seed, seeds=self.seeds)
 
     def configuration(self) -> dict[str, Any]:
         """What the results depend on, as JSON; weights, episode lists, and the world (robots, objects, looks, sensors) by their checksums."""
@@ -110,15 +103,16 @@ def register_personal(study: Study, bank: Path) -> None:
 _stack = cache(load_stack)
 
 
-def scripted(detector: Detector, scene: Scene) -> Scripted:
-    """The scripted policy, calibrated to the first camera of `scene`."""
-    return Scripted(detector, Env(scene).cameras()[0], scene.robot.base_world)
+def scripted(detector: Detector, scene: Scene, suite: Suite) -> Scripted:
+    """The scripted policy, calibrated to the suite's first camera."""
+    camera = next(camera for camera in Env(scene).cameras() if camera.name == suite.cameras[0])
+    return Scripted(detector, camera, scene.robot, suite.hz, suite.control)
 
 
-POLICIES: dict[str, Callable[[Study, Scene], Policy[Any] | Insider[Any]]] = {
-    "scripted": lambda study, scene: scripted(_stack(study.stack).detector, scene),
-    "expert": lambda study, scene: Expert(),
-    "random": lambda study, scene: Random(),
+POLICIES: dict[str, Callable[[Study, Scene, Suite], Policy[Any] | Insider[Any]]] = {
+    "scripted": lambda study, scene, suite: scripted(_stack(study.stack).detector, scene, suite),
+    "expert": lambda study, scene, suite: Expert(),
+    "random": lambda study, scene, suite: Random(),
 }
 """Policies by name; each is built for one scene."""
 INSIDERS = ("expert", "random")
@@ -139,7 +133,7 @@ def make_trial(study: Study, rows: Sequence[EpisodeRow], method: str, bank: Path
         stack = _stack(study.stack)
         attender = Attender(stack, {first.target: load_bank(bank, stack.encoder.name)[first.target]}, prompting)
     sizes: Mapping[str, tuple[float, float, float]] = {name: extent_m(get(name)) for name in scene.objects}
-    return Trial(method, scene, POLICIES[study.policy](study, scene), attender, sizes, suite.control, suite.sensor, study.images_every)
+    return Trial(method, scene, POLICIES[study.policy](study, scene, suite), attender, sizes, suite.control, suite.sensor, study.images_every)
 
 
 @lru_cache(maxsize=4)

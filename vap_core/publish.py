@@ -28,14 +28,16 @@ def publish(folders: Sequence[Path], target: Path, *, replace: bool = False) -> 
     for folder in folders:
         table, about = read(folder), note(folder)
         study = about["configuration"]
-        wanted = len(study["methods"]) * sum(len(suites.rows(suite, task, study["episodes"], study["seed"])) for suite, task in study["tasks"])
+        wanted = len(study["methods"]) * sum(
+            len(suites.listed(suite, task, study["episodes"], study["seed"], study["seeds"])) for suite, task in study["tasks"]
+        )
         if len(table) < wanted:
             raise BadOutput(f"publish: {folder} holds {len(table)} of {wanted} episodes; run the same command again to finish it.")
         columns = [name for name in table.columns if name != "detail" and not name.startswith("seconds_")]
         tables.append(pa.Table.from_pandas(table[columns].assign(configuration=about["digest"]), preserve_index=False))
         notes.append(about)
     whole = pa.concat_tables(tables, promote_options="permissive")
-    keys = whole.select([*KEY, "policy", "seed"]).to_pandas()
+    keys = whole.select([*KEY, "policy"]).to_pandas()
     if keys.duplicated().any():
         raise BadOutput(f"publish: two of {', '.join(map(str, folders))} hold the same episodes; name each run once.")
     metadata = {**(whole.schema.metadata or {}), b"runs": json.dumps(notes, sort_keys=True).encode()}

@@ -29,15 +29,19 @@ def rescore(folder: Path) -> str:
     for suite, digest in study["lists"].items():
         if suites.lists.digest(suite) != digest:
             raise BadOutput(f"rescore: the list of {suite} has changed since {folder} was run; its states fit no row of today. Run it again.")
-    rows = {(r.suite, r.task, r.episode): r for suite, task in study["tasks"] for r in suites.rows(suite, task, study["episodes"], study["seed"])}
+    rows = {
+        (r.suite, r.task, r.seed, r.episode): r
+        for suite, task in study["tasks"]
+        for r in suites.listed(suite, task, study["episodes"], study["seed"], study["seeds"])
+    }
     stored = {tuple(row[name] for name in KEY): row for row in table.to_dict("records")}
     again: list[dict[str, Any]] = []
     judged, changed = set(), []
     for key, truths in traces.read(folder):
         if key not in stored or stored[key]["outcome"] == "error":
             continue
-        suite, task, _, episode = key
-        row = rows[suite, task, episode]
+        suite, task, _, seed, episode = key
+        row = rows[suite, task, seed, episode]
         outcome = rejudge(row, {place.model: extent_m(get(place.model)) for place in row.placements}, truths).outcome()
         ruled = {name: getattr(outcome, name) for name in RULED}
         judged.add(key)

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-KEY = ["suite", "task", "method", "episode"]
+KEY = ["suite", "task", "method", "seed", "episode"]
+"""Names an episode of a run; the table is in this order."""
 
 
 def digest(configuration: Mapping[str, Any]) -> str:
@@ -92,14 +93,15 @@ def append(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def read(folder: Path) -> "pd.DataFrame":
-    """Every finished episode, in the order of their keys; an episode that ran twice counts once."""
+    """Every finished episode, in the order of their keys; of one that ran twice the last attempt counts."""
     import pandas as pd
     from pyarrow import concat_tables
 
     parts = [_part(part) for part in sorted((folder / "parts").glob("*.parquet"))]
     if not parts:
         return pd.DataFrame(columns=KEY)
-    return concat_tables(parts, promote_options="permissive").to_pandas().drop_duplicates(KEY).sort_values(KEY, ignore_index=True)
+    table = concat_tables(parts, promote_options="permissive").to_pandas().sort_values([*KEY, "attempt"], ignore_index=True)
+    return table.drop_duplicates(KEY, keep="last", ignore_index=True)
 
 
 def _part(path: Path) -> "pa.Table":

@@ -17,7 +17,10 @@ def write(folder: Path, episodes: Sequence[Episode]) -> None:
     """Add the traces of some finished episodes to a run, as one part. Raises BadOutput when the disk is full."""
     import pandas as pd
 
-    table = pd.DataFrame([_to_row(episode) for episode in episodes if episode.frames])
+    rows = [_to_row(episode) for episode in episodes if episode.frames and episode.outcome.status != "error"]  # an error is not judged again
+    if not rows:
+        return
+    table = pd.DataFrame(rows)
     try:
         (folder / "traces").mkdir(exist_ok=True)
         write_atomic(folder / "traces" / f"{uuid4().hex}.parquet", table.to_parquet(index=False, compression="zstd"))
@@ -50,7 +53,7 @@ def _to_row(episode: Episode) -> dict[str, Any]:
     names = [place.model for place in row.placements]
     truths = [frame.truth for frame in frames]
     return {
-        **dict(zip(KEY, (row.suite, row.task, episode.opening.method, row.episode), strict=True)),
+        **dict(zip(KEY, (row.suite, row.task, episode.opening.method, row.seed, row.episode), strict=True)),
         "objects": names,
         "poses": np.concatenate([truth.objects_world[name] for truth in truths for name in names]),
         "touched": [list(truth.touched) for truth in truths],

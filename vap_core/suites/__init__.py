@@ -66,3 +66,8 @@ def rows(suite_name: str, task_name: str, n: int | None = None, seed: int = 0) -
     listed = [row for row in benchmark(suite_name) if row.task == task_name]
     chosen = range(len(listed)) if n is None or n >= len(listed) else np.unique(np.linspace(0, len(listed) - 1, n).astype(int)).tolist()
     return tuple(replace(listed[i], seed=seed) for i in chosen)
+
+
+def listed(suite_name: str, task_name: str, n: int | None = None, seed: int = 0, seeds: int = 1) -> tuple[EpisodeRow, ...]:
+    """`rows` of `seeds` seeds from `seed` on, one seed after the other."""
+    return tuple(row for one in range(seed, seed + seeds) for row in rows(suite_name, task_name, n, one))

@@ -56,7 +56,7 @@ def measure(stack: Stack, repeat: int = 25, against: Mapping[str, Work] | None =
 def _works(stack: Stack, scene: Scene) -> dict[str, Work]:
     row = suites.rows(SUITE, TASK, 1)[0]
     film = shoot(Job(row, 1, (), "plate"), scene).frames
-    env, policy = Env(scene), scripted(stack.detector, scene)
+    env, policy = Env(scene), scripted(stack.detector, scene, suites.suite(SUITE))
     env.reset(row)
     seen = env.observe(row.instruction)
     camera = env.camera_names[0]

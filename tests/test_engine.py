@@ -1,0 +1,172 @@
+"""The engine loses nothing: killed at random moments, with workers that die and episodes that break, it ends with the table of an undisturbed run.
+
+python tests/test_engine.py 20        # kill a run twenty times, and compare
+"""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pandas as pd
+import pytest
+
+from vap_core import engine, store
+from vap_core.engine import key, missing
+from vap_core.experiments import Study
+from vap_core.store import append, note, open_run, read
+from vap_core.traces import read as read_traces
+
+STUDY = Study((("simpler-bridge", "pick-shaver"), ("simpler-bridge", "put-camera")), ("generic",), policy="random", episodes=3, seeds=2)
+ENV = {**os.environ, "OMP_NUM_THREADS": "1"}
+
+
+def command(out: Path) -> list[str]:
+    asked = ["--suite", "simpler-bridge", "--suite", "tabletop", "--policy", "random", "--episodes", "12", "--seeds", "2"]
+    return [sys.executable, "-m", "vap_core", "eval", *asked, "--workers", "2", "--out", str(out)]
+
+
+def told(out: Path) -> pd.DataFrame:
+    table = read(out)
+    return table[[name for name in table.columns if not name.startswith("seconds_")]]
+
+
+def kills(out: Path, times: int, rng: random.Random) -> tuple[int, list[int]]:
+    """Start the same command again and again and kill it after a while, whole or its parent alone; kills done and rows seen after each."""
+    done, rows = 0, []
+    longest = 12.0
+    while done < times:
+        with subprocess.Popen(command(out), env=ENV, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True) as run:
+            try:
+                run.wait(rng.uniform(0.5, longest))
+                assert run.returncode == 0, f"status {run.returncode}"
+                break
+            except subprocess.TimeoutExpired:
+                how = rng.choice(["interrupt", "kill", "parent"])
+                if how == "interrupt":
+                    run.send_signal(signal.SIGINT)
+                elif how == "kill":
+                    os.killpg(run.pid, signal.SIGKILL)
+                else:
+                    run.kill()
+                run.wait(60)
+        done += 1
+        rows.append(len(read(out)) if (out / "run.json").exists() else 0)
+        time.sleep(0.5)  # orphans end with their parent
+    return done, rows
+
+
+def check(folder: Path, times: int, seed: int = 0) -> str:
+    whole, torn = folder / "whole", folder / "torn"
+    done, rows = kills(torn, times, random.Random(seed))
+    for out in (torn, whole):
+        subprocess.run(command(out), env=ENV, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, timeout=600)
+    pd.testing.assert_frame_equal(told(torn), told(whole))
+    assert told(whole).key.is_unique
+    assert rows == sorted(rows), "rows were lost"
+    assert {k for k, _ in read_traces(torn)} == {k for k, _ in read_traces(whole)}
+    parts = pd.concat(pd.read_parquet(part) for part in (torn / "parts").glob("*.parquet"))
+    assert parts.key.is_unique, "an episode ran to its end twice"
+    return f"killed {done} times, with {rows} rows after each; then {len(told(torn))} rows, as in the undisturbed run"
+
+
+@pytest.mark.slow
+def test_killed_at_random_moments_it_ends_with_the_rows_of_an_undisturbed_run(tmp_path: Path) -> None:
+    check(tmp_path, 4)
+
+
+def test_keys_tell_row_method_and_run_apart() -> None:
+    (row, other), *_ = STUDY.rows(*STUDY.tasks[0])[:2], None
+    assert key(row, "vap", "a") == key(replace(row), "vap", "a")
+    assert (
+        len({key(row, "vap", "a"), key(other, "vap", "a"), key(row, "generic", "a"), key(row, "vap", "b"), key(replace(row, seed=9), "vap", "a")})
+        == 5
+    )
+
+
+def stored(out: Path, names: list[str], **cells: object) -> None:
+    """Rows as if they had been run."""
+    jobs = list(missing(STUDY, out, retries=9))
+    found = {name: (job, row) for job in jobs for name, row in zip(job.keys, job.rows, strict=True)}
+    rows = []
+    for job, row, name in ((*found[name], name) for name in names):
+        about = {"suite": row.suite, "task": row.task, "method": job.method, "seed": row.seed, "episode": row.episode}
+        rows.append({"key": name, "attempt": job.attempt, **about, **cells})
+    append(out, rows)
+
+
+def test_only_what_is_missing_runs_and_errors_run_again_recorded(tmp_path: Path) -> None:
+    out = open_run(tmp_path / "run", STUDY.configuration())
+    jobs = list(missing(STUDY, out))
+    names = [name for job in jobs for name in job.keys]
+    assert len(names) == len(set(names)) == 12
+    assert {(job.attempt, job.record) for job in jobs} == {(1, "none")}
+    stored(out, names[:3], outcome="success")
+    stored(out, names[3:5], outcome="error")
+    assert [name for job in missing(STUDY, out) for name in job.keys] == names[5:]
+    again = [job for job in missing(STUDY, out, retries=1) if job.attempt == 2]
+    assert [name for job in again for name in job.keys] == names[3:5]
+    assert {job.record for job in again} == {"all"}
+    stored(out, names[3:4], outcome="failure")
+    stored(out, names[4:5], outcome="error")
+    assert [name for job in missing(STUDY, out, retries=1) for name in job.keys] == names[5:]
+    table = read(out).set_index("key")
+    assert table.attempt[names[3:5]].tolist() == [2, 2]
+    assert table.outcome[names[3:5]].tolist() == ["failure", "error"]
+
+
+def test_another_configuration_shares_no_key(tmp_path: Path) -> None:
+    one, other = (open_run(tmp_path / policy, replace(STUDY, policy=policy).configuration()) for policy in ("random", "expert"))
+    keys = [{name for job in missing(STUDY, out) for name in job.keys} for out in (one, other)]
+    assert not keys[0] & keys[1]
+
+
+def test_a_worker_that_dies_once_is_forgiven_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fell: list[int] = []
+
+    def spread(work, jobs, workers, mend):  # type: ignore[no-untyped-def]
+        for i, job in enumerate(jobs):
+            if i == 1 and not fell:
+                fell.append(len(jobs))
+                raise engine.WorkerDied("a worker process died")
+            yield job, work(job)
+
+    table = engine.run(STUDY, tmp_path / "run", record="none", spread=spread)
+    assert fell == [4]
+    assert len(table) == 12
+    assert table.attempt.tolist() == [1] * 12
+    assert "a worker process died" in capsys.readouterr().err
+
+
+def test_an_episode_that_always_breaks_is_an_error_with_its_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from vap_core.policies.random import Random
+
+    class Breaks(Random):
+        def plan_inside(self, states, envs):  # type: ignore[no-untyped-def]
+            if any(env.row.episode == 0 for env in envs):
+                raise RuntimeError("the policy fell over")
+            return super().plan_inside(states, envs)
+
+    monkeypatch.setitem(engine.make_trial.__globals__["POLICIES"], "random", lambda study, scene: Breaks())
+    study = replace(STUDY, tasks=STUDY.tasks[:1], episodes=2, seeds=1)
+
+    def here(work, jobs, workers, mend):  # type: ignore[no-untyped-def]
+        return ((job, work(job)) for job in jobs)
+
+    table = engine.run(study, tmp_path / "run", record="none", spread=here, progress=False)
+    assert table.outcome.tolist()[0] == "error"
+    assert table.attempt.tolist() == [2, 1]
+    assert "the policy fell over" in table.detail[0]
+    assert [path.name for path in (tmp_path / "run" / "recordings").glob("*.rrd")] == ["simpler-bridge.pick-shaver.000.s0.generic.rrd"]
+    assert note(tmp_path / "run")["configuration"]["seeds"] == 1
+    assert store.read(tmp_path / "run").success.tolist()[0] is False or not table.success[0]
+
+
+if __name__ == "__main__":
+    with TemporaryDirectory() as folder:
+        print(check(Path(folder), int(sys.argv[1]) if len(sys.argv) > 1 else 20))
