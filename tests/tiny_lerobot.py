@@ -20,11 +20,11 @@ def pi0(folder: Path, cameras: tuple[str, ...] = ("front",)) -> Path:
     return save_toy(folder, cameras, STATE, ACTION, TOY)
 
 
-def act(folder: Path, **how: Any) -> Path:
+def act(folder: Path, side: int = 64, **how: Any) -> Path:
     """One image, no language; actions are un-normalised by a known mean and deviation."""
     config = ACTConfig(
         input_features={
-            "observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, 64, 64)),
+            "observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, side, side)),
             "observation.state": PolicyFeature(FeatureType.STATE, (STATE,)),
         },
         output_features={"action": PolicyFeature(FeatureType.ACTION, (ACTION,))},

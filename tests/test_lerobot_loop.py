@@ -1,0 +1,224 @@
+"""VAP inside lerobot: the step alone on exact parts, then lerobot's own evaluation against our rollout."""
+
+import json
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from lerobot.envs.utils import preprocess_observation
+from lerobot.lerobot_types import TransitionKey
+from lerobot.policies import make_pre_post_processors
+from lerobot.processor import PolicyProcessorPipeline
+from lerobot.scripts import lerobot_eval
+
+from tests import tiny_lerobot as tiny
+from tests.toys import TOYS, personal, scene
+from vap_core import attend, memory, suites
+from vap_core.attend import Attender, load_stack
+from vap_core.errors import BadMemory, BadOutput, BadPolicy, BadViews, UnknownName
+from vap_core.integrations.lerobot import LeRobotEnv, VapEnvConfig, VapPrompt, attach
+from vap_core.policies.lerobot import load
+from vap_core.rollout import Trial, rollout
+from vap_core.sim.objects import extent_m, get
+from vap_core.sim.scenes import build
+from vap_core.sim.studio import reference_views
+
+SUITE, TASK = "simpler-bridge", "put-camera"
+BLUE, GREEN = (0, 0, 255), (0, 255, 0)
+
+
+@pytest.fixture
+def bank(tmp_path, monkeypatch):
+    """My mug is the blue square."""
+    monkeypatch.setitem(attend.STACKS, "toys", lambda: TOYS)
+    memory.save(tmp_path / "memory", personal("mug", "mug", BLUE))
+    return tmp_path / "memory"
+
+
+def at(x):
+    return scene([(x, 30, BLUE), (40, 10, GREEN)])
+
+
+def batch(pictures, steps=None, text="bring my mug"):
+    """What lerobot-eval hands to a preprocessor."""
+    seen = {"pixels": {"top": np.stack(pictures)}, "agent_pos": np.zeros((len(pictures), 2), np.float32)}
+    if steps is not None:
+        seen["vap_step"] = np.array(steps, np.float32)[:, None]
+    out = preprocess_observation(seen)
+    return {**out, "task": [text] * len(pictures)}
+
+
+def pipeline(bank, **how):
+    return PolicyProcessorPipeline(steps=[VapPrompt(str(bank), stack="toys", **how)])
+
+
+def rgb(out, i=0):
+    return (out["observation.images.top"][i].permute(1, 2, 0) * 255).round().byte().numpy()
+
+
+def direct(bank, pictures):
+    """The same episode by the Attender itself."""
+    attender, shown = Attender(TOYS, memory.load_bank(bank)), []
+    state, attended = attender.start({"top": pictures[0]}, "bring my mug")
+    shown.append(attended)
+    for picture in pictures[1:]:
+        state, attended = attender.step(state, {"top": picture})
+        shown.append(attended)
+    return shown
+
+
+def test_the_step_does_what_the_attender_does_at_every_phase_of_every_environment(bank):
+    """Two environments, the second a step behind the first and starting again in the middle."""
+    first, second = [at(x) for x in (2, 4, 6, 8)], [at(x) for x in (20, 22)]
+    step = pipeline(bank)
+    expected = direct(bank, first)
+    other = direct(bank, second)
+    for t, (a, i) in enumerate(zip(first, (0, 1, 0, 1), strict=True)):
+        out = step(batch([a, second[i]], [t, i]))
+        for k, wanted in enumerate((expected[t], other[i])):
+            assert (rgb(out, k) == wanted.images["top"]).all()
+            assert out["task"][k] == wanted.text != "bring my mug"
+        assert (rgb(out) != a).any()
+        assert "observation.vap_step" not in out
+
+
+def test_an_episode_that_is_over_stands_still(bank):
+    step, pictures = pipeline(bank), [at(2), at(4)]
+    step(batch(pictures, [0, 0]))
+    moved = step(batch([at(6), at(8)], [1, 1]))
+    still = step(batch([at(6), at(10)], [1, 2]))
+    assert torch.equal(moved["observation.images.top"][0], still["observation.images.top"][0])
+
+
+def test_views_without_the_object_and_a_batch_in_hand_pass_bit_for_bit(bank):
+    empty = scene([])
+    given = batch([empty, at(4)], [0, 0])
+    given["observation.images.top"] += 1e-4  # not a whole number of 255ths
+    before = given["observation.images.top"].clone()
+    out = pipeline(bank)(given)
+    assert torch.equal(out["observation.images.top"][0], before[0])
+    assert torch.equal(given["observation.images.top"], before)
+    assert out["task"][0] == "bring my mug"
+    assert torch.equal(out["observation.state"], given["observation.state"])
+
+
+def test_switches_and_resets(bank):
+    only_words = pipeline(bank, highlight=False)(batch([at(4)], [0]))
+    assert (rgb(only_words) == at(4)).all()
+    assert only_words["task"] != ["bring my mug"]
+    step = pipeline(bank, episodes="reset", rewrite=False)
+    shown = [step(batch([at(x)])) for x in (4, 6)]
+    assert shown[0]["task"] == ["bring my mug"]
+    assert (rgb(shown[1]) == direct(bank, [at(4), at(6)])[1].images["top"]).all()
+    step.reset()
+    single = {"observation.images.top": batch([at(8)])["observation.images.top"][0], "task": "bring my mug"}
+    assert torch.equal(step(single)["observation.images.top"], pipeline(bank)(batch([at(8)], [0]))["observation.images.top"][0])
+
+
+def test_what_cannot_be_known_fails_loudly(bank, tmp_path):
+    with pytest.raises(BadViews, match=r"observation.vap_step is missing.*episodes='reset'"):
+        pipeline(bank)(batch([at(4)]))
+    with pytest.raises(BadViews, match="2 environments but episodes='reset', which knows one"):
+        pipeline(bank, episodes="reset")(batch([at(4), at(6)]))
+    step = pipeline(bank)
+    with pytest.raises(BadViews, match="environment 0 is at step 3 after nothing"):
+        step(batch([at(4)], [3]))
+    step(batch([at(4)], [0]))
+    with pytest.raises(BadViews, match="environment 0 is at step 2 after 0; give every picture, in order"):
+        step(batch([at(6)], [2]))
+    with pytest.raises(BadViews, match="holds actions, so it is for training"):
+        step({**batch([at(6)], [1]), "action": torch.zeros(1, 2)})
+    with pytest.raises(BadViews, match=r"no observation.images.\* among"):
+        step({"observation.state": torch.zeros(1, 2), "task": ["bring my mug"]})
+    with pytest.raises(UnknownName, match="stack 'nonesuch' is unknown; known: embedded"):
+        VapPrompt(str(bank), stack="nonesuch")
+    with pytest.raises(BadMemory, match="is no folder of remembered objects"):
+        VapPrompt(str(tmp_path / "none"))
+
+
+def test_the_configuration_is_json_and_comes_back(bank, tmp_path):
+    step = VapPrompt(str(bank), stack="toys", objects=["mug"], rewrite=False, alpha=0.3)
+    assert VapPrompt(**json.loads(json.dumps(step.get_config()))).get_config() == step.get_config()
+    PolicyProcessorPipeline(steps=[step], name="p").save_pretrained(tmp_path / "p")
+    again = PolicyProcessorPipeline.from_pretrained(tmp_path / "p", config_filename="p.json")
+    assert again.steps[0].get_config() == step.get_config()
+    assert step.transform_features({}) == {}
+    assert step({TransitionKey.OBSERVATION: batch([at(4)], [0]), TransitionKey.COMPLEMENTARY_DATA: {"task": "bring my mug"}})
+
+
+def test_the_environment_numbers_its_steps_and_ends_like_ours():
+    env = LeRobotEnv(SUITE, TASK, image_size=64, max_steps=2)
+    rows = suites.rows(SUITE, TASK)
+    for seed in (1, 1 + len(rows)):
+        seen, info = env.reset(seed=seed)
+        assert info["episode"] == rows[1].episode
+        assert seen["vap_step"] == [0]
+        assert env.observation_space.contains(seen)
+    assert env._max_episode_steps == 2
+    ends = [env.step(env.action_space.low * 0)[2:4] for _ in range(2)]
+    assert ends == [(False, False), (False, True)]
+    assert env.render().shape == (64, 64, 3)
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A checkpoint, the memory of the personal camera, and the checkpoint with VAP attached."""
+    root = tmp_path_factory.mktemp("loop")
+    stack, row = load_stack("embedded"), suites.rows(SUITE, TASK, 1)[0]
+    obj, _ = memory.register(row.target, row.category, reference_views(get(row.target)), stack.detector, stack.encoder)
+    memory.save(root / "memory", obj)
+    tiny.act(root / "act", side=224)
+    attach(root / "act", root / "personal", root / "memory")
+    return root
+
+
+def test_attaching_links_the_frozen_files_and_adds_one_step(whole):
+    kept = {file.name: file for file in (whole / "act").iterdir()}
+    for file in (whole / "personal").iterdir():
+        if file.name == "policy_preprocessor.json":
+            before, after = (json.loads(one.read_text())["steps"] for one in (kept[file.name], file))
+            assert [*after[:1], *after[2:]] == before
+            assert after[1]["class"] == "vap_core.integrations.lerobot.VapPrompt"
+        else:
+            assert file.resolve() == kept[file.name].resolve()
+    with pytest.raises(BadOutput, match="personal exists; choose another folder"):
+        attach(whole / "act", whole / "personal", whole / "memory")
+    with pytest.raises(BadPolicy, match="has VAP attached for lerobot's own loops"):
+        load(whole / "personal")
+
+
+def test_lerobots_own_loop_and_our_rollout_do_the_same(whole):
+    """Same frozen policy, episodes and per-step VAP: every action is the same in both."""
+    policy, config = load(whole / "act"), VapEnvConfig(task=f"{SUITE}/{TASK}", max_steps=3)
+    before = policy.sha256()
+    env = config.create_envs(2)[SUITE][0]
+    pipelines = (*config.get_env_processors(), *make_pre_post_processors(policy.policy.config, str(whole / "personal")))
+    theirs = lerobot_eval.eval_policy(env, policy.policy, *pipelines, n_episodes=2, start_seed=0, return_episode_data=True)["episodes"]
+    env.close()
+
+    rows = [replace(row, max_steps=3) for row in suites.rows(SUITE, TASK)[:2]]
+    models = dict.fromkeys(place.model for row in suites.rows(SUITE, TASK) for place in row.placements)
+    attender = Attender(load_stack("embedded"), memory.load_bank(whole / "memory"))
+    with build(suites.suite(SUITE).robot, tuple(models)) as built:
+        ours = {}
+        for name, how in (("vap", attender), ("generic", None)):
+            trial = Trial(name, built, policy, how, {model: extent_m(get(model)) for model in models}, sensor=suites.suite(SUITE).sensor)
+            ours[name] = [np.stack([frame.action for frame in episode.frames[:3]]) for episode in rollout(trial, rows)]
+    for i in range(2):
+        actions = theirs["action"][theirs["episode_index"] == i][:3].numpy()
+        assert np.allclose(actions, ours["vap"][i], atol=1e-6)
+        assert np.abs(actions - ours["generic"][i]).max() > 1e-5  # the tint reached it
+    assert policy.sha256() == before
+
+
+def test_lerobot_eval_runs_it_from_the_command_line(whole, tmp_path, monkeypatch):
+    arguments = f"""--policy.path={whole / "personal"} --env.type=vap --env.task={SUITE}/{TASK} --env.max_steps=2 --policy.device=cpu
+        --env.discover_packages_path=vap_core.integrations --eval.n_episodes=1 --seed=0 --output_dir={tmp_path / "out"}"""
+    monkeypatch.setattr(sys, "argv", ["lerobot-eval", *arguments.split()])
+    lerobot_eval.eval_main()
+    said = json.loads((tmp_path / "out" / "eval_info.json").read_text())
+    assert said["per_task"][0]["task_group"] == SUITE
+    assert list((tmp_path / "out" / "videos").rglob("*.mp4"))
