@@ -2,6 +2,7 @@
 
 import math
 
+import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -54,3 +55,23 @@ def test_json_has_the_promised_fields() -> None:
 
 def test_step_times_are_weighted_by_steps() -> None:
     assert step_times([episode(), episode(steps=30, seconds_render=0.7)]) == {"render": pytest.approx(20.0)}
+
+
+def test_a_table_is_scored_as_its_rows_are() -> None:
+    rows = [
+        episode(task="a", cmr=None),
+        episode(method="generic", outcome="error", success=False),
+        episode(task="a", outcome="failure", success=False, cmr=None, steps=30),
+        episode(wrong_object=True),
+    ]
+    one_by_one, at_once = score(rows), score(pd.DataFrame(rows))
+    assert [s.to_json() for s in one_by_one] == [s.to_json() for s in at_once]
+    assert [(s.task, s.method, s.n, s.errors, s.sr.k, s.cmr.n, s.wrong_object.k, s.steps) for s in at_once] == [
+        ("a", "vap", 2, 0, 1, 0, 0, 40), ("t", "generic", 1, 1, 0, 1, 0, 10), ("t", "vap", 1, 0, 1, 1, 1, 10),
+    ]  # fmt: skip
+    assert step_times(pd.DataFrame(rows)) == step_times(rows)
+
+
+def test_no_episodes_are_no_scores() -> None:
+    assert score([]) == []
+    assert step_times([]) == {}

@@ -1,16 +1,26 @@
 """SR, CMR and wrong-object rate with 95 % intervals, over a fixed denominator (P 5.1, SPEC section 6)."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float64, Int64
 
 from vap_core.values import value
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MEASURES = ("success", "cmr", "wrong_object", "first_object_correct")
+TRACK = ("suite", "task", "split", "method", "policy")
+"""What one line of a results table shares."""
+Counts = Int64[np.ndarray, " g"]
+Bounds = Float64[np.ndarray, " g"]
 
 
 @value
 class Rate:
-    """k successes of n with its 95 % Wilson interval; n may be 0, then everything but n is nan."""
+    """k successes of n with its 95 % interval, Wilson's unless said otherwise; n may be 0, then everything but n is nan."""
 
     k: int
     n: int
@@ -26,14 +36,23 @@ class Rate:
         return self.low > other.high or other.low > self.high
 
 
-def rate(k: int, n: int) -> Rate:
-    """The Wilson score interval of k out of n, by statsmodels."""
+def intervals(k: Counts, n: Counts, *, conservative: bool = False) -> tuple[Bounds, Bounds]:
+    """95 % intervals of k out of n, nan where n is 0: Wilson's score intervals, or Clopper and Pearson's, which never cover less."""
     from statsmodels.stats.proportion import proportion_confint
 
+    low, high = np.full(len(n), np.nan), np.full(len(n), np.nan)
+    some = n > 0
+    if some.any():
+        low[some], high[some] = proportion_confint(k[some], n[some], alpha=0.05, method="beta" if conservative else "wilson")
+    return low, high
+
+
+def rate(k: int, n: int, *, conservative: bool = False) -> Rate:
+    """k out of n with its interval (see `intervals`)."""
     if n == 0:
         return Rate(0, 0, float("nan"), float("nan"), float("nan"))
-    low, high = proportion_confint(k, n, alpha=0.05, method="wilson")
-    return Rate(k, n, k / n, float(low), float(high))
+    low, high = intervals(np.array([k]), np.array([n]), conservative=conservative)
+    return Rate(k, n, k / n, float(low[0]), float(high[0]))
 
 
 @value
@@ -63,34 +82,51 @@ class Score:
         }  # fmt: skip
 
 
-def score(episodes: Iterable[Mapping[str, Any]]) -> list[Score]:
+def score(episodes: "Iterable[Mapping[str, Any]] | pd.DataFrame") -> list[Score]:
     """Group flat episode rows (`Episode.summary`) by suite, task, split, method and policy, in order of appearance."""
-    groups: dict[tuple[str, str, str, str, str], list[Mapping[str, Any]]] = {}
-    for row in episodes:
-        groups.setdefault((row["suite"], row["task"], row["split"], row["method"], row["policy"]), []).append(row)
-    return [_score(key, rows) for key, rows in groups.items()]
+    return [
+        Score(
+            suite=str(line["suite"]),
+            task=str(line["task"]),
+            split=str(line["split"]),
+            method=str(line["method"]),
+            policy=str(line["policy"]),
+            n=int(line["n"]),
+            errors=int(line["errors"]),
+            sr=rate(int(line["success"]), int(line["success_n"])),
+            cmr=rate(int(line["cmr"]), int(line["cmr_n"])),
+            wrong_object=rate(int(line["wrong_object"]), int(line["wrong_object_n"])),
+            first_object_correct=rate(int(line["first_object_correct"]), int(line["first_object_correct_n"])),
+            steps=int(line["steps"]),
+        )
+        for line in count(episodes, TRACK).to_dict("records")
+    ]
 
 
-def _score(key: tuple[str, str, str, str, str], rows: list[Mapping[str, Any]]) -> Score:
-    def share(column: str) -> Rate:
-        defined = [row for row in rows if isinstance(row[column], bool | np.bool_)]  # a selection has no CMR
-        return rate(sum(bool(row[column]) and row["outcome"] != "error" for row in defined), len(defined))
+def count(episodes: "Iterable[Mapping[str, Any]] | pd.DataFrame", by: Iterable[str]) -> "pd.DataFrame":
+    """One line per group in order of appearance: `n`, `errors`, `steps`, and of every measure m how often it holds, `m`, of `m_n` episodes.
 
-    return Score(
-        *key,
-        n=len(rows),
-        errors=sum(row["outcome"] == "error" for row in rows),
-        sr=share("success"),
-        cmr=share("cmr"),
-        wrong_object=share("wrong_object"),
-        first_object_correct=share("first_object_correct"),
-        steps=sum(int(row["steps"]) for row in rows),
-    )
+    A measure that is undefined in an episode (a selection has no CMR) leaves it out of `m_n`; an error counts as never holding.
+    """
+    import pandas as pd
+
+    table = episodes if isinstance(episodes, pd.DataFrame) else pd.DataFrame(list(episodes))
+    names = list(by)
+    if table.empty:
+        return pd.DataFrame(columns=[*names, "n", "errors", "steps", *(column for m in MEASURES for column in (m, f"{m}_n"))])
+    error = table["outcome"].eq("error")
+    flat = table[names].assign(n=1, errors=error.astype(int), steps=table["steps"].astype(int))
+    for measure in MEASURES:
+        flat[measure] = (table[measure].eq(True) & ~error).astype(int)
+        flat[f"{measure}_n"] = table[measure].notna().astype(int)
+    return flat.groupby(names, sort=False, dropna=False).sum().reset_index()
 
 
-def step_times(episodes: Iterable[Mapping[str, Any]]) -> dict[str, float]:
+def step_times(episodes: "Iterable[Mapping[str, Any]] | pd.DataFrame") -> dict[str, float]:
     """Mean wall milliseconds of one control step by part, summed seconds over summed steps."""
-    rows = list(episodes)
-    steps = max(sum(int(r["steps"]) for r in rows), 1)
-    parts = dict.fromkeys(key for r in rows for key in r if key.startswith("seconds_"))
-    return {part.removeprefix("seconds_"): 1e3 * sum(float(r.get(part) or 0.0) for r in rows) / steps for part in parts}
+    import pandas as pd
+
+    table = episodes if isinstance(episodes, pd.DataFrame) else pd.DataFrame(list(episodes))
+    parts = [str(name) for name in table.columns if str(name).startswith("seconds_")]
+    steps = max(int(table["steps"].sum()), 1) if len(table) else 1
+    return {part.removeprefix("seconds_"): 1e3 * float(table[part].astype(float).sum()) / steps for part in parts if table[part].notna().any()}
