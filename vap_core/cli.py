@@ -306,26 +306,32 @@ def doctor() -> None:
 @app.command()
 def bench(
     what: Annotated[
-        str, typer.Argument(help="loop: the prompted control loop; suites: every benchmark's simulator; stack: a stack's models.")
+        str,
+        typer.Argument(
+            help="loop: the prompted control loop; suites: every benchmark's simulator; stack: a stack's models; eval: episodes per hour against "
+            "lerobot's own loop."
+        ),
     ] = "loop",
     steps: Annotated[int, typer.Option(min=5, help="loop: control steps to time.")] = 60,
     workers: Workers = 2,
     stack: StackName = "foundation",
     random_weights: Annotated[bool, typer.Option("--random-weights", help="stack: without weights; they change nothing about speed.")] = False,
     device: Annotated[str | None, typer.Option(help="stack: cpu or cuda; default VAP_DEVICE, or a GPU where there is one.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="eval: a few steps, to see that it runs; its numbers mean nothing.")] = False,
 ) -> None:
     """Time a control step by part, as shares and ratios within one run: of the prompted loop, every benchmark's simulator, or a stack's models.
 
     Example: python -m vap_core bench suites
     """
     from vap_core import bench as loop
-    from vap_core import bench_stack, bench_suites
+    from vap_core import bench_eval, bench_stack, bench_suites
     from vap_core.errors import one_of
 
     runs = {
         "loop": lambda: loop.run(steps),
         "suites": lambda: bench_suites.run(workers),
         "stack": lambda: bench_stack.run(stack, random=random_weights, device=device),
+        "eval": lambda: bench_eval.run(workers, quick),
     }
     if what not in runs:
         raise one_of("bench:", what, runs)

@@ -162,7 +162,8 @@ def load(checkpoint: str | Path, device: str | None = None) -> LeRobot:
         raise BadPolicy(
             f"load: {folder} cannot become a policy ({type(error).__name__}: {reason[0]:.200}); check its files, or save it again with lerobot 0.6."
         ) from error
-    compare(policy, folder / WEIGHTS)
+    with _silence():
+        compare(policy, folder / WEIGHTS)
     return LeRobot(policy, before, after, f"{config.type}:{folder.name if Path(checkpoint).is_dir() else checkpoint}")
 
 
