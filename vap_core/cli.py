@@ -187,6 +187,9 @@ def evaluate(
     workers: Workers = 2,
     record: Recorded = "none",
     retries: Retries = 1,
+    audit: Annotated[
+        bool, typer.Option("--audit", help="Prove that tint and text reach the policy: every call is made with the raw input, too.")
+    ] = False,
     images_every: Annotated[int, typer.Option(min=0, help="Expert and random: render all cameras every so many steps; 0 never.")] = 0,
     robots: Meshes = "plain",
     stack: StackName = "embedded",
@@ -200,7 +203,7 @@ def evaluate(
     names = [name for each in suite for name in (known.BENCHMARKS if each == "all" else [each])]
     tasks = tuple((name, task.name) for name in dict.fromkeys(names) for task in known.suite(name).tasks)
     study = _study(
-        tasks, method, policy=policy, episodes=episodes, seed=seed, seeds=seeds, robots=robots, stack=stack, images_every=images_every
+        tasks, method, policy=policy, episodes=episodes, seed=seed, seeds=seeds, robots=robots, stack=stack, images_every=images_every, audit=audit
     )  # fmt: skip
     _run(study, out or Path(f"data/runs/{policy}-{'-'.join(dict.fromkeys(suite))}"), workers, record, retries)
 
@@ -457,6 +460,10 @@ def _run(study: "Study", out: Path, workers: int, record: "Record", retries: int
     from vap_core.report import conclude
 
     print(conclude(study, run(study, out, workers=workers, record=record, retries=retries), out))
+    if study.audit:
+        from vap_core.audit import verdict
+
+        print("\n" + verdict(out))
 
 
 def _note(domain: str, by_hand: bool, mend: str) -> None:

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from vap_core import store, traces
+from vap_core import audit, store, traces
 from vap_core.errors import WorkerDied
 from vap_core.experiments import Study, make_trial, register_personal
 from vap_core.processes import results
@@ -122,6 +122,7 @@ def work(job: Job) -> Rows:
             if episode.outcome.status == "success":
                 _recording(job.folder / "recordings", episode.opening).unlink(missing_ok=True)
     traces.write(job.folder, episodes)
+    audit.write(job.folder, episodes)
     return [{"key": name, "attempt": job.attempt, **episode.summary()} for name, episode in zip(job.keys, episodes, strict=True)]
 
 

@@ -51,6 +51,7 @@ class Study:
     stack: str = "embedded"
     robots: str = "plain"
     images_every: int = 0
+    audit: bool = False
 
     def __post_init__(self) -> None:
         for method in self.methods:
@@ -64,6 +65,8 @@ class Study:
             raise one_of("Study: stack", self.stack, STACKS)
         for suite, task in self.tasks:
             rows(suite, task, n=1)
+        if self.policy in INSIDERS and self.audit:
+            raise BadStudy(f"Study: policy {self.policy!r} consumes no prompt; there is nothing to audit. Leave --audit out.")
         if self.policy in INSIDERS and self.methods != ("generic",):
             raise BadStudy(f"Study: policy {self.policy!r} reads the simulator, not pictures; no method can prompt it. Use --method generic.")
 
@@ -133,7 +136,17 @@ def make_trial(study: Study, rows: Sequence[EpisodeRow], method: str, bank: Path
         stack = _stack(study.stack)
         attender = Attender(stack, {first.target: load_bank(bank, stack.encoder.name)[first.target]}, prompting)
     sizes: Mapping[str, tuple[float, float, float]] = {name: extent_m(get(name)) for name in scene.objects}
-    return Trial(method, scene, POLICIES[study.policy](study, scene, suite), attender, sizes, suite.control, suite.sensor, study.images_every)
+    return Trial(
+        method,
+        scene,
+        POLICIES[study.policy](study, scene, suite),
+        attender,
+        sizes,
+        suite.control,
+        suite.sensor,
+        study.images_every,
+        audit=study.audit,
+    )
 
 
 @lru_cache(maxsize=4)

@@ -13,6 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from vap_core import audit
 from vap_core.attend import Attender, AttendState
 from vap_core.errors import BadAction, OutOfReach, VapError
 from vap_core.policies import Insider, Policy
@@ -21,7 +22,7 @@ from vap_core.sim.occluder import Occlusion
 from vap_core.sim.scenes import Scene
 from vap_core.sim.sensor import PERFECT, Sensor
 from vap_core.suites import Judge
-from vap_core.values import Attended, Chunk, Episode, EpisodeRow, Frame, Opening, Outcome, PolicyInput
+from vap_core.values import Attended, Call, Chunk, Episode, EpisodeRow, Frame, Opening, Outcome, PolicyInput
 
 
 @runtime_checkable
@@ -38,6 +39,7 @@ class Trial:
     """What a batch of episodes shares. `attender` None is the generic policy: raw images, raw instruction.
 
     An Insider needs no pictures; it gets them every `images_every` control steps all the same (0: never), for their cost or their look.
+    `audit` keeps what the policy consumed in every call (module audit).
     """
 
     method: str
@@ -49,6 +51,7 @@ class Trial:
     sensor: Sensor = PERFECT
     images_every: int = 0
     occlusion: Occlusion | None = None
+    audit: bool = False
 
 
 @dataclass
@@ -65,6 +68,7 @@ class Running:
     attend_state: AttendState | None = None
     queue: deque[np.ndarray] = field(default_factory=deque)
     frames: list[Frame] = field(default_factory=list)
+    calls: list[Call] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("attend", "policy", "record"), 0.0))
     outcome: Outcome | None = None
 
@@ -134,7 +138,7 @@ def _plan(trial: Trial, live: Sequence[Running], seen: Mapping[int, tuple[Policy
         return
     start = time.perf_counter()
     try:
-        states, chunks = _ask(trial.policy, asking, seen)
+        states, chunks = _ask(trial, asking, seen)
     except Exception as error:
         if _ends_the_run(error):
             raise
@@ -151,13 +155,18 @@ def _plan(trial: Trial, live: Sequence[Running], seen: Mapping[int, tuple[Policy
         one.seconds["policy"] += share
 
 
-def _ask(
-    policy: Policy[Any] | Insider[Any], asking: Sequence[Running], seen: Mapping[int, tuple[PolicyInput, Attended]]
-) -> tuple[list[Any], list[Chunk]]:
-    states = [one.policy_state for one in asking]
+def _ask(trial: Trial, asking: Sequence[Running], seen: Mapping[int, tuple[PolicyInput, Attended]]) -> tuple[list[Any], list[Chunk]]:
+    policy, states = trial.policy, [one.policy_state for one in asking]
     if isinstance(policy, Insider):
         return policy.plan_inside(states, [one.env for one in asking])
-    return policy.plan(states, [PolicyInput(attended.images, attended.text, raw.state) for raw, attended in (seen[id(one)] for one in asking)])
+    raw, attended = zip(*(seen[id(one)] for one in asking), strict=True)
+    prompted = [PolicyInput(a.images, a.text, r.state) for r, a in zip(raw, attended, strict=True)]
+    if not trial.audit:
+        return policy.plan(states, prompted)
+    after, chunks, heard, plain = audit.plan(policy, states, prompted, raw)
+    for i, (one, r, a) in enumerate(zip(asking, raw, attended, strict=True)):
+        one.calls += audit.calls(one.judge.steps, a, r, heard[i], plain[i])
+    return after, chunks
 
 
 def _act(one: Running, raw: PolicyInput, attended: Attended, keep_images: bool) -> None:
@@ -189,7 +198,7 @@ def _end(trial: Trial, one: Running) -> Episode:
             _guard(one, one.sink.close, one.outcome)
     assert one.outcome is not None
     opening = one.opening or _open(trial, one, Attended({}, one.row.instruction, (), {}, {}, ()))
-    return Episode(opening, tuple(one.frames), one.outcome, {**one.env.seconds, **one.seconds})
+    return Episode(opening, tuple(one.frames), one.outcome, {**one.env.seconds, **one.seconds}, tuple(one.calls))
 
 
 def _guard[**P, R](one: Running, work: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R | None:

@@ -53,7 +53,7 @@ def _to_row(episode: Episode) -> dict[str, Any]:
     names = [place.model for place in row.placements]
     truths = [frame.truth for frame in frames]
     return {
-        **dict(zip(KEY, (row.suite, row.task, episode.opening.method, row.seed, row.episode), strict=True)),
+        **dict(zip(KEY, episode.key, strict=True)),
         "objects": names,
         "poses": np.concatenate([truth.objects_world[name] for truth in truths for name in names]),
         "touched": [list(truth.touched) for truth in truths],

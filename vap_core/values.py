@@ -341,13 +341,41 @@ class Outcome:
 
 
 @value
+class Call:
+    """One policy call of one episode, and one thing that it consumed: a camera's image, or the text.
+
+    `changed` says whether the prompt changes it: pixels tinted in that view, or words rewritten. `consumed` and `raw` are digests of what the
+    policy consumed of the prompted and of the raw input.
+    """
+
+    step: int
+    name: str
+    changed: bool
+    pixels: int
+    consumed: str
+    raw: str
+
+    @property
+    def sound(self) -> bool:
+        """What the prompt changes, changes what is consumed, and nothing else does."""
+        return (self.consumed != self.raw) == self.changed
+
+
+@value
 class Episode:
-    """A finished episode. `seconds` sums wall time by part: physics, render, attend, policy, record, ..."""
+    """A finished episode. `seconds` sums wall time by part: physics, render, attend, policy, record, ...; `calls` are there when it was audited."""
 
     opening: Opening
     frames: tuple[Frame, ...]
     outcome: Outcome
     seconds: Mapping[str, float]
+    calls: tuple[Call, ...] = ()
+
+    @property
+    def key(self) -> tuple[str, str, str, int, int]:
+        """Suite, task, method, seed and episode: what names it in a run."""
+        row = self.opening.row
+        return row.suite, row.task, self.opening.method, row.seed, row.episode
 
     def summary(self) -> dict[str, Any]:
         """One flat row for a results table."""

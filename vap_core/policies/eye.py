@@ -19,8 +19,8 @@ PLACE = re.compile(r"\b(?P<how>near|on|onto|in|into|inside)\s+(?:(?:the|a|an|my)
 TOUCH = re.compile(r"\b(?:select|touch|point)\b", re.IGNORECASE)
 COLOURED = 0.25
 """A candidate carries a colour when at least this share of its box looks like it."""
-SURE = 0.5
-"""Candidates with at least this share of the best one's score may be meant."""
+SURE = 0.2
+"""Candidates with at least this share of the best one's score may be meant: a detector likes some instances better, which must not decide."""
 WIDEST_M = 0.15
 """Radius of the widest thing that something is put on, metres."""
 RING = np.stack([np.cos(np.linspace(0, 2 * np.pi, 24, endpoint=False)), np.sin(np.linspace(0, 2 * np.pi, 24, endpoint=False))], axis=1)

@@ -13,6 +13,7 @@ from jaxtyping import Float64
 
 from vap_core.detect import Detector
 from vap_core.policies.eye import Eye, Wish, read
+from vap_core.policies.witness import TEXT, tell
 from vap_core.sim.control import LEASH, arm
 from vap_core.sim.robots import Robot
 from vap_core.values import Camera, Chunk, PolicyInput, value
@@ -85,6 +86,9 @@ class Scripted:
         return ScriptedState(float(rng.random()), None, "seek", 0.0)
 
     def plan(self, states: Sequence[ScriptedState], inputs: Sequence[PolicyInput]) -> tuple[list[ScriptedState], list[Chunk]]:
+        for i, seen in enumerate(inputs):
+            tell(i, self.eye.camera.name, seen.images[self.eye.camera.name])
+            tell(i, TEXT, seen.text)
         pairs = [self._plan(state, seen) for state, seen in zip(states, inputs, strict=True)]
         return [state for state, _ in pairs], [chunk for _, chunk in pairs]
 
