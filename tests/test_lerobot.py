@@ -13,7 +13,7 @@ from tests import tiny_lerobot as tiny
 from vap_core import suites
 from vap_core.errors import BadPolicy
 from vap_core.policies import Policy
-from vap_core.policies.lerobot import LeRobot, compare, fingerprint, load
+from vap_core.policies.lerobot import LeRobot, compare, fingerprint, fitted, load, named
 from vap_core.policies.toy_pi0 import toy_sizes
 from vap_core.rollout import Trial, rollout
 from vap_core.sim.objects import extent_m, get
@@ -26,7 +26,7 @@ SUITE, TASK = "simpler-bridge", "put-camera"
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
     root = tmp_path_factory.mktemp("checkpoints")
-    return {"pi0": tiny.pi0(root / "pi0"), "act": tiny.act(root / "act"), "ensemble": tiny.act(
+    return {"pi0": tiny.pi0(root / "pi0"), "pi05": tiny.pi05(root / "pi05"), "act": tiny.act(root / "act"), "ensemble": tiny.act(
         root / "ensemble", n_action_steps=1, temporal_ensemble_coeff=0.01)}  # fmt: skip
 
 
@@ -50,7 +50,7 @@ def run(policy, states, looks):
     return np.stack(chunks)
 
 
-@pytest.mark.parametrize("name", ["pi0", "act", "ensemble"])
+@pytest.mark.parametrize("name", ["pi0", "pi05", "act", "ensemble"])
 def test_the_contract_of_a_policy(policies, name):
     policy = policies[name]
     assert isinstance(policy, Policy)
@@ -61,13 +61,13 @@ def test_the_contract_of_a_policy(policies, name):
     for chunk in chunks:
         assert chunk.dtype == np.float32
         assert chunk.shape == (policy.execute, tiny.ACTION)
-    assert policy.execute == {"pi0": 2, "act": 3, "ensemble": 1}[name]
+    assert policy.execute == {"pi0": 2, "pi05": 2, "act": 3, "ensemble": 1}[name]
     assert policy.sha256() == before
     assert not policy.policy.training
     assert not any(weight.requires_grad for weight in policy.policy.parameters())
 
 
-@pytest.mark.parametrize("name", ["pi0", "act", "ensemble"])
+@pytest.mark.parametrize("name", ["pi0", "pi05", "act", "ensemble"])
 def test_a_batch_equals_one_by_one_whatever_the_global_seed(policies, name):
     policy, looks = (
         policies[name],
@@ -248,7 +248,7 @@ def scene(rows):
         yield built
 
 
-@pytest.mark.parametrize("name", ["pi0", "act", "ensemble"])
+@pytest.mark.parametrize("name", ["pi0", "pi05", "act", "ensemble"])
 def test_a_rollout_in_a_real_suite(policies, rows, scene, name):
     policy: LeRobot = policies[name]
     before = policy.sha256()
@@ -263,3 +263,13 @@ def test_a_rollout_in_a_real_suite(policies, rows, scene, name):
         assert np.allclose(actions, [frame.action for frame in b.frames], atol=1e-6)
         assert np.abs(actions[:3]).max() > 1e-4
         assert a.opening.policy == policy.label
+
+
+def test_a_name_that_means_a_checkpoint_is_fitted_to_the_suite(folders, scene):
+    assert all(map(named, (str(folders["act"]), "lerobot/pi0_base")))
+    assert not any(map(named, ("scripted", "expert", "a/b/c", "/no/such/folder")))
+    name = str(folders["act"])
+    policy = fitted(name, scene, suites.suite(SUITE))
+    assert fitted(name, scene, suites.suite(SUITE)) is policy
+    with pytest.raises(BadPolicy, match=r"there is observation.images.head, observation.state \(13\)"):
+        fitted(name, scene, replace(suites.suite(SUITE), cameras=("head",)))

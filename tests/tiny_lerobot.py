@@ -20,6 +20,10 @@ def pi0(folder: Path, cameras: tuple[str, ...] = ("front",)) -> Path:
     return save_toy(folder, cameras, STATE, ACTION, TOY)
 
 
+def pi05(folder: Path) -> Path:
+    return save_toy(folder, ("front",), STATE, ACTION, TOY, "pi05")
+
+
 def act(folder: Path, side: int = 64, **how: Any) -> Path:
     """One image, no language; actions are un-normalised by a known mean and deviation."""
     config = ACTConfig(

@@ -13,8 +13,10 @@ import inspect
 import io
 import json
 import logging
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +26,9 @@ import numpy as np
 import torch
 
 from vap_core.errors import BadPolicy
+from vap_core.sim.env import Env
+from vap_core.sim.scenes import Scene
+from vap_core.suites import Suite
 from vap_core.values import Chunk, PolicyInput, value
 
 if TYPE_CHECKING:
@@ -167,6 +172,18 @@ def load(checkpoint: str | Path, device: str | None = None) -> LeRobot:
     return LeRobot(policy, before, after, f"{config.type}:{folder.name if Path(checkpoint).is_dir() else checkpoint}")
 
 
+def named(policy: str) -> bool:
+    """Whether a policy's name means a checkpoint: a folder that exists, or owner/name."""
+    return Path(policy).expanduser().is_dir() or re.fullmatch(r"[\w.-]+/[\w.-]+", policy) is not None
+
+
+def fitted(checkpoint: str, scene: Scene, suite: Suite) -> LeRobot:
+    """The checkpoint, loaded once in this process, whose inputs and actions are the suite's. Raises: BadPolicy."""
+    policy, env = _loaded(checkpoint), Env(scene, control=suite.control)
+    policy.check(suite.cameras, len(env.state()), env.action_size)
+    return policy
+
+
 def locate(checkpoint: str | Path) -> Path:
     """The folder of a checkpoint on this machine. Raises: BadPolicy when a file is missing."""
     from huggingface_hub import snapshot_download
@@ -219,6 +236,9 @@ def compare(policy: "PreTrainedPolicy", file: Path) -> None:
         raise BadPolicy(
             f"load: {len(bad)} of {len(mine)} tensors differ from {file}, {bad[0]} for one; the file belongs to another architecture or size."
         )
+
+
+_loaded = cache(load)
 
 
 def _refuse_code(folder: Path) -> None:

@@ -1,10 +1,10 @@
-"""lerobot's PI0 at toy size with random weights: the real classes and files, small enough for a test or a bench.
+"""lerobot's PI0 and PI0.5 at toy size with random weights: the real classes and files, small enough for a test or a bench.
 
-PI0's sizes stand in its source, not in its checkpoint, so they are small only inside `toy_sizes()`, for saving and for loading alike.
+Their sizes stand in their source, not in their checkpoints, so they are small only inside `toy_sizes()`, for saving and for loading alike.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -32,12 +32,13 @@ class Toy:
 
 @contextmanager
 def toy_sizes(toy: Toy | None = None) -> Iterator[None]:
-    """Inside, PI0 is built at toy size."""
-    from lerobot.policies.pi0 import modeling_pi0 as pi0
+    """Inside, PI0 and PI0.5 are built at toy size."""
+    from lerobot.policies.pi0 import modeling_pi0
+    from lerobot.policies.pi05 import modeling_pi05
 
     size = toy or Toy()
     sizes = {"gemma_2b": size.width, "gemma_300m": size.expert}
-    vlm, expert = pi0.PaliGemmaForConditionalGenerationWithPiGemma, pi0.PiGemmaForCausalLM
+    vlm, expert = modeling_pi0.PaliGemmaForConditionalGenerationWithPiGemma, modeling_pi0.PiGemmaForCausalLM
 
     def small_vlm(config: Any) -> Any:
         config.text_config.vocab_size = config.image_token_index = config._vocab_size = VOCABULARY
@@ -51,50 +52,49 @@ def toy_sizes(toy: Toy | None = None) -> Iterator[None]:
         return expert(config=config)
 
     def small(variant: str) -> Any:
-        return pi0.GemmaConfig(
-            width=sizes[variant], depth=size.layers, mlp_dim=2 * sizes[variant], num_heads=8, num_kv_heads=1, head_dim=size.width // 4
-        )
+        wide = sizes[variant]
+        return modeling_pi0.GemmaConfig(width=wide, depth=size.layers, mlp_dim=2 * wide, num_heads=8, num_kv_heads=1, head_dim=size.width // 4)
 
-    with (
-        patch.object(pi0, "get_gemma_config", small),
-        patch.object(pi0, "PaliGemmaForConditionalGenerationWithPiGemma", small_vlm),
-        patch.object(pi0, "PiGemmaForCausalLM", small_expert),
-    ):
+    with ExitStack() as patches:
+        for module in (modeling_pi0, modeling_pi05):
+            patches.enter_context(patch.object(module, "get_gemma_config", small))
+            patches.enter_context(patch.object(module, "PaliGemmaForConditionalGenerationWithPiGemma", small_vlm))
+            patches.enter_context(patch.object(module, "PiGemmaForCausalLM", small_expert))
         yield
 
 
-def save_toy(folder: Path, cameras: Sequence[str], state_size: int, action_size: int, toy: Toy | None = None) -> Path:
+def save_toy(folder: Path, cameras: Sequence[str], state_size: int, action_size: int, toy: Toy | None = None, kind: str = "pi0") -> Path:
     """A checkpoint as lerobot leaves it: config, weights, processors, and a tokenizer of a few dozen words. Its actions are small."""
     import torch
     from lerobot.configs import FeatureType, PolicyFeature
-    from lerobot.policies import make_pre_post_processors
-    from lerobot.policies.pi0.configuration_pi0 import PI0Config
-    from lerobot.policies.pi0.modeling_pi0 import PI0Policy
-    from lerobot.policies.pi0.processor_pi0 import TokenizerProcessorStep
+    from lerobot.policies import get_policy_class, make_policy_config, make_pre_post_processors
+    from lerobot.processor import tokenizer_processor
 
     size = toy or Toy()
     side, features = size.image, {f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (3, 224, 224)) for name in cameras}
-    config = PI0Config(
+    config = make_policy_config(
+        kind,
         input_features={**features, "observation.state": PolicyFeature(FeatureType.STATE, (state_size,))},
         output_features={"action": PolicyFeature(FeatureType.ACTION, (action_size,))},
         device="cpu", chunk_size=size.chunk, n_action_steps=size.chunk, max_state_dim=state_size, max_action_dim=action_size,
-        image_resolution=(side, side), num_inference_steps=size.denoise, tokenizer_max_length=16,
+        image_resolution=(side, side), num_inference_steps=size.denoise, tokenizer_max_length=16 if kind == "pi0" else 48,
     )  # fmt: skip
     names = _tokenizer(folder / "tokenizer")
     with toy_sizes(size), torch.random.fork_rng():
         torch.manual_seed(0)
-        PI0Policy(config).save_pretrained(folder)
-    stats: Mapping[str, Any] = {
-        "observation.state": {"mean": torch.zeros(state_size), "std": torch.ones(state_size)},
-        "action": {"mean": torch.zeros(action_size), "std": torch.full((action_size,), 0.005)},
-    }
-    with patch(f"{TokenizerProcessorStep.__module__}.AutoTokenizer.from_pretrained", return_value=names):  # PI0 asks the hub for PaliGemma's
-        before, after = make_pre_post_processors(config, dataset_stats=dict(stats))
+        get_policy_class(kind)(config).save_pretrained(folder)
+    stats = {"observation.state": _statistics(torch.ones(state_size)), "action": _statistics(torch.full((action_size,), 0.005))}
+    with patch.object(tokenizer_processor.AutoTokenizer, "from_pretrained", return_value=names):  # it asks the hub for PaliGemma's
+        before, after = make_pre_post_processors(config, dataset_stats=stats)
     before.save_pretrained(folder)
     after.save_pretrained(folder)
     file = folder / "policy_preprocessor.json"
     file.write_text(file.read_text().replace("google/paligemma-3b-pt-224", str((folder / "tokenizer").resolve())))
     return folder
+
+
+def _statistics(std: Any) -> dict[str, Any]:
+    return {"mean": 0 * std, "std": std, "q01": -2 * std, "q99": 2 * std}
 
 
 def _tokenizer(folder: Path) -> Any:
