@@ -1,32 +1,28 @@
 """What a finished run says: the table, the time of a step by part, summary.json and one figure."""
 
 import json
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vap_core import suites
-from vap_core.experiments import Study
 from vap_core.files import write_atomic
 from vap_core.metrics import Score, rate, score, step_times
 from vap_core.plots import scores_figure, write_png
+from vap_core.report.text import align
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from vap_core.experiments import Study
 
-def conclude(study: Study, table: "pd.DataFrame", folder: Path) -> str:
+
+def conclude(study: "Study", table: "pd.DataFrame", folder: Path) -> str:
     """Write `summary.json` and `figure.png` into the run's folder, and return the text to print."""
-    rows = table.to_dict("records")
-    scores = score({str(key): cell for key, cell in row.items()} for row in rows)
-    scores = ordered(scores, study.tasks, study.methods)
+    scores = ordered(score(table), study.tasks, study.methods)
     write_atomic(folder / "summary.json", json.dumps([{**s.to_json(), "seed": study.seed} for s in scores], indent=1).encode())
     figure = folder / "figure.png"
     write_png(scores_figure(scores), figure)
-    times = {
-        (s.suite, s.method): step_times(r for r in rows if (r["suite"], r["method"]) == (s.suite, s.method)) for s in scores
-    }  # fmt: skip
+    times = {(s.suite, s.method): step_times(table[(table["suite"] == s.suite) & (table["method"] == s.method)]) for s in scores}
     lines = [results_table(scores), *_overall(scores), "", "time per control step, ms by part:", times_table(times)]
     recordings = sorted((folder / "recordings").glob("*.rrd")) if (folder / "recordings").is_dir() else []
     lines += ["", f"wrote {folder / 'summary.json'}, {figure}" + (f", {len(recordings)} recordings in {folder / 'recordings'}" if recordings else "")]
@@ -62,39 +58,9 @@ def _overall(scores: list[Score]) -> list[str]:
     return ["", *lines] if lines else []
 
 
-def suites_table() -> str:
-    """The benchmarks as their hashed lists hold them, one row per track; then the warm-up suites."""
-    head = ["suite", "robot", "cameras", "Hz", "control", "track", "episodes", "sha256 of the list"]
-    body, tasks = [], [["suite", "task", "instruction", "success when", "max steps", "episodes"]]
-    for name, suite in suites.BENCHMARKS.items():
-        listed = suites.lists.read(name)
-        about = [name, suite.robot, " ".join(suite.cameras), f"{suite.hz:g}", suite.control]
-        for split, count in Counter(row.split for row in listed).items():
-            body.append([*about, split or "-", str(count), suites.lists.digest(name)[:12]])
-        for task in suite.tasks:
-            counts = Counter(row.split for row in listed if row.task == task.name)
-            tasks.append([name, task.name, task.instruction, task.rule, str(task.max_steps), " + ".join(str(count) for count in counts.values())])
-    lines = [
-        align([head, *body]),
-        "",
-        align(tasks),
-        "",
-        "protocol-matched in MuJoCo: other physics, renderings and objects than SIMPLER's and VLABench's own.",
-    ]
-    for name, suite in suites.WARM_UPS.items():
-        lines.append(f"warm-up {name}: {suite.robot}, {len(suite.tasks)} picks of {suite.tasks[0].max_steps} steps, any number of episodes")
-    return "\n".join(lines)
-
-
 def times_table(times: dict[tuple[str, str], dict[str, float]]) -> str:
     """Milliseconds of one control step, one row per suite and method."""
     parts = list(dict.fromkeys(part for row in times.values() for part in row))
     head = ["suite", "method", *parts, "total"]
     body = [[*key, *(f"{row.get(part, 0.0):.1f}" for part in parts), f"{sum(row.values()):.1f}"] for key, row in times.items()]
     return align([head, *body])
-
-
-def align(rows: list[list[str]]) -> str:
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    ruled = [rows[0], ["-" * width for width in widths], *rows[1:]]
-    return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in ruled)

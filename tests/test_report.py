@@ -1,0 +1,292 @@
+"""The report of synthetic runs: to the letter for a tiny one, in seconds for a large one, honest about what is missing, one line about damage."""
+
+import csv
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+from vap_core import suites
+from vap_core.errors import BadOutput
+from vap_core.report import report
+from vap_core.report.pictures import OKABE_ITO, differences_figure, forest_figure, method_marks
+from vap_core.report.results import command, errors, results
+from vap_core.report.runs import load
+from vap_core.report.text import escape, latex, markdown
+from vap_core.statistics import ALL_TASKS, compare
+from vap_core.store import append, open_run
+
+BRIDGE = (("simpler-bridge", "pick-shaver"), ("simpler-bridge", "put-camera"))
+GOLDEN = Path(__file__).parent / "golden_report.md"
+
+
+def run(
+    folder: Path, tasks: tuple[tuple[str, str], ...] = BRIDGE, episodes: int | None = 6, seed: int = 0, keep: float = 1.0, **changes: Any
+) -> Path:
+    """A run whose outcomes follow from the episode alone: vap wins all but every third, generic every third; vap's last one is an error."""
+    names = dict.fromkeys(suite for suite, _ in tasks)
+    study = {"tasks": [list(task) for task in tasks], "methods": ["generic", "vap"], "episodes": episodes, "seed": seed, "policy": "scripted",
+             "lists": {name: suites.lists.digest(name) for name in names if name in suites.BENCHMARKS}, "version": "0.1.0", **changes}  # fmt: skip
+    rows = []
+    for suite, task in tasks:
+        listed = suites.rows(suite, task, episodes, seed)
+        for i, row in enumerate(listed):
+            for method in study["methods"]:
+                won, error = (i % 3 > 0) if method == "vap" else (i % 3 == 1), method == "vap" and i == len(listed) - 1
+                rows.append({
+                    "suite": suite, "task": task, "split": row.split, "variant": row.variant, "episode": row.episode, "seed": seed, "method": method,
+                    "policy": "scripted", "outcome": "error" if error else "success" if won else "failure", "success": won and not error,
+                    "success_once": won, "held_steps": 0, "cmr": None if row.rule == "selected" else i % 3 > 0,
+                    "wrong_object": method == "generic" and i == 0, "first_object_correct": won, "steps": 10, "margin": None,
+                    "attempt": 2 if i == 2 else 1, "detail": "Traceback (most recent call last):\n  ...\nRuntimeError: the arm | fell off\n" if error else "",
+                })  # fmt: skip
+    open_run(folder, study)
+    append(folder, rows[: round(keep * len(rows))])
+    return folder
+
+
+def plain(text: str, *folders: Path) -> str:
+    """Without what differs from machine to machine: folders and digests."""
+    for i, folder in enumerate(folders):
+        text = text.replace(str(folder), f"RUN{i}")
+    return re.sub(r"digest \w{16}", "digest D", text)
+
+
+def test_a_tiny_run_is_reported_to_the_letter(tmp_path: Path) -> None:
+    folder, out = run(tmp_path / "run"), tmp_path / "out"
+    text = report([folder], out)
+    assert (out / "report.md").read_text() == text + "\n"
+    assert plain(text, folder) + "\n" == GOLDEN.read_text()
+    assert sorted(path.name for path in out.iterdir()) == [
+        "comparisons.csv", "comparisons.tex", "forest.png", "outcomes.csv", "outcomes.tex", "paired.png", "provenance.csv", "report.md",
+        "results.csv", "results.tex",
+    ]  # fmt: skip
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    report([folder], out)
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before, "the same run, the same files"
+
+
+def test_the_golden_numbers_by_hand(tmp_path: Path) -> None:
+    report([run(tmp_path / "run")], tmp_path)
+    with (tmp_path / "results.csv").open() as file:
+        lines = {(line["task"], line["method"]): line for line in csv.DictReader(file)}
+    shaver, both = lines["pick-shaver", "vap"], lines[ALL_TASKS, "vap"]
+    assert [shaver[name] for name in ("n", "asked", "listed", "errors", "sr_k", "cmr_k")] == ["6", "6", "24", "1", "3", "3"]
+    assert [both[name] for name in ("n", "listed", "errors", "sr_k")] == ["12", "48", "2", "6"]
+    assert float(shaver["sr"]) == 50.0
+    assert (float(shaver["sr_cp_low"]), float(shaver["sr_cp_high"])) == (pytest.approx(11.8, abs=0.05), pytest.approx(88.2, abs=0.05))
+    assert (float(shaver["paper_sr"]), float(shaver["paper_cmr"])) == (71.3, 82.9)
+    (pair,) = pd.read_csv(tmp_path / "comparisons.csv").query("task == 'pick-shaver'").to_dict("records")
+    assert [pair[name] for name in ("one", "other", "pairs", "both", "only_one", "only_other", "neither")] == ["generic", "vap", 6, 2, 0, 1, 3]
+    (end,) = pd.read_csv(tmp_path / "outcomes.csv").query("method == 'vap'").to_dict("records")
+    assert [end[name] for name in ("asked", "run", "success", "failure", "error", "retried", "most_attempts")] == [12, 12, 6, 4, 2, 2, 2]
+
+
+def test_every_latex_table_is_a_whole_one(tmp_path: Path) -> None:
+    report([run(tmp_path / "run")], tmp_path)
+    for name, tables in (("results.tex", 1), ("comparisons.tex", 1), ("outcomes.tex", 1)):
+        text = (tmp_path / name).read_text()
+        for word in (r"\begin{tabular}", r"\toprule", r"\bottomrule", r"\end{tabular}"):
+            assert text.count(word) == tables, (name, word)
+        width = len(re.findall(r"\\begin\{tabular\}\{([lc]+)\}", text)[0])
+        for line in text.splitlines():
+            if line.endswith(r"\\"):
+                spanned = sum(int(n) - 1 for n in re.findall(r"\\multicolumn\{(\d+)\}", line))
+                assert len(re.findall(r"(?<!\\)&", line)) + 1 + spanned == width, line
+    assert "another world" in (tmp_path / "results.tex").read_text()
+    assert escape("50 % of a_b & {c}") == r"50 \% of a\_b \& \{c\}"
+    assert latex([["a", "b"], ["1 %", "2"]]).splitlines()[2] == r"a & b \\"
+
+
+def test_a_bar_in_a_cell_stays_in_its_cell() -> None:
+    assert markdown([["a"], ["x|y"]]).splitlines() == ["| a    |", "| ---- |", r"| x\|y |"]
+
+
+def test_an_unfinished_run_is_reported_as_it_is(tmp_path: Path) -> None:
+    folder = run(tmp_path / "run", keep=0.75)
+    text = report([folder], tmp_path / "out")
+    assert "18 of the 24 episodes that 1 run asked for." in text
+    assert f"**Unfinished**: {folder} is unfinished: 18 of 24 episodes; run the same command again to finish it." in text
+    lines = results(load([folder])).set_index(["task", "method"])
+    assert lines.loc["put-camera", "n"].tolist() == [3, 3]
+    early = run(tmp_path / "early", keep=0.5)  # one task is not there at all
+    lines = results(load([early])).set_index(["task", "method"])
+    assert lines.loc["put-camera", "n"].tolist() == [0, 0]
+    assert "0 of 24" in report([early], tmp_path / "out")
+
+
+def test_seeds_of_a_benchmark_are_one_report_with_layouts_for_units(tmp_path: Path) -> None:
+    runs = load([run(tmp_path / str(seed), seed=seed) for seed in range(3)])
+    lines = results(runs).set_index(["task", "method"])
+    shaver = lines.loc[("pick-shaver", "vap")]
+    assert (shaver.n, shaver.listed, shaver.seeds, shaver.layouts) == (18, 72, 3, 6)
+    assert shaver.sr_layout_low < shaver.sr_low, "Wilson's 18 independent episodes claim too much"
+    (c,) = (c for c in compare(runs.table, runs.methods) if c.task == "pick-shaver")
+    assert (c.pairs, c.layouts) == (18, 6)
+    once = results(load([tmp_path / "0"])).set_index(["task", "method"]).loc["pick-shaver"]
+    assert once["sr_layout_low"].isna().all(), "no layout returns: Wilson alone"
+
+
+def test_one_run_of_several_seeds_is_several_runs_of_one(tmp_path: Path) -> None:
+    apart = [run(tmp_path / str(seed), seed=seed) for seed in range(2)]
+    held = json.loads((apart[0] / "run.json").read_text())["configuration"]
+    both = open_run(tmp_path / "both", {**held, "seeds": 2})
+    append(both, [row for folder in apart for row in pd.read_parquet(next((folder / "parts").iterdir())).to_dict("records")])
+    pd.testing.assert_frame_equal(results(load([both])), results(load(apart)))
+    assert "seed 0..1" in report([both], tmp_path / "out")
+    assert "--seed 0 --policy scripted --seeds 2" in report([both], tmp_path / "out")
+
+
+def test_the_order_of_runs_and_rows_changes_no_number(tmp_path: Path) -> None:
+    one, two = run(tmp_path / "one"), run(tmp_path / "two", seed=1)
+    keys = ["task", "method"]
+    there, back = (results(load(folders)).sort_values(keys, ignore_index=True) for folders in ([one, two], [two, one]))
+    pd.testing.assert_frame_equal(there, back)
+
+
+def test_errors_are_counted_by_their_last_line(tmp_path: Path) -> None:
+    runs = load([run(tmp_path / "run")])
+    assert errors(runs) == ["2 x RuntimeError: the arm | fell off"]
+    table = runs.table.assign(outcome="error", detail=[f"E{i}" for i in range(len(runs.table))])
+    assert errors(type(runs)(table, runs.wanted, runs.notes, ()), most=2)[-1] == f"and {len(table) - 2} of {len(table) - 2} other kinds"
+
+
+def test_a_run_without_attempts_or_comparisons(tmp_path: Path) -> None:
+    folder = run(tmp_path / "run")
+    part = next((folder / "parts").iterdir())
+    table = pd.read_parquet(part).assign(attempt=np.nan)
+    table[table.method == "vap"].to_parquet(part)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "paired.png").write_bytes(b"of another report")
+    text = report([folder], tmp_path / "out")
+    assert "No two methods ran the same episodes under one policy." in text
+    assert "not kept" in text
+    assert not (tmp_path / "out" / "paired.png").exists()
+
+
+def damage(folder: Path, how: str) -> str:
+    """Break a run, and return what must be said about it."""
+    note, part = folder / "run.json", next((folder / "parts").iterdir())
+    held, table = json.loads(note.read_text()), pd.read_parquet(part)
+    if how == "no note":
+        note.unlink()
+        return "run.json is absent or damaged"
+    if how == "torn part":
+        part.write_bytes(part.read_bytes()[:500])
+        return f"{part.name} is damaged; delete it"
+    if how == "no rows":
+        part.unlink()
+        return "holds no finished episode yet; run the same command again"
+    if how == "other rows":
+        table.assign(episode=table.episode + 100).to_parquet(part)
+        return "run is damaged: it was never asked for 24 of its episodes, the first simpler-bridge/pick-shaver episode 100 seed 0 of method generic"
+    if how == "another method":
+        table.replace({"vap": "nap"}).to_parquet(part)
+        return "run is damaged: it was never asked for 12 of its episodes"
+    if how == "old columns":
+        table.drop(columns=["variant", "cmr"]).to_parquet(part)
+        return "lacks the columns variant, cmr"
+    if how == "other list":
+        held["configuration"]["lists"]["simpler-bridge"] = "0" * 64
+    if how == "another command":
+        held["configuration"] = {"stack": "embedded"}
+    note.write_text(json.dumps(held))
+    return {"other list": "the list of simpler-bridge has changed since", "another command": "holds no run of eval, rollout or demo"}[how]
+
+
+@pytest.mark.parametrize(
+    "how", ["no note", "torn part", "no rows", "other rows", "another method", "old columns", "other list", "another command"]
+)  # fmt: skip
+def test_damage_is_told_in_one_line(tmp_path: Path, how: str) -> None:
+    folder = run(tmp_path / "run")
+    wanted = damage(folder, how)
+    with pytest.raises(BadOutput) as told:
+        report([folder], tmp_path / "out")
+    assert wanted in str(told.value)
+    assert "\n" not in str(told.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_same_episodes_twice_are_refused_and_a_run_named_twice_counts_once(tmp_path: Path) -> None:
+    one, other = run(tmp_path / "one"), run(tmp_path / "other")
+    with pytest.raises(BadOutput, match="hold the same episodes; name each run once"):
+        load([one, other])
+    assert len(load([one, one]).table) == len(load([one]).table)
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(BadOutput, match="file cannot be written .*choose another folder with --out"):
+        report([run(tmp_path / "run")], tmp_path / "file")
+
+
+def test_the_command_prints_what_it_writes(tmp_path: Path) -> None:
+    folder, env = run(tmp_path / "run"), {**os.environ, "OMP_NUM_THREADS": "1"}
+    words = [sys.executable, "-m", "vap_core", "report", str(folder)]
+    done = subprocess.run(words, env=env, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith((folder / "report" / "report.md").read_text())
+    (folder / "run.json").unlink()
+    refused = subprocess.run(words, env=env, capture_output=True, text=True, timeout=120)
+    assert (refused.returncode, refused.stdout, refused.stderr.count("\n")) == (2, "", 1)
+    assert refused.stderr.startswith("error: run: ")
+
+
+def test_the_command_of_a_run_is_told() -> None:
+    whole = [["simpler-bridge", task.name] for task in suites.suite("simpler-bridge").tasks]
+    study = {"tasks": whole, "methods": ["generic", "vap"], "policy": "scripted", "episodes": None, "seed": 2}
+    told = "python -m vap_core eval --suite simpler-bridge --method generic --method vap --seed 2 --policy scripted"
+    assert command(study) == told
+    part = "python -m vap_core rollout --suite simpler-bridge --task pick-shaver --method vap --episodes 3 --seed 2 --policy scripted"
+    assert command({**study, "tasks": whole[:1], "methods": ["vap"], "episodes": 3}) == part
+    assert command({**study, "seeds": 5, "audit": True}) == f"{told} --seeds 5 --audit"
+    demo = [["widowx-pick", "pick-straw-cup"], ["franka-pick", "pick-cup"]]
+    assert command({**study, "tasks": demo, "episodes": 20}) == "python -m vap_core demo --episodes 20 --seed 2"
+
+
+def test_pictures_show_every_line_and_overlap_nothing(tmp_path: Path) -> None:
+    tasks = tuple((name, task.name) for name in suites.BENCHMARKS for task in suites.suite(name).tasks)
+    runs = load([run(tmp_path / "run", tasks)])
+    lines, compared = results(runs), compare(runs.table, runs.methods)
+    for figure, count in ((forest_figure(lines), len(lines) // 2), (differences_figure(compared), len(compared))):
+        figure.savefig(tmp_path / "drawn.png")
+        (axes,) = figure.axes
+        assert len(axes.get_yticks()) == count
+        boxes = [text.get_window_extent() for text in (*axes.get_yticklabels(), *axes.texts, *figure.legends[0].get_texts())]
+        assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
+        assert all(text.get_fontsize() >= 8 for text in (*axes.get_yticklabels(), *axes.texts))
+    assert np.asarray(Image.open(tmp_path / "drawn.png").convert("L")).std() > 10
+
+
+def test_methods_are_told_apart_by_colour_and_by_marker() -> None:
+    marks = method_marks(["generic", "vap", "mask-only", "rewrite-only", "vap-associated"])
+    assert len({colour for colour, _ in marks.values()}) == len({marker for _, marker in marks.values()}) == 5
+    assert marks["mask-only"][0] == OKABE_ITO[0]
+
+
+def test_a_hundred_thousand_rows_take_seconds(tmp_path: Path) -> None:
+    """Processor time of the whole report, shapes checked as in every test; 23 seeds of all four lists under two methods."""
+    tasks = tuple((name, task.name) for name in suites.BENCHMARKS for task in suites.suite(name).tasks)
+    first = run(tmp_path / "0", tasks, episodes=None)
+    table, held = pd.read_parquet(next((first / "parts").iterdir())), json.loads((first / "run.json").read_text())["configuration"]
+    folders = [first]
+    for seed in range(1, 23):
+        folder = open_run(tmp_path / str(seed), {**held, "seed": seed})
+        (folder / "parts").mkdir()
+        won = np.random.default_rng(seed).random(len(table)) < np.where(table.method == "vap", 0.7, 0.4)
+        table.assign(seed=seed, success=won, outcome=np.where(won, "success", "failure")).to_parquet(folder / "parts" / "a.parquet")
+        folders.append(folder)
+    start = time.process_time()
+    text = report(folders, tmp_path / "out")
+    took = time.process_time() - start
+    assert text.splitlines()[2] == "100786 of the 100786 episodes that 23 runs asked for."
+    assert took < 10, f"{took:.1f} s"
