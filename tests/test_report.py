@@ -47,7 +47,8 @@ def run(
                     "policy": "scripted", "outcome": "error" if error else "success" if won else "failure", "success": won and not error,
                     "success_once": won, "held_steps": 0, "cmr": None if row.rule == "selected" else i % 3 > 0,
                     "wrong_object": method == "generic" and i == 0, "first_object_correct": won, "steps": 10, "margin": None,
-                    "attempt": 2 if i == 2 else 1, "detail": "Traceback (most recent call last):\n  ...\nRuntimeError: the arm | fell off\n" if error else "",
+                    "attempt": 2 if i == 2 else 1,
+                    "detail": "Traceback (most recent call last):\n  ...\nRuntimeError: the arm | fell off\n" if error else "",
                 })  # fmt: skip
     open_run(folder, study)
     append(folder, rows[: round(keep * len(rows))])
