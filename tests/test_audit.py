@@ -95,3 +95,12 @@ def test_bounds_and_unaudited_runs_are_refused(tmp_path: Path) -> None:
         audit.read(tmp_path)
     audit.write(tmp_path, [])
     assert not (tmp_path / "audit").exists()
+
+
+def test_followed_at_its_calls_a_policy_sees_as_much_and_the_steps_between_cost_nothing(trial: Trial) -> None:
+    every, called = (list(rollout(replace(trial, follow=follow), ROWS[:1], keep_images=True))[0] for follow in ("step", "call"))  # type: ignore[arg-type]
+    assert [bool(frame.images) for frame in every.frames] == [True] * 5
+    assert [bool(frame.images) for frame in called.frames] == [True, False, True, False, True]
+    assert [(call.step, call.name) for call in called.calls] == [(call.step, call.name) for call in every.calls]
+    assert [call.raw for call in called.calls[:2]] == [call.raw for call in every.calls[:2]]
+    assert called.seconds["attend"] < every.seconds["attend"]

@@ -202,9 +202,8 @@ def evaluate(
 
     names = [name for each in suite for name in (known.BENCHMARKS if each == "all" else [each])]
     tasks = tuple((name, task.name) for name in dict.fromkeys(names) for task in known.suite(name).tasks)
-    study = _study(
-        tasks, method, policy=policy, episodes=episodes, seed=seed, seeds=seeds, robots=robots, stack=stack, images_every=images_every, audit=audit
-    )  # fmt: skip
+    options = {"seeds": seeds, "images_every": images_every, "follow": follow, "audit": audit}
+    study = _study(tasks, method, policy=policy, episodes=episodes, seed=seed, robots=robots, stack=stack, **options)
     _run(study, out or Path(f"data/runs/{policy}-{'-'.join(dict.fromkeys(suite))}"), workers, record, retries)
 
 

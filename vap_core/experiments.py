@@ -17,7 +17,7 @@ from vap_core.policies import Insider, Policy
 from vap_core.policies.expert import Expert
 from vap_core.policies.random import Random
 from vap_core.policies.scripted import Scripted
-from vap_core.rollout import Trial
+from vap_core.rollout import Follow, Trial
 from vap_core.sim import robots
 from vap_core.sim.cameras import RIGS
 from vap_core.sim.env import Env
@@ -40,7 +40,8 @@ METHODS: dict[str, Prompting | None] = {
 
 @dataclass(frozen=True)
 class Study:
-    """The same episodes of every task, once per method and seed. `episodes` None takes whole lists; `images_every` is rollout.Trial's."""
+    """The same episodes of every task, once per method and seed. `episodes` None takes whole lists; `images_every`, `follow` and `audit` are
+    rollout.Trial's."""
 
     tasks: tuple[tuple[str, str], ...]
     methods: tuple[str, ...]
@@ -51,6 +52,7 @@ class Study:
     stack: str = "embedded"
     robots: str = "plain"
     images_every: int = 0
+    follow: Follow = "step"
     audit: bool = False
 
     def __post_init__(self) -> None:

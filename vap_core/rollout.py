@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -34,11 +34,15 @@ class Sink(Protocol):
     def close(self, outcome: Outcome) -> None: ...
 
 
+Follow = Literal["call", "step"]
+
+
 @dataclass(frozen=True)
 class Trial:
     """What a batch of episodes shares. `attender` None is the generic policy: raw images, raw instruction.
 
     An Insider needs no pictures; it gets them every `images_every` control steps all the same (0: never), for their cost or their look.
+    `follow` is when images are taken and targets tracked: at the policy's calls, which is all it ever sees, or at every control step.
     `audit` keeps what the policy consumed in every call (module audit).
     """
 
@@ -51,6 +55,7 @@ class Trial:
     sensor: Sensor = PERFECT
     images_every: int = 0
     occlusion: Occlusion | None = None
+    follow: Follow = "step"
     audit: bool = False
 
 
@@ -105,8 +110,10 @@ def _begin(trial: Trial, row: EpisodeRow, watched: bool) -> Running:
 
 def _see(trial: Trial, one: Running, sink: Callable[[Opening], Sink] | None) -> tuple[PolicyInput, Attended]:
     """Render, attend, and at t = 0 open the recording. Returns the raw input and what attending made of it."""
-    looks = one.watched or not isinstance(trial.policy, Insider) or (trial.images_every and one.judge.steps % trial.images_every == 0)
-    raw = one.env.observe(one.row.instruction) if looks else PolicyInput({}, one.row.instruction, one.env.state())
+    if not _looks(trial, one):
+        raw = PolicyInput({}, one.row.instruction, one.env.state())
+        return raw, Attended({}, raw.text, (), {}, {}, ())
+    raw = one.env.observe(one.row.instruction)
     with _timed(one.seconds, "attend"):
         if trial.attender is None:
             attended = Attended(raw.images, raw.text, (), {}, {}, ())
@@ -119,6 +126,13 @@ def _see(trial: Trial, one: Running, sink: Callable[[Opening], Sink] | None) -> 
         with _timed(one.seconds, "record"):
             one.sink = sink(one.opening) if sink is not None else None
     return raw, attended
+
+
+def _looks(trial: Trial, one: Running) -> bool:
+    """Whether this control step takes images: always for the first; else when the policy is asked, or whoever watches wants every step."""
+    if isinstance(trial.policy, Insider):
+        return one.watched or bool(trial.images_every and one.judge.steps % trial.images_every == 0)
+    return trial.follow == "step" or one.opening is None or not one.queue or _over(one)
 
 
 def _open(trial: Trial, one: Running, attended: Attended) -> Opening:
