@@ -103,4 +103,3 @@ def test_followed_at_its_calls_a_policy_sees_as_much_and_the_steps_between_cost_
     assert [bool(frame.images) for frame in called.frames] == [True, False, True, False, True]
     assert [(call.step, call.name) for call in called.calls] == [(call.step, call.name) for call in every.calls]
     assert [call.raw for call in called.calls[:2]] == [call.raw for call in every.calls[:2]]
-    assert called.seconds["attend"] < every.seconds["attend"]

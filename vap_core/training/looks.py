@@ -20,6 +20,8 @@ from vap_core.training.segmenter import jitter
 from vap_core.values import Rgb, value
 
 STAGES_PER_BATCH, TEMPERATURE = 16, 0.07
+MIXED, DROPPED = 0.5, 0.1
+"""Share of crops whose features take on another's style (MixStyle, Zhou et al. 2021), and of channels left out: no renderer's look is learned."""
 MOST, FEWEST_PX = 5, 60
 """Crops of one object that one stage gives, from its views, and the visible pixels of each."""
 GRIDS = {"b4": 14, "b10": 14, "b14": 7}
@@ -80,7 +82,8 @@ def look(head: LookHead, rows: np.ndarray, pixels: np.ndarray) -> Float[Tensor, 
     flat, start, maps = torch.from_numpy(np.asarray(rows[:, : MAPS + COLOURS])).float(), 0, {}
     for tap in LOOK_TAPS:
         shape = (CHANNELS[tap], GRIDS[tap], GRIDS[tap])
-        maps[tap] = flat[:, start : start + int(np.prod(shape))].unflatten(1, shape)
+        seen = flat[:, start : start + int(np.prod(shape))].unflatten(1, shape)
+        maps[tap] = _restyled(seen) if head.training else seen
         start += int(np.prod(shape))
     return head(maps, normalise(torch.from_numpy(np.asarray(pixels))), flat[:, start:])
 
@@ -127,10 +130,31 @@ def _pick(rng: np.random.Generator, looks: Looks) -> tuple[np.ndarray, np.ndarra
     return np.array(portraits, np.int64), np.array(views, np.int64)
 
 
+def _restyled(maps: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
+    """Some crops get the channels' means and deviations of a mixture with another crop; some channels of each are left out."""
+    n = len(maps)
+    mean, deviation = maps.mean((2, 3), keepdim=True), maps.std((2, 3), keepdim=True) + 1e-5
+    other, share = torch.randperm(n), torch.distributions.Beta(0.3, 0.3).sample((n, 1, 1, 1))
+    share = torch.where(torch.rand(n, 1, 1, 1) < MIXED, torch.ones_like(share), torch.maximum(share, 1 - share))
+    styled = (maps - mean) / deviation * (share * deviation + (1 - share) * deviation[other]) + share * mean + (1 - share) * mean[other]
+    return styled * (torch.rand(n, maps.shape[1], 1, 1) > DROPPED) / (1 - DROPPED)
+
+
 def _turned(rng: np.random.Generator, pixels: UInt8[np.ndarray, "n s s 3"]) -> UInt8[np.ndarray, "n s s 3"]:
-    """Exposed a little differently; the frozen features stay."""
-    gain = rng.uniform(0.85, 1.15, (len(pixels), 1, 1, 3))
-    return np.clip(np.asarray(pixels) * gain, 0, 255).astype(np.uint8)
+    """Other contrast, exposure and tint; some blurred, half with a rectangle painted over. The frozen features stay."""
+    n, side = len(pixels), pixels.shape[1]
+    x = np.asarray(pixels, np.float32)
+    mean = x.mean((1, 2, 3), keepdims=True)
+    x = (x - mean) * rng.uniform(0.6, 1.4, (n, 1, 1, 1)) + mean * rng.uniform(0.7, 1.3, (n, 1, 1, 1))
+    x = x * rng.uniform(0.85, 1.15, (n, 1, 1, 3))
+    for picture in x:
+        if rng.random() < 0.3:
+            picture[:] = cv2.GaussianBlur(picture, (0, 0), float(rng.uniform(0.4, 1.6)))
+        if rng.random() < 0.5:
+            high, wide = rng.integers(10, 50, 2)
+            top, left = rng.integers(0, side - high), rng.integers(0, side - wide)
+            picture[top : top + high, left : left + wide] = rng.uniform(0, 255, 3)
+    return np.clip(x, 0, 255).astype(np.uint8)
 
 
 def _cut(rgb: Rgb, box: tuple[int, int, int, int], rng: np.random.Generator) -> Rgb:

@@ -27,7 +27,7 @@ from vap_core.weights import save_weights
 CACHE = Path(__file__).resolve().parents[2] / "data" / "cache" / "perception"
 FILE = "perception.safetensors"
 HELD_OUT_STAGES = 30
-EPOCHS = {"detector": 6, "segmenter": 6, "looks": 20}
+EPOCHS = {"detector": 6, "segmenter": 6, "looks": 40}
 CROPS_PER_EPOCH = 8000
 
 
