@@ -161,6 +161,11 @@ def test_the_environment_numbers_its_steps_and_ends_like_ours():
     assert ends == [(False, False), (False, True)]
     assert env.render().shape == (64, 64, 3)
     env.close()
+    config = VapEnvConfig(task=SUITE, image_size=64)
+    assert config.tasks == tuple(task.name for task in suites.suite(SUITE).tasks)
+    assert config.fps == 5
+    with pytest.raises(UnknownName, match="task 'nonesuch' is unknown; known: pick-shaver"):
+        VapEnvConfig(task=f"{SUITE}/nonesuch")
 
 
 @pytest.fixture(scope="module")
