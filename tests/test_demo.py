@@ -2,6 +2,7 @@
 
 import json
 import os
+import random
 import subprocess
 import sys
 import time
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from vap_core.attend import Attender
 from vap_core.errors import BadOutput, UnknownName
@@ -86,14 +88,18 @@ def same(one: Episode, other: Episode) -> None:
         assert (a.state == b.state).all()
 
 
-def test_batched_equals_one_by_one_and_global_seeds_change_nothing(bank: Path) -> None:
+def test_neither_batch_nor_order_nor_global_seeds_change_an_episode(bank: Path) -> None:
     trial = make_trial(STUDY, STUDY.rows(SUITE, TASK), "vap", bank)
     rows = STUDY.rows(SUITE, TASK)
     together = list(rollout(trial, rows, batch=3))
     np.random.seed(123)  # noqa: NPY002
+    torch.manual_seed(123)
+    random.seed(123)
     alone = list(rollout(trial, rows, batch=1))
-    for one, other in zip(together, alone, strict=True):
+    backwards = list(rollout(trial, rows[::-1], batch=2))[::-1]
+    for one, other, third in zip(together, alone, backwards, strict=True):
         same(one, other)
+        same(one, third)
 
 
 def test_the_prompt_reaches_the_policy_and_only_the_prompt(bank: Path) -> None:

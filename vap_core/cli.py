@@ -185,6 +185,8 @@ def evaluate(
     seed: Seed = 0,
     seeds: Annotated[int, typer.Option(min=1, help="Run every episode with so many seeds, from --seed on.")] = 1,
     workers: Workers = 2,
+    engine: Annotated[Literal["local", "ray"], typer.Option(help="local: processes of this machine; ray: a Ray cluster.")] = "local",
+    address: Annotated[str, typer.Option(help="ray: host:port of the cluster, or auto for the one on this machine.")] = "auto",
     record: Recorded = "none",
     retries: Retries = 1,
     audit: Annotated[
@@ -196,7 +198,10 @@ def evaluate(
 ) -> None:
     """Run whole suites, and print the table with 95 % intervals. Interrupted, the same command goes on.
 
-    Example: python -m vap_core eval --suite simpler-bridge --policy expert
+    Examples:
+      python -m vap_core eval --suite simpler-bridge --policy expert
+      python -m vap_core eval --suite all --methods generic,vap --episodes 4 --out data/runs/all
+      python -m vap_core eval --suite all --engine ray --address 10.0.0.5:6379
     """
     from vap_core import suites as known
 
@@ -204,7 +209,8 @@ def evaluate(
     tasks = tuple((name, task.name) for name in dict.fromkeys(names) for task in known.suite(name).tasks)
     options = {"seeds": seeds, "images_every": images_every, "follow": follow, "audit": audit}
     study = _study(tasks, method, policy=policy, episodes=episodes, seed=seed, robots=robots, stack=stack, **options)
-    _run(study, out or Path(f"data/runs/{policy}-{'-'.join(dict.fromkeys(suite))}"), workers, record, retries)
+    folder = out or Path(f"data/runs/{Path(policy).name}-{'-'.join(dict.fromkeys(suite))}")
+    _run(study, folder, workers, record, retries, address if engine == "ray" else None)
 
 
 @app.command("eval-perception")
@@ -454,11 +460,17 @@ def _study(tasks: tuple[tuple[str, str], ...], methods: list[str] | None, *, pol
     return Study(tasks, tuple(dict.fromkeys(asked)) or usual, policy=policy, **options)
 
 
-def _run(study: "Study", out: Path, workers: int, record: "Record", retries: int) -> None:
+def _run(study: "Study", out: Path, workers: int, record: "Record", retries: int, address: str | None = None) -> None:
+    from vap_core.cluster import spread
     from vap_core.engine import run
+    from vap_core.processes import results
     from vap_core.report import conclude
+    from vap_core.statistics import foresight
 
-    print(conclude(study, run(study, out, workers=workers, record=record, retries=retries), out))
+    if len(study.methods) > 1:
+        print(foresight([row for suite, task in study.tasks for row in study.rows(suite, task)]), file=sys.stderr)
+    table = run(study, out, workers=workers, record=record, retries=retries, spread=spread(address) if address else results)
+    print(conclude(study, table, out))
     if study.audit:
         from vap_core.audit import verdict
 

@@ -65,6 +65,10 @@ class BadPolicy(VapError):
     """A checkpoint that is not there, would execute code, is not what its files say, or does not fit the suite."""
 
 
+class BadCluster(VapError):
+    """No Ray cluster where one was expected, or no Ray."""
+
+
 class OutOfReach(VapError):
     """A pose that inverse kinematics cannot reach."""
 

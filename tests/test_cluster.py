@@ -1,0 +1,60 @@
+"""A Ray cluster of two nodes on this machine gives the table, traces and recordings of local processes."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from vap_core import cluster, engine
+from vap_core.errors import BadCluster, WorkerDied
+from vap_core.experiments import Study
+from vap_core.processes import results
+from vap_core.traces import read as read_traces
+
+STUDY = Study((("simpler-bridge", "pick-shaver"),), ("generic",), policy="random", episodes=6)
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    from ray.cluster_utils import Cluster
+
+    local = {"num_cpus": 1, "node_ip_address": "127.0.0.1", "object_store_memory": 2**28}
+    nodes = Cluster(initialize_head=True, head_node_args={**local, "include_dashboard": False})
+    nodes.add_node(**local)
+    yield nodes.address
+    nodes.shutdown()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning", "ignore::FutureWarning")
+def test_a_cluster_gives_what_local_processes_give(address: str, tmp_path: Path) -> None:
+    there = engine.run(STUDY, tmp_path / "ray", record="all", progress=False, spread=cluster.spread(address))
+    here = engine.run(STUDY, tmp_path / "local", record="all", progress=False, spread=results)
+    columns = [name for name in here.columns if not name.startswith("seconds_")]
+    pd.testing.assert_frame_equal(there[columns], here[columns])
+    one, other = (dict(read_traces(tmp_path / name)) for name in ("ray", "local"))
+    assert one.keys() == other.keys()
+    for name in one:
+        assert [truth.objects_world.keys() for truth in one[name]] == [truth.objects_world.keys() for truth in other[name]]
+    names = [sorted(path.name for path in (tmp_path / name / "recordings").iterdir()) for name in ("ray", "local")]
+    assert names[0] == names[1]
+    assert len(names[0]) == 6
+    again = engine.run(STUDY, tmp_path / "ray", progress=False, spread=cluster.spread("127.0.0.1:1"))
+    pd.testing.assert_frame_equal(again, there), "nothing is missing, nobody is asked"
+
+    def dies(job: engine.Job) -> engine.Rows:
+        import os
+
+        os.kill(os.getpid(), 9)
+        return []
+
+    jobs = list(engine.missing(replace(STUDY, seeds=2), tmp_path / "ray"))[:1]
+    with pytest.raises(WorkerDied, match="a worker of the cluster died"):
+        list(cluster.spread(address)(dies, jobs, 1, ""))
+
+
+def test_no_cluster_is_said_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(BadCluster, match=r"no Ray cluster answers at 'nowhere'; start one with `ray start --head"):
+        engine.run(STUDY, tmp_path / "run", progress=False, spread=cluster.spread("nowhere"))
