@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import binom, binomtest, norm
+from scipy.stats import binom, binomtest, norm, permutation_test
 
 from vap_core import suites
 from vap_core.metrics import intervals, rate
@@ -88,8 +88,22 @@ def test_the_sign_test_of_few_clusters_counts_every_pattern_of_signs() -> None:
     gain = np.array([3.0, 1.0, -2.0, 4.0, 5.0])
     totals = [abs(float(np.dot(signs, gain))) for signs in product((-1, 1), repeat=5)]
     assert sign_flip(gain) == pytest.approx(sum(total >= abs(gain.sum()) for total in totals) / 32)
-    assert sign_flip(np.array([0.0, 2.0, 2.0, -2.0, 2.0])) == mcnemar(1, 3)
+    assert sign_flip(np.array([0.0, 2.0, 2.0, -2.0, 2.0])) == pytest.approx(mcnemar(1, 3))
     assert sign_flip(np.zeros(4)) == 1.0
+
+
+@given(st.lists(st.integers(-6, 6), min_size=2, max_size=40))
+@settings(max_examples=15)
+def test_the_sign_test_of_more_clusters_is_scipys_permutation_test(gain: list[int]) -> None:
+    def total(g: np.ndarray, axis: int = -1) -> np.ndarray:
+        return g.sum(axis=axis)
+
+    drawn = permutation_test((np.array(gain, float),), total, permutation_type="samples", n_resamples=4000, rng=np.random.default_rng(6))
+    assert sign_flip(np.array(gain, float)) == pytest.approx(min(1.0, float(drawn.pvalue)), abs=0.035)
+
+
+def test_the_sign_test_is_fine_enough_for_many_comparisons() -> None:
+    assert sign_flip(np.full(40, 3.0)) == pytest.approx(2 * 0.5**40)
 
 
 def episodes(won: dict[str, list[int]], task: str = "pick-shaver", suite: str = "simpler-bridge", **more: object) -> pd.DataFrame:
@@ -157,7 +171,7 @@ def test_seeds_of_one_layout_are_one_cluster() -> None:
     (once,), (ten,) = compare(one), compare(pd.concat([one.assign(seed=seed) for seed in range(10)]))
     assert (ten.pairs, ten.layouts, ten.only_other) == (100, 10, 60)
     assert (ten.low, ten.high) == (pytest.approx(once.low), pytest.approx(once.high))
-    assert ten.p == once.p, "the same episodes ten times over prove no more"
+    assert ten.p == pytest.approx(once.p), "the same episodes ten times over prove no more"
     assert ten.p_mcnemar < 1e-9 < ten.p
 
 

@@ -26,7 +26,8 @@ READING = """- n: episodes that were run, of those in the suite's whole list; al
 - paper's row, SR and CMR: {world}"""
 COMPARED = """Pairs are the same episodes (suite, task, split, variant, episode, seed, policy) under two methods; an error is no success.
 - difference: SR of the method minus SR of the one it is compared with, in points; 95 % interval by {resamples} bootstrap samples of whole layouts.
-- p McNemar: exact, every pair on its own. p layouts: the same where no layout returns; else whole layouts change their sign (permutation).
+  In simulations it covers 94 to 96 % from 40 layouts on, 90 to 94 % at 10 to 24; with so few go by p.
+- p McNemar: exact, every pair on its own. p layouts: the same where no layout returns; else exact, too, with whole layouts changing sign.
 - p Holm: p layouts, corrected for all comparisons of single tasks, and apart from them for those of all tasks together."""
 
 
@@ -50,7 +51,7 @@ def report(folders: Sequence[Path], out: Path) -> str:
             write_atomic(out / name, content.encode())
         write_png(forest_figure(lines), out / "forest.png")
         if many:
-            write_png(differences_figure(compared), out / "paired.png")
+            write_png(differences_figure([c for c in compared if c.one == compared[0].one]), out / "paired.png")
         else:
             for name in ("paired.png", "comparisons.csv", "comparisons.tex"):  # of another report
                 (out / name).unlink(missing_ok=True)
@@ -127,7 +128,7 @@ def _compared_rows(found: "pd.DataFrame") -> list[list[str]]:
 
 def _pictures(many: bool) -> str:
     shown = ["## Pictures", "![Success rates with 95 % intervals](forest.png)"]
-    return "\n\n".join([*shown, "![Differences of methods on the same episodes](paired.png)"] if many else shown)
+    return "\n\n".join([*shown, "![Differences from the first method on the same episodes](paired.png)"] if many else shown)
 
 
 def _provenance(made: "pd.DataFrame") -> list[str]:
