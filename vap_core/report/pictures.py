@@ -48,18 +48,21 @@ def forest_figure(results: "pd.DataFrame") -> "Figure":
 
 
 def differences_figure(comparisons: Sequence[Comparison]) -> "Figure":
-    """Differences of success rates on the same episodes with their 95 % cluster bootstrap; filled where Holm's p is below 0.05."""
+    """Differences from one method on the same episodes with their 95 % cluster bootstrap; filled where Holm's p is below 0.05.
+
+    Colours and markers are those of the methods in `forest_figure`.
+    """
     contrasts = list(dict.fromkeys((c.other, c.one) for c in comparisons))
-    marks = method_marks([f"{other} minus {one}" for other, one in contrasts])
+    marks = method_marks([comparisons[0].one, *(other for other, _ in contrasts)])
     figure, axes, place = _lines(list(dict.fromkeys(_about(c) for c in comparisons)), len(contrasts), -100.0)
     axes.axvline(0, color="#555555", linewidth=1)
     for c in comparisons:
-        (colour, marker), i = marks[f"{c.other} minus {c.one}"], contrasts.index((c.other, c.one))
+        (colour, marker), i = marks[c.other], contrasts.index((c.other, c.one))
         spread, fill = np.maximum([[c.difference - c.low], [c.high - c.difference]], 0), colour if c.p_holm < 0.05 else "white"
         look: dict[str, Any] = {"color": colour, "markerfacecolor": fill, "fmt": marker, "markersize": 5, "capsize": 2.5, "linewidth": 1.2}
         axes.errorbar(100 * c.difference, place[_about(c)] + _aside(i, len(contrasts)), xerr=100 * spread, **look)
-    for label, (colour, marker) in marks.items():
-        axes.plot([], [], marker, color=colour, label=label)
+    for other, one in contrasts:
+        axes.plot([], [], marks[other][1], color=marks[other][0], label=f"{other} minus {one}")
     axes.set_xlim(-102, 102)
     axes.set_xlabel("difference of success rates in points, same episodes, 95 % interval over layouts\nfilled: p < 0.05 after Holm's correction")
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=min(3, len(contrasts)), frameon=False)
