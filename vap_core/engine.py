@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from resource import RUSAGE_SELF, getrusage
 from typing import TYPE_CHECKING, Any, Literal
 
 from vap_core import audit, store, traces
@@ -111,7 +112,7 @@ def key(row: EpisodeRow, method: str, run: str) -> str:
 
 
 def work(job: Job) -> Rows:
-    """Run one job in this process."""
+    """Run one job in this process; `peak_mb` is the most memory that it has taken so far."""
     from vap_core.rollout import rollout
 
     trial = make_trial(job.study, job.rows, job.method, job.folder / "memory")
@@ -123,7 +124,8 @@ def work(job: Job) -> Rows:
                 _recording(job.folder / "recordings", episode.opening).unlink(missing_ok=True)
     traces.write(job.folder, episodes)
     audit.write(job.folder, episodes)
-    return [{"key": name, "attempt": job.attempt, **episode.summary()} for name, episode in zip(job.keys, episodes, strict=True)]
+    about = {"attempt": job.attempt, "peak_mb": getrusage(RUSAGE_SELF).ru_maxrss // 1024}
+    return [{"key": name, **about, **episode.summary()} for name, episode in zip(job.keys, episodes, strict=True)]
 
 
 def _recording(folder: Path, opening: Opening) -> Path:

@@ -13,7 +13,7 @@ from vap_core.store import KEY, note, read
 def publish(folders: Sequence[Path], target: Path, *, replace: bool = False) -> int:
     """Write every episode of the runs, with each run's configuration in the file's metadata; returns the number of episodes.
 
-    Tracebacks and wall times stay behind.
+    Tracebacks, wall times and memory stay behind.
     Raises: BadOutput for a folder that holds no run or an unfinished one, for two runs of the same episodes, or a target that is no new
     parquet file.
     """
@@ -33,7 +33,7 @@ def publish(folders: Sequence[Path], target: Path, *, replace: bool = False) -> 
         )
         if len(table) < wanted:
             raise BadOutput(f"publish: {folder} holds {len(table)} of {wanted} episodes; run the same command again to finish it.")
-        columns = [name for name in table.columns if name != "detail" and not name.startswith("seconds_")]
+        columns = [name for name in table.columns if name not in ("detail", "peak_mb") and not name.startswith("seconds_")]
         tables.append(pa.Table.from_pandas(table[columns].assign(configuration=about["digest"]), preserve_index=False))
         notes.append(about)
     whole = pa.concat_tables(tables, promote_options="permissive")
