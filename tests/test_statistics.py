@@ -71,6 +71,13 @@ def test_the_bootstrap_of_many_even_clusters_is_the_normal_interval_of_their_mea
     assert (low, high) == (pytest.approx(gain.mean() - half, abs=0.005), pytest.approx(gain.mean() + half, abs=0.005))
 
 
+def test_the_bootstrap_covers_the_truth_about_as_often_as_it_says() -> None:
+    rng, draws = np.random.default_rng(7), 150
+    gains = rng.choice([-1.0, 0.0, 1.0], size=(draws, 60), p=[0.05, 0.7, 0.25])
+    inside = [low <= 0.2 <= high for low, high in (bootstrap_interval(gain, np.ones(60)) for gain in gains)]
+    assert 0.89 <= np.mean(inside) <= 0.99
+
+
 def test_repeating_every_episode_of_a_cluster_adds_no_certainty() -> None:
     gain, ones = np.random.default_rng(2).choice([-1.0, 0.0, 1.0], size=40), np.ones(40)
     assert bootstrap_interval(10 * gain, 10 * ones) == pytest.approx(bootstrap_interval(gain, ones))

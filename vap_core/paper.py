@@ -129,6 +129,6 @@ def attainable(percent: float, n: int, decimals: int = 1) -> bool:
     return bool((np.abs(100 * np.arange(n + 1) / n - percent) <= 0.5 * 10.0**-decimals + 1e-9).any())
 
 
-def oddities(suites: object) -> list[str]:
-    """What to say under a table that shows the paper's numbers of `suites`."""
-    return [odd.text for odd in ODDITIES if set(odd.suites) & set(suites)]  # type: ignore[call-overload]
+def oddities(suite: str) -> list[str]:
+    """What to say under a table that shows the paper's numbers of `suite`."""
+    return [odd.text for odd in ODDITIES if suite in odd.suites]

@@ -70,7 +70,7 @@ def _results(lines: "pd.DataFrame") -> list[str]:
     for suite, tracks in lines.groupby("suite", sort=False):
         for split, part in tracks.groupby("split", sort=False):
             parts += [f"### {suite}{f', {split}' if split else ''}", markdown(_result_rows(part, str(suite), str(split)))]
-        notes = [*([paper.real_arm()] if suite == "tabletop" else []), *paper.oddities([suite])]
+        notes = [*([paper.real_arm()] if suite == "tabletop" else []), *paper.oddities(str(suite))]
         parts += ["Footnotes to the paper's numbers:\n\n" + "\n".join(f"{i}. {note}" for i, note in enumerate(notes, 1))] if notes else []
     return parts
 
