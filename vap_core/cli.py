@@ -189,6 +189,9 @@ def evaluate(
     address: Annotated[str, typer.Option(help="ray: host:port of the cluster, or auto for the one on this machine.")] = "auto",
     record: Recorded = "none",
     retries: Retries = 1,
+    follow: Annotated[
+        Literal["call", "step"], typer.Option(help="Take images and track when the policy is asked, or at every control step (smoother recordings).")
+    ] = "call",
     audit: Annotated[
         bool, typer.Option("--audit", help="Prove that tint and text reach the policy: every call is made with the raw input, too.")
     ] = False,
