@@ -144,7 +144,6 @@ def test_one_run_of_several_seeds_is_several_runs_of_one(tmp_path: Path) -> None
     append(both, [row for folder in apart for row in pd.read_parquet(next((folder / "parts").iterdir())).to_dict("records")])
     pd.testing.assert_frame_equal(results(load([both])), results(load(apart)))
     assert "seed 0..1" in report([both], tmp_path / "out")
-    assert "--seed 0 --policy scripted --seeds 2" in report([both], tmp_path / "out")
 
 
 def test_the_order_of_runs_and_rows_changes_no_number(tmp_path: Path) -> None:
@@ -249,7 +248,8 @@ def test_the_command_of_a_run_is_told() -> None:
     assert command(study) == told
     part = "python -m vap_core rollout --suite simpler-bridge --task pick-shaver --method vap --episodes 3 --seed 2 --policy scripted"
     assert command({**study, "tasks": whole[:1], "methods": ["vap"], "episodes": 3}) == part
-    assert command({**study, "seeds": 5, "audit": True}) == f"{told} --seeds 5 --audit"
+    assert command({**study, "seeds": 5, "images_every": 0, "audit": True}) == f"{told} --seeds 5 --audit"
+    assert command({**study, "seeds": 1, "follow": "step", "images_every": 4}) == f"{told} --follow step --images-every 4"
     demo = [["widowx-pick", "pick-straw-cup"], ["franka-pick", "pick-cup"]]
     assert command({**study, "tasks": demo, "episodes": 20}) == "python -m vap_core demo --episodes 20 --seed 2"
 

@@ -144,6 +144,8 @@ def command(study: dict[str, Any]) -> str:
     for suite, tasks in named.items():
         words += ["--suite", suite, *([] if whole else [word for task in tasks for word in ("--task", task)])]
     words += [word for method in study["methods"] for word in ("--method", method)]
-    options |= {"seeds": study.get("seeds", 1) if study.get("seeds", 1) > 1 else None}
+    if whole:
+        options |= {"seeds": study["seeds"] if study.get("seeds", 1) > 1 else None, "follow": study.get("follow")}
+        options |= {"images-every": study.get("images_every") or None}
     words += [word for name, cell in options.items() if cell is not None for word in (f"--{name}", str(cell))]
     return "python -m vap_core " + shlex.join([*words, *(["--audit"] if study.get("audit") else [])])
