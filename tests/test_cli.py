@@ -37,7 +37,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return paths
 
 
-COMMANDS = ("register", "ground", "demo", "suites", "rollout", "eval", "rescore", "publish", "show", "doctor", "bench", "eval-perception")
+COMMANDS = ("register", "ground", "demo", "suites", "rollout", "eval", "rescore", "publish", "show", "doctor", "bench", "eval-perception", "report")
 
 
 @pytest.fixture(scope="module")

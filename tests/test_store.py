@@ -68,3 +68,10 @@ def test_foreign_folders_and_files_are_left_alone(tmp_path: Path) -> None:
     (tmp_path / "run" / "run.json").write_text("{")
     with pytest.raises(BadOutput, match="damaged"):
         open_run(tmp_path / "run", {})
+
+
+def test_a_run_of_an_older_version_is_said_to_be_one(tmp_path: Path) -> None:
+    run = open_run(tmp_path / "run", {})
+    append(run, [{name: cell for name, cell in ROW.items() if name != "attempt"}])
+    with pytest.raises(BadOutput, match="written by an older version"):
+        read(run)

@@ -201,10 +201,9 @@ def evaluate(
 ) -> None:
     """Run whole suites, and print the table with 95 % intervals. Interrupted, the same command goes on.
 
-    Examples:
-      python -m vap_core eval --suite simpler-bridge --policy expert
-      python -m vap_core eval --suite all --methods generic,vap --episodes 4 --out data/runs/all
-      python -m vap_core eval --suite all --engine ray --address 10.0.0.5:6379
+    Example: python -m vap_core eval --suite simpler-bridge --policy expert
+    Example: python -m vap_core eval --suite all --methods generic,vap --episodes 4 --out data/runs/all
+    Example: python -m vap_core eval --suite all --engine ray --address 10.0.0.5:6379
     """
     from vap_core import suites as known
 

@@ -100,7 +100,10 @@ def read(folder: Path) -> "pd.DataFrame":
     parts = [_part(part) for part in sorted((folder / "parts").glob("*.parquet"))]
     if not parts:
         return pd.DataFrame(columns=KEY)
-    table = concat_tables(parts, promote_options="permissive").to_pandas().sort_values([*KEY, "attempt"], ignore_index=True)
+    table = concat_tables(parts, promote_options="permissive").to_pandas()
+    if not {*KEY, "attempt"} <= set(table.columns):
+        raise BadOutput(f"read: {folder} was written by an older version; run the same command again with another --out.")
+    table = table.sort_values([*KEY, "attempt"], ignore_index=True)
     return table.drop_duplicates(KEY, keep="last", ignore_index=True)
 
 
