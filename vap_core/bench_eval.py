@@ -83,6 +83,7 @@ def run(workers: int = 2, quick: bool = False) -> str:
 def measure(plan: Plan) -> tuple[Plan, list[Arm], list[Arm]]:
     """lerobot's arms and ours; the arms of a repeat follow each other in turn, beginning with another one each time."""
     import torch
+    from tqdm import tqdm
 
     threads = torch.get_num_threads()
     with tempfile.TemporaryDirectory() as scratch, toy_sizes(plan.toy), ExitStack() as stack:
@@ -92,9 +93,8 @@ def measure(plan: Plan) -> tuple[Plan, list[Arm], list[Arm]]:
         ours = [Arm(name, work, [], {}) for name, work in _ours(plan, folder, stack)]
         arms = [*theirs, *ours]
         try:
-            for repeat in range(plan.repeats):
-                for i in range(len(arms)):
-                    arms[(i + repeat) % len(arms)].go()
+            for turn in tqdm(range(plan.repeats * len(arms)), unit="run", disable=None):
+                arms[(turn + turn // len(arms)) % len(arms)].go()
         finally:
             torch.set_num_threads(threads)
     return plan, theirs, ours

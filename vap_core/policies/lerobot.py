@@ -64,7 +64,8 @@ class LeRobot:
         self.preprocessor = preprocessor
         self.postprocessor = postprocessor
         self.label = label
-        self.noisy = "noise" in inspect.signature(getattr(getattr(policy, "model", None), "sample_actions", print)).parameters
+        sampler = getattr(getattr(policy, "model", None), "sample_actions", None)
+        self.noisy = sampler is not None and "noise" in inspect.signature(sampler).parameters
         plain = config.n_obs_steps == 1 and getattr(config, "temporal_ensemble_coeff", None) is None
         self.batched = plain and (self.noisy or config.type in DRAWS_NOTHING)
         self.execute = int(config.n_action_steps) if self.batched else 1
