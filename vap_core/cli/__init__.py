@@ -1,0 +1,32 @@
+"""The commands. Each parses, calls one function of the house, and prints; errors the user can mend are one line, status 2."""
+
+import os
+import sys
+
+import typer
+
+from vap_core.cli import machine, own, runs
+from vap_core.errors import VapError
+
+HELP = """Visual Attentive Prompting: steer a frozen policy to your own object, and see why it worked or failed.
+
+Start with: python -m vap_core doctor, then python -m vap_core demo."""
+
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False, rich_markup_mode=None, help=HELP)
+for room in (own, runs, machine):
+    app.add_typer(room.app)
+INTERRUPTED = 130
+
+
+def main() -> None:
+    """Run the command line; what the user can mend is printed as one line."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    try:
+        app()
+    except VapError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except SystemExit as stop:
+        if stop.code == INTERRUPTED:
+            print("interrupted; run the same command again, it goes on where it stopped.", file=sys.stderr)
+        raise

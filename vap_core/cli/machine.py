@@ -1,0 +1,148 @@
+"""Commands about this machine and what it measures: doctor, weights, bench, eval-perception, train, show."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vap_core.cli.options import StackName, Workers
+
+app = typer.Typer()
+train_app = typer.Typer(no_args_is_help=True, help="Train shipped parts again; every training resumes after an interruption.")
+app.add_typer(train_app, name="train")
+weights_app = typer.Typer(no_args_is_help=True, help="The foundation stack's weights: what is there, and how to get the rest.")
+app.add_typer(weights_app, name="weights")
+
+
+@app.command("eval-perception")
+def eval_perception(
+    stack: StackName = "embedded",
+    suite: Annotated[list[str] | None, typer.Option(help="A benchmark; repeatable. Default all four.")] = None,
+    episodes: Annotated[int | None, typer.Option(min=1, help="Opening frames per task, as episodes spread evenly over its list.")] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+    out: Annotated[Path, typer.Option(help="Run folder; a run found there is resumed.")] = Path("data/runs/perception"),
+    quick: Annotated[bool, typer.Option("--quick", help="Two opening frames per task and one tracked episode per suite.")] = False,
+    publish: Annotated[Path | None, typer.Option(help="Keep the tables in this folder too, as perception_NAME.parquet.")] = None,
+) -> None:
+    """Measure perception against the simulator: opening frames, tracks through whole expert episodes, and time. Interrupted, it goes on.
+
+    Example: python -m vap_core eval-perception --suite simpler-bridge --quick
+    """
+    from vap_core import suites as known
+    from vap_core.survey.report import conclude
+    from vap_core.survey.run import Survey, run
+    from vap_core.survey.run import publish as keep
+
+    asked = Survey(stack, tuple(dict.fromkeys(suite or known.BENCHMARKS)), episodes, quick)
+    print(conclude(run(asked, out, jobs=jobs), asked.stack, out))
+    if publish is not None:
+        print("wrote " + ", ".join(map(str, keep(out, publish))))
+
+
+@app.command()
+def show(
+    recording: Annotated[Path, typer.Argument(help="A .rrd file.")],
+    png: Annotated[Path, typer.Argument(help="Picture to write.")],
+    frame: Annotated[int | None, typer.Option(help="Control step to show; default the middle one.")] = None,
+) -> None:
+    """Take a picture of a recording as the viewer shows it, without a display.
+
+    Example: python -m vap_core show data/runs/demo/recordings/NAME.rrd shot.png --frame 20
+    """
+    from vap_core.record import screenshot
+
+    screenshot(recording, png, frame_index=frame)
+    print(f"wrote {png}")
+
+
+@app.command()
+def doctor() -> None:
+    """Say what works on this machine, and how to mend what does not; status 1 when the main job cannot run.
+
+    Example: python -m vap_core doctor
+    """
+    from vap_core.doctor import examine
+
+    findings = examine()
+    for finding in findings:
+        print(finding)
+    if any(finding.needed and not finding.works for finding in findings):
+        raise typer.Exit(1)
+
+
+@app.command()
+def bench(
+    what: Annotated[
+        str,
+        typer.Argument(
+            help="loop: the prompted control loop; suites: every benchmark's simulator; stack: a stack's models; eval: episodes per hour against "
+            "lerobot's own loop."
+        ),
+    ] = "loop",
+    steps: Annotated[int, typer.Option(min=5, help="loop: control steps to time.")] = 60,
+    workers: Workers = 2,
+    stack: StackName = "foundation",
+    random_weights: Annotated[bool, typer.Option("--random-weights", help="stack: without weights; they change nothing about speed.")] = False,
+    device: Annotated[str | None, typer.Option(help="stack: cpu or cuda; default VAP_DEVICE, or a GPU where there is one.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="eval: a few steps, to see that it runs; its numbers mean nothing.")] = False,
+) -> None:
+    """Time a control step by part, as shares and ratios within one run: of the prompted loop, every benchmark's simulator, or a stack's models.
+
+    Example: python -m vap_core bench suites
+    """
+    from vap_core import bench as loop
+    from vap_core import bench_eval, bench_stack, bench_suites
+    from vap_core.errors import one_of
+
+    runs = {
+        "loop": lambda: loop.run(steps),
+        "suites": lambda: bench_suites.run(workers),
+        "stack": lambda: bench_stack.run(stack, random=random_weights, device=device),
+        "eval": lambda: bench_eval.run(workers, quick),
+    }
+    if what not in runs:
+        raise one_of("bench:", what, runs)
+    print(runs[what]())
+
+
+@weights_app.command("list")
+def list_weights() -> None:
+    """What is on this machine, what is missing, and how to get it.
+
+    Example: python -m vap_core weights list
+    """
+    from vap_core.hub import table
+
+    print(table())
+
+
+@weights_app.command("pull")
+def pull_weights(
+    stack: Annotated[str, typer.Option("--stack", help="foundation, or foundation-small.")] = "foundation",
+    origin: Annotated[Path | None, typer.Option("--from", help="Without internet: a folder with a copy of another machine's.")] = None,
+    unpinned: Annotated[bool, typer.Option("--unpinned", help="Take other weights of the same architecture, for example your own.")] = False,
+) -> None:
+    """Get a stack's weights at their pinned revisions and check them. Interrupted, the same command goes on.
+
+    Example: python -m vap_core weights pull --stack foundation-small
+    """
+    from vap_core import hub
+
+    hub.pull(hub.names(stack), hub.home(), origin=origin, unpinned=unpinned)
+
+
+@train_app.command()
+def perception(
+    out: Annotated[Path, typer.Option(help="Folder of the weights and their manifest.")] = Path("data/weights"),
+    scenes: Annotated[int, typer.Option(min=1, help="Rendered training views.")] = 6480,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    minutes: Annotated[float | None, typer.Option(help="Stop training after this long.")] = None,
+) -> None:
+    """Train the heads of detector, segmenter and encoder on rendered generic objects, and evaluate them on unseen ones.
+
+    Example: python -m vap_core train perception --out data/runs/weights --scenes 400
+    """
+    from vap_core.training.perception import train
+
+    print(json.dumps(train(out, scenes=scenes, seed=seed, minutes=minutes), indent=1))

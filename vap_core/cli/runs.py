@@ -1,0 +1,186 @@
+"""Commands that run episodes, and that read what runs left: demo, rollout, eval; rescore, report, publish."""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from vap_core.cli.options import StackName, Workers
+
+if TYPE_CHECKING:
+    from vap_core.engine import Record
+    from vap_core.experiments import Study
+
+app = typer.Typer()
+
+Methods = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--methods", "--method", help="generic, vap, vap-associated, mask-only, rewrite-only; with commas, or repeated. Default: generic,vap."
+    ),
+]
+PolicyName = Annotated[str, typer.Option("--policy", help="scripted, or the bounds: expert (reads the simulator), random.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the policy and the sensors; of a warm-up suite's episode list, too.")]
+Recorded = Annotated[Literal["all", "failures", "none"], typer.Option("--record", help="Which episodes become a .rrd file; errors always do.")]
+Retries = Annotated[int, typer.Option(min=0, help="How often an episode that ended in an error is tried again.")]
+Meshes = Annotated[str, typer.Option("--robots", help="plain, or menagerie: MuJoCo Menagerie's meshes, downloaded or found in MENAGERIE_ROOT.")]
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Run folder; a run found there is resumed.")] = Path("data/runs/demo"),
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes per task and method.")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the episode list.")] = 0,
+) -> None:
+    """The main job: personalise a scripted policy on two robots, generic against VAP, with recordings of every episode.
+
+    Example: python -m vap_core demo --episodes 20
+    """
+    from dataclasses import replace
+
+    from vap_core.experiments import DEMO
+
+    _run(replace(DEMO, episodes=episodes, seed=seed), out, workers, "all", retries=1)
+
+
+@app.command()
+def suites() -> None:
+    """List the benchmarks: robots, cameras, tasks, episodes, and the hashes of their episode lists.
+
+    Example: python -m vap_core suites
+    """
+    from vap_core.report import suites_table
+
+    print(suites_table())
+
+
+@app.command()
+def rollout(
+    suite: Annotated[str, typer.Option(help="A suite: see python -m vap_core suites.")],
+    task: Annotated[list[str], typer.Option(help="Task of the suite, for example pick-cup; repeatable.")],
+    out: Annotated[Path, typer.Option(help="Run folder; a run found there is resumed.")],
+    method: Methods = None,
+    policy: PolicyName = "scripted",
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes per task and method.")] = 20,
+    seed: Seed = 0,
+    workers: Workers = 2,
+    record: Recorded = "all",
+    retries: Retries = 1,
+    robots: Meshes = "plain",
+    stack: StackName = "embedded",
+) -> None:
+    """Run tasks of a suite in closed loop, record every episode, and print the table.
+
+    Example: python -m vap_core rollout --suite widowx-pick --task pick-bottle --episodes 4 --out data/runs/bottle
+    """
+    tasks = tuple((suite, name) for name in dict.fromkeys(task))
+    _run(_study(tasks, method, policy=policy, episodes=episodes, seed=seed, robots=robots, stack=stack), out, workers, record, retries)
+
+
+@app.command("eval")
+def evaluate(
+    suite: Annotated[list[str], typer.Option(help="A suite, or all four benchmarks: all; repeatable.")],
+    out: Annotated[Path | None, typer.Option(help="Run folder; a run found there is resumed. Default data/runs/POLICY-SUITE.")] = None,
+    method: Methods = None,
+    policy: PolicyName = "scripted",
+    episodes: Annotated[int | None, typer.Option(min=1, help="Episodes per task, spread evenly over its list. Default the whole list.")] = None,
+    seed: Seed = 0,
+    seeds: Annotated[int, typer.Option(min=1, help="Run every episode with so many seeds, from --seed on.")] = 1,
+    workers: Workers = 2,
+    engine: Annotated[Literal["local", "ray"], typer.Option(help="local: processes of this machine; ray: a Ray cluster.")] = "local",
+    address: Annotated[str, typer.Option(help="ray: host:port of the cluster, or auto for the one on this machine.")] = "auto",
+    record: Recorded = "none",
+    retries: Retries = 1,
+    follow: Annotated[
+        Literal["call", "step"], typer.Option(help="Take images and track when the policy is asked, or at every control step (smoother recordings).")
+    ] = "call",
+    audit: Annotated[
+        bool, typer.Option("--audit", help="Prove that tint and text reach the policy: every call is made with the raw input, too.")
+    ] = False,
+    images_every: Annotated[int, typer.Option(min=0, help="Expert and random: render all cameras every so many steps; 0 never.")] = 0,
+    robots: Meshes = "plain",
+    stack: StackName = "embedded",
+) -> None:
+    """Run whole suites, and print the table with 95 % intervals. Interrupted, the same command goes on.
+
+    Example: python -m vap_core eval --suite simpler-bridge --policy expert
+    Example: python -m vap_core eval --suite all --methods generic,vap --episodes 4 --out data/runs/all
+    Example: python -m vap_core eval --suite all --engine ray --address 10.0.0.5:6379
+    """
+    from vap_core import suites as known
+
+    names = [name for each in suite for name in (known.BENCHMARKS if each == "all" else [each])]
+    tasks = tuple((name, task.name) for name in dict.fromkeys(names) for task in known.suite(name).tasks)
+    options = {"seeds": seeds, "images_every": images_every, "follow": follow, "audit": audit}
+    study = _study(tasks, method, policy=policy, episodes=episodes, seed=seed, robots=robots, stack=stack, **options)
+    folder = out or Path(f"data/runs/{Path(policy).name}-{'-'.join(dict.fromkeys(suite))}")
+    _run(study, folder, workers, record, retries, address if engine == "ray" else None)
+
+
+@app.command()
+def rescore(run: Annotated[Path, typer.Argument(help="Run folder of eval, rollout or demo.")]) -> None:
+    """Judge a finished run again from its saved states, without a simulator, and say what changed.
+
+    Example: python -m vap_core rescore data/runs/expert-simpler-bridge
+    """
+    from vap_core.rescore import rescore as judge_again
+
+    print(judge_again(run))
+
+
+@app.command()
+def report(
+    runs: Annotated[list[Path], typer.Argument(help="Run folders of eval, rollout or demo; several seeds of a suite make one report.")],
+    out: Annotated[Path | None, typer.Option(help="Folder for report.md, CSV and LaTeX tables and pictures. Default RUN/report.")] = None,
+) -> None:
+    """Print and write what runs found: tables with intervals beside the paper's, paired comparisons, errors, provenance, pictures.
+
+    Example: python -m vap_core report data/runs/demo
+    """
+    from vap_core.report import report as conclude
+
+    place = out or runs[0] / "report"
+    print(conclude(runs, place))
+    print(f"\nwrote {place}: report.md, tables as CSV and LaTeX, pictures")
+
+
+@app.command()
+def publish(
+    runs: Annotated[list[Path], typer.Argument(help="Run folders of eval, rollout or demo.")],
+    to: Annotated[Path, typer.Option(help="The table to write, for example data/results/mine.parquet.")],
+    replace: Annotated[bool, typer.Option("--replace", help="Overwrite that table.")] = False,
+) -> None:
+    """Keep the results of finished runs as one small table, with their configurations.
+
+    Example: python -m vap_core publish data/runs/expert-all data/runs/random-all --to data/results/bounds.parquet --replace
+    """
+    from vap_core.publish import publish as keep
+
+    print(f"wrote {to}: {keep(runs, to, replace=replace)} episodes")
+
+
+def _study(tasks: tuple[tuple[str, str], ...], methods: list[str] | None, *, policy: str, **options: Any) -> "Study":
+    from vap_core.experiments import INSIDERS, Study
+
+    asked = [name for each in methods or () for name in each.split(",") if name]
+    usual = ("generic",) if policy in INSIDERS else ("generic", "vap")
+    return Study(tasks, tuple(dict.fromkeys(asked)) or usual, policy=policy, **options)
+
+
+def _run(study: "Study", out: Path, workers: int, record: "Record", retries: int, address: str | None = None) -> None:
+    from vap_core.cluster import spread
+    from vap_core.engine import run
+    from vap_core.processes import results
+    from vap_core.report import conclude
+    from vap_core.statistics import foresight
+
+    if len(study.methods) > 1:
+        print(foresight([row for suite, task in study.tasks for row in study.rows(suite, task)]), file=sys.stderr)
+    table = run(study, out, workers=workers, record=record, retries=retries, spread=spread(address) if address else results)
+    print(conclude(study, table, out))
+    if study.audit:
+        from vap_core.audit import verdict
+
+        print("\n" + verdict(out))
