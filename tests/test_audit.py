@@ -10,7 +10,7 @@ from vap_core import audit
 from vap_core.errors import BadOutput, BadPolicy, BadStudy
 from vap_core.experiments import DEMO, Study, make_trial, register_personal
 from vap_core.policies.witness import TEXT, listened, listening, tell
-from vap_core.rollout import Trial, rollout
+from vap_core.rollout import Follow, Trial, rollout
 from vap_core.values import PolicyInput
 
 STUDY = replace(DEMO, tasks=DEMO.tasks[:1], episodes=2)
@@ -98,8 +98,14 @@ def test_bounds_and_unaudited_runs_are_refused(tmp_path: Path) -> None:
 
 
 def test_followed_at_its_calls_a_policy_sees_as_much_and_the_steps_between_cost_nothing(trial: Trial) -> None:
-    every, called = (list(rollout(replace(trial, follow=follow), ROWS[:1], keep_images=True))[0] for follow in ("step", "call"))  # type: ignore[arg-type]
+    (every,), (called,) = (list(rollout(replace(trial, follow=follow), ROWS[:1], keep_images=True)) for follow in ("step", "call"))  # type: ignore[arg-type]
     assert [bool(frame.images) for frame in every.frames] == [True] * 5
     assert [bool(frame.images) for frame in called.frames] == [True, False, True, False, True]
     assert [(call.step, call.name) for call in called.calls] == [(call.step, call.name) for call in every.calls]
     assert [call.raw for call in called.calls[:2]] == [call.raw for call in every.calls[:2]]
+
+
+@pytest.mark.parametrize(("follow", "audited"), [("call", True), ("step", False)])
+def test_what_a_study_asks_for_reaches_its_trials(bank: Path, follow: Follow, audited: bool) -> None:
+    made = make_trial(replace(STUDY, follow=follow, audit=audited), ROWS, "vap", bank)
+    assert (made.follow, made.audit) == (follow, audited)

@@ -10,11 +10,12 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from tests import tiny_lerobot as tiny
-from vap_core import suites
+from vap_core import audit, suites
 from vap_core.errors import BadPolicy
 from vap_core.policies import Policy
 from vap_core.policies.lerobot import LeRobot, compare, fingerprint, fitted, load, named
 from vap_core.policies.toy_pi0 import toy_sizes
+from vap_core.policies.witness import TEXT
 from vap_core.rollout import Trial, rollout
 from vap_core.sim.objects import extent_m, get
 from vap_core.sim.scenes import build
@@ -98,6 +99,19 @@ def test_text_and_picture_reach_the_policy(policies):
     plain, worded, tinted = (run(policy, [state], [one]) for one in (seen, look(0, "put the red camera on the plate"), red))
     assert np.abs(plain - worded).max() > 1e-6
     assert np.abs(plain - tinted).max() > 1e-6
+
+
+@pytest.mark.parametrize("name", ["pi0", "pi05", "act", "ensemble"])
+def test_it_tells_what_its_tensors_hold(policies, name):
+    """The audit hears the image and token tensors themselves, after the checkpoint's own preprocessing."""
+    policy, plain = policies[name], [look(0), look(1)]
+    tinted = plain[1].images["front"].copy()
+    tinted[:20, :20] = (255, 0, 0)
+    prompted = [plain[0], replace(plain[1], images={"front": tinted}, text="put the red camera on the plate")]
+    _, _, heard, raw = audit.plan(policy, begin(policy, 2), prompted, plain)
+    assert heard[0] == raw[0]
+    assert heard[1].keys() == ({"front", TEXT} if name.startswith("pi") else {"front"})
+    assert all(heard[1][part] != raw[1][part] for part in heard[1])
 
 
 def test_chunks_are_those_of_lerobots_own_loop(policies):

@@ -147,6 +147,7 @@ def make_trial(study: Study, rows: Sequence[EpisodeRow], method: str, bank: Path
         suite.control,
         suite.sensor,
         study.images_every,
+        follow=study.follow,
         audit=study.audit,
     )
 

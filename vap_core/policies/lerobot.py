@@ -26,6 +26,7 @@ import numpy as np
 import torch
 
 from vap_core.errors import BadPolicy
+from vap_core.policies.witness import TEXT, listened, tell
 from vap_core.sim.env import Env
 from vap_core.sim.scenes import Scene
 from vap_core.suites import Suite
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from lerobot.policies.pretrained import PreTrainedPolicy
 
 STATE, IMAGE, EMPTY = "observation.state", "observation.images.", "observation.images.empty_camera"
+TOKENS = "observation.language.tokens"
 """lerobot's feature keys; a checkpoint fills its empty cameras itself."""
 WEIGHTS, CONFIG, PIPELINES = "model.safetensors", "config.json", ("policy_preprocessor.json", "policy_postprocessor.json")
 WANTED_FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
@@ -70,9 +72,9 @@ class LeRobot:
         self.batched = plain and (self.noisy or config.type in DRAWS_NOTHING)
         self.execute = int(config.n_action_steps) if self.batched else 1
         self.action_size = int(config.action_feature.shape[0])
-        renamed = {new: old for step in preprocessor.steps for old, new in getattr(step, "rename_map", {}).items()}
+        self.renamed = {new: old for step in preprocessor.steps for old, new in getattr(step, "rename_map", {}).items()}
         self.wanted: dict[str, tuple[int, ...]] = {
-            renamed.get(key, key): tuple(feature.shape) for key, feature in config.input_features.items() if not key.startswith(EMPTY)
+            self.renamed.get(key, key): tuple(feature.shape) for key, feature in config.input_features.items() if not key.startswith(EMPTY)
         }
         """Shape of every feature that the checkpoint reads, under the key that its preprocessor expects."""
 
@@ -92,10 +94,11 @@ class LeRobot:
         """The next chunk of every episode, un-normalised by the checkpoint's own postprocessor. Raises: BadPolicy when the inputs do not fit."""
         if self.batched:
             batch = self.preprocessor(self._observation(inputs))
+            self._tell(batch, range(len(inputs)))
             noise = {"noise": self._noise(states)} if self.noisy else {}
             actions = self.postprocessor(self.policy.predict_action_chunk(batch, **noise)[:, : self.execute])
             return list(states), [chunk.float().cpu().numpy() for chunk in actions]
-        return list(states), [self._step(state, seen) for state, seen in zip(states, inputs, strict=True)]
+        return list(states), [self._step(i, state, seen) for i, (state, seen) in enumerate(zip(states, inputs, strict=True))]
 
     def check(self, cameras: Sequence[str], state_size: int, action_size: int) -> None:
         """Raises: BadPolicy, unless the checkpoint reads no more than these cameras and this state, and its actions have this length."""
@@ -129,14 +132,24 @@ class LeRobot:
                 out[key] = _sized(torch.from_numpy(rgb).permute(0, 3, 1, 2).float() / 255, shape)
         return out
 
+    def _tell(self, batch: dict[str, Any], episodes: Sequence[int]) -> None:
+        """What stands in the tensors that the policy is about to read, one row per episode."""
+        if not listened():
+            return
+        for key, tensor in batch.items():
+            name = TEXT if key == TOKENS else self.renamed.get(key, key).removeprefix(IMAGE) if key.startswith(IMAGE) else ""
+            for episode, row in zip(episodes, tensor if name else (), strict=bool(name)):
+                tell(episode, name, row.float().cpu().numpy())
+
     def _noise(self, states: Sequence[LeRobotState]) -> torch.Tensor:
         config: Any = self.policy.config
         shape = (config.chunk_size, config.max_action_dim)
         drawn = [torch.randn(shape, generator=torch.Generator().manual_seed(state.seed)) for state in states]
         return torch.stack(drawn).to(config.device)
 
-    def _step(self, state: LeRobotState, seen: PolicyInput) -> Chunk:
+    def _step(self, i: int, state: LeRobotState, seen: PolicyInput) -> Chunk:
         batch = self.preprocessor(self._observation([seen]))
+        self._tell(batch, [i])
         with torch.random.fork_rng():
             torch.manual_seed(state.seed)
             action = self.postprocessor(state.own.select_action(batch))
