@@ -152,20 +152,30 @@ class Attender:
         Raises:
             ValueError: `views` are not of the cameras that the episode started with.
         """
-        if set(views) != set(state.groundings):
-            raise ValueError(
-                f"Attender.step: views of {sorted(views)}, but the episode started with {sorted(state.groundings)}; give the same cameras."
-            )
-        cameras = list(state.trackers)
-        trackers, found = self.stack.tracker.step([state.trackers[c] for c in cameras], [views[c] for c in cameras])
-        by_camera = dict(zip(cameras, found, strict=True))
+        return self.steps([state], [views])[0]
+
+    def steps(self, states: Sequence[AttendState], views: Sequence[Views]) -> list[tuple[AttendState, Attended]]:
+        """`step` for a batch of episodes, whose views reach the tracker in one call; what one gets does not depend on the others."""
+        for state, seen in zip(states, views, strict=True):
+            if set(seen) != set(state.groundings):
+                raise ValueError(
+                    f"Attender.step: views of {sorted(seen)}, but the episode started with {sorted(state.groundings)}; give the same cameras."
+                )
+        where = [(i, camera) for i, state in enumerate(states) for camera in state.trackers]
+        trackers, found = self.stack.tracker.step([states[i].trackers[c] for i, c in where], [views[i][c] for i, c in where])
+        after: list[dict[str, tuple[Any, tuple[Track, ...]]]] = [{} for _ in states]
+        for (i, camera), tracker, tracks in zip(where, trackers, found, strict=True):
+            after[i][camera] = tracker, tracks
+        return [self._stepped(state, seen, parts) for state, seen, parts in zip(states, views, after, strict=True)]
+
+    def _stepped(self, state: AttendState, views: Views, parts: Mapping[str, tuple[Any, tuple[Track, ...]]]) -> tuple[AttendState, Attended]:
         tracks = {
-            camera: tuple(Track(None, 0.0) if i is None else by_camera[camera][i] for i in state.ids[camera]) for camera in views
+            camera: tuple(Track(None, 0.0) if i is None else parts[camera][1][i] for i in state.ids[camera]) for camera in views
         }  # fmt: skip
         index, visible = state.frame_index + 1, _visible(tracks)
         lost = [Event(index, "WARN", f"{c}: target {j} not visible, the view passes unmodified") for c, j in sorted(state.visible - visible)]
         back = [Event(index, "INFO", f"{c}: target {j} re-acquired") for c, j in sorted(visible - state.visible)]
-        state = replace(state, frame_index=index, trackers=dict(zip(cameras, trackers, strict=True)), visible=visible)
+        state = replace(state, frame_index=index, trackers={camera: tracker for camera, (tracker, _) in parts.items()}, visible=visible)
         return state, self._prompt(state, views, tracks, (*lost, *back))
 
     def _look(self, rgb: Rgb, candidates: Boxes, before: tuple[Seen, ...]) -> Seen:

@@ -90,7 +90,7 @@ def rollout(
         running = [_begin(trial, row, sink is not None or keep_images) for row in rows[first : first + batch]]
         while any(one.outcome is None for one in running):
             live = [one for one in running if one.outcome is None]
-            seen = {id(one): shown for one in live if (shown := _guard(one, _see, trial, one, sink)) is not None}
+            seen = _see(trial, live, sink)
             live = [one for one in live if one.outcome is None]
             _plan(trial, live, seen)
             for one in live:
@@ -108,24 +108,64 @@ def _begin(trial: Trial, row: EpisodeRow, watched: bool) -> Running:
     return one
 
 
-def _see(trial: Trial, one: Running, sink: Callable[[Opening], Sink] | None) -> tuple[PolicyInput, Attended]:
-    """Render, attend, and at t = 0 open the recording. Returns the raw input and what attending made of it."""
-    if not _looks(trial, one):
-        raw = PolicyInput({}, one.row.instruction, one.env.state())
-        return raw, Attended({}, raw.text, (), {}, {}, ())
-    raw = one.env.observe(one.row.instruction)
+Seen = dict[int, tuple[PolicyInput, Attended]]
+"""By id of the running episode: the raw input, and what attending made of it."""
+
+
+def _see(trial: Trial, live: Sequence[Running], sink: Callable[[Opening], Sink] | None) -> Seen:
+    """Render, attend, and at t = 0 open the recordings. An episode that fails here ends, and is left out."""
+    raws = {id(one): raw for one in live if (raw := _guard(one, _observe, trial, one)) is not None}
+    followed = _follow(trial, [one for one in live if one.attend_state is not None and id(one) in raws and raws[id(one)].images], raws)
+    seen: Seen = {}
+    for one in live:
+        if one.outcome is None:
+            raw = raws[id(one)]
+            attended = followed.get(id(one)) or _guard(one, _start, trial, one, raw)
+            if attended is not None and (one.opening is not None or _guard(one, _begin_record, trial, one, attended, sink)):
+                seen[id(one)] = raw, attended
+    return seen
+
+
+def _observe(trial: Trial, one: Running) -> PolicyInput:
+    return one.env.observe(one.row.instruction) if _looks(trial, one) else PolicyInput({}, one.row.instruction, one.env.state())
+
+
+def _start(trial: Trial, one: Running, raw: PolicyInput) -> Attended:
+    """Ground at t = 0; a step without images, or without VAP, passes as it is."""
+    if trial.attender is None or not raw.images:
+        return Attended(raw.images, raw.text, (), {}, {}, ())
     with _timed(one.seconds, "attend"):
-        if trial.attender is None:
-            attended = Attended(raw.images, raw.text, (), {}, {}, ())
-        elif one.attend_state is None:
-            one.attend_state, attended = trial.attender.start(raw.images, raw.text, cameras={c.name: c for c in one.env.cameras()})
-        else:
-            one.attend_state, attended = trial.attender.step(one.attend_state, raw.images)
-    if one.opening is None:
-        one.opening = _open(trial, one, attended)
-        with _timed(one.seconds, "record"):
-            one.sink = sink(one.opening) if sink is not None else None
-    return raw, attended
+        one.attend_state, attended = trial.attender.start(raw.images, raw.text, cameras={c.name: c for c in one.env.cameras()})
+    return attended
+
+
+def _follow(trial: Trial, following: Sequence[Running], raws: Mapping[int, PolicyInput]) -> dict[int, Attended]:
+    """Track in one batch; when that fails, one by one, to find out whose fault it is."""
+    if trial.attender is None or not following:
+        return {}
+    start = time.perf_counter()
+    try:
+        done = trial.attender.steps([one.attend_state for one in following if one.attend_state], [raws[id(one)].images for one in following])
+    except Exception as error:
+        if _ends_the_run(error):
+            raise
+        if len(following) == 1:
+            following[0].outcome = following[0].judge.outcome("error", traceback.format_exc(limit=8))
+            return {}
+        return {name: attended for one in following for name, attended in _follow(trial, [one], raws).items()}
+    share, found = (time.perf_counter() - start) / len(following), {}
+    for one, (state, attended) in zip(following, done, strict=True):
+        one.attend_state = state
+        one.seconds["attend"] += share
+        found[id(one)] = attended
+    return found
+
+
+def _begin_record(trial: Trial, one: Running, attended: Attended, sink: Callable[[Opening], Sink] | None) -> bool:
+    one.opening = _open(trial, one, attended)
+    with _timed(one.seconds, "record"):
+        one.sink = sink(one.opening) if sink is not None else None
+    return True
 
 
 def _looks(trial: Trial, one: Running) -> bool:
@@ -145,7 +185,7 @@ def _open(trial: Trial, one: Running, attended: Attended) -> Opening:
     )  # fmt: skip
 
 
-def _plan(trial: Trial, live: Sequence[Running], seen: Mapping[int, tuple[PolicyInput, Attended]]) -> None:
+def _plan(trial: Trial, live: Sequence[Running], seen: Seen) -> None:
     """Ask the policy, in one batch, for every episode that goes on and whose chunk is used up."""
     asking = [one for one in live if not one.queue and not _over(one)]
     if not asking:
@@ -169,7 +209,7 @@ def _plan(trial: Trial, live: Sequence[Running], seen: Mapping[int, tuple[Policy
         one.seconds["policy"] += share
 
 
-def _ask(trial: Trial, asking: Sequence[Running], seen: Mapping[int, tuple[PolicyInput, Attended]]) -> tuple[list[Any], list[Chunk]]:
+def _ask(trial: Trial, asking: Sequence[Running], seen: Seen) -> tuple[list[Any], list[Chunk]]:
     policy, states = trial.policy, [one.policy_state for one in asking]
     if isinstance(policy, Insider):
         return policy.plan_inside(states, [one.env for one in asking])
