@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager, redirect_stderr
 from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,8 @@ from vap_core.values import EpisodeRow
 SUITE, TASK = "simpler-bridge", "put-camera"
 TOY = Toy(image=128, patch=16, width=128, layers=4, expert=96, chunk=4, denoise=10)
 BATCH = 4
+FOLLOW = {"step": "", "call": ", at calls"}
+"""rollout.Trial's: at every step is the work that lerobot's loop does; at the policy's calls is less, which that loop cannot leave out."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +37,8 @@ class Plan:
     """How much is measured: `episodes` of `steps` control steps, `repeats` times over. `workers` of ours, besides one; 0: in this process."""
 
     episodes: int = 8
-    steps: int = 15
-    repeats: int = 5
+    steps: int = 40
+    repeats: int = 4
     workers: int = 2
     toy: Toy = TOY
     loops: tuple[tuple[int, bool], ...] = ((1, False), (4, False), (4, True))
@@ -169,22 +172,24 @@ def _ours(plan: Plan, folder: Path, stack: ExitStack) -> Iterator[tuple[str, Cal
     if not plan.workers:
         _build(plan, folder)
         stack.callback(_close)
-        yield f"ours, batches of {BATCH}, in this process", lambda: _batch(plan.rows())
+        for follow in FOLLOW:
+            yield f"ours, batches of {BATCH}, in this process{FOLLOW[follow]}", partial(_batch, plan.rows(), follow)
         return
     for workers in sorted({1, plan.workers}):
         pool = stack.enter_context(ProcessPoolExecutor(workers, get_context("spawn"), _worker, (plan, folder)))
-        ready = [pool.submit(_batch, []) for _ in range(workers)]  # one for each: the first is still starting when the next comes
+        ready = [pool.submit(_batch, [], "step") for _ in range(workers)]  # one for each: the first is still starting when the next comes
         for one in ready:
             one.result()
-        yield f"ours, batches of {BATCH}, {workers} worker{'s'[: workers - 1]}", _spread(plan, pool)
+        for follow in FOLLOW:
+            yield f"ours, batches of {BATCH}, {workers} worker{'s'[: workers - 1]}{FOLLOW[follow]}", _spread(plan, pool, follow)
 
 
-def _spread(plan: Plan, pool: ProcessPoolExecutor) -> Callable[[], Mapping[str, float]]:
+def _spread(plan: Plan, pool: ProcessPoolExecutor, follow: str) -> Callable[[], Mapping[str, float]]:
     rows = plan.rows()
 
     def go() -> Mapping[str, float]:
         parts: dict[str, float] = {}
-        for found in pool.map(_batch, [rows[i : i + BATCH] for i in range(0, len(rows), BATCH)]):
+        for found in pool.map(partial(_batch, follow=follow), [rows[i : i + BATCH] for i in range(0, len(rows), BATCH)]):
             for part, seconds in found.items():
                 parts[part] = parts.get(part, 0.0) + seconds
         return parts
@@ -217,7 +222,7 @@ def _build(plan: Plan, folder: Path) -> None:
     attender = Attender(load_stack("embedded"), load_bank(folder / "memory"))
     scene = build(suite.robot, models)
     _trial = Trial("vap", scene, policy, attender, {name: extent_m(get(name)) for name in models}, suite.control, suite.sensor)
-    _batch([replace(row, max_steps=2) for row in plan.rows()[:BATCH]])
+    _batch([replace(row, max_steps=2) for row in plan.rows()[:BATCH]], "step")
 
 
 def _close() -> None:
@@ -226,11 +231,11 @@ def _close() -> None:
     _trial = None
 
 
-def _batch(rows: Sequence[EpisodeRow]) -> Mapping[str, float]:
+def _batch(rows: Sequence[EpisodeRow], follow: str) -> Mapping[str, float]:
     from vap_core.rollout import rollout
 
     start, parts = time.perf_counter(), dict.fromkeys(("environment", "attend", "policy", "record"), 0.0)
-    for episode in rollout(_trial, rows, batch=BATCH):
+    for episode in rollout(replace(_trial, follow=follow), rows, batch=BATCH):
         assert episode.outcome.status != "error", episode.outcome.detail
         assert episode.outcome.steps == episode.opening.row.max_steps
         for part, seconds in episode.seconds.items():
@@ -243,9 +248,13 @@ def report(plan: Plan, theirs: Sequence[Arm], ours: Sequence[Arm]) -> str:
     best, default = min(theirs, key=_typical), theirs[0] if len(theirs) == 1 else next((arm for arm in theirs if "videos" in arm.name), theirs[0])
     hour = [["", "episodes/hour", "seconds, every repeat"]]
     hour += [[arm.name, f"{3600 * plan.episodes / _typical(arm):.0f}", " ".join(f"{s:.1f}" for s in arm.seconds)] for arm in (*theirs, *ours)]
-    pairs = [(f"{ours[-1].name} / {default.name}", default, ours[-1]), (f"{ours[-1].name} / {best.name} (its best)", best, ours[-1])]
-    if len(ours) > 1:
-        pairs += [(f"{ours[0].name} / {best.name} (its best)", best, ours[0]), (f"scaling, 1 to {plan.workers} workers", ours[0], ours[-1])]
+    every, calls = ours[::2], ours[1::2]
+    pairs = [
+        (f"{fast.name} / {slow.name}{mark}", slow, fast) for fast in (every[-1], calls[-1]) for slow, mark in ((default, ""), (best, " (its best)"))
+    ]
+    if len(every) > 1:
+        pairs += [(f"{every[0].name} / {best.name} (its best)", best, every[0])]
+        pairs += [(f"scaling, 1 to {plan.workers} workers{end}", arms[0], arms[1]) for end, arms in zip(FOLLOW.values(), (every, calls), strict=True)]
     ratios = [["times as fast", "ratio", "95 % interval"], *([what, *_ratio(slow, fast)] for what, slow, fast in pairs)]
     steps = plan.episodes * plan.steps * plan.repeats
     names = list(dict.fromkeys(part for arm in (best, *ours) for part in arm.parts))
