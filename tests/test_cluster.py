@@ -18,6 +18,7 @@ STUDY = Study((("simpler-bridge", "pick-shaver"),), ("generic",), policy="random
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
+    cluster.spread("127.0.0.1")  # before ray is imported: everything stays on loopback
     from ray.cluster_utils import Cluster
 
     local = {"num_cpus": 1, "node_ip_address": "127.0.0.1", "object_store_memory": 2**28}

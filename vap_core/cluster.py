@@ -4,6 +4,7 @@ engine.run(study, folder, spread=cluster.spread("auto"))
 """
 
 import logging
+import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +23,9 @@ MEMORY = "memory"
 
 
 def spread(address: str) -> "Spread":
-    """`processes.results` over the cluster at `address` (host:port, or auto: the one that runs on this machine). Raises: BadCluster."""
+    """`processes.results` over the cluster at `address` (host:port). Raises: BadCluster."""
+    if address.startswith(("127.", "localhost")):  # else Ray asks at this machine's outward address, where a cluster on loopback is deaf
+        os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
     try:
         import ray  # noqa: F401
     except ImportError as error:
@@ -43,7 +46,9 @@ def _results(address: str, work: "Callable[[Job], Rows]", jobs: "Sequence[Job]",
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, runtime_env={"env_vars": {"OMP_NUM_THREADS": "1"}})
     except (ConnectionError, RuntimeError, ValueError) as error:
-        raise BadCluster(f"cluster: no Ray cluster answers at {address!r}; start one with `ray start --head --node-ip-address 127.0.0.1`.") from error
+        raise BadCluster(
+            f"cluster: no Ray cluster answers at {address!r}; start one with `ray start --head --node-ip-address 127.0.0.1 --port 6379`."
+        ) from error
     try:
         there = ray.remote(num_cpus=1, max_retries=0)(_away)
         bank, left = ray.put(_pack(home / MEMORY)), list(reversed(jobs))

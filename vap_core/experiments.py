@@ -13,7 +13,7 @@ from vap_core.attend import STACKS, Attender, Prompting, load_stack
 from vap_core.detect import Detector
 from vap_core.errors import BadStudy, one_of
 from vap_core.memory import load_bank, register, save
-from vap_core.policies import Insider, Policy
+from vap_core.policies import Insider, Policy, lerobot
 from vap_core.policies.expert import Expert
 from vap_core.policies.random import Random
 from vap_core.policies.scripted import Scripted
@@ -59,8 +59,8 @@ class Study:
         for method in self.methods:
             if method not in METHODS:
                 raise one_of("Study: method", method, METHODS)
-        if self.policy not in POLICIES:
-            raise one_of("Study: policy", self.policy, POLICIES)
+        if self.policy not in POLICIES and not lerobot.named(self.policy):
+            raise one_of("Study: policy (or a lerobot checkpoint's folder or hub id)", self.policy, POLICIES)
         if self.robots not in ("plain", "menagerie"):
             raise one_of("Study: robots", self.robots, ("plain", "menagerie"))
         if self.stack not in STACKS:
@@ -78,7 +78,8 @@ class Study:
     def configuration(self) -> dict[str, Any]:
         """What the results depend on, as JSON; weights, episode lists, and the world (robots, objects, looks, sensors) by their checksums."""
         listed = {suite: lists.digest(suite) for suite, _ in self.tasks if suite in suites.BENCHMARKS}
-        return {**asdict(self), "version": __version__, "weights": weights_sha256(), "lists": listed, "world": self._world()}
+        checkpoint = {} if self.policy in POLICIES else {"checkpoint": lerobot.fingerprint(self.policy)}
+        return {**asdict(self), **checkpoint, "version": __version__, "weights": weights_sha256(), "lists": listed, "world": self._world()}
 
     def _world(self) -> str:
         found = hashlib.sha256(repr((RIGS, VARIANTS)).encode())
@@ -141,7 +142,7 @@ def make_trial(study: Study, rows: Sequence[EpisodeRow], method: str, bank: Path
     return Trial(
         method,
         scene,
-        POLICIES[study.policy](study, scene, suite),
+        POLICIES[study.policy](study, scene, suite) if study.policy in POLICIES else lerobot.fitted(study.policy, scene, suite),
         attender,
         sizes,
         suite.control,

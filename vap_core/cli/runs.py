@@ -20,7 +20,9 @@ Methods = Annotated[
         "--methods", "--method", help="generic, vap, vap-associated, mask-only, rewrite-only; with commas, or repeated. Default: generic,vap."
     ),
 ]
-PolicyName = Annotated[str, typer.Option("--policy", help="scripted, or the bounds: expert (reads the simulator), random.")]
+PolicyName = Annotated[
+    str, typer.Option("--policy", help="scripted; a lerobot checkpoint, as folder or hub id; or the bounds: expert (reads the simulator), random.")
+]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the policy and the sensors; of a warm-up suite's episode list, too.")]
 Recorded = Annotated[Literal["all", "failures", "none"], typer.Option("--record", help="Which episodes become a .rrd file; errors always do.")]
 Retries = Annotated[int, typer.Option(min=0, help="How often an episode that ended in an error is tried again.")]
@@ -90,7 +92,7 @@ def evaluate(
     seeds: Annotated[int, typer.Option(min=1, help="Run every episode with so many seeds, from --seed on.")] = 1,
     workers: Workers = 2,
     engine: Annotated[Literal["local", "ray"], typer.Option(help="local: processes of this machine; ray: a Ray cluster.")] = "local",
-    address: Annotated[str, typer.Option(help="ray: host:port of the cluster, or auto for the one on this machine.")] = "auto",
+    address: Annotated[str, typer.Option(help="ray: host:port of the cluster.")] = "127.0.0.1:6379",
     record: Recorded = "none",
     retries: Retries = 1,
     follow: Annotated[
