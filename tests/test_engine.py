@@ -24,10 +24,12 @@ from vap_core.traces import read as read_traces
 
 STUDY = Study((("simpler-bridge", "pick-shaver"), ("simpler-bridge", "put-camera")), ("generic",), policy="random", episodes=3, seeds=2)
 ENV = {**os.environ, "OMP_NUM_THREADS": "1"}
+LONGEST_S = 15.0
+"""Longest life of a run that is to be killed."""
 
 
-def command(out: Path) -> list[str]:
-    asked = ["--suite", "simpler-bridge", "--suite", "tabletop", "--policy", "random", "--episodes", "12", "--seeds", "2"]
+def command(out: Path, episodes: int) -> list[str]:
+    asked = ["--suite", "simpler-bridge", "--suite", "tabletop", "--policy", "random", "--episodes", str(episodes), "--seeds", "2"]
     return [sys.executable, "-m", "vap_core", "eval", *asked, "--workers", "2", "--out", str(out)]
 
 
@@ -36,14 +38,13 @@ def told(out: Path) -> pd.DataFrame:
     return table[[name for name in table.columns if name != "peak_mb" and not name.startswith("seconds_")]]
 
 
-def kills(out: Path, times: int, rng: random.Random) -> tuple[int, list[int]]:
+def kills(out: Path, episodes: int, times: int, rng: random.Random) -> tuple[int, list[int]]:
     """Start the same command again and again and kill it after a while, whole or its parent alone; kills done and rows seen after each."""
     done, rows = 0, []
-    longest = 12.0
     while done < times:
-        with subprocess.Popen(command(out), env=ENV, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True) as run:
+        with subprocess.Popen(command(out, episodes), env=ENV, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True) as run:
             try:
-                run.wait(rng.uniform(0.5, longest))
+                run.wait(rng.uniform(0.5, LONGEST_S))
                 assert run.returncode == 0, f"status {run.returncode}"
                 break
             except subprocess.TimeoutExpired:
@@ -61,11 +62,11 @@ def kills(out: Path, times: int, rng: random.Random) -> tuple[int, list[int]]:
     return done, rows
 
 
-def check(folder: Path, times: int, seed: int = 0) -> str:
+def check(folder: Path, episodes: int, times: int, seed: int = 0) -> str:
     whole, torn = folder / "whole", folder / "torn"
-    done, rows = kills(torn, times, random.Random(seed))
+    done, rows = kills(torn, episodes, times, random.Random(seed))
     for out in (torn, whole):
-        subprocess.run(command(out), env=ENV, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, timeout=600)
+        subprocess.run(command(out, episodes), env=ENV, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, timeout=1800)
     pd.testing.assert_frame_equal(told(torn), told(whole))
     assert told(whole).key.is_unique
     assert rows == sorted(rows), "rows were lost"
@@ -77,7 +78,7 @@ def check(folder: Path, times: int, seed: int = 0) -> str:
 
 @pytest.mark.slow
 def test_killed_at_random_moments_it_ends_with_the_rows_of_an_undisturbed_run(tmp_path: Path) -> None:
-    check(tmp_path, 4)
+    check(tmp_path, episodes=2, times=3)
 
 
 def test_keys_tell_row_method_and_run_apart() -> None:
@@ -169,4 +170,4 @@ def test_an_episode_that_always_breaks_is_an_error_with_its_recording(tmp_path: 
 
 if __name__ == "__main__":
     with TemporaryDirectory() as folder:
-        print(check(Path(folder), int(sys.argv[1]) if len(sys.argv) > 1 else 20))
+        print(check(Path(folder), episodes=12, times=int(sys.argv[1]) if len(sys.argv) > 1 else 20))
