@@ -1,0 +1,171 @@
+"""Demonstrations of the scripted expert with generic objects: what a frozen policy has learned from before it meets a user (P 5.1).
+
+A stage is one compiled scene of one task: some generic objects of its category, seen in `EPISODES` episodes from new places. Stages are numbered;
+the same suite, seed and number give the same films. Personal objects and their look-alikes never appear (`only_generic` refuses them).
+"""
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from vap_core.errors import OutOfReach
+from vap_core.files import write_atomic
+from vap_core.policies.expert import Expert
+from vap_core.sim import objects
+from vap_core.sim.env import Env
+from vap_core.sim.objects import extent_m
+from vap_core.sim.scenes import Scene, build
+from vap_core.suites import VARIANTS, Judge, Suite, Task, simpler, suite, tabletop, vlabench
+from vap_core.suites.layout import Area, place, radius_m, scatter, turned
+from vap_core.training.scenes import TRAIN_INSTANCES, only_generic
+from vap_core.values import EpisodeRow, Mask, Placement, value
+
+SIDE, SEEN = 112, 224
+"""Pixels of a film, and of the views that it is made of: a policy sees views of SEEN pixels scaled down to SIDE."""
+EPISODES = 8
+"""Episodes of one stage."""
+JOLT, JOLT_M = 0.15, 0.012
+"""Share of steps in which the hand is knocked off its way, so that recovering is shown, too; and how far, metres (deviation)."""
+AREAS = {
+    "simpler-fractal": simpler.DESK,
+    "simpler-bridge": Area(0.18, 0.35, -0.095, 0.095),
+    "vlabench": vlabench.TABLE,
+    "tabletop": tabletop.TABLE,
+}
+"""Where the objects of each suite stand in training; a put on the tabletop keeps to tabletop.REACH."""
+GAPS_M = (0.05, 0.035, 0.02)
+"""Room between objects, tried in turn."""
+
+
+@value
+class Film:
+    """One successful episode. Frame t is what the cameras saw before action t; `ids` are 0 for the scene, 1 for the target, i + 1 for object i.
+
+    `places` are the objects' x, y, z in the world, metres; `names[0]` is the target, `goal` the index of its goal or -1.
+    """
+
+    images: UInt8[np.ndarray, "t c s s 3"]
+    ids: UInt8[np.ndarray, "t c s s"]
+    state: Float32[np.ndarray, "t p"]
+    action: Float32[np.ndarray, "t a"]
+    places: Float32[np.ndarray, "t n 3"]
+    names: tuple[str, ...]
+    task: str
+    goal: int
+
+
+def cast(task: Task, rng: np.random.Generator) -> list[str]:
+    """The target and its rivals, generic and of the task's category, then the task's goal if it has one. Half the rivals are look-alikes."""
+    first, rivals = int(rng.integers(TRAIN_INSTANCES)), int(rng.choice([1, 2, 3], p=[0.15, 0.7, 0.15]))
+    if rng.random() < 0.5:
+        models = [objects.generic(task.stem, first, int(twin)) for twin in rng.permutation(6)[: rivals + 1]]
+    else:
+        others = rng.choice([i for i in range(TRAIN_INSTANCES) if i != first], rivals, replace=False)
+        models = [objects.generic(task.stem, int(i)) for i in (first, *others)]
+    only_generic(models)
+    return [model.name for model in models] + ([task.goal] if task.goal else [])
+
+
+def row(known: Suite, task: Task, names: Sequence[str], number: int, variant: str, rng: np.random.Generator) -> EpisodeRow:
+    """An episode of the task with these objects in new places; any of the category may be its target. Raises: ValueError when they do not fit."""
+    things = [names[i] for i in rng.permutation(len(names) - bool(task.goal))]
+    goal = [task.goal] if task.goal else []
+    fixed = {task.goal: tabletop.BOWLS[int(rng.integers(2))]} if goal and known.name == "tabletop" else {}
+    area = tabletop.REACH if fixed else AREAS[known.name]
+    loose = [name for name in things + goal if name not in fixed]
+    for gap in GAPS_M:
+        try:
+            spots = scatter(
+                rng, area, [radius_m(name) for name in loose], [(spot, radius_m(name) / 2**0.5) for name, spot in fixed.items()], gap_m=gap
+            )
+            break
+        except ValueError:
+            if gap == GAPS_M[-1]:
+                raise
+    at = {**dict(zip(loose, spots, strict=True)), **fixed}
+    placed = [place(name, at[name], 0.0 if name == task.goal else turned(rng)) for name in things + goal]
+    order: tuple[Placement, ...] = (placed[0], *placed[len(things) :], *placed[1 : len(things)])
+    return replace(known.row(task, number, order, seed=number, variant=variant), instruction=task.instruction)
+
+
+def films(suite_name: str, seed: int, number: int) -> list[Film]:
+    """The successful episodes of one stage."""
+    known, rng = suite(suite_name), np.random.default_rng([71, seed, *suite_name.encode(), number])
+    task = known.tasks[number % len(known.tasks)]
+    variant = str(rng.choice(list(VARIANTS))) if suite_name == "simpler-fractal" else "base"
+    names = cast(task, rng)
+    found = []
+    with build(known.robot, names, look=VARIANTS[variant].look) as scene:
+        for i in range(EPISODES):
+            try:
+                shot = shoot(known, scene, row(known, task, names, number * EPISODES + i, variant, rng), rng)
+            except (OutOfReach, ValueError):  # no grasp from here, or no room: another place will do
+                continue
+            if shot is not None:
+                found.append(shot)
+    return found
+
+
+def shoot(known: Suite, scene: Scene, start: EpisodeRow, rng: np.random.Generator) -> Film | None:
+    """The expert's episode, filmed; None when it fails."""
+    env, expert = Env(scene, image_size=SEEN, cameras=known.cameras, control=known.control, sensor=known.sensor), Expert()
+    env.reset(start)
+    names = [placed.model for placed in start.placements]
+    judge, state = Judge.start(start, {name: extent_m(objects.get(name)) for name in names}, env.truth()), expert.start(rng)
+    frames = []
+    while not judge.done and judge.steps < start.max_steps:
+        truth = env.truth(masks=True)
+        (state,), (chunk,) = expert.plan_inside([state], [env])
+        seen = np.stack([cv2.resize(rgb, (SIDE, SIDE), interpolation=cv2.INTER_AREA) for rgb in env.observe().images.values()])
+        ids = np.stack([_ids(truth.masks[camera], names) for camera in known.cameras])
+        spots = np.array([truth.objects_world[name][:3] for name in names], np.float32)
+        frames.append((seen, ids, env.state(), chunk[0].astype(np.float32), spots))
+        env.step(_knocked(chunk[0], known, rng))
+        judge = judge.step(env.truth())
+    if not judge.outcome().success:
+        return None
+    views, masks, states, actions, places = (np.stack(part) for part in zip(*frames, strict=True))
+    return Film(views, masks, states, actions, places, tuple(names), start.task, names.index(start.goal) if start.goal else -1)
+
+
+def _ids(masks: Mapping[str, Mask], names: Sequence[str]) -> UInt8[np.ndarray, "s s"]:
+    out = np.zeros((SEEN, SEEN), np.uint8)
+    for i, name in enumerate(names):
+        out[masks[name]] = i + 1
+    return cv2.resize(out, (SIDE, SIDE), interpolation=cv2.INTER_NEAREST)
+
+
+def _knocked(action: Float32[np.ndarray, " a"], known: Suite, rng: np.random.Generator) -> Float32[np.ndarray, " a"]:
+    """The action, now and then with a jolt that the expert did not ask for and corrects next."""
+    if rng.random() > JOLT:
+        return action
+    jolt, out = rng.normal(size=len(action) - 1), action.copy()
+    out[: len(jolt)] += jolt * (JOLT_M if known.control == "ee" else 2 * JOLT_M)
+    if known.control == "ee":
+        out[3:6] = action[3:6]
+    return out
+
+
+PARTS = ("images", "ids", "state", "action", "places", "names", "task", "goal")
+
+
+def cached(folder: Path, suite_name: str, seed: int, number: int) -> list[Film]:
+    """The stage's films from `folder`, shot first if they are not there."""
+    path = folder / f"{suite_name}-{seed}-{number:05d}.npz"
+    if not path.exists():
+        made, buffer = films(suite_name, seed, number), io.BytesIO()
+        np.savez_compressed(buffer, n=len(made), **{f"{part}{i}": getattr(film, part) for i, film in enumerate(made) for part in PARTS})
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, buffer.getvalue())
+    with np.load(path) as held:
+        return [_film({part: held[f"{part}{i}"] for part in PARTS}) for i in range(int(held["n"]))]
+
+
+def _film(parts: dict[str, np.ndarray]) -> Film:
+    names, task, goal = tuple(map(str, parts["names"])), str(parts["task"]), int(parts["goal"])
+    return Film(parts["images"], parts["ids"], parts["state"], parts["action"], parts["places"], names, task, goal)
