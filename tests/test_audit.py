@@ -33,7 +33,7 @@ def test_tint_and_words_are_proven_to_arrive_and_nothing_changes(trial: Trial) -
     audited, plain = (list(rollout(t, ROWS, batch=2)) for t in (trial, replace(trial, audit=False)))
     for one, other in zip(audited, plain, strict=True):
         assert other.calls == ()
-        assert [(call.step, call.name) for call in one.calls] == [(step, name) for step in (0, 2) for name in ("front", TEXT)]
+        assert [(call.step, call.name) for call in one.calls] == [(step, name) for step in (0, 2) for name in (TEXT, "front")]
         assert all(call.changed and call.sound for call in one.calls)
         assert all(call.pixels > 30 for call in one.calls if call.name == "front")
         assert all((a.action == b.action).all() for a, b in zip(one.frames, other.frames, strict=True))
@@ -109,3 +109,12 @@ def test_followed_at_its_calls_a_policy_sees_as_much_and_the_steps_between_cost_
 def test_what_a_study_asks_for_reaches_its_trials(bank: Path, follow: Follow, audited: bool) -> None:
     made = make_trial(replace(STUDY, follow=follow, audit=audited), ROWS, "vap", bank)
     assert (made.follow, made.audit) == (follow, audited)
+
+
+def test_a_call_that_a_killed_run_made_too_counts_once(trial: Trial, tmp_path: Path) -> None:
+    episodes = list(rollout(trial, ROWS[:1]))
+    audit.write(tmp_path, episodes)
+    once = audit.verdict(tmp_path)
+    audit.write(tmp_path, episodes)
+    assert audit.verdict(tmp_path) == once
+    assert once.startswith("audit vap: 2 policy calls; 2 of 2 images tinted")

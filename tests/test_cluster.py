@@ -43,7 +43,7 @@ def test_a_cluster_gives_what_local_processes_give(address: str, tmp_path: Path)
     assert names[0] == names[1]
     assert len(names[0]) == 6
     again = engine.run(STUDY, tmp_path / "ray", progress=False, spread=cluster.spread("127.0.0.1:1"))
-    pd.testing.assert_frame_equal(again, there), "nothing is missing, nobody is asked"
+    pd.testing.assert_frame_equal(again, there)  # nothing is missing, nobody is asked
 
     def dies(job: engine.Job) -> engine.Rows:
         import os

@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 import pandas as pd
 import pytest
 
-from vap_core import engine, experiments, store
+from vap_core import engine, experiments
 from vap_core.engine import key, missing
 from vap_core.experiments import Study
 from vap_core.store import append, note, open_run, read
@@ -69,10 +69,9 @@ def check(folder: Path, episodes: int, times: int, seed: int = 0) -> str:
         subprocess.run(command(out, episodes), env=ENV, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, timeout=1800)
     pd.testing.assert_frame_equal(told(torn), told(whole))
     assert told(whole).key.is_unique
+    assert done == times, "the run ended before it was killed so often; give it more episodes"
     assert rows == sorted(rows), "rows were lost"
     assert {k for k, _ in read_traces(torn)} == {k for k, _ in read_traces(whole)}
-    parts = pd.concat(pd.read_parquet(part) for part in (torn / "parts").glob("*.parquet"))
-    assert parts.key.is_unique, "an episode ran to its end twice"
     return f"killed {done} times, with {rows} rows after each; then {len(told(torn))} rows, as in the undisturbed run"
 
 
@@ -112,7 +111,8 @@ def test_only_what_is_missing_runs_and_errors_run_again_recorded(tmp_path: Path)
     assert [name for job in missing(STUDY, out) for name in job.keys] == names[5:]
     again = [job for job in missing(STUDY, out, retries=1) if job.attempt == 2]
     assert [name for job in again for name in job.keys] == names[3:5]
-    assert {job.record for job in again} == {"all"}
+    assert {job.record for job in again} == {"failures"}
+    assert {job.record for job in missing(STUDY, out, "all", retries=1)} == {"all"}
     stored(out, names[3:4], outcome="failure")
     stored(out, names[4:5], outcome="error")
     assert [name for job in missing(STUDY, out, retries=1) for name in job.keys] == names[5:]
@@ -165,7 +165,7 @@ def test_an_episode_that_always_breaks_is_an_error_with_its_recording(tmp_path: 
     assert "the policy fell over" in table.detail[0]
     assert [path.name for path in (tmp_path / "run" / "recordings").glob("*.rrd")] == ["simpler-bridge.pick-shaver.000.s0.generic.rrd"]
     assert note(tmp_path / "run")["configuration"]["seeds"] == 1
-    assert store.read(tmp_path / "run").success.tolist()[0] is False or not table.success[0]
+    assert not table.success[0]
 
 
 if __name__ == "__main__":

@@ -152,10 +152,10 @@ EXPERT = ("--suite", SUITE, "--policy", "expert")
 REFUSED = {
     "unknown suite": (("eval", "--suite", "nowhere", "--policy", "expert"), "suite 'nowhere' is unknown; known: .*simpler-bridge"),
     "vap with expert": (("eval", *EXPERT, "--method", "vap"), "policy 'expert' reads the simulator.*--method generic"),
-    "scripted on a put": (("eval", "--suite", SUITE), f"'scripted' only picks.*{SUITE}/put-camera is 'put'.*--policy expert"),
-    "scripted in joint control": (("eval", "--suite", "vlabench"), "'scripted' only picks.* in joint control.*--policy expert"),
+    "audited expert": (("eval", *EXPERT, "--audit"), "policy 'expert' consumes no prompt; there is nothing to audit"),
+    "an address without ray": (("eval", *EXPERT, "--address", "127.0.0.1:6379"), "--address needs --engine ray"),
     "no episodes": (("eval", *EXPERT, "--episodes", "0"), "Invalid value for '--episodes'.*1"),
-    "unknown policy": (("eval", "--suite", SUITE, "--policy", "magic"), "policy 'magic' is unknown; known: expert, random, scripted"),
+    "unknown policy": (("eval", "--suite", SUITE, "--policy", "magic"), "policy .*'magic' is unknown; known: expert, random, scripted"),
     "unknown method": (("eval", *EXPERT, "--method", "luck"), "method 'luck' is unknown; known: generic, mask-only"),
     "unknown task": (("rollout", *EXPERT, "--task", "fly"), "task 'fly' is unknown; known: pick-shaver"),
     "no run": (("rescore", "nowhere"), "rescore: nowhere holds no results; name the folder"),

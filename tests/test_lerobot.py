@@ -1,6 +1,7 @@
 """lerobot both ways: its policies drive our rollouts, and VAP personalises its own loop. The real classes, tiny and random."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 
@@ -55,7 +56,7 @@ def run(policy, states, looks):
 def test_the_contract_of_a_policy(policies, name):
     policy = policies[name]
     assert isinstance(policy, Policy)
-    assert policy.label == f"{name.replace('ensemble', 'act')}:{name}"
+    assert re.fullmatch(rf"{name.replace('ensemble', 'act')}:{name}@[0-9a-f]{{8}}", policy.label)
     before = policy.sha256()
     states, chunks = policy.plan(begin(policy, 3), [look(i) for i in range(3)])
     assert len(states) == len(chunks) == 3
@@ -151,7 +152,7 @@ def test_a_smaller_picture_is_scaled_to_the_checkpoints_size(policies):
 
 def test_what_does_not_fit_is_one_line(policies):
     policy, seen = policies["act"], look(0)
-    wants = r"act:act wants observation.images.front, observation.state \(13\); there is observation.images."
+    wants = r"act:act@\w{8} wants observation.images.front, observation.state \(13\); there is observation.images."
     with pytest.raises(BadPolicy, match=wants + r"head, observation.state \(13\).*rename_map"):
         policy.plan(begin(policy, 1), [replace(seen, images={"head": seen.images["front"]})])
     with pytest.raises(BadPolicy, match=wants + r"front, observation.state \(14\)"):

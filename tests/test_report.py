@@ -30,8 +30,9 @@ GOLDEN = Path(__file__).parent / "golden_report.md"
 
 
 def run(
-    folder: Path, tasks: tuple[tuple[str, str], ...] = BRIDGE, episodes: int | None = 6, seed: int = 0, keep: float = 1.0, **changes: Any
-) -> Path:
+    folder: Path, tasks: tuple[tuple[str, str], ...] = BRIDGE, episodes: int | None = 6, seed: int = 0, keep: float = 1.0,
+    label: str = "scripted", **changes: Any,
+) -> Path:  # fmt: skip
     """A run whose outcomes follow from the episode alone: vap wins all but every third, generic every third; vap's last one is an error."""
     names = dict.fromkeys(suite for suite, _ in tasks)
     study = {"tasks": [list(task) for task in tasks], "methods": ["generic", "vap"], "episodes": episodes, "seed": seed, "policy": "scripted",
@@ -44,7 +45,7 @@ def run(
                 won, error = (i % 3 > 0) if method == "vap" else (i % 3 == 1), method == "vap" and i == len(listed) - 1
                 rows.append({
                     "suite": suite, "task": task, "split": row.split, "variant": row.variant, "episode": row.episode, "seed": seed, "method": method,
-                    "policy": "scripted", "outcome": "error" if error else "success" if won else "failure", "success": won and not error,
+                    "policy": label, "outcome": "error" if error else "success" if won else "failure", "success": won and not error,
                     "success_once": won, "held_steps": 0, "cmr": None if row.rule == "selected" else i % 3 > 0,
                     "wrong_object": method == "generic" and i == 0, "first_object_correct": won, "steps": 10, "margin": None,
                     "attempt": 2 if i == 2 else 1,
@@ -74,6 +75,12 @@ def test_a_tiny_run_is_reported_to_the_letter(tmp_path: Path) -> None:
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     report([folder], out)
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before, "the same run, the same files"
+
+
+def test_a_checkpoint_goes_by_its_label_not_by_its_path(tmp_path: Path) -> None:
+    lines = results(load([run(tmp_path / "run", policy="some/where/last", label="pi0:last@0123abcd")]))
+    assert set(lines.policy) == {"pi0:last@0123abcd"}
+    assert lines[lines.task != ALL_TASKS].n.tolist() == [6] * 4
 
 
 def test_the_golden_numbers_by_hand(tmp_path: Path) -> None:

@@ -2,10 +2,11 @@
 
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from vap_core.errors import BadOutput
-from vap_core.store import KEY, append, digest, open_run, read
+from vap_core.store import KEY, append, compact, digest, open_run, read
 
 ROW = {"suite": "s", "task": "t", "method": "vap", "seed": 0, "episode": 0, "attempt": 1, "success": True}
 
@@ -75,3 +76,19 @@ def test_a_run_of_an_older_version_is_said_to_be_one(tmp_path: Path) -> None:
     append(run, [{name: cell for name, cell in ROW.items() if name != "attempt"}])
     with pytest.raises(BadOutput, match="written by an older version"):
         read(run)
+
+
+def test_many_parts_become_one_and_nothing_is_lost(tmp_path: Path) -> None:
+    run = open_run(tmp_path / "run", {})
+    for i in range(4):
+        append(run, [{**ROW, "episode": i, "success": None if i else True, "outcome": "error"}])
+    append(run, [{**ROW, "episode": 1, "attempt": 2, "outcome": "success"}])
+    before, whole = read(run), sorted((run / "parts").glob("*.parquet"))
+    compact(run)
+    assert len(list((run / "parts").glob("*.parquet"))) == 1
+    pd.testing.assert_frame_equal(read(run), before)
+    held = pd.read_parquet(next((run / "parts").glob("*.parquet")))
+    assert sorted(zip(held.episode, held.attempt, strict=True)) == [(0, 1), (1, 1), (1, 2), (2, 1), (3, 1)]
+    append(run, [{**ROW, "episode": 0, "success": True, "outcome": "error"}])  # as if cut short before the old parts were gone
+    pd.testing.assert_frame_equal(read(run), before)
+    assert len(whole) == 5

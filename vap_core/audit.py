@@ -71,7 +71,8 @@ def read(folder: Path) -> "pd.DataFrame":
     parts = sorted((folder / "audit").glob("*.parquet"))
     if not parts:
         raise BadOutput(f"audit: {folder} was not audited; run it with --audit into another folder.")
-    return pd.concat([pd.read_parquet(part) for part in parts], ignore_index=True)
+    whole = pd.concat([pd.read_parquet(part) for part in parts], ignore_index=True)
+    return whole.drop_duplicates([*KEY, "step", "name"], ignore_index=True)  # a killed run may have made a call that its successor made again
 
 
 def verdict(folder: Path) -> str:
@@ -81,7 +82,8 @@ def verdict(folder: Path) -> str:
         images, words = of_method[of_method.name != TEXT], of_method[of_method.name == TEXT]
         wrong = of_method[~of_method.sound]
         lines.append(
-            f"audit {method}: {len(words)} policy calls; {images.changed.sum()} of {len(images)} images tinted ({images.pixels.sum()} pixels), "
+            f"audit {method}: {len(of_method.drop_duplicates([*KEY, 'step']))} policy calls; "
+            f"{images.changed.sum()} of {len(images)} images tinted ({images.pixels.sum()} pixels), "
             f"{words.changed.sum()} of {len(words)} texts rewritten; {len(wrong)} reached the policy otherwise"
         )
         lines += [

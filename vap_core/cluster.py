@@ -5,14 +5,17 @@ engine.run(study, folder, spread=cluster.spread("auto"))
 
 import logging
 import os
+import platform
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from vap_core.errors import BadCluster, WorkerDied
+from vap_core.errors import BadCluster, BadOutput, WorkerDied
 from vap_core.files import write_atomic
+from vap_core.store import digest as run_digest
+from vap_core.store import note
 
 if TYPE_CHECKING:
     from vap_core.engine import Job, Rows, Spread
@@ -38,6 +41,7 @@ def spread(address: str) -> "Spread":
 
 
 def _results(address: str, work: "Callable[[Job], Rows]", jobs: "Sequence[Job]", workers: int) -> "Iterator[tuple[Job, Rows]]":
+    """At most `workers` jobs at once; 0: as many as the cluster has CPUs."""
     import ray
 
     if not jobs:
@@ -47,21 +51,21 @@ def _results(address: str, work: "Callable[[Job], Rows]", jobs: "Sequence[Job]",
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, runtime_env={"env_vars": {"OMP_NUM_THREADS": "1"}})
     except (ConnectionError, RuntimeError, ValueError) as error:
         raise BadCluster(
-            f"cluster: no Ray cluster answers at {address!r}; start one with `ray start --head --node-ip-address 127.0.0.1 --port 6379`."
+            f"cluster: no Ray cluster answers at {address!r} ({str(error).strip().splitlines()[0]:.120}); "
+            "start one with `ray start --head --node-ip-address 127.0.0.1 --port 6379`."
         ) from error
     try:
         there = ray.remote(num_cpus=1, max_retries=0)(_away)
         bank, left = ray.put(_pack(home / MEMORY)), list(reversed(jobs))
+        digest, most = note(home)["digest"], workers or int(ray.cluster_resources().get("CPU", 1))
         running: dict[ray.ObjectRef, Job] = {}
         while left or running:
-            while left and len(running) < max(workers, int(ray.cluster_resources().get("CPU", 1))):
+            while left and len(running) < most:
                 job = left.pop()
-                running[there.remote(work, job, bank)] = job
+                running[there.remote(work, job, bank, digest)] = job
             (done,), _ = ray.wait(list(running), num_returns=1)
             rows, files = ray.get(done)
-            for name, data in files.items():
-                (home / name).parent.mkdir(parents=True, exist_ok=True)
-                write_atomic(home / name, data)
+            _keep(home, files)
             yield running.pop(done), rows
     except (
         ray.exceptions.WorkerCrashedError,
@@ -76,8 +80,19 @@ def _results(address: str, work: "Callable[[Job], Rows]", jobs: "Sequence[Job]",
         ray.shutdown()
 
 
-def _away(work: "Callable[[Job], Rows]", job: "Job", bank: Files) -> "tuple[Rows, Files]":
-    """Run one job on another machine, in a folder of its own."""
+def _keep(home: Path, files: Files) -> None:
+    try:
+        for name, data in files.items():
+            (home / name).parent.mkdir(parents=True, exist_ok=True)
+            write_atomic(home / name, data)
+    except OSError as error:
+        raise BadOutput(f"cluster: {home} cannot be written ({error.strerror}); make room and run the same command again.") from error
+
+
+def _away(work: "Callable[[Job], Rows]", job: "Job", bank: Files, digest: str) -> "tuple[Rows, Files]":
+    """Run one job on another machine, in a folder of its own. Raises: BadCluster when that machine has other weights, lists or code."""
+    if run_digest(job.study.configuration()) != digest:
+        raise BadCluster(f"cluster: {platform.node()} has another version, other weights or other episode lists; install the same on all machines.")
     with TemporaryDirectory() as scratch:
         here = Path(scratch)
         for name, data in bank.items():

@@ -1,7 +1,7 @@
 """Runs a study: batches of episodes per process, results appended as they come, only what is missing.
 
-Killed at any time, by Ctrl-C, a full disk or a lost machine, the same call goes on where it stopped. An episode that ends in an error, or whose
-worker dies, is tried again, and what it said is kept; its second try is recorded.
+Killed at any time, by Ctrl-C, a full disk or a lost machine, the same call goes on where it stopped. An episode that ends in an error is tried again,
+and recorded then; both tries are kept. What a worker was doing when it died runs again, unless nothing else ends in between.
 """
 
 import sys
@@ -13,7 +13,7 @@ from resource import RUSAGE_SELF, getrusage
 from typing import TYPE_CHECKING, Any, Literal
 
 from vap_core import audit, store, traces
-from vap_core.errors import WorkerDied
+from vap_core.errors import BadOutput, WorkerDied
 from vap_core.experiments import Study, make_trial, register_personal
 from vap_core.processes import results
 from vap_core.values import EpisodeRow, Opening
@@ -51,11 +51,14 @@ def run(
 ) -> "pd.DataFrame":
     """Run whatever of `study` is not in `folder` yet, and return the table of all its episodes.
 
-    Raises: BadOutput when the folder holds another run, is in use or cannot be written; WorkerDied when workers died more than `retries` times.
+    Raises: BadOutput when the folder holds another run, is in use or cannot be written; WorkerDied when workers died more often
+    than `retries` in a row.
     """
     store.open_run(folder, study.configuration())
     with store.locked(folder):
+        store.compact(folder)
         _run(study, folder, workers, record, retries, progress, spread)
+        store.compact(folder)
     return store.read(folder)
 
 
@@ -71,6 +74,7 @@ def _run(study: Study, folder: Path, workers: int, record: Record, retries: int,
             try:
                 for job, rows in spread(work, jobs, workers, "--workers"):
                     store.append(folder, rows)
+                    deaths = 0
                     if job.attempt == 1:
                         bar.update(len(rows))
                     ended.setdefault(job.method, Counter()).update(success=sum(row["success"] for row in rows), n=len(rows) * (job.attempt == 1))
@@ -103,7 +107,7 @@ def missing(study: Study, folder: Path, record: Record = "none", retries: int = 
             for (_, attempt), group in groups.items():
                 for first in range(0, len(group), BATCH):
                     rows, keys = zip(*group[first : first + BATCH], strict=True)
-                    yield Job(study, method, rows, keys, attempt, folder, record if attempt == 1 else "all")
+                    yield Job(study, method, rows, keys, attempt, folder, record if attempt == 1 or record == "all" else "failures")
 
 
 def key(row: EpisodeRow, method: str, run: str) -> str:
@@ -137,7 +141,10 @@ def _recording(folder: Path, opening: Opening) -> Path:
 def _recorders(folder: Path) -> Callable[[Opening], "Recorder"]:
     from vap_core.record import Recorder
 
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadOutput(f"engine: {folder} cannot be written ({error.strerror}); make room and run the same command again.") from error
 
     def begin(opening: Opening) -> "Recorder":
         path = _recording(folder, opening)

@@ -92,6 +92,19 @@ def append(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         raise BadOutput(f"append: {folder} cannot be written ({error.strerror}); make room and run the same command again.") from error
 
 
+def compact(folder: Path) -> None:
+    """Make one part of many, every attempt kept; cut short, it leaves rows that stand in two parts, which `read` takes for one. Raises: BadOutput."""
+    from pyarrow import concat_tables
+
+    parts = sorted((folder / "parts").glob("*.parquet"))
+    if len(parts) < 2:
+        return
+    rows = concat_tables([_part(part) for part in parts], promote_options="permissive").to_pandas()
+    append(folder, rows.drop_duplicates([name for name in (*KEY, "attempt") if name in rows]).to_dict("records"))
+    for part in parts:
+        part.unlink()
+
+
 def read(folder: Path) -> "pd.DataFrame":
     """Every finished episode, in the order of their keys; of one that ran twice the last attempt counts."""
     import pandas as pd

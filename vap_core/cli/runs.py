@@ -11,6 +11,7 @@ from vap_core.cli.options import StackName, Workers
 if TYPE_CHECKING:
     from vap_core.engine import Record
     from vap_core.experiments import Study
+    from vap_core.values import EpisodeRow
 
 app = typer.Typer()
 
@@ -24,7 +25,9 @@ PolicyName = Annotated[
     str, typer.Option("--policy", help="scripted; a lerobot checkpoint, as folder or hub id; or the bounds: expert (reads the simulator), random.")
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the policy and the sensors; of a warm-up suite's episode list, too.")]
-Recorded = Annotated[Literal["all", "failures", "none"], typer.Option("--record", help="Which episodes become a .rrd file; errors always do.")]
+Recorded = Annotated[
+    Literal["all", "failures", "none"], typer.Option("--record", help="Which episodes become a .rrd file; an error that is tried again does.")
+]
 Retries = Annotated[int, typer.Option(min=0, help="How often an episode that ended in an error is tried again.")]
 Meshes = Annotated[str, typer.Option("--robots", help="plain, or menagerie: MuJoCo Menagerie's meshes, downloaded or found in MENAGERIE_ROOT.")]
 
@@ -90,9 +93,9 @@ def evaluate(
     episodes: Annotated[int | None, typer.Option(min=1, help="Episodes per task, spread evenly over its list. Default the whole list.")] = None,
     seed: Seed = 0,
     seeds: Annotated[int, typer.Option(min=1, help="Run every episode with so many seeds, from --seed on.")] = 1,
-    workers: Workers = 2,
+    workers: Annotated[int | None, typer.Option(min=1, help="Jobs at once. Default 2 processes; on a cluster, its CPUs.")] = None,
     engine: Annotated[Literal["local", "ray"], typer.Option(help="local: processes of this machine; ray: a Ray cluster.")] = "local",
-    address: Annotated[str, typer.Option(help="ray: host:port of the cluster.")] = "127.0.0.1:6379",
+    address: Annotated[str | None, typer.Option(help="ray: host:port of the cluster. Default 127.0.0.1:6379.")] = None,
     record: Recorded = "none",
     retries: Retries = 1,
     follow: Annotated[
@@ -112,13 +115,16 @@ def evaluate(
     Example: python -m vap_core eval --suite all --engine ray --address 10.0.0.5:6379
     """
     from vap_core import suites as known
+    from vap_core.errors import BadStudy
 
     names = [name for each in suite for name in (known.BENCHMARKS if each == "all" else [each])]
     tasks = tuple((name, task.name) for name in dict.fromkeys(names) for task in known.suite(name).tasks)
     options = {"seeds": seeds, "images_every": images_every, "follow": follow, "audit": audit}
     study = _study(tasks, method, policy=policy, episodes=episodes, seed=seed, robots=robots, stack=stack, **options)
+    if address and engine != "ray":
+        raise BadStudy("eval: --address needs --engine ray.")
     folder = out or Path(f"data/runs/{Path(policy).name}-{'-'.join(dict.fromkeys(suite))}")
-    _run(study, folder, workers, record, retries, address if engine == "ray" else None)
+    _run(study, folder, workers, record, retries, (address or "127.0.0.1:6379") if engine == "ray" else None)
 
 
 @app.command()
@@ -171,7 +177,7 @@ def _study(tasks: tuple[tuple[str, str], ...], methods: list[str] | None, *, pol
     return Study(tasks, tuple(dict.fromkeys(asked)) or usual, policy=policy, **options)
 
 
-def _run(study: "Study", out: Path, workers: int, record: "Record", retries: int, address: str | None = None) -> None:
+def _run(study: "Study", out: Path, workers: int | None, record: "Record", retries: int, address: str | None = None) -> None:
     from vap_core.cluster import spread
     from vap_core.engine import run
     from vap_core.processes import results
@@ -179,8 +185,12 @@ def _run(study: "Study", out: Path, workers: int, record: "Record", retries: int
     from vap_core.statistics import foresight
 
     if len(study.methods) > 1:
-        print(foresight([row for suite, task in study.tasks for row in study.rows(suite, task)]), file=sys.stderr)
-    table = run(study, out, workers=workers, record=record, retries=retries, spread=spread(address) if address else results)
+        tracks: dict[str, list[EpisodeRow]] = {}
+        for row in (row for suite, task in study.tasks for row in study.rows(suite, task)):
+            tracks.setdefault(f"{row.suite} ({row.split})" if row.split else row.suite, []).append(row)
+        for track, rows in tracks.items():
+            print(f"{track}: {foresight(rows)}", file=sys.stderr)
+    table = run(study, out, workers=workers or (0 if address else 2), record=record, retries=retries, spread=spread(address) if address else results)
     print(conclude(study, table, out))
     if study.audit:
         from vap_core.audit import verdict

@@ -51,6 +51,9 @@ class LeRobotState:
     seed: int
     own: Any
 
+    def __deepcopy__(self, memo: Any) -> "LeRobotState":
+        return LeRobotState(self.seed, None if self.own is None else _own(self.own))
+
 
 class LeRobot:
     """A lerobot policy between its own processors; see `load`.
@@ -82,10 +85,7 @@ class LeRobot:
         seed = int(rng.integers(2**63 - 1))
         if self.batched:
             return LeRobotState(seed, None)
-        own = copy.copy(self.policy)
-        for name, held in vars(self.policy).items():
-            if not name.startswith("_") and not isinstance(held, torch.nn.Module) and name != "config":
-                setattr(own, name, copy.deepcopy(held))
+        own = _own(self.policy)
         own.reset()
         return LeRobotState(seed, own)
 
@@ -156,6 +156,15 @@ class LeRobot:
         return action.float().cpu().numpy()
 
 
+def _own(policy: "PreTrainedPolicy") -> "PreTrainedPolicy":
+    """A copy that shares weights and configuration, and keeps its own memory of what it saw."""
+    own = copy.copy(policy)
+    for name, held in vars(policy).items():
+        if not name.startswith("_") and not isinstance(held, torch.nn.Module) and name != "config":
+            setattr(own, name, copy.deepcopy(held))
+    return own
+
+
 def load(checkpoint: str | Path, device: str | None = None) -> LeRobot:
     """Load a checkpoint through lerobot's factory: a folder, or the `owner/name` of a model that was downloaded before.
 
@@ -183,7 +192,7 @@ def load(checkpoint: str | Path, device: str | None = None) -> LeRobot:
         ) from error
     with _silence():
         compare(policy, folder / WEIGHTS)
-    return LeRobot(policy, before, after, f"{config.type}:{folder.name if Path(checkpoint).is_dir() else checkpoint}")
+    return LeRobot(policy, before, after, f"{config.type}:{folder.name if Path(checkpoint).is_dir() else checkpoint}@{fingerprint(folder)[:8]}")
 
 
 def named(policy: str) -> bool:
@@ -220,8 +229,8 @@ def locate(checkpoint: str | Path) -> Path:
 def fingerprint(checkpoint: str | Path) -> str:
     """SHA-256 of everything in a checkpoint that decides what it does, without loading it."""
     found, folder = hashlib.sha256(), locate(checkpoint)
-    for file in sorted(file for file in folder.iterdir() if file.suffix in (".json", ".safetensors") and file.is_file()):
-        found.update(file.name.encode())
+    for file in sorted(file for file in folder.rglob("*") if file.is_file() and any(file.match(pattern) for pattern in WANTED_FILES)):
+        found.update(file.relative_to(folder).as_posix().encode())
         with file.open("rb") as stream:
             found.update(hashlib.file_digest(stream, "sha256").digest())
     return found.hexdigest()
@@ -262,7 +271,7 @@ def _refuse_code(folder: Path) -> None:
     for file in PIPELINES:
         try:
             steps = json.loads((folder / file).read_text())["steps"]
-            foreign = [step["class"] for step in steps if "registry_name" not in step]
+            foreign = [step.get("class", "vap_core.integrations.") for step in steps if step.get("registry_name") in (None, "vap_prompt")]
         except (ValueError, KeyError, TypeError) as error:
             raise BadPolicy(f"load: {folder / file} is no processor pipeline ({type(error).__name__}); save it again with lerobot 0.6.") from error
         for name in foreign:

@@ -86,9 +86,10 @@ class Scripted:
         return ScriptedState(float(rng.random()), None, "seek", 0.0)
 
     def plan(self, states: Sequence[ScriptedState], inputs: Sequence[PolicyInput]) -> tuple[list[ScriptedState], list[Chunk]]:
-        for i, seen in enumerate(inputs):
-            tell(i, self.eye.camera.name, seen.images[self.eye.camera.name])
+        for i, (state, seen) in enumerate(zip(states, inputs, strict=True)):
             tell(i, TEXT, seen.text)
+            if state.phase in LOOKING:
+                tell(i, self.eye.camera.name, seen.images[self.eye.camera.name])
         pairs = [self._plan(state, seen) for state, seen in zip(states, inputs, strict=True)]
         return [state for state, _ in pairs], [chunk for _, chunk in pairs]
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vap_core.errors import BadOutput
 from vap_core.files import write_atomic
 from vap_core.metrics import Score, rate, score, step_times
 from vap_core.plots import scores_figure, write_png
@@ -17,11 +18,14 @@ if TYPE_CHECKING:
 
 
 def conclude(study: "Study", table: "pd.DataFrame", folder: Path) -> str:
-    """Write `summary.json` and `figure.png` into the run's folder, and return the text to print."""
-    scores = ordered(score(table), study.tasks, study.methods)
-    write_atomic(folder / "summary.json", json.dumps([{**s.to_json(), "seed": study.seed} for s in scores], indent=1).encode())
-    figure = folder / "figure.png"
-    write_png(scores_figure(scores), figure)
+    """Write `summary.json` and `figure.png` into the run's folder, and return the text to print. Raises: BadOutput."""
+    scores, figure = ordered(score(table), study.tasks, study.methods), folder / "figure.png"
+    summary = json.dumps([{**s.to_json(), "seed": study.seed, "seeds": study.seeds} for s in scores], indent=1)
+    try:
+        write_atomic(folder / "summary.json", summary.encode())
+        write_png(scores_figure(scores), figure)
+    except OSError as error:
+        raise BadOutput(f"conclude: {folder} cannot be written ({error.strerror}); make room and run the same command again.") from error
     times = {(s.suite, s.method): step_times(table[(table["suite"] == s.suite) & (table["method"] == s.method)]) for s in scores}
     lines = [results_table(scores), *_overall(scores), "", "time per control step, ms by part:", times_table(times)]
     recordings = sorted((folder / "recordings").glob("*.rrd")) if (folder / "recordings").is_dir() else []

@@ -77,13 +77,13 @@ def _row(rgb: Rgb, whole: Rgb) -> np.ndarray:
     return np.concatenate(parts).astype(np.float16)
 
 
-def look(head: LookHead, rows: np.ndarray, pixels: np.ndarray) -> Float[Tensor, "n d"]:
-    """The head's answer to crops as `featurise` keeps them."""
+def look(head: LookHead, rows: np.ndarray, pixels: np.ndarray, rng: np.random.Generator | None = None) -> Float[Tensor, "n d"]:
+    """The head's answer to crops as `featurise` keeps them; with `rng`, restyled as in training."""
     flat, start, maps = torch.from_numpy(np.asarray(rows[:, : MAPS + COLOURS])).float(), 0, {}
     for tap in LOOK_TAPS:
         shape = (CHANNELS[tap], GRIDS[tap], GRIDS[tap])
         seen = flat[:, start : start + int(np.prod(shape))].unflatten(1, shape)
-        maps[tap] = _restyled(seen) if head.training else seen
+        maps[tap] = seen if rng is None else _restyled(rng, seen)
         start += int(np.prod(shape))
     return head(maps, normalise(torch.from_numpy(np.asarray(pixels))), flat[:, start:])
 
@@ -108,7 +108,7 @@ def fit_looks(stages: Sequence[Looks], run: Run) -> LookHead:
             frozen = np.concatenate([stages[s].rows[at] for s, at in where])
             pixels = np.concatenate([_turned(rng, stages[s].pixels[at]) for s, at in where])
             with halved():
-                rows = look(head, frozen, pixels)
+                rows = look(head, frozen, pixels, rng)
             rows = F.normalize(rows.float(), dim=1)
             who = torch.from_numpy(np.concatenate([stages[s].who[at] + 100 * s for s, at in where]))
             portrait = torch.from_numpy(np.concatenate([stages[s].portrait[at] for s, at in where])) > 0
@@ -130,14 +130,14 @@ def _pick(rng: np.random.Generator, looks: Looks) -> tuple[np.ndarray, np.ndarra
     return np.array(portraits, np.int64), np.array(views, np.int64)
 
 
-def _restyled(maps: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
+def _restyled(rng: np.random.Generator, maps: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
     """Some crops get the channels' means and deviations of a mixture with another crop; some channels of each are left out."""
-    n = len(maps)
+    n, channels = maps.shape[:2]
     mean, deviation = maps.mean((2, 3), keepdim=True), maps.std((2, 3), keepdim=True) + 1e-5
-    other, share = torch.randperm(n), torch.distributions.Beta(0.3, 0.3).sample((n, 1, 1, 1))
-    share = torch.where(torch.rand(n, 1, 1, 1) < MIXED, torch.ones_like(share), torch.maximum(share, 1 - share))
+    other, drawn = rng.permutation(n), rng.beta(0.3, 0.3, (n, 1, 1, 1))
+    share = torch.from_numpy(np.where(rng.random((n, 1, 1, 1)) < MIXED, np.maximum(drawn, 1 - drawn), 1.0)).float()
     styled = (maps - mean) / deviation * (share * deviation + (1 - share) * deviation[other]) + share * mean + (1 - share) * mean[other]
-    return styled * (torch.rand(n, maps.shape[1], 1, 1) > DROPPED) / (1 - DROPPED)
+    return styled * torch.from_numpy(rng.random((n, channels, 1, 1)) > DROPPED) / (1 - DROPPED)
 
 
 def _turned(rng: np.random.Generator, pixels: UInt8[np.ndarray, "n s s 3"]) -> UInt8[np.ndarray, "n s s 3"]:
