@@ -10,6 +10,7 @@ from hypothesis import settings
 from jaxtyping import install_import_hook
 
 install_import_hook("vap_core", "beartype.beartype")
+os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"  # read when ray is first imported: the tests' cluster stays on loopback
 
 settings.register_profile("vap", deadline=None, derandomize=True)
 settings.load_profile("vap")

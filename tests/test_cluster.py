@@ -1,7 +1,6 @@
 """A Ray cluster of two nodes on this machine gives the table, traces and recordings of local processes."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -11,6 +10,7 @@ from vap_core import cluster, engine
 from vap_core.errors import BadCluster, WorkerDied
 from vap_core.experiments import Study
 from vap_core.processes import results
+from vap_core.store import open_run
 from vap_core.traces import read as read_traces
 
 STUDY = Study((("simpler-bridge", "pick-shaver"),), ("generic",), policy="random", episodes=6)
@@ -18,7 +18,6 @@ STUDY = Study((("simpler-bridge", "pick-shaver"),), ("generic",), policy="random
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
-    cluster.spread("127.0.0.1")  # before ray is imported: everything stays on loopback
     from ray.cluster_utils import Cluster
 
     local = {"num_cpus": 1, "node_ip_address": "127.0.0.1", "object_store_memory": 2**28}
@@ -51,11 +50,14 @@ def test_a_cluster_gives_what_local_processes_give(address: str, tmp_path: Path)
         os.kill(os.getpid(), 9)
         return []
 
-    jobs = list(engine.missing(replace(STUDY, seeds=2), tmp_path / "ray"))[:1]
+    jobs = list(engine.missing(STUDY, open_run(tmp_path / "dies", STUDY.configuration())))[:1]
     with pytest.raises(WorkerDied, match="a worker of the cluster died"):
         list(cluster.spread(address)(dies, jobs, 1, ""))
+    strange = list(engine.missing(STUDY, open_run(tmp_path / "strange", {**STUDY.configuration(), "version": "9.9"})))[:1]
+    with pytest.raises(BadCluster, match=r"is not like this machine \(version 9.9 there"):
+        list(cluster.spread(address)(dies, strange, 1, ""))
 
 
 def test_no_cluster_is_said_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(BadCluster, match=r"no Ray cluster answers at 'nowhere'; start one with `ray start --head"):
+    with pytest.raises(BadCluster, match=r"no Ray cluster answers at 'nowhere' .*; start one with `ray start --head"):
         engine.run(STUDY, tmp_path / "run", progress=False, spread=cluster.spread("nowhere"))

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -119,6 +120,13 @@ def test_only_what_is_missing_runs_and_errors_run_again_recorded(tmp_path: Path)
     table = read(out).set_index("key")
     assert table.attempt[names[3:5]].tolist() == [2, 2]
     assert table.outcome[names[3:5]].tolist() == ["failure", "error"]
+
+
+def test_how_numbers_are_printed_changes_no_configuration() -> None:
+    before = STUDY.configuration()
+    with np.printoptions(precision=2, threshold=3):
+        assert STUDY.configuration() == before
+    assert replace(STUDY, tasks=STUDY.tasks[:1]).configuration()["world"] != before["world"]
 
 
 def test_another_configuration_shares_no_key(tmp_path: Path) -> None:

@@ -10,11 +10,11 @@ from vap_core.errors import BadOutput
 from vap_core.publish import publish
 from vap_core.store import KEY, append, open_run
 
-ROW = {"suite": "widowx-pick", "task": "pick-cup", "method": "generic", "policy": "scripted", "success": True}
+ROW = {"suite": "widowx-pick", "task": "pick-cup", "method": "generic", "policy": "scripted", "attempt": 1, "success": True}
 
 
 def run(folder: Path, seed: int, episodes: int = 2, done: int = 2) -> Path:
-    study = {"tasks": [["widowx-pick", "pick-cup"]], "methods": ["generic"], "episodes": episodes, "seed": seed}
+    study = {"tasks": [["widowx-pick", "pick-cup"]], "methods": ["generic"], "episodes": episodes, "seed": seed, "seeds": 1}
     open_run(folder, study)
     append(folder, [{**ROW, "episode": i, "seed": seed, "detail": "Traceback ...", "seconds_ik": 0.1} for i in range(done)])
     return folder
@@ -24,7 +24,7 @@ def test_published_results_keep_their_configurations_and_leave_tracebacks_behind
     target = tmp_path / "results" / "both.parquet"
     assert publish([run(tmp_path / "one", 0), run(tmp_path / "two", 1)], target) == 4
     table = pq.read_table(target)
-    assert set(table.column_names) == {*KEY, "policy", "seed", "success", "configuration"}
+    assert set(table.column_names) == {*KEY, "policy", "attempt", "success", "configuration"}
     notes = json.loads(table.schema.metadata[b"runs"])
     assert [note["configuration"]["seed"] for note in notes] == [0, 1]
     assert sorted(set(table["configuration"].to_pylist())) == sorted(note["digest"] for note in notes)

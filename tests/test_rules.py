@@ -258,7 +258,7 @@ def test_a_saved_episode_is_judged_alike(tmp_path):
     opening = Opening(PUT, "vap", "scripted", 5.0, (), "", "", {}, SIZES)
     traces.write(tmp_path, [Episode(opening, frames, judge.outcome(), {})])
     ((key, saved),) = traces.read(tmp_path)
-    assert key == ("s", "t", "vap", 0)
+    assert key == ("s", "t", "vap", 0, 0)
     again = rejudge(PUT, SIZES, saved)
     assert repr(again.outcome()) == repr(judge.outcome())
     for before, after in zip(steps, saved, strict=True):

@@ -10,12 +10,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from vap_core.errors import BadCluster, BadOutput, WorkerDied
 from vap_core.files import write_atomic
-from vap_core.store import digest as run_digest
-from vap_core.store import note
+from vap_core.store import differences, digest, note
 
 if TYPE_CHECKING:
     from vap_core.engine import Job, Rows, Spread
@@ -57,12 +56,12 @@ def _results(address: str, work: "Callable[[Job], Rows]", jobs: "Sequence[Job]",
     try:
         there = ray.remote(num_cpus=1, max_retries=0)(_away)
         bank, left = ray.put(_pack(home / MEMORY)), list(reversed(jobs))
-        digest, most = note(home)["digest"], workers or int(ray.cluster_resources().get("CPU", 1))
+        about, most = note(home), workers or int(ray.cluster_resources().get("CPU", 1))
         running: dict[ray.ObjectRef, Job] = {}
         while left or running:
             while left and len(running) < most:
                 job = left.pop()
-                running[there.remote(work, job, bank, digest)] = job
+                running[there.remote(work, job, bank, about)] = job
             (done,), _ = ray.wait(list(running), num_returns=1)
             rows, files = ray.get(done)
             _keep(home, files)
@@ -89,10 +88,11 @@ def _keep(home: Path, files: Files) -> None:
         raise BadOutput(f"cluster: {home} cannot be written ({error.strerror}); make room and run the same command again.") from error
 
 
-def _away(work: "Callable[[Job], Rows]", job: "Job", bank: Files, digest: str) -> "tuple[Rows, Files]":
+def _away(work: "Callable[[Job], Rows]", job: "Job", bank: Files, run: dict[str, Any]) -> "tuple[Rows, Files]":
     """Run one job on another machine, in a folder of its own. Raises: BadCluster when that machine has other weights, lists or code."""
-    if run_digest(job.study.configuration()) != digest:
-        raise BadCluster(f"cluster: {platform.node()} has another version, other weights or other episode lists; install the same on all machines.")
+    mine = job.study.configuration()
+    if digest(mine) != run["digest"]:
+        raise BadCluster(f"cluster: {platform.node()} is not like this machine ({differences(run, mine)}); install the same version on all.")
     with TemporaryDirectory() as scratch:
         here = Path(scratch)
         for name, data in bank.items():

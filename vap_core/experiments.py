@@ -1,11 +1,14 @@
 """Every named study: which tasks, methods and policy, how many episodes; and the parts that one batch of it needs."""
 
 import hashlib
+import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from vap_core import __version__, suites
 from vap_core.associate import PAIRINGS
@@ -82,12 +85,27 @@ class Study:
         return {**asdict(self), **checkpoint, "version": __version__, "weights": weights_sha256(), "lists": listed, "world": self._world()}
 
     def _world(self) -> str:
-        found = hashlib.sha256(repr((RIGS, VARIANTS)).encode())
+        found = hashlib.sha256(_exactly((RIGS, VARIANTS)))
         for suite, task in self.tasks:
             known = suites.suite(suite)
             arm, placed = robots.get(known.robot), {place.model for row in self.rows(suite, task) for place in row.placements}
-            found.update(repr((known, replace(arm, xml=Path(arm.xml.name)), [get(name) for name in sorted(placed)])).encode() + arm.xml.read_bytes())
+            found.update(_exactly((known, arm, [get(name) for name in sorted(placed)])) + arm.xml.read_bytes())
         return found.hexdigest()[:16]
+
+
+def _exactly(thing: Any) -> bytes:
+    """Every number in it, whatever numpy's print options are; of files their names."""
+
+    def plain(part: Any) -> Any:
+        if is_dataclass(part) and not isinstance(part, type):
+            return {"kind": type(part).__name__, **{each.name: getattr(part, each.name) for each in fields(part)}}
+        if isinstance(part, np.ndarray | np.generic):
+            return part.tolist()
+        if isinstance(part, Path):
+            return part.name
+        raise TypeError(f"Study: {type(part).__name__} cannot be hashed; give it fields, or add its kind here.")
+
+    return json.dumps(thing, default=plain, sort_keys=True).encode()
 
 
 def register_personal(study: Study, bank: Path) -> None:

@@ -24,7 +24,7 @@ def rescore(folder: Path) -> str:
     if table.empty:
         raise BadOutput(f"rescore: {folder} holds no results; name the folder that eval or rollout wrote.")
     study = note(folder)["configuration"]
-    if not {"lists", "tasks", "methods", "episodes", "seed"} <= study.keys():
+    if not {"lists", "tasks", "methods", "episodes", "seed", "seeds"} <= study.keys():
         raise BadOutput(f"rescore: {folder} was written by an older version, without the hashes of its episode lists; run it again.")
     for suite, digest in study["lists"].items():
         if suites.lists.digest(suite) != digest:

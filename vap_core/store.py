@@ -38,7 +38,7 @@ def open_run(folder: Path, configuration: Mapping[str, Any]) -> Path:
     if path.exists():
         held = note(folder)
         if held["digest"] != digest(configuration):
-            raise BadOutput(f"open_run: {folder} holds another run ({_differences(held, configuration)}); choose another folder with --out.")
+            raise BadOutput(f"open_run: {folder} holds another run ({differences(held, configuration)}); choose another folder with --out.")
         return folder
     if folder.exists() and any(not path.name.startswith(".run.json") for path in folder.iterdir()):
         raise BadOutput(f"open_run: {folder} is not empty and holds no run; choose another folder with --out.")
@@ -50,7 +50,7 @@ def open_run(folder: Path, configuration: Mapping[str, Any]) -> Path:
     return folder
 
 
-def _differences(held: Mapping[str, Any], configuration: Mapping[str, Any]) -> str:
+def differences(held: Mapping[str, Any], configuration: Mapping[str, Any]) -> str:
     """What a run was asked for and what is asked for now, where they differ."""
     was, now = held["configuration"], json.loads(json.dumps(dict(configuration)))
     odd = [name for name in {**was, **now} if was.get(name) != now.get(name)]

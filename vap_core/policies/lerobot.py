@@ -173,6 +173,7 @@ def load(checkpoint: str | Path, device: str | None = None) -> LeRobot:
     from lerobot import policies
     from lerobot.configs import PreTrainedConfig
 
+    import_module("vap_core.policies.mini_pi0.processor_mini_pi0")  # registers our own type and its step
     folder = locate(checkpoint)
     _refuse_code(folder)
     try:

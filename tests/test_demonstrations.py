@@ -1,0 +1,106 @@
+"""Demonstrations show generic objects only, the same ones every time; a command says what its picture shows."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vap_core.prompt import PALETTE, looks_like
+from vap_core.sim import objects
+from vap_core.suites import BENCHMARKS, suite
+from vap_core.training import demonstrations
+from vap_core.training.commands import command, near, painted, rough, say, tinted, vocabulary
+from vap_core.training.demonstrations import PARTS, SIDE, Film, cached, cast
+
+SUITE = "simpler-bridge"
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Film]]:
+    folder = tmp_path_factory.mktemp("films")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demonstrations, "EPISODES", 2)
+        return folder, cached(folder, SUITE, 0, 1)
+
+
+def test_a_film_shows_a_generic_target_from_first_to_last_action(stage: tuple[Path, list[Film]]) -> None:
+    _, films = stage
+    assert films
+    for film in films:
+        steps = len(film.action)
+        assert film.images.shape == (steps, 1, SIDE, SIDE, 3)
+        assert film.action.shape[1] == 7
+        assert film.names[film.goal] == suite(SUITE).task(film.task).goal
+        assert {objects.get(name).split for i, name in enumerate(film.names) if i != film.goal} == {"generic"}
+        assert (film.ids[0] == 1).sum() > 30, "the target is in view"
+        assert np.linalg.norm(film.places[-1, 0] - film.places[0, 0]) > 0.03, "and is moved"
+        still = np.linalg.norm(film.places[-1, 1:] - film.places[0, 1:], axis=1)
+        assert np.delete(still, film.goal - 1).max() < 0.03, "its rivals are not"
+
+
+def test_films_are_kept_and_come_again_alike(stage: tuple[Path, list[Film]], monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, films = stage
+    (path,) = folder.glob("*.npz")
+    before = path.stat().st_mtime_ns
+    kept = cached(folder, SUITE, 0, 1)
+    assert path.stat().st_mtime_ns == before
+    monkeypatch.setattr(demonstrations, "EPISODES", 2)
+    for one, other, again in zip(films, kept, demonstrations.films(SUITE, 0, 1), strict=True):
+        for part in PARTS:
+            assert np.array_equal(getattr(one, part), getattr(other, part))
+            assert np.array_equal(getattr(one, part), getattr(again, part))
+
+
+def test_casts_are_generic_and_of_one_category() -> None:
+    for known in BENCHMARKS.values():
+        for task in known.tasks:
+            for i in range(6):
+                names = cast(task, np.random.default_rng(i))
+                things = names[: len(names) - bool(task.goal)]
+                assert {objects.get(name).category for name in things} == {task.category}
+                assert {objects.get(name).split for name in things} == {"generic"}
+                assert len(set(names)) == len(names) > 1
+
+
+def test_a_command_says_what_its_picture_shows(stage: tuple[Path, list[Film]]) -> None:
+    _, films = stage
+    words, kinds = set(vocabulary()), {"coloured": 0, "plain": 0}
+    for seed in range(120):
+        film, rng = films[seed % len(films)], np.random.default_rng(seed)
+        t = int(rng.integers(len(film.action)))
+        made = command(film, t, SUITE, rng)
+        assert set(re.findall(r"[\w']+", made.text)) <= words
+        named = [colour for colour in PALETTE if f"the {colour.name} " in made.text]
+        mask = film.ids[t, 0] == 1
+        if named:
+            kinds["coloured"] += 1
+            if mask.sum() > 60:
+                assert looks_like(made.images[0][mask], named[0]).mean() > 0.15, made.text
+        else:
+            kinds["plain"] += 1
+            assert near(film, t, SUITE, [i for i in range(1, len(film.names)) if i != film.goal])
+    assert min(kinds.values()) > 5
+
+
+def test_my_is_said_of_a_generic_thing_too_and_once() -> None:
+    rng = np.random.default_rng(0)
+    said = {say("put my camera on the plate", None, rng) for _ in range(40)}
+    assert said == {f"put {word} camera on the plate" for word in ("my", "the", "a")}
+    assert say("select my cup", PALETTE[1], rng) == "select the blue cup"
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 2**16), st.floats(0.1, 1.0))
+def test_only_what_is_masked_changes_colour(seed: int, share: float) -> None:
+    rng = np.random.default_rng(seed)
+    images, masks = rng.integers(0, 256, (2, 12, 12, 3), np.uint8), rng.random((2, 12, 12)) < 0.3
+    for change in (tinted, painted):
+        out = change(images, masks, PALETTE[seed % len(PALETTE)], share)
+        assert (out[~masks] == images[~masks]).all()
+    exact = (1 - share) * images[masks].astype(np.float32) + share * np.asarray(PALETTE[0].rgb, np.float32)
+    assert np.abs(tinted(images, masks, PALETTE[0], share)[masks] - exact).max() <= 0.51
+    empty = np.zeros((12, 12), bool)
+    assert not rough(empty, rng).any()

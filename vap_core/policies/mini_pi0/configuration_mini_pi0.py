@@ -1,0 +1,41 @@
+"""The sizes of a mini-pi0, in its checkpoint's config.json rather than in the source."""
+
+from dataclasses import dataclass
+
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies.pi0.configuration_pi0 import PI0Config
+
+HEADS = 8
+"""Attention heads of decoder and expert; PI0's attention takes no other number."""
+
+
+@PreTrainedConfig.register_subclass("mini_pi0")
+@dataclass
+class MiniPI0Config(PI0Config):
+    """PI0's options, and numbers where it has variants: a SigLIP tower and a Gemma decoder (together a small PaliGemma), and the action expert.
+
+    Widths are features, `patch` pixels. Decoder and expert have the same depth and the same `head_dim`.
+    """
+
+    image_resolution: tuple[int, int] = (112, 112)
+    patch: int = 16
+    vision_width: int = 128
+    vision_depth: int = 4
+    width: int = 128
+    depth: int = 4
+    head_dim: int = 16
+    expert_width: int = 96
+    chunk_size: int = 4
+    n_action_steps: int = 4
+    tokenizer_max_length: int = 20
+    num_inference_steps: int = 5
+    words: tuple[str, ...] = ()
+    """The vocabulary: token i is word i; see processor_mini_pi0."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.words = tuple(self.words)
+        if self.image_resolution[0] % self.patch or self.vision_width % HEADS:
+            raise ValueError(
+                f"MiniPI0Config: {self.image_resolution} pixels do not part into patches of {self.patch}, or {self.vision_width} features by {HEADS}"
+            )

@@ -1,0 +1,87 @@
+"""PI0's model with small towers. Masks, prefix and suffix, flow matching and sampling are lerobot's, unchanged."""
+
+from typing import Any, cast
+
+from lerobot.policies.pi0.modeling_pi0 import PaliGemmaWithExpertModel, PI0Policy, PI0Pytorch
+from lerobot.policies.pi_gemma import PaliGemmaForConditionalGenerationWithPiGemma, PiGemmaForCausalLM
+from lerobot.policies.pretrained import PreTrainedPolicy
+from torch import nn
+from transformers import GemmaConfig, PaliGemmaConfig
+
+from vap_core.policies.mini_pi0.configuration_mini_pi0 import HEADS, MiniPI0Config
+
+
+class MiniTowers(PaliGemmaWithExpertModel):
+    """A small PaliGemma, whose prefix the action expert attends to."""
+
+    def __init__(self, config: MiniPI0Config) -> None:
+        nn.Module.__init__(self)
+        self.freeze_vision_encoder, self.train_expert_only = config.freeze_vision_encoder, config.train_expert_only
+        self.paligemma = PaliGemmaForConditionalGenerationWithPiGemma(config=vlm_config(config))
+        self.gemma_expert = PiGemmaForCausalLM(config=_gemma(config, config.expert_width))
+        self.gemma_expert.model.embed_tokens = None
+        self.to_bfloat16_for_selected_params(cast(Any, config.dtype))
+        self._set_requires_grad()
+
+
+class MiniPI0Pytorch(PI0Pytorch):
+    """PI0's flow-matching model around `MiniTowers`."""
+
+    def __init__(self, config: MiniPI0Config, rtc_processor: Any = None) -> None:
+        nn.Module.__init__(self)
+        wide = config.expert_width
+        self.config, self.rtc_processor = config, rtc_processor
+        self.paligemma_with_expert = MiniTowers(config)
+        self.action_in_proj, self.action_out_proj = nn.Linear(config.max_action_dim, wide), nn.Linear(wide, config.max_action_dim)
+        self.state_proj = nn.Linear(config.max_state_dim, wide)
+        self.action_time_mlp_in, self.action_time_mlp_out = nn.Linear(2 * wide, wide), nn.Linear(wide, wide)
+        self.gradient_checkpointing_enabled = False
+
+
+class MiniPI0Policy(PI0Policy):
+    """The policy. Unlike PI0's, a load that does not match raises."""
+
+    config_class = MiniPI0Config
+    name = "mini_pi0"
+
+    def __init__(self, config: MiniPI0Config, **kwargs: Any) -> None:
+        PreTrainedPolicy.__init__(self, config)
+        config.validate_features()
+        self.config = config
+        self.init_rtc_processor()
+        self.model = MiniPI0Pytorch(config, self.rtc_processor)
+        self.model.to(config.device)
+        self.reset()
+
+    @classmethod
+    def from_pretrained(cls, pretrained_name_or_path: Any, **kwargs: Any) -> "MiniPI0Policy":
+        """The checkpoint, tensor for tensor. Raises: RuntimeError when names or shapes differ."""
+        return cast(
+            MiniPI0Policy,
+            PreTrainedPolicy.from_pretrained.__func__(cls, pretrained_name_or_path, **{**kwargs, "strict": True}),
+        )
+
+
+def vlm_config(config: MiniPI0Config) -> Any:
+    """Of the small PaliGemma: its language head answers questions in the same words that instruct the policy."""
+    tower = {
+        "model_type": "siglip_vision_model", "image_size": config.image_resolution[0], "patch_size": config.patch, "hidden_size": config.vision_width,
+        "intermediate_size": 2 * config.vision_width, "num_hidden_layers": config.vision_depth, "num_attention_heads": HEADS,
+        "projection_dim": config.width, "projector_hidden_act": "gelu_fast", "vision_use_head": False,
+    }  # fmt: skip
+    parts: dict[str, Any] = {"text_config": _gemma(config, config.width).to_dict(), "vision_config": tower, "projection_dim": config.width}
+    made: Any = PaliGemmaConfig(**parts)
+    made.image_token_index = made._vocab_size = len(config.words)
+    made.text_config.use_adarms, made.text_config.adarms_cond_dim = False, None
+    return made
+
+
+def _gemma(config: MiniPI0Config, width: int) -> Any:
+    sizes: dict[str, Any] = {
+        "vocab_size": len(config.words), "hidden_size": width, "intermediate_size": 2 * width, "num_hidden_layers": config.depth,
+        "num_attention_heads": HEADS, "num_key_value_heads": 1, "head_dim": config.head_dim,
+        "hidden_activation": "gelu_pytorch_tanh", "pad_token_id": 0,
+    }  # fmt: skip
+    made: Any = GemmaConfig(**sizes)
+    made.use_adarms, made.adarms_cond_dim = False, None
+    return made
