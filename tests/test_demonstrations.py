@@ -5,13 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from safetensors.torch import load_file
 
+from vap_core.policies.lerobot import load
+from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
 from vap_core.prompt import PALETTE, looks_like
 from vap_core.sim import objects
 from vap_core.suites import BENCHMARKS, suite
-from vap_core.training import demonstrations
+from vap_core.training import demonstrations, policy
 from vap_core.training.commands import command, near, painted, rough, say, tinted, vocabulary
 from vap_core.training.demonstrations import PARTS, SIDE, Film, cached, cast
 
@@ -104,3 +108,48 @@ def test_only_what_is_masked_changes_colour(seed: int, share: float) -> None:
     assert np.abs(tinted(images, masks, PALETTE[0], share)[masks] - exact).max() <= 0.51
     empty = np.zeros((12, 12), bool)
     assert not rough(empty, rng).any()
+
+
+def test_a_training_that_was_stopped_ends_like_one_that_was_not(
+    stage: tuple[Path, list[Film]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, _ = stage
+    monkeypatch.setattr(demonstrations, "EPISODES", 2)
+    monkeypatch.setattr(policy, "HELD_OUT", 2)
+    recipe = policy.Recipe(SUITE, stages=2, steps=3, batch=3, draws=2, width=32, depth=2, vision_width=32, vision_depth=1, expert_width=32)
+    whole = policy.train(recipe, tmp_path / "whole", cache=folder)
+    first = policy.train(recipe, tmp_path / "torn", cache=folder, minutes=0.0)
+    assert [line["step"] for line in first["log"]] == [1]
+    policy.train(recipe, tmp_path / "torn", cache=folder)
+    one, other = (load_file(tmp_path / name / "model.safetensors") for name in ("whole", "torn"))
+    assert one.keys() == other.keys()
+    assert all(torch.equal(one[name], other[name]) for name in one)
+    assert set(whole["held_out"]) == {"flow", "heat", "where", "hit"}
+    trained = load(tmp_path / "whole")
+    assert trained.execute == 4
+    assert (trained.action_size, set(trained.wanted)) == (7, {"observation.images.front", "observation.state"})
+
+
+def test_one_batch_can_be_learned_by_heart(stage: tuple[Path, list[Film]]) -> None:
+    """Flow, patches and place all fall when the same few frames are seen again and again."""
+    _, films = stage
+    recipe = policy.Recipe(SUITE, batch=8, draws=2, width=32, depth=2, vision_width=32, vision_depth=1, expert_width=32)
+    stats = policy.statistics(films)
+    config = policy.configuration(recipe, films[0].state.shape[1], films[0].action.shape[1])
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model, asked = MiniPI0Policy(config), policy.Questions(recipe.width)
+    batch = policy.collate(recipe, films, stats, np.random.default_rng(0), config)
+    optimiser = torch.optim.AdamW([*model.parameters(), *asked.parameters()], 3e-3)
+    told = []
+    for step in range(60):
+        loss, parts = policy.losses(model, asked, batch, 2, torch.Generator().manual_seed(step))
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        told.append(parts)
+    early, late = ({name: np.mean([one[name] for one in part]) for name in told[0]} for part in (told[:5], told[-5:]))
+    assert late["flow"] < 0.8 * early["flow"]
+    assert late["heat"] < 0.8 * early["heat"]
+    assert late["where"] < 0.5 * early["where"]
+    assert late["hit"] > early["hit"]

@@ -146,3 +146,29 @@ def perception(
     from vap_core.training.perception import train
 
     print(json.dumps(train(out, scenes=scenes, seed=seed, minutes=minutes), indent=1))
+
+
+@train_app.command()
+def policy(
+    suite: Annotated[str, typer.Option(help="The benchmark whose robot, cameras and kinds of task it learns.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the checkpoint; a training found there goes on. Default data/runs/mini-pi0-SUITE.")
+    ] = None,
+    stages: Annotated[int, typer.Option(min=2, help="Scenes with generic objects, of about eight demonstrations each; filmed first.")] = 400,
+    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps.")] = 12_000,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    minutes: Annotated[float | None, typer.Option(help="Stop after this long; the same command goes on.")] = None,
+) -> None:
+    """Train a mini-pi0, the small frozen policy, on demonstrations with generic objects. Interrupted, the same command goes on.
+
+    Example: python -m vap_core train policy --suite simpler-bridge --stages 40 --steps 500 --out data/runs/small-policy
+    """
+    from vap_core.errors import one_of
+    from vap_core.suites import BENCHMARKS
+    from vap_core.training.policy import Recipe, train
+
+    if suite not in BENCHMARKS:
+        raise one_of("train policy: suite", suite, BENCHMARKS)
+    folder = out or Path(f"data/runs/mini-pi0-{suite}")
+    print(json.dumps(train(Recipe(suite, stages, steps, seed=seed), folder, minutes=minutes)["held_out"], indent=1))
+    print(f"next: python -m vap_core eval --suite {suite} --policy {folder} --methods generic,vap --episodes 4 --out {folder}-eval")

@@ -1,0 +1,272 @@
+"""Train a mini-pi0 on filmed demonstrations (P 5.1): flow matching as in pi0, and, while training only, questions about what is meant.
+
+    python -m vap_core train policy --suite simpler-bridge --stages 400 --out data/runs/mini-pi0-bridge
+
+The penultimate decoder layer is asked, besides, which image patches show the object that is meant and where it stands: in pi0 the last layer
+gives its keys and values alone, so that this is where looking is learned. The answers' heads are not part of the policy.
+"""
+
+import copy
+import json
+import os
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812
+
+from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
+from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
+from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
+from vap_core.suites import suite
+from vap_core.training.commands import command, vocabulary
+from vap_core.training.demonstrations import SIDE, Film, cached
+
+CACHE = Path(__file__).resolve().parents[2] / "data" / "cache" / "demonstrations"
+CHUNKS = {"simpler-fractal": (4, 2), "simpler-bridge": (4, 4), "vlabench": (4, 4), "tabletop": (32, 10)}
+"""Actions in one chunk, and how many of them are carried out before the policy is asked again."""
+HELD_OUT = 20
+"""Every so many stages one is kept from training, to see what was learned."""
+KEEP = 0.999
+"""Of the moving average of the weights, a step; the average is what is saved."""
+SEEN, PLACED = 0.5, 0.3
+"""Weights of the two questions beside the flow."""
+STEADY = 0.01
+"""Least deviation by which an action or a state is scaled: what hardly moves is not blown up."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How long, how fast, how large. `draws` flow samples share one look at the pictures."""
+
+    suite: str
+    stages: int = 400
+    steps: int = 12_000
+    batch: int = 64
+    draws: int = 4
+    rate: float = 1e-3
+    seed: int = 0
+    width: int = 128
+    depth: int = 4
+    vision_width: int = 128
+    vision_depth: int = 4
+    expert_width: int = 96
+
+
+class Questions(nn.Module):
+    """Which patches show the object that is meant, and where it stands: asked of hidden states, in training only."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norm, self.patch, self.place = nn.LayerNorm(width), nn.Linear(width, 1), nn.Linear(width, 3)
+
+    def forward(self, hidden: Float[Tensor, "b p d"]) -> tuple[Float[Tensor, "b p"], Float[Tensor, "b 3"]]:
+        x = self.norm(hidden)
+        chance = self.patch(x).squeeze(-1)
+        return chance, self.place(torch.einsum("bp,bpd->bd", chance.softmax(-1), x))
+
+
+@dataclass
+class Batch:
+    """Tensors of one step: pictures (b x c x 3 x s x s in 0..1), tokens, scaled state and chunk, share of the target in every patch, its place."""
+
+    images: Tensor
+    tokens: Tensor
+    there: Tensor
+    state: Tensor
+    actions: Tensor
+    patches: Tensor
+    place: Tensor
+
+
+def configuration(recipe: Recipe, state_size: int, action_size: int) -> MiniPI0Config:
+    from lerobot.configs import FeatureType, PolicyFeature
+
+    chunk, execute = CHUNKS[recipe.suite]
+    views = {f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (3, SIDE, SIDE)) for name in suite(recipe.suite).cameras}
+    return MiniPI0Config(
+        words=vocabulary(), device="cpu", width=recipe.width, depth=recipe.depth, head_dim=recipe.width // 8, vision_width=recipe.vision_width,
+        vision_depth=recipe.vision_depth, expert_width=recipe.expert_width, chunk_size=chunk, n_action_steps=execute, max_state_dim=state_size,
+        max_action_dim=action_size, image_resolution=(SIDE, SIDE),
+        input_features={**views, "observation.state": PolicyFeature(FeatureType.STATE, (state_size,))},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (action_size,))},
+    )  # fmt: skip
+
+
+def statistics(films: Sequence[Film]) -> dict[str, dict[str, Tensor]]:
+    """Mean and deviation of states and actions, as lerobot's normalisers want them."""
+    found = {}
+    for name, parts in (("observation.state", [film.state for film in films]), ("action", [film.action for film in films])):
+        rows = np.concatenate(parts)
+        found[name] = {
+            "mean": torch.from_numpy(rows.mean(0)),
+            "std": torch.from_numpy(np.maximum(rows.std(0), STEADY * max(1e-3, float(rows.std())))),
+        }
+    return found
+
+
+def collate(recipe: Recipe, films: Sequence[Film], stats: dict[str, dict[str, Tensor]], rng: np.random.Generator, config: MiniPI0Config) -> Batch:
+    """One batch: frames drawn anew, each with a command of its own."""
+    number = {word: i for i, word in enumerate(config.words)}
+    lengths = np.array([len(film.action) for film in films])
+    made, states, chunks, shares, places = [], [], [], [], []
+    for i in rng.choice(len(films), recipe.batch, p=lengths / lengths.sum()):
+        film = films[i]
+        t = int(rng.integers(lengths[i]))
+        made.append(command(film, t, recipe.suite, rng))
+        rest = film.action[t : t + config.chunk_size]
+        still = np.repeat(rest[-1:], config.chunk_size - len(rest), axis=0)
+        still[:, :-1] = 0.0
+        chunks.append(np.concatenate([rest, still]))
+        states.append(film.state[t])
+        side = SIDE // config.patch
+        shares.append((film.ids[t] == 1).reshape(-1, side, config.patch, side, config.patch).mean((2, 4)).reshape(-1))
+        places.append(film.places[t, 0])
+    tokens, there = encode([one.text for one in made], number, config.tokenizer_max_length)
+    scaled = {
+        name: (torch.from_numpy(np.stack(rows)) - stats[name]["mean"]) / stats[name]["std"]
+        for name, rows in (("observation.state", states), ("action", chunks))
+    }
+    images = torch.from_numpy(np.stack([one.images for one in made])).permute(0, 1, 4, 2, 3).float() / 255
+    patches, place = torch.from_numpy(np.stack(shares)).float(), torch.from_numpy(np.stack(places)).float()
+    return Batch(images, tokens, there, scaled["observation.state"], scaled["action"], patches, place)
+
+
+def losses(policy: MiniPI0Policy, asked: Questions, batch: Batch, draws: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
+    """Flow matching, `draws` times over one look; and what the hidden states know about the object that is meant."""
+    from lerobot.policies.common.vla_utils import make_att_2d_masks, prepare_attention_masks_4d
+
+    model, cameras = policy.model, list(policy.config.image_features)
+    images, there = policy._preprocess_images({name: batch.images[:, i] for i, name in enumerate(cameras)})
+    prefix, pad, attend = model.embed_prefix(images, there, batch.tokens, batch.there)
+    seen: list[Tensor] = []
+    decoder = model.paligemma_with_expert.paligemma.model.language_model
+    decoder.config._attn_implementation = "eager"
+    hook = decoder.layers[-2].register_forward_hook(lambda module, args, out: seen.append(out[0] if isinstance(out, tuple) else out))
+    try:
+        _, cache = model.paligemma_with_expert.forward(
+            attention_mask=prepare_attention_masks_4d(make_att_2d_masks(pad, attend)), position_ids=torch.cumsum(pad, dim=1) - 1,
+            past_key_values=None, inputs_embeds=[prefix, None], use_cache=True,
+        )  # fmt: skip
+    finally:
+        hook.remove()
+    flow = torch.zeros(())
+    for _ in range(draws):
+        noise = torch.randn(batch.actions.shape, generator=generator)
+        at = _times(len(noise), policy.config, generator)
+        noisy = at[:, None, None] * noise + (1 - at[:, None, None]) * batch.actions
+        flow = flow + F.mse_loss(model.denoise_step(batch.state, pad, cache, noisy, at), noise - batch.actions) / draws
+    patches = batch.patches.shape[1]
+    chance, place = asked(seen[0][:, :patches])
+    shown = batch.patches.sum(1) > 0
+    share = batch.patches / batch.patches.sum(1, keepdim=True).clamp(min=1e-6)
+    heat = -(share * chance.log_softmax(-1)).sum(1)[shown].mean() if shown.any() else torch.zeros(())
+    where = F.smooth_l1_loss(place * 0.1, batch.place, beta=0.02) * 50
+    hit = (batch.patches.gather(1, chance.argmax(1, keepdim=True)).squeeze(1) > 0)[shown].float().mean()
+    told = {"flow": flow, "heat": heat, "where": where, "hit": hit}
+    return flow + SEEN * heat + PLACED * where, {name: float(part.detach()) for name, part in told.items()}
+
+
+def _times(n: int, config: MiniPI0Config, generator: torch.Generator) -> Float[Tensor, " n"]:
+    """pi0's times: a Beta(1.5, 1) of lerobot's scale and offset, by inversion."""
+    drawn = torch.rand(n, generator=generator) ** (1 / config.time_sampling_beta_alpha)
+    return drawn * config.time_sampling_scale + config.time_sampling_offset
+
+
+def load_films(recipe: Recipe, cache: Path = CACHE, jobs: int | None = None) -> tuple[list[Film], list[Film]]:
+    """Films to train on and to look at, shot in processes where they are missing."""
+    from tqdm import tqdm
+
+    missing = [n for n in range(recipe.stages) if not (cache / f"{recipe.suite}-{recipe.seed}-{n:05d}.npz").exists()]
+    if missing:
+        with get_context("spawn").Pool(jobs or os.cpu_count()) as pool:
+            work = pool.imap_unordered(_shoot, [(cache, recipe.suite, recipe.seed, n) for n in missing])
+            list(tqdm(work, f"films of {recipe.suite}", len(missing), mininterval=10))
+    both: tuple[list[Film], list[Film]] = ([], [])
+    for n in range(recipe.stages):
+        both[n % HELD_OUT == HELD_OUT - 1].extend(cached(cache, recipe.suite, recipe.seed, n))
+    return both
+
+
+def _shoot(job: tuple[Path, str, int, int]) -> None:
+    cached(*job)
+
+
+def train(recipe: Recipe, out: Path, *, minutes: float | None = None, cache: Path = CACHE, every: int = 250) -> dict[str, Any]:
+    """Train, or go on where an earlier call stopped, and write a checkpoint that lerobot loads; returns what was measured on the films held out."""
+    from tqdm import tqdm
+
+    films, held = load_films(recipe, cache)
+    stats = statistics(films)
+    config = configuration(recipe, films[0].state.shape[1], films[0].action.shape[1])
+    torch.manual_seed(recipe.seed)  # initial weights only; every other draw comes from the step's stream
+    policy, asked = MiniPI0Policy(config), Questions(recipe.width)
+    weights = [*policy.parameters(), *asked.parameters()]
+    optimiser = torch.optim.AdamW(weights, recipe.rate, betas=(0.9, 0.95), weight_decay=1e-4)
+    mean, begun, log = copy.deepcopy(policy), 0, []
+    out.mkdir(parents=True, exist_ok=True)
+    kept = out / "training.pt"
+    if kept.exists():
+        state = torch.load(kept, weights_only=True)
+        for part, name in ((policy, "policy"), (asked, "asked"), (mean, "mean"), (optimiser, "optimiser")):
+            part.load_state_dict(state[name])
+        begun, log = state["step"], state["log"]
+    started, recent = time.monotonic(), []
+    for step, batch in enumerate(
+        tqdm(_batches(recipe, films, stats, config, begun), recipe.suite, recipe.steps, initial=begun, mininterval=10), begun
+    ):
+        for group in optimiser.param_groups:
+            group["lr"] = recipe.rate * min(1.0, (step + 1) / 300) * 0.5 * (1 + float(np.cos(np.pi * step / recipe.steps)))
+        loss, told = losses(policy, asked, batch, recipe.draws, torch.Generator().manual_seed(recipe.seed * 1_000_003 + step))
+        optimiser.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(weights, 1.0)
+        optimiser.step()
+        with torch.no_grad():
+            share = min(KEEP, (step + 1) / (step + 10))
+            for average, now in zip(mean.parameters(), policy.parameters(), strict=True):
+                average.lerp_(now, 1 - share)
+        recent.append(told)
+        last = step + 1 == recipe.steps or (minutes is not None and time.monotonic() - started > 60 * minutes)
+        if last or (step + 1) % every == 0:
+            log.append({"step": step + 1, **{name: float(np.mean([one[name] for one in recent])) for name in told}})
+            recent = []
+            parts = {"policy": policy.state_dict(), "asked": asked.state_dict(), "mean": mean.state_dict(), "optimiser": optimiser.state_dict()}
+            torch.save({**parts, "step": step + 1, "log": log}, kept.with_suffix(".part"))
+            os.replace(kept.with_suffix(".part"), kept)
+        if last:
+            break
+    return save(recipe, mean, asked, stats, held, log, out)
+
+
+def _batches(recipe: Recipe, films: Sequence[Film], stats: Any, config: MiniPI0Config, begun: int) -> Iterator[Batch]:
+    for step in range(begun, recipe.steps):
+        yield collate(recipe, films, stats, np.random.default_rng([73, recipe.seed, step]), config)
+
+
+def save(recipe: Recipe, policy: MiniPI0Policy, asked: Questions, stats: Any, held: Sequence[Film], log: list[Any], out: Path) -> dict[str, Any]:
+    """Weights, configuration and processors as lerobot keeps them, and what was measured."""
+    from lerobot.policies import make_pre_post_processors
+
+    policy.save_pretrained(out)
+    for pipeline in make_pre_post_processors(policy.config, dataset_stats=stats):
+        pipeline.save_pretrained(out)
+    with torch.no_grad():
+        told = [
+            losses(policy, asked, collate(recipe, held, stats, np.random.default_rng([74, i]), policy.config), 4,
+                   torch.Generator().manual_seed(i))[1] for i in range(8)
+        ] if held else []  # fmt: skip
+    about = {
+        "recipe": vars(recipe),
+        "held_out": {name: float(np.mean([one[name] for one in told])) for name in (told[0] if told else ())},
+        "log": log,
+    }
+    (out / "training.json").write_text(json.dumps(about, indent=1))
+    return about
