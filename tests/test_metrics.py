@@ -26,11 +26,6 @@ def test_nothing_is_not_a_number() -> None:
     assert math.isnan(rate(0, 0).value)
 
 
-def test_apart() -> None:
-    assert rate(20, 20).apart_from(rate(5, 20))
-    assert not rate(12, 20).apart_from(rate(10, 20))
-
-
 def episode(**changes: object) -> dict[str, object]:
     base = {
         "suite": "s", "task": "t", "split": "", "method": "vap", "policy": "scripted", "outcome": "success", "success": True, "cmr": True,

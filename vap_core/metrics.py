@@ -31,10 +31,6 @@ class Rate:
     def __str__(self) -> str:
         return f"{100 * self.value:.0f} % [{100 * self.low:.0f}, {100 * self.high:.0f}]" if self.n else "-"
 
-    def apart_from(self, other: "Rate") -> bool:
-        """Whether the two intervals do not overlap."""
-        return self.low > other.high or other.low > self.high
-
 
 def intervals(k: Counts, n: Counts, *, conservative: bool = False) -> tuple[Bounds, Bounds]:
     """95 % intervals of k out of n, nan where n is 0: Wilson's score intervals, or Clopper and Pearson's, which never cover less."""
