@@ -56,7 +56,7 @@ def kills(out: Path, episodes: int, times: int, rng: random.Random) -> tuple[int
                     os.killpg(run.pid, signal.SIGKILL)
                 else:
                     run.kill()
-                run.wait(60)
+                run.wait(20)
         done += 1
         rows.append(len(read(out)) if (out / "run.json").exists() else 0)
         time.sleep(0.5)  # orphans end with their parent

@@ -20,14 +20,19 @@ def results[J, R](work: Callable[[J], R], jobs: Sequence[J], workers: int, mend:
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")  # inherited by the workers: two threads in each would fight over the cores
     with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=get_context("spawn"), initializer=end_with_parent) as pool:
-        futures = {pool.submit(work, job): job for job in jobs}
+        futures, done = {pool.submit(work, job): job for job in jobs}, 0
         try:
             for future in as_completed(futures):
+                done += 1
                 yield futures[future], future.result()
         except BrokenProcessPool as error:
             raise WorkerDied(f"a worker process died, perhaps for lack of memory; run the same command again, with fewer {mend}.") from error
         finally:
+            processes = list((pool._processes or {}).values())
             pool.shutdown(wait=False, cancel_futures=True)
+            if done < len(jobs):  # interrupted: nobody waits for what is half done, and what is kept is whole
+                for process in processes:
+                    process.kill()
 
 
 def end_with_parent() -> None:
