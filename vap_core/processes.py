@@ -20,8 +20,9 @@ def results[J, R](work: Callable[[J], R], jobs: Sequence[J], workers: int, mend:
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")  # inherited by the workers: two threads in each would fight over the cores
     with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=get_context("spawn"), initializer=end_with_parent) as pool:
-        futures, done = {pool.submit(work, job): job for job in jobs}, 0
+        done = 0
         try:
+            futures = {pool.submit(work, job): job for job in jobs}
             for future in as_completed(futures):
                 done += 1
                 yield futures[future], future.result()
