@@ -43,7 +43,8 @@ def kills(out: Path, episodes: int, times: int, rng: random.Random) -> tuple[int
     """Start the same command again and again and kill it after a while, whole or its parent alone; kills done and rows seen after each."""
     done, rows = 0, []
     while done < times:
-        with subprocess.Popen(command(out, episodes), env=ENV, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True) as run:
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
+        with subprocess.Popen(command(out, episodes), env=ENV, preexec_fn=hear_interrupts, **quiet) as run:
             try:
                 run.wait(rng.uniform(0.5, LONGEST_S))
                 assert run.returncode == 0, f"status {run.returncode}"
@@ -61,6 +62,11 @@ def kills(out: Path, episodes: int, times: int, rng: random.Random) -> tuple[int
         rows.append(len(read(out)) if (out / "run.json").exists() else 0)
         time.sleep(0.5)  # orphans end with their parent
     return done, rows
+
+
+def hear_interrupts() -> None:
+    """A shell's background jobs ignore SIGINT, and so would their children."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def check(folder: Path, episodes: int, times: int, seed: int = 0) -> str:
