@@ -8,13 +8,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from uuid import uuid4
 
 from vap_core.errors import BadOutput, BadPolicy
-from vap_core.files import write_atomic
 from vap_core.policies import Policy
 from vap_core.policies.witness import TEXT, Heard, listening
-from vap_core.store import KEY
+from vap_core.store import KEY, add
 from vap_core.values import Attended, Call, Chunk, Episode, PolicyInput
 
 if TYPE_CHECKING:
@@ -50,18 +48,11 @@ def calls(step: int, attended: Attended, raw: PolicyInput, consumed: Mapping[str
 
 def write(folder: Path, episodes: Sequence[Episode]) -> None:
     """Add the calls of some finished episodes to a run. Raises: BadOutput."""
-    import pandas as pd
-
     lines = [
         {**dict(zip(KEY, episode.key, strict=True)), **asdict(call), "sound": call.sound} for episode in episodes for call in episode.calls
     ]  # fmt: skip
-    if not lines:
-        return
-    try:
-        (folder / "audit").mkdir(exist_ok=True)
-        write_atomic(folder / "audit" / f"{uuid4().hex}.parquet", pd.DataFrame(lines).to_parquet(index=False, compression="zstd"))
-    except OSError as error:
-        raise BadOutput(f"audit: {folder} cannot be written ({error.strerror}); make room and run the same command again.") from error
+    if lines:
+        add(folder, "audit", lines, "audit")
 
 
 def read(folder: Path) -> "pd.DataFrame":

@@ -1,6 +1,6 @@
 """Jobs on a Ray cluster. Its machines need this package and no shared disk: the memory travels with the job, what a job writes comes back.
 
-engine.run(study, folder, spread=cluster.spread("auto"))
+engine.run(study, folder, spread=cluster.spread("10.0.0.5:6379"))
 """
 
 import logging

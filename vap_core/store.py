@@ -83,13 +83,18 @@ def locked(folder: Path) -> Iterator[None]:
 
 def append(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Add finished episodes as one new part. Raises BadOutput when the disk is full."""
+    add(folder, "parts", rows, "append")
+
+
+def add(folder: Path, kind: str, rows: Sequence[Mapping[str, Any]], who: str) -> None:
+    """Add `rows` to the run's tables of a `kind`, as one new part. Raises: BadOutput, in the name of `who`, when the disk is full."""
     import pandas as pd
 
     try:
-        (folder / "parts").mkdir(exist_ok=True)
-        write_atomic(folder / "parts" / f"{uuid4().hex}.parquet", pd.DataFrame(list(rows)).to_parquet(index=False))
+        (folder / kind).mkdir(exist_ok=True)
+        write_atomic(folder / kind / f"{uuid4().hex}.parquet", pd.DataFrame(list(rows)).to_parquet(index=False, compression="zstd"))
     except OSError as error:
-        raise BadOutput(f"append: {folder} cannot be written ({error.strerror}); make room and run the same command again.") from error
+        raise BadOutput(f"{who}: {folder} cannot be written ({error.strerror}); make room and run the same command again.") from error
 
 
 def compact(folder: Path) -> None:

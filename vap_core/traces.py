@@ -3,29 +3,19 @@
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import numpy as np
 
 from vap_core.errors import BadOutput
-from vap_core.files import write_atomic
-from vap_core.store import KEY
+from vap_core.store import KEY, add
 from vap_core.values import Episode, Truth
 
 
 def write(folder: Path, episodes: Sequence[Episode]) -> None:
     """Add the traces of some finished episodes to a run, as one part. Raises BadOutput when the disk is full."""
-    import pandas as pd
-
     rows = [_to_row(episode) for episode in episodes if episode.frames and episode.outcome.status != "error"]  # an error is not judged again
-    if not rows:
-        return
-    table = pd.DataFrame(rows)
-    try:
-        (folder / "traces").mkdir(exist_ok=True)
-        write_atomic(folder / "traces" / f"{uuid4().hex}.parquet", table.to_parquet(index=False, compression="zstd"))
-    except OSError as error:
-        raise BadOutput(f"traces: {folder} cannot be written ({error.strerror}); make room and run the same command again.") from error
+    if rows:
+        add(folder, "traces", rows, "traces")
 
 
 def read(folder: Path) -> Iterator[tuple[tuple[Any, ...], list[Truth]]]:

@@ -1,7 +1,9 @@
 """One loop for every head: epochs that can be interrupted, a warm-up and a cosine of the rate, the loss on a bar."""
 
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -51,3 +53,14 @@ def fit(head: nn.Module, losses: Callable[[np.random.Generator], Iterator[Tensor
             total += loss.item()
             bar.set_postfix(loss=f"{total / batch:.3f}", refresh=False)
         run.save({"head": head.state_dict(), "optimiser": optimiser.state_dict(), "epoch": epoch + 1, "loss": total / max(batch, 1)})
+
+
+def checkpoint(path: Path, resume: bool) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
+    """What an interrupted run left at `path`, or nothing; and a function that replaces it atomically."""
+
+    def save(state: dict[str, Any]) -> None:
+        part = path.with_suffix(".part")
+        torch.save(state, part)
+        os.replace(part, path)
+
+    return torch.load(path, weights_only=True) if resume and path.exists() else {}, save

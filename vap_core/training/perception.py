@@ -7,10 +7,8 @@ Everything lands in data/cache/perception and is found again after an interrupti
 
 import os
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +16,10 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from vap_core.processes import results
 from vap_core.sim import objects
 from vap_core.training import detector, looks, segmenter
-from vap_core.training.fitting import Run
+from vap_core.training.fitting import Run, checkpoint
 from vap_core.training.scenes import VIEWS, Shots, cached, only_generic
 from vap_core.weights import save_weights
 
@@ -73,9 +72,8 @@ def prepare(cache: Path, seed: int, n: int, *, held_out: bool = False, jobs: int
     """The first n stages with their features, rendered where they are missing; refuses any that shows an object of the evaluation."""
     todo = [number for number in range(n) if not _ready(cache, seed, number, held_out)]
     if todo:
-        with ProcessPoolExecutor(jobs or os.cpu_count(), mp_context=get_context("spawn")) as pool:
-            work = pool.map(partial(_prepare, cache, seed, held_out), todo)
-            list(tqdm(work, "held-out scenes" if held_out else "scenes", len(todo), mininterval=10))
+        work = results(partial(_prepare, cache, seed, held_out), todo, jobs or os.cpu_count() or 1, "jobs")
+        list(tqdm(work, "held-out scenes" if held_out else "scenes", len(todo), mininterval=10))
     stages = [cached(cache, seed, number, held_out=held_out) for number in range(n)]
     for shots in stages:
         only_generic([objects.get(name) for name in shots.names])
@@ -109,14 +107,3 @@ def looks_of(cache: Path, seed: int, number: int, shots: Shots) -> looks.Looks:
 def stream(seed: int, number: int, part: str) -> np.random.Generator:
     """The randomness of one part of one stage."""
     return np.random.default_rng([seed, *part.encode(), number])
-
-
-def checkpoint(path: Path, resume: bool) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
-    """What an interrupted run left at `path`, or nothing; and a function that replaces it atomically."""
-
-    def save(state: dict[str, Any]) -> None:
-        part = path.with_suffix(".part")
-        torch.save(state, part)
-        os.replace(part, path)
-
-    return torch.load(path, weights_only=True) if resume and path.exists() else {}, save

@@ -12,7 +12,7 @@ import os
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +25,11 @@ from torch.nn import functional as F  # noqa: N812
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
 from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
+from vap_core.processes import results
 from vap_core.suites import suite
 from vap_core.training.commands import command, vocabulary
 from vap_core.training.demonstrations import SIDE, Film, cached
+from vap_core.training.fitting import checkpoint
 
 CACHE = Path(__file__).resolve().parents[2] / "data" / "cache" / "demonstrations"
 CHUNKS = {"simpler-fractal": (4, 2), "simpler-bridge": (4, 4), "vlabench": (4, 4), "tabletop": (32, 10)}
@@ -186,17 +188,16 @@ def load_films(recipe: Recipe, cache: Path = CACHE, jobs: int | None = None) -> 
 
     missing = [n for n in range(recipe.stages) if not (cache / f"{recipe.suite}-{recipe.seed}-{n:05d}.npz").exists()]
     if missing:
-        with get_context("spawn").Pool(jobs or os.cpu_count()) as pool:
-            work = pool.imap_unordered(_shoot, [(cache, recipe.suite, recipe.seed, n) for n in missing])
-            list(tqdm(work, f"films of {recipe.suite}", len(missing), mininterval=10))
+        work = results(partial(_shoot, cache, recipe.suite, recipe.seed), missing, jobs or os.cpu_count() or 1, "jobs")
+        list(tqdm(work, f"films of {recipe.suite}", len(missing), mininterval=10))
     both: tuple[list[Film], list[Film]] = ([], [])
     for n in range(recipe.stages):
         both[n % HELD_OUT == HELD_OUT - 1].extend(cached(cache, recipe.suite, recipe.seed, n))
     return both
 
 
-def _shoot(job: tuple[Path, str, int, int]) -> None:
-    cached(*job)
+def _shoot(cache: Path, suite_name: str, seed: int, number: int) -> None:
+    cached(cache, suite_name, seed, number)
 
 
 def train(recipe: Recipe, out: Path, *, minutes: float | None = None, cache: Path = CACHE, every: int = 250) -> dict[str, Any]:
@@ -212,9 +213,8 @@ def train(recipe: Recipe, out: Path, *, minutes: float | None = None, cache: Pat
     optimiser = torch.optim.AdamW(weights, recipe.rate, betas=(0.9, 0.95), weight_decay=1e-4)
     mean, begun, log = copy.deepcopy(policy), 0, []
     out.mkdir(parents=True, exist_ok=True)
-    kept = out / "training.pt"
-    if kept.exists():
-        state = torch.load(kept, weights_only=True)
+    state, keep = checkpoint(out / "training.pt", resume=True)
+    if state:
         for part, name in ((policy, "policy"), (asked, "asked"), (mean, "mean"), (optimiser, "optimiser")):
             part.load_state_dict(state[name])
         begun, log = state["step"], state["log"]
@@ -239,8 +239,7 @@ def train(recipe: Recipe, out: Path, *, minutes: float | None = None, cache: Pat
             log.append({"step": step + 1, **{name: float(np.mean([one[name] for one in recent])) for name in told}})
             recent = []
             parts = {"policy": policy.state_dict(), "asked": asked.state_dict(), "mean": mean.state_dict(), "optimiser": optimiser.state_dict()}
-            torch.save({**parts, "step": step + 1, "log": log}, kept.with_suffix(".part"))
-            os.replace(kept.with_suffix(".part"), kept)
+            keep({**parts, "step": step + 1, "log": log})
         if last:
             break
     return save(recipe, mean, asked, stats, held, log, out)
