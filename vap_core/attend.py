@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from vap_core import detect, embed, segment, track
+from vap_core import events as events_of
 from vap_core.associate import Pairing, Sighting, associate, overrule
 from vap_core.errors import BadInstruction, BadViews, one_of
 from vap_core.instruction import Parser, parse, rewrite
@@ -111,11 +112,7 @@ class Attender:
             BadInstruction, UnknownName: what was said cannot be matched with the memory.
             BadViews: the views cannot be associated.
         """
-        parsed = self.parser(instruction, {obj.category for obj in self.memory.values()})
-        if objects is not None and len(objects) != len(parsed.targets):
-            raise BadInstruction(f"Attender.start: {len(objects)} objects named for {len(parsed.targets)} targets in {instruction!r}; one each.")
-        names: Sequence[str | None] = objects or [None] * len(parsed.targets)
-        wanted = [recall(self.memory, target, name) for target, name in zip(parsed.targets, names, strict=True)]
+        parsed, wanted = self.understand(instruction, objects)
         seen: dict[str, dict[str, Seen]] = {camera: {} for camera in views}
         for phrase in dict.fromkeys(target.category for target in parsed.targets):
             found = [boxes[camera] for camera in views] if boxes is not None else self.stack.detector(list(views.values()), phrase)
@@ -124,9 +121,31 @@ class Attender:
 
         phrases = [target.category for target in parsed.targets]
         groundings = {
-            camera: tuple(self._ground(camera, obj, seen[camera][phrase]) for phrase, obj in zip(phrases, wanted, strict=True)) for camera in views
+            camera: tuple(self.ground(camera, obj, seen[camera][phrase]) for phrase, obj in zip(phrases, wanted, strict=True)) for camera in views
         }
         groundings, associations = self._associate(groundings, [{c: seen[c][phrase] for c in views} for phrase in phrases], views, cameras or {})
+        return self.begin(parsed, views, seen, groundings, associations)
+
+    def understand(self, instruction: str, objects: Sequence[str] | None = None) -> tuple[Instruction, list[PersonalObject]]:
+        """What is said, and the remembered object of each of its targets. Raises: BadInstruction, UnknownName."""
+        parsed = self.parser(instruction, {obj.category for obj in self.memory.values()})
+        if objects is not None and len(objects) != len(parsed.targets):
+            raise BadInstruction(f"Attender.start: {len(objects)} objects named for {len(parsed.targets)} targets in {instruction!r}; one each.")
+        names: Sequence[str | None] = objects or [None] * len(parsed.targets)
+        return parsed, [recall(self.memory, target, name) for target, name in zip(parsed.targets, names, strict=True)]
+
+    def begin(
+        self,
+        parsed: Instruction,
+        views: Views,
+        seen: Mapping[str, Mapping[str, Seen]],
+        groundings: Mapping[str, tuple[Grounding, ...]],
+        associations: tuple[Association | None, ...] = (),
+        by: str = "association",
+    ) -> tuple[AttendState, Attended]:
+        """Start tracking and prompt the first images, whoever grounded the targets: `seen[camera][phrase]` are the candidates of each view, and
+        `by` says what overruled the vote where something did."""
+        phrases = [target.category for target in parsed.targets]
         ids = {
             camera: tuple(
                 None if g.winner is None else seen[camera][phrase].ids[g.winner] for phrase, g in zip(phrases, groundings[camera], strict=True)
@@ -135,16 +154,14 @@ class Attender:
         }
         masks = {camera: _masks_by_id(tuple(seen[camera].values())) for camera in views}
 
-        colours = choose_colours(len(wanted), [(views[camera], list(masks[camera])) for camera in views], self.prompting.palette)
+        colours = choose_colours(len(phrases), [(views[camera], list(masks[camera])) for camera in views], self.prompting.palette)
         named = [colour if any(ids[camera][j] is not None for camera in views) else None for j, colour in enumerate(colours)]
-        text = rewrite(parsed, named) if self.prompting.rewrite else instruction
+        text = rewrite(parsed, named) if self.prompting.rewrite else parsed.text
         tracked = [camera for camera in views if len(masks[camera])]
         trackers = dict(zip(tracked, self.stack.tracker.start([views[c] for c in tracked], [masks[c] for c in tracked]), strict=True))
         tracks = {camera: tuple(Track(g.mask, 0.0 if g.mask is None else 1.0) for g in groundings[camera]) for camera in views}
         state = AttendState(0, parsed, colours, text, groundings, associations, ids, trackers, _visible(tracks))
-        agreed = (_agreement(groundings, j, a) for j, a in enumerate(associations) if a is not None)
-        events = (*(_describe(g) for per_view in groundings.values() for g in per_view), *agreed, *_shared(ids))
-        return state, self._prompt(state, views, tracks, events)
+        return state, self._prompt(state, views, tracks, events_of.grounded(groundings, associations, ids, by))
 
     def step(self, state: AttendState, views: Views) -> tuple[AttendState, Attended]:
         """Follow every target by the tracker alone and prompt the new images (t > 0). Consumes `state`.
@@ -172,11 +189,16 @@ class Attender:
         tracks = {
             camera: tuple(Track(None, 0.0) if i is None else parts[camera][1][i] for i in state.ids[camera]) for camera in views
         }  # fmt: skip
+        return self.follow(state, views, tracks, {camera: tracker for camera, (tracker, _) in parts.items()})
+
+    def follow(
+        self, state: AttendState, views: Views, tracks: Mapping[str, tuple[Track, ...]], trackers: Mapping[str, Any]
+    ) -> tuple[AttendState, Attended]:
+        """One step on and prompted, with every target where `tracks` says it is, whoever found it there."""
         index, visible = state.frame_index + 1, _visible(tracks)
-        lost = [Event(index, "WARN", f"{c}: target {j} not visible, the view passes unmodified") for c, j in sorted(state.visible - visible)]
-        back = [Event(index, "INFO", f"{c}: target {j} re-acquired") for c, j in sorted(visible - state.visible)]
-        state = replace(state, frame_index=index, trackers={camera: tracker for camera, (tracker, _) in parts.items()}, visible=visible)
-        return state, self._prompt(state, views, tracks, (*lost, *back))
+        events = events_of.changed(index, state.visible, visible)
+        state = replace(state, frame_index=index, trackers=trackers, visible=visible)
+        return state, self._prompt(state, views, tracks, events)
 
     def _look(self, rgb: Rgb, candidates: Boxes, before: tuple[Seen, ...]) -> Seen:
         """Embed and segment every candidate of one view; what an earlier phrase proposed too keeps its identity."""
@@ -192,7 +214,8 @@ class Attender:
                 fresh += 1
         return Seen(candidates, embeddings, self.stack.segmenter(rgb, candidates), tuple(ids))
 
-    def _ground(self, camera: str, obj: PersonalObject, seen: Seen) -> Grounding:
+    def ground(self, camera: str, obj: PersonalObject, seen: Seen) -> Grounding:
+        """The vote of one view."""
         cosine = similarity(seen.embeddings, obj.embeddings)
         b = vote(cosine, self.prompting.rule)
         return Grounding(camera, obj.name, seen.candidates, cosine, b.votes, b.tied, b.winner, b.margin, b.cosine_margin, seen.masks)
@@ -272,26 +295,3 @@ def _masks_by_id(parts: tuple[Seen, ...]) -> Bool[np.ndarray, "n h w"]:
     """One mask per identity, in the order of identities."""
     masks, ids = np.concatenate([part.masks for part in parts]), [i for part in parts for i in part.ids]
     return masks[[ids.index(i) for i in range(1 + max(ids, default=-1))]]
-
-
-def _shared(ids: Mapping[str, tuple[int | None, ...]]) -> list[Event]:
-    """A warning for every view in which two targets were matched with the same object."""
-    found = {camera: [i for i in per_target if i is not None] for camera, per_target in ids.items()}
-    doubled = [camera for camera, of_view in found.items() if len(set(of_view)) < len(of_view)]
-    return [Event(0, "WARN", f"{camera}: two targets share one object, at most one is right") for camera in doubled]
-
-
-def _describe(g: Grounding) -> Event:
-    if g.elected is None:
-        return Event(0, "WARN", f"{g.camera}: no {g.candidates.phrase} found, the view passes unmodified")
-    if g.winner is None:
-        return Event(0, "WARN", f"{g.camera}: {g.object} is none of {len(g.candidates)} candidates by association, the view passes unmodified")
-    tie = " after a tie" if g.overruled is None and g.tied[g.winner] else ""
-    by = "" if g.overruled is None else f" by association, over candidate {g.overruled} with {g.votes[g.overruled]}"
-    return Event(0, "INFO", f"{g.camera}: {g.object} is candidate {g.winner} with {g.votes[g.winner]}/{g.similarity.shape[1]} votes{tie}{by}")
-
-
-def _agreement(groundings: Mapping[str, tuple[Grounding, ...]], j: int, a: Association) -> Event:
-    """How sure the views are of target j together, and by what."""
-    name = next(iter(groundings.values()))[j].object
-    return Event(0, "INFO", f"{name}: views associated, margin {a.margin:.2f}; " + ", ".join(f"{term} {part:.2f}" for term, part in a.terms.items()))
