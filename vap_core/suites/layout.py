@@ -26,13 +26,18 @@ class Area:
 
 
 def scatter(
-    rng: np.random.Generator, area: Area, reach_m: Sequence[float], fixed: Sequence[tuple[Spot, float]] = (), gap_m: float = 0.05
+    rng: np.random.Generator,
+    area: Area,
+    reach_m: Sequence[float],
+    fixed: Sequence[tuple[Spot, float]] = (),
+    gap_m: float = 0.05,
+    tries: int = TRIES,
 ) -> list[Spot]:
     """One spot in `area` per radius in `reach_m`, so that discs of those radii keep `gap_m` apart, and from the `fixed` (spot, radius).
 
-    Raises: ValueError when the area is too small for that.
+    Raises: ValueError when the area is too small for that, or `tries` too few.
     """
-    for _ in range(TRIES):
+    for _ in range(tries):
         taken, found = list(fixed), dict.fromkeys(range(len(reach_m)), (0.0, 0.0))
         for i in rng.permutation(len(reach_m)).tolist():  # whoever is placed last gets the rim more often
             spot = _free(rng, area, reach_m[i], taken, gap_m)

@@ -13,6 +13,7 @@ from jaxtyping import Float32, UInt8
 
 from vap_core.prompt import PALETTE
 from vap_core.sim import robots
+from vap_core.sim.objects import CATEGORIES, CLUTTER
 from vap_core.suites import BENCHMARKS, suite
 from vap_core.training.demonstrations import Film
 from vap_core.values import Colour, value
@@ -31,6 +32,15 @@ QUESTIONS = re.findall(
     r"\w+", "where is there can you recognize in this image what colour yes no left right top bottom middle near far it point to at"
 )
 """Words that a vision-language model is asked and answers with."""
+PATTERNS = {"plain": "plain", "diagonal": "striped", "waves": "wavy", "speckle": "speckled", "tiles": "tiled", "gradient": "shaded"}
+"""Words for motifs of generic objects; every other one is "patterned"."""
+DESCRIBING = re.findall(
+    r"\w+",
+    "white grey black brown beige orange purple pink light dark bright pale "
+    "plain striped wavy speckled tiled shaded patterned spotted checked dotted "
+    "tall short wide narrow small large round square with and body top base stripes spots dots marks pattern lid handle mostly some",
+)
+"""Words of descriptions."""
 NEAR_M = 0.02
 """A hand that is nearer to its target than to any rival by this much gives its choice away."""
 
@@ -47,8 +57,9 @@ class Command:
 def vocabulary() -> tuple[str, ...]:
     """Every word of the benchmarks' instructions, of colours and of questions; token i is word i."""
     said = [task.instruction for known in BENCHMARKS.values() for task in known.tasks] + [colour.name for colour in PALETTE]
+    said += [*CATEGORIES, *CLUTTER]
     words = [word for text in said for word in re.findall(r"[\w']+", text.lower())]
-    return (*FIRST, *dict.fromkeys([*words, *DETERMINERS, "up", *QUESTIONS]), *RESERVED)
+    return (*FIRST, *dict.fromkeys([*words, *DETERMINERS, "up", *QUESTIONS, *DESCRIBING]), *RESERVED)
 
 
 def command(film: Film, t: int, suite_name: str, rng: np.random.Generator) -> Command:

@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
+from PIL import Image
 
 from vap_core.errors import OutOfReach
 from vap_core.files import write_atomic
@@ -23,7 +24,7 @@ from vap_core.sim.scenes import Scene, build
 from vap_core.suites import VARIANTS, Judge, Suite, Task, simpler, suite, tabletop, vlabench
 from vap_core.suites.layout import Area, place, radius_m, scatter, turned
 from vap_core.training.scenes import TRAIN_INSTANCES, only_generic
-from vap_core.values import EpisodeRow, Mask, Placement, value
+from vap_core.values import EpisodeRow, Mask, Placement, Rgb, value
 
 SIDE, SEEN = 112, 224
 """Pixels of a film, and of the views that it is made of: a policy sees views of SEEN pixels scaled down to SIDE."""
@@ -38,8 +39,8 @@ AREAS = {
     "tabletop": tabletop.TABLE,
 }
 """Where the objects of each suite stand in training; a put on the tabletop keeps to tabletop.REACH."""
-GAPS_M = (0.05, 0.035, 0.02)
-"""Room between objects, tried in turn."""
+GAPS_M, TRIES = (0.05, 0.035, 0.02), 400
+"""Room between objects, tried in turn, so many times each."""
 
 
 @value
@@ -80,9 +81,8 @@ def row(known: Suite, task: Task, names: Sequence[str], number: int, variant: st
     loose = [name for name in things + goal if name not in fixed]
     for gap in GAPS_M:
         try:
-            spots = scatter(
-                rng, area, [radius_m(name) for name in loose], [(spot, radius_m(name) / 2**0.5) for name, spot in fixed.items()], gap_m=gap
-            )
+            kept = [(spot, radius_m(name) / 2**0.5) for name, spot in fixed.items()]
+            spots = scatter(rng, area, [radius_m(name) for name in loose], kept, gap_m=gap, tries=TRIES)
             break
         except ValueError:
             if gap == GAPS_M[-1]:
@@ -121,7 +121,7 @@ def shoot(known: Suite, scene: Scene, start: EpisodeRow, rng: np.random.Generato
     while not judge.done and judge.steps < start.max_steps:
         truth = env.truth(masks=True)
         (state,), (chunk,) = expert.plan_inside([state], [env])
-        seen = np.stack([cv2.resize(rgb, (SIDE, SIDE), interpolation=cv2.INTER_AREA) for rgb in env.observe().images.values()])
+        seen = np.stack([small(rgb) for rgb in env.observe().images.values()])
         ids = np.stack([_ids(truth.masks[camera], names) for camera in known.cameras])
         spots = np.array([truth.objects_world[name][:3] for name in names], np.float32)
         frames.append((seen, ids, env.state(), chunk[0].astype(np.float32), spots))
@@ -131,6 +131,11 @@ def shoot(known: Suite, scene: Scene, start: EpisodeRow, rng: np.random.Generato
         return None
     views, masks, states, actions, places = (np.stack(part) for part in zip(*frames, strict=True))
     return Film(views, masks, states, actions, places, tuple(names), start.task, names.index(start.goal) if start.goal else -1)
+
+
+def small(rgb: Rgb) -> UInt8[np.ndarray, "s s 3"]:
+    """As policies.lerobot scales a view for its policy: bilinear, antialiased."""
+    return np.asarray(Image.fromarray(rgb).resize((SIDE, SIDE), Image.Resampling.BILINEAR))
 
 
 def _ids(masks: Mapping[str, Mask], names: Sequence[str]) -> UInt8[np.ndarray, "s s"]:

@@ -6,11 +6,9 @@ The penultimate decoder layer is asked, besides, which image patches show the ob
 gives its keys and values alone, so that this is where looking is learned. The answers' heads are not part of the policy.
 """
 
-import copy
 import json
 import os
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -25,19 +23,19 @@ from torch.nn import functional as F  # noqa: N812
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
 from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
+from vap_core.policies.mini_pi0.vlm import grow
+from vap_core.policies.mini_pi0.vlm import load as load_vlm
 from vap_core.processes import results
 from vap_core.suites import suite
 from vap_core.training.commands import command, vocabulary
 from vap_core.training.demonstrations import SIDE, Film, cached
-from vap_core.training.fitting import checkpoint
+from vap_core.training.descent import Descent, Told, average_of, descend
 
 CACHE = Path(__file__).resolve().parents[2] / "data" / "cache" / "demonstrations"
 CHUNKS = {"simpler-fractal": (4, 2), "simpler-bridge": (4, 4), "vlabench": (4, 4), "tabletop": (32, 10)}
 """Actions in one chunk, and how many of them are carried out before the policy is asked again."""
 HELD_OUT = 20
 """Every so many stages one is kept from training, to see what was learned."""
-KEEP = 0.999
-"""Of the moving average of the weights, a step; the average is what is saved."""
 SEEN, PLACED = 0.5, 0.3
 """Weights of the two questions beside the flow."""
 STEADY = 0.01
@@ -200,72 +198,50 @@ def _shoot(cache: Path, suite_name: str, seed: int, number: int) -> None:
     cached(cache, suite_name, seed, number)
 
 
-def train(recipe: Recipe, out: Path, *, minutes: float | None = None, cache: Path = CACHE, every: int = 250) -> dict[str, Any]:
-    """Train, or go on where an earlier call stopped, and write a checkpoint that lerobot loads; returns what was measured on the films held out."""
-    from tqdm import tqdm
+class Learner(nn.Module):
+    """What is trained: the policy, and the questions beside it."""
 
+    def __init__(self, config: MiniPI0Config) -> None:
+        super().__init__()
+        self.policy, self.asked = MiniPI0Policy(config), Questions(config.width)
+
+
+def train(
+    recipe: Recipe, out: Path, *, vlm: Path | None = None, minutes: float | None = None, cache: Path = CACHE, every: int = 250
+) -> dict[str, Any]:
+    """Train, or go on where an earlier call stopped, and write a checkpoint that lerobot loads; returns what was measured on the films held out.
+
+    The policy grows from the mini-PaliGemma in `vlm`; None: from nothing.
+    """
     films, held = load_films(recipe, cache)
     stats = statistics(films)
     config = configuration(recipe, films[0].state.shape[1], films[0].action.shape[1])
     torch.manual_seed(recipe.seed)  # initial weights only; every other draw comes from the step's stream
-    policy, asked = MiniPI0Policy(config), Questions(recipe.width)
-    weights = [*policy.parameters(), *asked.parameters()]
-    optimiser = torch.optim.AdamW(weights, recipe.rate, betas=(0.9, 0.95), weight_decay=1e-4)
-    mean, begun, log = copy.deepcopy(policy), 0, []
-    out.mkdir(parents=True, exist_ok=True)
-    state, keep = checkpoint(out / "training.pt", resume=True)
-    if state:
-        for part, name in ((policy, "policy"), (asked, "asked"), (mean, "mean"), (optimiser, "optimiser")):
-            part.load_state_dict(state[name])
-        begun, log = state["step"], state["log"]
-    started, recent = time.monotonic(), []
-    for step, batch in enumerate(
-        tqdm(_batches(recipe, films, stats, config, begun), recipe.suite, recipe.steps, initial=begun, mininterval=10), begun
-    ):
-        for group in optimiser.param_groups:
-            group["lr"] = recipe.rate * min(1.0, (step + 1) / 300) * 0.5 * (1 + float(np.cos(np.pi * step / recipe.steps)))
-        loss, told = losses(policy, asked, batch, recipe.draws, torch.Generator().manual_seed(recipe.seed * 1_000_003 + step))
-        optimiser.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(weights, 1.0)
-        optimiser.step()
-        with torch.no_grad():
-            share = min(KEEP, (step + 1) / (step + 10))
-            for average, now in zip(mean.parameters(), policy.parameters(), strict=True):
-                average.lerp_(now, 1 - share)
-        recent.append(told)
-        last = step + 1 == recipe.steps or (minutes is not None and time.monotonic() - started > 60 * minutes)
-        if last or (step + 1) % every == 0:
-            log.append({"step": step + 1, **{name: float(np.mean([one[name] for one in recent])) for name in told}})
-            recent = []
-            parts = {"policy": policy.state_dict(), "asked": asked.state_dict(), "mean": mean.state_dict(), "optimiser": optimiser.state_dict()}
-            keep({**parts, "step": step + 1, "log": log})
-        if last:
-            break
-    return save(recipe, mean, asked, stats, held, log, out)
+    learner = Learner(config)
+    if vlm is not None:
+        grow(load_vlm(vlm), learner.policy)
+
+    def step(model: Learner, at: int) -> tuple[Tensor, Told]:
+        batch = collate(recipe, films, stats, np.random.default_rng([73, recipe.seed, at]), config)
+        return losses(model.policy, model.asked, batch, recipe.draws, torch.Generator().manual_seed(recipe.seed * 1_000_003 + at))
+
+    mean, log = descend(learner, step, Descent(recipe.suite, recipe.steps, recipe.rate, minutes, every), out)
+    return save(recipe, mean, stats, held, log, out)
 
 
-def _batches(recipe: Recipe, films: Sequence[Film], stats: Any, config: MiniPI0Config, begun: int) -> Iterator[Batch]:
-    for step in range(begun, recipe.steps):
-        yield collate(recipe, films, stats, np.random.default_rng([73, recipe.seed, step]), config)
-
-
-def save(recipe: Recipe, policy: MiniPI0Policy, asked: Questions, stats: Any, held: Sequence[Film], log: list[Any], out: Path) -> dict[str, Any]:
+def save(recipe: Recipe, learner: Learner, stats: Any, held: Sequence[Film], log: list[Any], out: Path) -> dict[str, Any]:
     """Weights, configuration and processors as lerobot keeps them, and what was measured."""
     from lerobot.policies import make_pre_post_processors
 
+    policy = learner.policy
     policy.save_pretrained(out)
     for pipeline in make_pre_post_processors(policy.config, dataset_stats=stats):
         pipeline.save_pretrained(out)
     with torch.no_grad():
         told = [
-            losses(policy, asked, collate(recipe, held, stats, np.random.default_rng([74, i]), policy.config), 4,
+            losses(policy, learner.asked, collate(recipe, held, stats, np.random.default_rng([74, i]), policy.config), 4,
                    torch.Generator().manual_seed(i))[1] for i in range(8)
         ] if held else []  # fmt: skip
-    about = {
-        "recipe": vars(recipe),
-        "held_out": {name: float(np.mean([one[name] for one in told])) for name in (told[0] if told else ())},
-        "log": log,
-    }
+    about = {"recipe": vars(recipe), "held_out": average_of(told), "log": log}
     (out / "training.json").write_text(json.dumps(about, indent=1))
     return about

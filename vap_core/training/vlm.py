@@ -1,0 +1,186 @@
+"""Train a mini-PaliGemma on questions about rendered views of generic objects, before any policy grows from it (P 5.1, SPEC section 4).
+
+    python -m vap_core train vlm --out data/runs/mini-paligemma
+
+The answers' words are its loss, and, while training only, which patches show the object that is meant, asked of the penultimate layer.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812
+
+from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
+from vap_core.policies.mini_pi0.vlm import ANSWER, MiniVlm
+from vap_core.processes import results
+from vap_core.training.commands import vocabulary
+from vap_core.training.demonstrations import SIDE, small
+from vap_core.training.descent import Descent, Told, average_of, descend
+from vap_core.training.questions import Question, ask
+from vap_core.training.scenes import cached
+from vap_core.values import value
+
+CACHE = Path(__file__).resolve().parents[2] / "data" / "cache" / "perception"
+"""The same scenes as perception's; what is there is not rendered again."""
+SEEN = 0.5
+"""Weight of the patches beside the words."""
+KINDS = ("where", "whether", "colour")
+HELD_OUT = 24
+"""Stages with unseen objects that the result is measured on."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How long, how fast, how large. `questions` are asked of each of `batch` views."""
+
+    stages: int = 540
+    steps: int = 4000
+    batch: int = 64
+    questions: int = 2
+    rate: float = 1e-3
+    seed: int = 0
+    width: int = 128
+    depth: int = 4
+    vision_width: int = 128
+    vision_depth: int = 4
+    expert_width: int = 96
+
+
+@value
+class View:
+    """A rendered view, and i + 1 wherever names[i] is seen."""
+
+    image: UInt8[np.ndarray, "s s 3"]
+    ids: UInt8[np.ndarray, "s s"]
+    names: tuple[str, ...]
+
+
+@dataclass
+class Batch:
+    """Views (b x 3 x s x s in 0..1), the questions of each in turn (q), answers (q x ANSWER tokens; 0 counts nothing), patches (q x p)."""
+
+    images: Tensor
+    questions: list[Question]
+    answers: Tensor
+    patches: Tensor
+
+
+class Shown(nn.Module):
+    """Which patches show the object that is meant: asked of hidden states, in training only."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norm, self.patch = nn.LayerNorm(width), nn.Linear(width, 1)
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        return self.patch(self.norm(hidden)).squeeze(-1)
+
+
+class Learner(nn.Module):
+    """What is trained: the model, and the question beside it."""
+
+    def __init__(self, config: MiniPI0Config) -> None:
+        super().__init__()
+        self.vlm, self.shown = MiniVlm(config), Shown(config.width)
+
+
+def configuration(recipe: Recipe) -> MiniPI0Config:
+    return MiniPI0Config(
+        words=vocabulary(), device="cpu", width=recipe.width, depth=recipe.depth, head_dim=recipe.width // 8, vision_width=recipe.vision_width,
+        vision_depth=recipe.vision_depth, expert_width=recipe.expert_width, image_resolution=(SIDE, SIDE),
+    )  # fmt: skip
+
+
+def views(stages: int, seed: int, cache: Path, *, held_out: bool = False, jobs: int = 2) -> list[View]:
+    """Views of so many stages, scaled down; rendered in processes where they are missing."""
+    from tqdm import tqdm
+
+    kind = "held" if held_out else "train"
+    missing = [n for n in range(stages) if not (cache / f"{kind}-{seed}-{n:05d}.npz").exists()]
+    if missing:
+        list(tqdm(results(partial(_render, cache, seed, held_out), missing, jobs, "jobs"), "scenes", len(missing), mininterval=10))
+    found = []
+    for n in range(stages):
+        shots = cached(cache, seed, n, held_out=held_out)
+        found += [View(small(rgb), ids[::2, ::2].copy(), shots.names) for rgb, ids in zip(shots.rgb, shots.ids, strict=True)]
+    return found
+
+
+def _render(cache: Path, seed: int, held_out: bool, number: int) -> None:
+    cached(cache, seed, number, held_out=held_out)
+
+
+def collate(recipe: Recipe, pool: Sequence[View], number: dict[str, int], rng: np.random.Generator, config: MiniPI0Config) -> Batch:
+    """One batch: views drawn anew, coloured anew, with questions of their own."""
+    images, questions, shares, side = [], [], [], SIDE // config.patch
+    for i in rng.integers(len(pool), size=recipe.batch):
+        view = pool[i]
+        asked = ask(view.image, view.ids, view.names, recipe.questions, rng)
+        images.append(asked.image)
+        for question in asked.questions:
+            questions.append(question)
+            meant = (view.ids == question.target + 1) & (question.target >= 0)
+            shares.append(meant.reshape(side, config.patch, side, config.patch).mean((1, 3)).ravel())
+    answers = torch.zeros((len(questions), ANSWER), dtype=torch.long)
+    for row, question in zip(answers, questions, strict=True):
+        if question.answer:
+            said = [number[word] for word in (*question.answer, "\n")]
+            row[: len(said)] = torch.tensor(said)
+    pictures = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).float() / 255
+    return Batch(pictures, questions, answers, torch.from_numpy(np.stack(shares)).float())
+
+
+def losses(learner: Learner, batch: Batch) -> tuple[Tensor, Told]:
+    """Cross-entropy of the answers' words and of the patches; shares of right answers by kind of question (NaN: none was asked)."""
+    vlm = learner.vlm
+    tokens, there = vlm.ask([question.text for question in batch.questions])
+    patches = vlm.look(batch.images).repeat_interleave(len(batch.questions) // len(batch.images), 0)
+    scores, hidden = vlm(patches, tokens, there, batch.answers)
+    words = F.cross_entropy(scores.flatten(0, 1), batch.answers.flatten(), ignore_index=0)
+    shown = batch.patches.sum(1) > 0
+    share = batch.patches / batch.patches.sum(1, keepdim=True).clamp(min=1e-6)
+    chance = learner.shown(hidden)
+    heat = -(share * chance.log_softmax(-1)).sum(1)[shown].mean()
+    hit = (batch.patches.gather(1, chance.argmax(1, keepdim=True)).squeeze(1) > 0)[shown].float().mean()
+    right = ((scores.argmax(-1) == batch.answers) | (batch.answers == 0)).all(1)
+    kinds = [_kind(question) for question in batch.questions]
+    told = {kind: _share([bool(good) for good, each in zip(right, kinds, strict=True) if each == kind]) for kind in KINDS}
+    return words + SEEN * heat, {"words": float(words.detach()), "heat": float(heat.detach()), "hit": float(hit), **told}
+
+
+def _kind(question: Question) -> str:
+    if not question.answer:
+        return ""
+    return {"where": "where", "what": "colour"}.get(question.text.split()[0], "whether")
+
+
+def _share(good: list[bool]) -> float:
+    return float(np.mean(good)) if good else float("nan")
+
+
+def train(recipe: Recipe, out: Path, *, minutes: float | None = None, cache: Path = CACHE, jobs: int = 2) -> dict[str, Any]:
+    """Train, or go on where an earlier call stopped; write the model and what was measured on unseen objects."""
+    pool, config = views(recipe.stages, recipe.seed, cache, jobs=jobs), configuration(recipe)
+    torch.manual_seed(recipe.seed)  # initial weights only; every other draw comes from the step's stream
+    learner = Learner(config)
+    number = learner.vlm.number
+
+    def step(model: Learner, at: int) -> tuple[Tensor, Told]:
+        return losses(model, collate(recipe, pool, number, np.random.default_rng([75, recipe.seed, at]), config))
+
+    mean, log = descend(learner, step, Descent("mini-paligemma", recipe.steps, recipe.rate, minutes), out)
+    held = views(min(HELD_OUT, recipe.stages), recipe.seed, cache, held_out=True, jobs=jobs)
+    with torch.no_grad():
+        told = [losses(mean, collate(recipe, held, number, np.random.default_rng([76, i]), config))[1] for i in range(16)]
+    mean.vlm.save(out)
+    about = {"recipe": vars(recipe), "held_out": average_of(told), "log": log}
+    (out / "training.json").write_text(json.dumps(about, indent=1))
+    return about
