@@ -14,7 +14,7 @@ import io
 import json
 import logging
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from functools import cache
 from importlib import import_module
@@ -24,6 +24,7 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
+from jaxtyping import Float32
 
 from vap_core.errors import BadPolicy
 from vap_core.policies.witness import TEXT, listened, tell
@@ -80,6 +81,15 @@ class LeRobot:
             self.renamed.get(key, key): tuple(feature.shape) for key, feature in config.input_features.items() if not key.startswith(EMPTY)
         }
         """Shape of every feature that the checkpoint reads, under the key that its preprocessor expects."""
+        self.learned: dict[int, torch.Tensor] = {}
+
+    def saying(self, words: Mapping[str, Float32[np.ndarray, " d"]]) -> "LeRobot":
+        """The same frozen policy, to whom some reserved words mean learned embeddings; its own table stays as it is. Raises: BadPolicy."""
+        known, out = {word: i for i, word in enumerate(getattr(self.policy.config, "words", ()))}, copy.copy(self)
+        if missing := [word for word in words if word not in known]:
+            raise BadPolicy(f"LeRobot: {self.label} has no word {missing[0]}; learned words need a mini-pi0, which reserves some for them.")
+        out.learned = {known[word]: torch.from_numpy(embedding) for word, embedding in words.items()}
+        return out
 
     def start(self, rng: np.random.Generator) -> LeRobotState:
         seed = int(rng.integers(2**63 - 1))
@@ -96,7 +106,8 @@ class LeRobot:
             batch = self.preprocessor(self._observation(inputs))
             self._tell(batch, range(len(inputs)))
             noise = {"noise": self._noise(states)} if self.noisy else {}
-            actions = self.postprocessor(self.policy.predict_action_chunk(batch, **noise)[:, : self.execute])
+            with self._speaking():
+                actions = self.postprocessor(self.policy.predict_action_chunk(batch, **noise)[:, : self.execute])
             return list(states), [chunk.float().cpu().numpy() for chunk in actions]
         return list(states), [self._step(i, state, seen) for i, (state, seen) in enumerate(zip(states, inputs, strict=True))]
 
@@ -140,6 +151,25 @@ class LeRobot:
             name = TEXT if key == TOKENS else self.renamed.get(key, key).removeprefix(IMAGE) if key.startswith(IMAGE) else ""
             for episode, row in zip(episodes, tensor if name else (), strict=bool(name)):
                 tell(episode, name, row.float().cpu().numpy())
+
+    @contextmanager
+    def _speaking(self) -> Iterator[None]:
+        """Inside, the table of words answers learned words by what was learned."""
+        if not self.learned:
+            yield
+            return
+
+        def spoken(table: Any, asked: Any, found: torch.Tensor) -> torch.Tensor:
+            for number, embedding in self.learned.items():
+                found = torch.where((asked[0] == number)[..., None], embedding.to(found), found)
+            return found
+
+        towers: Any = self.policy.model
+        hook = towers.paligemma_with_expert.paligemma.model.language_model.embed_tokens.register_forward_hook(spoken)
+        try:
+            yield
+        finally:
+            hook.remove()
 
     def _noise(self, states: Sequence[LeRobotState]) -> torch.Tensor:
         config: Any = self.policy.config

@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import UInt8
@@ -25,15 +26,15 @@ from vap_core.training.commands import vocabulary
 from vap_core.training.demonstrations import SIDE, small
 from vap_core.training.descent import Descent, Told, average_of, descend
 from vap_core.training.questions import Question, ask
-from vap_core.training.scenes import cached
-from vap_core.values import value
+from vap_core.training.scenes import Shots, cached
+from vap_core.values import Rgb, value
 
 CACHE = Path(__file__).resolve().parents[2] / "data" / "cache" / "perception"
 """The same scenes as perception's; what is there is not rendered again."""
 SEEN = 0.5
 """Weight of the patches beside the words."""
 KINDS = ("where", "whether", "colour")
-HELD_OUT = 24
+HELD_OUT = 30
 """Stages with unseen objects that the result is measured on."""
 
 
@@ -100,7 +101,7 @@ def configuration(recipe: Recipe) -> MiniPI0Config:
 
 
 def views(stages: int, seed: int, cache: Path, *, held_out: bool = False, jobs: int = 2) -> list[View]:
-    """Views of so many stages, scaled down; rendered in processes where they are missing."""
+    """Views and every other portrait of so many stages, scaled down; rendered in processes where they are missing."""
     from tqdm import tqdm
 
     kind = "held" if held_out else "train"
@@ -110,8 +111,13 @@ def views(stages: int, seed: int, cache: Path, *, held_out: bool = False, jobs: 
     found = []
     for n in range(stages):
         shots = cached(cache, seed, n, held_out=held_out)
-        found += [View(small(rgb), ids[::2, ::2].copy(), shots.names) for rgb, ids in zip(shots.rgb, shots.ids, strict=True)]
+        found += [_view(rgb, ids, shots) for rgb, ids in zip(shots.rgb, shots.ids, strict=True)]
+        found += [_view(rgb, ids, shots) for rgb, ids in zip(shots.portraits[::2], shots.portrait_ids[::2], strict=True)]
     return found
+
+
+def _view(rgb: Rgb, ids: UInt8[np.ndarray, "h w"], shots: Shots) -> View:
+    return View(small(rgb), cv2.resize(ids, (SIDE, SIDE), interpolation=cv2.INTER_NEAREST), shots.names)
 
 
 def _render(cache: Path, seed: int, held_out: bool, number: int) -> None:

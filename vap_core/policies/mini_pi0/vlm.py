@@ -1,5 +1,6 @@
 """A mini-PaliGemma by itself: it reads views and questions, and answers in words. A mini-pi0 grows from it; a token is learned in it (SPEC 4)."""
 
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -38,19 +39,25 @@ class MiniVlm(nn.Module):
         self, patches: Float[Tensor, "q p d"], tokens: Int64[Tensor, "q l"], there: Bool[Tensor, "q l"], answers: Int64[Tensor, "q a"]
     ) -> tuple[Float[Tensor, "q a w"], Float[Tensor, "q p d"]]:
         """Scores of every word at every place of the answer, given the words before it; and the penultimate layer's states of the patches."""
+        return self.read(patches, self.towers.embed_language_tokens(tokens), there, answers)
+
+    def read(
+        self, patches: Float[Tensor, "q p d"], words: Float[Tensor, "q l d"], there: Bool[Tensor, "q l"], answers: Int64[Tensor, "q a"]
+    ) -> tuple[Float[Tensor, "q a w"], Float[Tensor, "q p d"]]:
+        """`forward` with the question's words embedded already."""
         from lerobot.policies.common.vla_utils import make_att_2d_masks, prepare_attention_masks_4d
 
-        length, words = patches.shape[1], answers.shape[1]
-        embedded = self.towers.embed_language_tokens(torch.cat([tokens, answers[:, :-1]], 1))
-        pad = torch.cat([torch.ones_like(patches[..., 0], dtype=torch.bool), there, torch.ones_like(answers[:, :-1], dtype=torch.bool)], 1)
+        length, start, before = patches.shape[1], patches.shape[1] + words.shape[1], answers[:, :-1]
+        pad = torch.cat([torch.ones_like(patches[..., 0], dtype=torch.bool), there, torch.ones_like(before, dtype=torch.bool)], 1)
         causal = torch.zeros_like(pad)
-        causal[:, length + tokens.shape[1] :] = True
+        causal[:, start:] = True
         out = self.towers.paligemma.model.language_model(
-            inputs_embeds=torch.cat([patches, embedded], 1), attention_mask=prepare_attention_masks_4d(make_att_2d_masks(pad, causal)),
-            position_ids=torch.cumsum(pad, dim=1) - 1, use_cache=False, output_hidden_states=True,
+            inputs_embeds=torch.cat([patches, words, self.towers.embed_language_tokens(before)], 1),
+            attention_mask=prepare_attention_masks_4d(make_att_2d_masks(pad, causal)), position_ids=torch.cumsum(pad, dim=1) - 1,
+            use_cache=False, output_hidden_states=True,
         )  # fmt: skip
         last = length + there.sum(1, keepdim=True) - 1
-        places = torch.cat([last, length + tokens.shape[1] + torch.arange(words - 1).expand(len(tokens), -1)], 1)
+        places = torch.cat([last, start + torch.arange(before.shape[1]).expand(len(words), -1)], 1)
         states = out.last_hidden_state.gather(1, places[..., None].expand(-1, -1, patches.shape[2]))
         return self.towers.paligemma.lm_head(states), out.hidden_states[-2][:, :length]
 
@@ -70,6 +77,13 @@ class MiniVlm(nn.Module):
         longest = int(there.sum(1).max())
         return tokens[:, :longest], there[:, :longest]
 
+    def sha256(self) -> str:
+        """Checksum of all weights as they stand."""
+        found = hashlib.sha256()
+        for name, tensor in sorted(self.towers.state_dict().items()):
+            found.update(name.encode() + tensor.detach().contiguous().numpy().tobytes())
+        return found.hexdigest()
+
     def save(self, folder: Path) -> None:
         """Write `folder`: sizes and words as config.json, weights as safetensors."""
         folder.mkdir(parents=True, exist_ok=True)
@@ -79,15 +93,14 @@ class MiniVlm(nn.Module):
 
 def load(folder: Path) -> MiniVlm:
     """The frozen model that `save` wrote. Raises: BadPolicy."""
+    if not (folder / WEIGHTS).is_file():
+        raise BadPolicy(f"vlm.load: {folder} holds no mini-PaliGemma ({WEIGHTS}); make one: python -m vap_core train vlm")
     try:
-        config = PreTrainedConfig.from_pretrained(folder)
-        vlm = MiniVlm(cast(MiniPI0Config, config))
+        vlm = MiniVlm(cast(MiniPI0Config, PreTrainedConfig.from_pretrained(folder)))
         vlm.towers.load_state_dict(load_file(folder / WEIGHTS))
     except Exception as error:
         reason = (str(error).strip().splitlines() or [""])[0]
-        raise BadPolicy(
-            f"vlm.load: {folder} holds no mini-PaliGemma ({type(error).__name__}: {reason:.200}); train one: vap-core train vlm."
-        ) from error
+        raise BadPolicy(f"vlm.load: {folder} is damaged ({type(error).__name__}: {reason:.150}); make it again: python -m vap_core train vlm") from error
     return vlm.eval().requires_grad_(False)
 
 
