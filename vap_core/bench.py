@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vap_core.attend import Attender
 from vap_core.experiments import DEMO, make_trial, register_personal
 from vap_core.features import features
 from vap_core.record import Recorder
@@ -68,7 +69,7 @@ def _pass_ms(trial: Trial) -> float:
 
 
 def _attend_limits(trial: Trial, row: EpisodeRow, unit: float) -> list[Limit]:
-    assert trial.attender is not None
+    assert isinstance(trial.attender, Attender)
     attender, env = trial.attender, Env(trial.scene)
     env.reset(row)
     views = {trial.scene.cameras[0]: env.observe().images[trial.scene.cameras[0]]}

@@ -15,6 +15,9 @@ from typing import TYPE_CHECKING, Any, Literal
 from vap_core import audit, store, traces
 from vap_core.errors import BadOutput, WorkerDied
 from vap_core.experiments import Study, make_trial, register_personal
+from vap_core.frozen import frozen
+from vap_core.oracle import Revealed
+from vap_core.policies import Insider
 from vap_core.processes import results
 from vap_core.values import EpisodeRow, Opening
 
@@ -116,19 +119,23 @@ def key(row: EpisodeRow, method: str, run: str) -> str:
 
 
 def work(job: Job) -> Rows:
-    """Run one job in this process; `peak_mb` is the most memory that it has taken so far."""
+    """Run one job in this process; `peak_mb` is the most memory that it has taken so far, `policy_sha256` begins the checksum of the policy's
+    parameters, and `bound` marks what is no result: a method or policy that reads the simulator. Raises: BadPolicy when the parameters changed."""
     from vap_core.rollout import rollout
 
     trial = make_trial(job.study, job.rows, job.method, job.folder / "memory")
     sink = None if job.record == "none" else _recorders(job.folder / "recordings")
-    episodes = list(rollout(trial, job.rows, sink, batch=BATCH))
+    with frozen(trial.policy) as checksum:
+        episodes = list(rollout(trial, job.rows, sink, batch=BATCH))
     if job.record == "failures":
         for episode in episodes:
             if episode.outcome.status == "success":
                 _recording(job.folder / "recordings", episode.opening).unlink(missing_ok=True)
     traces.write(job.folder, episodes)
     audit.write(job.folder, episodes)
-    about = {"attempt": job.attempt, "peak_mb": getrusage(RUSAGE_SELF).ru_maxrss // 1024}
+    bound = isinstance(trial.attender, Revealed) or isinstance(trial.policy, Insider)
+    about: dict[str, Any] = {"attempt": job.attempt, "policy_sha256": checksum, "bound": bound}
+    about["peak_mb"] = getrusage(RUSAGE_SELF).ru_maxrss // 1024
     return [{"key": name, **about, **episode.summary()} for name, episode in zip(job.keys, episodes, strict=True)]
 
 

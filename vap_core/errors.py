@@ -65,6 +65,10 @@ class BadPolicy(VapError):
     """A checkpoint that is not there, would execute code, is not what its files say, or does not fit the suite."""
 
 
+class BadEndpoint(VapError):
+    """A chat endpoint that cannot be reached, refuses, or does not speak the protocol."""
+
+
 class BadCluster(VapError):
     """No Ray cluster where one was expected, or no Ray."""
 

@@ -13,9 +13,12 @@ import numpy as np
 from vap_core import __version__, suites
 from vap_core.associate import PAIRINGS
 from vap_core.attend import STACKS, Attender, Prompting, load_stack
+from vap_core.describe import Attributes, Captioner, described
 from vap_core.detect import Detector
 from vap_core.errors import BadStudy, one_of
+from vap_core.hard_prompt import Described, Reworded, hard_prompt
 from vap_core.memory import load_bank, register, save
+from vap_core.oracle import Oracle, Revealed
 from vap_core.policies import Insider, Policy, lerobot
 from vap_core.policies.expert import Expert
 from vap_core.policies.random import Random
@@ -31,14 +34,23 @@ from vap_core.suites import SUITES, VARIANTS, Suite, listed, lists, rows
 from vap_core.values import EpisodeRow
 from vap_core.weights import weights_sha256
 
-METHODS: dict[str, Prompting | None] = {
+type Method = Prompting | Described | Oracle | None
+
+METHODS: dict[str, Method] = {
     "generic": None,
+    "hard-short": Described("short"),
+    "hard-long": Described("long"),
     "vap": Prompting(),
     "mask-only": Prompting(rewrite=False),
     "rewrite-only": Prompting(highlight=False),
     "vap-associated": Prompting(associate=PAIRINGS["geometry"]),
+    "oracle-box": Oracle("box"),
+    "oracle-mask": Oracle("mask"),
+    "oracle-track": Oracle("track"),
+    "wrong-mask": Oracle("track", of="rival"),
 }
-"""What each method changes in the policy's inputs; None changes nothing (P 5.2). Association is not the paper's."""
+"""What each method changes in the policy's inputs; None changes nothing (P 5.2). Association is not the paper's, nor are the last four: they read the
+simulator, and bound what results can be."""
 
 
 @dataclass(frozen=True)
@@ -108,18 +120,23 @@ def _exactly(thing: Any) -> bytes:
     return json.dumps(thing, default=plain, sort_keys=True).encode()
 
 
-def register_personal(study: Study, bank: Path) -> None:
+def register_personal(study: Study, bank: Path, captioner: Captioner | None = None) -> None:
     """Remember the personal object of every task from five rendered reference views; what the bank holds already stays.
 
-    A study that prompts nothing needs no memory.
+    Where a method tells what it looks like, it is described too, by `captioner`, or offline. A study that prompts nothing needs no memory.
     """
     if all(METHODS[method] is None for method in study.methods):
         return
     stack, held = load_stack(study.stack), load_bank(bank)
+    telling = any(isinstance(METHODS[method], Described) for method in study.methods)
     for suite, task in study.tasks:
         row = study.rows(suite, task)[0]
-        if row.target not in held:
+        obj = held.get(row.target)
+        if obj is None:
             obj, _ = register(row.target, row.category, reference_views(get(row.target)), stack.detector, stack.encoder)
+        if telling and obj.description is None:
+            obj = described(obj, captioner or Attributes(stack.segmenter))
+        if obj is not held.get(row.target):
             save(bank, obj, replace=True)
             held[row.target] = obj
 
@@ -149,19 +166,15 @@ DEMO = Study(tasks=(("widowx-pick", "pick-straw-cup"), ("franka-pick", "pick-cup
 
 def make_trial(study: Study, rows: Sequence[EpisodeRow], method: str, bank: Path) -> Trial:
     """Build, or take from this process's cache, what some rows of one task and one variant need: scene, models, policy."""
-    first, prompting = rows[0], METHODS[method]
+    first = rows[0]
     suite = suites.suite(first.suite)
     scene = _scene(study, first.suite, first.task, first.variant)
-    attender = None
-    if prompting is not None:
-        stack = _stack(study.stack)
-        attender = Attender(stack, {first.target: load_bank(bank, stack.encoder.name)[first.target]}, prompting)
     sizes: Mapping[str, tuple[float, float, float]] = {name: extent_m(get(name)) for name in scene.objects}
     return Trial(
         method,
         scene,
         POLICIES[study.policy](study, scene, suite) if study.policy in POLICIES else lerobot.fitted(study.policy, scene, suite),
-        attender,
+        _attender(METHODS[method], study, first, bank, scene),
         sizes,
         suite.control,
         suite.sensor,
@@ -169,6 +182,22 @@ def make_trial(study: Study, rows: Sequence[EpisodeRow], method: str, bank: Path
         follow=study.follow,
         audit=study.audit,
     )
+
+
+def _attender(how: Method, study: Study, row: EpisodeRow, bank: Path, scene: Scene) -> Attender | Reworded | Revealed | None:
+    """What stands between the cameras and the policy under one method."""
+    match how:
+        case None:
+            return None
+        case Described():
+            return hard_prompt(load_bank(bank)[row.target], how)
+    stack = _stack(study.stack)
+    mine = {row.target: load_bank(bank, stack.encoder.name)[row.target]}
+    match how:
+        case Oracle():
+            return Revealed(Attender(stack, mine, how.prompting), how, frozenset(n for n in scene.objects if get(n).category == row.category))
+        case Prompting():
+            return Attender(stack, mine, how)
 
 
 @lru_cache(maxsize=4)

@@ -5,6 +5,7 @@ import os
 import re
 import struct
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 
@@ -13,7 +14,7 @@ import numpy as np
 from vap_core.detect import Detector
 from vap_core.embed import Encoder, crop
 from vap_core.errors import BadMemory, BadOutput, BadPhoto, UnknownName, one_of
-from vap_core.values import Boxes, PersonalObject, Rgb, Target
+from vap_core.values import Boxes, Description, PersonalObject, Rgb, Target
 
 VERSION = 1
 SUFFIX = ".object.safetensors"
@@ -107,6 +108,8 @@ def save(bank: Path, obj: PersonalObject, *, replace: bool = False) -> Path:
         raise BadOutput(f"save: {path} exists; choose another name or pass --replace.")
     tensors = {"embeddings": obj.embeddings, **{f"crop.{i:03d}": np.ascontiguousarray(crop) for i, crop in enumerate(obj.crops)}}
     about = {"format": "vap-personal-object", "version": str(VERSION), "name": obj.name, "category": obj.category, "encoder": obj.encoder}
+    if obj.description is not None:
+        about["description"] = json.dumps(asdict(obj.description))
     try:
         bank.mkdir(parents=True, exist_ok=True)
         with NamedTemporaryFile(dir=bank, prefix=".", suffix=".tmp", delete=False) as file:
@@ -142,7 +145,8 @@ def load(path: Path, encoder: str | None = None) -> PersonalObject:
         raise BadMemory(f"load: {path} was embedded by {about.get('encoder')!r}, this stack uses {encoder!r}; {again}.")
     try:
         crops = tuple(tensors[key] for key in sorted(tensors) if key.startswith("crop."))
-        return PersonalObject(about["name"], about["category"], tensors["embeddings"], crops, about["encoder"])
+        told = Description(**json.loads(about["description"])) if "description" in about else None
+        return PersonalObject(about["name"], about["category"], tensors["embeddings"], crops, about["encoder"], told)
     except (KeyError, ValueError, TypeError) as error:
         raise BadMemory(f"load: {path} lacks what an object needs ({type(error).__name__}); {again}.") from error
 

@@ -14,8 +14,10 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 
 from vap_core import audit
-from vap_core.attend import Attender, AttendState
+from vap_core.attend import Attender
 from vap_core.errors import BadAction, OutOfReach, VapError
+from vap_core.hard_prompt import Reworded
+from vap_core.oracle import Revealed
 from vap_core.policies import Insider, Policy
 from vap_core.sim.env import Control, Env
 from vap_core.sim.occluder import Occlusion
@@ -39,7 +41,7 @@ Follow = Literal["call", "step"]
 
 @dataclass(frozen=True)
 class Trial:
-    """What a batch of episodes shares. `attender` None is the generic policy: raw images, raw instruction.
+    """What a batch of episodes shares. `attender` None is the generic policy: raw images, raw instruction; a Revealed reads the simulator.
 
     An Insider needs no pictures; it gets them every `images_every` control steps all the same (0: never), for their cost or their look.
     `follow` is when images are taken and targets tracked: at the policy's calls, which is all it ever sees, or at every control step.
@@ -49,7 +51,7 @@ class Trial:
     method: str
     scene: Scene
     policy: Policy[Any] | Insider[Any]
-    attender: Attender | None
+    attender: Attender | Reworded | Revealed | None
     sizes_m: Mapping[str, tuple[float, float, float]]
     control: Control = "ee"
     sensor: Sensor = PERFECT
@@ -70,7 +72,7 @@ class Running:
     sink: Sink | None
     watched: bool
     opening: Opening | None = None
-    attend_state: AttendState | None = None
+    attend_state: Any = None
     queue: deque[np.ndarray] = field(default_factory=deque)
     frames: list[Frame] = field(default_factory=list)
     calls: list[Call] = field(default_factory=list)
@@ -134,8 +136,12 @@ def _start(trial: Trial, one: Running, raw: PolicyInput) -> Attended:
     """Ground at t = 0; a step without images, or without VAP, passes as it is."""
     if trial.attender is None or not raw.images:
         return Attended(raw.images, raw.text, (), {}, {}, ())
+    masks = one.env.truth(masks=True).masks if isinstance(trial.attender, Revealed) else {}
     with _timed(one.seconds, "attend"):
-        one.attend_state, attended = trial.attender.start(raw.images, raw.text, cameras={c.name: c for c in one.env.cameras()})
+        if isinstance(trial.attender, Revealed):
+            one.attend_state, attended = trial.attender.start(raw.images, raw.text, one.row, masks)
+        else:
+            one.attend_state, attended = trial.attender.start(raw.images, raw.text, cameras={c.name: c for c in one.env.cameras()})
     return attended
 
 
@@ -143,9 +149,14 @@ def _follow(trial: Trial, following: Sequence[Running], raws: Mapping[int, Polic
     """Track in one batch; when that fails, one by one, to find out whose fault it is."""
     if trial.attender is None or not following:
         return {}
+    states, views = [one.attend_state for one in following], [raws[id(one)].images for one in following]
     start = time.perf_counter()
     try:
-        done = trial.attender.steps([one.attend_state for one in following if one.attend_state], [raws[id(one)].images for one in following])
+        if isinstance(trial.attender, Revealed):
+            masks = [one.env.truth(masks=True).masks if trial.attender.always else {} for one in following]
+            done: Sequence[tuple[Any, Attended]] = trial.attender.steps(states, views, [one.row for one in following], masks)
+        else:
+            done = trial.attender.steps(states, views)
     except Exception as error:
         if _ends_the_run(error):
             raise

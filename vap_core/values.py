@@ -54,6 +54,14 @@ class Boxes:
 
 
 @value
+class Description:
+    """What an object looks like, in words that can follow "my cup is": a few, and as many as tell it apart."""
+
+    short: str
+    long: str
+
+
+@value
 class PersonalObject:
     """One remembered object: K reference crops and their embeddings Z_o (P 3.3), rows L2-normalised."""
 
@@ -62,6 +70,7 @@ class PersonalObject:
     embeddings: Float32[np.ndarray, "k d"]
     crops: tuple[Rgb, ...]
     encoder: str
+    description: Description | None = None
 
     def __post_init__(self) -> None:
         if len(self.crops) != len(self.embeddings) or not self.crops:

@@ -26,6 +26,7 @@ def register(
     memory: Memory = BANK,
     stack: StackName = "embedded",
     whole: Annotated[bool, typer.Option("--whole", help="The photos are cut out already: use them whole, without the detector.")] = False,
+    describe: Annotated[str, typer.Option(help="Who puts it into words: offline, chat (OPENAI_BASE_URL, _MODEL, _API_KEY), or a URL.")] = "offline",
     replace: Annotated[bool, typer.Option("--replace", help="Overwrite an object of this name.")] = False,
 ) -> None:
     """Remember a personal object from photos.
@@ -33,6 +34,7 @@ def register(
     Example: python -m vap_core register mug --category cup photos/mug-*.jpg
     """
     from vap_core.attend import load_stack
+    from vap_core.describe import captioner, described
     from vap_core.memory import load_photo, remember, save
     from vap_core.memory import register as learn
 
@@ -45,7 +47,7 @@ def register(
         obj, uncropped = learn(name, category, pictures, models.detector, models.encoder)
         for index in uncropped:
             print(f"note: no sure {obj.category} found in {photos[index]}; the whole photo is used.", file=sys.stderr)
-    path = save(memory, obj, replace=replace)
+    path = save(memory, described(obj, captioner(models.segmenter, describe)), replace=replace)
     print(f"{obj.name}: a {obj.category} with {len(obj.crops)} references, saved to {path}")
     print(f'next: python -m vap_core ground IMAGE "bring my {obj.category}" --memory {memory}')
 
