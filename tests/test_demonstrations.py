@@ -1,6 +1,7 @@
 """Demonstrations show generic objects only, the same ones every time; a command says what its picture shows."""
 
 import re
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,9 @@ from vap_core.prompt import PALETTE, looks_like
 from vap_core.sim import objects
 from vap_core.suites import BENCHMARKS, suite
 from vap_core.training import demonstrations, policy
-from vap_core.training.commands import command, near, painted, rough, say, tinted, vocabulary
+from vap_core.training.commands import command, near, painted, rough, say, tinted
 from vap_core.training.demonstrations import PARTS, SIDE, Film, cached, cast
+from vap_core.training.words import described, vocabulary
 
 SUITE = "simpler-bridge"
 
@@ -71,29 +73,31 @@ def test_casts_are_generic_and_of_one_category() -> None:
 
 def test_a_command_says_what_its_picture_shows(stage: tuple[Path, list[Film]]) -> None:
     _, films = stage
-    words, kinds = set(vocabulary()), {"coloured": 0, "plain": 0}
-    for seed in range(120):
+    words, ways = set(vocabulary()), Counter[str]()
+    for seed in range(160):
         film, rng = films[seed % len(films)], np.random.default_rng(seed)
         t = int(rng.integers(len(film.action)))
         made = command(film, t, SUITE, rng)
-        assert set(re.findall(r"[\w']+", made.text)) <= words
-        named = [colour for colour in PALETTE if f"the {colour.name} " in made.text]
-        mask = film.ids[t, 0] == 1
-        if named:
-            kinds["coloured"] += 1
-            if mask.sum() > 60:
-                assert looks_like(made.images[0][mask], named[0]).mean() > 0.15, made.text
-        else:
-            kinds["plain"] += 1
-            assert near(film, t, SUITE, [i for i in range(1, len(film.names)) if i != film.goal])
-    assert min(kinds.values()) > 5
+        ways[made.way] += 1
+        assert set(re.findall(r"[\w']+", made.text.lower())) <= words
+        mask, rivals = film.ids[t, 0] == 1, [i for i in range(1, len(film.names)) if i != film.goal]
+        looks = [described(objects.get(film.names[i]).texture) for i in (0, *rivals)]
+        if made.way == "plain":
+            assert near(film, t, SUITE, rivals)
+        elif made.way == "described":
+            assert [word for word in looks[0].difference(*looks[1:]) if f" {word}" in made.text]
+        elif mask.sum() > 60:
+            (colour,) = (colour for colour in PALETTE if f" {colour.name}" in made.text)
+            assert looks_like(made.images[0][mask], colour).mean() > 0.15, made.text
+    assert min(ways[way] for way in ("tinted", "painted", "described", "plain")) > 5
 
 
 def test_my_is_said_of_a_generic_thing_too_and_once() -> None:
-    rng = np.random.default_rng(0)
-    said = {say("put my camera on the plate", None, rng) for _ in range(40)}
+    rng, task = np.random.default_rng(0), BENCHMARKS["simpler-bridge"].task("put-camera")
+    said = {say(task, "", rng) for _ in range(40)}
     assert said == {f"put {word} camera on the plate" for word in ("my", "the", "a")}
-    assert say("select my cup", PALETTE[1], rng) == "select the blue cup"
+    said = {say(task, "blue", rng) for _ in range(40)}
+    assert said == {"put the blue camera on the plate", "put my camera on the plate. My camera is blue."}
 
 
 @settings(max_examples=25)

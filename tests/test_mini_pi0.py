@@ -14,7 +14,7 @@ from vap_core.policies.lerobot import load
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
 from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
-from vap_core.training.commands import vocabulary
+from vap_core.training.words import vocabulary
 from vap_core.values import PolicyInput
 
 STATE, ACTION = 13, 7
@@ -85,7 +85,7 @@ def test_words_become_the_tokens_that_they_are() -> None:
     assert len(set(words)) == len(words)
     number = {word: i for i, word in enumerate(words)}
     tokens, there = encode(["put the red camera on the plate", "Find <my_0>, zebra"], number, 10)
-    assert [words[i] for i in tokens[0]] == ["put", "the", "red", "camera", "on", "the", "plate", "\n", "<pad>", "<pad>"]
+    assert [words[i] for i in tokens[0]] == ["put", "the", "red", "camera", "on", "the", "plate", "\n"]
     assert [words[i] for i in tokens[1]][:4] == ["<unk>", "<my_0>", "<unk>", "\n"]
     assert there.sum(1).tolist() == [8, 4]
 

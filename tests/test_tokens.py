@@ -12,7 +12,7 @@ from vap_core.policies.lerobot import load as load_policy
 from vap_core.policies.mini_pi0.vlm import MiniVlm, grow
 from vap_core.policies.mini_pi0.vlm import load as load_vlm
 from vap_core.tokens import SUFFIX, WORD, Lesson, Photos, Token, framed, learn
-from vap_core.training.commands import vocabulary
+from vap_core.training.words import vocabulary
 from vap_core.values import PolicyInput, Rgb
 
 from .test_mini_pi0 import checkpoint, config  # noqa: F401
@@ -28,7 +28,7 @@ def vlm() -> MiniVlm:
         torch.manual_seed(0)
         model = MiniVlm(config())
     optimiser = torch.optim.AdamW(model.parameters(), 3e-3)
-    for _ in range(120):
+    for _ in range(300):
         shown = photos(rng, 8)
         views = torch.from_numpy(np.stack([*shown.own, *shown.rivals])).permute(0, 3, 1, 2).float() / 255
         colours = rng.choice(["red", "blue"], 16)

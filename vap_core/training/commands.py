@@ -1,88 +1,71 @@
 """What is said beside a filmed frame, and how it is coloured to fit: one demonstration teaches many commands.
 
-*Tinted*: the target carries a tint, as VAP's policy will see it, and is called by the colour. *Painted*: it has the colour by nature. *Plain*: no
-colour is named; only frames in which the hand is nearer to the target than to any rival, so that a plain command means what the hand already nears.
-Rivals and bystanders are often painted in other colours, in all three.
+*Tinted*: the target carries a tint, as VAP's policy will see it, and is called by the colour. *Painted*: it has the colour by nature.
+*Described*: nothing is coloured, and what it looks like is said, where that tells it from its rivals. *Plain*: nothing tells it; only frames in
+which the hand is nearer to the target than to any rival, so that a plain command means what the hand already nears. Rivals are often painted.
 """
 
-import re
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 
 from vap_core.prompt import PALETTE
-from vap_core.sim import robots
-from vap_core.sim.objects import CATEGORIES, CLUTTER
-from vap_core.suites import BENCHMARKS, suite
+from vap_core.sim import objects, robots
+from vap_core.suites import Task, suite
 from vap_core.training.demonstrations import Film
+from vap_core.training.words import DETERMINERS, described
 from vap_core.values import Colour, value
 
-TINTED, PAINTED = 0.5, 0.2
-"""Shares of the commands; the rest is plain where it can be, else tinted."""
+TINTED, PAINTED, DESCRIBED = 0.5, 0.15, 0.1
+"""Shares of the commands; the rest is plain where it can be, and what cannot be plain or described is tinted."""
+AFTERWARDS = 0.15
+"""How often the word that tells the target comes in a sentence of its own, as a description does."""
 ALPHA, COAT = (0.3, 0.7), (0.7, 0.95)
 """Opacity of a tint, and of paint."""
 OTHERS, LOST = 0.3, 0.12
 """How often a rival is painted, and a view's tint is missing (a tracker that lost its target); one view keeps it."""
-DETERMINERS = ("my", "the", "a")
-FIRST = ("<pad>", "<unk>", "\n")
-RESERVED = tuple(f"<my_{i}>" for i in range(8))
-"""Tokens that nothing is said with yet: a soft prompt learns one."""
-QUESTIONS = re.findall(
-    r"\w+", "where is there can you recognize in this image what colour yes no left right top bottom middle near far it point to at"
-)
-"""Words that a vision-language model is asked and answers with."""
-PATTERNS = {"plain": "plain", "diagonal": "striped", "waves": "wavy", "speckle": "speckled", "tiles": "tiled", "gradient": "shaded"}
-"""Words for motifs of generic objects; every other one is "patterned"."""
-DESCRIBING = re.findall(
-    r"\w+",
-    "white grey black brown beige orange purple pink light dark bright pale "
-    "plain striped wavy speckled tiled shaded patterned spotted checked dotted "
-    "tall short wide narrow small large round square with and body top base stripes spots dots marks pattern lid handle mostly some",
-)
-"""Words of descriptions."""
 NEAR_M = 0.02
 """A hand that is nearer to its target than to any rival by this much gives its choice away."""
 
 
+Way = Literal["tinted", "painted", "described", "plain"]
+
+
 @value
 class Command:
-    """One training sample: views (uint8), words, and the index of the object that is meant."""
+    """One training sample: views and words, and how the two name the target, which is object 0."""
 
     images: UInt8[np.ndarray, "c s s 3"]
     text: str
-    target: int
-
-
-def vocabulary() -> tuple[str, ...]:
-    """Every word of the benchmarks' instructions, of colours and of questions; token i is word i."""
-    said = [task.instruction for known in BENCHMARKS.values() for task in known.tasks] + [colour.name for colour in PALETTE]
-    said += [*CATEGORIES, *CLUTTER]
-    words = [word for text in said for word in re.findall(r"[\w']+", text.lower())]
-    return (*FIRST, *dict.fromkeys([*words, *DETERMINERS, "up", *QUESTIONS, *DESCRIBING]), *RESERVED)
+    way: Way
 
 
 def command(film: Film, t: int, suite_name: str, rng: np.random.Generator) -> Command:
     """Frame t of a film with something said that its action answers."""
-    instruction = suite(suite_name).task(film.task).instruction
+    task = suite(suite_name).task(film.task)
     rivals = [i for i in range(1, len(film.names)) if i != film.goal]
     images, ids = film.images[t].copy(), film.ids[t]
     mine, *others = (PALETTE[i] for i in rng.permutation(len(PALETTE)))
     for rival, colour in zip(rivals, others, strict=False):
         if rng.random() < OTHERS:
             images = painted(images, ids == rival + 1, colour, float(rng.uniform(*COAT)))
-    way = rng.random()
-    if way < 1 - TINTED - PAINTED and near(film, t, suite_name, rivals):
-        text = say(instruction, None, rng)
-    elif way < 1 - TINTED:
-        images, text = painted(images, ids == 1, mine, float(rng.uniform(*COAT))), say(instruction, mine, rng)
-    else:
+    drawn, word = rng.random(), mine.name
+    way: Way = "tinted"
+    if drawn < DESCRIBED and (told := _telling(film, rivals, rng)):
+        images, way, word = film.images[t].copy(), "described", told
+    elif DESCRIBED < drawn < 1 - TINTED - PAINTED and near(film, t, suite_name, rivals):
+        way, word = "plain", ""
+    elif 1 - TINTED - PAINTED < drawn < 1 - TINTED:
+        images, way = painted(images, ids == 1, mine, float(rng.uniform(*COAT))), "painted"
+    if way == "tinted":
         seen = rng.random(len(images)) > LOST
         seen[rng.integers(len(images))] = True
         masks = np.stack([rough(ids[c] == 1, rng) & bool(seen[c]) for c in range(len(images))])
-        images, text = tinted(images, masks, mine, float(rng.uniform(*ALPHA))), say(instruction, mine, rng)
+        images = tinted(images, masks, mine, float(rng.uniform(*ALPHA)))
     gain = rng.uniform(0.9, 1.1) * rng.uniform(0.96, 1.04, 3)
-    return Command(np.clip(images * gain, 0, 255).astype(np.uint8), text, 0)
+    return Command(np.clip(images * gain, 0, 255).astype(np.uint8), say(task, word, rng), way)
 
 
 def near(film: Film, t: int, suite_name: str, rivals: Sequence[int]) -> bool:
@@ -92,9 +75,18 @@ def near(film: Film, t: int, suite_name: str, rivals: Sequence[int]) -> bool:
     return bool(all(away[0] + NEAR_M < away[i] for i in rivals))
 
 
-def say(instruction: str, colour: Colour | None, rng: np.random.Generator) -> str:
-    """The task's instruction with its "my" replaced: by a colour, or by any determiner."""
-    return instruction.replace("my ", f"the {colour.name} " if colour else f"{rng.choice(DETERMINERS)} ", 1)
+def _telling(film: Film, rivals: Sequence[int], rng: np.random.Generator) -> str:
+    """A word for the target's own look that fits no rival; "" when there is none."""
+    looks = [described(objects.get(film.names[i]).texture) for i in (0, *rivals)]
+    words = sorted(looks[0].difference(*looks[1:]))
+    return str(rng.choice(words)) if words else ""
+
+
+def say(task: Task, word: str, rng: np.random.Generator) -> str:
+    """The task's instruction with its "my" replaced: by "the" and a word, or by any determiner; now and then the word comes afterwards."""
+    if word and rng.random() < AFTERWARDS:
+        return f"{task.instruction}. My {task.category} is {word}."
+    return task.instruction.replace("my ", f"the {word} " if word else f"{rng.choice(DETERMINERS)} ", 1)
 
 
 def tinted(images: UInt8[np.ndarray, "c s s 3"], masks: np.ndarray, colour: Colour, alpha: float) -> UInt8[np.ndarray, "c s s 3"]:

@@ -27,9 +27,10 @@ from vap_core.policies.mini_pi0.vlm import grow
 from vap_core.policies.mini_pi0.vlm import load as load_vlm
 from vap_core.processes import results
 from vap_core.suites import suite
-from vap_core.training.commands import command, vocabulary
+from vap_core.training.commands import command
 from vap_core.training.demonstrations import SIDE, Film, cached
 from vap_core.training.descent import Descent, Told, average_of, descend
+from vap_core.training.words import vocabulary
 
 CACHE = Path(__file__).resolve().parents[2] / "data" / "cache" / "demonstrations"
 CHUNKS = {"simpler-fractal": (4, 2), "simpler-bridge": (4, 4), "vlabench": (4, 4), "tabletop": (32, 10)}

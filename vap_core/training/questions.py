@@ -7,16 +7,15 @@ where it is the only one.
 """
 
 from collections.abc import Sequence
-from colorsys import rgb_to_hsv
 
 import numpy as np
 from jaxtyping import UInt8
 
 from vap_core.prompt import PALETTE
 from vap_core.sim import objects
-from vap_core.sim.textures import Ink, Texture
 from vap_core.suites import BENCHMARKS
-from vap_core.training.commands import ALPHA, COAT, DETERMINERS, PATTERNS, painted, tinted
+from vap_core.training.commands import ALPHA, COAT, painted, tinted
+from vap_core.training.words import DETERMINERS, described
 from vap_core.values import value
 
 COLOURED, TINTED = 0.45, 0.5
@@ -24,8 +23,6 @@ COLOURED, TINTED = 0.45, 0.5
 LEAST_PX = 20
 """Visible pixels of an object that is asked about."""
 TASKS = tuple(task for suite in BENCHMARKS.values() for task in suite.tasks)
-HUES = ((16, "red"), (48, "orange"), (72, "yellow"), (160, "green"), (195, "cyan"), (262, "blue"), (292, "purple"), (344, "magenta"), (361, "red"))
-"""Names of hues up to so many degrees."""
 
 
 @value
@@ -122,23 +119,3 @@ def place(mask: np.ndarray) -> tuple[str, str]:
     ys, xs = np.nonzero(mask)
     thirds = (3 * np.array([ys.mean(), xs.mean()]) / mask.shape[0]).astype(int)
     return ("top", "middle", "bottom")[thirds[0]], ("left", "middle", "right")[thirds[1]]
-
-
-def described(texture: Texture | np.ndarray) -> set[str]:
-    """An object's own colour and pattern, in words."""
-    return {colour_word(texture.base), PATTERNS.get(texture.motif, "patterned")} if isinstance(texture, Texture) else set()
-
-
-def colour_word(rgb: Ink) -> str:
-    """What a person calls a colour, sRGB 0..255."""
-    hue, vivid, bright = rgb_to_hsv(*(part / 255 for part in rgb))
-    if bright < 0.25:
-        return "black"
-    if vivid < 0.12:
-        return "white" if bright > 0.8 else "grey"
-    name = next(name for limit, name in HUES if 360 * hue < limit)
-    if name in ("orange", "yellow", "red") and vivid < 0.45:
-        return "beige" if bright > 0.65 else "brown"
-    if name in ("magenta", "red", "purple") and bright > 0.65 and vivid < 0.6:
-        return "pink"
-    return "brown" if name == "orange" and bright < 0.6 else name

@@ -22,11 +22,11 @@ from torch.nn import functional as F  # noqa: N812
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.vlm import ANSWER, MiniVlm
 from vap_core.processes import results
-from vap_core.training.commands import vocabulary
 from vap_core.training.demonstrations import SIDE, small
 from vap_core.training.descent import Descent, Told, average_of, descend
 from vap_core.training.questions import Question, ask
 from vap_core.training.scenes import Shots, cached
+from vap_core.training.words import vocabulary
 from vap_core.values import Rgb, value
 
 CACHE = Path(__file__).resolve().parents[2] / "data" / "cache" / "perception"

@@ -27,7 +27,7 @@ class MiniPI0Config(PI0Config):
     expert_width: int = 96
     chunk_size: int = 4
     n_action_steps: int = 4
-    tokenizer_max_length: int = 20
+    tokenizer_max_length: int = 40
     num_inference_steps: int = 5
     words: tuple[str, ...] = ()
     """The vocabulary: token i is word i; see processor_mini_pi0."""

@@ -52,10 +52,10 @@ class Words(ProcessorStep):
 
 
 def encode(texts: list[str], number: dict[str, int], longest: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Token numbers, n x `longest`, padded on the right, and where there are any."""
-    tokens = torch.zeros((len(texts), longest), dtype=torch.long)
-    for row, text in zip(tokens, texts, strict=True):
-        words = [*SPLIT.findall(text.lower().rstrip("\n"))[: longest - 1], END]
+    """Token numbers, one row a text, as many as the longest has but at most `longest`, padded on the right; and where there are any."""
+    said = [[*SPLIT.findall(text.lower().rstrip("\n"))[: longest - 1], END] for text in texts]
+    tokens = torch.zeros((len(texts), max(map(len, said))), dtype=torch.long)
+    for row, words in zip(tokens, said, strict=True):
         row[: len(words)] = torch.tensor([number.get(word, number[UNKNOWN]) for word in words])
     return tokens, tokens != number[PAD]
 

@@ -72,10 +72,8 @@ class MiniVlm(nn.Module):
         return [tuple(row[: row.index(END)] if END in row else row) for row in words]
 
     def ask(self, questions: Sequence[str]) -> tuple[Int64[Tensor, "q l"], Bool[Tensor, "q l"]]:
-        """Tokens of questions, as long as the longest."""
-        tokens, there = encode(list(questions), self.number, self.config.tokenizer_max_length)
-        longest = int(there.sum(1).max())
-        return tokens[:, :longest], there[:, :longest]
+        """Tokens of questions, and where there are any."""
+        return encode(list(questions), self.number, self.config.tokenizer_max_length)
 
     def sha256(self) -> str:
         """Checksum of all weights as they stand."""
@@ -100,7 +98,9 @@ def load(folder: Path) -> MiniVlm:
         vlm.towers.load_state_dict(load_file(folder / WEIGHTS))
     except Exception as error:
         reason = (str(error).strip().splitlines() or [""])[0]
-        raise BadPolicy(f"vlm.load: {folder} is damaged ({type(error).__name__}: {reason:.150}); make it again: python -m vap_core train vlm") from error
+        raise BadPolicy(
+            f"vlm.load: {folder} is damaged ({type(error).__name__}: {reason:.150}); run: python -m vap_core train vlm"
+        ) from error
     return vlm.eval().requires_grad_(False)
 
 
