@@ -30,16 +30,20 @@ from vap_core.sim.env import Env
 from vap_core.sim.objects import extent_m, get
 from vap_core.sim.scenes import Scene, build
 from vap_core.sim.studio import reference_views
+from vap_core.soft_prompt import MODEL, Learned, soft_prompt, teach
 from vap_core.suites import SUITES, VARIANTS, Suite, listed, lists, rows
+from vap_core.tokens import WORD
+from vap_core.tokens import load as load_token
 from vap_core.values import EpisodeRow
 from vap_core.weights import weights_sha256
 
-type Method = Prompting | Described | Oracle | None
+type Method = Prompting | Described | Learned | Oracle | None
 
 METHODS: dict[str, Method] = {
     "generic": None,
     "hard-short": Described("short"),
     "hard-long": Described("long"),
+    "soft": Learned(),
     "vap": Prompting(),
     "mask-only": Prompting(rewrite=False),
     "rewrite-only": Prompting(highlight=False),
@@ -74,8 +78,12 @@ class Study:
         for method in self.methods:
             if method not in METHODS:
                 raise one_of("Study: method", method, METHODS)
-        if self.policy not in POLICIES and not lerobot.named(self.policy):
-            raise one_of("Study: policy (or a lerobot checkpoint's folder or hub id)", self.policy, POLICIES)
+        if self.policy not in (*POLICIES, MINI) and not lerobot.named(self.policy):
+            raise one_of("Study: policy (or a lerobot checkpoint's folder or hub id)", self.policy, [*POLICIES, MINI])
+        for suite, _ in self.tasks:
+            if self.policy == MINI and not (SHIPPED / f"{MINI}-{suite}").is_dir():
+                there = ", ".join(sorted(folder.name for folder in SHIPPED.glob(f"{MINI}-*"))) or "none"
+                raise BadStudy(f"Study: no {MINI} for {suite} ships (there is {there}); run: python -m vap_core train policy --suite {suite}")
         if self.robots not in ("plain", "menagerie"):
             raise one_of("Study: robots", self.robots, ("plain", "menagerie"))
         if self.stack not in STACKS:
@@ -86,14 +94,21 @@ class Study:
             raise BadStudy(f"Study: policy {self.policy!r} consumes no prompt; there is nothing to audit. Leave --audit out.")
         if self.policy in INSIDERS and self.methods != ("generic",):
             raise BadStudy(f"Study: policy {self.policy!r} reads the simulator, not pictures; no method can prompt it. Use --method generic.")
+        if self.policy in POLICIES and any(isinstance(METHODS[method], Learned) for method in self.methods):
+            raise BadStudy(f"Study: policy {self.policy!r} has no words that could be learned; leave soft out, or take --policy {MINI}.")
 
     def rows(self, suite: str, task: str) -> tuple[EpisodeRow, ...]:
         return listed(suite, task, n=self.episodes, seed=self.seed, seeds=self.seeds)
 
+    def checkpoint(self, suite: str) -> str:
+        """The folder or hub id of the policy's weights for a suite; "" for a policy that has none."""
+        return str(SHIPPED / f"{MINI}-{suite}") if self.policy == MINI else "" if self.policy in POLICIES else self.policy
+
     def configuration(self) -> dict[str, Any]:
         """What the results depend on, as JSON; weights, episode lists, and the world (robots, objects, looks, sensors) by their checksums."""
         listed = {suite: lists.digest(suite) for suite, _ in self.tasks if suite in suites.BENCHMARKS}
-        checkpoint = {} if self.policy in POLICIES else {"checkpoint": lerobot.fingerprint(self.policy)}
+        held = {name: lerobot.fingerprint(name) for name in sorted({self.checkpoint(suite) for suite, _ in self.tasks} - {""})}
+        checkpoint = {"checkpoint": held[self.policy]} if self.policy in held else {"checkpoints": list(held.values())} if held else {}
         return {**asdict(self), **checkpoint, "version": __version__, "weights": weights_sha256(), "lists": listed, "world": self._world()}
 
     def _world(self) -> str:
@@ -136,6 +151,8 @@ def register_personal(study: Study, bank: Path, captioner: Captioner | None = No
             obj, _ = register(row.target, row.category, reference_views(get(row.target)), stack.detector, stack.encoder)
         if telling and obj.description is None:
             obj = described(obj, captioner or Attributes(stack.segmenter))
+        if any(isinstance(METHODS[method], Learned) for method in study.methods):
+            teach(study.rows(suite, task), bank, MODEL)
         if obj is not held.get(row.target):
             save(bank, obj, replace=True)
             held[row.target] = obj
@@ -158,6 +175,8 @@ POLICIES: dict[str, Callable[[Study, Scene, Suite], Policy[Any] | Insider[Any]]]
 """Policies by name; each is built for one scene."""
 INSIDERS = ("expert", "random")
 """Policies that read the simulator, or nothing at all: bounds on what a task allows, never results."""
+MINI, SHIPPED = "mini-pi0", MODEL.parent
+"""The shipped frozen policy, one checkpoint a suite, and where they lie."""
 
 
 DEMO = Study(tasks=(("widowx-pick", "pick-straw-cup"), ("franka-pick", "pick-cup")), methods=("generic", "vap"), episodes=20)
@@ -173,7 +192,7 @@ def make_trial(study: Study, rows: Sequence[EpisodeRow], method: str, bank: Path
     return Trial(
         method,
         scene,
-        POLICIES[study.policy](study, scene, suite) if study.policy in POLICIES else lerobot.fitted(study.policy, scene, suite),
+        _policy(METHODS[method], study, first, bank, scene),
         _attender(METHODS[method], study, first, bank, scene),
         sizes,
         suite.control,
@@ -184,6 +203,17 @@ def make_trial(study: Study, rows: Sequence[EpisodeRow], method: str, bank: Path
     )
 
 
+def _policy(how: Method, study: Study, row: EpisodeRow, bank: Path, scene: Scene) -> Policy[Any] | Insider[Any]:
+    """The one frozen policy of the study; to the soft prompt it listens with one word more."""
+    known = suites.suite(row.suite)
+    if study.policy in POLICIES:
+        return POLICIES[study.policy](study, scene, known)
+    policy = lerobot.fitted(study.checkpoint(row.suite), scene, known)
+    if not isinstance(how, Learned):
+        return policy
+    return policy.saying({WORD: load_token(bank, row.target, getattr(policy.policy.config, "vlm", "")).embedding})
+
+
 def _attender(how: Method, study: Study, row: EpisodeRow, bank: Path, scene: Scene) -> Attender | Reworded | Revealed | None:
     """What stands between the cameras and the policy under one method."""
     match how:
@@ -191,6 +221,8 @@ def _attender(how: Method, study: Study, row: EpisodeRow, bank: Path, scene: Sce
             return None
         case Described():
             return hard_prompt(load_bank(bank)[row.target], how)
+        case Learned():
+            return soft_prompt()
     stack = _stack(study.stack)
     mine = {row.target: load_bank(bank, stack.encoder.name)[row.target]}
     match how:

@@ -23,7 +23,7 @@ from torch.nn import functional as F  # noqa: N812
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
 from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
-from vap_core.policies.mini_pi0.vlm import grow
+from vap_core.policies.mini_pi0.vlm import grow, halve
 from vap_core.policies.mini_pi0.vlm import load as load_vlm
 from vap_core.processes import results
 from vap_core.suites import suite
@@ -220,7 +220,9 @@ def train(
     torch.manual_seed(recipe.seed)  # initial weights only; every other draw comes from the step's stream
     learner = Learner(config)
     if vlm is not None:
-        grow(load_vlm(vlm), learner.policy)
+        teacher = load_vlm(vlm)
+        config.vlm = teacher.sha256()
+        grow(teacher, learner.policy)
 
     def step(model: Learner, at: int) -> tuple[Tensor, Told]:
         batch = collate(recipe, films, stats, np.random.default_rng([73, recipe.seed, at]), config)
@@ -236,6 +238,7 @@ def save(recipe: Recipe, learner: Learner, stats: Any, held: Sequence[Film], log
 
     policy = learner.policy
     policy.save_pretrained(out)
+    halve(out / "model.safetensors")
     for pipeline in make_pre_post_processors(policy.config, dataset_stats=stats):
         pipeline.save_pretrained(out)
     with torch.no_grad():

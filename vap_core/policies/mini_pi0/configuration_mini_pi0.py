@@ -29,6 +29,8 @@ class MiniPI0Config(PI0Config):
     n_action_steps: int = 4
     tokenizer_max_length: int = 40
     num_inference_steps: int = 5
+    vlm: str = ""
+    """SHA-256 of the mini-PaliGemma that it grew from; learned words mean the same in both."""
     words: tuple[str, ...] = ()
     """The vocabulary: token i is word i; see processor_mini_pi0."""
 

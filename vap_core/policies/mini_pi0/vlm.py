@@ -83,10 +83,11 @@ class MiniVlm(nn.Module):
         return found.hexdigest()
 
     def save(self, folder: Path) -> None:
-        """Write `folder`: sizes and words as config.json, weights as safetensors."""
+        """Write `folder`: sizes and words as config.json, weights as safetensors in bfloat16."""
         folder.mkdir(parents=True, exist_ok=True)
         self.config.save_pretrained(folder)
         save_file({name: tensor.contiguous() for name, tensor in self.towers.state_dict().items()}, folder / WEIGHTS)
+        halve(folder / WEIGHTS)
 
 
 def load(folder: Path) -> MiniVlm:
@@ -98,10 +99,13 @@ def load(folder: Path) -> MiniVlm:
         vlm.towers.load_state_dict(load_file(folder / WEIGHTS))
     except Exception as error:
         reason = (str(error).strip().splitlines() or [""])[0]
-        raise BadPolicy(
-            f"vlm.load: {folder} is damaged ({type(error).__name__}: {reason:.150}); run: python -m vap_core train vlm"
-        ) from error
+        raise BadPolicy(f"vlm.load: {folder} is damaged ({type(error).__name__}: {reason:.150}); run: python -m vap_core train vlm") from error
     return vlm.eval().requires_grad_(False)
+
+
+def halve(file: Path) -> None:
+    """Keep a file's tensors in bfloat16; a model that loads them computes in its own precision."""
+    save_file({name: tensor.bfloat16() for name, tensor in load_file(file).items()}, file, metadata={"format": "pt"})
 
 
 def grow(vlm: MiniVlm, policy: Any) -> None:

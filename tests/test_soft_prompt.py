@@ -1,0 +1,94 @@
+"""The soft prompt as a method: the word is learned from photos, said in place of "my cup", and no weight of the policy moves."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies import make_pre_post_processors
+
+from vap_core import engine, experiments, soft_prompt, suites, tokens
+from vap_core.errors import BadMemory, BadStudy
+from vap_core.experiments import Study
+from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
+from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
+from vap_core.policies.mini_pi0.vlm import MiniVlm, grow
+from vap_core.policies.mini_pi0.vlm import load as load_vlm
+from vap_core.sim import objects
+from vap_core.soft_prompt import photographs
+from vap_core.tokens import Lesson
+from vap_core.training.words import vocabulary
+
+SUITE, TASK, STATE, ACTION = "simpler-bridge", "put-camera", 13, 7
+
+
+def config(vlm: str = "") -> MiniPI0Config:
+    return MiniPI0Config(
+        words=vocabulary(), device="cpu", max_state_dim=STATE, max_action_dim=ACTION, vision_depth=1, depth=2, vision_width=16, width=16, head_dim=2,
+        expert_width=16, image_resolution=(32, 32), vlm=vlm, num_inference_steps=2,
+        input_features={"observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, 32, 32)),
+                        "observation.state": PolicyFeature(FeatureType.STATE, (STATE,))},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (ACTION,))},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def grown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A tiny model, and a tiny policy that grew from it."""
+    home, far = tmp_path_factory.mktemp("vlm"), tmp_path_factory.mktemp("policy")
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        MiniVlm(config()).save(home)
+        vlm = load_vlm(home)
+        policy = MiniPI0Policy(config(vlm.sha256()))
+    grow(vlm, policy)
+    policy.save_pretrained(far)
+    stats = {name: {"mean": torch.zeros(n), "std": torch.ones(n)} for name, n in (("observation.state", STATE), ("action", ACTION))}
+    for pipeline in make_pre_post_processors(policy.config, dataset_stats=stats):
+        pipeline.save_pretrained(far)
+    return home, far
+
+
+def test_my_cup_becomes_a_word() -> None:
+    say = soft_prompt.soft_prompt().say
+    assert say("put my camera on the plate") == "put <my_0> on the plate"
+    assert say("pick up my straw cup") == "pick up <my_0>"
+
+
+def test_photos_show_the_target_its_look_alikes_and_others() -> None:
+    rows = suites.rows(SUITE, TASK)
+    photos = photographs(rows, 0)
+    names = {place.model for row in rows for place in row.placements}
+    rivals = [name for name in names if "lookalike" in name]
+    assert (len(photos.own), len(photos.rivals), len(photos.others)) == (5, 12 * len(rivals), 5 * soft_prompt.OTHERS)
+    assert {objects.get(name).category for name in rivals} == {"camera"}
+    unseen = photographs(rows, 1)
+    assert not any(np.array_equal(one, two) for one in photos.own for two in unseen.own)
+
+
+def test_it_runs_as_a_method_and_the_policy_stays(grown: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    home, far = grown
+    monkeypatch.setattr(experiments, "MODEL", home)
+    monkeypatch.setattr(soft_prompt, "VIEWS", 2)
+    monkeypatch.setattr(tokens, "Lesson", lambda: Lesson(epochs=2, looks=1))
+    study = Study(((SUITE, TASK),), ("generic", "soft"), episodes=1, policy=str(far))
+    engine.store.open_run(tmp_path, study.configuration())
+    experiments.register_personal(study, tmp_path / "memory")
+    jobs = list(engine.missing(study, tmp_path))
+    rows = {job.method: engine.work(job)[0] for job in jobs}
+    assert {row["outcome"] for row in rows.values()} == {"failure"}
+    assert rows["soft"]["policy_sha256"] == rows["generic"]["policy_sha256"] != ""
+    row, bank = study.rows(SUITE, TASK)[0], tmp_path / "memory"
+    soft, plain = (experiments.make_trial(study, [row], method, bank) for method in ("soft", "generic"))
+    assert soft.attender is not None
+    assert plain.attender is None
+    (token,) = bank.glob("*.token.safetensors")
+    token.unlink()
+    with pytest.raises(BadMemory, match="no learned word"):
+        experiments.make_trial(study, [row], "soft", bank)
+
+
+def test_a_policy_without_words_is_refused() -> None:
+    with pytest.raises(BadStudy, match="no words that could be learned"):
+        Study(((SUITE, TASK),), ("soft",), policy="scripted")
