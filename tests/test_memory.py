@@ -1,6 +1,8 @@
 """Photos in, objects out and back; every damaged input is one clear line and loses nothing."""
 
+import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ from PIL import Image
 from tests.toys import TOYS, personal, scene
 from vap_core.errors import BadMemory, BadOutput, BadPhoto
 from vap_core.memory import load, load_bank, load_photo, register, remember, save
+from vap_core.values import Description
 
 TEAL = (40, 120, 110)
 
@@ -70,6 +73,34 @@ def test_a_bank_in_a_file_is_no_bank(tmp_path: Path) -> None:
 
 def test_empty_bank_is_empty(tmp_path: Path) -> None:
     assert load_bank(tmp_path / "none") == {}
+
+
+@given(st.text(min_size=1, max_size=40), st.text(max_size=40))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=20)
+def test_what_an_object_looks_like_is_kept_in_words(tmp_path: Path, short: str, long: str) -> None:
+    told = Description(short, long)
+    back = load(save(tmp_path, replace(personal("mug", "cup", TEAL), description=told), replace=True)).description
+    assert back is not None
+    assert (back.short, back.long) == (short, long)
+
+
+def test_a_memory_from_before_descriptions_still_loads(tmp_path: Path) -> None:
+    path = save(tmp_path, personal("mug", "cup", TEAL))
+    assert b"description" not in path.read_bytes()
+    assert load(path).description is None
+
+
+@pytest.mark.parametrize("odd", ['"[1]"', '"{}"', '"null"', r'"{\"short\": 3, \"long\": \"x\"}"', '"not json"'])
+def test_a_damaged_description_is_said(tmp_path: Path, odd: str) -> None:
+    path = save(tmp_path, replace(personal("mug", "cup", TEAL), description=Description("red", "all red")))
+    data = path.read_bytes()
+    (size,) = struct.unpack("<Q", data[:8])
+    header = json.loads(data[8 : 8 + size])
+    header["__metadata__"]["description"] = json.loads(odd)
+    told = json.dumps(header).encode()
+    path.write_bytes(struct.pack("<Q", len(told)) + told + data[8 + size :])
+    with pytest.raises(BadMemory, match="lacks what an object needs.*register the object again"):
+        load(path)
 
 
 @pytest.mark.parametrize("cut", [0, 4, 30, -1])
