@@ -347,6 +347,8 @@ class Outcome:
     first_object_correct: bool
     steps: int
     detail: str = ""
+    touched: bool = False
+    """Whether the robot touched or moved any object but the goal."""
 
 
 @value
@@ -406,6 +408,7 @@ class Episode:
             "cmr": out.cmr,
             "wrong_object": out.wrong_object,
             "first_object_correct": out.first_object_correct,
+            "touched": out.touched,
             "steps": out.steps,
             "margin": min(margins) if margins else None,
             "detail": out.detail,

@@ -111,6 +111,7 @@ class Judge:
             first_object_correct=self.order[:1] == (target,),
             steps=self.steps,
             detail=detail,
+            touched=bool(self.order),
         )
 
 

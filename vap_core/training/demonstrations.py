@@ -23,7 +23,7 @@ from vap_core.sim.objects import extent_m
 from vap_core.sim.scenes import Scene, build
 from vap_core.suites import VARIANTS, Judge, Suite, Task, simpler, suite, tabletop, vlabench
 from vap_core.suites.layout import Area, place, radius_m, scatter, turned
-from vap_core.training.scenes import TRAIN_INSTANCES, only_generic
+from vap_core.training.scenes import HELD_OUT, TRAIN_INSTANCES, only_generic
 from vap_core.values import EpisodeRow, Mask, Placement, Rgb, value
 
 SIDE, SEEN = 112, 224
@@ -60,13 +60,17 @@ class Film:
     goal: int
 
 
-def cast(task: Task, rng: np.random.Generator) -> list[str]:
-    """The target and its rivals, generic and of the task's category, then the task's goal if it has one. Half the rivals are look-alikes."""
-    first, rivals = int(rng.integers(TRAIN_INSTANCES)), int(rng.choice([1, 2, 3], p=[0.15, 0.7, 0.15]))
+def cast(task: Task, rng: np.random.Generator, held_out: bool = False) -> list[str]:
+    """The target and its rivals, generic and of the task's category, then the task's goal if it has one. Half the rivals are look-alikes.
+
+    Those `held_out` are in no film.
+    """
+    pool = range(HELD_OUT, HELD_OUT + TRAIN_INSTANCES) if held_out else range(TRAIN_INSTANCES)
+    first, rivals = pool[int(rng.integers(len(pool)))], int(rng.choice([1, 2, 3], p=[0.15, 0.7, 0.15]))
     if rng.random() < 0.5:
         models = [objects.generic(task.stem, first, int(twin)) for twin in rng.permutation(6)[: rivals + 1]]
     else:
-        others = rng.choice([i for i in range(TRAIN_INSTANCES) if i != first], rivals, replace=False)
+        others = rng.choice([i for i in pool if i != first], rivals, replace=False)
         models = [objects.generic(task.stem, int(i)) for i in (first, *others)]
     only_generic(models)
     return [model.name for model in models] + ([task.goal] if task.goal else [])

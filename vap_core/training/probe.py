@@ -1,0 +1,102 @@
+"""What a trained policy can do before anybody's own object is in play: closed-loop episodes with generic objects that no film has shown.
+
+Four ways to say which of them is meant: a tint from the simulator's masks and the colour's word (VAP at its best), paint (it has the colour by
+nature), a description of its own look, or nothing. When nothing is said, any of its kind is right, and what counts is whether the hand commits.
+"""
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vap_core.oracle import Masks, Revealed
+from vap_core.policies import lerobot
+from vap_core.processes import results
+from vap_core.prompt import ALPHA, PALETTE
+from vap_core.rollout import Trial, rollout
+from vap_core.sim import objects
+from vap_core.sim.scenes import build
+from vap_core.suites import VARIANTS, suite
+from vap_core.training.commands import Way, painted, tinted
+from vap_core.training.demonstrations import cast, row
+from vap_core.training.words import described
+from vap_core.values import Attended, EpisodeRow, Views
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+WAYS: tuple[Way, ...] = ("tinted", "painted", "described", "plain")
+EACH = 4
+"""Episodes of one scene, each said in every way."""
+COAT = 0.85
+"""Opacity of paint."""
+
+
+class Told(Revealed):
+    """Colours the target by the simulator's masks at every step, and says what tells it."""
+
+    def __init__(self, way: Way) -> None:
+        self.way = way
+
+    @property
+    def always(self) -> bool:
+        return True
+
+    def start(self, views: Views, instruction: str, row: EpisodeRow, masks: Masks) -> tuple[Any, Attended]:
+        rng = np.random.default_rng([79, row.seed, row.episode])
+        colour = PALETTE[int(rng.integers(len(PALETTE)))]
+        word = "" if self.way == "plain" else colour.name
+        if self.way == "described":
+            looks = [described(objects.get(place.model).texture) for place in row.placements if place.model != row.goal]
+            words = sorted(looks[0].difference(*looks[1:])) or sorted(looks[0])
+            word = str(rng.choice(words))
+        text = instruction.replace("my ", f"the {word} " if word else "the ", 1)
+        return (colour, text), self._show((colour, text), views, row, masks)
+
+    def steps(self, states: Sequence[Any], views: Sequence[Views], rows: Sequence[EpisodeRow], masks: Sequence[Masks]) -> list[tuple[Any, Attended]]:
+        return [(state, self._show(state, seen, row, now)) for state, seen, row, now in zip(states, views, rows, masks, strict=True)]
+
+    def _show(self, state: Any, views: Views, row: EpisodeRow, masks: Masks) -> Attended:
+        (colour, text), shown = state, dict(views)
+        if self.way in ("tinted", "painted"):
+            for camera, rgb in views.items():
+                mask = masks[camera].get(row.target)
+                if mask is not None:
+                    change = partial(tinted, alpha=ALPHA) if self.way == "tinted" else partial(painted, coat=COAT)
+                    shown[camera] = change(rgb[None], mask[None], colour)[0]
+        return Attended(shown, text, (), {}, {}, ())
+
+
+def probe(checkpoint: str, suite_name: str, *, scenes: int = 12, ways: Sequence[Way] = WAYS, seed: int = 0, workers: int = 2) -> "pd.DataFrame":
+    """One row per episode: suite, task, way, and how it ended. Scenes are spread over the suite's tasks."""
+    import pandas as pd
+    from tqdm import tqdm
+
+    work = partial(_scene, checkpoint, suite_name, tuple(ways), seed)
+    done = results(work, list(range(scenes)), workers, "--workers")
+    return pd.DataFrame([line for _, lines in tqdm(done, f"episodes of {suite_name}", scenes, unit="scene") for line in lines])
+
+
+def _scene(checkpoint: str, suite_name: str, ways: Sequence[Way], seed: int, number: int) -> list[dict[str, Any]]:
+    known, rng = suite(suite_name), np.random.default_rng([78, seed, *suite_name.encode(), number])
+    task = known.tasks[number % len(known.tasks)]
+    names = cast(task, rng, held_out=True)
+    rows = list(_rows(known, task, names, number, rng))
+    sizes = {name: objects.extent_m(objects.get(name)) for name in names}
+    lines = []
+    with build(known.robot, names, look=VARIANTS["base"].look) as scene:
+        policy = lerobot.fitted(checkpoint, scene, known)
+        for way in ways:
+            trial = Trial(way, scene, policy, Told(way), sizes, known.control, known.sensor, follow="call")
+            for episode in rollout(trial, rows, batch=EACH):
+                lines.append({**episode.summary(), "scene": number})
+    return lines
+
+
+def _rows(known: Any, task: Any, names: Sequence[str], number: int, rng: np.random.Generator) -> Iterator[EpisodeRow]:
+    for i in range(EACH):
+        try:
+            yield row(known, task, names, number * EACH + i, "base", rng)
+        except ValueError:  # no room for these: the next draw may have it
+            continue
