@@ -17,6 +17,7 @@ from PIL import Image
 
 from vap_core import suites
 from vap_core.errors import BadOutput
+from vap_core.publish import publish
 from vap_core.report import report
 from vap_core.report.pictures import OKABE_ITO, differences_figure, forest_figure, method_marks
 from vap_core.report.results import command, errors, results
@@ -117,6 +118,18 @@ def test_every_latex_table_is_a_whole_one(tmp_path: Path) -> None:
 
 def test_a_bar_in_a_cell_stays_in_its_cell() -> None:
     assert markdown([["a"], ["x|y"]]).splitlines() == ["| a    |", "| ---- |", r"| x\|y |"]
+
+
+def test_a_published_table_is_reported_like_its_runs(tmp_path: Path) -> None:
+    folders = [run(tmp_path / "one", seeds=1), run(tmp_path / "two", tasks=(("tabletop", "put-plant"),), seeds=1)]
+    publish(folders, tmp_path / "kept.parquet")
+    one, two = load(folders), load([tmp_path / "kept.parquet"])
+    columns = [name for name in one.table if name != "detail"]
+    pd.testing.assert_frame_equal(one.table[columns], two.table[columns], check_dtype=False)
+    pd.testing.assert_frame_equal(results(one), results(two))
+    (tmp_path / "kept.parquet").write_bytes((tmp_path / "kept.parquet").read_bytes()[:100])
+    with pytest.raises(BadOutput, match="no table of finished runs"):
+        load([tmp_path / "kept.parquet"])
 
 
 def test_an_unfinished_run_is_reported_as_it_is(tmp_path: Path) -> None:

@@ -3,11 +3,29 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from vap_core import suites
 from vap_core.errors import BadOutput
 from vap_core.files import write_atomic
 from vap_core.store import KEY, note, read
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def published(table: Path) -> "list[tuple[dict[str, Any], pd.DataFrame]]":
+    """Every run in a table that `publish` wrote: its run.json, and its episodes. Raises: BadOutput when it is none of them."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        held = pq.read_table(table)
+        notes = json.loads((held.schema.metadata or {})[b"runs"])
+        whole = held.to_pandas()
+        return [(note, whole[whole["configuration"] == note["digest"]].drop(columns="configuration")) for note in notes]
+    except (OSError, pa.ArrowInvalid, KeyError, ValueError) as error:
+        raise BadOutput(f"published: {table} is no table of finished runs ({type(error).__name__}); publish writes one.") from error
 
 
 def publish(folders: Sequence[Path], target: Path, *, replace: bool = False) -> int:

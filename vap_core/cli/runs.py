@@ -140,16 +140,17 @@ def rescore(run: Annotated[Path, typer.Argument(help="Run folder of eval, rollou
 
 @app.command()
 def report(
-    runs: Annotated[list[Path], typer.Argument(help="Run folders of eval, rollout or demo; several seeds of a suite make one report.")],
+    runs: Annotated[list[Path], typer.Argument(help="Run folders of eval, rollout or demo, or published tables; several make one report.")],
     out: Annotated[Path | None, typer.Option(help="Folder for report.md, CSV and LaTeX tables and pictures. Default RUN/report.")] = None,
 ) -> None:
     """Print and write what runs found: tables with intervals beside the paper's, paired comparisons, errors, provenance, pictures.
 
     Example: python -m vap_core report data/runs/demo
+    Example: python -m vap_core report data/results/scripted.parquet --out data/runs/scripted-report
     """
     from vap_core.report import report as conclude
 
-    place = out or runs[0] / "report"
+    place = out or (Path("data/runs") / f"{runs[0].stem}-report" if runs[0].suffix == ".parquet" else runs[0] / "report")
     print(conclude(runs, place))
     print(f"\nwrote {place}: report.md, tables as CSV and LaTeX, pictures")
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from vap_core import store, suites
 from vap_core.errors import BadOutput
 from vap_core.metrics import MEASURES, TRACK
+from vap_core.publish import published
 from vap_core.statistics import EPISODE, layouts
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ class Runs:
 
 
 def load(folders: Sequence[Path]) -> Runs:
-    """Read runs of eval, rollout or demo.
+    """Read runs of eval, rollout or demo: their folders, or tables that `publish` made of them.
 
     Raises: BadOutput for a folder that holds no run, no episode, damaged parts or episodes it was not asked for, for two runs of the same episodes,
     and for a run whose episode list has changed since; BadSuite.
@@ -46,13 +47,11 @@ def load(folders: Sequence[Path]) -> Runs:
     import pandas as pd
 
     tables, wanted, unfinished, notes = [], [], [], {}
-    for folder in dict.fromkeys(folders):
-        notes[folder] = about = store.note(folder)
-        study = about["configuration"]
+    for folder, about, table in (run for place in dict.fromkeys(folders) for run in _runs(place)):
+        notes[folder], study = about, about["configuration"]
         if not isinstance(study, dict) or not study.keys() >= ASKED:
             raise BadOutput(f"report: {folder} holds no run of eval, rollout or demo; name the folder that one of them wrote.")
         _same_lists(folder, study)
-        table = store.read(folder)
         if table.empty:
             raise BadOutput(f"report: {folder} holds no finished episode yet; run the same command again, it goes on where it stopped.")
         if NEEDED.keys() - table.columns:
@@ -76,6 +75,15 @@ def load(folders: Sequence[Path]) -> Runs:
     place = lines.get_indexer(pd.MultiIndex.from_frame(whole[list(TRACK)]))
     whole = whole.assign(layout=layouts(whole)).iloc[place.argsort(kind="stable")].reset_index(drop=True)
     return Runs(whole, everything, notes, tuple(unfinished))
+
+
+def _runs(place: Path) -> "Iterator[tuple[Path, dict[str, Any], pd.DataFrame]]":
+    """The run of a folder, or every run in a published table; each with a name, its run.json and its episodes."""
+    if place.suffix != ".parquet":
+        yield place, store.note(place), store.read(place)
+        return
+    for about, table in published(place):
+        yield Path(f"{place}@{about['digest'][:8]}"), about, table
 
 
 def _by_track(wanted: "pd.DataFrame") -> "pd.DataFrame":
