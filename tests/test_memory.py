@@ -76,7 +76,7 @@ def test_empty_bank_is_empty(tmp_path: Path) -> None:
 
 
 @given(st.text(min_size=1, max_size=40), st.text(max_size=40))
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=20)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=10)
 def test_what_an_object_looks_like_is_kept_in_words(tmp_path: Path, short: str, long: str) -> None:
     told = Description(short, long)
     back = load(save(tmp_path, replace(personal("mug", "cup", TEAL), description=told), replace=True)).description
