@@ -6,14 +6,18 @@ nature), a description of its own look, or nothing. When nothing is said, any of
 
 from collections.abc import Iterator, Sequence
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vap_core.files import write_atomic
+from vap_core.metrics import rate
 from vap_core.oracle import Masks, Revealed
 from vap_core.policies import lerobot
 from vap_core.processes import results
 from vap_core.prompt import ALPHA, PALETTE
+from vap_core.report.text import align
 from vap_core.rollout import Trial, rollout
 from vap_core.sim import objects
 from vap_core.sim.scenes import build
@@ -100,3 +104,23 @@ def _rows(known: Any, task: Any, names: Sequence[str], number: int, rng: np.rand
             yield row(known, task, names, number * EACH + i, "base", rng)
         except ValueError:  # no room for these: the next draw may have it
             continue
+
+
+def conclude(table: "pd.DataFrame") -> str:
+    """Rates by suite, task and way: n, and percent with Wilson's 95 % interval."""
+    lines = [["suite", "policy", "way", "n", "succeeds", "moves a wrong object", "touches something"]]
+    for (known, policy, way), part in table.groupby(["suite", "policy", "method"], sort=False):
+        shown = [rate(int(part[name].sum()), len(part)) for name in ("success", "wrong_object", "touched")]
+        lines.append([str(known), str(policy), str(way), str(len(part)), *map(str, shown)])
+    return align(lines)
+
+
+def keep(table: "pd.DataFrame", path: Path) -> None:
+    """Add the episodes to a table; those of the same suite in it are replaced."""
+    import pandas as pd
+
+    old = pd.read_parquet(path) if path.exists() else table[:0]
+    columns = [name for name in table if name != "detail" and not name.startswith("seconds_")]
+    whole = pd.concat([part for part in (old[~old["suite"].isin(table["suite"])], table[columns]) if len(part)], ignore_index=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, whole.to_parquet(compression="zstd", index=False))

@@ -1,0 +1,61 @@
+"""The probe of a policy: every way says or shows what it should, on objects that no film has; its table is kept suite by suite."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from vap_core import suites
+from vap_core.prompt import PALETTE
+from vap_core.sim import objects
+from vap_core.training import probe
+from vap_core.training.demonstrations import cast, row
+from vap_core.training.probe import WAYS, Told, conclude, keep
+
+from .test_soft_prompt import SUITE, grown  # noqa: F401
+
+
+def test_the_ways_differ_in_what_is_shown_and_said() -> None:
+    known = suites.suite(SUITE)
+    task = known.task("put-camera")
+    names = cast(task, np.random.default_rng(3), held_out=True)
+    start = row(known, task, names, 0, "base", np.random.default_rng(0))
+    rgb, mask = np.full((8, 8, 3), 120, np.uint8), np.zeros((8, 8), bool)
+    mask[2:5, 2:5] = True
+    masks, shown = {"front": {start.target: mask}}, {}
+    for way in WAYS:
+        state, attended = Told(way).start({"front": rgb}, start.instruction, start, masks)
+        ((again, later),) = Told(way).steps([state], [{"front": rgb}], [start], [masks])
+        assert again == state
+        assert np.array_equal(later.images["front"], attended.images["front"])
+        assert np.array_equal(attended.images["front"][~mask], rgb[~mask])
+        assert (attended.images["front"][mask] != rgb[mask]).any() == (way in ("tinted", "painted"))
+        shown[way] = attended
+    assert shown["plain"].text == "put the camera on the plate"
+    assert any(shown["tinted"].text == f"put the {colour.name} camera on the plate" for colour in PALETTE)
+    assert shown["tinted"].text == shown["painted"].text != shown["described"].text
+    hidden = Told("tinted").start({"front": rgb}, start.instruction, start, {"front": {}})[1]
+    assert np.array_equal(hidden.images["front"], rgb)
+
+
+def test_held_out_objects_are_in_no_film() -> None:
+    task = suites.suite(SUITE).tasks[0]
+    seen = {name for i in range(20) for name in cast(task, np.random.default_rng(i))}
+    unseen = {name for i in range(20) for name in cast(task, np.random.default_rng(i), held_out=True)}
+    assert not seen & unseen
+    assert {objects.get(name).split for name in unseen} == {"generic"}
+
+
+def test_a_scene_is_played_in_every_way(grown: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+    monkeypatch.setattr(probe, "EACH", 1)
+    table = pd.DataFrame(probe._scene(str(grown[1]), SUITE, ("tinted", "plain"), 0, 0))
+    assert table["method"].tolist() == ["tinted", "plain"]
+    assert set(table["outcome"]) <= {"success", "failure"}
+    assert "touches something" in conclude(table)
+    keep(table, tmp_path / "probe.parquet")
+    keep(table.assign(suite="vlabench"), tmp_path / "probe.parquet")
+    keep(table, tmp_path / "probe.parquet")
+    held = pd.read_parquet(tmp_path / "probe.parquet")
+    assert held["suite"].tolist() == ["vlabench"] * 2 + [SUITE] * 2
+    assert "detail" not in held
