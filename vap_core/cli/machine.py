@@ -149,6 +149,33 @@ def perception(
 
 
 @train_app.command()
+def demonstrations(
+    suite: Annotated[str, typer.Option(help="The benchmark whose robot, cameras and kinds of task are shown.")],
+    stages: Annotated[int, typer.Option(min=1, help="Scenes with generic objects, of about eight demonstrations each.")] = 400,
+    out: Annotated[Path | None, typer.Option(help="Folder of the dataset. Default data/runs/demonstrations-SUITE.")] = None,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes that film. Default one a core.")] = None,
+) -> None:
+    """Film the scripted expert with generic objects, as a LeRobotDataset v3. Interrupted, the same command goes on.
+
+    Example: python -m vap_core train demonstrations --suite simpler-bridge --stages 2 --out data/runs/small-demonstrations
+    """
+    from vap_core.errors import one_of
+    from vap_core.suites import BENCHMARKS
+    from vap_core.training.dataset import ABOUT, write
+    from vap_core.training.policy import CACHE
+
+    if suite not in BENCHMARKS:
+        raise one_of("train demonstrations: suite", suite, BENCHMARKS)
+    folder = out or Path(f"data/runs/demonstrations-{suite}")
+    whole = (folder / ABOUT).exists()
+    made = write(suite, stages, folder, cache=CACHE, seed=seed, jobs=jobs)
+    print(
+        f"{folder}: {len(made['episodes'])} episodes of {stages} stages, sha256 {made['data_sha256']}" + ("; it was whole already." if whole else "")
+    )
+
+
+@train_app.command()
 def policy(
     suite: Annotated[str, typer.Option(help="The benchmark whose robot, cameras and kinds of task it learns.")],
     out: Annotated[
