@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from vap_core.describe import WORDS
+from vap_core.memory import load_bank
 from vap_core.sim.objects import get
 from vap_core.sim.studio import reference_views
 
@@ -57,6 +59,9 @@ def bank(photos: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = vap("register", "mug", "--category", "cup", "--memory", folder, *photos)
     assert done.returncode == 0, done.stderr
     assert "mug: a cup with 5 references" in done.stdout
+    (mug,) = load_bank(folder).values()
+    assert mug.description is not None
+    assert set(mug.description.long.replace(",", "").split()) <= {*WORDS, "cup"}
     return folder
 
 
@@ -135,7 +140,7 @@ def test_rollout_refuses_unknown_names_and_foreign_folders(tmp_path: Path) -> No
     )
     assert "pick-bottle" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-moon", *out)
     assert "known: generic" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--method", "magic", *out)
-    assert "known: expert, random, scripted" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--policy", "pi9", *out)
+    assert "known: expert, mini-pi0, random, scripted" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--policy", "pi9", *out)
     assert not (tmp_path / "run").exists()
     (tmp_path / "thesis.txt").write_text("dear")
     assert "choose another folder" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--out", tmp_path)

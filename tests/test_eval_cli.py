@@ -155,8 +155,8 @@ REFUSED = {
     "audited expert": (("eval", *EXPERT, "--audit"), "policy 'expert' consumes no prompt; there is nothing to audit"),
     "an address without ray": (("eval", *EXPERT, "--address", "127.0.0.1:6379"), "--address needs --engine ray"),
     "no episodes": (("eval", *EXPERT, "--episodes", "0"), "Invalid value for '--episodes'.*1"),
-    "unknown policy": (("eval", "--suite", SUITE, "--policy", "magic"), "policy .*'magic' is unknown; known: expert, random, scripted"),
-    "unknown method": (("eval", *EXPERT, "--method", "luck"), "method 'luck' is unknown; known: generic, mask-only"),
+    "unknown policy": (("eval", "--suite", SUITE, "--policy", "magic"), "policy .*'magic' is unknown; known: expert, mini-pi0, random, scripted"),
+    "unknown method": (("eval", *EXPERT, "--method", "luck"), "method 'luck' is unknown; known: generic, hard-long, hard-short, mask-only"),
     "unknown task": (("rollout", *EXPERT, "--task", "fly"), "task 'fly' is unknown; known: pick-shaver"),
     "no run": (("rescore", "nowhere"), "rescore: nowhere holds no results; name the folder"),
 }
