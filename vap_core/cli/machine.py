@@ -40,6 +40,30 @@ def eval_perception(
         print("wrote " + ", ".join(map(str, keep(out, publish))))
 
 
+@app.command("eval-policy")
+def eval_policy(
+    suite: Annotated[str, typer.Option(help="The benchmark that the policy was trained for.")],
+    policy: Annotated[str, typer.Option(help="mini-pi0, or a checkpoint's folder or hub id.")] = "mini-pi0",
+    scenes: Annotated[int, typer.Option(min=1, help="Scenes of four episodes each, spread over the suite's tasks.")] = 24,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    workers: Workers = 2,
+    out: Annotated[Path | None, typer.Option(help="A table to add the episodes to, for example data/results/probe.parquet.")] = None,
+) -> None:
+    """Measure what a policy can do with generic objects that no film has shown, told by a tint, by paint, by words, or not at all.
+
+    Example: python -m vap_core eval-policy --suite simpler-bridge --scenes 4
+    """
+    from vap_core.soft_prompt import MODEL
+    from vap_core.training.probe import conclude, keep, probe
+
+    checkpoint = str(MODEL.parent / f"mini-pi0-{suite}") if policy == "mini-pi0" else policy
+    table = probe(checkpoint, suite, scenes=scenes, seed=seed, workers=workers)
+    print(conclude(table))
+    if out is not None:
+        keep(table, out)
+        print(f"wrote {out}")
+
+
 @app.command()
 def show(
     recording: Annotated[Path, typer.Argument(help="A .rrd file.")],
@@ -77,7 +101,7 @@ def bench(
         str,
         typer.Argument(
             help="loop: the prompted control loop; suites: every benchmark's simulator; stack: a stack's models; eval: episodes per hour against "
-            "lerobot's own loop."
+            "lerobot's own loop; engine: a Ray cluster on this machine against local processes."
         ),
     ] = "loop",
     steps: Annotated[int, typer.Option(min=5, help="loop: control steps to time.")] = 60,
@@ -85,14 +109,14 @@ def bench(
     stack: StackName = "foundation",
     random_weights: Annotated[bool, typer.Option("--random-weights", help="stack: without weights; they change nothing about speed.")] = False,
     device: Annotated[str | None, typer.Option(help="stack: cpu or cuda; default VAP_DEVICE, or a GPU where there is one.")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="eval: a few steps, to see that it runs; its numbers mean nothing.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="eval, engine: a few steps, to see that it runs; its numbers mean nothing.")] = False,
 ) -> None:
     """Time a control step by part, as shares and ratios within one run: of the prompted loop, every benchmark's simulator, or a stack's models.
 
     Example: python -m vap_core bench suites
     """
     from vap_core import bench as loop
-    from vap_core import bench_eval, bench_stack, bench_suites
+    from vap_core import bench_engine, bench_eval, bench_stack, bench_suites
     from vap_core.errors import one_of
 
     runs = {
@@ -100,6 +124,7 @@ def bench(
         "suites": lambda: bench_suites.run(workers),
         "stack": lambda: bench_stack.run(stack, random=random_weights, device=device),
         "eval": lambda: bench_eval.run(workers, quick),
+        "engine": lambda: bench_engine.run(workers, quick),
     }
     if what not in runs:
         raise one_of("bench:", what, runs)
@@ -176,6 +201,24 @@ def demonstrations(
 
 
 @train_app.command()
+def vlm(
+    out: Annotated[Path, typer.Option(help="Folder of the model; a training found there goes on.")] = Path("data/runs/mini-paligemma"),
+    stages: Annotated[int, typer.Option(min=2, help="Scenes with generic objects, of about sixteen views each; rendered first.")] = 540,
+    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps.")] = 1600,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    minutes: Annotated[float | None, typer.Option(help="Stop after this long; the same command goes on.")] = None,
+) -> None:
+    """Train the mini-PaliGemma that policies grow from, on questions about generic objects. Interrupted, the same command goes on.
+
+    Example: python -m vap_core train vlm --stages 20 --steps 100 --out data/runs/small-vlm
+    """
+    from vap_core.training.vlm import Recipe, train
+
+    print(json.dumps(train(Recipe(stages, steps, seed=seed), out, minutes=minutes)["held_out"], indent=1))
+    print(f"next: python -m vap_core train policy --suite simpler-bridge --vlm {out}")
+
+
+@train_app.command()
 def policy(
     suite: Annotated[str, typer.Option(help="The benchmark whose robot, cameras and kinds of task it learns.")],
     out: Annotated[
@@ -183,6 +226,7 @@ def policy(
     ] = None,
     stages: Annotated[int, typer.Option(min=2, help="Scenes with generic objects, of about eight demonstrations each; filmed first.")] = 400,
     steps: Annotated[int, typer.Option(min=1, help="Optimiser steps.")] = 12_000,
+    vlm: Annotated[Path | None, typer.Option(help="The mini-PaliGemma that it grows from. Default the shipped one.")] = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     minutes: Annotated[float | None, typer.Option(help="Stop after this long; the same command goes on.")] = None,
 ) -> None:
@@ -191,11 +235,12 @@ def policy(
     Example: python -m vap_core train policy --suite simpler-bridge --stages 40 --steps 500 --out data/runs/small-policy
     """
     from vap_core.errors import one_of
+    from vap_core.soft_prompt import MODEL
     from vap_core.suites import BENCHMARKS
     from vap_core.training.policy import Recipe, train
 
     if suite not in BENCHMARKS:
         raise one_of("train policy: suite", suite, BENCHMARKS)
     folder = out or Path(f"data/runs/mini-pi0-{suite}")
-    print(json.dumps(train(Recipe(suite, stages, steps, seed=seed), folder, minutes=minutes)["held_out"], indent=1))
+    print(json.dumps(train(Recipe(suite, stages, steps, seed=seed), folder, vlm=vlm or MODEL, minutes=minutes)["held_out"], indent=1))
     print(f"next: python -m vap_core eval --suite {suite} --policy {folder} --methods generic,vap --episodes 4 --out {folder}-eval")

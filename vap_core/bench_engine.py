@@ -1,0 +1,56 @@
+"""What a Ray cluster costs over local processes: the same run both ways on this machine, in turn, start-up included."""
+
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from vap_core import cluster, engine
+from vap_core.experiments import Study
+from vap_core.processes import results
+from vap_core.report import align
+from vap_core.suites import suite
+
+SUITE, REPEATS = "simpler-bridge", 4
+STUDY = Study(tuple((SUITE, task.name) for task in suite(SUITE).tasks), ("generic", "vap"), episodes=5, follow="call")
+
+
+@contextmanager
+def local_cluster(cpus: int) -> Iterator[str]:
+    """The address of a Ray cluster of one node on this machine, on loopback."""
+    os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # else Ray listens at this machine's outward address
+    from ray.cluster_utils import Cluster
+
+    head = {"num_cpus": cpus, "node_ip_address": "127.0.0.1", "object_store_memory": 2**28, "include_dashboard": False}
+    nodes = Cluster(initialize_head=True, head_node_args=head)
+    try:
+        yield nodes.address
+    finally:
+        nodes.shutdown()
+
+
+def run(workers: int = 2, quick: bool = False) -> str:
+    """Measure and say it; about five minutes on two cores, `quick` a smoke test."""
+    from scipy import stats
+    from tqdm import tqdm
+
+    study = replace(STUDY, tasks=STUDY.tasks[:1], policy="random", methods=("generic",), episodes=1) if quick else STUDY
+    seconds: dict[str, list[float]] = {"processes": [], "ray": []}
+    with tempfile.TemporaryDirectory() as scratch, local_cluster(workers) as address:
+        spreads: dict[str, engine.Spread] = {"processes": results, "ray": cluster.spread(address)}
+        for turn in tqdm(range(2 if quick else REPEATS), unit="repeat", disable=None):
+            for name in ("processes", "ray") if turn % 2 else ("ray", "processes"):
+                start = time.perf_counter()
+                table = engine.run(study, Path(scratch) / f"{name}-{turn}", workers=workers, record="none", progress=False, spread=spreads[name])
+                seconds[name].append(time.perf_counter() - start)
+    logs = np.log(np.array(seconds["ray"]) / np.array(seconds["processes"]))
+    half = stats.t.ppf(0.975, len(logs) - 1) * logs.std(ddof=1) / np.sqrt(len(logs))
+    low, middle, high = (100 * (np.exp(logs.mean() + off) - 1) for off in (-half, 0.0, half))
+    lines = [["", "seconds, every repeat"], *([name, " ".join(f"{s:.1f}" for s in held)] for name, held in seconds.items())]
+    head = f"{SUITE}: {len(table)} episodes a run, {workers} workers, {len(logs)} repeats, start-up included"
+    return f"{head}\n\n{align(lines)}\n\nRay over processes: {middle:+.1f} % [{low:+.1f}, {high:+.1f}] of the time"
