@@ -132,6 +132,16 @@ def test_a_published_table_is_reported_like_its_runs(tmp_path: Path) -> None:
         load([tmp_path / "kept.parquet"])
 
 
+def test_what_reads_the_simulator_is_marked(tmp_path: Path) -> None:
+    folder = run(tmp_path / "run")
+    runs = load([folder])
+    assert not results(runs)["bound"].any()
+    runs.table["bound"] = runs.table["method"].eq("vap")
+    marked = results(runs).groupby("method")["bound"].agg(["all", "any"])
+    assert marked.loc["vap"].all()
+    assert not marked.loc["generic"].any()
+
+
 def test_an_unfinished_run_is_reported_as_it_is(tmp_path: Path) -> None:
     folder = run(tmp_path / "run", keep=0.75)
     text = report([folder], tmp_path / "out")

@@ -32,7 +32,7 @@ TASKS: dict[tuple[str, str], tuple[str, str, str]] = {
 """Which of our suite, split and task stands where a column of the paper's main tables does."""
 METHODS = {
     "generic": "{}",
-    "soft-prompt": "{} + soft prompt",
+    "soft": "{} + soft prompt",
     "hard-short": "{} + hard prompt (short)",
     "hard-long": "{} + hard prompt (long)",
     "vap": "{} + VAP",

@@ -18,11 +18,15 @@ app = typer.Typer()
 Methods = Annotated[
     list[str] | None,
     typer.Option(
-        "--methods", "--method", help="generic, vap, vap-associated, mask-only, rewrite-only; with commas, or repeated. Default: generic,vap."
+        "--methods",
+        "--method",
+        help="generic, hard-short, hard-long, soft, vap, mask-only, rewrite-only, vap-associated; bounds, which read the simulator: oracle-box, "
+        "oracle-mask, oracle-track, wrong-mask. With commas, or repeated. Default: generic,vap.",
     ),
 ]
 PolicyName = Annotated[
-    str, typer.Option("--policy", help="scripted; a lerobot checkpoint, as folder or hub id; or the bounds: expert (reads the simulator), random.")
+    str,
+    typer.Option("--policy", help="scripted; mini-pi0; a lerobot checkpoint, as folder or hub id; the bounds: expert (reads the simulator), random."),
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the policy and the sensors; of a warm-up suite's episode list, too.")]
 Recorded = Annotated[

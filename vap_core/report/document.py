@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 READING = """- n: episodes that were run, of those in the suite's whole list; all tasks: their episodes together.
   An error is no success and stays in n; an episode that was not run is not in n.
 - SR, CMR, wrong object: % of n with Wilson's 95 % interval (results.csv has Clopper and Pearson's, too). CMR is not defined for selections.
+- (bound): the method or the policy reads the simulator; it bounds what results can be, and is none.
 - over layouts: 95 % interval of SR with the starting layouts drawn again (bootstrap), where layouts were run under several seeds or looks;
   Wilson's takes every episode for independent and is too narrow there.
 - paper's row, SR and CMR: {world}"""
@@ -84,7 +85,8 @@ def _result_rows(part: "pd.DataFrame", suite: str, split: str) -> list[list[str]
     for task in dict.fromkeys(part["task"]):
         ours, theirs = part[part["task"] == task], beside[beside["task"] == task]
         for line in ours.itertuples():
-            cells = [line.task, line.method, line.policy, f"{line.n} of {line.listed}" + (f" ({line.seeds} seeds)" if line.seeds > 1 else "")]
+            seeds = f" ({line.seeds} seeds)" if line.seeds > 1 else ""
+            cells = [line.task, f"{line.method} (bound)" if line.bound else line.method, line.policy, f"{line.n} of {line.listed}{seeds}"]
             cells += [str(line.layouts), str(line.errors), percent(line.sr, line.sr_low, line.sr_high)]
             cells += [percent(line.sr, line.sr_layout_low, line.sr_layout_high).partition(" ")[2] or "-"] if over else []
             cells += [percent(line.cmr, line.cmr_low, line.cmr_high), percent(line.wrong_object, line.wrong_object_low, line.wrong_object_high)]

@@ -22,7 +22,7 @@ def results(runs: Runs) -> "pd.DataFrame":
 
     `sr_k` of `sr_n` episodes succeed; `sr_low`, `sr_high` are Wilson's, `sr_cp_*` Clopper and Pearson's; `sr_layout_*` is the cluster
     bootstrap over starting layouts where a layout was run more than once, else nan. `n` of `listed` episodes were run, `asked` for were as many
-    as it says; `paper_*` are the paper's, in another world.
+    as it says; `bound`: method or policy reads the simulator, and bounds what results can be; `paper_*` are the paper's, in another world.
     """
     import pandas as pd
 
@@ -40,6 +40,8 @@ def results(runs: Runs) -> "pd.DataFrame":
             for side, bound in zip(("low", "high"), intervals(k, n, conservative=conservative), strict=True):
                 lines[f"{name}{form}_{side}"] = 100 * bound
     lines = lines.merge(_by_layout(table), on=track, how="left")
+    reads = table[table["bound"].fillna(False).astype(bool)] if "bound" in table else table[:0]
+    lines["bound"] = pd.MultiIndex.from_frame(lines[track]).isin(pd.MultiIndex.from_frame(reads[track]))
     lines["layouts"] = lines["layouts"].fillna(0).astype(int)
     told = paper.main_results().rename(columns={"sr": "paper_sr", "cmr": "paper_cmr"})
     return pd.DataFrame(lines.merge(told, on=["suite", "split", "task", "method"], how="left"))
