@@ -2,6 +2,7 @@
 
 import re
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +12,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import load_file
 
+from vap_core.errors import BadOutput
 from vap_core.policies.lerobot import load
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
+from vap_core.policies.mini_pi0.vlm import load as load_vlm
 from vap_core.prompt import PALETTE, looks_like
 from vap_core.sim import objects
 from vap_core.suites import BENCHMARKS, suite
-from vap_core.training import demonstrations, policy
+from vap_core.training import demonstrations, policy, vlm
 from vap_core.training.commands import command, near, painted, rough, say, tinted
+from vap_core.training.dataset import data_sha256
 from vap_core.training.demonstrations import PARTS, SIDE, Film, cached, cast
+from vap_core.training.questions import ask, place
 from vap_core.training.words import described, vocabulary
 
 SUITE = "simpler-bridge"
@@ -129,9 +134,49 @@ def test_a_training_that_was_stopped_ends_like_one_that_was_not(
     assert one.keys() == other.keys()
     assert all(torch.equal(one[name], other[name]) for name in one)
     assert set(whole["held_out"]) == {"flow", "heat", "where", "hit"}
+    assert whole["data_sha256"] == data_sha256([film for n in range(2) for film in cached(folder, SUITE, 0, n)])
+    with pytest.raises(BadOutput, match="another recipe or other data"):
+        policy.train(replace(recipe, rate=0.1), tmp_path / "torn", cache=folder)
     trained = load(tmp_path / "whole")
     assert trained.execute == 4
     assert (trained.action_size, set(trained.wanted)) == (7, {"observation.images.front", "observation.state"})
+
+
+def test_questions_are_true_of_their_views(stage: tuple[Path, list[Film]]) -> None:
+    _, films = stage
+    known, ends = set(vocabulary()), Counter[tuple[str, ...]]()
+    for seed in range(150):
+        film, rng = films[seed % len(films)], np.random.default_rng(seed)
+        t = int(rng.integers(len(film.action)))
+        asked = ask(film.images[t, 0], film.ids[t, 0], film.names, 3, rng)
+        assert asked.image.shape == film.images[t, 0].shape
+        for question in asked.questions:
+            assert set(re.findall(r"[\w']+", question.text.lower())) | set(question.answer) <= known, question.text
+            kind = objects.get(film.names[question.target]).category if question.target >= 0 else ""
+            assert kind in question.text
+            ends[question.answer[:1] if question.answer[:1] in (("yes",), ("no",)) else (question.text.split()[0],)] += 1
+            if question.text.startswith("where"):
+                assert question.answer == place(film.ids[t, 0] == question.target + 1)
+            if question.answer == ("no",):
+                assert question.target == -1
+    assert min(ends[key] for key in (("yes",), ("no",), ("where",), ("put",))) > 20
+
+
+def test_a_vision_language_model_learns_and_resumes(stage: tuple[Path, list[Film]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, films = stage
+    pool = [vlm.View(film.images[t, 0], film.ids[t, 0], film.names) for film in films for t in range(0, len(film.action), 6)]
+    monkeypatch.setattr(vlm, "views", lambda *args, **kwargs: pool)
+    recipe = vlm.Recipe(stages=1, steps=3, batch=4, width=32, depth=2, vision_width=32, vision_depth=1, expert_width=32)
+    whole = vlm.train(recipe, tmp_path / "whole")
+    vlm.train(recipe, tmp_path / "torn", minutes=0.0)
+    vlm.train(recipe, tmp_path / "torn")
+    one, other = (load_vlm(tmp_path / name).sha256() for name in ("whole", "torn"))
+    assert one == other
+    assert {"words", "heat", "hit", "where", "whether"} <= set(whole["held_out"])
+    grown = policy.Recipe(SUITE, stages=1, steps=1, batch=2, draws=1, width=32, depth=2, vision_width=32, vision_depth=1, expert_width=32)
+    monkeypatch.setattr(demonstrations, "EPISODES", 2)
+    about = policy.train(grown, tmp_path / "policy", vlm=tmp_path / "whole", cache=stage[0])
+    assert about["vlm"] == one == load(tmp_path / "policy").policy.config.vlm  # type: ignore[union-attr]
 
 
 def test_one_batch_can_be_learned_by_heart(stage: tuple[Path, list[Film]]) -> None:

@@ -227,6 +227,9 @@ def policy(
     stages: Annotated[int, typer.Option(min=2, help="Scenes with generic objects, of about eight demonstrations each; filmed first.")] = 400,
     steps: Annotated[int, typer.Option(min=1, help="Optimiser steps.")] = 12_000,
     vlm: Annotated[Path | None, typer.Option(help="The mini-PaliGemma that it grows from. Default the shipped one.")] = None,
+    demonstrations: Annotated[
+        Path | None, typer.Option("--demonstrations", help="A dataset of train demonstrations to learn from, instead of filming.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     minutes: Annotated[float | None, typer.Option(help="Stop after this long; the same command goes on.")] = None,
 ) -> None:
@@ -242,5 +245,6 @@ def policy(
     if suite not in BENCHMARKS:
         raise one_of("train policy: suite", suite, BENCHMARKS)
     folder = out or Path(f"data/runs/mini-pi0-{suite}")
-    print(json.dumps(train(Recipe(suite, stages, steps, seed=seed), folder, vlm=vlm or MODEL, minutes=minutes)["held_out"], indent=1))
+    recipe = Recipe(suite, stages, steps, seed=seed)
+    print(json.dumps(train(recipe, folder, vlm=vlm or MODEL, demonstrations=demonstrations, minutes=minutes)["held_out"], indent=1))
     print(f"next: python -m vap_core eval --suite {suite} --policy {folder} --methods generic,vap --episodes 4 --out {folder}-eval")

@@ -1,6 +1,7 @@
 """One loop for what is trained by steps, not epochs: warm-up and cosine, clipped steps, a moving average of the weights, resumed bit for bit."""
 
 import copy
+import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from vap_core.errors import BadOutput
 from vap_core.training.fitting import checkpoint
 
 KEEP = 0.999
@@ -29,12 +31,14 @@ class Descent:
     rate: float
     minutes: float | None = None
     every: int = 250
+    made_of: Any = None
+    """Recipe and data, as JSON: a training of something else is not gone on with."""
 
 
 def descend[M: nn.Module](model: M, losses: Callable[[M, int], tuple[Tensor, Told]], run: Descent, out: Path) -> tuple[M, list[Any]]:
     """Train `model`, or go on where an earlier call stopped; returns the average of its weights, and the log.
 
-    `losses` gives the loss of one step, drawn from streams of its number, and figures to log.
+    `losses` gives the loss of one step, drawn from streams of its number, and figures to log. Raises: BadOutput when `out` holds another training.
     """
     from tqdm import tqdm
 
@@ -42,6 +46,9 @@ def descend[M: nn.Module](model: M, losses: Callable[[M, int], tuple[Tensor, Tol
     mean, begun, log = copy.deepcopy(model), 0, []
     out.mkdir(parents=True, exist_ok=True)
     state, keep = checkpoint(out / "training.pt", resume=True)
+    made_of = json.dumps(run.made_of, sort_keys=True)
+    if state.get("made_of", made_of) != made_of:
+        raise BadOutput(f"train: {out} holds a training with another recipe or other data; go on with those, or choose another --out.")
     if state:
         for part, name in ((model, "model"), (mean, "mean"), (optimiser, "optimiser")):
             part.load_state_dict(state[name])
@@ -64,12 +71,22 @@ def descend[M: nn.Module](model: M, losses: Callable[[M, int], tuple[Tensor, Tol
         if last or (step + 1) % run.every == 0:
             log.append({"step": step + 1, **average_of(recent)})
             recent = []
-            keep({"model": model.state_dict(), "mean": mean.state_dict(), "optimiser": optimiser.state_dict(), "step": step + 1, "log": log})
+            keep(
+                {
+                    "model": model.state_dict(),
+                    "mean": mean.state_dict(),
+                    "optimiser": optimiser.state_dict(),
+                    "step": step + 1,
+                    "log": log,
+                    "made_of": made_of,
+                }
+            )
         if last:
             break
     return mean, log
 
 
 def average_of(told: list[Told]) -> Told:
-    """The mean of every figure; a figure that a batch could not measure (NaN) is left out of it."""
-    return {name: float(np.nanmean([one[name] for one in told])) for name in (told[0] if told else ())}
+    """The mean of every figure over the batches that could measure it (not NaN); what none could is left out."""
+    held = {name: [one[name] for one in told if not np.isnan(one[name])] for name in (told[0] if told else ())}
+    return {name: float(np.mean(values)) for name, values in held.items() if values}

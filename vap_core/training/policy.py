@@ -7,10 +7,8 @@ gives its keys and values alone, so that this is where looking is learned. The a
 """
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +18,16 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
+from vap_core.errors import BadOutput
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
 from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
 from vap_core.policies.mini_pi0.vlm import grow, halve
 from vap_core.policies.mini_pi0.vlm import load as load_vlm
-from vap_core.processes import results
 from vap_core.suites import suite
 from vap_core.training.commands import command
+from vap_core.training.dataset import data_sha256, read
+from vap_core.training.dataset import film as shoot
 from vap_core.training.demonstrations import SIDE, Film, cached
 from vap_core.training.descent import Descent, Told, average_of, descend
 from vap_core.training.words import vocabulary
@@ -181,22 +181,19 @@ def _times(n: int, config: MiniPI0Config, generator: torch.Generator) -> Float[T
     return drawn * config.time_sampling_scale + config.time_sampling_offset
 
 
-def load_films(recipe: Recipe, cache: Path = CACHE, jobs: int | None = None) -> tuple[list[Film], list[Film]]:
-    """Films to train on and to look at, shot in processes where they are missing."""
-    from tqdm import tqdm
-
-    missing = [n for n in range(recipe.stages) if not (cache / f"{recipe.suite}-{recipe.seed}-{n:05d}.npz").exists()]
-    if missing:
-        work = results(partial(_shoot, cache, recipe.suite, recipe.seed), missing, jobs or os.cpu_count() or 1, "jobs")
-        list(tqdm(work, f"films of {recipe.suite}", len(missing), mininterval=10))
+def load_films(recipe: Recipe, cache: Path = CACHE, demonstrations: Path | None = None) -> tuple[list[Film], list[Film]]:
+    """Films to train on and to look at: of a dataset, or of the cache, shot where they are missing there."""
     both: tuple[list[Film], list[Film]] = ([], [])
+    if demonstrations is not None:
+        return read(demonstrations, lambda n: not _held_out(n)), read(demonstrations, _held_out)
+    shoot(recipe.suite, recipe.stages, cache, seed=recipe.seed)
     for n in range(recipe.stages):
-        both[n % HELD_OUT == HELD_OUT - 1].extend(cached(cache, recipe.suite, recipe.seed, n))
+        both[_held_out(n)].extend(cached(cache, recipe.suite, recipe.seed, n))
     return both
 
 
-def _shoot(cache: Path, suite_name: str, seed: int, number: int) -> None:
-    cached(cache, suite_name, seed, number)
+def _held_out(stage: int) -> bool:
+    return stage % HELD_OUT == HELD_OUT - 1
 
 
 class Learner(nn.Module):
@@ -208,13 +205,23 @@ class Learner(nn.Module):
 
 
 def train(
-    recipe: Recipe, out: Path, *, vlm: Path | None = None, minutes: float | None = None, cache: Path = CACHE, every: int = 250
+    recipe: Recipe,
+    out: Path,
+    *,
+    vlm: Path | None = None,
+    demonstrations: Path | None = None,
+    minutes: float | None = None,
+    cache: Path = CACHE,
+    every: int = 250,
 ) -> dict[str, Any]:
     """Train, or go on where an earlier call stopped, and write a checkpoint that lerobot loads; returns what was measured on the films held out.
 
-    The policy grows from the mini-PaliGemma in `vlm`; None: from nothing.
+    The policy grows from the mini-PaliGemma in `vlm`; None: from nothing. `demonstrations` is a dataset of train demonstrations; None: the cache.
+    Raises: BadOutput when `out` holds another training.
     """
-    films, held = load_films(recipe, cache)
+    films, held = load_films(recipe, cache, demonstrations)
+    if not films:
+        raise BadOutput(f"train policy: {demonstrations or recipe.suite} holds no film to learn from; make more stages.")
     stats = statistics(films)
     config = configuration(recipe, films[0].state.shape[1], films[0].action.shape[1])
     torch.manual_seed(recipe.seed)  # initial weights only; every other draw comes from the step's stream
@@ -228,15 +235,16 @@ def train(
         batch = collate(recipe, films, stats, np.random.default_rng([73, recipe.seed, at]), config)
         return losses(model.policy, model.asked, batch, recipe.draws, torch.Generator().manual_seed(recipe.seed * 1_000_003 + at))
 
-    mean, log = descend(learner, step, Descent(recipe.suite, recipe.steps, recipe.rate, minutes, every), out)
-    return save(recipe, mean, stats, held, log, out)
+    made_of = {"recipe": vars(recipe), "data_sha256": data_sha256([*films, *held]), "vlm": config.vlm}
+    mean, log = descend(learner, step, Descent(recipe.suite, recipe.steps, recipe.rate, minutes, every, made_of), out)
+    return save(mean, stats, held, {**made_of, "log": log}, out)
 
 
-def save(recipe: Recipe, learner: Learner, stats: Any, held: Sequence[Film], log: list[Any], out: Path) -> dict[str, Any]:
+def save(learner: Learner, stats: Any, held: Sequence[Film], made_of: dict[str, Any], out: Path) -> dict[str, Any]:
     """Weights, configuration and processors as lerobot keeps them, and what was measured."""
     from lerobot.policies import make_pre_post_processors
 
-    policy = learner.policy
+    policy, recipe = learner.policy, Recipe(**made_of["recipe"])
     policy.save_pretrained(out)
     halve(out / "model.safetensors")
     for pipeline in make_pre_post_processors(policy.config, dataset_stats=stats):
@@ -246,6 +254,6 @@ def save(recipe: Recipe, learner: Learner, stats: Any, held: Sequence[Film], log
             losses(policy, learner.asked, collate(recipe, held, stats, np.random.default_rng([74, i]), policy.config), 4,
                    torch.Generator().manual_seed(i))[1] for i in range(8)
         ] if held else []  # fmt: skip
-    about = {"recipe": vars(recipe), "held_out": average_of(told), "log": log}
+    about = {**made_of, "held_out": average_of(told)}
     (out / "training.json").write_text(json.dumps(about, indent=1))
     return about

@@ -182,7 +182,7 @@ def train(recipe: Recipe, out: Path, *, minutes: float | None = None, cache: Pat
     def step(model: Learner, at: int) -> tuple[Tensor, Told]:
         return losses(model, collate(recipe, pool, number, np.random.default_rng([75, recipe.seed, at]), config))
 
-    mean, log = descend(learner, step, Descent("mini-paligemma", recipe.steps, recipe.rate, minutes), out)
+    mean, log = descend(learner, step, Descent("mini-paligemma", recipe.steps, recipe.rate, minutes, made_of={"recipe": vars(recipe)}), out)
     held = views(min(HELD_OUT, recipe.stages), recipe.seed, cache, held_out=True, jobs=jobs)
     with torch.no_grad():
         told = [losses(mean, collate(recipe, held, number, np.random.default_rng([76, i]), config))[1] for i in range(16)]
