@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import load_file
 
+from vap_core import describe
 from vap_core.errors import BadOutput
 from vap_core.policies.lerobot import load
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
@@ -23,8 +24,8 @@ from vap_core.training import demonstrations, policy, vlm
 from vap_core.training.commands import command, near, painted, rough, say, tinted
 from vap_core.training.dataset import data_sha256
 from vap_core.training.demonstrations import PARTS, SIDE, Film, cached, cast
-from vap_core.training.questions import ask, place
-from vap_core.training.words import described, vocabulary
+from vap_core.training.questions import LEAST_PX, ask, place
+from vap_core.training.words import PAINTS, akin, looks, phrases, vocabulary
 
 SUITE = "simpler-bridge"
 
@@ -86,14 +87,19 @@ def test_a_command_says_what_its_picture_shows(stage: tuple[Path, list[Film]]) -
         ways[made.way] += 1
         assert set(re.findall(r"[\w']+", made.text.lower())) <= words
         mask, rivals = film.ids[t, 0] == 1, [i for i in range(1, len(film.names)) if i != film.goal]
-        looks = [described(objects.get(film.names[i]).texture) for i in (0, *rivals)]
+        mine, *others = (looks(film.names[i]) for i in (0, *rivals))
         if made.way == "plain":
             assert near(film, t, SUITE, rivals)
         elif made.way == "described":
-            assert [word for word in looks[0].difference(*looks[1:]) if f" {word}" in made.text]
-        elif mask.sum() > 60:
-            (colour,) = (colour for colour in PALETTE if f" {colour.name}" in made.text)
-            assert looks_like(made.images[0][mask], colour).mean() > 0.15, made.text
+            said = [word for word in (*mine.difference(*others), *phrases(film.names[0])) if f" {word}" in made.text]
+            assert said
+            assert mine.difference(*others)
+        else:
+            colour = max((colour for colour in PAINTS if f" {colour.name}" in made.text), key=lambda colour: len(colour.name))
+            assert made.way == "painted" or colour in PALETTE
+            assert not any(akin(colour.name) & other for other in others)
+            if colour in PALETTE and mask.sum() > 60:
+                assert looks_like(made.images[0][mask], colour).mean() > 0.15, made.text
     assert min(ways[way] for way in ("tinted", "painted", "described", "plain")) > 5
 
 
@@ -142,6 +148,14 @@ def test_a_training_that_was_stopped_ends_like_one_that_was_not(
     assert (trained.action_size, set(trained.wanted)) == (7, {"observation.images.front", "observation.state"})
 
 
+def test_training_hears_every_word_that_the_captioner_says() -> None:
+    names = [objects.generic(kind, i).name for kind in ("cup", "camera", "vase", "slipper") for i in range(120)]
+    heard = {word for name in names for phrase in phrases(name) for word in re.findall(r"\w+", phrase)}
+    heard |= {colour.name for colour in PAINTS}
+    assert set(describe.WORDS) <= heard, set(describe.WORDS) - heard
+    assert heard <= set(vocabulary())
+
+
 def test_questions_are_true_of_their_views(stage: tuple[Path, list[Film]]) -> None:
     _, films = stage
     known, ends = set(vocabulary()), Counter[tuple[str, ...]]()
@@ -154,12 +168,17 @@ def test_questions_are_true_of_their_views(stage: tuple[Path, list[Film]]) -> No
             assert set(re.findall(r"[\w']+", question.text.lower())) | set(question.answer) <= known, question.text
             kind = objects.get(film.names[question.target]).category if question.target >= 0 else ""
             assert kind in question.text
+            if question.answer == ("no",):  # nothing in view is of that kind and called so
+                asked_for = question.text.removeprefix("is there a ").removeprefix("can you recognize the ").removesuffix(" in this image")
+                assert not any(asked_for in (objects.get(name).category, *(f"{word} {objects.get(name).category}" for word in looks(name)))
+                               for i, name in enumerate(film.names) if (film.ids[t, 0] == i + 1).sum() >= LEAST_PX)  # fmt: skip
             ends[question.answer[:1] if question.answer[:1] in (("yes",), ("no",)) else (question.text.split()[0],)] += 1
             if question.text.startswith("where"):
                 assert question.answer == place(film.ids[t, 0] == question.target + 1)
             if question.answer == ("no",):
                 assert question.target == -1
     assert min(ends[key] for key in (("yes",), ("no",), ("where",), ("put",))) > 20
+    assert 0.5 < ends["yes",] / ends["no",] < 1.6
 
 
 def test_a_vision_language_model_learns_and_resumes(stage: tuple[Path, list[Film]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -172,7 +191,7 @@ def test_a_vision_language_model_learns_and_resumes(stage: tuple[Path, list[Film
     vlm.train(recipe, tmp_path / "torn")
     one, other = (load_vlm(tmp_path / name).sha256() for name in ("whole", "torn"))
     assert one == other
-    assert {"words", "heat", "hit", "where", "whether"} <= set(whole["held_out"])
+    assert {"words", "heat", "hit", "where", "yes", "no"} <= set(whole["held_out"])
     grown = policy.Recipe(SUITE, stages=1, steps=1, batch=2, draws=1, width=32, depth=2, vision_width=32, vision_depth=1, expert_width=32)
     monkeypatch.setattr(demonstrations, "EPISODES", 2)
     about = policy.train(grown, tmp_path / "policy", vlm=tmp_path / "whole", cache=stage[0])

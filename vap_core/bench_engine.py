@@ -11,20 +11,23 @@ from pathlib import Path
 import numpy as np
 
 from vap_core import cluster, engine
+from vap_core.errors import BadCluster
 from vap_core.experiments import Study
 from vap_core.processes import results
 from vap_core.report import align
 from vap_core.suites import suite
 
 SUITE, REPEATS = "simpler-bridge", 4
-STUDY = Study(tuple((SUITE, task.name) for task in suite(SUITE).tasks), ("generic", "vap"), episodes=5, follow="call")
 
 
 @contextmanager
 def local_cluster(cpus: int) -> Iterator[str]:
-    """The address of a Ray cluster of one node on this machine, on loopback."""
+    """The address of a Ray cluster of one node on this machine, on loopback. Raises: BadCluster."""
     os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # else Ray listens at this machine's outward address
-    from ray.cluster_utils import Cluster
+    try:
+        from ray.cluster_utils import Cluster
+    except ImportError as error:
+        raise BadCluster("bench engine: ray is not installed; run: pip install 'ray>=2.50'") from error
 
     head = {"num_cpus": cpus, "node_ip_address": "127.0.0.1", "object_store_memory": 2**28, "include_dashboard": False}
     nodes = Cluster(initialize_head=True, head_node_args=head)
@@ -39,7 +42,9 @@ def run(workers: int = 2, quick: bool = False) -> str:
     from scipy import stats
     from tqdm import tqdm
 
-    study = replace(STUDY, tasks=STUDY.tasks[:1], policy="random", methods=("generic",), episodes=1) if quick else STUDY
+    study = Study(tuple((SUITE, task.name) for task in suite(SUITE).tasks), ("generic", "vap"), episodes=5, follow="call")
+    if quick:
+        study = replace(study, tasks=study.tasks[:1], policy="random", methods=("generic",), episodes=1)
     seconds: dict[str, list[float]] = {"processes": [], "ray": []}
     with tempfile.TemporaryDirectory() as scratch, local_cluster(workers) as address:
         spreads: dict[str, engine.Spread] = {"processes": results, "ray": cluster.spread(address)}

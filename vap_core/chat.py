@@ -34,16 +34,22 @@ class Chat:
     timeout_s: float = 60.0
 
     def __post_init__(self) -> None:
-        parts = urlsplit(self.url)
-        if parts.scheme not in ("http", "https") or not parts.hostname:
+        try:
+            parts = urlsplit(self.url)
+            known = parts.scheme in ("http", "https") and bool(parts.hostname)
+        except ValueError:
+            known = False
+        if not known:
             raise BadEndpoint(f"chat: {self.url!r} is no address of a chat endpoint; give one like https://api.openai.com/v1.")
         if not self.model:
             raise BadEndpoint(f"chat: no model named for {self.url}; set {MODEL}.")
+        if not self.key.isascii() or not (self.key.isprintable() or not self.key):
+            raise BadEndpoint(f"chat: the key for {self.url} holds a line break or another character that no key has; set {KEY} again.")
 
 
 def endpoint(url: str = "", timeout_s: float = 60.0) -> Chat:
     """The endpoint at `url`, or at OPENAI_BASE_URL; model and key from OPENAI_MODEL and OPENAI_API_KEY. Raises: BadEndpoint."""
-    return Chat(url or os.environ.get(URL, ""), os.environ.get(MODEL, ""), os.environ.get(KEY, ""), timeout_s)
+    return Chat(url or os.environ.get(URL, ""), os.environ.get(MODEL, ""), os.environ.get(KEY, "").strip(), timeout_s)
 
 
 def ask(chat: Chat, question: str, pictures: Sequence[Rgb] = ()) -> str:
@@ -85,8 +91,9 @@ def data_url(rgb: Rgb) -> str:
 
 def _reason(error: HTTPError) -> str:
     """The first line of what the server says, in the protocol's form or plainly."""
-    said = error.read(2000).decode(errors="replace")
-    with suppress(ValueError, KeyError, TypeError, RecursionError):
+    said = ""
+    with suppress(OSError, HTTPException, ValueError, KeyError, TypeError, RecursionError):
+        said = error.read(2000).decode(errors="replace")
         said = str(json.loads(said)["error"]["message"])
     return " ".join(said.split())[:200] or error.reason
 

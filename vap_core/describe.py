@@ -68,7 +68,7 @@ class Attributes:
         share["grey"] *= share["grey"] >= SHADY
         first, *rest = sorted(COLOURS, key=lambda name: -share[name])
         others = {name: _usual([look.kinds[name] for look in looks if look.share[name] > FEW]) for name in rest if share[name] >= FEW}
-        main = _shaded(first, float(np.median([look.lightness[first] for look in looks if look.share[first] > FEW])))
+        main = shaded(first, float(np.median([look.lightness[first] for look in looks if look.share[first] > FEW])))
         told = [f"{name} {kind}" for name, kind in others.items() if share[name] >= SOME][:2]
         hints = [name for name in others if share[name] < SOME][:2]
         short = " with ".join([main, *([" and ".join(told)] if told else [])])
@@ -201,7 +201,7 @@ def spread(part: Bool[np.ndarray, "h w"], whole: Mask) -> str:
     return "patches" if len(blobs) >= 2 and blobs[0] < 0.2 * size else "parts"
 
 
-def _shaded(name: str, lightness: float) -> str:
+def shaded(name: str, lightness: float) -> str:
     """A colour with its shade, where it has one that is worth a word."""
     if name in ("black", "white"):
         return name

@@ -138,7 +138,8 @@ def _exactly(thing: Any) -> bytes:
 def register_personal(study: Study, bank: Path, captioner: Captioner | None = None) -> None:
     """Remember the personal object of every task from five rendered reference views; what the bank holds already stays.
 
-    Where a method tells what it looks like, it is described too, by `captioner`, or offline. A study that prompts nothing needs no memory.
+    Where a method tells what it looks like, it is described too, by `captioner`, or offline; for the soft prompt a word of its own is learned.
+    A study that prompts nothing needs no memory.
     """
     if all(METHODS[method] is None for method in study.methods):
         return
@@ -152,7 +153,7 @@ def register_personal(study: Study, bank: Path, captioner: Captioner | None = No
         if telling and obj.description is None:
             obj = described(obj, captioner or Attributes(stack.segmenter))
         if any(isinstance(METHODS[method], Learned) for method in study.methods):
-            teach(study.rows(suite, task), bank, MODEL)
+            teach(study.rows(suite, task), bank, lerobot.setting(study.checkpoint(suite), "vlm"), MODEL)
         if obj is not held.get(row.target):
             save(bank, obj, replace=True)
             held[row.target] = obj

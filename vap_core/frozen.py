@@ -37,9 +37,10 @@ def frozen(policy: object) -> Iterator[str]:
     if not isinstance(policy, Weighted):
         yield ""
         return
-    if policy not in _first:
-        _first[policy] = checksum(policy)
-    before = _first[policy]
+    inner = getattr(policy, "policy", policy)  # one set of parameters, however many speak for it
+    if inner not in _first:
+        _first[inner] = checksum(policy)
+    before = _first[inner]
     yield before
     after = checksum(policy)
     if after != before:

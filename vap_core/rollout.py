@@ -150,10 +150,11 @@ def _follow(trial: Trial, following: Sequence[Running], raws: Mapping[int, Polic
     if trial.attender is None or not following:
         return {}
     states, views = [one.attend_state for one in following], [raws[id(one)].images for one in following]
+    told = isinstance(trial.attender, Revealed) and trial.attender.always
+    masks = [one.env.truth(masks=True).masks if told else {} for one in following]
     start = time.perf_counter()
     try:
         if isinstance(trial.attender, Revealed):
-            masks = [one.env.truth(masks=True).masks if trial.attender.always else {} for one in following]
             done: Sequence[tuple[Any, Attended]] = trial.attender.steps(states, views, [one.row for one in following], masks)
         else:
             done = trial.attender.steps(states, views)

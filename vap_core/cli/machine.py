@@ -53,11 +53,15 @@ def eval_policy(
 
     Example: python -m vap_core eval-policy --suite simpler-bridge --scenes 4
     """
-    from vap_core.soft_prompt import MODEL
+    from vap_core import suites as known
+    from vap_core.errors import BadStudy
+    from vap_core.experiments import Study
     from vap_core.training.probe import conclude, keep, probe
 
-    checkpoint = str(MODEL.parent / f"mini-pi0-{suite}") if policy == "mini-pi0" else policy
-    table = probe(checkpoint, suite, scenes=scenes, seed=seed, workers=workers)
+    study = Study(tuple((suite, task.name) for task in known.suite(suite).tasks), ("generic",), policy=policy)
+    if not study.checkpoint(suite):
+        raise BadStudy(f"eval-policy: {policy!r} has no weights; take mini-pi0, or a lerobot checkpoint's folder or hub id.")
+    table = probe(study.checkpoint(suite), suite, scenes=scenes, seed=seed, workers=workers)
     print(conclude(table))
     if out is not None:
         keep(table, out)

@@ -257,10 +257,20 @@ def locate(checkpoint: str | Path) -> Path:
     return folder
 
 
+def setting(checkpoint: str | Path, name: str) -> str:
+    """What a checkpoint's config.json says there; "" when it says nothing. Raises: BadPolicy."""
+    file = locate(checkpoint) / CONFIG
+    try:
+        return str(json.loads(file.read_text()).get(name, ""))
+    except (ValueError, AttributeError) as error:
+        raise BadPolicy(f"load: {file} is no configuration ({type(error).__name__}); save the checkpoint again with lerobot 0.6.") from error
+
+
 def fingerprint(checkpoint: str | Path) -> str:
     """SHA-256 of everything in a checkpoint that decides what it does, without loading it."""
     found, folder = hashlib.sha256(), locate(checkpoint)
-    for file in sorted(file for file in folder.rglob("*") if file.is_file() and any(file.match(pattern) for pattern in WANTED_FILES)):
+    kept = [file for file in folder.rglob("*") if file.is_file() and any(file.match(pattern) for pattern in WANTED_FILES)]
+    for file in sorted(file for file in kept if file.name != "training.json"):  # how it was made decides nothing
         found.update(file.relative_to(folder).as_posix().encode())
         with file.open("rb") as stream:
             found.update(hashlib.file_digest(stream, "sha256").digest())

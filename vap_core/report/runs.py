@@ -57,7 +57,7 @@ def load(folders: Sequence[Path]) -> Runs:
         if NEEDED.keys() - table.columns:
             missing = ", ".join(name for name in NEEDED if name not in table)
             raise BadOutput(f"report: {folder} lacks the columns {missing}; an older version wrote it. Run it again in another folder.")
-        asked = _asked(study, str(table["policy"].iloc[0]))  # a checkpoint goes by its label, not by its path
+        asked = _asked(study, dict(table.groupby("suite")["policy"].first()))  # a checkpoint goes by its label, not by its path
         _expected(folder, study, table)
         if len(table) < asked["asked"].sum():
             unfinished.append(f"{folder} is unfinished: {len(table)} of {asked['asked'].sum()} episodes; run the same command again to finish it.")
@@ -110,7 +110,7 @@ def _listed(study: dict[str, Any]) -> Iterator[tuple[str, str, int, tuple[tuple[
             yield suite, task, seed, _rows(suite, task, study["episodes"], 0 if suite in suites.BENCHMARKS else seed)
 
 
-def _asked(study: dict[str, Any], policy: str) -> "pd.DataFrame":
+def _asked(study: dict[str, Any], labels: dict[str, str]) -> "pd.DataFrame":
     import pandas as pd
 
     lines = []
@@ -118,6 +118,7 @@ def _asked(study: dict[str, Any], policy: str) -> "pd.DataFrame":
         asked = Counter(split for _, split in rows)
         whole = Counter(split for _, split in _rows(suite, task, None, 0)) if suite in suites.BENCHMARKS else asked
         for method in study["methods"]:
+            policy = labels.get(suite, study["policy"])
             lines += [(suite, task, split, method, policy, seed, n, whole[split]) for split, n in asked.items()]
     return pd.DataFrame(lines, columns=[*TRACK, "seed", "asked", "listed"])
 

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from vap_core.prompt import PALETTE
-from vap_core.sim import objects, robots
+from vap_core.sim import robots
 from vap_core.suites import Task, suite
 from vap_core.training.demonstrations import Film
-from vap_core.training.words import DETERMINERS, described
+from vap_core.training.words import DETERMINERS, PAINTS, akin, free, looks, phrases
 from vap_core.values import Colour, value
 
 TINTED, PAINTED, DESCRIBED = 0.5, 0.15, 0.1
@@ -47,17 +47,22 @@ def command(film: Film, t: int, suite_name: str, rng: np.random.Generator) -> Co
     task = suite(suite_name).task(film.task)
     rivals = [i for i in range(1, len(film.names)) if i != film.goal]
     images, ids = film.images[t].copy(), film.ids[t]
-    mine, *others = (PALETTE[i] for i in rng.permutation(len(PALETTE)))
+    drawn = rng.random()
+    natural = 1 - TINTED - PAINTED < drawn < 1 - TINTED
+    usable = free({word for i in rivals for word in looks(film.names[i])}, PAINTS if natural else PALETTE)
+    mine = usable[int(rng.integers(len(usable)))]
+    others = [colour for colour in PAINTS if not akin(colour.name) & akin(mine.name)]
+    others = [others[i] for i in rng.permutation(len(others))]
     for rival, colour in zip(rivals, others, strict=False):
         if rng.random() < OTHERS:
             images = painted(images, ids == rival + 1, colour, float(rng.uniform(*COAT)))
-    drawn, word = rng.random(), mine.name
+    word = mine.name
     way: Way = "tinted"
-    if drawn < DESCRIBED and (told := _telling(film, rivals, rng)):
+    if drawn < DESCRIBED and (told := telling([film.names[i] for i in (0, *rivals)], rng)):
         images, way, word = film.images[t].copy(), "described", told
     elif DESCRIBED < drawn < 1 - TINTED - PAINTED and near(film, t, suite_name, rivals):
         way, word = "plain", ""
-    elif 1 - TINTED - PAINTED < drawn < 1 - TINTED:
+    elif natural:
         images, way = painted(images, ids == 1, mine, float(rng.uniform(*COAT))), "painted"
     if way == "tinted":
         seen = rng.random(len(images)) > LOST
@@ -75,16 +80,19 @@ def near(film: Film, t: int, suite_name: str, rivals: Sequence[int]) -> bool:
     return bool(all(away[0] + NEAR_M < away[i] for i in rivals))
 
 
-def _telling(film: Film, rivals: Sequence[int], rng: np.random.Generator) -> str:
-    """A word for the target's own look that fits no rival; "" when there is none."""
-    looks = [described(objects.get(film.names[i]).texture) for i in (0, *rivals)]
-    words = sorted(looks[0].difference(*looks[1:]))
-    return str(rng.choice(words)) if words else ""
+def telling(names: Sequence[str], rng: np.random.Generator) -> str:
+    """A word, or a captioner's phrase, that fits names[0] and none of the others; "" when there is none."""
+    mine, *others = (looks(name) for name in names)
+    words = sorted(mine.difference(*others))
+    if not words:
+        return ""
+    return str(rng.choice(phrases(names[0]))) if rng.random() < 0.5 else str(rng.choice(words))
 
 
 def say(task: Task, word: str, rng: np.random.Generator) -> str:
-    """The task's instruction with its "my" replaced: by "the" and a word, or by any determiner; now and then the word comes afterwards."""
-    if word and rng.random() < AFTERWARDS:
+    """The task's instruction with its "my" replaced: by "the" and a word, or by any determiner; a phrase, and now and then a word, comes
+    afterwards, as a description does."""
+    if " " in word or (word and rng.random() < AFTERWARDS):
         return f"{task.instruction}. My {task.category} is {word}."
     return task.instruction.replace("my ", f"the {word} " if word else f"{rng.choice(DETERMINERS)} ", 1)
 

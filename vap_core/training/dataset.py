@@ -94,8 +94,9 @@ def write(
             film(suite_name, stages, cache, seed=seed, jobs=jobs)
             folders = []
             for first in tqdm(range(0, stages, part), f"dataset of {suite_name}", mininterval=10):
-                folders.append(out / "parts" / f"{first:05d}")
-                _write_part(known, seed, range(first, min(first + part, stages)), cache, folders[-1])
+                after = min(first + part, stages)
+                folders.append(out / "parts" / f"{first:05d}-{after:05d}")
+                _write_part(known, seed, range(first, after), cache, folders[-1])
             _join(known, {"suite": suite_name, "seed": seed, "stages": stages}, folders, out)
         shutil.rmtree(out / "parts", ignore_errors=True)
     return about(out)

@@ -47,7 +47,7 @@ def descend[M: nn.Module](model: M, losses: Callable[[M, int], tuple[Tensor, Tol
     out.mkdir(parents=True, exist_ok=True)
     state, keep = checkpoint(out / "training.pt", resume=True)
     made_of = json.dumps(run.made_of, sort_keys=True)
-    if state.get("made_of", made_of) != made_of:
+    if state and state.get("made_of") != made_of:
         raise BadOutput(f"train: {out} holds a training with another recipe or other data; go on with those, or choose another --out.")
     if state:
         for part, name in ((model, "model"), (mean, "mean"), (optimiser, "optimiser")):

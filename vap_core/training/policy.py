@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
+from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
@@ -24,12 +25,14 @@ from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
 from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
 from vap_core.policies.mini_pi0.vlm import grow, halve
 from vap_core.policies.mini_pi0.vlm import load as load_vlm
+from vap_core.sim.objects import get
 from vap_core.suites import suite
 from vap_core.training.commands import command
-from vap_core.training.dataset import data_sha256, read
+from vap_core.training.dataset import about, data_sha256, read
 from vap_core.training.dataset import film as shoot
 from vap_core.training.demonstrations import SIDE, Film, cached
 from vap_core.training.descent import Descent, Told, average_of, descend
+from vap_core.training.scenes import only_generic
 from vap_core.training.words import vocabulary
 
 CACHE = Path(__file__).resolve().parents[2] / "data" / "cache" / "demonstrations"
@@ -185,6 +188,8 @@ def load_films(recipe: Recipe, cache: Path = CACHE, demonstrations: Path | None 
     """Films to train on and to look at: of a dataset, or of the cache, shot where they are missing there."""
     both: tuple[list[Film], list[Film]] = ([], [])
     if demonstrations is not None:
+        if (shown := about(demonstrations)["suite"]) != recipe.suite:
+            raise BadOutput(f"train policy: {demonstrations} shows {shown}, not {recipe.suite}; name its suite, or another dataset.")
         return read(demonstrations, lambda n: not _held_out(n)), read(demonstrations, _held_out)
     shoot(recipe.suite, recipe.stages, cache, seed=recipe.seed)
     for n in range(recipe.stages):
@@ -222,6 +227,7 @@ def train(
     films, held = load_films(recipe, cache, demonstrations)
     if not films:
         raise BadOutput(f"train policy: {demonstrations or recipe.suite} holds no film to learn from; make more stages.")
+    only_generic([get(name) for film in (*films, *held) for i, name in enumerate(film.names) if i != film.goal])
     stats = statistics(films)
     config = configuration(recipe, films[0].state.shape[1], films[0].action.shape[1])
     torch.manual_seed(recipe.seed)  # initial weights only; every other draw comes from the step's stream
@@ -247,6 +253,7 @@ def save(learner: Learner, stats: Any, held: Sequence[Film], made_of: dict[str, 
     policy, recipe = learner.policy, Recipe(**made_of["recipe"])
     policy.save_pretrained(out)
     halve(out / "model.safetensors")
+    policy.load_state_dict(load_file(out / "model.safetensors"))  # what is measured is what was saved
     for pipeline in make_pre_post_processors(policy.config, dataset_stats=stats):
         pipeline.save_pretrained(out)
     with torch.no_grad():
@@ -254,6 +261,6 @@ def save(learner: Learner, stats: Any, held: Sequence[Film], made_of: dict[str, 
             losses(policy, learner.asked, collate(recipe, held, stats, np.random.default_rng([74, i]), policy.config), 4,
                    torch.Generator().manual_seed(i))[1] for i in range(8)
         ] if held else []  # fmt: skip
-    about = {**made_of, "held_out": average_of(told)}
-    (out / "training.json").write_text(json.dumps(about, indent=1))
-    return about
+    card = {**made_of, "held_out": average_of(told)}
+    (out / "training.json").write_text(json.dumps(card, indent=1))
+    return card

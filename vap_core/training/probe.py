@@ -11,20 +11,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vap_core.errors import BadOutput, BadStudy
 from vap_core.files import write_atomic
 from vap_core.metrics import rate
 from vap_core.oracle import Masks, Revealed
 from vap_core.policies import lerobot
 from vap_core.processes import results
-from vap_core.prompt import ALPHA, PALETTE
+from vap_core.prompt import ALPHA
 from vap_core.report.text import align
 from vap_core.rollout import Trial, rollout
 from vap_core.sim import objects
 from vap_core.sim.scenes import build
 from vap_core.suites import VARIANTS, suite
-from vap_core.training.commands import Way, painted, tinted
+from vap_core.training.commands import Way, painted, say, telling, tinted
 from vap_core.training.demonstrations import cast, row
-from vap_core.training.words import described
+from vap_core.training.words import free, looks
 from vap_core.values import Attended, EpisodeRow, Views
 
 if TYPE_CHECKING:
@@ -49,13 +50,11 @@ class Told(Revealed):
 
     def start(self, views: Views, instruction: str, row: EpisodeRow, masks: Masks) -> tuple[Any, Attended]:
         rng = np.random.default_rng([79, row.seed, row.episode])
-        colour = PALETTE[int(rng.integers(len(PALETTE)))]
-        word = "" if self.way == "plain" else colour.name
-        if self.way == "described":
-            looks = [described(objects.get(place.model).texture) for place in row.placements if place.model != row.goal]
-            words = sorted(looks[0].difference(*looks[1:])) or sorted(looks[0])
-            word = str(rng.choice(words))
-        text = instruction.replace("my ", f"the {word} " if word else "the ", 1)
+        names = _same_kind(row)
+        usable = free({word for name in names[1:] for word in looks(name)})
+        colour = usable[int(rng.integers(len(usable)))]
+        word = {"plain": "", "described": telling(names, rng)}.get(self.way, colour.name)
+        text = say(suite(row.suite).task(row.task), word, rng) if word else instruction.replace("my ", "the ", 1)
         return (colour, text), self._show((colour, text), views, row, masks)
 
     def steps(self, states: Sequence[Any], views: Sequence[Views], rows: Sequence[EpisodeRow], masks: Sequence[Masks]) -> list[tuple[Any, Attended]]:
@@ -78,8 +77,11 @@ def probe(checkpoint: str, suite_name: str, *, scenes: int = 12, ways: Sequence[
     from tqdm import tqdm
 
     work = partial(_scene, checkpoint, suite_name, tuple(ways), seed)
-    done = results(work, list(range(scenes)), workers, "--workers")
-    return pd.DataFrame([line for _, lines in tqdm(done, f"episodes of {suite_name}", scenes, unit="scene") for line in lines])
+    done = tqdm(results(work, list(range(scenes)), workers, "--workers"), f"episodes of {suite_name}", scenes, unit="scene")
+    lines = [line for _, part in sorted(done, key=lambda found: found[0]) for line in part]
+    if not lines:
+        raise BadStudy(f"probe: nothing fits on the table of {suite_name} in {scenes} scenes; ask for more --scenes.")
+    return pd.DataFrame(lines)
 
 
 def _scene(checkpoint: str, suite_name: str, ways: Sequence[Way], seed: int, number: int) -> list[dict[str, Any]]:
@@ -92,10 +94,16 @@ def _scene(checkpoint: str, suite_name: str, ways: Sequence[Way], seed: int, num
     with build(known.robot, names, look=VARIANTS["base"].look) as scene:
         policy = lerobot.fitted(checkpoint, scene, known)
         for way in ways:
+            played = [row for row in rows if way != "described" or looks(row.target).difference(*map(looks, _same_kind(row)[1:]))]
             trial = Trial(way, scene, policy, Told(way), sizes, known.control, known.sensor, follow="call")
-            for episode in rollout(trial, rows, batch=EACH):
+            for episode in rollout(trial, played, batch=EACH):
                 lines.append({**episode.summary(), "scene": number})
     return lines
+
+
+def _same_kind(row: EpisodeRow) -> list[str]:
+    """The target, then its rivals."""
+    return [place.model for place in row.placements if place.model != row.goal]
 
 
 def _rows(known: Any, task: Any, names: Sequence[str], number: int, rng: np.random.Generator) -> Iterator[EpisodeRow]:
@@ -116,11 +124,16 @@ def conclude(table: "pd.DataFrame") -> str:
 
 
 def keep(table: "pd.DataFrame", path: Path) -> None:
-    """Add the episodes to a table; those of the same suite in it are replaced."""
+    """Add the episodes to a table; those of the same suite and policy in it are replaced. Raises: BadOutput."""
     import pandas as pd
 
-    old = pd.read_parquet(path) if path.exists() else table[:0]
     columns = [name for name in table if name != "detail" and not name.startswith("seconds_")]
-    whole = pd.concat([part for part in (old[~old["suite"].isin(table["suite"])], table[columns]) if len(part)], ignore_index=True)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomic(path, whole.to_parquet(compression="zstd", index=False))
+    keys = table[["suite", "policy"]].drop_duplicates().itertuples(index=False, name=None)
+    try:
+        old = pd.read_parquet(path) if path.exists() else table[:0]
+        others = old[~pd.MultiIndex.from_frame(old[["suite", "policy"]]).isin(list(keys))]
+        whole = pd.concat([part for part in (others, table[columns]) if len(part)], ignore_index=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, whole.to_parquet(compression="zstd", index=False))
+    except (OSError, ValueError, KeyError) as error:
+        raise BadOutput(f"probe: {path} cannot be added to ({type(error).__name__}); name another table with --out.") from error

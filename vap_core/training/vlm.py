@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
-from vap_core.policies.mini_pi0.vlm import ANSWER, MiniVlm
+from vap_core.policies.mini_pi0.vlm import ANSWER, MiniVlm, load
 from vap_core.processes import results
 from vap_core.training.demonstrations import SIDE, small
 from vap_core.training.descent import Descent, Told, average_of, descend
@@ -33,7 +33,7 @@ CACHE = Path(__file__).resolve().parents[2] / "data" / "cache" / "perception"
 """The same scenes as perception's; what is there is not rendered again."""
 SEEN = 0.5
 """Weight of the patches beside the words."""
-KINDS = ("where", "whether", "colour")
+KINDS = ("where", "yes", "no", "colour")
 HELD_OUT = 30
 """Stages with unseen objects that the result is measured on."""
 
@@ -43,7 +43,7 @@ class Recipe:
     """How long, how fast, how large. `questions` are asked of each of `batch` views."""
 
     stages: int = 540
-    steps: int = 4000
+    steps: int = 1600
     batch: int = 64
     questions: int = 2
     rate: float = 1e-3
@@ -154,8 +154,8 @@ def losses(learner: Learner, batch: Batch) -> tuple[Tensor, Told]:
     shown = batch.patches.sum(1) > 0
     share = batch.patches / batch.patches.sum(1, keepdim=True).clamp(min=1e-6)
     chance = learner.shown(hidden)
-    heat = -(share * chance.log_softmax(-1)).sum(1)[shown].mean()
-    hit = (batch.patches.gather(1, chance.argmax(1, keepdim=True)).squeeze(1) > 0)[shown].float().mean()
+    heat = -(share * chance.log_softmax(-1)).sum(1)[shown].mean() if shown.any() else torch.zeros(())
+    hit = (batch.patches.gather(1, chance.argmax(1, keepdim=True)).squeeze(1) > 0)[shown].float().mean()  # NaN: nothing was shown
     right = ((scores.argmax(-1) == batch.answers) | (batch.answers == 0)).all(1)
     kinds = [_kind(question) for question in batch.questions]
     told = {kind: _share([bool(good) for good, each in zip(right, kinds, strict=True) if each == kind]) for kind in KINDS}
@@ -163,9 +163,10 @@ def losses(learner: Learner, batch: Batch) -> tuple[Tensor, Told]:
 
 
 def _kind(question: Question) -> str:
+    """What was asked, and, of yes and no, what is right: a model that always says the same is half right at most."""
     if not question.answer:
         return ""
-    return {"where": "where", "what": "colour"}.get(question.text.split()[0], "whether")
+    return {"where": "where", "what": "colour"}.get(question.text.split()[0], question.answer[0])
 
 
 def _share(good: list[bool]) -> float:
@@ -182,11 +183,14 @@ def train(recipe: Recipe, out: Path, *, minutes: float | None = None, cache: Pat
     def step(model: Learner, at: int) -> tuple[Tensor, Told]:
         return losses(model, collate(recipe, pool, number, np.random.default_rng([75, recipe.seed, at]), config))
 
-    mean, log = descend(learner, step, Descent("mini-paligemma", recipe.steps, recipe.rate, minutes, made_of={"recipe": vars(recipe)}), out)
+    mean, log = descend(
+        learner, step, Descent("mini-paligemma", recipe.steps, recipe.rate, minutes, made_of={"recipe": vars(recipe), "words": config.words}), out
+    )
     held = views(min(HELD_OUT, recipe.stages), recipe.seed, cache, held_out=True, jobs=jobs)
+    mean.vlm.save(out)
+    mean.vlm = load(out)  # what is measured is what was saved
     with torch.no_grad():
         told = [losses(mean, collate(recipe, held, number, np.random.default_rng([76, i]), config))[1] for i in range(16)]
-    mean.vlm.save(out)
     about = {"recipe": vars(recipe), "held_out": average_of(told), "log": log}
     (out / "training.json").write_text(json.dumps(about, indent=1))
     return about

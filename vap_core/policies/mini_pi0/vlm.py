@@ -19,6 +19,7 @@ from vap_core.policies.mini_pi0.processor_mini_pi0 import END, encode
 ANSWER = 3
 """Words of the longest answer, END included."""
 WEIGHTS = "vlm.safetensors"
+SIZES = ("image_resolution", "patch", "width", "depth", "head_dim", "vision_width", "vision_depth")
 
 
 class MiniVlm(nn.Module):
@@ -109,5 +110,8 @@ def halve(file: Path) -> None:
 
 
 def grow(vlm: MiniVlm, policy: Any) -> None:
-    """Start a policy's image tower, decoder and words from the model's. Raises: RuntimeError when sizes differ."""
+    """Start a policy's image tower, decoder and words from the model's. Raises: BadPolicy when words or sizes differ."""
+    for name in ("words", *SIZES):
+        if getattr(policy.config, name) != getattr(vlm.config, name):
+            raise BadPolicy(f"vlm.grow: policy and mini-PaliGemma differ in {name}; make the model again: python -m vap_core train vlm")
     policy.model.paligemma_with_expert.paligemma.load_state_dict(vlm.towers.paligemma.state_dict())
