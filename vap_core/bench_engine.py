@@ -8,13 +8,12 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from vap_core import cluster, engine
 from vap_core.errors import BadCluster
 from vap_core.experiments import Study
 from vap_core.processes import results
 from vap_core.report import align
+from vap_core.statistics import ratio
 from vap_core.suites import suite
 
 SUITE, REPEATS = "simpler-bridge", 4
@@ -39,7 +38,6 @@ def local_cluster(cpus: int) -> Iterator[str]:
 
 def run(workers: int = 2, quick: bool = False) -> str:
     """Measure and say it; about five minutes on two cores, `quick` a smoke test."""
-    from scipy import stats
     from tqdm import tqdm
 
     study = Study(tuple((SUITE, task.name) for task in suite(SUITE).tasks), ("generic", "vap"), episodes=5, follow="call")
@@ -53,9 +51,7 @@ def run(workers: int = 2, quick: bool = False) -> str:
                 start = time.perf_counter()
                 table = engine.run(study, Path(scratch) / f"{name}-{turn}", workers=workers, record="none", progress=False, spread=spreads[name])
                 seconds[name].append(time.perf_counter() - start)
-    logs = np.log(np.array(seconds["ray"]) / np.array(seconds["processes"]))
-    half = stats.t.ppf(0.975, len(logs) - 1) * logs.std(ddof=1) / np.sqrt(len(logs))
-    low, middle, high = (100 * (np.exp(logs.mean() + off) - 1) for off in (-half, 0.0, half))
+    middle, low, high = (100 * (times - 1) for times in ratio(seconds["ray"], seconds["processes"]))
     lines = [["", "seconds, every repeat"], *([name, " ".join(f"{s:.1f}" for s in held)] for name, held in seconds.items())]
-    head = f"{SUITE}: {len(table)} episodes a run, {workers} workers, {len(logs)} repeats, start-up included"
+    head = f"{SUITE}: {len(table)} episodes a run, {workers} workers, {len(seconds['ray'])} repeats, start-up included"
     return f"{head}\n\n{align(lines)}\n\nRay over processes: {middle:+.1f} % [{low:+.1f}, {high:+.1f}] of the time"

@@ -23,6 +23,7 @@ from vap_core import suites
 from vap_core.policies.toy_pi0 import Toy, save_toy, toy_sizes
 from vap_core.processes import end_with_parent
 from vap_core.report import align
+from vap_core.statistics import ratio
 from vap_core.values import EpisodeRow
 
 SUITE, TASK = "simpler-bridge", "put-camera"
@@ -269,12 +270,8 @@ def report(plan: Plan, theirs: Sequence[Arm], ours: Sequence[Arm]) -> str:
 
 
 def _ratio(slow: Arm, fast: Arm) -> list[str]:
-    """Geometric mean of the ratios within each repeat, and Student's interval of its logarithm."""
-    from scipy import stats
-
-    logs = np.log(np.array(slow.seconds) / np.array(fast.seconds))
-    half = stats.t.ppf(0.975, len(logs) - 1) * logs.std(ddof=1) / np.sqrt(len(logs))
-    return [f"{np.exp(logs.mean()):.2f}", f"{np.exp(logs.mean() - half):.2f} .. {np.exp(logs.mean() + half):.2f}"]
+    middle, low, high = ratio(slow.seconds, fast.seconds)
+    return [f"{middle:.2f}", f"{low:.2f} .. {high:.2f}"]
 
 
 def _typical(arm: Arm) -> float:

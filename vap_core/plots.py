@@ -222,39 +222,6 @@ def bounds_figure(scores: Sequence[Score]) -> "Figure":
     return figure
 
 
-def learning_figure(logs: Mapping[str, Sequence[Mapping[str, float]]], panels: Mapping[str, str]) -> "Figure":
-    """What trainings logged, over their steps: a panel per figure of the log (its name there, and its title), a line per training that has it."""
-    figure = _figure(3.1 * len(panels) + 0.4, 3.0)
-    for axes, (name, title) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
-        for i, (label, log) in enumerate(logs.items()):
-            if log and name in log[0]:
-                axes.plot([line["step"] for line in log], [line[name] for line in log], color=f"C{i}", linewidth=1.4, label=label)
-        axes.set(title=title, xlabel="optimiser steps")
-        axes.set_ylim(bottom=0)
-        axes.grid(color="#eeeeee")
-        axes.spines[["top", "right"]].set_visible(False)
-        if len(logs) > 1:
-            axes.legend(frameon=False, fontsize=8)
-    return figure
-
-
-def rates_figure(groups: Mapping[str, Mapping[str, tuple[float, float, float]]], label: str) -> "Figure":
-    """Grouped bars of rates in percent with their intervals (value, low, high), a group per key, a colour per inner key."""
-    figure = _figure(1.9 + 1.9 * len(groups), 3.3)
-    axes, inner = figure.subplots(), list(dict.fromkeys(name for rates in groups.values() for name in rates))
-    for i, name in enumerate(inner):
-        held = [(at, rates[name]) for at, rates in enumerate(groups.values()) if name in rates]
-        x = np.array([at for at, _ in held]) + (i - (len(inner) - 1) / 2) * 0.8 / len(inner)
-        value, low, high = np.array([rate for _, rate in held]).T
-        axes.bar(x, value, 0.72 / len(inner), color=f"C{i}", label=name)
-        axes.errorbar(x, value, np.maximum([value - low, high - value], 0), fmt="none", ecolor="black", capsize=3, linewidth=1)
-    axes.set_xticks(range(len(groups)), list(groups))
-    axes.set(ylim=(0, 105), ylabel=label)
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=len(inner), frameon=False)
-    return figure
-
-
 def keep(figure: "Figure", path: Path, dpi: int = 110, limit: int = 480_000, small: int = 115_000) -> bytes:
     """Save a figure as a PNG of `limit` bytes at most, and return a JPEG of it for a notebook, `small` bytes at most.
 

@@ -57,6 +57,15 @@ class Comparison:
     p_holm: float
 
 
+def ratio(slow: Sequence[float], fast: Sequence[float]) -> tuple[float, float, float]:
+    """Geometric mean of the ratios within each repeat, and Student's 95 % interval of its logarithm."""
+    from scipy import stats
+
+    logs = np.log(np.array(slow) / np.array(fast))
+    half = stats.t.ppf(0.975, len(logs) - 1) * logs.std(ddof=1) / np.sqrt(len(logs))
+    return float(np.exp(logs.mean())), float(np.exp(logs.mean() - half)), float(np.exp(logs.mean() + half))
+
+
 def mcnemar(only_one: int, only_other: int) -> float:
     """The exact two-sided p of McNemar's test from the discordant pairs; 1 where there are none."""
     from statsmodels.stats.contingency_tables import mcnemar as test

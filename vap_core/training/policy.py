@@ -32,8 +32,8 @@ from vap_core.training.dataset import about, data_sha256, read
 from vap_core.training.dataset import film as shoot
 from vap_core.training.demonstrations import SIDE, Film, cached
 from vap_core.training.descent import Descent, Told, average_of, descend
+from vap_core.training.looking import Shown, Sizes, looking, shares
 from vap_core.training.scenes import only_generic
-from vap_core.training.words import vocabulary
 
 CACHE = Path(__file__).resolve().parents[2] / "data" / "cache" / "demonstrations"
 CHUNKS = {"simpler-fractal": (4, 2), "simpler-bridge": (4, 4), "vlabench": (4, 4), "tabletop": (32, 10)}
@@ -47,7 +47,7 @@ STEADY = 0.01
 
 
 @dataclass(frozen=True)
-class Recipe:
+class Recipe(Sizes):
     """How long, how fast, how large. `draws` flow samples share one look at the pictures."""
 
     suite: str
@@ -57,19 +57,14 @@ class Recipe:
     draws: int = 4
     rate: float = 1e-3
     seed: int = 0
-    width: int = 128
-    depth: int = 4
-    vision_width: int = 128
-    vision_depth: int = 4
-    expert_width: int = 96
 
 
-class Questions(nn.Module):
+class Questions(Shown):
     """Which patches show the object that is meant, and where it stands: asked of hidden states, in training only."""
 
     def __init__(self, width: int) -> None:
-        super().__init__()
-        self.norm, self.patch, self.place = nn.LayerNorm(width), nn.Linear(width, 1), nn.Linear(width, 3)
+        super().__init__(width)
+        self.place = nn.Linear(width, 3)
 
     def forward(self, hidden: Float[Tensor, "b p d"]) -> tuple[Float[Tensor, "b p"], Float[Tensor, "b 3"]]:
         x = self.norm(hidden)
@@ -96,9 +91,7 @@ def configuration(recipe: Recipe, state_size: int, action_size: int) -> MiniPI0C
     chunk, execute = CHUNKS[recipe.suite]
     views = {f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (3, SIDE, SIDE)) for name in suite(recipe.suite).cameras}
     return MiniPI0Config(
-        words=vocabulary(), device="cpu", width=recipe.width, depth=recipe.depth, head_dim=recipe.width // 8, vision_width=recipe.vision_width,
-        vision_depth=recipe.vision_depth, expert_width=recipe.expert_width, chunk_size=chunk, n_action_steps=execute, max_state_dim=state_size,
-        max_action_dim=action_size, image_resolution=(SIDE, SIDE),
+        **recipe.configuration(), chunk_size=chunk, n_action_steps=execute, max_state_dim=state_size, max_action_dim=action_size,
         input_features={**views, "observation.state": PolicyFeature(FeatureType.STATE, (state_size,))},
         output_features={"action": PolicyFeature(FeatureType.ACTION, (action_size,))},
     )  # fmt: skip
@@ -120,7 +113,7 @@ def collate(recipe: Recipe, films: Sequence[Film], stats: dict[str, dict[str, Te
     """One batch: frames drawn anew, each with a command of its own."""
     number = {word: i for i, word in enumerate(config.words)}
     lengths = np.array([len(film.action) for film in films])
-    made, states, chunks, shares, places = [], [], [], [], []
+    made, states, chunks, shown, places = [], [], [], [], []
     for i in rng.choice(len(films), recipe.batch, p=lengths / lengths.sum()):
         film = films[i]
         t = int(rng.integers(lengths[i]))
@@ -130,8 +123,7 @@ def collate(recipe: Recipe, films: Sequence[Film], stats: dict[str, dict[str, Te
         still[:, :-1] = 0.0
         chunks.append(np.concatenate([rest, still]))
         states.append(film.state[t])
-        side = SIDE // config.patch
-        shares.append((film.ids[t] == 1).reshape(-1, side, config.patch, side, config.patch).mean((2, 4)).reshape(-1))
+        shown.append(shares(film.ids[t] == 1, config.patch))
         places.append(film.places[t, 0])
     tokens, there = encode([one.text for one in made], number, config.tokenizer_max_length)
     scaled = {
@@ -139,7 +131,7 @@ def collate(recipe: Recipe, films: Sequence[Film], stats: dict[str, dict[str, Te
         for name, rows in (("observation.state", states), ("action", chunks))
     }
     images = torch.from_numpy(np.stack([one.images for one in made])).permute(0, 1, 4, 2, 3).float() / 255
-    patches, place = torch.from_numpy(np.stack(shares)).float(), torch.from_numpy(np.stack(places)).float()
+    patches, place = torch.from_numpy(np.stack(shown)).float(), torch.from_numpy(np.stack(places)).float()
     return Batch(images, tokens, there, scaled["observation.state"], scaled["action"], patches, place)
 
 
@@ -169,11 +161,8 @@ def losses(policy: MiniPI0Policy, asked: Questions, batch: Batch, draws: int, ge
         flow = flow + F.mse_loss(model.denoise_step(batch.state, pad, cache, noisy, at), noise - batch.actions) / draws
     patches = batch.patches.shape[1]
     chance, place = asked(seen[0][:, :patches])
-    shown = batch.patches.sum(1) > 0
-    share = batch.patches / batch.patches.sum(1, keepdim=True).clamp(min=1e-6)
-    heat = -(share * chance.log_softmax(-1)).sum(1)[shown].mean() if shown.any() else torch.zeros(())
+    heat, hit = looking(chance, batch.patches)
     where = F.smooth_l1_loss(place * 0.1, batch.place, beta=0.02) * 50
-    hit = (batch.patches.gather(1, chance.argmax(1, keepdim=True)).squeeze(1) > 0)[shown].float().mean()
     told = {"flow": flow, "heat": heat, "where": where, "hit": hit}
     return flow + SEEN * heat + PLACED * where, {name: float(part.detach()) for name, part in told.items()}
 

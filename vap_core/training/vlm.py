@@ -24,9 +24,9 @@ from vap_core.policies.mini_pi0.vlm import ANSWER, MiniVlm, load
 from vap_core.processes import results
 from vap_core.training.demonstrations import SIDE, small
 from vap_core.training.descent import Descent, Told, average_of, descend
+from vap_core.training.looking import Shown, Sizes, looking, shares
 from vap_core.training.questions import Question, ask
 from vap_core.training.scenes import Shots, cached
-from vap_core.training.words import vocabulary
 from vap_core.values import Rgb, value
 
 CACHE = Path(__file__).resolve().parents[2] / "data" / "cache" / "perception"
@@ -39,7 +39,7 @@ HELD_OUT = 30
 
 
 @dataclass(frozen=True)
-class Recipe:
+class Recipe(Sizes):
     """How long, how fast, how large. `questions` are asked of each of `batch` views."""
 
     stages: int = 540
@@ -48,11 +48,6 @@ class Recipe:
     questions: int = 2
     rate: float = 1e-3
     seed: int = 0
-    width: int = 128
-    depth: int = 4
-    vision_width: int = 128
-    vision_depth: int = 4
-    expert_width: int = 96
 
 
 @value
@@ -74,17 +69,6 @@ class Batch:
     patches: Tensor
 
 
-class Shown(nn.Module):
-    """Which patches show the object that is meant: asked of hidden states, in training only."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.norm, self.patch = nn.LayerNorm(width), nn.Linear(width, 1)
-
-    def forward(self, hidden: Tensor) -> Tensor:
-        return self.patch(self.norm(hidden)).squeeze(-1)
-
-
 class Learner(nn.Module):
     """What is trained: the model, and the question beside it."""
 
@@ -94,10 +78,7 @@ class Learner(nn.Module):
 
 
 def configuration(recipe: Recipe) -> MiniPI0Config:
-    return MiniPI0Config(
-        words=vocabulary(), device="cpu", width=recipe.width, depth=recipe.depth, head_dim=recipe.width // 8, vision_width=recipe.vision_width,
-        vision_depth=recipe.vision_depth, expert_width=recipe.expert_width, image_resolution=(SIDE, SIDE),
-    )  # fmt: skip
+    return MiniPI0Config(**recipe.configuration())
 
 
 def views(stages: int, seed: int, cache: Path, *, held_out: bool = False, jobs: int = 2) -> list[View]:
@@ -126,7 +107,7 @@ def _render(cache: Path, seed: int, held_out: bool, number: int) -> None:
 
 def collate(recipe: Recipe, pool: Sequence[View], number: dict[str, int], rng: np.random.Generator, config: MiniPI0Config) -> Batch:
     """One batch: views drawn anew, coloured anew, with questions of their own."""
-    images, questions, shares, side = [], [], [], SIDE // config.patch
+    images, questions, shown = [], [], []
     for i in rng.integers(len(pool), size=recipe.batch):
         view = pool[i]
         asked = ask(view.image, view.ids, view.names, recipe.questions, rng)
@@ -134,14 +115,14 @@ def collate(recipe: Recipe, pool: Sequence[View], number: dict[str, int], rng: n
         for question in asked.questions:
             questions.append(question)
             meant = (view.ids == question.target + 1) & (question.target >= 0)
-            shares.append(meant.reshape(side, config.patch, side, config.patch).mean((1, 3)).ravel())
+            shown.append(shares(meant, config.patch))
     answers = torch.zeros((len(questions), ANSWER), dtype=torch.long)
     for row, question in zip(answers, questions, strict=True):
         if question.answer:
             said = [number[word] for word in (*question.answer, "\n")]
             row[: len(said)] = torch.tensor(said)
     pictures = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).float() / 255
-    return Batch(pictures, questions, answers, torch.from_numpy(np.stack(shares)).float())
+    return Batch(pictures, questions, answers, torch.from_numpy(np.stack(shown)).float())
 
 
 def losses(learner: Learner, batch: Batch) -> tuple[Tensor, Told]:
@@ -151,11 +132,7 @@ def losses(learner: Learner, batch: Batch) -> tuple[Tensor, Told]:
     patches = vlm.look(batch.images).repeat_interleave(len(batch.questions) // len(batch.images), 0)
     scores, hidden = vlm(patches, tokens, there, batch.answers)
     words = F.cross_entropy(scores.flatten(0, 1), batch.answers.flatten(), ignore_index=0)
-    shown = batch.patches.sum(1) > 0
-    share = batch.patches / batch.patches.sum(1, keepdim=True).clamp(min=1e-6)
-    chance = learner.shown(hidden)
-    heat = -(share * chance.log_softmax(-1)).sum(1)[shown].mean() if shown.any() else torch.zeros(())
-    hit = (batch.patches.gather(1, chance.argmax(1, keepdim=True)).squeeze(1) > 0)[shown].float().mean()  # NaN: nothing was shown
+    heat, hit = looking(learner.shown(hidden), batch.patches)
     right = ((scores.argmax(-1) == batch.answers) | (batch.answers == 0)).all(1)
     kinds = [_kind(question) for question in batch.questions]
     told = {kind: _share([bool(good) for good, each in zip(right, kinds, strict=True) if each == kind]) for kind in KINDS}
