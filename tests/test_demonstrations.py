@@ -2,8 +2,10 @@
 
 import re
 from collections import Counter
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import load_file
+from torch.nn import functional as F  # noqa: N812
 
 from vap_core import describe
 from vap_core.errors import BadOutput
@@ -24,6 +27,7 @@ from vap_core.training import demonstrations, policy, vlm
 from vap_core.training.commands import command, near, painted, rough, say, tinted
 from vap_core.training.dataset import data_sha256
 from vap_core.training.demonstrations import PARTS, SIDE, Film, cached, cast
+from vap_core.training.fitting import fused
 from vap_core.training.questions import LEAST_PX, ask, place
 from vap_core.training.words import PAINTS, akin, looks, phrases, vocabulary
 
@@ -196,6 +200,27 @@ def test_a_vision_language_model_learns_and_resumes(stage: tuple[Path, list[Film
     monkeypatch.setattr(demonstrations, "EPISODES", 2)
     about = policy.train(grown, tmp_path / "policy", vlm=tmp_path / "whole", cache=stage[0])
     assert about["vlm"] == one == load(tmp_path / "policy").policy.config.vlm  # type: ignore[union-attr]
+
+
+def test_attention_that_is_fused_gives_the_same_losses_and_gradients(stage: tuple[Path, list[Film]]) -> None:
+    _, films = stage
+    recipe = policy.Recipe(SUITE, batch=4, draws=2, width=32, depth=2, vision_width=32, vision_depth=1, expert_width=32)
+    stats = policy.statistics(films)
+    config = policy.configuration(recipe, films[0].state.shape[1], films[0].action.shape[1])
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model, asked = MiniPI0Policy(config), policy.Questions(recipe.width)
+    batch, found = policy.collate(recipe, films, stats, np.random.default_rng(0), config), []
+    for context in (nullcontext, fused):
+        with context(), patch.object(torch.nn.functional, "scaled_dot_product_attention", wraps=F.scaled_dot_product_attention) as kernel:
+            loss, told = policy.losses(model, asked, batch, 2, torch.Generator().manual_seed(0))
+        found.append((kernel.call_count, told, torch.autograd.grad(loss, list(model.parameters()), allow_unused=True)))
+    (few, slow, eager), (many, fast, kernels) = found
+    assert many > few
+    assert slow == pytest.approx(fast, rel=1e-5)
+    for one, other in zip(eager, kernels, strict=True):
+        assert (one is None) == (other is None)
+        assert one is None or torch.allclose(one, other, rtol=1e-3, atol=1e-5)
 
 
 def test_one_batch_can_be_learned_by_heart(stage: tuple[Path, list[Film]]) -> None:

@@ -32,6 +32,7 @@ from vap_core.training.dataset import about, data_sha256, read
 from vap_core.training.dataset import film as shoot
 from vap_core.training.demonstrations import SIDE, Film, cached
 from vap_core.training.descent import Descent, Told, average_of, descend
+from vap_core.training.fitting import fused
 from vap_core.training.looking import Shown, Sizes, looking, shares
 from vap_core.training.scenes import only_generic
 
@@ -228,7 +229,8 @@ def train(
 
     def step(model: Learner, at: int) -> tuple[Tensor, Told]:
         batch = collate(recipe, films, stats, np.random.default_rng([73, recipe.seed, at]), config)
-        return losses(model.policy, model.asked, batch, recipe.draws, torch.Generator().manual_seed(recipe.seed * 1_000_003 + at))
+        with fused():
+            return losses(model.policy, model.asked, batch, recipe.draws, torch.Generator().manual_seed(recipe.seed * 1_000_003 + at))
 
     made_of = {"recipe": vars(recipe), "data_sha256": data_sha256([*films, *held]), "vlm": config.vlm}
     mean, log = descend(learner, step, Descent(recipe.suite, recipe.steps, recipe.rate, minutes, every, made_of), out)

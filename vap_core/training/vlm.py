@@ -24,6 +24,7 @@ from vap_core.policies.mini_pi0.vlm import ANSWER, MiniVlm, load
 from vap_core.processes import results
 from vap_core.training.demonstrations import SIDE, small
 from vap_core.training.descent import Descent, Told, average_of, descend
+from vap_core.training.fitting import fused
 from vap_core.training.looking import Shown, Sizes, looking, shares
 from vap_core.training.questions import Question, ask
 from vap_core.training.scenes import Shots, cached
@@ -158,7 +159,8 @@ def train(recipe: Recipe, out: Path, *, minutes: float | None = None, cache: Pat
     number = learner.vlm.number
 
     def step(model: Learner, at: int) -> tuple[Tensor, Told]:
-        return losses(model, collate(recipe, pool, number, np.random.default_rng([75, recipe.seed, at]), config))
+        with fused():
+            return losses(model, collate(recipe, pool, number, np.random.default_rng([75, recipe.seed, at]), config))
 
     mean, log = descend(
         learner, step, Descent("mini-paligemma", recipe.steps, recipe.rate, minutes, made_of={"recipe": vars(recipe), "words": config.words}), out
