@@ -14,7 +14,8 @@ from tests import tiny_lerobot as tiny
 from vap_core import audit, suites
 from vap_core.errors import BadPolicy
 from vap_core.policies import Policy
-from vap_core.policies.lerobot import LeRobot, compare, fingerprint, fitted, load, named
+from vap_core.policies.checkpoints import fingerprint, named
+from vap_core.policies.lerobot import LeRobot, compare, fitted, load
 from vap_core.policies.toy_pi0 import toy_sizes
 from vap_core.policies.witness import TEXT
 from vap_core.rollout import Trial, rollout

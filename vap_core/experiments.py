@@ -19,7 +19,7 @@ from vap_core.errors import BadStudy, one_of
 from vap_core.hard_prompt import Described, Reworded, hard_prompt
 from vap_core.memory import load_bank, register, save
 from vap_core.oracle import Oracle, Revealed
-from vap_core.policies import Insider, Policy, lerobot
+from vap_core.policies import Insider, Policy, checkpoints, lerobot
 from vap_core.policies.expert import Expert
 from vap_core.policies.random import Random
 from vap_core.policies.scripted import Scripted
@@ -78,7 +78,7 @@ class Study:
         for method in self.methods:
             if method not in METHODS:
                 raise one_of("Study: method", method, METHODS)
-        if self.policy not in (*POLICIES, MINI) and not lerobot.named(self.policy):
+        if self.policy not in (*POLICIES, MINI) and not checkpoints.named(self.policy):
             raise one_of("Study: policy (or a lerobot checkpoint's folder or hub id)", self.policy, [*POLICIES, MINI])
         for suite, _ in self.tasks:
             if self.policy == MINI and not (SHIPPED / f"{MINI}-{suite}").is_dir():
@@ -107,7 +107,7 @@ class Study:
     def configuration(self) -> dict[str, Any]:
         """What the results depend on, as JSON; weights, episode lists, and the world (robots, objects, looks, sensors) by their checksums."""
         listed = {suite: lists.digest(suite) for suite, _ in self.tasks if suite in suites.BENCHMARKS}
-        held = {name: lerobot.fingerprint(name) for name in sorted({self.checkpoint(suite) for suite, _ in self.tasks} - {""})}
+        held = {name: checkpoints.fingerprint(name) for name in sorted({self.checkpoint(suite) for suite, _ in self.tasks} - {""})}
         checkpoint = {"checkpoint": held[self.policy]} if self.policy in held else {"checkpoints": list(held.values())} if held else {}
         return {**asdict(self), **checkpoint, "version": __version__, "weights": weights_sha256(), "lists": listed, "world": self._world()}
 
@@ -153,7 +153,7 @@ def register_personal(study: Study, bank: Path, captioner: Captioner | None = No
         if telling and obj.description is None:
             obj = described(obj, captioner or Attributes(stack.segmenter))
         if any(isinstance(METHODS[method], Learned) for method in study.methods):
-            teach(study.rows(suite, task), bank, lerobot.setting(study.checkpoint(suite), "vlm"), MODEL)
+            teach(study.rows(suite, task), bank, checkpoints.setting(study.checkpoint(suite), "vlm"), MODEL)
         if obj is not held.get(row.target):
             save(bank, obj, replace=True)
             held[row.target] = obj

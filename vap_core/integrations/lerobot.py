@@ -31,7 +31,7 @@ from vap_core.attend import STACKS, Attender, AttendState, Prompting, load_stack
 from vap_core.errors import BadMemory, BadOutput, BadViews, one_of
 from vap_core.integrations.gym import VapEnv, env_id
 from vap_core.memory import load_bank
-from vap_core.policies.lerobot import PIPELINES, locate
+from vap_core.policies.checkpoints import PIPELINES, locate
 from vap_core.values import Rgb, Views
 
 IMAGES, STEP, AFTER = "observation.images.", "observation.vap_step", "rename_observations_processor"

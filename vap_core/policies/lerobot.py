@@ -11,9 +11,7 @@ import copy
 import hashlib
 import inspect
 import io
-import json
 import logging
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from functools import cache
@@ -27,6 +25,7 @@ import torch
 from jaxtyping import Float32
 
 from vap_core.errors import BadPolicy
+from vap_core.policies.checkpoints import PIPELINES, WEIGHTS, fingerprint, locate, refuse_code
 from vap_core.policies.witness import TEXT, listened, tell
 from vap_core.sim.env import Env
 from vap_core.sim.scenes import Scene
@@ -39,8 +38,6 @@ if TYPE_CHECKING:
 STATE, IMAGE, EMPTY = "observation.state", "observation.images.", "observation.images.empty_camera"
 TOKENS = "observation.language.tokens"
 """lerobot's feature keys; a checkpoint fills its empty cameras itself."""
-WEIGHTS, CONFIG, PIPELINES = "model.safetensors", "config.json", ("policy_preprocessor.json", "policy_postprocessor.json")
-WANTED_FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
 DRAWS_NOTHING = ("act",)
 """Policies whose chunk is a function of what they see."""
 
@@ -205,7 +202,7 @@ def load(checkpoint: str | Path, device: str | None = None) -> LeRobot:
 
     import_module("vap_core.policies.mini_pi0.processor_mini_pi0")  # registers our own type and its step
     folder = locate(checkpoint)
-    _refuse_code(folder)
+    refuse_code(folder)
     try:
         with _silence(), patch("transformers.dynamic_module_utils.get_class_in_module", _no_code):  # some policies trust any repository
             config: Any = PreTrainedConfig.from_pretrained(folder)
@@ -226,55 +223,11 @@ def load(checkpoint: str | Path, device: str | None = None) -> LeRobot:
     return LeRobot(policy, before, after, f"{config.type}:{folder.name if Path(checkpoint).is_dir() else checkpoint}@{fingerprint(folder)[:8]}")
 
 
-def named(policy: str) -> bool:
-    """Whether a policy's name means a checkpoint: a folder that exists, or owner/name."""
-    return Path(policy).expanduser().is_dir() or re.fullmatch(r"[\w.-]+/[\w.-]+", policy) is not None
-
-
 def fitted(checkpoint: str, scene: Scene, suite: Suite) -> LeRobot:
     """The checkpoint, loaded once in this process, whose inputs and actions are the suite's. Raises: BadPolicy."""
     policy, env = _loaded(checkpoint), Env(scene, control=suite.control)
     policy.check(suite.cameras, len(env.state()), env.action_size)
     return policy
-
-
-def locate(checkpoint: str | Path) -> Path:
-    """The folder of a checkpoint on this machine. Raises: BadPolicy when a file is missing."""
-    from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError
-
-    folder = Path(checkpoint).expanduser()
-    if not folder.is_dir():
-        try:
-            folder = Path(snapshot_download(str(checkpoint), allow_patterns=list(WANTED_FILES), local_files_only=True))
-        except (HFValidationError, LocalEntryNotFoundError) as error:
-            raise BadPolicy(
-                f"load: {checkpoint} is no folder and no model on this machine; download it with `hf download {checkpoint}`, or give a folder."
-            ) from error
-    missing = [name for name in (CONFIG, WEIGHTS, *PIPELINES) if not (folder / name).is_file()]
-    if missing:
-        raise BadPolicy(f"load: {folder} lacks {', '.join(missing)}; give the folder that lerobot's save_pretrained wrote, processors included.")
-    return folder
-
-
-def setting(checkpoint: str | Path, name: str) -> str:
-    """What a checkpoint's config.json says there; "" when it says nothing. Raises: BadPolicy."""
-    file = locate(checkpoint) / CONFIG
-    try:
-        return str(json.loads(file.read_text()).get(name, ""))
-    except (ValueError, AttributeError) as error:
-        raise BadPolicy(f"load: {file} is no configuration ({type(error).__name__}); save the checkpoint again with lerobot 0.6.") from error
-
-
-def fingerprint(checkpoint: str | Path) -> str:
-    """SHA-256 of everything in a checkpoint that decides what it does, without loading it."""
-    found, folder = hashlib.sha256(), locate(checkpoint)
-    kept = [file for file in folder.rglob("*") if file.is_file() and any(file.match(pattern) for pattern in WANTED_FILES)]
-    for file in sorted(file for file in kept if file.name != "training.json"):  # how it was made decides nothing
-        found.update(file.relative_to(folder).as_posix().encode())
-        with file.open("rb") as stream:
-            found.update(hashlib.file_digest(stream, "sha256").digest())
-    return found.hexdigest()
 
 
 def compare(policy: "PreTrainedPolicy", file: Path) -> None:
@@ -303,27 +256,6 @@ def compare(policy: "PreTrainedPolicy", file: Path) -> None:
 
 
 _loaded = cache(load)
-
-
-def _refuse_code(folder: Path) -> None:
-    """A pipeline may only name lerobot's own steps: lerobot would import, and call, whatever stands there."""
-    from lerobot.processor import ProcessorStep
-
-    for file in PIPELINES:
-        try:
-            steps = json.loads((folder / file).read_text())["steps"]
-            foreign = [step.get("class", "vap_core.integrations.") for step in steps if step.get("registry_name") in (None, "vap_prompt")]
-        except (ValueError, KeyError, TypeError) as error:
-            raise BadPolicy(f"load: {folder / file} is no processor pipeline ({type(error).__name__}); save it again with lerobot 0.6.") from error
-        for name in foreign:
-            if str(name).startswith("vap_core.integrations."):
-                raise BadPolicy(
-                    f"load: {folder} has VAP attached for lerobot's own loops; here give the plain checkpoint, and the method by --method."
-                )
-            module, _, attribute = str(name).rpartition(".")
-            found = getattr(import_module(module), attribute, None) if module.startswith("lerobot.processor") else None
-            if not (isinstance(found, type) and issubclass(found, ProcessorStep)):
-                raise BadPolicy(f"load: {folder / file} asks to run {name!r}, which is no step of lerobot; files are parsed here, never executed.")
 
 
 def _sized(images: torch.Tensor, shape: tuple[int, ...]) -> torch.Tensor:
