@@ -202,6 +202,17 @@ def test_a_vision_language_model_learns_and_resumes(stage: tuple[Path, list[Film
     assert about["vlm"] == one == load(tmp_path / "policy").policy.config.vlm  # type: ignore[union-attr]
 
 
+def test_frames_close_to_a_turn_of_the_gripper_and_to_the_end_come_more_often(stage: tuple[Path, list[Film]]) -> None:
+    _, films = stage
+    action = np.ones((40, films[0].action.shape[1]), np.float32)
+    action[15:, -1] = 0.2
+    chances = policy.emphasis(replace(films[0], action=action), 3.0)
+    assert set(np.flatnonzero(chances == 3.0)) == {*range(11, 20), *range(35, 40)}
+    assert set(np.flatnonzero(chances == 1.0)) == {*range(11), *range(20, 35)}
+    for film in films:
+        assert len(policy.emphasis(film, 3.0)) == len(film.action)
+
+
 def test_attention_that_is_fused_gives_the_same_losses_and_gradients(stage: tuple[Path, list[Film]]) -> None:
     _, films = stage
     recipe = policy.Recipe(SUITE, batch=4, draws=2, width=32, depth=2, vision_width=32, vision_depth=1, expert_width=32)

@@ -41,6 +41,8 @@ CHUNKS = {"simpler-fractal": (4, 2), "simpler-bridge": (4, 4), "vlabench": (4, 4
 """Actions in one chunk, and how many of them are carried out before the policy is asked again."""
 HELD_OUT = 20
 """Every so many stages one is kept from training, to see what was learned."""
+AROUND = 4
+"""Steps from there that `focus` still calls close."""
 SEEN, PLACED = 0.5, 0.3
 """Weights of the two questions beside the flow."""
 STEADY = 0.01
@@ -49,7 +51,8 @@ STEADY = 0.01
 
 @dataclass(frozen=True)
 class Recipe(Sizes):
-    """How long, how fast, how large. `draws` flow samples share one look at the pictures."""
+    """How long, how fast, how large. `draws` flow samples share one look at the pictures; frames close to a grasp, a release or
+    the end come `focus` times as often as others."""
 
     suite: str
     stages: int = 400
@@ -58,6 +61,7 @@ class Recipe(Sizes):
     draws: int = 4
     rate: float = 1e-3
     seed: int = 0
+    focus: float = 3.0
 
 
 class Questions(Shown):
@@ -110,14 +114,23 @@ def statistics(films: Sequence[Film]) -> dict[str, dict[str, Tensor]]:
     return found
 
 
+def emphasis(film: Film, focus: float) -> Float[np.ndarray, " t"]:
+    """How often each frame is drawn: more often close to a change of the gripper's command, and to the end, where a centimetre decides."""
+    shut = film.action[:, -1] < 0.5
+    turns = [*np.flatnonzero(shut[1:] != shut[:-1]) + 1, len(shut) - 1]
+    away = np.abs(np.arange(len(shut))[:, None] - turns).min(axis=1)
+    return np.where(away <= AROUND, focus, 1.0)
+
+
 def collate(recipe: Recipe, films: Sequence[Film], stats: dict[str, dict[str, Tensor]], rng: np.random.Generator, config: MiniPI0Config) -> Batch:
     """One batch: frames drawn anew, each with a command of its own."""
     number = {word: i for i, word in enumerate(config.words)}
-    lengths = np.array([len(film.action) for film in films])
+    chances = [emphasis(film, recipe.focus) for film in films]
+    totals = np.array([chance.sum() for chance in chances])
     made, states, chunks, shown, places = [], [], [], [], []
-    for i in rng.choice(len(films), recipe.batch, p=lengths / lengths.sum()):
+    for i in rng.choice(len(films), recipe.batch, p=totals / totals.sum()):
         film = films[i]
-        t = int(rng.integers(lengths[i]))
+        t = int(rng.choice(len(chances[i]), p=chances[i] / totals[i]))
         made.append(command(film, t, recipe.suite, rng))
         rest = film.action[t : t + config.chunk_size]
         still = np.repeat(rest[-1:], config.chunk_size - len(rest), axis=0)
