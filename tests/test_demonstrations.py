@@ -206,7 +206,8 @@ def test_frames_close_to_a_turn_of_the_gripper_and_to_the_end_come_more_often(st
     _, films = stage
     action = np.ones((40, films[0].action.shape[1]), np.float32)
     action[15:, -1] = 0.2
-    chances = policy.emphasis(replace(films[0], action=action), 3.0)
+    rest = {part: np.repeat(getattr(films[0], part)[:1], 40, axis=0) for part in ("images", "ids", "state", "places")}
+    chances = policy.emphasis(replace(films[0], action=action, **rest), 3.0)
     assert set(np.flatnonzero(chances == 3.0)) == {*range(11, 20), *range(35, 40)}
     assert set(np.flatnonzero(chances == 1.0)) == {*range(11), *range(20, 35)}
     for film in films:
