@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cache, lru_cache
 from pathlib import Path
@@ -178,6 +178,11 @@ INSIDERS = ("expert", "random")
 """Policies that read the simulator, or nothing at all: bounds on what a task allows, never results."""
 MINI, SHIPPED = "mini-pi0", MODEL.parent
 """The shipped frozen policy, one checkpoint a suite, and where they lie."""
+
+
+def usual(names: Iterable[str]) -> str:
+    """The policy for suites of which nobody named one: the shipped frozen one, or the scripted one when some suite has none."""
+    return MINI if all((SHIPPED / f"{MINI}-{suite}").is_dir() for suite in names) else "scripted"
 
 
 DEMO = Study(tasks=(("widowx-pick", "pick-straw-cup"), ("franka-pick", "pick-cup")), methods=("generic", "vap"), episodes=20)

@@ -24,10 +24,8 @@ Methods = Annotated[
         "oracle-mask, oracle-track, wrong-mask. With commas, or repeated. Default: generic,vap.",
     ),
 ]
-PolicyName = Annotated[
-    str,
-    typer.Option("--policy", help="scripted; mini-pi0; a lerobot checkpoint, as folder or hub id; the bounds: expert (reads the simulator), random."),
-]
+POLICIES = "scripted; mini-pi0; a lerobot checkpoint, as folder or hub id; the bounds: expert (reads the simulator), random."
+PolicyName = Annotated[str, typer.Option("--policy", help=POLICIES)]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the policy and the sensors; of a warm-up suite's episode list, too.")]
 Recorded = Annotated[
     Literal["all", "failures", "none"], typer.Option("--record", help="Which episodes become a .rrd file; an error that is tried again does.")
@@ -93,7 +91,7 @@ def evaluate(
     suite: Annotated[list[str], typer.Option(help="A suite, or all four benchmarks: all; repeatable.")],
     out: Annotated[Path | None, typer.Option(help="Run folder; a run found there is resumed. Default data/runs/POLICY-SUITE.")] = None,
     method: Methods = None,
-    policy: PolicyName = "scripted",
+    policy: Annotated[str | None, typer.Option(help=f"{POLICIES} Default: mini-pi0 where one ships for every suite, else scripted.")] = None,
     episodes: Annotated[int | None, typer.Option(min=1, help="Episodes per task, spread evenly over its list. Default the whole list.")] = None,
     seed: Seed = 0,
     seeds: Annotated[int, typer.Option(min=1, help="Run every episode with so many seeds, from --seed on.")] = 1,
@@ -120,9 +118,11 @@ def evaluate(
     """
     from vap_core import suites as known
     from vap_core.errors import BadStudy
+    from vap_core.experiments import usual
 
-    names = [name for each in suite for name in (known.BENCHMARKS if each == "all" else [each])]
-    tasks = tuple((name, task.name) for name in dict.fromkeys(names) for task in known.suite(name).tasks)
+    names = dict.fromkeys(name for each in suite for name in (known.BENCHMARKS if each == "all" else [each]))
+    tasks = tuple((name, task.name) for name in names for task in known.suite(name).tasks)
+    policy = policy or usual(names)
     options = {"seeds": seeds, "images_every": images_every, "follow": follow, "audit": audit}
     study = _study(tasks, method, policy=policy, episodes=episodes, seed=seed, robots=robots, stack=stack, **options)
     if address and engine != "ray":
