@@ -6,8 +6,8 @@ import pytest
 from tests.toys import TOYS, personal, scene
 from vap_core.attend import Attender
 from vap_core.inspection import grounding_table
-from vap_core.metrics import score
-from vap_core.plots import candidates, film, grounding_figure, scores_figure, write_png
+from vap_core.metrics import rate, score
+from vap_core.plots import candidates, film, grounding_figure, learning_figure, rates_figure, scores_figure, write_png
 from vap_core.segment import iou
 
 TEAL, GREY = (40, 120, 110), (90, 90, 90)
@@ -55,3 +55,19 @@ def test_scores_and_film_draw() -> None:
     rows = [{**row, "method": m, "first_object_correct": True, "steps": 3} for m in ("generic", "vap")]
     assert len(scores_figure(score(rows)).axes) == 1
     assert len(film({"raw": [LINE, LINE]}, ["a", "b"]).axes) == 2
+
+
+def test_learning_has_a_panel_per_figure_and_a_line_per_training_that_logged_it() -> None:
+    logs = {"one": [{"step": 1, "flow": 2.0, "hit": 0.5}, {"step": 2, "flow": 1.0, "hit": 0.75}], "other": [{"step": 1, "flow": 3.0}]}
+    flow, hit = learning_figure(logs, {"flow": "Flow", "hit": "Hit"}).axes
+    assert [axes.get_title() for axes in (flow, hit)] == ["Flow", "Hit"]
+    assert [list(line.get_ydata()) for line in flow.lines] == [[2.0, 1.0], [3.0]]
+    assert [list(line.get_ydata()) for line in hit.lines] == [[0.5, 0.75]]
+
+
+def test_rates_are_bars_as_high_as_they_are_with_their_intervals() -> None:
+    half, all_ = rate(2, 4), rate(4, 4)
+    (axes,) = rates_figure({"suite": {"tinted": {"succeeds": half, "touches": all_}, "plain": {"succeeds": all_}}}, "%").axes
+    assert [round(patch.get_height()) for patch in axes.patches] == [50, 100, 100]
+    spread = [segment[:, 1] for held in axes.collections for segment in held.get_segments()]
+    assert {(round(low, 6), round(high, 6)) for low, high in spread} == {(round(100 * r.low, 6), round(100 * r.high, 6)) for r in (half, all_)}

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vap_core.metrics import Score
+from vap_core.metrics import Rate, Score
 from vap_core.values import Attended, EpisodeRow, Grounding, PersonalObject, Rgb, value
 
 if TYPE_CHECKING:
@@ -219,6 +219,41 @@ def bounds_figure(scores: Sequence[Score]) -> "Figure":
     axes.grid(axis="y", color="#eeeeee")
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=len(policies), frameon=False)
+    return figure
+
+
+def learning_figure(logs: Mapping[str, Sequence[Mapping[str, int | float]]], panels: Mapping[str, str]) -> "Figure":
+    """What trainings logged, over their steps: a panel per figure of the log (its name there, and its title), a line per training that has it."""
+    figure = _figure(3.1 * len(panels) + 0.4, 3.0)
+    for axes, (name, title) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
+        for i, (label, log) in enumerate(logs.items()):
+            if log and name in log[0]:
+                axes.plot([line["step"] for line in log], [line[name] for line in log], color=f"C{i}", linewidth=1.4, label=label)
+        axes.set(title=title, xlabel="optimiser steps")
+        axes.set_ylim(bottom=0)
+        axes.grid(color="#eeeeee")
+        axes.spines[["top", "right"]].set_visible(False)
+        if len(logs) > 1:
+            axes.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def rates_figure(panels: Mapping[str, Mapping[str, Mapping[str, "Rate"]]], label: str) -> "Figure":
+    """A panel per key, of grouped bars: a group per inner key, a colour per innermost one; rates in percent with their intervals."""
+    figure = _figure(0.9 + 2.9 * len(panels), 3.2)
+    for axes, (title, groups) in zip(figure.subplots(1, len(panels), squeeze=False, sharey=True)[0], panels.items(), strict=True):
+        inner = list(dict.fromkeys(name for rates in groups.values() for name in rates))
+        for i, name in enumerate(inner):
+            held = [(at, rates[name]) for at, rates in enumerate(groups.values()) if name in rates]
+            x = np.array([at for at, _ in held]) + (i - (len(inner) - 1) / 2) * 0.84 / len(inner)
+            value, low, high = 100 * np.array([(rate.value, rate.low, rate.high) for _, rate in held]).T
+            axes.bar(x, value, 0.76 / len(inner), color=f"C{i}", label=name)
+            axes.errorbar(x, value, np.maximum([value - low, high - value], 0), fmt="none", ecolor="black", capsize=2, linewidth=0.9)
+        axes.set_xticks(range(len(groups)), list(groups), fontsize=8)
+        axes.set(title=title, ylim=(0, 105))
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.axes[0].set_ylabel(label)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     return figure
 
 
