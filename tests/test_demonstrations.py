@@ -16,7 +16,8 @@ from safetensors.torch import load_file
 from torch.nn import functional as F  # noqa: N812
 
 from vap_core import describe
-from vap_core.errors import BadOutput
+from vap_core.errors import BadOutput, BadPolicy
+from vap_core.policies.checkpoints import fingerprint
 from vap_core.policies.lerobot import load
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
 from vap_core.policies.mini_pi0.vlm import load as load_vlm
@@ -200,6 +201,14 @@ def test_a_vision_language_model_learns_and_resumes(stage: tuple[Path, list[Film
     monkeypatch.setattr(demonstrations, "EPISODES", 2)
     about = policy.train(grown, tmp_path / "policy", vlm=tmp_path / "whole", cache=stage[0])
     assert about["vlm"] == one == load(tmp_path / "policy").policy.config.vlm  # type: ignore[union-attr]
+    further = policy.train(replace(grown, rate=0.0), tmp_path / "further", start=tmp_path / "policy", cache=stage[0])
+    assert further["vlm"] == one
+    assert further["start"] == fingerprint(tmp_path / "policy")
+    first, second = (load_file(tmp_path / name / "model.safetensors") for name in ("policy", "further"))
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    other = policy.Learner(replace(policy.configuration(grown, 13, 7), words=("a", "b"))).policy
+    with pytest.raises(BadPolicy, match="no mini-pi0 with the same words"):
+        policy.go_on(tmp_path / "policy", other)
 
 
 def test_frames_close_to_a_turn_of_the_gripper_and_to_the_end_come_more_often(stage: tuple[Path, list[Film]]) -> None:

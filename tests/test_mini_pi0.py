@@ -80,6 +80,17 @@ def test_it_drives_our_rollouts_and_hears_words_and_pictures(checkpoint: Path) -
     assert not np.allclose(chunks[1], chunks[2], atol=1e-6)
 
 
+def test_cooler_noise_is_less_noise(checkpoint: Path) -> None:
+    warm, cool, cold = (MiniPI0Policy.from_pretrained(checkpoint) for _ in range(3))
+    cool.config.temperature, cold.config.temperature = 0.5, 0.0
+    before, _ = make_pre_post_processors(config(), str(checkpoint))
+    batch = before({"observation.images.front": torch.rand(2, 3, 64, 64), "observation.state": torch.rand(2, STATE), "task": ["pick it up"] * 2})
+    noise = torch.randn(2, 4, ACTION)
+    assert torch.equal(cool.predict_action_chunk(batch, noise=noise), warm.predict_action_chunk(batch, noise=0.5 * noise))
+    assert torch.equal(cold.predict_action_chunk(batch), cold.predict_action_chunk(batch, noise=noise))
+    assert not torch.equal(cool.predict_action_chunk(batch, noise=noise), warm.predict_action_chunk(batch, noise=noise))
+
+
 def test_words_become_the_tokens_that_they_are() -> None:
     words = vocabulary()
     assert len(set(words)) == len(words)

@@ -232,6 +232,7 @@ def policy(
     steps: Annotated[int, typer.Option(min=1, help="Optimiser steps.")] = 12_000,
     batch: Annotated[int, typer.Option(min=1, help="Frames of one optimiser step.")] = 64,
     vlm: Annotated[Path | None, typer.Option(help="The mini-PaliGemma that it grows from. Default the shipped one.")] = None,
+    start: Annotated[Path | None, typer.Option(help="A mini-pi0 to go on from instead, of the same suite or of another.")] = None,
     demonstrations: Annotated[
         Path | None, typer.Option("--demonstrations", help="A dataset of train demonstrations to learn from, instead of filming.")
     ] = None,
@@ -251,5 +252,5 @@ def policy(
         raise one_of("train policy: suite", suite, BENCHMARKS)
     folder = out or Path(f"data/runs/mini-pi0-{suite}")
     recipe = Recipe(suite, stages, steps, batch, seed=seed)
-    print(json.dumps(train(recipe, folder, vlm=vlm or MODEL, demonstrations=demonstrations, minutes=minutes)["held_out"], indent=1))
+    print(json.dumps(train(recipe, folder, vlm=vlm or MODEL, start=start, demonstrations=demonstrations, minutes=minutes)["held_out"], indent=1))
     print(f"next: python -m vap_core eval --suite {suite} --policy {folder} --methods generic,vap --episodes 4 --out {folder}-eval")

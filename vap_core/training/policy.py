@@ -19,7 +19,9 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
-from vap_core.errors import BadOutput
+from vap_core.errors import BadOutput, BadPolicy
+from vap_core.policies.checkpoints import fingerprint
+from vap_core.policies.lerobot import load as load_policy
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
 from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
@@ -217,6 +219,7 @@ def train(
     out: Path,
     *,
     vlm: Path | None = None,
+    start: Path | None = None,
     demonstrations: Path | None = None,
     minutes: float | None = None,
     cache: Path = CACHE,
@@ -224,8 +227,8 @@ def train(
 ) -> dict[str, Any]:
     """Train, or go on where an earlier call stopped, and write a checkpoint that lerobot loads; returns what was measured on the films held out.
 
-    The policy grows from the mini-PaliGemma in `vlm`; None: from nothing. `demonstrations` is a dataset of train demonstrations; None: the cache.
-    Raises: BadOutput when `out` holds another training.
+    The policy goes on from the mini-pi0 in `start`, or grows from the mini-PaliGemma in `vlm`, or, both None, begins with nothing. `demonstrations`
+    is a dataset of train demonstrations; None: the cache. Raises: BadOutput when `out` holds another training; BadPolicy when `start` is no mini-pi0.
     """
     films, held = load_films(recipe, cache, demonstrations)
     if not films:
@@ -235,19 +238,33 @@ def train(
     config = configuration(recipe, films[0].state.shape[1], films[0].action.shape[1])
     torch.manual_seed(recipe.seed)  # initial weights only; every other draw comes from the step's stream
     learner = Learner(config)
-    if vlm is not None:
+    made_of = {"recipe": vars(recipe), "data_sha256": data_sha256([*films, *held])}
+    if start is not None:
+        go_on(start, learner.policy)
+        made_of["start"] = fingerprint(start)
+    elif vlm is not None:
         teacher = load_vlm(vlm)
         config.vlm = teacher.sha256()
         grow(teacher, learner.policy)
+    made_of["vlm"] = config.vlm
 
     def step(model: Learner, at: int) -> tuple[Tensor, Told]:
         batch = collate(recipe, films, stats, np.random.default_rng([73, recipe.seed, at]), config)
         with fused():
             return losses(model.policy, model.asked, batch, recipe.draws, torch.Generator().manual_seed(recipe.seed * 1_000_003 + at))
 
-    made_of = {"recipe": vars(recipe), "data_sha256": data_sha256([*films, *held]), "vlm": config.vlm}
     mean, log = descend(learner, step, Descent(recipe.suite, recipe.steps, recipe.rate, minutes, every, made_of), out)
     return save(mean, stats, held, {**made_of, "log": log}, out)
+
+
+def go_on(start: Path, policy: MiniPI0Policy) -> None:
+    """Give a policy what fits of another's weights: all of them for the same suite; other states and actions stay as they are. Raises: BadPolicy."""
+    held: Any = load_policy(start).policy
+    if held.config.type != policy.config.type or held.config.words != policy.config.words:
+        raise BadPolicy(f"train policy: {start} is no mini-pi0 with the same words; start from one that train policy wrote, or leave --start out.")
+    theirs = held.state_dict()
+    policy.load_state_dict({name: theirs[name] if theirs[name].shape == mine.shape else mine for name, mine in policy.state_dict().items()})
+    policy.config.vlm = held.config.vlm
 
 
 def save(learner: Learner, stats: Any, held: Sequence[Film], made_of: dict[str, Any], out: Path) -> dict[str, Any]:

@@ -29,6 +29,8 @@ class MiniPI0Config(PI0Config):
     n_action_steps: int = 4
     tokenizer_max_length: int = 40
     num_inference_steps: int = 5
+    temperature: float = 1.0
+    """Of the sampling noise, that it is scaled by when actions are drawn: below 1 they keep closer to what was demonstrated most, 0 draws none."""
     vlm: str = ""
     """SHA-256 of the mini-PaliGemma that it grew from; learned words mean the same in both."""
     words: tuple[str, ...] = ()

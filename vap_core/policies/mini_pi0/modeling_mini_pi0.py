@@ -5,7 +5,7 @@ from typing import Any, cast
 from lerobot.policies.pi0.modeling_pi0 import PaliGemmaWithExpertModel, PI0Policy, PI0Pytorch
 from lerobot.policies.pi_gemma import PaliGemmaForConditionalGenerationWithPiGemma, PiGemmaForCausalLM
 from lerobot.policies.pretrained import PreTrainedPolicy
-from torch import nn
+from torch import Tensor, nn
 from transformers import GemmaConfig, PaliGemmaConfig
 
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import HEADS, MiniPI0Config
@@ -36,6 +36,14 @@ class MiniPI0Pytorch(PI0Pytorch):
         self.state_proj = nn.Linear(config.max_state_dim, wide)
         self.action_time_mlp_in, self.action_time_mlp_out = nn.Linear(2 * wide, wide), nn.Linear(wide, wide)
         self.gradient_checkpointing_enabled = False
+
+    def sample_actions(
+        self, images: Any, img_masks: Any, lang_tokens: Any, lang_masks: Any, state: Tensor, noise: Any = None, **kwargs: Any
+    ) -> Tensor:
+        """PI0's, from cooler noise."""
+        if noise is None:
+            noise = self.sample_noise((len(state), self.config.chunk_size, self.config.max_action_dim), state.device)
+        return super().sample_actions(images, img_masks, lang_tokens, lang_masks, state, noise=self.config.temperature * noise, **kwargs)
 
 
 class MiniPI0Policy(PI0Policy):
