@@ -47,6 +47,8 @@ AROUND = 4
 """Steps from there that `focus` still calls close."""
 SEEN, PLACED = 0.5, 0.3
 """Weights of the two questions beside the flow."""
+TEMPERATURE = 0.0
+"""Of the trained policy's sampling noise: without any, three in five generic objects are grasped where with all of it two in five are."""
 STEADY = 0.01
 """Least deviation by which an action or a state is scaled: what hardly moves is not blown up."""
 
@@ -99,6 +101,7 @@ def configuration(recipe: Recipe, state_size: int, action_size: int) -> MiniPI0C
     views = {f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (3, SIDE, SIDE)) for name in suite(recipe.suite).cameras}
     return MiniPI0Config(
         **recipe.configuration(), chunk_size=chunk, n_action_steps=execute, max_state_dim=state_size, max_action_dim=action_size,
+        temperature=TEMPERATURE,
         input_features={**views, "observation.state": PolicyFeature(FeatureType.STATE, (state_size,))},
         output_features={"action": PolicyFeature(FeatureType.ACTION, (action_size,))},
     )  # fmt: skip
