@@ -1,5 +1,6 @@
 """Demonstrations show generic objects only, the same ones every time; a command says what its picture shows."""
 
+import itertools
 import re
 from collections import Counter
 from contextlib import nullcontext
@@ -69,6 +70,20 @@ def test_films_are_kept_and_come_again_alike(stage: tuple[Path, list[Film]], mon
         for part in PARTS:
             assert np.array_equal(getattr(one, part), getattr(other, part))
             assert np.array_equal(getattr(one, part), getattr(again, part))
+
+
+def test_a_film_can_begin_where_a_grasp_has_missed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Low beside the target, empty; then up with an open gripper, and a second grasp that succeeds."""
+    monkeypatch.setattr(demonstrations, "EPISODES", 3)
+    begun = {}
+    for share in (0.0, 1.0):
+        monkeypatch.setattr(demonstrations, "MISSES", share)
+        begun[share] = demonstrations.films(SUITE, 0, 0)
+    for first, missed in itertools.product(begun[0.0], begun[1.0]):
+        assert missed.state[0, 2] < first.state[0, 2] - 0.08
+        assert missed.action[:3, 2].sum() > 0.04 > 0.0 > first.action[:3, 2].sum()
+        assert missed.action[2, -1] == 1.0
+        assert missed.action[-1, -1] == pytest.approx(first.action[-1, -1])
 
 
 def test_casts_are_generic_and_of_one_category() -> None:
@@ -203,7 +218,8 @@ def test_a_vision_language_model_learns_and_resumes(stage: tuple[Path, list[Film
     assert about["vlm"] == one == load(tmp_path / "policy").policy.config.vlm  # type: ignore[union-attr]
     further = policy.train(replace(grown, rate=0.0), tmp_path / "further", start=tmp_path / "policy", cache=stage[0])
     assert further["vlm"] == one
-    assert further["start"] == fingerprint(tmp_path / "policy")
+    assert further["start"]["sha256"] == fingerprint(tmp_path / "policy")
+    assert further["start"]["recipe"] == about["recipe"]
     first, second = (load_file(tmp_path / name / "model.safetensors") for name in ("policy", "further"))
     assert all(torch.equal(first[name], second[name]) for name in first)
     other = policy.Learner(replace(policy.configuration(grown, 13, 7), words=("a", "b"))).policy

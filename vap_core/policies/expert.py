@@ -27,6 +27,8 @@ JAW_GAP_M = 0.003
 """Room between an object and the jaw that does not move."""
 ELSEWHERE = 5
 """After an empty grasp the next one is tried so many places down the list: its neighbours differ too little."""
+MISS_M = (0.015, 0.04)
+"""How far beside the target a grasp goes that is to miss."""
 BESIDE_M = 0.035
 """How far inside the limit of the near rule a thing is set down."""
 
@@ -58,6 +60,13 @@ class Expert:
 
     def start(self, rng: np.random.Generator) -> ExpertState:
         return ExpertState()
+
+    def astray(self, env: Env, rng: np.random.Generator) -> ExpertState:
+        """As if its first grasp went beside the target, open or closed; what it does once its phase is no longer "miss" shows how to begin again.
+
+        Raises: OutOfReach.
+        """
+        return ExpertState("miss", tuple(_miss(env, env.truth(), rng)))
 
     def plan_inside(self, states: Sequence[ExpertState], envs: Sequence[Env]) -> tuple[list[ExpertState], list[Chunk]]:
         after = [self._advance(state, env) for state, env in zip(states, envs, strict=True)]
@@ -122,20 +131,38 @@ def _off(one: Float64[np.ndarray, "4 4"], other: Float64[np.ndarray, "4 4"]) -> 
 
 def _take(env: Env, truth: Truth, attempt: int) -> list[Waypoint]:
     """Over the target, down, close, and up until it is clear of everything."""
+    low = _low(env, truth, attempt)
+    above = _over(env, truth, low)
+    lift = _above(env, low, max(0.09, _ceiling(env, truth) - _foot(truth, env.row.target) + 0.015))
+    return [Waypoint(above, 1.0), Waypoint(low, 1.0), Waypoint(low, 0.0, 0.3), Waypoint(lift, 0.0)]
+
+
+def _miss(env: Env, truth: Truth, rng: np.random.Generator) -> list[Waypoint]:
+    """Over a place beside the best grasp, down, and as often as not closed."""
+    angle, away = rng.uniform(0, 2 * np.pi), rng.uniform(*MISS_M)
+    low = _low(env, truth, 0)
+    low[:3, 3] += _into_base(env) @ np.array([away * np.cos(angle), away * np.sin(angle), rng.uniform(0.0, 0.02)])
+    plan = [Waypoint(_over(env, truth, low), 1.0), Waypoint(low, 1.0), Waypoint(low, 0.0, 0.2)]
+    return plan[: int(rng.integers(2, 4))]
+
+
+def _low(env: Env, truth: Truth, attempt: int) -> Float64[np.ndarray, "4 4"]:
+    """Where the hand closes. Raises: OutOfReach."""
     found = grasps(env.robot, env.row.target, truth.objects_world)
     if not found:
         raise OutOfReach(
             f"Expert: {env.row.target} is too wide for {1000 * env.robot.opening_m:.0f} mm of {env.robot.name}; choose another object or robot."
         )
-    over = _ceiling(env, truth) + ABOVE_M
     order = found[ELSEWHERE * attempt % len(found) :] + found
     low = next((pose for grasp in order if (pose := _reachable(env, grasp)) is not None), None)
     if low is None:
         raise OutOfReach(f"Expert: {env.row.key}: no grasp of {env.row.target} can be reached by {env.robot.name}; move it closer.")
-    z = float(low[2, 3] + env.robot.base_world[2])
-    above = _above(env, low, over - z)
-    lift = _above(env, low, max(0.09, _ceiling(env, truth) - _foot(truth, env.row.target) + 0.015))
-    return [Waypoint(above, 1.0), Waypoint(low, 1.0), Waypoint(low, 0.0, 0.3), Waypoint(lift, 0.0)]
+    return low
+
+
+def _over(env: Env, truth: Truth, low: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
+    """Straight over a pose, clear of everything."""
+    return _above(env, low, _ceiling(env, truth) + ABOVE_M - float(low[2, 3] + env.robot.base_world[2]))
 
 
 def _reachable(env: Env, grasp: Grasp) -> Float64[np.ndarray, "4 4"] | None:

@@ -16,7 +16,7 @@ from PIL import Image
 
 from vap_core.errors import OutOfReach
 from vap_core.files import write_atomic
-from vap_core.policies.expert import Expert
+from vap_core.policies.expert import Expert, ExpertState
 from vap_core.sim import objects
 from vap_core.sim.env import Env
 from vap_core.sim.objects import extent_m
@@ -32,6 +32,8 @@ EPISODES = 8
 """Episodes of one stage."""
 JOLT, JOLT_M = 0.15, 0.012
 """Share of steps in which the hand is knocked off its way, so that recovering is shown, too; and how far, metres (deviation)."""
+MISSES = 0.5
+"""Share of the grasping films that begin where a first grasp has missed: a policy that has not seen that presses on for ever."""
 AREAS = {
     "simpler-fractal": simpler.DESK,
     "simpler-bridge": Area(0.18, 0.35, -0.095, 0.095),
@@ -100,6 +102,7 @@ def row(known: Suite, task: Task, names: Sequence[str], number: int, variant: st
 def films(suite_name: str, seed: int, number: int) -> list[Film]:
     """The successful episodes of one stage."""
     known, rng = suite(suite_name), np.random.default_rng([71, seed, *suite_name.encode(), number])
+    slips = np.random.default_rng([72, seed, *suite_name.encode(), number])
     task = known.tasks[number % len(known.tasks)]
     variant = str(rng.choice(list(VARIANTS))) if suite_name == "simpler-fractal" else "base"
     names = cast(task, rng)
@@ -107,7 +110,8 @@ def films(suite_name: str, seed: int, number: int) -> list[Film]:
     with build(known.robot, names, look=VARIANTS[variant].look) as scene:
         for i in range(EPISODES):
             try:
-                shot = shoot(known, scene, row(known, task, names, number * EPISODES + i, variant, rng), rng)
+                start = row(known, task, names, number * EPISODES + i, variant, rng)
+                shot = shoot(known, scene, start, rng, slips if start.rule != "selected" and slips.random() < MISSES else None)
             except (OutOfReach, ValueError):  # no grasp from here, or no room: another place will do
                 continue
             if shot is not None:
@@ -115,12 +119,13 @@ def films(suite_name: str, seed: int, number: int) -> list[Film]:
     return found
 
 
-def shoot(known: Suite, scene: Scene, start: EpisodeRow, rng: np.random.Generator) -> Film | None:
-    """The expert's episode, filmed; None when it fails."""
+def shoot(known: Suite, scene: Scene, start: EpisodeRow, rng: np.random.Generator, slips: np.random.Generator | None = None) -> Film | None:
+    """The expert's episode, filmed; None when it fails. With `slips`, the film begins where a first grasp has missed."""
     env, expert = Env(scene, image_size=SEEN, cameras=known.cameras, control=known.control, sensor=known.sensor), Expert()
     env.reset(start)
     names = [placed.model for placed in start.placements]
-    judge, state = Judge.start(start, {name: extent_m(objects.get(name)) for name in names}, env.truth()), expert.start(rng)
+    state = expert.start(rng) if slips is None else _missed(env, expert, slips)
+    judge = Judge.start(start, {name: extent_m(objects.get(name)) for name in names}, env.truth())
     frames = []
     while not judge.done and judge.steps < start.max_steps:
         truth = env.truth(masks=True)
@@ -135,6 +140,20 @@ def shoot(known: Suite, scene: Scene, start: EpisodeRow, rng: np.random.Generato
         return None
     views, masks, states, actions, places = (np.stack(part) for part in zip(*frames, strict=True))
     return Film(views, masks, states, actions, places, tuple(names), start.task, names.index(start.goal) if start.goal else -1)
+
+
+def _missed(env: Env, expert: Expert, rng: np.random.Generator) -> ExpertState:
+    """Go astray, unfilmed, as far as the moment of beginning again. What was held by luck is put back: that is no miss."""
+    state = expert.astray(env, rng)
+    while True:
+        (state,), (chunk,) = expert.plan_inside([state], [env])
+        if state.phase != "miss":
+            break
+        env.step(chunk[0])
+    if env.row.target not in env.truth().held:
+        return state
+    env.reset(env.row)
+    return expert.start(rng)
 
 
 def small(rgb: Rgb) -> UInt8[np.ndarray, "s s 3"]:

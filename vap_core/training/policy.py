@@ -244,7 +244,7 @@ def train(
     made_of = {"recipe": vars(recipe), "data_sha256": data_sha256([*films, *held])}
     if start is not None:
         go_on(start, learner.policy)
-        made_of["start"] = fingerprint(start)
+        made_of["start"] = {"sha256": fingerprint(start), **_card(start)}
     elif vlm is not None:
         teacher = load_vlm(vlm)
         config.vlm = teacher.sha256()
@@ -268,6 +268,12 @@ def go_on(start: Path, policy: MiniPI0Policy) -> None:
     theirs = held.state_dict()
     policy.load_state_dict({name: theirs[name] if theirs[name].shape == mine.shape else mine for name, mine in policy.state_dict().items()})
     policy.config.vlm = held.config.vlm
+
+
+def _card(checkpoint: Path) -> dict[str, Any]:
+    """How a checkpoint was made, as its training.json tells; the measurements left out."""
+    file = checkpoint / "training.json"
+    return {name: part for name, part in json.loads(file.read_text()).items() if name not in ("log", "held_out")} if file.is_file() else {}
 
 
 def save(learner: Learner, stats: Any, held: Sequence[Film], made_of: dict[str, Any], out: Path) -> dict[str, Any]:
