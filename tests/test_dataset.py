@@ -266,7 +266,7 @@ def test_the_shipped_ones_are_generic_and_whole(name: str) -> None:
     assert manifest[name] == {"episodes": len(films), "frames": sum(len(film.action) for film in films), "sha256": held["data_sha256"]}
     for film in films:
         assert {objects.get(thing).split for i, thing in enumerate(film.names) if i != film.goal} == {"generic"}
-        assert (film.ids[0] == 1).sum() > 20
+        assert (film.ids == 1).sum((1, 2, 3)).max() > 20, "the target is in view; the hand may hide it at first"
     assert held["data_sha256"] in (SHIPPED / "README.md").read_text()
     through_lerobot(folder, films)
 

@@ -53,7 +53,7 @@ def test_a_film_shows_a_generic_target_from_first_to_last_action(stage: tuple[Pa
         assert film.action.shape[1] == 7
         assert film.names[film.goal] == suite(SUITE).task(film.task).goal
         assert {objects.get(name).split for i, name in enumerate(film.names) if i != film.goal} == {"generic"}
-        assert (film.ids[0] == 1).sum() > 30, "the target is in view"
+        assert (film.ids == 1).sum((1, 2, 3)).max() > 30, "the target is in view; the hand may hide it at first"
         assert np.linalg.norm(film.places[-1, 0] - film.places[0, 0]) > 0.03, "and is moved"
         still = np.linalg.norm(film.places[-1, 1:] - film.places[0, 1:], axis=1)
         assert np.delete(still, film.goal - 1).max() < 0.03, "its rivals are not"
