@@ -226,7 +226,7 @@ def vlm(
 def policy(
     suite: Annotated[str, typer.Option(help="The benchmark whose robot, cameras and kinds of task it learns.")],
     out: Annotated[
-        Path | None, typer.Option(help="Folder of the checkpoint; a training found there goes on. Default data/runs/mini-pi0-SUITE.")
+        Path | None, typer.Option(help="Folder of the checkpoint; a training found there goes on. Default data/runs/trained/mini-pi0-SUITE.")
     ] = None,
     stages: Annotated[int, typer.Option(min=2, help="Scenes with generic objects, of about eight demonstrations each; filmed first.")] = 400,
     steps: Annotated[int, typer.Option(min=1, help="Optimiser steps.")] = 12_000,
@@ -250,7 +250,7 @@ def policy(
 
     if suite not in BENCHMARKS:
         raise one_of("train policy: suite", suite, BENCHMARKS)
-    folder = out or Path(f"data/runs/mini-pi0-{suite}")
+    folder = out or Path(f"data/runs/trained/mini-pi0-{suite}")
     recipe = Recipe(suite, stages, steps, batch, seed=seed)
     print(json.dumps(train(recipe, folder, vlm=vlm or MODEL, start=start, demonstrations=demonstrations, minutes=minutes)["held_out"], indent=1))
     print(f"next: python -m vap_core eval --suite {suite} --policy {folder} --methods generic,vap --episodes 4 --out {folder}-eval")

@@ -1,6 +1,6 @@
 """Train a mini-pi0 on filmed demonstrations (P 5.1): flow matching as in pi0, and, while training only, questions about what is meant.
 
-    python -m vap_core train policy --suite simpler-bridge --stages 400 --out data/runs/mini-pi0-bridge
+    python -m vap_core train policy --suite simpler-bridge --stages 400
 
 The penultimate decoder layer is asked, besides, which image patches show the object that is meant and where it stands: in pi0 the last layer
 gives its keys and values alone, so that this is where looking is learned. The answers' heads are not part of the policy.
