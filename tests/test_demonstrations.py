@@ -20,7 +20,7 @@ from vap_core import describe
 from vap_core.errors import BadOutput, BadPolicy
 from vap_core.policies.checkpoints import fingerprint
 from vap_core.policies.lerobot import load
-from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
+from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy, fused
 from vap_core.policies.mini_pi0.vlm import load as load_vlm
 from vap_core.prompt import PALETTE, looks_like
 from vap_core.sim import objects
@@ -29,7 +29,6 @@ from vap_core.training import demonstrations, policy, vlm
 from vap_core.training.commands import command, near, painted, rough, say, tinted
 from vap_core.training.dataset import data_sha256
 from vap_core.training.demonstrations import PARTS, SIDE, Film, cached, cast
-from vap_core.training.fitting import fused
 from vap_core.training.questions import LEAST_PX, ask, place
 from vap_core.training.words import PAINTS, akin, looks, phrases, vocabulary
 

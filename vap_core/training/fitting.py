@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,19 +29,6 @@ class Run:
 def halved() -> torch.autocast:
     """A context in which heads compute in bfloat16 where that is safe: three times as fast on processors that have it in hardware."""
     return torch.autocast("cpu", dtype=torch.bfloat16)
-
-
-@contextmanager
-def fused() -> Iterator[None]:
-    """A context in which the eager attention that lerobot's PI0 asks for is PyTorch's fused one: the same numbers, a third less time a step."""
-    from transformers.integrations.sdpa_attention import sdpa_attention_forward
-    from transformers.modeling_utils import ALL_ATTENTION_FUNCTIONS
-
-    ALL_ATTENTION_FUNCTIONS["eager"] = sdpa_attention_forward
-    try:
-        yield
-    finally:
-        del ALL_ATTENTION_FUNCTIONS["eager"]
 
 
 def fit(head: nn.Module, losses: Callable[[np.random.Generator], Iterator[Tensor]], per_epoch: int, run: Run) -> None:

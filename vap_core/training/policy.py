@@ -23,7 +23,7 @@ from vap_core.errors import BadOutput, BadPolicy
 from vap_core.policies.checkpoints import fingerprint
 from vap_core.policies.lerobot import load as load_policy
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
-from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
+from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy, fused
 from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
 from vap_core.policies.mini_pi0.vlm import grow, halve
 from vap_core.policies.mini_pi0.vlm import load as load_vlm
@@ -34,7 +34,6 @@ from vap_core.training.dataset import about, data_sha256, read
 from vap_core.training.dataset import film as shoot
 from vap_core.training.demonstrations import SIDE, Film, cached
 from vap_core.training.descent import Descent, Told, average_of, descend
-from vap_core.training.fitting import fused
 from vap_core.training.looking import Shown, Sizes, looking, shares
 from vap_core.training.scenes import only_generic
 

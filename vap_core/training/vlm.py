@@ -20,11 +20,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
+from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused
 from vap_core.policies.mini_pi0.vlm import ANSWER, MiniVlm, load
 from vap_core.processes import results
 from vap_core.training.demonstrations import SIDE, small
 from vap_core.training.descent import Descent, Told, average_of, descend
-from vap_core.training.fitting import fused
 from vap_core.training.looking import Shown, Sizes, looking, shares
 from vap_core.training.questions import Question, ask
 from vap_core.training.scenes import Shots, cached
