@@ -21,7 +21,7 @@ from vap_core.sim import objects
 from vap_core.suites import Suite, suite
 from vap_core.training import dataset
 from vap_core.training.dataset import ABOUT, MOST, about, data_sha256, film_sha256, read, said, write
-from vap_core.training.demonstrations import PARTS, Film, cached
+from vap_core.training.demonstrations import PARTS, Film, after_a_miss, cached
 from vap_core.training.policy import STEADY, statistics
 
 SUITE, SIDE, STAGES = "simpler-bridge", 64, 4
@@ -266,7 +266,8 @@ def test_the_shipped_ones_are_generic_and_whole(name: str) -> None:
     assert manifest[name] == {"episodes": len(films), "frames": sum(len(film.action) for film in films), "sha256": held["data_sha256"]}
     for film in films:
         assert {objects.get(thing).split for i, thing in enumerate(film.names) if i != film.goal} == {"generic"}
-        assert (film.ids == 1).sum((1, 2, 3)).max() > 20, "the target is in view; the hand may hide it at first"
+        seen = (film.ids == 1).sum((1, 2, 3))
+        assert (seen.max() if after_a_miss(film) else seen[0]) > 20, "the target is in view; a hand that missed may hide it at first"
     assert held["data_sha256"] in (SHIPPED / "README.md").read_text()
     through_lerobot(folder, films)
 

@@ -28,7 +28,7 @@ from vap_core.suites import BENCHMARKS, suite
 from vap_core.training import demonstrations, policy, vlm
 from vap_core.training.commands import command, near, painted, rough, say, tinted
 from vap_core.training.dataset import data_sha256
-from vap_core.training.demonstrations import PARTS, SIDE, Film, cached, cast
+from vap_core.training.demonstrations import PARTS, SIDE, Film, after_a_miss, cached, cast
 from vap_core.training.questions import LEAST_PX, ask, place
 from vap_core.training.words import PAINTS, akin, looks, phrases, vocabulary
 
@@ -52,7 +52,8 @@ def test_a_film_shows_a_generic_target_from_first_to_last_action(stage: tuple[Pa
         assert film.action.shape[1] == 7
         assert film.names[film.goal] == suite(SUITE).task(film.task).goal
         assert {objects.get(name).split for i, name in enumerate(film.names) if i != film.goal} == {"generic"}
-        assert (film.ids == 1).sum((1, 2, 3)).max() > 30, "the target is in view; the hand may hide it at first"
+        seen = (film.ids == 1).sum((1, 2, 3))
+        assert (seen.max() if after_a_miss(film) else seen[0]) > 30, "the target is in view; a hand that missed may hide it at first"
         assert np.linalg.norm(film.places[-1, 0] - film.places[0, 0]) > 0.03, "and is moved"
         still = np.linalg.norm(film.places[-1, 1:] - film.places[0, 1:], axis=1)
         assert np.delete(still, film.goal - 1).max() < 0.03, "its rivals are not"
@@ -240,15 +241,19 @@ def test_frames_close_to_a_turn_of_the_gripper_a_miss_or_the_end_come_more_often
     assert set(np.flatnonzero(after_a_miss != chances)) == {*range(5)}
 
 
-def test_attention_that_is_fused_gives_the_same_losses_and_gradients(stage: tuple[Path, list[Film]]) -> None:
-    _, films = stage
-    recipe = policy.Recipe(SUITE, batch=4, draws=2, width=32, depth=2, vision_width=32, vision_depth=1, expert_width=32)
-    stats = policy.statistics(films)
+def small_policy(films: list[Film], batch: int) -> tuple[MiniPI0Policy, policy.Questions, policy.Batch]:
+    """An untrained policy of the smallest sizes, the questions beside it, and one batch of so many frames."""
+    recipe = policy.Recipe(SUITE, batch=batch, draws=2, width=32, depth=2, vision_width=32, vision_depth=1, expert_width=32)
     config = policy.configuration(recipe, films[0].state.shape[1], films[0].action.shape[1])
     with torch.random.fork_rng():
         torch.manual_seed(0)
         model, asked = MiniPI0Policy(config), policy.Questions(recipe.width)
-    batch, found = policy.collate(recipe, films, stats, np.random.default_rng(0), config), []
+    return model, asked, policy.collate(recipe, films, policy.statistics(films), np.random.default_rng(0), config)
+
+
+def test_attention_that_is_fused_gives_the_same_losses_and_gradients(stage: tuple[Path, list[Film]]) -> None:
+    model, asked, batch = small_policy(stage[1], 4)
+    found = []
     for context in (nullcontext, fused):
         with context(), patch.object(torch.nn.functional, "scaled_dot_product_attention", wraps=F.scaled_dot_product_attention) as kernel:
             loss, told = policy.losses(model, asked, batch, 2, torch.Generator().manual_seed(0))
@@ -263,14 +268,7 @@ def test_attention_that_is_fused_gives_the_same_losses_and_gradients(stage: tupl
 
 def test_one_batch_can_be_learned_by_heart(stage: tuple[Path, list[Film]]) -> None:
     """Flow, patches and place all fall when the same few frames are seen again and again."""
-    _, films = stage
-    recipe = policy.Recipe(SUITE, batch=8, draws=2, width=32, depth=2, vision_width=32, vision_depth=1, expert_width=32)
-    stats = policy.statistics(films)
-    config = policy.configuration(recipe, films[0].state.shape[1], films[0].action.shape[1])
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        model, asked = MiniPI0Policy(config), policy.Questions(recipe.width)
-    batch = policy.collate(recipe, films, stats, np.random.default_rng(0), config)
+    model, asked, batch = small_policy(stage[1], 8)
     optimiser = torch.optim.AdamW([*model.parameters(), *asked.parameters()], 3e-3)
     told = []
     for step in range(60):

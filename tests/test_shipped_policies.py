@@ -9,7 +9,7 @@ from lerobot.policies import get_policy_class, make_pre_post_processors
 
 from tests.test_cli import vap
 from vap_core import suites
-from vap_core.experiments import MINI, SHIPPED, usual
+from vap_core.experiments import MINI, SHIPPED, shipped, usual
 from vap_core.policies.lerobot import load
 from vap_core.policies.mini_pi0.vlm import load as load_vlm
 from vap_core.soft_prompt import MODEL
@@ -17,7 +17,7 @@ from vap_core.store import read
 from vap_core.training.probe import probe
 
 FOLDERS = sorted(SHIPPED.glob(f"{MINI}-*"))
-BRIDGE = SHIPPED / f"{MINI}-simpler-bridge"
+BRIDGE = shipped("simpler-bridge")
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)

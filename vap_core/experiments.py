@@ -81,7 +81,7 @@ class Study:
         if self.policy not in (*POLICIES, MINI) and not checkpoints.named(self.policy):
             raise one_of("Study: policy (or a lerobot checkpoint's folder or hub id)", self.policy, [*POLICIES, MINI])
         for suite, _ in self.tasks:
-            if self.policy == MINI and not (SHIPPED / f"{MINI}-{suite}").is_dir():
+            if self.policy == MINI and not shipped(suite).is_dir():
                 there = ", ".join(sorted(folder.name for folder in SHIPPED.glob(f"{MINI}-*"))) or "none"
                 raise BadStudy(f"Study: no {MINI} for {suite} ships (there is {there}); run: python -m vap_core train policy --suite {suite}")
         if self.robots not in ("plain", "menagerie"):
@@ -102,7 +102,7 @@ class Study:
 
     def checkpoint(self, suite: str) -> str:
         """The folder or hub id of the policy's weights for a suite; "" for a policy that has none."""
-        return str(SHIPPED / f"{MINI}-{suite}") if self.policy == MINI else "" if self.policy in POLICIES else self.policy
+        return str(shipped(suite)) if self.policy == MINI else "" if self.policy in POLICIES else self.policy
 
     def configuration(self) -> dict[str, Any]:
         """What the results depend on, as JSON; weights, episode lists, and the world (robots, objects, looks, sensors) by their checksums."""
@@ -180,9 +180,14 @@ MINI, SHIPPED = "mini-pi0", MODEL.parent
 """The shipped frozen policy, one checkpoint a suite, and where they lie."""
 
 
+def shipped(suite: str) -> Path:
+    """Where the shipped policy of a suite lies, if there is one."""
+    return SHIPPED / f"{MINI}-{suite}"
+
+
 def usual(names: Iterable[str]) -> str:
     """The policy for suites of which nobody named one: the shipped frozen one, or the scripted one when some suite has none."""
-    return MINI if all((SHIPPED / f"{MINI}-{suite}").is_dir() for suite in names) else "scripted"
+    return MINI if all(shipped(suite).is_dir() for suite in names) else "scripted"
 
 
 DEMO = Study(tasks=(("widowx-pick", "pick-straw-cup"), ("franka-pick", "pick-cup")), methods=("generic", "vap"), episodes=20)

@@ -32,6 +32,8 @@ EPISODES = 8
 """Episodes of one stage."""
 JOLT, JOLT_M = 0.15, 0.012
 """Share of steps in which the hand is knocked off its way, so that recovering is shown, too; and how far, metres (deviation)."""
+LOW_M = 0.05
+"""A hand that begins so far below its highest point begins after a miss."""
 MISSES = 0.5
 """Share of the grasping films that begin where a first grasp has missed: a policy that has not seen that presses on for ever."""
 AREAS = {
@@ -140,6 +142,12 @@ def shoot(known: Suite, scene: Scene, start: EpisodeRow, rng: np.random.Generato
         return None
     views, masks, states, actions, places = (np.stack(part) for part in zip(*frames, strict=True))
     return Film(views, masks, states, actions, places, tuple(names), start.task, names.index(start.goal) if start.goal else -1)
+
+
+def after_a_miss(film: Film) -> bool:
+    """Whether the film begins with a second try: its hand begins far below its highest point."""
+    height = film.state[:, 2]
+    return bool(height[0] + LOW_M < height.max())
 
 
 def _missed(env: Env, expert: Expert, rng: np.random.Generator) -> ExpertState:

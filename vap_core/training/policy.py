@@ -32,7 +32,7 @@ from vap_core.suites import suite
 from vap_core.training.commands import command
 from vap_core.training.dataset import about, data_sha256, read
 from vap_core.training.dataset import film as shoot
-from vap_core.training.demonstrations import SIDE, Film, cached
+from vap_core.training.demonstrations import SIDE, Film, after_a_miss, cached
 from vap_core.training.descent import Descent, Told, average_of, descend
 from vap_core.training.looking import Shown, Sizes, looking, shares
 from vap_core.training.scenes import only_generic
@@ -44,8 +44,6 @@ HELD_OUT = 19
 """Every so many stages one is kept from training, to see what was learned: a prime, as tasks take turns."""
 CLOSE_M = 0.005
 """Error of a place up to which it is squared."""
-LOW_M = 0.05
-"""A film whose hand begins so far below its highest point begins after a miss."""
 AROUND = 4
 """Steps from there that `focus` still calls close."""
 SEEN, PLACED = 0.5, 1.0
@@ -124,9 +122,9 @@ def statistics(films: Sequence[Film]) -> dict[str, dict[str, Tensor]]:
 
 def emphasis(film: Film, focus: float) -> Float[np.ndarray, " t"]:
     """How often each frame is drawn: more often close to a change of the gripper's command, to the end, and to a miss, where a centimetre decides."""
-    shut, height = film.action[:, -1] < 0.5, film.state[:, 2]
+    shut = film.action[:, -1] < 0.5
     turns = [*np.flatnonzero(shut[1:] != shut[:-1]) + 1, len(shut) - 1]
-    if height[0] + LOW_M < height.max():
+    if after_a_miss(film):
         turns.append(0)
     away = np.abs(np.arange(len(shut))[:, None] - turns).min(axis=1)
     return np.where(away <= AROUND, focus, 1.0)
