@@ -19,7 +19,7 @@ import torch
 from vap_core.errors import BadOutput
 from vap_core.sim import objects
 from vap_core.suites import Suite, suite
-from vap_core.training import dataset
+from vap_core.training import dataset, demonstrations
 from vap_core.training.dataset import ABOUT, MOST, about, data_sha256, film_sha256, read, said, write
 from vap_core.training.demonstrations import PARTS, Film, after_a_miss, cached
 from vap_core.training.policy import STEADY, statistics
@@ -89,6 +89,17 @@ def test_films_come_back_bit_for_bit(written: Path, films: list[Film], cache: Pa
     assert about(written)["data_sha256"] == data_sha256(films)
     assert [one["stage"] for one in about(written)["episodes"]] == [0, 0, 2, 3, 3]
     assert not {path.name for path in written.iterdir()} - {"run.json", "data", "videos", "meta"}
+
+
+def test_so_do_those_with_fewer_pictures_than_steps(films: list[Film], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(demonstrations, "EVERY", {SUITE: 3})
+    fewer = [replace(film, images=film.images[::3], ids=film.ids[::3]) for film in films]
+    kept = {f"{part}{i}": getattr(film, part) for i, film in enumerate(fewer) for part in PARTS}
+    np.savez(tmp_path / f"{SUITE}-0-00000.npz", n=len(fewer), **kept)
+    write(SUITE, 1, tmp_path / "out", cache=tmp_path)
+    assert alike(read(tmp_path / "out"), fewer)
+    repeated = [replace(film, images=film.images.repeat(3, 0)[: len(film.action)], ids=film.ids.repeat(3, 0)[: len(film.action)]) for film in fewer]
+    through_lerobot(tmp_path / "out", repeated)
 
 
 def test_the_checksum_is_of_the_content_alone(written: Path, films: list[Film], cache: Path, tmp_path: Path) -> None:

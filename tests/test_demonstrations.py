@@ -72,6 +72,28 @@ def test_films_are_kept_and_come_again_alike(stage: tuple[Path, list[Film]], mon
             assert np.array_equal(getattr(one, part), getattr(again, part))
 
 
+def test_fewer_pictures_of_the_same_film_teach_the_same(stage: tuple[Path, list[Film]], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A suite may keep every third picture: the film is the same otherwise, and a step that has one is told and answered as before."""
+    _, whole = stage
+    monkeypatch.setattr(demonstrations, "EPISODES", 2)
+    before = [command(film, t, SUITE, np.random.default_rng(t)) for film in whole for t in range(0, len(film.action), 3)]
+    monkeypatch.setattr(demonstrations, "EVERY", {SUITE: 3})
+    films = demonstrations.films(SUITE, 0, 1)
+    for film, all_of_it in zip(films, whole, strict=True):
+        fewer = replace(all_of_it, images=all_of_it.images[::3], ids=all_of_it.ids[::3])
+        assert all(np.array_equal(getattr(film, part), getattr(fewer, part)) for part in PARTS)
+    after = [command(film, t, SUITE, np.random.default_rng(t)) for film in films for t in range(0, len(film.action), 3)]
+    for one, other in zip(before, after, strict=True):
+        assert (one.text, one.way) == (other.text, other.way)
+        assert np.array_equal(one.images, other.images)
+    recipe = policy.Recipe(SUITE, batch=64)
+    config, stats = policy.configuration(recipe, films[0].state.shape[1], 7), policy.statistics(films)
+    made = policy.collate(recipe, films, stats, np.random.default_rng(0), config)
+    scaled = [(film.state - stats["observation.state"]["mean"].numpy()) / stats["observation.state"]["std"].numpy() for film in films]
+    shown = np.concatenate([part[::3] for part in scaled])
+    assert all((np.abs(shown - state.numpy()).max(axis=1) < 1e-4).any() for state in made.state), "only steps with a picture are learned from"
+
+
 def test_a_film_can_begin_where_a_grasp_has_missed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Low beside the target, empty; then up with an open gripper, and a second grasp that succeeds."""
     monkeypatch.setattr(demonstrations, "EPISODES", 3)
@@ -225,6 +247,9 @@ def test_a_vision_language_model_learns_and_resumes(stage: tuple[Path, list[Film
     other = policy.Learner(replace(policy.configuration(grown, 13, 7), words=("a", "b"))).policy
     with pytest.raises(BadPolicy, match="no mini-pi0 with the same words"):
         policy.go_on(tmp_path / "policy", other)
+    (tmp_path / "policy" / "training.json").write_text('{"recipe": ')
+    with pytest.raises(BadPolicy, match="training.json is damaged"):
+        policy.train(grown, tmp_path / "another", start=tmp_path / "policy", cache=stage[0])
 
 
 def test_frames_close_to_a_turn_of_the_gripper_a_miss_or_the_end_come_more_often(stage: tuple[Path, list[Film]]) -> None:
@@ -235,6 +260,8 @@ def test_frames_close_to_a_turn_of_the_gripper_a_miss_or_the_end_come_more_often
     chances = policy.emphasis(replace(films[0], action=action, **rest), 3.0)
     assert set(np.flatnonzero(chances == 3.0)) == {*range(11, 20), *range(35, 40)}
     assert set(np.flatnonzero(chances == 1.0)) == {*range(11), *range(20, 35)}
+    thirds = policy.emphasis(replace(films[0], action=action, **rest), 3.0, 3)
+    assert [3 * int(i) for i in np.flatnonzero(thirds == 3.0)] == [*range(3, 40, 3)]
     low = {**rest, "state": rest["state"].copy()}
     low["state"][0, 2] -= 0.1
     after_a_miss = policy.emphasis(replace(films[0], action=action, **low), 3.0)

@@ -14,7 +14,7 @@ from jaxtyping import Float32, UInt8
 from vap_core.prompt import PALETTE
 from vap_core.sim import robots
 from vap_core.suites import Task, suite
-from vap_core.training.demonstrations import Film
+from vap_core.training.demonstrations import Film, every
 from vap_core.training.words import DETERMINERS, PAINTS, akin, free, looks, phrases
 from vap_core.values import Colour, value
 
@@ -43,10 +43,10 @@ class Command:
 
 
 def command(film: Film, t: int, suite_name: str, rng: np.random.Generator) -> Command:
-    """Frame t of a film with something said that its action answers."""
+    """Step t of a film, which has a picture, with something said that its action answers."""
     task = suite(suite_name).task(film.task)
     rivals = [i for i in range(1, len(film.names)) if i != film.goal]
-    images, ids = film.images[t].copy(), film.ids[t]
+    images, ids = (part[t // every(suite_name)] for part in (film.images, film.ids))
     drawn = rng.random()
     natural = 1 - TINTED - PAINTED < drawn < 1 - TINTED
     usable = free({word for i in rivals for word in looks(film.names[i])}, PAINTS if natural else PALETTE)
@@ -59,7 +59,7 @@ def command(film: Film, t: int, suite_name: str, rng: np.random.Generator) -> Co
     word = mine.name
     way: Way = "tinted"
     if drawn < DESCRIBED and (told := telling([film.names[i] for i in (0, *rivals)], rng)):
-        images, way, word = film.images[t].copy(), "described", told
+        images, way, word = film.images[t // every(suite_name)], "described", told
     elif DESCRIBED < drawn < 1 - TINTED - PAINTED and near(film, t, suite_name, rivals):
         way, word = "plain", ""
     elif natural:

@@ -5,7 +5,7 @@
 A film is an episode. lerobot's policies see `observation.images.<camera>` (lossless video), `observation.state`, `action` and the task in generic
 words. What our own training asks besides stands where no policy looks: `vap.ids.<camera>` (a grayscale PNG in base64: 0 the scene, i + 1 object i)
 and `vap.places` (x, y, z of every object, world, metres, zeros behind the last) in every frame; what an episode is about, and the checksum of every
-film, in meta/demonstrations.json.
+film, in meta/demonstrations.json. A suite whose films have fewer pictures than steps repeats each until the next.
 """
 
 import base64
@@ -30,7 +30,7 @@ from vap_core.processes import results
 from vap_core.sim import robots
 from vap_core.store import locked, open_run
 from vap_core.suites import Suite, suite
-from vap_core.training.demonstrations import PARTS, Film, cached
+from vap_core.training.demonstrations import PARTS, Film, cached, every
 from vap_core.values import EE_ACTION
 
 if TYPE_CHECKING:
@@ -177,8 +177,9 @@ def _frames(known: Suite, film: Film) -> Iterator[dict[str, Any]]:
     places = np.zeros((len(film.action), MOST, 3), np.float32)
     places[:, : len(film.names)] = film.places
     for t in range(len(film.action)):
-        seen = {IMAGES + name: film.images[t, c] for c, name in enumerate(known.cameras)}
-        ids = {IDS + name: _png(film.ids[t, c]) for c, name in enumerate(known.cameras)}
+        shown = t // every(known.name)
+        seen = {IMAGES + name: film.images[shown, c] for c, name in enumerate(known.cameras)}
+        ids = {IDS + name: _png(film.ids[shown, c]) for c, name in enumerate(known.cameras)}
         yield {**seen, **ids, STATE: film.state[t], ACTION: film.action[t], PLACES: places[t].reshape(-1), "task": said(known, film.task)}
 
 
@@ -294,9 +295,11 @@ def _film(known: Suite, folder: Path, row: dict[str, Any], told: dict[str, Any],
     for camera in known.cameras:
         video = f"videos/{IMAGES}{camera}"
         path = folder / video / f"chunk-{row[f'{video}/chunk_index']:03d}" / f"file-{row[f'{video}/file_index']:03d}.mp4"
-        times = [row[f"{video}/from_timestamp"] + t / round(known.hz) for t in range(steps)]
+        times = [row[f"{video}/from_timestamp"] + t / round(known.hz) for t in range(0, steps, every(known.name))]
         images.append(decode_video_frames(path, times, 0.1 / known.hz, "pyav", return_uint8=True).permute(0, 2, 3, 1).numpy())
-        ids.append(np.stack([np.asarray(Image.open(io.BytesIO(base64.b64decode(png)))) for png in mine[IDS + camera].to_pylist()]))
+        ids.append(
+            np.stack([np.asarray(Image.open(io.BytesIO(base64.b64decode(png)))) for png in mine[IDS + camera].to_pylist()[:: every(known.name)]])
+        )
     state, action, places = (np.stack(mine[name].to_numpy()).astype(np.float32) for name in (STATE, ACTION, PLACES))
     where = np.ascontiguousarray(places.reshape(steps, MOST, 3)[:, : len(names)])
     return Film(np.stack(images, 1), np.stack(ids, 1), state, action, where, names, told["task"], told["goal"])

@@ -34,6 +34,8 @@ JOLT, JOLT_M = 0.15, 0.012
 """Share of steps in which the hand is knocked off its way, so that recovering is shown, too; and how far, metres (deviation)."""
 LOW_M = 0.05
 """A hand that begins so far below its highest point begins after a miss."""
+EVERY = {"tabletop": 3}
+"""Control steps from one picture to the next; elsewhere each has its own. At 30 Hz neighbours hardly differ, and pictures are what a film costs."""
 MISSES = 0.5
 """Share of the grasping films that begin where a first grasp has missed: a policy that has not seen that presses on for ever."""
 AREAS = {
@@ -49,19 +51,25 @@ GAPS_M, TRIES = (0.05, 0.035, 0.02), 400
 
 @value
 class Film:
-    """One successful episode. Frame t is what the cameras saw before action t; `ids` are 0 for the scene, 1 for the target, i + 1 for object i.
+    """One successful episode. Frame f is what the cameras saw before action f x `every(suite)`, and `ids` are 0 there for the scene, 1 for the
+    target, i + 1 for object i; state t and places t are those before action t.
 
     `places` are the objects' x, y, z in the world, metres; `names[0]` is the target, `goal` the index of its goal or -1.
     """
 
-    images: UInt8[np.ndarray, "t c s s 3"]
-    ids: UInt8[np.ndarray, "t c s s"]
+    images: UInt8[np.ndarray, "f c s s 3"]
+    ids: UInt8[np.ndarray, "f c s s"]
     state: Float32[np.ndarray, "t p"]
     action: Float32[np.ndarray, "t a"]
     places: Float32[np.ndarray, "t n 3"]
     names: tuple[str, ...]
     task: str
     goal: int
+
+
+def every(suite_name: str) -> int:
+    """Control steps from one picture of a suite's films to the next."""
+    return EVERY.get(suite_name, 1)
 
 
 def cast(task: Task, rng: np.random.Generator, held_out: bool = False) -> list[str]:
@@ -128,19 +136,22 @@ def shoot(known: Suite, scene: Scene, start: EpisodeRow, rng: np.random.Generato
     names = [placed.model for placed in start.placements]
     state = expert.start(rng) if slips is None else _missed(env, expert, slips)
     judge = Judge.start(start, {name: extent_m(objects.get(name)) for name in names}, env.truth())
-    frames = []
+    pictures, steps = [], []
     while not judge.done and judge.steps < start.max_steps:
-        truth = env.truth(masks=True)
+        shown = judge.steps % every(known.name) == 0
+        truth = env.truth(masks=shown)
         (state,), (chunk,) = expert.plan_inside([state], [env])
-        seen = np.stack([small(rgb) for rgb in env.observe().images.values()])
-        ids = np.stack([_ids(truth.masks[camera], names) for camera in known.cameras])
+        if shown:
+            seen = np.stack([small(rgb) for rgb in env.observe().images.values()])
+            pictures.append((seen, np.stack([_ids(truth.masks[camera], names) for camera in known.cameras])))
         spots = np.array([truth.objects_world[name][:3] for name in names], np.float32)
-        frames.append((seen, ids, env.state(), chunk[0].astype(np.float32), spots))
+        steps.append((env.state(), chunk[0].astype(np.float32), spots))
         env.step(_knocked(chunk[0], known, rng))
         judge = judge.step(env.truth())
     if not judge.outcome().success:
         return None
-    views, masks, states, actions, places = (np.stack(part) for part in zip(*frames, strict=True))
+    views, masks = (np.stack(part) for part in zip(*pictures, strict=True))
+    states, actions, places = (np.stack(part) for part in zip(*steps, strict=True))
     return Film(views, masks, states, actions, places, tuple(names), start.task, names.index(start.goal) if start.goal else -1)
 
 

@@ -32,7 +32,7 @@ from vap_core.suites import suite
 from vap_core.training.commands import command
 from vap_core.training.dataset import about, data_sha256, read
 from vap_core.training.dataset import film as shoot
-from vap_core.training.demonstrations import SIDE, Film, after_a_miss, cached
+from vap_core.training.demonstrations import SIDE, Film, after_a_miss, cached, every
 from vap_core.training.descent import Descent, Told, average_of, descend
 from vap_core.training.looking import Shown, Sizes, looking, shares
 from vap_core.training.scenes import only_generic
@@ -45,7 +45,7 @@ HELD_OUT = 19
 CLOSE_M = 0.005
 """Error of a place up to which it is squared."""
 AROUND = 4
-"""Steps from there that `focus` still calls close."""
+"""Pictures from there that `focus` still calls close."""
 SEEN, PLACED = 0.5, 1.0
 """Weights of the two questions beside the flow."""
 TEMPERATURE = 0.0
@@ -120,32 +120,33 @@ def statistics(films: Sequence[Film]) -> dict[str, dict[str, Tensor]]:
     return found
 
 
-def emphasis(film: Film, focus: float) -> Float[np.ndarray, " t"]:
-    """How often each frame is drawn: more often close to a change of the gripper's command, to the end, and to a miss, where a centimetre decides."""
+def emphasis(film: Film, focus: float, apart: int = 1) -> Float[np.ndarray, " f"]:
+    """How often each picture, one in `apart` steps, is drawn: more often close to a change of the gripper's command, to the end, and to a miss,
+    where a centimetre decides."""
     shut = film.action[:, -1] < 0.5
     turns = [*np.flatnonzero(shut[1:] != shut[:-1]) + 1, len(shut) - 1]
     if after_a_miss(film):
         turns.append(0)
-    away = np.abs(np.arange(len(shut))[:, None] - turns).min(axis=1)
-    return np.where(away <= AROUND, focus, 1.0)
+    away = np.abs(np.arange(0, len(shut), apart)[:, None] - turns).min(axis=1)
+    return np.where(away <= AROUND * apart, focus, 1.0)
 
 
 def collate(recipe: Recipe, films: Sequence[Film], stats: dict[str, dict[str, Tensor]], rng: np.random.Generator, config: MiniPI0Config) -> Batch:
     """One batch: frames drawn anew, each with a command of its own."""
-    number = {word: i for i, word in enumerate(config.words)}
-    chances = [emphasis(film, recipe.focus) for film in films]
+    number, apart = {word: i for i, word in enumerate(config.words)}, every(recipe.suite)
+    chances = [emphasis(film, recipe.focus, apart) for film in films]
     totals = np.array([chance.sum() for chance in chances])
     made, states, chunks, shown, places = [], [], [], [], []
     for i in rng.choice(len(films), recipe.batch, p=totals / totals.sum()):
         film = films[i]
-        t = int(rng.choice(len(chances[i]), p=chances[i] / totals[i]))
+        t = apart * int(rng.choice(len(chances[i]), p=chances[i] / totals[i]))
         made.append(command(film, t, recipe.suite, rng))
         rest = film.action[t : t + config.chunk_size]
         still = np.repeat(rest[-1:], config.chunk_size - len(rest), axis=0)
         still[:, :-1] = 0.0
         chunks.append(np.concatenate([rest, still]))
         states.append(film.state[t])
-        shown.append(shares(film.ids[t] == 1, config.patch))
+        shown.append(shares(film.ids[t // apart] == 1, config.patch))
         places.append(film.places[t, 0])
     tokens, there = encode([one.text for one in made], number, config.tokenizer_max_length)
     scaled = {
@@ -274,9 +275,12 @@ def go_on(start: Path, policy: MiniPI0Policy) -> None:
 
 
 def _card(checkpoint: Path) -> dict[str, Any]:
-    """How a checkpoint was made, as its training.json tells; the measurements left out."""
+    """How a checkpoint was made, as its training.json tells; the measurements left out. Raises: BadPolicy."""
     file = checkpoint / "training.json"
-    return {name: part for name, part in json.loads(file.read_text()).items() if name not in ("log", "held_out")} if file.is_file() else {}
+    try:
+        return {name: part for name, part in json.loads(file.read_text()).items() if name not in ("log", "held_out")} if file.is_file() else {}
+    except (ValueError, AttributeError) as error:
+        raise BadPolicy(f"train policy: {file} is damaged ({type(error).__name__}); restore it, or remove it and its card stays empty.") from error
 
 
 def save(learner: Learner, stats: Any, held: Sequence[Film], made_of: dict[str, Any], out: Path) -> dict[str, Any]:
