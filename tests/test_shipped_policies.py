@@ -42,6 +42,17 @@ def test_it_is_taken_when_nobody_names_another() -> None:
     assert usual(["simpler-bridge", "widowx-pick"]) == "scripted"
 
 
+def test_the_cost_of_a_call_is_told_for_every_policy_that_ships() -> None:
+    done = vap("bench", "policy", "--quick")
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert [line.split()[0] for line in lines[5:]] == [name for name in suites.BENCHMARKS if shipped(name) in FOLDERS]
+    for line in lines[5:]:
+        call, gain = float(line.split()[2]), float(line.split()[-3])
+        assert 0 < call < 1000
+        assert gain > 1, "a batch costs less than its episodes one by one"
+
+
 @pytest.mark.slow
 def test_a_tint_steers_it_to_objects_that_it_never_saw() -> None:
     """Not how well: that it goes for what is tinted. Twelve episodes; a guess among three moves the wrong one in half of those that it moves."""

@@ -104,8 +104,8 @@ def bench(
     what: Annotated[
         str,
         typer.Argument(
-            help="loop: the prompted control loop; suites: every benchmark's simulator; stack: a stack's models; eval: episodes per hour against "
-            "lerobot's own loop; engine: a Ray cluster on this machine against local processes."
+            help="loop: the prompted control loop; suites: every benchmark's simulator; stack: a stack's models; policy: the shipped policies; "
+            "eval: episodes per hour against lerobot's own loop; engine: a Ray cluster on this machine against local processes."
         ),
     ] = "loop",
     steps: Annotated[int, typer.Option(min=5, help="loop: control steps to time.")] = 60,
@@ -113,20 +113,21 @@ def bench(
     stack: StackName = "foundation",
     random_weights: Annotated[bool, typer.Option("--random-weights", help="stack: without weights; they change nothing about speed.")] = False,
     device: Annotated[str | None, typer.Option(help="stack: cpu or cuda; default VAP_DEVICE, or a GPU where there is one.")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="eval, engine: a few steps, to see that it runs; its numbers mean nothing.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="policy, eval, engine: a few steps, to see that it runs; its numbers mean nothing.")] = False,
 ) -> None:
-    """Time a control step by part, as shares and ratios within one run: of the prompted loop, every benchmark's simulator, or a stack's models.
+    """Time a control step by part, as shares and ratios within one run: of the prompted loop, every benchmark's simulator, the models.
 
     Example: python -m vap_core bench suites
     """
     from vap_core import bench as loop
-    from vap_core import bench_engine, bench_eval, bench_stack, bench_suites
+    from vap_core import bench_engine, bench_eval, bench_policy, bench_stack, bench_suites
     from vap_core.errors import one_of
 
     runs = {
         "loop": lambda: loop.run(steps),
         "suites": lambda: bench_suites.run(workers),
         "stack": lambda: bench_stack.run(stack, random=random_weights, device=device),
+        "policy": lambda: bench_policy.run(quick),
         "eval": lambda: bench_eval.run(workers, quick),
         "engine": lambda: bench_engine.run(workers, quick),
     }
