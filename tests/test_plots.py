@@ -59,7 +59,9 @@ def test_scores_and_film_draw() -> None:
 
 def test_learning_has_a_panel_per_figure_and_a_line_per_training_that_logged_it() -> None:
     logs = {"one": [{"step": 1, "flow": 2.0, "hit": 0.5}, {"step": 2, "flow": 1.0, "hit": 0.75}], "other": [{"step": 1, "flow": 3.0}]}
-    flow, hit = learning_figure(logs, {"flow": "Flow", "hit": "Hit"}).axes
+    figure = learning_figure(logs, {"flow": "Flow", "hit": "Hit"})
+    flow, hit = figure.axes
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "other"]
     assert [axes.get_title() for axes in (flow, hit)] == ["Flow", "Hit"]
     assert [list(line.get_ydata()) for line in flow.lines] == [[2.0, 1.0], [3.0]]
     assert [list(line.get_ydata()) for line in hit.lines] == [[0.5, 0.75]]

@@ -130,7 +130,8 @@ def sheet(rows: Mapping[str, Sequence[Tile]], side_in: float = 1.0, label_in: fl
     from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle
 
-    most, caption = max(map(len, rows.values())), 0.16 if any(tile.title for row in rows.values() for tile in row) else 0.0
+    most = max(map(len, rows.values()))
+    caption = max(0.05 + 0.11 * len(tile.title.splitlines()) if tile.title else 0.0 for row in rows.values() for tile in row)
     deep, gap, width = -(-len(rows) // columns), 0.06, label_in + (side := side_in) * most
     figure = Figure(figsize=(columns * width, deep * (side + caption + gap)))
     axes = figure.add_axes((0, 0, 1, 1))
@@ -224,17 +225,17 @@ def bounds_figure(scores: Sequence[Score]) -> "Figure":
 
 def learning_figure(logs: Mapping[str, Sequence[Mapping[str, int | float]]], panels: Mapping[str, str]) -> "Figure":
     """What trainings logged, over their steps: a panel per figure of the log (its name there, and its title), a line per training that has it."""
-    figure = _figure(3.1 * len(panels) + 0.4, 3.0)
+    figure, shown = _figure(3.1 * len(panels) + 0.4, 3.0 + 0.3 * (len(logs) > 1)), {}
     for axes, (name, title) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
         for i, (label, log) in enumerate(logs.items()):
             if log and name in log[0]:
-                axes.plot([line["step"] for line in log], [line[name] for line in log], color=f"C{i}", linewidth=1.4, label=label)
+                (shown[label],) = axes.plot([line["step"] for line in log], [line[name] for line in log], color=f"C{i}", linewidth=1.4)
         axes.set(title=title, xlabel="optimiser steps")
         axes.set_ylim(bottom=0)
         axes.grid(color="#eeeeee")
         axes.spines[["top", "right"]].set_visible(False)
-        if len(logs) > 1:
-            axes.legend(frameon=False, fontsize=8)
+    if len(logs) > 1:
+        figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=5, frameon=False)
     return figure
 
 
