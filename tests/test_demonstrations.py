@@ -268,14 +268,31 @@ def test_frames_close_to_a_turn_of_the_gripper_a_miss_or_the_end_come_more_often
     assert set(np.flatnonzero(after_a_miss != chances)) == {*range(5)}
 
 
-def small_policy(films: list[Film], batch: int) -> tuple[MiniPI0Policy, policy.Questions, policy.Batch]:
+def small_policy(films: list[Film], batch: int, depth: int = 2) -> tuple[MiniPI0Policy, policy.Questions, policy.Batch]:
     """An untrained policy of the smallest sizes, the questions beside it, and one batch of so many frames."""
-    recipe = policy.Recipe(SUITE, batch=batch, draws=2, width=32, depth=2, vision_width=32, vision_depth=1, expert_width=32)
+    recipe = policy.Recipe(SUITE, batch=batch, draws=2, width=32, depth=depth, vision_width=32, vision_depth=1, expert_width=32)
     config = policy.configuration(recipe, films[0].state.shape[1], films[0].action.shape[1])
     with torch.random.fork_rng():
         torch.manual_seed(0)
         model, asked = MiniPI0Policy(config), policy.Questions(recipe.width)
     return model, asked, policy.collate(recipe, films, policy.statistics(films), np.random.default_rng(0), config)
+
+
+@pytest.mark.parametrize(("depth", "asked_of"), [(1, []), (2, [0]), (4, [1, 2]), (6, [2, 3, 4])])
+def test_the_middle_of_the_decoder_is_asked_and_every_layer_after_it_but_the_last(
+    stage: tuple[Path, list[Film]], depth: int, asked_of: list[int]
+) -> None:
+    model, asked, batch = small_policy(stage[1], 4, depth)
+    layers = list(model.model.paligemma_with_expert.paligemma.model.language_model.layers)  # type: ignore[union-attr]
+    seen: list[torch.Tensor] = []
+    hooks = [layer.register_forward_hook(lambda _, args, out: seen.append(out)) for layer in layers]
+    with patch.object(asked, "forward", wraps=asked.forward) as question:
+        policy.losses(model, asked, batch, 1, torch.Generator().manual_seed(0))
+    for hook in hooks:
+        hook.remove()
+    patches = batch.patches.shape[1]
+    told = [call.args[0] for call in question.call_args_list]
+    assert [[torch.equal(one, state[:, :patches]) for state in seen].index(True) for one in told] == asked_of
 
 
 def test_attention_that_is_fused_gives_the_same_losses_and_gradients(stage: tuple[Path, list[Film]]) -> None:

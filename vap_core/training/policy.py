@@ -2,8 +2,9 @@
 
     python -m vap_core train policy --suite simpler-bridge --stages 400
 
-The penultimate decoder layer is asked, besides, which image patches show the object that is meant and where it stands: in pi0 the last layer
-gives its keys and values alone, so that this is where looking is learned. The answers' heads are not part of the policy.
+The middle of the decoder is asked, besides, which image patches show the object that is meant and where it stands, and so is every later layer but
+the last, which in pi0 gives its keys and values alone. What the middle knows, the action expert has half its layers left to act upon. The answers'
+heads are not part of the policy.
 """
 
 import json
@@ -159,7 +160,7 @@ def collate(recipe: Recipe, films: Sequence[Film], stats: dict[str, dict[str, Te
 
 
 def losses(policy: MiniPI0Policy, asked: Questions, batch: Batch, draws: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
-    """Flow matching, `draws` times over one look; and what the hidden states know about the object that is meant."""
+    """Flow matching, `draws` times over one look; and what hidden states know about the object that is meant, in the mean over layers."""
     from lerobot.policies.common.vla_utils import make_att_2d_masks, prepare_attention_masks_4d
 
     model, cameras = policy.model, list(policy.config.image_features)
@@ -168,24 +169,28 @@ def losses(policy: MiniPI0Policy, asked: Questions, batch: Batch, draws: int, ge
     seen: list[Tensor] = []
     decoder = model.paligemma_with_expert.paligemma.model.language_model
     decoder.config._attn_implementation = "eager"
-    hook = decoder.layers[-2].register_forward_hook(lambda module, args, out: seen.append(out[0] if isinstance(out, tuple) else out))
+    middle = decoder.layers[max(0, len(decoder.layers) // 2 - 1) : -1]
+    hooks = [layer.register_forward_hook(lambda module, args, out: seen.append(out[0] if isinstance(out, tuple) else out)) for layer in middle]
     try:
         _, cache = model.paligemma_with_expert.forward(
             attention_mask=prepare_attention_masks_4d(make_att_2d_masks(pad, attend)), position_ids=torch.cumsum(pad, dim=1) - 1,
             past_key_values=None, inputs_embeds=[prefix, None], use_cache=True,
         )  # fmt: skip
     finally:
-        hook.remove()
+        for hook in hooks:
+            hook.remove()
     flow = torch.zeros(())
     for _ in range(draws):
         noise = torch.randn(batch.actions.shape, generator=generator)
         at = _times(len(noise), policy.config, generator)
         noisy = at[:, None, None] * noise + (1 - at[:, None, None]) * batch.actions
         flow = flow + F.mse_loss(model.denoise_step(batch.state, pad, cache, noisy, at), noise - batch.actions) / draws
-    patches = batch.patches.shape[1]
-    chance, place = asked(seen[0][:, :patches])
-    heat, hit = looking(chance, batch.patches)
-    where = F.smooth_l1_loss(place * 0.1, batch.place, beta=CLOSE_M) / 0.02
+    patches, heat, where, hit = batch.patches.shape[1], torch.zeros(()), torch.zeros(()), torch.zeros(())
+    for hidden in seen:
+        chance, place = asked(hidden[:, :patches])
+        found = looking(chance, batch.patches)
+        heat, hit = heat + found[0] / len(seen), hit + found[1] / len(seen)
+        where = where + F.smooth_l1_loss(place * 0.1, batch.place, beta=CLOSE_M) / 0.02 / len(seen)
     told = {"flow": flow, "heat": heat, "where": where, "hit": hit}
     return flow + SEEN * heat + PLACED * where, {name: float(part.detach()) for name, part in told.items()}
 
@@ -300,6 +305,6 @@ def save(learner: Learner, stats: Any, held: Sequence[Film], made_of: dict[str, 
             losses(policy, learner.asked, collate(recipe, held, stats, np.random.default_rng([74, i]), policy.config), 4,
                    torch.Generator().manual_seed(i))[1] for i in range(8)
         ] if held else []  # fmt: skip
-    card = {**made_of, "written_by": code_version(), "held_out": average_of(told)}
+    card = {**made_of, "trained_steps": made_of["log"][-1]["step"], "written_by": code_version(), "held_out": average_of(told)}
     (out / "training.json").write_text(json.dumps(card, indent=1))
     return card
