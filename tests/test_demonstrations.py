@@ -181,7 +181,7 @@ def test_a_training_that_was_stopped_ends_like_one_that_was_not(
     one, other = (load_file(tmp_path / name / "model.safetensors") for name in ("whole", "torn"))
     assert one.keys() == other.keys()
     assert all(torch.equal(one[name], other[name]) for name in one)
-    assert set(whole["held_out"]) == {"flow", "heat", "where", "hit"}
+    assert set(whole["held_out"]) == {"flow", "heat", "where", "hit", "goal_where", "goal_hit"}
     assert whole["data_sha256"] == data_sha256([film for n in range(2) for film in cached(folder, SUITE, 0, n)])
     with pytest.raises(BadOutput, match="another recipe or other data"):
         policy.train(replace(recipe, rate=0.1), tmp_path / "torn", cache=folder)
@@ -268,6 +268,24 @@ def test_frames_close_to_a_turn_of_the_gripper_a_miss_or_the_end_come_more_often
     assert set(np.flatnonzero(after_a_miss != chances)) == {*range(5)}
 
 
+def test_waiting_is_not_taught_but_for_the_end(stage: tuple[Path, list[Film]]) -> None:
+    _, films = stage
+    rest = {part: np.repeat(getattr(films[0], part)[:1], 40, axis=0) for part in ("images", "ids", "state", "places")}
+    rest["state"][:, 0] += 0.01 * np.arange(40)
+    action = np.ones((40, films[0].action.shape[1]), np.float32)
+    action[20:24, :-1] = action[36:, :-1] = 0.0
+    still = {**rest, "state": rest["state"].copy()}
+    still["state"][20:25], still["state"][36:] = rest["state"][20], rest["state"][36]
+    assert list(np.flatnonzero(policy.waits(replace(films[0], action=action, **still)))) == [20, 21, 22, 23]
+    assert not policy.waits(replace(films[0], action=action, **rest)).any(), "something happens"
+    closing = action.copy()
+    closing[21:, -1] = 0.0
+    assert list(np.flatnonzero(policy.waits(replace(films[0], action=closing, **still)))) == [20, 22, 23], "it asks for something"
+    chances, shown = (policy.emphasis(replace(films[0], action=action, **part), 3.0) for part in (still, rest))
+    assert (chances[20:24] == 0).all()
+    assert (np.delete(chances, range(20, 24)) == np.delete(shown, range(20, 24))).all()
+
+
 def small_policy(films: list[Film], batch: int, depth: int = 2) -> tuple[MiniPI0Policy, policy.Questions, policy.Batch]:
     """An untrained policy of the smallest sizes, the questions beside it, and one batch of so many frames."""
     recipe = policy.Recipe(SUITE, batch=batch, draws=2, width=32, depth=depth, vision_width=32, vision_depth=1, expert_width=32)
@@ -278,7 +296,7 @@ def small_policy(films: list[Film], batch: int, depth: int = 2) -> tuple[MiniPI0
     return model, asked, policy.collate(recipe, films, policy.statistics(films), np.random.default_rng(0), config)
 
 
-@pytest.mark.parametrize(("depth", "asked_of"), [(1, []), (2, [0]), (4, [1, 2]), (6, [2, 3, 4])])
+@pytest.mark.parametrize(("depth", "asked_of"), [(1, [0]), (2, [0]), (4, [1, 2]), (6, [2, 3, 4])])
 def test_the_middle_of_the_decoder_is_asked_and_every_layer_after_it_but_the_last(
     stage: tuple[Path, list[Film]], depth: int, asked_of: list[int]
 ) -> None:
@@ -290,9 +308,29 @@ def test_the_middle_of_the_decoder_is_asked_and_every_layer_after_it_but_the_las
         policy.losses(model, asked, batch, 1, torch.Generator().manual_seed(0))
     for hook in hooks:
         hook.remove()
-    patches = batch.patches.shape[1]
+    patches = batch.patches.shape[2]
     told = [call.args[0] for call in question.call_args_list]
     assert [[torch.equal(one, state[:, :patches]) for state in seen].index(True) for one in told] == asked_of
+
+
+def test_the_goal_is_asked_for_where_there_is_one(stage: tuple[Path, list[Film]]) -> None:
+    _, films = stage
+    assert all(film.goal > 0 for film in films)
+    model, asked, batch = small_policy(films, 6)
+    assert not batch.place.isnan().any()
+    for film in films:  # every place is the target's, and the goal's, of one moment of one film
+        assert film.places.shape[1] > film.goal
+    spots = torch.cat([torch.from_numpy(film.places[:, [0, film.goal]]) for film in films])
+    assert all(any(torch.equal(one, spot) for spot in spots) for one in batch.place)
+    goalless = [replace(film, goal=-1) for film in films]
+    _, _, without = small_policy(goalless, 6)
+    assert without.place[:, 1].isnan().all()
+    assert not without.patches[:, 1].any()
+    _, with_goal = policy.losses(model, asked, batch, 1, torch.Generator().manual_seed(0))
+    loss, told = policy.losses(model, asked, without, 1, torch.Generator().manual_seed(0))
+    assert loss.isfinite()
+    assert np.isnan([told["goal_where"], told["goal_hit"]]).all()
+    assert np.isfinite(list(with_goal.values())).all()
 
 
 def test_attention_that_is_fused_gives_the_same_losses_and_gradients(stage: tuple[Path, list[Film]]) -> None:

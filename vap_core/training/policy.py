@@ -2,9 +2,9 @@
 
     python -m vap_core train policy --suite simpler-bridge --stages 400
 
-The middle of the decoder is asked, besides, which image patches show the object that is meant and where it stands, and so is every later layer but
-the last, which in pi0 gives its keys and values alone. What the middle knows, the action expert has half its layers left to act upon. The answers'
-heads are not part of the policy.
+The middle of the decoder is asked, besides, which image patches show the object that is meant and where it stands, and the same of what it goes to,
+if anything; and so is every later layer but the last, which in pi0 gives its keys and values alone. What the middle knows, the action expert has half
+its layers left to act upon. The answers' heads are not part of the policy.
 """
 
 import json
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
@@ -47,6 +47,8 @@ CLOSE_M = 0.005
 """Error of a place up to which it is squared."""
 AROUND = 4
 """Pictures from there that `focus` still calls close."""
+STILL = 2e-3
+"""Metres or radians: a step that asks for less and changes less is a wait."""
 SEEN, PLACED = 0.5, 1.0
 """Weights of the two questions beside the flow."""
 TEMPERATURE = 0.0
@@ -70,8 +72,8 @@ class Recipe(Sizes):
     focus: float = 3.0
 
 
-class Questions(Shown):
-    """Which patches show the object that is meant, and where it stands: asked of hidden states, in training only."""
+class Place(Shown):
+    """Which patches show an object, and where it stands: asked of hidden states, in training only."""
 
     def __init__(self, width: int) -> None:
         super().__init__(width)
@@ -83,9 +85,34 @@ class Questions(Shown):
         return chance, self.place(torch.einsum("bp,bpd->bd", chance.softmax(-1), x))
 
 
+class Questions(nn.Module):
+    """About the object that is meant, and about its goal."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.of = nn.ModuleList([Place(width), Place(width)])
+
+    def forward(
+        self, hidden: Float[Tensor, "b p d"], patches: Float[Tensor, "b 2 p"], place: Float[Tensor, "b 2 3"]
+    ) -> tuple[Float[Tensor, " 2"], Float[Tensor, " 2"], Float[Tensor, " 2"]]:
+        """What looking and placing cost, and the share of looks that hit, of both; `place` is nan where there is no goal, and nothing is asked."""
+        found = []
+        for i, ask in enumerate(self.of):
+            there = ~place[:, i, 0].isnan()
+            if not there.any():
+                found.append((torch.zeros(()), torch.zeros(()), torch.tensor(torch.nan)))
+                continue
+            chance, guess = ask(hidden[there])
+            heat, hit = looking(chance, patches[there, i])
+            found.append((heat, F.smooth_l1_loss(guess * 0.1, place[there, i], beta=CLOSE_M) / 0.02, hit))
+        heats, wheres, hits = (torch.stack(part) for part in zip(*found, strict=True))
+        return heats, wheres, hits
+
+
 @dataclass
 class Batch:
-    """Tensors of one step: pictures (b x c x 3 x s x s in 0..1), tokens, scaled state and chunk, share of the target in every patch, its place."""
+    """Tensors of one step: pictures (b x c x 3 x s x s in 0..1), tokens, scaled state and chunk; of target and goal, the share of either in every
+    patch (b x 2 x p) and its place (b x 2 x 3, metres, nan without a goal)."""
 
     images: Tensor
     tokens: Tensor
@@ -123,13 +150,21 @@ def statistics(films: Sequence[Film]) -> dict[str, dict[str, Tensor]]:
 
 def emphasis(film: Film, focus: float, apart: int = 1) -> Float[np.ndarray, " f"]:
     """How often each picture, one in `apart` steps, is drawn: more often close to a change of the gripper's command, to the end, and to a miss,
-    where a centimetre decides."""
+    where a centimetre decides; and never where the expert waits, as a policy without memory would wait for ever."""
     shut = film.action[:, -1] < 0.5
     turns = [*np.flatnonzero(shut[1:] != shut[:-1]) + 1, len(shut) - 1]
     if after_a_miss(film):
         turns.append(0)
     away = np.abs(np.arange(0, len(shut), apart)[:, None] - turns).min(axis=1)
-    return np.where(away <= AROUND * apart, focus, 1.0)
+    return np.where(waits(film)[::apart], 0.0, np.where(away <= AROUND * apart, focus, 1.0))
+
+
+def waits(film: Film) -> Bool[np.ndarray, " t"]:
+    """The steps in which nothing is asked for and nothing happens; those at the end, where there is nothing left to do, do not count."""
+    asked = np.abs(film.action[:, :-1]).max(axis=1) + np.abs(np.diff(film.action[:, -1], prepend=film.action[0, -1]))
+    happens = np.abs(np.diff(film.state, axis=0, append=film.state[-1:])).max(axis=1)
+    idle = (asked < STILL) & (happens < 2 * STILL)
+    return idle & np.logical_or.accumulate(~idle[::-1])[::-1]
 
 
 def collate(recipe: Recipe, films: Sequence[Film], stats: dict[str, dict[str, Tensor]], rng: np.random.Generator, config: MiniPI0Config) -> Batch:
@@ -147,15 +182,16 @@ def collate(recipe: Recipe, films: Sequence[Film], stats: dict[str, dict[str, Te
         still[:, :-1] = 0.0
         chunks.append(np.concatenate([rest, still]))
         states.append(film.state[t])
-        shown.append(shares(film.ids[t // apart] == 1, config.patch))
-        places.append(film.places[t, 0])
+        asked = (0, film.goal)
+        shown.append(np.stack([shares((film.ids[t // apart] == i + 1) & (i >= 0), config.patch) for i in asked]))
+        places.append([film.places[t, i] if i >= 0 else (np.nan,) * 3 for i in asked])
     tokens, there = encode([one.text for one in made], number, config.tokenizer_max_length)
     scaled = {
         name: (torch.from_numpy(np.stack(rows)) - stats[name]["mean"]) / stats[name]["std"]
         for name, rows in (("observation.state", states), ("action", chunks))
     }
     images = torch.from_numpy(np.stack([one.images for one in made])).permute(0, 1, 4, 2, 3).float() / 255
-    patches, place = torch.from_numpy(np.stack(shown)).float(), torch.from_numpy(np.stack(places)).float()
+    patches, place = torch.from_numpy(np.stack(shown)).float(), torch.from_numpy(np.array(places, np.float32))
     return Batch(images, tokens, there, scaled["observation.state"], scaled["action"], patches, place)
 
 
@@ -169,7 +205,7 @@ def losses(policy: MiniPI0Policy, asked: Questions, batch: Batch, draws: int, ge
     seen: list[Tensor] = []
     decoder = model.paligemma_with_expert.paligemma.model.language_model
     decoder.config._attn_implementation = "eager"
-    middle = decoder.layers[max(0, len(decoder.layers) // 2 - 1) : -1]
+    middle = decoder.layers[max(0, len(decoder.layers) // 2 - 1) : max(1, len(decoder.layers) - 1)]
     hooks = [layer.register_forward_hook(lambda module, args, out: seen.append(out[0] if isinstance(out, tuple) else out)) for layer in middle]
     try:
         _, cache = model.paligemma_with_expert.forward(
@@ -185,14 +221,11 @@ def losses(policy: MiniPI0Policy, asked: Questions, batch: Batch, draws: int, ge
         at = _times(len(noise), policy.config, generator)
         noisy = at[:, None, None] * noise + (1 - at[:, None, None]) * batch.actions
         flow = flow + F.mse_loss(model.denoise_step(batch.state, pad, cache, noisy, at), noise - batch.actions) / draws
-    patches, heat, where, hit = batch.patches.shape[1], torch.zeros(()), torch.zeros(()), torch.zeros(())
-    for hidden in seen:
-        chance, place = asked(hidden[:, :patches])
-        found = looking(chance, batch.patches)
-        heat, hit = heat + found[0] / len(seen), hit + found[1] / len(seen)
-        where = where + F.smooth_l1_loss(place * 0.1, batch.place, beta=CLOSE_M) / 0.02 / len(seen)
-    told = {"flow": flow, "heat": heat, "where": where, "hit": hit}
-    return flow + SEEN * heat + PLACED * where, {name: float(part.detach()) for name, part in told.items()}
+    found = [asked(hidden[:, : batch.patches.shape[2]], batch.patches, batch.place) for hidden in seen]
+    heats, wheres, hits = (torch.stack(part).mean(0) for part in zip(*found, strict=True))
+    told = {"flow": flow, "heat": heats[0], "where": wheres[0], "hit": hits[0], "goal_hit": hits[1]}
+    told["goal_where"] = wheres[1] + 0 * hits[1]  # nan where nothing has a goal
+    return flow + SEEN * heats.sum() + PLACED * wheres.sum(), {name: float(part.detach()) for name, part in told.items()}
 
 
 def _times(n: int, config: MiniPI0Config, generator: torch.Generator) -> Float[Tensor, " n"]:
