@@ -51,3 +51,15 @@ def test_only_finished_runs_and_each_once(tmp_path: Path) -> None:
         publish([whole, whole], tmp_path / "t.parquet")
     with pytest.raises(BadOutput, match="run.json is absent"):
         publish([tmp_path / "nothing"], tmp_path / "t.parquet")
+
+
+def test_a_published_table_and_a_new_run_become_one_table(tmp_path: Path) -> None:
+    old, both = tmp_path / "old.parquet", tmp_path / "both.parquet"
+    publish([run(tmp_path / "one", 0)], old)
+    at_once = publish([tmp_path / "one", run(tmp_path / "two", 1)], both)
+    assert publish([old, tmp_path / "two"], old, replace=True) == at_once == 4
+    one, other = pq.read_table(old), pq.read_table(both)
+    assert one.schema.metadata[b"runs"] == other.schema.metadata[b"runs"]
+    assert one.to_pylist() == other.to_pylist()
+    with pytest.raises(BadOutput, match="hold the same episodes"):
+        publish([old, tmp_path / "one"], both, replace=True)

@@ -1,7 +1,7 @@
 """Keep the results of finished runs as one small table, with their configurations."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,10 +28,18 @@ def published(table: Path) -> "list[tuple[dict[str, Any], pd.DataFrame]]":
         raise BadOutput(f"published: {table} is no table of finished runs ({type(error).__name__}); publish writes one.") from error
 
 
+def _runs(place: Path) -> "Iterator[tuple[Path, pd.DataFrame, dict[str, Any]]]":
+    if place.suffix != ".parquet":
+        yield place, read(place), note(place)
+        return
+    for about, table in published(place):
+        yield place, table, about
+
+
 def publish(folders: Sequence[Path], target: Path, *, replace: bool = False) -> int:
     """Write every episode of the runs, with each run's configuration in the file's metadata; returns the number of episodes.
 
-    Tracebacks, wall times and memory stay behind.
+    A folder may be a table that `publish` wrote, too: its runs are taken as they are. Tracebacks, wall times and memory stay behind.
     Raises: BadOutput for a folder that holds no run or an unfinished one, for two runs of the same episodes, or a target that is no new
     parquet file.
     """
@@ -43,8 +51,7 @@ def publish(folders: Sequence[Path], target: Path, *, replace: bool = False) -> 
     if target.exists() and not replace:
         raise BadOutput(f"publish: {target} exists; choose another name with --to, or pass --replace.")
     tables, notes = [], []
-    for folder in folders:
-        table, about = read(folder), note(folder)
+    for folder, table, about in (run for place in folders for run in _runs(place)):
         study = about["configuration"]
         wanted = len(study["methods"]) * sum(
             len(suites.listed(suite, task, study["episodes"], study["seed"], study["seeds"])) for suite, task in study["tasks"]

@@ -161,13 +161,14 @@ def report(
 
 @app.command()
 def publish(
-    runs: Annotated[list[Path], typer.Argument(help="Run folders of eval, rollout or demo.")],
+    runs: Annotated[list[Path], typer.Argument(help="Run folders of eval, rollout or demo, or tables that publish wrote.")],
     to: Annotated[Path, typer.Option(help="The table to write, for example data/results/mine.parquet.")],
     replace: Annotated[bool, typer.Option("--replace", help="Overwrite that table.")] = False,
 ) -> None:
     """Keep the results of finished runs as one small table, with their configurations.
 
     Example: python -m vap_core publish data/runs/expert-all data/runs/random-all --to data/results/bounds.parquet --replace
+    Example: python -m vap_core publish data/results/mine.parquet data/runs/more --to data/results/mine.parquet --replace
     """
     from vap_core.publish import publish as keep
 
