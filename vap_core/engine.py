@@ -12,7 +12,7 @@ from pathlib import Path
 from resource import RUSAGE_SELF, getrusage
 from typing import TYPE_CHECKING, Any, Literal
 
-from vap_core import audit, store, traces
+from vap_core import audit, failures, store, traces
 from vap_core.errors import BadOutput, WorkerDied
 from vap_core.experiments import Study, make_trial, register_personal
 from vap_core.frozen import frozen
@@ -136,7 +136,7 @@ def work(job: Job) -> Rows:
     bound = isinstance(trial.attender, Revealed) or isinstance(trial.policy, Insider)
     about: dict[str, Any] = {"attempt": job.attempt, "policy_sha256": checksum, "bound": bound}
     about["peak_mb"] = getrusage(RUSAGE_SELF).ru_maxrss // 1024
-    return [{"key": name, **about, **episode.summary()} for name, episode in zip(job.keys, episodes, strict=True)]
+    return [{"key": name, **about, **episode.summary(), **failures.columns(episode)} for name, episode in zip(job.keys, episodes, strict=True)]
 
 
 def _recording(folder: Path, opening: Opening) -> Path:

@@ -19,6 +19,7 @@ from vap_core.errors import BadAction, OutOfReach, VapError
 from vap_core.hard_prompt import Reworded
 from vap_core.oracle import Revealed
 from vap_core.policies import Insider, Policy
+from vap_core.shown import shown
 from vap_core.sim.env import Control, Env
 from vap_core.sim.occluder import Occlusion
 from vap_core.sim.scenes import Scene
@@ -97,7 +98,7 @@ def rollout(
             _plan(trial, live, seen)
             for one in live:
                 if one.outcome is None:
-                    _guard(one, _act, one, *seen[id(one)], keep_images)
+                    _guard(one, _act, one, *seen[id(one)], keep_images, _highlights(trial))
         for one in running:
             yield _end(trial, one)
 
@@ -235,15 +236,17 @@ def _ask(trial: Trial, asking: Sequence[Running], seen: Seen) -> tuple[list[Any]
     return after, chunks
 
 
-def _act(one: Running, raw: PolicyInput, attended: Attended, keep_images: bool) -> None:
+def _act(one: Running, raw: PolicyInput, attended: Attended, keep_images: bool, highlights: bool) -> None:
     """Execute one action, or none when the episode is over, and hand the frame on."""
     over = _over(one)
     action = np.zeros(one.env.action_size, np.float32) if over else one.queue.popleft()
-    truth, cameras = one.env.truth(masks=one.sink is not None), one.env.cameras()
+    judged = highlights and bool(attended.tracks)
+    truth, cameras = one.env.truth(masks=one.sink is not None or judged), one.env.cameras()
     if over:
         one.outcome = one.judge.outcome()
     events = (*attended.events, *one.judge.events)
-    frame = Frame(one.judge.steps, one.env.time_s, raw.images, attended.images, attended.tracks, cameras, raw.state, action, truth, events)
+    covered = shown(attended, truth, one.row.target, opening=not one.frames) if judged else ()
+    frame = Frame(one.judge.steps, one.env.time_s, raw.images, attended.images, attended.tracks, cameras, raw.state, action, truth, events, covered)
     with _timed(one.seconds, "record"):
         if one.sink is not None:
             one.sink.frame(frame)
@@ -251,6 +254,12 @@ def _act(one: Running, raw: PolicyInput, attended: Attended, keep_images: bool) 
     if not over:
         one.env.step(action)
         one.judge = one.judge.step(one.env.truth())
+
+
+def _highlights(trial: Trial) -> bool:
+    """Whether the method changes pixels, so that it can be asked which."""
+    attender = trial.attender.attender if isinstance(trial.attender, Revealed) else trial.attender
+    return isinstance(attender, Attender) and attender.prompting.highlight
 
 
 def _over(one: Running) -> bool:

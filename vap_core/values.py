@@ -312,8 +312,26 @@ class Opening:
 
 
 @value
+class Shown:
+    """What the prompt covered in one view at one control step, by the simulator: for diagnosis alone, no method reads it.
+
+    `object` is what the mask lies on: an object's name, "" for none in particular, None where nothing is highlighted. `iou` is the mask's with the
+    target's visible pixels, of which there are `pixels`. `proposal`, at t = 0, is the best box IoU of any candidate with the target; else nan.
+    """
+
+    camera: str
+    object: str | None
+    iou: float
+    pixels: int
+    proposal: float
+
+
+@value
 class Frame:
-    """One control step: what was seen, what the policy was shown, what it did. `action` was decided from `images`."""
+    """One control step: what was seen, what the policy was shown, what it did. `action` was decided from `images`.
+
+    `shown` has an entry per view at steps whose images were prompted.
+    """
 
     frame_index: int
     timestamp_s: float
@@ -325,6 +343,7 @@ class Frame:
     action: Action
     truth: Truth
     events: tuple[Event, ...]
+    shown: tuple[Shown, ...] = ()
 
     def light(self) -> "Frame":
         """The same step without its pictures, to keep in memory."""

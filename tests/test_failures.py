@@ -1,0 +1,246 @@
+"""The rules of the failure taxonomy on exact episodes: every sub-case just met and just missed, deciding frames, evidence, confidence."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.test_rules import GOAL, OTHER, SIZES, TARGET, WHERE, row, truth
+from vap_core import failures
+from vap_core.failures import CASES, LIMITS, NEIGHBOURS, Limits, diagnose, neighbours, stages
+from vap_core.shown import covered, shown
+from vap_core.suites.rules import rejudge
+from vap_core.values import REST, ROBOT, Attended, Boxes, Episode, Frame, Grounding, Opening, Outcome, Shown, Track, Truth
+
+THIRD = "cup-lookalike-2"
+NAN = float("nan")
+
+
+def view(what, iou=0.0, pixels=500, camera="front", proposal=NAN):
+    return Shown(camera, what, iou, pixels, proposal)
+
+
+RIGHT = view(TARGET, 0.9, proposal=0.9)
+AFAR, NEAR = (0.3, 0.0, 0.5), (0.3, 0.0, 0.08)
+"""Where the tcp is: half a metre over the target's foot, and 1 cm over its top."""
+
+
+def episode(rule, steps, goal="", candidates=1, outcome=None):
+    """`steps`: truth, what is shown, where the tcp is, the gripper's command."""
+    known = replace(row(rule, goal), suite="simpler-bridge")
+    frames = tuple(
+        Frame(i, i / 5, {}, {}, {}, (), np.array([*where, 0, 0, 0, 1], np.float32), np.array([0] * 6 + [grip], np.float32), now, (), tuple(seen))
+        for i, (now, seen, where, grip) in enumerate(steps)
+    )
+    boxes = Boxes(np.array([[0, 0, 5, 5]] * candidates, np.float32).reshape(-1, 4), np.ones(candidates, np.float32), "cup")
+    grounding = Grounding(
+        "front", TARGET, boxes, np.ones((candidates, 1), np.float32), np.zeros(candidates, np.int64), np.zeros(candidates, bool),
+        0 if candidates else None, 1.0, 1.0, np.zeros((candidates, 8, 8), bool),
+    )  # fmt: skip
+    opening = Opening(known, "vap", "p", 5.0, (), "", "", {"front": (grounding,)}, SIZES)
+    judged = rejudge(known, SIZES, [frame.truth for frame in frames])
+    return Episode(opening, frames, outcome or judged.outcome(), {})
+
+
+def still(n, seen=(RIGHT,), now=None, where=AFAR, grip=1.0):
+    return [(now or truth(), seen, where, grip)] * n
+
+
+def held(height):
+    return truth(up={TARGET: height}, contacts={TARGET: (ROBOT,)}, touched=(TARGET,))
+
+
+def told(rule, steps, limits=LIMITS, **more):
+    found = diagnose(episode(rule, steps, **more), limits)
+    assert found is not None
+    assert found.sub_case in CASES[found.case]
+    return found
+
+
+def label(found):
+    return found.case, found.sub_case, found.frame_index, found.camera
+
+
+@pytest.mark.parametrize(
+    ("opening", "candidates", "sub_case"),
+    [
+        (view(None, proposal=0.0), 0, "no proposal"),
+        (view(None, proposal=0.49), 1, "shifted proposal"),
+        (view(OTHER, proposal=0.49), 2, "shifted proposal"),
+        (view(OTHER, proposal=0.51), 2, "distractor vote"),
+        (view("", proposal=0.51), 1, "poor mask"),
+        (view(TARGET, 0.49, proposal=0.51), 1, "poor mask"),
+    ],
+)
+def test_case_1_at_the_opening(opening, candidates, sub_case):
+    found = told("picked", still(6, [opening]), candidates=candidates)
+    assert label(found) == ("case 1", sub_case, 0, "front")
+    assert found.evidence["wrong_share"] == 1.0
+    assert sub_case != "distractor vote" or OTHER in found.sentence
+
+
+def test_drift_opens_where_the_track_leaves():
+    found = told("picked", still(4) + still(5, [view(OTHER)]))
+    assert label(found) == ("case 1", "drift", 4, "front")
+    assert f"from step 4 on the track is on {OTHER}" in found.sentence
+
+
+def test_a_prompt_that_is_wrong_for_less_than_half_of_the_time_is_no_excuse():
+    assert told("picked", still(4) + still(3, [view(OTHER)]) + still(1)).case == "case 3"
+    assert told("picked", still(4) + still(4, [view(OTHER)])).case == "case 1"
+
+
+def test_a_late_drift_onto_what_is_then_touched_is_one():
+    steps = [*still(7), *still(1, [view(OTHER)]), *still(2, [view(OTHER)], truth(touched=(OTHER,)))]
+    assert label(told("picked", steps)) == ("case 1", "drift", 7, "front")
+    assert told("picked", [*still(7), *still(1, [view(None)]), *steps[8:]]).case == "case 3", "lost for a moment is not misled"
+    assert told("picked", [*still(7), *still(1, [view(THIRD)]), *steps[8:]]).case == "case 3", "nor is another than the one touched"
+
+
+def test_what_a_track_does_after_the_grasp_is_not_held_against_it():
+    steps = still(3) + still(3, now=held(0.03)) + still(20, [view(OTHER)])
+    assert label(told("picked", steps, candidates=2))[:2] == ("case 3", "slip")
+
+
+def test_a_view_that_hardly_shows_the_target_does_not_count():
+    assert told("picked", still(3) + still(6, [view(None, pixels=99)])).case == "case 3"
+    assert told("picked", still(3) + still(6, [view(None, pixels=100)])).case == "case 1"
+    assert told("picked", still(3) + still(6, [view(OTHER, pixels=0)])).case == "case 1", "but one that highlights another does"
+
+
+def test_views_that_contradict_each_other_are_case_2():
+    apart = [RIGHT, view(OTHER, camera="wrist", proposal=0.8)]
+    assert label(told("selected", still(6, apart))) == ("case 2", "views disagree", 0, "wrist")
+    both = [RIGHT, view(TARGET, 0.9, camera="wrist", proposal=0.8)]
+    found = told("selected", still(2, both) + still(6, apart))
+    assert label(found) == ("case 2", "views drift apart", 2, "wrist")
+    assert (found.evidence["shows_front"], found.evidence["shows_wrist"]) == (TARGET, OTHER)
+    same = [view(OTHER, proposal=0.8), view(OTHER, camera="wrist", proposal=0.8)]
+    assert told("selected", still(6, same), candidates=2).case == "case 1", "all wrong together"
+    nowhere = [view("", camera=camera, proposal=0.8) for camera in ("front", "wrist")]
+    assert told("selected", still(6, nowhere)).case == "case 2", "no object here and no object there are two things"
+    blank = [RIGHT, view(None, camera="wrist", proposal=0.8)]
+    assert told("selected", still(6, blank)).case == "case 3", "a view left as it is contradicts nothing"
+
+
+def on(where, height=0.0, by=(REST,)):
+    return truth(at={TARGET: where}, up={TARGET: height}, contacts={TARGET: by}, touched=(TARGET,) if ROBOT in by else ())
+
+
+took = truth(up={OTHER: 0.1}, contacts={OTHER: (ROBOT,)}, touched=(OTHER,))
+
+
+@pytest.mark.parametrize(
+    ("rule", "goal", "steps", "sub_case", "frame"),
+    [
+        ("picked", "", still(3) + still(3, now=held(0.02), grip=0.0) + still(3), "slip", 5),
+        ("picked", "", still(3) + still(3, now=held(0.02), grip=0.0) + still(3, grip=1.0), "slip", 5),
+        ("put", GOAL, still(3) + still(3, now=held(0.02), grip=0.0) + still(3, grip=1.0), "misplacement", 5),
+        ("put", GOAL, still(3) + still(3, now=held(0.02), grip=0.0) + still(3, grip=0.1), "slip", 5),
+        ("put", GOAL, still(3) + still(6, now=held(0.02), grip=0.0), "timeout", 8),
+        ("picked", "", still(3) + still(2, where=NEAR, grip=0.0) + still(9), "missed grasp", 3),
+        ("picked", "", still(3) + still(2, where=AFAR, grip=0.0) + still(9), "timeout", 0),
+        ("picked", "", still(3) + still(2, now=truth(touched=(TARGET,)), where=NEAR) + still(9), "missed grasp", 3),
+        ("picked", "", still(3) + still(2, where=NEAR) + still(9), "timeout", 3),
+        ("picked", "", still(3) + still(2, now=truth(touched=(OTHER,))), "wrong object", 3),
+        ("picked", "", still(3) + still(2, now=truth(touched=(OTHER,))) + still(2, where=NEAR), "timeout", 5),
+        ("picked", "", still(3) + still(2, now=truth(at={OTHER: (0.3, 0.54)}, touched=(OTHER,))) + still(2, where=NEAR), "collision", 3),
+        ("picked", "", still(3) + still(2, now=truth(at={OTHER: (0.3, 0.54)})) + still(3, now=truth(touched=(TARGET,))), "collision", 3),
+        ("picked", "", still(3) + still(2, now=truth(at={OTHER: (0.3, 0.52)})) + still(3, now=truth(touched=(TARGET,))), "missed grasp", 5),
+        ("selected", "", still(3) + still(2, now=truth(touched=(OTHER,))), "wrong object", 3),
+        ("selected", "", still(3) + still(2, now=truth(touched=(OTHER,))) + still(2, now=truth(touched=(TARGET,))), "collision", 3),
+        ("selected", "", still(3) + still(9, where=NEAR), "timeout", 3),
+        ("picked", "", [*still(3), *still(5, now=took), *still(1, where=NEAR)], "wrong object", 3),
+        ("picked", "", [*still(3), *still(4, now=took), *still(1, where=NEAR)], "collision", 3),
+        ("picked", "", [*still(3, grip=0.0), *still(5, now=took), *still(1, where=NEAR)], "collision", 3),
+    ],
+)  # fmt: skip
+def test_case_3(rule, goal, steps, sub_case, frame):
+    found = told(rule, steps, goal=goal)
+    assert label(found) == ("case 3", sub_case, frame, "")
+    assert told(rule, [(now, (), *rest) for now, _, *rest in steps], goal=goal).case == "unprompted"
+
+
+def test_touching_the_goal_is_no_mistake():
+    assert told("put", still(3) + still(3, now=truth(touched=(GOAL,))), goal=GOAL).sub_case == "timeout"
+
+
+def test_only_failures_are_diagnosed():
+    lifted = episode("picked", still(3) + still(6, now=held(0.06)))
+    assert lifted.outcome.success
+    assert diagnose(lifted) is None
+    assert failures.columns(lifted)["case"] == ""
+    broken = episode("picked", still(2), outcome=Outcome("error", False, False, 0, False, False, False, 2, "boom"))
+    assert diagnose(broken) is None
+    assert all(cell is None for cell in stages(broken).values())
+
+
+def test_confidence_is_the_share_of_neighbouring_limits_that_agree():
+    sure = told("picked", still(9, [view(OTHER, proposal=0.9)]), candidates=2)
+    assert sure.confidence == 1.0
+    torn = told("picked", still(9, [view(TARGET, 0.6, proposal=0.9)]) + still(1))
+    assert torn.case == "case 3"
+    assert torn.confidence == pytest.approx(15 / 16), "an IoU of 0.6 is poor where 0.65 is asked"
+
+
+def test_every_limit_has_its_neighbours_and_nothing_else():
+    assert set(NEIGHBOURS) == set(Limits.__dataclass_fields__)
+    assert all(low < getattr(LIMITS, name) < high for name, (low, high) in NEIGHBOURS.items())
+    assert len({repr(near) for near in neighbours(LIMITS)}) == 2 * len(NEIGHBOURS)
+
+
+def test_a_row_of_the_table_can_be_read_back():
+    cells = failures.columns(episode("picked", still(9, [view(OTHER, proposal=0.9)]), candidates=2))
+    assert (cells["case"], cells["sub_case"], cells["deciding_frame"], cells["deciding_camera"]) == ("case 1", "distractor vote", 0, "front")
+    assert json.loads(cells["case_evidence"])["shows_front"] == OTHER
+    assert set(failures.NONE) == {name for name in cells if name in failures.NONE}
+
+
+def test_the_road_of_an_episode():
+    way = stages(episode("picked", still(3) + still(3, now=held(0.02)) + still(3)))
+    assert [way[f"stage_{name}"] for name in failures.STAGES] == [True, True, True, True, True, True, False]
+    way = stages(episode("picked", still(3, [view(OTHER, proposal=0.3)]), candidates=2))
+    assert [way[f"stage_{name}"] for name in failures.STAGES] == [False, False, False, False, False, False, False]
+    way = stages(episode("picked", still(3, [])))
+    assert [way[f"stage_{name}"] for name in failures.STAGES[:5]] == [None, None, None, None, False]
+
+
+SQUARE = np.zeros((20, 20), bool)
+SQUARE[2:6, 2:6] = True
+BESIDE = np.roll(SQUARE, 8, axis=1)
+
+
+def attended(mask, xyxy):
+    boxes = Boxes(np.array(xyxy, np.float32).reshape(-1, 4), np.ones(len(xyxy), np.float32), "cup")
+    n = len(boxes)
+    votes, tied, masks = np.zeros(n, np.int64), np.zeros(n, bool), np.zeros((n, 20, 20), bool)
+    grounding = Grounding("front", TARGET, boxes, np.ones((n, 1), np.float32), votes, tied, 0 if n else None, 1.0, 1.0, masks)
+    return Attended({}, "", (), {"front": (Track(mask, 1.0),)}, {"front": (grounding,)}, ())
+
+
+def seen_by(masks):
+    return Truth({name: np.array([*WHERE[name], 0.0, 1.0, 0, 0, 0]) for name in WHERE}, {}, (), {}, {}, {"front": masks})
+
+
+@pytest.mark.parametrize(
+    ("mask", "what", "iou"),
+    [(SQUARE, TARGET, 1.0), (BESIDE, OTHER, 0.0), (np.roll(SQUARE, 4, axis=0), "", 0.0), (None, None, 0.0), (SQUARE & False, None, 0.0)],
+)
+def test_what_a_mask_covers(mask, what, iou):
+    (found,) = shown(attended(mask, [[2, 2, 6, 6]]), seen_by({TARGET: SQUARE, OTHER: BESIDE}), TARGET, opening=False)
+    assert (found.camera, found.object, found.iou, found.pixels) == ("front", what, iou, 16)
+    assert np.isnan(found.proposal)
+
+
+@pytest.mark.parametrize(("xyxy", "best"), [([[2, 2, 6, 6]], 1.0), ([[10, 2, 14, 6], [2, 2, 6, 4]], 0.5), ([[10, 2, 14, 6]], 0.0), ([], 0.0)])
+def test_the_best_proposal_counts_at_the_opening(xyxy, best):
+    (found,) = shown(attended(SQUARE, xyxy), seen_by({TARGET: SQUARE, OTHER: BESIDE}), TARGET, opening=True)
+    assert found.proposal == pytest.approx(best)
+
+
+def test_a_mask_belongs_to_what_most_of_it_covers():
+    half = SQUARE | np.roll(SQUARE, 4, axis=0)
+    assert covered(half, {TARGET: SQUARE, OTHER: BESIDE}) == TARGET
+    assert covered(half | np.roll(SQUARE, 8, axis=0), {TARGET: SQUARE, OTHER: BESIDE}) == ""
+    assert covered(SQUARE, {}) == ""
