@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.test_rules import GOAL, OTHER, SIZES, TARGET, WHERE, row, truth
-from vap_core import failures
+from vap_core import events, failures
 from vap_core.failures import CASES, LIMITS, NEIGHBOURS, Limits, diagnose, neighbours, stages
 from vap_core.shown import covered, shown
 from vap_core.suites.rules import rejudge
@@ -204,6 +204,28 @@ def test_the_road_of_an_episode():
     assert [way[f"stage_{name}"] for name in failures.STAGES] == [False, False, False, False, False, False, False]
     way = stages(episode("picked", still(3, [])))
     assert [way[f"stage_{name}"] for name in failures.STAGES[:5]] == [None, None, None, None, False]
+
+
+@pytest.mark.parametrize(
+    ("candidates", "margin", "events", "sub_case", "frame"),
+    [
+        (0, 0.0, (), "nothing found", 0),
+        (1, 0.2, (), "narrow vote", 0),
+        (1, 1.0, events.changed(4, frozenset({("front", 0)}), frozenset()), "lost track", 4),
+        (1, 1.0, (), "no signal", 5),
+    ],
+)
+def test_without_truth_a_failure_stays_unlabelled(candidates, margin, events, sub_case, frame):
+    made = episode("picked", still(6), candidates=candidates)
+    nowhere = Truth({}, {}, (), {}, {})
+    frames = tuple(replace(each, truth=nowhere, shown=(), events=events if i == 4 else ()) for i, each in enumerate(made.frames))
+    grounding = replace(made.opening.groundings["front"][0], margin=margin)
+    made = replace(made, frames=frames, opening=replace(made.opening, groundings={"front": (grounding,)}))
+    found = diagnose(made)
+    assert found is not None
+    assert (found.case, found.sub_case, found.frame_index, found.confidence) == ("unlabelled", sub_case, frame, 0.0)
+    assert found.evidence["margin"] == margin
+    assert stages(made)["stage_touched"] is None
 
 
 SQUARE = np.zeros((20, 20), bool)

@@ -290,8 +290,9 @@ def test_a_method_that_grounds_nothing_records_too(tmp_path: Path) -> None:
     start = replace(opening(1), method="generic", groundings={}, rewritten=ROW.instruction)
     with Recorder(tmp_path / "one.rrd", start) as recorder:
         recorder.frame(replace(frame(0, opening(1)), tracks={}))
-        recorder.close(replace(SUCCESS, status="failure", success=False, steps=1), failure_case="Case 3")
-    assert read_summary(tmp_path / "one.rrd")["outcome.failure_case"] == "Case 3"
+        recorder.close(replace(SUCCESS, status="failure", success=False, steps=1))
+    summary = read_summary(tmp_path / "one.rrd")
+    assert (summary["outcome.failure_case"], summary["outcome.sub_case"], summary["outcome.deciding_frame"]) == ("unprompted", "timeout", 0)
     assert "/vap/vote_margin/front" not in entities(tmp_path / "one.rrd")
 
 

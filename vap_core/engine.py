@@ -24,17 +24,19 @@ from vap_core.values import EpisodeRow, Opening
 if TYPE_CHECKING:
     import pandas as pd
 
-    from vap_core.record import Recorder
+    from vap_core.record import Recorder, Waiting
 
 BATCH = 5
 """Episodes of one job; small enough that a killed run loses little, large enough to share one policy call."""
-Record = Literal["all", "failures", "none"]
+Record = Literal["all", "failures", "none"] | int
+"""Which episodes are recorded: every one; every failure, and one success in ten to compare with; none; or so many per task and method, spread
+evenly."""
 Rows = list[dict[str, Any]]
 
 
 @dataclass(frozen=True)
 class Job:
-    """Some rows of one task and variant under one method, for one worker; `attempt` 1 is the first."""
+    """Some rows of one task and variant under one method, for one worker; `attempt` 1 is the first. `chosen` are the keys to record of a number."""
 
     study: Study
     method: str
@@ -43,6 +45,7 @@ class Job:
     attempt: int
     folder: Path
     record: Record
+    chosen: frozenset[str] = frozenset()
 
 
 Spread = Callable[[Callable[[Job], Rows], Sequence[Job], int, str], Iterator[tuple[Job, Rows]]]
@@ -102,15 +105,21 @@ def missing(study: Study, folder: Path, record: Record = "none", retries: int = 
     for method in reversed(study.methods):  # the slower, prompted method first, so that workers finish together
         for suite, task in study.tasks:
             groups: dict[tuple[str, int], list[tuple[EpisodeRow, str]]] = {}
-            for row in study.rows(suite, task):
-                name = key(row, method, run)
+            listed = [(row, key(row, method, run)) for row in study.rows(suite, task)]
+            chosen = frozenset(name for _, name in spread_evenly(listed, record)) if isinstance(record, int) else frozenset()
+            for row, name in listed:
                 tried, outcome = held.get(name, (0, "error"))
                 if outcome == "error" and (tried == 0 or tried <= retries):
                     groups.setdefault((row.variant, tried + 1), []).append((row, name))
             for (_, attempt), group in groups.items():
                 for first in range(0, len(group), BATCH):
                     rows, keys = zip(*group[first : first + BATCH], strict=True)
-                    yield Job(study, method, rows, keys, attempt, folder, record if attempt == 1 or record == "all" else "failures")
+                    yield Job(study, method, rows, keys, attempt, folder, record if attempt == 1 or record == "all" else "failures", chosen)
+
+
+def spread_evenly[T](items: Sequence[T], n: int) -> list[T]:
+    """`n` of them, or all if there are fewer, at equal distances."""
+    return [items[i * len(items) // n] for i in range(n)] if n < len(items) else list(items)
 
 
 def key(row: EpisodeRow, method: str, run: str) -> str:
@@ -124,13 +133,9 @@ def work(job: Job) -> Rows:
     from vap_core.rollout import rollout
 
     trial = make_trial(job.study, job.rows, job.method, job.folder / "memory")
-    sink = None if job.record == "none" else _recorders(job.folder / "recordings")
+    sink = None if job.record == "none" or (isinstance(job.record, int) and not job.chosen & set(job.keys)) else _recorders(job)
     with frozen(trial.policy) as checksum:
         episodes = list(rollout(trial, job.rows, sink, batch=BATCH))
-    if job.record == "failures":
-        for episode in episodes:
-            if episode.outcome.status == "success":
-                _recording(job.folder / "recordings", episode.opening).unlink(missing_ok=True)
     traces.write(job.folder, episodes)
     audit.write(job.folder, episodes)
     bound = isinstance(trial.attender, Revealed) or isinstance(trial.policy, Insider)
@@ -139,23 +144,23 @@ def work(job: Job) -> Rows:
     return [{"key": name, **about, **episode.summary(), **failures.columns(episode)} for name, episode in zip(job.keys, episodes, strict=True)]
 
 
-def _recording(folder: Path, opening: Opening) -> Path:
-    from vap_core.record import recording_name
+def _recorders(job: Job) -> Callable[[Opening], "Recorder | Waiting"]:
+    from vap_core.record import Recorder, Waiting, recording_name, wanted
 
-    return folder / recording_name(opening.row, opening.method)
-
-
-def _recorders(folder: Path) -> Callable[[Opening], "Recorder"]:
-    from vap_core.record import Recorder
-
+    folder, keys = job.folder / "recordings", dict(zip(((row.key, row.seed) for row in job.rows), job.keys, strict=True))
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BadOutput(f"engine: {folder} cannot be written ({error.strerror}); make room and run the same command again.") from error
 
-    def begin(opening: Opening) -> "Recorder":
-        path = _recording(folder, opening)
+    def begin(opening: Opening) -> "Recorder | Waiting":
+        row = opening.row
+        path = folder / recording_name(row, job.method)
         path.unlink(missing_ok=True)  # left by a run that was killed after recording and before its result was stored
-        return Recorder(path, opening)
+        if job.record == "all":
+            return Recorder(path, opening)
+        if job.record == "failures":
+            return Waiting(path, opening, lambda outcome: wanted(outcome, row, job.method))
+        return Waiting(path, opening, lambda outcome: keys[row.key, row.seed] in job.chosen)
 
     return begin

@@ -8,6 +8,7 @@ Case 2, views are prompted with different instances: *views disagree* (at t = 0)
 Case 3, the prompts are right and the hand fails: *wrong object* (it takes another all the same, or touches it and never comes near the target),
 *collision* (it knocks another on its way), *missed grasp*, *slip*, *misplacement* (let go in the wrong place), *timeout*.
 Methods that highlight nothing have no prompt to be wrong: their failures are *unprompted*, with the sub-cases of Case 3.
+A real robot's episode has no truth: it stays *unlabelled*, with the signals that the method itself gives (`_unlabelled`).
 
 Every threshold is a field of `Limits`. The confidence of a diagnosis is the share of neighbouring limits (NEIGHBOURS) under which it stays the same.
 """
@@ -26,12 +27,13 @@ from vap_core.suites import suite
 from vap_core.suites.rules import HELD_STEPS, LIFT_M, MOVED_M, Judge
 from vap_core.values import Episode, Frame, Pose, Shown, value
 
-type Case = Literal["case 1", "case 2", "case 3", "unprompted"]
+type Case = Literal["case 1", "case 2", "case 3", "unprompted", "unlabelled"]
 CASES: dict[Case, tuple[str, ...]] = {
     "case 1": ("no proposal", "shifted proposal", "distractor vote", "poor mask", "drift"),
     "case 2": ("views disagree", "views drift apart"),
     "case 3": ("wrong object", "collision", "missed grasp", "slip", "misplacement", "timeout"),
     "unprompted": ("wrong object", "collision", "missed grasp", "slip", "misplacement", "timeout"),
+    "unlabelled": ("nothing found", "lost track", "narrow vote", "no signal"),
 }
 """Every sub-case of every case, in the order of the way from the picture to the hand."""
 
@@ -102,6 +104,8 @@ def diagnose(episode: Episode, limits: Limits = LIMITS) -> Diagnosis | None:
     """The one case of a failed episode; None for a success, and for an error, whose traceback says why."""
     if episode.outcome.status != "failure" or not episode.frames:
         return None
+    if not episode.frames[0].truth.objects_world:
+        return _unlabelled(episode)
     course = follow(episode)
     found = _classify(course, limits)
     same = [(other.case, other.sub_case) == (found.case, found.sub_case) for other in (_classify(course, near) for near in neighbours(limits))]
@@ -119,6 +123,34 @@ def columns(episode: Episode) -> dict[str, Any]:
     """What a results table keeps of an episode beside its outcome: its diagnosis, and how far it came (`stages`)."""
     found = diagnose(episode)
     return {**(NONE if found is None else found.columns()), **stages(episode)}
+
+
+NARROW = 0.25
+"""A vote won by less of the references than this could as well have gone to another."""
+
+
+def _unlabelled(episode: Episode) -> Diagnosis:
+    """What can be said without truth: the narrowest vote, tracks that were lost, and how differently the views liked what they chose."""
+    groundings = [per_target[0] for per_target in episode.opening.groundings.values() if per_target]
+    found = [g for g in groundings if g.winner is not None]
+    lost = [event.frame_index for frame in episode.frames for event in frame.events if "not visible, the view passes unmodified" in event.text]
+    likings = [float(g.similarity[g.winner].mean()) for g in found]
+    narrowest = min(found, key=lambda g: g.margin, default=None)
+    margin = 0.0 if narrowest is None else narrowest.margin
+    evidence: dict[str, float | str] = {
+        "margin": margin, "lost": float(len(lost)), "disagreement": max(likings) - min(likings) if likings else 0.0,
+        "views_without": float(len(groundings) - len(found)),
+    }  # fmt: skip
+    at, camera = 0, "" if narrowest is None else narrowest.camera
+    if not found:
+        sub_case, words = "nothing found", "no view has a candidate"
+    elif margin < NARROW:
+        sub_case, words = "narrow vote", f"{camera}: the vote was won by {margin:.2f} of the references only"
+    elif lost:
+        sub_case, at, words = "lost track", lost[0], f"the target was lost {len(lost)} times, first at step {lost[0]}"
+    else:
+        sub_case, at, words = "no signal", episode.frames[-1].frame_index, "votes and tracks give no sign of what went wrong"
+    return Diagnosis("unlabelled", sub_case, at, camera if at == 0 else "", evidence, 0.0, words)
 
 
 @value
@@ -354,7 +386,7 @@ def stages(episode: Episode, limits: Limits = LIMITS) -> dict[str, Any]:
     then, by the hand: the target touched; carried or selected; success.
     """
     told: dict[str, Any] = {f"stage_{name}": None for name in STAGES} | {"mask_iou": None, "track_right": None}
-    if not episode.frames or episode.outcome.status == "error":
+    if not episode.frames or episode.outcome.status == "error" or not episode.frames[0].truth.objects_world:
         return told
     course = follow(episode)
     first = [view for view in course.shown[0] if view.pixels >= limits.pixels]

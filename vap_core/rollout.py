@@ -25,7 +25,7 @@ from vap_core.sim.occluder import Occlusion
 from vap_core.sim.scenes import Scene
 from vap_core.sim.sensor import PERFECT, Sensor
 from vap_core.suites import Judge
-from vap_core.values import Attended, Call, Chunk, Episode, EpisodeRow, Frame, Opening, Outcome, PolicyInput
+from vap_core.values import Attended, Call, Chunk, Episode, EpisodeRow, Frame, Opening, Outcome, PersonalObject, PolicyInput
 
 
 @runtime_checkable
@@ -194,7 +194,7 @@ def _open(trial: Trial, one: Running, attended: Attended) -> Opening:
     sizes = {place.model: trial.sizes_m[place.model] for place in row.placements}
     return Opening(
         row, trial.method, trial.policy.label, env.hz, env.cameras(), row.instruction, attended.text, attended.groundings, sizes, env.action_names,
-        attended.associations,
+        attended.associations, {name: obj.crops for name, obj in _memory(trial).items()},
     )  # fmt: skip
 
 
@@ -241,7 +241,7 @@ def _act(one: Running, raw: PolicyInput, attended: Attended, keep_images: bool, 
     over = _over(one)
     action = np.zeros(one.env.action_size, np.float32) if over else one.queue.popleft()
     judged = highlights and bool(attended.tracks)
-    truth, cameras = one.env.truth(masks=one.sink is not None or judged), one.env.cameras()
+    truth, cameras = one.env.truth(masks=bool(raw.images) and (one.sink is not None or judged)), one.env.cameras()
     if over:
         one.outcome = one.judge.outcome()
     events = (*attended.events, *one.judge.events)
@@ -256,10 +256,21 @@ def _act(one: Running, raw: PolicyInput, attended: Attended, keep_images: bool, 
         one.judge = one.judge.step(one.env.truth())
 
 
+def _attender(trial: Trial) -> Attender | None:
+    """The one who grounds and prompts, be it told by the simulator."""
+    attender = trial.attender.attender if isinstance(trial.attender, Revealed) else trial.attender
+    return attender if isinstance(attender, Attender) else None
+
+
+def _memory(trial: Trial) -> Mapping[str, PersonalObject]:
+    attender = _attender(trial)
+    return {} if attender is None else attender.memory
+
+
 def _highlights(trial: Trial) -> bool:
     """Whether the method changes pixels, so that it can be asked which."""
-    attender = trial.attender.attender if isinstance(trial.attender, Revealed) else trial.attender
-    return isinstance(attender, Attender) and attender.prompting.highlight
+    attender = _attender(trial)
+    return attender is not None and attender.prompting.highlight
 
 
 def _over(one: Running) -> bool:

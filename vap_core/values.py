@@ -309,6 +309,8 @@ class Opening:
     action_names: tuple[str, ...] = EE_ACTION
     associations: tuple[Association | None, ...] = ()
     """Those of `Attended`."""
+    references: Mapping[str, tuple[Rgb, ...]] = field(default_factory=dict)
+    """The remembered crops of every object that could be meant, by name."""
 
 
 @value

@@ -28,7 +28,13 @@ POLICIES = "scripted; mini-pi0; a lerobot checkpoint, as folder or hub id; the b
 PolicyName = Annotated[str, typer.Option("--policy", help=POLICIES)]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the policy and the sensors; of a warm-up suite's episode list, too.")]
 Recorded = Annotated[
-    Literal["all", "failures", "none"], typer.Option("--record", help="Which episodes become a .rrd file; an error that is tried again does.")
+    str,
+    typer.Option(
+        "--record",
+        metavar="all|failures|none|N",
+        help="Which episodes become a .rrd file (1 to 4 MB each): all; failures and one success in ten; none; or N per task and method. "
+        "An error that is tried again does.",
+    ),
 ]
 Retries = Annotated[int, typer.Option(min=0, help="How often an episode that ended in an error is tried again.")]
 Meshes = Annotated[str, typer.Option("--robots", help="plain, or menagerie: MuJoCo Menagerie's meshes, downloaded or found in MENAGERIE_ROOT.")]
@@ -98,7 +104,7 @@ def evaluate(
     workers: Annotated[int | None, typer.Option(min=1, help="Jobs at once. Default 2 processes; on a cluster, its CPUs.")] = None,
     engine: Annotated[Literal["local", "ray"], typer.Option(help="local: processes of this machine; ray: a Ray cluster.")] = "local",
     address: Annotated[str | None, typer.Option(help="ray: host:port of the cluster. Default 127.0.0.1:6379.")] = None,
-    record: Recorded = "none",
+    record: Recorded = "failures",
     retries: Retries = 1,
     follow: Annotated[
         Literal["call", "step"], typer.Option(help="Take images and track when the policy is asked, or at every control step (smoother recordings).")
@@ -129,6 +135,43 @@ def evaluate(
         raise BadStudy("eval: --address needs --engine ray.")
     folder = out or Path(f"data/runs/{Path(policy).name}-{'-'.join(dict.fromkeys(suite))}")
     _run(study, folder, workers, record, retries, (address or "127.0.0.1:6379") if engine == "ray" else None)
+
+
+@app.command()
+def diagnose(
+    run: Annotated[Path, typer.Argument(help="Run folder of eval, rollout or demo, or a table that publish wrote.")],
+    suite: Annotated[str | None, typer.Option(help="Only failures of this suite.")] = None,
+    task: Annotated[str | None, typer.Option(help="Only failures of this task.")] = None,
+    method: Annotated[str | None, typer.Option("--method", help="Only failures of this method.")] = None,
+    case: Annotated[str | None, typer.Option(help="1 wrong mask, 2 views disagree, 3 right prompt but failed hand; unprompted; unlabelled.")] = None,
+    sub_case: Annotated[str | None, typer.Option(help='Only this sub-case, for example "distractor vote" or "slip".')] = None,
+    where: Annotated[str | None, typer.Option(help='SQL condition on the columns of the table: "margin < 0.3 and steps > 20".')] = None,
+    limit: Annotated[int, typer.Option(min=1, help="Failures to list.")] = 20,
+    show: Annotated[int | None, typer.Option("--open", min=0, help="Open this one of the list in the Rerun viewer, at its deciding frame.")] = None,
+    png: Annotated[Path | None, typer.Option(help="With --open: save a picture of it instead, without a display.")] = None,
+) -> None:
+    """Say why episodes failed, list them, and open one at the frame that decided it; one that was not recorded is run again.
+
+    Example: python -m vap_core diagnose data/results/mini_pi0.parquet --method vap
+    Example: python -m vap_core diagnose data/results/mini_pi0.parquet --method vap --suite vlabench --case 2 --open 0
+    Example: python -m vap_core diagnose data/runs/demo --where "margin < 0.3" --open 0 --png why.png
+    """
+    from vap_core import diagnosis
+
+    failures = diagnosis.listed(run, suite=suite, task=task, method=method, case=case, sub_case=sub_case, where=where)
+    if show is None and png is None:
+        print(diagnosis.text(failures, limit))
+        return
+    from vap_core.record import open_viewer, screenshot
+
+    number = show or 0
+    path, frame = diagnosis.recording(failures, number), diagnosis.deciding_frame(failures, number)
+    print(f"{path}, frame {frame}: {failures.table['case_sentence'].iloc[number]}")
+    if png is None:
+        open_viewer(path, frame_index=frame)
+    else:
+        screenshot(path, png, frame_index=frame, size=(1920, 1080))
+        print(f"wrote {png}")
 
 
 @app.command()
@@ -183,13 +226,25 @@ def _study(tasks: tuple[tuple[str, str], ...], methods: list[str] | None, *, pol
     return Study(tasks, tuple(dict.fromkeys(asked)) or usual, policy=policy, **options)
 
 
-def _run(study: "Study", out: Path, workers: int | None, record: "Record", retries: int, address: str | None = None) -> None:
+def _record(said: str) -> "Record":
+    from vap_core.errors import BadStudy
+
+    match said:
+        case "all" | "failures" | "none":
+            return said
+        case _ if said.isdigit():
+            return int(said)
+    raise BadStudy(f"--record {said}: say all, failures, none, or how many per task and method.")
+
+
+def _run(study: "Study", out: Path, workers: int | None, said: str, retries: int, address: str | None = None) -> None:
     from vap_core.cluster import spread
     from vap_core.engine import run
     from vap_core.processes import results
     from vap_core.report import conclude
     from vap_core.statistics import foresight
 
+    record = _record(said)
     if len(study.methods) > 1:
         tracks: dict[str, list[EpisodeRow]] = {}
         for row in (row for suite, task in study.tasks for row in study.rows(suite, task)):

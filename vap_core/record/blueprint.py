@@ -10,6 +10,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from vap_core.failures import Diagnosis
 from vap_core.values import Grounding, Opening
 
 TARGET = (255, 150, 40)
@@ -110,56 +111,114 @@ def _panels(root: Part, fps: float = 1.0) -> rrb.Blueprint:
     )
 
 
-def episode_blueprint(opening: Opening) -> rrb.Blueprint:
-    """Big pictures first; beside them the scene and the votes; below, the words, the curves and the course of events."""
-    names = [camera.name for camera in opening.cameras]
-    pictures, share = _cameras(opening)
-    scene = rrb.Spatial3DView(
+def _scene(opening: Opening) -> Part:
+    return rrb.Spatial3DView(
         origin="/",
-        contents=["/world/**", *(f"/observation.images.{cam}" for cam in names)],
+        contents=["/world/**", *(f"/observation.images.{camera.name}" for camera in opening.cameras)],
         name="scene (simulator truth)",
         background=BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=_eye(opening),
     )
-    votes = rrb.Horizontal(*(bars_view(cam, opening.groundings.get(cam, ())) for cam in names))
+
+
+def _course(opening: Opening, *more: Part) -> Part:
+    """The words, the curves, `more` first, and the course of events."""
     unit, arm = (-0.05, 1.05), [True] * (len(opening.action_names) - 1)
-    evidence = rrb.Tabs(
-        _curves("/vap/track_score", "track score", limits=unit), _curves("/vap/vote_margin", "vote margin", limits=unit), active_tab=0
-    )
     columns = rrb.archetypes.TextLogColumns(
         timeline_columns=[rrb.encodings.TimelineColumn("frame_index")],
         text_log_columns=[rrb.encodings.TextLogColumn("loglevel"), rrb.encodings.TextLogColumn("body")],
     )
-    events = rrb.TextLogView(origin="/vap/events", name="events", columns=columns)
-    course = rrb.StateTimelineView(origin="/vap/status", name="course")
-    bottom = rrb.Horizontal(
+    actions = [
+        _curves("/action", "action", shown=[*arm, False]),
+        _curves("/action", "gripper", shown=[*(not shown for shown in arm), True]),
+        _curves("/observation.state", "state"),
+    ]
+    scores = [_curves("/vap/track_score", "track score", limits=unit), _curves("/vap/vote_margin", "vote margin", limits=unit)]
+    return rrb.Horizontal(
         rrb.TextDocumentView(origin="/vap/instruction", name="instruction"),
-        rrb.Tabs(
-            _curves("/action", "action", shown=[*arm, False]),
-            _curves("/action", "gripper", shown=[*(not shown for shown in arm), True]),
-            _curves("/observation.state", "state"),
-            active_tab=0,
-        ),
-        evidence,
-        course,
-        events,
+        rrb.Tabs(*more, *actions, active_tab=0),
+        rrb.Tabs(*scores, active_tab=0),
+        rrb.StateTimelineView(origin="/vap/status", name="course"),
+        rrb.TextLogView(origin="/vap/events", name="events", columns=columns),
         column_shares=[1.15, 1, 1, 0.95, 1.15],
     )
-    right = rrb.Vertical(scene, votes, row_shares=[2.4, 1])
-    return _panels(rrb.Vertical(rrb.Horizontal(pictures, right, column_shares=[share, 1 - share]), bottom, row_shares=[0.745, 0.255]), opening.hz)
+
+
+def _hand() -> Part:
+    return _curves("/vap/hand", "hand")
+
+
+def _everything(opening: Opening) -> rrb.Container:
+    """Big pictures first; beside them the scene and the votes; below, the words, the curves and the course of events."""
+    pictures, share = _cameras(opening)
+    votes = rrb.Horizontal(*(bars_view(camera.name, opening.groundings.get(camera.name, ())) for camera in opening.cameras))
+    right = rrb.Vertical(_scene(opening), votes, row_shares=[2.4, 1])
+    top = rrb.Horizontal(pictures, right, column_shares=[share, 1 - share])
+    return rrb.Vertical(top, _course(opening, _hand()), row_shares=[0.745, 0.255], name="everything")
+
+
+def identity_view(cam: str) -> Part:
+    return _image(cam, "prompt by whom it covers", ["", "/identity"])
+
+
+def crops_view(cam: str) -> Part:
+    return rrb.Spatial2DView(origin=f"/vap/crops/{cam}", name=f"{cam} · reference views, and the candidates below", background=BACKGROUND)
+
+
+def cosine_view(cam: str) -> Part:
+    return rrb.TensorView(
+        origin=f"/vap/similarity/{cam}",
+        name="cosine (candidate x reference)",
+        scalar_mapping=rrb.TensorScalarMapping(mag_filter=rr.components.MagnificationFilter.Nearest, colormap=rr.components.Colormap.Viridis),
+        view_fit=rrb.components.ViewFit.Fill,
+    )
+
+
+def _vote_first(opening: Opening, cam: str, drifted: bool) -> Part:
+    """Case 1: what was compared with what, and who won; after a drift, what the prompt is on now."""
+    groundings = opening.groundings.get(cam, ())
+    big, small = (identity_view(cam), vote_view(cam)) if drifted else (vote_view(cam), identity_view(cam))
+    compared = rrb.Vertical(crops_view(cam), rrb.Horizontal(cosine_view(cam), bars_view(cam, groundings)), row_shares=[1.25, 1])
+    return rrb.Horizontal(big, rrb.Vertical(small, policy_view(cam)), compared, column_shares=[1.3, 0.68, 1.2])
+
+
+def _views_first(opening: Opening) -> Part:
+    """Case 2: every view's prompt in the colour of what it covers, side by side."""
+    names = [camera.name for camera in opening.cameras]
+    columns = [rrb.Vertical(identity_view(cam), rrb.Horizontal(vote_view(cam, narrow=True), policy_view(cam)), row_shares=[1.9, 1]) for cam in names]
+    return rrb.Horizontal(*columns)
+
+
+def _hand_first(opening: Opening) -> Part:
+    """Case 3: the scene, the way of the hand, and what the policy saw."""
+    names = [camera.name for camera in opening.cameras]
+    views = rrb.Vertical(*(policy_view(cam) for cam in names)) if len(names) > 1 else rrb.Vertical(policy_view(names[0]), identity_view(names[0]))
+    return rrb.Horizontal(_scene(opening), views, _hand(), column_shares=[1.45, 0.55 if len(names) > 1 else 0.75, 1])
+
+
+def episode_blueprint(opening: Opening, diagnosis: Diagnosis | None = None) -> rrb.Blueprint:
+    """Everything; before it, once a failure is diagnosed, the evidence that decided its case."""
+    whole = _everything(opening)
+    if diagnosis is None or not opening.cameras:
+        return _panels(whole, opening.hz)
+    cam, more = diagnosis.camera or opening.cameras[0].name, [_hand()]
+    match diagnosis.case:
+        case "case 1" | "unlabelled":
+            why = _vote_first(opening, cam, diagnosis.sub_case == "drift")
+        case "case 2":
+            why = _views_first(opening)
+        case _:
+            why, more = _hand_first(opening), []
+    first = rrb.Vertical(why, _course(opening, *more), row_shares=[0.72, 0.28], name=f"{diagnosis.case}: {diagnosis.sub_case}")
+    return _panels(rrb.Tabs(first, whole, active_tab=0), opening.hz)
 
 
 def grounding_blueprint(cam: str, grounding: Grounding) -> rrb.Blueprint:
     """One image, and why that box won."""
     words = rrb.TextDocumentView(origin="/vap/instruction", name="instruction")
     references = rrb.Spatial2DView(origin="/vap/references", name="reference views #0, #1, ...", background=BACKGROUND)
-    cosine = rrb.TensorView(
-        origin=f"/vap/similarity/{cam}",
-        name="cosine (candidate x reference)",
-        scalar_mapping=rrb.TensorScalarMapping(mag_filter=rr.components.MagnificationFilter.Nearest, colormap=rr.components.Colormap.Viridis),
-        view_fit=rrb.components.ViewFit.Fill,
-    )
+    cosine = cosine_view(cam)
     top = rrb.Horizontal(vote_view(cam), _image(cam, "mask", ["", "/mask/**"]), policy_view(cam))
     why = rrb.Horizontal(words, references, bars_view(cam, [grounding]), cosine, column_shares=[1, 1.2, 1, 1])
     return _panels(rrb.Vertical(top, why, row_shares=[1.5, 1]))

@@ -129,13 +129,13 @@ def log_association(rec: rr.RecordingStream, association: Association, j: int, a
     put(rec, f"/vap/association{suffix(j)}", numbers, at=at)
 
 
-def words(opening: Opening, ending: str = "") -> rr.TextDocument:
-    """The instruction and its rewrite, the verdict of every view, and how it ended."""
+def words(opening: Opening, ending: str = "", reason: str = "") -> rr.TextDocument:
+    """The instruction and its rewrite, the verdict of every view, how it ended, and why."""
     row, rewritten = opening.row, opening.rewritten
     verdicts = [f"| {cam} | {evidence_line(g)} |" for cam, per_view in opening.groundings.items() for g in per_view]
     table = ["| view | vote at t = 0 |", "| --- | --- |", *verdicts] if verdicts else ["*no grounding: this method does not prompt*"]
     read = f'**policy read** "{rewritten}"' if rewritten != opening.instruction else "**policy read** the same words"
-    head = [f'**said** "{opening.instruction}"', read, *([f"**ended** {ending}"] if ending else [])]
+    head = [f'**said** "{opening.instruction}"', read, *([f"**ended** {ending}"] if ending else []), *([f"**why** {reason}"] if reason else [])]
     origin = f"{row.suite} · {row.task} · episode {row.episode} · seed {row.seed} · {opening.method} · {opening.policy}"
     return rr.TextDocument("\n\n".join(["  \n".join([*head, origin]), "\n".join(table)]), media_type=rr.MediaType.MARKDOWN)
 

@@ -6,7 +6,9 @@ Entities (lerobot's feature keys; timelines `frame_index` and `timestamp`):
 `/vap/status/{outcome,grasp}`; `/world/{table,robot/link*,objects/*}`. Evidence of a further target j ends in `_j`;
 `/candidates` carries the picture the vote was held on, `/vap/votes/<cam>` its `counts`, with `/winner` and `/others` as bars;
 `/vap/association` is what the views agreed on, when they were asked together.
-Recording properties: `rollout` and `outcome`. Pictures are JPEG; everything that changes travels in columns.
+`/observation.images.<cam>/identity` colours each prompt by the object it covers; `/vap/{similarity,crops}/<cam>` are what the vote compared;
+`/vap/hand/*` is where the hand was. Recording properties: `rollout` and `outcome`, which says why an episode failed (module failures).
+Pictures are JPEG, at the steps that have them; everything that changes travels in columns.
 """
 
 from collections.abc import Sequence
@@ -18,11 +20,13 @@ import rerun as rr
 from scipy.spatial.transform import Rotation
 
 from vap_core.errors import BadOutput
+from vap_core.failures import diagnose, follow
+from vap_core.record import why
 from vap_core.record.blueprint import SERIES, episode_blueprint, evidence_line, grounding_blueprint, packed, series_style, state_style
 from vap_core.record.evidence import CLASSES, classes, contact_sheet, jpeg, log_association, log_vote, picture, suffix, words
-from vap_core.record.file import code_version, finish_stream, open_stream, put, put_property
+from vap_core.record.file import code_version, finish_stream, open_stream, put, put_property, temporary
 from vap_core.record.scene import log_cameras, log_links, log_objects, log_table, send_poses, send_truth
-from vap_core.values import Event, Frame, Grounding, Mask, Opening, Outcome, PersonalObject, Rgb
+from vap_core.values import Episode, Event, Frame, Grounding, Mask, Opening, Outcome, PersonalObject, Rgb
 
 STATE_NAMES = ("x", "y", "z", "rx", "ry", "rz", "gripper")
 PROMPTED_QUALITY_DROP = 5
@@ -64,6 +68,7 @@ class Recorder:
         self._times: list[float] = []
         self._frames: list[Frame] = []
         self._jpegs: list[dict[str, tuple[np.ndarray, np.ndarray]]] = []
+        self._course: list[Frame] = []
         self._grasp: str | None = None
         self._rec: rr.RecordingStream | None = open_stream(self.path, f"{row.key}.s{row.seed}.{opening.method}.{opening.policy}")
         self._rec.send_recording_name(f"{row.key} · {opening.method}")
@@ -73,7 +78,7 @@ class Recorder:
                 hz=opening.hz, instruction=opening.instruction, rewritten=opening.rewritten,
             ),
         )  # fmt: skip
-        put(self._rec, "/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, rr.AnnotationContext(CLASSES))
+        put(self._rec, "/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, rr.AnnotationContext([*CLASSES, *why.identity_classes(opening)]))
         put(self._rec, "/vap/instruction", words(opening))
         log_table(self._rec, row)
         log_objects(self._rec, opening)
@@ -100,18 +105,21 @@ class Recorder:
         self._steps.append(frame.frame_index)
         self._times.append(frame.timestamp_s)
         self._frames.append(frame)
+        self._course.append(frame.light())
         self._jpegs.append(pictures)
         if len(self._frames) >= self._flush_every:
             self._flush()
 
-    def close(self, outcome: Outcome, failure_case: str = "") -> None:
-        """Flush, write outcome and footer, and give the recording its name.
+    def close(self, outcome: Outcome) -> None:
+        """Flush, write outcome, diagnosis and footer, and give the recording its name.
 
         Raises: BadOutput, when a file of that name appeared meanwhile.
         """
         rec = self._stream()
         self._flush()
-        verdict = self._verdict(outcome, failure_case)
+        episode = Episode(self._opening, tuple(self._course), outcome, {})
+        diagnosis = diagnose(episode)
+        verdict = self._verdict(outcome)
         if self._steps:
             n = len(self._steps)
             done = np.zeros(n)
@@ -122,21 +130,32 @@ class Recorder:
             # The whole lane wears the ending: a state that starts on the last step would have no width.
             rec.send_columns("/vap/status/outcome", self._index(self._steps[:1], self._times[:1]), rr.StateChange.columns(state=[outcome.status]))
             level = {"success": "INFO", "failure": "WARN", "error": "ERROR"}[outcome.status]
-            self._send_events([Event(self._steps[-1], level, f"episode ends: {verdict}")])  # type: ignore[arg-type]
-        put(rec, "/vap/instruction", words(self._opening, verdict))
+            decided = [] if diagnosis is None else [why.event(diagnosis)]
+            self._send_events([*decided, Event(self._steps[-1], level, f"episode ends: {verdict}")])  # type: ignore[arg-type]
+            if self._course[0].truth.objects_world:
+                why.send_hand(rec, follow(episode), index)
+            if diagnosis is not None:
+                rec.send_blueprint(episode_blueprint(self._opening, diagnosis))
+        put(rec, "/vap/instruction", words(self._opening, verdict, "" if diagnosis is None else why.verdict(diagnosis)))
         put_property(rec, "outcome",
             rr.AnyValues(
-                status=outcome.status, success=outcome.success, cmr=outcome.cmr, failure_case=failure_case, length=outcome.steps,
+                status=outcome.status, success=outcome.success, cmr=outcome.cmr, length=outcome.steps,
                 success_once=outcome.success_once, held_steps=outcome.held_steps, wrong_object=outcome.wrong_object,
-                first_object_correct=outcome.first_object_correct, detail=outcome.detail,
+                first_object_correct=outcome.first_object_correct, detail=outcome.detail, **why.property_of(diagnosis),
             ),
         )  # fmt: skip
         self._rec = None
         finish_stream(rec, self.path)
 
+    def discard(self) -> None:
+        """End without a recording; what was flushed is deleted."""
+        self._stream().disconnect()
+        self._rec = None
+        temporary(self.path).unlink(missing_ok=True)
+
     @staticmethod
-    def _verdict(outcome: Outcome, failure_case: str) -> str:
-        parts = [outcome.status, f"{outcome.steps} steps", failure_case, "moved a wrong object" if outcome.wrong_object else "", outcome.detail]
+    def _verdict(outcome: Outcome) -> str:
+        parts = [outcome.status, f"{outcome.steps} steps", "moved a wrong object" if outcome.wrong_object else "", outcome.detail]
         return ", ".join(part for part in parts if part)
 
     def _stream(self) -> rr.RecordingStream:
@@ -168,6 +187,8 @@ class Recorder:
             per_view = opening.groundings.get(cam, ())
             for j, grounding in enumerate(per_view):
                 log_vote(rec, grounding, j, None if j else pictures[cam], at)
+                if j == 0:
+                    why.log_compared(rec, grounding, frame.images[cam], opening.references.get(grounding.object, ()), at)
             if not per_view:
                 put(rec, f"/observation.images.{cam}/candidates", picture(pictures[cam]), at=at)
         for j, association in enumerate(opening.associations):
@@ -181,45 +202,54 @@ class Recorder:
         if not frames:
             return
         index = self._index(self._steps[-len(frames) :], self._times[-len(frames) :])
-        self._send_pictures(index)
-        self._send_masks(index)
+        seen = [i for i, pictures in enumerate(self._jpegs) if pictures]
+        if seen:
+            at = self._index([frames[i].frame_index for i in seen], [frames[i].timestamp_s for i in seen])
+            self._send_pictures(at, [self._jpegs[i] for i in seen])
+            self._send_masks(at, [frames[i] for i in seen])
+            if any(frames[i].shown for i in seen):
+                why.send_identities(rec, self._opening, at, [frames[i] for i in seen])
+        self._send_cameras(index)
         rec.send_columns("/observation.state", index, rr.Scalars.columns(scalars=np.stack([f.state for f in frames])))
         rec.send_columns("/action", index, rr.Scalars.columns(scalars=np.stack([f.action for f in frames])))
         for cam, per_view in self._opening.groundings.items():
             for j, grounding in enumerate(per_view):
-                tracks = [f.tracks.get(cam, ())[j : j + 1] for f in frames]
-                scores = np.array([track[0].score if track else 0.0 for track in tracks])
+                followed = [f for f in frames if f.tracks.get(cam, ())[j : j + 1]]
+                at = self._index([f.frame_index for f in followed], [f.timestamp_s for f in followed])
+                scores = np.array([f.tracks[cam][j].score for f in followed])
                 rec.send_columns(f"/vap/vote_margin/{cam}{suffix(j)}", index, rr.Scalars.columns(scalars=np.full(len(frames), grounding.margin)))
-                rec.send_columns(f"/vap/track_score/{cam}{suffix(j)}", index, rr.Scalars.columns(scalars=scores))
+                if followed:
+                    rec.send_columns(f"/vap/track_score/{cam}{suffix(j)}", at, rr.Scalars.columns(scalars=scores))
         send_truth(rec, index, [f.truth for f in frames])
         self._send_grasp()
         self._send_events([event for f in frames for event in f.events])
         rec.flush()
         self._frames, self._jpegs = [], []
 
-    def _send_pictures(self, index: list[rr.TimeColumn]) -> None:
-        rec = self._stream()
+    def _send_cameras(self, index: list[rr.TimeColumn]) -> None:
         for i, camera in enumerate(self._frames[0].cameras):
-            cam, root, n = camera.name, f"/observation.images.{camera.name}", len(self._frames)
             poses = np.stack([f.cameras[i].pose_world for f in self._frames])
-            send_poses(rec, root, index, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat())
-            for entity, which in ((root, 0), (f"{root}/prompted", 1)):
-                if all(cam in pictures for pictures in self._jpegs):
-                    blobs = [pictures[cam][which] for pictures in self._jpegs]
-                    rec.send_columns(entity, index, rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * n))
+            send_poses(self._stream(), f"/observation.images.{camera.name}", index, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat())
 
-    def _send_masks(self, index: list[rr.TimeColumn]) -> None:
+    def _send_pictures(self, index: list[rr.TimeColumn], jpegs: Sequence[dict[str, tuple[np.ndarray, np.ndarray]]]) -> None:
+        for cam in jpegs[0]:
+            root = f"/observation.images.{cam}"
+            for entity, which in ((root, 0), (f"{root}/prompted", 1)):
+                blobs = [pictures[cam][which] for pictures in jpegs]
+                self._stream().send_columns(entity, index, rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs)))
+
+    def _send_masks(self, index: list[rr.TimeColumn], frames: Sequence[Frame]) -> None:
         """The track and the truth of every target; a lost track is an empty mask."""
-        for camera in self._frames[0].cameras:
+        for camera in frames[0].cameras:
             cam, shape = camera.name, (camera.height, camera.width)
             targets = self._opening.groundings.get(cam, ())
             for j in range(max(1, len(targets))):
                 model = self._opening.row.target if j == 0 else targets[j].object
                 if j < len(targets):
-                    tracks = [f.tracks.get(cam, ())[j : j + 1] for f in self._frames]
+                    tracks = [f.tracks.get(cam, ())[j : j + 1] for f in frames]
                     self._send_classes(index, f"{cam}/mask/target{suffix(j)}", [t[0].mask if t else None for t in tracks], shape, 1)
-                if any(model in f.truth.masks.get(cam, {}) for f in self._frames):
-                    seen = [f.truth.masks.get(cam, {}).get(model) for f in self._frames]
+                if any(model in f.truth.masks.get(cam, {}) for f in frames):
+                    seen = [f.truth.masks.get(cam, {}).get(model) for f in frames]
                     self._send_classes(index, f"{cam}/mask/gt{suffix(j)}", seen, shape, 3)
 
     def _send_classes(self, index: list[rr.TimeColumn], tail: str, masks: Sequence[Mask | None], shape: tuple[int, int], inside: int) -> None:

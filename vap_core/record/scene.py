@@ -6,7 +6,7 @@ import numpy as np
 import rerun as rr
 from scipy.spatial.transform import Rotation
 
-from vap_core.record.blueprint import QUIET, TARGET
+from vap_core.record.blueprint import QUIET, TARGET, TRUTH
 from vap_core.record.file import put
 from vap_core.values import EpisodeRow, Frame, Opening, Pose, Truth
 
@@ -32,15 +32,15 @@ def log_table(rec: rr.RecordingStream, row: EpisodeRow) -> None:
 def log_objects(rec: rr.RecordingStream, opening: Opening) -> None:
     """Bounding boxes: an object's origin is the centre of its base, so the box's centre is half its height above."""
     for name, size in opening.target_sizes_m.items():
-        target = name == opening.row.target
+        target, goal = name == opening.row.target, name == opening.row.goal
         half = np.asarray(size) / 2
         box = rr.Boxes3D(
             centers=[[0, 0, half[2]]],
             half_sizes=[half],
-            colors=[TARGET if target else QUIET],
+            colors=[TARGET if target else TRUTH if goal else QUIET],
             fill_mode="solid" if target else "transparentfillmajorwireframe",
-            labels=[f"target: {name}" if target else name],
-            show_labels=target,
+            labels=[f"target: {name}" if target else f"goal: {name}" if goal else name],
+            show_labels=target or goal,
         )
         put(rec, f"/world/objects/{name}", box)
 

@@ -4,6 +4,7 @@ import os
 import signal
 import socket
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -93,6 +94,26 @@ def screenshot(rrd: Path, png: Path, *, frame_index: int | None = None, size: tu
         png.write_bytes(picture)
     except OSError as err:
         raise BadOutput(f"screenshot: cannot write {png} ({err.strerror}); choose a folder you may write to.") from err
+
+
+def open_viewer(rrd: Path, *, frame_index: int = 0) -> None:
+    """Open a recording in Rerun's own window at one step; the window stays when this returns.
+
+    Raises: BadRecording, when `rrd` cannot be read; MissingGL, when there is no display or nothing can draw.
+    """
+    rrd = Path(rrd).resolve()
+    read_summary(rrd)
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise MissingGL(f"open_viewer: there is no display; add --png FILE for a picture, or copy {rrd} to a machine that has one.")
+    port = free_port()
+    command = rerun_cli("--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen", "--expect-data-soon")
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    try:
+        viewer = connect(process, port, 40.0)
+    except (RuntimeError, ConnectionError) as err:
+        raise MissingGL(f"open_viewer: the viewer did not come up ({err}); add --png FILE for a picture.") from err
+    viewer.open(str(rrd))
+    viewer.set_time("frame_index", sequence=frame_index, play_state="paused")
 
 
 def settled(viewer: ViewerClient, patience_s: float = 20.0) -> bytes:

@@ -1,0 +1,163 @@
+"""From the table of a run to the frame that explains a failure.
+
+    failures = listed(Path("data/results/mini_pi0.parquet"), case=2, suite="vlabench")
+    path = recording(failures, 0)
+
+A failure that was not recorded is run again: the same row, weights and seed give the same episode.
+"""
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vap_core import store
+from vap_core.errors import BadOutput, BadStudy
+from vap_core.experiments import Study, make_trial, register_personal
+from vap_core.publish import published
+from vap_core.report.failures import breakdown, breakdown_text, diagnosed, sub_cases_text
+from vap_core.report.text import align
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+COLUMNS = ("suite", "task", "method", "episode", "seed", "case", "sub_case", "deciding_frame", "case_confidence", "case_sentence")
+SHORT = {"deciding_frame": "frame", "case_confidence": "sure", "case_sentence": "why"}
+
+
+@dataclass(frozen=True)
+class Failures:
+    """The failed episodes of a run (or of all runs in a published table) that were asked for. `notes` are the runs' configurations by digest,
+    `table` has their digests as `configuration`; `whole` are all episodes, failed or not, of the suites and methods asked for."""
+
+    place: Path
+    notes: dict[str, dict[str, Any]]
+    whole: "pd.DataFrame"
+    table: "pd.DataFrame"
+
+    @property
+    def recordings(self) -> Path:
+        """Where its recordings lie, or will."""
+        return (Path("data/runs") / f"{self.place.stem}-diagnosed" if self.place.suffix == ".parquet" else self.place) / "recordings"
+
+
+def listed(
+    place: Path,
+    *,
+    suite: str | None = None,
+    task: str | None = None,
+    method: str | None = None,
+    case: int | str | None = None,
+    sub_case: str | None = None,
+    where: str | None = None,
+) -> Failures:
+    """The failures in a run folder or a published table, narrowed down; `where` is a SQL condition on the table's columns.
+
+    Raises: BadOutput when there is no such run, or it was never diagnosed; BadStudy for a name or a condition that fits nothing in it.
+    """
+    import pandas as pd
+
+    runs = published(place) if place.suffix == ".parquet" else [(store.note(place), store.read(place))]
+    whole = pd.concat([table.assign(configuration=about["digest"]) for about, table in runs if not table.empty] or [pd.DataFrame()])
+    if whole.empty:
+        raise BadOutput(f"diagnose: {place} holds no finished episode; run eval first.")
+    whole = diagnosed(whole).reset_index(drop=True)
+    for name, wanted in (("suite", suite), ("task", task), ("method", method)):
+        whole = _only(whole, name, wanted)
+    table = whole[whole["outcome"].eq("failure")]
+    table = _only(table, "case", f"case {case}" if str(case).isdigit() else case)
+    table = _only(table, "sub_case", sub_case)
+    if where is not None:
+        table = matching(table, where)
+    return Failures(place, {about["digest"]: about for about, _ in runs}, whole, table.reset_index(drop=True))
+
+
+def _only(table: "pd.DataFrame", column: str, wanted: Any) -> "pd.DataFrame":
+    if wanted is None:
+        return table
+    known = sorted(set(table[column]))
+    if wanted not in known:
+        raise BadStudy(f"diagnose: no {column.replace('_', '-')} {wanted!r} here; there is {', '.join(map(str, known)) or 'none'}.")
+    return table[table[column] == wanted]
+
+
+def matching(table: "pd.DataFrame", where: str) -> "pd.DataFrame":
+    """The rows for which a SQL condition holds, such as "margin < 0.05 and success = false". Raises: BadStudy."""
+    import pyarrow as pa
+    from datafusion import SessionContext
+
+    flat = table.reset_index(drop=True)
+    arrow = pa.Table.from_pandas(flat.assign(line=flat.index), preserve_index=False)
+    try:
+        context = SessionContext()
+        context.register_record_batches("episodes", [arrow.to_batches()])
+        held = [line for batch in context.table("episodes").filter(where).select("line").collect() for line in batch["line"].to_pylist()]
+    except Exception as error:  # datafusion raises bare exceptions
+        told = " ".join(str(error).split())[:200]
+        raise BadStudy(
+            f"diagnose: {where!r} is no condition on this table ({told}); its columns are {', '.join(map(str, table.columns))}."
+        ) from error
+    return flat.loc[sorted(held)]
+
+
+def text(failures: Failures, limit: int = 20) -> str:
+    """How the failures divide, and the first of them, numbered as `recording` takes them."""
+    counts = breakdown(failures.whole)
+    lines = [breakdown_text(counts), "", sub_cases_text(counts), ""]
+    if failures.table.empty:
+        return "\n".join([*lines, "no failure is left of what was asked for."])
+    shown = failures.table.head(limit)
+    head = ["#", *(SHORT.get(name, name) for name in COLUMNS)]
+    rows = [[str(i), *(_cell(row[name]) for name in COLUMNS)] for i, row in enumerate(shown.to_dict("records"))]
+    rest = len(failures.table) - len(shown)
+    return "\n".join(
+        [*lines, align([head, *rows]), *([f"and {rest} more; --limit shows them, --case, --suite, --where narrow them down."] if rest else [])]
+    )
+
+
+def _cell(cell: Any) -> str:
+    return f"{cell:.2f}" if isinstance(cell, float) else str(cell)
+
+
+def recording(failures: Failures, number: int) -> Path:
+    """The recording of one listed failure; made now, by running the episode again, when there is none.
+
+    Raises: BadStudy when there is no such number, or today's weights or lists are not those of the run.
+    """
+    from vap_core.record import Recorder, recording_name
+    from vap_core.rollout import rollout
+
+    line = _line(failures, number)
+    study = _study(failures.notes[line["configuration"]], line)
+    row = next((r for r in study.rows(line["suite"], line["task"]) if (r.episode, r.seed) == (line["episode"], line["seed"])), None)
+    if row is None:
+        raise BadStudy(f"diagnose: episode {line['episode']} of {line['suite']}/{line['task']} is in today's list no more; run eval again.")
+    path = failures.recordings / recording_name(row, line["method"])
+    if path.exists():
+        return path
+    memory = failures.recordings.parent / "memory"
+    register_personal(study, memory)
+    trial = make_trial(study, [row], line["method"], memory)
+    if trial.policy.label != line["policy"]:
+        raise BadStudy(f"diagnose: this was run with {line['policy']}, and {trial.policy.label} is here now; run eval again.")
+    (episode,) = rollout(trial, [row], lambda opening: Recorder(path, opening), batch=1)
+    if (episode.outcome.status, episode.outcome.steps) != (line["outcome"], line["steps"]):
+        print(f"note: run again, it is a {episode.outcome.status} after {episode.outcome.steps} steps (was {line['outcome']} after {line['steps']}).")
+    return path
+
+
+def deciding_frame(failures: Failures, number: int) -> int:
+    return max(0, int(_line(failures, number)["deciding_frame"]))
+
+
+def _line(failures: Failures, number: int) -> dict[str, Any]:
+    if not 0 <= number < len(failures.table):
+        raise BadStudy(f"diagnose: no failure #{number}; there are {len(failures.table)}, counted from 0.")
+    return {str(name): cell for name, cell in failures.table.iloc[number].items()}
+
+
+def _study(about: dict[str, Any], line: dict[str, Any]) -> Study:
+    """The study of a run, of one task and method alone."""
+    held = about["configuration"]
+    known = {field.name: held[field.name] for field in fields(Study) if field.name in held}
+    study = Study(**{**known, "tasks": ((line["suite"], line["task"]),), "methods": (line["method"],)})
+    return replace(study, audit=False)

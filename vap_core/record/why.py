@@ -1,0 +1,129 @@
+"""The evidence that decides why an episode failed, drawn into its recording: who is highlighted, what was compared, where the hand was."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+import rerun as rr
+
+from vap_core.failures import Course, Diagnosis
+from vap_core.record.blueprint import QUIET, SERIES, TARGET
+from vap_core.record.evidence import contact_sheet, jpeg, picture
+from vap_core.record.file import put
+from vap_core.values import Camera, Event, Frame, Grounding, Opening, Rgb
+
+NOBODY, FIRST = 8, 10
+"""Class of a prompt on no object; class of the first object's inside. An inside is even, its rim the number after it."""
+IDENTITIES = [colour for colour in SERIES if colour != TARGET]
+CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
+SIDE, BAND = 120, 20
+"""Pixels of a crop in the sheet, and of the line of words over it."""
+
+
+def identity_classes(opening: Opening) -> list[rr.AnnotationInfo]:
+    """One colour for each object of the episode, the target's first: an inside for the prompt that covers it, a rim for where it is."""
+    colours = {name: identity_colour(opening, name) for name in opening.target_sizes_m}
+    named = [
+        rr.AnnotationInfo(id=FIRST + 2 * i + rim, label=f"{name}{', edge' if rim else ''}", color=(*colour, 255 if rim else 170))
+        for i, (name, colour) in enumerate(colours.items())
+        for rim in (0, 1)
+    ]
+    return [rr.AnnotationInfo(id=NOBODY, label="no object", color=(255, 255, 255, 190)), *named]
+
+
+def identity_colour(opening: Opening, name: str) -> tuple[int, int, int]:
+    """The target's orange, or a colour of its own for every other object."""
+    others = [each for each in opening.target_sizes_m if each != opening.row.target]
+    return TARGET if name == opening.row.target else IDENTITIES[others.index(name) % len(IDENTITIES)]
+
+
+def identity(opening: Opening, frame: Frame, camera: Camera) -> np.ndarray:
+    """Class image of one view: the prompt filled with the colour of what it covers, and the rims of all objects in theirs."""
+    masks, tracks = frame.truth.masks.get(camera.name, {}), frame.tracks.get(camera.name, ())
+    names = list(opening.target_sizes_m)
+    image = np.zeros((camera.height, camera.width), np.uint8)
+    on = next((view.object for view in frame.shown if view.camera == camera.name), None)
+    if tracks and tracks[0].mask is not None and on is not None:
+        image[tracks[0].mask] = FIRST + 2 * names.index(on) if on in names else NOBODY
+    whose = np.zeros_like(image)
+    for i, name in enumerate(names):
+        if name in masks:
+            whose |= masks[name].view(np.uint8) * np.uint8(FIRST + 2 * i + 1)  # visible pixels belong to one object each
+    inner = cv2.erode(whose, CROSS) == cv2.dilate(whose, CROSS)
+    return np.where((whose > 0) & ~inner, whose, image)
+
+
+def send_identities(rec: rr.RecordingStream, opening: Opening, index: Sequence[rr.TimeColumn], frames: Sequence[Frame]) -> None:
+    """One class image per view and step; the steps are those that have truth and pictures."""
+    for i, camera in enumerate(frames[0].cameras):
+        images = [identity(opening, frame, frame.cameras[i]).reshape(-1) for frame in frames]
+        kind = rr.components.ImageFormat(camera.width, camera.height, color_model="L", channel_datatype="U8")
+        columns = rr.SegmentationImage.columns(buffer=images, format=[kind] * len(frames), opacity=[1.0] * len(frames))
+        rec.send_columns(f"/observation.images.{camera.name}/identity", index, columns)
+
+
+def log_compared(rec: rr.RecordingStream, grounding: Grounding, rgb: Rgb, references: Sequence[Rgb], at: Sequence[rr.TimeColumn]) -> None:
+    """The cosine of every candidate with every reference, and the crops that were compared, side by side."""
+    if len(grounding.candidates):
+        put(rec, f"/vap/similarity/{grounding.camera}", rr.Tensor(grounding.similarity, dim_names=("candidate", "reference")), at=at)
+    if references:
+        put(rec, f"/vap/crops/{grounding.camera}", picture(jpeg(crops_sheet(grounding, rgb, references), 90)), at=at)
+
+
+def crops_sheet(grounding: Grounding, rgb: Rgb, references: Sequence[Rgb]) -> Rgb:
+    """References in the top row, candidates in the rows below, best first, each with its votes and mean cosine; the winner framed in orange."""
+    k, cosine = len(references), grounding.similarity.mean(axis=1) if len(grounding.candidates) else np.zeros(0)
+    order = sorted(range(len(cosine)), key=lambda i: (-int(grounding.votes[i]), -float(cosine[i])))
+    rows = [_row([f"reference {i}" for i in range(k)], contact_sheet(references, SIDE), QUIET, k)]
+    for first in range(0, len(order), k):
+        part = order[first : first + k]
+        crops = [_cut(rgb, grounding.candidates.xyxy[i]) for i in part]
+        words = [f"#{i} v{grounding.votes[i]} {cosine[i]:.2f}" for i in part]
+        row = _row(words, contact_sheet(crops, SIDE), QUIET, k)
+        if grounding.winner in part:
+            x = part.index(grounding.winner) * SIDE
+            cv2.rectangle(row, (x + 1, BAND + 1), (x + SIDE - 2, BAND + SIDE - 2), TARGET, 3)
+        rows.append(row)
+    return np.concatenate(rows, axis=0)
+
+
+def _row(words: Sequence[str], sheet: Rgb, colour: tuple[int, int, int], k: int) -> Rgb:
+    row = np.full((BAND + SIDE, k * SIDE, 3), 24, np.uint8)
+    row[BAND:, : sheet.shape[1]] = sheet
+    for i, text in enumerate(words):
+        cv2.putText(row, text, (i * SIDE + 4, BAND - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+    return row
+
+
+def _cut(rgb: Rgb, xyxy: np.ndarray) -> Rgb:
+    x0, y0, x1, y1 = (int(v) for v in np.clip(np.round(xyxy), 0, [*rgb.shape[1::-1]] * 2))
+    return rgb[y0 : max(y1, y0 + 1), x0 : max(x1, x0 + 1)]
+
+
+def send_hand(rec: rr.RecordingStream, course: Course, index: Sequence[rr.TimeColumn]) -> None:
+    """How far the gripper is from the target's bounding box, and how high the target is lifted, centimetres."""
+    for name, path in (("gripper to target", course.gap_m), ("target lifted", course.lift_m[course.target])):
+        entity = f"/vap/hand/{name.replace(' ', '_')}"
+        put(rec, entity, rr.SeriesLines(names=[f"{name}, cm"], colors=[SERIES[0] if "grip" in name else TARGET], widths=[2.0]))
+        rec.send_columns(entity, index, rr.Scalars.columns(scalars=100 * path))
+
+
+def verdict(diagnosis: Diagnosis) -> str:
+    """In a line: which case, and why."""
+    return f"{diagnosis.case.capitalize()}, {diagnosis.sub_case}: {diagnosis.sentence}"
+
+
+def event(diagnosis: Diagnosis) -> Event:
+    """The deciding moment, for the list of events."""
+    return Event(diagnosis.frame_index, "ERROR", verdict(diagnosis))
+
+
+def property_of(diagnosis: Diagnosis | None) -> Mapping[str, Any]:
+    """Its part of the recording's properties; empty words for a success."""
+    if diagnosis is None:
+        return {"failure_case": "", "sub_case": "", "deciding_frame": np.int64(-1), "deciding_camera": "", "confidence": 0.0, "why": ""}
+    return {
+        "failure_case": diagnosis.case, "sub_case": diagnosis.sub_case, "deciding_frame": np.int64(diagnosis.frame_index),
+        "deciding_camera": diagnosis.camera, "confidence": diagnosis.confidence, "why": diagnosis.sentence,
+    }  # fmt: skip
