@@ -98,9 +98,12 @@ def test_a_late_drift_onto_what_is_then_touched_is_one():
     assert told("picked", [*still(7), *still(1, [view(THIRD)]), *steps[8:]]).case == "case 3", "nor is another than the one touched"
 
 
-def test_what_a_track_does_after_the_grasp_is_not_held_against_it():
+def test_what_a_track_does_after_the_touch_is_not_held_against_it_unless_the_hand_follows():
     steps = still(3) + still(3, now=held(0.03)) + still(20, [view(OTHER)])
     assert label(told("picked", steps, candidates=2))[:2] == ("case 3", "slip")
+    steps = still(3) + still(1, now=truth(touched=(TARGET,))) + still(9, [view(OTHER)])
+    assert label(told("picked", steps))[:2] == ("case 3", "missed grasp")
+    assert label(told("picked", [*steps, *still(1, [view(OTHER)], truth(touched=(OTHER,)))])) == ("case 1", "drift", 4, "front")
 
 
 def test_a_view_that_hardly_shows_the_target_does_not_count():

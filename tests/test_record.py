@@ -7,6 +7,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,7 +17,7 @@ from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
 from vap_core.errors import BadOutput, BadRecording, MissingGL
-from vap_core.record import Recorder, read_summary, record_grounding, recording_name, recover, screenshot
+from vap_core.record import Recorder, keep, read_summary, record_grounding, recording_name, recover, screenshot
 from vap_core.record.blueprint import evidence_line
 from vap_core.record.evidence import apart, classes, label_spots
 from vap_core.record.file import rerun_cli, temporary
@@ -35,6 +36,7 @@ from vap_core.values import (
     PersonalObject,
     Placement,
     Rgb,
+    Shown,
     Track,
     Truth,
 )  # fmt: skip
@@ -319,6 +321,112 @@ def test_a_second_target_wears_a_suffix(tmp_path: Path) -> None:
         "/observation.images.front/mask/gt_1",
     }
     assert names <= entities(tmp_path / "one.rrd")
+
+
+def failed(outcome: Outcome) -> bool:
+    return outcome.status == "failure"
+
+
+@pytest.mark.parametrize("most_mb", [1e9, 0.1], ids=["in memory", "streamed"])
+def test_only_what_is_wanted_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most_mb: float) -> None:
+    monkeypatch.setattr(keep, "MOST_MB", most_mb)
+    start = opening(2)
+    for status in ("success", "failure"):
+        sink = keep.Waiting(tmp_path / f"{status}.rrd", start, failed)
+        for step in range(8):
+            sink.frame(frame(step, start))
+        assert temporary(sink.path).exists() == (most_mb < 1)
+        sink.close(replace(SUCCESS, status=status, success=status == "success", steps=7))
+    assert [path.name for path in sorted(tmp_path.iterdir())] == ["failure.rrd"]
+    assert read_summary(tmp_path / "failure.rrd")["frames"] == 8
+
+
+def test_what_waited_is_recorded_as_if_it_had_streamed(tmp_path: Path) -> None:
+    start = opening(2)
+    streamed = Recorder(tmp_path / "streamed.rrd", start)
+    waited = keep.Waiting(tmp_path / "waited.rrd", start, lambda outcome: True)
+    for sink in (streamed, waited):
+        for step in range(12):
+            sink.frame(frame(step, start))
+        sink.close(replace(SUCCESS, steps=12))
+    same = rerun("rrd", "compare", tmp_path / "streamed.rrd", tmp_path / "waited.rrd")
+    assert same.returncode == 0, same.stderr[-500:]
+
+
+def test_one_success_in_ten_is_kept_and_always_the_same() -> None:
+    rows = [replace(ROW, episode=i) for i in range(400)]
+    chosen = [keep.wanted(SUCCESS, row, "vap") for row in rows]
+    assert chosen == [keep.wanted(SUCCESS, row, "vap") for row in rows]
+    assert 0.06 < sum(chosen) / 400 < 0.14
+    assert all(keep.wanted(replace(SUCCESS, status=status, success=False), row, "vap") for row in rows for status in ("failure", "error"))
+
+
+def fail(path: Path, shown: str, second: str | None = None, after: int = 0) -> dict[str, Any]:
+    """A failed episode whose prompts cover `shown`, and in a second view `second`; from step `after` on."""
+    start = replace(opening(1 if second is None else 2), references={"owl_a": (np.full((20, 30, 3), 99, np.uint8),) * K})
+    with Recorder(path, start) as recorder:
+        for step in range(12):
+            one, names = frame(step, start), ["front", "side"]
+            covers = {cam: what if step >= after else "owl_a" for cam, what in zip(names, (shown, second), strict=True) if what is not None}
+            tracks = {cam: (Track(one.truth.masks[cam][what], 0.9),) for cam, what in covers.items()}
+            seen = tuple(Shown(cam, what, 0.9 * (what == "owl_a"), 500, 0.9) for cam, what in covers.items())
+            recorder.frame(replace(one, tracks=tracks, shown=seen))
+        recorder.close(replace(SUCCESS, status="failure", success=False, steps=11))
+    return read_summary(path)
+
+
+def tabs(path: Path) -> set[str]:
+    """Names of the containers in a recording's blueprints."""
+    reader = RrdReader(path)
+    batches = [chunk.to_record_batch() for held in reader.blueprints() for chunk in reader.stream(store=held)]
+    name = "ContainerBlueprint:display_name"
+    return {cell[0] for batch in batches if name in batch.schema.names for cell in batch[name].to_pylist() if cell}
+
+
+@pytest.mark.parametrize(
+    ("shown", "second", "after", "case", "sub_case", "frame_index"),
+    [
+        ("owl_b", None, 0, "case 1", "distractor vote", 0),
+        ("owl_b", None, 4, "case 1", "drift", 4),
+        ("owl_a", "owl_b", 0, "case 2", "views disagree", 0),
+        ("owl_a", None, 0, "case 3", "timeout", 0),
+    ],
+)
+def test_a_recording_says_why_and_its_blueprint_opens_there(
+    tmp_path: Path, shown: str, second: str | None, after: int, case: str, sub_case: str, frame_index: int
+) -> None:
+    path = tmp_path / "one.rrd"
+    summary = fail(path, shown, second, after)
+    assert (summary["outcome.failure_case"], summary["outcome.sub_case"], summary["outcome.deciding_frame"]) == (case, sub_case, frame_index)
+    assert summary["outcome.why"]
+    assert {"/observation.images.front/identity", "/vap/crops/front", "/vap/similarity/front", "/vap/hand/gripper_to_target"} <= entities(path)
+    told = [text for texts in columns(path, "/vap/events", "TextLog:text").values() for text in texts]  # type: ignore[attr-defined]
+    assert any(text.startswith(f"{case.capitalize()}, {sub_case}: ") for text in told)
+    assert rerun("rrd", "verify", path).returncode == 0
+    assert f"{case}: {sub_case}" in tabs(path)
+
+
+def test_a_prompt_wears_the_colour_of_what_it_covers(tmp_path: Path) -> None:
+    fail(tmp_path / "one.rrd", "owl_b")
+    buffer = columns(tmp_path / "one.rrd", "/observation.images.front/identity", "SegmentationImage:buffer")[3]
+    image = np.frombuffer(bytes(buffer[0]), np.uint8).reshape(SIDE, SIDE)  # type: ignore[index]
+    masks = frame(3, opening(1)).truth.masks["front"]
+    i = list(SIZES).index("owl_b")
+    assert set(np.unique(image[masks["owl_b"]])) == {10 + 2 * i, 11 + 2 * i}
+    assert set(np.unique(image[masks["owl_a"]])) == {0, 10 + 2 * list(SIZES).index("owl_a") + 1}, "a rim alone"
+
+
+def test_pictures_may_be_rarer_than_steps(tmp_path: Path) -> None:
+    start = opening(1)
+    with Recorder(tmp_path / "one.rrd", start, flush_every=5) as recorder:
+        for step in range(12):
+            one = frame(step, start)
+            recorder.frame(one if step % 4 == 0 else one.light())
+        recorder.close(SUCCESS)
+    for entity in ("", "/prompted"):
+        assert sorted(columns(tmp_path / "one.rrd", f"/observation.images.front{entity}", "EncodedImage:blob")) == [0, 4, 8]
+    assert len(columns(tmp_path / "one.rrd", "/action", "Scalars:scalars")) == 12
+    assert sorted(columns(tmp_path / "one.rrd", "/vap/track_score/front", "Scalars:scalars")) == [0, 4, 8]
 
 
 def test_equal_episodes_give_equal_recordings(tmp_path: Path) -> None:

@@ -1,7 +1,8 @@
 """Why an episode failed: one case with its sub-case, deciding frame, camera and evidence, from the simulator's truth (P 5.5; SPEC section 7).
 
-The prompts are judged up to the moment that decides: the first touch of an object that is not meant, else the grasp of the target, else the end.
-They are wrong when they are wrong for half of that time, or last thing before the touch point at what is touched.
+The prompts are judged up to the first touch of the target or of another object that is not the goal: they have then brought the hand where it is, and
+what a track loses when its object topples is the hand's doing. They are wrong when they are wrong for half of that time; or when, any time later,
+the hand touches another object while a prompt points at it.
 
 Case 1, all views are prompted alike, and wrong: *no proposal*, *shifted proposal*, *distractor vote*, *poor mask* (all at t = 0), *drift* (later).
 Case 2, views are prompted with different instances: *views disagree* (at t = 0), *views drift apart* (later).
@@ -254,16 +255,18 @@ def _carried(course: Course, limits: Limits, name: str) -> list[bool]:
 
 def _wrong_prompt(course: Course, limits: Limits) -> Diagnosis | None:
     """Case 1 or 2, or None where the prompts were right when it mattered."""
-    strayed = _first([bool(names) for names in course.others])
-    grasped = _first(_carried(course, limits, course.target))
-    until = strayed if strayed is not None else grasped if grasped is not None else len(course.steps)
+    touched, strayed = _first(course.touches), _first([bool(names) for names in course.others])
+    until = min((at for at in (touched, strayed) if at is not None), default=len(course.steps))
     told = _verdicts(course, limits, until)
+    share = float(np.mean([verdict != "right" for _, verdict in told])) if told else 0.0
+    if share < limits.share:
+        told = _verdicts(course, limits, strayed) if strayed is not None else []
+        if not told or told[-1][1] == "right" or not _points_at(course, told[-1][0], course.others[strayed or 0]):
+            return None
     wrong = [verdict != "right" for _, verdict in told]
-    share = float(np.mean(wrong)) if wrong else 0.0
-    misled = strayed is not None and bool(wrong) and wrong[-1] and _points_at(course, told[-1][0], course.others[strayed])
-    if not wrong or not (share >= limits.share or misled):
+    if not any(wrong):
         return None
-    start, stop = max(_runs(wrong), key=lambda run: (run[1] == len(wrong)) if misled else run[1] - run[0])
+    start, stop = max(_runs(wrong), key=lambda run: (run[1] == len(wrong)) if share < limits.share else run[1] - run[0])
     kinds = [verdict for _, verdict in told[start:stop]]
     case: Case = "case 2" if 2 * kinds.count("case 2") >= len(kinds) else "case 1"
     at = next(i for i, verdict in told[start:stop] if verdict == case)
@@ -272,11 +275,11 @@ def _wrong_prompt(course: Course, limits: Limits) -> Diagnosis | None:
     opening = at == told[0][0]
     sub_case = _opening_sub_case(course, case, view, limits) if opening else "views drift apart" if case == "case 2" else "drift"
     evidence: dict[str, float | str] = {
-        "wrong_share": share, "judged_steps": float(len(wrong)), "iou": view.iou, "pixels": float(view.pixels),
+        "wrong_share": float(np.mean(wrong)), "judged_steps": float(len(wrong)), "iou": view.iou, "pixels": float(view.pixels),
         **{f"shows_{camera}": "nothing" if what is None else what for camera, what in labels.items()},
         **({"proposal": view.proposal} if np.isfinite(view.proposal) else {}),
     }  # fmt: skip
-    many = f"{round(100 * share)} % of {len(wrong)} judged steps"
+    many = f"{round(100 * float(np.mean(wrong)))} % of {len(wrong)} judged steps"
     seen = ", ".join(f"{camera} {_named(what)}" for camera, what in labels.items())
     words = {
         "no proposal": f"{view.camera}: no candidate was found, the target passes unmarked",
@@ -382,7 +385,7 @@ STAGES = ("proposed", "voted", "masked", "tracked", "touched", "lifted", "succes
 def stages(episode: Episode, limits: Limits = LIMITS) -> dict[str, Any]:
     """How far an episode came, as `stage_<name>` for STAGES, and `mask_iou` (t = 0, mean over the views that count), `track_right` (share of steps).
 
-    At t = 0 in every view that counts: a box fits, the vote is right, the mask is on target; tracked: right in 9 of 10 steps up to the grasp;
+    At t = 0 in every view that counts: a box fits, the vote is right, the mask is on target; tracked: right in 9 of 10 steps up to the touch;
     then, by the hand: the target touched; carried or selected; success.
     """
     told: dict[str, Any] = {f"stage_{name}": None for name in STAGES} | {"mask_iou": None, "track_right": None}
@@ -391,8 +394,8 @@ def stages(episode: Episode, limits: Limits = LIMITS) -> dict[str, Any]:
     course = follow(episode)
     first = [view for view in course.shown[0] if view.pixels >= limits.pixels]
     if course.prompted and first:
-        grasped = _first(_carried(course, limits, course.target))
-        verdicts = [verdict == "right" for _, verdict in _verdicts(course, limits, len(course.steps) if grasped is None else grasped)]
+        touched = _first(course.touches)
+        verdicts = [verdict == "right" for _, verdict in _verdicts(course, limits, len(course.steps) if touched is None else touched)]
         right = float(np.mean(verdicts)) if verdicts else 0.0
         told |= {
             "stage_proposed": all(view.proposal >= limits.proposal for view in first),

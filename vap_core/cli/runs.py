@@ -27,15 +27,8 @@ Methods = Annotated[
 POLICIES = "scripted; mini-pi0; a lerobot checkpoint, as folder or hub id; the bounds: expert (reads the simulator), random."
 PolicyName = Annotated[str, typer.Option("--policy", help=POLICIES)]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the policy and the sensors; of a warm-up suite's episode list, too.")]
-Recorded = Annotated[
-    str,
-    typer.Option(
-        "--record",
-        metavar="all|failures|none|N",
-        help="Which episodes become a .rrd file (1 to 4 MB each): all; failures and one success in ten; none; or N per task and method. "
-        "An error that is tried again does.",
-    ),
-]
+RECORDED = "Which episodes become a .rrd file: all; failures and one success in ten; none; or N per task and method. A retried error always does."
+Recorded = Annotated[str, typer.Option("--record", metavar="all|failures|none|N", help=RECORDED)]
 Retries = Annotated[int, typer.Option(min=0, help="How often an episode that ended in an error is tried again.")]
 Meshes = Annotated[str, typer.Option("--robots", help="plain, or menagerie: MuJoCo Menagerie's meshes, downloaded or found in MENAGERIE_ROOT.")]
 
@@ -104,7 +97,9 @@ def evaluate(
     workers: Annotated[int | None, typer.Option(min=1, help="Jobs at once. Default 2 processes; on a cluster, its CPUs.")] = None,
     engine: Annotated[Literal["local", "ray"], typer.Option(help="local: processes of this machine; ray: a Ray cluster.")] = "local",
     address: Annotated[str | None, typer.Option(help="ray: host:port of the cluster. Default 127.0.0.1:6379.")] = None,
-    record: Recorded = "failures",
+    record: Annotated[
+        str | None, typer.Option("--record", metavar="all|failures|none|N", help=f"{RECORDED} Default failures; none for the bounds.")
+    ] = None,
     retries: Retries = 1,
     follow: Annotated[
         Literal["call", "step"], typer.Option(help="Take images and track when the policy is asked, or at every control step (smoother recordings).")
@@ -124,7 +119,7 @@ def evaluate(
     """
     from vap_core import suites as known
     from vap_core.errors import BadStudy
-    from vap_core.experiments import usual
+    from vap_core.experiments import INSIDERS, usual
 
     names = dict.fromkeys(name for each in suite for name in (known.BENCHMARKS if each == "all" else [each]))
     tasks = tuple((name, task.name) for name in names for task in known.suite(name).tasks)
@@ -134,6 +129,7 @@ def evaluate(
     if address and engine != "ray":
         raise BadStudy("eval: --address needs --engine ray.")
     folder = out or Path(f"data/runs/{Path(policy).name}-{'-'.join(dict.fromkeys(suite))}")
+    record = record or ("none" if policy in INSIDERS else "failures")
     _run(study, folder, workers, record, retries, (address or "127.0.0.1:6379") if engine == "ray" else None)
 
 

@@ -1,0 +1,179 @@
+"""From a run's table to the frame: failures divided, listed, narrowed down, run again and opened; what is refused, in one line."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from vap_core import diagnosis, engine
+from vap_core.diagnosis import deciding_frame, listed, recording, text
+from vap_core.errors import BadOutput, BadStudy
+from vap_core.experiments import Study
+from vap_core.failures import CASES, STAGES
+from vap_core.publish import publish
+from vap_core.record import read_summary
+from vap_core.report.failures import breakdown, breakdown_text, roads, sub_cases_text
+
+STUDY = Study((("widowx-pick", "pick-straw-cup"),), ("generic",), episodes=3, policy="random")
+
+
+def here(work, jobs, workers, mend):  # type: ignore[no-untyped-def]
+    return ((job, work(job)) for job in jobs)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("diagnosed") / "run"
+    engine.run(STUDY, folder, record="none", spread=here, progress=False)
+    return folder
+
+
+def row(method: str = "vap", case: str = "", sub_case: str = "", stages: int = 7, outcome: str = "", suite: str = "vlabench") -> dict[str, Any]:
+    """One episode that passes so many stages."""
+    ended = outcome or ("failure" if case else "success")
+    passed = {f"stage_{name}": i < stages if method == "vap" or i > 3 else None for i, name in enumerate(STAGES)}
+    about = {"suite": suite, "method": method, "outcome": ended, "success": ended == "success"}
+    return {**about, "case": case, "sub_case": sub_case, "case_confidence": 0.5 if case else float("nan"), **passed}
+
+
+TABLE = pd.DataFrame(
+    [
+        *[row()] * 4,
+        *[row(case="case 2", sub_case="views disagree", stages=1)] * 3,
+        row(case="case 3", sub_case="timeout", stages=4),
+        row(outcome="error", stages=0),
+        *[row("generic", "unprompted", "wrong object", stages=5)] * 2,
+    ]
+)
+
+
+def test_the_cases_of_a_row_sum_to_its_failures() -> None:
+    counts = breakdown(TABLE).set_index("method")
+    assert (counts.loc["vap", ["n", "failed", "case 1", "case 2", "case 3"]].tolist()) == [9, 4, 0, 3, 1]
+    assert (counts[list(CASES)].sum(axis=1) == counts["failed"]).all()
+    for case, parts in CASES.items():
+        assert (counts[[f"{case}: {part}" for part in parts]].sum(axis=1) == counts[case]).all()
+    assert counts.loc["vap", "sure"] == 0.5
+
+
+def test_as_text_every_share_has_its_interval() -> None:
+    told = breakdown_text(breakdown(TABLE))
+    assert "44 % [19, 73]" in told
+    assert "75 % [30, 95]" in told
+    assert "case 1 %" not in told, "no row has any"
+    assert sub_cases_text(breakdown(TABLE)).splitlines()[0] == "vlabench vap: 3 x case 2: views disagree, 1 x case 3: timeout"
+
+
+def test_the_road_narrows_and_ends_with_the_successes() -> None:
+    vap, generic = roads(TABLE)
+    assert (vap.n, vap.left) == (9, (8, 5, 5, 5, 4, 4, 4))
+    assert (generic.n, generic.left) == (2, (None, None, None, None, 2, 0, 0))
+    assert all(a >= b for a, b in zip(vap.left, vap.left[1:], strict=False))  # type: ignore[operator]
+
+
+def test_a_run_lists_its_failures_with_their_reasons(run: Path) -> None:
+    failures = listed(run)
+    assert len(failures.table) == 3
+    told = text(failures, limit=2)
+    assert "unprompted" in told
+    assert "and 1 more; --limit shows them" in told
+    assert set(failures.table["case"]) == {"unprompted"}
+    assert failures.table["deciding_frame"].between(0, 60).all()
+
+
+def test_a_condition_narrows_them_down(run: Path) -> None:
+    whole = listed(run).table
+    some = listed(run, where=f"success = false and episode < {sorted(whole.episode)[2]}").table
+    assert sorted(some.episode) == sorted(whole.episode)[:2]
+    assert listed(run, where="steps < 0").table.empty
+    assert "no failure is left" in text(listed(run, where="steps < 0"))
+
+
+def test_an_episode_that_was_not_recorded_is_run_again_alike(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    failures = listed(run)
+    path = recording(failures, 1)
+    line = failures.table.iloc[1]
+    said = read_summary(path)
+    assert path == run / "recordings" / f"widowx-pick.pick-straw-cup.{line.episode:03d}.s0.generic.rrd"
+    assert (said["outcome.length"], said["outcome.failure_case"], said["outcome.sub_case"]) == (line.steps, line.case, line.sub_case)
+    assert said["outcome.deciding_frame"] == deciding_frame(failures, 1) == line.deciding_frame
+    before = path.stat().st_mtime_ns
+    assert recording(failures, 1) == path
+    assert path.stat().st_mtime_ns == before, "what is recorded is not run again"
+    assert capsys.readouterr().out == ""
+
+
+def test_a_published_table_opens_too(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    publish([run], tmp_path / "mine.parquet")
+    failures = listed(tmp_path / "mine.parquet", suite="widowx-pick", case="unprompted")
+    assert failures.recordings == Path("data/runs/mine-diagnosed/recordings")
+    monkeypatch.chdir(tmp_path)
+    assert recording(failures, 0).exists()
+
+
+@pytest.mark.parametrize(
+    ("asked", "match"),
+    [
+        ({"suite": "vlabench"}, "no suite 'vlabench' here; there is widowx-pick"),
+        ({"case": 2}, "no case 'case 2' here; there is unprompted"),
+        ({"where": "margin <"}, "is no condition on this table"),
+        ({"where": "colour = 'red'"}, "its columns are"),
+        ({"where": "1 = 1; drop table episodes"}, "is no condition on this table"),
+    ],
+)
+def test_what_fits_nothing_is_refused_in_one_line(run: Path, asked: dict[str, Any], match: str) -> None:
+    with pytest.raises(BadStudy, match=match) as caught:
+        listed(run, **asked)
+    assert "\n" not in str(caught.value)
+
+
+def test_other_refusals(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadStudy, match="no failure #3; there are 3, counted from 0"):
+        recording(listed(run), 3)
+    with pytest.raises(BadOutput, match=r"run\.json is absent or damaged"):
+        listed(tmp_path)
+    with pytest.raises(BadOutput, match="is no table of finished runs"):
+        listed(Path("data/results/perception_views.parquet"))
+    with pytest.raises(BadOutput, match="before failures were diagnosed"):
+        breakdown(TABLE.drop(columns="case"))
+    failures = listed(run)
+    failures.table.loc[0, "policy"] = "another"
+    (failures.recordings / f"widowx-pick.pick-straw-cup.{failures.table.episode[0]:03d}.s0.generic.rrd").unlink(missing_ok=True)
+    with pytest.raises(BadStudy, match="run with another, and random is here now"):
+        recording(failures, 0)
+
+
+def command(*words: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "vap_core", *map(str, words)], capture_output=True, text=True, check=False)
+
+
+def test_the_command_lists_and_refuses(run: Path) -> None:
+    done = command("diagnose", run, "--limit", 1)
+    assert done.returncode == 0, done.stderr
+    assert "fail % [95 %]" in done.stdout
+    refused = command("diagnose", run, "--case", 7)
+    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
+    refused = command("eval", "--suite", "widowx-pick", "--record", "some", "--out", run.parent / "other")
+    assert (refused.returncode, refused.stderr) == (2, "error: --record some: say all, failures, none, or how many per task and method.\n")
+
+
+def test_without_a_display_the_viewer_says_what_to_do(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from vap_core.errors import MissingGL
+    from vap_core.record import open_viewer
+
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(MissingGL, match="add --png FILE"):
+        open_viewer(recording(listed(run), 1))
+
+
+def test_so_many_recordings_are_spread_over_a_task(tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    study = replace(STUDY, episodes=4)
+    engine.run(study, tmp_path / "run", record=2, spread=here, progress=False)
+    assert sorted(path.name.split(".")[2] for path in (tmp_path / "run" / "recordings").glob("*.rrd")) == ["000", "002"]
+    assert diagnosis.listed(tmp_path / "run").table.shape[0] == 4
