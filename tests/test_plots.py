@@ -1,13 +1,17 @@
 """Figures show what they were given; tables against ground truth are exact."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
+from tests.test_diagnosis import TABLE
 from tests.toys import TOYS, personal, scene
 from vap_core.attend import Attender
 from vap_core.inspection import grounding_table
 from vap_core.metrics import rate, score
 from vap_core.plots import candidates, film, grounding_figure, learning_figure, rates_figure, scores_figure, write_png
+from vap_core.report.failures import breakdown, roads
+from vap_core.report.roads import cases_figure, funnel_figure
 from vap_core.segment import iou
 
 TEAL, GREY = (40, 120, 110), (90, 90, 90)
@@ -55,6 +59,21 @@ def test_scores_and_film_draw() -> None:
     rows = [{**row, "method": m, "first_object_correct": True, "steps": 3} for m in ("generic", "vap")]
     assert len(scores_figure(score(rows)).axes) == 1
     assert len(film({"raw": [LINE, LINE]}, ["a", "b"]).axes) == 2
+
+
+def test_the_funnel_has_a_panel_per_suite_and_a_line_per_method() -> None:
+    several = pd.concat([TABLE, TABLE.assign(suite="tabletop"), TABLE.assign(suite="simpler-bridge")])
+    figure = funnel_figure(roads(several), {"vap": "red", "generic": "grey"})
+    assert [len(axes.lines) for axes in figure.axes] == [2, 2, 2, 0]
+    assert figure.axes[0].lines[0].get_ydata()[-1] == pytest.approx(100 * 4 / 9)
+    assert list(figure.axes[0].lines[1].get_xdata()) == [4, 5, 6], "nothing is said of stages that a method does not have"
+
+
+def test_every_bar_of_cases_is_a_hundred_percent() -> None:
+    axes = cases_figure(breakdown(TABLE)).axes[0]
+    ends = {patch.get_y() + patch.get_height() / 2: patch.get_x() + patch.get_width() for patch in axes.patches}
+    assert list(ends.values()) == pytest.approx([100.0] * 2)
+    assert sorted(ends) == pytest.approx([0, 1])
 
 
 def test_learning_has_a_panel_per_figure_and_a_line_per_training_that_logged_it() -> None:
