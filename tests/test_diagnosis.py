@@ -177,3 +177,17 @@ def test_so_many_recordings_are_spread_over_a_task(tmp_path: Path) -> None:
     engine.run(study, tmp_path / "run", record=2, spread=here, progress=False)
     assert sorted(path.name.split(".")[2] for path in (tmp_path / "run" / "recordings").glob("*.rrd")) == ["000", "002"]
     assert diagnosis.listed(tmp_path / "run").table.shape[0] == 4
+
+
+def test_a_correction_changes_the_table_and_nothing_else(run: Path) -> None:
+    failures = listed(run)
+    layer = diagnosis.correct(failures, 1, "unprompted: slip", "it held for a moment")
+    again = listed(run)
+    assert (again.table.sub_case[1], again.table.case_sentence[1], again.table.corrected.tolist()) == (
+        "slip",
+        "it held for a moment",
+        [False, True, False],
+    )
+    assert "* as corrected by hand" in text(again)
+    layer.unlink()
+    assert not listed(run).table.corrected.any()

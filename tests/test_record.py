@@ -361,9 +361,10 @@ def test_one_success_in_ten_is_kept_and_always_the_same() -> None:
     assert all(keep.wanted(replace(SUCCESS, status=status, success=False), row, "vap") for row in rows for status in ("failure", "error"))
 
 
-def fail(path: Path, shown: str, second: str | None = None, after: int = 0) -> dict[str, Any]:
+def fail(path: Path, shown: str, second: str | None = None, after: int = 0, episode: int = 3) -> dict[str, Any]:
     """A failed episode whose prompts cover `shown`, and in a second view `second`; from step `after` on."""
-    start = replace(opening(1 if second is None else 2), references={"owl_a": (np.full((20, 30, 3), 99, np.uint8),) * K})
+    start = opening(1 if second is None else 2)
+    start = replace(start, row=replace(ROW, episode=episode), references={"owl_a": (np.full((20, 30, 3), 99, np.uint8),) * K})
     with Recorder(path, start) as recorder:
         for step in range(12):
             one, names = frame(step, start), ["front", "side"]

@@ -27,17 +27,18 @@ SHORT = {"deciding_frame": "frame", "case_confidence": "sure", "case_sentence": 
 @dataclass(frozen=True)
 class Failures:
     """The failed episodes of a run (or of all runs in a published table) that were asked for. `notes` are the runs' configurations by digest,
-    `table` has their digests as `configuration`; `whole` are all episodes, failed or not, of the suites and methods asked for."""
+    `table` has their digests as `configuration`; `whole` are all episodes, failed or not, of the suites and methods asked for, `every` of all."""
 
     place: Path
     notes: dict[str, dict[str, Any]]
+    every: "pd.DataFrame"
     whole: "pd.DataFrame"
     table: "pd.DataFrame"
 
     @property
     def recordings(self) -> Path:
         """Where its recordings lie, or will."""
-        return (Path("data/runs") / f"{self.place.stem}-diagnosed" if self.place.suffix == ".parquet" else self.place) / "recordings"
+        return _home(self.place) / "recordings"
 
 
 def listed(
@@ -60,7 +61,7 @@ def listed(
     whole = pd.concat([table.assign(configuration=about["digest"]) for about, table in runs if not table.empty] or [pd.DataFrame()])
     if whole.empty:
         raise BadOutput(f"diagnose: {place} holds no finished episode; run eval first.")
-    whole = diagnosed(whole).reset_index(drop=True)
+    whole = every = _corrected(diagnosed(whole).reset_index(drop=True), place)
     for name, wanted in (("suite", suite), ("task", task), ("method", method)):
         whole = _only(whole, name, wanted)
     table = whole[whole["outcome"].eq("failure")]
@@ -68,7 +69,40 @@ def listed(
     table = _only(table, "sub_case", sub_case)
     if where is not None:
         table = matching(table, where)
-    return Failures(place, {about["digest"]: about for about, _ in runs}, whole, table.reset_index(drop=True))
+    return Failures(place, {about["digest"]: about for about, _ in runs}, every, whole, table.reset_index(drop=True))
+
+
+def _corrected(table: "pd.DataFrame", place: Path) -> "pd.DataFrame":
+    """With what researchers have corrected since, marked in `corrected`."""
+    from vap_core.record import corrections, file_name
+
+    table = table.assign(corrected=False)
+    held = corrections(_home(place))
+    if held:
+        for at, line in table[["suite", "task", "episode", "seed", "method"]].iterrows():
+            if (right := held.get(file_name(*line))) is not None:
+                table.loc[at, ["case", "sub_case", "case_sentence", "case_confidence", "corrected"]] = [
+                    right.case,
+                    right.sub_case,
+                    right.note,
+                    1.0,
+                    True,
+                ]
+    return table
+
+
+def _home(place: Path) -> Path:
+    """Where recordings and corrections of a run lie: in its folder, and for a published table in one of its own."""
+    return Path("data/runs") / f"{place.stem}-diagnosed" if place.suffix == ".parquet" else place
+
+
+def correct(failures: Failures, number: int, case: str, note: str = "") -> Path:
+    """Say what a listed failure really is, "case 3: slip" for example; kept as a layer beside its recording. Raises: BadStudy, UnknownName."""
+    from vap_core.record import Correction
+    from vap_core.record import correct as keep
+
+    name, _, part = case.partition(":")
+    return keep(recording(failures, number), Correction(name.strip(), part.strip(), note), deciding_frame(failures, number))
 
 
 def _only(table: "pd.DataFrame", column: str, wanted: Any) -> "pd.DataFrame":
@@ -107,7 +141,11 @@ def text(failures: Failures, limit: int = 20) -> str:
         return "\n".join([*lines, "no failure is left of what was asked for."])
     shown = failures.table.head(limit)
     head = ["#", *(SHORT.get(name, name) for name in COLUMNS)]
-    rows = [[str(i), *(_cell(row[name]) for name in COLUMNS)] for i, row in enumerate(shown.to_dict("records"))]
+    marks = ["*" if corrected else "" for corrected in shown["corrected"]]
+    rows = [
+        [f"{i}{mark}", *(_cell(row[name]) for name in COLUMNS)] for i, (row, mark) in enumerate(zip(shown.to_dict("records"), marks, strict=True))
+    ]
+    lines += ["* as corrected by hand", ""] if any(marks) else []
     rest = len(failures.table) - len(shown)
     return "\n".join(
         [*lines, align([head, *rows]), *([f"and {rest} more; --limit shows them, --case, --suite, --where narrow them down."] if rest else [])]
@@ -123,10 +161,31 @@ def recording(failures: Failures, number: int) -> Path:
 
     Raises: BadStudy when there is no such number, or today's weights or lists are not those of the run.
     """
+    return _recorded(failures, _line(failures, number))
+
+
+def beside(failures: Failures, number: int, method: str) -> Path:
+    """One recording of a listed failure and of another method on the same episode, on one time line. Raises: as `recording`."""
+    from vap_core.record import together
+
+    line = _line(failures, number)
+    same = failures.every
+    for name in ("suite", "task", "episode", "seed", "policy"):
+        same = same[same[name] == line[name]]
+    other = same[same["method"] == method]
+    if other.empty:
+        raise BadStudy(f"diagnose: {method!r} did not run this episode here; there is {', '.join(sorted(same['method']))}.")
+    paths = {name: _recorded(failures, one) for name, one in ((line["method"], line), (method, dict(other.iloc[0].items())))}
+    out = failures.recordings.parent / "together" / paths[line["method"]].name.replace(".rrd", f"-{method}.rrd")
+    out.unlink(missing_ok=True)
+    together(paths, out)
+    return out
+
+
+def _recorded(failures: Failures, line: dict[str, Any]) -> Path:
     from vap_core.record import Recorder, recording_name
     from vap_core.rollout import rollout
 
-    line = _line(failures, number)
     study = _study(failures.notes[line["configuration"]], line)
     row = next((r for r in study.rows(line["suite"], line["task"]) if (r.episode, r.seed) == (line["episode"], line["seed"])), None)
     if row is None:

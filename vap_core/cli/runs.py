@@ -145,24 +145,66 @@ def diagnose(
     limit: Annotated[int, typer.Option(min=1, help="Failures to list.")] = 20,
     show: Annotated[int | None, typer.Option("--open", min=0, help="Open this one of the list in the Rerun viewer, at its deciding frame.")] = None,
     png: Annotated[Path | None, typer.Option(help="With --open: save a picture of it instead, without a display.")] = None,
+    against: Annotated[str | None, typer.Option(help="With --open: another method on the same episode beside it, on one time line.")] = None,
+    correct: Annotated[str | None, typer.Option(help='With --open: what it really is, "case 3: slip"; kept as a layer beside the recording.')] = None,
+    note: Annotated[str, typer.Option(help="With --correct: why you think so.")] = "",
 ) -> None:
     """Say why episodes failed, list them, and open one at the frame that decided it; one that was not recorded is run again.
 
     Example: python -m vap_core diagnose data/results/mini_pi0.parquet --method vap
     Example: python -m vap_core diagnose data/results/mini_pi0.parquet --method vap --suite vlabench --case 2 --open 0
+    Example: python -m vap_core diagnose data/results/mini_pi0.parquet --method generic --open 0 --against vap
     Example: python -m vap_core diagnose data/runs/demo --where "margin < 0.3" --open 0 --png why.png
+    Example: python -m vap_core diagnose data/runs/demo --open 0 --correct "case 3: slip" --note "it held for a moment"
     """
     from vap_core import diagnosis
 
     failures = diagnosis.listed(run, suite=suite, task=task, method=method, case=case, sub_case=sub_case, where=where)
+    if correct is not None:
+        print(f"wrote {diagnosis.correct(failures, show or 0, correct, note)}")
+        return
     if show is None and png is None:
         print(diagnosis.text(failures, limit))
         return
     from vap_core.record import open_viewer, screenshot
 
     number = show or 0
-    path, frame = diagnosis.recording(failures, number), diagnosis.deciding_frame(failures, number)
+    path = diagnosis.beside(failures, number, against) if against else diagnosis.recording(failures, number)
+    frame = diagnosis.deciding_frame(failures, number)
     print(f"{path}, frame {frame}: {failures.table['case_sentence'].iloc[number]}")
+    if png is None:
+        open_viewer(path, frame_index=frame)
+    else:
+        screenshot(path, png, frame_index=frame, size=(1920, 1080))
+        print(f"wrote {png}")
+
+
+@app.command()
+def query(
+    run: Annotated[Path, typer.Argument(help="Run folder with recordings.")],
+    where: Annotated[
+        str,
+        typer.Argument(help="SQL condition on steps: margin, track_score, gap_cm, lift_cm, frame_index, method, success, failure_case, length, ..."),
+    ],
+    limit: Annotated[int, typer.Option(min=1, help="Recordings to list.")] = 20,
+    show: Annotated[int | None, typer.Option("--open", min=0, help="Open this one of the list in the Rerun viewer, at the first such step.")] = None,
+    png: Annotated[Path | None, typer.Option(help="With --open: save a picture of it instead, without a display.")] = None,
+) -> None:
+    """Ask all recordings of a run at once: in which of them, and at which steps, does a condition hold?
+
+    Example: python -m vap_core query data/runs/demo "margin < 0.05 and success = false"
+    Example: python -m vap_core query data/runs/demo "gap_cm < 1 and lift_cm < 1 and frame_index > 20" --open 0 --png near.png
+    """
+    from vap_core import asking
+
+    answer = asking.ask(run, where)
+    if show is None and png is None:
+        print(asking.text(answer, limit))
+        return
+    from vap_core.record import open_viewer, screenshot
+
+    path, frame = asking.frame(answer, show or 0)
+    print(f"{path}, frame {frame}")
     if png is None:
         open_viewer(path, frame_index=frame)
     else:

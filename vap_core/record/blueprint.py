@@ -99,7 +99,8 @@ def _curves(
     return rrb.TimeSeriesView(origin=origin, name=name, contents=list(contents), axis_y=axis, plot_legend=legend, overrides=overrides)
 
 
-def _panels(root: Part, fps: float = 1.0) -> rrb.Blueprint:
+def panels(root: Part, fps: float = 1.0) -> rrb.Blueprint:
+    """The whole window: `root`, and the time line at its foot."""
     return rrb.Blueprint(
         root,
         rrb.TimePanel(state="collapsed", timeline="frame_index", play_state="paused", fps=fps),
@@ -201,7 +202,7 @@ def episode_blueprint(opening: Opening, diagnosis: Diagnosis | None = None) -> r
     """Everything; before it, once a failure is diagnosed, the evidence that decided its case."""
     whole = _everything(opening)
     if diagnosis is None or not opening.cameras:
-        return _panels(whole, opening.hz)
+        return panels(whole, opening.hz)
     cam, more = diagnosis.camera or opening.cameras[0].name, [_hand()]
     match diagnosis.case:
         case "case 1" | "unlabelled":
@@ -211,7 +212,7 @@ def episode_blueprint(opening: Opening, diagnosis: Diagnosis | None = None) -> r
         case _:
             why, more = _hand_first(opening), []
     first = rrb.Vertical(why, _course(opening, *more), row_shares=[0.72, 0.28], name=f"{diagnosis.case}: {diagnosis.sub_case}")
-    return _panels(rrb.Tabs(first, whole, active_tab=0), opening.hz)
+    return panels(rrb.Tabs(first, whole, active_tab=0), opening.hz)
 
 
 def grounding_blueprint(cam: str, grounding: Grounding) -> rrb.Blueprint:
@@ -221,7 +222,7 @@ def grounding_blueprint(cam: str, grounding: Grounding) -> rrb.Blueprint:
     cosine = cosine_view(cam)
     top = rrb.Horizontal(vote_view(cam), _image(cam, "mask", ["", "/mask/**"]), policy_view(cam))
     why = rrb.Horizontal(words, references, bars_view(cam, [grounding]), cosine, column_shares=[1, 1.2, 1, 1])
-    return _panels(rrb.Vertical(top, why, row_shares=[1.5, 1]))
+    return panels(rrb.Vertical(top, why, row_shares=[1.5, 1]))
 
 
 def series_style(names: Sequence[str]) -> rr.SeriesLines:

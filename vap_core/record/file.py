@@ -33,7 +33,12 @@ def code_version() -> str:
 
 def recording_name(row: EpisodeRow, method: str) -> str:
     """The file name of an episode's recording, e.g. `simpler-bridge.put-owl.003.s7.vap.rrd`."""
-    return re.sub(r"[^\w.+-]+", "-", f"{row.key}.s{row.seed}.{method}").strip("-.") + ".rrd"
+    return file_name(row.suite, row.task, row.episode, row.seed, method)
+
+
+def file_name(suite: str, task: str, episode: int, seed: int, method: str) -> str:
+    """The same from what a results table says."""
+    return re.sub(r"[^\w.+-]+", "-", f"{suite}.{task}.{episode:03d}.s{seed}.{method}").strip("-.") + ".rrd"
 
 
 def temporary(path: Path) -> Path:

@@ -1,0 +1,127 @@
+"""All recordings of a run asked at once, corrections as layers beside them, and files that are no recordings."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.test_record import ROW, SUCCESS, columns, entities, fail, frame, opening, rerun
+from vap_core import asking
+from vap_core.errors import BadOutput, BadRecording, BadStudy, UnknownName
+from vap_core.record import Correction, Recorder, correct, corrections, read_summary, steps, together
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two failures and a success, and beside them what is no recording of an episode."""
+    folder = tmp_path_factory.mktemp("asked") / "recordings"
+    fail(folder / "wrong.rrd", "owl_b")
+    fail(folder / "apart.rrd", "owl_a", "owl_b", after=4, episode=4)
+    start = replace(opening(1), row=replace(ROW, episode=5))
+    with Recorder(folder / "fine.rrd", start) as recorder:
+        for step in range(30):
+            recorder.frame(frame(step + 31, start))
+        recorder.close(replace(SUCCESS, steps=30))
+    whole = (folder / "wrong.rrd").read_bytes()
+    for name, data in (("noise", b"noise" * 99), ("half", whole[: len(whole) // 2]), ("empty", b"")):
+        (folder / f"{name}.rrd").write_bytes(data)
+    (folder / "z-copy.rrd").write_bytes(whole)
+    program = "import rerun as rr, sys; r = rr.RecordingStream('other'); r.save(sys.argv[1]); r.log('x', rr.Scalars(1.0)); r.flush(); r.disconnect()"
+    subprocess.run([sys.executable, "-c", program, str(folder / "foreign.rrd")], check=True)
+    return folder.parent
+
+
+def test_every_step_is_a_row_and_what_cannot_be_read_is_named(run: Path) -> None:
+    held = steps(run / "recordings")
+    counted = held.table.groupby("file")["frame_index"].agg(list)
+    assert {Path(file).name: len(rows) for file, rows in counted.items()} == {"apart.rrd": 12, "fine.rrd": 30, "wrong.rrd": 12}
+    assert {path.name for path in held.unreadable} == {"noise.rrd", "half.rrd", "empty.rrd", "foreign.rrd", "copy.rrd"} or {
+        path.name for path in held.unreadable
+    }
+    assert all("\n" not in why for why in held.unreadable.values())
+    wrong = held.table[held.table["file"].str.endswith("wrong.rrd")]
+    assert set(wrong["margin"]) == {0.6}
+    assert wrong["track_score"].tolist() == pytest.approx([0.9] * 12)
+    assert (wrong["gap_cm"] > 0).all()
+    assert set(wrong["failure_case"]) == {"case 1"}
+
+
+def test_a_condition_leads_to_recordings_and_frames(run: Path) -> None:
+    answer = asking.ask(run, "success = false and margin < 0.7 and frame_index >= 7")
+    assert [(Path(line.file).name, line.steps, line.first, line.last) for line in answer.found.itertuples()] == [
+        ("apart.rrd", 5, 7, 11),
+        ("wrong.rrd", 5, 7, 11),
+    ]
+    assert asking.frame(answer, 1) == (run / "recordings" / "wrong.rrd", 7)
+    told = asking.text(answer, limit=1)
+    assert told.startswith("2 of 3 recordings, 10 steps")
+    assert "and 1 more" in told
+    assert told.count("was left out") == 5
+    assert asking.ask(run, "lift_cm > 5 and success").found["file"].tolist() == [str(run / "recordings" / "fine.rrd")]
+    assert asking.text(asking.ask(run, "margin > 2")).startswith("0 of 3 recordings, 0 steps")
+    with pytest.raises(BadStudy, match="no recording #2; 2 were found"):
+        asking.frame(answer, 2)
+    with pytest.raises(BadStudy, match="is no condition on this table"):
+        asking.ask(run, "margin <")
+
+
+def test_a_folder_without_recordings_says_so(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadRecording, match="there is no recording in .*; run eval with --record"):
+        steps(tmp_path)
+    (tmp_path / "noise.rrd").write_bytes(b"noise" * 99)
+    with pytest.raises(BadRecording, match="none of 1 files"):
+        steps(tmp_path)
+
+
+def test_a_correction_is_a_layer_and_leaves_the_recording_alone(run: Path) -> None:
+    path = run / "recordings" / "wrong.rrd"
+    before = path.read_bytes()
+    for part, note in (("missed grasp", ""), ("slip", "it held for a moment")):
+        layer = correct(path, Correction("case 3", part, note), 5)
+    assert path.read_bytes() == before
+    assert layer == run / "corrections" / "wrong.rrd"
+    assert [p.name for p in layer.parent.iterdir()] == ["wrong.rrd"], "the second replaced the first"
+    assert corrections(run) == {"wrong.rrd": Correction("case 3", "slip", "it held for a moment")}
+    assert rerun("rrd", "verify", layer).returncode == 0
+    assert "/vap/events" in entities(layer)
+    table = steps(run / "recordings").table
+    mine = table[table["file"].str.endswith("wrong.rrd")].iloc[0]
+    assert (mine.failure_case, mine.sub_case, mine.why, mine.corrected) == ("case 3", "slip", "it held for a moment", True)
+    assert not table[table["file"].str.endswith("apart.rrd")]["corrected"].any()
+    assert read_summary(path)["outcome.failure_case"] == "case 1"
+    layer.unlink()
+
+
+def test_what_cannot_be_corrected(run: Path) -> None:
+    with pytest.raises(UnknownName, match="case 3"):
+        Correction("case 4", "slip")
+    with pytest.raises(UnknownName, match="missed grasp"):
+        Correction("case 3", "drift")
+    with pytest.raises(BadStudy, match="ended in success; only failures have a case"):
+        correct(run / "recordings" / "fine.rrd", Correction("case 3", "slip"), 0)
+    with pytest.raises(BadRecording, match="cannot be read"):
+        correct(run / "recordings" / "noise.rrd", Correction("case 3", "slip"), 0)
+
+
+def test_a_damaged_layer_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "corrections").mkdir()
+    (tmp_path / "corrections" / "a.rrd").write_bytes(b"noise")
+    with pytest.raises(BadRecording, match="is damaged .*; delete it") as caught:
+        corrections(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_two_methods_share_a_time_line(run: Path, tmp_path: Path) -> None:
+    folder = run / "recordings"
+    together({"mine": folder / "wrong.rrd", "theirs": folder / "z-copy.rrd"}, tmp_path / "both.rrd")
+    assert rerun("rrd", "verify", tmp_path / "both.rrd").returncode == 0
+    alone = {name for name in entities(folder / "wrong.rrd") if not name.startswith("/__")}
+    assert {f"/{name}{entity.rstrip('/')}" for name in ("mine", "theirs") for entity in alone} <= entities(tmp_path / "both.rrd")
+    one = columns(folder / "wrong.rrd", "/vap/hand/gripper_to_target", "Scalars:scalars")
+    assert columns(tmp_path / "both.rrd", "/theirs/vap/hand/gripper_to_target", "Scalars:scalars") == one
+    with pytest.raises(BadStudy, match="not recordings of one episode: mine tabletop pick-owl 3 7; other tabletop pick-owl 4 7"):
+        together({"mine": folder / "wrong.rrd", "other": folder / "apart.rrd"}, tmp_path / "more.rrd")
+    with pytest.raises(BadOutput, match="never overwritten"):
+        together({"mine": folder / "wrong.rrd"}, tmp_path / "both.rrd")
