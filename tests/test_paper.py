@@ -153,3 +153,10 @@ def test_a_damaged_ledger_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     whole.to_csv(broken, index=False)
     with pytest.raises(BadOutput, match="a value that is no number"):
         ledger.__wrapped__()
+
+
+def test_the_papers_cases_sum_to_a_hundred_percent() -> None:
+    cases = paper.failure_cases()
+    assert list(cases.index) == list(paper.FAILURES.values())
+    assert cases[["case 1", "case 2", "case 3"]].sum(axis=1).round(6).tolist() == [100.0] * 4
+    assert cases.loc["vlabench", "fail"] == 38.4

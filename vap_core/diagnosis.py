@@ -204,6 +204,15 @@ def _recorded(failures: Failures, line: dict[str, Any]) -> Path:
     return path
 
 
+def still(failures: Failures, number: int, png: Path, against: str | None = None) -> str:
+    """Picture a listed failure at its deciding frame as the viewer shows it, and say why it failed. Raises: as `recording`; MissingGL."""
+    from vap_core.record import screenshot
+
+    path = recording(failures, number) if against is None else beside(failures, number, against)
+    screenshot(path, png, frame_index=deciding_frame(failures, number), size=(1920, 1080))
+    return str(_line(failures, number)["case_sentence"])
+
+
 def deciding_frame(failures: Failures, number: int) -> int:
     return max(0, int(_line(failures, number)["deciding_frame"]))
 

@@ -38,6 +38,8 @@ METHODS = {
     "vap": "{} + VAP",
 }
 """Which row of the paper's main tables a method of ours stands beside, after the name of the policy."""
+FAILURES = {"P-SIMPLER (Fractal)": "simpler-fractal", "P-SIMPLER (Bridge)": "simpler-bridge", "P-VLABench": "vlabench", "Real-world": "tabletop"}
+"""Which of our suites stands where a row of the paper's failure table does; its real arm is the robot of our tabletop."""
 OTHER_WORLD = (
     "another world. The paper's own simulators or real arm, objects, pictures and 3-billion-parameter policies; "
     "they show the shape of its tables and are no target for the numbers beside them."
@@ -112,6 +114,15 @@ def main_results() -> "pd.DataFrame":
     first = {key: i for i, key in reversed(list(enumerate(named[keys].itertuples(index=False, name=None))))}
     wide = named.pivot(index=keys, columns="metric", values="value").rename(columns=str.lower).rename_axis(columns=None)
     return wide.loc[sorted(wide.index, key=lambda key: first[key])].reset_index()[[*keys, "sr", "cmr"]]
+
+
+def failure_cases() -> "pd.DataFrame":
+    """The paper's failures of VAP (P tab:error_case_breakdown_simple): one row per suite; `fail` in percent of episodes, each case in percent of
+    failures, nan where the paper says that it does not apply."""
+    facts = ledger()
+    facts = facts[facts["table"] == "error_case_breakdown_simple"]
+    wide = facts.assign(suite=facts["row"].map(FAILURES)).pivot(index="suite", columns="metric", values="value").rename_axis(columns=None)
+    return wide.loc[list(FAILURES.values()), ["fail", "case 1", "case 2", "case 3"]]
 
 
 def real_arm() -> str:

@@ -259,14 +259,16 @@ def rates_figure(panels: Mapping[str, Mapping[str, Mapping[str, "Rate"]]], label
 
 
 def keep(figure: "Figure", path: Path, dpi: int = 110, limit: int = 480_000, small: int = 115_000) -> bytes:
-    """Save a figure as a PNG of `limit` bytes at most, and return a JPEG of it for a notebook, `small` bytes at most.
+    """Save a figure as a PNG of `limit` bytes at most, and return a JPEG of it for a notebook, `small` bytes at most."""
+    figure.savefig(drawn := BytesIO(), dpi=dpi, metadata={"Software": None})
+    return keep_png(drawn.getvalue(), path, limit, small)
 
-    What is too large is saved with coarser colours (6 or 5 bits a channel), then with fewer pixels.
-    """
+
+def keep_png(drawn: bytes, path: Path, limit: int = 480_000, small: int = 115_000) -> bytes:
+    """The same for a picture: what is too large is saved with coarser colours (6 or 5 bits a channel), then with fewer pixels."""
     from PIL import Image
 
-    figure.savefig(drawn := BytesIO(), dpi=dpi, metadata={"Software": None})
-    full = Image.open(drawn).convert("RGB")
+    full = Image.open(BytesIO(drawn)).convert("RGB")
     for share, bits in ((1.0, 8), (1.0, 6), (1.0, 5), (0.8, 6), (0.8, 5), (0.6, 5)):
         size = round(share * full.width), round(share * full.height)
         coarse = [round(round(v / 255 * (2**bits - 1)) * 255 / (2**bits - 1)) for v in range(256)]

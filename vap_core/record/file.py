@@ -6,8 +6,6 @@ import sys
 import warnings
 from collections.abc import Sequence
 from datetime import timedelta
-from functools import lru_cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +14,6 @@ from rerun.chunk import RrdReader
 
 from vap_core.errors import BadOutput, BadRecording
 from vap_core.values import EpisodeRow
-
-
-@lru_cache(maxsize=1)
-def code_version() -> str:
-    """The commit this package runs from, with `+` when the tree differs, or the installed version outside a checkout."""
-    here = Path(__file__).resolve().parent
-    try:
-        found = subprocess.run(
-            ["git", "-C", str(here), "describe", "--always", "--dirty=+", "--abbrev=10"], capture_output=True, text=True, timeout=10, check=True
-        )
-    except (OSError, subprocess.SubprocessError):
-        return f"vap-core {version('vap-core')}"
-    return found.stdout.strip()
 
 
 def recording_name(row: EpisodeRow, method: str) -> str:

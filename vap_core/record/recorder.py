@@ -24,9 +24,10 @@ from vap_core.failures import diagnose, follow
 from vap_core.record import why
 from vap_core.record.blueprint import SERIES, episode_blueprint, evidence_line, grounding_blueprint, packed, series_style, state_style
 from vap_core.record.evidence import CLASSES, classes, contact_sheet, jpeg, log_association, log_vote, picture, suffix, words
-from vap_core.record.file import code_version, finish_stream, open_stream, put, put_property, temporary
+from vap_core.record.file import finish_stream, open_stream, put, put_property, temporary
 from vap_core.record.scene import log_cameras, log_links, log_objects, log_table, send_poses, send_truth
 from vap_core.values import Episode, Event, Frame, Grounding, Mask, Opening, Outcome, PersonalObject, Rgb
+from vap_core.version import code_version
 
 STATE_NAMES = ("x", "y", "z", "rx", "ry", "rz", "gripper")
 PROMPTED_QUALITY_DROP = 5

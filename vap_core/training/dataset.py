@@ -32,6 +32,7 @@ from vap_core.store import locked, open_run
 from vap_core.suites import Suite, suite
 from vap_core.training.demonstrations import PARTS, Film, cached, every
 from vap_core.values import EE_ACTION
+from vap_core.version import code_version
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -192,8 +193,6 @@ def _png(ids: UInt8[np.ndarray, "s s"]) -> str:
 def _join(known: Suite, recipe: dict[str, Any], folders: Sequence[Path], out: Path) -> None:
     """One dataset of all parts; meta/ comes last, so that whatever was cut short is joined anew."""
     from lerobot.datasets.aggregate import aggregate_datasets
-
-    from vap_core.record.file import code_version
 
     lists = [json.loads((folder / ABOUT).read_text()) for folder in folders]
     full = [folder for folder, episodes in zip(folders, lists, strict=True) if episodes]

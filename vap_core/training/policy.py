@@ -37,6 +37,7 @@ from vap_core.training.demonstrations import SIDE, Film, after_a_miss, cached, e
 from vap_core.training.descent import Descent, Told, average_of, descend
 from vap_core.training.looking import Shown, Sizes, looking, shares
 from vap_core.training.scenes import only_generic
+from vap_core.version import code_version
 
 CACHE = Path(__file__).resolve().parents[2] / "data" / "cache" / "demonstrations"
 CHUNKS = {"simpler-fractal": (4, 2), "simpler-bridge": (4, 4), "vlabench": (4, 4), "tabletop": (32, 10)}
@@ -324,8 +325,6 @@ def _card(checkpoint: Path) -> dict[str, Any]:
 def save(learner: Learner, stats: Any, held: Sequence[Film], made_of: dict[str, Any], out: Path) -> dict[str, Any]:
     """Weights, configuration and processors as lerobot keeps them, and what was measured."""
     from lerobot.policies import make_pre_post_processors
-
-    from vap_core.record.file import code_version
 
     policy, recipe = learner.policy, Recipe(**made_of["recipe"])
     policy.save_pretrained(out)
