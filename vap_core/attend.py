@@ -93,6 +93,11 @@ class Attender:
         self.prompting = prompting or Prompting()
         self.parser = parser
 
+    @property
+    def highlights(self) -> bool:
+        """Whether pixels are changed, so that it can be asked which."""
+        return self.prompting.highlight
+
     def start(
         self,
         views: Views,

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Literal
 
 from vap_core.errors import BadMemory
@@ -17,6 +18,9 @@ class Described:
 
 class Reworded:
     """Attends to nothing: images pass as they are, and the policy reads `say(instruction)` from the first step of an episode to its last."""
+
+    highlights = False
+    memory: Mapping[str, PersonalObject] = MappingProxyType({})
 
     def __init__(self, say: Callable[[str], str]) -> None:
         self.say = say

@@ -15,7 +15,7 @@ from vap_core.associate import overrule
 from vap_core.attend import Attender, AttendState, Prompting, Seen
 from vap_core.errors import BadInstruction, BadStudy
 from vap_core.segment import bounds
-from vap_core.values import Attended, Boxes, EpisodeRow, Event, Grounding, Mask, Rgb, Track, Views
+from vap_core.values import Attended, Boxes, EpisodeRow, Event, Grounding, Mask, PersonalObject, Rgb, Track, Views
 
 Masks = Mapping[str, Mapping[str, Mask]]
 """`masks[camera][object]`: visible pixels, as in Truth."""
@@ -42,6 +42,14 @@ class Revealed:
         self.attender = attender
         self.oracle = oracle
         self.alike = alike
+
+    @property
+    def memory(self) -> Mapping[str, PersonalObject]:
+        return self.attender.memory
+
+    @property
+    def highlights(self) -> bool:
+        return self.attender.highlights
 
     @property
     def always(self) -> bool:

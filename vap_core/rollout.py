@@ -25,7 +25,7 @@ from vap_core.sim.occluder import Occlusion
 from vap_core.sim.scenes import Scene
 from vap_core.sim.sensor import PERFECT, Sensor
 from vap_core.suites import Judge
-from vap_core.values import Attended, Call, Chunk, Episode, EpisodeRow, Frame, Opening, Outcome, PersonalObject, PolicyInput
+from vap_core.values import Attended, Call, Chunk, Episode, EpisodeRow, Frame, Opening, Outcome, PolicyInput
 
 
 @runtime_checkable
@@ -98,7 +98,7 @@ def rollout(
             _plan(trial, live, seen)
             for one in live:
                 if one.outcome is None:
-                    _guard(one, _act, one, *seen[id(one)], keep_images, _highlights(trial))
+                    _guard(one, _act, one, *seen[id(one)], keep_images, trial.attender is not None and trial.attender.highlights)
         for one in running:
             yield _end(trial, one)
 
@@ -194,7 +194,7 @@ def _open(trial: Trial, one: Running, attended: Attended) -> Opening:
     sizes = {place.model: trial.sizes_m[place.model] for place in row.placements}
     return Opening(
         row, trial.method, trial.policy.label, env.hz, env.cameras(), row.instruction, attended.text, attended.groundings, sizes, env.action_names,
-        attended.associations, {name: obj.crops for name, obj in _memory(trial).items()},
+        attended.associations, {} if trial.attender is None else {name: obj.crops for name, obj in trial.attender.memory.items()},
     )  # fmt: skip
 
 
@@ -254,23 +254,6 @@ def _act(one: Running, raw: PolicyInput, attended: Attended, keep_images: bool, 
     if not over:
         one.env.step(action)
         one.judge = one.judge.step(one.env.truth())
-
-
-def _attender(trial: Trial) -> Attender | None:
-    """The one who grounds and prompts, be it told by the simulator."""
-    attender = trial.attender.attender if isinstance(trial.attender, Revealed) else trial.attender
-    return attender if isinstance(attender, Attender) else None
-
-
-def _memory(trial: Trial) -> Mapping[str, PersonalObject]:
-    attender = _attender(trial)
-    return {} if attender is None else attender.memory
-
-
-def _highlights(trial: Trial) -> bool:
-    """Whether the method changes pixels, so that it can be asked which."""
-    attender = _attender(trial)
-    return attender is not None and attender.prompting.highlight
 
 
 def _over(one: Running) -> bool:

@@ -4,7 +4,7 @@ Four ways to say which of them is meant: a tint from the simulator's masks and t
 nature), a description of its own look, or nothing. When nothing is said, any of its kind is right, and what counts is whether the hand commits.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,7 +26,7 @@ from vap_core.suites import VARIANTS, suite
 from vap_core.training.commands import Way, painted, say, telling, tinted
 from vap_core.training.demonstrations import cast, row
 from vap_core.training.words import free, looks
-from vap_core.values import Attended, EpisodeRow, Views
+from vap_core.values import Attended, EpisodeRow, PersonalObject, Views
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -43,6 +43,15 @@ class Told(Revealed):
 
     def __init__(self, way: Way) -> None:
         self.way = way
+
+    @property
+    def memory(self) -> Mapping[str, PersonalObject]:
+        return {}
+
+    @property
+    def highlights(self) -> bool:
+        """Nothing of it is judged: what it shows is the truth."""
+        return False
 
     @property
     def always(self) -> bool:
