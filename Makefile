@@ -22,7 +22,8 @@ test: setup
 	$(RUN) -m ruff check .
 	$(RUN) -m ruff format --check .
 	$(RUN) -m mypy
-	$(RUN) -m pytest
+	$(RUN) -m pytest -n 2 --dist loadfile -m "not alone"
+	$(RUN) -m pytest -m alone
 	$(RUN) -m pytest --nbval-lax notebooks
 
 lab: setup

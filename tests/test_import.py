@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 import vap_core
 
 HEAVY = ("torch", "mujoco", "rerun", "transformers", "matplotlib", "pandas", "cv2")
@@ -13,6 +15,7 @@ def test_import_loads_nothing_heavy() -> None:
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
 
 
+@pytest.mark.alone
 def test_import_is_fast() -> None:
     code = "import time; t = time.perf_counter(); import vap_core; print(time.perf_counter() - t)"
     took = [float(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout) for _ in range(3)]

@@ -475,6 +475,7 @@ def test_an_exception_keeps_every_step_under_the_temporary_name(tmp_path: Path) 
     assert read_summary(recover(tmp_path / ".one.rrd.tmp"))["frames"] == 1
 
 
+@pytest.mark.alone
 def test_sixty_steps_of_three_cameras_stay_small_and_quick(tmp_path: Path) -> None:
     start = opening(3)
     frames = [frame(step, start) for step in range(60)]
