@@ -343,7 +343,7 @@ def test_only_what_is_wanted_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_what_waited_is_recorded_as_if_it_had_streamed(tmp_path: Path) -> None:
     start = opening(2)
-    streamed = Recorder(tmp_path / "streamed.rrd", start)
+    streamed = Recorder(tmp_path / "streamed.rrd", start, flush_every=keep.TOGETHER)
     waited = keep.Waiting(tmp_path / "waited.rrd", start, lambda outcome: True)
     for sink in (streamed, waited):
         for step in range(12):
@@ -428,6 +428,30 @@ def test_pictures_may_be_rarer_than_steps(tmp_path: Path) -> None:
         assert sorted(columns(tmp_path / "one.rrd", f"/observation.images.front{entity}", "EncodedImage:blob")) == [0, 4, 8]
     assert len(columns(tmp_path / "one.rrd", "/action", "Scalars:scalars")) == 12
     assert sorted(columns(tmp_path / "one.rrd", "/vap/track_score/front", "Scalars:scalars")) == [0, 4, 8]
+
+
+def test_as_video_every_picture_stands_at_its_step_and_weighs_less(tmp_path: Path) -> None:
+    import av
+
+    start = opening(1)
+    for name, video in (("stills", False), ("video", True)):
+        with Recorder(tmp_path / f"{name}.rrd", start, video=video) as recorder:
+            for step in range(20):
+                one = frame(step, start)
+                recorder.frame(one if step % 2 == 0 else one.light())
+            recorder.close(SUCCESS)
+    assert rerun("rrd", "verify", tmp_path / "video.rrd").returncode == 0
+    for entity, kind in (("", "images"), ("/prompted", "prompted")):
+        samples = columns(tmp_path / "video.rrd", f"/observation.images.front{entity}", "VideoStream:sample")
+        assert sorted(samples) == list(range(0, 20, 2))
+        decoder = av.CodecContext.create("libdav1d", "r")
+        packets = [av.Packet(bytes(samples[step][0])) for step in sorted(samples)]  # type: ignore[index]
+        shown = [seen.to_ndarray(format="rgb24") for packet in (*packets, None) for seen in decoder.decode(packet)]
+        assert len(shown) == 10
+        for step, picture in zip(range(0, 20, 2), shown, strict=True):
+            assert np.abs(picture.astype(int) - getattr(frame(step, start), kind)["front"]).mean() < 6
+        blobs = columns(tmp_path / "stills.rrd", f"/observation.images.front{entity}", "EncodedImage:blob")
+        assert 2 * sum(len(one[0]) for one in samples.values()) < sum(len(one[0]) for one in blobs.values())  # type: ignore[index, misc]
 
 
 def test_equal_episodes_give_equal_recordings(tmp_path: Path) -> None:

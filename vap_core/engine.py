@@ -7,7 +7,7 @@ and recorded then; both tries are kept. What a worker was doing when it died run
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from resource import RUSAGE_SELF, getrusage
 from typing import TYPE_CHECKING, Any, Literal
@@ -36,7 +36,8 @@ Rows = list[dict[str, Any]]
 
 @dataclass(frozen=True)
 class Job:
-    """Some rows of one task and variant under one method, for one worker; `attempt` 1 is the first. `chosen` are the keys to record of a number."""
+    """Some rows of one task and variant under one method, for one worker; `attempt` 1 is the first. `chosen` are the keys to record when `record` is
+    a number; `video` records AV1 instead of JPEGs."""
 
     study: Study
     method: str
@@ -46,6 +47,7 @@ class Job:
     folder: Path
     record: Record
     chosen: frozenset[str] = frozenset()
+    video: bool = False
 
 
 Spread = Callable[[Callable[[Job], Rows], Sequence[Job], int, str], Iterator[tuple[Job, Rows]]]
@@ -53,7 +55,15 @@ Spread = Callable[[Callable[[Job], Rows], Sequence[Job], int, str], Iterator[tup
 
 
 def run(
-    study: Study, folder: Path, *, workers: int = 2, record: Record = "all", retries: int = 1, progress: bool = True, spread: Spread = results
+    study: Study,
+    folder: Path,
+    *,
+    workers: int = 2,
+    record: Record = "all",
+    retries: int = 1,
+    progress: bool = True,
+    spread: Spread = results,
+    video: bool = False,
 ) -> "pd.DataFrame":
     """Run whatever of `study` is not in `folder` yet, and return the table of all its episodes.
 
@@ -63,12 +73,12 @@ def run(
     store.open_run(folder, study.configuration())
     with store.locked(folder):
         store.compact(folder)
-        _run(study, folder, workers, record, retries, progress, spread)
+        _run(study, folder, workers, record, retries, progress, spread, video)
         store.compact(folder)
     return store.read(folder)
 
 
-def _run(study: Study, folder: Path, workers: int, record: Record, retries: int, progress: bool, spread: Spread) -> None:
+def _run(study: Study, folder: Path, workers: int, record: Record, retries: int, progress: bool, spread: Spread, video: bool) -> None:
     from tqdm import tqdm
 
     register_personal(study, folder / "memory")
@@ -76,7 +86,7 @@ def _run(study: Study, folder: Path, workers: int, record: Record, retries: int,
     table = store.read(folder)
     ended = {str(method): Counter(success=int(part.success.sum()), n=len(part)) for method, part in table.groupby("method")}
     with tqdm(total=total, initial=len(table), unit="episode", disable=not progress, smoothing=0.05) as bar:
-        while jobs := list(missing(study, folder, record, retries)):
+        while jobs := [replace(job, video=video) for job in missing(study, folder, record, retries)]:
             try:
                 for job, rows in spread(work, jobs, workers, "--workers"):
                     store.append(folder, rows)
@@ -158,9 +168,9 @@ def _recorders(job: Job) -> Callable[[Opening], "Recorder | Waiting"]:
         path = folder / recording_name(row, job.method)
         path.unlink(missing_ok=True)  # left by a run that was killed after recording and before its result was stored
         if job.record == "all":
-            return Recorder(path, opening)
+            return Recorder(path, opening, video=job.video)
         if job.record == "failures":
-            return Waiting(path, opening, lambda outcome: wanted(outcome, row, job.method))
-        return Waiting(path, opening, lambda outcome: keys[row.key, row.seed] in job.chosen)
+            return Waiting(path, opening, lambda outcome: wanted(outcome, row, job.method), video=job.video)
+        return Waiting(path, opening, lambda outcome: keys[row.key, row.seed] in job.chosen, video=job.video)
 
     return begin

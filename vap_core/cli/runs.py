@@ -29,6 +29,7 @@ PolicyName = Annotated[str, typer.Option("--policy", help=POLICIES)]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the policy and the sensors; of a warm-up suite's episode list, too.")]
 RECORDED = "Which episodes become a .rrd file: all; failures and one success in ten; none; or N per task and method. A retried error always does."
 Recorded = Annotated[str, typer.Option("--record", metavar="all|failures|none|N", help=RECORDED)]
+Video = Annotated[bool, typer.Option("--video", help="Record AV1 video instead of JPEG pictures: far smaller, for about twice the recording time.")]
 Retries = Annotated[int, typer.Option(min=0, help="How often an episode that ended in an error is tried again.")]
 Meshes = Annotated[str, typer.Option("--robots", help="plain, or menagerie: MuJoCo Menagerie's meshes, downloaded or found in MENAGERIE_ROOT.")]
 
@@ -73,6 +74,7 @@ def rollout(
     seed: Seed = 0,
     workers: Workers = 2,
     record: Recorded = "all",
+    video: Video = False,
     retries: Retries = 1,
     robots: Meshes = "plain",
     stack: StackName = "embedded",
@@ -82,7 +84,7 @@ def rollout(
     Example: python -m vap_core rollout --suite widowx-pick --task pick-bottle --episodes 4 --out data/runs/bottle
     """
     tasks = tuple((suite, name) for name in dict.fromkeys(task))
-    _run(_study(tasks, method, policy=policy, episodes=episodes, seed=seed, robots=robots, stack=stack), out, workers, record, retries)
+    _run(_study(tasks, method, policy=policy, episodes=episodes, seed=seed, robots=robots, stack=stack), out, workers, record, retries, video=video)
 
 
 @app.command("eval")
@@ -100,6 +102,7 @@ def evaluate(
     record: Annotated[
         str | None, typer.Option("--record", metavar="all|failures|none|N", help=f"{RECORDED} Default failures; none for the bounds.")
     ] = None,
+    video: Video = False,
     retries: Retries = 1,
     follow: Annotated[
         Literal["call", "step"], typer.Option(help="Take images and track when the policy is asked, or at every control step (smoother recordings).")
@@ -130,7 +133,7 @@ def evaluate(
         raise BadStudy("eval: --address needs --engine ray.")
     folder = out or Path(f"data/runs/{Path(policy).name}-{'-'.join(dict.fromkeys(suite))}")
     record = record or ("none" if policy in INSIDERS else "failures")
-    _run(study, folder, workers, record, retries, (address or "127.0.0.1:6379") if engine == "ray" else None)
+    _run(study, folder, workers, record, retries, (address or "127.0.0.1:6379") if engine == "ray" else None, video)
 
 
 @app.command()
@@ -275,7 +278,7 @@ def _record(said: str) -> "Record":
     raise BadStudy(f"--record {said}: say all, failures, none, or how many per task and method.")
 
 
-def _run(study: "Study", out: Path, workers: int | None, said: str, retries: int, address: str | None = None) -> None:
+def _run(study: "Study", out: Path, workers: int | None, said: str, retries: int, address: str | None = None, video: bool = False) -> None:
     from vap_core.cluster import spread
     from vap_core.engine import run
     from vap_core.processes import results
@@ -289,7 +292,15 @@ def _run(study: "Study", out: Path, workers: int | None, said: str, retries: int
             tracks.setdefault(f"{row.suite} ({row.split})" if row.split else row.suite, []).append(row)
         for track, rows in tracks.items():
             print(f"{track}: {foresight(rows)}", file=sys.stderr)
-    table = run(study, out, workers=workers or (0 if address else 2), record=record, retries=retries, spread=spread(address) if address else results)
+    table = run(
+        study,
+        out,
+        workers=workers or (0 if address else 2),
+        record=record,
+        retries=retries,
+        spread=spread(address) if address else results,
+        video=video,
+    )
     print(conclude(study, table, out))
     if study.audit:
         from vap_core.audit import verdict

@@ -3,17 +3,16 @@
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
 
 from vap_core.record.recorder import Recorder
 from vap_core.values import EpisodeRow, Frame, Opening, Outcome
 
-type Record = Literal["all", "failures", "none"] | int
-"""Every episode, every failure and a sample of the successes, none; or so many per task and method."""
 ONE_IN = 10
 """Of the successes that "failures" keeps for comparison."""
 MOST_MB = 256.0
 """Pictures of one episode that wait in memory; a longer one streams to disk from there on."""
+TOGETHER = 500
+"""Steps that are written at once, since nothing of them is lost by a kill that was not lost anyway: long columns are smaller and quicker."""
 
 
 def sampled(row: EpisodeRow, method: str) -> bool:
@@ -29,8 +28,8 @@ def wanted(outcome: Outcome, row: EpisodeRow, method: str) -> bool:
 class Waiting:
     """A sink that records an episode only if `keep` says so once its outcome is known; until then its frames wait in memory."""
 
-    def __init__(self, path: Path, opening: Opening, keep: Callable[[Outcome], bool]) -> None:
-        self.path, self._opening, self._keep = path, opening, keep
+    def __init__(self, path: Path, opening: Opening, keep: Callable[[Outcome], bool], *, video: bool = False) -> None:
+        self.path, self._opening, self._keep, self._video = path, opening, keep, video
         self._frames: list[Frame] = []
         self._held_mb = 0.0
         self._recorder: Recorder | None = None
@@ -54,7 +53,7 @@ class Waiting:
 
     def _begin(self) -> Recorder:
         if self._recorder is None:
-            self._recorder = Recorder(self.path, self._opening)
+            self._recorder = Recorder(self.path, self._opening, flush_every=TOGETHER, video=self._video)
             for frame in self._frames:
                 self._recorder.frame(frame)
             self._frames = []

@@ -25,13 +25,12 @@ from vap_core.record import why
 from vap_core.record.blueprint import SERIES, episode_blueprint, evidence_line, grounding_blueprint, packed, series_style, state_style
 from vap_core.record.evidence import CLASSES, classes, contact_sheet, jpeg, log_association, log_vote, picture, suffix, words
 from vap_core.record.file import finish_stream, open_stream, put, put_property, temporary
+from vap_core.record.pictures import Pictures, Reels, Stills, time_index
 from vap_core.record.scene import log_cameras, log_links, log_objects, log_table, send_poses, send_truth
 from vap_core.values import Episode, Event, Frame, Grounding, Mask, Opening, Outcome, PersonalObject, Rgb
 from vap_core.version import code_version
 
 STATE_NAMES = ("x", "y", "z", "rx", "ry", "rz", "gripper")
-PROMPTED_QUALITY_DROP = 5
-"""Prompted pictures repeat the raw ones outside the mask: they may be a little coarser."""
 OUTCOMES = {"success": (40, 140, 85), "failure": (190, 120, 30), "error": (190, 60, 60)}
 GRASPS = {
     "free": (70, 78, 92),
@@ -56,19 +55,20 @@ class Recorder:
     """Streams one episode to disk; what was flushed outlives the process (`recover`).
 
     `frame` buffers; every `flush_every` frames the buffered columns go to the file. `close` writes the ending and renames
-    the file. Left through an exception, the context manager keeps the unfinished file under its temporary name.
+    the file. `video` keeps pictures as AV1, much smaller for more time.
+    Left through an exception, the context manager keeps the unfinished file under its temporary name.
 
     Raises: BadOutput, when `path` exists or its folder cannot be written.
     """
 
-    def __init__(self, path: Path, opening: Opening, *, flush_every: int = 10, jpeg_quality: int = 90) -> None:
+    def __init__(self, path: Path, opening: Opening, *, flush_every: int = 10, jpeg_quality: int = 90, video: bool = False) -> None:
         row = opening.row
         self.path = Path(path)
         self._opening, self._flush_every, self._quality = opening, flush_every, jpeg_quality
         self._steps: list[int] = []
         self._times: list[float] = []
         self._frames: list[Frame] = []
-        self._jpegs: list[dict[str, tuple[np.ndarray, np.ndarray]]] = []
+        self._pictures: Pictures = Reels(opening.hz) if video else Stills(jpeg_quality)
         self._course: list[Frame] = []
         self._grasp: str | None = None
         self._rec: rr.RecordingStream | None = open_stream(self.path, f"{row.key}.s{row.seed}.{opening.method}.{opening.policy}")
@@ -95,19 +95,14 @@ class Recorder:
             self._rec = None
 
     def frame(self, frame: Frame) -> None:
-        """Take one control step; pictures are compressed at once."""
-        pictures = {}
-        for cam, raw in frame.images.items():
-            seen, shown = jpeg(raw, self._quality), frame.prompted.get(cam, raw)
-            same = shown is raw or np.array_equal(shown, raw)
-            pictures[cam] = (seen, seen if same else jpeg(shown, self._quality - PROMPTED_QUALITY_DROP))
+        """Take one control step."""
         if not self._steps:
-            self._first(frame, {cam: seen for cam, (seen, _) in pictures.items()})
+            self._first(frame, {cam: jpeg(raw, self._quality) for cam, raw in frame.images.items()})
+        self._pictures.take(frame)
         self._steps.append(frame.frame_index)
         self._times.append(frame.timestamp_s)
         self._frames.append(frame)
         self._course.append(frame.light())
-        self._jpegs.append(pictures)
         if len(self._frames) >= self._flush_every:
             self._flush()
 
@@ -118,6 +113,7 @@ class Recorder:
         """
         rec = self._stream()
         self._flush()
+        self._pictures.send(rec, last=True)
         episode = Episode(self._opening, tuple(self._course), outcome, {})
         diagnosis = diagnose(episode)
         verdict = self._verdict(outcome)
@@ -166,7 +162,7 @@ class Recorder:
 
     @staticmethod
     def _index(steps: Sequence[int], times: Sequence[float]) -> list[rr.TimeColumn]:
-        return [rr.TimeColumn("frame_index", sequence=steps), rr.TimeColumn("timestamp", duration=np.asarray(times, np.float64))]
+        return time_index(list(zip(steps, times, strict=True)))
 
     def _first(self, frame: Frame, pictures: dict[str, np.ndarray]) -> None:
         """What only the first step can tell: shapes, links, and the pictures the vote was held on."""
@@ -203,13 +199,13 @@ class Recorder:
         if not frames:
             return
         index = self._index(self._steps[-len(frames) :], self._times[-len(frames) :])
-        seen = [i for i, pictures in enumerate(self._jpegs) if pictures]
+        self._pictures.send(rec)
+        seen = [frame for frame in frames if frame.images]
         if seen:
-            at = self._index([frames[i].frame_index for i in seen], [frames[i].timestamp_s for i in seen])
-            self._send_pictures(at, [self._jpegs[i] for i in seen])
-            self._send_masks(at, [frames[i] for i in seen])
-            if any(frames[i].shown for i in seen):
-                why.send_identities(rec, self._opening, at, [frames[i] for i in seen])
+            at = self._index([frame.frame_index for frame in seen], [frame.timestamp_s for frame in seen])
+            self._send_masks(at, seen)
+            if any(frame.shown for frame in seen):
+                why.send_identities(rec, self._opening, at, seen)
         self._send_cameras(index)
         rec.send_columns("/observation.state", index, rr.Scalars.columns(scalars=np.stack([f.state for f in frames])))
         rec.send_columns("/action", index, rr.Scalars.columns(scalars=np.stack([f.action for f in frames])))
@@ -225,19 +221,12 @@ class Recorder:
         self._send_grasp()
         self._send_events([event for f in frames for event in f.events])
         rec.flush()
-        self._frames, self._jpegs = [], []
+        self._frames = []
 
     def _send_cameras(self, index: list[rr.TimeColumn]) -> None:
         for i, camera in enumerate(self._frames[0].cameras):
             poses = np.stack([f.cameras[i].pose_world for f in self._frames])
             send_poses(self._stream(), f"/observation.images.{camera.name}", index, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat())
-
-    def _send_pictures(self, index: list[rr.TimeColumn], jpegs: Sequence[dict[str, tuple[np.ndarray, np.ndarray]]]) -> None:
-        for cam in jpegs[0]:
-            root = f"/observation.images.{cam}"
-            for entity, which in ((root, 0), (f"{root}/prompted", 1)):
-                blobs = [pictures[cam][which] for pictures in jpegs]
-                self._stream().send_columns(entity, index, rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs)))
 
     def _send_masks(self, index: list[rr.TimeColumn], frames: Sequence[Frame]) -> None:
         """The track and the truth of every target; a lost track is an empty mask."""
