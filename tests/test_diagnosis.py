@@ -15,7 +15,8 @@ from vap_core.experiments import Study
 from vap_core.failures import CASES, STAGES
 from vap_core.publish import publish
 from vap_core.record import read_summary
-from vap_core.report.failures import breakdown, breakdown_text, roads, sub_cases_text
+from vap_core.report import align
+from vap_core.report.failures import breakdown, breakdown_rows, roads, sub_cases_text
 
 STUDY = Study((("widowx-pick", "pick-straw-cup"),), ("generic",), episodes=3, policy="random")
 
@@ -60,7 +61,7 @@ def test_the_cases_of_a_row_sum_to_its_failures() -> None:
 
 
 def test_as_text_every_share_has_its_interval() -> None:
-    told = breakdown_text(breakdown(TABLE))
+    told = align(breakdown_rows(breakdown(TABLE)))
     assert "44 % [19, 73]" in told
     assert "75 % [30, 95]" in told
     assert "case 1 %" not in told, "no row has any"
@@ -82,6 +83,12 @@ def test_a_run_lists_its_failures_with_their_reasons(run: Path) -> None:
     assert "and 1 more; --limit shows them" in told
     assert set(failures.table["case"]) == {"unprompted"}
     assert failures.table["deciding_frame"].between(0, 60).all()
+
+
+def test_several_places_are_one_list(run: Path, tmp_path: Path) -> None:
+    publish([run], tmp_path / "mine.parquet")
+    both = listed(run, tmp_path / "mine.parquet")
+    assert both.table["place"].tolist() == [str(run)] * 3 + [str(tmp_path / "mine.parquet")] * 3
 
 
 def test_a_condition_narrows_them_down(run: Path) -> None:
@@ -109,9 +116,10 @@ def test_an_episode_that_was_not_recorded_is_run_again_alike(run: Path, capsys: 
 def test_a_published_table_opens_too(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     publish([run], tmp_path / "mine.parquet")
     failures = listed(tmp_path / "mine.parquet", suite="widowx-pick", case="unprompted")
-    assert failures.recordings == Path("data/runs/mine-diagnosed/recordings")
     monkeypatch.chdir(tmp_path)
-    assert recording(failures, 0).exists()
+    path = recording(failures, 0)
+    assert path.parent == Path("data/runs/mine-diagnosed/recordings")
+    assert path.exists()
 
 
 @pytest.mark.parametrize(
@@ -141,7 +149,7 @@ def test_other_refusals(run: Path, tmp_path: Path) -> None:
         breakdown(TABLE.drop(columns="case"))
     failures = listed(run)
     failures.table.loc[0, "policy"] = "another"
-    (failures.recordings / f"widowx-pick.pick-straw-cup.{failures.table.episode[0]:03d}.s0.generic.rrd").unlink(missing_ok=True)
+    (run / "recordings" / f"widowx-pick.pick-straw-cup.{failures.table.episode[0]:03d}.s0.generic.rrd").unlink(missing_ok=True)
     with pytest.raises(BadStudy, match="run with another, and random is here now"):
         recording(failures, 0)
 

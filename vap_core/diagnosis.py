@@ -14,7 +14,7 @@ from vap_core import store
 from vap_core.errors import BadOutput, BadStudy
 from vap_core.experiments import Study, make_trial, register_personal
 from vap_core.publish import published
-from vap_core.report.failures import breakdown, breakdown_text, diagnosed, sub_cases_text
+from vap_core.report.failures import breakdown, breakdown_rows, diagnosed, sub_cases_text
 from vap_core.report.text import align
 
 if TYPE_CHECKING:
@@ -26,24 +26,17 @@ SHORT = {"deciding_frame": "frame", "case_confidence": "sure", "case_sentence": 
 
 @dataclass(frozen=True)
 class Failures:
-    """The failed episodes of a run (or of all runs in a published table) that were asked for. `notes` are the runs' configurations by digest,
+    """The failed episodes of runs (folders, or published tables) that were asked for. `notes` are the runs' configurations by digest,
     `table` has their digests as `configuration`; `whole` are all episodes, failed or not, of the suites and methods asked for, `every` of all."""
 
-    place: Path
     notes: dict[str, dict[str, Any]]
     every: "pd.DataFrame"
     whole: "pd.DataFrame"
     table: "pd.DataFrame"
 
-    @property
-    def recordings(self) -> Path:
-        """Where its recordings lie, or will."""
-        return _home(self.place) / "recordings"
-
 
 def listed(
-    place: Path,
-    *,
+    *places: Path,
     suite: str | None = None,
     task: str | None = None,
     method: str | None = None,
@@ -51,17 +44,17 @@ def listed(
     sub_case: str | None = None,
     where: str | None = None,
 ) -> Failures:
-    """The failures in a run folder or a published table, narrowed down; `where` is a SQL condition on the table's columns.
+    """The failures in run folders or published tables, narrowed down; `where` is a SQL condition on the table's columns.
 
     Raises: BadOutput when there is no such run, or it was never diagnosed; BadStudy for a name or a condition that fits nothing in it.
     """
     import pandas as pd
 
-    runs = published(place) if place.suffix == ".parquet" else [(store.note(place), store.read(place))]
-    whole = pd.concat([table.assign(configuration=about["digest"]) for about, table in runs if not table.empty] or [pd.DataFrame()])
-    if whole.empty:
-        raise BadOutput(f"diagnose: {place} holds no finished episode; run eval first.")
-    whole = every = _corrected(diagnosed(whole).reset_index(drop=True), place)
+    runs = [(place, about, table) for place in places for about, table in _runs(place)]
+    tables = [diagnosed(table.assign(configuration=about["digest"], place=str(place))) for place, about, table in runs if not table.empty]
+    if not tables:
+        raise BadOutput(f"diagnose: {' and '.join(map(str, places))} hold no finished episode; run eval first.")
+    whole = every = _corrected(pd.concat(tables, ignore_index=True))
     for name, wanted in (("suite", suite), ("task", task), ("method", method)):
         whole = _only(whole, name, wanted)
     table = whole[whole["outcome"].eq("failure")]
@@ -69,25 +62,24 @@ def listed(
     table = _only(table, "sub_case", sub_case)
     if where is not None:
         table = matching(table, where)
-    return Failures(place, {about["digest"]: about for about, _ in runs}, every, whole, table.reset_index(drop=True))
+    return Failures({about["digest"]: about for _, about, _ in runs}, every, whole, table.reset_index(drop=True))
 
 
-def _corrected(table: "pd.DataFrame", place: Path) -> "pd.DataFrame":
+def _runs(place: Path) -> "list[tuple[dict[str, Any], pd.DataFrame]]":
+    return published(place) if place.suffix == ".parquet" else [(store.note(place), store.read(place))]
+
+
+def _corrected(table: "pd.DataFrame") -> "pd.DataFrame":
     """With what researchers have corrected since, marked in `corrected`."""
     from vap_core.record import corrections, file_name
 
     table = table.assign(corrected=False)
-    held = corrections(_home(place))
-    if held:
-        for at, line in table[["suite", "task", "episode", "seed", "method"]].iterrows():
+    for place, part in table.groupby("place", sort=False):
+        held = corrections(_home(Path(str(place))))
+        for at, line in part[["suite", "task", "episode", "seed", "method"]].iterrows() if held else ():
             if (right := held.get(file_name(*line))) is not None:
-                table.loc[at, ["case", "sub_case", "case_sentence", "case_confidence", "corrected"]] = [
-                    right.case,
-                    right.sub_case,
-                    right.note,
-                    1.0,
-                    True,
-                ]
+                told = {"case": right.case, "sub_case": right.sub_case, "case_sentence": right.note, "case_confidence": 1.0, "corrected": True}
+                table.loc[at, list(told)] = list(told.values())
     return table
 
 
@@ -136,7 +128,7 @@ def matching(table: "pd.DataFrame", where: str) -> "pd.DataFrame":
 def text(failures: Failures, limit: int = 20) -> str:
     """How the failures divide, and the first of them, numbered as `recording` takes them."""
     counts = breakdown(failures.whole)
-    lines = [breakdown_text(counts), "", sub_cases_text(counts), ""]
+    lines = [align(breakdown_rows(counts)), "", sub_cases_text(counts), ""]
     if failures.table.empty:
         return "\n".join([*lines, "no failure is left of what was asked for."])
     shown = failures.table.head(limit)
@@ -176,7 +168,7 @@ def beside(failures: Failures, number: int, method: str) -> Path:
     if other.empty:
         raise BadStudy(f"diagnose: {method!r} did not run this episode here; there is {', '.join(sorted(same['method']))}.")
     paths = {name: _recorded(failures, one) for name, one in ((line["method"], line), (method, dict(other.iloc[0].items())))}
-    out = failures.recordings.parent / "together" / paths[line["method"]].name.replace(".rrd", f"-{method}.rrd")
+    out = _home(Path(line["place"])) / "together" / paths[line["method"]].name.replace(".rrd", f"-{method}.rrd")
     out.unlink(missing_ok=True)
     together(paths, out)
     return out
@@ -190,10 +182,11 @@ def _recorded(failures: Failures, line: dict[str, Any]) -> Path:
     row = next((r for r in study.rows(line["suite"], line["task"]) if (r.episode, r.seed) == (line["episode"], line["seed"])), None)
     if row is None:
         raise BadStudy(f"diagnose: episode {line['episode']} of {line['suite']}/{line['task']} is in today's list no more; run eval again.")
-    path = failures.recordings / recording_name(row, line["method"])
+    home = _home(Path(line["place"]))
+    path = home / "recordings" / recording_name(row, line["method"])
     if path.exists():
         return path
-    memory = failures.recordings.parent / "memory"
+    memory = home / "memory"
     register_personal(study, memory)
     trial = make_trial(study, [row], line["method"], memory)
     if trial.policy.label != line["policy"]:

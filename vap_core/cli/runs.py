@@ -138,7 +138,7 @@ def evaluate(
 
 @app.command()
 def diagnose(
-    run: Annotated[Path, typer.Argument(help="Run folder of eval, rollout or demo, or a table that publish wrote.")],
+    runs: Annotated[list[Path], typer.Argument(help="Run folders of eval, rollout or demo, or tables that publish wrote.")],
     suite: Annotated[str | None, typer.Option(help="Only failures of this suite.")] = None,
     task: Annotated[str | None, typer.Option(help="Only failures of this task.")] = None,
     method: Annotated[str | None, typer.Option("--method", help="Only failures of this method.")] = None,
@@ -162,7 +162,7 @@ def diagnose(
     """
     from vap_core import diagnosis
 
-    failures = diagnosis.listed(run, suite=suite, task=task, method=method, case=case, sub_case=sub_case, where=where)
+    failures = diagnosis.listed(*runs, suite=suite, task=task, method=method, case=case, sub_case=sub_case, where=where)
     if correct is not None:
         print(f"wrote {diagnosis.correct(failures, show or 0, correct, note)}")
         return

@@ -29,9 +29,13 @@ def conclude(study: "Study", table: "pd.DataFrame", folder: Path) -> str:
     times = {(s.suite, s.method): step_times(table[(table["suite"] == s.suite) & (table["method"] == s.method)]) for s in scores}
     lines = [results_table(scores), *_overall(scores), "", "time per control step, ms by part:", times_table(times)]
     recordings = sorted((folder / "recordings").glob("*.rrd")) if (folder / "recordings").is_dir() else []
-    lines += ["", f"wrote {folder / 'summary.json'}, {figure}" + (f", {len(recordings)} recordings in {folder / 'recordings'}" if recordings else "")]
+    size = sum(path.stat().st_size for path in recordings) / 1e6
+    held = f", {len(recordings)} recordings ({size:.0f} MB) in {folder / 'recordings'}" if recordings else ""
+    lines += ["", f"wrote {folder / 'summary.json'}, {figure}{held}"]
     if recordings:
         lines.append(f"look at one: .venv/bin/rerun --bind 127.0.0.1 {next((r for r in recordings if '.vap.' in r.name), recordings[0])}")
+    if table["outcome"].eq("failure").any():
+        lines.append(f"why they failed: python -m vap_core diagnose {folder}")
     return "\n".join(lines)
 
 

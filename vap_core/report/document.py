@@ -9,6 +9,7 @@ from vap_core.errors import BadOutput
 from vap_core.files import write_atomic
 from vap_core.plots import write_png
 from vap_core.report import results as tables
+from vap_core.report.failures import breakdown, breakdown_rows, sub_cases_text
 from vap_core.report.latex import main_tables
 from vap_core.report.pictures import differences_figure, forest_figure
 from vap_core.report.runs import Runs, load
@@ -31,6 +32,10 @@ COMPARED = """Pairs are the same episodes (suite, task, split, variant, episode,
 - p McNemar: exact, every pair on its own. p layouts: the same where no layout returns; else exact, too, with whole layouts changing sign.
 - p Holm: p layouts, corrected for all comparisons of single tasks, and apart from them for those of all tasks together."""
 
+FAILED = """Case 1: all views are prompted alike, and wrong. Case 2: views are prompted with different instances. Case 3: the prompt is right, the
+hand fails. Unprompted: the method highlights nothing. Confidence: the share of neighbouring thresholds under which a label stays the same.
+`python -m vap_core diagnose` lists the failures and opens one at the frame that decided it; runs older than the diagnosis are left out."""
+
 
 def report(folders: Sequence[Path], out: Path) -> str:
     """Write report.md, results, comparisons, outcomes and provenance as CSV and LaTeX, forest.png and paired.png into `out`; returns report.md.
@@ -41,7 +46,8 @@ def report(folders: Sequence[Path], out: Path) -> str:
     lines, compared = tables.results(runs), compare(runs.table, runs.methods)
     found, ends, made = tables.comparisons(compared), tables.outcomes(runs), tables.provenance(runs)
     many = bool(compared)
-    text = "\n\n".join(["# Report", _opening(runs), *_results(lines), *_outcomes(runs, ends), *_compared(found), _pictures(many), *_provenance(made)])
+    parts = [_opening(runs), *_results(lines), *_outcomes(runs, ends), *_failures(runs), *_compared(found), _pictures(many), *_provenance(made)]
+    text = "\n\n".join(["# Report", *parts])
     files = {"report.md": text + "\n", "results.tex": main_tables(lines), "outcomes.tex": latex(_outcome_rows(ends))}
     files |= {f"{name}.csv": table.to_csv(index=False) for name, table in (("results", lines), ("outcomes", ends), ("provenance", made))}
     if many:
@@ -110,6 +116,14 @@ def _outcome_rows(ends: "pd.DataFrame") -> list[list[str]]:
          *("not kept" if cell != cell else f"{cell:.0f}" for cell in (line.retried, line.most_attempts))]
         for line in ends.itertuples()
     ]  # fmt: skip
+
+
+def _failures(runs: Runs) -> list[str]:
+    if "case" not in runs.table:
+        return []
+    counts = breakdown(runs.table)
+    told = "\n".join(f"- {line}" for line in sub_cases_text(counts).splitlines())
+    return ["## Why episodes failed", FAILED, markdown(breakdown_rows(counts)), told]
 
 
 def _compared(found: "pd.DataFrame") -> list[str]:

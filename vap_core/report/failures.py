@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from vap_core.errors import BadOutput
 from vap_core.failures import CASES, STAGES
 from vap_core.metrics import rate
-from vap_core.report.text import align
 from vap_core.values import value
 
 if TYPE_CHECKING:
@@ -37,15 +36,15 @@ def breakdown(table: "pd.DataFrame", by: tuple[str, ...] = ("suite", "method")) 
     return pd.DataFrame(counted.merge(sure, on=list(by), how="left"))
 
 
-def breakdown_text(counts: "pd.DataFrame") -> str:
-    """As text: failures in percent of all episodes, cases in percent of failures, each with its 95 % Wilson interval."""
+def breakdown_rows(counts: "pd.DataFrame") -> list[list[str]]:
+    """To print: failures in percent of all episodes, cases in percent of failures, each with its 95 % Wilson interval."""
     cases = [case for case in CASES if counts[case].any()]
     rows = [["suite", "method", "n", "fail % [95 %]", *(f"{case} % of failures" for case in cases), "confidence"]]
     for line in counts.to_dict("records"):
         shares = [str(rate(int(line[case]), int(line["failed"]))) for case in cases]
         sure = "-" if line["sure"] != line["sure"] else f"{line['sure']:.2f}"
         rows.append([str(line["suite"]), str(line["method"]), str(line["n"]), str(rate(int(line["failed"]), int(line["n"]))), *shares, sure])
-    return align(rows)
+    return rows
 
 
 def sub_cases_text(counts: "pd.DataFrame") -> str:
