@@ -8,7 +8,7 @@ Entities (lerobot's feature keys; timelines `frame_index` and `timestamp`):
 `/vap/association` is what the views agreed on, when they were asked together.
 `/observation.images.<cam>/identity` colours each prompt by the object it covers; `/vap/{similarity,crops}/<cam>` are what the vote compared;
 `/vap/hand/*` is where the hand was. Recording properties: `rollout` and `outcome`, which says why an episode failed (module failures).
-Pictures are JPEG, at the steps that have them; everything that changes travels in columns.
+Pictures are JPEG or AV1, at the steps that have them; everything that changes travels in columns.
 """
 
 from collections.abc import Sequence
