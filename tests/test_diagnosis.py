@@ -37,7 +37,7 @@ def row(method: str = "vap", case: str = "", sub_case: str = "", stages: int = 7
     ended = outcome or ("failure" if case else "success")
     passed = {f"stage_{name}": i < stages if method == "vap" or i > 3 else None for i, name in enumerate(STAGES)}
     about = {"suite": suite, "method": method, "outcome": ended, "success": ended == "success"}
-    return {**about, "case": case, "sub_case": sub_case, "case_confidence": 0.5 if case else float("nan"), **passed}
+    return {**about, "case": case, "sub_case": sub_case, "case_confidence": 0.5 if case else float("nan"), "deciding_frame": 3.0, **passed}
 
 
 TABLE = pd.DataFrame(

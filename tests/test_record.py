@@ -245,6 +245,14 @@ def test_summary_tells_what_ran_and_how_it_ended(three: tuple[Path, Opening, lis
     assert summary["rollout.git"]
 
 
+def test_what_is_undefined_is_none_in_the_summary(tmp_path: Path) -> None:
+    start = opening(1)
+    with Recorder(tmp_path / "one.rrd", start) as recorder:
+        recorder.frame(frame(0, start))
+        recorder.close(replace(SUCCESS, cmr=None))
+    assert read_summary(tmp_path / "one.rrd").get("outcome.cmr") is None, "a selection has none"
+
+
 def test_a_recording_has_a_safe_name_of_its_own() -> None:
     assert recording_name(ROW, "vap") == "tabletop.pick-owl.003.s7.vap.rrd"
     assert recording_name(replace(ROW, task="/x y"), "a/b") == "tabletop.-x-y.003.s7.a-b.rrd"

@@ -118,7 +118,8 @@ def read_summary(path: Path) -> dict[str, Any]:
                 batch = chunk.to_record_batch()
                 group = chunk.entity_path.removeprefix("/__properties/")
                 if group in ("rollout", "outcome"):
-                    summary |= {f"{group}.{name}": batch[name][0].as_py()[0] for name in batch.schema.names if not name.startswith("rerun.")}
+                    held = {name: batch[name][0].as_py() for name in batch.schema.names if not name.startswith("rerun.")}
+                    summary |= {f"{group}.{name}": cells[0] if cells else None for name, cells in held.items()}
                 elif "frame_index" in batch.schema.names:
                     steps.update(batch["frame_index"].to_pylist())
     except (RuntimeError, ValueError, OSError, Warning) as err:

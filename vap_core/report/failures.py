@@ -17,7 +17,7 @@ def diagnosed(table: "pd.DataFrame") -> "pd.DataFrame":
     """The episodes whose failures were diagnosed. Raises: BadOutput when the table is older than the diagnosis."""
     if "case" not in table:
         raise BadOutput("diagnose: this run was made before failures were diagnosed; run the same eval again in another folder.")
-    return table[table["case"].notna()]
+    return table[table["case"].notna()].astype({"deciding_frame": int})
 
 
 def breakdown(table: "pd.DataFrame", by: tuple[str, ...] = ("suite", "method")) -> "pd.DataFrame":
