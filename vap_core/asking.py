@@ -32,7 +32,7 @@ def ask(run: Path, where: str) -> Answer:
 
     folder = run / "recordings" if (run / "recordings").is_dir() else run
     held = steps(folder)
-    rows = matching(held.table, where)
+    rows = matching(held.table, where).fillna({"failure_case": "", "sub_case": ""})
     grouped = rows.groupby(["file", *SHOWN], sort=False, dropna=False)["frame_index"]
     found = grouped.agg(steps="size", first="min", last="max").reset_index()
     return Answer(found, int(held.table["file"].nunique()), held.unreadable)
