@@ -1,6 +1,7 @@
 """Every method over one frozen policy: what it changes and what it may read; and nothing that it does changes the policy."""
 
 import inspect
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -255,20 +256,34 @@ class Keep:
 
 
 def test_truth_reaches_nobody_but_a_revealed(bank: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a sink, no other method ever has the true masks rendered."""
+    """Without a sink, no other method has the true masks rendered before its policy is asked; what highlights is judged by them afterwards."""
     from vap_core.sim.env import Env
 
-    asked: list[bool] = []
+    asked: list[tuple[str, bool]] = []
     truth = Env.truth
-    monkeypatch.setattr(Env, "truth", lambda self, masks=False: asked.append(masks) or truth(self, masks))
-    counts: dict[str, int] = {}
+    monkeypatch.setattr(Env, "truth", lambda self, masks=False: asked.append((sys._getframe(1).f_code.co_name, masks)) or truth(self, masks))
+    before: dict[str, int] = {}
+    after: dict[str, int] = {}
     for method in PLAIN:
         asked.clear()
         list(rollout(make_trial(replace(STUDY, policy=str(checkpoint)), ROWS[:1], method, bank), ROWS[:1]))
-        counts[method] = sum(asked)
-    assert {m: n for m, n in counts.items() if n} == {"oracle-box": 1, "oracle-mask": 1, "oracle-track": 3, "wrong-mask": 3}
+        before[method] = sum(masks for caller, masks in asked if caller != "_act")
+        after[method] = sum(masks for caller, masks in asked if caller == "_act")
+    oracles = {"oracle-box": 1, "oracle-mask": 1, "oracle-track": 3, "wrong-mask": 3}
+    assert {m: n for m, n in before.items() if n} == oracles
+    assert {m: n for m, n in after.items() if n} == dict.fromkeys((*oracles, "vap", "mask-only", "vap-associated"), 3)
     assert not {"truth", "masks", "row"} & set(inspect.signature(Attender.start).parameters)
     assert not {"truth", "masks", "row"} & set(inspect.signature(Reworded.start).parameters)
+
+
+def test_what_is_judged_afterwards_changes_nothing(bank: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def actions() -> np.ndarray:
+        (episode,) = rollout(make_trial(replace(STUDY, policy=str(checkpoint)), ROWS[:1], "vap", bank), ROWS[:1])
+        return np.stack([frame.action for frame in episode.frames])
+
+    judged = actions()
+    monkeypatch.setattr("vap_core.rollout.shown", lambda *args, **kwargs: ())
+    assert (actions() == judged).all()
 
 
 class Soft:
