@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.test_record import ROW, SUCCESS, columns, entities, fail, frame, opening, rerun
+from tests.test_record import ROW, SUCCESS, columns, entities, frame, opening, rerun
+from tests.test_why import fail
 from vap_core import asking
 from vap_core.errors import BadOutput, BadRecording, BadStudy, UnknownName
 from vap_core.record import Correction, Recorder, correct, corrections, read_summary, steps, together

@@ -1,5 +1,6 @@
 """Failures planted in the real simulator, ten of each kind, are told apart: wrong prompts by hand-made masks, failed hands by hand-made policies."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
@@ -76,11 +77,11 @@ class Still:
         return state, np.array([0.0] * (env.action_size - 1) + [1.0], np.float32)
 
 
-class Plans(Still):
+class Plans(Still, ABC):
     """Goes along waypoints, then stays there."""
 
-    def plan(self, env: Env) -> tuple[Waypoint, ...]:
-        raise NotImplementedError
+    @abstractmethod
+    def plan(self, env: Env) -> tuple[Waypoint, ...]: ...
 
     def act(self, state: ExpertState, env: Env) -> tuple[ExpertState, Action]:
         plan = state.plan or (self.plan(env) if state.phase == "grasp" else ())
@@ -116,7 +117,7 @@ class Knocks(Plans):
         return tuple(Waypoint(pose, 0.0) for pose in path)
 
 
-class Drops(Still):
+class Drops(Still, ABC):
     """Lifts the target, and then does something else."""
 
     def act(self, state: ExpertState, env: Env) -> tuple[ExpertState, Action]:
@@ -128,10 +129,12 @@ class Drops(Still):
         (state,), (chunk,) = Expert().plan_inside([state], [env])
         return state, chunk[0]
 
-    def drop(self, env: Env) -> None: ...
+    def drop(self, env: Env) -> None:
+        """What is done to the world then; nothing, unless said otherwise."""
+        return
 
-    def after(self, env: Env) -> Action:
-        raise NotImplementedError
+    @abstractmethod
+    def after(self, env: Env) -> Action: ...
 
 
 class Slips(Drops):

@@ -5,9 +5,9 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
 from vap_core.errors import BadOutput, BadRecording, MissingGL
-from vap_core.record import Recorder, keep, read_summary, record_grounding, recording_name, recover, screenshot
+from vap_core.record import Recorder, read_summary, record_grounding, recording_name, recover, screenshot
 from vap_core.record.blueprint import evidence_line
-from vap_core.record.evidence import apart, classes, label_spots
+from vap_core.record.evidence import apart, classes, jpeg, label_spots
 from vap_core.record.file import rerun_cli, temporary
 from vap_core.values import (
     ROBOT,
@@ -36,7 +36,6 @@ from vap_core.values import (
     PersonalObject,
     Placement,
     Rgb,
-    Shown,
     Track,
     Truth,
 )  # fmt: skip
@@ -331,137 +330,6 @@ def test_a_second_target_wears_a_suffix(tmp_path: Path) -> None:
     assert names <= entities(tmp_path / "one.rrd")
 
 
-def failed(outcome: Outcome) -> bool:
-    return outcome.status == "failure"
-
-
-@pytest.mark.parametrize("most_mb", [1e9, 0.1], ids=["in memory", "streamed"])
-def test_only_what_is_wanted_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most_mb: float) -> None:
-    monkeypatch.setattr(keep, "MOST_MB", most_mb)
-    start = opening(2)
-    for status in ("success", "failure"):
-        sink = keep.Waiting(tmp_path / f"{status}.rrd", start, failed)
-        for step in range(8):
-            sink.frame(frame(step, start))
-        assert temporary(sink.path).exists() == (most_mb < 1)
-        sink.close(replace(SUCCESS, status=status, success=status == "success", steps=7))
-    assert [path.name for path in sorted(tmp_path.iterdir())] == ["failure.rrd"]
-    assert read_summary(tmp_path / "failure.rrd")["frames"] == 8
-
-
-def test_what_waited_is_recorded_as_if_it_had_streamed(tmp_path: Path) -> None:
-    start = opening(2)
-    streamed = Recorder(tmp_path / "streamed.rrd", start, flush_every=keep.TOGETHER)
-    waited = keep.Waiting(tmp_path / "waited.rrd", start, lambda outcome: True)
-    for sink in (streamed, waited):
-        for step in range(12):
-            sink.frame(frame(step, start))
-        sink.close(replace(SUCCESS, steps=12))
-    same = rerun("rrd", "compare", tmp_path / "streamed.rrd", tmp_path / "waited.rrd")
-    assert same.returncode == 0, same.stderr[-500:]
-
-
-def test_one_success_in_ten_is_kept_and_always_the_same() -> None:
-    rows = [replace(ROW, episode=i) for i in range(400)]
-    chosen = [keep.wanted(SUCCESS, row, "vap") for row in rows]
-    assert chosen == [keep.wanted(SUCCESS, row, "vap") for row in rows]
-    assert 0.06 < sum(chosen) / 400 < 0.14
-    assert all(keep.wanted(replace(SUCCESS, status=status, success=False), row, "vap") for row in rows for status in ("failure", "error"))
-
-
-def fail(path: Path, shown: str, second: str | None = None, after: int = 0, episode: int = 3) -> dict[str, Any]:
-    """A failed episode whose prompts cover `shown`, and in a second view `second`; from step `after` on."""
-    start = opening(1 if second is None else 2)
-    start = replace(start, row=replace(ROW, episode=episode), references={"owl_a": (np.full((20, 30, 3), 99, np.uint8),) * K})
-    with Recorder(path, start) as recorder:
-        for step in range(12):
-            one, names = frame(step, start), ["front", "side"]
-            covers = {cam: what if step >= after else "owl_a" for cam, what in zip(names, (shown, second), strict=True) if what is not None}
-            tracks = {cam: (Track(one.truth.masks[cam][what], 0.9),) for cam, what in covers.items()}
-            seen = tuple(Shown(cam, what, 0.9 * (what == "owl_a"), 500, 0.9) for cam, what in covers.items())
-            recorder.frame(replace(one, tracks=tracks, shown=seen))
-        recorder.close(replace(SUCCESS, status="failure", success=False, steps=11))
-    return read_summary(path)
-
-
-def tabs(path: Path) -> set[str]:
-    """Names of the containers in a recording's blueprints."""
-    reader = RrdReader(path)
-    batches = [chunk.to_record_batch() for held in reader.blueprints() for chunk in reader.stream(store=held)]
-    name = "ContainerBlueprint:display_name"
-    return {cell[0] for batch in batches if name in batch.schema.names for cell in batch[name].to_pylist() if cell}
-
-
-@pytest.mark.parametrize(
-    ("shown", "second", "after", "case", "sub_case", "frame_index"),
-    [
-        ("owl_b", None, 0, "case 1", "distractor vote", 0),
-        ("owl_b", None, 4, "case 1", "drift", 4),
-        ("owl_a", "owl_b", 0, "case 2", "views disagree", 0),
-        ("owl_a", None, 0, "case 3", "timeout", 0),
-    ],
-)
-def test_a_recording_says_why_and_its_blueprint_opens_there(
-    tmp_path: Path, shown: str, second: str | None, after: int, case: str, sub_case: str, frame_index: int
-) -> None:
-    path = tmp_path / "one.rrd"
-    summary = fail(path, shown, second, after)
-    assert (summary["outcome.failure_case"], summary["outcome.sub_case"], summary["outcome.deciding_frame"]) == (case, sub_case, frame_index)
-    assert summary["outcome.why"]
-    assert {"/observation.images.front/identity", "/vap/crops/front", "/vap/similarity/front", "/vap/hand/gripper_to_target"} <= entities(path)
-    told = [text for texts in columns(path, "/vap/events", "TextLog:text").values() for text in texts]  # type: ignore[attr-defined]
-    assert any(text.startswith(f"{case.capitalize()}, {sub_case}: ") for text in told)
-    assert rerun("rrd", "verify", path).returncode == 0
-    assert f"{case}: {sub_case}" in tabs(path)
-
-
-def test_a_prompt_wears_the_colour_of_what_it_covers(tmp_path: Path) -> None:
-    fail(tmp_path / "one.rrd", "owl_b")
-    buffer = columns(tmp_path / "one.rrd", "/observation.images.front/identity", "SegmentationImage:buffer")[3]
-    image = np.frombuffer(bytes(buffer[0]), np.uint8).reshape(SIDE, SIDE)  # type: ignore[index]
-    masks = frame(3, opening(1)).truth.masks["front"]
-    i = list(SIZES).index("owl_b")
-    assert set(np.unique(image[masks["owl_b"]])) == {10 + 2 * i, 11 + 2 * i}
-    assert set(np.unique(image[masks["owl_a"]])) == {0, 10 + 2 * list(SIZES).index("owl_a") + 1}, "a rim alone"
-
-
-def test_pictures_may_be_rarer_than_steps(tmp_path: Path) -> None:
-    start = opening(1)
-    with Recorder(tmp_path / "one.rrd", start, flush_every=5) as recorder:
-        for step in range(12):
-            one = frame(step, start)
-            recorder.frame(one if step % 4 == 0 else one.light())
-        recorder.close(SUCCESS)
-    for entity in ("", "/prompted"):
-        assert sorted(columns(tmp_path / "one.rrd", f"/observation.images.front{entity}", "EncodedImage:blob")) == [0, 4, 8]
-    assert len(columns(tmp_path / "one.rrd", "/action", "Scalars:scalars")) == 12
-    assert sorted(columns(tmp_path / "one.rrd", "/vap/track_score/front", "Scalars:scalars")) == [0, 4, 8]
-
-
-def test_as_video_every_picture_stands_at_its_step_and_weighs_less(tmp_path: Path) -> None:
-    import av
-
-    start = opening(1)
-    for name, video in (("stills", False), ("video", True)):
-        with Recorder(tmp_path / f"{name}.rrd", start, video=video) as recorder:
-            for step in range(20):
-                one = frame(step, start)
-                recorder.frame(one if step % 2 == 0 else one.light())
-            recorder.close(SUCCESS)
-    assert rerun("rrd", "verify", tmp_path / "video.rrd").returncode == 0
-    for entity, kind in (("", "images"), ("/prompted", "prompted")):
-        samples = columns(tmp_path / "video.rrd", f"/observation.images.front{entity}", "VideoStream:sample")
-        assert sorted(samples) == list(range(0, 20, 2))
-        decoder = av.CodecContext.create("libdav1d", "r")
-        packets = [av.Packet(bytes(samples[step][0])) for step in sorted(samples)]  # type: ignore[index]
-        shown = [seen.to_ndarray(format="rgb24") for packet in (*packets, None) for seen in decoder.decode(packet)]
-        assert len(shown) == 10
-        for step, picture in zip(range(0, 20, 2), shown, strict=True):
-            assert np.abs(picture.astype(int) - getattr(frame(step, start), kind)["front"]).mean() < 6
-        blobs = columns(tmp_path / "stills.rrd", f"/observation.images.front{entity}", "EncodedImage:blob")
-        assert 2 * sum(len(one[0]) for one in samples.values()) < sum(len(one[0]) for one in blobs.values())  # type: ignore[index, misc]
-
-
 def test_equal_episodes_give_equal_recordings(tmp_path: Path) -> None:
     start = opening(2)
     for name in ("a", "b"):
@@ -509,17 +377,30 @@ def test_an_exception_keeps_every_step_under_the_temporary_name(tmp_path: Path) 
 
 @pytest.mark.alone
 def test_sixty_steps_of_three_cameras_stay_small_and_quick(tmp_path: Path) -> None:
+    """The CPU of recording against that of encoding the same pictures once, in the same run: what `bench loop` measures against a whole rollout."""
     start = opening(3)
     frames = [frame(step, start) for step in range(60)]
     record(tmp_path / "warm.rrd", start, steps=2)
-    recorder = Recorder(tmp_path / "one.rrd", start)
-    began = time.process_time()
-    for one in frames:
-        recorder.frame(one)
-    recorder.close(SUCCESS)
-    per_step_ms = (time.process_time() - began) / 60 * 1e3
-    assert (tmp_path / "one.rrd").stat().st_size < 5e6
-    assert per_step_ms < 8, "a rollout step costs 70-200 ms, and recording may take a tenth of it"
+
+    def encodes(n: int) -> None:
+        for one in frames:
+            for picture in (*one.images.values(), *one.prompted.values()):
+                jpeg(picture, 85)
+
+    def records(n: int) -> None:
+        recorder = Recorder(tmp_path / f"{n}.rrd", start)
+        for one in frames:
+            recorder.frame(one)
+        recorder.close(SUCCESS)
+
+    def cpu_s(work: Callable[[int], None], n: int) -> float:
+        began = time.process_time()
+        work(n)
+        return time.process_time() - began
+
+    ratios = [cpu_s(records, n) / cpu_s(encodes, n) for n in range(5)]
+    assert (tmp_path / "0.rrd").stat().st_size < 4e6
+    assert np.median(ratios) < 10, ratios
 
 
 def test_nothing_is_ever_overwritten(tmp_path: Path, three: tuple[Path, Opening, list[Frame]]) -> None:

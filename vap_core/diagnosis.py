@@ -1,6 +1,6 @@
 """From the table of a run to the frame that explains a failure.
 
-    failures = listed(Path("data/results/mini_pi0.parquet"), case=2, suite="vlabench")
+    failures = listed(Path("data/results/failures.parquet"), case=2, suite="vlabench")
     path = recording(failures, 0)
 
 A failure that was not recorded is run again: the same row, weights and seed give the same episode.
@@ -10,10 +10,9 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vap_core import store
 from vap_core.errors import BadOutput, BadStudy
 from vap_core.experiments import Study, make_trial, register_personal
-from vap_core.publish import published
+from vap_core.publish import runs
 from vap_core.report.failures import breakdown, breakdown_rows, diagnosed, sub_cases_text
 from vap_core.report.text import align
 
@@ -50,8 +49,8 @@ def listed(
     """
     import pandas as pd
 
-    runs = [(place, about, table) for place in places for about, table in _runs(place)]
-    tables = [diagnosed(table.assign(configuration=about["digest"], place=str(place))) for place, about, table in runs if not table.empty]
+    held = [(place, *run) for place in places for run in runs(place)]
+    tables = [diagnosed(table.assign(configuration=about["digest"], place=str(place))) for place, about, table in held if not table.empty]
     if not tables:
         raise BadOutput(f"diagnose: {' and '.join(map(str, places))} hold no finished episode; run eval first.")
     whole = every = _corrected(pd.concat(tables, ignore_index=True))
@@ -62,11 +61,7 @@ def listed(
     table = _only(table, "sub_case", sub_case)
     if where is not None:
         table = matching(table, where)
-    return Failures({about["digest"]: about for _, about, _ in runs}, every, whole, table.reset_index(drop=True))
-
-
-def _runs(place: Path) -> "list[tuple[dict[str, Any], pd.DataFrame]]":
-    return published(place) if place.suffix == ".parquet" else [(store.note(place), store.read(place))]
+    return Failures({about["digest"]: about for _, about, _ in held}, every, whole, table.reset_index(drop=True))
 
 
 def _corrected(table: "pd.DataFrame") -> "pd.DataFrame":

@@ -11,7 +11,7 @@ from vap_core.associate import PAIRINGS, Pairing, case
 from vap_core.attend import Attender, Prompting, Stack
 from vap_core.errors import BadOutput, UnknownName
 from vap_core.gallery import seen
-from vap_core.plots import GENERIC, OTHER, WINNER, candidates
+from vap_core.plots import GENERIC, OTHER, WINNER, candidates, empty_figure
 from vap_core.policies.expert import Expert
 from vap_core.rollout import Trial, rollout
 from vap_core.segment import bounds, iou
@@ -204,7 +204,7 @@ def write_photo(folder: Path, row: EpisodeRow, camera: str, size: int = 448) -> 
 
 def choices_figure(ways: Ways, views: Sequence[View], shown: Sequence[str]) -> "Figure":
     """The candidates of every view, and in orange the one highlighted, by these ways; titles name the object under it."""
-    figure = _figure(3.3 * len(views), 3.5 * len(shown))
+    figure = empty_figure(3.3 * len(views), 3.5 * len(shown))
     grid = figure.subplots(len(shown), len(views), squeeze=False)
     for line, way in zip(grid, shown, strict=True):
         for axes, view in zip(line, views, strict=True):
@@ -222,7 +222,7 @@ def mask_figure(views: Sequence[View], groundings: Mapping[str, Grounding]) -> "
     from matplotlib.colors import to_rgb
     from matplotlib.patches import Patch
 
-    figure = _figure(3.0 * len(views), 3.9)
+    figure = empty_figure(3.0 * len(views), 3.9)
     for axes, view in zip(figure.subplots(1, len(views), squeeze=False)[0], views, strict=True):
         true, drawn = view.masks[view.row.target], groundings[view.camera].mask
         mask = np.zeros_like(true) if drawn is None else drawn
@@ -245,7 +245,7 @@ def mask_figure(views: Sequence[View], groundings: Mapping[str, Grounding]) -> "
 def following_figure(track: "pd.DataFrame", hz: float) -> "Figure":
     """`track_table` over time, a panel per camera: IoU with the target, the tracker's score, and where it says "not visible"; grey: not shown."""
     cameras = list(dict.fromkeys(track.camera))
-    figure = _figure(8.5, 1.75 * len(cameras) + 0.6)
+    figure = empty_figure(8.5, 1.75 * len(cameras) + 0.6)
     grid = figure.subplots(len(cameras), 1, sharex=True, squeeze=False)[:, 0]
     key: dict[str, Artist] = {}
     for axes, camera in zip(grid, cameras, strict=True):
@@ -262,9 +262,3 @@ def following_figure(track: "pd.DataFrame", hz: float) -> "Figure":
     grid[-1].set_xlabel("seconds from the opening frame")
     figure.legend(key.values(), key.keys(), loc="outside upper center", ncols=4, frameon=False, fontsize=9)
     return figure
-
-
-def _figure(width: float, height: float) -> "Figure":
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")

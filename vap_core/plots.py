@@ -26,7 +26,7 @@ def write_png(figure: "Figure", path: Path, dpi: int = 110) -> None:
 
 def grounding_figure(rgb: Rgb, attended: Attended, objects: Sequence[PersonalObject], camera: str) -> "Figure":
     """One row per target: the candidates, what the policy would see, the references, and the similarity matrix."""
-    figure = _figure(13.0, 3.9 * len(objects))
+    figure = empty_figure(13.0, 3.9 * len(objects))
     rows = figure.subfigures(len(objects), 1, squeeze=False)[:, 0]
     for row, grounding, obj in zip(rows, attended.groundings[camera], objects, strict=True):
         left, middle, refs, right = row.subplots(1, 4, width_ratios=[3, 3, 1.5, 2.6])
@@ -79,7 +79,7 @@ def scores_figure(scores: Sequence[Score]) -> "Figure":
     measures = (("sr", "success rate"), ("cmr", "correct movement\nratio (CMR)"), ("wrong_object", "wrong object\nmoved"))
     columns = min(4, len(panels))
     rows = -(-len(panels) // columns)
-    figure = _figure(4.6 * columns + 0.8, 3.4 * rows + 0.4)
+    figure = empty_figure(4.6 * columns + 0.8, 3.4 * rows + 0.4)
     grid = np.atleast_2d(figure.subplots(rows, columns, sharey=True, squeeze=False))
     for axes in grid.ravel()[len(panels) :]:
         axes.set_axis_off()
@@ -104,7 +104,7 @@ def scores_figure(scores: Sequence[Score]) -> "Figure":
 
 def film(images: Mapping[str, Sequence[Rgb]], titles: Sequence[str]) -> "Figure":
     """Rows of pictures, one row per label, one column per title."""
-    figure = _figure(2.1 * len(titles), 2.2 * len(images) + 0.3)
+    figure = empty_figure(2.1 * len(titles), 2.2 * len(images) + 0.3)
     grid = figure.subplots(len(images), len(titles), squeeze=False)
     for row, (label, pictures) in zip(grid, images.items(), strict=True):
         for axes, picture in zip(row, pictures, strict=True):
@@ -153,7 +153,7 @@ def sheet(rows: Mapping[str, Sequence[Tile]], side_in: float = 1.0, label_in: fl
 
 def hardness_figure(table: "pd.DataFrame", colours: Mapping[str, str]) -> "Figure":
     """Cosines of look-alikes by tier, one line per personal object, a diamond for its own new views (columns of `gallery.hardness`)."""
-    figure = _figure(8.5, 5.6)
+    figure = empty_figure(8.5, 5.6)
     axes = figure.subplots()
     names = list(dict.fromkeys(table.object))
     place = {name: i for i, name in enumerate(names)}
@@ -177,7 +177,7 @@ def layouts_figure(lists: Mapping[str, Sequence[EpisodeRow]], tables_m: Mapping[
     """Where things stand at the start, seen from above with the robot at the bottom: one panel per suite; `tables_m` are its table's x0 y0 x1 y1."""
     from matplotlib.patches import Rectangle
 
-    figure = _figure(3.4 * len(lists), 3.9)
+    figure = empty_figure(3.4 * len(lists), 3.9)
     grid = figure.subplots(1, len(lists), squeeze=False)[0]
     roles = {"other objects": "#c9ccd1", "look-alike": OTHER, "target": WINNER, "goal": "#59a14f"}
     for axes, (name, rows) in zip(grid, lists.items(), strict=True):
@@ -206,7 +206,7 @@ def bounds_figure(scores: Sequence[Score]) -> "Figure":
     """Success rates with 95 % Wilson intervals, one line per task and track, one colour per policy."""
     lines = list(dict.fromkeys((s.suite, s.task, s.split) for s in scores))
     policies = {policy: f"C{i}" for i, policy in enumerate(dict.fromkeys(s.policy for s in scores))}
-    figure = _figure(8.5, 0.27 * len(lines) + 1.1)
+    figure = empty_figure(8.5, 0.27 * len(lines) + 1.1)
     axes = figure.subplots()
     for policy, colour in policies.items():
         shown = [s for s in scores if s.policy == policy]
@@ -225,7 +225,7 @@ def bounds_figure(scores: Sequence[Score]) -> "Figure":
 
 def learning_figure(logs: Mapping[str, Sequence[Mapping[str, int | float]]], panels: Mapping[str, str]) -> "Figure":
     """What trainings logged, over their steps: a panel per figure of the log (its name there, and its title), a line per training that has it."""
-    figure, shown = _figure(3.1 * len(panels) + 0.4, 3.0 + 0.3 * (len(logs) > 1)), {}
+    figure, shown = empty_figure(3.1 * len(panels) + 0.4, 3.0 + 0.3 * (len(logs) > 1)), {}
     for axes, (name, title) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
         for i, (label, log) in enumerate(logs.items()):
             if log and name in log[0]:
@@ -241,7 +241,7 @@ def learning_figure(logs: Mapping[str, Sequence[Mapping[str, int | float]]], pan
 
 def rates_figure(panels: Mapping[str, Mapping[str, Mapping[str, "Rate"]]], label: str) -> "Figure":
     """A panel per key, of grouped bars: a group per inner key, a colour per innermost one; rates in percent with their intervals."""
-    figure = _figure(0.9 + 2.9 * len(panels), 3.2)
+    figure = empty_figure(0.9 + 2.9 * len(panels), 3.2)
     for axes, (title, groups) in zip(figure.subplots(1, len(panels), squeeze=False, sharey=True)[0], panels.items(), strict=True):
         inner = list(dict.fromkeys(name for rates in groups.values() for name in rates))
         for i, name in enumerate(inner):
@@ -299,7 +299,8 @@ def _strip(crops: Sequence[Rgb], side: int = 96) -> Rgb:
     return np.concatenate([np.concatenate(tiles[i : i + 2], axis=1) for i in range(0, len(tiles), 2)])
 
 
-def _figure(width: float, height: float) -> "Figure":
+def empty_figure(width: float, height: float) -> "Figure":
+    """A figure of so many inches that makes room for what is drawn; matplotlib loads when it is asked for."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")

@@ -1,7 +1,7 @@
 """Keep the results of finished runs as one small table, with their configurations."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,12 +28,9 @@ def published(table: Path) -> "list[tuple[dict[str, Any], pd.DataFrame]]":
         raise BadOutput(f"published: {table} is no table of finished runs ({type(error).__name__}); publish writes one.") from error
 
 
-def _runs(place: Path) -> "Iterator[tuple[Path, pd.DataFrame, dict[str, Any]]]":
-    if place.suffix != ".parquet":
-        yield place, read(place), note(place)
-        return
-    for about, table in published(place):
-        yield place, table, about
+def runs(place: Path) -> "list[tuple[dict[str, Any], pd.DataFrame]]":
+    """The run of a folder, or every run in a published table: its run.json, and its episodes. Raises: BadOutput."""
+    return published(place) if place.suffix == ".parquet" else [(note(place), read(place))]
 
 
 def publish(folders: Sequence[Path], target: Path, *, replace: bool = False) -> int:
@@ -51,7 +48,7 @@ def publish(folders: Sequence[Path], target: Path, *, replace: bool = False) -> 
     if target.exists() and not replace:
         raise BadOutput(f"publish: {target} exists; choose another name with --to, or pass --replace.")
     tables, notes = [], []
-    for folder, table, about in (run for place in folders for run in _runs(place)):
+    for folder, about, table in ((place, *run) for place in folders for run in runs(place)):
         study = about["configuration"]
         wanted = len(study["methods"]) * sum(
             len(suites.listed(suite, task, study["episodes"], study["seed"], study["seeds"])) for suite, task in study["tasks"]

@@ -169,17 +169,11 @@ def diagnose(
     if show is None and png is None:
         print(diagnosis.text(failures, limit))
         return
-    from vap_core.record import open_viewer, screenshot
-
     number = show or 0
     path = diagnosis.beside(failures, number, against) if against else diagnosis.recording(failures, number)
     frame = diagnosis.deciding_frame(failures, number)
     print(f"{path}, frame {frame}: {failures.table['case_sentence'].iloc[number]}")
-    if png is None:
-        open_viewer(path, frame_index=frame)
-    else:
-        screenshot(path, png, frame_index=frame, size=(1920, 1080))
-        print(f"wrote {png}")
+    _look(path, frame, png)
 
 
 @app.command()
@@ -204,15 +198,9 @@ def query(
     if show is None and png is None:
         print(asking.text(answer, limit))
         return
-    from vap_core.record import open_viewer, screenshot
-
     path, frame = asking.frame(answer, show or 0)
     print(f"{path}, frame {frame}")
-    if png is None:
-        open_viewer(path, frame_index=frame)
-    else:
-        screenshot(path, png, frame_index=frame, size=(1920, 1080))
-        print(f"wrote {png}")
+    _look(path, frame, png)
 
 
 @app.command()
@@ -265,6 +253,17 @@ def _study(tasks: tuple[tuple[str, str], ...], methods: list[str] | None, *, pol
     asked = [name for each in methods or () for name in each.split(",") if name]
     usual = ("generic",) if policy in INSIDERS else ("generic", "vap")
     return Study(tasks, tuple(dict.fromkeys(asked)) or usual, policy=policy, **options)
+
+
+def _look(recording: Path, frame: int, png: Path | None) -> None:
+    """Open a recording in the viewer at one step, or picture it."""
+    from vap_core.record import open_viewer, screenshot
+
+    if png is None:
+        open_viewer(recording, frame_index=frame)
+    else:
+        screenshot(recording, png, frame_index=frame, size=(1920, 1080))
+        print(f"wrote {png}")
 
 
 def _record(said: str) -> "Record":

@@ -21,6 +21,7 @@ import numpy as np
 
 from vap_core.failures.course import Course as Course
 from vap_core.failures.course import follow as follow
+from vap_core.failures.course import told as told
 from vap_core.failures.hand import failed_hand
 from vap_core.failures.labels import CASES as CASES
 from vap_core.failures.labels import LIMITS as LIMITS
@@ -37,13 +38,13 @@ from vap_core.failures.signals import unlabelled
 from vap_core.values import Episode
 
 
-def diagnose(episode: Episode, limits: Limits = LIMITS) -> Diagnosis | None:
-    """The one case of a failed episode; None for a success, and for an error, whose traceback says why."""
+def diagnose(episode: Episode, limits: Limits = LIMITS, course: Course | None = None) -> Diagnosis | None:
+    """The one case of a failed episode; None for a success, and for an error, whose traceback says why. `course` spares following it again."""
     if episode.outcome.status != "failure" or not episode.frames:
         return None
-    if not episode.frames[0].truth.objects_world:
+    if not told(episode):
         return unlabelled(episode)
-    course = follow(episode)
+    course = course or follow(episode)
     found = _classify(course, limits)
     same = [(other.case, other.sub_case) == (found.case, found.sub_case) for other in (_classify(course, near) for near in neighbours(limits))]
     return replace(found, confidence=float(np.mean(same)))
@@ -51,8 +52,9 @@ def diagnose(episode: Episode, limits: Limits = LIMITS) -> Diagnosis | None:
 
 def columns(episode: Episode) -> dict[str, Any]:
     """What a results table keeps of an episode beside its outcome: its diagnosis, and how far it came (`stages`)."""
-    found = diagnose(episode)
-    return {**(NONE if found is None else found.columns()), **stages(episode)}
+    course = follow(episode) if told(episode) and episode.outcome.status != "error" else None
+    found = diagnose(episode, course=course)
+    return {**(NONE if found is None else found.columns()), **stages(episode, course=course)}
 
 
 def _classify(course: Course, limits: Limits) -> Diagnosis:

@@ -35,6 +35,11 @@ class Course:
     prompted: bool
 
 
+def told(episode: Episode) -> bool:
+    """Whether the simulator's truth is there to follow."""
+    return bool(episode.frames) and bool(episode.frames[0].truth.objects_world)
+
+
 def follow(episode: Episode) -> Course:
     """An episode's course, from its frames."""
     opening, frames = episode.opening, episode.frames

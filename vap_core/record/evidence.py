@@ -37,6 +37,18 @@ def classes(mask: Mask, inside: int, rim: int) -> np.ndarray:
     return raw * np.uint8(inside + 1) - eroded
 
 
+def send_classes(
+    rec: rr.RecordingStream, entity: str, index: Sequence[rr.TimeColumn], images: Sequence[np.ndarray], above: float | None = None
+) -> None:
+    """Class images of one size, one per step; `above` orders them over one another."""
+    n, (height, width) = len(images), images[0].shape
+    kind = rr.components.ImageFormat(width, height, color_model="L", channel_datatype="U8")
+    columns = rr.SegmentationImage.columns(
+        buffer=[image.reshape(-1) for image in images], format=[kind] * n, opacity=[1.0] * n, draw_order=None if above is None else [above] * n
+    )
+    rec.send_columns(entity, index, columns)
+
+
 def suffix(j: int) -> str:
     return f"_{j}" if j else ""
 

@@ -20,10 +20,10 @@ import rerun as rr
 from scipy.spatial.transform import Rotation
 
 from vap_core.errors import BadOutput
-from vap_core.failures import diagnose, follow
+from vap_core.failures import diagnose, follow, told
 from vap_core.record import why
 from vap_core.record.blueprint import SERIES, episode_blueprint, evidence_line, grounding_blueprint, packed, series_style, state_style
-from vap_core.record.evidence import CLASSES, classes, contact_sheet, jpeg, log_association, log_vote, picture, suffix, words
+from vap_core.record.evidence import CLASSES, classes, contact_sheet, jpeg, log_association, log_vote, picture, send_classes, suffix, words
 from vap_core.record.file import finish_stream, open_stream, put, put_property, temporary
 from vap_core.record.pictures import Pictures, Reels, Stills, time_index
 from vap_core.record.scene import log_cameras, log_links, log_objects, log_table, send_poses, send_truth
@@ -115,7 +115,8 @@ class Recorder:
         self._flush()
         self._pictures.send(rec, last=True)
         episode = Episode(self._opening, tuple(self._course), outcome, {})
-        diagnosis = diagnose(episode)
+        course = follow(episode) if told(episode) else None
+        diagnosis = diagnose(episode, course=course)
         verdict = self._verdict(outcome)
         if self._steps:
             n = len(self._steps)
@@ -129,8 +130,8 @@ class Recorder:
             level = {"success": "INFO", "failure": "WARN", "error": "ERROR"}[outcome.status]
             decided = [] if diagnosis is None else [why.event(diagnosis)]
             self._send_events([*decided, Event(self._steps[-1], level, f"episode ends: {verdict}")])  # type: ignore[arg-type]
-            if self._course[0].truth.objects_world:
-                why.send_hand(rec, follow(episode), index)
+            if course is not None:
+                why.send_hand(rec, course, index)
             if diagnosis is not None:
                 rec.send_blueprint(episode_blueprint(self._opening, diagnosis))
         put(rec, "/vap/instruction", words(self._opening, verdict, "" if diagnosis is None else why.verdict(diagnosis)))
@@ -244,12 +245,8 @@ class Recorder:
 
     def _send_classes(self, index: list[rr.TimeColumn], tail: str, masks: Sequence[Mask | None], shape: tuple[int, int], inside: int) -> None:
         blank = np.zeros(shape, np.uint8)
-        buffers = np.stack([blank if mask is None else classes(mask, inside, 2 if inside == 1 else 1) for mask in masks]).reshape(len(masks), -1)
-        kind = rr.components.ImageFormat(shape[1], shape[0], color_model="L", channel_datatype="U8")
-        columns = rr.SegmentationImage.columns(
-            buffer=list(buffers), format=[kind] * len(masks), opacity=[1.0] * len(masks), draw_order=[float(inside)] * len(masks)
-        )
-        self._stream().send_columns(f"/observation.images.{tail}", index, columns)
+        images = [blank if mask is None else classes(mask, inside, 2 if inside == 1 else 1) for mask in masks]
+        send_classes(self._stream(), f"/observation.images.{tail}", index, images, float(inside))
 
     def _send_grasp(self) -> None:
         """Only changes: a state lasts until the next."""

@@ -9,7 +9,7 @@ import rerun as rr
 
 from vap_core.failures import Course, Diagnosis
 from vap_core.record.blueprint import QUIET, SERIES, TARGET
-from vap_core.record.evidence import contact_sheet, jpeg, picture
+from vap_core.record.evidence import contact_sheet, jpeg, picture, send_classes
 from vap_core.record.file import put
 from vap_core.values import Camera, Event, Frame, Grounding, Opening, Rgb
 
@@ -57,14 +57,12 @@ def identity(opening: Opening, frame: Frame, camera: Camera) -> np.ndarray:
 def send_identities(rec: rr.RecordingStream, opening: Opening, index: Sequence[rr.TimeColumn], frames: Sequence[Frame]) -> None:
     """One class image per view and step; the steps are those that have truth and pictures."""
     for i, camera in enumerate(frames[0].cameras):
-        images = [identity(opening, frame, frame.cameras[i]).reshape(-1) for frame in frames]
-        kind = rr.components.ImageFormat(camera.width, camera.height, color_model="L", channel_datatype="U8")
-        columns = rr.SegmentationImage.columns(buffer=images, format=[kind] * len(frames), opacity=[1.0] * len(frames))
-        rec.send_columns(f"/observation.images.{camera.name}/identity", index, columns)
+        images = [identity(opening, frame, frame.cameras[i]) for frame in frames]
+        send_classes(rec, f"/observation.images.{camera.name}/identity", index, images)
 
 
 def log_compared(rec: rr.RecordingStream, grounding: Grounding, rgb: Rgb, references: Sequence[Rgb], at: Sequence[rr.TimeColumn]) -> None:
-    """The cosine of every candidate with every reference, and the crops that were compared, side by side."""
+    """The cosine of every candidate with every reference, and what was compared, side by side."""
     if len(grounding.candidates):
         put(rec, f"/vap/similarity/{grounding.camera}", rr.Tensor(grounding.similarity, dim_names=("candidate", "reference")), at=at)
     if references:

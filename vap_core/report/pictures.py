@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vap_core.plots import METHOD_COLOURS
+from vap_core.plots import METHOD_COLOURS, empty_figure
 from vap_core.statistics import Comparison
 
 if TYPE_CHECKING:
@@ -80,11 +80,9 @@ def _aside(i: int, of: int) -> float:
 
 def _lines(lines: Sequence[Line], of: int, left: float) -> "tuple[Figure, Axes, dict[Line, float]]":
     """An empty figure with a labelled line per task, room for `of` marks on each, and a heading over each group, written from x = `left`."""
-    from matplotlib.figure import Figure
-
     groups = list(dict.fromkeys(line[:-1] for line in lines))
     place = {line: i + 0.8 * (groups.index(line[:-1]) + 1) for i, line in enumerate(lines)}
-    figure = Figure(figsize=(8.5, (0.2 + 0.13 * of) * (max(place.values()) + 1) + 1.2), layout="constrained")
+    figure = empty_figure(8.5, (0.2 + 0.13 * of) * (max(place.values()) + 1) + 1.2)
     axes = figure.subplots()
     for group in groups:
         first = min(at for line, at in place.items() if line[:-1] == group)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vap_core.failures import CASES, STAGES
+from vap_core.plots import empty_figure
 from vap_core.report.failures import Road
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ def funnel_figure(roads: Sequence[Road], colours: Mapping[str, str]) -> "Figure"
     """
     suites = list(dict.fromkeys(road.suite for road in roads))
     columns = min(2, len(suites))
-    figure = _figure(5.4 * columns, 2.9 * -(-len(suites) // columns) + 0.4)
+    figure = empty_figure(5.4 * columns, 2.9 * -(-len(suites) // columns) + 0.4)
     grid = figure.subplots(-(-len(suites) // columns), columns, squeeze=False, sharey=True).ravel()
     drawn: dict[str, Artist] = {}
     for axes, suite in zip(grid, suites, strict=False):
@@ -53,7 +54,7 @@ def cases_figure(counts: "pd.DataFrame") -> "Figure":
     import matplotlib
 
     lines = counts[counts["failed"] > 0].to_dict("records")
-    figure = _figure(10.5, 0.42 * len(lines) + 1.9)
+    figure = empty_figure(10.5, 0.42 * len(lines) + 1.9)
     axes = figure.subplots()
     start = np.zeros(len(lines))
     for case, parts in CASES.items():
@@ -71,9 +72,3 @@ def cases_figure(counts: "pd.DataFrame") -> "Figure":
     axes.spines[["top", "right", "left"]].set_visible(False)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=8)
     return figure
-
-
-def _figure(width: float, height: float) -> "Figure":
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")

@@ -7,10 +7,10 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vap_core import store, suites
+from vap_core import suites
 from vap_core.errors import BadOutput
 from vap_core.metrics import MEASURES, TRACK
-from vap_core.publish import published
+from vap_core.publish import runs as read_runs
 from vap_core.statistics import EPISODE, layouts
 
 if TYPE_CHECKING:
@@ -78,12 +78,9 @@ def load(folders: Sequence[Path]) -> Runs:
 
 
 def _runs(place: Path) -> "Iterator[tuple[Path, dict[str, Any], pd.DataFrame]]":
-    """The run of a folder, or every run in a published table; each with a name, its run.json and its episodes."""
-    if place.suffix != ".parquet":
-        yield place, store.note(place), store.read(place)
-        return
-    for about, table in published(place):
-        yield Path(f"{place}@{about['digest'][:8]}"), about, table
+    """Every run of a place with a name of its own: the folder, or the table and the digest."""
+    for about, table in read_runs(place):
+        yield Path(f"{place}@{about['digest'][:8]}") if place.suffix == ".parquet" else place, about, table
 
 
 def _by_track(wanted: "pd.DataFrame") -> "pd.DataFrame":

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vap_core.gallery import TIER_COLOURS, TIERS
-from vap_core.plots import OTHER, WINNER
+from vap_core.plots import OTHER, WINNER, empty_figure
 from vap_core.suites import BENCHMARKS
 from vap_core.survey.estimates import Estimate, mean, share
 from vap_core.survey.openings import KS, RULES, USUAL_K
@@ -180,9 +180,7 @@ def _panel(width: float, height: float) -> "tuple[Figure, Axes]":
 
 
 def _panels(width: float, height: float, n: int, sharey: bool = False) -> "tuple[Figure, list[Axes]]":
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = empty_figure(width, height)
     grid = figure.subplots(1, n, squeeze=False, sharey=sharey)[0].tolist()
     for axes in grid:
         axes.spines[["top", "right"]].set_visible(False)
