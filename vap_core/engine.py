@@ -6,7 +6,7 @@ and recorded then; both tries are kept. What a worker was doing when it died run
 
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from resource import RUSAGE_SELF, getrusage
@@ -37,7 +37,7 @@ Rows = list[dict[str, Any]]
 @dataclass(frozen=True)
 class Job:
     """Some rows of one task and variant under one method, for one worker; `attempt` 1 is the first. `chosen` are the keys to record when `record` is
-    a number; `video` records AV1 instead of JPEGs."""
+    a number; `video` records AV1 instead of JPEGs, and `attention` where the policy looks."""
 
     study: Study
     method: str
@@ -48,6 +48,7 @@ class Job:
     record: Record
     chosen: frozenset[str] = frozenset()
     video: bool = False
+    attention: bool = False
 
 
 Spread = Callable[[Callable[[Job], Rows], Sequence[Job], int, str], Iterator[tuple[Job, Rows]]]
@@ -64,6 +65,7 @@ def run(
     progress: bool = True,
     spread: Spread = results,
     video: bool = False,
+    attention: bool = False,
 ) -> "pd.DataFrame":
     """Run whatever of `study` is not in `folder` yet, and return the table of all its episodes.
 
@@ -73,12 +75,12 @@ def run(
     store.open_run(folder, study.configuration())
     with store.locked(folder):
         store.compact(folder)
-        _run(study, folder, workers, record, retries, progress, spread, video)
+        _run(study, folder, workers, record, retries, progress, spread, {"video": video, "attention": attention})
         store.compact(folder)
     return store.read(folder)
 
 
-def _run(study: Study, folder: Path, workers: int, record: Record, retries: int, progress: bool, spread: Spread, video: bool) -> None:
+def _run(study: Study, folder: Path, workers: int, record: Record, retries: int, progress: bool, spread: Spread, recorded: Mapping[str, Any]) -> None:
     from tqdm import tqdm
 
     register_personal(study, folder / "memory")
@@ -86,7 +88,7 @@ def _run(study: Study, folder: Path, workers: int, record: Record, retries: int,
     table = store.read(folder)
     ended = {str(method): Counter(success=int(part.success.sum()), n=len(part)) for method, part in table.groupby("method")}
     with tqdm(total=total, initial=len(table), unit="episode", disable=not progress, smoothing=0.05) as bar:
-        while jobs := [replace(job, video=video) for job in missing(study, folder, record, retries)]:
+        while jobs := [replace(job, **recorded) for job in missing(study, folder, record, retries)]:
             try:
                 for job, rows in spread(work, jobs, workers, "--workers"):
                     store.append(folder, rows)
@@ -144,6 +146,7 @@ def work(job: Job) -> Rows:
 
     trial = make_trial(job.study, job.rows, job.method, job.folder / "memory")
     sink = None if job.record == "none" or (isinstance(job.record, int) and not job.chosen & set(job.keys)) else _recorders(job)
+    trial = replace(trial, attention=job.attention and sink is not None)
     with frozen(trial.policy) as checksum:
         episodes = list(rollout(trial, job.rows, sink, batch=BATCH))
     traces.write(job.folder, episodes)

@@ -7,7 +7,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -18,7 +18,7 @@ from vap_core.attend import Attender
 from vap_core.errors import BadAction, OutOfReach, VapError
 from vap_core.hard_prompt import Reworded
 from vap_core.oracle import Revealed
-from vap_core.policies import Insider, Policy
+from vap_core.policies import Insider, Policy, attention
 from vap_core.shown import shown
 from vap_core.sim.env import Control, Env
 from vap_core.sim.occluder import Occlusion
@@ -46,7 +46,7 @@ class Trial:
 
     An Insider needs no pictures; it gets them every `images_every` control steps all the same (0: never), for their cost or their look.
     `follow` is when images are taken and targets tracked: at the policy's calls, which is all it ever sees, or at every control step.
-    `audit` keeps what the policy consumed in every call (module audit).
+    `audit` keeps what the policy consumed in every call (module audit); `attention` where it looked, for the sink (policies.attention).
     """
 
     method: str
@@ -60,6 +60,7 @@ class Trial:
     occlusion: Occlusion | None = None
     follow: Follow = "step"
     audit: bool = False
+    attention: bool = False
 
 
 @dataclass
@@ -77,6 +78,8 @@ class Running:
     queue: deque[np.ndarray] = field(default_factory=deque)
     frames: list[Frame] = field(default_factory=list)
     calls: list[Call] = field(default_factory=list)
+    looked: Mapping[str, attention.Heat] = field(default_factory=dict)
+    """Where the policy looked in this step's call."""
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("attend", "policy", "record"), 0.0))
     outcome: Outcome | None = None
 
@@ -228,11 +231,16 @@ def _ask(trial: Trial, asking: Sequence[Running], seen: Seen) -> tuple[list[Any]
         return policy.plan_inside(states, [one.env for one in asking])
     raw, attended = zip(*(seen[id(one)] for one in asking), strict=True)
     prompted = [PolicyInput(a.images, a.text, r.state) for r, a in zip(raw, attended, strict=True)]
-    if not trial.audit:
-        return policy.plan(states, prompted)
-    after, chunks, heard, plain = audit.plan(policy, states, prompted, raw)
-    for i, (one, r, a) in enumerate(zip(asking, raw, attended, strict=True)):
-        one.calls += audit.calls(one.judge.steps, a, r, heard[i], plain[i])
+    looking: AbstractContextManager[attention.Heats] = attention.watching() if trial.attention else nullcontext({})
+    with looking as heats:
+        if trial.audit:
+            after, chunks, heard, plain = audit.plan(policy, states, prompted, raw)
+            for i, (one, r, a) in enumerate(zip(asking, raw, attended, strict=True)):
+                one.calls += audit.calls(one.judge.steps, a, r, heard[i], plain[i])
+        else:
+            after, chunks = policy.plan(states, prompted)
+    for i, one in enumerate(asking):
+        one.looked = heats.get(i, {})
     return after, chunks
 
 
@@ -246,7 +254,10 @@ def _act(one: Running, raw: PolicyInput, attended: Attended, keep_images: bool, 
         one.outcome = one.judge.outcome()
     events = (*attended.events, *one.judge.events)
     covered = shown(attended, truth, one.row.target, opening=not one.frames) if judged else ()
-    frame = Frame(one.judge.steps, one.env.time_s, raw.images, attended.images, attended.tracks, cameras, raw.state, action, truth, events, covered)
+    frame = Frame(
+        one.judge.steps, one.env.time_s, raw.images, attended.images, attended.tracks, cameras, raw.state, action, truth, events, covered, one.looked
+    )
+    one.looked = {}
     with _timed(one.seconds, "record"):
         if one.sink is not None:
             one.sink.frame(frame)

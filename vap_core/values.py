@@ -332,7 +332,8 @@ class Shown:
 class Frame:
     """One control step: what was seen, what the policy was shown, what it did. `action` was decided from `images`.
 
-    `shown` has an entry per view at steps whose images were prompted.
+    `shown` has an entry per view at steps whose images were prompted. `attention`, at steps in which the policy was watched deciding, is the share
+    of its attention that every image patch of a view got.
     """
 
     frame_index: int
@@ -346,10 +347,11 @@ class Frame:
     truth: Truth
     events: tuple[Event, ...]
     shown: tuple[Shown, ...] = ()
+    attention: Mapping[str, Float32[np.ndarray, "_ _"]] = field(default_factory=dict)
 
     def light(self) -> "Frame":
         """The same step without its pictures, to keep in memory."""
-        return replace(self, images={}, prompted={}, tracks={}, truth=replace(self.truth, masks={}))
+        return replace(self, images={}, prompted={}, tracks={}, truth=replace(self.truth, masks={}), attention={})
 
 
 @value

@@ -30,6 +30,7 @@ Seed = Annotated[int, typer.Option(min=0, help="Seed of the policy and the senso
 RECORDED = "Which episodes become a .rrd file: all; failures and one success in ten; none; or N per task and method. A retried error always does."
 Recorded = Annotated[str, typer.Option("--record", metavar="all|failures|none|N", help=RECORDED)]
 Video = Annotated[bool, typer.Option("--video", help="Record AV1 video instead of JPEG pictures: far smaller, for about twice the recording time.")]
+Attention = Annotated[bool, typer.Option("--attention", help="Record where a pi0 or mini-pi0 looks when it decides, over every view.")]
 Retries = Annotated[int, typer.Option(min=0, help="How often an episode that ended in an error is tried again.")]
 Meshes = Annotated[str, typer.Option("--robots", help="plain, or menagerie: MuJoCo Menagerie's meshes, downloaded or found in MENAGERIE_ROOT.")]
 
@@ -75,6 +76,7 @@ def rollout(
     workers: Workers = 2,
     record: Recorded = "all",
     video: Video = False,
+    attention: Attention = False,
     retries: Retries = 1,
     robots: Meshes = "plain",
     stack: StackName = "embedded",
@@ -84,7 +86,8 @@ def rollout(
     Example: python -m vap_core rollout --suite widowx-pick --task pick-bottle --episodes 4 --out data/runs/bottle
     """
     tasks = tuple((suite, name) for name in dict.fromkeys(task))
-    _run(_study(tasks, method, policy=policy, episodes=episodes, seed=seed, robots=robots, stack=stack), out, workers, record, retries, video=video)
+    study = _study(tasks, method, policy=policy, episodes=episodes, seed=seed, robots=robots, stack=stack)
+    _run(study, out, workers, record, retries, video=video, attention=attention)
 
 
 @app.command("eval")
@@ -103,6 +106,7 @@ def evaluate(
         str | None, typer.Option("--record", metavar="all|failures|none|N", help=f"{RECORDED} Default failures; none for the bounds.")
     ] = None,
     video: Video = False,
+    attention: Attention = False,
     retries: Retries = 1,
     follow: Annotated[
         Literal["call", "step"], typer.Option(help="Take images and track when the policy is asked, or at every control step (smoother recordings).")
@@ -133,7 +137,7 @@ def evaluate(
         raise BadStudy("eval: --address needs --engine ray.")
     folder = out or Path(f"data/runs/{Path(policy).name}-{'-'.join(dict.fromkeys(suite))}")
     record = record or ("none" if policy in INSIDERS else "failures")
-    _run(study, folder, workers, record, retries, (address or "127.0.0.1:6379") if engine == "ray" else None, video)
+    _run(study, folder, workers, record, retries, (address or "127.0.0.1:6379") if engine == "ray" else None, video=video, attention=attention)
 
 
 @app.command()
@@ -277,7 +281,7 @@ def _record(said: str) -> "Record":
     raise BadStudy(f"--record {said}: say all, failures, none, or how many per task and method.")
 
 
-def _run(study: "Study", out: Path, workers: int | None, said: str, retries: int, address: str | None = None, video: bool = False) -> None:
+def _run(study: "Study", out: Path, workers: int | None, said: str, retries: int, address: str | None = None, **recorded: Any) -> None:
     from vap_core.cluster import spread
     from vap_core.engine import run
     from vap_core.processes import results
@@ -298,7 +302,7 @@ def _run(study: "Study", out: Path, workers: int | None, said: str, retries: int
         record=record,
         retries=retries,
         spread=spread(address) if address else results,
-        video=video,
+        **recorded,
     )
     print(conclude(study, table, out))
     if study.audit:

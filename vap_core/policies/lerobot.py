@@ -25,6 +25,7 @@ import torch
 from jaxtyping import Float32
 
 from vap_core.errors import BadPolicy
+from vap_core.policies import attention
 from vap_core.policies.checkpoints import PIPELINES, WEIGHTS, fingerprint, locate, refuse_code
 from vap_core.policies.witness import TEXT, listened, tell
 from vap_core.sim.env import Env
@@ -103,7 +104,7 @@ class LeRobot:
             batch = self.preprocessor(self._observation(inputs))
             self._tell(batch, range(len(inputs)))
             noise = {"noise": self._noise(states)} if self.noisy else {}
-            with self._speaking():
+            with self._speaking(), self._looking():
                 actions = self.postprocessor(self.policy.predict_action_chunk(batch, **noise)[:, : self.execute])
             return list(states), [chunk.float().cpu().numpy() for chunk in actions]
         return list(states), [self._step(i, state, seen) for i, (state, seen) in enumerate(zip(states, inputs, strict=True))]
@@ -167,6 +168,30 @@ class LeRobot:
             yield
         finally:
             hook.remove()
+
+    @contextmanager
+    def _looking(self) -> Iterator[None]:
+        """Inside, while somebody watches, the last layer of a pi0's action expert tells how its actions weigh image patches, in the mean over heads,
+        actions and denoising steps."""
+        towers = getattr(getattr(self.policy, "model", None), "paligemma_with_expert", None)
+        if towers is None or not attention.watched():
+            yield
+            return
+        weights: list[torch.Tensor] = []
+        config: Any = self.policy.config
+        last = towers.gemma_expert.model.layers[-1].self_attn
+        hook = last.register_forward_hook(lambda module, args, out: weights.append(out[1][:, :, -config.chunk_size :].mean(dim=(1, 2))))
+        try:
+            yield
+        finally:
+            hook.remove()
+        side = config.image_resolution[0] // towers.paligemma.config.vision_config.patch_size
+        cameras = [key for key in config.image_features if not key.startswith(EMPTY)]  # lerobot puts empty ones behind them
+        prefix = torch.stack(weights).mean(0)[:, : len(cameras) * side**2]
+        heats = prefix.unflatten(1, (len(cameras), side, side)).float().cpu().numpy()
+        for i, key in enumerate(cameras):
+            for episode, heat in enumerate(heats[:, i]):
+                attention.tell(episode, self.renamed.get(key, key).removeprefix(IMAGE), heat)
 
     def _noise(self, states: Sequence[LeRobotState]) -> torch.Tensor:
         config: Any = self.policy.config

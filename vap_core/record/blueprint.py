@@ -159,6 +159,12 @@ def _everything(opening: Opening) -> rrb.Container:
     return rrb.Vertical(top, _course(opening, _hand()), row_shares=[0.745, 0.255], name="everything")
 
 
+def _attention(opening: Opening) -> rrb.Container:
+    """Where the policy looked when it decided, in every view."""
+    views = rrb.Horizontal(*(_image(camera.name, "where the policy looks", ["/attention"]) for camera in opening.cameras))
+    return rrb.Vertical(views, _course(opening, _hand()), row_shares=[0.72, 0.28], name="attention")
+
+
 def identity_view(cam: str) -> Part:
     return _image(cam, "prompt by whom it covers", ["", "/identity"])
 
@@ -198,11 +204,11 @@ def _hand_first(opening: Opening) -> Part:
     return rrb.Horizontal(_scene(opening), views, _hand(), column_shares=[1.45, 0.55 if len(names) > 1 else 0.75, 1])
 
 
-def episode_blueprint(opening: Opening, diagnosis: Diagnosis | None = None) -> rrb.Blueprint:
-    """Everything; before it, once a failure is diagnosed, the evidence that decided its case."""
-    whole = _everything(opening)
+def episode_blueprint(opening: Opening, diagnosis: Diagnosis | None = None, *, looked: bool = False) -> rrb.Blueprint:
+    """Everything; before it, once a failure is diagnosed, the evidence that decided its case; last, if `looked`, the policy's attention."""
+    whole = [_everything(opening), *([_attention(opening)] if looked else [])]
     if diagnosis is None or not opening.cameras:
-        return panels(whole, opening.hz)
+        return panels(rrb.Tabs(*whole, active_tab=0) if looked else whole[0], opening.hz)
     cam, more = diagnosis.camera or opening.cameras[0].name, [_hand()]
     match diagnosis.case:
         case "case 1" | "unlabelled":
@@ -212,7 +218,7 @@ def episode_blueprint(opening: Opening, diagnosis: Diagnosis | None = None) -> r
         case _:
             why, more = _hand_first(opening), []
     first = rrb.Vertical(why, _course(opening, *more), row_shares=[0.72, 0.28], name=f"{diagnosis.case}: {diagnosis.sub_case}")
-    return panels(rrb.Tabs(first, whole, active_tab=0), opening.hz)
+    return panels(rrb.Tabs(first, *whole, active_tab=0), opening.hz)
 
 
 def grounding_blueprint(cam: str, grounding: Grounding) -> rrb.Blueprint:

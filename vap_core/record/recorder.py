@@ -71,6 +71,7 @@ class Recorder:
         self._pictures: Pictures = Reels(opening.hz) if video else Stills(jpeg_quality)
         self._course: list[Frame] = []
         self._grasp: str | None = None
+        self._looked = False
         self._rec: rr.RecordingStream | None = open_stream(self.path, f"{row.key}.s{row.seed}.{opening.method}.{opening.policy}")
         self._rec.send_recording_name(f"{row.key} · {opening.method}")
         put_property(self._rec, "rollout",
@@ -99,6 +100,8 @@ class Recorder:
         if not self._steps:
             self._first(frame, {cam: jpeg(raw, self._quality) for cam, raw in frame.images.items()})
         self._pictures.take(frame)
+        if frame.attention:
+            why.log_attention(self._stream(), frame, self._quality, self._index([frame.frame_index], [frame.timestamp_s]))
         self._steps.append(frame.frame_index)
         self._times.append(frame.timestamp_s)
         self._frames.append(frame)
@@ -133,7 +136,7 @@ class Recorder:
             if course is not None:
                 why.send_hand(rec, course, index)
             if diagnosis is not None:
-                rec.send_blueprint(episode_blueprint(self._opening, diagnosis))
+                rec.send_blueprint(episode_blueprint(self._opening, diagnosis, looked=self._looked))
         put(rec, "/vap/instruction", words(self._opening, verdict, "" if diagnosis is None else why.verdict(diagnosis)))
         put_property(rec, "outcome",
             rr.AnyValues(
@@ -192,7 +195,8 @@ class Recorder:
         for j, association in enumerate(opening.associations):
             if association is not None:
                 log_association(rec, association, j, at)
-        rec.send_blueprint(episode_blueprint(opening))
+        self._looked = bool(frame.attention)
+        rec.send_blueprint(episode_blueprint(opening, looked=self._looked))
 
     def _flush(self) -> None:
         """Send the buffered steps as columns and push them to the file."""

@@ -61,6 +61,22 @@ def send_identities(rec: rr.RecordingStream, opening: Opening, index: Sequence[r
         send_classes(rec, f"/observation.images.{camera.name}/identity", index, images)
 
 
+def log_attention(rec: rr.RecordingStream, frame: Frame, quality: int, at: Sequence[rr.TimeColumn]) -> None:
+    """The share of the policy's attention that every image patch got, as numbers, and as a glow over what the policy saw."""
+    for cam, heat in frame.attention.items():
+        put(rec, f"/vap/attention/{cam}", rr.Tensor(heat, dim_names=("row", "column")), at=at)
+        put(rec, f"/observation.images.{cam}/attention", picture(jpeg(glowing(frame.prompted[cam], heat), quality)), at=at)
+
+
+def glowing(rgb: Rgb, heat: np.ndarray) -> Rgb:
+    """The picture, dimmed, lit up by its most attended patch's share and less."""
+    height, width = rgb.shape[:2]
+    share = cv2.resize(heat / max(float(heat.max()), 1e-9), (width, height), interpolation=cv2.INTER_LINEAR)
+    colour = cv2.cvtColor(cv2.applyColorMap((255 * share).astype(np.uint8), cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
+    weight = (0.4 + 0.35 * share)[..., None]
+    return ((1 - weight) * rgb + weight * colour).astype(np.uint8)
+
+
 def log_compared(rec: rr.RecordingStream, grounding: Grounding, rgb: Rgb, references: Sequence[Rgb], at: Sequence[rr.TimeColumn]) -> None:
     """The cosine of every candidate with every reference, and what was compared, side by side."""
     if len(grounding.candidates):
