@@ -1,6 +1,7 @@
 """Recordings: what is in them, how large they are, how they survive, and that rerun's own tools accept them."""
 
 import math
+import re
 import signal
 import subprocess
 import sys
@@ -373,6 +374,26 @@ def test_an_exception_keeps_every_step_under_the_temporary_name(tmp_path: Path) 
         crash()
     assert [p.name for p in tmp_path.iterdir()] == [".one.rrd.tmp"]
     assert read_summary(recover(tmp_path / ".one.rrd.tmp"))["frames"] == 1
+
+
+def test_a_process_that_records_much_keeps_neither_threads_nor_memory(tmp_path: Path) -> None:
+    def held() -> tuple[int, float]:
+        told = Path("/proc/self/status").read_text()
+        threads, kilobytes = (int(re.search(rf"^{name}:\s*(\d+)", told, re.MULTILINE)[1]) for name in ("Threads", "VmRSS"))  # type: ignore[index]
+        return threads, kilobytes / 1024
+
+    start = opening(3)
+    frames = [frame(step, start) for step in range(6)]
+    after = []
+    for n in range(24):
+        with Recorder(tmp_path / f"{n}.rrd", start) as recorder:
+            for one in frames:
+                recorder.frame(one)
+            recorder.close(replace(SUCCESS, status="failure", success=False) if n % 2 else SUCCESS)
+        del recorder
+        after.append(held())
+    assert after[-1][0] <= after[3][0] + 1, "threads"
+    assert after[-1][1] < after[11][1] + 12, "megabytes"
 
 
 @pytest.mark.alone

@@ -11,6 +11,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from vap_core.failures import Diagnosis
+from vap_core.record.file import Layout
 from vap_core.values import Grounding, Opening
 
 TARGET = (255, 150, 40)
@@ -99,9 +100,9 @@ def _curves(
     return rrb.TimeSeriesView(origin=origin, name=name, contents=list(contents), axis_y=axis, plot_legend=legend, overrides=overrides)
 
 
-def panels(root: Part, fps: float = 1.0) -> rrb.Blueprint:
+def panels(root: Part, fps: float = 1.0) -> Layout:
     """The whole window: `root`, and the time line at its foot."""
-    return rrb.Blueprint(
+    return Layout(
         root,
         rrb.TimePanel(state="collapsed", timeline="frame_index", play_state="paused", fps=fps),
         rrb.SelectionPanel(state="hidden"),
@@ -204,7 +205,7 @@ def _hand_first(opening: Opening) -> Part:
     return rrb.Horizontal(_scene(opening), views, _hand(), column_shares=[1.45, 0.55 if len(names) > 1 else 0.75, 1])
 
 
-def episode_blueprint(opening: Opening, diagnosis: Diagnosis | None = None, *, looked: bool = False) -> rrb.Blueprint:
+def episode_blueprint(opening: Opening, diagnosis: Diagnosis | None = None, *, looked: bool = False) -> Layout:
     """Everything; before it, once a failure is diagnosed, the evidence that decided its case; last, if `looked`, the policy's attention."""
     whole = [_everything(opening), *([_attention(opening)] if looked else [])]
     if diagnosis is None or not opening.cameras:
@@ -221,7 +222,7 @@ def episode_blueprint(opening: Opening, diagnosis: Diagnosis | None = None, *, l
     return panels(rrb.Tabs(first, *whole, active_tab=0), opening.hz)
 
 
-def grounding_blueprint(cam: str, grounding: Grounding) -> rrb.Blueprint:
+def grounding_blueprint(cam: str, grounding: Grounding) -> Layout:
     """One image, and why that box won."""
     words = rrb.TextDocumentView(origin="/vap/instruction", name="instruction")
     references = rrb.Spatial2DView(origin="/vap/references", name="reference views #0, #1, ...", background=BACKGROUND)

@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import rerun as rr
+import rerun.blueprint as rrb
+import rerun_bindings
 from rerun.chunk import RrdReader
 
 from vap_core.errors import BadOutput, BadRecording
@@ -43,11 +45,25 @@ def open_stream(path: Path, recording_id: str) -> rr.RecordingStream:
         temporary(path).write_bytes(b"")
     except OSError as err:
         raise BadOutput(f"record: cannot write in {path.parent} ({err.strerror}); choose a folder you may write to.") from err
+    rerun_bindings.flush_and_cleanup_orphaned_recordings()  # else every finished recording keeps its threads and some megabytes
     config = rr.ChunkBatcherConfig(flush_tick=timedelta(days=365), flush_num_bytes=2**40, flush_num_rows=2**40)
     rec = rr.RecordingStream("vap", recording_id=recording_id, send_properties=False, batcher_config=config)
     rec.set_log_time_enabled(False)
     rec.save(temporary(path))
     return rec
+
+
+class Layout(rrb.Blueprint):
+    """A blueprint that ends the stream it is sent through: rerun keeps one of each, with its threads, until the process ends."""
+
+    def _log_to_stream(self, stream: rr.RecordingStream) -> None:
+        super()._log_to_stream(stream)
+        self._through = stream
+
+    def send(self, rec: rr.RecordingStream) -> None:
+        """Make it what the recording opens with."""
+        rec.send_blueprint(self)
+        self._through.disconnect()
 
 
 def put(rec: rr.RecordingStream, entity: str, *parts: rr.AsComponents, at: Sequence[rr.TimeColumn] = ()) -> None:

@@ -136,7 +136,7 @@ class Recorder:
             if course is not None:
                 why.send_hand(rec, course, index)
             if diagnosis is not None:
-                rec.send_blueprint(episode_blueprint(self._opening, diagnosis, looked=self._looked))
+                episode_blueprint(self._opening, diagnosis, looked=self._looked).send(rec)
         put(rec, "/vap/instruction", words(self._opening, verdict, "" if diagnosis is None else why.verdict(diagnosis)))
         put_property(rec, "outcome",
             rr.AnyValues(
@@ -196,7 +196,7 @@ class Recorder:
             if association is not None:
                 log_association(rec, association, j, at)
         self._looked = bool(frame.attention)
-        rec.send_blueprint(episode_blueprint(opening, looked=self._looked))
+        episode_blueprint(opening, looked=self._looked).send(rec)
 
     def _flush(self) -> None:
         """Send the buffered steps as columns and push them to the file."""
@@ -296,5 +296,5 @@ def record_grounding(path: Path, image: Rgb, grounding: Grounding, obj: Personal
     lines = [f'**said** "{text}"', f'**policy reads** "{rewritten}"', evidence_line(grounding)]
     lines.append(f"{obj.name} · {obj.category} · {len(obj.crops)} references · {obj.encoder}")
     put(rec, "/vap/instruction", rr.TextDocument("\n\n".join(lines), media_type=rr.MediaType.MARKDOWN), at=at)
-    rec.send_blueprint(grounding_blueprint(cam, grounding))
+    grounding_blueprint(cam, grounding).send(rec)
     finish_stream(rec, path)

@@ -8,7 +8,7 @@ from rerun.chunk import RrdReader
 
 from vap_core.errors import BadStudy
 from vap_core.record.blueprint import BACKGROUND, panels
-from vap_core.record.file import finish_stream, open_stream, read_summary
+from vap_core.record.file import Layout, finish_stream, open_stream, read_summary
 
 SAME = ("suite", "task", "episode", "seed")
 
@@ -36,11 +36,11 @@ def together(recordings: Mapping[str, Path], out: Path) -> None:
             if len(parts) == 3 and parts[1].startswith("observation.images.") and parts[2] == "prompted":
                 cameras[name] = list(dict.fromkeys([*cameras[name], parts[1]]))
             rec.send_chunks(chunk.with_entity_path(f"/{name}{chunk.entity_path.rstrip('/')}"))
-    rec.send_blueprint(_blueprint(cameras, float(next(iter(about.values())).get("rollout.hz") or 1.0)))
+    _blueprint(cameras, float(next(iter(about.values())).get("rollout.hz") or 1.0)).send(rec)
     finish_stream(rec, out)
 
 
-def _blueprint(cameras: Mapping[str, list[str]], fps: float) -> rrb.Blueprint:
+def _blueprint(cameras: Mapping[str, list[str]], fps: float) -> Layout:
     """A column for each method, the same things at the same height: words, views as the policy got them, the scene, the hand, events."""
 
     def column(name: str) -> rrb.Container:
