@@ -127,9 +127,9 @@ def test_a_published_table_opens_too(run: Path, tmp_path: Path, monkeypatch: pyt
     [
         ({"suite": "vlabench"}, "no suite 'vlabench' here; there is widowx-pick"),
         ({"case": 2}, "no case 'case 2' here; there is unprompted"),
-        ({"where": "margin <"}, "is no condition on this table"),
+        ({"where": "margin <"}, "is none on this table"),
         ({"where": "colour = 'red'"}, "its columns are"),
-        ({"where": "1 = 1; drop table episodes"}, "is no condition on this table"),
+        ({"where": "1 = 1; drop table episodes"}, "is none on this table"),
     ],
 )
 def test_what_fits_nothing_is_refused_in_one_line(run: Path, asked: dict[str, Any], match: str) -> None:

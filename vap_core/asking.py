@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vap_core.diagnosis import matching
+from vap_core.condition import matching
 from vap_core.errors import BadStudy
 from vap_core.report.text import align
 from vap_core.values import value

@@ -10,6 +10,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vap_core.condition import matching
 from vap_core.errors import BadOutput, BadStudy
 from vap_core.experiments import Study, make_trial, register_personal
 from vap_core.publish import runs
@@ -99,25 +100,6 @@ def _only(table: "pd.DataFrame", column: str, wanted: Any) -> "pd.DataFrame":
     if wanted not in known:
         raise BadStudy(f"diagnose: no {column.replace('_', '-')} {wanted!r} here; there is {', '.join(map(str, known)) or 'none'}.")
     return table[table[column] == wanted]
-
-
-def matching(table: "pd.DataFrame", where: str) -> "pd.DataFrame":
-    """The rows for which a SQL condition holds, such as "margin < 0.05 and success = false". Raises: BadStudy."""
-    import pyarrow as pa
-    from datafusion import SessionContext
-
-    flat = table.reset_index(drop=True)
-    arrow = pa.Table.from_pandas(flat.assign(line=flat.index), preserve_index=False)
-    try:
-        context = SessionContext()
-        context.register_record_batches("episodes", [arrow.to_batches()])
-        held = [line for batch in context.table("episodes").filter(where).select("line").collect() for line in batch["line"].to_pylist()]
-    except Exception as error:  # datafusion raises bare exceptions
-        told = " ".join(str(error).split())[:200]
-        raise BadStudy(
-            f"diagnose: {where!r} is no condition on this table ({told}); its columns are {', '.join(map(str, table.columns))}."
-        ) from error
-    return flat.loc[sorted(held)]
 
 
 def text(failures: Failures, limit: int = 20) -> str:

@@ -149,12 +149,23 @@ def work(job: Job) -> Rows:
     trial = replace(trial, attention=job.attention and sink is not None)
     with frozen(trial.policy) as checksum:
         episodes = list(rollout(trial, job.rows, sink, batch=BATCH))
+    if sink is not None:
+        _index(job)
     traces.write(job.folder, episodes)
     audit.write(job.folder, episodes)
     bound = isinstance(trial.attender, Revealed) or isinstance(trial.policy, Insider)
     about: dict[str, Any] = {"attempt": job.attempt, "policy_sha256": checksum, "bound": bound}
     about["peak_mb"] = getrusage(RUSAGE_SELF).ru_maxrss // 1024
     return [{"key": name, **about, **episode.summary(), **failures.columns(episode)} for name, episode in zip(job.keys, episodes, strict=True)]
+
+
+def _index(job: Job) -> None:
+    """So that a query need not read what was recorded as a whole."""
+    from vap_core.record import index, recording_name
+
+    for path in (job.folder / "recordings" / recording_name(row, job.method) for row in job.rows):
+        if path.exists():
+            index(path)
 
 
 def _recorders(job: Job) -> Callable[[Opening], "Recorder | Waiting"]:

@@ -105,7 +105,8 @@ def bench(
         str,
         typer.Argument(
             help="loop: the prompted control loop; suites: every benchmark's simulator; stack: a stack's models; policy: the shipped policies; "
-            "eval: episodes per hour against lerobot's own loop; engine: a Ray cluster on this machine against local processes."
+            "eval: episodes per hour against lerobot's own loop; engine: a Ray cluster on this machine against local processes; "
+            "query: a question to a thousand recordings."
         ),
     ] = "loop",
     steps: Annotated[int, typer.Option(min=5, help="loop: control steps to time.")] = 60,
@@ -113,14 +114,16 @@ def bench(
     stack: StackName = "foundation",
     random_weights: Annotated[bool, typer.Option("--random-weights", help="stack: without weights; they change nothing about speed.")] = False,
     device: Annotated[str | None, typer.Option(help="stack: cpu or cuda; default VAP_DEVICE, or a GPU where there is one.")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="policy, eval, engine: a few steps, to see that it runs; its numbers mean nothing.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="policy, eval, engine, query: a few steps, to see that it runs; its numbers mean nothing.")
+    ] = False,
 ) -> None:
     """Time a control step by part, as shares and ratios within one run: of the prompted loop, every benchmark's simulator, the models.
 
     Example: python -m vap_core bench suites
     """
     from vap_core import bench as loop
-    from vap_core import bench_engine, bench_eval, bench_policy, bench_stack, bench_suites
+    from vap_core import bench_engine, bench_eval, bench_policy, bench_query, bench_stack, bench_suites
     from vap_core.errors import one_of
 
     runs = {
@@ -130,6 +133,7 @@ def bench(
         "policy": lambda: bench_policy.run(quick),
         "eval": lambda: bench_eval.run(workers, quick),
         "engine": lambda: bench_engine.run(workers, quick),
+        "query": lambda: bench_query.run(quick=quick),
     }
     if what not in runs:
         raise one_of("bench:", what, runs)

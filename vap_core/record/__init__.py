@@ -9,6 +9,7 @@ from vap_core.record.file import file_name as file_name
 from vap_core.record.file import read_summary as read_summary
 from vap_core.record.file import recording_name as recording_name
 from vap_core.record.file import recover as recover
+from vap_core.record.index import index as index
 from vap_core.record.keep import Waiting as Waiting
 from vap_core.record.keep import wanted as wanted
 from vap_core.record.layers import Correction as Correction
