@@ -15,6 +15,7 @@ from vap_core.experiments import Study
 from vap_core.failures import CASES, STAGES
 from vap_core.publish import publish
 from vap_core.record import read_summary
+from vap_core.record.index import FOLDER
 from vap_core.report import align
 from vap_core.report.failures import breakdown, breakdown_rows, roads, sub_cases_text
 
@@ -184,6 +185,7 @@ def test_so_many_recordings_are_spread_over_a_task(tmp_path: Path) -> None:
     study = replace(STUDY, episodes=4)
     engine.run(study, tmp_path / "run", record=2, spread=here, progress=False)
     assert sorted(path.name.split(".")[2] for path in (tmp_path / "run" / "recordings").glob("*.rrd")) == ["000", "002"]
+    assert len(list((tmp_path / "run" / "recordings" / FOLDER).glob("*.rrd"))) == 2, "each with its index"
     assert diagnosis.listed(tmp_path / "run").table.shape[0] == 4
 
 
