@@ -17,7 +17,7 @@ from vap_core.record import Waiting
 from vap_core.report import align
 from vap_core.rollout import Trial, rollout
 from vap_core.sim.env import Env
-from vap_core.values import Episode, EpisodeRow, Opening
+from vap_core.values import Episode, EpisodeRow
 
 REPEAT, PAIRS = 15, 5
 
@@ -83,15 +83,15 @@ def _attend_limits(trial: Trial, row: EpisodeRow, unit: float) -> list[Limit]:
 
     track = _median_ms(step)
     return [
-        Limit("attend step (track + prompt), one view", track, 60, "ms", f"{track / unit:.2f} backbone passes"),
+        Limit("attend step (track + prompt), the wrist's view", track, 60, "ms", f"{track / unit:.2f} backbone passes"),
         Limit("start-up grounding, one view", start, 350, "ms", f"{start / unit:.2f} backbone passes"),
     ]
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """The same steps as recorded by default where the episode fails: the CPU that it takes, over the CPU of the rollout without, once per pair of
-    runs (the whole process, rerun's threads too), and the file's megabytes as JPEGs and as AV1."""
+    """What it takes to keep the steps of a rollout as is done by default where the episode fails: CPU of the whole process, rerun's threads too, in
+    percent of the rollout's, once per repeat; and the file's megabytes as JPEGs and as AV1."""
 
     episode: Episode
     over: tuple[float, ...]
@@ -100,24 +100,33 @@ class Recorded:
 
 
 def _record(trial: Trial, row: EpisodeRow, folder: Path) -> Recorded:
-    def sink(name: str, video: bool = False) -> Callable[[Opening], Waiting]:
-        return lambda opening: Waiting(folder / f"{name}.rrd", opening, lambda outcome: True, video=video)
-
-    def cpu_s(sink: Callable[[Opening], Waiting] | None) -> tuple[float, Episode]:
+    def keep(episode: Episode, name: str, video: bool = False) -> float:
         start = time.process_time()
-        episode = next(rollout(trial, [row], sink))
+        sink = Waiting(folder / f"{name}.rrd", episode.opening, lambda outcome: True, video=video)
+        for frame in episode.frames:
+            sink.frame(frame)
+        sink.close(episode.outcome)
+        return time.process_time() - start
+
+    def played() -> tuple[float, Episode]:
+        start = time.process_time()
+        episode = next(rollout(trial, [row], keep_images=True))
         return time.process_time() - start, episode
 
-    next(rollout(trial, [replace(row, max_steps=1)], sink("warm")))  # rerun's first call imports pandas
-    pairs = [(cpu_s(None)[0], cpu_s(sink(str(i)))) for i in range(PAIRS)]
-    cpu_s(sink("video", video=True))
+    keep(played()[1], "warm")  # rerun's first call imports pandas
+    over, episode = [], None
+    for i in range(PAIRS):
+        cpu_s, episode = played()
+        over.append(100 * keep(episode, str(i)) / cpu_s)
+    assert episode is not None
+    keep(episode, "video", video=True)
     jpeg_mb, video_mb = ((folder / f"{name}.rrd").stat().st_size / 1e6 for name in ("0", "video"))
-    return Recorded(pairs[0][1][1], tuple(100 * (with_it / plain - 1) for plain, (with_it, _) in pairs), jpeg_mb, video_mb)
+    return Recorded(episode, tuple(over), jpeg_mb, video_mb)
 
 
 def _record_limits(recorded: Recorded) -> list[Limit]:
     steps, over = max(recorded.episode.outcome.steps, 1), sorted(recorded.over)
-    told = f"{over[0]:.1f} to {over[-1]:.1f} % in {len(over)} pairs of runs"
+    told = f"{over[0]:.1f} to {over[-1]:.1f} % in {len(over)} repeats"
     return [
         Limit("recording, over the CPU of the rollout", float(np.median(over)), 8, "%", told),
         Limit("60 steps of 3 cameras, as JPEGs", recorded.jpeg_mb * 60 / steps, 4, "MB", f"{recorded.jpeg_mb:.2f} MB for {steps} steps"),
@@ -134,7 +143,7 @@ def _import_limit(unit: float) -> Limit:
 def _shares(episode: Episode) -> list[list[str]]:
     total, steps = sum(episode.seconds.values()), max(episode.outcome.steps, 1)
     ranked = sorted(episode.seconds.items(), key=lambda item: -item[1])
-    return [[part, f"{1e3 * seconds / steps:.1f}", f"{100 * seconds / total:.0f} %"] for part, seconds in ranked]
+    return [[part, f"{1e3 * seconds / steps:.1f}", f"{100 * seconds / total:.0f} %"] for part, seconds in ranked if seconds]
 
 
 def _median_ms(work: Callable[[], object]) -> float:
