@@ -1,6 +1,6 @@
 """How a recording looks when it is opened: what the policy saw, why that box won, what happened.
 
-Layouts are values that rerun stores inside the recording. `/vap/...` paths are explained in `record.py`.
+Layouts are values that rerun stores inside the recording. `/vap/...` paths are explained in `recorder.py`.
 """
 
 from collections.abc import Mapping, Sequence

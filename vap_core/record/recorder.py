@@ -7,7 +7,8 @@ Entities (lerobot's feature keys; timelines `frame_index` and `timestamp`):
 `/candidates` carries the picture the vote was held on, `/vap/votes/<cam>` its `counts`, with `/winner` and `/others` as bars;
 `/vap/association` is what the views agreed on, when they were asked together.
 `/observation.images.<cam>/identity` colours each prompt by the object it covers; `/vap/{similarity,crops}/<cam>` are what the vote compared;
-`/vap/hand/*` is where the hand was. Recording properties: `rollout` and `outcome`, which says why an episode failed (module failures).
+`/vap/hand/*` is where the hand was; `/vap/attention/<cam>` and `/observation.images.<cam>/attention` are where the policy
+looked. Recording properties: `rollout` and `outcome`, which says why an episode failed (module failures).
 Pictures are JPEG or AV1, at the steps that have them; everything that changes travels in columns.
 """
 
