@@ -143,7 +143,7 @@ def _import_limit(unit: float) -> Limit:
 def _shares(episode: Episode) -> list[list[str]]:
     total, steps = sum(episode.seconds.values()), max(episode.outcome.steps, 1)
     ranked = sorted(episode.seconds.items(), key=lambda item: -item[1])
-    return [[part, f"{1e3 * seconds / steps:.1f}", f"{100 * seconds / total:.0f} %"] for part, seconds in ranked if seconds]
+    return [[part, f"{1e3 * seconds / steps:.1f}", f"{100 * seconds / total:.0f} %"] for part, seconds in ranked if 1e3 * seconds >= 0.05 * steps]
 
 
 def _median_ms(work: Callable[[], object]) -> float:
