@@ -7,13 +7,14 @@ and recorded then; both tries are kept. What a worker was doing when it died run
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from resource import RUSAGE_SELF, getrusage
 from typing import TYPE_CHECKING, Any, Literal
 
 from vap_core import audit, failures, store, traces
-from vap_core.errors import BadOutput, WorkerDied
+from vap_core.errors import BadOutput, BadRecording, WorkerDied
 from vap_core.experiments import Study, make_trial, register_personal
 from vap_core.frozen import frozen
 from vap_core.oracle import Revealed
@@ -160,12 +161,13 @@ def work(job: Job) -> Rows:
 
 
 def _index(job: Job) -> None:
-    """So that a query need not read what was recorded as a whole."""
+    """So that a query need not read recordings whole; an episode that ended before its first step has nothing to ask for."""
     from vap_core.record import index, recording_name
 
     for path in (job.folder / "recordings" / recording_name(row, job.method) for row in job.rows):
         if path.exists():
-            index(path)
+            with suppress(BadRecording):
+                index(path)
 
 
 def _recorders(job: Job) -> Callable[[Opening], "Recorder | Waiting"]:
