@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CASE_SHADES = {"case 1": "Reds", "case 2": "Purples", "case 3": "Blues", "unprompted": "Greys", "unlabelled": "Greens"}
+LABEL_APART = 6.0
+"""Percent between two numbers at the ends of lines, so that both can be read."""
 
 
 def funnel_figure(roads: Sequence[Road], colours: Mapping[str, str]) -> "Figure":
@@ -28,14 +30,17 @@ def funnel_figure(roads: Sequence[Road], colours: Mapping[str, str]) -> "Figure"
     grid = figure.subplots(-(-len(suites) // columns), columns, squeeze=False, sharey=True).ravel()
     drawn: dict[str, Artist] = {}
     for axes, suite in zip(grid, suites, strict=False):
+        ends: list[tuple[float, str]] = []
         for road in (road for road in roads if road.suite == suite and road.method in colours):
             held = [(i, 100 * left / road.n) for i, left in enumerate(road.left) if left is not None]
             at, share = [i for i, _ in held], [value for _, value in held]
             dashes = "--" if road.method.startswith("oracle") else "-"
             (drawn[road.method],) = axes.plot(at, share, dashes, marker="o", markersize=4, color=colours[road.method], linewidth=1.8)
-            axes.annotate(
-                f"{share[-1]:.0f}", (at[-1], share[-1]), (5, 0), textcoords="offset points", fontsize=8, color=colours[road.method], va="center"
-            )
+            ends.append((share[-1], colours[road.method]))
+        lowest = -LABEL_APART
+        for value, colour in sorted(ends):
+            lowest = max(value, lowest + LABEL_APART)
+            axes.annotate(f"{value:.0f}", (len(STAGES) - 1, lowest), (5, 0), textcoords="offset points", fontsize=8, color=colour, va="center")
         n = next(road.n for road in roads if road.suite == suite)
         axes.set_xticks(range(len(STAGES)), STAGES, fontsize=8, rotation=20)
         axes.set(title=f"{suite} (n {n})", ylim=(0, 104))
