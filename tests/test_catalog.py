@@ -50,6 +50,12 @@ def test_every_step_is_a_row_and_what_cannot_be_read_is_named(run: Path) -> None
     assert set(wrong["failure_case"]) == {"case 1"}
 
 
+def test_from_inside_the_folder_its_recordings_have_short_names(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(run.parent)
+    answer = asking.ask(Path(run.name), "frame_index >= 0")
+    assert answer.found["file"].tolist() == [f"{run.name}/recordings/{name}.rrd" for name in ("apart", "fine", "wrong")]
+
+
 def test_a_condition_leads_to_recordings_and_frames(run: Path) -> None:
     answer = asking.ask(run, "success = false and margin < 0.7 and frame_index >= 7")
     assert [(Path(line.file).name, line.steps, line.first, line.last) for line in answer.found.itertuples()] == [

@@ -55,7 +55,7 @@ def steps(folder: Path) -> Steps:
         _register(dataset, indexes, unreadable)
         layers = {path: path for path in sorted((Path(folder).parent / CORRECTIONS).glob("*.rrd"))}
         _register(dataset, layers, unreadable, layer=CORRECTIONS)
-        return Steps(_joined(dataset, {index: file for file, index in indexes.items()}), unreadable)
+        return Steps(_joined(dataset, {at.resolve(): file for file, at in indexes.items()}), unreadable)
 
 
 def _indexed(files: Sequence[Path], folder: Path | None, unreadable: dict[Path, str]) -> dict[Path, Path]:
