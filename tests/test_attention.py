@@ -84,6 +84,8 @@ def test_a_policy_without_patches_tells_nothing_and_nobody_hears_outside(toys: d
         assert watched()
     tell(0, "front", np.zeros((2, 2), np.float32))
     assert seen == {}
+    assert not toys["act"].attends
+    assert toys["pi0"].attends
     assert not watched()
     with watching() as first:
         tell(0, "front", np.zeros((2, 2), np.float32))
@@ -181,3 +183,15 @@ def test_the_real_command_records_it(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     (path,) = (tmp_path / "run" / "recordings").glob("*.rrd")
     assert "/vap/attention/front" in {chunk.entity_path for chunk in RrdReader(path).stream()}
+
+
+def test_who_cannot_tell_is_refused_in_one_line(tmp_path: Path) -> None:
+    words = ("rollout", "--suite", "widowx-pick", "--task", "pick-bottle", "--episodes", "1", "--attention", "--out", tmp_path / "run")
+    done = vap(*words)
+    assert done.returncode == 2
+    assert "does not tell where it looks" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list((tmp_path / "run").rglob("*.rrd"))
+    done = vap(*words, "--record", "none")
+    assert done.returncode == 2
+    assert "with --record none leave them out" in done.stderr

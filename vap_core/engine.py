@@ -14,7 +14,7 @@ from resource import RUSAGE_SELF, getrusage
 from typing import TYPE_CHECKING, Any, Literal
 
 from vap_core import audit, failures, store, traces
-from vap_core.errors import BadOutput, BadRecording, WorkerDied
+from vap_core.errors import BadOutput, BadRecording, BadStudy, WorkerDied
 from vap_core.experiments import Study, make_trial, register_personal
 from vap_core.frozen import frozen
 from vap_core.oracle import Revealed
@@ -147,6 +147,8 @@ def work(job: Job) -> Rows:
 
     trial = make_trial(job.study, job.rows, job.method, job.folder / "memory")
     sink = None if job.record == "none" or (isinstance(job.record, int) and not job.chosen & set(job.keys)) else _recorders(job)
+    if job.attention and not getattr(trial.policy, "attends", False):
+        raise BadStudy(f"engine: {trial.policy.label} does not tell where it looks, as pi0, pi0.5 and mini-pi0 do; leave --attention out.")
     trial = replace(trial, attention=job.attention and sink is not None)
     with frozen(trial.policy) as checksum:
         episodes = list(rollout(trial, job.rows, sink, batch=BATCH))

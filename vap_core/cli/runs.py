@@ -284,11 +284,14 @@ def _record(said: str) -> "Record":
 def _run(study: "Study", out: Path, workers: int | None, said: str, retries: int, address: str | None = None, **recorded: Any) -> None:
     from vap_core.cluster import spread
     from vap_core.engine import run
+    from vap_core.errors import BadStudy
     from vap_core.processes import results
     from vap_core.report import conclude
     from vap_core.statistics import foresight
 
     record = _record(said)
+    if record == "none" and any(recorded.values()):
+        raise BadStudy("--video and --attention say how to record; with --record none leave them out.")
     if len(study.methods) > 1:
         tracks: dict[str, list[EpisodeRow]] = {}
         for row in (row for suite, task in study.tasks for row in study.rows(suite, task)):

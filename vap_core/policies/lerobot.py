@@ -80,6 +80,8 @@ class LeRobot:
         }
         """Shape of every feature that the checkpoint reads, under the key that its preprocessor expects."""
         self.learned: dict[int, torch.Tensor] = {}
+        self.attends = self.batched and hasattr(getattr(policy, "model", None), "paligemma_with_expert")
+        """Whether it tells where it looks (module attention)."""
 
     def saying(self, words: Mapping[str, Float32[np.ndarray, " d"]]) -> "LeRobot":
         """The same frozen policy, to whom some reserved words mean learned embeddings; its own table stays as it is. Raises: BadPolicy."""
@@ -173,12 +175,12 @@ class LeRobot:
     def _looking(self) -> Iterator[None]:
         """Inside, while somebody watches, the last layer of a pi0's action expert tells how its actions weigh image patches, in the mean over heads,
         actions and denoising steps."""
-        towers = getattr(getattr(self.policy, "model", None), "paligemma_with_expert", None)
-        if towers is None or not attention.watched():
+        if not self.attends or not attention.watched():
             yield
             return
         weights: list[torch.Tensor] = []
-        config: Any = self.policy.config
+        policy: Any = self.policy
+        config, towers = policy.config, policy.model.paligemma_with_expert
         last = towers.gemma_expert.model.layers[-1].self_attn
         hook = last.register_forward_hook(lambda module, args, out: weights.append(out[1][:, :, -config.chunk_size :].mean(dim=(1, 2))))
         try:
