@@ -8,7 +8,7 @@ import numpy as np
 import rerun as rr
 from rerun.chunk import Chunk, RrdReader
 
-from vap_core.errors import BadRecording
+from vap_core.errors import BadOutput, BadRecording
 from vap_core.record.file import finish_stream, open_stream, temporary
 
 CURVES = {"margin": "/vap/vote_margin/", "track_score": "/vap/track_score/", "gap_cm": "/vap/hand/gripper", "lift_cm": "/vap/hand/target"}
@@ -21,18 +21,20 @@ FOLDER = ".index-1"
 
 
 def index(recording: Path, folder: Path | None = None) -> Path:
-    """The index of a recording, in FOLDER beside it or in `folder`; written where it is missing or older than the recording.
+    """The index of a recording, in FOLDER beside it or in `folder`, its name and its size in bytes; written where there is none.
 
     Raises: BadRecording when the recording cannot be read, or is none of an episode.
     """
-    path = (folder or recording.parent / FOLDER) / recording.name
+    place = folder or recording.parent / FOLDER
     try:
-        if path.exists() and path.stat().st_mtime_ns >= recording.stat().st_mtime_ns:
-            return path
-        path.unlink(missing_ok=True)
-        _write(recording, path)
+        path = place / f"{recording.stem}.{recording.stat().st_size}.rrd"
+        if not path.exists():
+            temporary(path).unlink(missing_ok=True)
+            _write(recording, path)
+    except BadOutput:
+        if not path.exists():  # written by another process meanwhile
+            raise
     except (RuntimeError, ValueError, OSError, Warning) as error:
-        temporary(path).unlink(missing_ok=True)
         raise BadRecording(str(error).splitlines()[0][:160]) from error
     return path
 
