@@ -10,6 +10,7 @@ from vap_core import cluster, engine
 from vap_core.errors import BadCluster, WorkerDied
 from vap_core.experiments import Study
 from vap_core.processes import results
+from vap_core.record.index import FOLDER
 from vap_core.store import open_run
 from vap_core.traces import read as read_traces
 
@@ -38,9 +39,10 @@ def test_a_cluster_gives_what_local_processes_give(address: str, tmp_path: Path)
     assert one.keys() == other.keys()
     for name in one:
         assert [truth.objects_world.keys() for truth in one[name]] == [truth.objects_world.keys() for truth in other[name]]
-    names = [sorted(path.name for path in (tmp_path / name / "recordings").rglob("*.rrd")) for name in ("ray", "local")]
+    names = [sorted(path.name for path in (tmp_path / name / "recordings").glob("*.rrd")) for name in ("ray", "local")]
     assert names[0] == names[1]
-    assert len(names[0]) == 12, "recordings and their indexes"
+    assert len(names[0]) == 6
+    assert [len(list((tmp_path / name / "recordings" / FOLDER).glob("*.rrd"))) for name in ("ray", "local")] == [6, 6]
     again = engine.run(STUDY, tmp_path / "ray", progress=False, spread=cluster.spread("127.0.0.1:1"))
     pd.testing.assert_frame_equal(again, there)  # nothing is missing, nobody is asked
 
