@@ -7,37 +7,13 @@ seen[0]["front"]        # of the first episode in the batch: height x width of p
 Policies that tell nothing (no transformer over patches, or one asked step by step) leave `seen` empty.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
-
 import numpy as np
 from jaxtyping import Float32
+
+from vap_core.policies.telling import Ear
 
 Heat = Float32[np.ndarray, "h w"]
 Heats = dict[int, dict[str, Heat]]
 """By episode of the batch, then by camera."""
-_seen: ContextVar[Heats | None] = ContextVar("seen", default=None)
-
-
-@contextmanager
-def watching() -> Iterator[Heats]:
-    """Collect what policies tell inside the block."""
-    found: Heats = {}
-    token = _seen.set(found)
-    try:
-        yield found
-    finally:
-        _seen.reset(token)
-
-
-def watched() -> bool:
-    """Whether anybody watches: attention is kept then only."""
-    return _seen.get() is not None
-
-
-def tell(episode: int, camera: str, heat: Heat) -> None:
-    """Say how episode number `episode` of the batch weighs the patches of a camera's image; what is told first stands."""
-    seen = _seen.get()
-    if seen is not None:
-        seen.setdefault(episode, {}).setdefault(camera, heat)
+_eye: Ear[Heat] = Ear("attention")
+watching, watched, tell = _eye.open, _eye.opened, _eye.tell
