@@ -4,7 +4,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from vap_core.rollout import Trial, rollout
 from vap_core.sim.env import Env
 from vap_core.values import Episode, EpisodeRow
 
-REPEAT, PAIRS = 15, 5
+REPEAT, PLAYS = 15, 5
 
 
 @dataclass(frozen=True)
@@ -41,31 +41,38 @@ def run(steps: int = 60) -> str:
     """Measure everything and say it; takes about a minute."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        bank = folder / "memory"
-        register_personal(DEMO, bank)
-        suite, task = DEMO.tasks[-1]
-        rows = DEMO.rows(suite, task)
-        trial, row = make_trial(DEMO, rows, "vap", bank), replace(rows[0], max_steps=steps)
+        trial, row = demo_trial(folder, steps)
         unit = _pass_ms(trial)
         recorded = _record(trial, row, folder)
         limits = [*_attend_limits(trial, row, unit), *_record_limits(recorded), _import_limit(unit)]
-    head = ["what", "measured", "budget", "", "ratio"]
     steps_run, views = recorded.episode.outcome.steps, len(trial.scene.cameras)
     return "\n".join(
         [
-            f"{suite}/{task}, {views} cameras, {steps_run} steps, one thread; one backbone pass takes {unit:.1f} ms",
+            f"{row.suite}/{row.task}, {views} cameras, {steps_run} steps, one thread; one backbone pass takes {unit:.1f} ms",
             "",
             align([["part of a control step", "ms", "share"], *_shares(recorded.episode)]),
             "",
-            align([head, *(limit.row() for limit in limits)]),
+            beside_budgets(limits),
         ]
     )
+
+
+def demo_trial(folder: Path, steps: int) -> tuple[Trial, EpisodeRow]:
+    """The demo's last task under VAP, its object remembered in `folder`, and an episode of so many steps at most."""
+    register_personal(DEMO, folder / "memory")
+    rows = DEMO.rows(*DEMO.tasks[-1])
+    return make_trial(DEMO, rows, "vap", folder / "memory"), replace(rows[0], max_steps=steps)
+
+
+def beside_budgets(limits: Sequence[Limit]) -> str:
+    """A line per figure."""
+    return align([["what", "measured", "budget", "", "ratio"], *(limit.row() for limit in limits)])
 
 
 def _pass_ms(trial: Trial) -> float:
     env = Env(trial.scene)
     rgb = next(iter(env.observe().images.values()))
-    return _median_ms(lambda: features([rgb], ["head"]))
+    return median_ms(lambda: features([rgb], ["head"]))
 
 
 def _attend_limits(trial: Trial, row: EpisodeRow, unit: float) -> list[Limit]:
@@ -74,14 +81,14 @@ def _attend_limits(trial: Trial, row: EpisodeRow, unit: float) -> list[Limit]:
     frames = next(rollout(trial, [replace(row, max_steps=REPEAT + 1)], keep_images=True)).frames
     films = iter([{camera: frame.images[camera]} for frame in frames])
     views = next(films)
-    start = _median_ms(lambda: attender.start(views, row.instruction))
+    start = median_ms(lambda: attender.start(views, row.instruction))
     state, _ = attender.start(views, row.instruction)
 
     def step() -> None:
         nonlocal state
         state, _ = attender.step(state, next(films))
 
-    track = _median_ms(step)
+    track = median_ms(step)
     return [
         Limit("attend step (track + prompt), the wrist's view", track, 60, "ms", f"{track / unit:.2f} backbone passes"),
         Limit("start-up grounding, one view", start, 350, "ms", f"{start / unit:.2f} backbone passes"),
@@ -113,15 +120,15 @@ def _record(trial: Trial, row: EpisodeRow, folder: Path) -> Recorded:
         episode = next(rollout(trial, [row], keep_images=True))
         return time.process_time() - start, episode
 
-    keep(played()[1], "warm")  # rerun's first call imports pandas
-    over, episode = [], None
-    for i in range(PAIRS):
+    first = played()[1]
+    keep(first, "warm")  # rerun's first call imports pandas
+    over = []
+    for i in range(PLAYS):
         cpu_s, episode = played()
         over.append(100 * keep(episode, str(i)) / cpu_s)
-    assert episode is not None
-    keep(episode, "video", video=True)
+    keep(first, "video", video=True)
     jpeg_mb, video_mb = ((folder / f"{name}.rrd").stat().st_size / 1e6 for name in ("0", "video"))
-    return Recorded(episode, tuple(over), jpeg_mb, video_mb)
+    return Recorded(first, tuple(over), jpeg_mb, video_mb)
 
 
 def _record_limits(recorded: Recorded) -> list[Limit]:
@@ -146,7 +153,8 @@ def _shares(episode: Episode) -> list[list[str]]:
     return [[part, f"{1e3 * seconds / steps:.1f}", f"{100 * seconds / total:.0f} %"] for part, seconds in ranked if 1e3 * seconds >= 0.05 * steps]
 
 
-def _median_ms(work: Callable[[], object]) -> float:
+def median_ms(work: Callable[[], object]) -> float:
+    """Of REPEAT times, after a first one that does not count."""
     work()
     took = []
     for _ in range(REPEAT):

@@ -5,7 +5,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -13,11 +12,9 @@ import numpy as np
 from rerun.chunk import RrdReader
 from tqdm import tqdm
 
-from vap_core.bench import Limit
+from vap_core.bench import Limit, beside_budgets, demo_trial, median_ms
 from vap_core.errors import MissingGL
-from vap_core.experiments import DEMO, make_trial, register_personal
 from vap_core.record import Waiting, index, screenshot
-from vap_core.report import align
 from vap_core.rollout import rollout
 
 STEPS = 30
@@ -38,7 +35,7 @@ def run(recordings: int = 1000, quick: bool = False) -> str:
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "recordings"
         first = _recorded(Path(scratch))
-        whole = float(np.median([_seconds(lambda: list(RrdReader(first).stream())) for _ in range(5)]))
+        whole = median_ms(lambda: list(RrdReader(first).stream())) / 1e3
         folder.mkdir()
         took = []
         for i in tqdm(range(n), "record", unit="recording", leave=False, mininterval=1):
@@ -58,21 +55,14 @@ def run(recordings: int = 1000, quick: bool = False) -> str:
             note = ""
         except MissingGL as error:
             note = f"\nopening a frame was not measured: {error}"
-    head = ["what", "measured", "budget", "", "ratio"]
-    return (
-        f"{STEPS} steps of 3 cameras; to read such a recording whole takes {1e3 * whole:.0f} ms\n\n"
-        + align([head, *(limit.row() for limit in limits)])
-        + note
-    )
+    return f"{STEPS} steps of 3 cameras; to read such a recording whole takes {1e3 * whole:.0f} ms\n\n{beside_budgets(limits)}{note}"
 
 
 def _recorded(scratch: Path) -> Path:
     """STEPS steps of three cameras, too few to reach anything."""
-    register_personal(DEMO, scratch / "memory")
-    rows = DEMO.rows(*DEMO.tasks[-1])
-    trial = make_trial(DEMO, rows, "vap", scratch / "memory")
+    trial, row = demo_trial(scratch, STEPS)
     path = scratch / "one.rrd"
-    next(rollout(trial, [replace(rows[0], max_steps=STEPS)], lambda opening: Waiting(path, opening, lambda outcome: True)))
+    next(rollout(trial, [row], lambda opening: Waiting(path, opening, lambda outcome: True)))
     return path
 
 

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 import rerun as rr
 
-from vap_core.record.evidence import jpeg
+from vap_core.record.evidence import jpeg, send_jpegs
 from vap_core.record.file import put
 from vap_core.values import Frame, Rgb
 
@@ -60,8 +60,7 @@ class Stills:
             return
         index = time_index([when for when, _ in self._held])
         for entity in self._held[0][1]:
-            blobs = [pictures[entity] for _, pictures in self._held]
-            rec.send_columns(entity, index, rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs)))
+            send_jpegs(rec, entity, index, [pictures[entity] for _, pictures in self._held])
         self._held = []
 
 

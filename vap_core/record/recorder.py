@@ -101,8 +101,6 @@ class Recorder:
         if not self._steps:
             self._first(frame, {cam: jpeg(raw, self._quality) for cam, raw in frame.images.items()})
         self._pictures.take(frame)
-        if frame.attention:
-            why.log_attention(self._stream(), frame, self._quality, self._index([frame.frame_index], [frame.timestamp_s]))
         self._steps.append(frame.frame_index)
         self._times.append(frame.timestamp_s)
         self._frames.append(frame)
@@ -212,6 +210,8 @@ class Recorder:
             self._send_masks(at, seen)
             if any(frame.shown for frame in seen):
                 why.send_identities(rec, self._opening, at, seen)
+        if looked := [frame for frame in frames if frame.attention]:
+            why.send_attention(rec, looked, self._quality)
         self._send_cameras(index)
         rec.send_columns("/observation.state", index, rr.Scalars.columns(scalars=np.stack([f.state for f in frames])))
         rec.send_columns("/action", index, rr.Scalars.columns(scalars=np.stack([f.action for f in frames])))

@@ -9,8 +9,9 @@ import rerun as rr
 
 from vap_core.failures import Course, Diagnosis
 from vap_core.record.blueprint import QUIET, SERIES, TARGET
-from vap_core.record.evidence import contact_sheet, jpeg, picture, send_classes
+from vap_core.record.evidence import contact_sheet, jpeg, picture, send_classes, send_jpegs
 from vap_core.record.file import put
+from vap_core.record.pictures import time_index
 from vap_core.values import Camera, Event, Frame, Grounding, Opening, Rgb
 
 NOBODY, FIRST = 8, 10
@@ -61,11 +62,14 @@ def send_identities(rec: rr.RecordingStream, opening: Opening, index: Sequence[r
         send_classes(rec, f"/observation.images.{camera.name}/identity", index, images)
 
 
-def log_attention(rec: rr.RecordingStream, frame: Frame, quality: int, at: Sequence[rr.TimeColumn]) -> None:
+def send_attention(rec: rr.RecordingStream, frames: Sequence[Frame], quality: int) -> None:
     """The share of the policy's attention that every image patch got, as numbers, and as a glow over what the policy saw."""
-    for cam, heat in frame.attention.items():
-        put(rec, f"/vap/attention/{cam}", rr.Tensor(heat, dim_names=("row", "column")), at=at)
-        put(rec, f"/observation.images.{cam}/attention", picture(jpeg(glowing(frame.prompted[cam], heat), quality)), at=at)
+    when = [(frame.frame_index, frame.timestamp_s) for frame in frames]
+    for cam in frames[0].attention:
+        for frame, at in zip(frames, when, strict=True):  # rerun has no columns of tensors
+            put(rec, f"/vap/attention/{cam}", rr.Tensor(frame.attention[cam], dim_names=("row", "column")), at=time_index([at]))
+        glows = [jpeg(glowing(frame.prompted[cam], frame.attention[cam]), quality) for frame in frames]
+        send_jpegs(rec, f"/observation.images.{cam}/attention", time_index(when), glows)
 
 
 def glowing(rgb: Rgb, heat: np.ndarray) -> Rgb:
