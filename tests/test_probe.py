@@ -19,7 +19,7 @@ from .test_soft_prompt import SUITE, grown  # noqa: F401
 def test_the_ways_differ_in_what_is_shown_and_said() -> None:
     known = suites.suite(SUITE)
     task = known.task("put-camera")
-    names = cast(task, np.random.default_rng(3), held_out=True)
+    names = cast(known, task, np.random.default_rng(3), held_out=True)
     start = row(known, task, names, 0, "base", np.random.default_rng(0))
     rgb, mask = np.full((8, 8, 3), 120, np.uint8), np.zeros((8, 8), bool)
     mask[2:5, 2:5] = True
@@ -40,9 +40,10 @@ def test_the_ways_differ_in_what_is_shown_and_said() -> None:
 
 
 def test_held_out_objects_are_in_no_film() -> None:
-    task = suites.suite(SUITE).tasks[0]
-    seen = {name for i in range(20) for name in cast(task, np.random.default_rng(i))}
-    unseen = {name for i in range(20) for name in cast(task, np.random.default_rng(i), held_out=True)}
+    known = suites.suite(SUITE)
+    task = known.tasks[0]
+    seen = {name for i in range(20) for name in cast(known, task, np.random.default_rng(i))}
+    unseen = {name for i in range(20) for name in cast(known, task, np.random.default_rng(i), held_out=True)}
     assert not seen & unseen
     assert {objects.get(name).split for name in unseen} == {"generic"}
 

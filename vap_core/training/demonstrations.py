@@ -22,7 +22,7 @@ from vap_core.sim.env import Env
 from vap_core.sim.objects import extent_m
 from vap_core.sim.scenes import Scene, build
 from vap_core.suites import VARIANTS, Judge, Suite, Task, simpler, suite, tabletop, vlabench
-from vap_core.suites.layout import Area, place, radius_m, scatter, turned
+from vap_core.suites.layout import Area, Spot, place, radius_m, scatter, turned
 from vap_core.training.scenes import HELD_OUT, TRAIN_INSTANCES, only_generic
 from vap_core.values import EpisodeRow, Mask, Placement, Rgb, value
 
@@ -47,6 +47,10 @@ AREAS = {
 """Where the objects of each suite stand in training; a put on the tabletop keeps to tabletop.REACH."""
 GAPS_M, TRIES = (0.05, 0.035, 0.02), 400
 """Room between objects, tried in turn, so many times each."""
+MOST = {"simpler-bridge": 4}
+"""Objects of a stage where an area has no room for every number: one to a corner."""
+CORNER_M = 0.01
+"""Within so much of the area's corners, in x and in y, stands what finds no room at random."""
 
 
 @value
@@ -72,13 +76,14 @@ def every(suite_name: str) -> int:
     return EVERY.get(suite_name, 1)
 
 
-def cast(task: Task, rng: np.random.Generator, held_out: bool = False) -> list[str]:
+def cast(known: Suite, task: Task, rng: np.random.Generator, held_out: bool = False) -> list[str]:
     """The target and its rivals, generic and of the task's category, then the task's goal if it has one. Half the rivals are look-alikes.
 
     Those `held_out` are in no film.
     """
     pool = range(HELD_OUT, HELD_OUT + TRAIN_INSTANCES) if held_out else range(TRAIN_INSTANCES)
     first, rivals = pool[int(rng.integers(len(pool)))], int(rng.choice([1, 2, 3], p=[0.15, 0.7, 0.15]))
+    rivals = min(rivals, MOST.get(known.name, rivals + 2) - 1 - bool(task.goal))
     if rng.random() < 0.5:
         models = [objects.generic(task.stem, first, int(twin)) for twin in rng.permutation(6)[: rivals + 1]]
     else:
@@ -95,18 +100,23 @@ def row(known: Suite, task: Task, names: Sequence[str], number: int, variant: st
     fixed = {task.goal: tabletop.BOWLS[int(rng.integers(2))]} if goal and known.name == "tabletop" else {}
     area = tabletop.REACH if fixed else AREAS[known.name]
     loose = [name for name in things + goal if name not in fixed]
-    for gap in GAPS_M:
-        try:
-            kept = [(spot, radius_m(name) / 2**0.5) for name, spot in fixed.items()]
-            spots = scatter(rng, area, [radius_m(name) for name in loose], kept, gap_m=gap, tries=TRIES)
-            break
-        except ValueError:
-            if gap == GAPS_M[-1]:
-                raise
-    at = {**dict(zip(loose, spots, strict=True)), **fixed}
+    at = {**dict(zip(loose, _spots(rng, area, loose, fixed), strict=True)), **fixed}
     placed = [place(name, at[name], 0.0 if name == task.goal else turned(rng)) for name in things + goal]
     order: tuple[Placement, ...] = (placed[0], *placed[len(things) :], *placed[1 : len(things)])
     return replace(known.row(task, number, order, seed=number, variant=variant), instruction=task.instruction)
+
+
+def _spots(rng: np.random.Generator, area: Area, loose: Sequence[str], fixed: Mapping[str, Spot]) -> list[Spot]:
+    """Anywhere in the area, clear of each other; where no such places are found, in its corners. Raises: ValueError."""
+    radii, kept = [radius_m(name) for name in loose], [(spot, radius_m(name) / 2**0.5) for name, spot in fixed.items()]
+    for gap in GAPS_M:
+        try:
+            return scatter(rng, area, radii, kept, gap_m=gap, tries=TRIES)
+        except ValueError:
+            if gap == GAPS_M[-1] and (fixed or len(loose) > 4):
+                raise
+    corners = rng.permutation([(x, y) for x in (area.x0 + CORNER_M, area.x1 - CORNER_M) for y in (area.y0 + CORNER_M, area.y1 - CORNER_M)])
+    return [(float(x), float(y)) for x, y in corners[: len(loose)] + rng.uniform(-CORNER_M, CORNER_M, (len(loose), 2))]
 
 
 def films(suite_name: str, seed: int, number: int) -> list[Film]:
@@ -115,7 +125,7 @@ def films(suite_name: str, seed: int, number: int) -> list[Film]:
     slips = np.random.default_rng([72, seed, *suite_name.encode(), number])
     task = known.tasks[number % len(known.tasks)]
     variant = str(rng.choice(list(VARIANTS))) if suite_name == "simpler-fractal" else "base"
-    names = cast(task, rng)
+    names = cast(known, task, rng)
     found = []
     with build(known.robot, names, look=VARIANTS[variant].look) as scene:
         for i in range(EPISODES):

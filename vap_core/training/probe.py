@@ -96,7 +96,7 @@ def probe(checkpoint: str, suite_name: str, *, scenes: int = 12, ways: Sequence[
 def _scene(checkpoint: str, suite_name: str, ways: Sequence[Way], seed: int, number: int) -> list[dict[str, Any]]:
     known, rng = suite(suite_name), np.random.default_rng([78, seed, *suite_name.encode(), number])
     task = known.tasks[number % len(known.tasks)]
-    names = cast(task, rng, held_out=True)
+    names = cast(known, task, rng, held_out=True)
     rows = list(_rows(known, task, names, number, rng))
     sizes = {name: objects.extent_m(objects.get(name)) for name in names}
     lines = []
