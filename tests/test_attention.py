@@ -10,8 +10,8 @@ import torch
 from rerun.chunk import RrdReader
 
 from tests import tiny_lerobot as tiny
+from tests.drawn import SUCCESS, columns, entities, frame, opening, rerun
 from tests.test_cli import vap
-from tests.test_record import SUCCESS, columns, entities, frame, opening, rerun
 from tests.test_why import tabs
 from vap_core.experiments import METHODS, Study, make_trial, register_personal, shipped
 from vap_core.policies.attention import tell, watched, watching

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.drawn import ROW, SUCCESS, columns, entities, frame, opening, rerun
 from tests.test_cli import vap
-from tests.test_record import ROW, SUCCESS, columns, entities, frame, opening, rerun
 from tests.test_why import fail
 from vap_core import asking
 from vap_core.errors import BadOutput, BadRecording, BadStudy, UnknownName

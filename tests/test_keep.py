@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.test_record import ROW, SUCCESS, columns, frame, opening, rerun
+from tests.drawn import ROW, SUCCESS, columns, frame, opening, rerun
 from vap_core.record import Recorder, keep, read_summary
 from vap_core.record.file import temporary
 from vap_core.values import Outcome

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from tests.test_record import ROW, SIDE, SIZES, SUCCESS, K, columns, entities, frame, opening, rerun
+from tests.drawn import ROW, SIDE, SIZES, SUCCESS, K, columns, entities, frame, opening, rerun
 from vap_core.record import Recorder, read_summary
 from vap_core.values import Shown, Track
 
