@@ -224,18 +224,17 @@ class Env:
         touched: dict[int, None] = {}
         running = {names.index(name): seconds for name, seconds in self._touch.running_s.items()}
         pressed: dict[int, float] = {}
+        meeting, met, squeezed = None, dict[int, None](), set[int]()
         for row in np.broadcast_to(ctrl, (steps, len(self._ctrl))):
             data.ctrl[self._ctrl] = row
             mujoco.mj_step(model, data)
             geoms = data.contact.geom
-            pairs = self._roles[geoms]
-            by_robot = (pairs.min(axis=1) == ARM) & (pairs.max(axis=1) >= 0)
-            if not by_robot.any():
-                running = {}
-                continue
-            others = pairs.max(axis=1)
-            touched.update(dict.fromkeys(others[by_robot].tolist()))
-            squeezed = set(others[by_robot & self._hand[geoms].any(axis=1)].tolist())
+            if (now := geoms.tobytes()) != meeting:  # else the same touch each other as a moment ago
+                meeting, pairs = now, self._roles[geoms]
+                by_robot, others = (pairs.min(axis=1) == ARM) & (pairs.max(axis=1) >= 0), pairs.max(axis=1)
+                met = dict.fromkeys(others[by_robot].tolist())
+                squeezed = set(others[by_robot & self._hand[geoms].any(axis=1)].tolist())
+            touched.update(met)
             running = {one: running.get(one, 0.0) + model.opt.timestep for one in squeezed}
             pressed.update({one: max(seconds, pressed.get(one, 0.0)) for one, seconds in running.items()})
         self._touch = Touch(
