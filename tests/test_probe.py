@@ -7,11 +7,14 @@ import pandas as pd
 import pytest
 
 from vap_core import suites
+from vap_core.errors import BadPolicy, UnknownName
+from vap_core.policies.lerobot import load
 from vap_core.prompt import PALETTE
 from vap_core.sim import objects
 from vap_core.training import probe
 from vap_core.training.demonstrations import cast, row
 from vap_core.training.probe import WAYS, Told, conclude, keep
+from vap_core.values import PolicyInput
 
 from .test_soft_prompt import SUITE, grown  # noqa: F401
 
@@ -50,7 +53,7 @@ def test_held_out_objects_are_in_no_film() -> None:
 
 def test_a_scene_is_played_in_every_way(grown: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
     monkeypatch.setattr(probe, "EACH", 1)
-    table = pd.DataFrame(probe._scene(str(grown[1]), SUITE, ("tinted", "plain"), 0, 0))
+    table = pd.DataFrame(probe._scene(str(grown[1]), SUITE, ("tinted", "plain"), None, 0, 0))
     assert table["method"].tolist() == ["tinted", "plain"]
     assert set(table["outcome"]) <= {"success", "failure"}
     assert "touches something" in conclude(table)
@@ -60,3 +63,20 @@ def test_a_scene_is_played_in_every_way(grown: tuple[Path, Path], tmp_path: Path
     held = pd.read_parquet(tmp_path / "probe.parquet")
     assert held["suite"].tolist() == ["vlabench"] * 2 + [SUITE] * 2
     assert "detail" not in held
+    (shorter,) = probe._scene(str(grown[1]), SUITE, ("plain",), 1, 0, 0)
+    assert shorter["policy"] == f"{table['policy'][0]}, 1 of 4"
+
+
+def test_what_cannot_be_asked_for_is_told_in_a_line(grown: tuple[Path, Path]) -> None:  # noqa: F811
+    with pytest.raises(UnknownName, match="way 'shouted' is unknown"):
+        probe.probe(str(grown[1]), SUITE, ways=("shouted",))
+    with pytest.raises(BadPolicy, match="decides on 4 actions at a time; ask for 1 to 4"):
+        load(str(grown[1])).executing(5)
+
+
+def test_fewer_actions_of_a_chunk_are_its_first(grown: tuple[Path, Path]) -> None:  # noqa: F811
+    policy = load(str(grown[1]))
+    seen = PolicyInput({"front": np.full((224, 224, 3), 90, np.uint8)}, "pick up the red shaver", np.zeros(13, np.float32))
+    chunks = {n: one.plan([one.start(np.random.default_rng(0))], [seen])[1][0] for n, one in ((n, policy.executing(n)) for n in (1, 4))}
+    assert np.array_equal(chunks[1], chunks[4][:1])
+    assert policy.execute == 4

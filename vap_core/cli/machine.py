@@ -45,6 +45,12 @@ def eval_policy(
     suite: Annotated[str, typer.Option(help="The benchmark that the policy was trained for.")],
     policy: Annotated[str, typer.Option(help="mini-pi0, or a checkpoint's folder or hub id.")] = "mini-pi0",
     scenes: Annotated[int, typer.Option(min=1, help="Scenes of four episodes each, spread over the suite's tasks.")] = 24,
+    ways: Annotated[
+        str, typer.Option(help="How the target is told, with commas: tinted, painted, described, plain.")
+    ] = "tinted,painted,described,plain",
+    execute: Annotated[
+        int | None, typer.Option(min=1, help="Actions of each chunk to carry out before the policy is asked again. Default as the checkpoint says.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     workers: Workers = 2,
     out: Annotated[Path | None, typer.Option(help="A table to add the episodes to, for example data/results/probe.parquet.")] = None,
@@ -52,6 +58,7 @@ def eval_policy(
     """Measure what a policy can do with generic objects that no film has shown, told by a tint, by paint, by words, or not at all.
 
     Example: python -m vap_core eval-policy --suite simpler-bridge --scenes 4
+    Example: python -m vap_core eval-policy --suite tabletop --ways tinted --execute 10
     """
     from vap_core import suites as known
     from vap_core.errors import BadStudy
@@ -61,7 +68,8 @@ def eval_policy(
     study = Study(tuple((suite, task.name) for task in known.suite(suite).tasks), ("generic",), policy=policy)
     if not study.checkpoint(suite):
         raise BadStudy(f"eval-policy: {policy!r} has no weights; take mini-pi0, or a lerobot checkpoint's folder or hub id.")
-    table = probe(study.checkpoint(suite), suite, scenes=scenes, seed=seed, workers=workers)
+    asked = [name for name in ways.split(",") if name]
+    table = probe(study.checkpoint(suite), suite, scenes=scenes, ways=asked, execute=execute, seed=seed, workers=workers)
     print(conclude(table))
     if out is not None:
         keep(table, out)

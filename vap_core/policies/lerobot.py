@@ -91,6 +91,14 @@ class LeRobot:
         out.learned = {known[word]: torch.from_numpy(embedding) for word, embedding in words.items()}
         return out
 
+    def executing(self, actions: int) -> "LeRobot":
+        """The same policy, asked again after so many actions of each chunk. Raises: BadPolicy."""
+        longest, out = int(getattr(self.policy.config, "chunk_size", 1)) if self.batched else 1, copy.copy(self)
+        if not 1 <= actions <= longest:
+            raise BadPolicy(f"LeRobot: {self.label} decides on {longest} actions at a time; ask for 1 to {longest} of them.")
+        out.execute, out.label = actions, f"{self.label}, {actions} of {longest}"
+        return out
+
     def start(self, rng: np.random.Generator) -> LeRobotState:
         seed = int(rng.integers(2**63 - 1))
         if self.batched:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vap_core.errors import BadOutput, BadStudy
+from vap_core.errors import BadOutput, BadStudy, one_of
 from vap_core.files import write_atomic
 from vap_core.metrics import rate
 from vap_core.oracle import Masks, Revealed
@@ -41,7 +41,7 @@ COAT = 0.85
 class Told(Revealed):
     """Colours the target by the simulator's masks at every step, and says what tells it."""
 
-    def __init__(self, way: Way) -> None:
+    def __init__(self, way: str) -> None:
         self.way = way
 
     @property
@@ -80,12 +80,25 @@ class Told(Revealed):
         return Attended(shown, text, (), {}, {}, ())
 
 
-def probe(checkpoint: str, suite_name: str, *, scenes: int = 12, ways: Sequence[Way] = WAYS, seed: int = 0, workers: int = 2) -> "pd.DataFrame":
-    """One row per episode: suite, task, way, and how it ended. Scenes are spread over the suite's tasks."""
+def probe(
+    checkpoint: str,
+    suite_name: str,
+    *,
+    scenes: int = 12,
+    ways: Sequence[str] = WAYS,
+    execute: int | None = None,
+    seed: int = 0,
+    workers: int = 2,
+) -> "pd.DataFrame":  # fmt: skip
+    """One row per episode: suite, task, way, and how it ended. Scenes are spread over the suite's tasks; `execute` is the number of actions of
+    each chunk that are carried out, None as the checkpoint says. Raises: UnknownName, BadStudy, BadPolicy."""
     import pandas as pd
     from tqdm import tqdm
 
-    work = partial(_scene, checkpoint, suite_name, tuple(ways), seed)
+    for way in ways:
+        if way not in WAYS:
+            raise one_of("probe: way", way, WAYS)
+    work = partial(_scene, checkpoint, suite_name, tuple(ways), execute, seed)
     done = tqdm(results(work, list(range(scenes)), workers, "--workers"), f"episodes of {suite_name}", scenes, unit="scene")
     lines = [line for _, part in sorted(done, key=lambda found: found[0]) for line in part]
     if not lines:
@@ -93,7 +106,7 @@ def probe(checkpoint: str, suite_name: str, *, scenes: int = 12, ways: Sequence[
     return pd.DataFrame(lines)
 
 
-def _scene(checkpoint: str, suite_name: str, ways: Sequence[Way], seed: int, number: int) -> list[dict[str, Any]]:
+def _scene(checkpoint: str, suite_name: str, ways: Sequence[str], execute: int | None, seed: int, number: int) -> list[dict[str, Any]]:
     known, rng = suite(suite_name), np.random.default_rng([78, seed, *suite_name.encode(), number])
     task = known.tasks[number % len(known.tasks)]
     names = cast(known, task, rng, held_out=True)
@@ -102,6 +115,8 @@ def _scene(checkpoint: str, suite_name: str, ways: Sequence[Way], seed: int, num
     lines = []
     with build(known.robot, names, look=VARIANTS["base"].look) as scene:
         policy = lerobot.fitted(checkpoint, scene, known)
+        if execute is not None:
+            policy = policy.executing(execute)
         for way in ways:
             played = [row for row in rows if way != "described" or looks(row.target).difference(*map(looks, _same_kind(row)[1:]))]
             trial = Trial(way, scene, policy, Told(way), sizes, known.control, known.sensor, follow="call")
