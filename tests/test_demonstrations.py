@@ -297,6 +297,11 @@ def test_waiting_is_not_taught_but_for_the_end(stage: tuple[Path, list[Film]]) -
     chances, shown = (policy.emphasis(replace(films[0], action=action, **part), 3.0) for part in (still, rest))
     assert (chances[20:24] == 0).all()
     assert (np.delete(chances, range(20, 24)) == np.delete(shown, range(20, 24))).all()
+    waiting = replace(films[0], action=closing, **still)
+    assert (policy.ahead(waiting, 18, 5) == closing[[18, 19, 21, 24, 25]]).all(), "the chunk goes on behind the wait, from the closed jaw"
+    assert (policy.ahead(waiting, 18, 2) == closing[18:20]).all()
+    assert (policy.ahead(waiting, 38, 4)[:, :-1] == 0).all()
+    assert (policy.ahead(waiting, 38, 4)[:, -1] == closing[-1, -1]).all()
 
 
 def small_policy(films: list[Film], batch: int, depth: int = 2) -> tuple[MiniPI0Policy, policy.Questions, policy.Batch]:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
 from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
@@ -168,6 +168,18 @@ def waits(film: Film) -> Bool[np.ndarray, " t"]:
     return idle & np.logical_or.accumulate(~idle[::-1])[::-1]
 
 
+def ahead(film: Film, t: int, size: int) -> Float32[np.ndarray, "n a"]:
+    """The chunk that is taught at step t: what the expert does from there, its waits left out, and, after its end, nothing.
+
+    A jaw that has just closed looks like one that has waited: with the waits in the chunk, a policy that is asked there waits for ever.
+    """
+    moving = np.flatnonzero(~waits(film))
+    rest = film.action[moving[moving >= t][:size]]
+    still = np.repeat(rest[-1:], size - len(rest), axis=0)
+    still[:, :-1] = 0.0
+    return np.concatenate([rest, still])
+
+
 def collate(recipe: Recipe, films: Sequence[Film], stats: dict[str, dict[str, Tensor]], rng: np.random.Generator, config: MiniPI0Config) -> Batch:
     """One batch: frames drawn anew, each with a command of its own."""
     number, apart = {word: i for i, word in enumerate(config.words)}, every(recipe.suite)
@@ -178,10 +190,7 @@ def collate(recipe: Recipe, films: Sequence[Film], stats: dict[str, dict[str, Te
         film = films[i]
         t = apart * int(rng.choice(len(chances[i]), p=chances[i] / totals[i]))
         made.append(command(film, t, recipe.suite, rng))
-        rest = film.action[t : t + config.chunk_size]
-        still = np.repeat(rest[-1:], config.chunk_size - len(rest), axis=0)
-        still[:, :-1] = 0.0
-        chunks.append(np.concatenate([rest, still]))
+        chunks.append(ahead(film, t, config.chunk_size))
         states.append(film.state[t])
         asked = (0, film.goal)
         shown.append(np.stack([shares((film.ids[t // apart] == i + 1) & (i >= 0), config.patch) for i in asked]))
