@@ -50,7 +50,7 @@ GAPS_M, TRIES = (0.05, 0.035, 0.02), 400
 MOST = {"simpler-bridge": 4}
 """Objects of a stage where an area has no room for every number: one to a corner."""
 CORNER_M = 0.01
-"""Within so much of the area's corners, in x and in y, stands what finds no room at random."""
+"""What finds no room at random stands so far from an area's corners, in x and in y, give or take as much."""
 
 
 @value
