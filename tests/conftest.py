@@ -4,10 +4,14 @@ import os
 import tarfile
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
+
+if TYPE_CHECKING:
+    from vap_core.training.demonstrations import Film
 
 install_import_hook("vap_core", "beartype.beartype")
 os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"  # read when ray is first imported: the tests' cluster stays on loopback
@@ -28,3 +32,14 @@ if ARCHIVES and "MENAGERIE_ROOT" not in os.environ:  # beside a checkout that ha
 @pytest.fixture(autouse=True)
 def _one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> "tuple[Path, list[Film]]":
+    """A folder that keeps a stage of two episodes of simpler-bridge, and its films."""
+    from vap_core.training import demonstrations
+
+    folder = tmp_path_factory.mktemp("films")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demonstrations, "EPISODES", 2)
+        return folder, demonstrations.cached(folder, "simpler-bridge", 0, 1)

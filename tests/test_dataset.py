@@ -20,9 +20,9 @@ from vap_core.errors import BadOutput
 from vap_core.sim import objects
 from vap_core.suites import Suite, suite
 from vap_core.training import dataset, demonstrations
+from vap_core.training.batches import STEADY, statistics
 from vap_core.training.dataset import ABOUT, MOST, about, data_sha256, film_sha256, read, said, write
 from vap_core.training.demonstrations import PARTS, Film, after_a_miss, cached
-from vap_core.training.policy import STEADY, statistics
 
 SUITE, SIDE, STAGES = "simpler-bridge", 64, 4
 SHIPPED = Path(__file__).parent.parent / "data" / "demonstrations"

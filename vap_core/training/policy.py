@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
@@ -25,17 +25,16 @@ from vap_core.policies.checkpoints import fingerprint
 from vap_core.policies.lerobot import load as load_policy
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy, fused
-from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
 from vap_core.policies.mini_pi0.vlm import grow, halve
 from vap_core.policies.mini_pi0.vlm import load as load_vlm
 from vap_core.sim.objects import get
 from vap_core.suites import suite
-from vap_core.training.commands import command
+from vap_core.training.batches import Batch, Frames, statistics
 from vap_core.training.dataset import about, data_sha256, read
 from vap_core.training.dataset import film as shoot
-from vap_core.training.demonstrations import SIDE, Film, after_a_miss, cached, every
+from vap_core.training.demonstrations import SIDE, Film, cached
 from vap_core.training.descent import Descent, Told, average_of, descend
-from vap_core.training.looking import Shown, Sizes, looking, shares
+from vap_core.training.looking import Shown, Sizes, looking
 from vap_core.training.scenes import only_generic
 from vap_core.version import code_version
 
@@ -46,16 +45,10 @@ HELD_OUT = 19
 """Every so many stages one is kept from training, to see what was learned: a prime, as tasks take turns."""
 CLOSE_M = 0.005
 """Error of a place up to which it is squared."""
-AROUND = 4
-"""Pictures from there that `focus` still calls close."""
-STILL = 2e-3
-"""Metres or radians: a step that asks for less and changes less is a wait."""
 SEEN, PLACED = 0.5, 1.0
 """Weights of the two questions beside the flow."""
 TEMPERATURE = 0.0
 """Of the trained policy's sampling noise: without any, three in five generic objects are grasped where with all of it two in five are."""
-STEADY = 0.01
-"""Least deviation by which an action or a state is scaled: what hardly moves is not blown up."""
 
 
 @dataclass(frozen=True)
@@ -110,20 +103,6 @@ class Questions(nn.Module):
         return heats, wheres, hits
 
 
-@dataclass
-class Batch:
-    """Tensors of one step: pictures (b x c x 3 x s x s in 0..1), tokens, scaled state and chunk; of target and goal, the share of either in every
-    patch (b x 2 x p) and its place (b x 2 x 3, metres, nan without a goal)."""
-
-    images: Tensor
-    tokens: Tensor
-    there: Tensor
-    state: Tensor
-    actions: Tensor
-    patches: Tensor
-    place: Tensor
-
-
 def configuration(recipe: Recipe, state_size: int, action_size: int) -> MiniPI0Config:
     from lerobot.configs import FeatureType, PolicyFeature
 
@@ -135,74 +114,6 @@ def configuration(recipe: Recipe, state_size: int, action_size: int) -> MiniPI0C
         input_features={**views, "observation.state": PolicyFeature(FeatureType.STATE, (state_size,))},
         output_features={"action": PolicyFeature(FeatureType.ACTION, (action_size,))},
     )  # fmt: skip
-
-
-def statistics(films: Sequence[Film]) -> dict[str, dict[str, Tensor]]:
-    """Mean and deviation of states and actions, as lerobot's normalisers want them."""
-    found = {}
-    for name, parts in (("observation.state", [film.state for film in films]), ("action", [film.action for film in films])):
-        rows = np.concatenate(parts)
-        found[name] = {
-            "mean": torch.from_numpy(rows.mean(0)),
-            "std": torch.from_numpy(np.maximum(rows.std(0), STEADY * max(1e-3, float(rows.std())))),
-        }
-    return found
-
-
-def emphasis(film: Film, focus: float, apart: int = 1) -> Float[np.ndarray, " f"]:
-    """How often each picture, one in `apart` steps, is drawn: more often close to a change of the gripper's command, to the end, and to a miss,
-    where a centimetre decides; and never where the expert waits, as a policy without memory would wait for ever."""
-    shut = film.action[:, -1] < 0.5
-    turns = [*np.flatnonzero(shut[1:] != shut[:-1]) + 1, len(shut) - 1]
-    if after_a_miss(film):
-        turns.append(0)
-    away = np.abs(np.arange(0, len(shut), apart)[:, None] - turns).min(axis=1)
-    return np.where(waits(film)[::apart], 0.0, np.where(away <= AROUND * apart, focus, 1.0))
-
-
-def waits(film: Film) -> Bool[np.ndarray, " t"]:
-    """The steps in which nothing is asked for and nothing happens; those at the end, where there is nothing left to do, do not count."""
-    asked = np.abs(film.action[:, :-1]).max(axis=1) + np.abs(np.diff(film.action[:, -1], prepend=film.action[0, -1]))
-    happens = np.abs(np.diff(film.state, axis=0, append=film.state[-1:])).max(axis=1)
-    idle = (asked < STILL) & (happens < 2 * STILL)
-    return idle & np.logical_or.accumulate(~idle[::-1])[::-1]
-
-
-def ahead(film: Film, t: int, size: int) -> Float32[np.ndarray, "n a"]:
-    """The chunk that is taught at step t: what the expert does from there, its waits left out, and, after its end, nothing.
-
-    A jaw that has just closed looks like one that has waited: with the waits in the chunk, a policy that is asked there waits for ever.
-    """
-    moving = np.flatnonzero(~waits(film))
-    rest = film.action[moving[moving >= t][:size]]
-    still = np.repeat(rest[-1:], size - len(rest), axis=0)
-    still[:, :-1] = 0.0
-    return np.concatenate([rest, still])
-
-
-def collate(recipe: Recipe, films: Sequence[Film], stats: dict[str, dict[str, Tensor]], rng: np.random.Generator, config: MiniPI0Config) -> Batch:
-    """One batch: frames drawn anew, each with a command of its own."""
-    number, apart = {word: i for i, word in enumerate(config.words)}, every(recipe.suite)
-    chances = [emphasis(film, recipe.focus, apart) for film in films]
-    totals = np.array([chance.sum() for chance in chances])
-    made, states, chunks, shown, places = [], [], [], [], []
-    for i in rng.choice(len(films), recipe.batch, p=totals / totals.sum()):
-        film = films[i]
-        t = apart * int(rng.choice(len(chances[i]), p=chances[i] / totals[i]))
-        made.append(command(film, t, recipe.suite, rng))
-        chunks.append(ahead(film, t, config.chunk_size))
-        states.append(film.state[t])
-        asked = (0, film.goal)
-        shown.append(np.stack([shares((film.ids[t // apart] == i + 1) & (i >= 0), config.patch) for i in asked]))
-        places.append([film.places[t, i] if i >= 0 else (np.nan,) * 3 for i in asked])
-    tokens, there = encode([one.text for one in made], number, config.tokenizer_max_length)
-    scaled = {
-        name: (torch.from_numpy(np.stack(rows)) - stats[name]["mean"]) / stats[name]["std"]
-        for name, rows in (("observation.state", states), ("action", chunks))
-    }
-    images = torch.from_numpy(np.stack([one.images for one in made])).permute(0, 1, 4, 2, 3).float() / 255
-    patches, place = torch.from_numpy(np.stack(shown)).float(), torch.from_numpy(np.array(places, np.float32))
-    return Batch(images, tokens, there, scaled["observation.state"], scaled["action"], patches, place)
 
 
 def losses(policy: MiniPI0Policy, asked: Questions, batch: Batch, draws: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
@@ -302,9 +213,10 @@ def train(
         config.vlm = teacher.sha256()
         grow(teacher, learner.policy)
     made_of["vlm"] = config.vlm
+    frames = Frames(recipe.suite, films, stats, config, recipe.focus)
 
     def step(model: Learner, at: int) -> tuple[Tensor, Told]:
-        batch = collate(recipe, films, stats, np.random.default_rng([73, recipe.seed, at]), config)
+        batch = frames.draw(recipe.batch, np.random.default_rng([73, recipe.seed, at]))
         with fused():
             return losses(model.policy, model.asked, batch, recipe.draws, torch.Generator().manual_seed(recipe.seed * 1_000_003 + at))
 
@@ -341,11 +253,13 @@ def save(learner: Learner, stats: Any, held: Sequence[Film], made_of: dict[str, 
     policy.load_state_dict(load_file(out / "model.safetensors"))  # what is measured is what was saved
     for pipeline in make_pre_post_processors(policy.config, dataset_stats=stats):
         pipeline.save_pretrained(out)
-    with torch.no_grad():
-        told = [
-            losses(policy, learner.asked, collate(recipe, held, stats, np.random.default_rng([74, i]), policy.config), 4,
-                   torch.Generator().manual_seed(i))[1] for i in range(8)
-        ] if held else []  # fmt: skip
+    told = []
+    if held:
+        frames = Frames(recipe.suite, held, stats, policy.config, recipe.focus)
+        with torch.no_grad():
+            for i in range(8):
+                batch = frames.draw(recipe.batch, np.random.default_rng([74, i]))
+                told.append(losses(policy, learner.asked, batch, 4, torch.Generator().manual_seed(i))[1])
     card = {**made_of, "trained_steps": made_of["log"][-1]["step"], "written_by": code_version(), "held_out": average_of(told)}
     (out / "training.json").write_text(json.dumps(card, indent=1))
     return card

@@ -1,0 +1,197 @@
+"""Training from films: what is taught and how often, what is asked besides, and that a training goes on where it stopped."""
+
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch.nn import functional as F  # noqa: N812
+
+from vap_core.errors import BadOutput, BadPolicy
+from vap_core.policies.checkpoints import fingerprint
+from vap_core.policies.lerobot import load
+from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy, fused
+from vap_core.policies.mini_pi0.vlm import load as load_vlm
+from vap_core.training import demonstrations, policy, vlm
+from vap_core.training.batches import Batch, Frames, ahead, emphasis, statistics, waits
+from vap_core.training.dataset import data_sha256
+from vap_core.training.demonstrations import Film, cached
+
+SUITE = "simpler-bridge"
+
+
+def test_a_training_that_was_stopped_ends_like_one_that_was_not(
+    stage: tuple[Path, list[Film]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    folder, _ = stage
+    monkeypatch.setattr(demonstrations, "EPISODES", 2)
+    monkeypatch.setattr(policy, "HELD_OUT", 2)
+    recipe = policy.Recipe(SUITE, stages=2, steps=3, batch=3, draws=2, width=32, depth=2, vision_width=32, vision_depth=1, expert_width=32)
+    whole = policy.train(recipe, tmp_path / "whole", cache=folder)
+    first = policy.train(recipe, tmp_path / "torn", cache=folder, minutes=0.0)
+    assert [line["step"] for line in first["log"]] == [1]
+    policy.train(recipe, tmp_path / "torn", cache=folder)
+    one, other = (load_file(tmp_path / name / "model.safetensors") for name in ("whole", "torn"))
+    assert one.keys() == other.keys()
+    assert all(torch.equal(one[name], other[name]) for name in one)
+    assert set(whole["held_out"]) == {"flow", "heat", "where", "hit", "goal_where", "goal_hit"}
+    assert whole["data_sha256"] == data_sha256([film for n in range(2) for film in cached(folder, SUITE, 0, n)])
+    with pytest.raises(BadOutput, match="another recipe or other data"):
+        policy.train(replace(recipe, rate=0.1), tmp_path / "torn", cache=folder)
+    trained = load(tmp_path / "whole")
+    assert trained.execute == 4
+    assert (trained.action_size, set(trained.wanted)) == (7, {"observation.images.front", "observation.state"})
+
+
+def test_a_vision_language_model_learns_and_resumes(stage: tuple[Path, list[Film]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, films = stage
+    pool = [vlm.View(film.images[t, 0], film.ids[t, 0], film.names) for film in films for t in range(0, len(film.action), 6)]
+    monkeypatch.setattr(vlm, "views", lambda *args, **kwargs: pool)
+    recipe = vlm.Recipe(stages=1, steps=3, batch=4, width=32, depth=2, vision_width=32, vision_depth=1, expert_width=32)
+    whole = vlm.train(recipe, tmp_path / "whole")
+    vlm.train(recipe, tmp_path / "torn", minutes=0.0)
+    vlm.train(recipe, tmp_path / "torn")
+    one, other = (load_vlm(tmp_path / name).sha256() for name in ("whole", "torn"))
+    assert one == other
+    assert {"words", "heat", "hit", "where", "yes", "no"} <= set(whole["held_out"])
+    grown = policy.Recipe(SUITE, stages=1, steps=1, batch=2, draws=1, width=32, depth=2, vision_width=32, vision_depth=1, expert_width=32)
+    monkeypatch.setattr(demonstrations, "EPISODES", 2)
+    about = policy.train(grown, tmp_path / "policy", vlm=tmp_path / "whole", cache=stage[0])
+    assert about["vlm"] == one == load(tmp_path / "policy").policy.config.vlm  # type: ignore[union-attr]
+    further = policy.train(replace(grown, rate=0.0), tmp_path / "further", start=tmp_path / "policy", cache=stage[0])
+    assert further["vlm"] == one
+    assert further["start"]["sha256"] == fingerprint(tmp_path / "policy")
+    assert further["start"]["recipe"] == about["recipe"]
+    first, second = (load_file(tmp_path / name / "model.safetensors") for name in ("policy", "further"))
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    other = policy.Learner(replace(policy.configuration(grown, 13, 7), words=("a", "b"))).policy
+    with pytest.raises(BadPolicy, match="no mini-pi0 with the same words"):
+        policy.go_on(tmp_path / "policy", other)
+    (tmp_path / "policy" / "training.json").write_text('{"recipe": ')
+    with pytest.raises(BadPolicy, match="training.json is damaged"):
+        policy.train(grown, tmp_path / "another", start=tmp_path / "policy", cache=stage[0])
+
+
+def test_frames_close_to_a_turn_of_the_gripper_a_miss_or_the_end_come_more_often(stage: tuple[Path, list[Film]]) -> None:
+    _, films = stage
+    action = np.ones((40, films[0].action.shape[1]), np.float32)
+    action[15:, -1] = 0.2
+    rest = {part: np.repeat(getattr(films[0], part)[:1], 40, axis=0) for part in ("images", "ids", "state", "places")}
+    chances = emphasis(replace(films[0], action=action, **rest), 3.0)
+    assert set(np.flatnonzero(chances == 3.0)) == {*range(11, 20), *range(35, 40)}
+    assert set(np.flatnonzero(chances == 1.0)) == {*range(11), *range(20, 35)}
+    thirds = emphasis(replace(films[0], action=action, **rest), 3.0, 3)
+    assert [3 * int(i) for i in np.flatnonzero(thirds == 3.0)] == [*range(3, 40, 3)]
+    low = {**rest, "state": rest["state"].copy()}
+    low["state"][0, 2] -= 0.1
+    after_a_miss = emphasis(replace(films[0], action=action, **low), 3.0)
+    assert set(np.flatnonzero(after_a_miss != chances)) == {*range(5)}
+
+
+def test_waiting_is_not_taught_but_for_the_end(stage: tuple[Path, list[Film]]) -> None:
+    _, films = stage
+    rest = {part: np.repeat(getattr(films[0], part)[:1], 40, axis=0) for part in ("images", "ids", "state", "places")}
+    rest["state"][:, 0] += 0.01 * np.arange(40)
+    action = np.ones((40, films[0].action.shape[1]), np.float32)
+    action[20:24, :-1] = action[36:, :-1] = 0.0
+    still = {**rest, "state": rest["state"].copy()}
+    still["state"][20:25], still["state"][36:] = rest["state"][20], rest["state"][36]
+    assert list(np.flatnonzero(waits(replace(films[0], action=action, **still)))) == [20, 21, 22, 23]
+    assert not waits(replace(films[0], action=action, **rest)).any(), "something happens"
+    closing = action.copy()
+    closing[21:, -1] = 0.0
+    assert list(np.flatnonzero(waits(replace(films[0], action=closing, **still)))) == [20, 22, 23], "it asks for something"
+    chances, shown = (emphasis(replace(films[0], action=action, **part), 3.0) for part in (still, rest))
+    assert (chances[20:24] == 0).all()
+    assert (np.delete(chances, range(20, 24)) == np.delete(shown, range(20, 24))).all()
+    waiting = replace(films[0], action=closing, **still)
+    assert (ahead(waiting, 18, 5) == closing[[18, 19, 21, 24, 25]]).all(), "the chunk goes on behind the wait, from the closed jaw"
+    assert (ahead(waiting, 18, 2) == closing[18:20]).all()
+    assert (ahead(waiting, 38, 4)[:, :-1] == 0).all()
+    assert (ahead(waiting, 38, 4)[:, -1] == closing[-1, -1]).all()
+
+
+def small_policy(films: list[Film], batch: int, depth: int = 2) -> tuple[MiniPI0Policy, policy.Questions, Batch]:
+    """An untrained policy of the smallest sizes, the questions beside it, and one batch of so many frames."""
+    recipe = policy.Recipe(SUITE, batch=batch, draws=2, width=32, depth=depth, vision_width=32, vision_depth=1, expert_width=32)
+    config = policy.configuration(recipe, films[0].state.shape[1], films[0].action.shape[1])
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model, asked = MiniPI0Policy(config), policy.Questions(recipe.width)
+    return model, asked, Frames(SUITE, films, statistics(films), config, recipe.focus).draw(batch, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(("depth", "asked_of"), [(1, [0]), (2, [0]), (4, [1, 2]), (6, [2, 3, 4])])
+def test_the_middle_of_the_decoder_is_asked_and_every_layer_after_it_but_the_last(
+    stage: tuple[Path, list[Film]], depth: int, asked_of: list[int]
+) -> None:
+    model, asked, batch = small_policy(stage[1], 4, depth)
+    layers = list(model.model.paligemma_with_expert.paligemma.model.language_model.layers)  # type: ignore[union-attr]
+    seen: list[torch.Tensor] = []
+    hooks = [layer.register_forward_hook(lambda _, args, out: seen.append(out)) for layer in layers]
+    with patch.object(asked, "forward", wraps=asked.forward) as question:
+        policy.losses(model, asked, batch, 1, torch.Generator().manual_seed(0))
+    for hook in hooks:
+        hook.remove()
+    patches = batch.patches.shape[2]
+    told = [call.args[0] for call in question.call_args_list]
+    assert [[torch.equal(one, state[:, :patches]) for state in seen].index(True) for one in told] == asked_of
+
+
+def test_the_goal_is_asked_for_where_there_is_one(stage: tuple[Path, list[Film]]) -> None:
+    _, films = stage
+    assert all(film.goal > 0 for film in films)
+    model, asked, batch = small_policy(films, 6)
+    assert not batch.place.isnan().any()
+    for film in films:  # every place is the target's, and the goal's, of one moment of one film
+        assert film.places.shape[1] > film.goal
+    spots = torch.cat([torch.from_numpy(film.places[:, [0, film.goal]]) for film in films])
+    assert all(any(torch.equal(one, spot) for spot in spots) for one in batch.place)
+    goalless = [replace(film, goal=-1) for film in films]
+    _, _, without = small_policy(goalless, 6)
+    assert without.place[:, 1].isnan().all()
+    assert not without.patches[:, 1].any()
+    _, with_goal = policy.losses(model, asked, batch, 1, torch.Generator().manual_seed(0))
+    loss, told = policy.losses(model, asked, without, 1, torch.Generator().manual_seed(0))
+    assert loss.isfinite()
+    assert np.isnan([told["goal_where"], told["goal_hit"]]).all()
+    assert np.isfinite(list(with_goal.values())).all()
+
+
+def test_attention_that_is_fused_gives_the_same_losses_and_gradients(stage: tuple[Path, list[Film]]) -> None:
+    model, asked, batch = small_policy(stage[1], 4)
+    found = []
+    for context in (nullcontext, fused):
+        with context(), patch.object(torch.nn.functional, "scaled_dot_product_attention", wraps=F.scaled_dot_product_attention) as kernel:
+            loss, told = policy.losses(model, asked, batch, 2, torch.Generator().manual_seed(0))
+        found.append((kernel.call_count, told, torch.autograd.grad(loss, list(model.parameters()), allow_unused=True)))
+    (few, slow, eager), (many, fast, kernels) = found
+    assert many > few
+    assert slow == pytest.approx(fast, rel=1e-5)
+    for one, other in zip(eager, kernels, strict=True):
+        assert (one is None) == (other is None)
+        assert one is None or torch.allclose(one, other, rtol=1e-3, atol=1e-5)
+
+
+def test_one_batch_can_be_learned_by_heart(stage: tuple[Path, list[Film]]) -> None:
+    """Flow, patches and place all fall when the same few frames are seen again and again."""
+    model, asked, batch = small_policy(stage[1], 8)
+    optimiser = torch.optim.AdamW([*model.parameters(), *asked.parameters()], 3e-3)
+    told = []
+    for step in range(60):
+        loss, parts = policy.losses(model, asked, batch, 2, torch.Generator().manual_seed(step))
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        told.append(parts)
+    early, late = ({name: np.mean([one[name] for one in part]) for name in told[0]} for part in (told[:5], told[-5:]))
+    assert late["flow"] < 0.8 * early["flow"]
+    assert late["heat"] < 0.8 * early["heat"]
+    assert late["where"] < 0.5 * early["where"]
+    assert late["hit"] > early["hit"]

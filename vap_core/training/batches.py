@@ -1,0 +1,112 @@
+"""What one step of a policy's training sees: frames of films, each with a command of its own and the chunk that the expert carries out from there."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32
+from torch import Tensor
+
+from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
+from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
+from vap_core.training.commands import command
+from vap_core.training.demonstrations import Film, after_a_miss, every
+from vap_core.training.looking import shares
+
+AROUND = 4
+"""Pictures from there that `focus` still calls close."""
+STILL = 2e-3
+"""Metres or radians: a step that asks for less and changes less is a wait."""
+STEADY = 0.01
+"""Least deviation by which an action or a state is scaled: what hardly moves is not blown up."""
+
+
+@dataclass
+class Batch:
+    """Tensors of one step: pictures (b x c x 3 x s x s in 0..1), tokens, scaled state and chunk; of target and goal, the share of either in every
+    patch (b x 2 x p) and its place (b x 2 x 3, metres, nan without a goal)."""
+
+    images: Tensor
+    tokens: Tensor
+    there: Tensor
+    state: Tensor
+    actions: Tensor
+    patches: Tensor
+    place: Tensor
+
+
+def statistics(films: Sequence[Film]) -> dict[str, dict[str, Tensor]]:
+    """Mean and deviation of states and actions, as lerobot's normalisers want them."""
+    found = {}
+    for name, parts in (("observation.state", [film.state for film in films]), ("action", [film.action for film in films])):
+        rows = np.concatenate(parts)
+        found[name] = {
+            "mean": torch.from_numpy(rows.mean(0)),
+            "std": torch.from_numpy(np.maximum(rows.std(0), STEADY * max(1e-3, float(rows.std())))),
+        }
+    return found
+
+
+class Frames:
+    """The frames of some films of one suite, to draw batches from; those close to a grasp, a release or the end `focus` times as often as others."""
+
+    def __init__(self, suite: str, films: Sequence[Film], stats: dict[str, dict[str, Tensor]], config: MiniPI0Config, focus: float) -> None:
+        self.suite, self.films, self.stats, self.config = suite, films, stats, config
+        self.apart = every(suite)
+        self.number = {word: i for i, word in enumerate(config.words)}
+        self.chances = [emphasis(film, focus, self.apart) for film in films]
+        self.totals = np.array([chance.sum() for chance in self.chances])
+
+    def draw(self, n: int, rng: np.random.Generator) -> Batch:
+        """A batch of `n` frames, drawn anew."""
+        made, states, chunks, shown, places = [], [], [], [], []
+        for i in rng.choice(len(self.films), n, p=self.totals / self.totals.sum()):
+            film, chances = self.films[i], self.chances[i]
+            f = int(rng.choice(len(chances), p=chances / self.totals[i]))
+            t = f * self.apart
+            made.append(command(film, t, self.suite, rng))
+            chunks.append(ahead(film, t, self.config.chunk_size))
+            states.append(film.state[t])
+            asked = (0, film.goal)
+            shown.append(np.stack([shares((film.ids[f] == i + 1) & (i >= 0), self.config.patch) for i in asked]))
+            places.append([film.places[t, i] if i >= 0 else (np.nan,) * 3 for i in asked])
+        tokens, there = encode([one.text for one in made], self.number, self.config.tokenizer_max_length)
+        state, actions = (self._scaled(name, rows) for name, rows in (("observation.state", states), ("action", chunks)))
+        images = torch.from_numpy(np.stack([one.images for one in made])).permute(0, 1, 4, 2, 3).float() / 255
+        patches, place = torch.from_numpy(np.stack(shown)).float(), torch.from_numpy(np.array(places, np.float32))
+        return Batch(images, tokens, there, state, actions, patches, place)
+
+    def _scaled(self, name: str, rows: Sequence[Float32[np.ndarray, "..."]]) -> Tensor:
+        return (torch.from_numpy(np.stack(rows)) - self.stats[name]["mean"]) / self.stats[name]["std"]
+
+
+def emphasis(film: Film, focus: float, apart: int = 1) -> Float[np.ndarray, " f"]:
+    """How often each picture, one in `apart` steps, is drawn: more often close to a change of the gripper's command, to the end, and to a miss,
+    where a centimetre decides; and never where the expert waits, as a policy without memory would wait for ever."""
+    shut = film.action[:, -1] < 0.5
+    turns = [*np.flatnonzero(shut[1:] != shut[:-1]) + 1, len(shut) - 1]
+    if after_a_miss(film):
+        turns.append(0)
+    away = np.abs(np.arange(0, len(shut), apart)[:, None] - turns).min(axis=1)
+    return np.where(waits(film)[::apart], 0.0, np.where(away <= AROUND * apart, focus, 1.0))
+
+
+def waits(film: Film) -> Bool[np.ndarray, " t"]:
+    """The steps in which nothing is asked for and nothing happens; those at the end, where there is nothing left to do, do not count."""
+    asked = np.abs(film.action[:, :-1]).max(axis=1) + np.abs(np.diff(film.action[:, -1], prepend=film.action[0, -1]))
+    happens = np.abs(np.diff(film.state, axis=0, append=film.state[-1:])).max(axis=1)
+    idle = (asked < STILL) & (happens < 2 * STILL)
+    return idle & np.logical_or.accumulate(~idle[::-1])[::-1]
+
+
+def ahead(film: Film, t: int, size: int) -> Float32[np.ndarray, "n a"]:
+    """The chunk that is taught at step t: what the expert does from there, its waits left out, and, after its end, nothing.
+
+    A jaw that has just closed looks like one that has waited: with the waits in the chunk, a policy that is asked there waits for ever.
+    """
+    moving = np.flatnonzero(~waits(film))
+    rest = film.action[moving[moving >= t][:size]]
+    still = np.repeat(rest[-1:], size - len(rest), axis=0)
+    still[:, :-1] = 0.0
+    return np.concatenate([rest, still])
