@@ -227,7 +227,8 @@ def test_no_film_at_all_is_said(cache: Path, tmp_path: Path) -> None:
 
 
 def test_an_encoder_that_changes_pixels_is_found_out(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dataset, "CODEC", {**dataset.CODEC, "crf": 40, "extra_options": {"x265-params": "log-level=error"}})
+    lossy = dataset.CODEC["extra_options"]["x265-params"].replace("lossless=1", "lossless=0")
+    monkeypatch.setattr(dataset, "CODEC", {**dataset.CODEC, "crf": 40, "extra_options": {"x265-params": lossy}})
     with pytest.raises(BadOutput, match="parts/00000-0000. was not written as it was filmed .ValueError: episode 0 is not what its checksum says"):
         write(SUITE, STAGES, tmp_path / "out", cache=cache)
     assert not [path for path in (tmp_path / "out" / "parts").iterdir() if not path.name.startswith(".")]

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from vap_core.cli.options import StackName, Workers
+from vap_core.cli.options import StackName, Workers, names
 
 app = typer.Typer()
 train_app = typer.Typer(no_args_is_help=True, help="Train shipped parts again; every training resumes after an interruption.")
@@ -68,8 +68,7 @@ def eval_policy(
     study = Study(tuple((suite, task.name) for task in known.suite(suite).tasks), ("generic",), policy=policy)
     if not study.checkpoint(suite):
         raise BadStudy(f"eval-policy: {policy!r} has no weights; take mini-pi0, or a lerobot checkpoint's folder or hub id.")
-    asked = [name for name in ways.split(",") if name]
-    table = probe(study.checkpoint(suite), suite, scenes=scenes, ways=asked, execute=execute, seed=seed, workers=workers)
+    table = probe(study.checkpoint(suite), suite, scenes=scenes, ways=names(ways), execute=execute, seed=seed, workers=workers)
     print(conclude(table))
     if out is not None:
         keep(table, out)

@@ -6,3 +6,8 @@ import typer
 
 StackName = Annotated[str, typer.Option("--stack", help="Perception stack: embedded (offline, CPU), foundation or foundation-small (see weights).")]
 Workers = Annotated[int, typer.Option(min=1, help="Processes.")]
+
+
+def names(given: str) -> list[str]:
+    """The names in "a,b,c"."""
+    return [name for name in given.split(",") if name]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from vap_core.cli.options import StackName, Workers
+from vap_core.cli.options import StackName, Workers, names
 
 if TYPE_CHECKING:
     from vap_core.engine import Record
@@ -254,7 +254,7 @@ def publish(
 def _study(tasks: tuple[tuple[str, str], ...], methods: list[str] | None, *, policy: str, **options: Any) -> "Study":
     from vap_core.experiments import INSIDERS, Study
 
-    asked = [name for each in methods or () for name in each.split(",") if name]
+    asked = names(",".join(methods or ()))
     usual = ("generic",) if policy in INSIDERS else ("generic", "vap")
     return Study(tasks, tuple(dict.fromkeys(asked)) or usual, policy=policy, **options)
 

@@ -83,7 +83,7 @@ def cast(known: Suite, task: Task, rng: np.random.Generator, held_out: bool = Fa
     """
     pool = range(HELD_OUT, HELD_OUT + TRAIN_INSTANCES) if held_out else range(TRAIN_INSTANCES)
     first, rivals = pool[int(rng.integers(len(pool)))], int(rng.choice([1, 2, 3], p=[0.15, 0.7, 0.15]))
-    rivals = min(rivals, MOST.get(known.name, rivals + 2) - 1 - bool(task.goal))
+    rivals = min(rivals, MOST.get(known.name, 5) - 1 - bool(task.goal))
     if rng.random() < 0.5:
         models = [objects.generic(task.stem, first, int(twin)) for twin in rng.permutation(6)[: rivals + 1]]
     else:
