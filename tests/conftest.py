@@ -12,6 +12,7 @@ from jaxtyping import install_import_hook
 
 if TYPE_CHECKING:
     from vap_core.training.demonstrations import Film
+    from vap_core.values import Frame, Opening
 
 install_import_hook("vap_core", "beartype.beartype")
 os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"  # read when ray is first imported: the tests' cluster stays on loopback
@@ -43,3 +44,12 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> "tuple[Path, list[Film]]"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demonstrations, "EPISODES", 2)
         return folder, demonstrations.cached(folder, "simpler-bridge", 0, 1)
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory: pytest.TempPathFactory) -> "tuple[Path, Opening, list[Frame]]":
+    """A recording of three cameras, how it opened, and its frames."""
+    from tests.drawn import opening, record
+
+    path, start = tmp_path_factory.mktemp("three") / "three.rrd", opening(3)
+    return path, start, record(path, start)
