@@ -17,7 +17,7 @@ from vap_core.policies.lerobot import load
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy, fused
 from vap_core.policies.mini_pi0.vlm import load as load_vlm
 from vap_core.training import demonstrations, policy, vlm
-from vap_core.training.batches import Batch, Frames, ahead, emphasis, statistics, waits
+from vap_core.training.batches import Batch, Frames, ahead, emphasis, statistics, turn, waits
 from vap_core.training.dataset import data_sha256
 from vap_core.training.demonstrations import Film, cached
 
@@ -40,7 +40,7 @@ def test_a_training_that_was_stopped_ends_like_one_that_was_not(
     one, other = (load_file(tmp_path / name / "model.safetensors") for name in ("whole", "torn"))
     assert one.keys() == other.keys()
     assert all(torch.equal(one[name], other[name]) for name in one)
-    assert set(whole["held_out"]) == {"flow", "heat", "where", "hit", "goal_where", "goal_hit"}
+    assert set(whole["held_out"]) == {"flow", "heat", "where", "hit", "turn", "goal_heat", "goal_where", "goal_hit"}
     assert whole["data_sha256"] == data_sha256([film for n in range(2) for film in cached(folder, SUITE, 0, n)])
     with pytest.raises(BadOutput, match="another recipe or other data"):
         policy.train(replace(recipe, rate=0.1), tmp_path / "torn", cache=folder)
@@ -117,6 +117,20 @@ def test_waiting_is_not_taught_but_for_the_end(stage: tuple[Path, list[Film]]) -
     assert (ahead(waiting, 38, 4)[:, -1] == closing[-1, -1]).all()
 
 
+def test_how_the_hand_will_close_is_asked_until_it_does(stage: tuple[Path, list[Film]]) -> None:
+    for film in stage[1]:
+        closes = int((film.action[:, -1] < 0.5).argmax())
+        angle = float(film.state[closes, 5])
+        assert closes > 4
+        assert turn(film, 0) == turn(film, closes - 1) == pytest.approx((np.cos(2 * angle), np.sin(2 * angle)))
+        around = film.state.copy()
+        around[:, 5] += np.pi
+        assert turn(replace(film, state=around), 0) == pytest.approx(turn(film, 0), abs=1e-5), "a jaw turned half around is the same"
+        assert np.isnan(turn(film, closes)).all(), "it is closed"
+        opens = closes + int((film.action[closes:, -1] > 0.5).argmax())
+        assert np.isnan(turn(film, opens)).all(), "it closes no more"
+
+
 def small_policy(films: list[Film], batch: int, depth: int = 2) -> tuple[MiniPI0Policy, policy.Questions, Batch]:
     """An untrained policy of the smallest sizes, the questions beside it, and one batch of so many frames."""
     recipe = policy.Recipe(SUITE, batch=batch, draws=2, width=32, depth=depth, vision_width=32, vision_depth=1, expert_width=32)
@@ -180,8 +194,8 @@ def test_attention_that_is_fused_gives_the_same_losses_and_gradients(stage: tupl
 
 
 def test_one_batch_can_be_learned_by_heart(stage: tuple[Path, list[Film]]) -> None:
-    """Flow, patches and place all fall when the same few frames are seen again and again."""
-    model, asked, batch = small_policy(stage[1], 8)
+    """Flow, patches, place and turn all fall when the same few frames are seen again and again."""
+    model, asked, batch = small_policy(stage[1], 12)
     optimiser = torch.optim.AdamW([*model.parameters(), *asked.parameters()], 3e-3)
     told = []
     for step in range(60):
@@ -194,4 +208,5 @@ def test_one_batch_can_be_learned_by_heart(stage: tuple[Path, list[Film]]) -> No
     assert late["flow"] < 0.8 * early["flow"]
     assert late["heat"] < 0.8 * early["heat"]
     assert late["where"] < 0.5 * early["where"]
+    assert late["turn"] < 0.5 * early["turn"]
     assert late["hit"] > early["hit"]

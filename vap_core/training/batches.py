@@ -10,6 +10,7 @@ from torch import Tensor
 
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
+from vap_core.suites import suite as known
 from vap_core.training.commands import command
 from vap_core.training.demonstrations import Film, after_a_miss, every
 from vap_core.training.looking import shares
@@ -18,6 +19,8 @@ AROUND = 4
 """Pictures from there that `focus` still calls close."""
 STILL = 2e-3
 """Metres or radians: a step that asks for less and changes less is a wait."""
+SPIN_Z = 5
+"""Where a state of end-effector control keeps the hand's turn about the vertical, radians."""
 STEADY = 0.01
 """Least deviation by which an action or a state is scaled: what hardly moves is not blown up."""
 
@@ -25,7 +28,7 @@ STEADY = 0.01
 @dataclass
 class Batch:
     """Tensors of one step: pictures (b x c x 3 x s x s in 0..1), tokens, scaled state and chunk; of target and goal, the share of either in every
-    patch (b x 2 x p) and its place (b x 2 x 3, metres, nan without a goal)."""
+    patch (b x 2 x p) and its place (b x 2 x 3, metres, nan without a goal); how the hand will close on the target (b x 2, `turn`)."""
 
     images: Tensor
     tokens: Tensor
@@ -34,6 +37,7 @@ class Batch:
     actions: Tensor
     patches: Tensor
     place: Tensor
+    turn: Tensor
 
 
 def statistics(films: Sequence[Film]) -> dict[str, dict[str, Tensor]]:
@@ -53,14 +57,14 @@ class Frames:
 
     def __init__(self, suite: str, films: Sequence[Film], stats: dict[str, dict[str, Tensor]], config: MiniPI0Config, focus: float) -> None:
         self.suite, self.films, self.stats, self.config = suite, films, stats, config
-        self.apart = every(suite)
+        self.apart, self.turns = every(suite), known(suite).control == "ee"
         self.number = {word: i for i, word in enumerate(config.words)}
         self.chances = [emphasis(film, focus, self.apart) for film in films]
         self.totals = np.array([chance.sum() for chance in self.chances])
 
     def draw(self, n: int, rng: np.random.Generator) -> Batch:
         """A batch of `n` frames, drawn anew."""
-        made, states, chunks, shown, places = [], [], [], [], []
+        made, states, chunks, shown, places, turns = [], [], [], [], [], []
         for i in rng.choice(len(self.films), n, p=self.totals / self.totals.sum()):
             film, chances = self.films[i], self.chances[i]
             f = int(rng.choice(len(chances), p=chances / self.totals[i]))
@@ -71,11 +75,12 @@ class Frames:
             asked = (0, film.goal)
             shown.append(np.stack([shares((film.ids[f] == i + 1) & (i >= 0), self.config.patch) for i in asked]))
             places.append([film.places[t, i] if i >= 0 else (np.nan,) * 3 for i in asked])
+            turns.append(turn(film, t) if self.turns else (np.nan, np.nan))
         tokens, there = encode([one.text for one in made], self.number, self.config.tokenizer_max_length)
         state, actions = (self._scaled(name, rows) for name, rows in (("observation.state", states), ("action", chunks)))
         images = torch.from_numpy(np.stack([one.images for one in made])).permute(0, 1, 4, 2, 3).float() / 255
         patches, place = torch.from_numpy(np.stack(shown)).float(), torch.from_numpy(np.array(places, np.float32))
-        return Batch(images, tokens, there, state, actions, patches, place)
+        return Batch(images, tokens, there, state, actions, patches, place, torch.from_numpy(np.array(turns, np.float32)))
 
     def _scaled(self, name: str, rows: Sequence[Float32[np.ndarray, "..."]]) -> Tensor:
         return (torch.from_numpy(np.stack(rows)) - self.stats[name]["mean"]) / self.stats[name]["std"]
@@ -90,6 +95,18 @@ def emphasis(film: Film, focus: float, apart: int = 1) -> Float[np.ndarray, " f"
         turns.append(0)
     away = np.abs(np.arange(0, len(shut), apart)[:, None] - turns).min(axis=1)
     return np.where(waits(film)[::apart], 0.0, np.where(away <= AROUND * apart, focus, 1.0))
+
+
+def turn(film: Film, t: int) -> tuple[float, float]:
+    """How the hand is turned where it closes next: cosine and sine of twice its angle about the vertical, as a jaw turned half around is the same.
+
+    NaN while it is closed, and when it closes no more. States begin with the hand's pose, as under end-effector control.
+    """
+    shut = film.action[t:, -1] < 0.5
+    if shut[0] or not shut.any():
+        return np.nan, np.nan
+    angle = float(film.state[t + int(shut.argmax()), SPIN_Z])
+    return float(np.cos(2 * angle)), float(np.sin(2 * angle))
 
 
 def waits(film: Film) -> Bool[np.ndarray, " t"]:

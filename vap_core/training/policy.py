@@ -3,8 +3,8 @@
     python -m vap_core train policy --suite simpler-bridge --stages 400
 
 The middle of the decoder is asked, besides, which image patches show the object that is meant and where it stands, and the same of what it goes to,
-if anything; and so is every later layer but the last, which in pi0 gives its keys and values alone. What the middle knows, the action expert has half
-its layers left to act upon. The answers' heads are not part of the policy.
+if anything; and how a hand under end-effector control will close on it; and so is every later layer but the last, which in pi0 gives its keys and
+values alone. What the middle knows, the action expert has half its layers left to act upon. The answers' heads are not part of the policy.
 """
 
 import json
@@ -45,8 +45,8 @@ HELD_OUT = 19
 """Every so many stages one is kept from training, to see what was learned: a prime, as tasks take turns."""
 CLOSE_M = 0.005
 """Error of a place up to which it is squared."""
-SEEN, PLACED = 0.5, 1.0
-"""Weights of the two questions beside the flow."""
+SEEN, PLACED, TURNED = 0.5, 1.0, 1.0
+"""Weights of the questions beside the flow."""
 TEMPERATURE = 0.0
 """Of the trained policy's sampling noise: without any, three in five generic objects are grasped where with all of it two in five are."""
 
@@ -73,34 +73,38 @@ class Place(Shown):
         super().__init__(width)
         self.place = nn.Linear(width, 3)
 
-    def forward(self, hidden: Float[Tensor, "b p d"]) -> tuple[Float[Tensor, "b p"], Float[Tensor, "b 3"]]:
+    def forward(self, hidden: Float[Tensor, "b p d"]) -> tuple[Float[Tensor, "b p"], Float[Tensor, "b 3"], Float[Tensor, "b d"]]:
+        """Scores of patches, the place in decimetres, and what was seen where it was looked."""
         x = self.norm(hidden)
         chance = self.patch(x).squeeze(-1)
-        return chance, self.place(torch.einsum("bp,bpd->bd", chance.softmax(-1), x))
+        seen = torch.einsum("bp,bpd->bd", chance.softmax(-1), x)
+        return chance, self.place(seen), seen
 
 
 class Questions(nn.Module):
-    """About the object that is meant, and about its goal."""
+    """About the object that is meant, how a hand will close on it, and about its goal."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.of = nn.ModuleList([Place(width), Place(width)])
+        self.target, self.goal, self.turn = Place(width), Place(width), nn.Linear(width, 2)
 
-    def forward(
-        self, hidden: Float[Tensor, "b p d"], patches: Float[Tensor, "b 2 p"], place: Float[Tensor, "b 2 3"]
-    ) -> tuple[Float[Tensor, " 2"], Float[Tensor, " 2"], Float[Tensor, " 2"]]:
-        """What looking and placing cost, and the share of looks that hit, of both; `place` is nan where there is no goal, and nothing is asked."""
-        found = []
-        for i, ask in enumerate(self.of):
-            there = ~place[:, i, 0].isnan()
-            if not there.any():
-                found.append((torch.zeros(()), torch.zeros(()), torch.tensor(torch.nan)))
-                continue
-            chance, guess = ask(hidden[there])
-            heat, hit = looking(chance, patches[there, i])
-            found.append((heat, F.smooth_l1_loss(guess * 0.1, place[there, i], beta=CLOSE_M) / 0.02, hit))
-        heats, wheres, hits = (torch.stack(part) for part in zip(*found, strict=True))
-        return heats, wheres, hits
+    def forward(self, hidden: Float[Tensor, "b p d"], batch: Batch) -> dict[str, Tensor]:
+        """What looking, placing and turning cost, and the share of looks that hit; 0, and that share nan, where nothing is asked."""
+        told, seen = self._place(self.target, hidden, batch, 0)
+        goal, _ = self._place(self.goal, hidden, batch, 1)
+        closes = ~batch.turn[:, 0].isnan()
+        told["turn"] = F.smooth_l1_loss(self.turn(seen[closes]), batch.turn[closes]) if closes.any() else torch.zeros(())
+        return told | {f"goal_{name}": part for name, part in goal.items()}
+
+    @staticmethod
+    def _place(ask: Place, hidden: Tensor, batch: Batch, i: int) -> tuple[dict[str, Tensor], Tensor]:
+        there = ~batch.place[:, i, 0].isnan()
+        chance, guess, seen = ask(hidden)
+        if not there.any():
+            return {"heat": torch.zeros(()), "where": torch.zeros(()), "hit": torch.tensor(torch.nan)}, seen
+        heat, hit = looking(chance[there], batch.patches[there, i])
+        where = F.smooth_l1_loss(guess[there] * 0.1, batch.place[there, i], beta=CLOSE_M) / 0.02
+        return {"heat": heat, "where": where, "hit": hit}, seen
 
 
 def configuration(recipe: Recipe, state_size: int, action_size: int) -> MiniPI0Config:
@@ -142,11 +146,12 @@ def losses(policy: MiniPI0Policy, asked: Questions, batch: Batch, draws: int, ge
         at = _times(len(noise), policy.config, generator)
         noisy = at[:, None, None] * noise + (1 - at[:, None, None]) * batch.actions
         flow = flow + F.mse_loss(model.denoise_step(batch.state, pad, cache, noisy, at), noise - batch.actions) / draws
-    found = [asked(hidden[:, : batch.patches.shape[2]], batch.patches, batch.place) for hidden in seen]
-    heats, wheres, hits = (torch.stack(part).mean(0) for part in zip(*found, strict=True))
-    told = {"flow": flow, "heat": heats[0], "where": wheres[0], "hit": hits[0], "goal_hit": hits[1]}
-    told["goal_where"] = wheres[1] + 0 * hits[1]  # nan where nothing has a goal
-    return flow + SEEN * heats.sum() + PLACED * wheres.sum(), {name: float(part.detach()) for name, part in told.items()}
+    found = [asked(hidden[:, : batch.patches.shape[2]], batch) for hidden in seen]
+    mean = {name: torch.stack([one[name] for one in found]).mean() for name in found[0]}
+    loss = flow + SEEN * (mean["heat"] + mean["goal_heat"]) + PLACED * (mean["where"] + mean["goal_where"]) + TURNED * mean["turn"]
+    if mean["goal_hit"].isnan():  # nothing has a goal
+        mean["goal_where"] = mean["goal_hit"]
+    return loss, {"flow": float(flow.detach())} | {name: float(part.detach()) for name, part in mean.items()}
 
 
 def _times(n: int, config: MiniPI0Config, generator: torch.Generator) -> Float[Tensor, " n"]:
