@@ -88,6 +88,8 @@ def test_a_film_can_begin_where_a_grasp_has_missed(monkeypatch: pytest.MonkeyPat
         assert missed.action[:3, 2].sum() > 0.04 > 0.0 > first.action[:3, 2].sum()
         assert missed.action[2, -1] == 1.0
         assert missed.action[-1, -1] == pytest.approx(first.action[-1, -1])
+    away = [missed.state[0, 5] - missed.state[int((missed.action[:, -1] < 0.5).argmax()), 5] for missed in begun[1.0]]
+    assert np.abs((np.array(away) + np.pi / 2) % np.pi - np.pi / 2).max() > 0.3, "and it turns to it"
 
 
 def test_casts_are_generic_and_of_one_category() -> None:

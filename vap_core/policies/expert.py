@@ -27,8 +27,8 @@ JAW_GAP_M = 0.003
 """Room between an object and the jaw that does not move."""
 ELSEWHERE = 5
 """After an empty grasp the next one is tried so many places down the list: its neighbours differ too little."""
-MISS_M = (0.015, 0.04)
-"""How far beside the target a grasp goes that is to miss."""
+MISS_M, MISS_RAD = (0.015, 0.04), 1.2
+"""How far beside the target a grasp goes that is to miss, and how far it is turned, either way."""
 BESIDE_M = 0.035
 """How far inside the limit of the near rule a thing is set down."""
 
@@ -138,10 +138,11 @@ def _take(env: Env, truth: Truth, attempt: int) -> list[Waypoint]:
 
 
 def _miss(env: Env, truth: Truth, rng: np.random.Generator) -> list[Waypoint]:
-    """Over a place beside the best grasp, down, and as often as not closed."""
+    """Over a place beside the best grasp and turned away from it, down, and as often as not closed."""
     angle, away = rng.uniform(0, 2 * np.pi), rng.uniform(*MISS_M)
     low = _low(env, truth, 0)
     low[:3, 3] += _into_base(env) @ np.array([away * np.cos(angle), away * np.sin(angle), rng.uniform(0.0, 0.02)])
+    low[:3, :3] = rotation(np.array([0.0, 0.0, rng.uniform(-MISS_RAD, MISS_RAD)])) @ low[:3, :3]
     plan = [Waypoint(_over(env, truth, low), 1.0), Waypoint(low, 1.0), Waypoint(low, 0.0, 0.2)]
     return plan[: int(rng.integers(2, 4))]
 

@@ -12,7 +12,7 @@ from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
 from vap_core.suites import suite as known
 from vap_core.training.commands import command
-from vap_core.training.demonstrations import Film, after_a_miss, every
+from vap_core.training.demonstrations import Film, every
 from vap_core.training.looking import shares
 
 AROUND = 4
@@ -53,7 +53,7 @@ def statistics(films: Sequence[Film]) -> dict[str, dict[str, Tensor]]:
 
 
 class Frames:
-    """The frames of some films of one suite, to draw batches from; those close to a grasp, a release or the end `focus` times as often as others."""
+    """The frames of some films of one suite, to draw batches from; those of which `emphasis` says so `focus` times as often as others."""
 
     def __init__(self, suite: str, films: Sequence[Film], stats: dict[str, dict[str, Tensor]], config: MiniPI0Config, focus: float) -> None:
         self.suite, self.films, self.stats, self.config = suite, films, stats, config
@@ -87,12 +87,11 @@ class Frames:
 
 
 def emphasis(film: Film, focus: float, apart: int = 1) -> Float[np.ndarray, " f"]:
-    """How often each picture, one in `apart` steps, is drawn: more often close to a change of the gripper's command, to the end, and to a miss,
-    where a centimetre decides; and never where the expert waits, as a policy without memory would wait for ever."""
+    """How often each picture, one in `apart` steps, is drawn: more often close to a change of the gripper's command and to the end, where a
+    centimetre decides, and to the start, where the hand turns as it will stay turned; and never where the expert waits, as a policy without
+    memory would wait for ever."""
     shut = film.action[:, -1] < 0.5
-    turns = [*np.flatnonzero(shut[1:] != shut[:-1]) + 1, len(shut) - 1]
-    if after_a_miss(film):
-        turns.append(0)
+    turns = [0, *np.flatnonzero(shut[1:] != shut[:-1]) + 1, len(shut) - 1]
     away = np.abs(np.arange(0, len(shut), apart)[:, None] - turns).min(axis=1)
     return np.where(waits(film)[::apart], 0.0, np.where(away <= AROUND * apart, focus, 1.0))
 

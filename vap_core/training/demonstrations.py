@@ -30,7 +30,7 @@ SIDE, SEEN = 112, 224
 """Pixels of a film, and of the views that it is made of: a policy sees views of SEEN pixels scaled down to SIDE."""
 EPISODES = 8
 """Episodes of one stage."""
-JOLT, JOLT_M = 0.15, 0.012
+JOLT, JOLT_M, JOLT_RAD = 0.15, 0.012, 0.2
 """Share of steps in which the hand is knocked off its way, so that recovering is shown, too; and how far, metres (deviation)."""
 LOW_M = 0.05
 """A hand that begins so far below its highest point begins after a miss."""
@@ -202,9 +202,11 @@ def _knocked(action: Float32[np.ndarray, " a"], known: Suite, rng: np.random.Gen
     if rng.random() > JOLT:
         return action
     jolt, out = rng.normal(size=len(action) - 1), action.copy()
-    out[: len(jolt)] += jolt * (JOLT_M if known.control == "ee" else 2 * JOLT_M)
     if known.control == "ee":
-        out[3:6] = action[3:6]
+        out[:3] += jolt[:3] * JOLT_M
+        out[5] += jolt[5] * JOLT_RAD
+    else:
+        out[: len(jolt)] += jolt * 2 * JOLT_M
     return out
 
 

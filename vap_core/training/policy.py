@@ -53,8 +53,8 @@ TEMPERATURE = 0.0
 
 @dataclass(frozen=True)
 class Recipe(Sizes):
-    """How long, how fast, how large. `draws` flow samples share one look at the pictures; frames close to a grasp, a release or
-    the end come `focus` times as often as others."""
+    """How long, how fast, how large. `draws` flow samples share one look at the pictures; frames close to the start, a grasp,
+    a release or the end come `focus` times as often as others."""
 
     suite: str
     stages: int = 400
