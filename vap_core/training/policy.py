@@ -39,7 +39,7 @@ from vap_core.training.scenes import only_generic
 from vap_core.version import code_version
 
 CACHE = Path(__file__).resolve().parents[2] / "data" / "cache" / "demonstrations"
-CHUNKS = {"simpler-fractal": (4, 2), "simpler-bridge": (4, 4), "vlabench": (4, 4), "tabletop": (32, 32)}
+CHUNKS = {"simpler-fractal": (4, 2), "simpler-bridge": (4, 4), "vlabench": (4, 4), "tabletop": (32, 10)}
 """Actions in one chunk, and how many of them are carried out before the policy is asked again."""
 HELD_OUT = 19
 """Every so many stages one is kept from training, to see what was learned: a prime, as tasks take turns."""
