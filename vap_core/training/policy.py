@@ -2,8 +2,8 @@
 
     python -m vap_core train policy --suite simpler-bridge --stages 400
 
-The middle of the decoder is asked, besides, which image patches show the object that is meant and where it stands, and the same of what it goes to,
-if anything; and how a hand under end-effector control will close on it; and so is every later layer but the last, which in pi0 gives its keys and
+The middle of the decoder is asked, besides, which image patches show the object that is meant, where it stands, and, under end-effector control, how
+the hand will close on it; the first two of what it goes to, too, if anything. So is every later layer but the last, which in pi0 gives its keys and
 values alone. What the middle knows, the action expert has half its layers left to act upon. The answers' heads are not part of the policy.
 """
 
