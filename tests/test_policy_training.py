@@ -16,8 +16,10 @@ from vap_core.policies.checkpoints import fingerprint
 from vap_core.policies.lerobot import load
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy, fused
 from vap_core.policies.mini_pi0.vlm import load as load_vlm
+from vap_core.sim.control import arm, rotation_vector
+from vap_core.suites import suite
 from vap_core.training import demonstrations, policy, vlm
-from vap_core.training.batches import Batch, Frames, ahead, emphasis, statistics, turn, waits
+from vap_core.training.batches import SPIN_Z, Batch, Frames, ahead, emphasis, spun, statistics, turn, waits
 from vap_core.training.dataset import data_sha256
 from vap_core.training.demonstrations import Film, cached
 
@@ -84,10 +86,42 @@ def test_frames_close_to_the_start_a_turn_of_the_gripper_or_the_end_come_more_of
     action[15:, -1] = 0.2
     rest = {part: np.repeat(getattr(films[0], part)[:1], 40, axis=0) for part in ("images", "ids", "state", "places")}
     chances = emphasis(replace(films[0], action=action, **rest), 3.0)
-    assert set(np.flatnonzero(chances == 3.0)) == {*range(5), *range(11, 20), *range(35, 40)}
+    assert set(np.flatnonzero(chances == 12.0)) == {0, 1, 2}, "there the hand decides which way it turns"
+    assert set(np.flatnonzero(chances == 3.0)) == {3, 4, *range(11, 20), *range(35, 40)}
     assert set(np.flatnonzero(chances == 1.0)) == {*range(5, 11), *range(20, 35)}
     thirds = emphasis(replace(films[0], action=action, **rest), 3.0, 3)
-    assert [3 * int(i) for i in np.flatnonzero(thirds == 3.0)] == [*range(0, 40, 3)]
+    assert [*thirds] == [12.0] * 3 + [3.0] * 11, "pictures are counted, not steps"
+
+
+def test_every_task_is_drawn_as_often_as_another(stage: tuple[Path, list[Film]]) -> None:
+    _, films = stage
+    config = policy.configuration(policy.Recipe(SUITE), films[0].state.shape[1], films[0].action.shape[1])
+    three = [films[0], replace(films[0], task="another"), replace(films[0], task="another")]
+    assert Frames(SUITE, three, statistics(three), config, 3.0).share == pytest.approx([0.5, 0.25, 0.25])
+
+
+def test_a_hand_that_is_shown_turned_otherwise_turns_back_in_time_and_does_all_else_as_before(stage: tuple[Path, list[Film]]) -> None:
+    _, films = stage
+    film, rate, kinematics = films[0], 0.28, arm(suite(SUITE).robot)
+    close = int(np.argmax(film.action[:, -1] < 0.5))
+    reach = min(np.pi / 2, 0.8 * rate * close)
+    seen = []
+    for i in range(20):
+        chunk = ahead(film, 0, close)
+        state, back = spun(film, 0, chunk, rate, np.random.default_rng(i))
+        assert (np.delete(back, SPIN_Z, axis=1) == np.delete(chunk, SPIN_Z, axis=1)).all()
+        assert (np.delete(state, [SPIN_Z, -1]) == np.delete(film.state[0], [SPIN_Z, len(state) - 1])).all()
+        assert np.abs(back[:, SPIN_Z]).max() <= rate + 1e-6
+        seen.append(float(back[:, SPIN_Z].sum()))
+        assert state[SPIN_Z] + seen[-1] == pytest.approx(film.state[0, SPIN_Z] + film.action[:close, SPIN_Z].sum(), abs=1e-4), "it ends as it did"
+        was, now = (kinematics.forward(one[7:].astype(float)) for one in (film.state[0], state))
+        assert now[:3, 3] == pytest.approx(was[:3, 3], abs=1e-4), "its last joint turns it on the spot"
+        assert rotation_vector(now[:3, :3] @ was[:3, :3].T) == pytest.approx([0, 0, state[SPIN_Z] - film.state[0, SPIN_Z]], abs=0.02)
+    assert min(seen) < -0.4 * reach, "either way"
+    assert max(seen) > 0.4 * reach, "either way"
+    state, back = spun(film, close, ahead(film, close, 4), rate, np.random.default_rng(0))
+    assert (state == film.state[close]).all(), "a hand that closes stays as it is"
+    assert (back == ahead(film, close, 4)).all(), "a hand that closes stays as it is"
 
 
 def test_waiting_is_not_taught_but_for_the_end(stage: tuple[Path, list[Film]]) -> None:

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
+from vap_core.policies.expert import TURN_RAD_S
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
 from vap_core.suites import suite as known
@@ -17,10 +18,14 @@ from vap_core.training.looking import shares
 
 AROUND = 4
 """Pictures from there that `focus` still calls close."""
+START, FIRST = 4.0, 3
+"""How many times `focus` the first pictures of a film are worth, and how many they are: which way the hand turns is decided there."""
 STILL = 2e-3
 """Metres or radians: a step that asks for less and changes less is a wait."""
 SPIN_Z = 5
-"""Where a state of end-effector control keeps the hand's turn about the vertical, radians."""
+"""Where states, and actions of end-effector control, keep the hand's turn about the vertical, radians."""
+SPUN, IN_TIME = 0.5, 0.8
+"""How often a hand is shown turned otherwise, and which part of the time that is left it has to turn back."""
 STEADY = 0.01
 """Least deviation by which an action or a state is scaled: what hardly moves is not blown up."""
 
@@ -53,25 +58,30 @@ def statistics(films: Sequence[Film]) -> dict[str, dict[str, Tensor]]:
 
 
 class Frames:
-    """The frames of some films of one suite, to draw batches from; those of which `emphasis` says so `focus` times as often as others."""
+    """The frames of some films of one suite, to draw batches from: every task as often, and in it a frame as often as `emphasis` says."""
 
     def __init__(self, suite: str, films: Sequence[Film], stats: dict[str, dict[str, Tensor]], config: MiniPI0Config, focus: float) -> None:
         self.suite, self.films, self.stats, self.config = suite, films, stats, config
-        self.apart, self.turns = every(suite), known(suite).control == "ee"
+        self.apart, self.turns, self.turn_rad = every(suite), known(suite).control == "ee", TURN_RAD_S / known(suite).hz
         self.number = {word: i for i, word in enumerate(config.words)}
         self.chances = [emphasis(film, focus, self.apart) for film in films]
         self.totals = np.array([chance.sum() for chance in self.chances])
+        of = {task: sum(total for film, total in zip(films, self.totals, strict=True) if film.task == task) for task in {film.task for film in films}}
+        self.share = np.array([total / of[film.task] / len(of) for film, total in zip(films, self.totals, strict=True)])
 
     def draw(self, n: int, rng: np.random.Generator) -> Batch:
         """A batch of `n` frames, drawn anew."""
         made, states, chunks, shown, places, turns = [], [], [], [], [], []
-        for i in rng.choice(len(self.films), n, p=self.totals / self.totals.sum()):
+        for i in rng.choice(len(self.films), n, p=self.share):
             film, chances = self.films[i], self.chances[i]
             f = int(rng.choice(len(chances), p=chances / self.totals[i]))
             t = f * self.apart
             made.append(command(film, t, self.suite, rng))
-            chunks.append(ahead(film, t, self.config.chunk_size))
-            states.append(film.state[t])
+            state, chunk = film.state[t], ahead(film, t, self.config.chunk_size)
+            if self.turns and rng.random() < SPUN:
+                state, chunk = spun(film, t, chunk, self.turn_rad, rng)
+            states.append(state)
+            chunks.append(chunk)
             asked = (0, film.goal)
             shown.append(np.stack([shares((film.ids[f] == i + 1) & (i >= 0), self.config.patch) for i in asked]))
             places.append([film.places[t, i] if i >= 0 else (np.nan,) * 3 for i in asked])
@@ -88,12 +98,14 @@ class Frames:
 
 def emphasis(film: Film, focus: float, apart: int = 1) -> Float[np.ndarray, " f"]:
     """How often each picture, one in `apart` steps, is drawn: more often close to a change of the gripper's command and to the end, where a
-    centimetre decides, and to the start, where the hand turns as it will stay turned; and never where the expert waits, as a policy without
-    memory would wait for ever."""
+    centimetre decides, most often at the start, where it is decided which way the hand turns; and never where the expert waits, as a policy
+    without memory would wait for ever."""
     shut = film.action[:, -1] < 0.5
     turns = [0, *np.flatnonzero(shut[1:] != shut[:-1]) + 1, len(shut) - 1]
     away = np.abs(np.arange(0, len(shut), apart)[:, None] - turns).min(axis=1)
-    return np.where(waits(film)[::apart], 0.0, np.where(away <= AROUND * apart, focus, 1.0))
+    often = np.where(away <= AROUND * apart, focus, 1.0)
+    often[:FIRST] *= START
+    return np.where(waits(film)[::apart], 0.0, often)
 
 
 def turn(film: Film, t: int) -> tuple[float, float]:
@@ -106,6 +118,30 @@ def turn(film: Film, t: int) -> tuple[float, float]:
         return np.nan, np.nan
     angle = float(film.state[t + int(shut.argmax()), SPIN_Z])
     return float(np.cos(2 * angle)), float(np.sin(2 * angle))
+
+
+def spun(
+    film: Film, t: int, chunk: Float32[np.ndarray, "n 7"], turn_rad: float, rng: np.random.Generator
+) -> tuple[Float32[np.ndarray, " p"], Float32[np.ndarray, "n 7"]]:
+    """The state at t and the chunk from there, had the hand been turned otherwise about the vertical, by as much as it can still turn back at
+    `turn_rad` a step; both as they are when it closes no more.
+
+    In the expert's films a hand that turns goes on turning, and one that does not is turned as it should be: who learns from them alone looks at
+    the hand, and not at the object. The hand points down, so its last joint turns it and nothing else; pictures stay as they are.
+    """
+    shut = film.action[t:, -1] < 0.5
+    state, chunk = film.state[t].copy(), chunk.copy()
+    if shut[0] or not shut.any():
+        return state, chunk
+    close = int(shut.argmax())
+    left = float(rng.uniform(-1, 1)) * min(np.pi / 2, IN_TIME * turn_rad * close)
+    by = float(film.action[t : t + close, SPIN_Z].sum()) - left
+    state[SPIN_Z] += by
+    state[-1] -= by
+    for action in chunk[: int(np.argmax(chunk[:, -1] < 0.5)) if (chunk[:, -1] < 0.5).any() else len(chunk)]:
+        action[SPIN_Z] = np.clip(left, -turn_rad, turn_rad)
+        left -= float(action[SPIN_Z])
+    return state, chunk
 
 
 def waits(film: Film) -> Bool[np.ndarray, " t"]:
