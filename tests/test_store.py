@@ -92,3 +92,20 @@ def test_many_parts_become_one_and_nothing_is_lost(tmp_path: Path) -> None:
     append(run, [{**ROW, "episode": 0, "success": True, "outcome": "error"}])  # as if cut short before the old parts were gone
     pd.testing.assert_frame_equal(read(run), before)
     assert len(whole) == 5
+
+
+def test_a_run_can_be_read_while_another_process_makes_one_part_of_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = open_run(tmp_path / "run", {"seed": 0})
+    for i in range(3):
+        append(run, [{**ROW, "episode": i}])
+    before, whole = read(run), Path.glob
+
+    def late(folder: Path, pattern: str) -> list[Path]:
+        found = list(whole(folder, pattern))
+        if len(found) == 3:
+            monkeypatch.setattr(Path, "glob", whole)
+            compact(run)
+        return found
+
+    monkeypatch.setattr(Path, "glob", late)
+    pd.testing.assert_frame_equal(read(run), before)

@@ -115,7 +115,7 @@ def read(folder: Path) -> "pd.DataFrame":
     import pandas as pd
     from pyarrow import concat_tables
 
-    parts = [_part(part) for part in sorted((folder / "parts").glob("*.parquet"))]
+    parts = _parts(folder)
     if not parts:
         return pd.DataFrame(columns=KEY)
     table = concat_tables(parts, promote_options="permissive").to_pandas()
@@ -125,11 +125,22 @@ def read(folder: Path) -> "pd.DataFrame":
     return table.drop_duplicates(KEY, keep="last", ignore_index=True)
 
 
+def _parts(folder: Path) -> "list[pa.Table]":
+    """Its parts; looked up anew when one is gone, for then another process has just made one of many."""
+    while True:
+        try:
+            return [_part(part) for part in sorted((folder / "parts").glob("*.parquet"))]
+        except FileNotFoundError:
+            continue
+
+
 def _part(path: Path) -> "pa.Table":
     from pyarrow import ArrowException
     from pyarrow.parquet import read_table
 
     try:
         return read_table(path)
+    except FileNotFoundError:
+        raise
     except (ArrowException, OSError) as error:
         raise BadOutput(f"read: {path} is damaged; delete it and run the same command again, its episodes run anew.") from error
