@@ -109,3 +109,6 @@ def test_a_run_can_be_read_while_another_process_makes_one_part_of_many(tmp_path
 
     monkeypatch.setattr(Path, "glob", late)
     pd.testing.assert_frame_equal(read(run), before)
+    (run / "parts" / "lost.parquet").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(BadOutput, match="lost.parquet is damaged"):
+        read(run)

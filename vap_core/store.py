@@ -126,12 +126,14 @@ def read(folder: Path) -> "pd.DataFrame":
 
 
 def _parts(folder: Path) -> "list[pa.Table]":
-    """Its parts; looked up anew when one is gone, for then another process has just made one of many."""
+    """Its parts; looked up anew when one is gone, for then another process has just made one of many. Raises: BadOutput."""
     while True:
+        parts = sorted((folder / "parts").glob("*.parquet"))
         try:
-            return [_part(part) for part in sorted((folder / "parts").glob("*.parquet"))]
-        except FileNotFoundError:
-            continue
+            return [_part(part) for part in parts]
+        except BadOutput:
+            if all(part.exists(follow_symlinks=False) for part in parts):
+                raise
 
 
 def _part(path: Path) -> "pa.Table":
@@ -140,7 +142,5 @@ def _part(path: Path) -> "pa.Table":
 
     try:
         return read_table(path)
-    except FileNotFoundError:
-        raise
     except (ArrowException, OSError) as error:
         raise BadOutput(f"read: {path} is damaged; delete it and run the same command again, its episodes run anew.") from error

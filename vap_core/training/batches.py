@@ -62,12 +62,13 @@ class Frames:
 
     def __init__(self, suite: str, films: Sequence[Film], stats: dict[str, dict[str, Tensor]], config: MiniPI0Config, focus: float) -> None:
         self.suite, self.films, self.stats, self.config = suite, films, stats, config
-        self.apart, self.turns, self.turn_rad = every(suite), known(suite).control == "ee", TURN_RAD_S / known(suite).hz
+        self.apart, told = every(suite), known(suite)
+        self.turns, self.turn_rad = told.control == "ee", TURN_RAD_S / told.hz
         self.number = {word: i for i, word in enumerate(config.words)}
         self.chances = [emphasis(film, focus, self.apart) for film in films]
         self.totals = np.array([chance.sum() for chance in self.chances])
-        of = {task: sum(total for film, total in zip(films, self.totals, strict=True) if film.task == task) for task in {film.task for film in films}}
-        self.share = np.array([total / of[film.task] / len(of) for film, total in zip(films, self.totals, strict=True)])
+        tasks, of = np.unique([film.task for film in films], return_inverse=True)
+        self.share = self.totals / np.bincount(of, self.totals)[of] / len(tasks)
 
     def draw(self, n: int, rng: np.random.Generator) -> Batch:
         """A batch of `n` frames, drawn anew."""
@@ -113,10 +114,10 @@ def turn(film: Film, t: int) -> tuple[float, float]:
 
     NaN while it is closed, and when it closes no more. States begin with the hand's pose, as under end-effector control.
     """
-    shut = film.action[t:, -1] < 0.5
-    if shut[0] or not shut.any():
+    close = _open_for(film.action[t:])
+    if not 0 < close < len(film.action) - t:
         return np.nan, np.nan
-    angle = float(film.state[t + int(shut.argmax()), SPIN_Z])
+    angle = float(film.state[t + close, SPIN_Z])
     return float(np.cos(2 * angle)), float(np.sin(2 * angle))
 
 
@@ -129,19 +130,24 @@ def spun(
     In the expert's films a hand that turns goes on turning, and one that does not is turned as it should be: who learns from them alone looks at
     the hand, and not at the object. The hand points down, so its last joint turns it and nothing else; pictures stay as they are.
     """
-    shut = film.action[t:, -1] < 0.5
+    close = _open_for(film.action[t:])
+    if not 0 < close < len(film.action) - t:
+        return film.state[t], chunk
     state, chunk = film.state[t].copy(), chunk.copy()
-    if shut[0] or not shut.any():
-        return state, chunk
-    close = int(shut.argmax())
     left = float(rng.uniform(-1, 1)) * min(np.pi / 2, IN_TIME * turn_rad * close)
     by = float(film.action[t : t + close, SPIN_Z].sum()) - left
     state[SPIN_Z] += by
     state[-1] -= by
-    for action in chunk[: int(np.argmax(chunk[:, -1] < 0.5)) if (chunk[:, -1] < 0.5).any() else len(chunk)]:
+    for action in chunk[: _open_for(chunk)]:
         action[SPIN_Z] = np.clip(left, -turn_rad, turn_rad)
         left -= float(action[SPIN_Z])
     return state, chunk
+
+
+def _open_for(actions: Float32[np.ndarray, "n a"]) -> int:
+    """How many actions come before the hand is told to close; all of them where it is not."""
+    shut = actions[:, -1] < 0.5
+    return int(shut.argmax()) if shut.any() else len(shut)
 
 
 def waits(film: Film) -> Bool[np.ndarray, " t"]:
