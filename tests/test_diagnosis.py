@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from vap_core.errors import BadOutput, BadStudy
 from vap_core.experiments import Study
 from vap_core.failures import CASES, STAGES
 from vap_core.publish import publish
-from vap_core.record import read_summary
+from vap_core.record import Recorder, read_summary
 from vap_core.record.index import FOLDER
 from vap_core.report import align
 from vap_core.report.failures import breakdown, breakdown_rows, roads, sub_cases_text
@@ -121,6 +122,19 @@ def test_a_published_table_opens_too(run: Path, tmp_path: Path, monkeypatch: pyt
     path = recording(failures, 0)
     assert path.parent == Path("data/runs/mine-diagnosed/recordings")
     assert path.exists()
+
+
+def test_a_recording_of_older_weights_is_made_anew(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    publish([run], tmp_path / "mine.parquet")
+    failures = listed(tmp_path / "mine.parquet")
+    monkeypatch.chdir(tmp_path)
+    with monkeypatch.context() as before:
+        before.setattr("vap_core.record.Recorder", lambda path, opening: Recorder(path, replace(opening, policy="random@older")))
+        assert read_summary(recording(failures, 0))["rollout.policy"] == "random@older"
+    path = recording(failures, 0)
+    assert read_summary(path)["rollout.policy"] == failures.table.policy[0]
+    made = path.stat().st_mtime_ns
+    assert recording(failures, 0).stat().st_mtime_ns == made
 
 
 @pytest.mark.parametrize(

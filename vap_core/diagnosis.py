@@ -152,7 +152,7 @@ def beside(failures: Failures, number: int, method: str) -> Path:
 
 
 def _recorded(failures: Failures, line: dict[str, Any]) -> Path:
-    from vap_core.record import Recorder, recording_name
+    from vap_core.record import Recorder, read_summary, recording_name
     from vap_core.rollout import rollout
 
     study = _study(failures.notes[line["configuration"]], line)
@@ -161,13 +161,14 @@ def _recorded(failures: Failures, line: dict[str, Any]) -> Path:
         raise BadStudy(f"diagnose: episode {line['episode']} of {line['suite']}/{line['task']} is in today's list no more; run eval again.")
     home = _home(Path(line["place"]))
     path = home / "recordings" / recording_name(row, line["method"])
-    if path.exists():
+    if path.exists() and read_summary(path)["rollout.policy"] == line["policy"]:
         return path
     memory = home / "memory"
     register_personal(study, memory)
     trial = make_trial(study, [row], line["method"], memory)
     if trial.policy.label != line["policy"]:
         raise BadStudy(f"diagnose: this was run with {line['policy']}, and {trial.policy.label} is here now; run eval again.")
+    path.unlink(missing_ok=True)  # of the weights that a table was published with before
     (episode,) = rollout(trial, [row], lambda opening: Recorder(path, opening), batch=1)
     if (episode.outcome.status, episode.outcome.steps) != (line["outcome"], line["steps"]):
         print(f"note: run again, it is a {episode.outcome.status} after {episode.outcome.steps} steps (was {line['outcome']} after {line['steps']}).")
