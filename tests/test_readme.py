@@ -1,0 +1,46 @@
+"""What the README quotes of the published tables is what they hold."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from vap_core.diagnosis import listed
+from vap_core.report.failures import breakdown
+from vap_core.report.results import results
+from vap_core.report.runs import load
+from vap_core.statistics import ALL_TASKS
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text()
+RESULTS = ROOT / "data" / "results"
+
+
+def rows(heading: str) -> list[list[str]]:
+    """The cells of the table that begins so, header first."""
+    table = README[README.index(heading) :].split("\n\n")[0].splitlines()
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in (table[0], *table[2:])]
+
+
+def test_success_rates() -> None:
+    (head, *body), whole = rows("| method | simpler-fractal"), results(load([RESULTS / "mini_pi0.parquet"]))
+    whole = whole[whole.task == ALL_TASKS]
+    quoted = {}
+    for method, *cells in body:
+        for track, cell in zip(head[1:], cells, strict=True):
+            quoted[method.split(" (")[0].strip("*").lower(), track] = cell.split("·")[0].strip(" *")
+    held = {}
+    for line in whole.itertuples():
+        track = ", ".join(filter(None, (line.suite, line.split, f"n = {line.n} of {line.listed}")))
+        held[line.method, track] = f"{line.sr:.0f} [{line.sr_low:.0f}, {line.sr_high:.0f}]"
+    assert quoted == held
+
+
+@pytest.mark.parametrize("suite", ["simpler-fractal", "simpler-bridge", "vlabench", "tabletop"])
+def test_cases_of_failure(suite: str) -> None:
+    counts = breakdown(listed(RESULTS / "mini_pi0.parquet", RESULTS / "failures.parquet", suite=suite, method="vap").whole).iloc[0]
+    text = " ".join(README[README.index("VAP's failures, by case") :].split())
+    quoted = re.search(rf"{suite} (\d+), (\d+) and (\d+) % \((\d+) of (\d+)", text)
+    shares = [f"{100 * counts[case] / counts.failed:.0f}" for case in ("case 1", "case 2", "case 3")]
+    assert quoted is not None
+    assert quoted.groups() == (*shares, str(counts.failed), str(counts.n))
