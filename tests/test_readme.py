@@ -34,6 +34,9 @@ def test_success_rates() -> None:
         track = ", ".join(filter(None, (line.suite, line.split, f"n = {line.n} of {line.listed}")))
         held[line.method, track] = f"{line.sr:.0f} [{line.sr_low:.0f}, {line.sr_high:.0f}]"
     assert quoted == held
+    vap = whole[(whole.method == "vap") & (whole.suite == "simpler-fractal")]
+    over = [f"[{line.sr_layout_low:.0f}, {line.sr_layout_high:.0f}]" for line in vap.itertuples()]
+    assert f"its VAP lies in {' and '.join(over)}" in README
 
 
 @pytest.mark.parametrize("suite", ["simpler-fractal", "simpler-bridge", "vlabench", "tabletop"])
