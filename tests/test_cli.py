@@ -7,8 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 from PIL import Image
+from typer.testing import CliRunner
 
+from vap_core.cli import app
 from vap_core.describe import WORDS
 from vap_core.memory import load_bank
 from vap_core.sim.objects import get
@@ -39,9 +42,6 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return paths
 
 
-COMMANDS = ("register", "ground", "demo", "suites", "rollout", "eval", "rescore", "publish", "show", "doctor", "bench", "eval-perception", "report")
-
-
 @pytest.fixture(scope="module")
 def line(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
     """One picture of a look-alike, the personal cup and another look-alike side by side, and the three boxes."""
@@ -65,11 +65,30 @@ def bank(photos: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS), ["train", "perception"], ["weights", "pull"]])
-def test_help_has_an_example(command: list[str]) -> None:
-    done = vap(*command, "--help")
+def leaves(app: typer.Typer, *above: str) -> list[tuple[str, ...]]:
+    """Every command, as the words that one types to run it."""
+    here = [(*above, command.name or getattr(command.callback, "__name__", "").replace("_", "-")) for command in app.registered_commands]
+    inner = [(each.typer_instance, each.name) for each in app.registered_groups]
+    return here + [words for part, name in inner if part is not None for words in leaves(part, *above, *([name] if name else []))]
+
+
+COMMANDS = leaves(app)
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_help_has_examples_to_copy_a_line_each(words: tuple[str, ...]) -> None:
+    done = CliRunner().invoke(app, [*words, "--help"])
+    lines = [line.strip() for line in done.stdout.splitlines() if line.startswith("  Example:")]
+    assert done.exit_code == 0
+    assert lines
+    assert done.stdout.count("Example:") == len(lines)
+    assert all(line.startswith(f"Example: python -m vap_core {' '.join(words)}") for line in lines)
+
+
+def test_help() -> None:
+    done = vap("--help")
     assert done.returncode == 0
-    assert not command or f"Example: python -m vap_core {' '.join(command)}" in " ".join(done.stdout.split())
+    assert all(f"  {words[0]} " in done.stdout for words in COMMANDS)
 
 
 def test_ground_answers_in_json_with_a_picture_and_a_recording(line: tuple[Path, list[str]], bank: Path, tmp_path: Path) -> None:

@@ -171,11 +171,3 @@ def test_what_makes_no_sense_is_refused_in_one_line(words: tuple[str, ...], said
     assert re.search(f"(?i)^error: .*{said}", last), done.stderr
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "out").exists(), "nothing begun, nothing left behind"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("command", ["suites", "eval", "rescore"])
-def test_help_has_an_example(command: str) -> None:
-    done = vap(command, "--help")
-    assert done.returncode == 0
-    assert f"Example: python -m vap_core {command}" in " ".join(done.stdout.split())

@@ -337,11 +337,6 @@ def test_decimation_keeps_a_closed_surface_and_its_volume():
     assert fewer.volume == pytest.approx(ball.volume, rel=0.01)
 
 
-@pytest.mark.parametrize("command", ["import", "list", "photograph"])
-def test_help_has_an_example(command):
-    assert f"Example: python -m vap_core objects {command}" in " ".join(vap(command, "--help").stdout.split())
-
-
 def test_parts_of_several_colours_become_one_object(tmp_path, quick):
     scene = trimesh.Scene()
     lower, upper = box(), box()

@@ -1,5 +1,6 @@
 """The commands. Each parses, calls one function of the house, and prints; errors the user can mend are one line, status 2."""
 
+import inspect
 import os
 import sys
 
@@ -16,6 +17,18 @@ app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_comp
 for room in (own, runs, machine):
     app.add_typer(room.app)
 INTERRUPTED = 130
+
+
+def keep_examples(app: typer.Typer) -> None:
+    """Have --help print every example on a line of its own, to be copied: click would fill them into one paragraph."""
+    for command in app.registered_commands:
+        command.help = (inspect.getdoc(command.callback) or "").replace("\n\nExample:", "\n\n\b\nExample:")
+    for group in app.registered_groups:
+        if group.typer_instance is not None:
+            keep_examples(group.typer_instance)
+
+
+keep_examples(app)
 
 
 def main() -> None:
