@@ -24,13 +24,15 @@ from vap_core.sim.scenes import build
 from vap_core.values import PolicyInput
 
 SUITE, TASK = "simpler-bridge", "put-camera"
+EVERY = ("pi0", "pi05", "smolvla", "act", "ensemble")
 
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
     root = tmp_path_factory.mktemp("checkpoints")
-    return {"pi0": tiny.pi0(root / "pi0"), "pi05": tiny.pi05(root / "pi05"), "act": tiny.act(root / "act"), "ensemble": tiny.act(
-        root / "ensemble", n_action_steps=1, temporal_ensemble_coeff=0.01)}  # fmt: skip
+    ensemble = tiny.act(root / "ensemble", n_action_steps=1, temporal_ensemble_coeff=0.01)
+    made = {make.__name__: make(root / make.__name__) for make in (tiny.pi0, tiny.pi05, tiny.smolvla, tiny.act)}
+    return {**made, "ensemble": ensemble}
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +55,7 @@ def run(policy, states, looks):
     return np.stack(chunks)
 
 
-@pytest.mark.parametrize("name", ["pi0", "pi05", "act", "ensemble"])
+@pytest.mark.parametrize("name", EVERY)
 def test_the_contract_of_a_policy(policies, name):
     policy = policies[name]
     assert isinstance(policy, Policy)
@@ -64,13 +66,13 @@ def test_the_contract_of_a_policy(policies, name):
     for chunk in chunks:
         assert chunk.dtype == np.float32
         assert chunk.shape == (policy.execute, tiny.ACTION)
-    assert policy.execute == {"pi0": 2, "pi05": 2, "act": 3, "ensemble": 1}[name]
+    assert policy.execute == {"pi0": 2, "pi05": 2, "smolvla": 2, "act": 3, "ensemble": 1}[name]
     assert policy.sha256() == before
     assert not policy.policy.training
     assert not any(weight.requires_grad for weight in policy.policy.parameters())
 
 
-@pytest.mark.parametrize("name", ["pi0", "pi05", "act", "ensemble"])
+@pytest.mark.parametrize("name", EVERY)
 def test_a_batch_equals_one_by_one_whatever_the_global_seed(policies, name):
     policy, looks = (
         policies[name],
@@ -86,16 +88,18 @@ def test_a_batch_equals_one_by_one_whatever_the_global_seed(policies, name):
     assert torch.equal(torch.get_rng_state(), drawn)
 
 
-def test_sampling_noise_is_fixed_within_an_episode_and_differs_between_episodes(policies):
-    policy = policies["pi0"]
+@pytest.mark.parametrize("name", ["pi0", "smolvla"])
+def test_sampling_noise_is_fixed_within_an_episode_and_differs_between_episodes(policies, name):
+    policy = policies[name]
     states, first = policy.plan(begin(policy, 2), [look(0), look(0)])
     _, again = policy.plan(states, [look(0), look(0)])
     assert all((a == b).all() for a, b in zip(first, again, strict=True))
     assert np.abs(first[0] - first[1]).max() > 1e-4
 
 
-def test_text_and_picture_reach_the_policy(policies):
-    policy, (state,) = policies["pi0"], begin(policies["pi0"], 1)
+@pytest.mark.parametrize("name", ["pi0", "smolvla"])
+def test_text_and_picture_reach_the_policy(policies, name):
+    policy, (state,) = policies[name], begin(policies[name], 1)
     seen = look(0)
     red = PolicyInput({"front": seen.images["front"] // 2}, seen.text, seen.state)
     plain, worded, tinted = (run(policy, [state], [one]) for one in (seen, look(0, "put the red camera on the plate"), red))
@@ -103,7 +107,7 @@ def test_text_and_picture_reach_the_policy(policies):
     assert np.abs(plain - tinted).max() > 1e-6
 
 
-@pytest.mark.parametrize("name", ["pi0", "pi05", "act", "ensemble"])
+@pytest.mark.parametrize("name", EVERY)
 def test_it_tells_what_its_tensors_hold(policies, name):
     """The audit hears the image and token tensors themselves, after the checkpoint's own preprocessing."""
     policy, plain = policies[name], [look(0), look(1)]
@@ -112,7 +116,7 @@ def test_it_tells_what_its_tensors_hold(policies, name):
     prompted = [plain[0], replace(plain[1], images={"front": tinted}, text="put the red camera on the plate")]
     _, _, heard, raw = audit.plan(policy, begin(policy, 2), prompted, plain)
     assert heard[0] == raw[0]
-    assert heard[1].keys() == ({"front", TEXT} if name.startswith("pi") else {"front"})
+    assert heard[1].keys() == ({"front", TEXT} if name in ("pi0", "pi05", "smolvla") else {"front"})
     assert all(heard[1][part] != raw[1][part] for part in heard[1])
 
 
@@ -179,7 +183,7 @@ def test_names_are_mapped_by_the_checkpoints_own_rename_map(folders, tmp_path):
     assert (run(policy, begin(policy, 1), [headed]) == run(load(folders["act"]), begin(policy, 1), [seen])).all()
 
 
-@pytest.mark.parametrize("name", ["pi0", "act"])
+@pytest.mark.parametrize("name", ["pi0", "smolvla", "act"])
 @pytest.mark.parametrize("fault", ["missing", "extra", "shape"])
 def test_weights_that_are_not_the_files_are_refused(folders, tmp_path, name, fault):
     folder = copy_of(folders[name], tmp_path)
@@ -245,6 +249,15 @@ def test_what_is_missing_or_damaged_is_one_line(folders, tmp_path):
             load(folder)
 
 
+def test_a_backbone_that_was_not_downloaded_is_named(folders, tmp_path, monkeypatch):
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    folder = copy_of(folders["smolvla"], tmp_path)
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps({**config, "vlm_model_name": "owner/backbone"}))
+    with pytest.raises(BadPolicy, match=r"cannot become a policy \(.*get what it builds on: `hf download owner/backbone`\.$"):
+        load(folder)
+
+
 def test_a_fingerprint_tells_checkpoints_apart(folders, tmp_path):
     folder = copy_of(folders["act"], tmp_path)
     assert fingerprint(folder) == fingerprint(folders["act"]) != fingerprint(folders["ensemble"])
@@ -264,7 +277,7 @@ def scene(rows):
         yield built
 
 
-@pytest.mark.parametrize("name", ["pi0", "pi05", "act", "ensemble"])
+@pytest.mark.parametrize("name", EVERY)
 def test_a_rollout_in_a_real_suite(policies, rows, scene, name):
     policy: LeRobot = policies[name]
     before = policy.sha256()

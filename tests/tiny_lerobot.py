@@ -7,8 +7,12 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import ACTConfig, make_pre_post_processors
 from lerobot.policies.act.modeling_act import ACTPolicy
+from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
+from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
+from tokenizers import Tokenizer, models, pre_tokenizers
+from transformers import PreTrainedTokenizerFast, SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor, SmolVLMVideoProcessor
 
-from vap_core.policies.toy_pi0 import Toy, save_toy
+from vap_core.policies.toy_pi0 import WORDS, Toy, save_toy
 
 TOY = Toy(image=64, patch=16, width=32, layers=1, expert=32, chunk=2, denoise=2)
 STATE, ACTION = 13, 7
@@ -24,20 +28,55 @@ def pi05(folder: Path) -> Path:
     return save_toy(folder, ("front",), STATE, ACTION, TOY, "pi05")
 
 
+def smolvla(folder: Path) -> Path:
+    """Its backbone, which a real checkpoint names by its hub id, lies beside it."""
+    config = SmolVLAConfig(
+        **_features(64), device="cpu", chunk_size=3, n_action_steps=2, resize_imgs_with_padding=(64, 64), tokenizer_max_length=16, num_steps=2,
+        num_vlm_layers=2, vlm_model_name=str(_smolvlm(folder.with_name(f"{folder.name}-backbone"))),
+    )  # fmt: skip
+    return _saved(folder, config, SmolVLAPolicy)
+
+
+def _smolvlm(folder: Path) -> Path:
+    """SmolVLM's configuration, and a processor whose tokenizer knows few words."""
+    special = {"image_token": "<image>", "fake_image_token": "<fake>", "global_image_token": "<global>", "end_of_utterance_token": "<end>"}
+    words = {word: i for i, word in enumerate((*WORDS.split(), "<s>", "</s>", *special.values()))}
+    known = Tokenizer(models.WordLevel(words, unk_token="<unk>"))
+    known.pre_tokenizer = pre_tokenizers.Whitespace()
+    tokenizer = PreTrainedTokenizerFast(
+        tokenizer_object=known, pad_token="<pad>", unk_token="<unk>", bos_token="<s>", eos_token="</s>", extra_special_tokens=special
+    )
+    SmolVLMProcessor(SmolVLMImageProcessor(), tokenizer, SmolVLMVideoProcessor(), image_seq_len=4).save_pretrained(folder)
+    numbers = {"pad_token_id": words["<pad>"], "bos_token_id": words["<s>"], "eos_token_id": words["</s>"], "vocab_size": len(words)}
+    heads = {"num_attention_heads": 4, "num_key_value_heads": 2, "head_dim": 16}
+    text = {"model_type": "llama", "hidden_size": 64, "intermediate_size": 64, "num_hidden_layers": 2, **heads, **numbers}
+    seen = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 1, "num_attention_heads": 2, "image_size": 64, "patch_size": 16}
+    config = SmolVLMConfig(text_config=text, vision_config=seen, scale_factor=2, image_token_id=words["<image>"], pad_token_id=words["<pad>"])
+    config.save_pretrained(folder)
+    return folder
+
+
 def act(folder: Path, side: int = 64, **how: Any) -> Path:
     """One image, no language; actions are un-normalised by a known mean and deviation."""
     config = ACTConfig(
-        input_features={
-            "observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, side, side)),
-            "observation.state": PolicyFeature(FeatureType.STATE, (STATE,)),
-        },
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (ACTION,))},
-        device="cpu", pretrained_backbone_weights=None, dim_model=32, n_heads=4, dim_feedforward=32, n_encoder_layers=1, n_vae_encoder_layers=1,
-        **{"chunk_size": 3, "n_action_steps": 3, **how},
+        **_features(side), device="cpu", pretrained_backbone_weights=None, dim_model=32, n_heads=4, dim_feedforward=32, n_encoder_layers=1,
+        n_vae_encoder_layers=1, **{"chunk_size": 3, "n_action_steps": 3, **how},
     )  # fmt: skip
+    return _saved(folder, config, ACTPolicy)
+
+
+def _features(side: int) -> dict[str, Any]:
+    seen = {
+        "observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, side, side)),
+        "observation.state": PolicyFeature(FeatureType.STATE, (STATE,)),
+    }
+    return {"input_features": seen, "output_features": {"action": PolicyFeature(FeatureType.ACTION, (ACTION,))}}
+
+
+def _saved(folder: Path, config: Any, kind: Any) -> Path:
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        ACTPolicy(config).save_pretrained(folder)
+        kind(config).save_pretrained(folder)
     stats = {
         "observation.images.front": {"mean": torch.zeros(3, 1, 1), "std": torch.ones(3, 1, 1)},
         "observation.state": {"mean": torch.zeros(STATE), "std": torch.ones(STATE)},

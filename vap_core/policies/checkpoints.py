@@ -45,6 +45,13 @@ def setting(checkpoint: str | Path, name: str) -> str:
         raise BadPolicy(f"load: {file} is no configuration ({type(error).__name__}); save the checkpoint again with lerobot 0.6.") from error
 
 
+def foundations(folder: Path) -> list[str]:
+    """Models of the hub that a checkpoint builds on: the backbone whose sizes it takes, the tokenizer that reads its commands."""
+    steps = json.loads((folder / PIPELINES[0]).read_text())["steps"]
+    names = [setting(folder, "vlm_model_name"), *(step.get("config", {}).get("tokenizer_name", "") for step in steps)]
+    return list(dict.fromkeys(name for name in names if name and not Path(name).is_dir()))
+
+
 def fingerprint(checkpoint: str | Path) -> str:
     """SHA-256 of everything in a checkpoint that decides what it does, without loading it."""
     found, folder = hashlib.sha256(), locate(checkpoint)

@@ -26,7 +26,7 @@ from jaxtyping import Float32
 
 from vap_core.errors import BadPolicy
 from vap_core.policies import attention
-from vap_core.policies.checkpoints import PIPELINES, WEIGHTS, fingerprint, locate, refuse_code
+from vap_core.policies.checkpoints import PIPELINES, WEIGHTS, fingerprint, foundations, locate, refuse_code
 from vap_core.policies.witness import TEXT, listened, tell
 from vap_core.sim.env import Env
 from vap_core.sim.scenes import Scene
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from lerobot.policies.pretrained import PreTrainedPolicy
 
 STATE, IMAGE, EMPTY = "observation.state", "observation.images.", "observation.images.empty_camera"
-TOKENS = "observation.language.tokens"
+TOKENS, READ = "observation.language.tokens", "observation.language.attention_mask"
 """lerobot's feature keys; a checkpoint fills its empty cameras itself."""
 DRAWS_NOTHING = ("act",)
 """Policies whose chunk is a function of what they see."""
@@ -152,12 +152,17 @@ class LeRobot:
         return out
 
     def _tell(self, batch: dict[str, Any], episodes: Sequence[int]) -> None:
-        """What stands in the tensors that the policy is about to read, one row per episode."""
+        """What stands in the tensors that the policy is about to read, one row per episode; of its tokens those that do not pad a shorter text."""
         if not listened():
             return
         for key, tensor in batch.items():
-            name = TEXT if key == TOKENS else self.renamed.get(key, key).removeprefix(IMAGE) if key.startswith(IMAGE) else ""
-            for episode, row in zip(episodes, tensor if name else (), strict=bool(name)):
+            if key == TOKENS:
+                name, rows = TEXT, [row[read] for row, read in zip(tensor, batch[READ], strict=True)]
+            elif key.startswith(IMAGE):
+                name, rows = self.renamed.get(key, key).removeprefix(IMAGE), list(tensor)
+            else:
+                continue
+            for episode, row in zip(episodes, rows, strict=True):
                 tell(episode, name, row.float().cpu().numpy())
 
     @contextmanager
@@ -249,10 +254,10 @@ def load(checkpoint: str | Path, device: str | None = None) -> LeRobot:
             moved = {"device_processor": {"device": config.device}}
             before, after = policies.make_pre_post_processors(config, str(folder), preprocessor_overrides=moved)
     except Exception as error:
-        reason = str(error).strip().splitlines() or [""]
-        raise BadPolicy(
-            f"load: {folder} cannot become a policy ({type(error).__name__}: {reason[0]:.200}); check its files, or save it again with lerobot 0.6."
-        ) from error
+        reason, mend = str(error).strip().splitlines() or [""], "check its files, or save it again with lerobot 0.6"
+        if "huggingface.co" in str(error):
+            mend = "get what it builds on: " + ", ".join(f"`hf download {name}`" for name in foundations(folder))
+        raise BadPolicy(f"load: {folder} cannot become a policy ({type(error).__name__}: {reason[0]:.200}); {mend}.") from error
     with _silence():
         compare(policy, folder / WEIGHTS)
     return LeRobot(policy, before, after, f"{config.type}:{folder.name if Path(checkpoint).is_dir() else checkpoint}@{fingerprint(folder)[:8]}")
