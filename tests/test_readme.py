@@ -41,7 +41,7 @@ def test_success_rates() -> None:
 
 @pytest.mark.parametrize("suite", ["simpler-fractal", "simpler-bridge", "vlabench", "tabletop"])
 def test_cases_of_failure(suite: str) -> None:
-    counts = breakdown(listed(RESULTS / "mini_pi0.parquet", RESULTS / "failures.parquet", suite=suite, method="vap").whole).iloc[0]
+    counts = breakdown(listed(RESULTS / "mini_pi0.parquet", suite=suite, method="vap").whole).iloc[0]
     text = " ".join(README[README.index("VAP's failures, by case") :].split())
     quoted = re.search(rf"{suite} (\d+), (\d+) and (\d+) % \((\d+) of (\d+)", text)
     shares = [f"{100 * counts[case] / counts.failed:.0f}" for case in ("case 1", "case 2", "case 3")]

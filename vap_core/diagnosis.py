@@ -1,6 +1,6 @@
 """From the table of a run to the frame that explains a failure.
 
-    failures = listed(Path("data/results/failures.parquet"), case=2, suite="vlabench")
+    failures = listed(Path("data/results/mini_pi0.parquet"), case=2, suite="vlabench")
     path = recording(failures, 0)
 
 A failure that was not recorded is run again: the same row, weights and seed give the same episode.

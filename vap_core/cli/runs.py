@@ -159,7 +159,7 @@ def diagnose(
     """Say why episodes failed, list them, and open one at the frame that decided it; one that was not recorded is run again.
 
     Example: python -m vap_core diagnose data/results/mini_pi0.parquet --method vap
-    Example: python -m vap_core diagnose data/results/failures.parquet --suite vlabench --case 2 --open 0
+    Example: python -m vap_core diagnose data/results/mini_pi0.parquet --suite vlabench --case 2 --open 0
     Example: python -m vap_core diagnose data/results/mini_pi0.parquet --method generic --open 0 --against vap --png beside.png
     Example: python -m vap_core diagnose data/runs/demo --where "margin < 0.3" --open 0 --png why.png
     Example: python -m vap_core diagnose data/runs/demo --open 0 --correct "case 3: slip" --note "it held for a moment"
