@@ -1,81 +1,16 @@
-"""Scans of the user's own: what comes in, what is refused and how it is mended, and that the object then works as any other."""
-
-import json
-import subprocess
-import sys
-from pathlib import Path
+"""Scans of the user's own: what comes in, what is refused, and how it is mended."""
 
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
 
-from vap_core.errors import BadObject, BadOutput, UnknownName
-from vap_core.sim import objects
-from vap_core.sim.gl import ensure_gl
+from tests.scanned import BLUE, RED, box, mug, put
+from vap_core.errors import BadObject
 from vap_core.sim.scans import bring as bringing
-from vap_core.sim.scans import stored
 from vap_core.sim.scans.bring import bring
 from vap_core.sim.scans.source import read
 from vap_core.sim.scans.triangles import decimate
-from vap_core.sim.scenes import build
 from vap_core.sim.shapes import Hull
-from vap_core.sim.studio import reference_views
-
-ensure_gl()
-import mujoco  # noqa: E402
-
-RED, BLUE = (204, 40, 40), (30, 60, 170)
-
-
-def mug(n: int = 24, rows: int = 5) -> trimesh.Trimesh:
-    """A hollow mug, 9 cm tall and 7 cm wide, y up as glTF has it: its lower half blue, its upper half red outside and inside."""
-    up, down = np.linspace(0, 0.09, rows), np.linspace(0.09, 0.01, rows)
-    profile = [(0, 0), *((0.035, z) for z in up), *((0.029, z) for z in down), (0, 0.01)]
-    radius, z = np.array(profile).T
-    turn = 2 * np.pi * np.arange(n + 1) / n
-    turn[-1] = 0
-    grid = np.stack([radius[:, None] * np.cos(turn), np.broadcast_to(z[:, None], (len(z), n + 1)), -radius[:, None] * np.sin(turn)], axis=-1)
-    uv = np.stack(np.broadcast_arrays(np.arange(n + 1) / n, z[:, None] / 0.09), axis=-1)
-    start = (np.arange(len(z) - 1)[:, None] * (n + 1) + np.arange(n)).ravel()
-    step = n + 1
-    face = np.concatenate([np.stack([start, start + 1, start + step + 1], 1), np.stack([start, start + step + 1, start + step], 1)])
-    picture = np.zeros((256, 256, 3), np.uint8)
-    picture[:128], picture[128:] = RED, BLUE
-    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(picture))
-    visual = trimesh.visual.TextureVisuals(uv=uv.reshape(-1, 2), material=material)
-    return trimesh.Trimesh(grid.reshape(-1, 3), face, visual=visual, process=False)
-
-
-def box(**look) -> trimesh.Trimesh:
-    solid = trimesh.creation.box((0.06, 0.05, 0.08))
-    if look:
-        solid.visual.vertex_colors = np.tile([*look["rgb"], 255], (8, 1)).astype(np.uint8)
-    return solid
-
-
-def put(folder: Path, name: str, mesh: trimesh.Trimesh | trimesh.Scene) -> Path:
-    mesh.export(folder / name)
-    return folder / name
-
-
-def vap(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "vap_core", "objects", *map(str, words)], capture_output=True, text=True, timeout=300)
-
-
-@pytest.fixture(scope="module")
-def shelf(tmp_path_factory):
-    """A folder of objects that holds one scanned mug, brought in by the command; all lookups go there."""
-    with pytest.MonkeyPatch.context() as patch:
-        folder = tmp_path_factory.mktemp("shelf")
-        patch.setenv("VAP_OBJECTS", str(folder / "objects"))
-        file = put(folder, "mug.glb", mug())
-        done = vap("import", file, "--category", "Cup", "--name", "my-mug", "--licence", "CC-BY 4.0, Jane Doe")
-        assert done.returncode == 0, done.stderr
-        assert "convex parts" in done.stderr
-        assert "my-mug: a cup, 7.0 x 7.0 x 9.0 cm" in done.stdout
-        assert "next: python -m vap_core objects photograph 'my-mug'" in done.stdout
-        yield folder
 
 
 @pytest.fixture
@@ -92,111 +27,6 @@ def quick(monkeypatch):
 
 def silent(line: str) -> None:
     """Say nothing."""
-
-
-def test_an_imported_mug_is_an_object_like_any_other(shelf):
-    model = objects.get("my-mug")
-    assert (model.category, model.split) == ("cup", "personal")
-    assert objects.extent_m(model) == pytest.approx((0.07, 0.07, 0.09), abs=1e-6)
-    assert objects.mesh(model).vertex[:, 2].min() == pytest.approx(0, abs=1e-9)
-    solids = model.shape.solids()
-    assert 4 <= len(solids) <= bringing.HULLS
-    assert model.mass_kg == pytest.approx(np.clip(400 * sum(hull.volume for hull in solids), 0.03, 0.5), abs=1e-4)
-    about = json.loads((shelf / "objects" / "my-mug" / "object.json").read_text())
-    assert about["licence"] == "CC-BY 4.0, Jane Doe"
-    assert about["source"] == "mug.glb"
-    assert len(about["source_sha256"]) == 64
-
-
-def test_it_stands_on_the_table_and_holds_its_shape_as_a_cup(shelf):
-    with build("wx250s", ["my-mug"]) as scene:
-        data = mujoco.MjData(scene.model)
-        data.joint("my-mug/free").qpos[:3] = 0.3, 0.0, 0.001
-        mujoco.mj_step(scene.model, data, 600)
-        pose = data.joint("my-mug/free").qpos
-        assert pose[:3] == pytest.approx((0.3, 0.0, 0.0), abs=1e-3)
-        assert 1 - 2 * (pose[4] ** 2 + pose[5] ** 2) > 0.999
-        assert scene.model.body("my-mug").mass[0] == pytest.approx(objects.get("my-mug").mass_kg)
-        mask = scene.eyes.masks(data, "front", 224)["my-mug"]
-        seen = scene.eyes.rgb(data, "front", 224)[mask].astype(int)
-    assert mask.sum() > 300
-    assert (seen[:, 0] > 1.8 * seen[:, 2]).mean() > 0.25
-    assert (seen[:, 2] > 1.8 * seen[:, 0]).mean() > 0.25
-
-
-def test_its_photos_show_the_texture_the_right_way_up(shelf):
-    for photo in reference_views(objects.get("my-mug"), n=3, size=160):
-        rows = np.arange(160)[:, None]
-        red, blue = ((photo[..., a] > 2.0 * photo[..., b]) & (photo[..., a] > 40) for a, b in ((0, 2), (2, 0)))
-        assert min(red.sum(), blue.sum()) > 300
-        assert (rows * red).sum() / red.sum() + 10 < (rows * blue).sum() / blue.sum()
-
-
-def test_list_shows_it_beside_the_workspaces_own(shelf):
-    done = vap("list")
-    assert done.returncode == 0, done.stderr
-    line = next(line for line in done.stdout.splitlines() if line.startswith("my-mug"))
-    assert line.split()[1:4] == ["cup", "personal", "-"]
-    assert "7.0 x 7.0 x 9.0" in line
-    assert "cup-lookalike-1" in done.stdout
-    with pytest.raises(UnknownName, match="known: .*my-mug"):
-        objects.get("my-jug")
-
-
-def test_a_name_that_is_taken_needs_replace(shelf):
-    file = shelf / "mug.glb"
-    again = vap("import", file, "--category", "cup", "--name", "my-mug")
-    assert again.returncode == 2
-    assert again.stderr.strip().endswith("choose another --name or pass --replace.")
-    with pytest.raises(BadObject, match="one of the workspace's own objects; choose another --name"):
-        bring(file, "cup-personal", "cup")
-    with pytest.raises(BadObject, match="cannot name an object"):
-        bring(file, "../mug", "cup")
-    with pytest.raises(BadObject, match="cannot be a category"):
-        bring(file, "mug", "cup!")
-
-
-@pytest.mark.parametrize("name", stored.FILES)
-def test_a_damaged_file_is_named(shelf, tmp_path, name):
-    card, body = stored.load(shelf / "objects" / "my-mug")
-    place = stored.save(tmp_path, card, body)
-    whole = (place / name).read_bytes()
-    (place / name).write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(BadObject, match=rf"{name} is damaged .*import the object again with --replace"):
-        stored.load(place)
-    (place / name).unlink()
-    with pytest.raises(BadObject, match=rf"{name} is missing"):
-        stored.load(place)
-
-
-def test_a_damaged_card_is_named(shelf, tmp_path):
-    card, body = stored.load(shelf / "objects" / "my-mug")
-    path = stored.save(tmp_path, card, body) / "object.json"
-    about = json.loads(path.read_text())
-    for change, message in (
-        ({"version": 9}, "another version"),
-        ({"mass_kg": -1.0}, "is damaged"),
-        ({"name": "x"}, "is damaged"),
-        ({"boo": 1}, "is damaged"),
-    ):
-        path.write_text(json.dumps(about | change) + " " * len(message))
-        with pytest.raises(BadObject, match=f"object.json is .*{message.removeprefix('is ')}"):
-            stored._card(path.parent)
-    path.write_text("{")
-    with pytest.raises(BadObject, match="object.json is damaged"):
-        stored._card(path.parent)
-
-
-def test_what_was_saved_is_what_is_loaded(shelf, tmp_path):
-    card, body = stored.load(shelf / "objects" / "my-mug")
-    _, again = stored.load(stored.save(tmp_path, card, body))
-    assert np.array_equal(again.form.vertex, body.form.vertex)
-    assert np.array_equal(again.image, body.image)
-    assert all(np.array_equal(a.vertex, b.vertex) for a, b in zip(again.hulls, body.hulls, strict=True))
-    with pytest.raises(BadOutput, match="--replace"):
-        stored.save(tmp_path, card, body)
-    stored.save(tmp_path, card, body, replace=True)
-    assert [path.name for path in tmp_path.iterdir()] == ["my-mug"]
 
 
 def test_unreadable_files_are_refused(tmp_path):
@@ -348,12 +178,3 @@ def test_parts_of_several_colours_become_one_object(tmp_path, quick):
     assert np.ptp(body.form.vertex, axis=0) == pytest.approx((0.06, 0.08, 0.15), abs=1e-6)
     found, count = np.unique(body.image.reshape(-1, 3), axis=0, return_counts=True)
     assert {tuple(map(int, rgb)) for rgb in found[np.argsort(-count)[:2]]} == {RED, BLUE}
-
-
-def test_photograph_writes_the_reference_views(shelf):
-    done = vap("photograph", "my-mug", "--out", shelf / "photos", "--views", "2")
-    assert done.returncode == 0, done.stderr
-    assert "register 'my-mug' --category 'cup'" in done.stdout
-    for i in range(2):
-        with Image.open(shelf / "photos" / f"my-mug-{i}.png") as photo:
-            assert photo.size == (320, 320)
