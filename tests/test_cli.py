@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -65,14 +66,13 @@ def bank(photos: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def leaves(app: typer.Typer, *above: str) -> list[tuple[str, ...]]:
+def leaves(command: Any, *above: str) -> list[tuple[str, ...]]:
     """Every command, as the words that one types to run it."""
-    here = [(*above, command.name or getattr(command.callback, "__name__", "").replace("_", "-")) for command in app.registered_commands]
-    inner = [(each.typer_instance, each.name) for each in app.registered_groups]
-    return here + [words for part, name in inner if part is not None for words in leaves(part, *above, *([name] if name else []))]
+    inner = getattr(command, "commands", {})
+    return [words for name, part in inner.items() for words in leaves(part, *above, name)] or [above]
 
 
-COMMANDS = leaves(app)
+COMMANDS = leaves(typer.main.get_command(app))
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)

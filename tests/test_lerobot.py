@@ -249,12 +249,16 @@ def test_what_is_missing_or_damaged_is_one_line(folders, tmp_path):
             load(folder)
 
 
-def test_a_backbone_that_was_not_downloaded_is_named(folders, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "file", "part"), [("smolvla", "config.json", "smolvla-backbone"), ("pi0", "policy_preprocessor.json", "pi0/tokenizer")]
+)
+def test_a_backbone_that_was_not_downloaded_is_named(folders, tmp_path, monkeypatch, name, file, part):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
-    folder = copy_of(folders["smolvla"], tmp_path)
-    config = json.loads((folder / "config.json").read_text())
-    (folder / "config.json").write_text(json.dumps({**config, "vlm_model_name": "owner/backbone"}))
-    with pytest.raises(BadPolicy, match=r"cannot become a policy \(.*get what it builds on: `hf download owner/backbone`\.$"):
+    folder, here = copy_of(folders[name], tmp_path), str(folders["pi0"].parent / part)
+    told = (folder / file).read_text()
+    assert here in told
+    (folder / file).write_text(told.replace(here, "owner/backbone"))
+    with toy_sizes(tiny.TOY), pytest.raises(BadPolicy, match=r"cannot become a policy \(.*get what it builds on: `hf download owner/backbone`\.$"):
         load(folder)
 
 

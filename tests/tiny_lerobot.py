@@ -9,10 +9,9 @@ from lerobot.policies import ACTConfig, make_pre_post_processors
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
-from tokenizers import Tokenizer, models, pre_tokenizers
-from transformers import PreTrainedTokenizerFast, SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor, SmolVLMVideoProcessor
+from transformers import SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor, SmolVLMVideoProcessor
 
-from vap_core.policies.toy_pi0 import WORDS, Toy, save_toy
+from vap_core.policies.toy_pi0 import Toy, save_toy, tokenizer
 
 TOY = Toy(image=64, patch=16, width=32, layers=1, expert=32, chunk=2, denoise=2)
 STATE, ACTION = 13, 7
@@ -40,18 +39,13 @@ def smolvla(folder: Path) -> Path:
 def _smolvlm(folder: Path) -> Path:
     """SmolVLM's configuration, and a processor whose tokenizer knows few words."""
     special = {"image_token": "<image>", "fake_image_token": "<fake>", "global_image_token": "<global>", "end_of_utterance_token": "<end>"}
-    words = {word: i for i, word in enumerate((*WORDS.split(), "<s>", "</s>", *special.values()))}
-    known = Tokenizer(models.WordLevel(words, unk_token="<unk>"))
-    known.pre_tokenizer = pre_tokenizers.Whitespace()
-    tokenizer = PreTrainedTokenizerFast(
-        tokenizer_object=known, pad_token="<pad>", unk_token="<unk>", bos_token="<s>", eos_token="</s>", extra_special_tokens=special
-    )
-    SmolVLMProcessor(SmolVLMImageProcessor(), tokenizer, SmolVLMVideoProcessor(), image_seq_len=4).save_pretrained(folder)
-    numbers = {"pad_token_id": words["<pad>"], "bos_token_id": words["<s>"], "eos_token_id": words["</s>"], "vocab_size": len(words)}
+    words = tokenizer(folder, "<s>", "</s>", *special.values(), bos_token="<s>", eos_token="</s>", extra_special_tokens=special)
+    SmolVLMProcessor(SmolVLMImageProcessor(), words, SmolVLMVideoProcessor(), image_seq_len=4).save_pretrained(folder)
+    numbers = {"pad_token_id": words.pad_token_id, "bos_token_id": words.bos_token_id, "eos_token_id": words.eos_token_id, "vocab_size": len(words)}
     heads = {"num_attention_heads": 4, "num_key_value_heads": 2, "head_dim": 16}
     text = {"model_type": "llama", "hidden_size": 64, "intermediate_size": 64, "num_hidden_layers": 2, **heads, **numbers}
     seen = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 1, "num_attention_heads": 2, "image_size": 64, "patch_size": 16}
-    config = SmolVLMConfig(text_config=text, vision_config=seen, scale_factor=2, image_token_id=words["<image>"], pad_token_id=words["<pad>"])
+    config = SmolVLMConfig(text_config=text, vision_config=seen, scale_factor=2, image_token_id=words.image_token_id, pad_token_id=words.pad_token_id)
     config.save_pretrained(folder)
     return folder
 

@@ -255,8 +255,8 @@ def load(checkpoint: str | Path, device: str | None = None) -> LeRobot:
             before, after = policies.make_pre_post_processors(config, str(folder), preprocessor_overrides=moved)
     except Exception as error:
         reason, mend = str(error).strip().splitlines() or [""], "check its files, or save it again with lerobot 0.6"
-        if "huggingface.co" in str(error):
-            mend = "get what it builds on: " + ", ".join(f"`hf download {name}`" for name in foundations(folder))
+        if "huggingface.co" in str(error) and (names := foundations(folder)):
+            mend = "get what it builds on: " + ", ".join(f"`hf download {name}`" for name in names)
         raise BadPolicy(f"load: {folder} cannot become a policy ({type(error).__name__}: {reason[0]:.200}); {mend}.") from error
     with _silence():
         compare(policy, folder / WEIGHTS)

@@ -79,7 +79,7 @@ def save_toy(folder: Path, cameras: Sequence[str], state_size: int, action_size:
         device="cpu", chunk_size=size.chunk, n_action_steps=size.chunk, max_state_dim=state_size, max_action_dim=action_size,
         image_resolution=(side, side), num_inference_steps=size.denoise, tokenizer_max_length=16 if kind == "pi0" else 48,
     )  # fmt: skip
-    names = _tokenizer(folder / "tokenizer")
+    names = tokenizer(folder / "tokenizer")
     with toy_sizes(size), torch.random.fork_rng():
         torch.manual_seed(0)
         get_policy_class(kind)(config).save_pretrained(folder)
@@ -97,12 +97,13 @@ def _statistics(std: Any) -> dict[str, Any]:
     return {"mean": 0 * std, "std": std, "q01": -2 * std, "q99": 2 * std}
 
 
-def _tokenizer(folder: Path) -> Any:
+def tokenizer(folder: Path, *more: str, **special: Any) -> Any:
+    """Kept in `folder`: a tokenizer of a few dozen words, and `more`; `special` says what some of them are for."""
     from tokenizers import Regex, Tokenizer, models, pre_tokenizers
     from transformers import PreTrainedTokenizerFast
 
-    tokens = Tokenizer(models.WordLevel({word: i for i, word in enumerate(WORDS.split())}, unk_token="<unk>"))
+    tokens = Tokenizer(models.WordLevel({word: i for i, word in enumerate((*WORDS.split(), *more))}, unk_token="<unk>"))
     tokens.pre_tokenizer = pre_tokenizers.Split(Regex(r"[\s,.]+"), "removed")
-    fast = PreTrainedTokenizerFast(tokenizer_object=tokens, pad_token="<pad>", unk_token="<unk>")
+    fast = PreTrainedTokenizerFast(tokenizer_object=tokens, pad_token="<pad>", unk_token="<unk>", **special)
     fast.save_pretrained(folder)
     return fast
