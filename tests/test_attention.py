@@ -123,7 +123,7 @@ def test_the_policy_that_ships_looks_at_what_is_tinted(tmp_path: Path) -> None:
     assert METHODS["oracle-mask"] is not None
     hits = 0
     for row, sink_of, one, other in zip(rows, sinks, watching_it, plain, strict=True):
-        assert all((a.action == b.action).all() for a, b in zip(one.frames, other.frames, strict=True))
+        assert all(np.array_equal(a.action, b.action) for a, b in zip(one.frames, other.frames, strict=True))
         frames = sink_of.frames
         assert [bool(kept.attention) for kept in frames] == [True, False, False, False, True, False]  # type: ignore[attr-defined]
         assert not any(kept.attention for kept in one.frames), "light frames carry none"

@@ -36,7 +36,7 @@ def test_tint_and_words_are_proven_to_arrive_and_nothing_changes(trial: Trial) -
         assert [(call.step, call.name) for call in one.calls] == [(step, name) for step in (0, 2) for name in (TEXT, "front")]
         assert all(call.changed and call.sound for call in one.calls)
         assert all(call.pixels > 30 for call in one.calls if call.name == "front")
-        assert all((a.action == b.action).all() for a, b in zip(one.frames, other.frames, strict=True))
+        assert all(np.array_equal(a.action, b.action) for a, b in zip(one.frames, other.frames, strict=True))
 
 
 def test_generic_consumes_what_the_cameras_saw(trial: Trial) -> None:

@@ -140,7 +140,7 @@ def test_a_batch_equals_one_by_one(joint):
     for one, other in zip(together, alone, strict=True):
         assert asdict(one.outcome) == asdict(other.outcome)
         for a, b in zip(one.frames, other.frames, strict=True):
-            assert (a.action == b.action).all()
+            assert np.array_equal(a.action, b.action)
             assert (a.state == b.state).all()
             assert all((a.truth.objects_world[name] == pose).all() for name, pose in b.truth.objects_world.items())
 

@@ -84,7 +84,7 @@ def same(one: Episode, other: Episode) -> None:
     assert one.outcome.steps == other.outcome.steps
     assert one.summary().items() >= {k: v for k, v in other.summary().items() if not k.startswith("seconds")}.items()
     for a, b in zip(one.frames, other.frames, strict=True):
-        assert (a.action == b.action).all()
+        assert np.array_equal(a.action, b.action)
         assert (a.state == b.state).all()
 
 
@@ -129,6 +129,7 @@ def test_generic_sees_raw_images_and_raw_words(bank: Path) -> None:
     (episode,) = rollout(trial, [replace(STUDY.rows(SUITE, TASK)[0], max_steps=2)], keep_images=True)
     assert episode.opening.rewritten == episode.opening.instruction
     assert all((f.images["front"] == f.prompted["front"]).all() for f in episode.frames)
+    assert [frame.action is None for frame in episode.frames] == [False, False, True], "nothing is executed at the terminal frame"
 
 
 def test_an_episode_that_breaks_is_an_error_with_its_traceback_and_its_recording(bank: Path, tmp_path: Path) -> None:

@@ -26,11 +26,15 @@ AFAR, NEAR = (0.3, 0.0, 0.5), (0.3, 0.0, 0.08)
 """Where the tcp is: half a metre over the target's foot, and 1 cm over its top."""
 
 
+def commanded(grip):
+    return None if grip is None else np.array([0] * 6 + [grip], np.float32)
+
+
 def episode(rule, steps, goal="", candidates=1, outcome=None):
-    """`steps`: truth, what is shown, where the tcp is, the gripper's command."""
+    """`steps`: truth, what is shown, where the tcp is, the gripper's command (None at a terminal frame)."""
     known = replace(row(rule, goal), suite="simpler-bridge")
     frames = tuple(
-        Frame(i, i / 5, {}, {}, {}, (), np.array([*where, 0, 0, 0, 1], np.float32), np.array([0] * 6 + [grip], np.float32), now, (), tuple(seen))
+        Frame(i, i / 5, {}, {}, {}, (), np.array([*where, 0, 0, 0, 1], np.float32), commanded(grip), now, (), tuple(seen))
         for i, (now, seen, where, grip) in enumerate(steps)
     )
     boxes = Boxes(np.array([[0, 0, 5, 5]] * candidates, np.float32).reshape(-1, 4), np.ones(candidates, np.float32), "cup")
@@ -163,6 +167,16 @@ def test_case_3(rule, goal, steps, sub_case, frame):
     found = told(rule, steps, goal=goal)
     assert label(found) == ("case 3", sub_case, frame, "")
     assert told(rule, [(now, (), *rest) for now, _, *rest in steps], goal=goal).case == "unprompted"
+
+
+def test_an_open_hand_beside_the_target_at_time_out_missed_no_grasp():
+    """The terminal frame has no action: a zero in its place once read as "closes"."""
+    found = told("picked", [*still(5), *still(1, where=NEAR, grip=None)])
+    assert label(found) == ("case 3", "timeout", 5, "")
+    assert found.confidence == 1.0, "no neighbouring limit makes it a grasp"
+    assert label(told("picked", [*still(4), *still(1, where=NEAR, grip=0.0), *still(1, where=NEAR, grip=None)])) == ("case 3", "missed grasp", 4, "")
+    lost = [*still(3), *still(3, now=held(0.03), grip=0.0), *still(1, grip=None)]
+    assert told("picked", lost).sub_case == "slip", "nor does the missing action open the hand"
 
 
 def test_touching_the_goal_is_no_mistake():

@@ -279,7 +279,7 @@ def test_truth_reaches_nobody_but_a_revealed(bank: Path, checkpoint: Path, monke
 def test_what_is_judged_afterwards_changes_nothing(bank: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def actions() -> np.ndarray:
         (episode,) = rollout(make_trial(replace(STUDY, policy=str(checkpoint)), ROWS[:1], "vap", bank), ROWS[:1])
-        return np.stack([frame.action for frame in episode.frames])
+        return np.stack([frame.action for frame in episode.frames[:-1]])
 
     judged = actions()
     monkeypatch.setattr("vap_core.rollout.shown", lambda *args, **kwargs: ())

@@ -247,7 +247,7 @@ def _ask(trial: Trial, asking: Sequence[Running], seen: Seen) -> tuple[list[Any]
 def _act(one: Running, raw: PolicyInput, attended: Attended, keep_images: bool, highlights: bool) -> None:
     """Execute one action, or none when the episode is over, and hand the frame on."""
     over = _over(one)
-    action = np.zeros(one.env.action_size, np.float32) if over else one.queue.popleft()
+    action = None if over else one.queue.popleft()
     judged = highlights and bool(attended.tracks)
     truth, cameras = one.env.truth(masks=bool(raw.images) and (one.sink is not None or judged)), one.env.cameras()
     if over:
@@ -262,7 +262,7 @@ def _act(one: Running, raw: PolicyInput, attended: Attended, keep_images: bool, 
         if one.sink is not None:
             one.sink.frame(frame)
     one.frames.append(frame if keep_images else frame.light())
-    if not over:
+    if action is not None:
         one.env.step(action)
         one.judge = one.judge.step(one.env.truth())
 

@@ -330,7 +330,8 @@ class Shown:
 
 @value
 class Frame:
-    """One control step: what was seen, what the policy was shown, what it did. `action` was decided from `images`.
+    """One control step: what was seen, what the policy was shown, what it did. `action` was decided from `images`; the terminal frame of an
+    episode has none (None), because nothing is executed after it.
 
     `shown` has an entry per view at steps whose images were prompted. `attention`, at steps in which the policy was watched deciding, is the share
     of its attention that every image patch of a view got.
@@ -343,7 +344,7 @@ class Frame:
     tracks: Mapping[str, tuple[Track, ...]]
     cameras: tuple[Camera, ...]
     state: Float32[np.ndarray, " s"]
-    action: Action
+    action: Action | None
     truth: Truth
     events: tuple[Event, ...]
     shown: tuple[Shown, ...] = ()

@@ -17,7 +17,8 @@ class Course:
     """What the rules look at, one entry per recorded step; nothing in it depends on the limits.
 
     `others` and `touches` say which objects other than the goal the robot touched in a step, and whether the target was one; `gap_m` how far the
-    tcp is from the target's bounding box; `lift_m` how much higher each object stands than at first, and `moved_m` how far it has moved.
+    tcp is from the target's bounding box; `lift_m` how much higher each object stands than at first, and `moved_m` how far it has moved; `grip` the
+    gripper's command, 0 closed .. 1 open, nan at the terminal frame, which has none.
     """
 
     target: str
@@ -59,7 +60,7 @@ def follow(episode: Episode) -> Course:
         np.array([_gap(frame, row.target, opening.target_sizes_m[row.target], base) for frame in frames]),
         {name: np.array([frame.truth.objects_world[name][2] - judge.start_world[name][2] for frame in frames]) for name in names},
         {name: np.array([judge.travel_m(name, frame.truth) for frame in frames]) for name in names},
-        np.array([float(frame.action[-1]) for frame in frames]),
+        np.array([np.nan if frame.action is None else float(frame.action[-1]) for frame in frames]),
         {camera: len(per_target[0].candidates) if per_target else 0 for camera, per_target in opening.groundings.items()},
         any(frame.shown for frame in frames),
     )

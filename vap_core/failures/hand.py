@@ -28,7 +28,7 @@ def failed_hand(course: Course, limits: Limits) -> Diagnosis:
         last = len(held) - 1 - held[::-1].index(True)
         if last == len(held) - 1:
             return told("timeout", last, f"still holds {target}, {100 * lift[last]:.0f} cm up,")
-        if course.rule != "picked" and course.grip[max(last - 1, 0) : last + 2].max() >= limits.closed:
+        if course.rule != "picked" and np.nanmax(course.grip[max(last - 1, 0) : last + 2]) >= limits.closed:
             return told("misplacement", last, f"lets go of {target} in the wrong place", grip=float(course.grip[last]))
         return told("slip", last, f"loses {target} out of the hand", grip=float(course.grip[last]))
     taken = _earliest({name: _taken(course, limits, name) for name in others})

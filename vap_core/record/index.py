@@ -13,9 +13,9 @@ from vap_core.record.file import finish_stream, open_stream, temporary
 
 CURVES = {"margin": "/vap/vote_margin/", "track_score": "/vap/track_score/", "gap_cm": "/vap/hand/gripper", "lift_cm": "/vap/hand/target"}
 """Columns of each step, and where their entities begin; of several views the least counts."""
-STEPS, ACTION = "/steps", "/action"
+STEPS, STATE = "/steps", "/observation.state"
 """Where the numbers stand in an index; and what every recording has at every step."""
-READ = ["/__properties/**", ACTION, "/vap/vote_margin/**", "/vap/track_score/**", "/vap/hand/**"]
+READ = ["/__properties/**", STATE, "/vap/vote_margin/**", "/vap/track_score/**", "/vap/hand/**"]
 FOLDER = ".index-1"
 """Beside recordings; counted on when what stands in it changes."""
 
@@ -45,19 +45,19 @@ def _write(recording: Path, path: Path) -> None:
         reader = RrdReader(recording)
     held, store = reader.recordings(), reader.store()
     about: list[Chunk] = []
-    parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {name: [] for name in (ACTION, *CURVES)}
+    parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {name: [] for name in (STATE, *CURVES)}
     for chunk in store.stream().filter(content=READ):
         if chunk.entity_path.startswith("/__properties"):
             about.append(chunk)
         elif not chunk.is_static:
             batch = chunk.to_record_batch()
             part = batch["frame_index"].to_numpy(zero_copy_only=False), batch["Scalars:scalars"].flatten().to_numpy()
-            for name, place in {ACTION: ACTION, **CURVES}.items():
+            for name, place in {STATE: STATE, **CURVES}.items():
                 if chunk.entity_path.startswith(place):
                     parts[name].append(part)
-    if not any(chunk.entity_path == "/__properties/rollout" for chunk in about) or not parts[ACTION]:
+    if not any(chunk.entity_path == "/__properties/rollout" for chunk in about) or not parts[STATE]:
         raise ValueError("no recording of an episode")
-    steps = np.unique(np.concatenate([at for at, _ in parts.pop(ACTION)]))
+    steps = np.unique(np.concatenate([at for at, _ in parts.pop(STATE)]))
     rec = open_stream(path, held[0].recording_id)
     rec.send_chunks(about)
     columns: dict[str, Any] = {name: _least(steps, of_views) for name, of_views in parts.items()}
