@@ -214,10 +214,10 @@ class Recorder:
             why.send_attention(rec, looked, self._quality)
         self._send_cameras(index)
         rec.send_columns("/observation.state", index, rr.Scalars.columns(scalars=np.stack([f.state for f in frames])))
-        acted = [f for f in frames if f.action is not None]
+        acted = [(f.frame_index, f.timestamp_s, f.action) for f in frames if f.action is not None]
         if acted:
-            at = self._index([f.frame_index for f in acted], [f.timestamp_s for f in acted])
-            rec.send_columns("/action", at, rr.Scalars.columns(scalars=np.stack([f.action for f in acted])))
+            at_steps, at_times, actions = zip(*acted, strict=True)
+            rec.send_columns("/action", self._index(at_steps, at_times), rr.Scalars.columns(scalars=np.stack(actions)))
         for cam, per_view in self._opening.groundings.items():
             for j, grounding in enumerate(per_view):
                 followed = [f for f in frames if f.tracks.get(cam, ())[j : j + 1]]
