@@ -11,18 +11,22 @@ from hypothesis import settings
 from jaxtyping import install_import_hook
 
 if TYPE_CHECKING:
-    from vap_core.training.demonstrations import Film
-    from vap_core.values import Frame, Opening
+    from vap_core.rollout.types import EpisodeHeader, Frame
+    from vap_core.training.films.demonstrations import Film
 
 install_import_hook("vap_core", "beartype.beartype")
-os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"  # read when ray is first imported: the tests' cluster stays on loopback
+os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = (
+    "0"  # read when ray is first imported: the tests' cluster stays on loopback
+)
 
 settings.register_profile("vap", deadline=None, derandomize=True)
 settings.load_profile("vap")
 
 ROOT = Path(__file__).parent.parent
 ARCHIVES = sorted((ROOT.parent / "shared" / "menagerie").glob("*.tar.xz"))
-if ARCHIVES and "MENAGERIE_ROOT" not in os.environ:  # beside a checkout that has them, the robots are compared with Menagerie's
+if (
+    ARCHIVES and "MENAGERIE_ROOT" not in os.environ
+):  # beside a checkout that has them, the robots are compared with Menagerie's
     UNPACKED = TemporaryDirectory(prefix="menagerie-")
     for archive in ARCHIVES:
         with tarfile.open(archive) as tar:
@@ -38,7 +42,7 @@ def _one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory: pytest.TempPathFactory) -> "tuple[Path, list[Film]]":
     """A folder that keeps a stage of two episodes of simpler-bridge, and its films."""
-    from vap_core.training import demonstrations
+    from vap_core.training.films import demonstrations
 
     folder = tmp_path_factory.mktemp("films")
     with pytest.MonkeyPatch.context() as patch:
@@ -47,7 +51,7 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> "tuple[Path, list[Film]]"
 
 
 @pytest.fixture(scope="module")
-def three(tmp_path_factory: pytest.TempPathFactory) -> "tuple[Path, Opening, list[Frame]]":
+def three(tmp_path_factory: pytest.TempPathFactory) -> "tuple[Path, EpisodeHeader, list[Frame]]":
     """A recording of three cameras, how it opened, and its frames."""
     from tests.drawn import opening, record
 

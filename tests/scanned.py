@@ -16,11 +16,23 @@ def mug(n: int = 24, rows: int = 5) -> trimesh.Trimesh:
     radius, z = np.array(profile).T
     turn = 2 * np.pi * np.arange(n + 1) / n
     turn[-1] = 0
-    grid = np.stack([radius[:, None] * np.cos(turn), np.broadcast_to(z[:, None], (len(z), n + 1)), -radius[:, None] * np.sin(turn)], axis=-1)
+    grid = np.stack(
+        [
+            radius[:, None] * np.cos(turn),
+            np.broadcast_to(z[:, None], (len(z), n + 1)),
+            -radius[:, None] * np.sin(turn),
+        ],
+        axis=-1,
+    )
     uv = np.stack(np.broadcast_arrays(np.arange(n + 1) / n, z[:, None] / 0.09), axis=-1)
     start = (np.arange(len(z) - 1)[:, None] * (n + 1) + np.arange(n)).ravel()
     step = n + 1
-    face = np.concatenate([np.stack([start, start + 1, start + step + 1], 1), np.stack([start, start + step + 1, start + step], 1)])
+    face = np.concatenate(
+        [
+            np.stack([start, start + 1, start + step + 1], 1),
+            np.stack([start, start + step + 1, start + step], 1),
+        ]
+    )
     picture = np.zeros((256, 256, 3), np.uint8)
     picture[:128], picture[128:] = RED, BLUE
     material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(picture))

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from tests.toys import TOYS, SameColour, personal, scene
-from vap_core.associate import PAIRINGS, case
-from vap_core.attend import Attender, Prompting, load_stack
-from vap_core.errors import BadInstruction, BadViews, UnknownName
+from vap_core.associate import PAIRINGS, compare_views
+from vap_core.attend import Attender, Prompting
+from vap_core.base.errors import BadInstruction, BadViews, UnknownName
+from vap_core.base.types import Attended, Boxes, Camera, Grounding
+from vap_core.perception.stacks import load_stack
+from vap_core.policies.protocol import PolicyInput
 from vap_core.prompt import PALETTE, tint
-from vap_core.values import Attended, Boxes, Camera, Grounding, PolicyInput
 from vap_core.vote import vote
 
 GREY, TEAL, SAND = (90, 90, 90), (40, 120, 110), (150, 130, 90)
@@ -28,7 +30,8 @@ def where(rgb: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
 def test_the_right_one_is_tinted_and_named() -> None:
     _, attended = Attender(TOYS, MEMORY).start({"front": LINE}, "bring my cup")
     (grounding,) = attended.groundings["front"]
-    assert (grounding.winner, grounding.votes.tolist(), grounding.margin) == (1, [0, 3, 0], 1.0)
+    ballot = grounding.ballot
+    assert (grounding.winner, ballot.votes.tolist(), ballot.margin) == (1, [0, 3, 0], 1.0)
     assert attended.text == "bring the red cup"
     assert (attended.images["front"] == tint(LINE, where(LINE, TEAL), RED)).all()
 
@@ -40,7 +43,9 @@ def test_tracking_follows_and_never_detects_again() -> None:
         calls.append(phrase)
         return TOYS.detector(images, phrase)  # type: ignore[arg-type]
 
-    attender = Attender(TOYS.__class__("toys", counting, TOYS.encoder, TOYS.segmenter, TOYS.tracker, ""), MEMORY)
+    attender = Attender(
+        TOYS.__class__("toys", counting, TOYS.encoder, TOYS.segmenter, TOYS.tracker, ""), MEMORY
+    )
     state, _ = attender.start({"front": LINE}, "bring my cup")
     moved = scene([(4, 20, GREY), (24, 40, TEAL), (44, 20, SAND)])
     state, attended = attender.step(state, {"front": moved})
@@ -88,7 +93,10 @@ def test_two_targets_two_colours() -> None:
     assert (attended.images["front"] == expected).all()
     moved = scene([(4, 20, GREY), (24, 40, TEAL), (44, 5, SAND)])
     _, attended = attender.step(state, {"front": moved})
-    assert (attended.images["front"] == tint(tint(moved, where(moved, TEAL), RED), where(moved, SAND), BLUE)).all()
+    assert (
+        attended.images["front"]
+        == tint(tint(moved, where(moved, TEAL), RED), where(moved, SAND), BLUE)
+    ).all()
 
 
 def test_one_object_proposed_for_two_phrases_is_tracked_once() -> None:
@@ -109,8 +117,12 @@ def test_one_object_proposed_for_two_phrases_is_tracked_once() -> None:
 
 def test_two_targets_on_one_object_is_a_warning_and_tints_once() -> None:
     memory = {"one": CUP, "two": personal("two", "cup", TEAL)}
-    _, attended = Attender(TOYS, memory).start({"front": LINE}, "put my cup near my cup", objects=["one", "two"])
-    assert any(e.level == "WARN" and "two targets share one object" in e.text for e in attended.events)
+    _, attended = Attender(TOYS, memory).start(
+        {"front": LINE}, "put my cup near my cup", objects=["one", "two"]
+    )
+    assert any(
+        e.level == "WARN" and "two targets share one object" in e.text for e in attended.events
+    )
     assert (attended.images["front"] == tint(LINE, where(LINE, TEAL), attended.colours[0])).all()
 
 
@@ -134,14 +146,20 @@ def test_switches(prompting: Prompting, tinted: bool, text: str) -> None:
 
 
 def test_boxes_by_hand_replace_the_detector() -> None:
-    by_hand = Boxes(np.array([[44, 20, 56, 32], [4, 20, 16, 32]], np.float32), np.ones(2, np.float32), "by hand")
-    _, attended = Attender(TOYS, MEMORY).start({"front": LINE}, "bring my cup", boxes={"front": by_hand})
+    by_hand = Boxes(
+        np.array([[44, 20, 56, 32], [4, 20, 16, 32]], np.float32), np.ones(2, np.float32), "by hand"
+    )
+    _, attended = Attender(TOYS, MEMORY).start(
+        {"front": LINE}, "bring my cup", boxes={"front": by_hand}
+    )
     assert len(attended.groundings["front"][0].candidates) == 2
 
 
 def test_what_cannot_be_matched_is_said() -> None:
     attender = Attender(TOYS, {**MEMORY, "other": personal("other", "cup", GREY)})
-    with pytest.raises(UnknownName, match="2 objects are a 'cup': mug, other; choose with --object"):
+    with pytest.raises(
+        UnknownName, match="2 objects are a 'cup': mug, other; choose with --object"
+    ):
         attender.start({"front": LINE}, "bring my cup")
     with pytest.raises(UnknownName, match="no 'shoe' is remembered"):
         attender.start({"front": LINE}, "bring my shoe")
@@ -161,11 +179,17 @@ def overhead(name: str, x: float) -> Camera:
 
 
 DIM, TEALISH, MOSS = (60, 80, 70), (55, 115, 100), (50, 115, 95)
-CAMERAS = {"front": overhead("front", 0.0), "side": overhead("side", 0.25), "wrist": overhead("wrist", 0.5)}
+CAMERAS = {
+    "front": overhead("front", 0.0),
+    "side": overhead("side", 0.25),
+    "wrist": overhead("wrist", 0.5),
+}
 """Each sees the table 16 pixels further left than the one before."""
 CONTRADICTING = {
     "front": scene([(4, 20, DIM), (36, 20, TEAL)]),
-    "side": scene([(20, 20, TEALISH), (4, 45, MOSS)]),  # the one at x = 20 is the front's at 36; the other, from beyond its edge, looks more like it
+    "side": scene(
+        [(20, 20, TEALISH), (4, 45, MOSS)]
+    ),  # the one at x = 20 is the front's at 36; the other, from beyond its edge, looks more like it
     "wrist": scene([(24, 8, DIM)]),  # and this is neither of them
 }
 
@@ -177,18 +201,23 @@ def same(one: Attended, two: Attended) -> bool:
         return [
             g.candidates.xyxy.tolist(),
             g.similarity.tolist(),
-            g.votes.tolist(),
+            g.ballot.votes.tolist(),
             g.winner,
+            g.ballot.winner,
             g.overruled,
-            g.margin,
-            g.cosine_margin,
+            g.ballot.margin,
+            g.ballot.cosine_margin,
             g.masks.tolist(),
         ]
 
     return (
-        (one.text, [e.text for e in one.events], list(one.images)) == (two.text, [e.text for e in two.events], list(two.images))
+        (one.text, [e.text for e in one.events], list(one.images))
+        == (two.text, [e.text for e in two.events], list(two.images))
         and all((one.images[c] == two.images[c]).all() for c in one.images)
-        and all([flat(g) for g in one.groundings[c]] == [flat(g) for g in two.groundings[c]] for c in one.groundings)
+        and all(
+            [flat(g) for g in one.groundings[c]] == [flat(g) for g in two.groundings[c]]
+            for c in one.groundings
+        )
     )
 
 
@@ -199,29 +228,50 @@ def test_views_by_themselves_contradict_each_other_and_together_agree() -> None:
     attender = Attender(TOYS, MEMORY, Prompting(associate=PAIRINGS["geometry"]))
     state, attended = attender.start(CONTRADICTING, "bring my cup", cameras=CAMERAS)
     front, side, wrist = (attended.groundings[c][0] for c in CONTRADICTING)
-    assert [(g.winner, g.elected, g.overruled) for g in (front, side, wrist)] == [(1, 1, None), (1, 0, 0), (None, 0, 0)]
-    assert (side.votes.tolist(), side.margin) == ([3, 0], 1.0)  # the vote's fields are the vote's
+    assert [(g.winner, g.ballot.winner, g.overruled) for g in (front, side, wrist)] == [
+        (1, 1, False),
+        (1, 0, True),
+        (None, 0, True),
+    ]
+    assert (side.ballot.votes.tolist(), side.ballot.margin) == (
+        [3, 0],
+        1.0,
+    )  # the ballot stays as it was
     (found,) = attended.associations
     assert found.chosen == {"front": 1, "side": 1, "wrist": None}
     assert found.margin > 0
     assert set(found.terms) == {"references", "geometry"}
-    assert (attended.images["side"] == tint(CONTRADICTING["side"], where(CONTRADICTING["side"], TEALISH), RED)).all()
+    assert (
+        attended.images["side"]
+        == tint(CONTRADICTING["side"], where(CONTRADICTING["side"], TEALISH), RED)
+    ).all()
     assert attended.images["wrist"] is CONTRADICTING["wrist"]
     assert attended.text == "bring the red cup"
     said = [e.text for e in attended.events]
-    assert any(text.startswith("side: mug is candidate 1 with 0/3 votes by association, over candidate 0 with 3") for text in said)
-    assert any(text.startswith("wrist: mug is none of 1 candidates by association") for text in said)
+    assert any(
+        text.startswith(
+            "side: mug is candidate 1 with 0/3 votes by association, over candidate 0 with 3"
+        )
+        for text in said
+    )
+    assert any(
+        text.startswith("wrist: mug is none of 1 candidates by association") for text in said
+    )
     assert any(text.startswith("mug: views associated, margin") for text in said)
     moved = {**CONTRADICTING, "side": scene([(30, 30, TEALISH), (4, 45, MOSS)])}
     _, followed = attender.step(state, moved)
-    assert (followed.images["side"] == tint(moved["side"], where(moved["side"], TEALISH), RED)).all()
+    assert (
+        followed.images["side"] == tint(moved["side"], where(moved["side"], TEALISH), RED)
+    ).all()
     assert followed.tracks["wrist"][0].mask is None
     assert followed.associations == attended.associations
 
 
 def test_association_off_and_cameras_given_is_the_paper_bit_for_bit() -> None:
     _, plain = Attender(TOYS, MEMORY).start(CONTRADICTING, "bring my cup")
-    _, off = Attender(TOYS, MEMORY, Prompting(associate=None)).start(CONTRADICTING, "bring my cup", cameras=CAMERAS)
+    _, off = Attender(TOYS, MEMORY, Prompting(associate=None)).start(
+        CONTRADICTING, "bring my cup", cameras=CAMERAS
+    )
     assert same(plain, off)
 
 
@@ -244,7 +294,10 @@ def test_each_of_several_targets_is_associated_by_itself() -> None:
     _, attended = attender.start(sandy, "put my cup near my vase", cameras=CAMERAS)
     cup, vase = attended.associations
     assert [g.object for g in attended.groundings["front"]] == ["mug", "ming"]
-    chosen = {camera: [None if g.mask is None else tuple(sandy[camera][g.mask][0]) for g in gs] for camera, gs in attended.groundings.items()}
+    chosen = {
+        camera: [None if g.mask is None else tuple(sandy[camera][g.mask][0]) for g in gs]
+        for camera, gs in attended.groundings.items()
+    }
     assert chosen == {"front": [TEAL, SAND], "side": [TEALISH, SAND], "wrist": [None, SAND]}
     assert {camera: g[0].winner for camera, g in attended.groundings.items()} == cup.chosen
     assert {camera: g[1].winner for camera, g in attended.groundings.items()} == vase.chosen
@@ -252,23 +305,27 @@ def test_each_of_several_targets_is_associated_by_itself() -> None:
 
 def test_views_that_cannot_be_associated_are_said() -> None:
     attender = Attender(TOYS, MEMORY, Prompting(associate=PAIRINGS["geometry"]))
-    with pytest.raises(BadViews, match="geometry needs calibrated cameras; give Attender.start cameras="):
+    with pytest.raises(
+        BadViews, match="geometry needs calibrated cameras; give Attender.start cameras="
+    ):
         attender.start(CONTRADICTING, "bring my cup")
     small = {**CAMERAS, "side": replace(CAMERAS["side"], width=32)}
-    with pytest.raises(BadViews, match="camera 'side' is calibrated for 32x64 pixels, but its view has 64x64"):
+    with pytest.raises(
+        BadViews, match="camera 'side' is calibrated for 32x64 pixels, but its view has 64x64"
+    ):
         attender.start(CONTRADICTING, "bring my cup", cameras=small)
 
 
 def test_on_a_rendered_desk_with_three_cameras_no_view_contradicts_another() -> None:
     """From the true boxes of the real models; the mug is remembered by what the front camera sees, so that its own view is beyond doubt."""
-    from vap_core.embed import crop
-    from vap_core.experiments import METHODS
+    from vap_core.evaluation.methods import METHODS
     from vap_core.memory import remember
-    from vap_core.rollout import Trial, rollout
-    from vap_core.sim.env import Env
-    from vap_core.sim.objects import extent_m, get
-    from vap_core.sim.scenes import build
-    from vap_core.suites import rows, suite
+    from vap_core.perception.boxes import crop
+    from vap_core.rollout.loop import Trial, rollout
+    from vap_core.rollout.prompters.tint import TintPrompter
+    from vap_core.simulation.env import Env
+    from vap_core.simulation.scenes import build
+    from vap_core.simulation.suites import rows, suite
 
     desk, row = suite("tabletop"), rows("tabletop", "select-cup")[3]
     stack = load_stack("embedded")
@@ -276,20 +333,49 @@ def test_on_a_rendered_desk_with_three_cameras_no_view_contradicts_another() -> 
         env = Env(world, cameras=row.cameras, control=desk.control, sensor=desk.sensor)
         env.reset(row)
         views, truth = env.observe().images, env.truth(masks=True).masks
-        shown = {c: [name for name, mask in masks.items() if mask.sum() > 40] for c, masks in truth.items()}
-        boxes = {c: Boxes(np.array([around(truth[c][name]) for name in shown[c]], np.float32), np.ones(len(shown[c]), np.float32), "") for c in views}
-        mine = remember("mug", "cup", [crop(views["front"], boxes["front"].xyxy[shown["front"].index(row.target)])], stack.encoder)
-        by_hand = replace(stack, detector=lambda images, phrase, threshold=None: [boxes[c] for c in row.cameras])
+        shown = {
+            c: [name for name, mask in masks.items() if mask.sum() > 40]
+            for c, masks in truth.items()
+        }
+        boxes = {
+            c: Boxes(
+                np.array([around(truth[c][name]) for name in shown[c]], np.float32),
+                np.ones(len(shown[c]), np.float32),
+                "",
+            )
+            for c in views
+        }
+        mine = remember(
+            "mug",
+            "cup",
+            [crop(views["front"], boxes["front"].xyxy[shown["front"].index(row.target)])],
+            stack.encoder,
+        )
+        by_hand = replace(
+            stack, detector=lambda images, phrase, threshold=None: [boxes[c] for c in row.cameras]
+        )
         attender = Attender(by_hand, {"mug": mine}, METHODS["vap-associated"])
-        trial = Trial("vap-associated", world, Still(), attender, {name: extent_m(get(name)) for name in world.objects}, desk.control, desk.sensor)
+        trial = Trial(
+            method="vap-associated",
+            scene=world,
+            policy=Still(),
+            prompter=TintPrompter(attender),
+            control=desk.control,
+            sensor=desk.sensor,
+        )
         (episode,) = rollout(trial, [replace(row, max_steps=1)])
     assert episode.outcome.status == "failure", episode.outcome.detail
-    groundings = {camera: of_view[0] for camera, of_view in episode.opening.groundings.items()}
-    prompted = {camera: None if g.winner is None else shown[camera][g.winner] for camera, g in groundings.items()}
-    assert (case(prompted, row.target), set(prompted.values())) == ("right", {row.target})
-    (found,) = episode.opening.associations
+    groundings = {camera: of_view[0] for camera, of_view in episode.header.groundings.items()}
+    prompted = {
+        camera: None if g.winner is None else shown[camera][g.winner]
+        for camera, g in groundings.items()
+    }
+    assert (compare_views(prompted, row.target), set(prompted.values())) == ("right", {row.target})
+    (found,) = episode.header.associations
     assert found.chosen == {camera: g.winner for camera, g in groundings.items()}
-    assert [g.elected for g in groundings.values()] == [vote(g.similarity).winner for g in groundings.values()]
+    assert [g.ballot.winner for g in groundings.values()] == [
+        vote(g.similarity).winner for g in groundings.values()
+    ]
 
 
 class Still:
@@ -300,8 +386,12 @@ class Still:
     def start(self, rng: np.random.Generator) -> None:
         return None
 
-    def plan(self, states: Sequence[None], inputs: Sequence[PolicyInput]) -> tuple[list[None], list[np.ndarray]]:
-        return list(states), [np.zeros((1, len(one.state) - 6), np.float32) for one in inputs]  # joints and gripper
+    def plan(
+        self, states: Sequence[None], inputs: Sequence[PolicyInput]
+    ) -> tuple[list[None], list[np.ndarray]]:
+        return list(states), [
+            np.zeros((1, len(one.state) - 6), np.float32) for one in inputs
+        ]  # joints and gripper
 
 
 def around(mask: np.ndarray) -> list[int]:

@@ -9,14 +9,15 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from vap_core.errors import BadAction
-from vap_core.policies.expert import Expert
-from vap_core.policies.random import Random
-from vap_core.rollout import Trial, rollout
-from vap_core.sim import objects, scenes
-from vap_core.sim.env import Env
-from vap_core.suites import BENCHMARKS, VARIANTS, Suite, Task, rows
-from vap_core.values import REST, EpisodeRow
+from vap_core.base.errors import BadAction
+from vap_core.policies.scripted.expert import Expert
+from vap_core.policies.scripted.random import Random
+from vap_core.rollout.loop import Trial, rollout
+from vap_core.rollout.prompters.text import generic
+from vap_core.simulation import scenes
+from vap_core.simulation.env import Env
+from vap_core.simulation.suites import BENCHMARKS, VARIANTS, Suite, Task, rows
+from vap_core.simulation.types import REST, EpisodeRow
 
 TASKS = [(suite.name, task.name) for suite in BENCHMARKS.values() for task in suite.tasks]
 STILL_M, UPRIGHT_COS = 0.005, np.cos(np.deg2rad(5.0))
@@ -34,24 +35,38 @@ class Bench(NamedTuple):
     scene: scenes.Scene
 
     def env(self, image_size: int = 32) -> Env:
-        return Env(self.scene, image_size=image_size, cameras=self.suite.cameras, control=self.suite.control, sensor=self.suite.sensor)
+        return Env(
+            self.scene,
+            image_size=image_size,
+            cameras=self.suite.cameras,
+            control=self.suite.control,
+            sensor=self.suite.sensor,
+        )
 
     def trial(self, policy: Expert | Random) -> Trial:
-        sizes = {name: objects.extent_m(objects.get(name)) for name in self.scene.objects}
-        return Trial("generic", self.scene, policy, None, sizes, self.suite.control, self.suite.sensor)
+        return Trial(
+            method="generic",
+            scene=self.scene,
+            policy=policy,
+            prompter=generic(),
+            control=self.suite.control,
+            sensor=self.suite.sensor,
+        )
 
 
 def opened(suite: str, task: str, chosen: tuple[EpisodeRow, ...]) -> Bench:
     names = tuple(dict.fromkeys(place.model for row in chosen for place in row.placements))
     (variant,) = {row.variant for row in chosen}
-    scene = scenes.build(BENCHMARKS[suite].robot, names, look=VARIANTS[variant].look)
+    scene = scenes.build(BENCHMARKS[suite].robot, names, style=VARIANTS[variant].style)
     return Bench(BENCHMARKS[suite], BENCHMARKS[suite].task(task), chosen, scene)
 
 
 @pytest.fixture(scope="module", params=TASKS, ids="/".join)
 def bench(request):
     suite, task = request.param
-    known = [row for row in rows(suite, task) if suite != "simpler-fractal" or row.variant == "base"]
+    known = [
+        row for row in rows(suite, task) if suite != "simpler-fractal" or row.variant == "base"
+    ]
     made = opened(suite, task, (known[0], known[len(known) // 2], known[-1]))
     yield made
     made.scene.close()
@@ -79,9 +94,13 @@ def test_everything_stands_still_on_the_table_alone(bench):
     for row in bench.rows:
         env.reset(row)
         before = env.truth()
-        assert {name: before.contacts.get(name) for name in before.objects_world} == dict.fromkeys(before.objects_world, frozenset({REST}))
+        assert {name: before.contacts.get(name) for name in before.objects_world} == dict.fromkeys(
+            before.objects_world, frozenset({REST})
+        )
         for place in row.placements:
-            assert before.objects_world[place.model][:3] == pytest.approx([place.x, place.y, 0], abs=STILL_M)
+            assert before.objects_world[place.model][:3] == pytest.approx(
+                [place.x, place.y, 0], abs=STILL_M
+            )
         for _ in range(round(env.hz)):
             env.step(idle(env))
             assert env.truth().touched == ()
@@ -101,14 +120,18 @@ def test_everything_is_in_view_of_every_fixed_camera_of_the_suite(bench):
         assert tuple(seen) == row.cameras == bench.suite.cameras == tuple(env.observe().images)
         assert tuple(cam.name for cam in env.cameras()) == row.cameras
         for camera, masks in seen.items():
-            looked_for = masks if camera != "wrist" else [row.target] * (bench.suite.robot == "panda")
+            looked_for = (
+                masks if camera != "wrist" else [row.target] * (bench.suite.robot == "panda")
+            )
             assert all(masks[name].sum() >= SEEN_PX for name in looked_for), (row.key, camera)
 
 
 def test_the_expert_solves_it_and_touches_the_right_thing_first(bench):
     slow = bench.task.max_steps >= 300
     for episode in rollout(bench.trial(Expert()), bench.rows[: 1 if slow else 2]):
-        assert (episode.outcome.status, episode.outcome.detail[-600:]) == ("success", ""), episode.opening.row.key
+        assert (episode.outcome.status, episode.outcome.detail[-600:]) == ("success", ""), (
+            episode.header.row.key
+        )
         assert episode.outcome.success_once
         assert episode.outcome.first_object_correct
         assert not episode.outcome.wrong_object
@@ -129,7 +152,10 @@ def test_an_action_of_the_wrong_length_is_refused(bench):
     assert env.action_size == right
     kept = env.snapshot().state
     for wrong in (0, right - 1, right + 1):
-        with pytest.raises(BadAction, match=f"{wrong} numbers, but {bench.suite.control} control of {bench.suite.robot} takes {right}"):
+        with pytest.raises(
+            BadAction,
+            match=f"{wrong} numbers, but {bench.suite.control} control of {bench.suite.robot} takes {right}",
+        ):
             env.step(np.zeros(wrong, np.float32))
     assert (env.snapshot().state == kept).all()
 
@@ -142,16 +168,21 @@ def test_a_batch_equals_one_by_one(joint):
         for a, b in zip(one.frames, other.frames, strict=True):
             assert np.array_equal(a.action, b.action)
             assert (a.state == b.state).all()
-            assert all((a.truth.objects_world[name] == pose).all() for name, pose in b.truth.objects_world.items())
+            assert all(
+                (a.truth.objects_world[name] == pose).all()
+                for name, pose in b.truth.objects_world.items()
+            )
 
 
-def played(bench: Bench, row: EpisodeRow, steps: int) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
+def played(
+    bench: Bench, row: EpisodeRow, steps: int
+) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
     """What every camera sees after so many steps of the expert, and the states and poses on the way; by then the arm is in view."""
     env, expert, states = bench.env(112), Expert(), []
     env.reset(row)
     state = expert.start(np.random.default_rng(0))
     for _ in range(steps):
-        (state,), (chunk,) = expert.plan_inside([state], [env])
+        (state,), (chunk,) = expert.plan_from_simulation([state], [env])
         env.step(chunk[0])
         states += [env.state(), *env.truth().objects_world.values()]
     return dict(env.observe().images), states
@@ -161,9 +192,16 @@ def played(bench: Bench, row: EpisodeRow, steps: int) -> tuple[dict[str, np.ndar
 def usual():
     """The first pick of the Google Robot under every variant; its layout is the same."""
     task = "pick-pen-holder"
-    row = {row.variant: row for row in reversed(rows("simpler-fractal", task)) if row.episode % 75 == 0}
+    row = {
+        row.variant: row for row in reversed(rows("simpler-fractal", task)) if row.episode % 75 == 0
+    }
     with opened("simpler-fractal", task, (row["base"],)).scene as scene:
-        made = Bench(BENCHMARKS["simpler-fractal"], BENCHMARKS["simpler-fractal"].task(task), (row["base"],), scene)
+        made = Bench(
+            BENCHMARKS["simpler-fractal"],
+            BENCHMARKS["simpler-fractal"].task(task),
+            (row["base"],),
+            scene,
+        )
         yield row, played(made, row["base"], 3)
 
 
@@ -182,10 +220,10 @@ def test_a_variant_changes_the_picture_and_not_the_physics(variant, usual):
 FINGERPRINT = """
 import hashlib
 import numpy as np
-from vap_core.policies.expert import Expert
-from vap_core.sim import scenes
-from vap_core.sim.env import Env
-from vap_core.suites import BENCHMARKS, rows
+from vap_core.policies.scripted.expert import Expert
+from vap_core.simulation import scenes
+from vap_core.simulation.env import Env
+from vap_core.simulation.suites import BENCHMARKS, rows
 
 for name, suite in BENCHMARKS.items():
     (row,) = rows(name, suite.tasks[-1].name, 1, seed=4)
@@ -194,7 +232,7 @@ for name, suite in BENCHMARKS.items():
         env.reset(row)
         state = expert.start(np.random.default_rng(0))
         for _ in range(5):
-            (state,), (chunk,) = expert.plan_inside([state], [env])
+            (state,), (chunk,) = expert.plan_from_simulation([state], [env])
             env.step(chunk[0])
             seen = env.observe()
             for part in (*seen.images.values(), seen.state, chunk, *env.truth().objects_world.values()):
@@ -206,7 +244,12 @@ for name, suite in BENCHMARKS.items():
 def test_two_processes_see_the_same_bits():
     """Whatever order their sets and dictionaries of names happen to have."""
     started = [
-        subprocess.Popen([sys.executable, "-c", FINGERPRINT], env={**os.environ, "PYTHONHASHSEED": seed}, stdout=subprocess.PIPE, text=True)
+        subprocess.Popen(
+            [sys.executable, "-c", FINGERPRINT],
+            env={**os.environ, "PYTHONHASHSEED": seed},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
         for seed in ("1", "2")
     ]
     one, other = (process.communicate(timeout=200)[0] for process in started)

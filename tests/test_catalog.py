@@ -10,10 +10,20 @@ import pytest
 from tests.drawn import ROW, SUCCESS, columns, entities, frame, opening, rerun
 from tests.test_cli import vap
 from tests.test_why import fail
-from vap_core import asking
-from vap_core.errors import BadOutput, BadRecording, BadStudy, UnknownName
-from vap_core.record import Correction, Recorder, correct, corrections, index, read_summary, steps, together
-from vap_core.record.index import FOLDER
+from vap_core.base.errors import BadOutput, BadRecording, BadStudy, UnknownName
+from vap_core.evaluation.diagnosis import explain
+from vap_core.recording import (
+    Correction,
+    Recorder,
+    combine_recordings,
+    ensure_index,
+    load_steps,
+    read_corrections,
+    read_summary,
+    write_correction,
+)
+from vap_core.recording.index import FOLDER
+from vap_core.recording.query import first_match, format_result, run_query
 
 
 @pytest.fixture(scope="module")
@@ -23,12 +33,16 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     fail(folder / "wrong.rrd", "owl_b")
     fail(folder / "apart.rrd", "owl_a", "owl_b", after=4, episode=4)
     start = replace(opening(1), row=replace(ROW, episode=5))
-    with Recorder(folder / "fine.rrd", start) as recorder:
+    with Recorder(folder / "fine.rrd", start, explain=explain) as recorder:
         for step in range(30):
             recorder.frame(frame(step + 31, start))
         recorder.close(replace(SUCCESS, steps=30))
     whole = (folder / "wrong.rrd").read_bytes()
-    for name, data in (("noise", b"noise" * 99), ("half", whole[: len(whole) // 2]), ("empty", b"")):
+    for name, data in (
+        ("noise", b"noise" * 99),
+        ("half", whole[: len(whole) // 2]),
+        ("empty", b""),
+    ):
         (folder / f"{name}.rrd").write_bytes(data)
     (folder / "z-copy.rrd").write_bytes(whole)
     program = "import rerun as rr, sys; r = rr.RecordingStream('other'); r.save(sys.argv[1]); r.log('x', rr.Scalars(1.0)); r.flush(); r.disconnect()"
@@ -37,81 +51,109 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_step_is_a_row_and_what_cannot_be_read_is_named(run: Path) -> None:
-    held = steps(run / "recordings")
+    held = load_steps(run / "recordings")
     counted = held.table.groupby("file")["frame_index"].agg(list)
-    assert {Path(file).name: len(rows) for file, rows in counted.items()} == {"apart.rrd": 12, "fine.rrd": 30, "wrong.rrd": 12}
-    assert {path.name for path in held.unreadable} == {"noise.rrd", "half.rrd", "empty.rrd", "foreign.rrd", "z-copy.rrd"}
+    assert {Path(file).name: len(rows) for file, rows in counted.items()} == {
+        "apart.rrd": 12,
+        "fine.rrd": 30,
+        "wrong.rrd": 12,
+    }
+    assert {path.name for path in held.unreadable} == {
+        "noise.rrd",
+        "half.rrd",
+        "empty.rrd",
+        "foreign.rrd",
+        "z-copy.rrd",
+    }
     assert all("\n" not in why for why in held.unreadable.values())
     wrong = held.table[held.table["file"].str.endswith("wrong.rrd")]
     assert set(wrong["margin"]) == {0.6}
     assert wrong["track_score"].tolist() == pytest.approx([0.9] * 12)
     assert (wrong["gap_cm"] > 0).all()
-    assert set(wrong["failure_case"]) == {"case 1"}
+    assert set(wrong["case"]) == {"case 1"}
 
 
-def test_from_inside_the_folder_its_recordings_have_short_names(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_from_inside_the_folder_its_recordings_have_short_names(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(run.parent)
-    answer = asking.ask(Path(run.name), "frame_index >= 0")
-    assert answer.found["file"].tolist() == [f"{run.name}/recordings/{name}.rrd" for name in ("apart", "fine", "wrong")]
+    result = run_query(Path(run.name), "frame_index >= 0")
+    assert result.matches["file"].tolist() == [
+        f"{run.name}/recordings/{name}.rrd" for name in ("apart", "fine", "wrong")
+    ]
 
 
 def test_a_condition_leads_to_recordings_and_frames(run: Path) -> None:
-    answer = asking.ask(run, "success = false and margin < 0.7 and frame_index >= 7")
-    assert [(Path(line.file).name, line.steps, line.first, line.last) for line in answer.found.itertuples()] == [
+    result = run_query(run, "success = false and margin < 0.7 and frame_index >= 7")
+    assert [
+        (Path(match.file).name, match.matching_steps, match.first_step, match.last_step)
+        for match in result.matches.itertuples()
+    ] == [
         ("apart.rrd", 5, 7, 11),
         ("wrong.rrd", 5, 7, 11),
     ]
-    assert asking.frame(answer, 1) == (run / "recordings" / "wrong.rrd", 7)
-    told = asking.text(answer, limit=1)
-    assert told.startswith("2 of 3 recordings, 10 steps")
-    assert "and 1 more" in told
-    assert told.count("was left out") == 5
-    assert asking.ask(run, "lift_cm > 5 and success").found["file"].tolist() == [str(run / "recordings" / "fine.rrd")]
-    assert asking.text(asking.ask(run, "margin > 2")).startswith("0 of 3 recordings, 0 steps")
+    assert first_match(result, 1) == (run / "recordings" / "wrong.rrd", 7)
+    text = format_result(result, limit=1)
+    assert text.startswith("2 of 3 recordings, 10 steps")
+    assert "and 1 more" in text
+    assert text.count("was left out") == 5
+    assert run_query(run, "lift_cm > 5 and success").matches["file"].tolist() == [
+        str(run / "recordings" / "fine.rrd")
+    ]
+    assert format_result(run_query(run, "margin > 2")).startswith("0 of 3 recordings, 0 steps")
     with pytest.raises(BadStudy, match="no recording #2; 2 were found"):
-        asking.frame(answer, 2)
+        first_match(result, 2)
     with pytest.raises(BadStudy, match="is none on this table"):
-        asking.ask(run, "margin <")
+        run_query(run, "margin <")
 
 
-def test_an_index_says_what_the_recording_says_and_is_made_anew_when_that_changes(tmp_path: Path) -> None:
+def test_an_index_says_what_the_recording_says_and_is_made_anew_when_that_changes(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "recordings" / "one.rrd"
     fail(path, "owl_a", "owl_b", after=4)
-    made = index(path)
+    made = ensure_index(path)
     assert made.parent.parent == path.parent
     assert rerun("rrd", "verify", made).returncode == 0
-    assert read_summary(made)["outcome.why"] == read_summary(path)["outcome.why"]
-    told = {name: [value[0] for _, value in sorted(columns(made, "/steps", name).items())] for name in ("margin", "track_score", "gap_cm", "lift_cm")}  # type: ignore[index, type-var]
-    views = [columns(path, f"/vap/track_score/{cam}", "Scalars:scalars") for cam in ("front", "side")]
+    assert read_summary(made)["case_sentence"] == read_summary(path)["case_sentence"]
+    told = {
+        name: [value[0] for _, value in sorted(columns(made, "/steps", name).items())]
+        for name in ("margin", "track_score", "gap_cm", "lift_cm")
+    }
+    views = [
+        columns(path, f"/vap/track_score/{cam}", "Scalars:scalars") for cam in ("front", "side")
+    ]
     assert told["track_score"] == [min(view[step][0] for view in views) for step in range(12)]  # type: ignore[index]
     gaps = columns(path, "/vap/hand/gripper_to_target", "Scalars:scalars")
     assert told["gap_cm"] == [gaps[step][0] for step in range(12)]  # type: ignore[index]
     assert made.stat().st_size < path.stat().st_size / 2
     before = made.stat().st_mtime_ns
-    assert index(path).stat().st_mtime_ns == before
+    assert ensure_index(path).stat().st_mtime_ns == before
     path.unlink()
     fail(path, "owl_b")
-    assert read_summary(index(path))["outcome.sub_case"] == "distractor vote"
+    assert read_summary(ensure_index(path))["sub_case"] == "distractor vote"
 
 
 def test_without_a_prompt_the_numbers_are_missing_and_the_steps_are_not(tmp_path: Path) -> None:
     start = replace(opening(1), groundings={})
-    with Recorder(tmp_path / "one.rrd", start) as recorder:
+    with Recorder(tmp_path / "one.rrd", start, explain=explain) as recorder:
         for step in range(5):
             recorder.frame(replace(frame(step, opening(1)), tracks={}))
         recorder.close(SUCCESS)
-    table = steps(tmp_path).table
+    table = load_steps(tmp_path).table
     assert table["frame_index"].tolist() == list(range(5))
     assert table[["margin", "track_score"]].isna().all(axis=None)
 
 
-def test_a_folder_that_cannot_be_written_is_asked_all_the_same(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = steps(run / "recordings").table
+def test_a_folder_that_cannot_be_written_is_asked_all_the_same(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = load_steps(run / "recordings").table
     for path in (run / "recordings" / FOLDER).iterdir():
         path.unlink()
     (run / "recordings" / FOLDER).rmdir()
-    monkeypatch.setattr("vap_core.record.catalog.os.access", lambda path, mode: False)
-    assert steps(run / "recordings").table.equals(whole)
+    monkeypatch.setattr("vap_core.recording.catalog.os.access", lambda path, mode: False)
+    assert load_steps(run / "recordings").table.equals(whole)
     assert not (run / "recordings" / FOLDER).exists()
 
 
@@ -125,28 +167,37 @@ def test_what_a_query_costs_is_told() -> None:
 
 def test_a_folder_without_recordings_says_so(run: Path, tmp_path: Path) -> None:
     with pytest.raises(BadRecording, match="there is no recording in .*; run eval with --record"):
-        steps(tmp_path)
+        load_steps(tmp_path)
     (tmp_path / "noise.rrd").write_bytes(b"noise" * 99)
     with pytest.raises(BadRecording, match="none of 1 files"):
-        steps(tmp_path)
+        load_steps(tmp_path)
 
 
 def test_a_correction_is_a_layer_and_leaves_the_recording_alone(run: Path) -> None:
     path = run / "recordings" / "wrong.rrd"
     before = path.read_bytes()
     for part, note in (("missed grasp", ""), ("slip", "it held for a moment")):
-        layer = correct(path, Correction("case 3", part, note), 5)
+        layer = write_correction(path, Correction("case 3", part, note), 5)
     assert path.read_bytes() == before
     assert layer == run / "corrections" / "wrong.rrd"
-    assert [p.name for p in layer.parent.iterdir()] == ["wrong.rrd"], "the second replaced the first"
-    assert corrections(run) == {"wrong.rrd": Correction("case 3", "slip", "it held for a moment")}
+    assert [p.name for p in layer.parent.iterdir()] == ["wrong.rrd"], (
+        "the second replaced the first"
+    )
+    assert read_corrections(run) == {
+        "wrong.rrd": Correction("case 3", "slip", "it held for a moment")
+    }
     assert rerun("rrd", "verify", layer).returncode == 0
     assert "/vap/events" in entities(layer)
-    table = steps(run / "recordings").table
+    table = load_steps(run / "recordings").table
     mine = table[table["file"].str.endswith("wrong.rrd")].iloc[0]
-    assert (mine.failure_case, mine.sub_case, mine.why, mine.corrected) == ("case 3", "slip", "it held for a moment", True)
+    assert (mine.case, mine.sub_case, mine.case_sentence, mine.corrected) == (
+        "case 3",
+        "slip",
+        "it held for a moment",
+        True,
+    )
     assert not table[table["file"].str.endswith("apart.rrd")]["corrected"].any()
-    assert read_summary(path)["outcome.failure_case"] == "case 1"
+    assert read_summary(path)["case"] == "case 1"
     layer.unlink()
 
 
@@ -156,28 +207,40 @@ def test_what_cannot_be_corrected(run: Path) -> None:
     with pytest.raises(UnknownName, match="missed grasp"):
         Correction("case 3", "drift")
     with pytest.raises(BadStudy, match="ended in success; only failures have a case"):
-        correct(run / "recordings" / "fine.rrd", Correction("case 3", "slip"), 0)
+        write_correction(run / "recordings" / "fine.rrd", Correction("case 3", "slip"), 0)
     with pytest.raises(BadRecording, match="cannot be read"):
-        correct(run / "recordings" / "noise.rrd", Correction("case 3", "slip"), 0)
+        write_correction(run / "recordings" / "noise.rrd", Correction("case 3", "slip"), 0)
 
 
 def test_a_damaged_layer_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "corrections").mkdir()
     (tmp_path / "corrections" / "a.rrd").write_bytes(b"noise")
     with pytest.raises(BadRecording, match="is damaged .*; delete it") as caught:
-        corrections(tmp_path)
+        read_corrections(tmp_path)
     assert "\n" not in str(caught.value)
 
 
 def test_two_methods_share_a_time_line(run: Path, tmp_path: Path) -> None:
     folder = run / "recordings"
-    together({"mine": folder / "wrong.rrd", "theirs": folder / "z-copy.rrd"}, tmp_path / "both.rrd")
+    combine_recordings(
+        {"mine": folder / "wrong.rrd", "theirs": folder / "z-copy.rrd"}, tmp_path / "both.rrd"
+    )
     assert rerun("rrd", "verify", tmp_path / "both.rrd").returncode == 0
     alone = {name for name in entities(folder / "wrong.rrd") if not name.startswith("/__")}
-    assert {f"/{name}{entity.rstrip('/')}" for name in ("mine", "theirs") for entity in alone} <= entities(tmp_path / "both.rrd")
+    assert {
+        f"/{name}{entity.rstrip('/')}" for name in ("mine", "theirs") for entity in alone
+    } <= entities(tmp_path / "both.rrd")
     one = columns(folder / "wrong.rrd", "/vap/hand/gripper_to_target", "Scalars:scalars")
-    assert columns(tmp_path / "both.rrd", "/theirs/vap/hand/gripper_to_target", "Scalars:scalars") == one
-    with pytest.raises(BadStudy, match="not recordings of one episode: mine tabletop pick-owl 3 7; other tabletop pick-owl 4 7"):
-        together({"mine": folder / "wrong.rrd", "other": folder / "apart.rrd"}, tmp_path / "more.rrd")
+    assert (
+        columns(tmp_path / "both.rrd", "/theirs/vap/hand/gripper_to_target", "Scalars:scalars")
+        == one
+    )
+    with pytest.raises(
+        BadStudy,
+        match="not recordings of one episode: mine tabletop pick-owl 3 7; other tabletop pick-owl 4 7",
+    ):
+        combine_recordings(
+            {"mine": folder / "wrong.rrd", "other": folder / "apart.rrd"}, tmp_path / "more.rrd"
+        )
     with pytest.raises(BadOutput, match="never overwritten"):
-        together({"mine": folder / "wrong.rrd"}, tmp_path / "both.rrd")
+        combine_recordings({"mine": folder / "wrong.rrd"}, tmp_path / "both.rrd")

@@ -13,14 +13,19 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from vap_core.cli import app
-from vap_core.describe import WORDS
 from vap_core.memory import load_bank
-from vap_core.sim.objects import get
-from vap_core.sim.studio import reference_views
+from vap_core.perception.describe import WORDS
+from vap_core.simulation.assets.objects import get_object
+from vap_core.simulation.studio import reference_views
 
 
 def vap(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "vap_core", *map(str, words)], capture_output=True, text=True, timeout=300)
+    return subprocess.run(
+        [sys.executable, "-m", "vap_core", *map(str, words)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
 
 
 def refused(*words: str | Path) -> str:
@@ -37,7 +42,7 @@ def refused(*words: str | Path) -> str:
 def photos(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Reference views of the personal cup as picture files, and one more of it and of two look-alikes."""
     folder, paths = tmp_path_factory.mktemp("photos"), []
-    for i, rgb in enumerate(reference_views(get("cup-personal"), n=5)):
+    for i, rgb in enumerate(reference_views(get_object("cup-personal"), n=5)):
         paths.append(folder / f"mug-{i}.png")
         Image.fromarray(rgb).save(paths[-1])
     return paths
@@ -47,7 +52,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 def line(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
     """One picture of a look-alike, the personal cup and another look-alike side by side, and the three boxes."""
     names = ("cup-lookalike-1", "cup-personal", "cup-lookalike-2")
-    tiles = [reference_views(get(name), n=1, seed=9)[0] for name in names]
+    tiles = [reference_views(get_object(name), n=1, seed=9)[0] for name in names]
     path = tmp_path_factory.mktemp("line") / "line.png"
     Image.fromarray(np.concatenate(tiles, axis=1)).save(path)
     height, width = tiles[0].shape[:2]
@@ -69,7 +74,9 @@ def bank(photos: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
 def leaves(command: Any, *above: str) -> list[tuple[str, ...]]:
     """Every command, as the words that one types to run it."""
     inner = getattr(command, "commands", {})
-    return [words for name, part in inner.items() for words in leaves(part, *above, name)] or [above]
+    return [words for name, part in inner.items() for words in leaves(part, *above, name)] or [
+        above
+    ]
 
 
 COMMANDS = leaves(typer.main.get_command(app))
@@ -91,24 +98,50 @@ def test_help() -> None:
     assert all(f"  {words[0]} " in done.stdout for words in COMMANDS)
 
 
-def test_ground_answers_in_json_with_a_picture_and_a_recording(line: tuple[Path, list[str]], bank: Path, tmp_path: Path) -> None:
+def test_ground_answers_in_json_with_a_picture_and_a_recording(
+    line: tuple[Path, list[str]], bank: Path, tmp_path: Path
+) -> None:
     image, boxes = line
     hand = [word for box in boxes for word in ("--box", box)]
-    done = vap("ground", image, "bring my cup", "--object", "mug", "--memory", bank, "--out", tmp_path, "--json", *hand)
+    done = vap(
+        "ground",
+        image,
+        "bring my cup",
+        "--object",
+        "mug",
+        "--memory",
+        bank,
+        "--out",
+        tmp_path,
+        "--json",
+        *hand,
+    )
     assert done.returncode == 0, done.stderr
     answer = json.loads(done.stdout)
-    assert (answer["winner"], answer["instruction"], sum(answer["votes"])) == (1, "bring the red cup", 5)
+    assert (answer["winner"], answer["instruction"], sum(answer["votes"])) == (
+        1,
+        "bring the red cup",
+        5,
+    )
     assert np.array(answer["similarity"]).shape == (3, 5)
     assert 0 <= answer["margin"] <= 1
     assert (tmp_path / "line.png").stat().st_size > 20_000
-    assert subprocess.run([sys.executable, "-m", "rerun", "rrd", "verify", str(tmp_path / "line.rrd")], capture_output=True).returncode == 0
+    assert (
+        subprocess.run(
+            [sys.executable, "-m", "rerun", "rrd", "verify", str(tmp_path / "line.rrd")],
+            capture_output=True,
+        ).returncode
+        == 0
+    )
     again = vap("ground", image, "bring my cup", "--memory", bank, "--out", tmp_path, *hand)
     assert "-> #1" in again.stdout
     assert (tmp_path / "line-2.rrd").exists()
     assert not again.stderr
 
 
-def test_ground_without_boxes_warns_that_the_detector_knows_renders_only(photos: list[Path], bank: Path, tmp_path: Path) -> None:
+def test_ground_without_boxes_warns_that_the_detector_knows_renders_only(
+    photos: list[Path], bank: Path, tmp_path: Path
+) -> None:
     done = vap("ground", photos[0], "bring my cup", "--memory", bank, "--out", tmp_path, "--json")
     assert "not real photos" in done.stderr
     assert json.loads(done.stdout)["winner"] == 0
@@ -116,7 +149,16 @@ def test_ground_without_boxes_warns_that_the_detector_knows_renders_only(photos:
 
 def test_nothing_found_is_an_answer_and_not_an_error(bank: Path, tmp_path: Path) -> None:
     Image.new("RGB", (224, 224), (120, 130, 140)).save(tmp_path / "empty.png")
-    done = vap("ground", tmp_path / "empty.png", "bring my cup", "--memory", bank, "--out", tmp_path / "out", "--json")
+    done = vap(
+        "ground",
+        tmp_path / "empty.png",
+        "bring my cup",
+        "--memory",
+        bank,
+        "--out",
+        tmp_path / "out",
+        "--json",
+    )
     assert done.returncode == 0, done.stderr
     answer = json.loads(done.stdout)
     assert (answer["winner"], answer["votes"], answer["instruction"]) == (None, [], "bring my cup")
@@ -124,52 +166,91 @@ def test_nothing_found_is_an_answer_and_not_an_error(bank: Path, tmp_path: Path)
     assert (tmp_path / "out" / "empty.png").exists()
 
 
-def test_register_refuses_bad_photos_and_loses_nothing(bank: Path, photos: list[Path], tmp_path: Path) -> None:
+def test_register_refuses_bad_photos_and_loses_nothing(
+    bank: Path, photos: list[Path], tmp_path: Path
+) -> None:
     (tmp_path / "note.txt").write_text("not a picture")
-    assert "cannot be read as an image" in refused("register", "x", "--category", "cup", "--memory", bank, photos[0], tmp_path / "note.txt")
-    assert "is not a file" in refused("register", "x", "--category", "cup", "--memory", bank, tmp_path / "missing.jpg")
-    assert "--replace" in refused("register", "mug", "--category", "cup", "--memory", bank, photos[0])
+    assert "cannot be read as an image" in refused(
+        "register", "x", "--category", "cup", "--memory", bank, photos[0], tmp_path / "note.txt"
+    )
+    assert "is not a file" in refused(
+        "register", "x", "--category", "cup", "--memory", bank, tmp_path / "missing.jpg"
+    )
+    assert "--replace" in refused(
+        "register", "mug", "--category", "cup", "--memory", bank, photos[0]
+    )
     assert [path.name for path in bank.iterdir()] == ["mug.object.safetensors"]
     assert vap("register", "x", "--category", "cup", "--memory", bank).returncode == 2
-    assert "cannot name an object" in refused("register", "../x", "--whole", "--category", "cup", "--memory", bank, photos[0])
-    assert "cannot be a category" in refused("register", "x", "--whole", "--category", "cup!", "--memory", bank, photos[0])
+    assert "cannot name an object" in refused(
+        "register", "../x", "--whole", "--category", "cup", "--memory", bank, photos[0]
+    )
+    assert "cannot be a category" in refused(
+        "register", "x", "--whole", "--category", "cup!", "--memory", bank, photos[0]
+    )
 
 
-def test_ground_refuses_what_it_cannot_match(line: tuple[Path, list[str]], bank: Path, tmp_path: Path) -> None:
+def test_ground_refuses_what_it_cannot_match(
+    line: tuple[Path, list[str]], bank: Path, tmp_path: Path
+) -> None:
     image, boxes = line
     common = ("--memory", bank, "--out", tmp_path, "--box", boxes[0])
     assert 'name one as "my <category>"' in refused("ground", image, "bring the cup", *common)
     assert "no 'shoe' is remembered" in refused("ground", image, "bring my shoe", *common)
     assert "known: mug" in refused("ground", image, "bring my cup", "--object", "jug", *common)
-    assert "x0,y0,x1,y1" in refused("ground", image, "bring my cup", "--box", "1,2,3", "--memory", bank, "--out", tmp_path)
-    assert "no area" in refused("ground", image, "bring my cup", "--box", "9,9,3,3", "--memory", bank, "--out", tmp_path)
-    assert "known: embedded" in refused("ground", image, "bring my cup", "--stack", "psychic", *common)
+    assert "x0,y0,x1,y1" in refused(
+        "ground", image, "bring my cup", "--box", "1,2,3", "--memory", bank, "--out", tmp_path
+    )
+    assert "no area" in refused(
+        "ground", image, "bring my cup", "--box", "9,9,3,3", "--memory", bank, "--out", tmp_path
+    )
+    assert "known: embedded" in refused(
+        "ground", image, "bring my cup", "--stack", "psychic", *common
+    )
 
 
-def test_ground_refuses_a_damaged_memory(line: tuple[Path, list[str]], bank: Path, tmp_path: Path) -> None:
+def test_ground_refuses_a_damaged_memory(
+    line: tuple[Path, list[str]], bank: Path, tmp_path: Path
+) -> None:
     whole = next(bank.iterdir()).read_bytes()
     (tmp_path / "mug.object.safetensors").write_bytes(whole[: len(whole) // 2])
-    assert "register the object again" in refused("ground", line[0], "bring my cup", "--memory", tmp_path, "--box", line[1][0])
+    assert "register the object again" in refused(
+        "ground", line[0], "bring my cup", "--memory", tmp_path, "--box", line[1][0]
+    )
 
 
 def test_rollout_refuses_unknown_names_and_foreign_folders(tmp_path: Path) -> None:
     out = ("--out", tmp_path / "run")
-    assert "known: franka-pick, simpler-bridge, simpler-fractal, tabletop, vlabench, widowx-pick" in refused(
-        "rollout", "--suite", "simpler", "--task", "pick-cup", *out
+    assert (
+        "known: franka-pick, simpler-bridge, simpler-fractal, tabletop, vlabench, widowx-pick"
+        in refused("rollout", "--suite", "simpler", "--task", "pick-cup", *out)
     )
-    assert "pick-bottle" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-moon", *out)
-    assert "known: generic" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--method", "magic", *out)
-    assert "known: expert, mini-pi0, random, scripted" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--policy", "pi9", *out)
+    assert "pick-bottle" in refused(
+        "rollout", "--suite", "widowx-pick", "--task", "pick-moon", *out
+    )
+    assert "known: generic" in refused(
+        "rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--method", "magic", *out
+    )
+    assert "known: expert, mini-pi0, random, scripted" in refused(
+        "rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--policy", "pi9", *out
+    )
     assert not (tmp_path / "run").exists()
     (tmp_path / "thesis.txt").write_text("dear")
-    assert "choose another folder" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--out", tmp_path)
-    assert "cannot be written" in refused("rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--out", "/proc/run")
+    assert "choose another folder" in refused(
+        "rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--out", tmp_path
+    )
+    assert "cannot be written" in refused(
+        "rollout", "--suite", "widowx-pick", "--task", "pick-cup", "--out", "/proc/run"
+    )
 
 
-def test_a_picture_in_the_output_folder_is_never_overwritten(line: tuple[Path, list[str]], bank: Path, tmp_path: Path) -> None:
+def test_a_picture_in_the_output_folder_is_never_overwritten(
+    line: tuple[Path, list[str]], bank: Path, tmp_path: Path
+) -> None:
     mine = tmp_path / "mine.png"
     mine.write_bytes(line[0].read_bytes())
-    done = vap("ground", mine, "bring my cup", "--memory", bank, "--out", tmp_path, "--box", line[1][0])
+    done = vap(
+        "ground", mine, "bring my cup", "--memory", bank, "--out", tmp_path, "--box", line[1][0]
+    )
     assert done.returncode == 0, done.stderr
     assert "the only candidate" in done.stdout
     assert mine.read_bytes() == line[0].read_bytes()

@@ -6,13 +6,13 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from vap_core import cluster, engine
-from vap_core.errors import BadCluster, WorkerDied
-from vap_core.experiments import Study
-from vap_core.processes import results
-from vap_core.record.index import FOLDER
-from vap_core.store import open_run
-from vap_core.traces import read as read_traces
+from vap_core.base.errors import BadCluster, WorkerDied
+from vap_core.evaluation import cluster, engine
+from vap_core.evaluation.processes import results
+from vap_core.evaluation.state_log import read as read_traces
+from vap_core.evaluation.store import open_run
+from vap_core.evaluation.study import Study
+from vap_core.recording.index import FOLDER
 
 STUDY = Study((("simpler-bridge", "pick-shaver"),), ("generic",), policy="random", episodes=6)
 
@@ -29,21 +29,37 @@ def address() -> Iterator[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning", "ignore::FutureWarning")
+@pytest.mark.filterwarnings(
+    "ignore::ResourceWarning", "ignore::DeprecationWarning", "ignore::FutureWarning"
+)
 def test_a_cluster_gives_what_local_processes_give(address: str, tmp_path: Path) -> None:
-    there = engine.run(STUDY, tmp_path / "ray", record="all", progress=False, spread=cluster.spread(address))
+    there = engine.run(
+        STUDY, tmp_path / "ray", record="all", progress=False, spread=cluster.spread(address)
+    )
     here = engine.run(STUDY, tmp_path / "local", record="all", progress=False, spread=results)
-    columns = [name for name in here.columns if name != "peak_mb" and not name.startswith("seconds_")]
+    columns = [
+        name for name in here.columns if name != "peak_mb" and not name.startswith("seconds_")
+    ]
     pd.testing.assert_frame_equal(there[columns], here[columns])
     one, other = (dict(read_traces(tmp_path / name)) for name in ("ray", "local"))
     assert one.keys() == other.keys()
     for name in one:
-        assert [truth.objects_world.keys() for truth in one[name]] == [truth.objects_world.keys() for truth in other[name]]
-    names = [sorted(path.name for path in (tmp_path / name / "recordings").glob("*.rrd")) for name in ("ray", "local")]
+        assert [truth.objects_world.keys() for truth in one[name]] == [
+            truth.objects_world.keys() for truth in other[name]
+        ]
+    names = [
+        sorted(path.name for path in (tmp_path / name / "recordings").glob("*.rrd"))
+        for name in ("ray", "local")
+    ]
     assert names[0] == names[1]
     assert len(names[0]) == 6
-    assert [len(list((tmp_path / name / "recordings" / FOLDER).glob("*.rrd"))) for name in ("ray", "local")] == [6, 6]
-    again = engine.run(STUDY, tmp_path / "ray", progress=False, spread=cluster.spread("127.0.0.1:1"))
+    assert [
+        len(list((tmp_path / name / "recordings" / FOLDER).glob("*.rrd")))
+        for name in ("ray", "local")
+    ] == [6, 6]
+    again = engine.run(
+        STUDY, tmp_path / "ray", progress=False, spread=cluster.spread("127.0.0.1:1")
+    )
     pd.testing.assert_frame_equal(again, there)  # nothing is missing, nobody is asked
 
     def dies(job: engine.Job) -> engine.Rows:
@@ -55,11 +71,18 @@ def test_a_cluster_gives_what_local_processes_give(address: str, tmp_path: Path)
     jobs = list(engine.missing(STUDY, open_run(tmp_path / "dies", STUDY.configuration())))[:1]
     with pytest.raises(WorkerDied, match="a worker of the cluster died"):
         list(cluster.spread(address)(dies, jobs, 1, ""))
-    strange = list(engine.missing(STUDY, open_run(tmp_path / "strange", {**STUDY.configuration(), "version": "9.9"})))[:1]
+    strange = list(
+        engine.missing(
+            STUDY, open_run(tmp_path / "strange", {**STUDY.configuration(), "version": "9.9"})
+        )
+    )[:1]
     with pytest.raises(BadCluster, match=r"is not like this machine \(version 9.9 there"):
         list(cluster.spread(address)(dies, strange, 1, ""))
 
 
 def test_no_cluster_is_said_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(BadCluster, match=r"no Ray cluster answers at 'nowhere' .*; start one with `ray start --head"):
+    with pytest.raises(
+        BadCluster,
+        match=r"no Ray cluster answers at 'nowhere' .*; start one with `ray start --head",
+    ):
         engine.run(STUDY, tmp_path / "run", progress=False, spread=cluster.spread("nowhere"))

@@ -7,22 +7,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vap_core.errors import BadAction
-from vap_core.sim.control import LEASH, Command, arm, follow_joints
-from vap_core.sim.robots import ROBOTS
+from vap_core.base.errors import BadAction
+from vap_core.simulation.control import LEASH, Setpoint, arm, follow_joints
+from vap_core.simulation.robots import ROBOTS
 
 SECONDS = 1 / 30
 
 
-def at_home(name: str) -> Command:
+def at_home(name: str) -> Setpoint:
     home = ROBOTS[name].home
-    return Command(arm(name).forward(home), home, 1.0)
+    return Setpoint(arm(name).forward(home), home, 1.0)
 
 
 @pytest.mark.parametrize("name", sorted(ROBOTS))
 def test_small_deltas_are_done_exactly_and_the_pose_is_the_joints(name: str) -> None:
     start, delta = at_home(name), np.full(len(ROBOTS[name].joints), 0.01)
-    after = follow_joints(arm(name), start, start.joints, np.array([*delta, 0.4], np.float32), SECONDS)
+    after = follow_joints(
+        arm(name), start, start.joints, np.array([*delta, 0.4], np.float32), SECONDS
+    )
     assert after.joints == pytest.approx(start.joints + delta, abs=1e-7)
     assert after.gripper == pytest.approx(0.4)
     assert after.tcp_base == pytest.approx(arm(name).forward(after.joints))

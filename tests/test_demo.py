@@ -14,24 +14,43 @@ import pytest
 import torch
 
 from vap_core.attend import Attender
-from vap_core.errors import BadOutput, UnknownName
-from vap_core.experiments import DEMO, Study, make_trial, register_personal
-from vap_core.record import Recorder, read_summary, recording_name
-from vap_core.rollout import rollout
-from vap_core.store import locked, open_run, read
-from vap_core.values import Episode, PolicyInput
+from vap_core.base.errors import BadOutput, UnknownName
+from vap_core.evaluation.store import locked, open_run, read
+from vap_core.evaluation.study import DEMO, Study, make_trial, register_personal
+from vap_core.policies.protocol import PolicyInput
+from vap_core.recording import Recorder, read_summary, recording_name
+from vap_core.rollout.loop import rollout
+from vap_core.rollout.prompters.tint import TintPrompter
+from vap_core.rollout.types import Episode
 
 ENV = {**os.environ, "OMP_NUM_THREADS": "1"}
 
 
 def command(out: Path, episodes: int) -> list[str]:
-    return [sys.executable, "-m", "vap_core", "demo", "--out", str(out), "--episodes", str(episodes), "--workers", "2"]
+    return [
+        sys.executable,
+        "-m",
+        "vap_core",
+        "demo",
+        "--out",
+        str(out),
+        "--episodes",
+        str(episodes),
+        "--workers",
+        "2",
+    ]
 
 
 @pytest.mark.slow
 def test_killed_then_resumed_it_ends_with_the_whole_table(tmp_path: Path) -> None:
     out = tmp_path / "demo"
-    with subprocess.Popen(command(out, 6), env=ENV, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True) as first:
+    with subprocess.Popen(
+        command(out, 6),
+        env=ENV,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    ) as first:
         deadline = time.monotonic() + 240
         while not list(out.glob("parts/*.parquet")) and time.monotonic() < deadline:
             time.sleep(0.3)
@@ -41,7 +60,9 @@ def test_killed_then_resumed_it_ends_with_the_whole_table(tmp_path: Path) -> Non
     done = subprocess.run(command(out, 6), env=ENV, capture_output=True, text=True, timeout=400)
     assert done.returncode == 0, done.stderr
     after = read(out).set_index("key").loc[before.key]
-    assert (after.seconds_physics.to_numpy() == before.seconds_physics.to_numpy()).all(), "what was stored did not run again"
+    assert (after.seconds_physics.to_numpy() == before.seconds_physics.to_numpy()).all(), (
+        "what was stored did not run again"
+    )
     _complete(out, done.stdout)
     again = subprocess.run(command(out, 6), env=ENV, capture_output=True, text=True, timeout=120)
     assert again.stdout == done.stdout
@@ -52,8 +73,12 @@ def test_killed_then_resumed_it_ends_with_the_whole_table(tmp_path: Path) -> Non
 
 def _complete(out: Path, printed: str) -> None:
     lines = json.loads((out / "summary.json").read_text())
-    assert [(s["suite"], s["method"], s["n"]) for s in lines] == [(suite, m, 6) for suite, _ in DEMO.tasks for m in ("generic", "vap")]
-    assert all({"task", "sr", "cmr", "wrong_object", "intervals", "errors"} <= s.keys() for s in lines)
+    assert [(s["suite"], s["method"], s["n"]) for s in lines] == [
+        (suite, m, 6) for suite, _ in DEMO.tasks for m in ("generic", "vap")
+    ]
+    assert all(
+        {"task", "sr", "cmr", "wrong_object", "intervals", "errors"} <= s.keys() for s in lines
+    )
     assert all(s["errors"] == 0 for s in lines)
     assert "CMR % [95 %]" in printed
     assert "scripted" in printed
@@ -61,12 +86,18 @@ def _complete(out: Path, printed: str) -> None:
     recordings = sorted((out / "recordings").glob("*.rrd"))
     assert len(recordings) == 24
     for recording in recordings[::5]:
-        done = subprocess.run([sys.executable, "-m", "rerun", "rrd", "verify", str(recording)], capture_output=True, text=True)
+        done = subprocess.run(
+            [sys.executable, "-m", "rerun", "rrd", "verify", str(recording)],
+            capture_output=True,
+            text=True,
+        )
         assert done.returncode == 0, done.stdout + done.stderr
-    told = {(r["suite"], r["episode"], r["method"]): r["success"] for r in read(out).to_dict("records")}
+    told = {
+        (r["suite"], r["episode"], r["method"]): r["success"] for r in read(out).to_dict("records")
+    }
     for recording in recordings[::6]:
         said = read_summary(recording)
-        assert said["outcome.success"] == told[said["rollout.suite"], said["rollout.episode"], said["rollout.method"]]
+        assert said["success"] == told[said["suite"], said["episode"], said["method"]]
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +113,10 @@ SUITE, TASK = DEMO.tasks[0]
 
 def same(one: Episode, other: Episode) -> None:
     assert one.outcome.steps == other.outcome.steps
-    assert one.summary().items() >= {k: v for k, v in other.summary().items() if not k.startswith("seconds")}.items()
+    assert (
+        one.summary().items()
+        >= {k: v for k, v in other.summary().items() if not k.startswith("seconds")}.items()
+    )
     for a, b in zip(one.frames, other.frames, strict=True):
         assert np.array_equal(a.action, b.action)
         assert (a.state == b.state).all()
@@ -117,7 +151,7 @@ def test_the_prompt_reaches_the_policy_and_only_the_prompt(bank: Path) -> None:
     row = replace(STUDY.rows(SUITE, TASK)[0], max_steps=2)
     (episode,) = rollout(replace(trial, policy=Witness()), [row], keep_images=True)
     frame = episode.frames[0]
-    assert seen[0].text == episode.opening.rewritten == f"pick up the red {row.category}"
+    assert seen[0].text == episode.header.rewritten == f"pick up the red {row.category}"
     assert seen[0].images["front"] is frame.prompted["front"]
     changed = (frame.images["front"] != frame.prompted["front"]).any(axis=2)
     assert changed.any()
@@ -126,13 +160,19 @@ def test_the_prompt_reaches_the_policy_and_only_the_prompt(bank: Path) -> None:
 
 def test_generic_sees_raw_images_and_raw_words(bank: Path) -> None:
     trial = make_trial(STUDY, STUDY.rows(SUITE, TASK), "generic", bank)
-    (episode,) = rollout(trial, [replace(STUDY.rows(SUITE, TASK)[0], max_steps=2)], keep_images=True)
-    assert episode.opening.rewritten == episode.opening.instruction
+    (episode,) = rollout(
+        trial, [replace(STUDY.rows(SUITE, TASK)[0], max_steps=2)], keep_images=True
+    )
+    assert episode.header.rewritten == episode.header.instruction
     assert all((f.images["front"] == f.prompted["front"]).all() for f in episode.frames)
-    assert [frame.action is None for frame in episode.frames] == [False, False, True], "nothing is executed at the terminal frame"
+    assert [frame.action is None for frame in episode.frames] == [False, False, True], (
+        "nothing is executed at the terminal frame"
+    )
 
 
-def test_an_episode_that_breaks_is_an_error_with_its_traceback_and_its_recording(bank: Path, tmp_path: Path) -> None:
+def test_an_episode_that_breaks_is_an_error_with_its_traceback_and_its_recording(
+    bank: Path, tmp_path: Path
+) -> None:
     trial = make_trial(STUDY, STUDY.rows(SUITE, TASK), "generic", bank)
 
     class Breaks:
@@ -148,7 +188,9 @@ def test_an_episode_that_breaks_is_an_error_with_its_traceback_and_its_recording
 
     rows = STUDY.rows(SUITE, TASK)[:1]
     path = tmp_path / recording_name(rows[0], "generic")
-    (episode,) = rollout(replace(trial, policy=Breaks()), rows, lambda opening: Recorder(path, opening))
+    (episode,) = rollout(
+        replace(trial, policy=Breaks()), rows, lambda opening: Recorder(path, opening)
+    )
     assert (episode.outcome.status, episode.outcome.success) == ("error", False)
     assert "the policy fell over" in episode.outcome.detail
     assert len(episode.frames) == 4
@@ -177,17 +219,20 @@ def test_a_policy_that_chokes_on_one_episode_spares_the_others(bank: Path) -> No
 def test_an_error_before_the_first_step_keeps_its_method_and_its_place(bank: Path) -> None:
     trial = make_trial(STUDY, STUDY.rows(SUITE, TASK), "vap", bank)
 
-    assert trial.attender is not None
+    assert isinstance(trial.prompter, TintPrompter)
+    attender = trial.prompter.attender
 
     class Blind(Attender):
         def start(self, views, instruction, **options):  # type: ignore[no-untyped-def]
             raise RuntimeError("the detector fell over")
 
-    blind = Blind(trial.attender.stack, trial.attender.memory)
+    blind = TintPrompter(Blind(attender.stack, attender.memory))
 
     rows = STUDY.rows(SUITE, TASK)[:2]
-    episodes = list(rollout(replace(trial, attender=blind), rows))
-    assert [(e.outcome.status, e.summary()["method"], e.summary()["policy"]) for e in episodes] == [("error", "vap", "scripted")] * 2
+    episodes = list(rollout(replace(trial, prompter=blind), rows))
+    assert [(e.outcome.status, e.summary()["method"], e.summary()["policy"]) for e in episodes] == [
+        ("error", "vap", "scripted")
+    ] * 2
     assert "the detector fell over" in episodes[0].outcome.detail
 
 
@@ -200,18 +245,27 @@ def test_a_run_in_use_is_left_alone(tmp_path: Path) -> None:
 def test_a_dead_worker_is_said_and_what_was_done_stays(tmp_path: Path) -> None:
     out = tmp_path / "demo"
     code = (
-        "import os, vap_core.engine as e, vap_core.experiments as x\n"
+        "import os, vap_core.evaluation.engine as e, vap_core.evaluation.study as x\n"
         "from dataclasses import replace; from pathlib import Path\n"
         "def work(job): os.kill(os.getpid(), 9)\n"
         "e.work = work\n"
         f"\nif __name__ == '__main__': e.run(replace(x.DEMO, episodes=1), Path({str(out)!r}), progress=False)\n"
     )
     (tmp_path / "die.py").write_text(code)
-    done = subprocess.run([sys.executable, str(tmp_path / "die.py")], env=ENV, capture_output=True, text=True, timeout=200)
+    done = subprocess.run(
+        [sys.executable, str(tmp_path / "die.py")],
+        env=ENV,
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
     assert "WorkerDied: a worker process died" in done.stderr.strip().splitlines()[-1]
     assert (out / "run.json").exists()
 
 
 def test_study_refuses_unknown_names() -> None:
-    with pytest.raises(UnknownName, match="known: franka-pick, simpler-bridge, simpler-fractal, tabletop, vlabench, widowx-pick"):
+    with pytest.raises(
+        UnknownName,
+        match="known: franka-pick, simpler-bridge, simpler-fractal, tabletop, vlabench, widowx-pick",
+    ):
         Study((("nowhere", "pick-cup"),), ("vap",))

@@ -11,21 +11,32 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vap_core import describe
-from vap_core.prompt import PALETTE, looks_like
-from vap_core.sim import objects
-from vap_core.suites import BENCHMARKS, suite
-from vap_core.training import demonstrations, policy
-from vap_core.training.batches import SPIN_Z, Frames, statistics
-from vap_core.training.commands import command, near, painted, rough, say, tinted
-from vap_core.training.demonstrations import PARTS, SIDE, Film, after_a_miss, cached, cast, row
-from vap_core.training.questions import LEAST_PX, ask, place
+from vap_core.perception import describe
+from vap_core.prompt import PALETTE, has_colour
+from vap_core.simulation.assets import objects
+from vap_core.simulation.suites import BENCHMARKS, suite
+from vap_core.training.films import demonstrations
+from vap_core.training.films.demonstrations import (
+    PARTS,
+    SIDE,
+    Film,
+    after_a_miss,
+    cached,
+    cast,
+    row,
+)
+from vap_core.training.policy import train as policy
+from vap_core.training.policy.batches import SPIN_Z, Frames, statistics
+from vap_core.training.policy.commands import command, near, painted, rough, say, tinted
+from vap_core.training.vlm.questions import LEAST_PX, ask, place
 from vap_core.training.words import PAINTS, akin, looks, phrases, vocabulary
 
 SUITE = "simpler-bridge"
 
 
-def test_a_film_shows_a_generic_target_from_first_to_last_action(stage: tuple[Path, list[Film]]) -> None:
+def test_a_film_shows_a_generic_target_from_first_to_last_action(
+    stage: tuple[Path, list[Film]],
+) -> None:
     _, films = stage
     assert films
     for film in films:
@@ -33,15 +44,21 @@ def test_a_film_shows_a_generic_target_from_first_to_last_action(stage: tuple[Pa
         assert film.images.shape == (steps, 1, SIDE, SIDE, 3)
         assert film.action.shape[1] == 7
         assert film.names[film.goal] == suite(SUITE).task(film.task).goal
-        assert {objects.get(name).split for i, name in enumerate(film.names) if i != film.goal} == {"generic"}
+        assert {
+            objects.get_object(name).split for i, name in enumerate(film.names) if i != film.goal
+        } == {"generic"}
         seen = (film.ids == 1).sum((1, 2, 3))
-        assert (seen.max() if after_a_miss(film) else seen[0]) > 30, "the target is in view; a hand that missed may hide it at first"
+        assert (seen.max() if after_a_miss(film) else seen[0]) > 30, (
+            "the target is in view; a hand that missed may hide it at first"
+        )
         assert np.linalg.norm(film.places[-1, 0] - film.places[0, 0]) > 0.03, "and is moved"
         still = np.linalg.norm(film.places[-1, 1:] - film.places[0, 1:], axis=1)
         assert np.delete(still, film.goal - 1).max() < 0.03, "its rivals are not"
 
 
-def test_films_are_kept_and_come_again_alike(stage: tuple[Path, list[Film]], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_films_are_kept_and_come_again_alike(
+    stage: tuple[Path, list[Film]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder, films = stage
     (path,) = folder.glob("*.npz")
     before = path.stat().st_mtime_ns
@@ -54,27 +71,47 @@ def test_films_are_kept_and_come_again_alike(stage: tuple[Path, list[Film]], mon
             assert np.array_equal(getattr(one, part), getattr(again, part))
 
 
-def test_fewer_pictures_of_the_same_film_teach_the_same(stage: tuple[Path, list[Film]], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fewer_pictures_of_the_same_film_teach_the_same(
+    stage: tuple[Path, list[Film]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A suite may keep every third picture: the film is the same otherwise, and a step that has one is told and answered as before."""
     _, whole = stage
     monkeypatch.setattr(demonstrations, "EPISODES", 2)
-    before = [command(film, t, SUITE, np.random.default_rng(t)) for film in whole for t in range(0, len(film.action), 3)]
+    before = [
+        command(film, t, SUITE, np.random.default_rng(t))
+        for film in whole
+        for t in range(0, len(film.action), 3)
+    ]
     monkeypatch.setattr(demonstrations, "EVERY", {SUITE: 3})
     films = demonstrations.films(SUITE, 0, 1)
     for film, all_of_it in zip(films, whole, strict=True):
         fewer = replace(all_of_it, images=all_of_it.images[::3], ids=all_of_it.ids[::3])
         assert all(np.array_equal(getattr(film, part), getattr(fewer, part)) for part in PARTS)
-    after = [command(film, t, SUITE, np.random.default_rng(t)) for film in films for t in range(0, len(film.action), 3)]
+    after = [
+        command(film, t, SUITE, np.random.default_rng(t))
+        for film in films
+        for t in range(0, len(film.action), 3)
+    ]
     for one, other in zip(before, after, strict=True):
         assert (one.text, one.way) == (other.text, other.way)
         assert np.array_equal(one.images, other.images)
     recipe = policy.Recipe(SUITE, batch=64)
     config, stats = policy.configuration(recipe, films[0].state.shape[1], 7), statistics(films)
-    made = Frames(SUITE, films, stats, config, recipe.focus).draw(recipe.batch, np.random.default_rng(0))
-    scaled = [(film.state - stats["observation.state"]["mean"].numpy()) / stats["observation.state"]["std"].numpy() for film in films]
+    made = Frames(SUITE, films, stats, config, recipe.focus).draw(
+        recipe.batch, np.random.default_rng(0)
+    )
+    scaled = [
+        (film.state - stats["observation.state"]["mean"].numpy())
+        / stats["observation.state"]["std"].numpy()
+        for film in films
+    ]
     shown = np.concatenate([part[::3] for part in scaled])
-    shown[:, [SPIN_Z, -1]] = made.state[:, [SPIN_Z, -1]] = 0.0  # a hand may be shown turned otherwise
-    assert all((np.abs(shown - state.numpy()).max(axis=1) < 1e-4).any() for state in made.state), "only steps with a picture are learned from"
+    shown[:, [SPIN_Z, -1]] = made.state[:, [SPIN_Z, -1]] = (
+        0.0  # a hand may be shown turned otherwise
+    )
+    assert all((np.abs(shown - state.numpy()).max(axis=1) < 1e-4).any() for state in made.state), (
+        "only steps with a picture are learned from"
+    )
 
 
 def test_a_film_can_begin_where_a_grasp_has_missed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,8 +126,13 @@ def test_a_film_can_begin_where_a_grasp_has_missed(monkeypatch: pytest.MonkeyPat
         assert missed.action[:3, 2].sum() > 0.04 > 0.0 > first.action[:3, 2].sum()
         assert missed.action[2, -1] == 1.0
         assert missed.action[-1, -1] == pytest.approx(first.action[-1, -1])
-    away = [missed.state[0, 5] - missed.state[int((missed.action[:, -1] < 0.5).argmax()), 5] for missed in begun[1.0]]
-    assert np.abs((np.array(away) + np.pi / 2) % np.pi - np.pi / 2).max() > 0.3, "and it turns to it"
+    away = [
+        missed.state[0, 5] - missed.state[int((missed.action[:, -1] < 0.5).argmax()), 5]
+        for missed in begun[1.0]
+    ]
+    assert np.abs((np.array(away) + np.pi / 2) % np.pi - np.pi / 2).max() > 0.3, (
+        "and it turns to it"
+    )
 
 
 def test_casts_are_generic_and_of_one_category() -> None:
@@ -99,8 +141,8 @@ def test_casts_are_generic_and_of_one_category() -> None:
             for i in range(6):
                 names = cast(known, task, np.random.default_rng(i))
                 things = names[: len(names) - bool(task.goal)]
-                assert {objects.get(name).category for name in things} == {task.category}
-                assert {objects.get(name).split for name in things} == {"generic"}
+                assert {objects.get_object(name).category for name in things} == {task.category}
+                assert {objects.get_object(name).split for name in things} == {"generic"}
                 assert len(set(names)) == len(names) > 1
 
 
@@ -113,8 +155,14 @@ def test_every_stage_finds_room_for_its_objects() -> None:
             placed = row(known, task, names, n, "base", rng).placements
             assert {one.model for one in placed} == set(names)
             for one, other in itertools.combinations(placed, 2):
-                wide = sum(max(objects.extent_m(objects.get(each.model))[:2]) / 2 for each in (one, other))
-                assert np.hypot(one.x - other.x, one.y - other.y) > wide - 0.005, (known.name, names)
+                wide = sum(
+                    max(objects.extent_m(objects.get_object(each.model))[:2]) / 2
+                    for each in (one, other)
+                )
+                assert np.hypot(one.x - other.x, one.y - other.y) > wide - 0.005, (
+                    known.name,
+                    names,
+                )
 
 
 def test_a_command_says_what_its_picture_shows(stage: tuple[Path, list[Film]]) -> None:
@@ -131,15 +179,22 @@ def test_a_command_says_what_its_picture_shows(stage: tuple[Path, list[Film]]) -
         if made.way == "plain":
             assert near(film, t, SUITE, rivals)
         elif made.way == "described":
-            said = [word for word in (*mine.difference(*others), *phrases(film.names[0])) if f" {word}" in made.text]
+            said = [
+                word
+                for word in (*mine.difference(*others), *phrases(film.names[0]))
+                if f" {word}" in made.text
+            ]
             assert said
             assert mine.difference(*others)
         else:
-            colour = max((colour for colour in PAINTS if f" {colour.name}" in made.text), key=lambda colour: len(colour.name))
+            colour = max(
+                (colour for colour in PAINTS if f" {colour.name}" in made.text),
+                key=lambda colour: len(colour.name),
+            )
             assert made.way == "painted" or colour in PALETTE
             assert not any(akin(colour.name) & other for other in others)
             if colour in PALETTE and mask.sum() > 60:
-                assert looks_like(made.images[0][mask], colour).mean() > 0.15, made.text
+                assert has_colour(made.images[0][mask], colour).mean() > 0.15, made.text
     assert min(ways[way] for way in ("tinted", "painted", "described", "plain")) > 5
 
 
@@ -148,7 +203,10 @@ def test_my_is_said_of_a_generic_thing_too_and_once() -> None:
     said = {say(task, "", rng) for _ in range(40)}
     assert said == {f"put {word} camera on the plate" for word in ("my", "the", "a")}
     said = {say(task, "blue", rng) for _ in range(40)}
-    assert said == {"put the blue camera on the plate", "put my camera on the plate. My camera is blue."}
+    assert said == {
+        "put the blue camera on the plate",
+        "put my camera on the plate. My camera is blue.",
+    }
 
 
 @settings(max_examples=25)
@@ -159,15 +217,23 @@ def test_only_what_is_masked_changes_colour(seed: int, share: float) -> None:
     for change in (tinted, painted):
         out = change(images, masks, PALETTE[seed % len(PALETTE)], share)
         assert (out[~masks] == images[~masks]).all()
-    exact = (1 - share) * images[masks].astype(np.float32) + share * np.asarray(PALETTE[0].rgb, np.float32)
+    exact = (1 - share) * images[masks].astype(np.float32) + share * np.asarray(
+        PALETTE[0].rgb, np.float32
+    )
     assert np.abs(tinted(images, masks, PALETTE[0], share)[masks] - exact).max() <= 0.51
     empty = np.zeros((12, 12), bool)
     assert not rough(empty, rng).any()
 
 
 def test_training_hears_every_word_that_the_captioner_says() -> None:
-    names = [objects.generic(kind, i).name for kind in ("cup", "camera", "vase", "slipper") for i in range(120)]
-    heard = {word for name in names for phrase in phrases(name) for word in re.findall(r"\w+", phrase)}
+    names = [
+        objects.generic_instance(kind, i).name
+        for kind in ("cup", "camera", "vase", "slipper")
+        for i in range(120)
+    ]
+    heard = {
+        word for name in names for phrase in phrases(name) for word in re.findall(r"\w+", phrase)
+    }
     heard |= {colour.name for colour in PAINTS}
     assert set(describe.WORDS) <= heard, set(describe.WORDS) - heard
     assert heard <= set(vocabulary())
@@ -182,14 +248,28 @@ def test_questions_are_true_of_their_views(stage: tuple[Path, list[Film]]) -> No
         asked = ask(film.images[t, 0], film.ids[t, 0], film.names, 3, rng)
         assert asked.image.shape == film.images[t, 0].shape
         for question in asked.questions:
-            assert set(re.findall(r"[\w']+", question.text.lower())) | set(question.answer) <= known, question.text
-            kind = objects.get(film.names[question.target]).category if question.target >= 0 else ""
+            assert (
+                set(re.findall(r"[\w']+", question.text.lower())) | set(question.answer) <= known
+            ), question.text
+            kind = (
+                objects.get_object(film.names[question.target]).category
+                if question.target >= 0
+                else ""
+            )
             assert kind in question.text
             if question.answer == ("no",):  # nothing in view is of that kind and called so
-                asked_for = question.text.removeprefix("is there a ").removeprefix("can you recognize the ").removesuffix(" in this image")
-                assert not any(asked_for in (objects.get(name).category, *(f"{word} {objects.get(name).category}" for word in looks(name)))
+                asked_for = (
+                    question.text.removeprefix("is there a ")
+                    .removeprefix("can you recognize the ")
+                    .removesuffix(" in this image")
+                )
+                assert not any(asked_for in (objects.get_object(name).category, *(f"{word} {objects.get_object(name).category}" for word in looks(name)))
                                for i, name in enumerate(film.names) if (film.ids[t, 0] == i + 1).sum() >= LEAST_PX)  # fmt: skip
-            ends[question.answer[:1] if question.answer[:1] in (("yes",), ("no",)) else (question.text.split()[0],)] += 1
+            ends[
+                question.answer[:1]
+                if question.answer[:1] in (("yes",), ("no",))
+                else (question.text.split()[0],)
+            ] += 1
             if question.text.startswith("where"):
                 assert question.answer == place(film.ids[t, 0] == question.target + 1)
             if question.answer == ("no",):

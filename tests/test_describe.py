@@ -14,11 +14,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.toys import personal
-from vap_core import describe
-from vap_core.chat import Chat, ask, data_url, endpoint
-from vap_core.describe import COLOURS, WORDS, Attributes, Captioner, Seer, captioner, colour_names, described, spread
-from vap_core.errors import BadEndpoint
-from vap_core.values import Boxes, Description
+from vap_core.base.errors import BadEndpoint
+from vap_core.base.types import Boxes, Description
+from vap_core.perception.attributes import pattern_of
+from vap_core.perception.chat import (
+    ChatEndpoint,
+    data_url,
+    endpoint_from_environment,
+    request_answer,
+)
+from vap_core.perception.colours import COLOURS, colour_indices
+from vap_core.perception.describe import (
+    WORDS,
+    AttributeCaptioner,
+    Captioner,
+    ChatCaptioner,
+    load_captioner,
+    with_description,
+)
 
 TABLE = (150, 148, 145)
 INKS = {
@@ -33,7 +46,7 @@ def everything_but_the_table(image: np.ndarray, boxes: Boxes) -> np.ndarray:
     return np.repeat((np.abs(image.astype(int) - TABLE).max(axis=2) > 12)[None], len(boxes), axis=0)
 
 
-TELL = Attributes(everything_but_the_table)
+TELL = AttributeCaptioner(everything_but_the_table)
 
 
 def words(told: Description | None) -> tuple[str, str]:
@@ -41,7 +54,9 @@ def words(told: Description | None) -> tuple[str, str]:
     return told.short, told.long
 
 
-def thing(base: str, height: int = 120, width: int = 120, pattern: str = "", ink: str = "white") -> np.ndarray:
+def thing(
+    base: str, height: int = 120, width: int = 120, pattern: str = "", ink: str = "white"
+) -> np.ndarray:
     """A painted block on the table, 10 pixels of which show all around."""
     block = np.full((height, width, 3), INKS[base], np.uint8)
     y, x = np.mgrid[0:height, 0:width]
@@ -78,7 +93,10 @@ def test_bands_turned_a_quarter_are_stripes() -> None:
 
 
 def test_proportions_are_those_of_the_object() -> None:
-    assert [TELL([thing("red", h, w)], "cup").long.split()[1] for h, w in ((180, 90), (110, 120), (60, 150))] == ["tall", "compact", "wide"]
+    assert [
+        TELL([thing("red", h, w)], "cup").long.split()[1]
+        for h, w in ((180, 90), (110, 120), (60, 150))
+    ] == ["tall", "compact", "wide"]
 
 
 def test_shade_and_darkness_are_told_apart() -> None:
@@ -91,20 +109,41 @@ def test_shade_and_darkness_are_told_apart() -> None:
 
 @settings(max_examples=8)
 @given(st.permutations(range(4)), st.sampled_from(["blue", "red", "white"]), st.integers(100, 400))
-def test_neither_order_nor_size_of_the_pictures_matters(order: list[int], base: str, side: int) -> None:
-    crops = [thing(base, pattern=pattern, ink="black") for pattern in ("spots", "spots", "parts", "spots")]
+def test_neither_order_nor_size_of_the_pictures_matters(
+    order: list[int], base: str, side: int
+) -> None:
+    crops = [
+        thing(base, pattern=pattern, ink="black")
+        for pattern in ("spots", "spots", "parts", "spots")
+    ]
     told = TELL(crops, "cup")
     assert words(TELL([crops[i] for i in order], "cup")) == words(told)
-    scaled = [cv2.resize(crop, (side, side), interpolation=cv2.INTER_AREA if side < 140 else cv2.INTER_NEAREST) for crop in crops]
+    scaled = [
+        cv2.resize(
+            crop, (side, side), interpolation=cv2.INTER_AREA if side < 140 else cv2.INTER_NEAREST
+        )
+        for crop in crops
+    ]
     assert TELL(scaled, "cup").short.split(" with ")[0] == told.short.split(" with ")[0]
 
 
 @settings(max_examples=25)
-@given(st.lists(st.tuples(*[st.integers(0, 255)] * 3), min_size=1, max_size=4), st.integers(1, 60), st.integers(1, 60))
-def test_whatever_is_shown_is_put_into_known_words(colours: list[tuple[int, int, int]], h: int, w: int) -> None:
+@given(
+    st.lists(st.tuples(*[st.integers(0, 255)] * 3), min_size=1, max_size=4),
+    st.integers(1, 60),
+    st.integers(1, 60),
+)
+def test_whatever_is_shown_is_put_into_known_words(
+    colours: list[tuple[int, int, int]], h: int, w: int
+) -> None:
     """Also a noisy crop of one pixel: the vocabulary of a policy can hold every word that will be said."""
     rng = np.random.default_rng(h)
-    crops = [np.clip(np.full((h, w, 3), colour) + rng.integers(-40, 40, (h, w, 3)), 0, 255).astype(np.uint8) for colour in colours]
+    crops = [
+        np.clip(np.full((h, w, 3), colour) + rng.integers(-40, 40, (h, w, 3)), 0, 255).astype(
+            np.uint8
+        )
+        for colour in colours
+    ]
     told = TELL(crops, "cup")
     for text in (told.short, told.long):
         assert set(text.replace(",", "").split()) <= {*WORDS, "cup"}
@@ -113,30 +152,39 @@ def test_whatever_is_shown_is_put_into_known_words(colours: list[tuple[int, int,
 
 def test_every_pixel_has_a_name_and_grey_needs_no_colour() -> None:
     ramp = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
-    found = [COLOURS[i] for i in colour_names(ramp, np.ones((1, 256), bool))[0]]
+    found = [COLOURS[i] for i in colour_indices(ramp, np.ones((1, 256), bool))[0]]
     assert (found[0], found[255]) == ("black", "white")
-    assert [name for i, name in enumerate(found) if i == 0 or name != found[i - 1]] == ["black", "grey", "white"]
+    assert [name for i, name in enumerate(found) if i == 0 or name != found[i - 1]] == [
+        "black",
+        "grey",
+        "white",
+    ]
 
 
 def test_nothing_is_part_of_nothing() -> None:
-    assert spread(np.zeros((9, 9), bool), np.ones((9, 9), bool)) == "parts"
+    assert pattern_of(np.zeros((9, 9), bool), np.ones((9, 9), bool)) == "parts"
 
 
 def test_an_object_is_described_and_stays_itself() -> None:
     obj = personal("mug", "cup", (200, 35, 40))
-    after = described(obj, TELL)
+    after = with_description(obj, TELL)
     assert words(after.description) == words(TELL(obj.crops, "cup"))
-    assert (after.name, after.crops is obj.crops, after.embeddings is obj.embeddings) == ("mug", True, True)
+    assert (after.name, after.crops is obj.crops, after.embeddings is obj.embeddings) == (
+        "mug",
+        True,
+        True,
+    )
 
 
 def test_the_shipped_segmenter_and_pictures_of_real_renders() -> None:
-    from vap_core.segment import load
-    from vap_core.sim.objects import get
-    from vap_core.sim.studio import reference_views
+    from vap_core.perception.embedded.segmenter import load
+    from vap_core.simulation.assets.objects import get_object
+    from vap_core.simulation.studio import reference_views
 
-    tell = captioner(load())
+    tell = load_captioner(load())
     told = {
-        name: tell([view[60:-60, 60:-60] for view in reference_views(get(name))], "thing") for name in ("cat-figurine-personal", "scrubber-personal")
+        name: tell([view[60:-60, 60:-60] for view in reference_views(get_object(name))], "thing")
+        for name in ("cat-figurine-personal", "scrubber-personal")
     }
     assert told["cat-figurine-personal"].short.startswith("black")
     assert "red with green" in told["scrubber-personal"].short
@@ -190,14 +238,16 @@ def _no_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_model_sees_every_crop_and_is_asked_once_for_each_length() -> None:
     crops = [thing("red"), thing("blue")]
     with serving(says('"A red cup."'), says("a  red cup\nwith a thin rim")) as server:
-        told = Seer(Chat(server.url, "seer-1", "secret"))(crops, "cup")
+        told = ChatCaptioner(ChatEndpoint(server.url, "seer-1", "secret"))(crops, "cup")
     assert words(told) == ("A red cup", "a red cup with a thin rim")
     (path, key, short), (_, _, long) = server.asked
     assert (path, key, short["model"]) == ("/v1/chat/completions", "Bearer secret", "seer-1")
     text, *pictures = short["messages"][0]["content"]
     assert "same cup" in text["text"]
     assert text["text"] != long["messages"][0]["content"][0]["text"]
-    assert [picture["image_url"]["url"] for picture in pictures] == [data_url(crop) for crop in crops]
+    assert [picture["image_url"]["url"] for picture in pictures] == [
+        data_url(crop) for crop in crops
+    ]
     assert set(short) == {"model", "messages"}
 
 
@@ -205,14 +255,19 @@ def test_a_picture_as_an_address_is_the_picture() -> None:
     import base64
 
     rgb = np.random.default_rng(0).integers(0, 256, (7, 5, 3), np.uint8)
-    data = np.frombuffer(base64.b64decode(data_url(rgb).removeprefix("data:image/png;base64,")), np.uint8)
+    data = np.frombuffer(
+        base64.b64decode(data_url(rgb).removeprefix("data:image/png;base64,")), np.uint8
+    )
     assert (cv2.cvtColor(cv2.imdecode(data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB) == rgb).all()
 
 
 @pytest.mark.parametrize(
     ("answer", "said"),
     [
-        ((401, {"error": {"message": "bad key\nsecond line"}}), r"refuses \(401: bad key second line\); check OPENAI_BASE_URL, OPENAI_MODEL and"),
+        (
+            (401, {"error": {"message": "bad key\nsecond line"}}),
+            r"refuses \(401: bad key second line\); check OPENAI_BASE_URL, OPENAI_MODEL and",
+        ),
         ((500, b"<html>oops"), r"refuses \(500: <html>oops\)"),
         ((302, b"", ("Location", "http://127.0.0.1:9/elsewhere")), r"refuses \(302: Found\)"),
         ((200, b"not json"), "does not answer as a chat endpoint does"),
@@ -226,7 +281,7 @@ def test_a_picture_as_an_address_is_the_picture() -> None:
 )
 def test_what_goes_wrong_is_one_line(answer: Any, said: str) -> None:
     with serving(answer) as server, pytest.raises(BadEndpoint, match=said) as caught:
-        Seer(Chat(server.url, "seer-1", "secret"))([thing("red")], "cup")
+        ChatCaptioner(ChatEndpoint(server.url, "seer-1", "secret"))([thing("red")], "cup")
     assert "\n" not in str(caught.value)
     assert "secret" not in str(caught.value)
 
@@ -235,32 +290,52 @@ def test_no_server_and_a_silent_one_are_said() -> None:
     with serving() as server:
         url = server.url
     with pytest.raises(BadEndpoint, match=r"gives no answer \(.*refused\); is the server up"):
-        ask(Chat(url, "seer-1"), "what?")
+        request_answer(ChatEndpoint(url, "seer-1"), "what?")
     import socket
 
-    with socket.create_server(("127.0.0.1", 0)) as mute, pytest.raises(BadEndpoint, match=r"gives no answer \(timed out\)"):
-        ask(Chat(f"http://127.0.0.1:{mute.getsockname()[1]}/v1", "seer-1", timeout_s=0.2), "what?")
+    with (
+        socket.create_server(("127.0.0.1", 0)) as mute,
+        pytest.raises(BadEndpoint, match=r"gives no answer \(timed out\)"),
+    ):
+        request_answer(
+            ChatEndpoint(f"http://127.0.0.1:{mute.getsockname()[1]}/v1", "seer-1", timeout_s=0.2),
+            "what?",
+        )
 
 
 def test_where_to_ask_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(BadEndpoint, match="'' is no address"):
-        endpoint()
+        endpoint_from_environment()
     with pytest.raises(BadEndpoint, match="set OPENAI_MODEL"):
-        endpoint("http://127.0.0.1:1/v1")
+        endpoint_from_environment("http://127.0.0.1:1/v1")
     for url in ("file:///etc/passwd", "ftp://host/v1", "http://"):
         with pytest.raises(BadEndpoint, match="is no address of a chat endpoint"):
-            Chat(url, "m")
+            ChatEndpoint(url, "m")
     monkeypatch.setenv("OPENAI_BASE_URL", "http://127.0.0.1:1/v1")
     monkeypatch.setenv("OPENAI_MODEL", "seer-2")
     monkeypatch.setenv("OPENAI_API_KEY", "hush")
-    found = captioner(everything_but_the_table, "chat")
-    assert isinstance(found, Seer)
-    assert (found.chat.url, found.chat.model, found.chat.key) == ("http://127.0.0.1:1/v1", "seer-2", "hush")
+    found = load_captioner(everything_but_the_table, "chat")
+    assert isinstance(found, ChatCaptioner)
+    assert (found.endpoint.url, found.endpoint.model, found.endpoint.key) == (
+        "http://127.0.0.1:1/v1",
+        "seer-2",
+        "hush",
+    )
     assert "hush" not in repr(found)
-    assert captioner(everything_but_the_table, "http://127.0.0.1:2/v1").chat.url == "http://127.0.0.1:2/v1"  # type: ignore[attr-defined]
+    assert (
+        load_captioner(everything_but_the_table, "http://127.0.0.1:2/v1").endpoint.url
+        == "http://127.0.0.1:2/v1"
+    )
 
 
-@pytest.mark.parametrize("one", [TELL, Seer(Chat("http://127.0.0.1:1/v1", "m")), lambda crops, category: Description("a", "b")])
+@pytest.mark.parametrize(
+    "one",
+    [
+        TELL,
+        ChatCaptioner(ChatEndpoint("http://127.0.0.1:1/v1", "m")),
+        lambda crops, category: Description("a", "b"),
+    ],
+)
 def test_captioners_are_captioners(one: Any) -> None:
     assert isinstance(one, Captioner)
-    assert describe.captioner(everything_but_the_table) == TELL
+    assert load_captioner(everything_but_the_table) == TELL

@@ -9,16 +9,23 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from vap_core import diagnosis, engine
-from vap_core.diagnosis import deciding_frame, listed, recording, text
-from vap_core.errors import BadOutput, BadStudy
-from vap_core.experiments import Study
-from vap_core.failures import CASES, STAGES
-from vap_core.publish import publish
-from vap_core.record import Recorder, read_summary
-from vap_core.record.index import FOLDER
-from vap_core.report import align
-from vap_core.report.failures import breakdown, breakdown_rows, roads, sub_cases_text
+from vap_core.base.errors import BadOutput, BadStudy
+from vap_core.base.tables import align
+from vap_core.evaluation import engine
+from vap_core.evaluation.diagnosis import STAGES
+from vap_core.evaluation.diagnosis.failures import deciding_frame, failures_text, list_failures
+from vap_core.evaluation.diagnosis.recordings import correct_failure, recording_of
+from vap_core.evaluation.publish import publish
+from vap_core.evaluation.report.failures import (
+    breakdown,
+    breakdown_rows,
+    funnel_table,
+    sub_cases_text,
+)
+from vap_core.evaluation.study import Study
+from vap_core.recording import Recorder, read_summary
+from vap_core.recording.index import FOLDER
+from vap_core.rollout.failure import CASES
 
 STUDY = Study((("widowx-pick", "pick-straw-cup"),), ("generic",), episodes=3, policy="random")
 
@@ -30,16 +37,33 @@ def here(work, jobs, workers, mend):  # type: ignore[no-untyped-def]
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("diagnosed") / "run"
-    engine.run(STUDY, folder, record="none", spread=here, progress=False)
+    engine.run(STUDY, folder, record="none", executor=here, progress=False)
     return folder
 
 
-def row(method: str = "vap", case: str = "", sub_case: str = "", stages: int = 7, outcome: str = "", suite: str = "vlabench") -> dict[str, Any]:
+def row(
+    method: str = "vap",
+    case: str = "",
+    sub_case: str = "",
+    stages: int = 7,
+    outcome: str = "",
+    suite: str = "vlabench",
+) -> dict[str, Any]:
     """One episode that passes so many stages."""
     ended = outcome or ("failure" if case else "success")
-    passed = {f"stage_{name}": i < stages if method == "vap" or i > 3 else None for i, name in enumerate(STAGES)}
+    passed = {
+        f"stage_{name}": i < stages if method == "vap" or i > 3 else None
+        for i, name in enumerate(STAGES)
+    }
     about = {"suite": suite, "method": method, "outcome": ended, "success": ended == "success"}
-    return {**about, "case": case, "sub_case": sub_case, "case_confidence": 0.5 if case else float("nan"), "deciding_frame": 3.0, **passed}
+    return {
+        **about,
+        "case": case,
+        "sub_case": sub_case,
+        "case_confidence": 0.5 if case else float("nan"),
+        "deciding_frame": 3.0,
+        **passed,
+    }
 
 
 TABLE = pd.DataFrame(
@@ -55,7 +79,13 @@ TABLE = pd.DataFrame(
 
 def test_the_cases_of_a_row_sum_to_its_failures() -> None:
     counts = breakdown(TABLE).set_index("method")
-    assert (counts.loc["vap", ["n", "failed", "case 1", "case 2", "case 3"]].tolist()) == [9, 4, 0, 3, 1]
+    assert (counts.loc["vap", ["n", "failed", "case 1", "case 2", "case 3"]].tolist()) == [
+        9,
+        4,
+        0,
+        3,
+        1,
+    ]
     assert (counts[list(CASES)].sum(axis=1) == counts["failed"]).all()
     for case, parts in CASES.items():
         assert (counts[[f"{case}: {part}" for part in parts]].sum(axis=1) == counts[case]).all()
@@ -67,20 +97,23 @@ def test_as_text_every_share_has_its_interval() -> None:
     assert "44 % [19, 73]" in told
     assert "75 % [30, 95]" in told
     assert "case 1 %" not in told, "no row has any"
-    assert sub_cases_text(breakdown(TABLE)).splitlines()[0] == "vlabench vap: 3 x case 2: views disagree, 1 x case 3: timeout"
+    assert (
+        sub_cases_text(breakdown(TABLE)).splitlines()[0]
+        == "vlabench vap: 3 x case 2: views disagree, 1 x case 3: timeout"
+    )
 
 
 def test_the_road_narrows_and_ends_with_the_successes() -> None:
-    vap, generic = roads(TABLE)
+    vap, generic = funnel_table(TABLE)
     assert (vap.n, vap.left) == (9, (8, 5, 5, 5, 4, 4, 4))
     assert (generic.n, generic.left) == (2, (None, None, None, None, 2, 0, 0))
     assert all(a >= b for a, b in zip(vap.left, vap.left[1:], strict=False))  # type: ignore[operator]
 
 
 def test_a_run_lists_its_failures_with_their_reasons(run: Path) -> None:
-    failures = listed(run)
+    failures = list_failures(run)
     assert len(failures.table) == 3
-    told = text(failures, limit=2)
+    told = failures_text(failures, limit=2)
     assert "unprompted" in told
     assert "and 1 more; --limit shows them" in told
     assert set(failures.table["case"]) == {"unprompted"}
@@ -89,52 +122,71 @@ def test_a_run_lists_its_failures_with_their_reasons(run: Path) -> None:
 
 def test_several_places_are_one_list(run: Path, tmp_path: Path) -> None:
     publish([run], tmp_path / "mine.parquet")
-    both = listed(run, tmp_path / "mine.parquet")
+    both = list_failures(run, tmp_path / "mine.parquet")
     assert both.table["place"].tolist() == [str(run)] * 3 + [str(tmp_path / "mine.parquet")] * 3
 
 
 def test_a_condition_narrows_them_down(run: Path) -> None:
-    whole = listed(run).table
-    some = listed(run, where=f"success = false and episode < {sorted(whole.episode)[2]}").table
+    whole = list_failures(run).table
+    some = list_failures(
+        run, where=f"success = false and episode < {sorted(whole.episode)[2]}"
+    ).table
     assert sorted(some.episode) == sorted(whole.episode)[:2]
-    assert listed(run, where="steps < 0").table.empty
-    assert "no failure is left" in text(listed(run, where="steps < 0"))
+    assert list_failures(run, where="steps < 0").table.empty
+    assert "no failure is left" in failures_text(list_failures(run, where="steps < 0"))
 
 
-def test_an_episode_that_was_not_recorded_is_run_again_alike(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    failures = listed(run)
-    path = recording(failures, 1)
+def test_an_episode_that_was_not_recorded_is_run_again_alike(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    failures = list_failures(run)
+    path = recording_of(failures, 1)
     line = failures.table.iloc[1]
     said = read_summary(path)
-    assert path == run / "recordings" / f"widowx-pick.pick-straw-cup.{line.episode:03d}.s0.generic.rrd"
-    assert (said["outcome.length"], said["outcome.failure_case"], said["outcome.sub_case"]) == (line.steps, line.case, line.sub_case)
-    assert said["outcome.deciding_frame"] == deciding_frame(failures, 1) == line.deciding_frame
+    assert (
+        path == run / "recordings" / f"widowx-pick.pick-straw-cup.{line.episode:03d}.s0.generic.rrd"
+    )
+    assert (said["steps"], said["case"], said["sub_case"]) == (
+        line.steps,
+        line.case,
+        line.sub_case,
+    )
+    assert said["deciding_frame"] == deciding_frame(failures, 1) == line.deciding_frame
     before = path.stat().st_mtime_ns
-    assert recording(failures, 1) == path
+    assert recording_of(failures, 1) == path
     assert path.stat().st_mtime_ns == before, "what is recorded is not run again"
     assert capsys.readouterr().out == ""
 
 
-def test_a_published_table_opens_too(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_published_table_opens_too(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     publish([run], tmp_path / "mine.parquet")
-    failures = listed(tmp_path / "mine.parquet", suite="widowx-pick", case="unprompted")
+    failures = list_failures(tmp_path / "mine.parquet", suite="widowx-pick", case="unprompted")
     monkeypatch.chdir(tmp_path)
-    path = recording(failures, 0)
+    path = recording_of(failures, 0)
     assert path.parent == Path("data/runs/mine-diagnosed/recordings")
     assert path.exists()
 
 
-def test_a_recording_of_older_weights_is_made_anew(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recording_of_older_weights_is_made_anew(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     publish([run], tmp_path / "mine.parquet")
-    failures = listed(tmp_path / "mine.parquet")
+    failures = list_failures(tmp_path / "mine.parquet")
     monkeypatch.chdir(tmp_path)
     with monkeypatch.context() as before:
-        before.setattr("vap_core.record.Recorder", lambda path, opening: Recorder(path, replace(opening, policy="random@older")))
-        assert read_summary(recording(failures, 0))["rollout.policy"] == "random@older"
-    path = recording(failures, 0)
-    assert read_summary(path)["rollout.policy"] == failures.table.policy[0]
+        before.setattr(
+            "vap_core.recording.Recorder",
+            lambda path, header, explain: Recorder(
+                path, replace(header, policy="random@older"), explain=explain
+            ),
+        )
+        assert read_summary(recording_of(failures, 0))["policy"] == "random@older"
+    path = recording_of(failures, 0)
+    assert read_summary(path)["policy"] == failures.table.policy[0]
     made = path.stat().st_mtime_ns
-    assert recording(failures, 0).stat().st_mtime_ns == made
+    assert recording_of(failures, 0).stat().st_mtime_ns == made
 
 
 @pytest.mark.parametrize(
@@ -147,30 +199,41 @@ def test_a_recording_of_older_weights_is_made_anew(run: Path, tmp_path: Path, mo
         ({"where": "1 = 1; drop table episodes"}, "is none on this table"),
     ],
 )
-def test_what_fits_nothing_is_refused_in_one_line(run: Path, asked: dict[str, Any], match: str) -> None:
+def test_what_fits_nothing_is_refused_in_one_line(
+    run: Path, asked: dict[str, Any], match: str
+) -> None:
     with pytest.raises(BadStudy, match=match) as caught:
-        listed(run, **asked)
+        list_failures(run, **asked)
     assert "\n" not in str(caught.value)
 
 
 def test_other_refusals(run: Path, tmp_path: Path) -> None:
     with pytest.raises(BadStudy, match="no failure #3; there are 3, counted from 0"):
-        recording(listed(run), 3)
+        recording_of(list_failures(run), 3)
     with pytest.raises(BadOutput, match=r"run\.json is absent or damaged"):
-        listed(tmp_path)
+        list_failures(tmp_path)
     with pytest.raises(BadOutput, match="is no table of finished runs"):
-        listed(Path("data/results/perception_views.parquet"))
+        list_failures(Path("data/results/perception_views.parquet"))
     with pytest.raises(BadOutput, match="before failures were diagnosed"):
         breakdown(TABLE.drop(columns="case"))
-    failures = listed(run)
+    failures = list_failures(run)
     failures.table.loc[0, "policy"] = "another"
-    (run / "recordings" / f"widowx-pick.pick-straw-cup.{failures.table.episode[0]:03d}.s0.generic.rrd").unlink(missing_ok=True)
+    (
+        run
+        / "recordings"
+        / f"widowx-pick.pick-straw-cup.{failures.table.episode[0]:03d}.s0.generic.rrd"
+    ).unlink(missing_ok=True)
     with pytest.raises(BadStudy, match="run with another, and random is here now"):
-        recording(failures, 0)
+        recording_of(failures, 0)
 
 
 def command(*words: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "vap_core", *map(str, words)], capture_output=True, text=True, check=False)
+    return subprocess.run(
+        [sys.executable, "-m", "vap_core", *map(str, words)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
 
 
 def test_the_command_lists_and_refuses(run: Path) -> None:
@@ -179,39 +242,54 @@ def test_the_command_lists_and_refuses(run: Path) -> None:
     assert "fail % [95 %]" in done.stdout
     refused = command("diagnose", run, "--case", 7)
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
-    refused = command("eval", "--suite", "widowx-pick", "--record", "some", "--out", run.parent / "other")
-    assert (refused.returncode, refused.stderr) == (2, "error: --record some: say all, failures, none, or how many per task and method.\n")
+    refused = command(
+        "eval", "--suite", "widowx-pick", "--record", "some", "--out", run.parent / "other"
+    )
+    assert (refused.returncode, refused.stderr) == (
+        2,
+        "error: --record some: say all, failures, none, or how many per task and method.\n",
+    )
 
 
-def test_without_a_display_the_viewer_says_what_to_do(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vap_core.errors import MissingGL
-    from vap_core.record import open_viewer
+def test_without_a_display_the_viewer_says_what_to_do(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from vap_core.base.errors import MissingGL
+    from vap_core.recording import open_viewer
 
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(MissingGL, match="add --png FILE"):
-        open_viewer(recording(listed(run), 1))
+        open_viewer(recording_of(list_failures(run), 1))
 
 
 def test_so_many_recordings_are_spread_over_a_task(tmp_path: Path) -> None:
     from dataclasses import replace
 
     study = replace(STUDY, episodes=4)
-    engine.run(study, tmp_path / "run", record=2, spread=here, progress=False)
-    assert sorted(path.name.split(".")[2] for path in (tmp_path / "run" / "recordings").glob("*.rrd")) == ["000", "002"]
-    assert len(list((tmp_path / "run" / "recordings" / FOLDER).glob("*.rrd"))) == 2, "each with its index"
-    assert diagnosis.listed(tmp_path / "run").table.shape[0] == 4
+    engine.run(study, tmp_path / "run", record=2, executor=here, progress=False)
+    assert sorted(
+        path.name.split(".")[2] for path in (tmp_path / "run" / "recordings").glob("*.rrd")
+    ) == ["000", "002"]
+    assert len(list((tmp_path / "run" / "recordings" / FOLDER).glob("*.rrd"))) == 2, (
+        "each with its index"
+    )
+    assert list_failures(tmp_path / "run").table.shape[0] == 4
 
 
 def test_a_correction_changes_the_table_and_nothing_else(run: Path) -> None:
-    failures = listed(run)
-    layer = diagnosis.correct(failures, 1, "unprompted: slip", "it held for a moment")
-    again = listed(run)
-    assert (again.table.sub_case[1], again.table.case_sentence[1], again.table.corrected.tolist()) == (
+    failures = list_failures(run)
+    layer = correct_failure(failures, 1, "unprompted: slip", "it held for a moment")
+    again = list_failures(run)
+    assert (
+        again.table.sub_case[1],
+        again.table.case_sentence[1],
+        again.table.corrected.tolist(),
+    ) == (
         "slip",
         "it held for a moment",
         [False, True, False],
     )
-    assert "* as corrected by hand" in text(again)
+    assert "* as corrected by hand" in failures_text(again)
     layer.unlink()
-    assert not listed(run).table.corrected.any()
+    assert not list_failures(run).table.corrected.any()

@@ -17,34 +17,60 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vap_core import engine, experiments
-from vap_core.engine import key, missing
-from vap_core.experiments import Study
-from vap_core.store import append, note, open_run, read
-from vap_core.traces import read as read_traces
+from vap_core.evaluation import engine
+from vap_core.evaluation import study as experiments
+from vap_core.evaluation.engine import missing_jobs, result_key
+from vap_core.evaluation.state_log import read as read_traces
+from vap_core.evaluation.store import append, open_run, read, read_manifest
+from vap_core.evaluation.study import Study
 
-STUDY = Study((("simpler-bridge", "pick-shaver"), ("simpler-bridge", "put-camera")), ("generic",), policy="random", episodes=3, seeds=2)
+STUDY = Study(
+    (("simpler-bridge", "pick-shaver"), ("simpler-bridge", "put-camera")),
+    ("generic",),
+    policy="random",
+    episodes=3,
+    seeds=2,
+)
 ENV = {**os.environ, "OMP_NUM_THREADS": "1"}
 LONGEST_S = 15.0
 """Longest life of a run that is to be killed."""
 
 
 def command(out: Path, episodes: int) -> list[str]:
-    asked = ["--suite", "simpler-bridge", "--suite", "tabletop", "--policy", "random", "--episodes", str(episodes), "--seeds", "2"]
+    asked = [
+        "--suite",
+        "simpler-bridge",
+        "--suite",
+        "tabletop",
+        "--policy",
+        "random",
+        "--episodes",
+        str(episodes),
+        "--seeds",
+        "2",
+    ]
     return [sys.executable, "-m", "vap_core", "eval", *asked, "--workers", "2", "--out", str(out)]
 
 
 def told(out: Path) -> pd.DataFrame:
     table = read(out)
-    return table[[name for name in table.columns if name != "peak_mb" and not name.startswith("seconds_")]]
+    return table[
+        [name for name in table.columns if name != "peak_mb" and not name.startswith("seconds_")]
+    ]
 
 
 def kills(out: Path, episodes: int, times: int, rng: random.Random) -> tuple[int, list[int]]:
     """Start the same command again and again and kill it after a while, whole or its parent alone; kills done and rows seen after each."""
     done, rows = 0, []
     while done < times:
-        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
-        with subprocess.Popen(command(out, episodes), env=ENV, preexec_fn=hear_interrupts, **quiet) as run:
+        quiet = {
+            "stdout": subprocess.DEVNULL,
+            "stderr": subprocess.DEVNULL,
+            "start_new_session": True,
+        }
+        with subprocess.Popen(
+            command(out, episodes), env=ENV, preexec_fn=hear_interrupts, **quiet
+        ) as run:
             try:
                 run.wait(rng.uniform(0.5, LONGEST_S))
                 assert run.returncode == 0, f"status {run.returncode}"
@@ -73,7 +99,14 @@ def check(folder: Path, episodes: int, times: int, seed: int = 0) -> str:
     whole, torn = folder / "whole", folder / "torn"
     done, rows = kills(torn, episodes, times, random.Random(seed))
     for out in (torn, whole):
-        subprocess.run(command(out, episodes), env=ENV, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, timeout=1800)
+        subprocess.run(
+            command(out, episodes),
+            env=ENV,
+            check=True,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            timeout=1800,
+        )
     pd.testing.assert_frame_equal(told(torn), told(whole))
     assert told(whole).key.is_unique
     assert done == times, "the run ended before it was killed so often; give it more episodes"
@@ -83,46 +116,62 @@ def check(folder: Path, episodes: int, times: int, seed: int = 0) -> str:
 
 
 @pytest.mark.slow
-def test_killed_at_random_moments_it_ends_with_the_rows_of_an_undisturbed_run(tmp_path: Path) -> None:
+def test_killed_at_random_moments_it_ends_with_the_rows_of_an_undisturbed_run(
+    tmp_path: Path,
+) -> None:
     check(tmp_path, episodes=2, times=3)
 
 
 def test_keys_tell_row_method_and_run_apart() -> None:
     (row, other), *_ = STUDY.rows(*STUDY.tasks[0])[:2], None
-    assert key(row, "vap", "a") == key(replace(row), "vap", "a")
+    assert result_key(row, "vap", "a") == result_key(replace(row), "vap", "a")
     assert (
-        len({key(row, "vap", "a"), key(other, "vap", "a"), key(row, "generic", "a"), key(row, "vap", "b"), key(replace(row, seed=9), "vap", "a")})
+        len(
+            {
+                result_key(row, "vap", "a"),
+                result_key(other, "vap", "a"),
+                result_key(row, "generic", "a"),
+                result_key(row, "vap", "b"),
+                result_key(replace(row, seed=9), "vap", "a"),
+            }
+        )
         == 5
     )
 
 
 def stored(out: Path, names: list[str], **cells: object) -> None:
     """Rows as if they had been run."""
-    jobs = list(missing(STUDY, out, retries=9))
+    jobs = list(missing_jobs(STUDY, out, retries=9))
     found = {name: (job, row) for job in jobs for name, row in zip(job.keys, job.rows, strict=True)}
     rows = []
     for job, row, name in ((*found[name], name) for name in names):
-        about = {"suite": row.suite, "task": row.task, "method": job.method, "seed": row.seed, "episode": row.episode}
+        about = {
+            "suite": row.suite,
+            "task": row.task,
+            "method": job.method,
+            "seed": row.seed,
+            "episode": row.episode,
+        }
         rows.append({"key": name, "attempt": job.attempt, **about, **cells})
     append(out, rows)
 
 
 def test_only_what_is_missing_runs_and_errors_run_again_recorded(tmp_path: Path) -> None:
     out = open_run(tmp_path / "run", STUDY.configuration())
-    jobs = list(missing(STUDY, out))
+    jobs = list(missing_jobs(STUDY, out))
     names = [name for job in jobs for name in job.keys]
     assert len(names) == len(set(names)) == 12
     assert {(job.attempt, job.record) for job in jobs} == {(1, "none")}
     stored(out, names[:3], outcome="success")
     stored(out, names[3:5], outcome="error")
-    assert [name for job in missing(STUDY, out) for name in job.keys] == names[5:]
-    again = [job for job in missing(STUDY, out, retries=1) if job.attempt == 2]
+    assert [name for job in missing_jobs(STUDY, out) for name in job.keys] == names[5:]
+    again = [job for job in missing_jobs(STUDY, out, retries=1) if job.attempt == 2]
     assert [name for job in again for name in job.keys] == names[3:5]
     assert {job.record for job in again} == {"failures"}
-    assert {job.record for job in missing(STUDY, out, "all", retries=1)} == {"all"}
+    assert {job.record for job in missing_jobs(STUDY, out, "all", retries=1)} == {"all"}
     stored(out, names[3:4], outcome="failure")
     stored(out, names[4:5], outcome="error")
-    assert [name for job in missing(STUDY, out, retries=1) for name in job.keys] == names[5:]
+    assert [name for job in missing_jobs(STUDY, out, retries=1) for name in job.keys] == names[5:]
     table = read(out).set_index("key")
     assert table.attempt[names[3:5]].tolist() == [2, 2]
     assert table.outcome[names[3:5]].tolist() == ["failure", "error"]
@@ -136,12 +185,17 @@ def test_how_numbers_are_printed_changes_no_configuration() -> None:
 
 
 def test_another_configuration_shares_no_key(tmp_path: Path) -> None:
-    one, other = (open_run(tmp_path / policy, replace(STUDY, policy=policy).configuration()) for policy in ("random", "expert"))
-    keys = [{name for job in missing(STUDY, out) for name in job.keys} for out in (one, other)]
+    one, other = (
+        open_run(tmp_path / policy, replace(STUDY, policy=policy).configuration())
+        for policy in ("random", "expert")
+    )
+    keys = [{name for job in missing_jobs(STUDY, out) for name in job.keys} for out in (one, other)]
     assert not keys[0] & keys[1]
 
 
-def test_a_worker_that_dies_once_is_forgiven_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_worker_that_dies_once_is_forgiven_and_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     fell: list[int] = []
 
     def spread(work, jobs, workers, mend):  # type: ignore[no-untyped-def]
@@ -151,34 +205,38 @@ def test_a_worker_that_dies_once_is_forgiven_and_said(tmp_path: Path, capsys: py
                 raise engine.WorkerDied("a worker process died")
             yield job, work(job)
 
-    table = engine.run(STUDY, tmp_path / "run", record="none", spread=spread)
+    table = engine.run(STUDY, tmp_path / "run", record="none", executor=spread)
     assert fell == [4]
     assert len(table) == 12
     assert table.attempt.tolist() == [1] * 12
     assert "a worker process died" in capsys.readouterr().err
 
 
-def test_an_episode_that_always_breaks_is_an_error_with_its_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vap_core.policies.random import Random
+def test_an_episode_that_always_breaks_is_an_error_with_its_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from vap_core.policies.scripted.random import Random
 
     class Breaks(Random):
-        def plan_inside(self, states, envs):  # type: ignore[no-untyped-def]
+        def plan_from_simulation(self, states, envs):  # type: ignore[no-untyped-def]
             if any(env.row.episode == 0 for env in envs):
                 raise RuntimeError("the policy fell over")
-            return super().plan_inside(states, envs)
+            return super().plan_from_simulation(states, envs)
 
-    monkeypatch.setitem(experiments.POLICIES, "random", lambda study, scene, suite: Breaks())
+    monkeypatch.setattr(experiments, "make_policy", lambda name, scene, suite, stack: Breaks())
     study = replace(STUDY, tasks=STUDY.tasks[:1], episodes=2, seeds=1)
 
     def here(work, jobs, workers, mend):  # type: ignore[no-untyped-def]
         return ((job, work(job)) for job in jobs)
 
-    table = engine.run(study, tmp_path / "run", record="none", spread=here, progress=False)
+    table = engine.run(study, tmp_path / "run", record="none", executor=here, progress=False)
     assert table.outcome.tolist()[0] == "error"
     assert table.attempt.tolist() == [2, 1]
     assert "the policy fell over" in table.detail[0]
-    assert [path.name for path in (tmp_path / "run" / "recordings").glob("*.rrd")] == ["simpler-bridge.pick-shaver.000.s0.generic.rrd"]
-    assert note(tmp_path / "run")["configuration"]["seeds"] == 1
+    assert [path.name for path in (tmp_path / "run" / "recordings").glob("*.rrd")] == [
+        "simpler-bridge.pick-shaver.000.s0.generic.rrd"
+    ]
+    assert read_manifest(tmp_path / "run")["configuration"]["seeds"] == 1
     assert not table.success[0]
 
 

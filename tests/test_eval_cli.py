@@ -11,10 +11,10 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from vap_core.errors import BadOutput, VapError
-from vap_core.rescore import rescore
-from vap_core.store import read
-from vap_core.suites import BENCHMARKS
+from vap_core.base.errors import BadOutput, VapError
+from vap_core.evaluation.rescore import rescore
+from vap_core.evaluation.store import read
+from vap_core.simulation.suites import BENCHMARKS
 
 SUITE = "simpler-bridge"
 TASKS = [task.name for task in BENCHMARKS[SUITE].tasks]
@@ -22,7 +22,13 @@ TASKS = [task.name for task in BENCHMARKS[SUITE].tasks]
 
 def vap(*words: str | Path) -> subprocess.CompletedProcess[str]:
     env = {**os.environ, "OMP_NUM_THREADS": "1"}
-    return subprocess.run([sys.executable, "-m", "vap_core", *map(str, words)], env=env, capture_output=True, text=True, timeout=300)
+    return subprocess.run(
+        [sys.executable, "-m", "vap_core", *map(str, words)],
+        env=env,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
 
 
 def evaluate(out: Path) -> subprocess.CompletedProcess[str]:
@@ -44,18 +50,28 @@ def copied(run: tuple[Path, str], tmp_path: Path) -> Path:
 
 
 def files(out: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(out)): path.read_bytes() for path in sorted(out.rglob("*")) if path.is_file()}
+    return {
+        str(path.relative_to(out)): path.read_bytes()
+        for path in sorted(out.rglob("*"))
+        if path.is_file()
+    }
 
 
 @pytest.mark.slow
 def test_it_prints_every_task_with_its_rates(run: tuple[Path, str]) -> None:
     out, printed = run
-    lines = [line.split() for line in printed.splitlines() if line.startswith(f"{SUITE}  ")][: len(TASKS)]
-    assert [line[:6] for line in lines] == [[SUITE, task, "generic", "expert", "2", "0"] for task in TASKS]
+    lines = [line.split() for line in printed.splitlines() if line.startswith(f"{SUITE}  ")][
+        : len(TASKS)
+    ]
+    assert [line[:6] for line in lines] == [
+        [SUITE, task, "generic", "expert", "2", "0"] for task in TASKS
+    ]
     assert "SR % [95 %]" in printed
     assert "8 of 8 succeed" in printed
     told = json.loads((out / "summary.json").read_text())
-    assert [(one["task"], one["n"], one["sr"], one["errors"]) for one in told] == [(task, 2, 1.0, 0) for task in TASKS]
+    assert [(one["task"], one["n"], one["sr"], one["errors"]) for one in told] == [
+        (task, 2, 1.0, 0) for task in TASKS
+    ]
     table = read(out)
     assert sorted(table[table.task == TASKS[0]].episode) == [0, 23], "spread over the list"
     assert (out / "figure.png").stat().st_size > 5_000
@@ -71,14 +87,21 @@ def test_a_second_call_runs_nothing_more(run: tuple[Path, str]) -> None:
     assert "0/8" not in again.stderr
     after = files(out)
     assert after.keys() == before.keys()
-    assert all(after[name] == data for name, data in before.items() if name.endswith((".parquet", "run.json", "summary.json")))
+    assert all(
+        after[name] == data
+        for name, data in before.items()
+        if name.endswith((".parquet", "run.json", "summary.json"))
+    )
 
 
 @pytest.mark.slow
 def test_judged_again_nothing_changes(run: tuple[Path, str]) -> None:
     done = vap("rescore", run[0])
     assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1] == "0 of 8 episodes judged differently; 0 without a saved state or in error kept as they were."
+    assert (
+        done.stdout.splitlines()[-1]
+        == "0 of 8 episodes judged differently; 0 without a saved state or in error kept as they were."
+    )
     assert done.stdout.count("100 % [34, 100]") == 8
 
 
@@ -92,7 +115,9 @@ def test_another_number_of_episodes_is_another_run(run: tuple[Path, str]) -> Non
 @pytest.mark.slow
 def test_episodes_without_a_saved_state_keep_their_outcome(copied: Path) -> None:
     shutil.rmtree(copied / "traces")
-    assert rescore(copied).endswith("0 of 0 episodes judged differently; 8 without a saved state or in error kept as they were.")
+    assert rescore(copied).endswith(
+        "0 of 0 episodes judged differently; 8 without a saved state or in error kept as they were."
+    )
 
 
 @pytest.mark.slow
@@ -125,16 +150,36 @@ def test_the_table_judged_again_has_the_order_of_the_suite(copied: Path) -> None
     for part in list((copied / "traces").iterdir()):
         (task,) = set(pd.read_parquet(part).task)
         part.rename(part.with_name(f"{len(TASKS) - TASKS.index(task)}.parquet"))
-    told = [line.split()[1] for line in rescore(copied).splitlines() if line.startswith(f"{SUITE}  ")]
+    told = [
+        line.split()[1] for line in rescore(copied).splitlines() if line.startswith(f"{SUITE}  ")
+    ]
     assert told == TASKS
 
 
 @pytest.mark.slow
 def test_a_recording_of_joint_control_through_three_cameras_is_sound(tmp_path: Path) -> None:
-    done = vap("rollout", "--suite", "vlabench", "--task", "select-cup", "--policy", "expert", "--episodes", "1", "--workers", "1", "--out", tmp_path)
+    done = vap(
+        "rollout",
+        "--suite",
+        "vlabench",
+        "--task",
+        "select-cup",
+        "--policy",
+        "expert",
+        "--episodes",
+        "1",
+        "--workers",
+        "1",
+        "--out",
+        tmp_path,
+    )
     assert done.returncode == 0, done.stderr
     (recording,) = (tmp_path / "recordings").glob("*.rrd")
-    verified = subprocess.run([sys.executable, "-m", "rerun", "rrd", "verify", str(recording)], capture_output=True, text=True)
+    verified = subprocess.run(
+        [sys.executable, "-m", "rerun", "rrd", "verify", str(recording)],
+        capture_output=True,
+        text=True,
+    )
     assert verified.returncode == 0, verified.stdout + verified.stderr
 
 
@@ -144,27 +189,54 @@ def test_suites_lists_every_track_and_task() -> None:
     words = [line.split() for line in done.stdout.splitlines()]
     for count in ("460", "1225", "96", "250", "160"):
         assert any(count in line for line in words)
-    assert all(any(line[:2] == [name, task.name] for line in words) for name, suite in BENCHMARKS.items() for task in suite.tasks)
+    assert all(
+        any(line[:2] == [name, task.name] for line in words)
+        for name, suite in BENCHMARKS.items()
+        for task in suite.tasks
+    )
     assert "protocol-matched" in done.stdout
 
 
 EXPERT = ("--suite", SUITE, "--policy", "expert")
 REFUSED = {
-    "unknown suite": (("eval", "--suite", "nowhere", "--policy", "expert"), "suite 'nowhere' is unknown; known: .*simpler-bridge"),
-    "vap with expert": (("eval", *EXPERT, "--method", "vap"), "policy 'expert' reads the simulator.*--method generic"),
-    "audited expert": (("eval", *EXPERT, "--audit"), "policy 'expert' consumes no prompt; there is nothing to audit"),
-    "an address without ray": (("eval", *EXPERT, "--address", "127.0.0.1:6379"), "--address needs --engine ray"),
+    "unknown suite": (
+        ("eval", "--suite", "nowhere", "--policy", "expert"),
+        "suite 'nowhere' is unknown; known: .*simpler-bridge",
+    ),
+    "vap with expert": (
+        ("eval", *EXPERT, "--method", "vap"),
+        "policy 'expert' reads the simulator.*--method generic",
+    ),
+    "audited expert": (
+        ("eval", *EXPERT, "--audit"),
+        "policy 'expert' consumes no prompt; there is nothing to audit",
+    ),
+    "an address without ray": (
+        ("eval", *EXPERT, "--address", "127.0.0.1:6379"),
+        "--address needs --engine ray",
+    ),
     "no episodes": (("eval", *EXPERT, "--episodes", "0"), "Invalid value for '--episodes'.*1"),
-    "unknown policy": (("eval", "--suite", SUITE, "--policy", "magic"), "policy .*'magic' is unknown; known: expert, mini-pi0, random, scripted"),
-    "unknown method": (("eval", *EXPERT, "--method", "luck"), "method 'luck' is unknown; known: generic, hard-long, hard-short, mask-only"),
-    "unknown task": (("rollout", *EXPERT, "--task", "fly"), "task 'fly' is unknown; known: pick-shaver"),
+    "unknown policy": (
+        ("eval", "--suite", SUITE, "--policy", "magic"),
+        "policy .*'magic' is unknown; known: expert, mini-pi0, random, scripted",
+    ),
+    "unknown method": (
+        ("eval", *EXPERT, "--method", "luck"),
+        "method 'luck' is unknown; known: generic, hard-long, hard-short, mask-only",
+    ),
+    "unknown task": (
+        ("rollout", *EXPERT, "--task", "fly"),
+        "task 'fly' is unknown; known: pick-shaver",
+    ),
     "no run": (("rescore", "nowhere"), "rescore: nowhere holds no results; name the folder"),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("words", "said"), REFUSED.values(), ids=REFUSED)
-def test_what_makes_no_sense_is_refused_in_one_line(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
+def test_what_makes_no_sense_is_refused_in_one_line(
+    words: tuple[str, ...], said: str, tmp_path: Path
+) -> None:
     done = vap(*words, *(() if words[0] == "rescore" else ("--out", tmp_path / "out")))
     assert (done.returncode, done.stdout) == (2, "")
     last = done.stderr.strip().splitlines()[-1]

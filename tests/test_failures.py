@@ -7,23 +7,39 @@ import numpy as np
 import pytest
 
 from tests.test_rules import GOAL, OTHER, SIZES, TARGET, WHERE, row, truth
-from vap_core import events, failures
-from vap_core.failures import CASES, LIMITS, NEIGHBOURS, Limits, diagnose, neighbours, stages
-from vap_core.shown import covered, shown
-from vap_core.suites.rules import rejudge
-from vap_core.values import REST, ROBOT, Attended, Boxes, Episode, Frame, Grounding, Opening, Outcome, Shown, Track, Truth
+from vap_core.base import events
+from vap_core.base.types import Attended, Ballot, Boxes, Grounding, Track
+from vap_core.evaluation import diagnosis as failures
+from vap_core.evaluation.diagnosis import (
+    NEIGHBOURS,
+    THRESHOLDS,
+    Thresholds,
+    diagnose,
+    neighbours,
+    stages,
+)
+from vap_core.rollout.coverage import covered_object, mask_coverage
+from vap_core.rollout.failure import CASES
+from vap_core.rollout.types import Episode, EpisodeHeader, Frame, MaskCoverage
+from vap_core.simulation.suites.rules import rejudge
+from vap_core.simulation.types import REST, ROBOT, Outcome, Truth
 
 THIRD = "cup-lookalike-2"
 NAN = float("nan")
 
 
 def view(what, iou=0.0, pixels=500, camera="front", proposal=NAN):
-    return Shown(camera, what, iou, pixels, proposal)
+    return MaskCoverage(camera, what, iou, pixels, proposal)
 
 
 RIGHT = view(TARGET, 0.9, proposal=0.9)
 AFAR, NEAR = (0.3, 0.0, 0.5), (0.3, 0.0, 0.08)
 """Where the tcp is: half a metre over the target's foot, and 1 cm over its top."""
+
+
+def ballot(n):
+    zeros = np.zeros(n, np.int64), np.zeros(n, bool)
+    return Ballot(*zeros, 0 if n else None, 1.0, 1.0)
 
 
 def commanded(grip):
@@ -34,15 +50,36 @@ def episode(rule, steps, goal="", candidates=1, outcome=None):
     """`steps`: truth, what is shown, where the tcp is, the gripper's command (None at a terminal frame)."""
     known = replace(row(rule, goal), suite="simpler-bridge")
     frames = tuple(
-        Frame(i, i / 5, {}, {}, {}, (), np.array([*where, 0, 0, 0, 1], np.float32), commanded(grip), now, (), tuple(seen))
+        Frame(
+            i,
+            i / 5,
+            {},
+            {},
+            {},
+            (),
+            np.array([*where, 0, 0, 0, 1], np.float32),
+            commanded(grip),
+            now,
+            (),
+            tuple(seen),
+        )
         for i, (now, seen, where, grip) in enumerate(steps)
     )
-    boxes = Boxes(np.array([[0, 0, 5, 5]] * candidates, np.float32).reshape(-1, 4), np.ones(candidates, np.float32), "cup")
+    boxes = Boxes(
+        np.array([[0, 0, 5, 5]] * candidates, np.float32).reshape(-1, 4),
+        np.ones(candidates, np.float32),
+        "cup",
+    )
     grounding = Grounding(
-        "front", TARGET, boxes, np.ones((candidates, 1), np.float32), np.zeros(candidates, np.int64), np.zeros(candidates, bool),
-        0 if candidates else None, 1.0, 1.0, np.zeros((candidates, 8, 8), bool),
-    )  # fmt: skip
-    opening = Opening(known, "vap", "p", 5.0, (), "", "", {"front": (grounding,)}, SIZES)
+        camera="front",
+        object=TARGET,
+        candidates=boxes,
+        similarity=np.ones((candidates, 1), np.float32),
+        ballot=ballot(candidates),
+        winner=0 if candidates else None,
+        masks=np.zeros((candidates, 8, 8), bool),
+    )
+    opening = EpisodeHeader(known, "vap", "p", 5.0, (), "", "", {"front": (grounding,)}, SIZES)
     judged = rejudge(known, SIZES, [frame.truth for frame in frames])
     return Episode(opening, frames, outcome or judged.outcome(), {})
 
@@ -55,7 +92,7 @@ def held(height):
     return truth(up={TARGET: height}, contacts={TARGET: (ROBOT,)}, touched=(TARGET,))
 
 
-def told(rule, steps, limits=LIMITS, **more):
+def told(rule, steps, limits=THRESHOLDS, **more):
     found = diagnose(episode(rule, steps, **more), limits)
     assert found is not None
     assert found.sub_case in CASES[found.case]
@@ -98,8 +135,12 @@ def test_a_prompt_that_is_wrong_for_less_than_half_of_the_time_is_no_excuse():
 def test_a_late_drift_onto_what_is_then_touched_is_one():
     steps = [*still(7), *still(1, [view(OTHER)]), *still(2, [view(OTHER)], truth(touched=(OTHER,)))]
     assert label(told("picked", steps)) == ("case 1", "drift", 7, "front")
-    assert told("picked", [*still(7), *still(1, [view(None)]), *steps[8:]]).case == "case 3", "lost for a moment is not misled"
-    assert told("picked", [*still(7), *still(1, [view(THIRD)]), *steps[8:]]).case == "case 3", "nor is another than the one touched"
+    assert told("picked", [*still(7), *still(1, [view(None)]), *steps[8:]]).case == "case 3", (
+        "lost for a moment is not misled"
+    )
+    assert told("picked", [*still(7), *still(1, [view(THIRD)]), *steps[8:]]).case == "case 3", (
+        "nor is another than the one touched"
+    )
 
 
 def test_what_a_track_does_after_the_touch_is_not_held_against_it_unless_the_hand_follows():
@@ -107,13 +148,20 @@ def test_what_a_track_does_after_the_touch_is_not_held_against_it_unless_the_han
     assert label(told("picked", steps, candidates=2))[:2] == ("case 3", "slip")
     steps = still(3) + still(1, now=truth(touched=(TARGET,))) + still(9, [view(OTHER)])
     assert label(told("picked", steps))[:2] == ("case 3", "missed grasp")
-    assert label(told("picked", [*steps, *still(1, [view(OTHER)], truth(touched=(OTHER,)))])) == ("case 1", "drift", 4, "front")
+    assert label(told("picked", [*steps, *still(1, [view(OTHER)], truth(touched=(OTHER,)))])) == (
+        "case 1",
+        "drift",
+        4,
+        "front",
+    )
 
 
 def test_a_view_that_hardly_shows_the_target_does_not_count():
     assert told("picked", still(3) + still(6, [view(None, pixels=99)])).case == "case 3"
     assert told("picked", still(3) + still(6, [view(None, pixels=100)])).case == "case 1"
-    assert told("picked", still(3) + still(6, [view(OTHER, pixels=0)])).case == "case 1", "but one that highlights another does"
+    assert told("picked", still(3) + still(6, [view(OTHER, pixels=0)])).case == "case 1", (
+        "but one that highlights another does"
+    )
 
 
 def test_views_that_contradict_each_other_are_case_2():
@@ -126,13 +174,22 @@ def test_views_that_contradict_each_other_are_case_2():
     same = [view(OTHER, proposal=0.8), view(OTHER, camera="wrist", proposal=0.8)]
     assert told("selected", still(6, same), candidates=2).case == "case 1", "all wrong together"
     nowhere = [view("", camera=camera, proposal=0.8) for camera in ("front", "wrist")]
-    assert told("selected", still(6, nowhere)).case == "case 2", "no object here and no object there are two things"
+    assert told("selected", still(6, nowhere)).case == "case 2", (
+        "no object here and no object there are two things"
+    )
     blank = [RIGHT, view(None, camera="wrist", proposal=0.8)]
-    assert told("selected", still(6, blank)).case == "case 3", "a view left as it is contradicts nothing"
+    assert told("selected", still(6, blank)).case == "case 3", (
+        "a view left as it is contradicts nothing"
+    )
 
 
 def on(where, height=0.0, by=(REST,)):
-    return truth(at={TARGET: where}, up={TARGET: height}, contacts={TARGET: by}, touched=(TARGET,) if ROBOT in by else ())
+    return truth(
+        at={TARGET: where},
+        up={TARGET: height},
+        contacts={TARGET: by},
+        touched=(TARGET,) if ROBOT in by else (),
+    )
 
 
 took = truth(up={OTHER: 0.1}, contacts={OTHER: (ROBOT,)}, touched=(OTHER,))
@@ -174,13 +231,20 @@ def test_an_open_hand_beside_the_target_at_time_out_missed_no_grasp():
     found = told("picked", [*still(5), *still(1, where=NEAR, grip=None)])
     assert label(found) == ("case 3", "timeout", 5, "")
     assert found.confidence == 1.0, "no neighbouring limit makes it a grasp"
-    assert label(told("picked", [*still(4), *still(1, where=NEAR, grip=0.0), *still(1, where=NEAR, grip=None)])) == ("case 3", "missed grasp", 4, "")
+    assert label(
+        told(
+            "picked", [*still(4), *still(1, where=NEAR, grip=0.0), *still(1, where=NEAR, grip=None)]
+        )
+    ) == ("case 3", "missed grasp", 4, "")
     lost = [*still(3), *still(3, now=held(0.03), grip=0.0), *still(1, grip=None)]
     assert told("picked", lost).sub_case == "slip", "nor does the missing action open the hand"
 
 
 def test_touching_the_goal_is_no_mistake():
-    assert told("put", still(3) + still(3, now=truth(touched=(GOAL,))), goal=GOAL).sub_case == "timeout"
+    assert (
+        told("put", still(3) + still(3, now=truth(touched=(GOAL,))), goal=GOAL).sub_case
+        == "timeout"
+    )
 
 
 def test_only_failures_are_diagnosed():
@@ -188,7 +252,11 @@ def test_only_failures_are_diagnosed():
     assert lifted.outcome.success
     assert diagnose(lifted) is None
     assert failures.columns(lifted)["case"] == ""
-    broken = episode("picked", still(2), outcome=Outcome("error", False, False, 0, False, False, False, 2, "boom"))
+    broken = episode(
+        "picked",
+        still(2),
+        outcome=Outcome("error", False, False, 0, False, False, False, 2, "boom"),
+    )
     assert diagnose(broken) is None
     assert all(cell is None for cell in stages(broken).values())
 
@@ -202,23 +270,44 @@ def test_confidence_is_the_share_of_neighbouring_limits_that_agree():
 
 
 def test_every_limit_has_its_neighbours_and_nothing_else():
-    assert set(NEIGHBOURS) == set(Limits.__dataclass_fields__)
-    assert all(low < getattr(LIMITS, name) < high for name, (low, high) in NEIGHBOURS.items())
-    assert len({repr(near) for near in neighbours(LIMITS)}) == 2 * len(NEIGHBOURS)
+    assert set(NEIGHBOURS) == set(Thresholds.__dataclass_fields__)
+    assert all(low < getattr(THRESHOLDS, name) < high for name, (low, high) in NEIGHBOURS.items())
+    assert len({repr(near) for near in neighbours(THRESHOLDS)}) == 2 * len(NEIGHBOURS)
 
 
 def test_a_row_of_the_table_can_be_read_back():
     cells = failures.columns(episode("picked", still(9, [view(OTHER, proposal=0.9)]), candidates=2))
-    assert (cells["case"], cells["sub_case"], cells["deciding_frame"], cells["deciding_camera"]) == ("case 1", "distractor vote", 0, "front")
+    assert (
+        cells["case"],
+        cells["sub_case"],
+        cells["deciding_frame"],
+        cells["deciding_camera"],
+    ) == ("case 1", "distractor vote", 0, "front")
     assert json.loads(cells["case_evidence"])["shows_front"] == OTHER
-    assert set(failures.NONE) == {name for name in cells if name in failures.NONE}
+    assert set(failures.NO_DIAGNOSIS) == {name for name in cells if name in failures.NO_DIAGNOSIS}
 
 
 def test_the_road_of_an_episode():
     way = stages(episode("picked", still(3) + still(3, now=held(0.02)) + still(3)))
-    assert [way[f"stage_{name}"] for name in failures.STAGES] == [True, True, True, True, True, True, False]
+    assert [way[f"stage_{name}"] for name in failures.STAGES] == [
+        True,
+        True,
+        True,
+        True,
+        True,
+        True,
+        False,
+    ]
     way = stages(episode("picked", still(3, [view(OTHER, proposal=0.3)]), candidates=2))
-    assert [way[f"stage_{name}"] for name in failures.STAGES] == [False, False, False, False, False, False, False]
+    assert [way[f"stage_{name}"] for name in failures.STAGES] == [
+        False,
+        False,
+        False,
+        False,
+        False,
+        False,
+        False,
+    ]
     way = stages(episode("picked", still(3, [])))
     assert [way[f"stage_{name}"] for name in failures.STAGES[:5]] == [None, None, None, None, False]
 
@@ -228,19 +317,36 @@ def test_the_road_of_an_episode():
     [
         (0, 0.0, (), "nothing found", 0),
         (1, 0.2, (), "narrow vote", 0),
-        (1, 1.0, events.changed(4, frozenset({("front", 0)}), frozenset()), "lost track", 4),
+        (
+            1,
+            1.0,
+            events.visibility_events(4, frozenset({("front", 0)}), frozenset()),
+            "lost track",
+            4,
+        ),
         (1, 1.0, (), "no signal", 5),
     ],
 )
 def test_without_truth_a_failure_stays_unlabelled(candidates, margin, events, sub_case, frame):
     made = episode("picked", still(6), candidates=candidates)
     nowhere = Truth({}, {}, (), {}, {})
-    frames = tuple(replace(each, truth=nowhere, shown=(), events=events if i == 4 else ()) for i, each in enumerate(made.frames))
-    grounding = replace(made.opening.groundings["front"][0], margin=margin)
-    made = replace(made, frames=frames, opening=replace(made.opening, groundings={"front": (grounding,)}))
+    frames = tuple(
+        replace(each, truth=nowhere, coverage=(), events=events if i == 4 else ())
+        for i, each in enumerate(made.frames)
+    )
+    grounding = made.header.groundings["front"][0]
+    grounding = replace(grounding, ballot=replace(grounding.ballot, margin=margin))
+    made = replace(
+        made, frames=frames, header=replace(made.header, groundings={"front": (grounding,)})
+    )
     found = diagnose(made)
     assert found is not None
-    assert (found.case, found.sub_case, found.frame_index, found.confidence) == ("unlabelled", sub_case, frame, 0.0)
+    assert (found.case, found.sub_case, found.frame_index, found.confidence) == (
+        "unlabelled",
+        sub_case,
+        frame,
+        0.0,
+    )
     assert found.evidence["margin"] == margin
     assert stages(made)["stage_touched"] is None
 
@@ -253,33 +359,69 @@ BESIDE = np.roll(SQUARE, 8, axis=1)
 def attended(mask, xyxy):
     boxes = Boxes(np.array(xyxy, np.float32).reshape(-1, 4), np.ones(len(xyxy), np.float32), "cup")
     n = len(boxes)
-    votes, tied, masks = np.zeros(n, np.int64), np.zeros(n, bool), np.zeros((n, 20, 20), bool)
-    grounding = Grounding("front", TARGET, boxes, np.ones((n, 1), np.float32), votes, tied, 0 if n else None, 1.0, 1.0, masks)
+    masks = np.zeros((n, 20, 20), bool)
+    grounding = Grounding(
+        "front",
+        TARGET,
+        boxes,
+        np.ones((n, 1), np.float32),
+        ballot(n),
+        0 if n else None,
+        masks,
+    )
     return Attended({}, "", (), {"front": (Track(mask, 1.0),)}, {"front": (grounding,)}, ())
 
 
 def seen_by(masks):
-    return Truth({name: np.array([*WHERE[name], 0.0, 1.0, 0, 0, 0]) for name in WHERE}, {}, (), {}, {}, {"front": masks})
+    return Truth(
+        {name: np.array([*WHERE[name], 0.0, 1.0, 0, 0, 0]) for name in WHERE},
+        {},
+        (),
+        {},
+        {},
+        {"front": masks},
+    )
 
 
 @pytest.mark.parametrize(
     ("mask", "what", "iou"),
-    [(SQUARE, TARGET, 1.0), (BESIDE, OTHER, 0.0), (np.roll(SQUARE, 4, axis=0), "", 0.0), (None, None, 0.0), (SQUARE & False, None, 0.0)],
+    [
+        (SQUARE, TARGET, 1.0),
+        (BESIDE, OTHER, 0.0),
+        (np.roll(SQUARE, 4, axis=0), "", 0.0),
+        (None, None, 0.0),
+        (SQUARE & False, None, 0.0),
+    ],
 )
 def test_what_a_mask_covers(mask, what, iou):
-    (found,) = shown(attended(mask, [[2, 2, 6, 6]]), seen_by({TARGET: SQUARE, OTHER: BESIDE}), TARGET, opening=False)
+    (found,) = mask_coverage(
+        attended(mask, [[2, 2, 6, 6]]),
+        seen_by({TARGET: SQUARE, OTHER: BESIDE}),
+        TARGET,
+        opening=False,
+    )
     assert (found.camera, found.object, found.iou, found.pixels) == ("front", what, iou, 16)
     assert np.isnan(found.proposal)
 
 
-@pytest.mark.parametrize(("xyxy", "best"), [([[2, 2, 6, 6]], 1.0), ([[10, 2, 14, 6], [2, 2, 6, 4]], 0.5), ([[10, 2, 14, 6]], 0.0), ([], 0.0)])
+@pytest.mark.parametrize(
+    ("xyxy", "best"),
+    [
+        ([[2, 2, 6, 6]], 1.0),
+        ([[10, 2, 14, 6], [2, 2, 6, 4]], 0.5),
+        ([[10, 2, 14, 6]], 0.0),
+        ([], 0.0),
+    ],
+)
 def test_the_best_proposal_counts_at_the_opening(xyxy, best):
-    (found,) = shown(attended(SQUARE, xyxy), seen_by({TARGET: SQUARE, OTHER: BESIDE}), TARGET, opening=True)
+    (found,) = mask_coverage(
+        attended(SQUARE, xyxy), seen_by({TARGET: SQUARE, OTHER: BESIDE}), TARGET, opening=True
+    )
     assert found.proposal == pytest.approx(best)
 
 
 def test_a_mask_belongs_to_what_most_of_it_covers():
     half = SQUARE | np.roll(SQUARE, 4, axis=0)
-    assert covered(half, {TARGET: SQUARE, OTHER: BESIDE}) == TARGET
-    assert covered(half | np.roll(SQUARE, 8, axis=0), {TARGET: SQUARE, OTHER: BESIDE}) == ""
-    assert covered(SQUARE, {}) == ""
+    assert covered_object(half, {TARGET: SQUARE, OTHER: BESIDE}) == TARGET
+    assert covered_object(half | np.roll(SQUARE, 8, axis=0), {TARGET: SQUARE, OTHER: BESIDE}) == ""
+    assert covered_object(SQUARE, {}) == ""

@@ -22,10 +22,19 @@ from torch.nn import functional as F  # noqa: N812
 import vap_core
 from tests import test_perception as contract
 from tests import tiny_foundation
-from vap_core import attend, bench_stack, foundation, hub, memory
-from vap_core.errors import MissingWeights, UnknownName
-from vap_core.foundation import architectures, dino, grounding, runtime, sam, video
-from vap_core.values import Boxes, Rgb
+from vap_core import attend, memory
+from vap_core.base.errors import MissingWeights, UnknownName
+from vap_core.base.types import Boxes, Rgb
+from vap_core.cli.bench import stack as bench_stack
+from vap_core.perception import foundation
+from vap_core.perception.boxes import MAX_BOXES, NMS_IOU, box_iou
+from vap_core.perception.foundation import architectures, runtime, sources, store
+from vap_core.perception.foundation import detector as grounding
+from vap_core.perception.foundation import encoder as dino
+from vap_core.perception.foundation import segmenter as sam
+from vap_core.perception.foundation import tracker as video
+from vap_core.perception.protocols import Stack
+from vap_core.perception.stacks import load_stack
 
 MEAN, STD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
 BATCHED = runtime.Runtime(torch.device("cpu"), None, batched=True)
@@ -39,7 +48,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def parts(weights: Path) -> foundation.Parts:
+def parts(weights: Path) -> Stack:
     return foundation.load("foundation", "cpu", weights)
 
 
@@ -48,7 +57,9 @@ def scene() -> Pair:
     """Two coloured discs on a blurred wall."""
     rgb = blurred(3, 120, 160)
     masks = np.zeros((2, 120, 160), np.uint8)
-    for mask, x, y, colour in zip(masks, (45, 110), (60, 70), ((200, 40, 40), (30, 60, 200)), strict=True):
+    for mask, x, y, colour in zip(
+        masks, (45, 110), (60, 70), ((200, 40, 40), (30, 60, 200)), strict=True
+    ):
         cv2.circle(mask, (x, y), 22, 1, -1)
         rgb[mask > 0] = colour
     xyxy = np.array([[23, 38, 68, 83], [88, 48, 133, 93]], np.float32)
@@ -64,24 +75,24 @@ def blurred(seed: int, h: int, w: int) -> Rgb:
 # --- The contracts of the four protocols, as the embedded stack keeps them -----------------------------------------------
 
 
-def test_contract_of_the_encoder(parts: foundation.Parts, scene: Pair) -> None:
+def test_contract_of_the_encoder(parts: Stack, scene: Pair) -> None:
     contract.test_encoder_gives_unit_rows_in_order_and_one_by_one(parts.encoder)
     contract.test_encoder_knows_an_object_again(parts.encoder, scene)
 
 
-def test_contract_of_the_detector(parts: foundation.Parts, scene: Pair) -> None:
+def test_contract_of_the_detector(parts: Stack, scene: Pair) -> None:
     contract.test_detector_gives_boxes_inside_the_image_best_first(parts.detector, scene)
     contract.test_detector_batches_as_one_by_one_and_repeats_its_bits(parts.detector, scene)
 
 
-def test_contract_of_the_segmenter(parts: foundation.Parts, scene: Pair) -> None:
+def test_contract_of_the_segmenter(parts: Stack, scene: Pair) -> None:
     contract.test_segmenter_takes_no_box_and_always_masks_a_box(parts.segmenter)
     rgb, masks, boxes = scene
     assert np.array_equal(parts.segmenter(rgb, boxes), parts.segmenter(rgb, boxes))
     assert parts.segmenter(rgb, boxes).shape == masks.shape
 
 
-def test_contract_of_the_tracker(parts: foundation.Parts, scene: Pair) -> None:
+def test_contract_of_the_tracker(parts: Stack, scene: Pair) -> None:
     contract.test_tracker_views_are_independent_and_repeat_their_bits(parts.tracker, scene)
 
 
@@ -90,7 +101,9 @@ def test_contract_of_the_tracker(parts: foundation.Parts, scene: Pair) -> None:
 
 def resized(image: Rgb, w: int, h: int, how: Image.Resampling) -> np.ndarray:
     """PIL's resampling, ImageNet's normalisation, channels first."""
-    return ((np.asarray(Image.fromarray(image).resize((w, h), how)) / 255 - MEAN) / STD).transpose(2, 0, 1)
+    return ((np.asarray(Image.fromarray(image).resize((w, h), how)) / 255 - MEAN) / STD).transpose(
+        2, 0, 1
+    )
 
 
 class Watch:
@@ -110,42 +123,56 @@ class Watch:
         self._hook.remove()
 
 
-@pytest.mark.parametrize(("hw", "seen"), [((120, 160), (800, 1066)), ((300, 100), (1333, 444)), ((90, 90), (800, 800))])
-def test_the_detector_sees_800_pixels_normalised(parts: foundation.Parts, hw: tuple[int, int], seen: tuple[int, int]) -> None:
+@pytest.mark.parametrize(
+    ("hw", "seen"), [((120, 160), (800, 1066)), ((300, 100), (1333, 444)), ((90, 90), (800, 800))]
+)
+def test_the_detector_sees_800_pixels_normalised(
+    parts: Stack, hw: tuple[int, int], seen: tuple[int, int]
+) -> None:
     """The shorter side becomes 800 pixels, or less where the longer one would exceed 1333."""
     image = blurred(0, *hw)
     with Watch(parts.detector.model) as watch:
         parts.detector([image], "cup")
     (given,) = watch.given
     assert tuple(given.shape[2:]) == seen
-    assert np.allclose(given[0].numpy(), resized(image, seen[1], seen[0], Image.Resampling.BILINEAR), atol=1e-5)
+    assert np.allclose(
+        given[0].numpy(), resized(image, seen[1], seen[0], Image.Resampling.BILINEAR), atol=1e-5
+    )
 
 
-def test_the_encoder_sees_the_whole_crop_in_a_grey_square(parts: foundation.Parts) -> None:
+def test_the_encoder_sees_the_whole_crop_in_a_grey_square(parts: Stack) -> None:
     crop = blurred(1, 50, 100)
     with Watch(parts.encoder.model) as watch:
         parts.encoder([crop])
     framed = np.full((100, 100, 3), np.round(MEAN * 255), np.uint8)
     framed[25:75] = crop
-    assert np.allclose(watch.given[0][0].numpy(), resized(framed, 224, 224, Image.Resampling.BICUBIC), atol=1e-5)
+    assert np.allclose(
+        watch.given[0][0].numpy(), resized(framed, 224, 224, Image.Resampling.BICUBIC), atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("hw", [(96, 128), (300, 200), (7, 90)])
 def test_sam_sees_the_image_stretched_to_a_square(hw: tuple[int, int]) -> None:
     image = blurred(2, *hw)
     given = sam.to_model(image, 128, torch.device("cpu"))[0].numpy()
-    assert np.abs(given - resized(image, 128, 128, Image.Resampling.BILINEAR)).max() <= 1.01 / 255 / STD.min()  # one grey level
+    assert (
+        np.abs(given - resized(image, 128, 128, Image.Resampling.BILINEAR)).max()
+        <= 1.01 / 255 / STD.min()
+    )  # one grey level
 
 
-@pytest.mark.parametrize(("phrase", "read"), [("cup", "cup."), ("  Owl  Statue ", "owl statue."), ("Dr. Pepper.", "dr pepper.")])
+@pytest.mark.parametrize(
+    ("phrase", "read"),
+    [("cup", "cup."), ("  Owl  Statue ", "owl statue."), ("Dr. Pepper.", "dr pepper.")],
+)
 def test_phrases_are_read_in_lower_case_with_one_dot(phrase: str, read: str) -> None:
-    assert grounding.caption(phrase) == read
+    assert grounding.text_query(phrase) == read
 
 
 # --- Detector ------------------------------------------------------------------------------------------------------------
 
 
-def test_boxes_are_those_of_transformers_post_processing(parts: foundation.Parts, scene: Pair) -> None:
+def test_boxes_are_those_of_transformers_post_processing(parts: Stack, scene: Pair) -> None:
     from transformers import GroundingDinoProcessor
 
     rgb, detector = scene[0], parts.detector
@@ -178,15 +205,17 @@ class _Decoder:
         self.batch_decode = tokenizer.batch_decode  # type: ignore[attr-defined]
 
 
-def test_the_threshold_is_the_detectors_own_or_the_one_given(parts: foundation.Parts, scene: Pair) -> None:
-    own, strict, all_of_them = (parts.detector([scene[0]], "cup", threshold)[0] for threshold in (None, 0.99, 0.0))
+def test_the_threshold_is_the_detectors_own_or_the_one_given(parts: Stack, scene: Pair) -> None:
+    own, strict, all_of_them = (
+        parts.detector([scene[0]], "cup", threshold)[0] for threshold in (None, 0.99, 0.0)
+    )
     assert (own.score >= grounding.THRESHOLD).all()
     assert (strict.score >= 0.99).all()
     assert len(strict) <= len(own) <= len(all_of_them)
     assert len(parts.detector([scene[0]], "cup", 1.01)[0]) == 0
 
 
-def test_images_of_different_sizes_keep_their_order_and_answers(parts: foundation.Parts) -> None:
+def test_images_of_different_sizes_keep_their_order_and_answers(parts: Stack) -> None:
     images = [blurred(0, 60, 80), blurred(1, 90, 70), blurred(2, 60, 80)]
     alone = parts.detector
     together = grounding.GroundingDino(alone.model, alone.tokenizer, alone.processor, BATCHED)
@@ -198,30 +227,38 @@ def test_images_of_different_sizes_keep_their_order_and_answers(parts: foundatio
         assert np.allclose(boxes.score, single.score, atol=1e-5)
 
 
-def test_choose_keeps_the_best_clips_and_drops_overlaps() -> None:
-    xyxy = np.array([[-5, 0, 10, 10], [0, 0, 10, 11], [20, 20, 30, 30], [40, 40, 40.5, 60], [0, 0, 50, 50]], np.float32)
+def test_selection_keeps_the_best_clips_and_drops_overlaps() -> None:
+    xyxy = np.array(
+        [[-5, 0, 10, 10], [0, 0, 10, 11], [20, 20, 30, 30], [40, 40, 40.5, 60], [0, 0, 50, 50]],
+        np.float32,
+    )
     score = np.array([0.5, 0.9, 0.7, 0.8, 0.2], np.float32)
-    kept = grounding.choose(xyxy, score, (25, 40), "cup", 0.3)
+    kept = grounding.select_boxes(xyxy, score, (25, 40), "cup", 0.3)
     assert kept.xyxy.tolist() == [[0, 0, 10, 11], [20, 20, 30, 25]]
     assert kept.score.tolist() == pytest.approx([0.9, 0.7])
-    assert len(grounding.choose(xyxy, score, (25, 40), "cup", 0.95)) == 0
+    assert len(grounding.select_boxes(xyxy, score, (25, 40), "cup", 0.95)) == 0
 
 
-@given(hnp.arrays(np.float32, (30, 4), elements=st.floats(-20, 120, width=16)), hnp.arrays(np.float32, (30,), elements=st.floats(0, 1, width=16)))
-def test_chosen_boxes_are_always_few_sorted_inside_and_apart(xyxy: np.ndarray, score: np.ndarray) -> None:
-    kept = grounding.choose(xyxy, score, (100, 80), "cup", 0.25)
-    assert len(kept) <= grounding.TOP
+@given(
+    hnp.arrays(np.float32, (30, 4), elements=st.floats(-20, 120, width=16)),
+    hnp.arrays(np.float32, (30,), elements=st.floats(0, 1, width=16)),
+)
+def test_chosen_boxes_are_always_few_sorted_inside_and_apart(
+    xyxy: np.ndarray, score: np.ndarray
+) -> None:
+    kept = grounding.select_boxes(xyxy, score, (100, 80), "cup", 0.25)
+    assert len(kept) <= MAX_BOXES
     assert (np.diff(kept.score) <= 0).all()
     assert ((kept.xyxy >= 0) & (kept.xyxy <= (80, 100, 80, 100))).all()
-    overlap = grounding.box_iou(kept.xyxy, kept.xyxy) - np.eye(len(kept))
-    assert (overlap < grounding.NMS_IOU).all()
+    overlap = box_iou(kept.xyxy, kept.xyxy) - np.eye(len(kept))
+    assert (overlap <= NMS_IOU).all()
 
 
 # --- Any image -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("hw", [(1, 1), (1, 300), (211, 3)])
-def test_any_image_size_and_aspect(parts: foundation.Parts, hw: tuple[int, int]) -> None:
+def test_any_image_size_and_aspect(parts: Stack, hw: tuple[int, int]) -> None:
     image = np.random.default_rng(0).integers(0, 255, (*hw, 3), dtype=np.uint8)
     image.setflags(write=False)
     flipped = image[::-1, ::-1]
@@ -247,7 +284,7 @@ def test_strips_are_padded_and_nothing_else(h: int, w: int) -> None:
 
 @given(st.integers(1, 400), st.integers(1, 400))
 def test_square_keeps_all_of_a_crop(h: int, w: int) -> None:
-    framed = dino.square(np.full((h, w, 3), 255, np.uint8))
+    framed = dino.pad_to_square(np.full((h, w, 3), 255, np.uint8))
     side = framed.shape[0]
     assert framed.shape == (side, side, 3)
     assert side == min(max(h, w), dino.SIDE)
@@ -259,16 +296,26 @@ def test_square_keeps_all_of_a_crop(h: int, w: int) -> None:
 # --- SAM 2.1 -------------------------------------------------------------------------------------------------------------
 
 
-def test_masks_are_those_of_transformers_image_model(parts: foundation.Parts, weights: Path, scene: Pair) -> None:
+def test_masks_are_those_of_transformers_image_model(
+    parts: Stack, weights: Path, scene: Pair
+) -> None:
     from transformers import Sam2Model
 
     rgb, _, boxes = scene
-    with tiny_foundation.quiet():
-        theirs = Sam2Model.from_pretrained(weights / hub.MODELS["sam2.1-hiera-large"].folder).eval()
-    corners = torch.from_numpy(boxes.xyxy * (128 / 160, 128 / 120, 128 / 160, 128 / 120)).float()[None]
+    with architectures.quiet_transformers():
+        theirs = Sam2Model.from_pretrained(
+            weights / sources.MODELS["sam2.1-hiera-large"].folder
+        ).eval()
+    corners = torch.from_numpy(boxes.xyxy * (128 / 160, 128 / 120, 128 / 160, 128 / 120)).float()[
+        None
+    ]
     with torch.inference_mode():
-        out = theirs(pixel_values=sam.to_model(rgb, 128, torch.device("cpu")), input_boxes=corners, multimask_output=False)
-    ours = parts.segmenter.logits(rgb, boxes)
+        out = theirs(
+            pixel_values=sam.to_model(rgb, 128, torch.device("cpu")),
+            input_boxes=corners,
+            multimask_output=False,
+        )
+    ours = parts.segmenter.decode_boxes(rgb, boxes)
     assert torch.allclose(ours.logits, out.pred_masks[0], atol=1e-4)
     assert torch.allclose(ours.quality, out.iou_scores[0], atol=1e-5)
     assert (ours.logits[0] - ours.logits[1]).abs().max() > 0.01
@@ -280,12 +327,14 @@ def test_masks_are_those_of_transformers_image_model(parts: foundation.Parts, we
 def test_a_box_without_a_likely_pixel_gets_its_most_likely_ones() -> None:
     chance = np.full((20, 30), 0.001, np.float32)
     chance[5:8, 5:9], chance[15, 25] = 0.2, 0.4
-    mask = sam._mask(chance, np.array([4.2, 4.0, 12.0, 10.0], np.float32))
+    mask = sam._threshold(chance, np.array([4.2, 4.0, 12.0, 10.0], np.float32))
     assert mask.sum() == 12
     assert mask[5:8, 5:9].all()
 
 
-def test_the_backbone_runs_once_per_opening_frame_and_once_per_step(parts: foundation.Parts, scene: Pair) -> None:
+def test_the_backbone_runs_once_per_opening_frame_and_once_per_step(
+    parts: Stack, scene: Pair
+) -> None:
     _, masks, boxes = scene
     views = [blurred(seed, 120, 160) for seed in (11, 12, 13)]
     shared = sam.Sam(parts.tracker.sam.model, BATCHED)
@@ -305,21 +354,27 @@ def test_the_backbone_runs_once_per_opening_frame_and_once_per_step(parts: found
         assert one.mask is None or (one.mask == other.mask).mean() > 0.999
 
 
-def test_encoding_in_batches_changes_nothing_but_last_bits(parts: foundation.Parts) -> None:
+def test_encoding_in_batches_changes_nothing_but_last_bits(parts: Stack) -> None:
     crops = [blurred(seed, 30 + seed, 50) for seed in range(dino.BATCH + 3)]
-    together = dino.Dino(parts.encoder.model, parts.encoder.processor, "batched", BATCHED)
+    together = dino.DinoEncoder(parts.encoder.model, parts.encoder.processor, "batched", BATCHED)
     with Watch(together.model) as watch:
         assert np.allclose(together(crops), parts.encoder(crops), atol=1e-5)
     assert [len(given) for given in watch.given[:2]] == [dino.BATCH, 3]
 
 
-def session(model: torch.nn.Module, frames: list[Rgb], masks: np.ndarray) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+def session(
+    model: torch.nn.Module, frames: list[Rgb], masks: np.ndarray
+) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
     """transformers' own streaming session: every frame's mask logits and presence logits; it keeps all frames."""
     from transformers.models.sam2_video.modeling_sam2_video import Sam2VideoInferenceSession
 
-    ours = Sam2VideoInferenceSession(video_height=masks.shape[1], video_width=masks.shape[2], dtype=torch.float32)
+    ours = Sam2VideoInferenceSession(
+        video_height=masks.shape[1], video_width=masks.shape[2], dtype=torch.float32
+    )
     for i, mask in enumerate(masks):
-        given = F.interpolate(torch.from_numpy(mask)[None, None].float(), (128, 128), mode="bilinear", antialias=True)
+        given = F.interpolate(
+            torch.from_numpy(mask)[None, None].float(), (128, 128), mode="bilinear", antialias=True
+        )
         ours.add_mask_inputs(ours.obj_id_to_idx(i), 0, (given >= 0.5).float())
     ours.obj_with_new_inputs = list(range(len(masks)))
     for frame in frames:
@@ -327,7 +382,7 @@ def session(model: torch.nn.Module, frames: list[Rgb], masks: np.ndarray) -> Ite
         yield out.pred_masks.clone(), out.object_score_logits.flatten().clone()
 
 
-def test_tracks_are_those_of_transformers_video_session(parts: foundation.Parts, scene: Pair) -> None:
+def test_tracks_are_those_of_transformers_video_session(parts: Stack, scene: Pair) -> None:
     """Longer than every memory (16 pointers), with identities that come and go, one that was never there, and a second view."""
     rgb, masks, _ = scene
     masks = np.concatenate([masks, np.zeros((1, 120, 160), bool)])
@@ -340,7 +395,9 @@ def test_tracks_are_those_of_transformers_video_session(parts: foundation.Parts,
             continue
         states, (tracks, _) = parts.tracker.step(states, [frames[k], np.roll(other, k, axis=0)])
         assert np.allclose([t.score for t in tracks], presence.sigmoid().numpy(), atol=1e-3)
-        for track, logit in zip(tracks, F.interpolate(logits, (120, 160), mode="bilinear")[:, 0], strict=True):
+        for track, logit in zip(
+            tracks, F.interpolate(logits, (120, 160), mode="bilinear")[:, 0], strict=True
+        ):
             assert (track.mask is None) == (not bool((logit > 0).any()))
             seen.add(track.mask is None)
             assert track.mask is None or ((logit > 0).numpy() == track.mask).mean() > 0.999
@@ -350,14 +407,21 @@ def test_tracks_are_those_of_transformers_video_session(parts: foundation.Parts,
     assert sizes[16][0] == 2 * (2 + 2 * 6 + 15)
 
 
-def stored(states: list[video.Stream]) -> tuple[int, int]:
+def stored(states: list[video.SamTrackState]) -> tuple[int, int]:
     """Tensors and bytes that the states hold."""
-    frames = [frame for state in states if state.first is not None for frame in (state.first, *state.recent)]
-    tensors = [tensor for frame in frames for tensor in (frame.cells, frame.pointer)] + [tensor for state in states for tensor in state.pointers]
+    frames = [
+        frame
+        for state in states
+        if state.first is not None
+        for frame in (state.first, *state.recent)
+    ]
+    tensors = [tensor for frame in frames for tensor in (frame.cells, frame.pointer)] + [
+        tensor for state in states for tensor in state.pointers
+    ]
     return len(tensors), sum(tensor.untyped_storage().nbytes() for tensor in tensors)
 
 
-def test_absence_is_said_with_a_low_score(parts: foundation.Parts, scene: Pair) -> None:
+def test_absence_is_said_with_a_low_score(parts: Stack, scene: Pair) -> None:
     rgb, masks, _ = scene
     bias = parts.tracker.sam.model.mask_decoder.pred_obj_score_head.proj_out.bias
     before = bias.clone()
@@ -371,7 +435,7 @@ def test_absence_is_said_with_a_low_score(parts: foundation.Parts, scene: Pair) 
         bias.data.copy_(before)
 
 
-def test_wrong_shapes_are_refused(parts: foundation.Parts, scene: Pair) -> None:
+def test_wrong_shapes_are_refused(parts: Stack, scene: Pair) -> None:
     rgb, masks, _ = scene
     with pytest.raises(ValueError, match="must agree"):
         parts.tracker.start([rgb], [masks[:, :100]])
@@ -382,18 +446,23 @@ def test_wrong_shapes_are_refused(parts: foundation.Parts, scene: Pair) -> None:
 # --- Precision and device ------------------------------------------------------------------------------------------------
 
 
-def test_half_precision_changes_little_and_ends_with_the_call(parts: foundation.Parts, scene: Pair) -> None:
+def test_half_precision_changes_little_and_ends_with_the_call(parts: Stack, scene: Pair) -> None:
     rgb, masks, boxes = scene
     half = runtime.Runtime(torch.device("cpu"), torch.bfloat16, batched=True)
     exact = parts.encoder([rgb])
-    encoder = dino.Dino(parts.encoder.model, parts.encoder.processor, "half", half)
+    encoder = dino.DinoEncoder(parts.encoder.model, parts.encoder.processor, "half", half)
     assert (encoder([rgb]) @ exact.T).item() > 0.995
     assert encoder([rgb]).dtype == np.float32
-    detector = grounding.GroundingDino(parts.detector.model, parts.detector.tokenizer, parts.detector.processor, half)
+    detector = grounding.GroundingDino(
+        parts.detector.model, parts.detector.tokenizer, parts.detector.processor, half
+    )
     assert detector([rgb], "cup", 0.0)[0].score.dtype == np.float32
     both = sam.Sam(parts.tracker.sam.model, half)
     found, whole = sam.SamSegmenter(both)(rgb, boxes), parts.segmenter(rgb, boxes)
-    assert (found.shape, found.dtype) == (whole.shape, whole.dtype)  # random weights put logits about zero: which pixels round over is the CPU's
+    assert (found.shape, found.dtype) == (
+        whole.shape,
+        whole.dtype,
+    )  # random weights put logits about zero: which pixels round over is the CPU's
     tracker = video.SamTracker(both)
     states, _ = tracker.step(tracker.start([rgb], [masks]), [rgb])
     assert states[0].recent[0].pointer.dtype == torch.float32
@@ -402,25 +471,35 @@ def test_half_precision_changes_little_and_ends_with_the_call(parts: foundation.
 
 
 def test_the_device_is_chosen_or_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert runtime.pick("cpu") == runtime.Runtime(torch.device("cpu"), None, batched=False)
-    monkeypatch.setenv(runtime.DEVICE, "cpu")
-    assert runtime.pick().device == torch.device("cpu")
-    monkeypatch.setenv(runtime.DEVICE, "abacus")
+    assert runtime.select_runtime("cpu") == runtime.Runtime(
+        torch.device("cpu"), None, batched=False
+    )
+    monkeypatch.setenv(runtime.DEVICE_VARIABLE, "cpu")
+    assert runtime.select_runtime().device == torch.device("cpu")
+    monkeypatch.setenv(runtime.DEVICE_VARIABLE, "abacus")
     with pytest.raises(UnknownName, match="device 'abacus' is not on this machine"):
-        runtime.pick()
+        runtime.select_runtime()
 
 
 # --- The whole stack -----------------------------------------------------------------------------------------------------
 
 
-def test_the_whole_attender_runs_and_repeats_its_bits(weights: Path, scene: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(hub.VARIABLE, str(weights))
-    monkeypatch.setenv(runtime.DEVICE, "cpu")
-    stack = attend.load_stack("foundation")
+def test_the_whole_attender_runs_and_repeats_its_bits(
+    weights: Path, scene: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(store.VARIABLE, str(weights))
+    monkeypatch.setenv(runtime.DEVICE_VARIABLE, "cpu")
+    stack = load_stack("foundation")
     assert (stack.name, stack.domain) == ("foundation", "")
     assert stack.encoder.name.startswith("dinov2-base-")
     rgb = scene[0]
-    mug, _ = memory.register("mug", "cup", [rgb[20:100, 10:80].copy(), rgb[30:90, 15:75].copy()], stack.detector, stack.encoder)
+    mug, _ = memory.register(
+        "mug",
+        "cup",
+        [rgb[20:100, 10:80].copy(), rgb[30:90, 15:75].copy()],
+        stack.detector,
+        stack.encoder,
+    )
     assert mug.encoder == stack.encoder.name
     attender = attend.Attender(stack, {"mug": mug})
     views = {"front": rgb, "side": blurred(5, 90, 70)}
@@ -429,7 +508,9 @@ def test_the_whole_attender_runs_and_repeats_its_bits(weights: Path, scene: Pair
         state, first = attender.start(views, "bring my cup")
         shown = [first]
         for k in range(1, 4):
-            state, attended = attender.step(state, {name: np.roll(image, k, axis=1) for name, image in views.items()})
+            state, attended = attender.step(
+                state, {name: np.roll(image, k, axis=1) for name, image in views.items()}
+            )
             shown.append(attended)
         return shown
 
@@ -443,22 +524,29 @@ def test_the_whole_attender_runs_and_repeats_its_bits(weights: Path, scene: Pair
         for name, image in views.items():
             (track,) = attended.tracks[name]
             outside = np.ones(image.shape[:2], bool) if track.mask is None else ~track.mask
-            assert np.array_equal(attended.images[name][outside], np.roll(image, k, axis=1)[outside])
+            assert np.array_equal(
+                attended.images[name][outside], np.roll(image, k, axis=1)[outside]
+            )
 
 
-def test_without_weights_both_ways_to_get_them_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(hub.VARIABLE, str(tmp_path))
+def test_without_weights_both_ways_to_get_them_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(store.VARIABLE, str(tmp_path))
     with pytest.raises(
-        MissingWeights, match=r"sam2\.1-hiera-tiny \(lacks config\.json, model\.safetensors\).*weights pull --stack .*--from DIR"
+        MissingWeights,
+        match=r"sam2\.1-hiera-tiny \(lacks config\.json, model\.safetensors\).*weights pull --stack .*--from DIR",
     ) as caught:
-        attend.load_stack("foundation-small")
+        load_stack("foundation-small")
     assert "\n" not in str(caught.value)
 
 
 def test_weights_of_another_architecture_are_named(weights: Path) -> None:
-    detector, encoder, _ = hub.ready("foundation", weights)
-    with pytest.raises(MissingWeights, match="lacks .* tensors of Sam2VideoModel|cannot be read as Sam2VideoModel"):
-        architectures.read(detector, encoder, encoder)
+    detector, encoder, _ = store.verify_stack("foundation", weights)
+    with pytest.raises(
+        MissingWeights, match="lacks .* tensors of Sam2VideoModel|cannot be read as Sam2VideoModel"
+    ):
+        architectures.read_networks(detector, encoder, encoder)
 
 
 @pytest.mark.parametrize(("part", "name", "published"), [
@@ -466,20 +554,26 @@ def test_weights_of_another_architecture_are_named(weights: Path) -> None:
 ])  # fmt: skip
 def test_random_networks_have_the_published_sizes(part: str, name: str, published: int) -> None:
     """Bytes of model.safetensors at the pinned revisions: four a parameter, and its header."""
-    assert name in hub.KINDS["foundation-small"]
+    assert name in sources.KINDS["foundation-small"]
     net = getattr(small(), part)
     assert 4 * sum(p.numel() for p in net.parameters()) == pytest.approx(published, rel=2e-3)
 
 
 @cache
 def small() -> architectures.Networks:
-    return architectures.invent("foundation-small")
+    return architectures.random_networks("foundation-small")
 
 
-def test_bench_names_every_part_beside_the_papers_time(parts: foundation.Parts, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bench_names_every_part_beside_the_papers_time(
+    parts: Stack, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(bench_stack, "_parts", lambda *how: parts)
     said = bench_stack.run("foundation", random=True, device="cpu").splitlines()
-    beside = {line.rsplit(maxsplit=3)[0].strip(): line.split()[-1] for line in said if line.split()[-1:] in (["190"], ["70"], ["20"])}
+    beside = {
+        line.rsplit(maxsplit=3)[0].strip(): line.split()[-1]
+        for line in said
+        if line.split()[-1:] in (["190"], ["70"], ["20"])
+    }
     assert beside == {"detection": "190", "segmentation and embedding": "70", "track step": "20"}
     assert "GPU figures were not measured" in said[-1]
 
@@ -489,7 +583,13 @@ def test_transformers_is_imported_by_the_foundation_stack_and_the_policies_alone
     importers = set()
     for path in package.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
-            wanted = [node.module or ""] if isinstance(node, ast.ImportFrom) else [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            wanted = (
+                [node.module or ""]
+                if isinstance(node, ast.ImportFrom)
+                else [a.name for a in node.names]
+                if isinstance(node, ast.Import)
+                else []
+            )
             if any(name.split(".")[0] == "transformers" for name in wanted):
-                importers.add(path.relative_to(package).parts[0])
-    assert importers == {"foundation", "policies"}
+                importers.add(path.relative_to(package).parent.as_posix())
+    assert importers == {"perception/foundation", "policies/lerobot", "policies/mini_pi0"}

@@ -8,14 +8,21 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from vap_core import gallery
-from vap_core.gallery import GOALS, STEMS, TIERS
-from vap_core.plots import Tile, bounds_figure, hardness_figure, keep, layouts_figure, sheet
-from vap_core.sim.objects import lookalikes, personal
-from vap_core.sim.studio import PORTRAIT, Shot, Stage, photograph
-from vap_core.suites import BENCHMARKS, VARIANTS, lists
+from vap_core.analysis import gallery
+from vap_core.analysis.gallery import GOALS, STEMS
+from vap_core.analysis.plots import (
+    Tile,
+    bounds_figure,
+    hardness_figure,
+    keep,
+    layouts_figure,
+    sheet,
+)
+from vap_core.simulation.assets.objects import TIERS, lookalikes, personal_instance
+from vap_core.simulation.studio import PORTRAIT, Shot, Stage, photograph
+from vap_core.simulation.suites import BENCHMARKS, VARIANTS, lists
 
-CUP, PLANT = personal("cup"), personal("plant")
+CUP, PLANT = personal_instance("cup"), personal_instance("plant")
 ASIDE = Shot(1.1, 0.7, 0.6, -0.9, 0.55, (0.5, 0.6, 0.7))
 FRACTAL = lists.read("simpler-fractal")
 
@@ -57,8 +64,12 @@ def test_every_personal_object_has_a_row_from_hard_to_easy():
     for stem in STEMS:
         ranks = [TIERS.index(gallery.tier(model)) for model in gallery.graded(stem)]
         assert ranks == sorted(ranks)
-        assert {model.name for model in gallery.graded(stem)} == {model.name for model in lookalikes(stem)}
-    assert {model.name for model in GOALS} >= {row.goal for name in BENCHMARKS for row in lists.read(name) if row.goal}
+        assert {model.name for model in gallery.graded(stem)} == {
+            model.name for model in lookalikes(stem)
+        }
+    assert {model.name for model in GOALS} >= {
+        row.goal for name in BENCHMARKS for row in lists.read(name) if row.goal
+    }
 
 
 def test_generics_are_in_rows():
@@ -80,15 +91,30 @@ def test_hardness_is_the_mean_cosine(stage, monkeypatch):
 
 
 def test_pairs_out_of_order_are_found():
-    table = pd.DataFrame({"object": ["cup"] * 3, "lookalike": list("abc"), "tier": ["hard", "medium", "easy"], "cosine": [0.6, 0.8, 0.7]})
+    table = pd.DataFrame(
+        {
+            "object": ["cup"] * 3,
+            "lookalike": list("abc"),
+            "tier": ["hard", "medium", "easy"],
+            "cosine": [0.6, 0.8, 0.7],
+        }
+    )
     wrong = gallery.out_of_order(table)
-    assert list(zip(wrong.lookalike, wrong.lookalike_easier, wrong.gap.round(6), strict=True)) == [("a", "b", 0.2), ("a", "c", 0.1)]
+    assert list(zip(wrong.lookalike, wrong.lookalike_easier, wrong.gap.round(6), strict=True)) == [
+        ("a", "b", 0.2),
+        ("a", "c", 0.1),
+    ]
     assert not len(gallery.out_of_order(table.assign(cosine=[0.9, 0.8, 0.7])))
 
 
 def test_the_census_counts_every_row_once():
     counts = gallery.census({name: lists.read(name) for name in BENCHMARKS})
-    assert counts.groupby("suite").episodes.sum().to_dict() == {"simpler-bridge": 96, "simpler-fractal": 1685, "tabletop": 160, "vlabench": 250}
+    assert counts.groupby("suite").episodes.sum().to_dict() == {
+        "simpler-bridge": 96,
+        "simpler-fractal": 1685,
+        "tabletop": 160,
+        "vlabench": 250,
+    }
     assert counts[counts.suite == "simpler-fractal"].episodes.tolist() == [300, 825, 160, 400]
 
 
@@ -96,14 +122,22 @@ def test_all_variants_return_to_one_layout():
     held = gallery.same_layout(FRACTAL, FRACTAL[12])
     assert list(held) == list(VARIANTS)
     assert all(
-        [p.model for p in row.placements[:3]] == [p.model for p in FRACTAL[12].placements] and row.variant == name for name, row in held.items()
+        [p.model for p in row.placements[:3]] == [p.model for p in FRACTAL[12].placements]
+        and row.variant == name
+        for name, row in held.items()
     )
     assert {len(row.placements) for row in held.values()} == {3, 5, 6}
 
 
 def test_what_is_seen_moves_with_the_expert():
-    row = replace(lists.read("simpler-bridge")[0], placements=lists.read("simpler-bridge")[0].placements[:1])
-    before, again, after = gallery.seen(row, size=64), gallery.seen(row, size=64), gallery.seen(row, steps=6, size=64)
+    row = replace(
+        lists.read("simpler-bridge")[0], placements=lists.read("simpler-bridge")[0].placements[:1]
+    )
+    before, again, after = (
+        gallery.seen(row, size=64),
+        gallery.seen(row, size=64),
+        gallery.seen(row, steps=6, size=64),
+    )
     assert list(before) == ["front"]
     assert np.array_equal(before["front"], again["front"])
     assert not np.array_equal(before["front"], after["front"])
@@ -131,14 +165,30 @@ def test_a_kept_figure_fits(tmp_path):
 
 
 def test_bounds_are_read_in_the_suites_order_and_pooled(tmp_path):
-    one = {"method": "generic", "outcome": "success", "cmr": None, "wrong_object": False, "first_object_correct": True, "steps": 3, "split": ""}
-    tasks = [("tabletop", "select-cup", True), ("simpler-bridge", "put-camera", False), ("simpler-bridge", "pick-shaver", True)]
+    one = {
+        "method": "generic",
+        "outcome": "success",
+        "cmr": None,
+        "wrong_object": False,
+        "first_object_correct": True,
+        "steps": 3,
+        "split": "",
+    }
+    tasks = [
+        ("tabletop", "select-cup", True),
+        ("simpler-bridge", "put-camera", False),
+        ("simpler-bridge", "pick-shaver", True),
+    ]
     pd.DataFrame(
         [{**one, "suite": suite, "task": task, "policy": policy, "success": done and policy == "expert"}
          for suite, task, done in tasks for policy in ("random", "expert")]
     ).to_parquet(tmp_path / "bounds.parquet")  # fmt: skip
     scores = gallery.bounds(tmp_path / "bounds.parquet")
-    assert [(s.task, s.policy) for s in scores[:3]] == [("pick-shaver", "expert"), ("pick-shaver", "random"), ("put-camera", "expert")]
+    assert [(s.task, s.policy) for s in scores[:3]] == [
+        ("pick-shaver", "expert"),
+        ("pick-shaver", "random"),
+        ("put-camera", "expert"),
+    ]
     assert scores[-1].suite == "tabletop"
     pooled = gallery.pooled(scores)
     assert pooled.iloc[0].tolist()[:3] == ["simpler-bridge", "expert", 2]
@@ -149,7 +199,13 @@ def test_layouts_and_hardness_draw():
     built = {name: lists.read(name) for name in ("simpler-bridge", "tabletop")}
     figure = layouts_figure(built, dict.fromkeys(built, (0.0, -0.5, 0.8, 0.5)))
     assert len(figure.axes) == 2
-    corners = {tuple(offset) for c in figure.axes[0].collections for offset in np.round(np.asarray(c.get_offsets()), 4)}
+    corners = {
+        tuple(offset)
+        for c in figure.axes[0].collections
+        for offset in np.round(np.asarray(c.get_offsets()), 4)
+    }
     assert corners == {(x, y) for x in (-0.075, 0.075) for y in (0.19, 0.34)}
-    table = pd.DataFrame({"object": ["cup"] * 2, "tier": ["hard", "easy"], "cosine": [0.9, 0.5], "own": [0.95] * 2})
+    table = pd.DataFrame(
+        {"object": ["cup"] * 2, "tier": ["hard", "easy"], "cosine": [0.9, 0.5], "own": [0.95] * 2}
+    )
     assert len(hardness_figure(table, gallery.TIER_COLOURS).axes[0].collections) == 3

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from jaxtyping import Float64
 
-from vap_core.errors import OutOfReach
-from vap_core.sim import cameras, robots, scenes
-from vap_core.sim.control import arm, rotation
-from vap_core.sim.env import Env
-from vap_core.values import EpisodeRow, Placement
+from vap_core.base.errors import OutOfReach
+from vap_core.simulation import cameras, robots, scenes
+from vap_core.simulation.control import arm, rotation
+from vap_core.simulation.env import Env
+from vap_core.simulation.types import EpisodeRow, Placement
 
 import mujoco  # isort: skip
 
@@ -42,7 +42,9 @@ def menagerie() -> mujoco.MjModel:
                 parent.remove(child)
     compiler = tree.find("compiler")
     assert compiler is not None
-    compiler.attrib.update(boundmass="0.01", boundinertia="0.0001")  # links that had their mass from a mesh
+    compiler.attrib.update(
+        boundmass="0.01", boundinertia="0.0001"
+    )  # links that had their mass from a mesh
     return mujoco.MjModel.from_xml_string(ElementTree.tostring(tree, encoding="unicode"))
 
 
@@ -50,7 +52,9 @@ def test_every_link_stands_where_menagerie_has_it(menagerie):
     model, _ = bare()
     rng = np.random.default_rng(3)
     for _ in range(100):
-        angles = {name: rng.uniform(*model.joint(name).range) for name in (*ROBOT.joints, *ROBOT.fingers)}
+        angles = {
+            name: rng.uniform(*model.joint(name).range) for name in (*ROBOT.joints, *ROBOT.fingers)
+        }
         poses = []
         for each in (model, menagerie):
             data = mujoco.MjData(each)
@@ -58,7 +62,14 @@ def test_every_link_stands_where_menagerie_has_it(menagerie):
                 data.joint(name).qpos[0] = angle
             mujoco.mj_kinematics(each, data)
             foot = data.body("base_link").xpos
-            poses.append(np.stack([[*(data.body(link).xpos - foot), *data.body(link).xmat] for link in ROBOT.links]))
+            poses.append(
+                np.stack(
+                    [
+                        [*(data.body(link).xpos - foot), *data.body(link).xmat]
+                        for link in ROBOT.links
+                    ]
+                )
+            )
         assert poses[0] == pytest.approx(poses[1], abs=1e-5)
 
 
@@ -89,7 +100,10 @@ def test_opening_is_the_clear_width_and_the_tips_stay_off_the_table():
     assert right[:, 1].min() - left[:, 1].max() == pytest.approx(ROBOT.opening_m, abs=5e-4)
     right, left = pads(ROBOT.fingers_closed[0])
     assert right[:, 1].min() - left[:, 1].max() == pytest.approx(0.0, abs=2e-3)
-    assert all(pads(turn)[..., 2].max() < 0.016 for turn in np.linspace(ROBOT.fingers_open[0], ROBOT.fingers_closed[0], 20))
+    assert all(
+        pads(turn)[..., 2].max() < 0.016
+        for turn in np.linspace(ROBOT.fingers_open[0], ROBOT.fingers_closed[0], 20)
+    )
 
 
 def test_pads_lie_parallel_around_six_centimetres():
@@ -120,7 +134,16 @@ def test_any_grasp_from_above_is_in_reach(x, y):
 
 
 def row(*places: tuple[str, float, float, float]) -> EpisodeRow:
-    return EpisodeRow("none", "hold", 0, 0, "pick up the cup", "cup", tuple(Placement(*place) for place in places), 80)
+    return EpisodeRow(
+        "none",
+        "hold",
+        0,
+        0,
+        "pick up the cup",
+        "cup",
+        tuple(Placement(*place) for place in places),
+        80,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +152,9 @@ def scene():
         yield built
 
 
-def drive(env: Env, goal_world: Float64[np.ndarray, "3"], yaw: float, grip: float, steps: int) -> None:
+def drive(
+    env: Env, goal_world: Float64[np.ndarray, "3"], yaw: float, grip: float, steps: int
+) -> None:
     """At most `steps` actions of up to 6 cm and 0.4 rad towards a goal."""
     goal = goal_world - env.robot.base_world[:3]
     for _ in range(steps):
@@ -140,7 +165,10 @@ def drive(env: Env, goal_world: Float64[np.ndarray, "3"], yaw: float, grip: floa
         env.step(action)
 
 
-@pytest.mark.parametrize(("x", "y", "yaw"), [(0.40, 0.22, 0.3), (0.63, -0.22, -0.9), (0.63, 0.22, 1.2), (0.515, 0.0, -0.2)])
+@pytest.mark.parametrize(
+    ("x", "y", "yaw"),
+    [(0.40, 0.22, 0.3), (0.63, -0.22, -0.9), (0.63, 0.22, 1.2), (0.515, 0.0, -0.2)],
+)
 def test_a_cup_is_lifted_shaken_and_held(scene, x, y, yaw):
     """Moves end within 3 mm; the cup slips less than 5 mm while shaken and 0.5 mm in the 5 s after."""
     env, cup = Env(scene), "cup-personal"
@@ -183,9 +211,18 @@ def test_the_grip_presses_with_twenty_newtons(scene):
 def test_the_head_sees_the_whole_grid(scene):
     """What is ten centimetres tall and six wide, at any corner, fits the picture and fills its width; cups at the corners show in full."""
     env = Env(scene)
-    env.reset(row(*((name, x, y, 0.5) for name, (x, y) in zip(scene.objects, CORNERS[:3], strict=True))))
+    env.reset(
+        row(*((name, x, y, 0.5) for name, (x, y) in zip(scene.objects, CORNERS[:3], strict=True)))
+    )
     (head,) = env.cameras()
-    boxes = np.array([[x + a, y + b, z] for x, y in CORNERS for a, b in product((-0.03, 0.03), repeat=2) for z in (0.0, 0.1)])
+    boxes = np.array(
+        [
+            [x + a, y + b, z]
+            for x, y in CORNERS
+            for a, b in product((-0.03, 0.03), repeat=2)
+            for z in (0.0, 0.1)
+        ]
+    )
     pixels = cameras.project(head, boxes)
     assert pixels.min() > 0
     assert pixels.max() < 224

@@ -6,11 +6,12 @@ from itertools import count
 import numpy as np
 import pytest
 
-from vap_core.sim import grasps, objects, robots
-from vap_core.sim.grasps import FINGER_M, HALF_PAD_M, PAD_M, TIGHT_M, TIP_M, YAWS
-from vap_core.sim.shapes import Hull, Mesh, Solid
-from vap_core.sim.textures import Texture
-from vap_core.values import value
+from vap_core.base.types import value
+from vap_core.simulation import grasps, robots
+from vap_core.simulation.assets import objects
+from vap_core.simulation.assets.shapes import Hull, Mesh, Solid
+from vap_core.simulation.assets.textures import Texture
+from vap_core.simulation.grasps import FINGER_M, HALF_PAD_M, PAD_M, TIGHT_M, TIP_M, YAWS
 
 PANDA = robots.get("panda")
 REACH_M = PANDA.opening_m / 2 + FINGER_M
@@ -41,7 +42,11 @@ def make(monkeypatch):
 
     def enter(*parts: Solid | Hull) -> str:
         name = f"brick-{next(NUMBER)}"
-        monkeypatch.setitem(objects.OBJECTS, name, objects.ObjectModel(name, "brick", "prop", Body(parts), PAINT, 0.1))
+        monkeypatch.setitem(
+            objects.OBJECTS,
+            name,
+            objects.ObjectModel(name, "brick", "prop", Body(parts), PAINT, 0.1),
+        )
         return name
 
     return enter
@@ -76,7 +81,9 @@ def test_a_box_is_taken_across_its_thin_side(yaw, make):
 def test_every_grasp_has_the_width_of_the_box_along_its_axis_and_no_other_fits(make):
     brick = make(box(0.04, 0.07, 0.06))
     found = grasps.grasps(PANDA, brick, {brick: at(0.45, 0.0)})
-    widths = {round(yaw, 6): 0.04 * abs(np.cos(yaw)) + 0.07 * abs(np.sin(yaw)) for yaw in YAWS.tolist()}
+    widths = {
+        round(yaw, 6): 0.04 * abs(np.cos(yaw)) + 0.07 * abs(np.sin(yaw)) for yaw in YAWS.tolist()
+    }
     for grasp in found:
         assert grasp.width_m == pytest.approx(widths[round(grasp.axis_rad, 6)])
         assert grasp.tcp_world[:2] == pytest.approx([0.45, 0.0])
@@ -116,12 +123,21 @@ def test_the_fingertips_stay_off_the_table_and_the_palm_above_the_top(height, ma
 def test_a_pyramids_taper_is_how_fast_it_narrows(make):
     """Corners of a frustum that narrows by 2 x 0.25 m a metre across x, and not at all across y."""
     low, high, half_y, height = 0.03, 0.015, 0.02, 0.06
-    corners = [(sx * half, sy * half_y, z) for half, z in ((low, 0.0), (high, height)) for sx in (-1, 1) for sy in (-1, 1)]
+    corners = [
+        (sx * half, sy * half_y, z)
+        for half, z in ((low, 0.0), (high, height))
+        for sx in (-1, 1)
+        for sy in (-1, 1)
+    ]
     frustum = make(Hull(np.array(corners), 1e-4))
     found = grasps.grasps(PANDA, frustum, {frustum: at(0.4, 0.0)})
-    (across_x, *_), (across_y, *_) = ([grasp for grasp in found if along(grasp, axis)] for axis in (0.0, np.pi / 2))
+    (across_x, *_), (across_y, *_) = (
+        [grasp for grasp in found if along(grasp, axis)] for axis in (0.0, np.pi / 2)
+    )
     assert across_x.taper == pytest.approx(2 * (low - high) / height)
-    assert across_x.width_m == pytest.approx(2 * (low - (low - high) / height * across_x.tcp_world[2]))
+    assert across_x.width_m == pytest.approx(
+        2 * (low - (low - high) / height * across_x.tcp_world[2])
+    )
     assert across_y.taper == pytest.approx(0, abs=1e-9)
     assert along(found[0], np.pi / 2), "what does not slip comes first"
 
@@ -152,8 +168,15 @@ def test_a_post_inside_the_fingers_reach_counts_as_negative(make):
 
 def test_the_palm_counts_only_for_what_is_as_high(make):
     """The hand above reaches further along its axis than the fingers: a tall post meets it, a low one does not."""
-    brick, low, tall = make(box(0.04, 0.04, 0.06)), make(box(0.02, 0.02, 0.07)), make(box(0.02, 0.02, 0.15))
-    first = [grasps.grasps(PANDA, brick, {brick: at(0.4, 0.0), post: at(0.53, 0.0)}) for post in (low, tall)]
+    brick, low, tall = (
+        make(box(0.04, 0.04, 0.06)),
+        make(box(0.02, 0.02, 0.07)),
+        make(box(0.02, 0.02, 0.15)),
+    )
+    first = [
+        grasps.grasps(PANDA, brick, {brick: at(0.4, 0.0), post: at(0.53, 0.0)})
+        for post in (low, tall)
+    ]
     clear = [max(grasp.clear_m for grasp in found if along(grasp, 0.0)) for found in first]
     assert clear == pytest.approx([0.12 - REACH_M, 0.12 - PANDA.hand_m[0]])
 
@@ -167,8 +190,12 @@ def test_what_is_lower_than_the_fingertips_is_no_obstacle(make):
 @pytest.mark.parametrize("length", [0.06, 0.2])
 def test_a_long_neighbour_is_in_the_way_although_its_corners_are_not(length, make):
     brick, wall = make(box(0.04, 0.04, 0.06)), make(box(0.02, length, 0.06))
-    beside = grasps.grasps(PANDA, brick, {brick: at(0.4, 0.0), wall: at(0.4 + REACH_M + 0.005 + 0.01, 0.0)})
-    assert [grasp.clear_m for grasp in beside if along(grasp, 0.0)] == pytest.approx([0.005] * sum(along(grasp, 0.0) for grasp in beside))
+    beside = grasps.grasps(
+        PANDA, brick, {brick: at(0.4, 0.0), wall: at(0.4 + REACH_M + 0.005 + 0.01, 0.0)}
+    )
+    assert [grasp.clear_m for grasp in beside if along(grasp, 0.0)] == pytest.approx(
+        [0.005] * sum(along(grasp, 0.0) for grasp in beside)
+    )
 
 
 @pytest.mark.parametrize("yaw", [0.0, np.deg2rad(60)])
@@ -179,9 +206,13 @@ def test_a_lying_object_is_taken_where_it_lies(yaw, make):
     pose = np.array([0.4, 0.1, 0.02, turn[0] * tip, -turn[1] * tip, turn[0] * tip, turn[1] * tip])
     found = grasps.grasps(PANDA, brick, {brick: pose})
     first = found[0]
-    assert all(along(grasp, yaw + np.pi / 2) for grasp in found), "it fits the hand in one direction only"
+    assert all(along(grasp, yaw + np.pi / 2) for grasp in found), (
+        "it fits the hand in one direction only"
+    )
     assert first.width_m == pytest.approx(0.05)
-    assert first.tcp_world == pytest.approx([0.4 + 0.06 * np.cos(yaw), 0.1 + 0.06 * np.sin(yaw), 0.55 * 0.04])
+    assert first.tcp_world == pytest.approx(
+        [0.4 + 0.06 * np.cos(yaw), 0.1 + 0.06 * np.sin(yaw), 0.55 * 0.04]
+    )
 
 
 def test_a_cut_is_the_outline_at_that_height_and_empty_beyond(make):
@@ -201,8 +232,14 @@ def test_a_handle_counts_for_the_width_only_where_it_is(make):
 
 
 def test_the_order_of_the_neighbours_changes_nothing(make):
-    brick, one, other = make(box(0.04, 0.04, 0.06)), make(box(0.02, 0.02, 0.06)), make(Solid("cylinder", (0.02, 0.03), (0, 0, 0.03)))
+    brick, one, other = (
+        make(box(0.04, 0.04, 0.06)),
+        make(box(0.02, 0.02, 0.06)),
+        make(Solid("cylinder", (0.02, 0.03), (0, 0, 0.03))),
+    )
     poses = {brick: at(0.4, 0.0), one: at(0.48, 0.02), other: at(0.4, 0.09)}
     first = grasps.grasps(PANDA, brick, poses)
     second = grasps.grasps(PANDA, brick, dict(reversed(poses.items())))
-    assert [(g.axis_rad, g.clear_m, g.width_m) for g in first] == [(g.axis_rad, g.clear_m, g.width_m) for g in second]
+    assert [(g.axis_rad, g.clear_m, g.width_m) for g in first] == [
+        (g.axis_rad, g.clear_m, g.width_m) for g in second
+    ]

@@ -8,10 +8,10 @@ import pytest
 from gymnasium.envs.registration import parse_env_id
 from gymnasium.utils.env_checker import check_env
 
-from vap_core import suites
-from vap_core.errors import BadSuite
-from vap_core.integrations.gym import env_id
-from vap_core.values import Placement
+from vap_core.base.errors import BadSuite
+from vap_core.simulation import suites
+from vap_core.simulation.gym_env import env_id
+from vap_core.simulation.types import Placement
 
 FIRST = [(name, suite.tasks[-1].name) for name, suite in suites.BENCHMARKS.items()]
 
@@ -26,8 +26,15 @@ def test_every_suite_passes_gymnasiums_checker(suite, task):
 
 
 def test_the_name_in_the_manual_works_and_other_names_read_as_before():
-    assert gym.spec("vap/simpler-bridge/put-camera-v0").kwargs == {"suite": "simpler-bridge", "task": "put-camera"}
-    assert parse_env_id("vap/simpler-bridge/put-camera-v0") == ("vap/simpler-bridge", "put-camera", 0)
+    assert gym.spec("vap/simpler-bridge/put-camera-v0").kwargs == {
+        "suite": "simpler-bridge",
+        "task": "put-camera",
+    }
+    assert parse_env_id("vap/simpler-bridge/put-camera-v0") == (
+        "vap/simpler-bridge",
+        "put-camera",
+        0,
+    )
     assert parse_env_id("CartPole-v1") == (None, "CartPole", 1)
     assert parse_env_id("ns/Name-v3") == ("ns", "Name", 3)
     with pytest.raises(gym.error.Error, match="Malformed"):
@@ -46,9 +53,13 @@ def test_synchronous_vector_equals_one_by_one_step_for_step():
     make = lambda: gym.make(name, image_size=64)  # noqa: E731
     one = make()
     rng = np.random.default_rng(0)
-    actions = [(0.5 * one.action_space.high * rng.uniform(-1, 1, 7)).astype(np.float32) for _ in range(6)]
+    actions = [
+        (0.5 * one.action_space.high * rng.uniform(-1, 1, 7)).astype(np.float32) for _ in range(6)
+    ]
     alone = wander(one, actions, 3)
-    vector = gym.vector.SyncVectorEnv([make, make], autoreset_mode=gym.vector.AutoresetMode.DISABLED)
+    vector = gym.vector.SyncVectorEnv(
+        [make, make], autoreset_mode=gym.vector.AutoresetMode.DISABLED
+    )
     together = [vector.reset(seed=[5, 5], options={"episode": 3})[0]]
     for action in actions:
         together.append(vector.step(np.stack([action, action]))[0])
@@ -63,13 +74,18 @@ def test_synchronous_vector_equals_one_by_one_step_for_step():
 def test_a_row_of_your_own_is_checked_and_run():
     env = gym.make(env_id("simpler-bridge", "pick-shaver"), image_size=64)
     row = suites.rows("simpler-bridge", "pick-shaver", 1)[0]
-    moved = type(row)(**{name: getattr(row, name) for name in row.__slots__} | {"placements": (Placement(row.target, 0.27, 0.02, 0.0),)})
+    moved = type(row)(
+        **{name: getattr(row, name) for name in row.__slots__}
+        | {"placements": (Placement(row.target, 0.27, 0.02, 0.0),)}
+    )
     _, info = env.reset(options={"row": moved})
     assert info["steps"] == 0
     bad = type(row)(**{name: getattr(row, name) for name in row.__slots__} | {"variant": "disco"})
     with pytest.raises(BadSuite, match="row 1, field 'variant': 'disco' is unknown; known: base"):
         env.reset(options={"row": bad})
-    with pytest.raises(BadSuite, match="no episode -1; vap/simpler-bridge/pick-shaver-v0 has 0 .. 23"):
+    with pytest.raises(
+        BadSuite, match="no episode -1; vap/simpler-bridge/pick-shaver-v0 has 0 .. 23"
+    ):
         env.reset(options={"episode": -1})
     with pytest.raises(BadSuite, match="is no EpisodeRow for wx250s"):
         env.reset(options={"row": suites.rows("vlabench", "select-shoe", 1)[0]})

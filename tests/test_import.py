@@ -12,13 +12,25 @@ HEAVY = ("torch", "mujoco", "rerun", "transformers", "matplotlib", "pandas", "cv
 
 def test_import_loads_nothing_heavy() -> None:
     code = f"import sys, vap_core; print([m for m in {HEAVY!r} if m in sys.modules])"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout.strip()
+        == "[]"
+    )
 
 
 @pytest.mark.alone
 def test_import_is_fast() -> None:
     code = "import time; t = time.perf_counter(); import vap_core; print(time.perf_counter() - t)"
-    took = [float(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout) for _ in range(3)]
+    took = [
+        float(
+            subprocess.run(
+                [sys.executable, "-c", code], capture_output=True, text=True, check=True
+            ).stdout
+        )
+        for _ in range(3)
+    ]
     assert min(took) < 0.3
 
 

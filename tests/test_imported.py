@@ -1,4 +1,4 @@
-"""A scan of the user's own, brought in by the command, is an object as any other; what is kept of it is checked when it is read."""
+"""A scan imported by the command is an object like any other; its files are checked on loading."""
 
 import json
 import subprocess
@@ -10,21 +10,26 @@ import pytest
 from PIL import Image
 
 from tests.scanned import mug, put
-from vap_core.errors import BadObject, BadOutput, UnknownName
-from vap_core.sim import objects
-from vap_core.sim.gl import ensure_gl
-from vap_core.sim.scans import bring as bringing
-from vap_core.sim.scans import stored
-from vap_core.sim.scans.bring import bring
-from vap_core.sim.scenes import build
-from vap_core.sim.studio import reference_views
+from vap_core.base.errors import BadObject, BadOutput, UnknownName
+from vap_core.simulation.assets import objects
+from vap_core.simulation.assets.scans import import_scan as importing
+from vap_core.simulation.assets.scans import storage
+from vap_core.simulation.assets.scans.import_scan import import_scan
+from vap_core.simulation.gl import ensure_gl
+from vap_core.simulation.scenes import build
+from vap_core.simulation.studio import reference_views
 
 ensure_gl()
 import mujoco  # noqa: E402
 
 
 def vap(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "vap_core", "objects", *map(str, words)], capture_output=True, text=True, timeout=300)
+    return subprocess.run(
+        [sys.executable, "-m", "vap_core", "objects", *map(str, words)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +39,16 @@ def shelf(tmp_path_factory):
         folder = tmp_path_factory.mktemp("shelf")
         patch.setenv("VAP_OBJECTS", str(folder / "objects"))
         file = put(folder, "mug.glb", mug())
-        done = vap("import", file, "--category", "Cup", "--name", "my-mug", "--licence", "CC-BY 4.0, Jane Doe")
+        done = vap(
+            "import",
+            file,
+            "--category",
+            "Cup",
+            "--name",
+            "my-mug",
+            "--licence",
+            "CC-BY 4.0, Jane Doe",
+        )
         assert done.returncode == 0, done.stderr
         assert "convex parts" in done.stderr
         assert "my-mug: a cup, 7.0 x 7.0 x 9.0 cm" in done.stdout
@@ -43,13 +57,15 @@ def shelf(tmp_path_factory):
 
 
 def test_an_imported_mug_is_an_object_like_any_other(shelf):
-    model = objects.get("my-mug")
+    model = objects.get_object("my-mug")
     assert (model.category, model.split) == ("cup", "personal")
     assert objects.extent_m(model) == pytest.approx((0.07, 0.07, 0.09), abs=1e-6)
-    assert objects.mesh(model).vertex[:, 2].min() == pytest.approx(0, abs=1e-9)
+    assert objects.mesh_of(model).vertex[:, 2].min() == pytest.approx(0, abs=1e-9)
     solids = model.shape.solids()
-    assert 4 <= len(solids) <= bringing.HULLS
-    assert model.mass_kg == pytest.approx(np.clip(400 * sum(hull.volume for hull in solids), 0.03, 0.5), abs=1e-4)
+    assert 4 <= len(solids) <= importing.HULLS
+    assert model.mass_kg == pytest.approx(
+        np.clip(400 * sum(hull.volume for hull in solids), 0.03, 0.5), abs=1e-4
+    )
     about = json.loads((shelf / "objects" / "my-mug" / "object.json").read_text())
     assert about["licence"] == "CC-BY 4.0, Jane Doe"
     assert about["source"] == "mug.glb"
@@ -64,18 +80,23 @@ def test_it_stands_on_the_table_and_holds_its_shape_as_a_cup(shelf):
         pose = data.joint("my-mug/free").qpos
         assert pose[:3] == pytest.approx((0.3, 0.0, 0.0), abs=1e-3)
         assert 1 - 2 * (pose[4] ** 2 + pose[5] ** 2) > 0.999
-        assert scene.model.body("my-mug").mass[0] == pytest.approx(objects.get("my-mug").mass_kg)
-        mask = scene.eyes.masks(data, "front", 224)["my-mug"]
-        seen = scene.eyes.rgb(data, "front", 224)[mask].astype(int)
+        assert scene.model.body("my-mug").mass[0] == pytest.approx(
+            objects.get_object("my-mug").mass_kg
+        )
+        mask = scene.renderer.masks(data, "front", 224)["my-mug"]
+        seen = scene.renderer.rgb(data, "front", 224)[mask].astype(int)
     assert mask.sum() > 300
     assert (seen[:, 0] > 1.8 * seen[:, 2]).mean() > 0.25
     assert (seen[:, 2] > 1.8 * seen[:, 0]).mean() > 0.25
 
 
 def test_its_photos_show_the_texture_the_right_way_up(shelf):
-    for photo in reference_views(objects.get("my-mug"), n=3, size=160):
+    for photo in reference_views(objects.get_object("my-mug"), n=3, size=160):
         rows = np.arange(160)[:, None]
-        red, blue = ((photo[..., a] > 2.0 * photo[..., b]) & (photo[..., a] > 40) for a, b in ((0, 2), (2, 0)))
+        red, blue = (
+            (photo[..., a] > 2.0 * photo[..., b]) & (photo[..., a] > 40)
+            for a, b in ((0, 2), (2, 0))
+        )
         assert min(red.sum(), blue.sum()) > 300
         assert (rows * red).sum() / red.sum() + 10 < (rows * blue).sum() / blue.sum()
 
@@ -88,7 +109,7 @@ def test_list_shows_it_beside_the_workspaces_own(shelf):
     assert "7.0 x 7.0 x 9.0" in line
     assert "cup-lookalike-1" in done.stdout
     with pytest.raises(UnknownName, match="known: .*my-mug"):
-        objects.get("my-jug")
+        objects.get_object("my-jug")
 
 
 def test_a_name_that_is_taken_needs_replace(shelf):
@@ -96,30 +117,34 @@ def test_a_name_that_is_taken_needs_replace(shelf):
     again = vap("import", file, "--category", "cup", "--name", "my-mug")
     assert again.returncode == 2
     assert again.stderr.strip().endswith("choose another --name or pass --replace.")
-    with pytest.raises(BadObject, match="one of the workspace's own objects; choose another --name"):
-        bring(file, "cup-personal", "cup")
+    with pytest.raises(
+        BadObject, match="one of the workspace's own objects; choose another --name"
+    ):
+        import_scan(file, "cup-personal", "cup")
     with pytest.raises(BadObject, match="cannot name an object"):
-        bring(file, "../mug", "cup")
+        import_scan(file, "../mug", "cup")
     with pytest.raises(BadObject, match="cannot be a category"):
-        bring(file, "mug", "cup!")
+        import_scan(file, "mug", "cup!")
 
 
-@pytest.mark.parametrize("name", stored.FILES)
+@pytest.mark.parametrize("name", storage.FILES)
 def test_a_damaged_file_is_named(shelf, tmp_path, name):
-    card, body = stored.load(shelf / "objects" / "my-mug")
-    place = stored.save(tmp_path, card, body)
+    metadata, scan = storage.load_scan(shelf / "objects" / "my-mug")
+    place = storage.save_scan(tmp_path, metadata, scan)
     whole = (place / name).read_bytes()
     (place / name).write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(BadObject, match=rf"{name} is damaged .*import the object again with --replace"):
-        stored.load(place)
+    with pytest.raises(
+        BadObject, match=rf"{name} is damaged .*import the object again with --replace"
+    ):
+        storage.load_scan(place)
     (place / name).unlink()
     with pytest.raises(BadObject, match=rf"{name} is missing"):
-        stored.load(place)
+        storage.load_scan(place)
 
 
-def test_a_damaged_card_is_named(shelf, tmp_path):
-    card, body = stored.load(shelf / "objects" / "my-mug")
-    path = stored.save(tmp_path, card, body) / "object.json"
+def test_damaged_metadata_is_named(shelf, tmp_path):
+    metadata, scan = storage.load_scan(shelf / "objects" / "my-mug")
+    path = storage.save_scan(tmp_path, metadata, scan) / "object.json"
     about = json.loads(path.read_text())
     for change, message in (
         ({"version": 9}, "another version"),
@@ -129,21 +154,23 @@ def test_a_damaged_card_is_named(shelf, tmp_path):
     ):
         path.write_text(json.dumps(about | change) + " " * len(message))
         with pytest.raises(BadObject, match=f"object.json is .*{message.removeprefix('is ')}"):
-            stored._card(path.parent)
+            storage._read_metadata(path.parent)
     path.write_text("{")
     with pytest.raises(BadObject, match="object.json is damaged"):
-        stored._card(path.parent)
+        storage._read_metadata(path.parent)
 
 
 def test_what_was_saved_is_what_is_loaded(shelf, tmp_path):
-    card, body = stored.load(shelf / "objects" / "my-mug")
-    _, again = stored.load(stored.save(tmp_path, card, body))
-    assert np.array_equal(again.form.vertex, body.form.vertex)
-    assert np.array_equal(again.image, body.image)
-    assert all(np.array_equal(a.vertex, b.vertex) for a, b in zip(again.hulls, body.hulls, strict=True))
+    metadata, scan = storage.load_scan(shelf / "objects" / "my-mug")
+    _, again = storage.load_scan(storage.save_scan(tmp_path, metadata, scan))
+    assert np.array_equal(again.form.vertex, scan.form.vertex)
+    assert np.array_equal(again.image, scan.image)
+    assert all(
+        np.array_equal(a.vertex, b.vertex) for a, b in zip(again.hulls, scan.hulls, strict=True)
+    )
     with pytest.raises(BadOutput, match="--replace"):
-        stored.save(tmp_path, card, body)
-    stored.save(tmp_path, card, body, replace=True)
+        storage.save_scan(tmp_path, metadata, scan)
+    storage.save_scan(tmp_path, metadata, scan, replace=True)
     assert [path.name for path in tmp_path.iterdir()] == ["my-mug"]
 
 

@@ -8,9 +8,7 @@ import pandas as pd
 import pytest
 
 from tests.toys import TOYS, personal, scene
-from vap_core.attend import Attender
-from vap_core.errors import BadOutput, UnknownName
-from vap_core.inspection import (
+from vap_core.analysis.inspection import (
     association_table,
     associations,
     choices_figure,
@@ -24,11 +22,15 @@ from vap_core.inspection import (
     recovery,
     track_table,
 )
-from vap_core.sim.occluder import Occlusion
-from vap_core.suites import BENCHMARKS, rows
-from vap_core.survey.openings import View
-from vap_core.survey.run import TABLES
-from vap_core.values import EE_ACTION, Frame, Mask, Placement, Track, Truth
+from vap_core.attend import Attender
+from vap_core.base.errors import BadOutput, UnknownName
+from vap_core.base.types import Mask, Track
+from vap_core.evaluation.perception.first_frames import View
+from vap_core.evaluation.perception.run import TABLES
+from vap_core.rollout.types import Frame
+from vap_core.simulation.occluder import Occlusion
+from vap_core.simulation.suites import BENCHMARKS, rows
+from vap_core.simulation.types import EE_ACTION, Placement, Truth
 
 TEAL, GREY = (40, 120, 110), (90, 90, 90)
 LINE = scene([(4, 20, GREY), (24, 20, TEAL)])
@@ -64,7 +66,9 @@ def squares(hidden: bool) -> dict[str, Mask]:
 def test_an_episode_is_found_by_its_number() -> None:
     assert episode("vlabench", "select-cup", 7).episode == 7
     assert episode("widowx-pick", "pick-straw-cup", 3).episode == 3
-    with pytest.raises(UnknownName, match="no episode 50 of vlabench/select-cup; its list has 0 to 49"):
+    with pytest.raises(
+        UnknownName, match="no episode 50 of vlabench/select-cup; its list has 0 to 49"
+    ):
         episode("vlabench", "select-cup", 50)
 
 
@@ -74,7 +78,12 @@ def test_a_track_is_told_by_what_lies_under_it() -> None:
     half[:10] = False
     nowhere = np.zeros((100, 100), bool)
     nowhere[90:, 90:] = True
-    tracks = [(Track(half, 0.9), seen), (Track(None, 0.7), covered), (Track(seen["other"], 0.6), seen), (Track(nowhere, 0.5), seen)]
+    tracks = [
+        (Track(half, 0.9), seen),
+        (Track(None, 0.7), covered),
+        (Track(seen["other"], 0.6), seen),
+        (Track(nowhere, 0.5), seen),
+    ]
     table = track_table([frame(i, track, masks) for i, (track, masks) in enumerate(tracks)], "mug")
     assert table.on.tolist() == ["mug", "", "other", "nothing"]
     assert table.shown.tolist() == [True, False, True, True]
@@ -86,7 +95,15 @@ def test_a_track_is_told_by_what_lies_under_it() -> None:
 def test_recovery_counts_the_frames_that_pass_before_the_track_is_back() -> None:
     seen, covered = squares(hidden=False), squares(hidden=True)
     right, gone, wrong = Track(seen["mug"], 1.0), Track(None, 0.5), Track(seen["other"], 0.5)
-    story = [(right, seen), (right, seen), (gone, covered), (wrong, covered), (gone, seen), (wrong, seen), (right, seen)]
+    story = [
+        (right, seen),
+        (right, seen),
+        (gone, covered),
+        (wrong, covered),
+        (gone, seen),
+        (wrong, seen),
+        (right, seen),
+    ]
     track = track_table([frame(i, found, masks) for i, (found, masks) in enumerate(story)], "mug")
     line = recovery(track, Occlusion(2, 2)).loc["front"]
     assert line.to_dict() == {
@@ -100,22 +117,34 @@ def test_recovery_counts_the_frames_that_pass_before_the_track_is_back() -> None
 
 def test_associated_views_are_told_by_the_object_under_their_boxes() -> None:
     mine = personal("mug", "cup", TEAL)
-    views = [view("front"), view("side", scene([(30, 8, TEAL), (4, 40, GREY)])), view("back", scene([(4, 40, GREY)]))]
+    views = [
+        view("front"),
+        view("side", scene([(30, 8, TEAL), (4, 40, GREY)])),
+        view("back", scene([(4, 40, GREY)])),
+    ]
     ways = associations(TOYS, mine, views[:2])
     table = association_table(ways, views[:2])
-    assert list(table.index) == ["off", "embedding", "hungarian"]  # these views have no calibrated cameras
+    assert list(table.index) == [
+        "off",
+        "embedding",
+        "hungarian",
+    ]  # these views have no calibrated cameras
     assert (table[["front", "side"]] == "mug").all(axis=None)
     assert set(table.together) == {"right"}
     alone = {camera: first for view in views for camera, (first, *_) in _ground(view).items()}
     torn = association_table({"off": alone}, views).loc["off"]
     assert torn.to_dict() == {"front": "mug", "side": "mug", "back": "other", "together": "case 2"}
-    blind = association_table({"off": {"back": replace(alone["back"], winner=None, overruled=0)}}, views[2:]).loc["off"]
+    blind = association_table(
+        {"off": {"back": replace(alone["back"], winner=None)}}, views[2:]
+    ).loc["off"]
     assert blind.to_dict() == {"back": "-", "together": "nothing"}
     assert len(choices_figure({"off": alone}, views, ["off"]).axes) == 3
 
 
 def _ground(one: View) -> dict[str, tuple]:
-    _, attended = Attender(TOYS, {"mug": personal("mug", "cup", TEAL)}).start({one.camera: one.rgb}, "bring my cup")
+    _, attended = Attender(TOYS, {"mug": personal("mug", "cup", TEAL)}).start(
+        {one.camera: one.rgb}, "bring my cup"
+    )
     return dict(attended.groundings)
 
 
@@ -133,7 +162,14 @@ def test_a_mask_is_drawn_against_what_is_there() -> None:
 
 def test_a_photo_has_no_truth_and_an_empty_view_no_lines() -> None:
     (grounding,) = _ground(view("front"))["front"]
-    assert list(grounding_table(grounding)) == ["candidate", "score", "votes", "tied", "mean cosine", "winner"]
+    assert list(grounding_table(grounding)) == [
+        "candidate",
+        "score",
+        "votes",
+        "tied",
+        "mean cosine",
+        "winner",
+    ]
     (nothing,) = _ground(View(ROW, "front", np.zeros_like(LINE), {}))["front"]
     assert len(grounding_table(nothing, {"mug": mask_of(TEAL)})) == 0
     assert "iou" in grounding_table(nothing, {"mug": mask_of(TEAL)})
@@ -151,19 +187,32 @@ def test_following_hides_the_target_when_told() -> None:
 def test_the_contradicted_episode_is_one_that_geometry_mends_if_there_is_any() -> None:
     def lines(number: int, off: str, geometry: str) -> list[dict[str, object]]:
         key = {"suite": "vlabench", "task": "select-cup", "episode": number}
-        return [{**key, "associate": "off", "case": off}, {**key, "associate": "geometry", "case": geometry}]
+        return [
+            {**key, "associate": "off", "case": off},
+            {**key, "associate": "geometry", "case": geometry},
+        ]
 
     never = pd.DataFrame(lines(0, "right", "right") + lines(1, "case 1", "case 2"))
     assert contradicted(never) is None
     kept = pd.DataFrame(lines(0, "right", "right") + lines(1, "case 2", "case 1"))
-    mended = pd.DataFrame(lines(0, "right", "right") + lines(1, "case 2", "case 1") + lines(2, "case 2", "right"))
-    assert [found.episode for found in (contradicted(kept), contradicted(mended)) if found] == [1, 2]
+    mended = pd.DataFrame(
+        lines(0, "right", "right") + lines(1, "case 2", "case 1") + lines(2, "case 2", "right")
+    )
+    assert [found.episode for found in (contradicted(kept), contradicted(mended)) if found] == [
+        1,
+        2,
+    ]
 
 
 def test_published_tables_are_all_there_or_named(tmp_path: Path) -> None:
     for name in TABLES[1:]:
-        pd.DataFrame({"suite": list(BENCHMARKS)}).to_parquet(tmp_path / f"perception_{name}.parquet")
-    with pytest.raises(BadOutput, match=f"lacks perception_{TABLES[0]}.parquet; make them with eval-perception --publish"):
+        pd.DataFrame({"suite": list(BENCHMARKS)}).to_parquet(
+            tmp_path / f"perception_{name}.parquet"
+        )
+    with pytest.raises(
+        BadOutput,
+        match=f"lacks perception_{TABLES[0]}.parquet; make them with eval-perception --publish",
+    ):
         published(tmp_path)
     pd.DataFrame({"suite": ["vlabench"]}).to_parquet(tmp_path / f"perception_{TABLES[0]}.parquet")
     assert list(published(tmp_path)) == list(TABLES)

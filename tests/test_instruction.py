@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vap_core.errors import BadInstruction
+from vap_core.base.errors import BadInstruction
 from vap_core.instruction import parse, rewrite
 from vap_core.prompt import PALETTE
 
@@ -19,7 +19,11 @@ RED, BLUE = PALETTE[0], PALETTE[1]
         ("My cup, please", "cup", "The red cup, please"),
         ("pick up my owl figurine", "owl figurine", "pick up the red owl figurine"),
         ("put my straw cup on the plate", "straw cup", "put the red straw cup on the plate"),
-        ("take my brother's dog figurine to the table", "dog figurine", "take the red dog figurine to the table"),
+        (
+            "take my brother's dog figurine to the table",
+            "dog figurine",
+            "take the red dog figurine to the table",
+        ),
         ("move my bottle near coke can", "bottle", "move the red bottle near coke can"),
         ("give me my  pen   holder now", "pen holder", "give me the red pen holder now"),
         ("bring MY CUP", "cup", "bring The red cup"),
@@ -46,7 +50,9 @@ def test_several_targets() -> None:
 
 
 def test_longest_known_category_wins() -> None:
-    assert parse("bring my straw cup holder", ["cup", "straw cup"]).targets[0].category == "straw cup"
+    assert (
+        parse("bring my straw cup holder", ["cup", "straw cup"]).targets[0].category == "straw cup"
+    )
     assert parse("bring my cup holder", ["cup", "cup holder"]).targets[0].category == "cup holder"
 
 
@@ -54,7 +60,9 @@ def test_plural_counts_as_the_category() -> None:
     assert rewrite(parse("bring my cups", ["cup"]), [RED]) == "bring the red cup"
 
 
-@pytest.mark.parametrize("text", ["", "bring the cup", "bring my", "mystery of the cup", "bring my and"])
+@pytest.mark.parametrize(
+    "text", ["", "bring the cup", "bring my", "mystery of the cup", "bring my and"]
+)
 def test_no_possessive_is_an_error_that_says_how(text: str) -> None:
     with pytest.raises(BadInstruction, match='name one as "my <category>"'):
         parse(text)

@@ -11,17 +11,17 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from tests import tiny_lerobot as tiny
-from vap_core import audit, suites
-from vap_core.errors import BadPolicy
-from vap_core.policies import Policy
-from vap_core.policies.checkpoints import fingerprint, named
-from vap_core.policies.lerobot import LeRobot, compare, fitted, load
-from vap_core.policies.toy_pi0 import toy_sizes
-from vap_core.policies.witness import TEXT
-from vap_core.rollout import Trial, rollout
-from vap_core.sim.objects import extent_m, get
-from vap_core.sim.scenes import build
-from vap_core.values import PolicyInput
+from vap_core.base.errors import BadPolicy
+from vap_core.policies.hooks import TEXT
+from vap_core.policies.lerobot.adapter import LeRobot, compare, load, load_for_suite
+from vap_core.policies.lerobot.checkpoints import fingerprint, named
+from vap_core.policies.lerobot.toy_pi0 import toy_sizes
+from vap_core.policies.protocol import Policy, PolicyInput
+from vap_core.rollout import audit
+from vap_core.rollout.loop import Trial, rollout
+from vap_core.rollout.prompters.text import generic
+from vap_core.simulation import suites
+from vap_core.simulation.scenes import build
 
 SUITE, TASK = "simpler-bridge", "put-camera"
 EVERY = ("pi0", "pi05", "smolvla", "act", "ensemble")
@@ -31,7 +31,10 @@ EVERY = ("pi0", "pi05", "smolvla", "act", "ensemble")
 def folders(tmp_path_factory):
     root = tmp_path_factory.mktemp("checkpoints")
     ensemble = tiny.act(root / "ensemble", n_action_steps=1, temporal_ensemble_coeff=0.01)
-    made = {make.__name__: make(root / make.__name__) for make in (tiny.pi0, tiny.pi05, tiny.smolvla, tiny.act)}
+    made = {
+        make.__name__: make(root / make.__name__)
+        for make in (tiny.pi0, tiny.pi05, tiny.smolvla, tiny.act)
+    }
     return {**made, "ensemble": ensemble}
 
 
@@ -43,7 +46,11 @@ def policies(folders):
 
 def look(i, text="put my camera on the plate", side=64):
     rng = np.random.default_rng(i)
-    return PolicyInput({"front": rng.integers(0, 256, (side, side, 3), np.uint8)}, text, rng.standard_normal(tiny.STATE).astype(np.float32))
+    return PolicyInput(
+        {"front": rng.integers(0, 256, (side, side, 3), np.uint8)},
+        text,
+        rng.standard_normal(tiny.STATE).astype(np.float32),
+    )
 
 
 def begin(policy, n):
@@ -76,13 +83,20 @@ def test_the_contract_of_a_policy(policies, name):
 def test_a_batch_equals_one_by_one_whatever_the_global_seed(policies, name):
     policy, looks = (
         policies[name],
-        [look(i, text) for i, text in enumerate(("put my camera on the plate", "pick up the red shaver", "select my cup"))],
+        [
+            look(i, text)
+            for i, text in enumerate(
+                ("put my camera on the plate", "pick up the red shaver", "select my cup")
+            )
+        ],
     )
     torch.manual_seed(1)
     together = run(policy, begin(policy, 3), looks)
     torch.manual_seed(2)
     drawn = torch.get_rng_state()
-    alone = np.concatenate([run(policy, [state], [seen]) for state, seen in zip(begin(policy, 3), looks, strict=True)])
+    alone = np.concatenate(
+        [run(policy, [state], [seen]) for state, seen in zip(begin(policy, 3), looks, strict=True)]
+    )
     assert np.allclose(together, alone, atol=1e-6)
     assert np.abs(together[0] - together[1]).max() > 1e-4  # what is seen matters
     assert torch.equal(torch.get_rng_state(), drawn)
@@ -102,7 +116,10 @@ def test_text_and_picture_reach_the_policy(policies, name):
     policy, (state,) = policies[name], begin(policies[name], 1)
     seen = look(0)
     red = PolicyInput({"front": seen.images["front"] // 2}, seen.text, seen.state)
-    plain, worded, tinted = (run(policy, [state], [one]) for one in (seen, look(0, "put the red camera on the plate"), red))
+    plain, worded, tinted = (
+        run(policy, [state], [one])
+        for one in (seen, look(0, "put the red camera on the plate"), red)
+    )
     assert np.abs(plain - worded).max() > 1e-6
     assert np.abs(plain - tinted).max() > 1e-6
 
@@ -113,11 +130,15 @@ def test_it_tells_what_its_tensors_hold(policies, name):
     policy, plain = policies[name], [look(0), look(1)]
     tinted = plain[1].images["front"].copy()
     tinted[:20, :20] = (255, 0, 0)
-    prompted = [plain[0], replace(plain[1], images={"front": tinted}, text="put the red camera on the plate")]
-    _, _, heard, raw = audit.plan(policy, begin(policy, 2), prompted, plain)
-    assert heard[0] == raw[0]
-    assert heard[1].keys() == ({"front", TEXT} if name in ("pi0", "pi05", "smolvla") else {"front"})
-    assert all(heard[1][part] != raw[1][part] for part in heard[1])
+    prompted = [
+        plain[0],
+        replace(plain[1], images={"front": tinted}, text="put the red camera on the plate"),
+    ]
+    _, _, (first, second) = audit.plan(policy, begin(policy, 2), prompted, plain)
+    assert first[0] == first[1]
+    heard, raw = second
+    assert heard.keys() == ({"front", TEXT} if name in ("pi0", "pi05", "smolvla") else {"front"})
+    assert all(heard[part] != raw[part] for part in heard)
 
 
 def test_chunks_are_those_of_lerobots_own_loop(policies):
@@ -128,7 +149,11 @@ def test_chunks_are_those_of_lerobots_own_loop(policies):
     pixels = torch.from_numpy(seen.images["front"]).permute(2, 0, 1)[None].float() / 255
     for row in chunk:
         batch = policy.preprocessor(
-            {"observation.images.front": pixels, "observation.state": torch.from_numpy(seen.state)[None], "task": [seen.text]}
+            {
+                "observation.images.front": pixels,
+                "observation.state": torch.from_numpy(seen.state)[None],
+                "task": [seen.text],
+            }
         )
         with torch.inference_mode():
             action = policy.postprocessor(policy.policy.select_action(batch))
@@ -151,8 +176,12 @@ def test_a_policy_with_a_memory_keeps_one_per_episode(policies):
 
 def test_a_smaller_picture_is_scaled_to_the_checkpoints_size(policies):
     policy, side = policies["act"], look(0, side=64)
-    double = PolicyInput({"front": side.images["front"].repeat(2, axis=0).repeat(2, axis=1)}, side.text, side.state)
-    assert np.allclose(run(policy, begin(policy, 1), [side]), run(policy, begin(policy, 1), [double]), atol=1e-3)
+    double = PolicyInput(
+        {"front": side.images["front"].repeat(2, axis=0).repeat(2, axis=1)}, side.text, side.state
+    )
+    assert np.allclose(
+        run(policy, begin(policy, 1), [side]), run(policy, begin(policy, 1), [double]), atol=1e-3
+    )
 
 
 def test_what_does_not_fit_is_one_line(policies):
@@ -175,12 +204,17 @@ def test_names_are_mapped_by_the_checkpoints_own_rename_map(folders, tmp_path):
     folder = copy_of(folders["act"], tmp_path)
     file = folder / "policy_preprocessor.json"
     pipeline = json.loads(file.read_text())
-    pipeline["steps"][0]["config"]["rename_map"] = {"observation.images.head": "observation.images.front"}
+    pipeline["steps"][0]["config"]["rename_map"] = {
+        "observation.images.head": "observation.images.front"
+    }
     file.write_text(json.dumps(pipeline))
     policy, seen = load(folder), look(0)
     assert set(policy.wanted) == {"observation.images.head", "observation.state"}
     headed = replace(seen, images={"head": seen.images["front"]})
-    assert (run(policy, begin(policy, 1), [headed]) == run(load(folders["act"]), begin(policy, 1), [seen])).all()
+    assert (
+        run(policy, begin(policy, 1), [headed])
+        == run(load(folders["act"]), begin(policy, 1), [seen])
+    ).all()
 
 
 @pytest.mark.parametrize("name", ["pi0", "smolvla", "act"])
@@ -196,7 +230,10 @@ def test_weights_that_are_not_the_files_are_refused(folders, tmp_path, name, fau
     elif fault == "shape":
         tensors[key] = tensors[key][:-1].contiguous()
     save_file(tensors, folder / "model.safetensors")
-    with toy_sizes(tiny.TOY), pytest.raises(BadPolicy, match=r"load: \d+ of \d+ tensors differ|cannot become a policy"):
+    with (
+        toy_sizes(tiny.TOY),
+        pytest.raises(BadPolicy, match=r"load: \d+ of \d+ tensors differ|cannot become a policy"),
+    ):
         load(folder)
 
 
@@ -207,7 +244,9 @@ def test_one_number_that_differs_is_found(folders, policies, tmp_path):
     name = sorted(tensors)[3]
     tensors[name].view(-1)[-1] += 1
     save_file(tensors, tmp_path / "other.safetensors")
-    with pytest.raises(BadPolicy, match=rf"load: 1 of \d+ tensors differ from .*other.safetensors, {name} for one"):
+    with pytest.raises(
+        BadPolicy, match=rf"load: 1 of \d+ tensors differ from .*other.safetensors, {name} for one"
+    ):
         compare(policies["pi0"].policy, tmp_path / "other.safetensors")
 
 
@@ -215,27 +254,50 @@ def test_a_toy_without_its_sizes_is_refused_not_random(folders):
     """The file's architecture is another one: lerobot prints a warning and would go on."""
     from lerobot.policies.pi0 import modeling_pi0
 
-    with toy_sizes(replace(tiny.TOY, expert=64)), pytest.raises(BadPolicy, match=r"load: \d+ of \d+ tensors differ from .*another architecture"):
+    with (
+        toy_sizes(replace(tiny.TOY, expert=64)),
+        pytest.raises(
+            BadPolicy, match=r"load: \d+ of \d+ tensors differ from .*another architecture"
+        ),
+    ):
         load(folders["pi0"])
     assert modeling_pi0.get_gemma_config("gemma_2b").width == 2048  # nothing small is left behind
 
 
-@pytest.mark.parametrize("step", ["subprocess.Popen", "lerobot.processor.pipeline.importlib", "os.system", 3, "vap_core.policies.lerobot.load"])
+@pytest.mark.parametrize(
+    "step",
+    [
+        "subprocess.Popen",
+        "lerobot.processor.pipeline.importlib",
+        "os.system",
+        3,
+        "vap_core.policies.lerobot.adapter.load",
+    ],
+)
 def test_files_are_parsed_never_executed(folders, tmp_path, step):
     folder = copy_of(folders["act"], tmp_path)
     file = folder / "policy_preprocessor.json"
     pipeline = json.loads(file.read_text())
-    pipeline["steps"].append({"class": step, "config": {"args": ["touch", str(tmp_path / "owned")]}})
+    pipeline["steps"].append(
+        {"class": step, "config": {"args": ["touch", str(tmp_path / "owned")]}}
+    )
     file.write_text(json.dumps(pipeline))
-    with pytest.raises(BadPolicy, match="which is no step of lerobot; files are parsed here, never executed"):
+    with pytest.raises(
+        BadPolicy, match="which is no step of lerobot; files are parsed here, never executed"
+    ):
         load(folder)
     assert not (tmp_path / "owned").exists()
 
 
 def test_what_is_missing_or_damaged_is_one_line(folders, tmp_path):
-    with pytest.raises(BadPolicy, match=r"no/such-model is no folder and no model on this machine; download it with `hf download no/such-model`"):
+    with pytest.raises(
+        BadPolicy,
+        match=r"no/such-model is no folder and no model on this machine; download it with `hf download no/such-model`",
+    ):
         load("no/such-model")
-    with pytest.raises(BadPolicy, match=r"lacks config.json, model.safetensors, policy_preprocessor.json"):
+    with pytest.raises(
+        BadPolicy, match=r"lacks config.json, model.safetensors, policy_preprocessor.json"
+    ):
         load(tmp_path)
     for name, text, said in (
         ("policy_preprocessor.json", "[", "is no processor pipeline"),
@@ -250,15 +312,27 @@ def test_what_is_missing_or_damaged_is_one_line(folders, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "file", "part"), [("smolvla", "config.json", "smolvla-backbone"), ("pi0", "policy_preprocessor.json", "pi0/tokenizer")]
+    ("name", "file", "part"),
+    [
+        ("smolvla", "config.json", "smolvla-backbone"),
+        ("pi0", "policy_preprocessor.json", "pi0/tokenizer"),
+    ],
 )
-def test_a_backbone_that_was_not_downloaded_is_named(folders, tmp_path, monkeypatch, name, file, part):
+def test_a_backbone_that_was_not_downloaded_is_named(
+    folders, tmp_path, monkeypatch, name, file, part
+):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     folder, here = copy_of(folders[name], tmp_path), str(folders["pi0"].parent / part)
     told = (folder / file).read_text()
     assert here in told
     (folder / file).write_text(told.replace(here, "owner/backbone"))
-    with toy_sizes(tiny.TOY), pytest.raises(BadPolicy, match=r"cannot become a policy \(.*get what it builds on: `hf download owner/backbone`\.$"):
+    with (
+        toy_sizes(tiny.TOY),
+        pytest.raises(
+            BadPolicy,
+            match=r"cannot become a policy \(.*get what it builds on: `hf download owner/backbone`\.$",
+        ),
+    ):
         load(folder)
 
 
@@ -285,24 +359,28 @@ def scene(rows):
 def test_a_rollout_in_a_real_suite(policies, rows, scene, name):
     policy: LeRobot = policies[name]
     before = policy.sha256()
-    trial = Trial("generic", scene, policy, None, {model: extent_m(get(model)) for model in scene.objects})
+    trial = Trial(method="generic", scene=scene, policy=policy, prompter=generic())
     policy.check(suites.suite(SUITE).cameras, tiny.STATE, tiny.ACTION)
     together, alone = (list(rollout(trial, rows, batch=batch)) for batch in (2, 1))
-    assert [episode.outcome.status for episode in together] == ["failure", "failure"], together[0].outcome.detail
+    assert [episode.outcome.status for episode in together] == ["failure", "failure"], together[
+        0
+    ].outcome.detail
     assert policy.sha256() == before
     for a, b in zip(together, alone, strict=True):
         assert len(a.frames) == 4
         actions, others = (np.stack([frame.action for frame in one.frames[:-1]]) for one in (a, b))
         assert np.allclose(actions, others, atol=1e-6)
         assert np.abs(actions[:3]).max() > 1e-4
-        assert a.opening.policy == policy.label
+        assert a.header.policy == policy.label
 
 
 def test_a_name_that_means_a_checkpoint_is_fitted_to_the_suite(folders, scene):
     assert all(map(named, (str(folders["act"]), "lerobot/pi0_base")))
     assert not any(map(named, ("scripted", "expert", "a/b/c", "/no/such/folder")))
     name = str(folders["act"])
-    policy = fitted(name, scene, suites.suite(SUITE))
-    assert fitted(name, scene, suites.suite(SUITE)) is policy
-    with pytest.raises(BadPolicy, match=r"there is observation.images.head, observation.state \(13\)"):
-        fitted(name, scene, replace(suites.suite(SUITE), cameras=("head",)))
+    policy = load_for_suite(name, scene, suites.suite(SUITE))
+    assert load_for_suite(name, scene, suites.suite(SUITE)) is policy
+    with pytest.raises(
+        BadPolicy, match=r"there is observation.images.head, observation.state \(13\)"
+    ):
+        load_for_suite(name, scene, replace(suites.suite(SUITE), cameras=("head",)))

@@ -15,15 +15,20 @@ from lerobot.scripts import lerobot_eval
 
 from tests import tiny_lerobot as tiny
 from tests.toys import TOYS, personal, scene
-from vap_core import attend, bench_eval, memory, suites
-from vap_core.attend import Attender, load_stack
-from vap_core.errors import BadMemory, BadOutput, BadPolicy, BadViews, UnknownName
-from vap_core.integrations.lerobot import LeRobotEnv, VapEnvConfig, VapPrompt, attach
-from vap_core.policies.lerobot import load
-from vap_core.rollout import Trial, rollout
-from vap_core.sim.objects import extent_m, get
-from vap_core.sim.scenes import build
-from vap_core.sim.studio import reference_views
+from vap_core import memory
+from vap_core.attend import Attender
+from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadViews, UnknownName
+from vap_core.cli.bench import eval as bench_eval
+from vap_core.perception.stacks import STACKS, load_stack
+from vap_core.policies.lerobot.adapter import load
+from vap_core.policies.lerobot.step import LeRobotEnv, VapEnvConfig, VapPrompt, attach
+from vap_core.rollout.loop import Trial, rollout
+from vap_core.rollout.prompters.text import generic
+from vap_core.rollout.prompters.tint import TintPrompter
+from vap_core.simulation import suites
+from vap_core.simulation.assets.objects import get_object
+from vap_core.simulation.scenes import build
+from vap_core.simulation.studio import reference_views
 
 SUITE, TASK = "simpler-bridge", "put-camera"
 BLUE, GREEN = (0, 0, 255), (0, 255, 0)
@@ -32,7 +37,7 @@ BLUE, GREEN = (0, 0, 255), (0, 255, 0)
 @pytest.fixture
 def bank(tmp_path, monkeypatch):
     """My mug is the blue square."""
-    monkeypatch.setitem(attend.STACKS, "toys", lambda: TOYS)
+    monkeypatch.setitem(STACKS, "toys", lambda: TOYS)
     memory.save(tmp_path / "memory", personal("mug", "mug", BLUE))
     return tmp_path / "memory"
 
@@ -43,7 +48,10 @@ def at(x):
 
 def batch(pictures, steps=None, text="bring my mug"):
     """What lerobot-eval hands to a preprocessor."""
-    seen = {"pixels": {"top": np.stack(pictures)}, "agent_pos": np.zeros((len(pictures), 2), np.float32)}
+    seen = {
+        "pixels": {"top": np.stack(pictures)},
+        "agent_pos": np.zeros((len(pictures), 2), np.float32),
+    }
     if steps is not None:
         seen["vap_step"] = np.array(steps, np.float32)[:, None]
     out = preprocess_observation(seen)
@@ -113,8 +121,14 @@ def test_switches_and_resets(bank):
     assert shown[0]["task"] == ["bring my mug"]
     assert (rgb(shown[1]) == direct(bank, [at(4), at(6)])[1].images["top"]).all()
     step.reset()
-    single = {"observation.images.top": batch([at(8)])["observation.images.top"][0], "task": "bring my mug"}
-    assert torch.equal(step(single)["observation.images.top"], pipeline(bank)(batch([at(8)], [0]))["observation.images.top"][0])
+    single = {
+        "observation.images.top": batch([at(8)])["observation.images.top"][0],
+        "task": "bring my mug",
+    }
+    assert torch.equal(
+        step(single)["observation.images.top"],
+        pipeline(bank)(batch([at(8)], [0]))["observation.images.top"][0],
+    )
 
 
 def test_what_cannot_be_known_fails_loudly(bank, tmp_path):
@@ -126,7 +140,9 @@ def test_what_cannot_be_known_fails_loudly(bank, tmp_path):
     with pytest.raises(BadViews, match="environment 0 is at step 3 after nothing"):
         step(batch([at(4)], [3]))
     step(batch([at(4)], [0]))
-    with pytest.raises(BadViews, match="environment 0 is at step 2 after 0; give every picture, in order"):
+    with pytest.raises(
+        BadViews, match="environment 0 is at step 2 after 0; give every picture, in order"
+    ):
         step(batch([at(6)], [2]))
     with pytest.raises(BadViews, match="holds actions, so it is for training"):
         step({**batch([at(6)], [1]), "action": torch.zeros(1, 2)})
@@ -145,7 +161,12 @@ def test_the_configuration_is_json_and_comes_back(bank, tmp_path):
     again = PolicyProcessorPipeline.from_pretrained(tmp_path / "p", config_filename="p.json")
     assert again.steps[0].get_config() == step.get_config()
     assert step.transform_features({}) == {}
-    assert step({TransitionKey.OBSERVATION: batch([at(4)], [0]), TransitionKey.COMPLEMENTARY_DATA: {"task": "bring my mug"}})
+    assert step(
+        {
+            TransitionKey.OBSERVATION: batch([at(4)], [0]),
+            TransitionKey.COMPLEMENTARY_DATA: {"task": "bring my mug"},
+        }
+    )
 
 
 def test_the_environment_numbers_its_steps_and_ends_like_ours():
@@ -173,7 +194,13 @@ def whole(tmp_path_factory):
     """A checkpoint, the memory of the personal camera, and the checkpoint with VAP attached."""
     root = tmp_path_factory.mktemp("loop")
     stack, row = load_stack("embedded"), suites.rows(SUITE, TASK, 1)[0]
-    obj, _ = memory.register(row.target, row.category, reference_views(get(row.target)), stack.detector, stack.encoder)
+    obj, _ = memory.register(
+        row.target,
+        row.category,
+        reference_views(get_object(row.target)),
+        stack.detector,
+        stack.encoder,
+    )
     memory.save(root / "memory", obj)
     tiny.act(root / "act", side=224)
     attach(root / "act", root / "personal", root / "memory")
@@ -184,9 +211,11 @@ def test_attaching_links_the_frozen_files_and_adds_one_step(whole):
     kept = {file.name: file for file in (whole / "act").iterdir()}
     for file in (whole / "personal").iterdir():
         if file.name == "policy_preprocessor.json":
-            before, after = (json.loads(one.read_text())["steps"] for one in (kept[file.name], file))
+            before, after = (
+                json.loads(one.read_text())["steps"] for one in (kept[file.name], file)
+            )
             assert [*after[:1], *after[2:]] == before
-            assert after[1]["class"] == "vap_core.integrations.lerobot.VapPrompt"
+            assert after[1]["class"] == "vap_core.policies.lerobot.step.VapPrompt"
         else:
             assert file.resolve() == kept[file.name].resolve()
     with pytest.raises(BadOutput, match="personal exists; choose another folder"):
@@ -200,18 +229,34 @@ def test_lerobots_own_loop_and_our_rollout_do_the_same(whole):
     policy, config = load(whole / "act"), VapEnvConfig(task=f"{SUITE}/{TASK}", max_steps=3)
     before = policy.sha256()
     env = config.create_envs(2)[SUITE][0]
-    pipelines = (*config.get_env_processors(), *make_pre_post_processors(policy.policy.config, str(whole / "personal")))
-    theirs = lerobot_eval.eval_policy(env, policy.policy, *pipelines, n_episodes=2, start_seed=0, return_episode_data=True)["episodes"]
+    pipelines = (
+        *config.get_env_processors(),
+        *make_pre_post_processors(policy.policy.config, str(whole / "personal")),
+    )
+    theirs = lerobot_eval.eval_policy(
+        env, policy.policy, *pipelines, n_episodes=2, start_seed=0, return_episode_data=True
+    )["episodes"]
     env.close()
 
     rows = [replace(row, max_steps=3) for row in suites.rows(SUITE, TASK)[:2]]
-    models = dict.fromkeys(place.model for row in suites.rows(SUITE, TASK) for place in row.placements)
+    models = dict.fromkeys(
+        place.model for row in suites.rows(SUITE, TASK) for place in row.placements
+    )
     attender = Attender(load_stack("embedded"), memory.load_bank(whole / "memory"))
     with build(suites.suite(SUITE).robot, tuple(models)) as built:
         ours = {}
-        for name, how in (("vap", attender), ("generic", None)):
-            trial = Trial(name, built, policy, how, {model: extent_m(get(model)) for model in models}, sensor=suites.suite(SUITE).sensor)
-            ours[name] = [np.stack([frame.action for frame in episode.frames[:3]]) for episode in rollout(trial, rows)]
+        for name, prompter in (("vap", TintPrompter(attender)), ("generic", generic())):
+            trial = Trial(
+                method=name,
+                scene=built,
+                policy=policy,
+                prompter=prompter,
+                sensor=suites.suite(SUITE).sensor,
+            )
+            ours[name] = [
+                np.stack([frame.action for frame in episode.frames[:3]])
+                for episode in rollout(trial, rows)
+            ]
     for i in range(2):
         actions = theirs["action"][theirs["episode_index"] == i][:3].numpy()
         assert np.allclose(actions, ours["vap"][i], atol=1e-6)
@@ -221,7 +266,7 @@ def test_lerobots_own_loop_and_our_rollout_do_the_same(whole):
 
 def test_lerobot_eval_runs_it_from_the_command_line(whole, tmp_path, monkeypatch):
     arguments = f"""--policy.path={whole / "personal"} --env.type=vap --env.task={SUITE}/{TASK} --env.max_steps=2 --policy.device=cpu
-        --env.discover_packages_path=vap_core.integrations --eval.n_episodes=1 --seed=0 --output_dir={tmp_path / "out"}"""
+        --env.discover_packages_path=vap_core.policies.lerobot --eval.n_episodes=1 --seed=0 --output_dir={tmp_path / "out"}"""
     monkeypatch.setattr(sys, "argv", ["lerobot-eval", *arguments.split()])
     lerobot_eval.eval_main()
     said = json.loads((tmp_path / "out" / "eval_info.json").read_text())
@@ -239,5 +284,8 @@ def test_the_bench_runs_both_loops_over_the_same_steps():
         assert arm.parts["policy"] > 0
     said = bench_eval.report(plan, theirs, ours)
     assert f"n = {plan.episodes} episodes of {plan.steps} steps, {plan.repeats} repeats" in said
-    slow, fast = bench_eval.Arm("a", dict, [6.0, 3.0], {}), bench_eval.Arm("b", dict, [3.0, 1.0], {})
+    slow, fast = (
+        bench_eval.Arm("a", dict, [6.0, 3.0], {}),
+        bench_eval.Arm("b", dict, [3.0, 1.0], {}),
+    )
     assert bench_eval._ratio(slow, fast)[0] == f"{6**0.5:.2f}"

@@ -11,13 +11,13 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from vap_core import suites
-from vap_core.errors import BadSuite
+from vap_core.base.errors import BadSuite
 from vap_core.instruction import parse
-from vap_core.sim import objects
-from vap_core.sim.grasps import points_world
-from vap_core.suites import BENCHMARKS, VARIANTS, lists, simpler, tabletop, vlabench
-from vap_core.suites.variants import AGGREGATION, MATCHING
+from vap_core.simulation import suites
+from vap_core.simulation.assets import objects
+from vap_core.simulation.grasps import points_world
+from vap_core.simulation.suites import BENCHMARKS, VARIANTS, lists, simpler, tabletop, vlabench
+from vap_core.simulation.suites.variants import AGGREGATION, MATCHING
 
 BUILDERS = {
     "simpler-fractal": simpler.fractal_rows,
@@ -30,10 +30,19 @@ PER_TASK = {
     ("simpler-fractal", "move-bottle-near-coke-can", "visual matching"): 160,
     ("simpler-fractal", "pick-pen-holder", "variant aggregation"): 825,
     ("simpler-fractal", "move-bottle-near-coke-can", "variant aggregation"): 400,
-    **{("simpler-bridge", task, ""): 24 for task in ("pick-shaver", "put-camera", "put-owl-figurine", "put-straw-cup")},
-    **{("vlabench", f"select-{what}", ""): 50 for what in ("leather-bag", "shoe", "cat-figurine", "miniature-house", "cup")},
+    **{
+        ("simpler-bridge", task, ""): 24
+        for task in ("pick-shaver", "put-camera", "put-owl-figurine", "put-straw-cup")
+    },
+    **{
+        ("vlabench", f"select-{what}", ""): 50
+        for what in ("leather-bag", "shoe", "cat-figurine", "miniature-house", "cup")
+    },
     **{("tabletop", f"select-{what}", ""): 20 for what in ("vase", "plushie", "cup", "slipper")},
-    **{("tabletop", f"put-{what}", ""): 20 for what in ("plant", "stuffed-toy", "pouch", "scrubber")},
+    **{
+        ("tabletop", f"put-{what}", ""): 20
+        for what in ("plant", "stuffed-toy", "pouch", "scrubber")
+    },
 }
 TOTALS = {"simpler-fractal": 460 + 1225, "simpler-bridge": 96, "vlabench": 250, "tabletop": 160}
 LEAST_GAP_M = 0.03
@@ -55,15 +64,21 @@ def test_the_counts_are_the_promised_ones(name, rows):
     assert len(rows) == TOTALS[name]
     counted = Counter((row.suite, row.task, row.split) for row in rows)
     assert counted == {key: count for key, count in PER_TASK.items() if key[0] == name}
-    assert sorted({row.task for row in rows}) == sorted(task.name for task in BENCHMARKS[name].tasks)
+    assert sorted({row.task for row in rows}) == sorted(
+        task.name for task in BENCHMARKS[name].tasks
+    )
 
 
 def test_fractal_has_every_layout_under_every_variant_as_often():
     pick, near = (task.name for task in BENCHMARKS["simpler-fractal"].tasks)
     counted = Counter((row.task, row.split, row.variant) for row in lists.read("simpler-fractal"))
     few = tuple(name for name in AGGREGATION if name != "distractors-many")
-    expected = {(pick, "visual matching", variant): 75 for variant in MATCHING} | {(pick, "variant aggregation", v): 75 for v in AGGREGATION}
-    expected |= {(near, "visual matching", variant): 40 for variant in MATCHING} | {(near, "variant aggregation", v): 40 for v in few}
+    expected = {(pick, "visual matching", variant): 75 for variant in MATCHING} | {
+        (pick, "variant aggregation", v): 75 for v in AGGREGATION
+    }
+    expected |= {(near, "visual matching", variant): 40 for variant in MATCHING} | {
+        (near, "variant aggregation", v): 40 for v in few
+    }
     assert counted == expected
     assert len(MATCHING) == 4
     assert len(AGGREGATION) == 11
@@ -89,8 +104,18 @@ def test_rows_agree_with_their_task_and_are_numbered(name, rows):
         mine = [row for row in rows if row.task == task.name]
         assert [row.episode for row in mine] == list(range(len(mine)))
         for row in mine:
-            assert (row.suite, row.instruction, row.category, row.max_steps) == (name, task.instruction, task.category, task.max_steps)
-            assert (row.rule, row.goal, row.cameras, row.seed) == (task.rule, task.goal, BENCHMARKS[name].cameras, 0)
+            assert (row.suite, row.instruction, row.category, row.max_steps) == (
+                name,
+                task.instruction,
+                task.category,
+                task.max_steps,
+            )
+            assert (row.rule, row.goal, row.cameras, row.seed) == (
+                task.rule,
+                task.goal,
+                BENCHMARKS[name].cameras,
+                0,
+            )
 
 
 def test_the_target_stands_first_beside_two_lookalikes_of_its_family(name, rows):
@@ -98,13 +123,19 @@ def test_the_target_stands_first_beside_two_lookalikes_of_its_family(name, rows)
         target, *others = (place.model for place in row.placements)
         stem = BENCHMARKS[name].task(row.task).stem
         assert target == f"{stem}-personal"
-        assert objects.get(target).split == "personal"
-        assert objects.get(target).category == row.category
-        rivals = [other for other in others if objects.get(other).split == "lookalike"]
+        assert objects.get_object(target).split == "personal"
+        assert objects.get_object(target).category == row.category
+        rivals = [other for other in others if objects.get_object(other).split == "lookalike"]
         assert len(rivals) == 2
         assert set(rivals) < {model.name for model in objects.lookalikes(stem)}
-        assert [other for other in others if objects.get(other).split == "prop"] == [row.goal] * bool(row.goal)
-        crowd = [objects.get(other) for other in others if objects.get(other).split == "generic"]
+        assert [other for other in others if objects.get_object(other).split == "prop"] == [
+            row.goal
+        ] * bool(row.goal)
+        crowd = [
+            objects.get_object(other)
+            for other in others
+            if objects.get_object(other).split == "generic"
+        ]
         assert len(crowd) == VARIANTS[row.variant].distractors
         assert row.category not in {model.category for model in crowd}
 
@@ -112,7 +143,13 @@ def test_the_target_stands_first_beside_two_lookalikes_of_its_family(name, rows)
 def test_every_lookalike_is_met(name, rows):
     """Two of a family's look-alikes, drawn evenly: none is left out of a whole list."""
     for task in BENCHMARKS[name].tasks:
-        met = {place.model for row in rows if row.task == task.name for place in row.placements if "-lookalike-" in place.model}
+        met = {
+            place.model
+            for row in rows
+            if row.task == task.name
+            for place in row.placements
+            if "-lookalike-" in place.model
+        }
         assert met == {model.name for model in objects.lookalikes(task.stem)}
 
 
@@ -126,17 +163,29 @@ def support_m(model, yaw):
 def gap_m(one, other):
     """Between the hulls of two collision outlines: the widest band that separates them, the exact distance but for the directions' grid."""
     away = np.array([other.x - one.x, other.y - one.y]) @ NORMALS
-    return float((away - support_m(one.model, one.yaw) - np.roll(support_m(other.model, other.yaw), len(DIRECTIONS) // 2)).max())
+    return float(
+        (
+            away
+            - support_m(one.model, one.yaw)
+            - np.roll(support_m(other.model, other.yaw), len(DIRECTIONS) // 2)
+        ).max()
+    )
 
 
 def test_collision_outlines_keep_three_centimetres_apart(name, rows):
-    near = {f"{row.key} {a.model} {b.model}": gap_m(a, b) for row in rows for a, b in combinations(row.placements, 2)}
+    near = {
+        f"{row.key} {a.model} {b.model}": gap_m(a, b)
+        for row in rows
+        for a, b in combinations(row.placements, 2)
+    }
     closest = min(near, key=near.__getitem__)
-    assert near[closest] >= LEAST_GAP_M, f"{closest}: {1000 * near[closest]:.1f} mm; {sum(g < LEAST_GAP_M for g in near.values())} pairs too close"
+    assert near[closest] >= LEAST_GAP_M, (
+        f"{closest}: {1000 * near[closest]:.1f} mm; {sum(g < LEAST_GAP_M for g in near.values())} pairs too close"
+    )
 
 
 def test_everything_stands_on_the_table(name, rows):
-    from vap_core.sim import robots
+    from vap_core.simulation import robots
 
     x0, y0, x1, y1 = robots.get(BENCHMARKS[name].robot).table_m
     for place in {(p.model, p.x, p.y, p.yaw): p for row in rows for p in row.placements}.values():
@@ -162,23 +211,43 @@ def test_the_pick_grid_is_three_orientations_times_twenty_five_cells():
     xs, ys = (sorted({key[i] for key in at}) for i in range(2))
     assert (len(xs), len(ys), set(at.values())) == (5, 5, {3})
     for cell in at:
-        turns = sorted(row.placements[0].yaw for row in rows if (row.placements[0].x, row.placements[0].y) == cell)
+        turns = sorted(
+            row.placements[0].yaw
+            for row in rows
+            if (row.placements[0].x, row.placements[0].y) == cell
+        )
         assert np.diff(turns) == pytest.approx([2 * np.pi / 3] * 2, abs=2e-4)
-    assert all({(p.x, p.y) for p in row.placements} <= set(at) for row in rows), "the look-alikes stand on the grid, too"
+    assert all({(p.x, p.y) for p in row.placements} <= set(at) for row in rows), (
+        "the look-alikes stand on the grid, too"
+    )
     assert np.diff(xs) == pytest.approx([0.23 / 4] * 4, abs=2e-4)
     assert np.diff(ys) == pytest.approx([0.44 / 4] * 4, abs=2e-4)
 
 
 def test_bridge_swaps_target_and_goal_over_the_corners_of_a_square():
     side, (x, y) = 0.15, simpler.CENTRE
-    corners = {(round(x + i * side / 2, 4), round(y + j * side / 2, 4)) for i in (-1, 1) for j in (-1, 1)}
+    corners = {
+        (round(x + i * side / 2, 4), round(y + j * side / 2, 4)) for i in (-1, 1) for j in (-1, 1)
+    }
     for task in BENCHMARKS["simpler-bridge"].tasks:
         mine = [row for row in lists.read("simpler-bridge") if row.task == task.name]
         assert all({(p.x, p.y) for p in row.placements} <= corners for row in mine)
-        assert Counter((row.placements[0].x, row.placements[0].y) for row in mine) == dict.fromkeys(corners, 6)
-        assert all(mine[i + 12].placements[0].yaw - mine[i].placements[0].yaw == pytest.approx(np.pi / 2, abs=2e-4) for i in range(12))
+        assert Counter((row.placements[0].x, row.placements[0].y) for row in mine) == dict.fromkeys(
+            corners, 6
+        )
+        assert all(
+            mine[i + 12].placements[0].yaw - mine[i].placements[0].yaw
+            == pytest.approx(np.pi / 2, abs=2e-4)
+            for i in range(12)
+        )
         if task.goal:
-            pairs = Counter(((row.placements[0].x, row.placements[0].y), (row.placements[1].x, row.placements[1].y)) for row in mine)
+            pairs = Counter(
+                (
+                    (row.placements[0].x, row.placements[0].y),
+                    (row.placements[1].x, row.placements[1].y),
+                )
+                for row in mine
+            )
             assert (len(pairs), set(pairs.values())) == (12, {2})
 
 
@@ -193,7 +262,9 @@ def test_some_rows_are_spread_over_the_list_and_carry_the_seed():
     whole = suites.rows("vlabench", "select-shoe")
     some = suites.rows("vlabench", "select-shoe", 5, seed=3)
     assert [row.episode for row in some] == [0, 12, 24, 36, 49]
-    assert [asdict(row) for row in some] == [asdict(replace(whole[row.episode], seed=3)) for row in some]
+    assert [asdict(row) for row in some] == [
+        asdict(replace(whole[row.episode], seed=3)) for row in some
+    ]
     assert len(suites.rows("vlabench", "select-shoe", 500)) == 50
     assert len(suites.rows("vlabench", "select-shoe", 1)) == 1
 
@@ -250,15 +321,24 @@ BROKEN = {
 
 def listed(folder, *lines):
     """A list with a matching hash, whatever its lines are."""
-    data = "".join((line if isinstance(line, str) else json.dumps(line)) + "\n" for line in lines).encode()
+    data = "".join(
+        (line if isinstance(line, str) else json.dumps(line)) + "\n" for line in lines
+    ).encode()
     (folder / "mine.jsonl").write_bytes(data)
-    (folder / "manifest.json").write_text(json.dumps({"mine": {"sha256": hashlib.sha256(data).hexdigest(), "episodes": len(lines)}}))
+    (folder / "manifest.json").write_text(
+        json.dumps({"mine": {"sha256": hashlib.sha256(data).hexdigest(), "episodes": len(lines)}})
+    )
     return folder
 
 
 def test_a_sound_row_reads_back(tmp_path):
     (row,) = lists.read("mine", listed(tmp_path, GOOD))
-    assert (row.target, row.goal, row.cameras, row.placements[2].yaw) == ("cup-personal", "plate-prop", ("front",), 1.0)
+    assert (row.target, row.goal, row.cameras, row.placements[2].yaw) == (
+        "cup-personal",
+        "plate-prop",
+        ("front",),
+        1.0,
+    )
 
 
 @pytest.mark.parametrize(("line", "said"), BROKEN.values(), ids=BROKEN)
@@ -271,13 +351,17 @@ def test_a_file_changed_by_one_byte_is_refused(tmp_path):
     path = listed(tmp_path, GOOD) / "mine.jsonl"
     wanted = lists.digest("mine", tmp_path)
     path.write_bytes(path.read_bytes().replace(b"0.5]", b"0.6]"))
-    with pytest.raises(BadSuite, match=f"mine.jsonl changed since its hash {wanted[:12]}.*restore it"):
+    with pytest.raises(
+        BadSuite, match=f"mine.jsonl changed since its hash {wanted[:12]}.*restore it"
+    ):
         lists.read("mine", tmp_path)
 
 
 def test_an_absent_file_names_what_makes_it(tmp_path):
     listed(tmp_path, GOOD)
-    with pytest.raises(BadSuite, match="yours.jsonl cannot be read .No such file.*notebooks/01_benchmark_building"):
+    with pytest.raises(
+        BadSuite, match="yours.jsonl cannot be read .No such file.*notebooks/01_benchmark_building"
+    ):
         lists.read("yours", tmp_path)
 
 
@@ -326,7 +410,11 @@ def test_check_refuses_a_row_made_in_memory():
 def test_neither_yaw_nor_place_tells_the_target():
     """Rules of thumb that know no picture find it no more often than chance allows (a third; 4 standard errors)."""
     for name in BENCHMARKS:
-        rows = [row for row in lists.read(name) if row.variant == "base" and row.split in ("", "visual matching")]
+        rows = [
+            row
+            for row in lists.read(name)
+            if row.variant == "base" and row.split in ("", "visual matching")
+        ]
         spots, yaws = [], []
         for row in rows:
             alike = [place for place in row.placements if place.model != row.goal][:3]
@@ -334,11 +422,25 @@ def test_neither_yaw_nor_place_tells_the_target():
             yaws.append([place.yaw for place in alike])
         spot, yaw = np.array(spots), np.array(yaws)
         middle = np.linalg.norm(spot - spot.mean(axis=(0, 1)), axis=2)
-        rules = (middle, -middle, np.abs(np.sin(2 * yaw)), np.abs(np.sin(1.5 * yaw)), np.abs(np.sin(yaw)))
-        distinct = [rule for rule in rules if (np.ptp(np.sort(rule, axis=1), axis=1) > 1e-3).mean() > 0.9]
+        rules = (
+            middle,
+            -middle,
+            np.abs(np.sin(2 * yaw)),
+            np.abs(np.sin(1.5 * yaw)),
+            np.abs(np.sin(yaw)),
+        )
+        distinct = [
+            rule for rule in rules if (np.ptp(np.sort(rule, axis=1), axis=1) > 1e-3).mean() > 0.9
+        ]
         for rule in distinct:
             assert (rule.argmin(axis=1) == 0).mean() < 1 / 3 + 4 * np.sqrt(2 / 9 / len(rows)), name
     near = [row for row in lists.read("simpler-fractal") if row.rule == "near"][:40]
-    away = [[np.hypot(p.x - row.placements[1].x, p.y - row.placements[1].y) for p in row.placements[:1] + row.placements[2:4]] for row in near]
+    away = [
+        [
+            np.hypot(p.x - row.placements[1].x, p.y - row.placements[1].y)
+            for p in row.placements[:1] + row.placements[2:4]
+        ]
+        for row in near
+    ]
     assert np.bincount(np.argsort(np.argsort(away, axis=1), axis=1)[:, 0]).tolist() == [14, 13, 13]
     assert np.min(away) > simpler.APART_M - 1e-3

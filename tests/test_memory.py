@@ -12,16 +12,21 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from tests.toys import TOYS, personal, scene
-from vap_core.errors import BadMemory, BadOutput, BadPhoto
+from vap_core.base.errors import BadMemory, BadOutput, BadPhoto
+from vap_core.base.types import Description
 from vap_core.memory import load, load_bank, load_photo, register, remember, save
-from vap_core.values import Description
 
 TEAL = (40, 120, 110)
 
 
-@given(st.lists(st.tuples(*[st.integers(1, 255)] * 3), min_size=1, max_size=6), st.sampled_from(["mug", "my owl.2", "a_b-c"]))
+@given(
+    st.lists(st.tuples(*[st.integers(1, 255)] * 3), min_size=1, max_size=6),
+    st.sampled_from(["mug", "my owl.2", "a_b-c"]),
+)
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=20)
-def test_save_then_load_is_the_same_object(tmp_path: Path, colours: list[tuple[int, int, int]], name: str) -> None:
+def test_save_then_load_is_the_same_object(
+    tmp_path: Path, colours: list[tuple[int, int, int]], name: str
+) -> None:
     obj = personal(name, "cup", *colours)
     back = load(save(tmp_path, obj, replace=True), obj.encoder)
     assert (back.name, back.category, back.encoder) == (obj.name, obj.category, obj.encoder)
@@ -30,7 +35,13 @@ def test_save_then_load_is_the_same_object(tmp_path: Path, colours: list[tuple[i
 
 
 def test_register_crops_with_the_detector() -> None:
-    obj, whole = register("mug", " Cup ", [scene([(4, 8, TEAL)]), scene([(30, 30, TEAL)])], TOYS.detector, TOYS.encoder)
+    obj, whole = register(
+        "mug",
+        " Cup ",
+        [scene([(4, 8, TEAL)]), scene([(30, 30, TEAL)])],
+        TOYS.detector,
+        TOYS.encoder,
+    )
     assert (obj.category, len(obj.crops), whole) == ("cup", 2, ())
     assert all(crop.shape[0] < 40 for crop in obj.crops)
 
@@ -79,7 +90,9 @@ def test_empty_bank_is_empty(tmp_path: Path) -> None:
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=10)
 def test_what_an_object_looks_like_is_kept_in_words(tmp_path: Path, short: str, long: str) -> None:
     told = Description(short, long)
-    back = load(save(tmp_path, replace(personal("mug", "cup", TEAL), description=told), replace=True)).description
+    back = load(
+        save(tmp_path, replace(personal("mug", "cup", TEAL), description=told), replace=True)
+    ).description
     assert back is not None
     assert (back.short, back.long) == (short, long)
 
@@ -90,9 +103,13 @@ def test_a_memory_from_before_descriptions_still_loads(tmp_path: Path) -> None:
     assert load(path).description is None
 
 
-@pytest.mark.parametrize("odd", ['"[1]"', '"{}"', '"null"', r'"{\"short\": 3, \"long\": \"x\"}"', '"not json"'])
+@pytest.mark.parametrize(
+    "odd", ['"[1]"', '"{}"', '"null"', r'"{\"short\": 3, \"long\": \"x\"}"', '"not json"']
+)
 def test_a_damaged_description_is_said(tmp_path: Path, odd: str) -> None:
-    path = save(tmp_path, replace(personal("mug", "cup", TEAL), description=Description("red", "all red")))
+    path = save(
+        tmp_path, replace(personal("mug", "cup", TEAL), description=Description("red", "all red"))
+    )
     data = path.read_bytes()
     (size,) = struct.unpack("<Q", data[:8])
     header = json.loads(data[8 : 8 + size])
@@ -137,7 +154,9 @@ def write(path: Path, kind: str) -> Path:
     if kind == "huge":
         Image.new("1", (9000, 9000)).save(path)
     else:
-        path.write_bytes({"empty": b"", "text": b"hello", "cut": b"\x89PNG\r\n\x1a\n" + b"\0" * 30}[kind])
+        path.write_bytes(
+            {"empty": b"", "text": b"hello", "cut": b"\x89PNG\r\n\x1a\n" + b"\0" * 30}[kind]
+        )
     return path
 
 

@@ -5,28 +5,36 @@ import os
 import numpy as np
 import pytest
 
-from vap_core.errors import MissingMeshes
-from vap_core.sim.gl import ensure_gl
-from vap_core.sim.robots import ROBOTS
-from vap_core.sim.robots.menagerie import MODELS, dress
-from vap_core.sim.scenes import build
+from vap_core.base.errors import MissingMeshes
+from vap_core.simulation.gl import ensure_gl
+from vap_core.simulation.robots import ROBOTS
+from vap_core.simulation.robots.menagerie import MODELS, dress
+from vap_core.simulation.scenes import build
 
 ensure_gl()
 import mujoco  # noqa: E402
 
-needs_meshes = pytest.mark.skipif("MENAGERIE_ROOT" not in os.environ, reason="set MENAGERIE_ROOT to a folder that holds Menagerie's models")
+needs_meshes = pytest.mark.skipif(
+    "MENAGERIE_ROOT" not in os.environ,
+    reason="set MENAGERIE_ROOT to a folder that holds Menagerie's models",
+)
 
 
 @pytest.fixture(scope="module", params=sorted(ROBOTS))
 def pair(request):
     """The same scene, plain and dressed."""
-    with build(request.param, ["cup-personal"]) as plain, build(request.param, ["cup-personal"], meshes="menagerie") as dressed:
+    with (
+        build(request.param, ["cup-personal"]) as plain,
+        build(request.param, ["cup-personal"], meshes="menagerie") as dressed,
+    ):
         yield plain, dressed
 
 
 def at_home(scene):
     data, robot = mujoco.MjData(scene.model), scene.robot
-    for joint, angle in zip((*robot.joints, *robot.fingers), (*robot.home, *robot.fingers_open), strict=True):
+    for joint, angle in zip(
+        (*robot.joints, *robot.fingers), (*robot.home, *robot.fingers_open), strict=True
+    ):
         data.joint(joint).qpos[0] = angle
         data.actuator(joint).ctrl[0] = angle
     data.joint("cup-personal/free").qpos[:3] = 0.4, 0.0, 0.0
@@ -36,7 +44,11 @@ def at_home(scene):
 
 def worn(model, body):
     """Menagerie's geoms on a body."""
-    geoms = [geom for geom in range(model.ngeom) if model.geom_bodyid[geom] == body and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH]
+    geoms = [
+        geom
+        for geom in range(model.ngeom)
+        if model.geom_bodyid[geom] == body and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH
+    ]
     return [geom for geom in geoms if model.geom_group[geom] == 2]
 
 
@@ -44,8 +56,14 @@ def box(model, data, geoms):
     """Bounding box of meshes in the world, metres."""
     points = []
     for geom in geoms:
-        start, count = model.mesh_vertadr[model.geom_dataid[geom]], model.mesh_vertnum[model.geom_dataid[geom]]
-        points.append(model.mesh_vert[start : start + count] @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])
+        start, count = (
+            model.mesh_vertadr[model.geom_dataid[geom]],
+            model.mesh_vertnum[model.geom_dataid[geom]],
+        )
+        points.append(
+            model.mesh_vert[start : start + count] @ data.geom_xmat[geom].reshape(3, 3).T
+            + data.geom_xpos[geom]
+        )
     return np.stack([np.concatenate(points).min(axis=0), np.concatenate(points).max(axis=0)])
 
 
@@ -55,12 +73,33 @@ def test_only_the_look_changes(pair):
     for size in ("nq", "nv", "nu", "nbody", "njnt", "nsite", "ncam", "neq"):
         assert getattr(plain, size) == getattr(dressed, size), size
     for what in ("actuator", "joint", "body", "site", "camera"):
-        count = {"actuator": plain.nu, "joint": plain.njnt, "body": plain.nbody, "site": plain.nsite, "camera": plain.ncam}[what]
-        assert [getattr(plain, what)(i).name for i in range(count)] == [getattr(dressed, what)(i).name for i in range(count)]
-    for field in ("jnt_range", "actuator_ctrlrange", "actuator_gainprm", "body_mass", "body_inertia", "body_ipos", "body_pos", "site_pos", "cam_pos"):
+        count = {
+            "actuator": plain.nu,
+            "joint": plain.njnt,
+            "body": plain.nbody,
+            "site": plain.nsite,
+            "camera": plain.ncam,
+        }[what]
+        assert [getattr(plain, what)(i).name for i in range(count)] == [
+            getattr(dressed, what)(i).name for i in range(count)
+        ]
+    for field in (
+        "jnt_range",
+        "actuator_ctrlrange",
+        "actuator_gainprm",
+        "body_mass",
+        "body_inertia",
+        "body_ipos",
+        "body_pos",
+        "site_pos",
+        "cam_pos",
+    ):
         assert np.array_equal(getattr(plain, field), getattr(dressed, field)), field
     touchable = [model.geom_contype | model.geom_conaffinity for model in (plain, dressed)]
-    forms = [np.concatenate([model.geom_size, model.geom_pos, model.geom_quat], axis=1) for model in (plain, dressed)]
+    forms = [
+        np.concatenate([model.geom_size, model.geom_pos, model.geom_quat], axis=1)
+        for model in (plain, dressed)
+    ]
     ours, theirs = (form[touch > 0] for form, touch in zip(forms, touchable, strict=True))
     assert np.array_equal(ours, theirs)
 
@@ -85,15 +124,22 @@ def test_every_link_wears_meshes_where_menagerie_has_them(pair):
     original = mujoco_menagerie.get(MODELS[robot.name])
     model = original.model(original.default_model)
     ours, theirs = at_home(scene), mujoco.MjData(model)
-    for joint, angle in zip((*robot.joints, *robot.fingers), (*robot.home, *robot.fingers_open), strict=True):
+    for joint, angle in zip(
+        (*robot.joints, *robot.fingers), (*robot.home, *robot.fingers_open), strict=True
+    ):
         theirs.joint(joint).qpos[0] = angle
     mujoco.mj_kinematics(model, theirs)
     body_of = {model.body(i).name.rpartition("/")[2]: i for i in range(model.nbody)}
     shift = ours.body(robot.links[0]).xpos - theirs.xpos[body_of[robot.links[0]]]
     for link in robot.links:
-        mine, original_geoms = worn(scene.model, scene.model.body(link).id), worn(model, body_of[link])
+        mine, original_geoms = (
+            worn(scene.model, scene.model.body(link).id),
+            worn(model, body_of[link]),
+        )
         assert len(mine) == len(original_geoms) > 0, link
-        assert box(scene.model, ours, mine) == pytest.approx(box(model, theirs, original_geoms) + shift, abs=1e-4), link
+        assert box(scene.model, ours, mine) == pytest.approx(
+            box(model, theirs, original_geoms) + shift, abs=1e-4
+        ), link
 
 
 @needs_meshes
@@ -101,13 +147,21 @@ def test_the_robot_looks_different_and_the_rest_the_same(pair):
     pictures = []
     for scene in pair:
         data, camera = at_home(scene), mujoco.MjvCamera()
-        camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = data.site("tcp").xpos, 0.9, 140, -15
+        camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = (
+            data.site("tcp").xpos,
+            0.9,
+            140,
+            -15,
+        )
         with mujoco.Renderer(scene.model, 224, 224, max_geom=500) as renderer:
             renderer.update_scene(data, camera)
             pictures.append(renderer.render().astype(int))
     differs = (np.abs(pictures[0] - pictures[1]).max(axis=2) > 8).mean()
     assert 0.01 < differs < 0.4
-    masks = [scene.eyes.masks(at_home(scene), scene.cameras[0], 224)["cup-personal"] for scene in pair]
+    masks = [
+        scene.renderer.masks(at_home(scene), scene.cameras[0], 224)["cup-personal"]
+        for scene in pair
+    ]
     assert (masks[0] & masks[1]).sum() >= 0.8 * (masks[0] | masks[1]).sum() > 0
 
 

@@ -8,14 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binomtest
 
-from vap_core.metrics import rate, score, step_times
+from vap_core.evaluation.metrics import rate, score, step_times
 
 
 @given(st.integers(1, 400).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
 def test_interval_is_scipys_wilson(kn: tuple[int, int]) -> None:
     k, n = kn
     ours, theirs = rate(k, n), binomtest(k, n).proportion_ci(method="wilson")
-    assert (ours.low, ours.high) == (pytest.approx(theirs.low, abs=1e-9), pytest.approx(theirs.high, abs=1e-9))
+    assert (ours.low, ours.high) == (
+        pytest.approx(theirs.low, abs=1e-9),
+        pytest.approx(theirs.high, abs=1e-9),
+    )
 
 
 def test_sixteen_of_twenty() -> None:
@@ -40,16 +43,22 @@ def test_an_error_stays_in_the_denominator_and_wins_nothing() -> None:
 
 
 def test_groups_by_method() -> None:
-    lines = score([episode(), episode(method="generic", success=False, outcome="failure"), episode()])
+    lines = score(
+        [episode(), episode(method="generic", success=False, outcome="failure"), episode()]
+    )
     assert [(s.method, s.n, s.sr.k) for s in lines] == [("vap", 2, 2), ("generic", 1, 0)]
 
 
 def test_json_has_the_promised_fields() -> None:
-    assert {"suite", "task", "method", "n", "sr", "cmr", "wrong_object", "intervals"} <= score([episode()])[0].to_json().keys()
+    assert {"suite", "task", "method", "n", "sr", "cmr", "wrong_object", "intervals"} <= score(
+        [episode()]
+    )[0].to_json().keys()
 
 
 def test_step_times_are_weighted_by_steps() -> None:
-    assert step_times([episode(), episode(steps=30, seconds_render=0.7)]) == {"render": pytest.approx(20.0)}
+    assert step_times([episode(), episode(steps=30, seconds_render=0.7)]) == {
+        "render": pytest.approx(20.0)
+    }
 
 
 def test_a_table_is_scored_as_its_rows_are() -> None:

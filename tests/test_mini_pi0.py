@@ -10,12 +10,12 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies import get_policy_class, make_pre_post_processors
 from lerobot.policies.pi0.modeling_pi0 import PI0Policy
 
-from vap_core.policies.lerobot import load
+from vap_core.policies.lerobot.adapter import load
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
 from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
+from vap_core.policies.protocol import PolicyInput
 from vap_core.training.words import vocabulary
-from vap_core.values import PolicyInput
 
 STATE, ACTION = 13, 7
 
@@ -36,14 +36,21 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with torch.random.fork_rng():
         torch.manual_seed(0)
         MiniPI0Policy(config()).save_pretrained(folder)
-    stats = {name: {"mean": torch.zeros(n), "std": torch.ones(n)} for name, n in (("observation.state", STATE), ("action", ACTION))}
+    stats = {
+        name: {"mean": torch.zeros(n), "std": torch.ones(n)}
+        for name, n in (("observation.state", STATE), ("action", ACTION))
+    }
     for pipeline in make_pre_post_processors(config(), dataset_stats=stats):
         pipeline.save_pretrained(folder)
     return folder
 
 
 def look(text: str) -> PolicyInput:
-    return PolicyInput({"front": np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)}, text, np.zeros(STATE, np.float32))
+    return PolicyInput(
+        {"front": np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)},
+        text,
+        np.zeros(STATE, np.float32),
+    )
 
 
 def test_it_comes_back_through_lerobots_factory(checkpoint: Path) -> None:
@@ -56,7 +63,10 @@ def test_it_comes_back_through_lerobots_factory(checkpoint: Path) -> None:
     loaded, built = kind.from_pretrained(checkpoint), MiniPI0Policy(config())
     assert loaded.state_dict().keys() == built.state_dict().keys()
     again = MiniPI0Policy.from_pretrained(checkpoint)
-    assert all(torch.equal(a, b) for a, b in zip(loaded.state_dict().values(), again.state_dict().values(), strict=True))
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(loaded.state_dict().values(), again.state_dict().values(), strict=True)
+    )
 
 
 def test_weights_of_another_size_are_refused(checkpoint: Path, tmp_path: Path) -> None:
@@ -72,7 +82,11 @@ def test_it_drives_our_rollouts_and_hears_words_and_pictures(checkpoint: Path) -
     policy = load(checkpoint)
     assert policy.label.startswith(f"mini_pi0:{checkpoint.name}@")
     states = [policy.start(np.random.default_rng(i)) for i in range(3)]
-    said = [look("put my camera on the plate"), look("put the red camera on the plate"), look("put the red camera on the plate")]
+    said = [
+        look("put my camera on the plate"),
+        look("put the red camera on the plate"),
+        look("put the red camera on the plate"),
+    ]
     said[2].images["front"][:] = 0
     _, chunks = policy.plan([states[0]] * 3, said)
     assert chunks[0].shape == (4, ACTION)
@@ -84,11 +98,24 @@ def test_cooler_noise_is_less_noise(checkpoint: Path) -> None:
     warm, cool, cold = (MiniPI0Policy.from_pretrained(checkpoint) for _ in range(3))
     cool.config.temperature, cold.config.temperature = 0.5, 0.0
     before, _ = make_pre_post_processors(config(), str(checkpoint))
-    batch = before({"observation.images.front": torch.rand(2, 3, 64, 64), "observation.state": torch.rand(2, STATE), "task": ["pick it up"] * 2})
+    batch = before(
+        {
+            "observation.images.front": torch.rand(2, 3, 64, 64),
+            "observation.state": torch.rand(2, STATE),
+            "task": ["pick it up"] * 2,
+        }
+    )
     noise = torch.randn(2, 4, ACTION)
-    assert torch.equal(cool.predict_action_chunk(batch, noise=noise), warm.predict_action_chunk(batch, noise=0.5 * noise))
-    assert torch.equal(cold.predict_action_chunk(batch), cold.predict_action_chunk(batch, noise=noise))
-    assert not torch.equal(cool.predict_action_chunk(batch, noise=noise), warm.predict_action_chunk(batch, noise=noise))
+    assert torch.equal(
+        cool.predict_action_chunk(batch, noise=noise),
+        warm.predict_action_chunk(batch, noise=0.5 * noise),
+    )
+    assert torch.equal(
+        cold.predict_action_chunk(batch), cold.predict_action_chunk(batch, noise=noise)
+    )
+    assert not torch.equal(
+        cool.predict_action_chunk(batch, noise=noise), warm.predict_action_chunk(batch, noise=noise)
+    )
 
 
 def test_words_become_the_tokens_that_they_are() -> None:
@@ -96,7 +123,16 @@ def test_words_become_the_tokens_that_they_are() -> None:
     assert len(set(words)) == len(words)
     number = {word: i for i, word in enumerate(words)}
     tokens, there = encode(["put the red camera on the plate", "Find <my_0>, zebra"], number, 10)
-    assert [words[i] for i in tokens[0]] == ["put", "the", "red", "camera", "on", "the", "plate", "\n"]
+    assert [words[i] for i in tokens[0]] == [
+        "put",
+        "the",
+        "red",
+        "camera",
+        "on",
+        "the",
+        "plate",
+        "\n",
+    ]
     assert [words[i] for i in tokens[1]][:4] == ["<unk>", "<my_0>", "<unk>", "\n"]
     assert there.sum(1).tolist() == [8, 4]
 
@@ -114,7 +150,11 @@ def test_a_step_of_training_reaches_every_part(checkpoint: Path) -> None:
                     "action": torch.rand(2, 4, ACTION), "task": ["pick up the red shaver"] * 2})  # fmt: skip
     loss, _ = policy.forward(batch)
     loss.backward()
-    felt = {name for name, weight in policy.named_parameters() if weight.grad is not None and weight.grad.abs().sum() > 0}
+    felt = {
+        name
+        for name, weight in policy.named_parameters()
+        if weight.grad is not None and weight.grad.abs().sum() > 0
+    }
     for part in ("vision_tower", "multi_modal_projector", "language_model.layers.0.self_attn.q_proj", "layers.1.self_attn.k_proj", "embed_tokens",
                  "gemma_expert.model.layers.1", "action_out_proj", "state_proj"):  # fmt: skip
         assert any(part in name for name in felt), part

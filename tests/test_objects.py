@@ -3,17 +3,29 @@
 import numpy as np
 import pytest
 
-from vap_core.errors import UnknownName
-from vap_core.sim.gl import ensure_gl
-from vap_core.sim.objects import CATEGORIES, CLUTTER, OBJECTS, add_object, extent_m, generic, get, lookalikes, mesh, personal, tier
-from vap_core.sim.studio import reference_views
-from vap_core.sim.textures import atlas
+from vap_core.base.errors import UnknownName
+from vap_core.simulation.assets.atlas import render_atlas
+from vap_core.simulation.assets.mujoco_object import add_object
+from vap_core.simulation.assets.objects import (
+    CATEGORIES,
+    CLUTTER,
+    OBJECTS,
+    extent_m,
+    generic_instance,
+    get_object,
+    lookalikes,
+    mesh_of,
+    personal_instance,
+    tier,
+)
+from vap_core.simulation.gl import ensure_gl
+from vap_core.simulation.studio import reference_views
 
 ensure_gl()
 import mujoco  # noqa: E402
 
 STEMS = sorted({name.rpartition("-personal")[0] for name in OBJECTS if name.endswith("-personal")})
-GENERICS = [generic(kind, i) for kind in [*STEMS, *CLUTTER] for i in range(3)]
+GENERICS = [generic_instance(kind, i) for kind in [*STEMS, *CLUTTER] for i in range(3)]
 EVERYTHING = [*OBJECTS.values(), *GENERICS]
 RECEPTACLES = ("plate", "basket", "plastic bowl")
 TABLE = """<mujoco><option timestep="0.002" integrator="implicitfast" cone="elliptic" impratio="10"/>
@@ -28,9 +40,9 @@ def on_table(model, height=0.0, yaw=0.0):
 
 
 def test_every_category_has_a_personal_instance_and_look_alikes():
-    assert {personal(stem).category for stem in STEMS} == set(CATEGORIES)
+    assert {personal_instance(stem).category for stem in STEMS} == set(CATEGORIES)
     for category in CATEGORIES:
-        assert personal(category).split == "personal"
+        assert personal_instance(category).split == "personal"
         assert len(lookalikes(category)) >= 2
         assert all(model.category == category for model in lookalikes(category))
     assert all(name == model.name for name, model in OBJECTS.items())
@@ -40,10 +52,14 @@ def test_every_category_has_a_personal_instance_and_look_alikes():
 
 def test_look_alikes_differ_in_motif_and_in_shape():
     for stem in STEMS:
-        models = (personal(stem), *lookalikes(stem))
+        models = (personal_instance(stem), *lookalikes(stem))
         assert len({(m.texture.motif, m.texture.layout) for m in models}) == len(models)
         assert len({repr(m.shape) for m in models}) == len(models)
-        assert all({m.texture.base, m.texture.ink, m.texture.accent} & {models[0].texture.base, models[0].texture.accent} for m in models)
+        assert all(
+            {m.texture.base, m.texture.ink, m.texture.accent}
+            & {models[0].texture.base, models[0].texture.accent}
+            for m in models
+        )
 
 
 @pytest.mark.parametrize("stem", STEMS)
@@ -52,19 +68,19 @@ def test_look_alikes_come_in_three_tiers(stem):
     assert tier(lookalikes(stem)[-1]) == "easy"
 
 
-def test_generic_is_deterministic_and_deaf_to_global_seeds():
-    first = generic("cup", 7)
-    generic.cache_clear()
+def test_generic_is_deterministic_and_ignores_global_seeds():
+    first = generic_instance("cup", 7)
+    generic_instance.cache_clear()
     np.random.seed(3)  # noqa: NPY002
-    again = generic("cup", 7)
+    again = generic_instance("cup", 7)
     assert repr(again) == repr(first)
     assert again.name == "cup-generic-0007"
-    assert repr(get("pen-holder-generic-0012")) == repr(generic("pen holder", 12))
-    assert len({repr(generic("vase", i)) for i in range(50)}) == 50
+    assert repr(get_object("pen-holder-generic-0012")) == repr(generic_instance("pen holder", 12))
+    assert len({repr(generic_instance("vase", i)) for i in range(50)}) == 50
 
 
 def test_generic_and_evaluation_parameters_are_disjoint():
-    trained = [generic(kind, i).texture for kind in [*STEMS, *CLUTTER] for i in range(300)]
+    trained = [generic_instance(kind, i).texture for kind in [*STEMS, *CLUTTER] for i in range(300)]
     held_out = [model.texture for model in OBJECTS.values()]
     for read in (lambda t: t.motif, lambda t: t.layout, lambda t: (t.base, t.ink, t.accent)):
         assert not {read(t) for t in trained} & {read(t) for t in held_out}
@@ -72,11 +88,13 @@ def test_generic_and_evaluation_parameters_are_disjoint():
 
 @pytest.mark.parametrize("name", ["cup-mine", "cup-generic-7", "mug-generic-0001", "cup-generic-"])
 def test_unknown_name_lists_what_exists(name):
-    with pytest.raises(UnknownName, match=r"get: object .* is unknown; known: .*cup-generic-NNNN.*cup-personal"):
-        get(name)
+    with pytest.raises(
+        UnknownName, match=r"objects: object .* is unknown; known: .*cup-generic-NNNN.*cup-personal"
+    ):
+        get_object(name)
 
 
-@pytest.mark.parametrize("find", [personal, lookalikes, lambda c: generic(c, 0)])
+@pytest.mark.parametrize("find", [personal_instance, lookalikes, lambda c: generic_instance(c, 0)])
 def test_unknown_category_lists_what_exists(find):
     with pytest.raises(UnknownName, match="known: .*bottle, .*camera, .*cup"):
         find("spaceship")
@@ -85,7 +103,7 @@ def test_unknown_category_lists_what_exists(find):
 @pytest.mark.parametrize("model", EVERYTHING, ids=lambda m: m.name)
 def test_object_compiles_fits_its_extent_and_rests_upright(model):
     compiled = on_table(model, height=0.001, yaw=0.3)
-    geom, form = compiled.geom(f"{model.name}/visual"), mesh(model)
+    geom, form = compiled.geom(f"{model.name}/visual"), mesh_of(model)
     assert len(form.face) <= 1500
     assert np.isclose(form.vertex[:, 2].min(), 0, atol=1e-6)
     turn = np.zeros(9)
@@ -93,7 +111,11 @@ def test_object_compiles_fits_its_extent_and_rests_upright(model):
     vertex = compiled.mesh_vert @ turn.reshape(3, 3).T + geom.pos
     assert np.allclose(np.ptp(vertex, axis=0), extent_m(model), atol=1e-3)
     assert np.isclose(compiled.body(model.name).mass[0], model.mass_kg)
-    mass_kg, tall_m = ((0.3, 0.5), (0.010, 0.060)) if model.category in RECEPTACLES else ((0.05, 0.16), (0.060, 0.122))
+    mass_kg, tall_m = (
+        ((0.3, 0.5), (0.010, 0.060))
+        if model.category in RECEPTACLES
+        else ((0.05, 0.16), (0.060, 0.122))
+    )
     assert mass_kg[0] <= model.mass_kg <= mass_kg[1]
     assert tall_m[0] <= extent_m(model)[2] <= tall_m[1]
 
@@ -110,9 +132,15 @@ def test_object_compiles_fits_its_extent_and_rests_upright(model):
 
 @pytest.mark.parametrize("model", EVERYTHING, ids=lambda m: m.name)
 def test_two_fingers_fit_around_it(model):
-    form = mesh(model)
+    form = mesh_of(model)
     level = (0.5 if model.category == "scrubber" else 0.6) * form.vertex[:, 2].max()
-    solids = [s for s in model.shape.solids() if s.pos[2] - s.size[-1] < level < s.pos[2] + s.size[-1] and s.kind == "cylinder" and s.axis == "z"]
+    solids = [
+        s
+        for s in model.shape.solids()
+        if s.pos[2] - s.size[-1] < level < s.pos[2] + s.size[-1]
+        and s.kind == "cylinder"
+        and s.axis == "z"
+    ]
     if model.category == "camera":
         assert 0.036 <= extent_m(model)[1] <= 0.042
     for solid in solids:
@@ -120,7 +148,7 @@ def test_two_fingers_fit_around_it(model):
 
 
 def test_visible_mask_has_the_size_of_the_can():
-    model = generic("coke can", 0)
+    model = generic_instance("coke can", 0)
     compiled = on_table(model)
     data = mujoco.MjData(compiled)
     mujoco.mj_forward(compiled, data)
@@ -137,13 +165,15 @@ def test_visible_mask_has_the_size_of_the_can():
 
 
 def test_atlas_keeps_its_swatches_below_the_decoration():
-    picture = atlas(personal("cup").texture, personal("cup").shape.aspect())
+    picture = render_atlas(
+        personal_instance("cup").texture, personal_instance("cup").shape.aspect()
+    )
     assert picture.shape == (512, 512, 3)
-    assert tuple(picture[-1, 0]) == personal("cup").texture.base
+    assert tuple(picture[-1, 0]) == personal_instance("cup").texture.base
 
 
 def test_reference_views_are_seeded_varied_and_framed():
-    model = personal("cup")
+    model = personal_instance("cup")
     views = reference_views(model, n=5, size=160)
     again = reference_views(model, n=5, size=160)
     other = reference_views(model, n=5, seed=1, size=160)
@@ -156,15 +186,19 @@ def test_reference_views_are_seeded_varied_and_framed():
 @pytest.mark.parametrize("kind", RECEPTACLES)
 @pytest.mark.parametrize("index", [None, 0, 1])
 def test_things_lie_inside_a_receptacle(kind, index):
-    place = get(f"{kind.replace(' ', '-')}-prop") if index is None else generic(kind, index)
-    thing = personal("owl figurine")
+    place = (
+        get_object(f"{kind.replace(' ', '-')}-prop")
+        if index is None
+        else generic_instance(kind, index)
+    )
+    thing = personal_instance("owl figurine")
     spec = mujoco.MjSpec.from_string(TABLE)
     add_object(spec, place)
     add_object(spec, thing, (0.012, 0, 0.02))
     compiled = spec.compile()
     data = mujoco.MjData(compiled)
     mujoco.mj_step(compiled, data, 750)
-    form = mesh(place).vertex
+    form = mesh_of(place).vertex
     floor_m = form[np.hypot(form[:, 0], form[:, 1]) < 1e-6, 2].max()
     assert data.body(thing.name).xpos == pytest.approx([0.012, 0, floor_m], abs=1e-3)
     assert data.body(thing.name).xmat[8] > 0.9999

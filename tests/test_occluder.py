@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vap_core import suites
-from vap_core.errors import UnknownName
-from vap_core.policies.expert import Expert
-from vap_core.sim.env import Env
-from vap_core.sim.occluder import Occlusion
-from vap_core.sim.scenes import Scene, build
-from vap_core.values import EpisodeRow
+from vap_core.base.errors import UnknownName
+from vap_core.policies.scripted.expert import Expert
+from vap_core.simulation import suites
+from vap_core.simulation.env import Env
+from vap_core.simulation.occluder import Occlusion
+from vap_core.simulation.scenes import Scene, build
+from vap_core.simulation.types import EpisodeRow
 
 ALWAYS = 10**6
 SUITE = suites.TABLETOP
@@ -30,7 +30,13 @@ def scene(row: EpisodeRow) -> Iterator[Scene]:
 
 
 def env_of(scene: Scene, occlusion: Occlusion | None = None) -> Env:
-    return Env(scene, cameras=SUITE.cameras, control=SUITE.control, sensor=SUITE.sensor, occlusion=occlusion)
+    return Env(
+        scene,
+        cameras=SUITE.cameras,
+        control=SUITE.control,
+        sensor=SUITE.sensor,
+        occlusion=occlusion,
+    )
 
 
 def drive(env: Env, row: EpisodeRow, steps: int) -> Iterator[int]:
@@ -40,12 +46,18 @@ def drive(env: Env, row: EpisodeRow, steps: int) -> Iterator[int]:
     state = expert.start(np.random.default_rng(0))
     for step in range(steps):
         yield step
-        (state,), (chunk,) = expert.plan_inside([state], [env])
+        (state,), (chunk,) = expert.plan_from_simulation([state], [env])
         env.step(chunk[0])
 
 
-def test_plates_hide_all_and_arms_most_of_the_target_through_a_whole_episode(scene: Scene, row: EpisodeRow) -> None:
-    plain, plate, arm = env_of(scene), env_of(scene, Occlusion(0, ALWAYS)), env_of(scene, Occlusion(0, ALWAYS, "arm"))
+def test_plates_hide_all_and_arms_most_of_the_target_through_a_whole_episode(
+    scene: Scene, row: EpisodeRow
+) -> None:
+    plain, plate, arm = (
+        env_of(scene),
+        env_of(scene, Occlusion(0, ALWAYS)),
+        env_of(scene, Occlusion(0, ALWAYS, "arm")),
+    )
     compared, wrist = 0, 0
     for step in drive(plain, row, 180):
         if step % 12 == 0:
@@ -56,14 +68,18 @@ def test_plates_hide_all_and_arms_most_of_the_target_through_a_whole_episode(sce
                 assert not behind[camera][row.target].any()
                 area = int(free[camera][row.target].sum())
                 assert int(partly[camera][row.target].sum()) <= 0.2 * area
-                assert all((behind[camera][name] <= free[camera][name]).all() for name in free[camera])  # nothing shows through or anew
+                assert all(
+                    (behind[camera][name] <= free[camera][name]).all() for name in free[camera]
+                )  # nothing shows through or anew
                 compared += area >= 100
                 wrist += camera == "wrist" and area > 5000
     assert compared >= 30  # the target did show
     assert wrist >= 3  # and filled the wrist camera's view when it was carried
 
 
-def test_it_is_drawn_in_its_camera_and_its_steps_alone_and_leaves_no_other_trace(scene: Scene, row: EpisodeRow) -> None:
+def test_it_is_drawn_in_its_camera_and_its_steps_alone_and_leaves_no_other_trace(
+    scene: Scene, row: EpisodeRow
+) -> None:
     plain, hidden = env_of(scene), env_of(scene, Occlusion(2, 3, cameras=("side",)))
     for env in (plain, hidden):
         env.reset(row)
@@ -71,14 +87,20 @@ def test_it_is_drawn_in_its_camera_and_its_steps_alone_and_leaves_no_other_trace
     for step in range(7):
         one, other = plain.observe(), hidden.observe()
         for camera in SUITE.cameras:
-            assert np.array_equal(one.images[camera], other.images[camera]) == (camera != "side" or not 2 <= step < 5)
+            assert np.array_equal(one.images[camera], other.images[camera]) == (
+                camera != "side" or not 2 <= step < 5
+            )
         assert np.array_equal(plain.snapshot().state, hidden.snapshot().state)
-        assert (one.images["side"] != other.images["side"]).any(axis=2).mean() < 0.05  # a plate of the target's size, no curtain
+        assert (one.images["side"] != other.images["side"]).any(
+            axis=2
+        ).mean() < 0.05  # a plate of the target's size, no curtain
         for env in (plain, hidden):
             env.step(action)
 
 
-def test_the_same_occlusion_is_the_same_picture_and_arms_differ_from_episode_to_episode(scene: Scene, row: EpisodeRow) -> None:
+def test_the_same_occlusion_is_the_same_picture_and_arms_differ_from_episode_to_episode(
+    scene: Scene, row: EpisodeRow
+) -> None:
     def look(episode: int) -> np.ndarray:
         env = Env(scene, cameras=("front",), occlusion=Occlusion(0, 1, "arm"))
         env.reset(replace(row, episode=episode))

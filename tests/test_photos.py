@@ -8,16 +8,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vap_core import detect, embed
+from vap_core.base.types import Rgb
 from vap_core.memory import load_photo, register
-from vap_core.values import Rgb
+from vap_core.perception.embedded import detector as detect
+from vap_core.perception.embedded import encoder as embed
 from vap_core.vote import similarity, vote
 
-PHOTOS = Path(os.environ.get("VAP_PHOTOS", Path(__file__).resolve().parents[2] / "shared" / "photos"))
-KINDS = {"dog": ("dog", "dog2", "dog6"), "toy": ("duck_toy", "monster_toy", "robot_toy", "bear_plushie", "grey_sloth_plushie")}
+PHOTOS = Path(
+    os.environ.get("VAP_PHOTOS", Path(__file__).resolve().parents[2] / "shared" / "photos")
+)
+KINDS = {
+    "dog": ("dog", "dog2", "dog6"),
+    "toy": ("duck_toy", "monster_toy", "robot_toy", "bear_plushie", "grey_sloth_plushie"),
+}
 """Subjects of one kind are each other's distractors; the others face everyone."""
 
-pytestmark = pytest.mark.skipif(not PHOTOS.is_dir(), reason=f"no photos at {PHOTOS}; set VAP_PHOTOS to their folder")
+pytestmark = pytest.mark.skipif(
+    not PHOTOS.is_dir(), reason=f"no photos at {PHOTOS}; set VAP_PHOTOS to their folder"
+)
 
 
 Rows = dict[str, np.ndarray]
@@ -25,7 +33,11 @@ Rows = dict[str, np.ndarray]
 
 @pytest.fixture(scope="module")
 def photos() -> dict[str, list[Rgb]]:
-    return {folder.name: [load_photo(path) for path in sorted(folder.glob("*.jpg"))] for folder in sorted(PHOTOS.iterdir()) if folder.is_dir()}
+    return {
+        folder.name: [load_photo(path) for path in sorted(folder.glob("*.jpg"))]
+        for folder in sorted(PHOTOS.iterdir())
+        if folder.is_dir()
+    }
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +49,10 @@ def rows(photos: dict[str, list[Rgb]]) -> Rows:
 @pytest.fixture(scope="module")
 def registered(photos: dict[str, list[Rgb]]) -> Rows:
     """Embeddings of the references as `register` cuts them with the shipped detector, which knows renders only."""
-    return {name: register(name, category(name), pictures, detect.load(), embed.load())[0].embeddings for name, pictures in photos.items()}
+    return {
+        name: register(name, category(name), pictures, detect.load(), embed.load())[0].embeddings
+        for name, pictures in photos.items()
+    }
 
 
 def category(subject: str) -> str:
@@ -45,7 +60,10 @@ def category(subject: str) -> str:
 
 
 def rivals(subject: str, subjects: list[str]) -> list[str]:
-    return next(([s for s in kind if s != subject] for kind in KINDS.values() if subject in kind), [s for s in subjects if s != subject])
+    return next(
+        ([s for s in kind if s != subject] for kind in KINDS.values() if subject in kind),
+        [s for s in subjects if s != subject],
+    )
 
 
 def trials(rows: Rows, registered: Rows) -> Iterator[tuple[str, np.ndarray]]:
@@ -58,13 +76,20 @@ def trials(rows: Rows, registered: Rows) -> Iterator[tuple[str, np.ndarray]]:
                 first, second = similarity(rows[a], references), similarity(rows[b], references)
                 shape = (len(own), len(first), len(second), 3)
                 parts = own[:, None, None], first[None, :, None], second[None, None]
-                yield subject, np.stack([np.broadcast_to(part, shape) for part in parts], axis=-2).reshape(-1, 3, 3)
+                yield (
+                    subject,
+                    np.stack([np.broadcast_to(part, shape) for part in parts], axis=-2).reshape(
+                        -1, 3, 3
+                    ),
+                )
 
 
 def winners(cosine: np.ndarray) -> np.ndarray:
     """`vote` for many elections at once."""
     votes = (cosine.argmax(axis=-2)[..., None] == np.arange(cosine.shape[-2])).sum(axis=-2)
-    return np.where(votes == votes.max(axis=-1, keepdims=True), cosine.mean(axis=-1), -np.inf).argmax(axis=-1)
+    return np.where(
+        votes == votes.max(axis=-1, keepdims=True), cosine.mean(axis=-1), -np.inf
+    ).argmax(axis=-1)
 
 
 @pytest.mark.parametrize("cut", ["whole", "registered"])

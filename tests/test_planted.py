@@ -1,44 +1,73 @@
 """Failures planted in the real simulator, ten of each kind, are told apart: wrong prompts by hand-made masks, failed hands by hand-made policies."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.toys import TOYS, personal
-from vap_core import suites
-from vap_core.attend import Attender
-from vap_core.errors import OutOfReach
-from vap_core.failures import Diagnosis, diagnose
-from vap_core.oracle import Oracle, Revealed
-from vap_core.policies.expert import Expert, ExpertState, Waypoint, _above, _over, _reached, _towards
-from vap_core.rollout import Trial, rollout
-from vap_core.sim.env import Env
-from vap_core.sim.objects import extent_m, get
-from vap_core.sim.scenes import Scene, build
-from vap_core.values import Action, Chunk, EpisodeRow
+from vap_core.attend import Attender, AttendState
+from vap_core.base.errors import OutOfReach
+from vap_core.base.types import Attended
+from vap_core.evaluation.diagnosis import diagnose
+from vap_core.policies.protocol import Chunk
+from vap_core.policies.scripted.expert import (
+    Expert,
+    ExpertState,
+    Waypoint,
+    _above,
+    _over,
+    _reached,
+    _towards,
+)
+from vap_core.rollout.failure import Diagnosis
+from vap_core.rollout.loop import Trial, rollout
+from vap_core.rollout.prompters.oracle import Oracle, OraclePrompter
+from vap_core.rollout.prompters.protocol import Masks, PromptContext
+from vap_core.simulation import suites
+from vap_core.simulation.assets.objects import get_object
+from vap_core.simulation.env import Env
+from vap_core.simulation.scenes import Scene, build
+from vap_core.simulation.types import Action, EpisodeRow, Observation
 
 N = 10
-type Masks = Mapping[str, Mapping[str, np.ndarray]]
 Plant = Callable[[int, EpisodeRow, Masks], Masks]
 """Step, row, true masks -> the masks that the prompts are made from."""
 
 
-class Planted(Revealed):
+class Planted(OraclePrompter):
     """Prompts by masks that somebody has tampered with."""
 
     def __init__(self, plant: Plant, mine: str, category: str, alike: frozenset[str]) -> None:
-        super().__init__(Attender(TOYS, {mine: personal(mine, category, (90, 90, 90))}), Oracle("track"), alike)
+        super().__init__(
+            Attender(TOYS, {mine: personal(mine, category, (90, 90, 90))}), Oracle("track"), alike
+        )
         self.plant = plant
 
-    def start(self, views, instruction, row, masks):  # type: ignore[no-untyped-def]
-        return super().start(views, instruction, row, self.plant(0, row, masks))
+    def start(
+        self, observation: Observation, context: PromptContext
+    ) -> tuple[AttendState, Attended]:
+        return super().start(observation, self.tampered(0, context))
 
-    def steps(self, states, views, rows, masks):  # type: ignore[no-untyped-def]
-        planted = [self.plant(state.frame_index + 1, row, now) for state, row, now in zip(states, rows, masks, strict=True)]
-        return super().steps(states, views, rows, planted)
+    def steps(
+        self,
+        states: Sequence[AttendState],
+        observations: Sequence[Observation],
+        contexts: Sequence[PromptContext],
+    ) -> list[tuple[AttendState, Attended]]:
+        planted = [
+            self.tampered(state.frame_index + 1, context)
+            for state, context in zip(states, contexts, strict=True)
+        ]
+        return super().steps(states, observations, planted)
+
+    def tampered(self, step: int, context: PromptContext) -> PromptContext:
+        truth = context.truth
+        assert truth is not None
+        masks = self.plant(step, truth.row, truth.masks)
+        return replace(context, truth=replace(truth, masks=masks))
 
 
 def true(step: int, row: EpisodeRow, masks: Masks) -> Masks:
@@ -47,7 +76,11 @@ def true(step: int, row: EpisodeRow, masks: Masks) -> Masks:
 
 def rival(row: EpisodeRow) -> str:
     """Its first look-alike."""
-    return next(place.model for place in row.placements[1:] if get(place.model).category == row.category)
+    return next(
+        place.model
+        for place in row.placements[1:]
+        if get_object(place.model).category == row.category
+    )
 
 
 def swapped(masks: Masks, row: EpisodeRow, cameras: Sequence[str]) -> Masks:
@@ -57,7 +90,10 @@ def swapped(masks: Masks, row: EpisodeRow, cameras: Sequence[str]) -> Masks:
 
 
 def rolled(step: int, row: EpisodeRow, masks: Masks) -> Masks:
-    return {c: {name: np.roll(mask, (23, 41), axis=(0, 1)) for name, mask in m.items()} for c, m in masks.items()}
+    return {
+        c: {name: np.roll(mask, (23, 41), axis=(0, 1)) for name, mask in m.items()}
+        for c, m in masks.items()
+    }
 
 
 class Still:
@@ -69,7 +105,9 @@ class Still:
         self.rng = rng
         return ExpertState()
 
-    def plan_inside(self, states: Sequence[ExpertState], envs: Sequence[Env]) -> tuple[list[ExpertState], list[Chunk]]:
+    def plan_from_simulation(
+        self, states: Sequence[ExpertState], envs: Sequence[Env]
+    ) -> tuple[list[ExpertState], list[Chunk]]:
         told = [self.act(state, env) for state, env in zip(states, envs, strict=True)]
         return [state for state, _ in told], [action[None] for _, action in told]
 
@@ -103,7 +141,7 @@ class Knocks(Plans):
 
     def plan(self, env: Env) -> tuple[Waypoint, ...]:
         truth = env.truth()
-        low = Expert().plan_inside([ExpertState()], [env])[0][0].plan[1].tcp_base
+        low = Expert().plan_from_simulation([ExpertState()], [env])[0][0].plan[1].tcp_base
         away = truth.objects_world[rival(env.row)][:2] - truth.objects_world[env.row.target][:2]
         side = np.array([-away[1], away[0], 0.0]) / np.linalg.norm(away)
         at = low.copy()
@@ -113,7 +151,15 @@ class Knocks(Plans):
         after[:3, 3] += 0.06 * side
         top = low.copy()
         top[2, 3] += 0.03
-        path = [_over(env, truth, before), before, after, before, _over(env, truth, before), _over(env, truth, low), top]
+        path = [
+            _over(env, truth, before),
+            before,
+            after,
+            before,
+            _over(env, truth, before),
+            _over(env, truth, low),
+            top,
+        ]
         return tuple(Waypoint(pose, 0.0) for pose in path)
 
 
@@ -123,10 +169,13 @@ class Drops(Still, ABC):
     def act(self, state: ExpertState, env: Env) -> tuple[ExpertState, Action]:
         if state.phase == "dropped":
             return state, self.after(env)
-        if env.row.target in env.truth().held and env.truth().objects_world[env.row.target][2] > 0.03:
+        if (
+            env.row.target in env.truth().held
+            and env.truth().objects_world[env.row.target][2] > 0.03
+        ):
             self.drop(env)
             return ExpertState("dropped"), self.after(env)
-        (state,), (chunk,) = Expert().plan_inside([state], [env])
+        (state,), (chunk,) = Expert().plan_from_simulation([state], [env])
         return state, chunk[0]
 
     def drop(self, env: Env) -> None:
@@ -172,13 +221,23 @@ def world() -> Iterator[Callable[[str, str], tuple[Scene, tuple[EpisodeRow, ...]
         scene.close()
 
 
-def failures(scene: Scene, rows: Sequence[EpisodeRow], plant: Plant, policy: Still, steps: int) -> list[Diagnosis]:
+def failures(
+    scene: Scene, rows: Sequence[EpisodeRow], plant: Plant, policy: Still, steps: int
+) -> list[Diagnosis]:
     """Diagnoses of the first N rows in which the plant took: in which the hand could do what it was to do, and failed."""
     suite, found = suites.suite(rows[0].suite), []
-    sizes = {name: extent_m(get(name)) for name in scene.objects}
-    alike = frozenset(name for name in scene.objects if get(name).category == rows[0].category)
+    alike = frozenset(
+        name for name in scene.objects if get_object(name).category == rows[0].category
+    )
     planted = Planted(plant, rows[0].target, rows[0].category, alike)
-    trial = Trial("planted", scene, policy, planted, sizes, suite.control, images_every=2)
+    trial = Trial(
+        method="planted",
+        scene=scene,
+        policy=policy,
+        prompter=planted,
+        control=suite.control,
+        images_every=2,
+    )
     friction, priority = scene.model.geom_friction.copy(), scene.model.geom_priority.copy()
     for row in rows:
         (episode,) = rollout(trial, [replace(row, max_steps=steps)], batch=1)
@@ -210,23 +269,41 @@ def test_case_1(world, kind):  # type: ignore[no-untyped-def]
     }
     found = failures(scene, rows, plants[kind], Still(), 8)
     assert [(each.case, each.sub_case) for each in found] == [("case 1", kind)] * N
-    assert {each.frame_index for each in found} == {4 if kind == "drift" else 0}, "images are taken every other step"
+    assert {each.frame_index for each in found} == {4 if kind == "drift" else 0}, (
+        "images are taken every other step"
+    )
 
 
 @pytest.mark.parametrize(("since", "kind"), [(0, "views disagree"), (2, "views drift apart")])
 def test_case_2(world, since, kind):  # type: ignore[no-untyped-def]
     scene, rows = world("vlabench", "select-shoe")
     astray = rows[0].cameras[1]
-    found = failures(scene, rows, lambda step, row, masks: swapped(masks, row, [astray] if step >= since else ()), Still(), 8)
-    assert [(each.case, each.sub_case, each.camera, each.frame_index) for each in found] == [("case 2", kind, astray, 2 * since)] * N
+    found = failures(
+        scene,
+        rows,
+        lambda step, row, masks: swapped(masks, row, [astray] if step >= since else ()),
+        Still(),
+        8,
+    )
+    assert [(each.case, each.sub_case, each.camera, each.frame_index) for each in found] == [
+        ("case 2", kind, astray, 2 * since)
+    ] * N
 
 
 @pytest.mark.parametrize(
     ("policy", "kind", "steps"),
-    [(Still(), "timeout", 6), (Misses(), "missed grasp", 22), (Knocks(), "collision", 48), (Slips(), "slip", 34), (LetsGo(), "misplacement", 34)],
+    [
+        (Still(), "timeout", 6),
+        (Misses(), "missed grasp", 22),
+        (Knocks(), "collision", 48),
+        (Slips(), "slip", 34),
+        (LetsGo(), "misplacement", 34),
+    ],
     ids=["timeout", "missed grasp", "collision", "slip", "misplacement"],
 )
 def test_case_3(world, policy, kind, steps):  # type: ignore[no-untyped-def]
     scene, rows = world(*BRIDGE)
     found = failures(scene, rows, true, policy, steps)
-    assert [(each.case, each.sub_case) for each in found] == [("case 3", kind)] * N, "\n".join(each.sentence for each in found)
+    assert [(each.case, each.sub_case) for each in found] == [("case 3", kind)] * N, "\n".join(
+        each.sentence for each in found
+    )

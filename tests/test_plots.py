@@ -6,13 +6,21 @@ import pytest
 
 from tests.test_diagnosis import TABLE
 from tests.toys import TOYS, personal, scene
+from vap_core.analysis.inspection import grounding_table
+from vap_core.analysis.plots import (
+    candidates,
+    film,
+    grounding_figure,
+    learning_figure,
+    rates_figure,
+)
 from vap_core.attend import Attender
-from vap_core.inspection import grounding_table
-from vap_core.metrics import rate, score
-from vap_core.plots import candidates, film, grounding_figure, learning_figure, rates_figure, scores_figure, write_png
-from vap_core.report.failures import breakdown, roads
-from vap_core.report.roads import cases_figure, funnel_figure
-from vap_core.segment import iou
+from vap_core.base.figures import write_png
+from vap_core.evaluation.metrics import rate, score
+from vap_core.evaluation.report.failures import breakdown, funnel_table
+from vap_core.evaluation.report.funnel import cases_figure, funnel_figure
+from vap_core.evaluation.report.pictures import scores_figure
+from vap_core.perception.boxes import mask_iou
 
 TEAL, GREY = (40, 120, 110), (90, 90, 90)
 LINE = scene([(4, 20, GREY), (24, 20, TEAL)])
@@ -21,13 +29,15 @@ LINE = scene([(4, 20, GREY), (24, 20, TEAL)])
 def test_iou_is_exact() -> None:
     one, other = np.zeros((4, 4), bool), np.zeros((4, 4), bool)
     one[:2], other[1:3] = True, True
-    assert iou(one, other) == pytest.approx(1 / 3)
-    assert iou(one & False, other & False) == 1.0
-    assert iou(one, one) == 1.0
+    assert mask_iou(one, other) == pytest.approx(1 / 3)
+    assert mask_iou(one & False, other & False) == 1.0
+    assert mask_iou(one, one) == 1.0
 
 
 def test_grounding_table_names_what_is_under_each_candidate() -> None:
-    _, attended = Attender(TOYS, {"mug": personal("mug", "cup", TEAL)}).start({"front": LINE}, "bring my cup")
+    _, attended = Attender(TOYS, {"mug": personal("mug", "cup", TEAL)}).start(
+        {"front": LINE}, "bring my cup"
+    )
     truth = {"mug": (LINE == TEAL).all(axis=2), "other": (LINE == GREY).all(axis=2)}
     table = grounding_table(attended.groundings["front"][0], truth)
     assert table["is"].tolist() == ["other", "mug"]
@@ -37,7 +47,9 @@ def test_grounding_table_names_what_is_under_each_candidate() -> None:
 
 def test_grounding_figure_has_a_row_per_target_and_survives_no_candidate(tmp_path) -> None:
     objects = (personal("mug", "cup", TEAL), personal("ming", "nothing", GREY))
-    _, attended = Attender(TOYS, {o.name: o for o in objects}).start({"front": LINE}, "put my cup near my nothing")
+    _, attended = Attender(TOYS, {o.name: o for o in objects}).start(
+        {"front": LINE}, "put my cup near my nothing"
+    )
     figure = grounding_figure(LINE, attended, objects, "front")
     assert len(figure.subfigs) == 2
     write_png(figure, tmp_path / "a.png")
@@ -48,36 +60,59 @@ def test_grounding_figure_has_a_row_per_target_and_survives_no_candidate(tmp_pat
 def test_the_winner_is_drawn_apart() -> None:
     from matplotlib.figure import Figure
 
-    _, attended = Attender(TOYS, {"mug": personal("mug", "cup", TEAL)}).start({"front": LINE}, "bring my cup")
+    _, attended = Attender(TOYS, {"mug": personal("mug", "cup", TEAL)}).start(
+        {"front": LINE}, "bring my cup"
+    )
     axes = Figure().subplots()
     candidates(axes, LINE, attended.groundings["front"][0])
     assert len({patch.get_edgecolor() for patch in axes.patches}) == 2
 
 
 def test_scores_and_film_draw() -> None:
-    row = {"suite": "s", "task": "t", "split": "", "policy": "scripted", "outcome": "success", "success": True, "cmr": True, "wrong_object": False}
-    rows = [{**row, "method": m, "first_object_correct": True, "steps": 3} for m in ("generic", "vap")]
+    row = {
+        "suite": "s",
+        "task": "t",
+        "split": "",
+        "policy": "scripted",
+        "outcome": "success",
+        "success": True,
+        "cmr": True,
+        "wrong_object": False,
+    }
+    rows = [
+        {**row, "method": m, "first_object_correct": True, "steps": 3} for m in ("generic", "vap")
+    ]
     assert len(scores_figure(score(rows)).axes) == 1
     assert len(film({"raw": [LINE, LINE]}, ["a", "b"]).axes) == 2
 
 
 def test_the_funnel_has_a_panel_per_suite_and_a_line_per_method() -> None:
-    several = pd.concat([TABLE, TABLE.assign(suite="tabletop"), TABLE.assign(suite="simpler-bridge")])
-    figure = funnel_figure(roads(several), {"vap": "red", "generic": "grey"})
+    several = pd.concat(
+        [TABLE, TABLE.assign(suite="tabletop"), TABLE.assign(suite="simpler-bridge")]
+    )
+    figure = funnel_figure(funnel_table(several), {"vap": "red", "generic": "grey"})
     assert [len(axes.lines) for axes in figure.axes] == [2, 2, 2, 0]
     assert figure.axes[0].lines[0].get_ydata()[-1] == pytest.approx(100 * 4 / 9)
-    assert list(figure.axes[0].lines[1].get_xdata()) == [4, 5, 6], "nothing is said of stages that a method does not have"
+    assert list(figure.axes[0].lines[1].get_xdata()) == [4, 5, 6], (
+        "nothing is said of stages that a method does not have"
+    )
 
 
 def test_every_bar_of_cases_is_a_hundred_percent() -> None:
     axes = cases_figure(breakdown(TABLE)).axes[0]
-    ends = {patch.get_y() + patch.get_height() / 2: patch.get_x() + patch.get_width() for patch in axes.patches}
+    ends = {
+        patch.get_y() + patch.get_height() / 2: patch.get_x() + patch.get_width()
+        for patch in axes.patches
+    }
     assert list(ends.values()) == pytest.approx([100.0] * 2)
     assert sorted(ends) == pytest.approx([0, 1])
 
 
 def test_learning_has_a_panel_per_figure_and_a_line_per_training_that_logged_it() -> None:
-    logs = {"one": [{"step": 1, "flow": 2.0, "hit": 0.5}, {"step": 2, "flow": 1.0, "hit": 0.75}], "other": [{"step": 1, "flow": 3.0}]}
+    logs = {
+        "one": [{"step": 1, "flow": 2.0, "hit": 0.5}, {"step": 2, "flow": 1.0, "hit": 0.75}],
+        "other": [{"step": 1, "flow": 3.0}],
+    }
     figure = learning_figure(logs, {"flow": "Flow", "hit": "Hit"})
     flow, hit = figure.axes
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "other"]
@@ -88,7 +123,11 @@ def test_learning_has_a_panel_per_figure_and_a_line_per_training_that_logged_it(
 
 def test_rates_are_bars_as_high_as_they_are_with_their_intervals() -> None:
     half, all_ = rate(2, 4), rate(4, 4)
-    (axes,) = rates_figure({"suite": {"tinted": {"succeeds": half, "touches": all_}, "plain": {"succeeds": all_}}}, "%").axes
+    (axes,) = rates_figure(
+        {"suite": {"tinted": {"succeeds": half, "touches": all_}, "plain": {"succeeds": all_}}}, "%"
+    ).axes
     assert [round(patch.get_height()) for patch in axes.patches] == [50, 100, 100]
     spread = [segment[:, 1] for held in axes.collections for segment in held.get_segments()]
-    assert {(round(low, 6), round(high, 6)) for low, high in spread} == {(round(100 * r.low, 6), round(100 * r.high, 6)) for r in (half, all_)}
+    assert {(round(low, 6), round(high, 6)) for low, high in spread} == {
+        (round(100 * r.low, 6), round(100 * r.high, 6)) for r in (half, all_)
+    }

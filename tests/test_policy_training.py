@@ -11,17 +11,29 @@ import torch
 from safetensors.torch import load_file
 from torch.nn import functional as F  # noqa: N812
 
-from vap_core.errors import BadOutput, BadPolicy
-from vap_core.policies.checkpoints import fingerprint
-from vap_core.policies.lerobot import load
+from vap_core.base.errors import BadOutput, BadPolicy
+from vap_core.policies.lerobot.adapter import load
+from vap_core.policies.lerobot.checkpoints import fingerprint
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy, fused
 from vap_core.policies.mini_pi0.vlm import load as load_vlm
-from vap_core.sim.control import arm, rotation_vector
-from vap_core.suites import suite
-from vap_core.training import demonstrations, policy, vlm
-from vap_core.training.batches import SPIN_Z, Batch, Frames, ahead, emphasis, spun, statistics, turn, waits
-from vap_core.training.dataset import data_sha256
-from vap_core.training.demonstrations import Film, cached
+from vap_core.simulation.control import arm, rotation_vector
+from vap_core.simulation.suites import suite
+from vap_core.training.films import demonstrations
+from vap_core.training.films.dataset import data_sha256
+from vap_core.training.films.demonstrations import Film, cached
+from vap_core.training.policy import train as policy
+from vap_core.training.policy.batches import (
+    SPIN_Z,
+    Batch,
+    Frames,
+    ahead,
+    emphasis,
+    spun,
+    statistics,
+    turn,
+    waits,
+)
+from vap_core.training.vlm import train as vlm
 
 SUITE = "simpler-bridge"
 
@@ -34,7 +46,18 @@ def test_a_training_that_was_stopped_ends_like_one_that_was_not(
     folder, _ = stage
     monkeypatch.setattr(demonstrations, "EPISODES", 2)
     monkeypatch.setattr(policy, "HELD_OUT", 2)
-    recipe = policy.Recipe(SUITE, stages=2, steps=3, batch=3, draws=2, width=32, depth=2, vision_width=32, vision_depth=1, expert_width=32)
+    recipe = policy.Recipe(
+        SUITE,
+        stages=2,
+        steps=3,
+        batch=3,
+        draws=2,
+        width=32,
+        depth=2,
+        vision_width=32,
+        vision_depth=1,
+        expert_width=32,
+    )
     whole = policy.train(recipe, tmp_path / "whole", cache=folder)
     first = policy.train(recipe, tmp_path / "torn", cache=folder, minutes=0.0)
     assert [line["step"] for line in first["log"]] == [1]
@@ -42,35 +65,79 @@ def test_a_training_that_was_stopped_ends_like_one_that_was_not(
     one, other = (load_file(tmp_path / name / "model.safetensors") for name in ("whole", "torn"))
     assert one.keys() == other.keys()
     assert all(torch.equal(one[name], other[name]) for name in one)
-    assert set(whole["held_out"]) == {"flow", "heat", "where", "hit", "turn", "goal_heat", "goal_where", "goal_hit"}
-    assert whole["data_sha256"] == data_sha256([film for n in range(2) for film in cached(folder, SUITE, 0, n)])
+    assert set(whole["held_out"]) == {
+        "flow",
+        "heat",
+        "where",
+        "hit",
+        "turn",
+        "goal_heat",
+        "goal_where",
+        "goal_hit",
+    }
+    assert whole["data_sha256"] == data_sha256(
+        [film for n in range(2) for film in cached(folder, SUITE, 0, n)]
+    )
     with pytest.raises(BadOutput, match="another recipe or other data"):
         policy.train(replace(recipe, rate=0.1), tmp_path / "torn", cache=folder)
     trained = load(tmp_path / "whole")
     assert trained.execute == 4
-    assert (trained.action_size, set(trained.wanted)) == (7, {"observation.images.front", "observation.state"})
+    assert (trained.action_size, set(trained.wanted)) == (
+        7,
+        {"observation.images.front", "observation.state"},
+    )
 
 
-def test_a_vision_language_model_learns_and_resumes(stage: tuple[Path, list[Film]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_vision_language_model_learns_and_resumes(
+    stage: tuple[Path, list[Film]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     _, films = stage
-    pool = [vlm.View(film.images[t, 0], film.ids[t, 0], film.names) for film in films for t in range(0, len(film.action), 6)]
+    pool = [
+        vlm.View(film.images[t, 0], film.ids[t, 0], film.names)
+        for film in films
+        for t in range(0, len(film.action), 6)
+    ]
     monkeypatch.setattr(vlm, "views", lambda *args, **kwargs: pool)
-    recipe = vlm.Recipe(stages=1, steps=3, batch=4, width=32, depth=2, vision_width=32, vision_depth=1, expert_width=32)
+    recipe = vlm.Recipe(
+        stages=1,
+        steps=3,
+        batch=4,
+        width=32,
+        depth=2,
+        vision_width=32,
+        vision_depth=1,
+        expert_width=32,
+    )
     whole = vlm.train(recipe, tmp_path / "whole")
     vlm.train(recipe, tmp_path / "torn", minutes=0.0)
     vlm.train(recipe, tmp_path / "torn")
     one, other = (load_vlm(tmp_path / name).sha256() for name in ("whole", "torn"))
     assert one == other
     assert {"words", "heat", "hit", "where", "yes", "no"} <= set(whole["held_out"])
-    grown = policy.Recipe(SUITE, stages=1, steps=1, batch=2, draws=1, width=32, depth=2, vision_width=32, vision_depth=1, expert_width=32)
+    grown = policy.Recipe(
+        SUITE,
+        stages=1,
+        steps=1,
+        batch=2,
+        draws=1,
+        width=32,
+        depth=2,
+        vision_width=32,
+        vision_depth=1,
+        expert_width=32,
+    )
     monkeypatch.setattr(demonstrations, "EPISODES", 2)
     about = policy.train(grown, tmp_path / "policy", vlm=tmp_path / "whole", cache=stage[0])
-    assert about["vlm"] == one == load(tmp_path / "policy").policy.config.vlm  # type: ignore[union-attr]
-    further = policy.train(replace(grown, rate=0.0), tmp_path / "further", start=tmp_path / "policy", cache=stage[0])
+    assert about["vlm"] == one == load(tmp_path / "policy").policy.config.vlm
+    further = policy.train(
+        replace(grown, rate=0.0), tmp_path / "further", start=tmp_path / "policy", cache=stage[0]
+    )
     assert further["vlm"] == one
     assert further["start"]["sha256"] == fingerprint(tmp_path / "policy")
     assert further["start"]["recipe"] == about["recipe"]
-    first, second = (load_file(tmp_path / name / "model.safetensors") for name in ("policy", "further"))
+    first, second = (
+        load_file(tmp_path / name / "model.safetensors") for name in ("policy", "further")
+    )
     assert all(torch.equal(first[name], second[name]) for name in first)
     other = policy.Learner(replace(policy.configuration(grown, 13, 7), words=("a", "b"))).policy
     with pytest.raises(BadPolicy, match="no mini-pi0 with the same words"):
@@ -80,13 +147,20 @@ def test_a_vision_language_model_learns_and_resumes(stage: tuple[Path, list[Film
         policy.train(grown, tmp_path / "another", start=tmp_path / "policy", cache=stage[0])
 
 
-def test_frames_close_to_the_start_a_turn_of_the_gripper_or_the_end_come_more_often(stage: tuple[Path, list[Film]]) -> None:
+def test_frames_close_to_the_start_a_turn_of_the_gripper_or_the_end_come_more_often(
+    stage: tuple[Path, list[Film]],
+) -> None:
     _, films = stage
     action = np.ones((40, films[0].action.shape[1]), np.float32)
     action[15:, -1] = 0.2
-    rest = {part: np.repeat(getattr(films[0], part)[:1], 40, axis=0) for part in ("images", "ids", "state", "places")}
+    rest = {
+        part: np.repeat(getattr(films[0], part)[:1], 40, axis=0)
+        for part in ("images", "ids", "state", "places")
+    }
     chances = emphasis(replace(films[0], action=action, **rest), 3.0)
-    assert set(np.flatnonzero(chances == 12.0)) == {0, 1, 2}, "there the hand decides which way it turns"
+    assert set(np.flatnonzero(chances == 12.0)) == {0, 1, 2}, (
+        "there the hand decides which way it turns"
+    )
     assert set(np.flatnonzero(chances == 3.0)) == {3, 4, *range(11, 20), *range(35, 40)}
     assert set(np.flatnonzero(chances == 1.0)) == {*range(5, 11), *range(20, 35)}
     thirds = emphasis(replace(films[0], action=action, **rest), 3.0, 3)
@@ -95,12 +169,18 @@ def test_frames_close_to_the_start_a_turn_of_the_gripper_or_the_end_come_more_of
 
 def test_every_task_is_drawn_as_often_as_another(stage: tuple[Path, list[Film]]) -> None:
     _, films = stage
-    config = policy.configuration(policy.Recipe(SUITE), films[0].state.shape[1], films[0].action.shape[1])
+    config = policy.configuration(
+        policy.Recipe(SUITE), films[0].state.shape[1], films[0].action.shape[1]
+    )
     three = [films[0], replace(films[0], task="another"), replace(films[0], task="another")]
-    assert Frames(SUITE, three, statistics(three), config, 3.0).share == pytest.approx([0.5, 0.25, 0.25])
+    assert Frames(SUITE, three, statistics(three), config, 3.0).share == pytest.approx(
+        [0.5, 0.25, 0.25]
+    )
 
 
-def test_a_hand_that_is_shown_turned_otherwise_turns_back_in_time_and_does_all_else_as_before(stage: tuple[Path, list[Film]]) -> None:
+def test_a_hand_that_is_shown_turned_otherwise_turns_back_in_time_and_does_all_else_as_before(
+    stage: tuple[Path, list[Film]],
+) -> None:
     _, films = stage
     film, rate, kinematics = films[0], 0.28, arm(suite(SUITE).robot)
     close = int(np.argmax(film.action[:, -1] < 0.5))
@@ -110,13 +190,21 @@ def test_a_hand_that_is_shown_turned_otherwise_turns_back_in_time_and_does_all_e
         chunk = ahead(film, 0, close)
         state, back = spun(film, 0, chunk, rate, np.random.default_rng(i))
         assert (np.delete(back, SPIN_Z, axis=1) == np.delete(chunk, SPIN_Z, axis=1)).all()
-        assert (np.delete(state, [SPIN_Z, -1]) == np.delete(film.state[0], [SPIN_Z, len(state) - 1])).all()
+        assert (
+            np.delete(state, [SPIN_Z, -1]) == np.delete(film.state[0], [SPIN_Z, len(state) - 1])
+        ).all()
         assert np.abs(back[:, SPIN_Z]).max() <= rate + 1e-6
         seen.append(float(back[:, SPIN_Z].sum()))
-        assert state[SPIN_Z] + seen[-1] == pytest.approx(film.state[0, SPIN_Z] + film.action[:close, SPIN_Z].sum(), abs=1e-4), "it ends as it did"
+        assert state[SPIN_Z] + seen[-1] == pytest.approx(
+            film.state[0, SPIN_Z] + film.action[:close, SPIN_Z].sum(), abs=1e-4
+        ), "it ends as it did"
         was, now = (kinematics.forward(one[7:].astype(float)) for one in (film.state[0], state))
-        assert now[:3, 3] == pytest.approx(was[:3, 3], abs=1e-4), "its last joint turns it on the spot"
-        assert rotation_vector(now[:3, :3] @ was[:3, :3].T) == pytest.approx([0, 0, state[SPIN_Z] - film.state[0, SPIN_Z]], abs=0.02)
+        assert now[:3, 3] == pytest.approx(was[:3, 3], abs=1e-4), (
+            "its last joint turns it on the spot"
+        )
+        assert rotation_vector(now[:3, :3] @ was[:3, :3].T) == pytest.approx(
+            [0, 0, state[SPIN_Z] - film.state[0, SPIN_Z]], abs=0.02
+        )
     assert min(seen) < -0.4 * reach, "either way"
     assert max(seen) > 0.4 * reach, "either way"
     state, back = spun(film, close, ahead(film, close, 4), rate, np.random.default_rng(0))
@@ -126,22 +214,38 @@ def test_a_hand_that_is_shown_turned_otherwise_turns_back_in_time_and_does_all_e
 
 def test_waiting_is_not_taught_but_for_the_end(stage: tuple[Path, list[Film]]) -> None:
     _, films = stage
-    rest = {part: np.repeat(getattr(films[0], part)[:1], 40, axis=0) for part in ("images", "ids", "state", "places")}
+    rest = {
+        part: np.repeat(getattr(films[0], part)[:1], 40, axis=0)
+        for part in ("images", "ids", "state", "places")
+    }
     rest["state"][:, 0] += 0.01 * np.arange(40)
     action = np.ones((40, films[0].action.shape[1]), np.float32)
     action[20:24, :-1] = action[36:, :-1] = 0.0
     still = {**rest, "state": rest["state"].copy()}
     still["state"][20:25], still["state"][36:] = rest["state"][20], rest["state"][36]
-    assert list(np.flatnonzero(waits(replace(films[0], action=action, **still)))) == [20, 21, 22, 23]
+    assert list(np.flatnonzero(waits(replace(films[0], action=action, **still)))) == [
+        20,
+        21,
+        22,
+        23,
+    ]
     assert not waits(replace(films[0], action=action, **rest)).any(), "something happens"
     closing = action.copy()
     closing[21:, -1] = 0.0
-    assert list(np.flatnonzero(waits(replace(films[0], action=closing, **still)))) == [20, 22, 23], "it asks for something"
-    chances, shown = (emphasis(replace(films[0], action=action, **part), 3.0) for part in (still, rest))
+    assert list(np.flatnonzero(waits(replace(films[0], action=closing, **still)))) == [
+        20,
+        22,
+        23,
+    ], "it asks for something"
+    chances, shown = (
+        emphasis(replace(films[0], action=action, **part), 3.0) for part in (still, rest)
+    )
     assert (chances[20:24] == 0).all()
     assert (np.delete(chances, range(20, 24)) == np.delete(shown, range(20, 24))).all()
     waiting = replace(films[0], action=closing, **still)
-    assert (ahead(waiting, 18, 5) == closing[[18, 19, 21, 24, 25]]).all(), "the chunk goes on behind the wait, from the closed jaw"
+    assert (ahead(waiting, 18, 5) == closing[[18, 19, 21, 24, 25]]).all(), (
+        "the chunk goes on behind the wait, from the closed jaw"
+    )
     assert (ahead(waiting, 18, 2) == closing[18:20]).all()
     assert (ahead(waiting, 38, 4)[:, :-1] == 0).all()
     assert (ahead(waiting, 38, 4)[:, -1] == closing[-1, -1]).all()
@@ -152,23 +256,46 @@ def test_how_the_hand_will_close_is_asked_until_it_does(stage: tuple[Path, list[
         closes = int((film.action[:, -1] < 0.5).argmax())
         angle = float(film.state[closes, 5])
         assert closes > 4
-        assert turn(film, 0) == turn(film, closes - 1) == pytest.approx((np.cos(2 * angle), np.sin(2 * angle)))
+        assert (
+            turn(film, 0)
+            == turn(film, closes - 1)
+            == pytest.approx((np.cos(2 * angle), np.sin(2 * angle)))
+        )
         around = film.state.copy()
         around[:, 5] += np.pi
-        assert turn(replace(film, state=around), 0) == pytest.approx(turn(film, 0), abs=1e-5), "a jaw turned half around is the same"
+        assert turn(replace(film, state=around), 0) == pytest.approx(turn(film, 0), abs=1e-5), (
+            "a jaw turned half around is the same"
+        )
         assert np.isnan(turn(film, closes)).all(), "it is closed"
         opens = closes + int((film.action[closes:, -1] > 0.5).argmax())
         assert np.isnan(turn(film, opens)).all(), "it closes no more"
 
 
-def small_policy(films: list[Film], batch: int, depth: int = 2) -> tuple[MiniPI0Policy, policy.Questions, Batch]:
+def small_policy(
+    films: list[Film], batch: int, depth: int = 2
+) -> tuple[MiniPI0Policy, policy.Questions, Batch]:
     """An untrained policy of the smallest sizes, the questions beside it, and one batch of so many frames."""
-    recipe = policy.Recipe(SUITE, batch=batch, draws=2, width=32, depth=depth, vision_width=32, vision_depth=1, expert_width=32)
+    recipe = policy.Recipe(
+        SUITE,
+        batch=batch,
+        draws=2,
+        width=32,
+        depth=depth,
+        vision_width=32,
+        vision_depth=1,
+        expert_width=32,
+    )
     config = policy.configuration(recipe, films[0].state.shape[1], films[0].action.shape[1])
     with torch.random.fork_rng():
         torch.manual_seed(0)
         model, asked = MiniPI0Policy(config), policy.Questions(recipe.width)
-    return model, asked, Frames(SUITE, films, statistics(films), config, recipe.focus).draw(batch, np.random.default_rng(0))
+    return (
+        model,
+        asked,
+        Frames(SUITE, films, statistics(films), config, recipe.focus).draw(
+            batch, np.random.default_rng(0)
+        ),
+    )
 
 
 @pytest.mark.parametrize(("depth", "asked_of"), [(1, [0]), (2, [0]), (4, [1, 2]), (6, [2, 3, 4])])
@@ -176,7 +303,7 @@ def test_the_middle_of_the_decoder_is_asked_and_every_layer_after_it_but_the_las
     stage: tuple[Path, list[Film]], depth: int, asked_of: list[int]
 ) -> None:
     model, asked, batch = small_policy(stage[1], 4, depth)
-    layers = list(model.model.paligemma_with_expert.paligemma.model.language_model.layers)  # type: ignore[union-attr]
+    layers = list(model.model.paligemma_with_expert.paligemma.model.language_model.layers)
     seen: list[torch.Tensor] = []
     hooks = [layer.register_forward_hook(lambda _, args, out: seen.append(out)) for layer in layers]
     with patch.object(asked, "forward", wraps=asked.forward) as question:
@@ -185,7 +312,9 @@ def test_the_middle_of_the_decoder_is_asked_and_every_layer_after_it_but_the_las
         hook.remove()
     patches = batch.patches.shape[2]
     told = [call.args[0] for call in question.call_args_list]
-    assert [[torch.equal(one, state[:, :patches]) for state in seen].index(True) for one in told] == asked_of
+    assert [
+        [torch.equal(one, state[:, :patches]) for state in seen].index(True) for one in told
+    ] == asked_of
 
 
 def test_the_goal_is_asked_for_where_there_is_one(stage: tuple[Path, list[Film]]) -> None:
@@ -208,13 +337,28 @@ def test_the_goal_is_asked_for_where_there_is_one(stage: tuple[Path, list[Film]]
     assert np.isfinite(list(with_goal.values())).all()
 
 
-def test_attention_that_is_fused_gives_the_same_losses_and_gradients(stage: tuple[Path, list[Film]]) -> None:
+def test_attention_that_is_fused_gives_the_same_losses_and_gradients(
+    stage: tuple[Path, list[Film]],
+) -> None:
     model, asked, batch = small_policy(stage[1], 4)
     found = []
     for context in (nullcontext, fused):
-        with context(), patch.object(torch.nn.functional, "scaled_dot_product_attention", wraps=F.scaled_dot_product_attention) as kernel:
+        with (
+            context(),
+            patch.object(
+                torch.nn.functional,
+                "scaled_dot_product_attention",
+                wraps=F.scaled_dot_product_attention,
+            ) as kernel,
+        ):
             loss, told = policy.losses(model, asked, batch, 2, torch.Generator().manual_seed(0))
-        found.append((kernel.call_count, told, torch.autograd.grad(loss, list(model.parameters()), allow_unused=True)))
+        found.append(
+            (
+                kernel.call_count,
+                told,
+                torch.autograd.grad(loss, list(model.parameters()), allow_unused=True),
+            )
+        )
     (few, slow, eager), (many, fast, kernels) = found
     assert many > few
     assert slow == pytest.approx(fast, rel=1e-5)
@@ -234,7 +378,10 @@ def test_one_batch_can_be_learned_by_heart(stage: tuple[Path, list[Film]]) -> No
         loss.backward()
         optimiser.step()
         told.append(parts)
-    early, late = ({name: np.mean([one[name] for one in part]) for name in told[0]} for part in (told[:5], told[-5:]))
+    early, late = (
+        {name: np.mean([one[name] for one in part]) for name in told[0]}
+        for part in (told[:5], told[-5:])
+    )
     assert late["flow"] < 0.8 * early["flow"]
     assert late["heat"] < 0.8 * early["heat"]
     assert late["where"] < 0.5 * early["where"]

@@ -1,22 +1,25 @@
 """The probe of a policy: every way says or shows what it should, on objects that no film has; its table is kept suite by suite."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from vap_core import suites
-from vap_core.errors import BadPolicy, UnknownName
-from vap_core.policies.lerobot import load
+from vap_core.base.errors import BadPolicy, UnknownName
+from vap_core.policies.lerobot.adapter import load
+from vap_core.policies.protocol import PolicyInput
 from vap_core.prompt import PALETTE
-from vap_core.sim import objects
-from vap_core.training import probe
-from vap_core.training.demonstrations import cast, row
-from vap_core.training.probe import WAYS, Told, conclude, keep
-from vap_core.values import PolicyInput
+from vap_core.rollout.prompters.protocol import PromptContext, SceneTruth
+from vap_core.simulation import suites
+from vap_core.simulation.assets import objects
+from vap_core.training.films.demonstrations import cast, row
+from vap_core.training.policy import probe
+from vap_core.training.policy.probe import WAYS, ProbePrompter, conclude, keep
 
 from .test_soft_prompt import SUITE, grown  # noqa: F401
+from .toys import observation
 
 
 def test_the_ways_differ_in_what_is_shown_and_said() -> None:
@@ -26,19 +29,25 @@ def test_the_ways_differ_in_what_is_shown_and_said() -> None:
     start = row(known, task, names, 0, "base", np.random.default_rng(0))
     rgb, mask = np.full((8, 8, 3), 120, np.uint8), np.zeros((8, 8), bool)
     mask[2:5, 2:5] = True
-    masks, shown = {"front": {start.target: mask}}, {}
+    seen, shown = observation({"front": rgb}), {}
+    context = PromptContext(
+        start.instruction, truth=SceneTruth(start, {"front": {start.target: mask}})
+    )
     for way in WAYS:
-        state, attended = Told(way).start({"front": rgb}, start.instruction, start, masks)
-        ((again, later),) = Told(way).steps([state], [{"front": rgb}], [start], [masks])
+        state, attended = ProbePrompter(way).start(seen, context)
+        ((again, later),) = ProbePrompter(way).steps([state], [seen], [context])
         assert again == state
         assert np.array_equal(later.images["front"], attended.images["front"])
         assert np.array_equal(attended.images["front"][~mask], rgb[~mask])
         assert (attended.images["front"][mask] != rgb[mask]).any() == (way in ("tinted", "painted"))
         shown[way] = attended
     assert shown["plain"].text == "put the camera on the plate"
-    assert any(shown["tinted"].text == f"put the {colour.name} camera on the plate" for colour in PALETTE)
+    assert any(
+        shown["tinted"].text == f"put the {colour.name} camera on the plate" for colour in PALETTE
+    )
     assert shown["tinted"].text == shown["painted"].text != shown["described"].text
-    hidden = Told("tinted").start({"front": rgb}, start.instruction, start, {"front": {}})[1]
+    unseen = replace(context, truth=SceneTruth(start, {"front": {}}))
+    _, hidden = ProbePrompter("tinted").start(seen, unseen)
     assert np.array_equal(hidden.images["front"], rgb)
 
 
@@ -46,12 +55,20 @@ def test_held_out_objects_are_in_no_film() -> None:
     known = suites.suite(SUITE)
     task = known.tasks[0]
     seen = {name for i in range(20) for name in cast(known, task, np.random.default_rng(i))}
-    unseen = {name for i in range(20) for name in cast(known, task, np.random.default_rng(i), held_out=True)}
+    unseen = {
+        name
+        for i in range(20)
+        for name in cast(known, task, np.random.default_rng(i), held_out=True)
+    }
     assert not seen & unseen
-    assert {objects.get(name).split for name in unseen} == {"generic"}
+    assert {objects.get_object(name).split for name in unseen} == {"generic"}
 
 
-def test_a_scene_is_played_in_every_way(grown: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+def test_a_scene_is_played_in_every_way(
+    grown: tuple[Path, Path],  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(probe, "EACH", 1)
     table = pd.DataFrame(probe._scene(str(grown[1]), SUITE, ("tinted", "plain"), None, 0, 0))
     assert table["method"].tolist() == ["tinted", "plain"]
@@ -71,12 +88,19 @@ def test_what_cannot_be_asked_for_is_told_in_a_line(grown: tuple[Path, Path]) ->
     with pytest.raises(UnknownName, match="way 'shouted' is unknown"):
         probe.probe(str(grown[1]), SUITE, ways=("shouted",))
     with pytest.raises(BadPolicy, match="decides on 4 actions at a time; ask for 1 to 4"):
-        load(str(grown[1])).executing(5)
+        load(str(grown[1])).with_execute(5)
 
 
 def test_fewer_actions_of_a_chunk_are_its_first(grown: tuple[Path, Path]) -> None:  # noqa: F811
     policy = load(str(grown[1]))
-    seen = PolicyInput({"front": np.full((224, 224, 3), 90, np.uint8)}, "pick up the red shaver", np.zeros(13, np.float32))
-    chunks = {n: one.plan([one.start(np.random.default_rng(0))], [seen])[1][0] for n, one in ((n, policy.executing(n)) for n in (1, 4))}
+    seen = PolicyInput(
+        {"front": np.full((224, 224, 3), 90, np.uint8)},
+        "pick up the red shaver",
+        np.zeros(13, np.float32),
+    )
+    chunks = {
+        n: one.plan([one.start(np.random.default_rng(0))], [seen])[1][0]
+        for n, one in ((n, policy.with_execute(n)) for n in (1, 4))
+    }
     assert np.array_equal(chunks[1], chunks[4][:1])
     assert policy.execute == 4

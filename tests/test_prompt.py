@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from vap_core.errors import BadInstruction
-from vap_core.prompt import PALETTE, choose_colours, looks_like, tint
+from vap_core.base.errors import BadInstruction
+from vap_core.prompt import PALETTE, choose_colours, has_colour, tint
 
 RED = PALETTE[0]
 images = arrays(np.uint8, (7, 9, 3))
@@ -15,7 +15,9 @@ masks = arrays(bool, (7, 9))
 
 
 @given(images, masks, st.floats(0, 1))
-def test_outside_is_bit_identical_and_inside_is_the_blend(rgb: np.ndarray, mask: np.ndarray, alpha: float) -> None:
+def test_outside_is_bit_identical_and_inside_is_the_blend(
+    rgb: np.ndarray, mask: np.ndarray, alpha: float
+) -> None:
     before = rgb.copy()
     out = tint(rgb, mask, RED, alpha)
     assert (out[~mask] == rgb[~mask]).all()
@@ -35,7 +37,9 @@ def test_alpha_zero_is_identity(rgb: np.ndarray, mask: np.ndarray) -> None:
 
 @given(images, masks)
 def test_commutes_with_mirroring(rgb: np.ndarray, mask: np.ndarray) -> None:
-    assert (tint(rgb[:, ::-1].copy(), mask[:, ::-1].copy(), RED) == tint(rgb, mask, RED)[:, ::-1]).all()
+    assert (
+        tint(rgb[:, ::-1].copy(), mask[:, ::-1].copy(), RED) == tint(rgb, mask, RED)[:, ::-1]
+    ).all()
 
 
 def test_sizes_and_opacity_are_checked() -> None:
@@ -49,12 +53,12 @@ def test_sizes_and_opacity_are_checked() -> None:
 @pytest.mark.parametrize("colour", PALETTE, ids=lambda c: c.name)
 def test_every_colour_looks_like_itself_alone_even_tinted_over_grey(colour: object) -> None:
     tinted = tint(np.full((2, 2, 3), 128, np.uint8), np.ones((2, 2), bool), colour)  # type: ignore[arg-type]
-    assert [c.name for c in PALETTE if looks_like(tinted, c).all()] == [colour.name]  # type: ignore[attr-defined]
+    assert [c.name for c in PALETTE if has_colour(tinted, c).all()] == [colour.name]  # type: ignore[attr-defined]
 
 
 def test_nobody_calls_grey_a_colour() -> None:
     grey = np.repeat(np.arange(256, dtype=np.uint8)[:, None], 3, axis=1)
-    assert not any(looks_like(grey, colour).any() for colour in PALETTE)
+    assert not any(has_colour(grey, colour).any() for colour in PALETTE)
 
 
 def test_a_colour_in_view_is_not_chosen() -> None:
@@ -75,6 +79,9 @@ def test_several_targets_get_different_colours() -> None:
 
 
 def test_when_every_colour_is_taken_the_least_present_is_used() -> None:
-    rgb = np.concatenate([np.full((1, 100 + 10 * i, 3), c.rgb, np.uint8) for i, c in enumerate(reversed(PALETTE))], axis=1)
+    rgb = np.concatenate(
+        [np.full((1, 100 + 10 * i, 3), c.rgb, np.uint8) for i, c in enumerate(reversed(PALETTE))],
+        axis=1,
+    )
     chosen = choose_colours(1, [(rgb, [np.ones(rgb.shape[:2], bool)])])
     assert chosen[0].name == PALETTE[-1].name

@@ -6,28 +6,51 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from vap_core.errors import BadOutput
-from vap_core.publish import publish
-from vap_core.store import KEY, append, open_run
+from vap_core.base.errors import BadOutput
+from vap_core.evaluation.publish import publish
+from vap_core.evaluation.store import KEY, append, open_run
 
-ROW = {"suite": "widowx-pick", "task": "pick-cup", "method": "generic", "policy": "scripted", "attempt": 1, "success": True}
+ROW = {
+    "suite": "widowx-pick",
+    "task": "pick-cup",
+    "method": "generic",
+    "policy": "scripted",
+    "attempt": 1,
+    "success": True,
+}
 
 
 def run(folder: Path, seed: int, episodes: int = 2, done: int = 2) -> Path:
-    study = {"tasks": [["widowx-pick", "pick-cup"]], "methods": ["generic"], "episodes": episodes, "seed": seed, "seeds": 1}
+    study = {
+        "tasks": [["widowx-pick", "pick-cup"]],
+        "methods": ["generic"],
+        "episodes": episodes,
+        "seed": seed,
+        "seeds": 1,
+    }
     open_run(folder, study)
-    append(folder, [{**ROW, "episode": i, "seed": seed, "detail": "Traceback ...", "seconds_ik": 0.1} for i in range(done)])
+    append(
+        folder,
+        [
+            {**ROW, "episode": i, "seed": seed, "detail": "Traceback ...", "seconds_ik": 0.1}
+            for i in range(done)
+        ],
+    )
     return folder
 
 
-def test_published_results_keep_their_configurations_and_leave_tracebacks_behind(tmp_path: Path) -> None:
+def test_published_results_keep_their_configurations_and_leave_tracebacks_behind(
+    tmp_path: Path,
+) -> None:
     target = tmp_path / "results" / "both.parquet"
     assert publish([run(tmp_path / "one", 0), run(tmp_path / "two", 1)], target) == 4
     table = pq.read_table(target)
     assert set(table.column_names) == {*KEY, "policy", "attempt", "success", "configuration"}
     notes = json.loads(table.schema.metadata[b"runs"])
     assert [note["configuration"]["seed"] for note in notes] == [0, 1]
-    assert sorted(set(table["configuration"].to_pylist())) == sorted(note["digest"] for note in notes)
+    assert sorted(set(table["configuration"].to_pylist())) == sorted(
+        note["digest"] for note in notes
+    )
 
 
 def test_what_is_there_is_left_alone(tmp_path: Path) -> None:
@@ -45,7 +68,9 @@ def test_what_is_there_is_left_alone(tmp_path: Path) -> None:
 
 def test_only_finished_runs_and_each_once(tmp_path: Path) -> None:
     whole, half = run(tmp_path / "one", 0), run(tmp_path / "half", 1, episodes=5, done=3)
-    with pytest.raises(BadOutput, match="half holds 3 of 5 episodes; run the same command again to finish it"):
+    with pytest.raises(
+        BadOutput, match="half holds 3 of 5 episodes; run the same command again to finish it"
+    ):
         publish([half], tmp_path / "t.parquet")
     with pytest.raises(BadOutput, match="hold the same episodes; name each run once"):
         publish([whole, whole], tmp_path / "t.parquet")

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from vap_core.diagnosis import listed
-from vap_core.report.failures import breakdown
-from vap_core.report.results import results
-from vap_core.report.runs import load
-from vap_core.statistics import ALL_TASKS
+from vap_core.evaluation.diagnosis.failures import list_failures
+from vap_core.evaluation.report.failures import breakdown
+from vap_core.evaluation.report.results import results
+from vap_core.evaluation.report.runs import load
+from vap_core.evaluation.statistics import ALL_TASKS
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()
@@ -19,11 +19,16 @@ RESULTS = ROOT / "data" / "results"
 def rows(heading: str) -> list[list[str]]:
     """The cells of the table that begins so, header first."""
     table = README[README.index(heading) :].split("\n\n")[0].splitlines()
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in (table[0], *table[2:])]
+    return [
+        [cell.strip() for cell in line.strip("|").split("|")] for line in (table[0], *table[2:])
+    ]
 
 
 def test_success_rates() -> None:
-    (head, *body), whole = rows("| method | simpler-fractal"), results(load([RESULTS / "mini_pi0.parquet"]))
+    (head, *body), whole = (
+        rows("| method | simpler-fractal"),
+        results(load([RESULTS / "mini_pi0.parquet"])),
+    )
     whole = whole[whole.task == ALL_TASKS]
     quoted = {}
     for method, *cells in body:
@@ -32,18 +37,27 @@ def test_success_rates() -> None:
     held = {}
     for line in whole.itertuples():
         track = ", ".join(filter(None, (line.suite, line.split, f"n = {line.n} of {line.listed}")))
-        held[line.method, track] = f"{line.sr:.0f} [{line.sr_low:.0f}, {line.sr_high:.0f}]"
+        held[line.method, track] = (
+            f"{100 * line.sr:.0f} [{100 * line.sr_low:.0f}, {100 * line.sr_high:.0f}]"
+        )
     assert quoted == held
     vap = whole[(whole.method == "vap") & (whole.suite == "simpler-fractal")]
-    over = [f"[{line.sr_layout_low:.0f}, {line.sr_layout_high:.0f}]" for line in vap.itertuples()]
+    over = [
+        f"[{100 * line.sr_layout_low:.0f}, {100 * line.sr_layout_high:.0f}]"
+        for line in vap.itertuples()
+    ]
     assert f"its VAP lies in {' and '.join(over)}" in README
 
 
 @pytest.mark.parametrize("suite", ["simpler-fractal", "simpler-bridge", "vlabench", "tabletop"])
 def test_cases_of_failure(suite: str) -> None:
-    counts = breakdown(listed(RESULTS / "mini_pi0.parquet", suite=suite, method="vap").whole).iloc[0]
+    counts = breakdown(
+        list_failures(RESULTS / "mini_pi0.parquet", suite=suite, method="vap").episodes
+    ).iloc[0]
     text = " ".join(README[README.index("VAP's failures, by case") :].split())
     quoted = re.search(rf"{suite} (\d+), (\d+) and (\d+) % \((\d+) of (\d+)", text)
-    shares = [f"{100 * counts[case] / counts.failed:.0f}" for case in ("case 1", "case 2", "case 3")]
+    shares = [
+        f"{100 * counts[case] / counts.failed:.0f}" for case in ("case 1", "case 2", "case 3")
+    ]
     assert quoted is not None
     assert quoted.groups() == (*shares, str(counts.failed), str(counts.n))

@@ -12,56 +12,124 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.drawn import ROW, SIDE, SUCCESS, K, columns, draw, entities, frame, opening, record, rerun
-from vap_core.errors import MissingGL
-from vap_core.record import Recorder, read_summary, record_grounding, recording_name, screenshot
-from vap_core.record.blueprint import evidence_line
-from vap_core.record.evidence import apart, classes, label_spots
-from vap_core.values import Association, Frame, Opening, PersonalObject, Track
+from tests.drawn import (
+    ROW,
+    SIDE,
+    SUCCESS,
+    K,
+    columns,
+    draw,
+    entities,
+    frame,
+    opening,
+    record,
+    rerun,
+)
+from vap_core.base.errors import MissingGL
+from vap_core.base.types import Association, PersonalObject, Track
+from vap_core.evaluation.diagnosis import explain
+from vap_core.recording import Recorder, read_summary, record_grounding, recording_name, screenshot
+from vap_core.recording.entities.labels import are_disjoint, place_labels
+from vap_core.recording.entities.masks import class_image
+from vap_core.recording.texts import describe_vote
+from vap_core.rollout.types import EpisodeHeader, Frame
 
 
 def test_rerun_loads_only_when_a_recording_is_asked_for() -> None:
-    subprocess.run([sys.executable, "-c", "import vap_core, vap_core.values, sys; assert 'rerun' not in sys.modules"], check=True)
+    subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "import vap_core, vap_core.base.types, sys; assert 'rerun' not in sys.modules",
+        ],
+        check=True,
+    )
 
 
-def test_every_entity_has_its_promised_name(three: tuple[Path, Opening, list[Frame]]) -> None:
+def test_every_entity_has_its_promised_name(three: tuple[Path, EpisodeHeader, list[Frame]]) -> None:
     views = [
         f"/observation.images.{cam}{tail}"
         for cam in ("front", "side", "wrist")
         for tail in ("", "/prompted", "/candidates", "/mask/target", "/mask/gt")
     ]
-    votes = [f"/vap/{part}/{cam}" for cam in ("front", "side", "wrist") for part in ("votes", "candidates", "vote_margin", "track_score")]
-    plain = ["/observation.state", "/action", "/next.reward", "/next.success", "/vap/instruction", "/vap/events"]
-    status = ["/vap/status/outcome", "/vap/status/grasp", "/__properties/rollout", "/__properties/outcome"]
-    world = ["/world/table", "/world/robot/link0", "/world/robot/link_finger1", "/world/objects/owl_a", "/world/objects/owl_c"]
+    votes = [
+        f"/vap/{part}/{cam}"
+        for cam in ("front", "side", "wrist")
+        for part in ("votes", "candidates", "vote_margin", "track_score")
+    ]
+    plain = [
+        "/observation.state",
+        "/action",
+        "/next.reward",
+        "/next.success",
+        "/vap/instruction",
+        "/vap/events",
+    ]
+    status = [
+        "/vap/status/outcome",
+        "/vap/status/grasp",
+        "/__properties/rollout",
+        "/__properties/outcome",
+    ]
+    world = [
+        "/world/table",
+        "/world/robot/link0",
+        "/world/robot/link_finger1",
+        "/world/objects/owl_a",
+        "/world/objects/owl_c",
+    ]
     assert {*views, *votes, *plain, *status, *world} <= entities(three[0])
 
 
-def test_numbers_come_back_at_their_step(three: tuple[Path, Opening, list[Frame]]) -> None:
+def test_numbers_come_back_at_their_step(three: tuple[Path, EpisodeHeader, list[Frame]]) -> None:
     path, start, frames = three
-    assert columns(path, "/vap/vote_margin/side", "Scalars:scalars") == {step: [0.6] for step in range(12)}
-    assert columns(path, "/next.success", "Scalars:scalars") == {step: [float(step == 11)] for step in range(12)}
-    assert columns(path, "/vap/votes/front", "counts") == {0: start.groundings["front"][0].votes.tolist()}
+    assert columns(path, "/vap/vote_margin/side", "Scalars:scalars") == {
+        step: [0.6] for step in range(12)
+    }
+    assert columns(path, "/next.success", "Scalars:scalars") == {
+        step: [float(step == 11)] for step in range(12)
+    }
+    assert columns(path, "/vap/votes/front", "counts") == {
+        0: start.groundings["front"][0].ballot.votes.tolist()
+    }
     similarity = columns(path, "/vap/candidates/front", "similarity")[0]
-    np.testing.assert_allclose(np.reshape(similarity, (3, K)), start.groundings["front"][0].similarity)  # type: ignore[arg-type]
+    np.testing.assert_allclose(
+        np.reshape(similarity, (3, K)), start.groundings["front"][0].similarity
+    )
     actions = columns(path, "/action", "Scalars:scalars")
-    np.testing.assert_allclose(np.array([actions[step] for step in range(12)]), np.stack([f.action for f in frames]))
+    np.testing.assert_allclose(
+        np.array([actions[step] for step in range(12)]), np.stack([f.action for f in frames])
+    )
     lift = columns(path, "/world/objects/owl_b", "Transform3D:translation")[3]
     np.testing.assert_allclose(lift, [frames[3].truth.objects_world["owl_b"][:3]], atol=1e-6)
 
 
-def test_pictures_and_masks_come_back_at_their_step(three: tuple[Path, Opening, list[Frame]]) -> None:
+def test_pictures_and_masks_come_back_at_their_step(
+    three: tuple[Path, EpisodeHeader, list[Frame]],
+) -> None:
     path, _, frames = three
     for entity, views in (("", frames[7].images), ("/prompted", frames[7].prompted)):
         blob = columns(path, f"/observation.images.wrist{entity}", "EncodedImage:blob")[7]
-        decoded = cv2.cvtColor(cv2.imdecode(np.frombuffer(bytes(blob[0]), np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)  # type: ignore[index]
+        decoded = cv2.cvtColor(
+            cv2.imdecode(np.frombuffer(bytes(blob[0]), np.uint8), cv2.IMREAD_COLOR),
+            cv2.COLOR_BGR2RGB,
+        )
         assert np.abs(decoded.astype(int) - views["wrist"]).mean() < 4
-    for tail, mask in (("target", frames[7].tracks["wrist"][0].mask), ("gt", frames[7].truth.masks["wrist"]["owl_a"])):
-        buffer = columns(path, f"/observation.images.wrist/mask/{tail}", "SegmentationImage:buffer")[7]
-        np.testing.assert_array_equal(np.frombuffer(bytes(buffer[0]), np.uint8).reshape(SIDE, SIDE) > 0, mask)  # type: ignore[index]
+    for tail, mask in (
+        ("target", frames[7].tracks["wrist"][0].mask),
+        ("gt", frames[7].truth.masks["wrist"]["owl_a"]),
+    ):
+        buffer = columns(
+            path, f"/observation.images.wrist/mask/{tail}", "SegmentationImage:buffer"
+        )[7]
+        np.testing.assert_array_equal(
+            np.frombuffer(bytes(buffer[0]), np.uint8).reshape(SIDE, SIDE) > 0, mask
+        )
 
 
-def test_the_catalog_server_sees_properties_and_columns(three: tuple[Path, Opening, list[Frame]]) -> None:
+def test_the_catalog_server_sees_properties_and_columns(
+    three: tuple[Path, EpisodeHeader, list[Frame]],
+) -> None:
     import rerun as rr
 
     with rr.server.Server(host="127.0.0.1", datasets={"r": [three[0]]}) as server:
@@ -69,23 +137,34 @@ def test_the_catalog_server_sees_properties_and_columns(three: tuple[Path, Openi
         table = dataset.segment_table().to_pandas()
         assert table["property:rollout:task"][0][0] == "pick-owl"
         assert bool(table["property:outcome:success"][0][0])
-        margins = dataset.filter_contents(["/vap/vote_margin/**"]).reader(index="frame_index").to_pandas()
+        margins = (
+            dataset.filter_contents(["/vap/vote_margin/**"]).reader(index="frame_index").to_pandas()
+        )
         assert len(margins) == 12
 
 
-def test_summary_tells_what_ran_and_how_it_ended(three: tuple[Path, Opening, list[Frame]]) -> None:
+def test_summary_tells_what_ran_and_how_it_ended(
+    three: tuple[Path, EpisodeHeader, list[Frame]],
+) -> None:
     summary = read_summary(three[0])
-    expected = {"rollout.suite": "tabletop", "rollout.method": "vap", "rollout.seed": 7, "outcome.success": True, "outcome.length": 12, "frames": 12}
+    expected = {
+        "suite": "tabletop",
+        "method": "vap",
+        "seed": 7,
+        "success": True,
+        "steps": 12,
+        "frames": 12,
+    }
     assert {name: summary[name] for name in expected} == expected
-    assert summary["rollout.git"]
+    assert summary["git"]
 
 
 def test_what_is_undefined_is_none_in_the_summary(tmp_path: Path) -> None:
     start = opening(1)
-    with Recorder(tmp_path / "one.rrd", start) as recorder:
+    with Recorder(tmp_path / "one.rrd", start, explain=explain) as recorder:
         recorder.frame(frame(0, start))
         recorder.close(replace(SUCCESS, cmr=None))
-    assert read_summary(tmp_path / "one.rrd").get("outcome.cmr") is None, "a selection has none"
+    assert read_summary(tmp_path / "one.rrd").get("cmr") is None, "a selection has none"
 
 
 def test_a_recording_has_a_safe_name_of_its_own() -> None:
@@ -107,7 +186,9 @@ def test_a_view_without_candidates_and_a_lost_track_are_results(tmp_path: Path) 
     assert columns(tmp_path / "one.rrd", "/vap/votes/side", "counts") == {}
     assert columns(tmp_path / "one.rrd", "/vap/candidates/side", "winner") == {0: [-1]}
     assert columns(tmp_path / "one.rrd", "/vap/candidates/side", "winner") == {0: [-1]}
-    buffers = columns(tmp_path / "one.rrd", "/observation.images.front/mask/target", "SegmentationImage:buffer")
+    buffers = columns(
+        tmp_path / "one.rrd", "/observation.images.front/mask/target", "SegmentationImage:buffer"
+    )
     assert [step for step, buffer in buffers.items() if not np.any(buffer)] == [4, 5, 6]
 
 
@@ -116,36 +197,63 @@ def test_what_the_views_agreed_on_can_be_read_back(tmp_path: Path) -> None:
     start = opening(2)
     front, side = (start.groundings[cam][0] for cam in ("front", "side"))
     support = {"front": np.array([0.5, 3.25, -1.0, 0.0]), "side": np.array([1.0, 2.0, -1.0, 3.25])}
-    agreed = Association({"front": 1, "side": None}, 3.25, 1.25, {"references": 2.0, "geometry": 1.25}, support)
-    groundings = {"front": (replace(front, winner=1, overruled=0),), "side": (replace(side, winner=None, overruled=0),)}
+    agreed = Association(
+        {"front": 1, "side": None}, 3.25, 1.25, {"references": 2.0, "geometry": 1.25}, support
+    )
+    groundings = {
+        "front": (replace(front, winner=1),),
+        "side": (replace(side, winner=None),),
+    }
     record(tmp_path / "one.rrd", replace(start, groundings=groundings, associations=(agreed, None)))
     for cam, winner in (("front", 1), ("side", -1)):
-        read = {name: columns(tmp_path / "one.rrd", f"/vap/candidates/{cam}", name) for name in ("winner", "elected")}
+        read = {
+            name: columns(tmp_path / "one.rrd", f"/vap/candidates/{cam}", name)
+            for name in ("winner", "elected")
+        }
         assert read == {"winner": {0: [winner]}, "elected": {0: [0]}}
-    numbers = {name: columns(tmp_path / "one.rrd", "/vap/association", name)[0] for name in ("chosen", "total", "margin", "scores", "support_side")}
-    assert numbers == {"chosen": [1, -1], "total": [3.25], "margin": [1.25], "scores": [2.0, 1.25], "support_side": [1.0, 2.0, -1.0, 3.25]}
+    numbers = {
+        name: columns(tmp_path / "one.rrd", "/vap/association", name)[0]
+        for name in ("chosen", "total", "margin", "scores", "support_side")
+    }
+    assert numbers == {
+        "chosen": [1, -1],
+        "total": [3.25],
+        "margin": [1.25],
+        "scores": [2.0, 1.25],
+        "support_side": [1.0, 2.0, -1.0, 3.25],
+    }
     assert columns(tmp_path / "one.rrd", "/vap/association", "cameras")[0] == ["front", "side"]
-    assert evidence_line(groundings["front"][0]).startswith("#1 by association · #0 wins 4/5")
-    assert evidence_line(groundings["side"][0]).startswith("none by association · #0 wins 4/5")
+    assert describe_vote(groundings["front"][0]).startswith(
+        "#1 by association · #0 wins: votes 4 of 5, cosine lead +0.12"
+    )
+    assert describe_vote(groundings["side"][0]).startswith(
+        "none by association · #0 wins: votes 4 of 5, cosine lead +0.12"
+    )
     assert "/vap/votes/side/winner" not in entities(tmp_path / "one.rrd")
     assert rerun("rrd", "verify", tmp_path / "one.rrd").returncode == 0
 
 
 def test_a_method_that_grounds_nothing_records_too(tmp_path: Path) -> None:
     start = replace(opening(1), method="generic", groundings={}, rewritten=ROW.instruction)
-    with Recorder(tmp_path / "one.rrd", start) as recorder:
+    with Recorder(tmp_path / "one.rrd", start, explain=explain) as recorder:
         recorder.frame(replace(frame(0, opening(1)), tracks={}))
         recorder.close(replace(SUCCESS, status="failure", success=False, steps=1))
     summary = read_summary(tmp_path / "one.rrd")
-    assert (summary["outcome.failure_case"], summary["outcome.sub_case"], summary["outcome.deciding_frame"]) == ("unprompted", "timeout", 0)
+    assert (
+        summary["case"],
+        summary["sub_case"],
+        summary["deciding_frame"],
+    ) == ("unprompted", "timeout", 0)
     assert "/vap/vote_margin/front" not in entities(tmp_path / "one.rrd")
 
 
 def test_an_episode_that_fails_before_its_first_step_records_its_error(tmp_path: Path) -> None:
-    with Recorder(tmp_path / "one.rrd", opening(1)) as recorder:
-        recorder.close(replace(SUCCESS, status="error", success=False, steps=0, detail="no grasp pose"))
+    with Recorder(tmp_path / "one.rrd", opening(1), explain=explain) as recorder:
+        recorder.close(
+            replace(SUCCESS, status="error", success=False, steps=0, detail="no grasp pose")
+        )
     summary = read_summary(tmp_path / "one.rrd")
-    assert (summary["frames"], summary["outcome.detail"]) == (0, "no grasp pose")
+    assert (summary["frames"], summary["detail"]) == (0, "no grasp pose")
     assert rerun("rrd", "verify", tmp_path / "one.rrd").returncode == 0
 
 
@@ -153,9 +261,16 @@ def test_a_second_target_wears_a_suffix(tmp_path: Path) -> None:
     start = opening(1)
     second = replace(start.groundings["front"][0], object="owl_b", winner=1)
     start = replace(start, groundings={"front": (start.groundings["front"][0], second)})
-    with Recorder(tmp_path / "one.rrd", start) as recorder:
+    with Recorder(tmp_path / "one.rrd", start, explain=explain) as recorder:
         one = frame(0, start)
-        recorder.frame(replace(one, tracks={"front": (*one.tracks["front"], Track(one.truth.masks["front"]["owl_b"], 0.7))}))
+        recorder.frame(
+            replace(
+                one,
+                tracks={
+                    "front": (*one.tracks["front"], Track(one.truth.masks["front"]["owl_b"], 0.7))
+                },
+            )
+        )
         recorder.close(SUCCESS)
     names = {
         "/vap/votes/front_1",
@@ -181,19 +296,23 @@ def test_equal_episodes_give_equal_recordings(tmp_path: Path) -> None:
 @settings(max_examples=60, deadline=None)
 def test_labels_never_overlap(corners: list[tuple[int, int]]) -> None:
     xyxy = np.array([[x, y, x + 20, y + 20] for x, y in corners], np.float32)
-    labels = [f"#{i} v1" for i in range(len(corners) - 1)] + ["#7 0.71 · votes 4/5 · cos 0.80"]
-    spots = label_spots(xyxy, labels, (SIDE, SIDE))
+    labels = [f"#{i} v1" for i in range(len(corners) - 1)] + ["#7 0.71 · votes 4 of 5 · cos 0.80"]
+    spots = place_labels(xyxy, labels, (SIDE, SIDE))
     unit = SIDE / 170
     wide = {i: (6.6 * len(labels[i]) + 12) * unit for i in spots}
     rects = [(x - wide[i] / 2, y, x + wide[i] / 2, y + 21 * unit) for i, (x, y) in spots.items()]
     assert len(labels) - 1 in spots
-    assert all(apart(a, (b[0] + 1e-6, b[1] + 1e-6, b[2] - 1e-6, b[3] - 1e-6)) for i, a in enumerate(rects) for b in rects[:i])
+    assert all(
+        are_disjoint(a, (b[0] + 1e-6, b[1] + 1e-6, b[2] - 1e-6, b[3] - 1e-6))
+        for i, a in enumerate(rects)
+        for b in rects[:i]
+    )
 
 
 def test_class_image_marks_inside_and_rim() -> None:
     mask = np.zeros((9, 9), bool)
     mask[2:7, 2:7] = True
-    image = classes(mask, 3, 1)
+    image = class_image(mask, 3, 1)
     assert (image[3:6, 3:6] == 3).all()
     assert (image > 0).sum() == 25
     assert (image == 4).sum() == 16
@@ -203,18 +322,31 @@ def test_a_grounding_alone_records(tmp_path: Path) -> None:
     start = opening(1)
     image, masks = draw(start.cameras[0], 0)
     z = np.eye(K, 16, dtype=np.float32)
-    owl = PersonalObject("owl_a", "owl", z, tuple(image[90:150, 60 + k : 120 + k].copy() for k in range(K)), "test")
+    owl = PersonalObject(
+        "owl_a", "owl", z, tuple(image[90:150, 60 + k : 120 + k].copy() for k in range(K)), "test"
+    )
     record_grounding(
-        tmp_path / "g.rrd", image, start.groundings["front"][0], owl, ROW.instruction, start.rewritten, frame(0, start).prompted["front"]
+        tmp_path / "g.rrd",
+        image,
+        start.groundings["front"][0],
+        owl,
+        ROW.instruction,
+        start.rewritten,
+        frame(0, start).prompted["front"],
     )
     assert rerun("rrd", "verify", tmp_path / "g.rrd").returncode == 0
-    assert {"/vap/references", "/vap/similarity/front", "/observation.images.front/prompted", "/observation.images.front/mask/target"} <= entities(
-        tmp_path / "g.rrd"
-    )
+    assert {
+        "/vap/references",
+        "/vap/similarity/front",
+        "/observation.images.front/prompted",
+        "/observation.images.front/mask/target",
+    } <= entities(tmp_path / "g.rrd")
     assert masks
 
 
-def test_screenshot_draws_the_recording(tmp_path: Path, three: tuple[Path, Opening, list[Frame]]) -> None:
+def test_screenshot_draws_the_recording(
+    tmp_path: Path, three: tuple[Path, EpisodeHeader, list[Frame]]
+) -> None:
     try:
         screenshot(three[0], tmp_path / "one.png", frame_index=6, size=(800, 500))
     except MissingGL:
@@ -225,7 +357,7 @@ def test_screenshot_draws_the_recording(tmp_path: Path, three: tuple[Path, Openi
 
 
 def test_screenshot_without_a_driver_names_the_package(
-    tmp_path: Path, three: tuple[Path, Opening, list[Frame]], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, three: tuple[Path, EpisodeHeader, list[Frame]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("VK_DRIVER_FILES", "/nonexistent.json")
     monkeypatch.setenv("VK_ICD_FILENAMES", "/nonexistent.json")

@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 
 from tests.drawn import SUCCESS, frame, opening, record, rerun
-from vap_core.errors import BadOutput, BadRecording
-from vap_core.record import Recorder, read_summary, recover
-from vap_core.record.evidence import jpeg
-from vap_core.record.file import temporary
-from vap_core.values import Frame, Opening
+from vap_core.base.errors import BadOutput, BadRecording
+from vap_core.evaluation.diagnosis import explain
+from vap_core.recording import Recorder, read_summary, recover
+from vap_core.recording.entities.images import encode_jpeg
+from vap_core.recording.file import temporary_path
+from vap_core.rollout.types import EpisodeHeader, Frame
 
 
 def test_a_killed_episode_keeps_all_flushed_steps(tmp_path: Path) -> None:
@@ -34,10 +35,14 @@ def test_a_killed_episode_keeps_all_flushed_steps(tmp_path: Path) -> None:
     assert done.returncode == -signal.SIGKILL
     assert [p.name for p in tmp_path.iterdir()] == [".killed.rrd.tmp"]
     with pytest.raises(BadRecording, match="rerun rrd optimize"):
-        read_summary(temporary(path))
-    assert recover(temporary(path)) == path
+        read_summary(temporary_path(path))
+    assert recover(temporary_path(path)) == path
     summary = read_summary(path)
-    assert (summary["frames"], summary["rollout.task"], "outcome.status" in summary) == (10, "pick-owl", False)
+    assert (summary["frames"], summary["task"], "outcome" in summary) == (
+        10,
+        "pick-owl",
+        False,
+    )
     assert rerun("rrd", "verify", path).returncode == 0
     assert [p.name for p in tmp_path.iterdir()] == ["killed.rrd"]
 
@@ -57,14 +62,17 @@ def test_an_exception_keeps_every_step_under_the_temporary_name(tmp_path: Path) 
 def test_a_process_that_records_much_keeps_neither_threads_nor_memory(tmp_path: Path) -> None:
     def held() -> tuple[int, float]:
         told = Path("/proc/self/status").read_text()
-        threads, kilobytes = (int(re.search(rf"^{name}:\s*(\d+)", told, re.MULTILINE)[1]) for name in ("Threads", "VmRSS"))  # type: ignore[index]
+        threads, kilobytes = (
+            int(re.search(rf"^{name}:\s*(\d+)", told, re.MULTILINE)[1])
+            for name in ("Threads", "VmRSS")
+        )
         return threads, kilobytes / 1024
 
     start = opening(3)
     frames = [frame(step, start) for step in range(6)]
     after = []
     for n in range(24):
-        with Recorder(tmp_path / f"{n}.rrd", start) as recorder:
+        with Recorder(tmp_path / f"{n}.rrd", start, explain=explain) as recorder:
             for one in frames:
                 recorder.frame(one)
             recorder.close(replace(SUCCESS, status="failure", success=False) if n % 2 else SUCCESS)
@@ -84,10 +92,10 @@ def test_sixty_steps_of_three_cameras_stay_small_and_quick(tmp_path: Path) -> No
     def encodes(n: int) -> None:
         for one in frames:
             for picture in (*one.images.values(), *one.prompted.values()):
-                jpeg(picture, 85)
+                encode_jpeg(picture, 85)
 
     def records(n: int) -> None:
-        recorder = Recorder(tmp_path / f"{n}.rrd", start)
+        recorder = Recorder(tmp_path / f"{n}.rrd", start, explain=explain)
         for one in frames:
             recorder.frame(one)
         recorder.close(SUCCESS)
@@ -102,7 +110,9 @@ def test_sixty_steps_of_three_cameras_stay_small_and_quick(tmp_path: Path) -> No
     assert np.median(ratios) < 10, ratios
 
 
-def test_nothing_is_ever_overwritten(tmp_path: Path, three: tuple[Path, Opening, list[Frame]]) -> None:
+def test_nothing_is_ever_overwritten(
+    tmp_path: Path, three: tuple[Path, EpisodeHeader, list[Frame]]
+) -> None:
     (tmp_path / "one.rrd").write_bytes(b"precious")
     with pytest.raises(BadOutput, match="never overwritten; choose another"):
         Recorder(tmp_path / "one.rrd", three[1])
@@ -121,9 +131,15 @@ def test_a_folder_that_cannot_be_written_says_so(tmp_path: Path) -> None:
         Recorder(tmp_path / "file" / "one.rrd", opening(1))
 
 
-def test_a_damaged_recording_says_how_to_mend_it(tmp_path: Path, three: tuple[Path, Opening, list[Frame]]) -> None:
+def test_a_damaged_recording_says_how_to_mend_it(
+    tmp_path: Path, three: tuple[Path, EpisodeHeader, list[Frame]]
+) -> None:
     whole = three[0].read_bytes()
-    for name, data in (("noise", b"noise" * 99), ("half", whole[: len(whole) // 2]), ("empty", b"")):
+    for name, data in (
+        ("noise", b"noise" * 99),
+        ("half", whole[: len(whole) // 2]),
+        ("empty", b""),
+    ):
         (tmp_path / f"{name}.rrd").write_bytes(data)
         with pytest.raises(BadRecording, match="rerun rrd optimize") as caught:
             read_summary(tmp_path / f"{name}.rrd")

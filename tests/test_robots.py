@@ -7,18 +7,37 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vap_core.errors import OutOfReach, UnknownName
-from vap_core.sim import robots
-from vap_core.sim.control import Command, Limits, arm, follow, rotation, rotation_vector
-from vap_core.sim.gl import REMEDY, ensure_gl
-from vap_core.sim.robots import ROBOTS
+from vap_core.base.errors import OutOfReach, UnknownName
+from vap_core.simulation import robots
+from vap_core.simulation.control import (
+    MotionLimits,
+    Setpoint,
+    arm,
+    follow,
+    rotation,
+    rotation_vector,
+)
+from vap_core.simulation.gl import REMEDY, ensure_gl
+from vap_core.simulation.robots import ROBOTS
 
 ensure_gl()
 import mujoco  # noqa: E402
 
 PEERS = {
-    "wx250s": ("trossen_wx250s", "wx250s.xml", "wx250s/gripper_link", "gripper_link", ("left_finger", "right_finger")),
-    "panda": ("franka_emika_panda", "panda.xml", "hand", "hand", ("finger_joint1", "finger_joint2")),
+    "wx250s": (
+        "trossen_wx250s",
+        "wx250s.xml",
+        "wx250s/gripper_link",
+        "gripper_link",
+        ("left_finger", "right_finger"),
+    ),
+    "panda": (
+        "franka_emika_panda",
+        "panda.xml",
+        "hand",
+        "hand",
+        ("finger_joint1", "finger_joint2"),
+    ),
 }
 
 
@@ -76,7 +95,9 @@ def test_opening_and_palm_are_what_the_registry_says(robot):
     tcp, axes = data.site("tcp").xpos, data.site("tcp").xmat.reshape(3, 3)
     pads = {side: (data.geom(f"{side}_pad").xpos - tcp) @ axes for side in ("left", "right")}
     half = model.geom("left_pad").size[1]
-    assert abs(pads["left"][1] - pads["right"][1]) - 2 * half == pytest.approx(robot.opening_m, abs=5e-4)
+    assert abs(pads["left"][1] - pads["right"][1]) - 2 * half == pytest.approx(
+        robot.opening_m, abs=5e-4
+    )
     assert pads["left"][1] == pytest.approx(-pads["right"][1], abs=1e-6)
     assert all(abs(pad[2]) < 0.02 for pad in pads.values())
 
@@ -107,7 +128,7 @@ def test_unreachable_pose_is_an_error_that_says_so(robot):
 
 def test_unreachable_action_gives_a_bounded_step_and_never_runs_away(robot):
     solver, seconds = arm(robot.name), 1 / robot.hz
-    command = Command(solver.forward(robot.home), robot.home, 1.0)
+    command = Setpoint(solver.forward(robot.home), robot.home, 1.0)
     outward = np.array([9.0, 0, 0, 0, 0, 0, 1], np.float32)
     for _ in range(40):
         after = follow(solver, command, solver.forward(command.joints), outward, seconds)
@@ -119,33 +140,44 @@ def test_unreachable_action_gives_a_bounded_step_and_never_runs_away(robot):
 def test_command_never_leads_an_arm_that_is_held_up_by_more_than_the_leash(robot):
     solver, seconds = arm(robot.name), 1 / robot.hz
     stuck = solver.forward(robot.home)
-    command = Command(stuck, robot.home, 1.0)
+    command = Setpoint(stuck, robot.home, 1.0)
     for _ in range(30):
-        command = follow(solver, command, stuck, np.array([0, 0, -0.02, 0, 0, 0.2, 1], np.float32), seconds)
+        command = follow(
+            solver, command, stuck, np.array([0, 0, -0.02, 0, 0, 0.2, 1], np.float32), seconds
+        )
         assert np.linalg.norm(command.tcp_base[:3, 3] - stuck[:3, 3]) < 0.05 + 0.02 + 1e-3
-        assert np.linalg.norm(rotation_vector(command.tcp_base[:3, :3] @ stuck[:3, :3].T)) < 0.5 + 0.2 + 1e-2
+        assert (
+            np.linalg.norm(rotation_vector(command.tcp_base[:3, :3] @ stuck[:3, :3].T))
+            < 0.5 + 0.2 + 1e-2
+        )
 
 
 def test_small_actions_add_up_exactly_in_the_base_frame(robot):
     """Ten centimetres out in ten steps and back, with a turn: the command returns to where it was."""
     solver = arm(robot.name)
-    start = command = Command(solver.forward(robot.home), robot.home, 1.0)
+    start = command = Setpoint(solver.forward(robot.home), robot.home, 1.0)
     for sign in (1, -1):
         for _ in range(10):
             action = np.array([0, sign * 0.01, 0, 0, 0, sign * 0.05, 0.25], np.float32)
             command = follow(solver, command, command.tcp_base, action, 1 / robot.hz)
         if sign == 1:
-            assert command.tcp_base[:3, 3] - start.tcp_base[:3, 3] == pytest.approx([0, 0.1, 0], abs=1e-4)
-            assert rotation_vector(command.tcp_base[:3, :3] @ start.tcp_base[:3, :3].T) == pytest.approx([0, 0, 0.5], abs=1e-3)
+            assert command.tcp_base[:3, 3] - start.tcp_base[:3, 3] == pytest.approx(
+                [0, 0.1, 0], abs=1e-4
+            )
+            assert rotation_vector(
+                command.tcp_base[:3, :3] @ start.tcp_base[:3, :3].T
+            ) == pytest.approx([0, 0, 0.5], abs=1e-3)
     assert command.tcp_base == pytest.approx(start.tcp_base, abs=1e-4)
     assert command.gripper == 0.25
 
 
 def test_actions_are_rate_limited(robot):
     solver = arm(robot.name)
-    command = Command(solver.forward(robot.home), robot.home, 1.0)
-    limits = Limits(speed_m_s=0.1)
-    after = follow(solver, command, command.tcp_base, np.array([0, 0, -1, 0, 0, 0, 2], np.float32), 0.1, limits)
+    command = Setpoint(solver.forward(robot.home), robot.home, 1.0)
+    limits = MotionLimits(speed_m_s=0.1)
+    after = follow(
+        solver, command, command.tcp_base, np.array([0, 0, -1, 0, 0, 0, 2], np.float32), 0.1, limits
+    )
     assert after.tcp_base[2, 3] - command.tcp_base[2, 3] == pytest.approx(-0.01, abs=1e-4)
     assert after.gripper == 1.0
 
@@ -156,8 +188,8 @@ def test_unknown_robot_lists_the_known_ones():
 
 
 def test_missing_gl_names_the_line_to_run(monkeypatch):
-    from vap_core.errors import MissingGL
-    from vap_core.sim import gl
+    from vap_core.base.errors import MissingGL
+    from vap_core.simulation import gl
 
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr(gl, "works", lambda backend: False)
@@ -169,7 +201,7 @@ def test_missing_gl_names_the_line_to_run(monkeypatch):
 
 
 def test_a_back_end_that_works_is_kept_and_probed_once(monkeypatch):
-    from vap_core.sim import gl
+    from vap_core.simulation import gl
 
     asked = []
     monkeypatch.setenv("MUJOCO_GL", "osmesa")

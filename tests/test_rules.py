@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vap_core import traces
-from vap_core.suites.rules import Judge, rejudge
-from vap_core.values import REST, ROBOT, Episode, EpisodeRow, Frame, Opening, Placement, Truth
+from vap_core.evaluation import state_log as traces
+from vap_core.rollout.types import Episode, EpisodeHeader, Frame
+from vap_core.simulation.suites.rules import Judge, rejudge
+from vap_core.simulation.types import REST, ROBOT, EpisodeRow, Placement, Truth
 
 TARGET, OTHER, GOAL = "cup-personal", "cup-lookalike-1", "plate-prop"
 SIZES = {TARGET: (0.04, 0.03, 0.07), OTHER: (0.04, 0.03, 0.07), GOAL: (0.12, 0.09, 0.012)}
@@ -17,7 +18,9 @@ LIMIT = 0.025 + 0.075 + 0.10
 
 
 def row(rule, goal=""):
-    placements = tuple(Placement(name, *WHERE[name], 0.0) for name in (TARGET, OTHER, GOAL) if name != GOAL or goal)
+    placements = tuple(
+        Placement(name, *WHERE[name], 0.0) for name in (TARGET, OTHER, GOAL) if name != GOAL or goal
+    )
     return EpisodeRow("s", "t", 0, 0, "do it", "cup", placements, 60, rule, goal)
 
 
@@ -31,7 +34,13 @@ def truth(at=None, up=None, contacts=None, touched=(), pressed=None):
         poses[name][:2] = xy
     for name, z in (up or {}).items():
         poses[name][2] = z
-    return Truth(poses, {}, touched, pressed or {}, {name: frozenset(by) for name, by in (contacts or {}).items()})
+    return Truth(
+        poses,
+        {},
+        touched,
+        pressed or {},
+        {name: frozenset(by) for name, by in (contacts or {}).items()},
+    )
 
 
 def judged(episode, *steps):
@@ -52,7 +61,14 @@ def up(height, by=(ROBOT,)):
         ([up(0.2, by=())] * 9, False),
         ([*[up(0.0101)] * 4, truth(), up(0.0101)], False),
     ],
-    ids=["just met", "a step short", "a hair too low", "leaning on another", "thrown", "in two parts"],
+    ids=[
+        "just met",
+        "a step short",
+        "a hair too low",
+        "leaning on another",
+        "thrown",
+        "in two parts",
+    ],
 )
 def test_picked(steps, won):
     assert judged(PICK, *steps).outcome().success == won
@@ -66,7 +82,11 @@ def test_an_episode_may_end_once_the_lift_is_done():
 
 def beside(distance, **more):
     x, y = WHERE[GOAL]
-    return truth(at={TARGET: (x, y + distance), **more.pop("at", {})}, contacts={TARGET: more.pop("by", (REST,))}, **more)
+    return truth(
+        at={TARGET: (x, y + distance), **more.pop("at", {})},
+        contacts={TARGET: more.pop("by", (REST,))},
+        **more,
+    )
 
 
 @pytest.mark.parametrize(
@@ -99,7 +119,12 @@ def test_near(step, won):
 
 
 def test_near_needs_a_move_of_three_centimetres():
-    close = replace(NEAR, placements=tuple(replace(p, y=-0.5 + LIMIT + 0.01) if p.model == TARGET else p for p in NEAR.placements))
+    close = replace(
+        NEAR,
+        placements=tuple(
+            replace(p, y=-0.5 + LIMIT + 0.01) if p.model == TARGET else p for p in NEAR.placements
+        ),
+    )
     start = beside(LIMIT + 0.01)
     assert not rejudge(close, SIZES, [start, beside(LIMIT + 0.01 - 0.0299)]).success
     assert rejudge(close, SIZES, [start, beside(LIMIT + 0.01 - 0.0301)]).success
@@ -155,7 +180,9 @@ def test_put_is_done_when_let_go_and_at_rest():
 
 
 def press(name, seconds, *touched):
-    return truth(touched=touched or (name,), pressed={name: seconds}, contacts={name: (ROBOT, REST)})
+    return truth(
+        touched=touched or (name,), pressed={name: seconds}, contacts={name: (ROBOT, REST)}
+    )
 
 
 @pytest.mark.parametrize(
@@ -189,7 +216,12 @@ def test_selected(steps, won):
 
 def test_success_is_read_at_the_end_and_kept_as_once_and_held():
     dropped = judged(PICK, *[up(0.02)] * 7, truth()).outcome()
-    assert (dropped.success, dropped.success_once, dropped.held_steps, dropped.steps) == (False, True, 7, 8)
+    assert (dropped.success, dropped.success_once, dropped.held_steps, dropped.steps) == (
+        False,
+        True,
+        7,
+        8,
+    )
 
 
 def moved(name, distance):
@@ -212,14 +244,22 @@ def test_toppling_in_place_is_moving():
 def test_wrong_object_is_three_centimetres_of_another_or_a_touch_when_selecting():
     assert judged(PICK, moved(OTHER, 0.0301), truth()).outcome().wrong_object
     assert not judged(PICK, moved(OTHER, 0.0299), truth(touched=(OTHER,))).outcome().wrong_object
-    assert not judged(PUT, moved(GOAL, 0.1)).outcome().wrong_object, "the receptacle is no wrong object"
-    assert judged(PUT, truth(touched=(GOAL,)), truth(touched=(TARGET,))).outcome().first_object_correct, "nor a wrong first one"
+    assert not judged(PUT, moved(GOAL, 0.1)).outcome().wrong_object, (
+        "the receptacle is no wrong object"
+    )
+    assert (
+        judged(PUT, truth(touched=(GOAL,)), truth(touched=(TARGET,))).outcome().first_object_correct
+    ), "nor a wrong first one"
     assert judged(SELECT, truth(touched=(OTHER,))).outcome().wrong_object
     assert not judged(SELECT, truth(touched=(TARGET,))).outcome().wrong_object
 
 
 def test_first_object_is_the_first_touched_or_moved():
-    assert judged(PICK, truth(touched=(TARGET,)), truth(touched=(OTHER,))).outcome().first_object_correct
+    assert (
+        judged(PICK, truth(touched=(TARGET,)), truth(touched=(OTHER,)))
+        .outcome()
+        .first_object_correct
+    )
     assert judged(PICK, moved(TARGET, 0.04)).outcome().first_object_correct
     assert judged(PICK, truth(touched=(TARGET, OTHER))).outcome().first_object_correct
     assert not judged(PICK, truth(touched=(OTHER, TARGET))).outcome().first_object_correct
@@ -253,14 +293,23 @@ def test_the_judge_is_a_value():
 
 def test_a_saved_episode_is_judged_alike(tmp_path):
     steps = [truth(), press(TARGET, 0.0123456789, TARGET, OTHER), on(0.01), up(1 / 3)]
-    frames = tuple(Frame(i, i / 5, {}, {}, {}, (), np.zeros(8, np.float32), np.zeros(7, np.float32), step, ()) for i, step in enumerate(steps))
+    frames = tuple(
+        Frame(i, i / 5, {}, {}, {}, (), np.zeros(8, np.float32), np.zeros(7, np.float32), step, ())
+        for i, step in enumerate(steps)
+    )
     judge = rejudge(PUT, SIZES, steps)
-    opening = Opening(PUT, "vap", "scripted", 5.0, (), "", "", {}, SIZES)
+    opening = EpisodeHeader(PUT, "vap", "scripted", 5.0, (), "", "", {}, SIZES)
     traces.write(tmp_path, [Episode(opening, frames, judge.outcome(), {})])
     ((key, saved),) = traces.read(tmp_path)
     assert key == ("s", "t", "vap", 0, 0)
     again = rejudge(PUT, SIZES, saved)
     assert repr(again.outcome()) == repr(judge.outcome())
     for before, after in zip(steps, saved, strict=True):
-        assert all((before.objects_world[name] == after.objects_world[name]).all() for name in SIZES)
-        assert (before.touched, before.pressed_s, before.contacts) == (after.touched, after.pressed_s, after.contacts)
+        assert all(
+            (before.objects_world[name] == after.objects_world[name]).all() for name in SIZES
+        )
+        assert (before.touched, before.pressed_s, before.contacts) == (
+            after.touched,
+            after.pressed_s,
+            after.contacts,
+        )

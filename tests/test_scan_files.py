@@ -1,16 +1,16 @@
-"""Scans of the user's own: what comes in, what is refused, and how it is mended."""
+"""Importing scans: what is accepted, what is refused, and what is repaired."""
 
 import numpy as np
 import pytest
 import trimesh
 
 from tests.scanned import BLUE, RED, box, mug, put
-from vap_core.errors import BadObject
-from vap_core.sim.scans import bring as bringing
-from vap_core.sim.scans.bring import bring
-from vap_core.sim.scans.source import read
-from vap_core.sim.scans.triangles import decimate
-from vap_core.sim.shapes import Hull
+from vap_core.base.errors import BadObject
+from vap_core.simulation.assets.scans import import_scan as importing
+from vap_core.simulation.assets.scans.import_scan import import_scan
+from vap_core.simulation.assets.scans.mesh_file import read_mesh_file
+from vap_core.simulation.assets.shapes import Hull
+from vap_core.simulation.assets.triangles import decimate
 
 
 @pytest.fixture
@@ -20,13 +20,13 @@ def quick(monkeypatch):
     def one(vertex, face):
         return (Hull(vertex, float(abs(trimesh.Trimesh(vertex, face).convex_hull.volume))),)
 
-    monkeypatch.setattr(bringing, "_hulls", one)
-    monkeypatch.setattr(bringing, "TEXTURE_PX", 256)
-    monkeypatch.setattr("vap_core.sim.scans.source.PAINT_POINTS", 100_000)
+    monkeypatch.setattr(importing, "_convex_parts", one)
+    monkeypatch.setattr(importing, "TEXTURE_PX", 256)
+    monkeypatch.setattr("vap_core.simulation.assets.scans.mesh_file.SAMPLES", 100_000)
 
 
-def silent(line: str) -> None:
-    """Say nothing."""
+def ignore(line: str) -> None:
+    """Print nothing."""
 
 
 def test_unreadable_files_are_refused(tmp_path):
@@ -42,7 +42,7 @@ def test_unreadable_files_are_refused(tmp_path):
         ("e.stl", "not there"),
     ):
         with pytest.raises(BadObject, match=message):
-            read(tmp_path / name)
+            read_mesh_file(tmp_path / name)
 
 
 def test_a_hole_is_counted_and_can_be_repaired(tmp_path, quick):
@@ -50,29 +50,33 @@ def test_a_hole_is_counted_and_can_be_repaired(tmp_path, quick):
     torn.update_faces(np.arange(12) != 5)
     file = put(tmp_path, "torn.ply", torn)
     with pytest.raises(BadObject, match="not watertight: 3 open edges .*pass --repair"):
-        bring(file, "torn", "box", say=silent)
-    _, body = bring(file, "torn", "box", repair=True, say=silent)
-    assert len(np.unique(body.form.vertex, axis=0)) >= 8
-    assert np.abs(body.image.reshape(-1, 3).astype(int) - RED).max() <= 2
+        import_scan(file, "torn", "box", report=ignore)
+    _, scan = import_scan(file, "torn", "box", repair=True, report=ignore)
+    assert len(np.unique(scan.form.vertex, axis=0)) >= 8
+    assert np.abs(scan.image.reshape(-1, 3).astype(int) - RED).max() <= 2
 
 
 def test_a_scan_without_a_bottom_and_with_crumbs_is_closed(tmp_path, quick):
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.04)
     middle = ball.triangles_center
-    ball.update_faces((middle[:, 2] > -0.03) & (np.linalg.norm(middle - (0.04, 0, 0), axis=1) > 0.01))
+    ball.update_faces(
+        (middle[:, 2] > -0.03) & (np.linalg.norm(middle - (0.04, 0, 0), axis=1) > 0.01)
+    )
     crumb = trimesh.creation.icosphere(subdivisions=1, radius=0.002)
     crumb.apply_translation((0.08, 0, 0))
     for part in (ball, crumb):
         part.visual.vertex_colors = np.tile([*RED, 255], (len(part.vertices), 1)).astype(np.uint8)
     file = put(tmp_path, "scan.ply", trimesh.util.concatenate([ball, crumb]))
     with pytest.raises(BadObject, match=r"\d\d+ open edges"):
-        bring(file, "scan", "ball", say=silent)
-    _, body = bring(file, "scan", "ball", repair=True, say=silent)
-    assert np.ptp(body.form.vertex, axis=0) == pytest.approx((0.079, 0.08, 0.07), abs=0.002)
-    vertex, face = np.unique(body.form.vertex, axis=0, return_inverse=True)[0], body.form.face
-    corner = body.form.vertex[face]
+        import_scan(file, "scan", "ball", report=ignore)
+    _, scan = import_scan(file, "scan", "ball", repair=True, report=ignore)
+    assert np.ptp(scan.form.vertex, axis=0) == pytest.approx((0.079, 0.08, 0.07), abs=0.002)
+    vertex, face = np.unique(scan.form.vertex, axis=0, return_inverse=True)[0], scan.form.face
+    corner = scan.form.vertex[face]
     assert len(vertex) > 1000
-    assert (corner[:, 0] * np.cross(corner[:, 1], corner[:, 2])).sum() / 6 == pytest.approx(4 / 3 * np.pi * 0.04**3, rel=0.06)
+    assert (corner[:, 0] * np.cross(corner[:, 1], corner[:, 2])).sum() / 6 == pytest.approx(
+        4 / 3 * np.pi * 0.04**3, rel=0.06
+    )
 
 
 def test_triangles_that_face_both_ways_can_be_repaired(tmp_path, quick):
@@ -80,78 +84,97 @@ def test_triangles_that_face_both_ways_can_be_repaired(tmp_path, quick):
     turned.faces[3] = turned.faces[3][::-1]
     file = put(tmp_path, "turned.ply", turned)
     with pytest.raises(BadObject, match="face opposite ways along 3 edges; pass --repair"):
-        bring(file, "turned", "box", say=silent)
-    bring(file, "turned", "box", repair=True, say=silent)
+        import_scan(file, "turned", "box", report=ignore)
+    import_scan(file, "turned", "box", repair=True, report=ignore)
 
 
 def test_a_surface_inside_out_is_turned(tmp_path, quick):
     inside = box(rgb=RED)
     inside.invert()
-    _, body = bring(put(tmp_path, "inside.ply", inside), "inside", "box", say=silent)
-    corner = body.form.vertex[body.form.face]
-    assert (corner[:, 0] * np.cross(corner[:, 1], corner[:, 2])).sum() / 6 == pytest.approx(0.06 * 0.05 * 0.08, rel=1e-4)
-    assert ((body.form.vertex - (0, 0, 0.04)) * body.form.normal).sum(axis=1).min() > 0
+    _, scan = import_scan(put(tmp_path, "inside.ply", inside), "inside", "box", report=ignore)
+    corner = scan.form.vertex[scan.form.face]
+    assert (corner[:, 0] * np.cross(corner[:, 1], corner[:, 2])).sum() / 6 == pytest.approx(
+        0.06 * 0.05 * 0.08, rel=1e-4
+    )
+    assert ((scan.form.vertex - (0, 0, 0.04)) * scan.form.normal).sum(axis=1).min() > 0
 
 
 def test_a_colourless_mesh_asks_for_a_colour(tmp_path, quick):
     file = put(tmp_path, "plain.stl", box())
-    with pytest.raises(BadObject, match="no texture, UV map or vertex colours; bake a texture .*--colour '#aa3322'"):
-        bring(file, "plain", "box", say=silent)
+    with pytest.raises(
+        BadObject, match="no texture, UV map or vertex colours; bake a texture .*--colour '#aa3322'"
+    ):
+        import_scan(file, "plain", "box", report=ignore)
     with pytest.raises(BadObject, match="no colour; write it as"):
-        bring(file, "plain", "box", colour="reddish", say=silent)
+        import_scan(file, "plain", "box", colour="reddish", report=ignore)
     mug().export(tmp_path / "mug.obj")
     for beside in ("material.mtl", "material_0.png"):
         (tmp_path / beside).unlink()
     with pytest.raises(BadObject, match=r"an OBJ needs its \.mtl and picture beside it"):
-        bring(tmp_path / "mug.obj", "mug", "cup", say=silent)
-    _, body = bring(file, "plain", "box", colour="#aa3322", say=silent)
-    assert (body.image == (0xAA, 0x33, 0x22)).all()
+        import_scan(tmp_path / "mug.obj", "mug", "cup", report=ignore)
+    _, scan = import_scan(file, "plain", "box", colour="#aa3322", report=ignore)
+    assert (scan.image == (0xAA, 0x33, 0x22)).all()
 
 
 def test_wrong_units_ask_for_the_height(tmp_path, quick):
     giant = box(rgb=RED)
     giant.apply_scale(125_000)
     file = put(tmp_path, "giant.ply", giant)
-    with pytest.raises(BadObject, match=r"would be 10 km long; an object is 1 cm to 60 cm.*units are most likely not metres.*--height-cm"):
-        bring(file, "giant", "box", say=silent)
-    _, body = bring(file, "giant", "box", height_cm=9.0, say=silent)
-    assert np.ptp(body.form.vertex, axis=0) == pytest.approx((0.0675, 0.05625, 0.09), abs=1e-6)
+    with pytest.raises(
+        BadObject,
+        match=r"would be 10 km long; an object is 1 cm to 60 cm.*units are most likely not metres.*--height-cm",
+    ):
+        import_scan(file, "giant", "box", report=ignore)
+    _, scan = import_scan(file, "giant", "box", height_cm=9.0, report=ignore)
+    assert np.ptp(scan.form.vertex, axis=0) == pytest.approx((0.0675, 0.05625, 0.09), abs=1e-6)
 
 
 def test_up_decides_how_it_stands(tmp_path, quick):
     file = put(tmp_path, "box.ply", box(rgb=RED))
     for up, size in (("z", (0.06, 0.05, 0.08)), ("y", (0.06, 0.08, 0.05))):
-        _, body = bring(file, "box", "box", up=up, say=silent)
-        assert np.ptp(body.form.vertex, axis=0) == pytest.approx(size, abs=1e-6)
-        assert body.form.vertex.min(axis=0) == pytest.approx((-size[0] / 2, -size[1] / 2, 0), abs=1e-6)
+        _, scan = import_scan(file, "box", "box", up=up, report=ignore)
+        assert np.ptp(scan.form.vertex, axis=0) == pytest.approx(size, abs=1e-6)
+        assert scan.form.vertex.min(axis=0) == pytest.approx(
+            (-size[0] / 2, -size[1] / 2, 0), abs=1e-6
+        )
 
 
 def test_a_body_thinner_than_a_card_is_refused(tmp_path, quick):
     slab = trimesh.creation.box(extents=(0.07, 0.07, 0.00001))
-    slab.visual = trimesh.visual.ColorVisuals(slab, vertex_colors=np.tile([180, 40, 40, 255], (len(slab.vertices), 1)))
-    with pytest.raises(BadObject, match=r"only 0.001 cm thick, less than 0.2 cm; give it thickness"):
-        bring(put(tmp_path, "flat.ply", slab), "flat", "cup", say=silent)
+    slab.visual = trimesh.visual.ColorVisuals(
+        slab, vertex_colors=np.tile([180, 40, 40, 255], (len(slab.vertices), 1))
+    )
+    with pytest.raises(
+        BadObject, match=r"only 0.001 cm thick, less than 0.2 cm; give it thickness"
+    ):
+        import_scan(put(tmp_path, "flat.ply", slab), "flat", "cup", report=ignore)
 
 
 def test_a_sheet_encloses_nothing(tmp_path, quick):
-    sheet = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]], [[0, 1, 2], [0, 2, 3], [0, 2, 1], [0, 3, 2]], process=False)
+    sheet = trimesh.Trimesh(
+        [[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]],
+        [[0, 1, 2], [0, 2, 3], [0, 2, 1], [0, 3, 2]],
+        process=False,
+    )
     with pytest.raises(BadObject, match="encloses no volume|not watertight"):
-        bring(put(tmp_path, "sheet.stl", sheet), "sheet", "box", colour="red", say=silent)
+        import_scan(put(tmp_path, "sheet.stl", sheet), "sheet", "box", colour="red", report=ignore)
 
 
 def test_too_many_faces_ask_to_decimate(tmp_path, monkeypatch):
-    monkeypatch.setattr("vap_core.sim.scans.source.MAX_FACES", 10)
+    monkeypatch.setattr("vap_core.simulation.assets.scans.mesh_file.MAX_FACES", 10)
     with pytest.raises(BadObject, match="has 12 faces, over 10; decimate it first"):
-        read(put(tmp_path, "box.ply", box(rgb=RED)))
+        read_mesh_file(put(tmp_path, "box.ply", box(rgb=RED)))
 
 
 def test_a_heavy_mesh_is_reduced_and_its_texture_painted_anew(tmp_path, quick):
-    _, body = bring(put(tmp_path, "fine.glb", mug(n=96, rows=30)), "fine", "cup", say=silent)
-    assert 2500 <= len(body.form.face) <= bringing.VISUAL_FACES
-    assert body.image.shape == (256, 256, 3)
-    centre = body.form.vertex[body.form.face].mean(axis=1)
-    uv = body.form.uv[body.form.face].mean(axis=1)
-    colour = body.image[(uv[:, 1] * 256).astype(int), (uv[:, 0] * 256).astype(int)].astype(int)
+    _, scan = import_scan(
+        put(tmp_path, "fine.glb", mug(n=96, rows=30)), "fine", "cup", report=ignore
+    )
+    assert 2500 <= len(scan.form.face) <= importing.VISUAL_FACES
+    assert scan.image.shape == (256, 256, 3)
+    centre = scan.form.vertex[scan.form.face].mean(axis=1)
+    uv = scan.form.uv[scan.form.face].mean(axis=1)
+    colour = scan.image[(uv[:, 1] * 256).astype(int), (uv[:, 0] * 256).astype(int)].astype(int)
     high, low = centre[:, 2] > 0.05, (centre[:, 2] < 0.04) & (centre[:, 2] > 1e-4)
     assert (np.abs(colour[high] - RED).max(axis=1) < 10).mean() > 0.95
     assert (np.abs(colour[low] - BLUE).max(axis=1) < 10).mean() > 0.95
@@ -171,10 +194,12 @@ def test_parts_of_several_colours_become_one_object(tmp_path, quick):
     scene = trimesh.Scene()
     lower, upper = box(), box()
     for part, rgb in ((lower, RED), (upper, BLUE)):
-        part.visual = trimesh.visual.TextureVisuals(material=trimesh.visual.material.PBRMaterial(baseColorFactor=[*rgb, 255]))
+        part.visual = trimesh.visual.TextureVisuals(
+            material=trimesh.visual.material.PBRMaterial(baseColorFactor=[*rgb, 255])
+        )
     scene.add_geometry(lower)
     scene.add_geometry(upper, transform=trimesh.transformations.translation_matrix((0, 0.1, 0)))
-    _, body = bring(put(tmp_path, "two.glb", scene), "two", "box", say=silent)
-    assert np.ptp(body.form.vertex, axis=0) == pytest.approx((0.06, 0.08, 0.15), abs=1e-6)
-    found, count = np.unique(body.image.reshape(-1, 3), axis=0, return_counts=True)
+    _, scan = import_scan(put(tmp_path, "two.glb", scene), "two", "box", report=ignore)
+    assert np.ptp(scan.form.vertex, axis=0) == pytest.approx((0.06, 0.08, 0.15), abs=1e-6)
+    found, count = np.unique(scan.image.reshape(-1, 3), axis=0, return_counts=True)
     assert {tuple(map(int, rgb)) for rgb in found[np.argsort(-count)[:2]]} == {RED, BLUE}

@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vap_core.policies.eye import coloured, read
-from vap_core.policies.scripted import SPEED_M_S, Scripted, ScriptedState
+from vap_core.base.types import Boxes, Camera, Rgb
+from vap_core.policies.protocol import PolicyInput
+from vap_core.policies.scripted.localizer import coloured, read
+from vap_core.policies.scripted.scripted import SPEED_M_S, Scripted, ScriptedState
 from vap_core.prompt import PALETTE
-from vap_core.sim import robots
-from vap_core.values import Boxes, Camera, PolicyInput, Rgb
+from vap_core.simulation import robots
 
 RED = PALETTE[0]
 
@@ -36,12 +37,21 @@ def box_of(x: float, y: float, radius: float, height: float) -> np.ndarray:
 
 
 def policy(boxes: Sequence[np.ndarray]) -> Scripted:
-    found = Boxes(np.array(boxes, np.float32).reshape(-1, 4), np.ones(len(boxes), np.float32), "cup")
-    return Scripted(lambda images, phrase, threshold=None: [found for _ in images], camera(), robots.get("wx250s"), 5.0)
+    found = Boxes(
+        np.array(boxes, np.float32).reshape(-1, 4), np.ones(len(boxes), np.float32), "cup"
+    )
+    return Scripted(
+        lambda images, phrase, threshold=None: [found for _ in images],
+        camera(),
+        robots.get("wx250s"),
+        5.0,
+    )
 
 
 def look(rgb: Rgb, text: str) -> PolicyInput:
-    return PolicyInput({"front": rgb}, text, np.array([0.3, 0, 0.25, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0], np.float32))
+    return PolicyInput(
+        {"front": rgb}, text, np.array([0.3, 0, 0.25, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0], np.float32)
+    )
 
 
 @pytest.mark.parametrize(
@@ -60,13 +70,22 @@ def look(rgb: Rgb, text: str) -> PolicyInput:
         ("select my leather bag", "touch", None, "leather bag", ""),
     ],
 )
-def test_reads_what_is_asked_for(text: str, verb: str, colour: str | None, category: str, goal: str) -> None:
+def test_reads_what_is_asked_for(
+    text: str, verb: str, colour: str | None, category: str, goal: str
+) -> None:
     wish = read(text)
-    assert (wish.verb, wish.colour.name if wish.colour else None, wish.category, wish.goal) == (verb, colour, category, goal)
+    assert (wish.verb, wish.colour.name if wish.colour else None, wish.category, wish.goal) == (
+        verb,
+        colour,
+        category,
+        goal,
+    )
 
 
 @given(st.floats(0.15, 0.45), st.floats(-0.2, 0.2), st.floats(0.012, 0.021), st.floats(0.05, 0.12))
-def test_places_an_upright_object_to_within_a_finger(x: float, y: float, radius: float, height: float) -> None:
+def test_places_an_upright_object_to_within_a_finger(
+    x: float, y: float, radius: float, height: float
+) -> None:
     place = policy([]).eye.place(box_of(x, y, radius, height), 0.021)
     assert np.hypot(place[0] - x, place[1] - y) < 0.003
     assert abs(place[3] - height) < 0.005
@@ -80,13 +99,18 @@ def test_goes_to_the_coloured_one_and_not_by_luck() -> None:
         rgb[y0:y1, x0:x1] = (190, 60, 60)
         for seed in range(3):
             p = policy(boxes)
-            (state,), _ = p.plan([p.start(np.random.default_rng(seed))], [look(rgb, "pick up the red cup")])
+            (state,), _ = p.plan(
+                [p.start(np.random.default_rng(seed))], [look(rgb, "pick up the red cup")]
+            )
             assert state.goal is not None
             assert abs(state.goal[1] - y) < 0.02
 
 
 def test_without_a_colour_any_of_the_category_is_taken_and_kept() -> None:
-    boxes, grey = [box_of(0.3, y, 0.02, 0.08) for y in (-0.15, 0.0, 0.15)], np.full((224, 224, 3), 128, np.uint8)
+    boxes, grey = (
+        [box_of(0.3, y, 0.02, 0.08) for y in (-0.15, 0.0, 0.15)],
+        np.full((224, 224, 3), 128, np.uint8),
+    )
     chosen = []
     for seed in range(60):
         p = policy(boxes)
@@ -103,7 +127,10 @@ def test_without_a_colour_any_of_the_category_is_taken_and_kept() -> None:
 def test_an_empty_gripper_after_lifting_means_try_again() -> None:
     p, boxes = policy([box_of(0.3, 0.1, 0.02, 0.08)]), np.array([0.3, 0.1, 0.02, 0.08])
     lifting = ScriptedState(0.5, boxes, "lift", 0.0)
-    held, empty = look(np.zeros((224, 224, 3), np.uint8), "pick up my cup"), look(np.zeros((224, 224, 3), np.uint8), "pick up my cup")
+    held, empty = (
+        look(np.zeros((224, 224, 3), np.uint8), "pick up my cup"),
+        look(np.zeros((224, 224, 3), np.uint8), "pick up my cup"),
+    )
     held.state[6], empty.state[6] = 0.5, 0.0
     (kept, again), (_, chunk) = p.plan([lifting, lifting], [held, empty])
     assert (kept.phase, again.phase) == ("lift", "above")
@@ -112,14 +139,20 @@ def test_an_empty_gripper_after_lifting_means_try_again() -> None:
 
 def test_nothing_seen_means_stand_still() -> None:
     p = policy([])
-    (state,), (chunk,) = p.plan([p.start(np.random.default_rng(0))], [look(np.zeros((224, 224, 3), np.uint8), "pick up my cup")])
+    (state,), (chunk,) = p.plan(
+        [p.start(np.random.default_rng(0))],
+        [look(np.zeros((224, 224, 3), np.uint8), "pick up my cup")],
+    )
     assert state.goal is None
     assert (chunk[:, :6] == 0).all()
 
 
 def test_no_action_is_longer_than_a_step() -> None:
     p = policy([box_of(0.3, 0.15, 0.02, 0.08)])
-    _, (chunk,) = p.plan([p.start(np.random.default_rng(0))], [look(np.full((224, 224, 3), 128, np.uint8), "pick up my cup")])
+    _, (chunk,) = p.plan(
+        [p.start(np.random.default_rng(0))],
+        [look(np.full((224, 224, 3), 128, np.uint8), "pick up my cup")],
+    )
     assert (np.linalg.norm(chunk[:, :3], axis=1) <= SPEED_M_S / p.hz * 1.0001).all()
     assert len(chunk) == p.execute
 

@@ -6,14 +6,25 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vap_core.sim import objects, scenes
-from vap_core.sim.cameras import project
-from vap_core.sim.env import Env
-from vap_core.sim.sensor import DESK, PERFECT, Sensor, exposed, stray
-from vap_core.values import EpisodeRow, Placement
+from vap_core.simulation import scenes
+from vap_core.simulation.assets import objects
+from vap_core.simulation.cameras import project
+from vap_core.simulation.env import Env
+from vap_core.simulation.sensor import DESK, PERFECT, Sensor, exposed, stray
+from vap_core.simulation.types import EpisodeRow, Placement
 
 MODEL = "cup-personal"
-ROW = EpisodeRow("tabletop", "select-cup", 3, 0, "select my cup", "cup", (Placement(MODEL, 0.22, 0.0, 0.4),), 150, "selected")
+ROW = EpisodeRow(
+    "tabletop",
+    "select-cup",
+    3,
+    0,
+    "select my cup",
+    "cup",
+    (Placement(MODEL, 0.22, 0.0, 0.4),),
+    150,
+    "selected",
+)
 EPISODES = [replace(ROW, episode=i, seed=j) for j in range(4) for i in range(250)]
 GREY = np.full((224, 224, 3), 120, np.uint8)
 
@@ -25,7 +36,9 @@ def scene():
 
 
 def env(scene, sensor, row=ROW, image_size=224):
-    made = Env(scene, sensor=sensor, image_size=image_size, cameras=("front", "side"), control="joint")
+    made = Env(
+        scene, sensor=sensor, image_size=image_size, cameras=("front", "side"), control="joint"
+    )
     made.reset(row)
     return made
 
@@ -41,7 +54,9 @@ def test_a_perfect_sensor_changes_nothing(scene):
     for name, rgb in plain.observe().images.items():
         assert (elsewhere.observe().images[name] == rgb).all()
     zero = env(scene, Sensor())
-    assert all((zero.observe().images[name] == rgb).all() for name, rgb in plain.observe().images.items())
+    assert all(
+        (zero.observe().images[name] == rgb).all() for name, rgb in plain.observe().images.items()
+    )
 
 
 def test_the_same_row_gives_the_same_picture_and_another_episode_or_seed_another(scene):
@@ -75,7 +90,9 @@ def test_noise_and_gain_of_a_picture_are_the_specified_ones():
     n = GREY[..., 0].size
     for channel in range(3):
         values = seen[..., channel]
-        assert values.mean() == pytest.approx(120 * astray.gain[channel], abs=4 * expected_sd / np.sqrt(n))
+        assert values.mean() == pytest.approx(
+            120 * astray.gain[channel], abs=4 * expected_sd / np.sqrt(n)
+        )
         assert values.std() == pytest.approx(expected_sd, rel=4 / np.sqrt(2 * n))
     grain = seen - seen.mean(axis=(0, 1))
     assert abs(np.corrcoef(grain[..., 0].ravel(), grain[..., 1].ravel())[0, 1]) < 0.02
@@ -117,23 +134,37 @@ def centre(truth, camera):
 
 def middle(truth):
     """A point in the middle of the cup, metres in the world."""
-    return truth.objects_world[MODEL][None, :3] + [[0, 0, objects.extent_m(objects.get(MODEL))[2] / 2]]
+    return truth.objects_world[MODEL][None, :3] + [
+        [0, 0, objects.extent_m(objects.get_object(MODEL))[2] / 2]
+    ]
 
 
-@pytest.mark.parametrize("sensor", [DESK, Sensor(jitter_m=0.03), Sensor(jitter_rad=0.1)], ids=["desk", "shifted", "turned"])
+@pytest.mark.parametrize(
+    "sensor",
+    [DESK, Sensor(jitter_m=0.03), Sensor(jitter_rad=0.1)],
+    ids=["desk", "shifted", "turned"],
+)
 def test_the_reported_camera_is_the_one_that_took_the_picture(sensor, scene):
     """Wherever the camera strays, the cup is rendered where the reported camera projects it."""
     usual = env(scene, PERFECT)
     truth = usual.truth(masks=True)
-    offset = {cam.name: centre(truth, cam.name) - project(cam, middle(truth))[0] for cam in usual.cameras()}
+    offset = {
+        cam.name: centre(truth, cam.name) - project(cam, middle(truth))[0]
+        for cam in usual.cameras()
+    }
     moved = []
     for episode in range(6):
         astray = env(scene, sensor, replace(ROW, episode=episode))
         seen = astray.truth(masks=True)
         for cam, home in zip(astray.cameras(), usual.cameras(), strict=True):
-            assert centre(seen, cam.name) - project(cam, middle(seen))[0] == pytest.approx(offset[cam.name], abs=1.0)
+            assert centre(seen, cam.name) - project(cam, middle(seen))[0] == pytest.approx(
+                offset[cam.name], abs=1.0
+            )
             moved.append(np.linalg.norm(centre(seen, cam.name) - centre(truth, cam.name)))
-            assert np.linalg.norm(cam.pose_world[:3, 3] - home.pose_world[:3, 3]) <= 4 * sensor.jitter_m + 1e-9
+            assert (
+                np.linalg.norm(cam.pose_world[:3, 3] - home.pose_world[:3, 3])
+                <= 4 * sensor.jitter_m + 1e-9
+            )
             assert cam.k == pytest.approx(home.k)
     assert max(moved) > 2.0
 
@@ -147,12 +178,18 @@ def test_a_knock_moves_a_point_by_focal_length_over_distance(scene):
         row = replace(ROW, episode=episode)
         turned = env(scene, Sensor(jitter_rad=0.01), row).cameras()[0]
         about = Rotation.from_matrix(stray(Sensor(jitter_rad=0.01), row, "front").turn).as_rotvec()
-        expected = focal * np.array([about[1], about[0]])  # OpenGL axes: y up; a turn to the left moves things right
-        assert project(turned, point)[0] - project(home, point)[0] == pytest.approx(expected, abs=0.1)
+        expected = focal * np.array(
+            [about[1], about[0]]
+        )  # OpenGL axes: y up; a turn to the left moves things right
+        assert project(turned, point)[0] - project(home, point)[0] == pytest.approx(
+            expected, abs=0.1
+        )
         shifted = env(scene, Sensor(jitter_m=0.004), row).cameras()[0]
         shift = stray(Sensor(jitter_m=0.004), row, "front").shift_m
         expected = focal * np.array([-shift[0], shift[1]]) / 0.4
-        assert project(shifted, point)[0] - project(home, point)[0] == pytest.approx(expected, abs=0.1)
+        assert project(shifted, point)[0] - project(home, point)[0] == pytest.approx(
+            expected, abs=0.1
+        )
 
 
 def test_a_camera_strays_once_and_then_stays(scene):
@@ -162,10 +199,14 @@ def test_a_camera_strays_once_and_then_stays(scene):
     for _ in range(3):
         desk.observe()
         desk.step(np.array([0, 0, 0, 0, 0, 1], np.float32))
-    assert all((cam.pose_world == pose).all() for cam, pose in zip(desk.cameras(), first, strict=True))
+    assert all(
+        (cam.pose_world == pose).all() for cam, pose in zip(desk.cameras(), first, strict=True)
+    )
     desk.restore(kept)
     desk.restore(kept)
-    assert all((cam.pose_world == pose).all() for cam, pose in zip(desk.cameras(), first, strict=True))
+    assert all(
+        (cam.pose_world == pose).all() for cam, pose in zip(desk.cameras(), first, strict=True)
+    )
 
 
 def test_global_seeding_changes_nothing(scene):

@@ -8,13 +8,13 @@ import torch
 from lerobot.policies import get_policy_class, make_pre_post_processors
 
 from tests.test_cli import vap
-from vap_core import suites
-from vap_core.experiments import MINI, SHIPPED, shipped, usual
-from vap_core.policies.lerobot import load
+from vap_core.evaluation.policy_names import MINI, SHIPPED, default_policy, shipped
+from vap_core.evaluation.store import read
+from vap_core.policies.lerobot.adapter import load
+from vap_core.policies.mini_pi0.teach_token import MODEL
 from vap_core.policies.mini_pi0.vlm import load as load_vlm
-from vap_core.soft_prompt import MODEL
-from vap_core.store import read
-from vap_core.training.probe import probe
+from vap_core.simulation import suites
+from vap_core.training.policy.probe import probe
 
 FOLDERS = sorted(SHIPPED.glob(f"{MINI}-*"))
 BRIDGE = shipped("simpler-bridge")
@@ -24,11 +24,18 @@ BRIDGE = shipped("simpler-bridge")
 def test_it_is_whole_small_and_grown_from_the_model_that_ships(folder: Path) -> None:
     policy = load(folder).policy
     again = get_policy_class("mini_pi0").from_pretrained(folder)
-    assert all(torch.equal(one, other) for one, other in zip(policy.state_dict().values(), again.state_dict().values(), strict=True))
+    assert all(
+        torch.equal(one, other)
+        for one, other in zip(
+            policy.state_dict().values(), again.state_dict().values(), strict=True
+        )
+    )
     assert len(make_pre_post_processors(policy.config, str(folder))) == 2
-    assert policy.config.vlm == load_vlm(MODEL).sha256()  # type: ignore[union-attr]
+    assert policy.config.vlm == load_vlm(MODEL).sha256()
     known = suites.suite(folder.name.removeprefix(f"{MINI}-"))
-    assert {name.removeprefix("observation.images.") for name in policy.config.image_features} == set(known.cameras)
+    assert {
+        name.removeprefix("observation.images.") for name in policy.config.image_features
+    } == set(known.cameras)
     told = json.loads((folder / "training.json").read_text())
     assert told["recipe"]["suite"] == known.name
     assert len(told["data_sha256"]) == 64
@@ -38,15 +45,17 @@ def test_it_is_whole_small_and_grown_from_the_model_that_ships(folder: Path) -> 
 
 def test_it_is_taken_when_nobody_names_another() -> None:
     assert BRIDGE in FOLDERS
-    assert usual(["simpler-bridge"]) == MINI
-    assert usual(["simpler-bridge", "widowx-pick"]) == "scripted"
+    assert default_policy(["simpler-bridge"]) == MINI
+    assert default_policy(["simpler-bridge", "widowx-pick"]) == "scripted"
 
 
 def test_the_cost_of_a_call_is_told_for_every_policy_that_ships() -> None:
     done = vap("bench", "policy", "--quick")
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
-    assert [line.split()[0] for line in lines[5:]] == [name for name in suites.BENCHMARKS if shipped(name) in FOLDERS]
+    assert [line.split()[0] for line in lines[5:]] == [
+        name for name in suites.BENCHMARKS if shipped(name) in FOLDERS
+    ]
     for line in lines[5:]:
         call, gain = float(line.split()[2]), float(line.split()[-3])
         assert 0 < call < 1000

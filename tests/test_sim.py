@@ -5,11 +5,13 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from vap_core.errors import UnknownName
-from vap_core.sim import cameras, objects, scenes
-from vap_core.sim.env import Env
-from vap_core.suites import WARM_UPS, Judge, Task, pick, rows
-from vap_core.values import Camera, EpisodeRow, Placement
+from vap_core.base.errors import UnknownName
+from vap_core.base.types import Camera
+from vap_core.simulation import cameras, scenes
+from vap_core.simulation.assets import objects
+from vap_core.simulation.env import Env
+from vap_core.simulation.suites import WARM_UPS, Judge, Task, pick, rows
+from vap_core.simulation.types import EpisodeRow, Placement
 
 import mujoco  # isort: skip
 
@@ -46,8 +48,8 @@ def test_a_known_slab_covers_the_computable_number_of_pixels():
     model = mujoco.MjModel.from_xml_string(SLAB)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    with cameras.Eyes(model, ("slab",)) as eyes:
-        seen = eyes.masks(data, "down", 224)["slab"]
+    with cameras.Renderer(model, ("slab",)) as renderer:
+        seen = renderer.masks(data, "down", 224)["slab"]
     focal = cameras.intrinsics(model, "down", (224, 224))[0, 0]
     assert focal == pytest.approx(112 / np.tan(np.pi / 8))
     assert seen.sum() == pytest.approx(focal**2 * 0.3 * 0.2 / 0.5**2, rel=0.01)
@@ -60,9 +62,15 @@ def test_projection_and_backprojection_are_inverse(scene, row):
     env.reset(row)
     rng = np.random.default_rng(0)
     for cam in env.cameras():
-        points = np.concatenate([rng.uniform((0.3, -0.1), (0.5, 0.1), (50, 2)), np.full((50, 1), 0.04)], axis=1)
-        assert cameras.backproject_to_plane(cam, cameras.project(cam, points), 0.04) == pytest.approx(points, abs=1e-9)
-        assert np.isnan(cameras.project(cam, cam.pose_world[None, :3, 3] - 0.1 * cam.pose_world[None, :3, 2])).all()
+        points = np.concatenate(
+            [rng.uniform((0.3, -0.1), (0.5, 0.1), (50, 2)), np.full((50, 1), 0.04)], axis=1
+        )
+        assert cameras.backproject_to_plane(
+            cam, cameras.project(cam, points), 0.04
+        ) == pytest.approx(points, abs=1e-9)
+        assert np.isnan(
+            cameras.project(cam, cam.pose_world[None, :3, 3] - 0.1 * cam.pose_world[None, :3, 2])
+        ).all()
     sky = np.array([[112.0, -500.0]])
     assert np.isnan(cameras.backproject_to_plane(env.cameras()[0], sky, 0.0)).all()
 
@@ -73,7 +81,9 @@ def test_projected_objects_lie_inside_their_masks(scene, row):
     truth = env.truth(masks=True)
     for cam in env.cameras():
         for name, pose in truth.objects_world.items():
-            ((u, v),) = cameras.project(cam, pose[None, :3] + [[0, 0, objects.extent_m(objects.get(name))[2] / 2]])
+            ((u, v),) = cameras.project(
+                cam, pose[None, :3] + [[0, 0, objects.extent_m(objects.get_object(name))[2] / 2]]
+            )
             assert truth.masks[cam.name][name][int(v), int(u)]
 
 
@@ -86,13 +96,22 @@ def test_every_row_is_in_view_of_every_fixed_camera(suite, scene):
             for cam in views.values():
                 columns = []
                 for place in row.placements:
-                    x, y, z = objects.extent_m(objects.get(place.model))
+                    x, y, z = objects.extent_m(objects.get_object(place.model))
                     half = np.hypot(x, y) / 2
-                    corners = np.array([[place.x + a * half, place.y + b * half, c * z] for a in (-1, 1) for b in (-1, 1) for c in (0, 1)])
+                    corners = np.array(
+                        [
+                            [place.x + a * half, place.y + b * half, c * z]
+                            for a in (-1, 1)
+                            for b in (-1, 1)
+                            for c in (0, 1)
+                        ]
+                    )
                     pixels = cameras.project(cam, corners)
                     assert pixels.min() > 0
                     assert pixels.max() < 224
-                    columns.append(cameras.project(cam, np.array([[place.x, place.y, z / 2]]))[0, 0])
+                    columns.append(
+                        cameras.project(cam, np.array([[place.x, place.y, z / 2]]))[0, 0]
+                    )
                 if cam.name == "front":
                     assert np.diff(sorted(columns)).min() > 30
 
@@ -106,13 +125,15 @@ def same(a, b):
     return a == b
 
 
-ACTIONS = np.random.default_rng(1).uniform(-1, 1, (6, 7)).astype(np.float32) * np.array([0.03, 0.03, 0.03, 0.1, 0.1, 0.2, 1], np.float32)
+ACTIONS = np.random.default_rng(1).uniform(-1, 1, (6, 7)).astype(np.float32) * np.array(
+    [0.03, 0.03, 0.03, 0.1, 0.1, 0.2, 1], np.float32
+)
 
 
 def play(env, row):
     env.reset(row)
     for action in ACTIONS:
-        yield asdict(env.observe("x")), asdict(env.truth(masks=True))
+        yield asdict(env.observe()), asdict(env.truth(masks=True))
         env.step(action)
 
 
@@ -123,10 +144,21 @@ def test_the_same_row_twice_is_bit_identical(scene, row):
 
 def test_episodes_that_share_a_scene_do_not_disturb_each_other(suite, scene):
     one, other = rows(suite.name, suite.tasks[0].name, 2)
-    alone = [list(play(Env(scene), row)) for row in (one, replace(other, placements=other.placements[:2]))]
-    woven = list(zip(play(Env(scene), one), play(Env(scene), replace(other, placements=other.placements[:2])), strict=True))
+    alone = [
+        list(play(Env(scene), row))
+        for row in (one, replace(other, placements=other.placements[:2]))
+    ]
+    woven = list(
+        zip(
+            play(Env(scene), one),
+            play(Env(scene), replace(other, placements=other.placements[:2])),
+            strict=True,
+        )
+    )
     for k in range(2):
-        assert all(same(a, c[k][0]) and same(b, c[k][1]) for (a, b), c in zip(alone[k], woven, strict=True))
+        assert all(
+            same(a, c[k][0]) and same(b, c[k][1]) for (a, b), c in zip(alone[k], woven, strict=True)
+        )
 
 
 def test_snapshot_goes_back_exactly(scene, row):
@@ -158,7 +190,7 @@ def test_state_time_and_cost_accounts(suite, scene, row):
     assert env.hz == suite.hz
     assert env.camera_names == suite.cameras
     env.reset(row)
-    state = env.observe("pick up my cup").state
+    state = env.observe().state
     assert state.shape == (7 + len(env.robot.joints),)
     assert state[3:6] == pytest.approx([0, 0, 0], abs=5e-3)
     assert state[6] == pytest.approx(1, abs=0.02)
@@ -192,10 +224,12 @@ def take(env: Env, row: EpisodeRow) -> tuple[Judge, float]:
     """Reach, close, lift 10 cm and hold for 2 s, guided by ground truth. Returns the judge and how far the object crept in the hand (m)."""
     env.reset(row)
     judge = Judge.start(row, SIZES, env.truth())
-    model = objects.get(row.target)
+    model = objects.get_object(row.target)
     spot = env.truth().objects_world[row.target][:3].copy()
     height = objects.extent_m(model)[2]
-    wide = height * (0.72 if model.category == "straw cup" else 1.0)  # the straw fits between the rails of the palm
+    wide = height * (
+        0.72 if model.category == "straw cup" else 1.0
+    )  # the straw fits between the rails of the palm
     spot[2] = max(0.62 * height, wide - env.robot.palm_m + 0.003)
     yaw, slow = turn(model, row.placements[0].yaw), env.hz / 5
     rest = 0.0
@@ -220,8 +254,15 @@ def test_grasps_hold(name):
             env = Env(built)
             for i, model in enumerate(models_of(task)):
                 rng = np.random.default_rng([9, k, i])
-                x, y, yaw = pick.ARRANGEMENTS[name].x_m + rng.uniform(-0.025, 0.025), rng.uniform(-0.13, 0.13), rng.uniform(-np.pi, np.pi)
-                row = replace(rows(name, task.name, 1)[0], placements=(Placement(model, float(x), float(y), float(yaw)),))
+                x, y, yaw = (
+                    pick.ARRANGEMENTS[name].x_m + rng.uniform(-0.025, 0.025),
+                    rng.uniform(-0.13, 0.13),
+                    rng.uniform(-np.pi, np.pi),
+                )
+                row = replace(
+                    rows(name, task.name, 1)[0],
+                    placements=(Placement(model, float(x), float(y), float(yaw)),),
+                )
                 judge, creep = take(env, row)
                 won.append(judge.success and judge.now.objects_world[model][2] > 0.08)
                 if won[-1]:

@@ -12,14 +12,15 @@ import numpy as np
 import pytest
 from jaxtyping import Float64
 
-from vap_core.errors import OutOfReach
-from vap_core.sim import objects, scenes
-from vap_core.sim.cameras import camera
-from vap_core.sim.control import arm, rotation, rotation_vector
-from vap_core.sim.env import Env
-from vap_core.sim.robots import ROBOTS
-from vap_core.sim.shapes import Mesh, Solid
-from vap_core.values import ROBOT, EpisodeRow, Placement
+from vap_core.base.errors import OutOfReach
+from vap_core.simulation import scenes
+from vap_core.simulation.assets import objects
+from vap_core.simulation.assets.shapes import Mesh, Solid
+from vap_core.simulation.cameras import camera
+from vap_core.simulation.control import arm, rotation, rotation_vector
+from vap_core.simulation.env import Env
+from vap_core.simulation.robots import ROBOTS
+from vap_core.simulation.types import ROBOT, EpisodeRow, Placement
 
 import mujoco  # isort: skip  (cameras has chosen a GL back end)
 
@@ -35,7 +36,9 @@ def pose(x: float, y: float, z: float, yaw: float = 0.0) -> Float64[np.ndarray, 
 
 
 def off(one: Float64[np.ndarray, "4 4"], other: Float64[np.ndarray, "4 4"]) -> tuple[float, float]:
-    return float(np.linalg.norm(one[:3, 3] - other[:3, 3])), float(np.linalg.norm(rotation_vector(one[:3, :3] @ other[:3, :3].T)))
+    return float(np.linalg.norm(one[:3, 3] - other[:3, 3])), float(
+        np.linalg.norm(rotation_vector(one[:3, :3] @ other[:3, :3].T))
+    )
 
 
 def reached(x: float, y: float, z: float, yaw: float) -> tuple[float, float]:
@@ -69,7 +72,9 @@ def test_forward_kinematics_and_limits_are_menageries(menagerie: mujoco.MjModel)
         assert ours.joint(name).range == pytest.approx(menagerie.joint(name).range, abs=1e-6), name
     for _ in range(200):
         for name in names:
-            mine.joint(name).qpos[0] = theirs.joint(name).qpos[0] = rng.uniform(*ours.joint(name).range)
+            mine.joint(name).qpos[0] = theirs.joint(name).qpos[0] = rng.uniform(
+                *ours.joint(name).range
+            )
         mujoco.mj_kinematics(ours, mine)
         mujoco.mj_kinematics(menagerie, theirs)
         for body in SO101.links:
@@ -79,7 +84,11 @@ def test_forward_kinematics_and_limits_are_menageries(menagerie: mujoco.MjModel)
 
 def test_the_jaws_open_as_wide_as_the_registry_says_and_all_but_meet() -> None:
     model = mujoco.MjModel.from_xml_path(str(SO101.xml))
-    data, fixed, moving = mujoco.MjData(model), model.geom("fixed_pad").id, model.geom("moving_pad").id
+    data, fixed, moving = (
+        mujoco.MjData(model),
+        model.geom("fixed_pad").id,
+        model.geom("moving_pad").id,
+    )
     gaps = []
     for travel in (*SO101.fingers_open, *SO101.fingers_closed):
         data.joint("gripper").qpos[0] = travel
@@ -91,7 +100,9 @@ def test_the_jaws_open_as_wide_as_the_registry_says_and_all_but_meet() -> None:
 
 @pytest.mark.parametrize("x", np.linspace(*X, 4).tolist())
 @pytest.mark.parametrize("y", [-Y, 0.0, Y])
-def test_straight_down_is_met_to_a_millimetre_and_a_degree_over_the_workspace(x: float, y: float) -> None:
+def test_straight_down_is_met_to_a_millimetre_and_a_degree_over_the_workspace(
+    x: float, y: float
+) -> None:
     """With the opening axis in every direction: the wrist does not turn all the way round, but one of the two ways to lay the axis fits."""
     for z in (0.02, 0.04, 0.06):
         for yaw in np.deg2rad([-90.0, -45.0, 0.0, 45.0]):
@@ -131,19 +142,36 @@ class Block:
         from trimesh import creation
 
         box = creation.box(extents=[self.width, self.depth, self.height])
-        vertex = np.asarray(box.triangles, np.float64).reshape(-1, 3) + np.array([0.0, 0.0, self.height / 2])
+        vertex = np.asarray(box.triangles, np.float64).reshape(-1, 3) + np.array(
+            [0.0, 0.0, self.height / 2]
+        )
         normal = np.repeat(np.asarray(box.face_normals, np.float64), 3, axis=0)
-        return Mesh(vertex, normal, np.zeros((len(vertex), 2)), np.arange(len(vertex)).reshape(-1, 3))
+        return Mesh(
+            vertex, normal, np.zeros((len(vertex), 2)), np.arange(len(vertex)).reshape(-1, 3)
+        )
 
     def solids(self) -> tuple[Solid, ...]:
-        return (Solid("box", (self.width / 2, self.depth / 2, self.height / 2), (0, 0, self.height / 2)),)
+        return (
+            Solid(
+                "box", (self.width / 2, self.depth / 2, self.height / 2), (0, 0, self.height / 2)
+            ),
+        )
 
     def aspect(self) -> float:
         return 1.0
 
 
-BLOCK = replace(objects.personal("pen holder"), name="block", shape=Block(0.05, 0.07, 0.07), mass_kg=0.1)
-THINGS = {"cup": (objects.personal("cup"), 0.04), "owl": (objects.personal("owl figurine"), 0.03), "block": (BLOCK, 0.04)}
+BLOCK = replace(
+    objects.personal_instance("pen holder"),
+    name="block",
+    shape=Block(0.05, 0.07, 0.07),
+    mass_kg=0.1,
+)
+THINGS = {
+    "cup": (objects.personal_instance("cup"), 0.04),
+    "owl": (objects.personal_instance("owl figurine"), 0.03),
+    "block": (BLOCK, 0.04),
+}
 """What is grasped, and how high above the table, metres."""
 
 
@@ -158,7 +186,9 @@ def drive(world: Env, goal: Float64[np.ndarray, "4 4"], gripper: float) -> None:
         delta = arm("so101").solve(world.command.joints, goal, 3 / world.hz) - world.command.joints
     else:
         now = world.command.tcp_base
-        delta = np.concatenate([goal[:3, 3] - now[:3, 3], rotation_vector(goal[:3, :3] @ now[:3, :3].T)])
+        delta = np.concatenate(
+            [goal[:3, 3] - now[:3, 3], rotation_vector(goal[:3, :3] @ now[:3, :3].T)]
+        )
     world.step(np.array([*delta, gripper], np.float32))
 
 
@@ -171,15 +201,37 @@ def go(world: Env, goal: Float64[np.ndarray, "4 4"], gripper: float, seconds: fl
         drive(world, between, gripper)
 
 
-SPOTS = [(0.18, 0.0, 0.0), (0.2, 0.1, 0.5), (0.24, -0.1, -0.5), (0.27, 0.05, 1.0), (0.17, -0.13, -1.0), (0.22, 0.13, 0.2)]
+SPOTS = [
+    (0.18, 0.0, 0.0),
+    (0.2, 0.1, 0.5),
+    (0.24, -0.1, -0.5),
+    (0.27, 0.05, 1.0),
+    (0.17, -0.13, -1.0),
+    (0.22, 0.13, 0.2),
+]
 
 
 @pytest.mark.parametrize(("x", "y", "yaw"), SPOTS)
-@pytest.mark.parametrize(("thing", "control"), [("cup", "joint"), ("owl", "joint"), ("block", "joint"), ("cup", "ee")])
-def test_a_scripted_grasp_lifts_shakes_and_holds(thing: str, control: Literal["ee", "joint"], x: float, y: float, yaw: float) -> None:
+@pytest.mark.parametrize(
+    ("thing", "control"), [("cup", "joint"), ("owl", "joint"), ("block", "joint"), ("cup", "ee")]
+)
+def test_a_scripted_grasp_lifts_shakes_and_holds(
+    thing: str, control: Literal["ee", "joint"], x: float, y: float, yaw: float
+) -> None:
     world, (model, z) = env(thing, control), THINGS[thing]
     turned = yaw + (np.pi / 2 if thing == "block" else 0.0)
-    world.reset(EpisodeRow("t", "t", 0, 0, "pick it up", model.category, (Placement(model.name, x, y, turned),), 1000))
+    world.reset(
+        EpisodeRow(
+            "t",
+            "t",
+            0,
+            0,
+            "pick it up",
+            model.category,
+            (Placement(model.name, x, y, turned),),
+            1000,
+        )
+    )
     go(world, pose(x, y, z + 0.07, yaw), 1.0, 1.5)
     go(world, pose(x, y, z, yaw), 1.0, 1.5)
     for i in range(24):
@@ -197,20 +249,36 @@ def test_a_scripted_grasp_lifts_shakes_and_holds(thing: str, control: Literal["e
     assert abs(truth.objects_world[model.name][2] - lifted) < 0.015
 
 
-def test_fixed_cameras_see_the_workspace_and_the_arm_at_home_hides_none_of_it_from_the_front() -> None:
+def test_fixed_cameras_see_the_workspace_and_the_arm_at_home_hides_none_of_it_from_the_front() -> (
+    None
+):
     model = env("cup", "joint").scene.model
     data = mujoco.MjData(model)
-    for name, angle in zip((*SO101.joints, *SO101.fingers), (*SO101.home, *SO101.fingers_open), strict=True):
+    for name, angle in zip(
+        (*SO101.joints, *SO101.fingers), (*SO101.home, *SO101.fingers_open), strict=True
+    ):
         data.joint(name).qpos[0] = angle
     mujoco.mj_forward(model, data)
-    corners = np.array([(x, y, z) for x in (X[0] - 0.02, X[1] + 0.02) for y in (-Y - 0.02, Y + 0.02) for z in (0.0, 0.12)])
+    corners = np.array(
+        [
+            (x, y, z)
+            for x in (X[0] - 0.02, X[1] + 0.02)
+            for y in (-Y - 0.02, Y + 0.02)
+            for z in (0.0, 0.12)
+        ]
+    )
     for name in ("front", "side"):
         seen = camera(model, data, name, (224, 224))
         local = (corners - seen.pose_world[:3, 3]) @ seen.pose_world[:3, :3]
         pixels = (local / local[:, 2:] @ seen.k.T)[:, :2]
         assert ((pixels > 0) & (pixels < 224)).all(), name
-    eye, met = camera(model, data, "front", (224, 224)).pose_world[:3, 3].copy(), np.zeros(1, np.int32)
+    eye, met = (
+        camera(model, data, "front", (224, 224)).pose_world[:3, 3].copy(),
+        np.zeros(1, np.int32),
+    )
     robot = model.body("base").id
     for corner in np.concatenate([corners, corners * [1, 0, 1]]):
         share = mujoco.mj_ray(model, data, eye, corner - eye, None, 1, -1, met)
-        assert share < 0 or share >= 0.999 or model.body_rootid[model.geom_bodyid[met[0]]] != robot, corner
+        assert (
+            share < 0 or share >= 0.999 or model.body_rootid[model.geom_bodyid[met[0]]] != robot
+        ), corner

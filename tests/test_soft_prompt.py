@@ -8,16 +8,20 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import make_pre_post_processors
 
-from vap_core import engine, experiments, soft_prompt, suites, tokens
-from vap_core.errors import BadMemory, BadStudy
-from vap_core.experiments import Study
+from vap_core.base.errors import BadMemory, BadStudy
+from vap_core.evaluation import engine
+from vap_core.evaluation import study as experiments
+from vap_core.evaluation.study import Study
+from vap_core.policies.mini_pi0 import learned_token, teach_token
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
+from vap_core.policies.mini_pi0.learned_token import WORD, Lesson
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
+from vap_core.policies.mini_pi0.teach_token import photographs
 from vap_core.policies.mini_pi0.vlm import MiniVlm, grow
 from vap_core.policies.mini_pi0.vlm import load as load_vlm
-from vap_core.sim import objects
-from vap_core.soft_prompt import photographs
-from vap_core.tokens import Lesson
+from vap_core.rollout.prompters.text import TextPrompter, soft_prompt
+from vap_core.simulation import suites
+from vap_core.simulation.assets import objects
 from vap_core.training.words import vocabulary
 
 SUITE, TASK, STATE, ACTION = "simpler-bridge", "put-camera", 13, 7
@@ -44,14 +48,17 @@ def grown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
         policy = MiniPI0Policy(config(vlm.sha256()))
     grow(vlm, policy)
     policy.save_pretrained(far)
-    stats = {name: {"mean": torch.zeros(n), "std": torch.ones(n)} for name, n in (("observation.state", STATE), ("action", ACTION))}
+    stats = {
+        name: {"mean": torch.zeros(n), "std": torch.ones(n)}
+        for name, n in (("observation.state", STATE), ("action", ACTION))
+    }
     for pipeline in make_pre_post_processors(policy.config, dataset_stats=stats):
         pipeline.save_pretrained(far)
     return home, far
 
 
 def test_my_cup_becomes_a_word() -> None:
-    say = soft_prompt.soft_prompt().say
+    say = soft_prompt(WORD).rewrite
     assert say("put my camera on the plate") == "put <my_0> on the plate"
     assert say("pick up my straw cup") == "pick up <my_0>"
 
@@ -61,17 +68,23 @@ def test_photos_show_the_target_its_look_alikes_and_others() -> None:
     photos = photographs(rows, 0, 5)
     names = {place.model for row in rows for place in row.placements}
     rivals = [name for name in names if "lookalike" in name]
-    assert (len(photos.own), len(photos.rivals), len(photos.others)) == (5, 12 * len(rivals), 5 * soft_prompt.OTHERS)
-    assert {objects.get(name).category for name in rivals} == {"camera"}
+    assert (len(photos.own), len(photos.rivals), len(photos.others)) == (
+        5,
+        12 * len(rivals),
+        5 * teach_token.OTHERS,
+    )
+    assert {objects.get_object(name).category for name in rivals} == {"camera"}
     unseen = photographs(rows, 1, 5)
     assert not any(np.array_equal(one, two) for one in photos.own for two in unseen.own)
 
 
-def test_it_runs_as_a_method_and_the_policy_stays(grown: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_runs_as_a_method_and_the_policy_stays(
+    grown: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     home, far = grown
     monkeypatch.setattr(experiments, "MODEL", home)
-    monkeypatch.setattr(soft_prompt, "VIEWS", 2)
-    monkeypatch.setattr(tokens, "Lesson", lambda: Lesson(epochs=2, looks=1))
+    monkeypatch.setattr(teach_token, "VIEWS", 2)
+    monkeypatch.setattr(learned_token, "Lesson", lambda: Lesson(epochs=2, looks=1))
     study = Study(((SUITE, TASK),), ("generic", "soft"), episodes=1, policy=str(far))
     engine.store.open_run(tmp_path, study.configuration())
     experiments.register_personal(study, tmp_path / "memory")
@@ -80,9 +93,13 @@ def test_it_runs_as_a_method_and_the_policy_stays(grown: tuple[Path, Path], tmp_
     assert {row["outcome"] for row in rows.values()} == {"failure"}
     assert rows["soft"]["policy_sha256"] == rows["generic"]["policy_sha256"] != ""
     row, bank = study.rows(SUITE, TASK)[0], tmp_path / "memory"
-    soft, plain = (experiments.make_trial(study, [row], method, bank) for method in ("soft", "generic"))
-    assert soft.attender is not None
-    assert plain.attender is None
+    soft, plain = (
+        experiments.make_trial(study, [row], method, bank) for method in ("soft", "generic")
+    )
+    assert isinstance(soft.prompter, TextPrompter)
+    assert isinstance(plain.prompter, TextPrompter)
+    assert soft.prompter.rewrite(row.instruction) == "put <my_0> on the plate"
+    assert plain.prompter.rewrite(row.instruction) == row.instruction
     (token,) = bank.glob("*.token.safetensors")
     token.unlink()
     with pytest.raises(BadMemory, match="no learned word"):
@@ -91,9 +108,12 @@ def test_it_runs_as_a_method_and_the_policy_stays(grown: tuple[Path, Path], tmp_
 
 def test_a_policy_of_another_model_is_refused(grown: tuple[Path, Path], tmp_path: Path) -> None:
     rows = suites.rows(SUITE, TASK)[:1]
-    for sha, told in (("f" * 64, "from mini-PaliGemma ffffffff"), ("", "from no mini-PaliGemma")):
-        with pytest.raises(BadStudy, match=f"the policy grew {told}, the one in .* leave soft out"):
-            soft_prompt.teach(rows, tmp_path, sha, grown[0])
+    for sha, told in (("f" * 64, "mini-PaliGemma ffffffff"), ("", "none")):
+        with pytest.raises(
+            BadStudy,
+            match=f"the policy was initialised from {told}, but the model in .* leave soft out",
+        ):
+            teach_token.teach(rows, tmp_path, sha, grown[0])
 
 
 def test_a_policy_without_words_is_refused() -> None:

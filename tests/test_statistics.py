@@ -10,29 +10,33 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import binom, binomtest, norm, permutation_test
 
-from vap_core import suites
-from vap_core.metrics import intervals, rate
-from vap_core.statistics import (
+from vap_core.evaluation.layouts import layout_name, layout_names
+from vap_core.evaluation.metrics import intervals, rate
+from vap_core.evaluation.power import (
+    detectable_effect_text,
+    minimum_detectable_effect,
+    power,
+)
+from vap_core.evaluation.statistics import (
     ALL_TASKS,
     Comparison,
     bootstrap_interval,
     compare,
-    foresight,
     holm,
-    layout,
-    layouts,
     mcnemar,
-    minimum_detectable_effect,
-    power,
     sign_flip,
 )
+from vap_core.simulation import suites
 
 
 @given(st.integers(1, 400).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
 def test_the_conservative_interval_is_scipys_exact_one(kn: tuple[int, int]) -> None:
     k, n = kn
     ours, theirs = rate(k, n, conservative=True), binomtest(k, n).proportion_ci(method="exact")
-    assert (ours.low, ours.high) == (pytest.approx(theirs.low, abs=1e-9), pytest.approx(theirs.high, abs=1e-9))
+    assert (ours.low, ours.high) == (
+        pytest.approx(theirs.low, abs=1e-9),
+        pytest.approx(theirs.high, abs=1e-9),
+    )
 
 
 def test_the_conservative_interval_never_covers_less_than_it_says_and_wilsons_does() -> None:
@@ -41,7 +45,9 @@ def test_the_conservative_interval_never_covers_less_than_it_says_and_wilsons_do
     for conservative in (True, False):
         low, high = intervals(np.arange(n + 1), np.full(n + 1, n), conservative=conservative)
         inside = (low[:, None] <= shares) & (shares <= high[:, None])
-        covered[conservative] = (binom.pmf(np.arange(n + 1)[:, None], n, shares) * inside).sum(axis=0)
+        covered[conservative] = (binom.pmf(np.arange(n + 1)[:, None], n, shares) * inside).sum(
+            axis=0
+        )
     assert covered[True].min() >= 0.95
     assert covered[False].min() < 0.95 < covered[False].mean() + 0.01
 
@@ -68,13 +74,19 @@ def test_the_bootstrap_of_many_even_clusters_is_the_normal_interval_of_their_mea
     gain = np.random.default_rng(1).choice([-1.0, 0.0, 1.0], size=600, p=[0.1, 0.6, 0.3])
     low, high = bootstrap_interval(gain, np.ones(600))
     half = norm.ppf(0.975) * gain.std() / math.sqrt(600)
-    assert (low, high) == (pytest.approx(gain.mean() - half, abs=0.005), pytest.approx(gain.mean() + half, abs=0.005))
+    assert (low, high) == (
+        pytest.approx(gain.mean() - half, abs=0.005),
+        pytest.approx(gain.mean() + half, abs=0.005),
+    )
 
 
 def test_the_bootstrap_covers_the_truth_about_as_often_as_it_says() -> None:
     rng, draws = np.random.default_rng(7), 150
     gains = rng.choice([-1.0, 0.0, 1.0], size=(draws, 60), p=[0.05, 0.7, 0.25])
-    inside = [low <= 0.2 <= high for low, high in (bootstrap_interval(gain, np.ones(60)) for gain in gains)]
+    inside = [
+        low <= 0.2 <= high
+        for low, high in (bootstrap_interval(gain, np.ones(60)) for gain in gains)
+    ]
     assert 0.89 <= np.mean(inside) <= 0.99
 
 
@@ -83,11 +95,16 @@ def test_repeating_every_episode_of_a_cluster_adds_no_certainty() -> None:
     assert bootstrap_interval(10 * gain, 10 * ones) == pytest.approx(bootstrap_interval(gain, ones))
 
 
-@pytest.mark.parametrize(("gain", "least"), [(0.0, -1.0), (1.0, -1.0), (-1.0, -1.0), (0.0, 0.0), (1.0, 0.0)])
+@pytest.mark.parametrize(
+    ("gain", "least"), [(0.0, -1.0), (1.0, -1.0), (-1.0, -1.0), (0.0, 0.0), (1.0, 0.0)]
+)
 def test_clusters_that_are_all_alike_are_not_certain(gain: float, least: float) -> None:
     unseen = 1 - 0.025 ** (1 / 20)  # the largest share that 20 draws miss in one of forty cases
     low, high = bootstrap_interval(np.full(20, gain), np.ones(20), least)
-    assert (low, high) == (pytest.approx(gain - unseen * (gain - least)), pytest.approx(gain + unseen * (1 - gain)))
+    assert (low, high) == (
+        pytest.approx(gain - unseen * (gain - least)),
+        pytest.approx(gain + unseen * (1 - gain)),
+    )
     assert high - low > 0.15
 
 
@@ -105,15 +122,28 @@ def test_the_sign_test_of_more_clusters_is_scipys_permutation_test(gain: list[in
     def total(g: np.ndarray, axis: int = -1) -> np.ndarray:
         return g.sum(axis=axis)
 
-    drawn = permutation_test((np.array(gain, float),), total, permutation_type="samples", n_resamples=4000, rng=np.random.default_rng(6))
-    assert sign_flip(np.array(gain, float)) == pytest.approx(min(1.0, float(drawn.pvalue)), abs=0.035)
+    drawn = permutation_test(
+        (np.array(gain, float),),
+        total,
+        permutation_type="samples",
+        n_resamples=4000,
+        rng=np.random.default_rng(6),
+    )
+    assert sign_flip(np.array(gain, float)) == pytest.approx(
+        min(1.0, float(drawn.pvalue)), abs=0.035
+    )
 
 
 def test_the_sign_test_is_fine_enough_for_many_comparisons() -> None:
     assert sign_flip(np.full(40, 3.0)) == pytest.approx(2 * 0.5**40)
 
 
-def episodes(won: dict[str, list[int]], task: str = "pick-shaver", suite: str = "simpler-bridge", **more: object) -> pd.DataFrame:
+def episodes(
+    won: dict[str, list[int]],
+    task: str = "pick-shaver",
+    suite: str = "simpler-bridge",
+    **more: object,
+) -> pd.DataFrame:
     """The first episodes of a list under each method, won or not."""
     rows = [
         {"suite": suite, "task": task, "split": "", "variant": "base", "episode": i, "seed": 0, "policy": "scripted", "method": method,
@@ -132,7 +162,16 @@ def told(c: Comparison) -> tuple[object, ...]:
 
 def test_a_pair_of_methods_is_counted_by_hand() -> None:
     (c,) = compare(episodes(WON))
-    assert (c.one, c.other, c.pairs, c.layouts, c.both, c.only_one, c.only_other, c.neither) == ("generic", "vap", 10, 10, 2, 1, 6, 1)
+    assert (c.one, c.other, c.pairs, c.layouts, c.both, c.only_one, c.only_other, c.neither) == (
+        "generic",
+        "vap",
+        10,
+        10,
+        2,
+        1,
+        6,
+        1,
+    )
     assert c.difference == pytest.approx(0.5)
     assert c.p == c.p_mcnemar == c.p_holm == mcnemar(1, 6)
     assert c.low < 0.5 < c.high
@@ -140,7 +179,9 @@ def test_a_pair_of_methods_is_counted_by_hand() -> None:
 
 def test_an_error_is_no_success() -> None:
     table = episodes(WON)
-    table.loc[table.method.eq("vap") & table.episode.eq(0), "outcome"] = "error"  # its success was already seen
+    table.loc[table.method.eq("vap") & table.episode.eq(0), "outcome"] = (
+        "error"  # its success was already seen
+    )
     (c,) = compare(table)
     assert (c.both, c.only_one, c.pairs) == (1, 2, 10)
 
@@ -155,27 +196,48 @@ def test_what_one_method_did_not_run_is_no_pair() -> None:
 
 
 def test_policies_are_never_mixed() -> None:
-    assert compare(pd.concat([episodes({"generic": [1, 0]}), episodes({"vap": [1, 0]}).assign(policy="other")])) == []
+    assert (
+        compare(
+            pd.concat(
+                [episodes({"generic": [1, 0]}), episodes({"vap": [1, 0]}).assign(policy="other")]
+            )
+        )
+        == []
+    )
 
 
 def test_order_of_rows_and_names_of_methods_change_nothing() -> None:
-    table = pd.concat([episodes(WON), episodes({"generic": [0, 1, 0], "vap": [1, 0, 1]}, task="put-camera")], ignore_index=True)
+    table = pd.concat(
+        [episodes(WON), episodes({"generic": [0, 1, 0], "vap": [1, 0, 1]}, task="put-camera")],
+        ignore_index=True,
+    )
     plain = [told(c) for c in compare(table, ["generic", "vap"])]
-    shuffled = sorted(told(c) for c in compare(table.sample(frac=1, random_state=3), ["generic", "vap"]))
+    shuffled = sorted(
+        told(c) for c in compare(table.sample(frac=1, random_state=3), ["generic", "vap"])
+    )
     assert shuffled == sorted(plain)
     renamed = compare(table.replace({"vap": "zzz", "generic": "yyy"}), ["yyy", "zzz"])
     assert [told(c)[6:] for c in renamed] == [line[6:] for line in plain]
 
 
 def test_turning_the_comparison_round_turns_its_sign() -> None:
-    (c,), (back,) = compare(episodes(WON), ["generic", "vap"]), compare(episodes(WON), ["vap", "generic"])
+    (c,), (back,) = (
+        compare(episodes(WON), ["generic", "vap"]),
+        compare(episodes(WON), ["vap", "generic"]),
+    )
     assert (back.one, back.other, back.difference, back.p) == ("vap", "generic", -c.difference, c.p)
-    assert (back.low, back.high) == (pytest.approx(-c.high, abs=0.11), pytest.approx(-c.low, abs=0.11))  # a tenth is one episode
+    assert (back.low, back.high) == (
+        pytest.approx(-c.high, abs=0.11),
+        pytest.approx(-c.low, abs=0.11),
+    )  # a tenth is one episode
 
 
 def test_seeds_of_one_layout_are_one_cluster() -> None:
     one = episodes(WON)
-    (once,), (ten,) = compare(one), compare(pd.concat([one.assign(seed=seed) for seed in range(10)]))
+    (once,), (ten,) = (
+        compare(one),
+        compare(pd.concat([one.assign(seed=seed) for seed in range(10)])),
+    )
     assert (ten.pairs, ten.layouts, ten.only_other) == (100, 10, 60)
     assert (ten.low, ten.high) == (pytest.approx(once.low), pytest.approx(once.high))
     assert ten.p == pytest.approx(once.p), "the same episodes ten times over prove no more"
@@ -192,7 +254,10 @@ def test_holm_takes_single_tasks_and_all_of_them_apart() -> None:
     methods = {**WON, "mask-only": [0] * 10}
     table = pd.concat([episodes(methods), episodes(methods, task="put-camera")])
     found = compare(table)
-    single, whole = [c for c in found if c.task != ALL_TASKS], [c for c in found if c.task == ALL_TASKS]
+    single, whole = (
+        [c for c in found if c.task != ALL_TASKS],
+        [c for c in found if c.task == ALL_TASKS],
+    )
     assert (len(single), len(whole)) == (6, 3)
     assert [c.p_holm for c in single] == pytest.approx(holm([c.p for c in single]))
     assert [c.p_holm for c in whole] == pytest.approx(holm([c.p for c in whole]))
@@ -201,18 +266,28 @@ def test_holm_takes_single_tasks_and_all_of_them_apart() -> None:
 
 def test_a_layout_of_simpler_returns_under_every_look() -> None:
     fractal = suites.lists.read("simpler-fractal")
-    known = pd.DataFrame([{"suite": r.suite, "task": r.task, "episode": r.episode, "seed": 0} for r in fractal]).assign(layout=lambda t: layouts(t))
-    assert known.groupby("task").layout.nunique().to_dict() == {"pick-pen-holder": 75, "move-bottle-near-coke-can": 40}
-    assert known.groupby("layout").size().value_counts().to_dict() == {15: 75, 14: 40}  # robot colours and variants
+    known = pd.DataFrame(
+        [{"suite": r.suite, "task": r.task, "episode": r.episode, "seed": 0} for r in fractal]
+    ).assign(layout=lambda t: layout_names(t))
+    assert known.groupby("task").layout.nunique().to_dict() == {
+        "pick-pen-holder": 75,
+        "move-bottle-near-coke-can": 40,
+    }
+    assert known.groupby("layout").size().value_counts().to_dict() == {
+        15: 75,
+        14: 40,
+    }  # robot colours and variants
     for name in ("simpler-bridge", "vlabench", "tabletop"):
         listed = suites.lists.read(name)
-        assert len({(row.task, layout(row)) for row in listed}) == len(listed)
+        assert len({(row.task, layout_name(row)) for row in listed}) == len(listed)
 
 
 def test_power_is_what_playing_it_gives() -> None:
     pairs, effect, discordant = 40, 0.3, 0.5
     rng = np.random.default_rng(5)
-    better = rng.multinomial(pairs, [(discordant + effect) / 2, (discordant - effect) / 2, 1 - discordant], size=4000)
+    better = rng.multinomial(
+        pairs, [(discordant + effect) / 2, (discordant - effect) / 2, 1 - discordant], size=4000
+    )
     found = np.mean([mcnemar(int(b), int(a)) <= 0.05 for a, b, _ in better])
     assert power(pairs, effect) == pytest.approx(found, abs=0.03)
     assert power(pairs, 0.0) <= 0.05
@@ -222,14 +297,18 @@ def test_what_can_be_detected() -> None:
     for pairs in (20, 24, 96, 300):
         effect = minimum_detectable_effect(pairs)
         assert power(pairs, effect) == pytest.approx(0.8, abs=2e-3)
-        assert effect == pytest.approx((norm.ppf(0.975) + norm.ppf(0.8)) * math.sqrt(0.5 / pairs), rel=0.2), "the normal approximation"
+        assert effect == pytest.approx(
+            (norm.ppf(0.975) + norm.ppf(0.8)) * math.sqrt(0.5 / pairs), rel=0.2
+        ), "the normal approximation"
     assert minimum_detectable_effect(96, discordant=0.2) < minimum_detectable_effect(96)
     assert math.isnan(minimum_detectable_effect(5)), "five discordant pairs give p = 0.0625 at best"
 
 
 def test_what_is_said_before_a_run() -> None:
-    assert foresight(suites.rows("simpler-bridge", "pick-shaver")) == (
+    assert detectable_effect_text(suites.rows("simpler-bridge", "pick-shaver")) == (
         "24 paired episodes: differences of 40 points or more are detected with 80 % power (alpha 5 %, exact McNemar, half of the pairs discordant)"
     )
-    assert foresight(suites.rows("simpler-fractal", "pick-pen-holder")).startswith("1125 paired episodes on 75 layouts: differences of 23 points")
-    assert "too few to detect" in foresight(suites.rows("widowx-pick", "pick-cup", 4))
+    assert detectable_effect_text(suites.rows("simpler-fractal", "pick-pen-holder")).startswith(
+        "1125 paired episodes on 75 layouts: differences of 23 points"
+    )
+    assert "too few to detect" in detectable_effect_text(suites.rows("widowx-pick", "pick-cup", 4))

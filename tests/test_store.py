@@ -5,10 +5,18 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from vap_core.errors import BadOutput
-from vap_core.store import KEY, append, compact, digest, open_run, read
+from vap_core.base.errors import BadOutput
+from vap_core.evaluation.store import KEY, append, compact, digest, open_run, read
 
-ROW = {"suite": "s", "task": "t", "method": "vap", "seed": 0, "episode": 0, "attempt": 1, "success": True}
+ROW = {
+    "suite": "s",
+    "task": "t",
+    "method": "vap",
+    "seed": 0,
+    "episode": 0,
+    "attempt": 1,
+    "success": True,
+}
 
 
 def test_digest_ignores_order_and_sees_change() -> None:
@@ -88,13 +96,23 @@ def test_many_parts_become_one_and_nothing_is_lost(tmp_path: Path) -> None:
     assert len(list((run / "parts").glob("*.parquet"))) == 1
     pd.testing.assert_frame_equal(read(run), before)
     held = pd.read_parquet(next((run / "parts").glob("*.parquet")))
-    assert sorted(zip(held.episode, held.attempt, strict=True)) == [(0, 1), (1, 1), (1, 2), (2, 1), (3, 1)]
-    append(run, [{**ROW, "episode": 0, "success": True, "outcome": "error"}])  # as if cut short before the old parts were gone
+    assert sorted(zip(held.episode, held.attempt, strict=True)) == [
+        (0, 1),
+        (1, 1),
+        (1, 2),
+        (2, 1),
+        (3, 1),
+    ]
+    append(
+        run, [{**ROW, "episode": 0, "success": True, "outcome": "error"}]
+    )  # as if cut short before the old parts were gone
     pd.testing.assert_frame_equal(read(run), before)
     assert len(whole) == 5
 
 
-def test_a_run_can_be_read_while_another_process_makes_one_part_of_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_can_be_read_while_another_process_makes_one_part_of_many(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run = open_run(tmp_path / "run", {"seed": 0})
     for i in range(3):
         append(run, [{**ROW, "episode": i}])

@@ -7,8 +7,8 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from vap_core.errors import UnknownName
-from vap_core.suites import WARM_UPS, pick, rows
+from vap_core.base.errors import UnknownName
+from vap_core.simulation.suites import WARM_UPS, pick, rows
 
 HASHES = {"widowx-pick": "5ffd241ec1089c2f", "franka-pick": "9ab6f5f161f891d5"}
 
@@ -17,7 +17,11 @@ FIELDS = ("suite", "task", "episode", "seed", "instruction", "category", "placem
 
 
 def digest(name: str) -> str:
-    listed = [{field: asdict(row)[field] for field in FIELDS} for task in WARM_UPS[name].tasks for row in rows(name, task.name, 20, 0)]
+    listed = [
+        {field: asdict(row)[field] for field in FIELDS}
+        for task in WARM_UPS[name].tasks
+        for row in rows(name, task.name, 20, 0)
+    ]
     return hashlib.sha256(json.dumps(listed, sort_keys=True).encode()).hexdigest()[:16]
 
 

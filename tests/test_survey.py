@@ -9,14 +9,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.toys import TOYS, personal, scene
-from vap_core import suites
 from vap_core.associate import PAIRINGS
-from vap_core.attend import Stack
-from vap_core.sim import objects
-from vap_core.survey.episodes import OFF, agreements, survey
-from vap_core.survey.openings import RULES, Looked, Tables, View, look, match, openings, remembered
-from vap_core.survey.openings import survey_view as survey_one
-from vap_core.values import Boxes, EpisodeRow, PersonalObject, Placement, Rgb
+from vap_core.base.types import Boxes, PersonalObject, Rgb
+from vap_core.evaluation.perception.episodes import OFF, agreements, survey
+from vap_core.evaluation.perception.first_frames import (
+    RULES,
+    Looked,
+    Tables,
+    View,
+    look,
+    match,
+    openings,
+    remembered,
+)
+from vap_core.evaluation.perception.first_frames import survey_view as survey_one
+from vap_core.perception.protocols import Stack
+from vap_core.simulation import suites
+from vap_core.simulation.assets import objects
+from vap_core.simulation.types import EpisodeRow, Placement
 
 RED, GREEN, BLUE = (250, 5, 5), (5, 250, 5), (5, 5, 250)
 MINE, HARD, EASY = "cup-personal", "cup-lookalike-3", "cup-lookalike-6"
@@ -30,7 +40,16 @@ def view(*names: str, hidden: Sequence[str] = ()) -> View:
         x, y, _ = PLACES[name]
         masks[name] = np.zeros((64, 64), bool)
         masks[name][y : y + 12, x : x + 12] = name not in hidden
-    row = EpisodeRow("toys", "pick-cup", 3, 0, "pick my cup", "cup", tuple(Placement(name, 0.1, 0.1, 0.0) for name in (MINE, HARD, EASY)), 10)
+    row = EpisodeRow(
+        "toys",
+        "pick-cup",
+        3,
+        0,
+        "pick my cup",
+        "cup",
+        tuple(Placement(name, 0.1, 0.1, 0.0) for name in (MINE, HARD, EASY)),
+        10,
+    )
     return View(row, "front", scene([PLACES[name] for name in names]), masks)
 
 
@@ -43,43 +62,76 @@ def survey_view(seen: View, stack: Stack, known: dict[int, PersonalObject]) -> T
 
 
 def test_tiers_of_the_toys() -> None:
-    assert [objects.tier(objects.get(name)) for name in (HARD, EASY)] == ["hard", "easy"]
+    assert [objects.tier(objects.get_object(name)) for name in (HARD, EASY)] == ["hard", "easy"]
 
 
-@pytest.mark.parametrize(("references", "elected"), [([RED] * 5, MINE), ([GREEN] * 3 + [RED] * 2, HARD), ([BLUE] * 5, EASY)])
+@pytest.mark.parametrize(
+    ("references", "elected"),
+    [([RED] * 5, MINE), ([GREEN] * 3 + [RED] * 2, HARD), ([BLUE] * 5, EASY)],
+)
 def test_the_elected_object_is_named(references: list[tuple[int, int, int]], elected: str) -> None:
     tables = survey_view(view(MINE, HARD, EASY), TOYS, memory(*references))
     vote = next(line for line in tables["choices"] if line["rule"] == "vote")
-    assert (vote["elected"], vote["right"], vote["right_given_boxes"]) == (elected, elected == MINE, elected == MINE)
+    assert (vote["elected"], vote["right"], vote["right_given_boxes"]) == (
+        elected,
+        elected == MINE,
+        elected == MINE,
+    )
     assert vote["mask_iou"] == (1.0 if elected == MINE else None)
     assert [line["rule"] for line in tables["choices"]] == list(RULES)
     (here,) = tables["views"]
-    assert (here["target_px"], here["counts"], here["visible_alike"], here["tier"], here["candidates"]) == (144, True, 3, "hard", 3)
+    assert (
+        here["target_px"],
+        here["counts"],
+        here["visible_alike"],
+        here["tier"],
+        here["candidates"],
+    ) == (144, True, 3, "hard", 3)
     assert (here["proposed"], here["mask_iou_true_box"]) == (True, 1.0)
-    assert [line["hit"] for line in tables["detections"] if line["asked"] == "category"] == [True] * 3
+    assert [line["hit"] for line in tables["detections"] if line["asked"] == "category"] == [
+        True
+    ] * 3
 
 
 def test_objects_carry_tier_and_cosine() -> None:
-    lines = {line["object"]: line for line in survey_view(view(MINE, HARD, EASY), TOYS, memory(RED))["objects"]}
+    lines = {
+        line["object"]: line
+        for line in survey_view(view(MINE, HARD, EASY), TOYS, memory(RED))["objects"]
+    }
     assert [lines[name]["tier"] for name in (MINE, HARD, EASY)] == ["personal", "hard", "easy"]
     assert lines[MINE]["cosine"] == pytest.approx(1.0)
     assert lines[MINE]["cosine"] > lines[HARD]["cosine"]
-    assert all(line["recalled"] and line["proposed"] and line["px"] == 144 for line in lines.values())
+    assert all(
+        line["recalled"] and line["proposed"] and line["px"] == 144 for line in lines.values()
+    )
 
 
 def test_a_view_without_the_target_elects_nobody_and_does_not_count() -> None:
     tables = survey_view(view(EASY, hidden=(MINE,)), TOYS, memory(RED))
     (here,) = tables["views"]
-    assert (here["counts"], here["target_px"], here["tier"], here["proposed"]) == (False, 0, "standard", None)
+    assert (here["counts"], here["target_px"], here["tier"], here["proposed"]) == (
+        False,
+        0,
+        "standard",
+        None,
+    )
     assert tables["choices"] == []
     assert [line["object"] for line in tables["objects"]] == [EASY]
 
 
 def test_a_view_without_candidates_is_a_miss_of_the_detector_alone() -> None:
-    blind = replace(TOYS, detector=lambda images, phrase, threshold=None: [Boxes.empty(phrase) for _ in images])
+    blind = replace(
+        TOYS, detector=lambda images, phrase, threshold=None: [Boxes.empty(phrase) for _ in images]
+    )
     tables = survey_view(view(MINE, HARD), blind, memory(RED))
     vote = tables["choices"][0]
-    assert (vote["elected"], vote["right"], vote["right_given_boxes"], vote["margin"], vote["mask_iou"]) == ("", False, True, 0.0, None)
+    assert (
+        vote["elected"],
+        vote["right"],
+        vote["right_given_boxes"],
+        vote["margin"],
+        vote["mask_iou"],
+    ) == ("", False, True, 0.0, None)
     assert tables["views"][0]["proposed"] is False
     assert not any(line["recalled"] for line in tables["objects"])
     assert tables["detections"] == []
@@ -87,7 +139,10 @@ def test_a_view_without_candidates_is_a_miss_of_the_detector_alone() -> None:
 
 def test_a_box_on_nothing_is_called_nothing() -> None:
     def astray(images: Sequence[Rgb], phrase: str, threshold: float | None = None) -> list[Boxes]:
-        return [Boxes(np.array([[4, 40, 16, 52]], np.float32), np.ones(1, np.float32), phrase) for _ in images]
+        return [
+            Boxes(np.array([[4, 40, 16, 52]], np.float32), np.ones(1, np.float32), phrase)
+            for _ in images
+        ]
 
     lit = replace(view(MINE), rgb=scene([PLACES[MINE], (4, 40, RED)]))
     tables = survey_view(lit, replace(TOYS, detector=astray), memory(RED))
@@ -99,15 +154,22 @@ def boxes(*corners: tuple[float, float, float, float]) -> np.ndarray:
     return np.array(corners, np.float32).reshape(-1, 4)
 
 
-def test_a_second_box_on_an_object_is_false_and_one_on_an_ignored_object_counts_neither_way() -> None:
+def test_a_second_box_on_an_object_is_false_and_one_on_an_ignored_object_counts_neither_way() -> (
+    None
+):
     here, there = (0.0, 0.0, 10.0, 10.0), (20.0, 0.0, 30.0, 10.0)
     assert match(boxes(here, here, there), boxes(here), boxes(there)) == [True, False, None]
     assert match(boxes(here), boxes(), boxes()) == [False]
     assert match(boxes(), boxes(here), boxes()) == []
 
 
-@given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=6), st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=4))
-def test_match_agrees_with_a_slow_reference(found: list[tuple[int, int]], wanted: list[tuple[int, int]]) -> None:
+@given(
+    st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=6),
+    st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=4),
+)
+def test_match_agrees_with_a_slow_reference(
+    found: list[tuple[int, int]], wanted: list[tuple[int, int]]
+) -> None:
     def box(corner: tuple[int, int]) -> tuple[float, float, float, float]:
         return (float(corner[0]), float(corner[1]), corner[0] + 4.0, corner[1] + 4.0)
 
@@ -139,20 +201,37 @@ def test_agreements_tell_contradiction_and_what_geometry_makes_of_it() -> None:
     """True boxes, and embeddings that say who is who by a hair, but for one view in which they name a look-alike."""
     (episode,) = openings(suites.rows("vlabench", "select-shoe", 1))
     target = episode[0].row.target
-    names = [name for name in episode[0].masks if objects.get(name).category == "shoe"]
+    names = [name for name in episode[0].masks if objects.get_object(name).category == "shoe"]
     assert all(name in v.visible() for v in episode for name in names)
 
     def told(view: View, favourite: str) -> Looked:
         side = np.array([0.45 if name == favourite else 0.40 for name in names])
         rows = np.stack([side, np.sqrt(1 - side**2)], axis=1).astype(np.float32)
-        return Looked(Boxes(np.stack([view.boxes()[name] for name in names]), np.ones(len(names), np.float32), "shoe"), rows)
+        return Looked(
+            Boxes(
+                np.stack([view.boxes()[name] for name in names]),
+                np.ones(len(names), np.float32),
+                "shoe",
+            ),
+            rows,
+        )
 
     mine = replace(personal(target, "shoe", RED), embeddings=np.array([[1.0, 0.0]], np.float32))
-    honest = {line["associate"]: line for line in agreements(episode, [told(v, target) for v in episode], mine)}
+    honest = {
+        line["associate"]: line
+        for line in agreements(episode, [told(v, target) for v in episode], mine)
+    }
     assert list(honest) == [OFF, *PAIRINGS]
-    assert all((line["case"], line["right"], line["views"]) == ("right", 3, 3) for line in honest.values())
+    assert all(
+        (line["case"], line["right"], line["views"]) == ("right", 3, 3) for line in honest.values()
+    )
     other = next(name for name in names if name != target)
-    torn = {line["associate"]: line for line in agreements(episode, [told(v, other if v.camera == "side" else target) for v in episode], mine)}
+    torn = {
+        line["associate"]: line
+        for line in agreements(
+            episode, [told(v, other if v.camera == "side" else target) for v in episode], mine
+        )
+    }
     assert (torn[OFF]["case"], torn[OFF]["right"]) == ("case 2", 2)
     assert (torn["geometry"]["case"], torn["geometry"]["right"]) == ("right", 3)
 
@@ -160,20 +239,29 @@ def test_agreements_tell_contradiction_and_what_geometry_makes_of_it() -> None:
 def test_the_list_is_spread_over_splits_and_variants() -> None:
     rows = suites.rows("simpler-fractal", "pick-pen-holder", 60)
     assert {row.split for row in rows} == {"visual matching", "variant aggregation"}
-    assert {row.variant for row in rows} == {row.variant for row in suites.rows("simpler-fractal", "pick-pen-holder")}
+    assert {row.variant for row in rows} == {
+        row.variant for row in suites.rows("simpler-fractal", "pick-pen-holder")
+    }
 
 
 def test_survey_fills_every_table_and_keys_every_line() -> None:
-    from vap_core.attend import load_stack
+    from vap_core.perception.stacks import load_stack
 
     (episode,) = openings(suites.rows("simpler-bridge", "pick-shaver", 1))
     stack = load_stack("embedded")
     tables = survey(episode, stack, ks=(1, 5))
     assert len(tables["views"]) == 1
-    assert [(line["k"], line["rule"]) for line in tables["choices"]] == [(1, "vote"), (1, "average"), (5, "vote"), (5, "average")]
+    assert [(line["k"], line["rule"]) for line in tables["choices"]] == [
+        (1, "vote"),
+        (1, "average"),
+        (5, "vote"),
+        (5, "average"),
+    ]
     assert tables.pop("agreements") == []
     for name, lines in tables.items():
         assert lines, name
-        assert all(line["suite"] == "simpler-bridge" and line["camera"] == "front" for line in lines)
+        assert all(
+            line["suite"] == "simpler-bridge" and line["camera"] == "front" for line in lines
+        )
     mine, _ = remembered(stack, "shaver-personal", 5)
     assert len(mine.crops) == 5

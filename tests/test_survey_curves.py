@@ -6,15 +6,23 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vap_core.metrics import rate
-from vap_core.plots import write_png
-from vap_core.survey import curves
-from vap_core.survey.episodes import OFF
-from vap_core.survey.openings import KS, RULES
-from vap_core.survey.report import measures, report
+from vap_core.base.figures import write_png
+from vap_core.evaluation.metrics import rate
+from vap_core.evaluation.perception import curves
+from vap_core.evaluation.perception.episodes import OFF
+from vap_core.evaluation.perception.first_frames import KS, RULES
+from vap_core.evaluation.perception.report import measures, report
 
-SUITES = {"vlabench": ("select-shoe", ("front", "side")), "simpler-bridge": ("pick-shaver", ("front",))}
-KEYS = [{"suite": s, "task": task, "episode": i, "camera": camera} for s, (task, cameras) in SUITES.items() for i in range(4) for camera in cameras]
+SUITES = {
+    "vlabench": ("select-shoe", ("front", "side")),
+    "simpler-bridge": ("pick-shaver", ("front",)),
+}
+KEYS = [
+    {"suite": s, "task": task, "episode": i, "camera": camera}
+    for s, (task, cameras) in SUITES.items()
+    for i in range(4)
+    for camera in cameras
+]
 
 
 def tables() -> dict[str, pd.DataFrame]:
@@ -23,30 +31,90 @@ def tables() -> dict[str, pd.DataFrame]:
     for n, key in enumerate(KEYS):
         counts, good = key["episode"] < 3, n % 2 == 0
         known = good if counts else None
-        views.append({**key, "counts": counts, "proposed": known, "mask_iou_true_box": 0.9 if counts else None, "false_alarm": False})
-        for role, tier, cosine in (("target", "personal", 0.8), ("look-alike", "hard", 0.9 if n == 0 else 0.5)):
+        views.append(
+            {
+                **key,
+                "counts": counts,
+                "proposed": known,
+                "mask_iou_true_box": 0.9 if counts else None,
+                "false_alarm": False,
+            }
+        )
+        for role, tier, cosine in (
+            ("target", "personal", 0.8),
+            ("look-alike", "hard", 0.9 if n == 0 else 0.5),
+        ):
             if counts or role != "target":
-                line = {"role": role, "tier": tier, "px": 200 + 10 * n, "recalled": good, "proposed": good, "cosine": cosine, "recalled_unseen": None}
+                line = {
+                    "role": role,
+                    "tier": tier,
+                    "px": 200 + 10 * n,
+                    "recalled": good,
+                    "proposed": good,
+                    "cosine": cosine,
+                    "recalled_unseen": None,
+                }
                 objects.append({**key, "object": f"{role} {n}", **line})
-        detections += [{**key, "asked": asked, "score": 0.9 - 0.01 * n, "hit": good} for asked in ("category", "unseen")]
-        tie = {"margin": (n % 3) / 5, "cosine_margin": 0.01 * n, "elected": "x" if n != 4 else "", "mask_iou": 0.9 if good else None}
+        detections += [
+            {**key, "asked": asked, "score": 0.9 - 0.01 * n, "hit": good}
+            for asked in ("category", "unseen")
+        ]
+        tie = {
+            "margin": (n % 3) / 5,
+            "cosine_margin": 0.01 * n,
+            "elected": "x" if n != 4 else "",
+            "mask_iou": 0.9 if good else None,
+        }
         if counts:
             choices += [
-                {**key, "tier": "hard", "k": k, "rule": rule, "right": good and n != 4, "right_given_boxes": True, **tie}
+                {
+                    **key,
+                    "tier": "hard",
+                    "k": k,
+                    "rule": rule,
+                    "right": good and n != 4,
+                    "right_given_boxes": True,
+                    **tie,
+                }
                 for k in KS
                 for rule in RULES
             ]
         for hidden, kind in ((0, ""), (3, "plate")):
             over_time = [None, 1.0, 0.5]
-            about = {"object": "a", "target": True, "hidden": hidden, "kind": kind, "kept": good, "mean_iou": 0.75, "iou_over_time": over_time}
+            about = {
+                "object": "a",
+                "target": True,
+                "hidden": hidden,
+                "kind": kind,
+                "kept": good,
+                "mean_iou": 0.75,
+                "iou_over_time": over_time,
+            }
             tracks.append({**key, **about})
     agreements = [{"suite": "vlabench", "task": "t", "episode": 0, "associate": way, "case": case, "right": right, "views": 2}
                   for way, case, right in ((OFF, "case 2", 1), ("geometry", "right", 2))]  # fmt: skip
     took = {"start-up grounding": 200.0, "track step": 60.0, "pass": 20.0}
-    speed = [{"what": what, "ms": ms, "low_ms": ms - 1, "high_ms": ms + 1, "rounds": 5} for what, ms in took.items()]
+    speed = [
+        {"what": what, "ms": ms, "low_ms": ms - 1, "high_ms": ms + 1, "rounds": 5}
+        for what, ms in took.items()
+    ]
     references = [{"suite": "vlabench", "task": "t", "target": "a", "k": 4, "whole": 1}]
-    made = {"views": views, "objects": objects, "detections": detections, "choices": choices, "tracks": tracks}
-    return {name: pd.DataFrame(lines) for name, lines in {**made, "agreements": agreements, "speed": speed, "references": references}.items()}
+    made = {
+        "views": views,
+        "objects": objects,
+        "detections": detections,
+        "choices": choices,
+        "tracks": tracks,
+    }
+    return {
+        name: pd.DataFrame(lines)
+        for name, lines in {
+            **made,
+            "agreements": agreements,
+            "speed": speed,
+            "references": references,
+        }.items()
+    }
 
 
 def test_measures_count_what_shows_the_target() -> None:
@@ -66,9 +134,18 @@ def test_measures_count_what_shows_the_target() -> None:
 
 def test_the_report_tells_every_part() -> None:
     told = report(tables(), "toys")
-    for part in ("stack toys", "simpler-bridge 1 of 4, vlabench 2 of 8", "K = 7, average", "vlabench side", "geometry", "by the detector: 75.0"):
+    for part in (
+        "stack toys",
+        "simpler-bridge 1 of 4, vlabench 2 of 8",
+        "K = 7, average",
+        "vlabench side",
+        "geometry",
+        "by the detector: 75.0",
+    ):
         assert part in told
-    times = {line.split("  ")[0]: line.split() for line in told.splitlines() if ", 5 rounds" in line}
+    times = {
+        line.split("  ")[0]: line.split() for line in told.splitlines() if ", 5 rounds" in line
+    }
     assert times["track step, 5 rounds"][-2:] == ["3.00", "short"]
     assert times["start-up grounding, 5 rounds"][-2:] == ["10.00", "met"]
 
@@ -102,7 +179,10 @@ def test_figures_draw(draw, table: str, axes: int, tmp_path: Path) -> None:
 
 def test_time_and_hidden_figures_show_the_numbers() -> None:
     lines = curves.time_figure(tables()["tracks"]).axes[0].lines
-    assert [line.get_label() for line in lines[:2]] == ["simpler-bridge, 4 tracks", "vlabench, 8 tracks"]
+    assert [line.get_label() for line in lines[:2]] == [
+        "simpler-bridge, 4 tracks",
+        "vlabench, 8 tracks",
+    ]
     assert lines[0].get_ydata()[1:].tolist() == [1.0, 0.5]
     assert np.isnan(lines[0].get_ydata()[0])
     kept = curves.hidden_figure(tables()["tracks"]).axes[0].containers[0].lines[0]

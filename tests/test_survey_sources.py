@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 import vap_core
-from vap_core.sim import objects
-from vap_core.suites import BENCHMARKS, benchmark, simpler
-from vap_core.training import scenes
+from vap_core.simulation.assets import objects
+from vap_core.simulation.suites import BENCHMARKS, benchmark, simpler
+from vap_core.training.films import scenes
 
-PLACED = sorted({place.model for name in BENCHMARKS for row in benchmark(name) for place in row.placements})
+PLACED = sorted(
+    {place.model for name in BENCHMARKS for row in benchmark(name) for place in row.placements}
+)
 NUMBER = re.compile(r"-generic-(\d+)")
 SOURCES = sorted(Path(vap_core.__file__).parent.rglob("*.py"))
 EXECUTES = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"}
@@ -22,7 +24,12 @@ TEXT_ONLY = re.compile("Tokenizer|Processor|Config|get_policy_class")
 
 
 def test_training_draws_no_object_that_a_benchmark_places() -> None:
-    cast = {model.name for i in range(40) for held_out in (False, True) for model in scenes.cast(np.random.default_rng(i), held_out)[0]}
+    cast = {
+        model.name
+        for i in range(40)
+        for held_out in (False, True)
+        for model in scenes.cast(np.random.default_rng(i), held_out)[0]
+    }
     assert len(cast) > 200
     assert not cast & set(PLACED)
 
@@ -32,14 +39,26 @@ def test_whatever_a_benchmark_places_lies_outside_the_numbers_that_training_draw
     found = [NUMBER.search(name) for name in PLACED]
     generic = [int(match[1]) for match in found if match]
     assert generic
-    assert all(scenes.TRAIN_INSTANCES <= simpler.NOVEL <= number < scenes.HELD_OUT for number in generic)
-    assert {objects.get(name).split for name, match in zip(PLACED, found, strict=True) if not match} == {"personal", "lookalike", "prop"}
+    assert all(
+        scenes.TRAIN_INSTANCES <= simpler.NOVEL <= number < scenes.HELD_OUT for number in generic
+    )
+    assert {
+        objects.get_object(name).split
+        for name, match in zip(PLACED, found, strict=True)
+        if not match
+    } == {"personal", "lookalike", "prop"}
 
 
 def test_no_training_instance_looks_like_one_that_a_benchmark_places() -> None:
-    placed = {repr((objects.get(name).shape, objects.get(name).texture)) for name in PLACED}
-    kinds = {objects.get(name).category for name in PLACED}
-    trained = {repr((model.shape, model.texture)) for kind in sorted(kinds) for model in (objects.generic(kind, i) for i in range(20))}
+    placed = {
+        repr((objects.get_object(name).shape, objects.get_object(name).texture)) for name in PLACED
+    }
+    kinds = {objects.get_object(name).category for name in PLACED}
+    trained = {
+        repr((model.shape, model.texture))
+        for kind in sorted(kinds)
+        for model in (objects.generic_instance(kind, i) for i in range(20))
+    }
     assert len(trained) == 20 * len(kinds)
     assert not placed & trained
 
@@ -48,7 +67,11 @@ def calls(tree: ast.AST) -> Iterator[tuple[str, dict[str, object]]]:
     """Every call by what it names, such as "torch.load", with its literal keywords."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Call):
-            keywords = {word.arg: word.value.value for word in node.keywords if word.arg and isinstance(word.value, ast.Constant)}
+            keywords = {
+                word.arg: word.value.value
+                for word in node.keywords
+                if word.arg and isinstance(word.value, ast.Constant)
+            }
             yield ast.unparse(node.func), keywords
 
 
@@ -57,17 +80,28 @@ def offences(tree: ast.AST) -> list[str]:
     found = []
     for node in ast.walk(tree):
         names = (
-            [alias.name for alias in node.names] if isinstance(node, ast.Import) else [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            [alias.name for alias in node.names]
+            if isinstance(node, ast.Import)
+            else [node.module or ""]
+            if isinstance(node, ast.ImportFrom)
+            else []
         )
         found += [f"import {name}" for name in names if name.split(".")[0] in EXECUTES]
     for name, keywords in calls(tree):
         if name == "torch.load" and keywords.get("weights_only") is not True:
             found.append("torch.load without weights_only=True")
-        if name.endswith(".from_pretrained") and not TEXT_ONLY.search(name) and keywords.get("use_safetensors") is not True:
+        if (
+            name.endswith(".from_pretrained")
+            and not TEXT_ONLY.search(name)
+            and keywords.get("use_safetensors") is not True
+        ):
             found.append(f"{name} without use_safetensors=True")
         if name in ("np.load", "numpy.load") and keywords.get("allow_pickle"):
             found.append("np.load with allow_pickle")
-        if name.endswith("read_pickle") or name in ("torch.jit.load", "torch.package.PackageImporter"):
+        if name.endswith("read_pickle") or name in (
+            "torch.jit.load",
+            "torch.package.PackageImporter",
+        ):
             found.append(name)
     return found
 
@@ -99,4 +133,6 @@ def test_no_weights_are_loaded_by_pickle() -> None:
     trees = {str(path): ast.parse(path.read_text()) for path in SOURCES}
     assert len(trees) > 100
     assert not {name: found for name, tree in trees.items() if (found := offences(tree))}
-    assert any(name == "torch.load" for tree in trees.values() for name, _ in calls(tree)), "the backbone's .pth comes so; this test has lost it"
+    assert any(name == "torch.load" for tree in trees.values() for name, _ in calls(tree)), (
+        "the backbone's .pth comes so; this test has lost it"
+    )

@@ -13,13 +13,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyarrow.parquet import read_schema
 
-from vap_core.errors import BadOutput, UnknownName
-from vap_core.metrics import rate
-from vap_core.suites import BENCHMARKS
-from vap_core.survey import following, run
-from vap_core.survey.estimates import NONE, Estimate, average_precision, mean, precision, share
-from vap_core.survey.report import ALL, Measure
-from vap_core.survey.run import Survey, plan, publish, read
+from vap_core.base.errors import BadOutput, UnknownName
+from vap_core.evaluation.metrics import rate
+from vap_core.evaluation.perception import run
+from vap_core.evaluation.perception import tracking as following
+from vap_core.evaluation.perception.estimates import (
+    NONE,
+    Estimate,
+    average_precision,
+    mean,
+    precision,
+    share,
+)
+from vap_core.evaluation.perception.report import ALL, Measure
+from vap_core.evaluation.perception.run import Survey, plan, publish, read
+from vap_core.simulation.suites import BENCHMARKS
 
 MARKS = st.lists(st.tuples(st.integers(0, 8), st.booleans()), max_size=12)
 
@@ -34,7 +42,9 @@ def test_average_precision_of_known_curves() -> None:
 
 
 @given(MARKS, st.integers(0, 3))
-def test_average_precision_agrees_with_a_slow_reference(marks: list[tuple[int, bool]], missed: int) -> None:
+def test_average_precision_agrees_with_a_slow_reference(
+    marks: list[tuple[int, bool]], missed: int
+) -> None:
     """The area by its definition: at every recall reached, the best precision at that recall or a higher one."""
     marks = sorted(marks, key=lambda mark: -mark[0])
     wanted = sum(hit for _, hit in marks) + missed
@@ -42,19 +52,29 @@ def test_average_precision_agrees_with_a_slow_reference(marks: list[tuple[int, b
     for n in range(1, len(marks) + 1):
         right = sum(hit for _, hit in marks[:n])
         curve.append((right, right / n))
-    slow = sum(max(p for reached, p in curve if reached >= r) for r in range(1, wanted - missed + 1)) / max(wanted, 1)
-    fast = average_precision(np.array([float(s) for s, _ in marks]), np.array([hit for _, hit in marks], bool), float(wanted))
+    slow = sum(
+        max(p for reached, p in curve if reached >= r) for r in range(1, wanted - missed + 1)
+    ) / max(wanted, 1)
+    fast = average_precision(
+        np.array([float(s) for s, _ in marks]),
+        np.array([hit for _, hit in marks], bool),
+        float(wanted),
+    )
     assert (np.isnan(fast) and wanted == 0) or fast == pytest.approx(slow)
 
 
 @given(MARKS, st.lists(st.integers(0, 3), min_size=12, max_size=12))
-def test_a_detection_that_counts_twice_is_two_detections(marks: list[tuple[int, bool]], times: list[int]) -> None:
+def test_a_detection_that_counts_twice_is_two_detections(
+    marks: list[tuple[int, bool]], times: list[int]
+) -> None:
     def arrays(chosen: list[tuple[int, bool]]) -> tuple[np.ndarray, np.ndarray]:
         return np.array([float(s) for s, _ in chosen]), np.array([hit for _, hit in chosen], bool)
 
     repeated = [mark for mark, n in zip(marks, times, strict=False) for _ in range(n)]
     weights = np.array(times[: len(marks)], np.float64)
-    assert average_precision(*arrays(marks), 9.0, weights) == pytest.approx(average_precision(*arrays(repeated), 9.0))
+    assert average_precision(*arrays(marks), 9.0, weights) == pytest.approx(
+        average_precision(*arrays(repeated), 9.0)
+    )
 
 
 def test_share_ignores_what_is_not_known_and_has_wilsons_interval() -> None:
@@ -71,7 +91,10 @@ def frame(episodes: list[int], values: list[float | None]) -> pd.DataFrame:
 
 def test_mean_is_bootstrapped_by_episode_not_by_view() -> None:
     values = np.random.default_rng(3).normal(size=30)
-    apart, thrice = mean(frame([*range(30)], list(values)), "x"), mean(frame([*range(30)] * 3, [*values] * 3), "x")
+    apart, thrice = (
+        mean(frame([*range(30)], list(values)), "x"),
+        mean(frame([*range(30)] * 3, [*values] * 3), "x"),
+    )
     assert apart.value == pytest.approx(values.mean()) == pytest.approx(thrice.value)
     assert (apart.low, apart.high) == (pytest.approx(thrice.low), pytest.approx(thrice.high))
     error = values.std() / np.sqrt(30)
@@ -85,7 +108,9 @@ def test_precision_is_the_mean_over_tasks() -> None:
         return pd.DataFrame({"suite": "s", **columns})
 
     wanted = lines(task=["a", "a", "b"], episode=[0, 1, 0])
-    found = lines(task=["a", "b", "b"], episode=[0, 0, 5], score=[0.9, 0.9, 0.8], hit=[True, True, False])
+    found = lines(
+        task=["a", "b", "b"], episode=[0, 0, 5], score=[0.9, 0.9, 0.8], hit=[True, True, False]
+    )
     both = precision(found, wanted)
     assert (both.value, both.n) == (pytest.approx((0.5 + 1) / 2), 3)
     assert both.low <= both.value <= both.high
@@ -93,7 +118,12 @@ def test_precision_is_the_mean_over_tasks() -> None:
 
 
 def test_a_measure_names_the_suites_that_miss_its_target() -> None:
-    cells = {"one": Estimate(0.97, 0.9, 1.0, 50), "two": Estimate(0.96, 0.9, 1.0, 50), "none": NONE, ALL: Estimate(0.965, 0.9, 1.0, 100)}
+    cells = {
+        "one": Estimate(0.97, 0.9, 1.0, 50),
+        "two": Estimate(0.96, 0.9, 1.0, 50),
+        "none": NONE,
+        ALL: Estimate(0.965, 0.9, 1.0, 100),
+    }
     assert Measure("m", 0.97, cells).verdict == "short: two"
     assert Measure("m", 0.96, cells).verdict == "met"
     assert Measure("m", 0.5, {"none": NONE}).verdict == "not measured"
@@ -104,14 +134,20 @@ def test_the_plan_is_the_same_every_time_and_every_part_has_its_own_name() -> No
     jobs = plan(Survey())
     assert [job.name for job in jobs] == [job.name for job in plan(Survey())]
     assert len({job.name for job in jobs}) == len(jobs)
-    opened = [row.key for job in jobs if not isinstance(job.what, following.Job) for row in job.what]
+    opened = [
+        row.key for job in jobs if not isinstance(job.what, following.Job) for row in job.what
+    ]
     wanted = sum(n * len(BENCHMARKS[suite].tasks) for suite, n in run.EPISODES.items())
     assert len(opened) == len(set(opened)) == wanted > 200
-    assert [isinstance(job.what, following.Job) for job in jobs] == sorted((isinstance(job.what, following.Job) for job in jobs), reverse=True)
+    assert [isinstance(job.what, following.Job) for job in jobs] == sorted(
+        (isinstance(job.what, following.Job) for job in jobs), reverse=True
+    )
 
 
 def test_unknown_names_are_refused() -> None:
-    with pytest.raises(UnknownName, match="known: simpler-bridge, simpler-fractal, tabletop, vlabench"):
+    with pytest.raises(
+        UnknownName, match="known: simpler-bridge, simpler-fractal, tabletop, vlabench"
+    ):
         Survey(suites=("widowx-pick",))
     with pytest.raises(UnknownName, match="embedded"):
         Survey(stack="none")
@@ -130,26 +166,52 @@ def test_the_command_measures_resumes_and_publishes(tmp_path: Path) -> None:
     out = tmp_path / "run"
     small = ["--quick", "--suite", "simpler-fractal", "--episodes", "1", "--jobs", "1"]
     words = ["eval-perception", *small, "--out", str(out), "--publish", str(tmp_path / "kept")]
-    done = subprocess.run([sys.executable, "-m", "vap_core", *words], capture_output=True, text=True, timeout=500)
+    done = subprocess.run(
+        [sys.executable, "-m", "vap_core", *words], capture_output=True, text=True, timeout=500
+    )
     assert done.returncode == 0, done.stderr
-    for told in ("detection AP50", ">= 97", "K = 7, average", "simpler-fractal head", "x backbone pass", "left out: simpler-fractal 0 of 2"):
+    for told in (
+        "detection AP50",
+        ">= 97",
+        "K = 7, average",
+        "simpler-fractal head",
+        "x backbone pass",
+        "left out: simpler-fractal 0 of 2",
+    ):
         assert told in done.stdout
     tables = read(out)
     assert len(tables["views"]) == 2
     assert len(tables["choices"]) == 2 * 4 * 2
     assert set(tables["tracks"].hidden) == {0, 3}
     assert len(tables["references"]) == 2 * 4
-    measured = {line["measure"]: line["cells"]["all"] for line in json.loads((out / "summary.json").read_text())}
-    assert sum((measured[f"right instance, {tier}"] or {"n": 0})["n"] for tier in ("standard", "hard")) == 2
+    measured = {
+        line["measure"]: line["cells"]["all"]
+        for line in json.loads((out / "summary.json").read_text())
+    }
+    assert (
+        sum((measured[f"right instance, {tier}"] or {"n": 0})["n"] for tier in ("standard", "hard"))
+        == 2
+    )
     held = json.loads(read_schema(tmp_path / "kept" / "perception_views.parquet").metadata[b"run"])
-    assert set(held["configuration"]) >= {"weights", "lists", "version", "world", "seed", "episodes"}
+    assert set(held["configuration"]) >= {
+        "weights",
+        "lists",
+        "version",
+        "world",
+        "seed",
+        "episodes",
+    }
 
     lost = next((out / "parts").glob("openings.simpler-fractal.pick*.json"))
-    kept = {part.name: part.stat().st_mtime_ns for part in (out / "parts").iterdir() if part != lost}
+    kept = {
+        part.name: part.stat().st_mtime_ns for part in (out / "parts").iterdir() if part != lost
+    }
     lost.unlink()
     asked = Survey(suites=("simpler-fractal",), episodes=1, quick=True)
     again = run.run(asked, out, jobs=1, progress=False)
-    assert {part.name: part.stat().st_mtime_ns for part in (out / "parts").iterdir() if part != lost} == kept
+    assert {
+        part.name: part.stat().st_mtime_ns for part in (out / "parts").iterdir() if part != lost
+    } == kept
     assert all(tables[name].equals(again[name]) for name in run.TABLES)
     lost.write_text("{")
     with pytest.raises(BadOutput, match="is damaged; delete it and run the same command again"):

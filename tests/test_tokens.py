@@ -6,14 +6,23 @@ import numpy as np
 import pytest
 import torch
 
-from vap_core import tokens
-from vap_core.errors import BadMemory, BadPolicy
-from vap_core.policies.lerobot import load as load_policy
+from vap_core.base.errors import BadMemory, BadPolicy
+from vap_core.base.types import Rgb
+from vap_core.policies.lerobot.adapter import load as load_policy
+from vap_core.policies.mini_pi0 import learned_token
+from vap_core.policies.mini_pi0.learned_token import (
+    SUFFIX,
+    WORD,
+    Lesson,
+    Photos,
+    Token,
+    framed,
+    learn,
+)
 from vap_core.policies.mini_pi0.vlm import MiniVlm, grow
 from vap_core.policies.mini_pi0.vlm import load as load_vlm
-from vap_core.tokens import SUFFIX, WORD, Lesson, Photos, Token, framed, learn
+from vap_core.policies.protocol import PolicyInput
 from vap_core.training.words import vocabulary
-from vap_core.values import PolicyInput, Rgb
 
 from .test_mini_pi0 import checkpoint, config  # noqa: F401
 
@@ -30,10 +39,18 @@ def vlm() -> MiniVlm:
     optimiser = torch.optim.AdamW(model.parameters(), 3e-3)
     for _ in range(300):
         shown = photos(rng, 8)
-        views = torch.from_numpy(np.stack([*shown.own, *shown.rivals])).permute(0, 3, 1, 2).float() / 255
+        views = (
+            torch.from_numpy(np.stack([*shown.own, *shown.rivals])).permute(0, 3, 1, 2).float()
+            / 255
+        )
         colours = rng.choice(["red", "blue"], 16)
-        tokens, there = model.ask([f"can you recognize the {colour} cup in this image" for colour in colours])
-        right = [model.number["yes" if (i < 8) == (colour == "red") else "no"] for i, colour in enumerate(colours)]
+        tokens, there = model.ask(
+            [f"can you recognize the {colour} cup in this image" for colour in colours]
+        )
+        right = [
+            model.number["yes" if (i < 8) == (colour == "red") else "no"]
+            for i, colour in enumerate(colours)
+        ]
         said, _ = model(model.look(views), tokens, there, torch.tensor(right)[:, None])
         loss = torch.nn.functional.cross_entropy(said[:, 0], torch.tensor(right))
         optimiser.zero_grad()
@@ -53,7 +70,11 @@ def photos(rng: np.random.Generator, n: int) -> Photos:
         return out
 
     noise = tuple(rng.integers(0, 256, (SIDE, SIDE, 3)).astype(np.uint8) for _ in range(n))
-    return Photos(tuple(disc((230, 20, 20)) for _ in range(n)), tuple(disc((20, 20, 230)) for _ in range(n)), noise)
+    return Photos(
+        tuple(disc((230, 20, 20)) for _ in range(n)),
+        tuple(disc((20, 20, 230)) for _ in range(n)),
+        noise,
+    )
 
 
 def test_one_embedding_is_learned_and_nothing_else_moves(vlm: MiniVlm) -> None:
@@ -71,7 +92,9 @@ def test_what_cannot_be_told_apart_is_not_learned(vlm: MiniVlm) -> None:
     """Own photos and its rivals' are drawn alike: no word tells new ones apart, though each half may be guessed."""
     rng = np.random.default_rng(1)
     one, two, three, four = (photos(rng, 8).own for _ in range(4))
-    token = learn(vlm, "disc", Photos(one, two, ()), Photos(three, four, ()), Lesson(epochs=4, looks=2))
+    token = learn(
+        vlm, "disc", Photos(one, two, ()), Photos(three, four, ()), Lesson(epochs=4, looks=2)
+    )
     assert token.accuracy < 0.85
 
 
@@ -91,61 +114,77 @@ def test_framing_keeps_size_and_type() -> None:
 
 def test_a_token_comes_back_from_disk_for_its_own_model_only(tmp_path: Path) -> None:
     token = Token("red-mug", np.arange(4, dtype=np.float32), 0.96875, "f" * 64)
-    path = tokens.save(tmp_path, token)
-    back = tokens.load(tmp_path, "red-mug", "f" * 64)
+    path = learned_token.save(tmp_path, token)
+    back = learned_token.load(tmp_path, "red-mug", "f" * 64)
     assert (back.object, back.accuracy, back.model) == (token.object, token.accuracy, token.model)
     assert np.array_equal(back.embedding, token.embedding)
     with pytest.raises(BadMemory, match="learned in model ffffffff"):
-        tokens.load(tmp_path, "red-mug", "e" * 64)
+        learned_token.load(tmp_path, "red-mug", "e" * 64)
     with pytest.raises(BadMemory, match="no learned word"):
-        tokens.load(tmp_path, "blue-mug", "f" * 64)
+        learned_token.load(tmp_path, "blue-mug", "f" * 64)
     path.write_bytes(path.read_bytes()[:20])
     with pytest.raises(BadMemory, match="no learned word"):
-        tokens.load(tmp_path, "red-mug", "f" * 64)
+        learned_token.load(tmp_path, "red-mug", "f" * 64)
     assert path.name == f"red-mug{SUFFIX}"
 
 
 def test_a_policy_hears_the_word_and_its_weights_stay(checkpoint: Path) -> None:  # noqa: F811
     policy = load_policy(checkpoint)
     before, rng = policy.sha256(), np.random.default_rng(0)
-    spoken = policy.saying({WORD: rng.normal(size=32).astype(np.float32)})
+    spoken = policy.with_tokens({WORD: rng.normal(size=32).astype(np.float32)})
     seen = rng.integers(0, 256, (64, 64, 3)).astype(np.uint8)
     state = policy.start(np.random.default_rng(0))
 
     def act(who: object, text: str) -> np.ndarray:
-        return who.plan([state], [PolicyInput({"front": seen}, text, np.zeros(13, np.float32))])[1][0]  # type: ignore[attr-defined]
+        return who.plan([state], [PolicyInput({"front": seen}, text, np.zeros(13, np.float32))])[1][
+            0
+        ]
 
     plain = act(policy, f"pick up {WORD}")
     assert not np.allclose(act(spoken, f"pick up {WORD}"), plain, atol=1e-6)
     assert np.array_equal(act(spoken, "pick up the cup"), act(policy, "pick up the cup"))
     assert np.array_equal(act(policy, f"pick up {WORD}"), plain)
-    towers = policy.policy.model.paligemma_with_expert  # type: ignore[union-attr]
-    own = towers.embed_language_tokens(torch.tensor(vocabulary().index(WORD))).detach().numpy()  # type: ignore[operator, union-attr]
-    assert np.array_equal(act(policy.saying({WORD: own}), f"pick up {WORD}"), plain)
+    towers = policy.policy.model.paligemma_with_expert
+    own = towers.embed_language_tokens(torch.tensor(vocabulary().index(WORD))).detach().numpy()
+    assert np.array_equal(act(policy.with_tokens({WORD: own}), f"pick up {WORD}"), plain)
     assert policy.sha256() == before
     with pytest.raises(BadPolicy, match="no word <mine>"):
-        policy.saying({"<mine>": np.zeros(32, np.float32)})
+        policy.with_tokens({"<mine>": np.zeros(32, np.float32)})
 
 
-def test_the_model_answers_after_a_round_trip_and_a_policy_grows_from_it(vlm: MiniVlm, tmp_path: Path, checkpoint: Path) -> None:  # noqa: F811
+def test_the_model_answers_after_a_round_trip_and_a_policy_grows_from_it(
+    vlm: MiniVlm,
+    tmp_path: Path,
+    checkpoint: Path,  # noqa: F811
+) -> None:
     vlm.save(tmp_path)
     back, looks = load_vlm(tmp_path), torch.rand(3, 3, SIDE, SIDE)
     asked = ["where is the red cup", "is there a cup in this image", "what colour is the cup"]
     assert back.sha256() == load_vlm(tmp_path).sha256()
     kept = back.towers.state_dict()
-    assert all(torch.equal(kept[name], tensor.bfloat16().float()) for name, tensor in vlm.towers.state_dict().items())
+    assert all(
+        torch.equal(kept[name], tensor.bfloat16().float())
+        for name, tensor in vlm.towers.state_dict().items()
+    )
     assert all(word in vocabulary() for answer in back.answer(looks, asked) for word in answer)
     policy = load_policy(checkpoint).policy
     grow(back, policy)
     grown = policy.state_dict()
-    assert all(torch.equal(tensor, grown[f"model.paligemma_with_expert.{name}"]) for name, tensor in kept.items() if name.startswith("paligemma"))
+    assert all(
+        torch.equal(tensor, grown[f"model.paligemma_with_expert.{name}"])
+        for name, tensor in kept.items()
+        if name.startswith("paligemma")
+    )
     with pytest.raises(BadPolicy, match=r"python -m vap_core train vlm"):
         load_vlm(tmp_path / "nothing")
 
 
 def test_an_answer_does_not_hear_what_comes_after_it(vlm: MiniVlm) -> None:
     """Prefix attention: the first word depends on view and question alone, and padding changes nothing."""
-    looks, (asked, there) = vlm.look(torch.rand(1, 3, SIDE, SIDE)), vlm.ask(["where is the red cup"])
+    looks, (asked, there) = (
+        vlm.look(torch.rand(1, 3, SIDE, SIDE)),
+        vlm.ask(["where is the red cup"]),
+    )
     one, two = (vlm(looks, asked, there, torch.tensor([[5, word, 7]]))[0] for word in (8, 9))
     assert torch.allclose(one[:, :2], two[:, :2], atol=1e-5)
     assert not torch.allclose(one[:, 2], two[:, 2], atol=1e-3)

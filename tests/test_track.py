@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from vap_core import track
-from vap_core.segment import iou
-from vap_core.track import cells, looks, state
-from vap_core.values import Track
+from vap_core.base.types import Track
+from vap_core.perception.boxes import mask_iou
+from vap_core.perception.embedded import tracker as track
+from vap_core.perception.embedded.tracker import appearance, cells, state
 
 RED, BLUE, TEAL = (200, 40, 40), (40, 60, 200), (20, 150, 140)
 SIZE = 128
@@ -48,7 +48,10 @@ def follow(images: list[np.ndarray], masks: np.ndarray) -> list[tuple[Track, ...
 
 def same(one: tuple[Track, ...], other: tuple[Track, ...]) -> bool:
     return all(
-        a.score == b.score and np.array_equal(a.mask, b.mask) if a.mask is not None else b.mask is None for a, b in zip(one, other, strict=True)
+        a.score == b.score and np.array_equal(a.mask, b.mask)
+        if a.mask is not None
+        else b.mask is None
+        for a, b in zip(one, other, strict=True)
     )
 
 
@@ -66,20 +69,34 @@ def size(part: Any) -> int:
 def test_a_still_scene_keeps_its_masks_to_the_pixel_and_sensor_noise_moves_none() -> None:
     image, masks = paint((RED, 40, 60), (BLUE, 90, 60))
     rng = np.random.default_rng(1)
-    noisy = [np.clip(image + rng.normal(0, 2.5, image.shape), 0, 255).astype(np.uint8) for _ in range(3)]
+    noisy = [
+        np.clip(image + rng.normal(0, 2.5, image.shape), 0, 255).astype(np.uint8) for _ in range(3)
+    ]
     for tracks in follow([image, image, *noisy], masks):
-        assert all(np.array_equal(each.mask, mask) and each.score == 1 for each, mask in zip(tracks, masks, strict=True))
+        assert all(
+            np.array_equal(each.mask, mask) and each.score == 1
+            for each, mask in zip(tracks, masks, strict=True)
+        )
 
 
 def test_one_moves_and_passes_while_the_other_stays() -> None:
     films = [paint((RED, 30 + 4 * t, 50), (BLUE, 70, 90)) for t in range(8)]
-    for (_, masks), tracks in zip(films[1:], follow([image for image, _ in films], films[0][1]), strict=True):
-        assert all(each.mask is not None and iou(each.mask, mask) > 0.7 for each, mask in zip(tracks, masks, strict=True))
+    for (_, masks), tracks in zip(
+        films[1:], follow([image for image, _ in films], films[0][1]), strict=True
+    ):
+        assert all(
+            each.mask is not None and mask_iou(each.mask, mask) > 0.7
+            for each, mask in zip(tracks, masks, strict=True)
+        )
         assert not (tracks[0].mask & tracks[1].mask).any()
 
 
 def test_hidden_is_a_state_with_a_score_and_the_right_one_is_taken_back() -> None:
-    both, (only, _), plate = paint((RED, 40, 60), (BLUE, 90, 60)), paint((BLUE, 90, 60)), wood().copy()
+    both, (only, _), plate = (
+        paint((RED, 40, 60), (BLUE, 90, 60)),
+        paint((BLUE, 90, 60)),
+        wood().copy(),
+    )
     plate[:, :] = only
     plate[42:78, 22:58] = (110, 110, 115)
     back = paint((RED, 48, 66), (BLUE, 90, 60))
@@ -90,14 +107,14 @@ def test_hidden_is_a_state_with_a_score_and_the_right_one_is_taken_back() -> Non
         assert tracks[1].mask is not None
     assert found[2][0].score > 0.5  # nothing there looks like it
     assert found[-1][0].mask is not None
-    assert iou(found[-1][0].mask, back[1][0]) > 0.6
+    assert mask_iou(found[-1][0].mask, back[1][0]) > 0.6
 
 
 def test_what_is_never_seen_again_stays_not_visible_and_its_place_is_not_given_away() -> None:
     both, (only, _) = paint((RED, 40, 60), (TEAL, 90, 60)), paint((TEAL, 90, 60))
     for tracks in follow([both[0]] + [only] * 8, both[1]):
         assert tracks[0].mask is None
-        assert iou(tracks[1].mask, both[1][1]) > 0.9
+        assert mask_iou(tracks[1].mask, both[1][1]) > 0.9
 
 
 def test_order_of_identities_permutes_the_tracks_and_views_do_not_meet() -> None:
@@ -105,7 +122,7 @@ def test_order_of_identities_permutes_the_tracks_and_views_do_not_meet() -> None
     images, masks = [image for image, _ in films], films[0][1]
     for forth, back in zip(follow(images, masks), follow(images, masks[::-1]), strict=True):
         assert [each.mask is None for each in forth] == [each.mask is None for each in back[::-1]]
-        assert all(iou(a.mask, b.mask) > 0.98 for a, b in zip(forth, back[::-1], strict=True))
+        assert all(mask_iou(a.mask, b.mask) > 0.98 for a, b in zip(forth, back[::-1], strict=True))
     tracker = track.load()
     states = tracker.start([images[0], images[2]], [masks, masks[:1]])
     _, (view, _) = tracker.step(states, [images[1], images[0]])
@@ -117,7 +134,9 @@ def test_a_mirrored_film_has_mirrored_tracks() -> None:
     forth = follow([image for image, _ in films], films[0][1])
     back = follow([image[:, ::-1].copy() for image, _ in films], films[0][1][:, :, ::-1].copy())
     for tracks, mirrored in zip(forth, back, strict=True):
-        assert all(iou(a.mask, b.mask[:, ::-1]) > 0.85 for a, b in zip(tracks, mirrored, strict=True))
+        assert all(
+            mask_iou(a.mask, b.mask[:, ::-1]) > 0.85 for a, b in zip(tracks, mirrored, strict=True)
+        )
 
 
 def test_memory_does_not_grow() -> None:
@@ -125,10 +144,12 @@ def test_memory_does_not_grow() -> None:
     states, seen = tracker.start([image], [masks]), {}
     for t in range(1, 31):
         states, _ = tracker.step(states, [paint((RED, 40 + t % 2, 60), (BLUE, 90, 60))[0]])
-        seen[t] = (size(states[0]), [crop.size for crop in states[0].late])
-        assert len(states[0].recent) <= track.RECENT
+        seen[t] = (size(states[0]), [crop.size for crop in states[0].last_crops])
+        assert len(states[0].recent) <= state.RECENT
     assert seen[30][0] - sum(seen[30][1]) == seen[5][0] - sum(seen[5][1])
-    assert max(sum(of) for _, of in seen.values()) <= 2 * 3 * SIZE * SIZE  # crops are never larger than the picture
+    assert (
+        max(sum(of) for _, of in seen.values()) <= 2 * 3 * SIZE * SIZE
+    )  # crops are never larger than the picture
 
 
 def test_an_unchanged_view_costs_no_features(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -144,47 +165,59 @@ def test_an_unchanged_view_costs_no_features(monkeypatch: pytest.MonkeyPatch) ->
     assert after[0] is not states[0]
 
 
-@given(hnp.arrays(np.float32, int(np.prod(looks.BINS)), elements=st.floats(0, 1, width=16)))
+@given(hnp.arrays(np.float32, int(np.prod(appearance.BINS)), elements=st.floats(0, 1, width=16)))
 def test_whatever_is_familiar_stays_so_when_colours_spread(shares: np.ndarray) -> None:
     tone = (shares / max(float(shares.sum()), 1e-6)).astype(np.float32)
-    wide = looks.spread(tone)
+    wide = appearance.blur_shares(tone)
     assert (wide >= tone).all()
-    assert abs(looks.familiar(tone, wide) - tone.sum()) < 1e-4
-    assert looks.familiar(tone, np.zeros_like(tone)) == 0
+    assert abs(appearance.familiar_share(tone, wide) - tone.sum()) < 1e-4
+    assert appearance.familiar_share(tone, np.zeros_like(tone)) == 0
 
 
 def test_a_third_of_an_object_is_as_familiar_as_the_whole_and_a_plate_is_not() -> None:
     image, (mask,) = paint((RED, 64, 64))
-    known, part = looks.tone_of(image, mask), mask & (np.arange(SIZE)[:, None] > 68)
-    assert looks.familiar(looks.tone_of(image, part), known) > 0.9
-    assert looks.familiar(looks.tone_of(wood(), mask), known) < 0.3
-    assert not looks.tone_of(image, np.zeros_like(mask)).any()
+    known, part = appearance.colour_shares(image, mask), mask & (np.arange(SIZE)[:, None] > 68)
+    assert appearance.familiar_share(appearance.colour_shares(image, part), known) > 0.9
+    assert appearance.familiar_share(appearance.colour_shares(wood(), mask), known) < 0.3
+    assert not appearance.colour_shares(image, np.zeros_like(mask)).any()
 
 
-def test_looks_are_measured_against_bare_surroundings_and_against_each_other() -> None:
+def test_appearances_are_measured_against_bare_surroundings_and_against_each_other() -> None:
     rows = np.eye(3, dtype=np.float32)[:2]
-    known = looks.Looks(rows, np.array([0.4, 0.4], np.float32))
+    known = appearance.Appearances(rows, np.array([0.4, 0.4], np.float32))
     tilted = np.array([0.5, 0.6, np.sqrt(0.39)], np.float32)
     assert known.accept(tilted, rows[1], 1)
     assert not known.accept(tilted, rows[0], 0)  # more like the other
     assert known.accept(tilted, tilted, 0)  # but it has looked like this of late
-    assert not known.accept(np.array([0.3, 0.0, np.sqrt(0.91)], np.float32), rows[0], 0)  # like nothing in particular
+    assert not known.accept(
+        np.array([0.3, 0.0, np.sqrt(0.91)], np.float32), rows[0], 0
+    )  # like nothing in particular
     boxes = np.array([[0, 0, 40, 40], [88, 0, 128, 40]], np.float32)
-    assert looks.bare(np.arange(SIZE * SIZE * 3, dtype=np.uint8).reshape(SIZE, SIZE, 3), boxes).shape[:2] <= (44, 44)
+    assert appearance.background_crop(
+        np.arange(SIZE * SIZE * 3, dtype=np.uint8).reshape(SIZE, SIZE, 3), boxes
+    ).shape[:2] <= (44, 44)
 
 
 def test_cells_lead_where_they_belong() -> None:
     keys = np.eye(4, dtype=np.float32)
-    memory = [cells.Memory(keys, np.array([[0, 1, 1, 1], [1, 0, 0, 0]], np.float32))]
-    assert cells.lead(keys, np.array([1, 0, 0, 0], np.float32), memory, 0) == 1
-    assert cells.lead(keys, np.array([0, 1, 0, 0], np.float32), memory, 0) == -1
-    rows = cells.around([cells.Memory(np.zeros((400, 2), np.float32), np.eye(2, 400, dtype=np.float32))], (20, 20), np.array([0]))
-    assert rows.reshape(20, 20).sum() == (1 + cells.RADIUS) * (2 + cells.RADIUS)  # identity 0 was in cell 1 of the first row
+    memory = [cells.FrameMemory(keys, np.array([[0, 1, 1, 1], [1, 0, 0, 0]], np.float32))]
+    assert cells.cosine_lead(keys, np.array([1, 0, 0, 0], np.float32), memory, 0) == 1
+    assert cells.cosine_lead(keys, np.array([0, 1, 0, 0], np.float32), memory, 0) == -1
+    rows = cells.cells_near(
+        [cells.FrameMemory(np.zeros((400, 2), np.float32), np.eye(2, 400, dtype=np.float32))],
+        (20, 20),
+        np.array([0]),
+    )
+    assert rows.reshape(20, 20).sum() == (1 + cells.RADIUS) * (
+        2 + cells.RADIUS
+    )  # identity 0 was in cell 1 of the first row
 
 
-def test_stirred_sees_what_changes_near_an_identity() -> None:
+def test_changes_near_an_identity_are_noticed() -> None:
     image, masks = paint((RED, 40, 60))
-    begun = state.begin(image, masks)
-    assert not state.stirred(begun, state.thumb(image)).any()
-    assert not state.stirred(begun, state.thumb(np.clip(image.astype(int) + 5, 0, 255).astype(np.uint8))).any()
-    assert state.stirred(begun, state.thumb(np.roll(image, 1, axis=1))).all()
+    begun = state.initial_state(image, masks)
+    assert not state.changed_nearby(begun, state.thumbnail_of(image)).any()
+    assert not state.changed_nearby(
+        begun, state.thumbnail_of(np.clip(image.astype(int) + 5, 0, 255).astype(np.uint8))
+    ).any()
+    assert state.changed_nearby(begun, state.thumbnail_of(np.roll(image, 1, axis=1))).all()

@@ -50,11 +50,20 @@ def test_every_reference_votes_once(cosine: np.ndarray) -> None:
     assert 0 <= ballot.margin <= 1
 
 
-@given(arrays(np.float32, st.tuples(st.integers(1, 5), st.integers(1, 5)), elements=st.sampled_from([0.25, 0.5, 1.0])))
+@given(
+    arrays(
+        np.float32,
+        st.tuples(st.integers(1, 5), st.integers(1, 5)),
+        elements=st.sampled_from([0.25, 0.5, 1.0]),
+    )
+)
 def test_margin_and_ties_are_what_they_say(cosine: np.ndarray) -> None:
     ballot = vote(cosine)
     rest = np.delete(ballot.votes, ballot.winner)
-    assert ballot.margin == (ballot.votes[ballot.winner] - (rest.max() if len(rest) else 0)) / cosine.shape[1]
+    assert (
+        ballot.margin
+        == (ballot.votes[ballot.winner] - (rest.max() if len(rest) else 0)) / cosine.shape[1]
+    )
     assert ballot.tied.any() == (np.count_nonzero(ballot.votes == ballot.votes.max()) > 1)
 
 

@@ -9,21 +9,38 @@ import pytest
 from rerun.chunk import RrdReader
 
 from tests.drawn import ROW, SIDE, SIZES, SUCCESS, K, columns, entities, frame, opening, rerun
-from vap_core.record import Recorder, read_summary
-from vap_core.values import Shown, Track
+from vap_core.base.types import Track
+from vap_core.evaluation.diagnosis import explain
+from vap_core.recording import Recorder, read_summary
+from vap_core.rollout.types import MaskCoverage
 
 
-def fail(path: Path, shown: str, second: str | None = None, after: int = 0, episode: int = 3) -> dict[str, Any]:
+def fail(
+    path: Path, shown: str, second: str | None = None, after: int = 0, episode: int = 3
+) -> dict[str, Any]:
     """A failed episode whose prompts cover `shown`, and in a second view `second`; from step `after` on."""
     start = opening(1 if second is None else 2)
-    start = replace(start, row=replace(ROW, episode=episode), references={"owl_a": (np.full((20, 30, 3), 99, np.uint8),) * K})
-    with Recorder(path, start) as recorder:
+    start = replace(
+        start,
+        row=replace(ROW, episode=episode),
+        references={"owl_a": (np.full((20, 30, 3), 99, np.uint8),) * K},
+    )
+    with Recorder(path, start, explain=explain) as recorder:
         for step in range(12):
             one, names = frame(step, start), ["front", "side"]
-            covers = {cam: what if step >= after else "owl_a" for cam, what in zip(names, (shown, second), strict=True) if what is not None}
-            tracks = {cam: (Track(one.truth.masks[cam][what], 0.9),) for cam, what in covers.items()}
-            seen = tuple(Shown(cam, what, 0.9 * (what == "owl_a"), 500, 0.9) for cam, what in covers.items())
-            recorder.frame(replace(one, tracks=tracks, shown=seen))
+            covers = {
+                cam: what if step >= after else "owl_a"
+                for cam, what in zip(names, (shown, second), strict=True)
+                if what is not None
+            }
+            tracks = {
+                cam: (Track(one.truth.masks[cam][what], 0.9),) for cam, what in covers.items()
+            }
+            seen = tuple(
+                MaskCoverage(cam, what, 0.9 * (what == "owl_a"), 500, 0.9)
+                for cam, what in covers.items()
+            )
+            recorder.frame(replace(one, tracks=tracks, coverage=seen))
         recorder.close(replace(SUCCESS, status="failure", success=False, steps=11))
     return read_summary(path)
 
@@ -31,9 +48,19 @@ def fail(path: Path, shown: str, second: str | None = None, after: int = 0, epis
 def tabs(path: Path) -> set[str]:
     """Names of the containers in a recording's blueprints."""
     reader = RrdReader(path)
-    batches = [chunk.to_record_batch() for held in reader.blueprints() for chunk in reader.stream(store=held)]
+    batches = [
+        chunk.to_record_batch()
+        for held in reader.blueprints()
+        for chunk in reader.stream(store=held)
+    ]
     name = "ContainerBlueprint:display_name"
-    return {cell[0] for batch in batches if name in batch.schema.names for cell in batch[name].to_pylist() if cell}
+    return {
+        cell[0]
+        for batch in batches
+        if name in batch.schema.names
+        for cell in batch[name].to_pylist()
+        if cell
+    }
 
 
 @pytest.mark.parametrize(
@@ -46,14 +73,31 @@ def tabs(path: Path) -> set[str]:
     ],
 )
 def test_a_recording_says_why_and_its_blueprint_opens_there(
-    tmp_path: Path, shown: str, second: str | None, after: int, case: str, sub_case: str, frame_index: int
+    tmp_path: Path,
+    shown: str,
+    second: str | None,
+    after: int,
+    case: str,
+    sub_case: str,
+    frame_index: int,
 ) -> None:
     path = tmp_path / "one.rrd"
     summary = fail(path, shown, second, after)
-    assert (summary["outcome.failure_case"], summary["outcome.sub_case"], summary["outcome.deciding_frame"]) == (case, sub_case, frame_index)
-    assert summary["outcome.why"]
-    assert {"/observation.images.front/identity", "/vap/crops/front", "/vap/similarity/front", "/vap/hand/gripper_to_target"} <= entities(path)
-    told = [text for texts in columns(path, "/vap/events", "TextLog:text").values() for text in texts]  # type: ignore[attr-defined]
+    assert (
+        summary["case"],
+        summary["sub_case"],
+        summary["deciding_frame"],
+    ) == (case, sub_case, frame_index)
+    assert summary["case_sentence"]
+    assert {
+        "/observation.images.front/identity",
+        "/vap/crops/front",
+        "/vap/similarity/front",
+        "/vap/hand/gripper_to_target",
+    } <= entities(path)
+    told = [
+        text for texts in columns(path, "/vap/events", "TextLog:text").values() for text in texts
+    ]
     assert any(text.startswith(f"{case.capitalize()}, {sub_case}: ") for text in told)
     assert rerun("rrd", "verify", path).returncode == 0
     assert f"{case}: {sub_case}" in tabs(path)
@@ -61,9 +105,13 @@ def test_a_recording_says_why_and_its_blueprint_opens_there(
 
 def test_a_prompt_wears_the_colour_of_what_it_covers(tmp_path: Path) -> None:
     fail(tmp_path / "one.rrd", "owl_b")
-    buffer = columns(tmp_path / "one.rrd", "/observation.images.front/identity", "SegmentationImage:buffer")[3]
+    buffer = columns(
+        tmp_path / "one.rrd", "/observation.images.front/identity", "SegmentationImage:buffer"
+    )[3]
     image = np.frombuffer(bytes(buffer[0]), np.uint8).reshape(SIDE, SIDE)  # type: ignore[index]
     masks = frame(3, opening(1)).truth.masks["front"]
     i = list(SIZES).index("owl_b")
     assert set(np.unique(image[masks["owl_b"]])) == {10 + 2 * i, 11 + 2 * i}
-    assert set(np.unique(image[masks["owl_a"]])) == {0, 10 + 2 * list(SIZES).index("owl_a") + 1}, "a rim alone"
+    assert set(np.unique(image[masks["owl_a"]])) == {0, 10 + 2 * list(SIZES).index("owl_a") + 1}, (
+        "a rim alone"
+    )

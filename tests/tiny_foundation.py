@@ -6,8 +6,9 @@ from typing import Any
 import torch
 from safetensors.torch import save_file
 
-from vap_core import hub
-from vap_core.foundation.architectures import letters, quiet
+from vap_core.perception.foundation.architectures import letter_tokenizer, quiet_transformers
+from vap_core.perception.foundation.downloads import pull
+from vap_core.perception.foundation.sources import KINDS, MODELS, TENSORS, Source
 
 KIND = "foundation"
 
@@ -29,8 +30,21 @@ def networks() -> tuple[Any, Any, Any]:
         SwinConfig,
     )
 
-    swin = SwinConfig(image_size=64, embed_dim=16, depths=[1, 1, 1, 1], num_heads=[1, 2, 4, 8], window_size=4, out_indices=[2, 3, 4])
-    bert = BertConfig(hidden_size=32, num_hidden_layers=1, num_attention_heads=2, intermediate_size=64, vocab_size=1030)
+    swin = SwinConfig(
+        image_size=64,
+        embed_dim=16,
+        depths=[1, 1, 1, 1],
+        num_heads=[1, 2, 4, 8],
+        window_size=4,
+        out_indices=[2, 3, 4],
+    )
+    bert = BertConfig(
+        hidden_size=32,
+        num_hidden_layers=1,
+        num_attention_heads=2,
+        intermediate_size=64,
+        vocab_size=1030,
+    )
     grounding = GroundingDinoConfig(
         backbone_config=swin, text_config=bert, d_model=32, num_queries=30, encoder_layers=1, decoder_layers=2,
         encoder_attention_heads=2, decoder_attention_heads=2, encoder_ffn_dim=64, decoder_ffn_dim=64,
@@ -41,7 +55,12 @@ def networks() -> tuple[Any, Any, Any]:
         num_attention_heads_per_stage=[1, 2, 4, 8], window_size_per_stage=[8, 4, 8, 4], global_attention_blocks=[3],
     )  # fmt: skip
     sizes = [[32, 32], [16, 16], [8, 8]]
-    vision = Sam2VisionConfig(backbone_config=hiera, backbone_channel_list=[64, 32, 16, 8], backbone_feature_sizes=sizes, fpn_hidden_size=128)
+    vision = Sam2VisionConfig(
+        backbone_config=hiera,
+        backbone_channel_list=[64, 32, 16, 8],
+        backbone_feature_sizes=sizes,
+        fpn_hidden_size=128,
+    )
     sam = Sam2VideoConfig(
         vision_config=vision,
         prompt_encoder_config=Sam2VideoPromptEncoderConfig(hidden_size=128, image_size=128),
@@ -50,39 +69,58 @@ def networks() -> tuple[Any, Any, Any]:
         memory_attention_rope_feat_sizes=[8, 8], memory_encoder_hidden_size=128, mask_downsampler_embed_dim=128, memory_fuser_embed_dim=128,
         memory_fuser_intermediate_dim=128,
     )  # fmt: skip
-    with quiet(), torch.random.fork_rng():
+    with quiet_transformers(), torch.random.fork_rng():
         torch.manual_seed(0)
         nets = GroundingDinoForObjectDetection(grounding), Dinov2Model(dino), Sam2VideoModel(sam)
         for net in nets:
             for name, weight in net.named_parameters():
                 if weight.ndim > 1 and "norm" not in name:
-                    gain = 1.5 if name.startswith("memory_attention") else 4.0 if name.startswith("mask_decoder.pred_obj") else 0.9
+                    gain = (
+                        1.5
+                        if name.startswith("memory_attention")
+                        else 4.0
+                        if name.startswith("mask_decoder.pred_obj")
+                        else 0.9
+                    )
                     torch.nn.init.normal_(weight, std=gain / weight[0].numel() ** 0.5)
         sam_net = nets[2]
-        for word in ("memory_temporal_positional_encoding", "no_memory_embedding", "no_object_pointer", "occlusion_spatial_embedding_parameter"):
+        for word in (
+            "memory_temporal_positional_encoding",
+            "no_memory_embedding",
+            "no_object_pointer",
+            "occlusion_spatial_embedding_parameter",
+        ):
             torch.nn.init.normal_(getattr(sam_net, word), std=1.0)
-        torch.nn.init.constant_(sam_net.mask_decoder.pred_obj_score_head.proj_out.bias, 50.5)  # identities come and go
+        torch.nn.init.constant_(
+            sam_net.mask_decoder.pred_obj_score_head.proj_out.bias, 50.5
+        )  # identities come and go
     return tuple(net.eval() for net in nets)
 
 
 def save(origin: Path) -> Path:
     """Folders owner/name below `origin`, as a hub download would leave them."""
-    detector, encoder, sam = (origin / hub.MODELS[name].repo for name in hub.KINDS[KIND])
+    detector, encoder, sam = (origin / MODELS[name].repo for name in KINDS[KIND])
     for net, folder in zip(networks(), (detector, encoder, sam), strict=True):
         net.save_pretrained(folder)
-    letters().save_pretrained(detector)
+    letter_tokenizer().save_pretrained(detector)
     return origin
 
 
 def store(folder: Path) -> Path:
     """A store filled by the same route that a cluster without internet takes."""
-    hub.pull(hub.KINDS[KIND], folder / "store", origin=save(folder / "origin"), unpinned=True, say=lambda line: None)
+    pull(
+        KINDS[KIND],
+        folder / "store",
+        origin=save(folder / "origin"),
+        unpinned=True,
+        say=lambda line: None,
+    )
     return folder / "store"
 
 
-def placeholder(folder: Path, source: hub.Source) -> None:
+def placeholder(folder: Path, source: Source) -> None:
     """The files of a model, a few bytes each."""
     folder.mkdir(parents=True)
-    for file in source.beside:
+    for file in source.small_files:
         (folder / file).write_text(f'{{"of": "{source.repo}"}}')
-    save_file({"weight": torch.arange(4.0)}, folder / hub.TENSORS)
+    save_file({"weight": torch.arange(4.0)}, folder / TENSORS)

@@ -9,9 +9,14 @@ from lerobot.policies import ACTConfig, make_pre_post_processors
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
-from transformers import SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor, SmolVLMVideoProcessor
+from transformers import (
+    SmolVLMConfig,
+    SmolVLMImageProcessor,
+    SmolVLMProcessor,
+    SmolVLMVideoProcessor,
+)
 
-from vap_core.policies.toy_pi0 import Toy, save_toy, tokenizer
+from vap_core.policies.lerobot.toy_pi0 import Toy, save_toy, tokenizer
 
 TOY = Toy(image=64, patch=16, width=32, layers=1, expert=32, chunk=2, denoise=2)
 STATE, ACTION = 13, 7
@@ -38,14 +43,54 @@ def smolvla(folder: Path) -> Path:
 
 def _smolvlm(folder: Path) -> Path:
     """SmolVLM's configuration, and a processor whose tokenizer knows few words."""
-    special = {"image_token": "<image>", "fake_image_token": "<fake>", "global_image_token": "<global>", "end_of_utterance_token": "<end>"}
-    words = tokenizer(folder, "<s>", "</s>", *special.values(), bos_token="<s>", eos_token="</s>", extra_special_tokens=special)
-    SmolVLMProcessor(SmolVLMImageProcessor(), words, SmolVLMVideoProcessor(), image_seq_len=4).save_pretrained(folder)
-    numbers = {"pad_token_id": words.pad_token_id, "bos_token_id": words.bos_token_id, "eos_token_id": words.eos_token_id, "vocab_size": len(words)}
+    special = {
+        "image_token": "<image>",
+        "fake_image_token": "<fake>",
+        "global_image_token": "<global>",
+        "end_of_utterance_token": "<end>",
+    }
+    words = tokenizer(
+        folder,
+        "<s>",
+        "</s>",
+        *special.values(),
+        bos_token="<s>",
+        eos_token="</s>",
+        extra_special_tokens=special,
+    )
+    SmolVLMProcessor(
+        SmolVLMImageProcessor(), words, SmolVLMVideoProcessor(), image_seq_len=4
+    ).save_pretrained(folder)
+    numbers = {
+        "pad_token_id": words.pad_token_id,
+        "bos_token_id": words.bos_token_id,
+        "eos_token_id": words.eos_token_id,
+        "vocab_size": len(words),
+    }
     heads = {"num_attention_heads": 4, "num_key_value_heads": 2, "head_dim": 16}
-    text = {"model_type": "llama", "hidden_size": 64, "intermediate_size": 64, "num_hidden_layers": 2, **heads, **numbers}
-    seen = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 1, "num_attention_heads": 2, "image_size": 64, "patch_size": 16}
-    config = SmolVLMConfig(text_config=text, vision_config=seen, scale_factor=2, image_token_id=words.image_token_id, pad_token_id=words.pad_token_id)
+    text = {
+        "model_type": "llama",
+        "hidden_size": 64,
+        "intermediate_size": 64,
+        "num_hidden_layers": 2,
+        **heads,
+        **numbers,
+    }
+    seen = {
+        "hidden_size": 32,
+        "intermediate_size": 64,
+        "num_hidden_layers": 1,
+        "num_attention_heads": 2,
+        "image_size": 64,
+        "patch_size": 16,
+    }
+    config = SmolVLMConfig(
+        text_config=text,
+        vision_config=seen,
+        scale_factor=2,
+        image_token_id=words.image_token_id,
+        pad_token_id=words.pad_token_id,
+    )
     config.save_pretrained(folder)
     return folder
 
@@ -64,7 +109,10 @@ def _features(side: int) -> dict[str, Any]:
         "observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, side, side)),
         "observation.state": PolicyFeature(FeatureType.STATE, (STATE,)),
     }
-    return {"input_features": seen, "output_features": {"action": PolicyFeature(FeatureType.ACTION, (ACTION,))}}
+    return {
+        "input_features": seen,
+        "output_features": {"action": PolicyFeature(FeatureType.ACTION, (ACTION,))},
+    }
 
 
 def _saved(folder: Path, config: Any, kind: Any) -> Path:

@@ -4,13 +4,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vap_core.attend import Stack
-from vap_core.values import Boxes, PersonalObject, Rgb, Track
+from vap_core.base.types import Boxes, PersonalObject, Rgb, Track, Views
+from vap_core.perception.protocols import Stack
+from vap_core.simulation.types import Observation
 
 BACKGROUND = 0
 
 
-def scene(squares: Sequence[tuple[int, int, tuple[int, int, int]]], size: int = 64, side: int = 12) -> Rgb:
+def scene(
+    squares: Sequence[tuple[int, int, tuple[int, int, int]]], size: int = 64, side: int = 12
+) -> Rgb:
     """Squares at (x, y) of an RGB colour on black."""
     rgb = np.zeros((size, size, 3), np.uint8)
     for x, y, colour in squares:
@@ -55,10 +58,18 @@ class SameColour:
     """Follows every identity by its exact colour."""
 
     def start(self, images: Sequence[Rgb], masks: Sequence[np.ndarray]) -> list[np.ndarray]:
-        return [np.array([rgb[m][0] for m in per_view]) for rgb, per_view in zip(images, masks, strict=True)]
+        return [
+            np.array([rgb[m][0] for m in per_view])
+            for rgb, per_view in zip(images, masks, strict=True)
+        ]
 
-    def step(self, states: Sequence[np.ndarray], images: Sequence[Rgb]) -> tuple[list[np.ndarray], list[tuple[Track, ...]]]:
-        found = [tuple(_track((rgb == colour).all(axis=2)) for colour in state) for state, rgb in zip(states, images, strict=True)]
+    def step(
+        self, states: Sequence[np.ndarray], images: Sequence[Rgb]
+    ) -> tuple[list[np.ndarray], list[tuple[Track, ...]]]:
+        found = [
+            tuple(_track((rgb == colour).all(axis=2)) for colour in state)
+            for state, rgb in zip(states, images, strict=True)
+        ]
         return list(states), found
 
 
@@ -73,3 +84,8 @@ def personal(name: str, category: str, *colours: tuple[int, int, int]) -> Person
     """An object remembered by flat crops of these colours."""
     crops = tuple(np.full((12, 12, 3), colour, np.uint8) for colour in colours)
     return PersonalObject(name, category, MeanColour()(crops), crops, MeanColour.name)
+
+
+def observation(views: Views) -> Observation:
+    """These views of a robot whose state is zero."""
+    return Observation(views, np.zeros(7, np.float32))

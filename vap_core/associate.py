@@ -1,11 +1,14 @@
-"""Cross-view association: the candidate of each view, or none, that together are most probably one and the same object.
+"""Cross-view association: the candidate of each view, or none, that are most probably the same
+object.
 
-Grounded one by one, views can elect different instances, and the policy sees contradictory tints (P appendix, Case 2; left there as
-future work). Here one choice per view is made for all views at once, the most probable one (MAP), by enumeration:
+Grounded one by one, views can elect different instances, and the policy sees contradictory tints (P
+appendix, Case 2; left there as future work). Here one choice per view is made for all views at
+once, the most probable one (MAP), by enumeration:
 
     sum_v references(v, i_v)  +  sum_{v < w} pair(v, i_v, w, i_w)
 
-Scores are natural logarithms. "None" (not visible in that view) scores 0, in itself and in every pair; the rest is measured against it.
+Scores are natural logarithms. "None" (not visible in that view) scores 0, alone and in every pair;
+the other scores are relative to it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -17,49 +20,58 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from vap_core.errors import BadViews
-from vap_core.values import Association, Camera, Grounding, value
+from vap_core.base.errors import BadViews
+from vap_core.base.types import Association, Camera, Grounding, value
+from vap_core.perception.candidates import Candidates
 
 Term = Literal["embedding", "hungarian", "geometry"]
 Scores = Float64[np.ndarray, "_ _"]
 """One row per candidate of one view, one column per candidate of another."""
+ViewScores = Float64[np.ndarray, " _"]
+"""One score per candidate of a view, and last that of none."""
 
-MOST_VIEWS, MOST_CHOICES = 4, 10_000_000
-"""Enumeration stops being cheap beyond these: views, and combinations of their candidates."""
+MOST_VIEWS, MOST_COMBINATIONS = 4, 10_000_000
+"""Limits of the enumeration: views, and combinations of their candidates."""
 NEAREST = 1e-3
-"""Cosine distances below this count as equal to it: a candidate can be infinitely like its references otherwise."""
+"""Cosine distances below this count as equal to it, so that their logarithm stays finite."""
 HEIGHTS_M = (0.0, 0.08)
-"""The middles of things that stand on the table, whose top is z = 0 in the world, lie between these heights."""
+"""The centres of objects that stand on the table (z = 0 in the world) lie between these heights."""
 
 
 @dataclass(frozen=True)
 class Pairing:
-    """What speaks for two candidates of two views being one object; of several `terms` the mean is taken, as none is independent of the others.
+    """The evidence that two candidates of two views are one object.
 
-    The numbers are near the greatest conditional likelihood of the true choice, each term by itself, in 114 rendered three-camera scenes of
-    generic objects with two twins each (342 views, every tenth box withheld; true boxes, embedded encoder). They do not depend on an encoder's
-    scale: `evidence` and `absent` count ratios of cosine distances, `likeness` cosines of what sets a view's candidates apart.
+    Of several `terms` the mean is taken, as they are not independent. The numbers are near the
+    greatest conditional likelihood of the true choice, each term by itself, in 114 rendered
+    three-camera scenes of generic objects with two twins each (342 views, every tenth box withheld;
+    true boxes, embedded encoder). They do not depend on an encoder's scale: `evidence` and `absent`
+    compare ratios of cosine distances, `likeness` cosines of centred embeddings.
     """
 
     terms: tuple[Term, ...]
     evidence: float = 3.7
-    """A candidate twice as far from the references, in cosine distance, is 2 ** `evidence` times less likely."""
+    """A candidate twice as far from the references, in cosine distance, is 2 ** `evidence` times
+    less likely."""
     absent: float = 0.4
-    """By itself, the nearest candidate of a view is likelier than none if it is less than exp(`absent`) times as far from the references as the
-    nearest of all views, and as likely if it is farther: views differ in how well they see, so that only the others can tell it is another."""
+    """The nearest candidate of a view is likelier than none if its distance to the references is
+    less than exp(`absent`) times the least distance in all views, and equally likely otherwise:
+    views differ in image quality, so only the other views can tell that it is another object."""
     likeness: float = 5.7
     matched: float = 1.0
-    """A pair of the one-to-one matching gains this, any other loses it."""
+    """A pair of the one-to-one matching gains this, any other pair loses it."""
     sigma_m: float = 0.03
     spread_m: float = 0.08
-    """Distances are drawn with `sigma_m` for one object, and as often below `spread_m` as objects stand that close on a table."""
+    """Distances between rays have deviation `sigma_m` for one object, and are as often below
+    `spread_m` as objects stand that close on a table."""
     astray: float = 0.015
-    """The share of boxes so cut or so wrong that their middle says nothing."""
+    """The share of boxes so cut or so wrong that their centres carry no evidence."""
 
 
 @value
 class Sighting:
-    """What one view has to say about one target: cosines with its k references, embeddings and boxes (pixels) of its n candidates."""
+    """One view's candidates for one target: cosines with its k references, embeddings and boxes
+    (pixels)."""
 
     cosine: Float32[np.ndarray, "n k"]
     embeddings: Float32[np.ndarray, "n d"]
@@ -67,63 +79,125 @@ class Sighting:
     camera: Camera | None = None
 
 
-def associate(views: Mapping[str, Sighting], pairing: Pairing) -> Association | None:
-    """The most probable choice for `views`, by camera; None where fewer than two have candidates, so that there is nothing to associate.
+def associate_targets(
+    groundings: Mapping[str, tuple[Grounding, ...]],
+    candidates: Mapping[str, Mapping[str, Candidates]],
+    phrases: Sequence[str],
+    cameras: Mapping[str, Camera],
+    pairing: Pairing,
+) -> tuple[dict[str, tuple[Grounding, ...]], tuple[Association | None, ...]]:
+    """Let the views agree on each target, one target at a time.
 
-    As long as `absent` is positive, the target is chosen in at least one view. Equal choices go to the candidates listed first.
-    Raises: BadViews, for more views or candidates than can be enumerated, or geometry without calibrated cameras.
+    `groundings[camera][j]` and `phrases[j]` are of target j, `candidates[camera][phrase]` of a
+    view.
+
+    Raises: as `associate`; BadViews, when a camera is calibrated for another image size.
     """
-    if sum(len(view.xyxy) > 0 for view in views.values()) < 2:
+    chosen: dict[str, list[Grounding]] = {camera: [] for camera in groundings}
+    associations: list[Association | None] = []
+    for j, phrase in enumerate(phrases):
+        sightings = {}
+        for camera, per_target in groundings.items():
+            _check_calibration(camera, per_target[j], cameras)
+            of_view = candidates[camera][phrase]
+            sightings[camera] = Sighting(
+                cosine=per_target[j].similarity,
+                embeddings=of_view.embeddings,
+                xyxy=of_view.boxes.xyxy,
+                camera=cameras.get(camera),
+            )
+        association = associate(sightings, pairing)
+        associations.append(association)
+        for camera, per_target in groundings.items():
+            grounding = per_target[j]
+            if association is not None:
+                grounding = overrule(grounding, association.chosen[camera])
+            chosen[camera].append(grounding)
+    return {camera: tuple(found) for camera, found in chosen.items()}, tuple(associations)
+
+
+def associate(views: Mapping[str, Sighting], pairing: Pairing) -> Association | None:
+    """The most probable choice for `views`, by camera; None where fewer than two have candidates.
+
+    As long as `absent` is positive, the target is chosen in at least one view. Equal choices go to
+    the candidates listed first.
+
+    Raises: BadViews, for more views or candidates than can be enumerated, or for geometry without
+        calibrated cameras.
+    """
+    names, sightings = list(views), list(views.values())
+    if sum(len(view.xyxy) > 0 for view in sightings) < 2:
         return None
-    names, sights = list(views), list(views.values())
-    combinations_of = prod(len(view.xyxy) + 1 for view in sights)
-    if len(sights) > MOST_VIEWS or combinations_of > MOST_CHOICES:
-        raise BadViews(
-            f"associate: {len(sights)} views with {combinations_of} combinations; at most {MOST_VIEWS} views and {MOST_CHOICES} combinations "
-            "are enumerated. Give fewer cameras or candidates, or ground views one by one (Prompting.associate=None)."
-        )
-    singles = references(sights, pairing)
-    pairs = {
-        term: {(v, w): _with_none(TERMS[term](sights[v], sights[w], pairing)) / len(pairing.terms) for v, w in combinations(range(len(sights)), 2)}
-        for term in pairing.terms
-    }
-    totals = add_up(singles, [scores for of_term in pairs.values() for scores in of_term.items()])
+    _check_size(sightings)
+
+    singles = references(sightings, pairing)
+    pairs: dict[str, dict[tuple[int, int], Scores]] = {term: {} for term in pairing.terms}
+    for v, w in combinations(range(len(sightings)), 2):
+        for term in pairing.terms:
+            scores = TERMS[term](sightings[v], sightings[w], pairing) / len(pairing.terms)
+            pairs[term][v, w] = np.pad(scores, ((0, 1), (0, 1)))  # none scores 0
+    totals = add_up(singles, [item for of_term in pairs.values() for item in of_term.items()])
     best = tuple(int(i) for i in np.unravel_index(totals.argmax(), totals.shape))
+
     terms = {"references": float(sum(single[i] for single, i in zip(singles, best, strict=True)))}
-    terms |= {term: float(sum(scores[best[v], best[w]] for (v, w), scores in of_term.items())) for term, of_term in pairs.items()}
-    support = [totals.max(axis=tuple(axis for axis in range(totals.ndim) if axis != v)) for v in range(totals.ndim)]
-    rival = max(float(np.delete(of_view, i).max(initial=-np.inf)) for of_view, i in zip(support, best, strict=True))
-    chosen = {name: None if i == len(view.xyxy) else i for name, view, i in zip(names, sights, best, strict=True)}
-    return Association(chosen, float(totals[best]), float(totals[best]) - rival, terms, dict(zip(names, support, strict=True)))
+    for name, of_term in pairs.items():
+        terms[name] = float(sum(scores[best[v], best[w]] for (v, w), scores in of_term.items()))
+
+    chosen: dict[str, int | None] = {}
+    support: dict[str, ViewScores] = {}
+    rival = -np.inf
+    for v, (name, view, i) in enumerate(zip(names, sightings, best, strict=True)):
+        chosen[name] = None if i == len(view.xyxy) else i
+        support[name] = totals.max(axis=tuple(axis for axis in range(totals.ndim) if axis != v))
+        rival = max(rival, float(np.delete(support[name], i).max(initial=-np.inf)))
+    total = float(totals[best])
+    return Association(chosen, total, total - rival, terms, support)
 
 
-def add_up(singles: Sequence[Float64[np.ndarray, " _"]], pairs: Sequence[tuple[tuple[int, int], Scores]]) -> Float64[np.ndarray, "..."]:
+def add_up(
+    singles: Sequence[ViewScores], pairs: Sequence[tuple[tuple[int, int], Scores]]
+) -> Float64[np.ndarray, "..."]:
     """The total of every combination: one axis per view, each candidate in turn and none last."""
     totals = np.zeros([len(single) for single in singles])
     for v, single in enumerate(singles):
-        totals += single.reshape([-1 if axis == v else 1 for axis in range(totals.ndim)])
+        shape = np.ones(totals.ndim, int)
+        shape[v] = -1
+        totals += single.reshape(shape)
     for (v, w), scores in pairs:
-        totals += scores.reshape([size if axis in (v, w) else 1 for axis, size in enumerate(totals.shape)])
+        shape = np.ones(totals.ndim, int)
+        shape[[v, w]] = scores.shape
+        totals += scores.reshape(shape)
     return totals
 
 
-def references(views: Sequence[Sighting], pairing: Pairing) -> list[Float64[np.ndarray, " _"]]:
-    """What the references say, per view: `evidence` (log(d_v / d_i) + max(log(d / d_v) + `absent`, 0)), and 0 for none.
+def references(views: Sequence[Sighting], pairing: Pairing) -> list[ViewScores]:
+    """The references' evidence, per view: `evidence` (log(d_v / d_i) + max(log(d / d_v) + `absent`,
+    0)); 0 for none.
 
-    d_i is 1 - the mean cosine of candidate i with the references, d_v the least in its view, d the least in all views.
+    d_i is 1 - the mean cosine of candidate i with the references, d_v the least in its view, d the
+    least in all views.
     """
-    distances = [np.maximum(1.0 - view.cosine.astype(np.float64).mean(axis=1), NEAREST) for view in views]
-    of_all = min(float(d.min()) for d in distances if len(d))
-    seen = [max(float(np.log(of_all / d.min())) + pairing.absent, 0.0) if len(d) else 0.0 for d in distances]
-    return [np.append(pairing.evidence * (np.log(d.min(initial=np.inf) / d) + more), 0.0) for d, more in zip(distances, seen, strict=True)]
+    distances = []
+    for view in views:
+        mean = view.cosine.astype(np.float64).mean(axis=1)
+        distances.append(np.maximum(1.0 - mean, NEAREST))
+    least = min(float(d.min()) for d in distances if len(d))
+    scores = []
+    for d in distances:
+        visible = max(float(np.log(least / d.min())) + pairing.absent, 0.0) if len(d) else 0.0
+        of_view = pairing.evidence * (np.log(d.min(initial=np.inf) / d) + visible)
+        scores.append(np.append(of_view, 0.0))
+    return scores
 
 
 def embedding(a: Sighting, b: Sighting, pairing: Pairing) -> Scores:
-    """How much likelier than by chance each would pick the other as its like: log-softmax of their cosines, both ways, halved.
+    """How much likelier than by chance each candidate would pick the other: log-softmax of their
+    cosines, both ways, halved.
 
-    The cosine is of what sets a view's candidates apart: their mean (category, light, viewpoint) is taken away first.
+    The cosine is that of centred embeddings: the mean of a view's candidates (category, light,
+    viewpoint) is subtracted first.
     """
-    cosine = pairing.likeness * (_apart(a.embeddings) @ _apart(b.embeddings).T)
+    cosine = pairing.likeness * (_centred(a.embeddings) @ _centred(b.embeddings).T)
     if not cosine.size:
         return cosine
     by_a = cosine - np.logaddexp.reduce(cosine, axis=1, keepdims=True) + np.log(cosine.shape[1])
@@ -132,7 +206,8 @@ def embedding(a: Sighting, b: Sighting, pairing: Pairing) -> Scores:
 
 
 def hungarian(a: Sighting, b: Sighting, pairing: Pairing) -> Scores:
-    """`matched` for the pairs of the one-to-one matching of greatest total cosine: all candidates are distinct objects; minus that for others."""
+    """`matched` for the pairs of the one-to-one matching of greatest total cosine, minus that for
+    others."""
     from scipy.optimize import linear_sum_assignment
 
     cosine = a.embeddings.astype(np.float64) @ b.embeddings.astype(np.float64).T
@@ -142,24 +217,31 @@ def hungarian(a: Sighting, b: Sighting, pairing: Pairing) -> Scores:
 
 
 def geometry(a: Sighting, b: Sighting, pairing: Pairing) -> Scores:
-    """Log ratio of two densities of `apart_m`: for one object a Gaussian of `sigma_m`, but for a share `astray`; for two, `spread_m` wide.
+    """Log ratio of two densities of `ray_distance_m`.
+
+    For one object a Gaussian of `sigma_m`, but for a share `astray`; for two, `spread_m` wide.
 
     Raises: BadViews, without calibrated cameras.
     """
     if a.camera is None or b.camera is None:
-        raise BadViews("associate: geometry needs calibrated cameras; give Attender.start cameras=..., or pair by 'embedding' or 'hungarian'.")
-    near = (pairing.spread_m / pairing.sigma_m) ** 2 * np.exp(-0.5 * (apart_m(a, b) / pairing.sigma_m) ** 2)
+        raise BadViews(
+            "associate: geometry needs calibrated cameras; give Attender.start cameras=..., or "
+            "pair by 'embedding' or 'hungarian'."
+        )
+    gaussian = np.exp(-0.5 * (ray_distance_m(a, b) / pairing.sigma_m) ** 2)
+    near = (pairing.spread_m / pairing.sigma_m) ** 2 * gaussian
     return np.log(pairing.astray + (1 - pairing.astray) * near)
 
 
-def apart_m(a: Sighting, b: Sighting) -> Scores:
-    """Metres between the rays through the middles of two boxes, where they pass each other best at one height within `HEIGHTS_M`; inf for a ray
-    that never meets the table.
+def ray_distance_m(a: Sighting, b: Sighting) -> Scores:
+    """Least distance, at one height within `HEIGHTS_M`, between the rays through the centres of two
+    boxes.
 
-    Of 2020 candidates with their like in another view (true boxes, opening frames of vlabench, tabletop and generic scenes), the nearest was
-    that like for 2019; by the rays' least distance at any height for 1953, as rays also meet in mid-air or below the table; by the feet of the
-    boxes on the table for 2016, but those lie 2 to 4 cm apart for one and the same object, and these rays 2 to 4 mm (medians).
-    """
+    Metres; inf for a ray that never meets the table. Of 2020 candidates visible in two views (true
+    boxes, first frames of vlabench, tabletop and generic scenes), the nearest candidate of the
+    other view was the same object for 2019; by the rays' least distance at any height for 1953, as
+    rays also meet in mid-air or below the table; by the feet of the boxes on the table for 2016,
+    but those lie 2 to 4 cm apart for the same object, and these rays 2 to 4 mm (medians)."""
     foot_a, lean_a = _rays(a)
     foot_b, lean_b = _rays(b)
     foot, lean = foot_a[:, None] - foot_b, lean_a[:, None] - lean_b
@@ -168,37 +250,76 @@ def apart_m(a: Sighting, b: Sighting) -> Scores:
     return np.where(np.isfinite(apart), apart, np.inf)
 
 
-TERMS: dict[Term, Callable[[Sighting, Sighting, Pairing], Scores]] = {"embedding": embedding, "hungarian": hungarian, "geometry": geometry}
-"""What can speak for a pair: a score for every candidate of one view with every candidate of another."""
+TERMS: dict[Term, Callable[[Sighting, Sighting, Pairing], Scores]] = {
+    "embedding": embedding,
+    "hungarian": hungarian,
+    "geometry": geometry,
+}
+"""The evidence for a pair: a score for every candidate of one view with every candidate of
+another."""
 
-PAIRINGS: dict[str, Pairing] = {**{term: Pairing((term,)) for term in TERMS}, "all": Pairing(tuple(TERMS))}
-"""By name, to choose from: each term alone, and all."""
+PAIRINGS: dict[str, Pairing] = {
+    "embedding": Pairing(("embedding",)),
+    "hungarian": Pairing(("hungarian",)),
+    "geometry": Pairing(("geometry",)),
+    "all": Pairing(("embedding", "hungarian", "geometry")),
+}
 
 
 def overrule(grounding: Grounding, choice: int | None) -> Grounding:
-    """The grounding with `choice` for its winner; what the vote elected stays beside it."""
-    return grounding if choice == grounding.winner else replace(grounding, winner=choice, overruled=grounding.winner)
+    """The grounding with `choice` for its winner; its ballot stays as it was."""
+    return replace(grounding, winner=choice)
 
 
-Case = Literal["right", "nothing", "case 1", "case 2"]
+ViewsVerdict = Literal["right", "nothing", "case 1", "case 2"]
 
 
-def case(prompted: Mapping[str, str | None], target: str) -> Case:
-    """What the views of an episode show (SPEC section 7): `prompted[camera]` is the object that is highlighted there, None where none is.
+def compare_views(prompted: Mapping[str, str | None], target: str) -> ViewsVerdict:
+    """What the views of an episode show (SPEC section 7).
 
-    "right": every highlighted view shows the target; "case 1": all show one and the same other; "case 2": they contradict each other.
+    `prompted[camera]` is the object that is highlighted there, None where none is. "right": every
+    highlighted view shows the target; "case 1": all show one and the same other object; "case 2":
+    they contradict each other.
     """
     shown = {name for name in prompted.values() if name is not None}
     if len(shown) > 1:
         return "case 2"
-    return "nothing" if not shown else "right" if shown == {target} else "case 1"
+    if not shown:
+        return "nothing"
+    return "right" if shown == {target} else "case 1"
+
+
+def _check_calibration(camera: str, grounding: Grounding, cameras: Mapping[str, Camera]) -> None:
+    if camera not in cameras:
+        return
+    known = cameras[camera]
+    height, width = grounding.masks.shape[1:]
+    if (known.height, known.width) != (height, width):
+        raise BadViews(
+            f"Attender.start: camera {camera!r} is calibrated for {known.width}x{known.height} "
+            f"pixels, but its view has {width}x{height}; scale its k, or the view."
+        )
+
+
+def _check_size(sightings: Sequence[Sighting]) -> None:
+    size = prod(len(view.xyxy) + 1 for view in sightings)
+    if len(sightings) > MOST_VIEWS or size > MOST_COMBINATIONS:
+        raise BadViews(
+            f"associate: {len(sightings)} views with {size} combinations; at most {MOST_VIEWS} "
+            f"views and {MOST_COMBINATIONS} combinations are enumerated. Give fewer cameras or "
+            "candidates, or ground views one by one (Prompting.associate=None)."
+        )
 
 
 def _rays(view: Sighting) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n 2"]]:
-    """Of the ray through each box's middle: the x, y where it meets the table (m), and how far x, y move per metre up; NaN if it never does."""
+    """Of the ray through each box's centre: the x, y where it meets the table (m), and its x, y
+    slope per metre of height.
+
+    NaN where it never meets the table.
+    """
     assert view.camera is not None
-    middle = 0.5 * (view.xyxy[:, :2] + view.xyxy[:, 2:]).astype(np.float64)
-    pixels = np.concatenate([middle, np.ones((len(middle), 1))], axis=1)
+    centre = 0.5 * (view.xyxy[:, :2] + view.xyxy[:, 2:]).astype(np.float64)
+    pixels = np.concatenate([centre, np.ones((len(centre), 1))], axis=1)
     rays = pixels @ np.linalg.inv(view.camera.k).T @ view.camera.pose_world[:3, :3].T
     eye = view.camera.pose_world[:3, 3]
     down = np.where(rays[:, 2:] * eye[2] < 0, rays[:, 2:], np.nan)
@@ -206,13 +327,9 @@ def _rays(view: Sighting) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarra
     return eye[:2] - eye[2] * lean, lean
 
 
-def _apart(embeddings: Float32[np.ndarray, "n d"]) -> Float64[np.ndarray, "n d"]:
-    """Rows of length 1 about their mean; a row that is their mean stays 0."""
+def _centred(embeddings: Float32[np.ndarray, "n d"]) -> Float64[np.ndarray, "n d"]:
+    """Rows minus their mean, of length 1; a row that equals the mean stays 0."""
     rows = embeddings.astype(np.float64)
     rows -= rows.mean(axis=0) if len(rows) else 0.0
     length = np.linalg.norm(rows, axis=1, keepdims=True)
     return np.where(length > 1e-6, rows / np.maximum(length, 1e-6), 0.0)
-
-
-def _with_none(scores: Scores) -> Scores:
-    return np.pad(scores, ((0, 1), (0, 1)))

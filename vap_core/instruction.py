@@ -1,21 +1,25 @@
-"""Personalised instructions: find "my cup", and rewrite it to "the red cup" (P 3.3, appendix "Instruction Rewriting Logic").
+"""Personalised instructions: find "my cup", and rewrite it to "the red cup" (P 3.3, appendix
+"Instruction Rewriting Logic").
 
-A parser is any function `(text, categories) -> Instruction`; `parse` is the deterministic rule of the paper's main results.
+A parser is any function `(text, categories) -> Instruction`; `parse` is the deterministic rule of
+the paper's main results.
 """
 
 import re
 from collections.abc import Collection, Sequence
 from typing import Protocol, runtime_checkable
 
-from vap_core.errors import BadInstruction
-from vap_core.values import Colour, Instruction, Target
+from vap_core.base.errors import BadInstruction
+from vap_core.base.types import Colour, Instruction, Target
 
 OWNER = re.compile(r"\bmy\s+(?:(?:[\w-]+\s+){0,2}?[\w-]+(?:['’]s|s['’])\s+)?", re.IGNORECASE)
 """A possessive trigger: "my cup", or with an owner beside the speaker, "my brother's cup"."""
 
-STOP_WORDS = """and or to into onto in on near next beside behind under over from with at by off up down left right of then before after
-please that which is it inside toward towards between against above below around away out back here there now if while for until so"""
-STOP = frozenset(STOP_WORDS.split())
+STOP_WORDS = frozenset(
+    """and or to into onto in on near next beside behind under over from with at by off up down left
+    right of then before after please that which is it inside toward towards between against above
+    below around away out back here there now if while for until so""".split()
+)
 """Words that end a category phrase when no known category matches."""
 
 
@@ -27,10 +31,11 @@ class Parser(Protocol):
 
 
 def parse(text: str, categories: Collection[str] = ()) -> Instruction:
-    """Parse by rule: every "my <category>" or "my <person>'s <category>" becomes a target, left to right.
+    """Parse by rule: every "my <category>" or "my <person>'s <category>" becomes a target, left to
+    right.
 
-    The longest of `categories` (a plural s allowed) that follows the trigger wins; otherwise the words up to
-    punctuation or the first preposition or conjunction are the category, so unseen nouns work too.
+    The longest of `categories` (a plural s allowed) that follows the trigger wins; otherwise the
+    words up to punctuation or the first stop word are the category, so unseen nouns work too.
 
     Raises:
         BadInstruction: the text holds no possessive span.
@@ -39,41 +44,53 @@ def parse(text: str, categories: Collection[str] = ()) -> Instruction:
     for trigger in OWNER.finditer(text):
         if targets and trigger.start() < targets[-1].stop:
             continue
-        owner = trigger.group().strip()
         category, length = leading_category(text[trigger.end() :], categories)
         if category:
+            owner = trigger.group().strip()
             targets.append(Target(trigger.start(), trigger.end() + length, owner, category))
     if not targets:
-        raise BadInstruction(f'parse: no personal object in {text!r}; name one as "my <category>", for example "bring my cup".')
+        raise BadInstruction(
+            f'parse: no personal object in {text!r}; name one as "my <category>", '
+            'for example "bring my cup".'
+        )
     return Instruction(text, tuple(targets))
 
 
 def rewrite(instruction: Instruction, colours: Sequence[Colour | None]) -> str:
-    """Replace each target's span by "the <colour> <category>"; a None colour leaves its span as the user said it.
+    """Replace each target's span by "the <colour> <category>"; a None colour leaves its span as it
+    is.
 
-    One colour per target. The rest of the text is untouched, character for character.
+    One colour per target. The rest of the text is unchanged, character for character.
     """
-    if len(colours) != len(instruction.targets):
-        raise BadInstruction(f"rewrite: {len(colours)} colours for {len(instruction.targets)} targets in {instruction.text!r}; one each.")
+    n = len(instruction.targets)
+    if len(colours) != n:
+        raise BadInstruction(
+            f"rewrite: {len(colours)} colours for {n} targets in {instruction.text!r}; one each."
+        )
     text = instruction.text
-    for target, colour in reversed(list(zip(instruction.targets, colours, strict=True))):
+    pairs = zip(instruction.targets, colours, strict=True)
+    for target, colour in reversed(list(pairs)):
         if colour is None:
             continue
         article = "The" if text[target.start].isupper() else "the"
-        text = f"{text[: target.start]}{article} {colour.name} {target.category}{text[target.stop :]}"
+        phrase = f"{article} {colour.name} {target.category}"
+        text = text[: target.start] + phrase + text[target.stop :]
     return text
 
 
 def leading_category(rest: str, categories: Collection[str] = ()) -> tuple[str, int]:
-    """The category phrase that `rest` begins with, lower case, and how many characters of `rest` it spans."""
+    """The category phrase that `rest` begins with, lower case, and how many characters of `rest` it
+    spans."""
     for known in sorted(categories, key=len, reverse=True):
         pattern = r"\s+".join(re.escape(word) for word in known.split())
         match = re.match(rf"{pattern}s?\b", rest, re.IGNORECASE)
         if match:
             return known, match.end()
-    words, length = [], 0
+    words: list[str] = []
+    length = 0
     for word in re.finditer(r"[\w-]+", rest):
-        if rest[length : word.start()].strip() or word.group().lower() in STOP:
+        between = rest[length : word.start()].strip()
+        if between or word.group().lower() in STOP_WORDS:
             break
         words.append(word.group().lower())
         length = word.end()

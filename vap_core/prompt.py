@@ -1,11 +1,12 @@
-"""Visual prompts: tint a mask, and choose a colour that can be named and seen (P 3.3, tab:ablation_prompt)."""
+"""Visual prompts: tint a mask, and choose a colour that can be named and seen (P 3.3,
+tab:ablation_prompt)."""
 
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from vap_core.errors import BadInstruction
-from vap_core.values import Colour, Mask, Rgb
+from vap_core.base.errors import BadInstruction
+from vap_core.base.types import Colour, Mask, Rgb
 
 PALETTE: tuple[Colour, ...] = (
     Colour("red", (255, 0, 0)),
@@ -15,59 +16,74 @@ PALETTE: tuple[Colour, ...] = (
     Colour("cyan", (0, 255, 255)),
     Colour("yellow", (255, 255, 0)),
 )
-"""Nameable colours, in the order of preference; the paper tints red."""
+"""Nameable tints, in the order of preference; the paper tints red."""
 
 ALPHA = 0.5
 """Opacity of the tint (P appendix: the default of the opacity ablation)."""
 
-OBVIOUS = 0.12
-"""A colour is free when fewer than this share of every object's pixels, ..."""
-SCENERY = 0.01
-"""... and of every view's pixels, already look like it."""
+OBJECT_SHARE = 0.12
+VIEW_SHARE = 0.01
+"""A tint is free while fewer than these shares of every candidate's, and of every view's, pixels
+have its colour."""
+
+HUE_WIDTH_DEG, LEAST_SATURATION, LEAST_VALUE = 25.0, 0.35, 60.0
+"""A pixel has a tint's colour when its hue is that near, and it is saturated and bright enough."""
 
 
 def tint(rgb: Rgb, mask: Mask, colour: Colour, alpha: float = ALPHA) -> Rgb:
-    """I~ = (1 - alpha) I + alpha * colour inside the mask, rounded to the nearest level; the rest is bit-identical."""
+    """I~ = (1 - alpha) I + alpha * colour inside the mask, rounded to the nearest level.
+
+    Pixels outside the mask are bit-identical.
+    """
     if rgb.shape[:2] != mask.shape:
         raise ValueError(f"tint: image {rgb.shape[:2]} and mask {mask.shape} differ in size")
     if not 0.0 <= alpha <= 1.0:
         raise ValueError(f"tint: alpha {alpha} outside [0, 1]")
     out = rgb.copy()
-    out[mask] = np.rint((1.0 - alpha) * rgb[mask] + alpha * np.asarray(colour.rgb)).astype(np.uint8)
+    blend = (1.0 - alpha) * rgb[mask] + alpha * np.asarray(colour.rgb)
+    out[mask] = np.rint(blend).astype(np.uint8)
     return out
 
 
-def looks_like(rgb: np.ndarray, colour: Colour) -> np.ndarray:
-    """Which pixels (... x 3, uint8) a person would call `colour`: saturated, and of its hue to within 25 degrees."""
+def has_colour(rgb: np.ndarray, colour: Colour) -> np.ndarray:
+    """Which pixels (... x 3, uint8) a person would call `colour`."""
     pixels = rgb.astype(np.float32)
     top, low = pixels.max(axis=-1), pixels.min(axis=-1)
     saturation = (top - low) / np.maximum(top, 1.0)
-    off = np.abs((_hue(pixels) - float(_hue(np.asarray([colour.rgb], np.float32))[0]) + 180.0) % 360.0 - 180.0)
-    return (off <= 25.0) & (saturation >= 0.35) & (top >= 60.0)
+    hue = float(_hue_deg(np.asarray([colour.rgb], np.float32))[0])
+    off = np.abs((_hue_deg(pixels) - hue + 180.0) % 360.0 - 180.0)
+    return (off <= HUE_WIDTH_DEG) & (saturation >= LEAST_SATURATION) & (top >= LEAST_VALUE)
 
 
-def choose_colours(count: int, scenes: Iterable[tuple[Rgb, Sequence[Mask]]], palette: Sequence[Colour] = PALETTE) -> tuple[Colour, ...]:
-    """The first `count` colours that nothing in view already has (P 3.3: the tint must stand out).
+def choose_colours(
+    count: int, scenes: Iterable[tuple[Rgb, Sequence[Mask]]], palette: Sequence[Colour] = PALETTE
+) -> tuple[Colour, ...]:
+    """The first `count` tints that nothing in view already has (P 3.3: the tint must stand out).
 
-    `scenes` pairs every view with the masks of the candidates in it. A colour is taken when it covers more than `OBVIOUS` of
-    any candidate, or more than `SCENERY` of any view. Free colours come first, in the palette's order; when too few are free,
-    the least present follow.
+    `scenes` pairs every view with the masks of the candidates in it. A tint is taken when its
+    colour covers more than `OBJECT_SHARE` of any candidate, or more than `VIEW_SHARE` of any view.
+    Free tints come first, in the palette's order; when too few are free, the least present follow.
 
     Raises:
-        BadInstruction: more targets than the palette has colours.
+        BadInstruction: more targets than the palette has tints.
     """
     if count > len(palette):
-        raise BadInstruction(f"choose_colours: {count} targets but {len(palette)} colours; name fewer objects at once.")
+        raise BadInstruction(
+            f"choose_colours: {count} targets but {len(palette)} colours; name fewer objects at "
+            "once."
+        )
     presence = np.zeros(len(palette))
     for rgb, masks in scenes:
-        pixels = [rgb[mask] for mask in masks if mask.any()]
+        inside = [rgb[mask] for mask in masks if mask.any()]
         for index, colour in enumerate(palette):
-            shares = [float(looks_like(inside, colour).mean()) / OBVIOUS for inside in pixels]
-            presence[index] = max([presence[index], float(looks_like(rgb, colour).mean()) / SCENERY, *shares])
+            shares = [float(has_colour(rgb, colour).mean()) / VIEW_SHARE]
+            for pixels in inside:
+                shares.append(float(has_colour(pixels, colour).mean()) / OBJECT_SHARE)
+            presence[index] = max(presence[index], *shares)
     ranked = sorted(range(len(palette)), key=lambda i: (max(presence[i], 1.0), i))
     return tuple(palette[i] for i in ranked[:count])
 
 
-def _hue(pixels: np.ndarray) -> np.ndarray:
+def _hue_deg(pixels: np.ndarray) -> np.ndarray:
     r, g, b = pixels[..., 0], pixels[..., 1], pixels[..., 2]
     return np.degrees(np.arctan2(np.sqrt(3.0) * (g - b), 2.0 * r - g - b)) % 360.0

@@ -1,53 +1,53 @@
-"""Which candidate is the user's object: each reference votes for its most similar candidate (P 3.3)."""
+"""Which candidate is the user's object: each reference votes for its most similar candidate (P
+3.3)."""
 
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Float32
 
-from vap_core.values import value
+from vap_core.base.types import Ballot
 
-Rule = Literal["vote", "average"]
+VoteRule = Literal["vote", "average"]
 
 SAME = 1e-6
-"""Cosines closer than this count as equal, so that float rounding never decides who wins."""
+"""Cosines closer than this are equal, so that rounding never decides an election."""
 
 
-@value
-class Ballot:
-    """The result of a vote over n candidates and K references; the fields are those of `values.Grounding`."""
-
-    votes: Int64[np.ndarray, " n"]
-    tied: Bool[np.ndarray, " n"]
-    winner: int | None
-    margin: float
-    cosine_margin: float
-
-
-def similarity(candidates: Float32[np.ndarray, "n d"], references: Float32[np.ndarray, "k d"]) -> Float32[np.ndarray, "n k"]:
+def similarity(
+    candidates: Float32[np.ndarray, "n d"], references: Float32[np.ndarray, "k d"]
+) -> Float32[np.ndarray, "n k"]:
     """cos(e_i, z_k) for L2-normalised rows."""
     return np.clip(candidates @ references.T, -1.0, 1.0).astype(np.float32)
 
 
-def vote(cosine: Float32[np.ndarray, "n k"], rule: Rule = "vote") -> Ballot:
+def vote(cosine: Float32[np.ndarray, "n k"], rule: VoteRule = "vote") -> Ballot:
     """Elect one of n candidates by K references.
 
-    "vote": b* = argmax_i sum_k [i = argmax_j cos(e_j, z_k)]; a tie in votes goes to the tied candidate with the highest
-    mean cosine (P 3.3). "average" is the ablation (P tab:ablation_vote): argmax of the mean cosine; votes are still counted.
-    What is equal even then (an exact duplicate) goes to the candidate listed first, the detector's more confident one.
+    "vote": b* = argmax_i sum_k [i = argmax_j cos(e_j, z_k)]; a tie in votes goes to the tied
+    candidate with the highest mean cosine (P 3.3). "average" is the ablation
+    (P tab:ablation_vote): argmax of the mean cosine; votes are still counted. Exact duplicates
+    go to the candidate listed first, the detector's more confident one.
+
+    Raises: ValueError, when there are candidates but no references.
     """
     n, k = cosine.shape
     if n == 0:
         return Ballot(np.zeros(0, np.int64), np.zeros(0, bool), None, 0.0, 0.0)
     if k == 0:
         raise ValueError("vote: no references; a personal object has at least one")
-    votes = np.bincount((cosine >= cosine.max(axis=0) - SAME).argmax(axis=0), minlength=n).astype(np.int64)
+    best_of_reference = (cosine >= cosine.max(axis=0) - SAME).argmax(axis=0)
+    votes = np.bincount(best_of_reference, minlength=n).astype(np.int64)
     mean = cosine.astype(np.float64).mean(axis=1)
-    eligible = votes == votes.max() if rule == "vote" else np.ones(n, bool)
+    most_votes = votes == votes.max()
+
+    eligible = most_votes if rule == "vote" else np.ones(n, bool)
     best = mean[eligible].max()
     winner = int(np.flatnonzero(eligible & (mean >= best - SAME))[0])
+
     others = np.arange(n) != winner
-    runner_up = int(votes[others].max()) if n > 1 else 0
+    runner_up = int(votes[others].max(initial=0))
+    margin = (int(votes[winner]) - runner_up) / k
     cosine_margin = float(mean[winner] - mean[others].max()) if n > 1 else 2.0
-    tied = (votes == votes.max()) & (np.count_nonzero(votes == votes.max()) > 1)
-    return Ballot(votes, tied, winner, (int(votes[winner]) - runner_up) / k, cosine_margin)
+    tied = most_votes & (np.count_nonzero(most_votes) > 1)
+    return Ballot(votes, tied, winner, margin, cosine_margin)

@@ -4,7 +4,13 @@ from typing import Annotated
 
 import typer
 
-StackName = Annotated[str, typer.Option("--stack", help="Perception stack: embedded (offline, CPU), foundation or foundation-small (see weights).")]
+StackName = Annotated[
+    str,
+    typer.Option(
+        "--stack",
+        help="Perception stack: embedded (offline, CPU), foundation or foundation-small (see weights).",
+    ),
+]
 Workers = Annotated[int, typer.Option(min=1, help="Processes.")]
 
 

@@ -1,0 +1,1 @@
+"""Training of every shipped part; every training resumes after an interruption."""

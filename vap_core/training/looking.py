@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from vap_core.training.demonstrations import SIDE
+from vap_core.training.films.demonstrations import SIDE
 from vap_core.training.words import vocabulary
 
 
@@ -53,5 +53,9 @@ def looking(chance: Tensor, patches: Tensor) -> tuple[Tensor, Tensor]:
     """
     shown = patches.sum(1) > 0
     share = patches / patches.sum(1, keepdim=True).clamp(min=1e-6)
-    heat = -(share * chance.log_softmax(-1)).sum(1)[shown].mean() if shown.any() else torch.zeros(())
-    return heat, (patches.gather(1, chance.argmax(1, keepdim=True)).squeeze(1) > 0)[shown].float().mean()
+    heat = (
+        -(share * chance.log_softmax(-1)).sum(1)[shown].mean() if shown.any() else torch.zeros(())
+    )
+    return heat, (patches.gather(1, chance.argmax(1, keepdim=True)).squeeze(1) > 0)[
+        shown
+    ].float().mean()

@@ -5,7 +5,10 @@ from contextlib import contextmanager
 from typing import Any, cast
 
 from lerobot.policies.pi0.modeling_pi0 import PaliGemmaWithExpertModel, PI0Policy, PI0Pytorch
-from lerobot.policies.pi_gemma import PaliGemmaForConditionalGenerationWithPiGemma, PiGemmaForCausalLM
+from lerobot.policies.pi_gemma import (
+    PaliGemmaForConditionalGenerationWithPiGemma,
+    PiGemmaForCausalLM,
+)
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor, nn
 from transformers import GemmaConfig, PaliGemmaConfig
@@ -20,7 +23,10 @@ class MiniTowers(PaliGemmaWithExpertModel):
 
     def __init__(self, config: MiniPI0Config) -> None:
         nn.Module.__init__(self)
-        self.freeze_vision_encoder, self.train_expert_only = config.freeze_vision_encoder, config.train_expert_only
+        self.freeze_vision_encoder, self.train_expert_only = (
+            config.freeze_vision_encoder,
+            config.train_expert_only,
+        )
         self.paligemma = PaliGemmaForConditionalGenerationWithPiGemma(config=vlm_config(config))
         self.gemma_expert = PiGemmaForCausalLM(config=_gemma(config, config.expert_width))
         self.gemma_expert.model.embed_tokens = None
@@ -36,18 +42,41 @@ class MiniPI0Pytorch(PI0Pytorch):
         wide = config.expert_width
         self.config, self.rtc_processor = config, rtc_processor
         self.paligemma_with_expert = MiniTowers(config)
-        self.action_in_proj, self.action_out_proj = nn.Linear(config.max_action_dim, wide), nn.Linear(wide, config.max_action_dim)
+        self.action_in_proj, self.action_out_proj = (
+            nn.Linear(config.max_action_dim, wide),
+            nn.Linear(wide, config.max_action_dim),
+        )
         self.state_proj = nn.Linear(config.max_state_dim, wide)
-        self.action_time_mlp_in, self.action_time_mlp_out = nn.Linear(2 * wide, wide), nn.Linear(wide, wide)
+        self.action_time_mlp_in, self.action_time_mlp_out = (
+            nn.Linear(2 * wide, wide),
+            nn.Linear(wide, wide),
+        )
         self.gradient_checkpointing_enabled = False
 
     def sample_actions(
-        self, images: Any, img_masks: Any, lang_tokens: Any, lang_masks: Any, state: Tensor, noise: Any = None, **kwargs: Any
+        self,
+        images: Any,
+        img_masks: Any,
+        lang_tokens: Any,
+        lang_masks: Any,
+        state: Tensor,
+        noise: Any = None,
+        **kwargs: Any,
     ) -> Tensor:
         """PI0's, from cooler noise."""
         if noise is None:
-            noise = self.sample_noise((len(state), self.config.chunk_size, self.config.max_action_dim), state.device)
-        return super().sample_actions(images, img_masks, lang_tokens, lang_masks, state, noise=self.config.temperature * noise, **kwargs)
+            noise = self.sample_noise(
+                (len(state), self.config.chunk_size, self.config.max_action_dim), state.device
+            )
+        return super().sample_actions(
+            images,
+            img_masks,
+            lang_tokens,
+            lang_masks,
+            state,
+            noise=self.config.temperature * noise,
+            **kwargs,
+        )
 
 
 class MiniPI0Policy(PI0Policy):
@@ -70,7 +99,9 @@ class MiniPI0Policy(PI0Policy):
         """The checkpoint, tensor for tensor. Raises: RuntimeError when names or shapes differ."""
         return cast(
             MiniPI0Policy,
-            PreTrainedPolicy.from_pretrained.__func__(cls, pretrained_name_or_path, **{**kwargs, "strict": True}),
+            PreTrainedPolicy.from_pretrained.__func__(
+                cls, pretrained_name_or_path, **{**kwargs, "strict": True}
+            ),
         )
 
 
@@ -91,7 +122,11 @@ def vlm_config(config: MiniPI0Config) -> Any:
         "intermediate_size": 2 * config.vision_width, "num_hidden_layers": config.vision_depth, "num_attention_heads": HEADS,
         "projection_dim": config.width, "projector_hidden_act": "gelu_fast", "vision_use_head": False,
     }  # fmt: skip
-    parts: dict[str, Any] = {"text_config": _gemma(config, config.width).to_dict(), "vision_config": tower, "projection_dim": config.width}
+    parts: dict[str, Any] = {
+        "text_config": _gemma(config, config.width).to_dict(),
+        "vision_config": tower,
+        "projection_dim": config.width,
+    }
     made: Any = PaliGemmaConfig(**parts)
     made.image_token_index = made._vocab_size = len(config.words)
     made.text_config.use_adarms, made.text_config.adarms_cond_dim = False, None

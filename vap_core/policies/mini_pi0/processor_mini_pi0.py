@@ -7,7 +7,12 @@ from typing import Any
 import torch
 from lerobot.configs import FeatureType, PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import EnvTransition, TransitionKey
-from lerobot.processor import ProcessorStep, ProcessorStepRegistry, make_default_policy_processor_steps, make_policy_processor_pipelines
+from lerobot.processor import (
+    ProcessorStep,
+    ProcessorStepRegistry,
+    make_default_policy_processor_steps,
+    make_policy_processor_pipelines,
+)
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
@@ -47,11 +52,16 @@ class Words(ProcessorStep):
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
         language = PolicyFeature(FeatureType.LANGUAGE, (self.longest,))
-        features[PipelineFeatureType.OBSERVATION] |= {OBS_LANGUAGE_TOKENS: language, OBS_LANGUAGE_ATTENTION_MASK: language}
+        features[PipelineFeatureType.OBSERVATION] |= {
+            OBS_LANGUAGE_TOKENS: language,
+            OBS_LANGUAGE_ATTENTION_MASK: language,
+        }
         return features
 
 
-def encode(texts: list[str], number: dict[str, int], longest: int) -> tuple[torch.Tensor, torch.Tensor]:
+def encode(
+    texts: list[str], number: dict[str, int], longest: int
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Token numbers, one row a text, as many as the longest has but at most `longest`, padded on the right; and where there are any."""
     said = [[*SPLIT.findall(text.lower().rstrip("\n"))[: longest - 1], END] for text in texts]
     tokens = torch.zeros((len(texts), max(map(len, said))), dtype=torch.long)
@@ -60,9 +70,19 @@ def encode(texts: list[str], number: dict[str, int], longest: int) -> tuple[torc
     return tokens, tokens != number[PAD]
 
 
-def make_mini_pi0_pre_post_processors(config: MiniPI0Config, dataset_stats: dict[str, dict[str, torch.Tensor]] | None = None) -> Any:
+def make_mini_pi0_pre_post_processors(
+    config: MiniPI0Config, dataset_stats: dict[str, dict[str, torch.Tensor]] | None = None
+) -> Any:
     """The two pipelines of a mini-pi0; lerobot's factory asks for them by this name."""
     steps = make_default_policy_processor_steps(config, dataset_stats)
     words = Words(list(config.words), config.tokenizer_max_length)
-    before = [steps.rename_observations, steps.add_batch_dim, words, steps.to_device, steps.normalize]
-    return make_policy_processor_pipelines(input_steps=before, output_steps=[steps.unnormalize, steps.to_cpu])
+    before = [
+        steps.rename_observations,
+        steps.add_batch_dim,
+        words,
+        steps.to_device,
+        steps.normalize,
+    ]
+    return make_policy_processor_pipelines(
+        input_steps=before, output_steps=[steps.unnormalize, steps.to_cpu]
+    )

@@ -11,7 +11,7 @@ from lerobot.configs import PreTrainedConfig
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from vap_core.errors import BadPolicy
+from vap_core.base.errors import BadPolicy
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniTowers
 from vap_core.policies.mini_pi0.processor_mini_pi0 import END, encode
@@ -37,19 +37,34 @@ class MiniVlm(nn.Module):
         return self.towers.embed_image(images * 2 - 1)
 
     def forward(
-        self, patches: Float[Tensor, "q p d"], tokens: Int64[Tensor, "q l"], there: Bool[Tensor, "q l"], answers: Int64[Tensor, "q a"]
+        self,
+        patches: Float[Tensor, "q p d"],
+        tokens: Int64[Tensor, "q l"],
+        there: Bool[Tensor, "q l"],
+        answers: Int64[Tensor, "q a"],
     ) -> tuple[Float[Tensor, "q a w"], Float[Tensor, "q p d"]]:
         """Scores of every word at every place of the answer, given the words before it; and the penultimate layer's states of the patches."""
         return self.read(patches, self.towers.embed_language_tokens(tokens), there, answers)
 
     def read(
-        self, patches: Float[Tensor, "q p d"], words: Float[Tensor, "q l d"], there: Bool[Tensor, "q l"], answers: Int64[Tensor, "q a"]
+        self,
+        patches: Float[Tensor, "q p d"],
+        words: Float[Tensor, "q l d"],
+        there: Bool[Tensor, "q l"],
+        answers: Int64[Tensor, "q a"],
     ) -> tuple[Float[Tensor, "q a w"], Float[Tensor, "q p d"]]:
         """`forward` with the question's words embedded already."""
         from lerobot.policies.common.vla_utils import make_att_2d_masks, prepare_attention_masks_4d
 
         length, start, before = patches.shape[1], patches.shape[1] + words.shape[1], answers[:, :-1]
-        pad = torch.cat([torch.ones_like(patches[..., 0], dtype=torch.bool), there, torch.ones_like(before, dtype=torch.bool)], 1)
+        pad = torch.cat(
+            [
+                torch.ones_like(patches[..., 0], dtype=torch.bool),
+                there,
+                torch.ones_like(before, dtype=torch.bool),
+            ],
+            1,
+        )
         causal = torch.zeros_like(pad)
         causal[:, start:] = True
         out = self.towers.paligemma.model.language_model(
@@ -63,7 +78,9 @@ class MiniVlm(nn.Module):
         return self.towers.paligemma.lm_head(states), out.hidden_states[-2][:, :length]
 
     @torch.inference_mode()
-    def answer(self, images: Float[Tensor, "b 3 s s"], questions: Sequence[str]) -> list[tuple[str, ...]]:
+    def answer(
+        self, images: Float[Tensor, "b 3 s s"], questions: Sequence[str]
+    ) -> list[tuple[str, ...]]:
         """One question per view, answered greedily."""
         patches, (tokens, there) = self.look(images), self.ask(questions)
         said = torch.zeros((len(questions), ANSWER), dtype=torch.long)
@@ -87,31 +104,44 @@ class MiniVlm(nn.Module):
         """Write `folder`: sizes and words as config.json, weights as safetensors in bfloat16."""
         folder.mkdir(parents=True, exist_ok=True)
         self.config.save_pretrained(folder)
-        save_file({name: tensor.contiguous() for name, tensor in self.towers.state_dict().items()}, folder / WEIGHTS)
+        save_file(
+            {name: tensor.contiguous() for name, tensor in self.towers.state_dict().items()},
+            folder / WEIGHTS,
+        )
         halve(folder / WEIGHTS)
 
 
 def load(folder: Path) -> MiniVlm:
     """The frozen model that `save` wrote. Raises: BadPolicy."""
     if not (folder / WEIGHTS).is_file():
-        raise BadPolicy(f"vlm.load: {folder} holds no mini-PaliGemma ({WEIGHTS}); make one: python -m vap_core train vlm")
+        raise BadPolicy(
+            f"vlm.load: {folder} holds no mini-PaliGemma ({WEIGHTS}); make one: python -m vap_core train vlm"
+        )
     try:
         vlm = MiniVlm(cast(MiniPI0Config, PreTrainedConfig.from_pretrained(folder)))
         vlm.towers.load_state_dict(load_file(folder / WEIGHTS))
     except Exception as error:
         reason = (str(error).strip().splitlines() or [""])[0]
-        raise BadPolicy(f"vlm.load: {folder} is damaged ({type(error).__name__}: {reason:.150}); run: python -m vap_core train vlm") from error
+        raise BadPolicy(
+            f"vlm.load: {folder} is damaged ({type(error).__name__}: {reason:.150}); run: python -m vap_core train vlm"
+        ) from error
     return vlm.eval().requires_grad_(False)
 
 
 def halve(file: Path) -> None:
     """Keep a file's tensors in bfloat16; a model that loads them computes in its own precision."""
-    save_file({name: tensor.bfloat16() for name, tensor in load_file(file).items()}, file, metadata={"format": "pt"})
+    save_file(
+        {name: tensor.bfloat16() for name, tensor in load_file(file).items()},
+        file,
+        metadata={"format": "pt"},
+    )
 
 
 def grow(vlm: MiniVlm, policy: Any) -> None:
     """Start a policy's image tower, decoder and words from the model's. Raises: BadPolicy when words or sizes differ."""
     for name in ("words", *SIZES):
         if getattr(policy.config, name) != getattr(vlm.config, name):
-            raise BadPolicy(f"vlm.grow: policy and mini-PaliGemma differ in {name}; make the model again: python -m vap_core train vlm")
+            raise BadPolicy(
+                f"vlm.grow: policy and mini-PaliGemma differ in {name}; make the model again: python -m vap_core train vlm"
+            )
     policy.model.paligemma_with_expert.paligemma.load_state_dict(vlm.towers.paligemma.state_dict())

@@ -1,0 +1,127 @@
+"""The structure of the package: few entries at the top, imports in one direction, and lines near the anchors' (STYLE.md section 0)."""
+
+import ast
+from pathlib import Path
+
+import vap_core
+from vap_core.cli.bench.style import measure
+
+ROOT = Path(vap_core.__file__).parent
+METHOD = ("memory", "instruction", "vote", "associate", "prompt", "attend")
+LAYERS = (
+    ("base",),
+    ("perception",),
+    METHOD,
+    ("simulation",),
+    ("policies",),
+    ("rollout",),
+    ("recording",),
+    ("evaluation",),
+    ("training",),
+    ("analysis",),
+    ("cli",),
+)
+"""From the bottom up: a module imports from its own layer and those before it."""
+SOLE_IMPORTERS = {
+    "rerun": ("recording",),
+    "lerobot": ("policies", "training", "cli"),
+    "transformers": ("perception.foundation", "policies"),
+}
+
+
+def modules() -> dict[str, Path]:
+    found = {}
+    for path in ROOT.rglob("*.py"):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        found[".".join(part for part in parts if part != "__init__")] = path
+    return found
+
+
+def imported(path: Path) -> set[str]:
+    """Every module or name that a file imports, in dotted form; those for type checkers only count as well."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+    return names
+
+
+def arrows() -> dict[str, set[str]]:
+    """Which modules of the package each module imports."""
+    known = modules()
+    graph: dict[str, set[str]] = {}
+    for name, path in known.items():
+        if name in ("", "__main__"):  # the public names of everything, and the command line
+            continue
+        graph[name] = set()
+        for dotted in imported(path):
+            if not dotted.startswith("vap_core."):
+                continue
+            inside = dotted.removeprefix("vap_core.")
+            target = inside if inside in known else inside.rpartition(".")[0]
+            if target in known and target not in ("", name):
+                graph[name].add(target)
+    return graph
+
+
+def layer(module: str) -> int:
+    top = module.partition(".")[0]
+    return next(i for i, names in enumerate(LAYERS) if top in names)
+
+
+def test_the_package_shows_at_most_18_entries() -> None:
+    entries = {path.name for path in ROOT.iterdir()} - {"__pycache__"}
+    assert len(entries) <= 18, sorted(entries)
+    folders = {path.name for path in ROOT.iterdir() if path.is_dir()} - {"__pycache__"}
+    assert folders == {name for names in LAYERS if names != METHOD for name in names}
+
+
+def test_imports_point_to_lower_layers_only() -> None:
+    wrong = []
+    for module, targets in arrows().items():
+        wrong += [f"{module} -> {name}" for name in targets if layer(name) > layer(module)]
+    assert not wrong, "\n".join(sorted(wrong))
+
+
+def test_no_module_imports_itself_by_a_detour() -> None:
+    graph = arrows()
+    done: set[str] = set()
+
+    def visit(module: str, path: tuple[str, ...]) -> None:
+        assert module not in path, " -> ".join([*path[path.index(module) :], module])
+        if module in done:
+            return
+        for target in sorted(graph[module]):
+            if not module.startswith(f"{target}.") and not target.startswith(f"{module}."):
+                visit(target, (*path, module))
+        done.add(module)
+
+    for module in sorted(graph):
+        visit(module, ())
+
+
+def test_heavy_libraries_have_their_place() -> None:
+    for name, path in modules().items():
+        for dotted in imported(path):
+            places = SOLE_IMPORTERS.get(dotted.partition(".")[0])
+            assert places is None or name.startswith(places), f"{name} imports {dotted}"
+
+
+def test_lines_are_near_the_anchors() -> None:
+    found = measure(list(modules().values()))
+    assert found.line_length_p95 <= 98, found
+    assert found.per_100_lines(found.comprehensions) <= 2.0, found
+
+
+def test_style_counts_what_it_says(tmp_path: Path) -> None:
+    file = tmp_path / "one.py"
+    file.write_text(
+        "a = [i for i in range(3)]\n\nb = {i: {j for j in a} for i in a}\nc = 1 if a else 2\n"
+    )
+    found = measure([file])
+    assert (found.lines, found.comprehensions, found.ternaries, found.longest_file) == (3, 3, 1, 4)
+    assert found.line_length_p95 > 30
+    assert found.per_100_lines(found.ternaries) == 100 / 3

@@ -1,0 +1,1 @@
+"""Figures and measurements that the notebooks call."""

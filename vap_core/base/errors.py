@@ -1,0 +1,92 @@
+"""Errors that carry their remedy: one line that says where, what was possible and what to do next."""
+
+from collections.abc import Iterable
+
+
+class VapError(Exception):
+    """Base of every error that the user can mend; the command line prints it and exits with 2."""
+
+
+class BadPhoto(VapError):
+    """A reference photo that is absent, empty, not an image, or too large to decode safely."""
+
+
+class BadInstruction(VapError):
+    """An instruction without a personal object, or with more of them than the palette has tints."""
+
+
+class UnknownName(VapError):
+    """A suite, task, object, category, robot, method, policy or stack that no registry holds."""
+
+
+class BadMemory(VapError):
+    """A memory file that is damaged, of another version, or made with another encoder."""
+
+
+class BadObject(VapError):
+    """A 3-D file that cannot become an object, or an object's folder that is damaged."""
+
+
+class BadOutput(VapError):
+    """An output folder that cannot be written, or already holds a different run."""
+
+
+class BadRecording(VapError):
+    """A recording that cannot be parsed."""
+
+
+class MissingGL(VapError):
+    """No OpenGL back end can render without a display."""
+
+
+class MissingWeights(VapError):
+    """Weights that are not on this machine, or whose checksum differs from the manifest."""
+
+
+class MissingMeshes(VapError):
+    """MuJoCo Menagerie's meshes of a robot, neither on this machine nor to be downloaded."""
+
+
+class BadAction(VapError):
+    """An action of the wrong length, or with numbers that are not finite."""
+
+
+class BadSuite(VapError):
+    """An episode list with a malformed row, or one that changed since it was hashed."""
+
+
+class BadViews(VapError):
+    """Views that cannot be associated: too many of them, or cameras without calibration."""
+
+
+class BadStudy(VapError):
+    """Tasks, methods and a policy that do not fit together."""
+
+
+class BadPolicy(VapError):
+    """A checkpoint that is absent, would execute code, is damaged, or does not fit the suite."""
+
+
+class BadEndpoint(VapError):
+    """A chat endpoint that cannot be reached, refuses, or does not follow the protocol."""
+
+
+class BadCluster(VapError):
+    """No Ray cluster where one was expected, or no Ray."""
+
+
+class OutOfReach(VapError):
+    """A pose that inverse kinematics cannot reach."""
+
+
+class WorkerDied(VapError):
+    """A worker process that was killed; what it had not finished runs again."""
+
+
+def one_of(what: str, name: str, known: Iterable[object]) -> UnknownName:
+    """The error for a name that a registry lacks, with the names that it holds.
+
+    `one_of("make_env: task", "x", TASKS)` reads "make_env: task 'x' is unknown; known: ...".
+    """
+    names = ", ".join(sorted(map(str, known)))
+    return UnknownName(f"{what} {name!r} is unknown; known: {names}.")

@@ -1,0 +1,93 @@
+"""The events of the method as text: what the vote elected, what the views agreed on, which targets
+were lost and found."""
+
+from collections.abc import Mapping
+
+from vap_core.base.types import Association, Ballot, Event, Grounding
+
+Visible = frozenset[tuple[str, int]]
+"""Camera and target index of every target that is visible in that view."""
+UNMODIFIED = "the view passes unmodified"
+
+
+def grounding_events(
+    groundings: Mapping[str, tuple[Grounding, ...]],
+    associations: tuple[Association | None, ...],
+    ids: Mapping[str, tuple[int | None, ...]],
+    chosen_by: str,
+) -> tuple[Event, ...]:
+    """Events of t = 0. `chosen_by` names what overruled a vote, where something did."""
+    events = [_elected(g, chosen_by) for per_view in groundings.values() for g in per_view]
+    for j, association in enumerate(associations):
+        if association is not None:
+            events.append(_associated(groundings, j, association))
+    for camera, per_target in ids.items():
+        found = [identity for identity in per_target if identity is not None]
+        if len(set(found)) < len(found):
+            text = f"{camera}: two targets share one object, at most one is right"
+            events.append(Event(0, "WARN", text))
+    return tuple(events)
+
+
+def visibility_events(frame_index: int, before: Visible, after: Visible) -> tuple[Event, ...]:
+    """Targets that one step lost, and targets that it found again."""
+    events = []
+    for camera, j in sorted(before - after):
+        text = f"{camera}: target {j} not visible, {UNMODIFIED}"
+        events.append(Event(frame_index, "WARN", text))
+    for camera, j in sorted(after - before):
+        events.append(Event(frame_index, "INFO", f"{camera}: target {j} re-acquired"))
+    return tuple(events)
+
+
+def is_lost(event: Event) -> bool:
+    """Whether the event says that a target was lost."""
+    return event.text.endswith(f"not visible, {UNMODIFIED}")
+
+
+def describe_ballot(grounding: Grounding) -> str:
+    """The elected candidate's votes and lead, such as "votes 5 of 5, cosine lead +0.06"."""
+    ballot = grounding.ballot
+    if ballot.winner is None:
+        return "no candidate"
+    votes = f"votes {ballot.votes[ballot.winner]} of {grounding.similarity.shape[1]}"
+    return f"{votes}, {describe_lead(ballot)}"
+
+
+def describe_lead(ballot: Ballot) -> str:
+    """How far the elected candidate is ahead of every other, by `Ballot.cosine_margin`."""
+    if len(ballot.votes) == 1:
+        return "the only candidate"
+    lead = f"cosine lead {ballot.cosine_margin:+.2f}"
+    if int(ballot.tied.sum()) > 1:
+        return f"tie, {lead}"
+    return lead
+
+
+def _elected(grounding: Grounding, chosen_by: str) -> Event:
+    ballot, camera, name = grounding.ballot, grounding.camera, grounding.object
+    n, k = grounding.similarity.shape
+    if ballot.winner is None:
+        phrase = grounding.candidates.phrase
+        return Event(0, "WARN", f"{camera}: no {phrase} found, {UNMODIFIED}")
+    if grounding.winner is None:
+        text = f"{camera}: {name} is none of {n} candidates by {chosen_by}, {UNMODIFIED}"
+        return Event(0, "WARN", text)
+    text = f"{camera}: {name} is candidate {grounding.winner} with "
+    text += f"{ballot.votes[grounding.winner]}/{k} votes"
+    if grounding.overruled:
+        text += (
+            f" by {chosen_by}, over candidate {ballot.winner} with {ballot.votes[ballot.winner]}"
+        )
+    elif ballot.tied[ballot.winner]:
+        text += " after a tie"
+    return Event(0, "INFO", text)
+
+
+def _associated(
+    groundings: Mapping[str, tuple[Grounding, ...]], j: int, association: Association
+) -> Event:
+    name = next(iter(groundings.values()))[j].object
+    terms = ", ".join(f"{term} {score:.2f}" for term, score in association.terms.items())
+    text = f"{name}: views associated, margin {association.margin:.2f}; {terms}"
+    return Event(0, "INFO", text)

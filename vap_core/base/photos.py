@@ -1,0 +1,71 @@
+"""Reading a user's photos: upright RGB, bounded in size, and one line of error for whatever cannot
+be read."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from vap_core.base.errors import BadPhoto
+from vap_core.base.types import Rgb
+
+MAX_PIXELS = 50_000_000
+MAX_BYTES = 200_000_000
+LONG_SIDE = 1024
+
+
+def load_photo(path: Path | str, long_side: int | None = LONG_SIDE) -> Rgb:
+    """Read a picture file upright and shrink its longer side to `long_side` pixels (None keeps its
+    size).
+
+    Raises:
+        BadPhoto: missing, empty, not an image, truncated, or more than 50 megapixels.
+    """
+    from PIL import Image, ImageOps, UnidentifiedImageError
+
+    path = Path(path)
+    _check_file(path)
+    undecodable = (
+        UnidentifiedImageError,
+        Image.DecompressionBombError,
+        Image.DecompressionBombWarning,
+        OSError,
+        ValueError,
+        SyntaxError,
+        struct.error,
+    )
+    try:
+        with path.open("rb") as file, Image.open(file) as image:
+            if image.width * image.height > MAX_PIXELS:
+                raise BadPhoto(
+                    f"load_photo: {path} has {image.width}x{image.height} pixels, over "
+                    f"{MAX_PIXELS / 1e6:.0f} million; scale it down."
+                )
+            if image.mode.startswith(("I", "F")):
+                raise BadPhoto(
+                    f"load_photo: {path} has {image.mode} pixels, more than 8 bits each; save it "
+                    "as an 8-bit JPEG or PNG."
+                )
+            upright = ImageOps.exif_transpose(image).convert("RGB")
+            if long_side is not None:
+                upright.thumbnail((long_side, long_side))
+            return np.array(upright, dtype=np.uint8)
+    except BadPhoto:
+        raise
+    except undecodable as error:
+        raise BadPhoto(
+            f"load_photo: {path} cannot be read as an image ({error}); export it as JPEG or PNG."
+        ) from error
+
+
+def _check_file(path: Path) -> None:
+    if not path.is_file():
+        raise BadPhoto(f"load_photo: {path} is not a file; check the path.")
+    size = path.stat().st_size
+    if not size:
+        raise BadPhoto(f"load_photo: {path} is empty; export the photo again.")
+    if size > MAX_BYTES:
+        raise BadPhoto(
+            f"load_photo: {path} has {size / 1e6:.0f} MB, over {MAX_BYTES / 1e6:.0f}; save it "
+            "smaller."
+        )

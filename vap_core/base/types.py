@@ -1,0 +1,226 @@
+"""The values of the method: frozen, and checked against their annotated types and shapes when they
+are built.
+
+Conventions in the whole package: images are RGB, height x width x 3, uint8. Boxes are `x0 y0 x1 y1`
+in pixels, x to the right and y down, the far corner exclusive. Lengths are metres, angles radians,
+times seconds. Cameras follow OpenCV: x right, y down, z into the scene. Rates are fractions;
+percent is for print.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, dataclass_transform
+
+import numpy as np
+from beartype import beartype
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8, jaxtyped
+
+Rgb = UInt8[np.ndarray, "_ _ 3"]
+Mask = Bool[np.ndarray, "_ _"]
+Views = Mapping[str, Rgb]
+"""One image per camera, keyed by the camera's name."""
+
+
+@dataclass_transform(frozen_default=True, eq_default=False)
+def value[T](cls: type[T]) -> type[T]:
+    """Make `cls` a frozen dataclass whose fields are checked when it is built."""
+    frozen = dataclass(frozen=True, slots=True, eq=False)(cls)
+    return jaxtyped(typechecker=beartype)(frozen)
+
+
+@value
+class Boxes:
+    """Category-level proposals of one view (P 3.3); n may be 0: a result, not an error."""
+
+    xyxy: Float32[np.ndarray, "n 4"]
+    score: Float32[np.ndarray, " n"]
+    phrase: str
+
+    def __post_init__(self) -> None:
+        if len(self.xyxy) and not (self.xyxy[:, 2:] > self.xyxy[:, :2]).all():
+            raise ValueError(f"Boxes: far corner must exceed near corner, got {self.xyxy.tolist()}")
+
+    def __len__(self) -> int:
+        return len(self.xyxy)
+
+    @staticmethod
+    def empty(phrase: str) -> "Boxes":
+        return Boxes(np.zeros((0, 4), np.float32), np.zeros(0, np.float32), phrase)
+
+
+@value
+class Description:
+    """An object's appearance in words that can follow "my cup is"."""
+
+    short: str
+    long: str
+
+
+@value
+class PersonalObject:
+    """One remembered object: K reference crops and their embeddings Z_o (P 3.3).
+
+    Rows of `embeddings` are L2-normalised.
+    """
+
+    name: str
+    category: str
+    embeddings: Float32[np.ndarray, "k d"]
+    crops: tuple[Rgb, ...]
+    encoder: str
+    description: Description | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.crops) != len(self.embeddings) or not self.crops:
+            raise ValueError(
+                f"PersonalObject {self.name!r}: {len(self.crops)} crops for {len(self.embeddings)} "
+                "embeddings; one each, and at least one"
+            )
+        norm = np.linalg.norm(self.embeddings, axis=1)
+        if not np.allclose(norm, 1.0, atol=1e-3):
+            raise ValueError(
+                f"PersonalObject {self.name!r}: embeddings must be L2-normalised, "
+                f"got norms {norm.tolist()}"
+            )
+
+
+@value
+class Target:
+    """One personalised span of an instruction.
+
+    `text[start:stop]` is "my cup" for owner "my" and category "cup".
+    """
+
+    start: int
+    stop: int
+    owner: str
+    category: str
+
+
+@value
+class Instruction:
+    """A parsed instruction: its text and its personalised spans, left to right and disjoint."""
+
+    text: str
+    targets: tuple[Target, ...]
+
+
+@value
+class Colour:
+    """A nameable tint."""
+
+    name: str
+    rgb: tuple[int, int, int]
+
+
+@value
+class Ballot:
+    """The result of one vote over n candidates and K references (P 3.3).
+
+    `votes[i]` counts the references whose best candidate is i; `tied` marks the candidates that
+    share the most votes, where more than one does. `winner` is the elected candidate, None exactly
+    when there is none to elect. `margin` is (votes of the winner - most votes of any other) / K, in
+    [0, 1] when votes decide; `cosine_margin` is the same difference of mean cosines, 2 when there
+    is no other candidate."""
+
+    votes: Int64[np.ndarray, " n"]
+    tied: Bool[np.ndarray, " n"]
+    winner: int | None
+    margin: float
+    cosine_margin: float
+
+    def __post_init__(self) -> None:
+        if (self.winner is None) != (len(self.votes) == 0):
+            raise ValueError(f"Ballot: winner {self.winner} of {len(self.votes)} candidates")
+
+
+@value
+class Grounding:
+    """Why a view's box was chosen, or none: everything that the vote saw at t = 0 (P 3.3).
+
+    `similarity[i, k]` is cos(e_i, z_k). `winner` is the candidate that is tracked and tinted: the
+    ballot's, unless cross-view association or the simulator chose otherwise; None where the object
+    is not visible in this view."""
+
+    camera: str
+    object: str
+    candidates: Boxes
+    similarity: Float32[np.ndarray, "n k"]
+    ballot: Ballot
+    winner: int | None
+    masks: Bool[np.ndarray, "n h w"]
+
+    @property
+    def overruled(self) -> bool:
+        """Whether another candidate than the elected one is used, or none."""
+        return self.winner != self.ballot.winner
+
+    @property
+    def mask(self) -> Mask | None:
+        return None if self.winner is None else self.masks[self.winner]
+
+
+@value
+class Association:
+    """Why every view got its candidate when all views were asked together for one target (SPEC
+    section 9).
+
+    Scores are natural logarithms. `chosen[camera]` is a candidate, or None: not visible there.
+    `total` is the chosen combination's score, `terms` its parts by name, and `margin` its lead over
+    the best combination that differs in any view. `support[camera]` holds the best total of any
+    combination with each candidate of that view, and last with none."""
+
+    chosen: Mapping[str, int | None]
+    total: float
+    margin: float
+    terms: Mapping[str, float]
+    support: Mapping[str, Float64[np.ndarray, " _"]]
+
+
+@value
+class Event:
+    """Something worth finding again in a recording, at one control step."""
+
+    frame_index: int
+    level: Literal["INFO", "WARN", "ERROR"]
+    text: str
+
+
+@value
+class Track:
+    """One target in one view at one step: its mask, None while it is not visible, and the tracker's
+    confidence in [0, 1]."""
+
+    mask: Mask | None
+    score: float
+
+
+@value
+class Attended:
+    """What the method gives to the policy at one control step, and the evidence for it.
+
+    `images` are the prompted views, `text` the rewritten instruction; `tracks[camera][j]` is target
+    j in that view.
+    `groundings[camera][j]` stays the same through an episode. `associations[j]` does too; there are
+    none unless views are associated, and None stands where fewer than two views had candidates.
+    `colours[j]` tints target j."""
+
+    images: Views
+    text: str
+    colours: tuple[Colour, ...]
+    tracks: Mapping[str, tuple[Track, ...]]
+    groundings: Mapping[str, tuple[Grounding, ...]]
+    events: tuple[Event, ...]
+    associations: tuple[Association | None, ...] = ()
+
+
+@value
+class Camera:
+    """A calibrated pinhole camera: `k` in pixels; `pose_world` maps camera (OpenCV axes) to world,
+    4 x 4."""
+
+    name: str
+    width: int
+    height: int
+    k: Float64[np.ndarray, "3 3"]
+    pose_world: Float64[np.ndarray, "4 4"]

@@ -1,0 +1,20 @@
+"""Which code is running: results and recordings carry it beside their numbers."""
+
+import subprocess
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+
+
+@cache
+def code_version() -> str:
+    """The commit of this checkout, with `+` when the tree differs; else the installed version."""
+    command = ["git", "describe", "--always", "--dirty=+", "--abbrev=10"]
+    folder = Path(__file__).resolve().parent
+    try:
+        done = subprocess.run(
+            command, cwd=folder, capture_output=True, text=True, timeout=10, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return f"vap-core {version('vap-core')}"
+    return done.stdout.strip()

@@ -1,0 +1,1 @@
+"""From methods and studies to tables: engine, store, metrics, statistics, diagnosis, reports."""

@@ -1,0 +1,186 @@
+"""From the table of a run to the frame that explains a failure.
+
+    failures = list_failures(Path("data/results/mini_pi0.parquet"), case=2, suite="vlabench")
+    print(failures_text(failures))
+    path = recording_of(failures, 0)
+
+`recordings` has the functions that open a failure.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vap_core.base.condition import rows_matching
+from vap_core.base.errors import BadOutput, BadStudy
+from vap_core.base.tables import align
+from vap_core.evaluation.publish import read_runs
+from vap_core.evaluation.report.failures import breakdown, breakdown_rows, diagnosed, sub_cases_text
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+COLUMNS = {
+    "suite": "suite",
+    "task": "task",
+    "method": "method",
+    "episode": "episode",
+    "seed": "seed",
+    "case": "case",
+    "sub_case": "sub_case",
+    "deciding_frame": "frame",
+    "case_confidence": "confidence",
+    "case_sentence": "why",
+}
+"""The columns that `failures_text` shows, and their titles."""
+
+
+@dataclass(frozen=True)
+class Failures:
+    """The failed episodes of runs (folders, or published tables) that were asked for.
+
+    `manifests` are the runs' run.json by digest. `all_episodes` are all episodes of the runs,
+    failed or not; `episodes` those of the suite, task and method asked for; `table` the failures
+    among them that are left. Each table has the run's digest as `configuration`, and its `source`.
+    """
+
+    manifests: Mapping[str, dict[str, Any]]
+    all_episodes: "pd.DataFrame"
+    episodes: "pd.DataFrame"
+    table: "pd.DataFrame"
+
+
+def list_failures(
+    *sources: Path,
+    suite: str | None = None,
+    task: str | None = None,
+    method: str | None = None,
+    case: int | str | None = None,
+    sub_case: str | None = None,
+    where: str | None = None,
+) -> Failures:
+    """The failures in run folders or published tables, narrowed down.
+
+    `where` is a SQL condition on the table's columns.
+
+    Raises: BadOutput when there is no such run, or it was never diagnosed; BadStudy for a name or a
+        condition that fits nothing in it.
+    """
+    import pandas as pd
+
+    manifests, tables = {}, []
+    for source in sources:
+        for manifest, episodes in read_runs(source):
+            manifests[manifest["digest"]] = manifest
+            if not episodes.empty:
+                named = episodes.assign(configuration=manifest["digest"], source=str(source))
+                tables.append(diagnosed(named))
+    if not tables:
+        raise BadOutput(
+            f"diagnose: {' and '.join(map(str, sources))} hold no finished episode; run eval first."
+        )
+    all_episodes = _with_corrections(pd.concat(tables, ignore_index=True))
+    selected = all_episodes
+    for column, wanted in (("suite", suite), ("task", task), ("method", method)):
+        selected = _select(selected, column, wanted)
+    table = selected[selected["outcome"].eq("failure")]
+    table = _select(table, "case", f"case {case}" if str(case).isdigit() else case)
+    table = _select(table, "sub_case", sub_case)
+    if where is not None:
+        table = rows_matching(table, where)
+    return Failures(manifests, all_episodes, selected, table.reset_index(drop=True))
+
+
+def failures_text(failures: Failures, limit: int = 20) -> str:
+    """How the failures divide, and the first of them, numbered as `recording_of` takes them."""
+    counts = breakdown(failures.episodes)
+    parts = [align(breakdown_rows(counts)), sub_cases_text(counts)]
+    if failures.table.empty:
+        return "\n\n".join([*parts, "no failure is left of what was asked for."])
+    shown = failures.table.head(limit)
+    if shown["corrected"].any():
+        parts.append("* as corrected by hand")
+    listing = _listing(shown)
+    rest = len(failures.table) - len(shown)
+    if rest:
+        listing += (
+            f"\nand {rest} more; --limit shows them, --case, --suite, --where narrow them down."
+        )
+    return "\n\n".join([*parts, listing])
+
+
+def failure_row(failures: Failures, number: int) -> dict[str, Any]:
+    """The row of one listed failure. Raises: BadStudy for a number that is not listed."""
+    if not 0 <= number < len(failures.table):
+        raise BadStudy(
+            f"diagnose: no failure #{number}; there are {len(failures.table)}, counted from 0."
+        )
+    return failures.table.iloc[number].to_dict()
+
+
+def deciding_frame(failures: Failures, number: int) -> int:
+    """The control step that decides a listed failure; 0 where none does."""
+    return max(0, int(failure_row(failures, number)["deciding_frame"]))
+
+
+def artifacts_folder(source: Path) -> Path:
+    """Where the recordings and corrections of a run are.
+
+    That is its folder; a published table has a folder of its own.
+    """
+    if source.suffix == ".parquet":
+        return Path("data/runs") / f"{source.stem}-diagnosed"
+    return source
+
+
+def _with_corrections(table: "pd.DataFrame") -> "pd.DataFrame":
+    """With the corrections of researchers, marked in the column `corrected`."""
+    from vap_core.recording import read_corrections, recording_file_name
+
+    table = table.assign(corrected=False)
+    for source, part in table.groupby("source", sort=False):
+        corrections = read_corrections(artifacts_folder(Path(str(source))))
+        if not corrections:
+            continue
+        for index, row in part[["suite", "task", "episode", "seed", "method"]].iterrows():
+            correction = corrections.get(recording_file_name(*row))
+            if correction is None:
+                continue
+            cells = {
+                "case": correction.case,
+                "sub_case": correction.sub_case,
+                "case_sentence": correction.note,
+                "case_confidence": 1.0,
+                "corrected": True,
+            }
+            table.loc[index, list(cells)] = list(cells.values())
+    return table
+
+
+def _select(table: "pd.DataFrame", column: str, wanted: Any) -> "pd.DataFrame":
+    """The rows that hold `wanted` in a column; all of them where it is None. Raises: BadStudy."""
+    if wanted is None:
+        return table
+    known = sorted(set(table[column]))
+    if wanted not in known:
+        raise BadStudy(
+            f"diagnose: no {column.replace('_', '-')} {wanted!r} here; there is "
+            f"{', '.join(map(str, known)) or 'none'}."
+        )
+    return table[table[column] == wanted]
+
+
+def _listing(shown: "pd.DataFrame") -> str:
+    """A numbered line per failure; corrected ones have a star."""
+    rows: list[Sequence[str]] = [["#", *COLUMNS.values()]]
+    for i, line in enumerate(shown.to_dict("records")):
+        number = f"{i}*" if line["corrected"] else str(i)
+        rows.append([number, *(_cell(line[name]) for name in COLUMNS)])
+    return align(rows)
+
+
+def _cell(cell: Any) -> str:
+    if isinstance(cell, float):
+        return f"{cell:.2f}"
+    return str(cell)

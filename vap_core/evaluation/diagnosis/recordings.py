@@ -1,0 +1,151 @@
+"""Opens listed failures: their recordings, pictures and corrections.
+
+A failure that was not recorded is run again: the same row, weights and seed give the same episode.
+"""
+
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+from vap_core.base.errors import BadStudy
+from vap_core.evaluation.diagnosis import explain
+from vap_core.evaluation.diagnosis.failures import (
+    Failures,
+    artifacts_folder,
+    deciding_frame,
+    failure_row,
+)
+from vap_core.evaluation.store import ROW_KEY
+from vap_core.evaluation.study import Study, make_trial, register_personal
+from vap_core.simulation.types import EpisodeRow
+
+
+def recording_of(failures: Failures, number: int) -> Path:
+    """The recording of a listed failure; made by running the episode again where there is none.
+
+    Raises: BadStudy for a number that is not listed, or for an episode list or policy that has
+        changed since.
+    """
+    return _recording_of_row(failures, failure_row(failures, number))
+
+
+def side_by_side_recording(failures: Failures, number: int, method: str) -> Path:
+    """One recording of a listed failure and of another method on the same episode.
+
+    Raises: as `recording_of`; BadStudy for a method that did not run the episode.
+    """
+    from vap_core.recording import combine_recordings
+
+    row = failure_row(failures, number)
+    same = failures.all_episodes
+    for name in (*ROW_KEY, "policy"):
+        same = same[same[name] == row[name]]
+    other = same[same["method"] == method]
+    if other.empty:
+        raise BadStudy(
+            f"diagnose: {method!r} did not run this episode here; there is "
+            f"{', '.join(sorted(same['method']))}."
+        )
+    paths = {}
+    for each in (row, other.iloc[0].to_dict()):
+        paths[each["method"]] = _recording_of_row(failures, each)
+    stem = paths[row["method"]].stem
+    out = artifacts_folder(Path(row["source"])) / "together" / f"{stem}-{method}.rrd"
+    out.unlink(missing_ok=True)
+    combine_recordings(paths, out)
+    return out
+
+
+def save_screenshot(failures: Failures, number: int, png: Path, against: str | None = None) -> str:
+    """Save the viewer's picture of a listed failure at its deciding frame; return why it failed.
+
+    `against` is another method on the same episode, to be shown next to it.
+
+    Raises: as `side_by_side_recording`; MissingGL.
+    """
+    from vap_core.recording import screenshot
+
+    if against is None:
+        path = recording_of(failures, number)
+    else:
+        path = side_by_side_recording(failures, number, against)
+    screenshot(path, png, frame_index=deciding_frame(failures, number), size=(1920, 1080))
+    return str(failure_row(failures, number)["case_sentence"])
+
+
+def correct_failure(failures: Failures, number: int, case: str, note: str = "") -> Path:
+    """Correct the case of a listed failure, to "case 3: slip" for example.
+
+    The correction is a layer beside the recording.
+
+    Returns: the layer's path.
+
+    Raises: BadStudy, UnknownName.
+    """
+    from vap_core.recording import Correction, write_correction
+
+    name, _, sub_case = case.partition(":")
+    return write_correction(
+        recording_of(failures, number),
+        Correction(name.strip(), sub_case.strip(), note),
+        deciding_frame(failures, number),
+    )
+
+
+def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
+    from vap_core.recording import Recorder, read_summary, recording_name
+    from vap_core.rollout.loop import rollout
+
+    study = _study_of(failures.manifests[row["configuration"]], row)
+    episode_row = _listed_row(study, row)
+    folder = artifacts_folder(Path(row["source"]))
+    path = folder / "recordings" / recording_name(episode_row, row["method"])
+    if path.exists() and read_summary(path)["policy"] == row["policy"]:
+        return path
+    memory = folder / "memory"
+    register_personal(study, memory)
+    trial = make_trial(study, [episode_row], row["method"], memory)
+    if trial.policy.label != row["policy"]:
+        raise BadStudy(
+            f"diagnose: this was run with {row['policy']}, and {trial.policy.label} is here now; "
+            "run eval again."
+        )
+    # Made with the weights that a table was published with before.
+    path.unlink(missing_ok=True)
+    (episode,) = rollout(
+        trial,
+        [episode_row],
+        lambda header: Recorder(path, header, explain=explain),
+        batch=1,
+    )
+    outcome = episode.outcome
+    if (outcome.status, outcome.steps) != (row["outcome"], row["steps"]):
+        print(
+            f"note: run again, it is a {outcome.status} after {outcome.steps} steps "
+            f"(was {row['outcome']} after {row['steps']})."
+        )
+    return path
+
+
+def _study_of(manifest: Mapping[str, Any], row: Mapping[str, Any]) -> Study:
+    """The study of a run, of one task and method alone."""
+    configuration = manifest["configuration"]
+    settings = {}
+    for field in fields(Study):
+        if field.name in configuration:
+            settings[field.name] = configuration[field.name]
+    settings["tasks"] = ((row["suite"], row["task"]),)
+    settings["methods"] = (row["method"],)
+    return replace(Study(**settings), audit=False)
+
+
+def _listed_row(study: Study, row: Mapping[str, Any]) -> EpisodeRow:
+    """The row of a failure in the episode list of today. Raises: BadStudy."""
+    for listed in study.rows(row["suite"], row["task"]):
+        if (listed.episode, listed.seed) == (row["episode"], row["seed"]):
+            return listed
+    raise BadStudy(
+        f"diagnose: episode {row['episode']} of {row['suite']}/{row['task']} is in today's list no "
+        "more; run eval again."
+    )

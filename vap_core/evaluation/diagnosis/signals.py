@@ -1,0 +1,57 @@
+"""Failures without ground truth, as on a real robot: no case, but signals from votes and tracks."""
+
+from vap_core.base.events import is_lost
+from vap_core.rollout.failure import Diagnosis
+from vap_core.rollout.types import Episode
+
+NARROW = 0.25
+"""A vote that is won by a smaller share of the references is a signal."""
+
+
+def unlabelled(episode: Episode) -> Diagnosis:
+    """The narrowest vote, lost tracks, and how differently similar the views' choices are."""
+    found, similarities, views_without = [], [], 0
+    for groundings in episode.header.groundings.values():
+        if not groundings:
+            continue
+        grounding = groundings[0]
+        if grounding.winner is None:
+            views_without += 1
+        else:
+            found.append(grounding)
+            similarities.append(float(grounding.similarity[grounding.winner].mean()))
+    margin, camera, disagreement = 0.0, "", 0.0
+    if found:
+        narrowest = min(found, key=lambda grounding: grounding.ballot.margin)
+        margin, camera = narrowest.ballot.margin, narrowest.camera
+        disagreement = max(similarities) - min(similarities)
+    lost = []
+    for frame in episode.frames:
+        lost += [event.frame_index for event in frame.events if is_lost(event)]
+
+    at = 0
+    if not found:
+        sub_case, sentence = "nothing found", "no view has a candidate"
+    elif margin < NARROW:
+        sub_case = "narrow vote"
+        sentence = f"{camera}: the vote was won by {margin:.2f} of the references only"
+    elif lost:
+        sub_case, at = "lost track", lost[0]
+        sentence = f"the target was lost {len(lost)} times, first at step {lost[0]}"
+    else:
+        sub_case, at = "no signal", episode.frames[-1].frame_index
+        sentence = "votes and tracks give no sign of the cause"
+    return Diagnosis(
+        case="unlabelled",
+        sub_case=sub_case,
+        frame_index=at,
+        camera="" if at else camera,
+        evidence={
+            "margin": margin,
+            "lost": float(len(lost)),
+            "disagreement": disagreement,
+            "views_without": float(views_without),
+        },
+        confidence=0.0,
+        sentence=sentence,
+    )

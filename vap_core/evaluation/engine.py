@@ -1,0 +1,190 @@
+"""Runs a study: batches of episodes per process, results appended as they come.
+
+Only what is missing runs. Killed at any time, by Ctrl-C, a full disk or a lost machine, the same
+call goes on where it stopped. An episode that ends in an error is tried again, and recorded then;
+both attempts are kept. The jobs of a worker that died run again, unless workers die again and again
+and no job finishes in between.
+"""
+
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vap_core.base.errors import WorkerDied
+from vap_core.evaluation import store
+from vap_core.evaluation.jobs import BATCH, Job, Record, Rows, run_job
+from vap_core.evaluation.processes import results
+from vap_core.evaluation.study import Study, register_personal
+from vap_core.simulation.types import EpisodeRow
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from tqdm import tqdm
+
+Executor = Callable[[Callable[[Job], Rows], Sequence[Job], int, str], Iterator[tuple[Job, Rows]]]
+"""How jobs reach processes: `processes.results`, or `cluster.ray_executor`'s."""
+KeyedRow = tuple[EpisodeRow, str]
+"""A row of an episode list, and the key of its result."""
+
+
+def run(
+    study: Study,
+    folder: Path,
+    *,
+    workers: int = 2,
+    record: Record = "all",
+    retries: int = 1,
+    progress: bool = True,
+    executor: Executor = results,
+    video: bool = False,
+    attention: bool = False,
+) -> "pd.DataFrame":
+    """Run the episodes of `study` that `folder` lacks, and return the table of all its episodes.
+
+    Raises: BadOutput when the folder holds another run, is in use or cannot be written; WorkerDied
+        when workers died more often than `retries` in a row.
+    """
+    from tqdm import tqdm
+
+    def missing() -> list[Job]:
+        jobs = missing_jobs(study, folder, record, retries)
+        return [replace(job, video=video, attention=attention) for job in jobs]
+
+    store.open_run(folder, study.configuration())
+    with store.locked(folder):
+        store.compact(folder)
+        register_personal(study, folder / "memory")
+        table = store.read(folder)
+        with tqdm(
+            total=len(study.methods) * _count_rows(study),
+            initial=len(table),
+            unit="episode",
+            disable=not progress,
+            smoothing=0.05,
+        ) as bar:
+            counts = _count_by_method(table)
+            deaths = 0
+            jobs = missing()
+            while jobs:
+                try:
+                    for job, rows in executor(run_job, jobs, workers, "--workers"):
+                        store.append(folder, rows)
+                        deaths = 0
+                        _show_progress(bar, counts, job, rows)
+                except WorkerDied:
+                    deaths += 1
+                    if deaths > retries:
+                        raise
+                    bar.write(
+                        "note: a worker process died; what it was doing runs again "
+                        f"({deaths} of {retries} retries).",
+                        file=sys.stderr,
+                    )
+                jobs = missing()
+        store.compact(folder)
+    return store.read(folder)
+
+
+def missing_jobs(
+    study: Study, folder: Path, record: Record = "none", retries: int = 0
+) -> Iterator[Job]:
+    """Jobs for the episodes that the run in `folder` lacks.
+
+    Also for episodes in error that were tried at most `retries` times; these are recorded. The
+    slower, prompted method comes first, so that workers finish together.
+    """
+    run_digest = store.read_manifest(folder)["digest"]
+    attempts = _attempts(store.read(folder))
+    for method in reversed(study.methods):
+        for suite, task in study.tasks:
+            rows = [(row, result_key(row, method, run_digest)) for row in study.rows(suite, task)]
+            chosen = _chosen_keys(rows, record)
+            for (_, attempt), group in _missing_groups(rows, attempts, retries).items():
+                record_now = record
+                if attempt > 1 and record != "all":
+                    record_now = "failures"
+                for first in range(0, len(group), BATCH):
+                    batch, keys = zip(*group[first : first + BATCH], strict=True)
+                    yield Job(
+                        study=study,
+                        method=method,
+                        rows=batch,
+                        keys=keys,
+                        attempt=attempt,
+                        folder=folder,
+                        record=record_now,
+                        chosen=chosen,
+                    )
+
+
+def result_key(row: EpisodeRow, method: str, run_digest: str) -> str:
+    """Names a result: a hash of the episode's row, the method and the digest of the run."""
+    return store.digest({"row": asdict(row), "method": method, "run": run_digest})
+
+
+def spread_evenly[T](items: Sequence[T], n: int) -> list[T]:
+    """`n` of them, or all if there are fewer, at equal distances."""
+    if n >= len(items):
+        return list(items)
+    return [items[i * len(items) // n] for i in range(n)]
+
+
+def _attempts(table: "pd.DataFrame") -> dict[str, tuple[int, str]]:
+    """The last attempt of every finished episode and its outcome, by key."""
+    attempts = {}
+    if not table.empty:
+        for row in table.itertuples():
+            attempts[row.key] = row.attempt, row.outcome
+    return attempts
+
+
+def _chosen_keys(rows: Sequence[KeyedRow], record: Record) -> frozenset[str]:
+    """The keys to record when `record` is a number."""
+    if not isinstance(record, int):
+        return frozenset()
+    return frozenset(key for _, key in spread_evenly(rows, record))
+
+
+def _missing_groups(
+    rows: Sequence[KeyedRow], attempts: dict[str, tuple[int, str]], retries: int
+) -> dict[tuple[str, int], list[KeyedRow]]:
+    """The missing rows, by their variant and the number of their next attempt."""
+    groups: dict[tuple[str, int], list[KeyedRow]] = {}
+    for row, key in rows:
+        tried, outcome = attempts.get(key, (0, "error"))
+        if outcome == "error" and (tried == 0 or tried <= retries):
+            groups.setdefault((row.variant, tried + 1), []).append((row, key))
+    return groups
+
+
+def _count_rows(study: Study) -> int:
+    total = 0
+    for suite, task in study.tasks:
+        total += len(study.rows(suite, task))
+    return total
+
+
+def _count_by_method(table: "pd.DataFrame") -> dict[str, Counter[str]]:
+    """Successes and episodes of every method."""
+    counts = {}
+    for method, part in table.groupby("method"):
+        counts[str(method)] = Counter(success=int(part.success.sum()), n=len(part))
+    return counts
+
+
+def _show_progress(bar: "tqdm", counts: dict[str, Counter[str]], job: Job, rows: Rows) -> None:
+    """Advance the bar by a finished job, and print the success rates so far."""
+    count = counts.setdefault(job.method, Counter())
+    for row in rows:
+        count["success"] += row["success"]
+    if job.attempt == 1:
+        count["n"] += len(rows)
+        bar.update(len(rows))
+    rates = []
+    for method, count in sorted(counts.items()):
+        if count["n"]:
+            rates.append(f"{method} {100 * count['success'] / count['n']:.0f} % of {count['n']}")
+    bar.set_postfix_str(", ".join(rates))

@@ -1,0 +1,144 @@
+"""What one worker process runs: a batch of episodes of one task and variant under one method."""
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from resource import RUSAGE_SELF, getrusage
+from typing import TYPE_CHECKING, Any, Literal
+
+from vap_core.base.errors import BadOutput, BadRecording, BadStudy
+from vap_core.evaluation import diagnosis, input_audit, state_log
+from vap_core.evaluation.study import Study, make_trial
+from vap_core.policies.weight_guard import frozen
+from vap_core.rollout.types import EpisodeHeader
+from vap_core.simulation.types import EpisodeRow, Outcome
+
+if TYPE_CHECKING:
+    from vap_core.recording import DeferredRecorder, Recorder
+
+BATCH = 5
+"""Episodes of one job: a killed run loses few, and they share one policy call."""
+Record = Literal["all", "failures", "none"] | int
+"""Which episodes are recorded: every one; every failure and one success in ten to compare with;
+none; or so many per task and method, at equal distances."""
+Rows = list[dict[str, Any]]
+"""Rows of a results table."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """Some rows of one task and variant under one method, for one worker.
+
+    `keys` name the results (engine.result_key); `attempt` 1 is the first. `chosen` are the keys to
+    record when `record` is a number. `video` records AV1 instead of JPEGs, `attention` the policy's
+    attention.
+    """
+
+    study: Study
+    method: str
+    rows: tuple[EpisodeRow, ...]
+    keys: tuple[str, ...]
+    attempt: int
+    folder: Path
+    record: Record
+    chosen: frozenset[str] = frozenset()
+    video: bool = False
+    attention: bool = False
+
+
+def run_job(job: Job) -> Rows:
+    """Run one job in this process, and return a row of the results table for each episode.
+
+    `peak_mb` is the most memory that the process has taken so far. `policy_sha256` begins the
+    checksum of the policy's parameters. `bound` marks a method or policy that reads the simulator:
+    its rows are no results.
+
+    Raises: BadPolicy when the parameters changed; BadStudy; BadOutput.
+    """
+    from vap_core.rollout.loop import rollout
+
+    trial = make_trial(job.study, job.rows, job.method, job.folder / "memory")
+    begin = None
+    if _records(job):
+        begin = _recorders(job)
+    if job.attention and not getattr(trial.policy, "attends", False):
+        raise BadStudy(
+            f"engine: {trial.policy.label} gives no attention maps, as pi0, pi0.5 and mini-pi0 do; "
+            "leave --attention out."
+        )
+    trial = replace(trial, attention=job.attention and begin is not None)
+    with frozen(trial.policy) as checksum:
+        episodes = list(rollout(trial, job.rows, begin, batch=BATCH))
+    if begin is not None:
+        _index_recordings(job)
+    state_log.write(job.folder, episodes)
+    input_audit.write(job.folder, episodes)
+    columns = {
+        "attempt": job.attempt,
+        "policy_sha256": checksum,
+        "bound": trial.bound,
+        "peak_mb": getrusage(RUSAGE_SELF).ru_maxrss // 1024,
+    }
+    rows = []
+    for key, episode in zip(job.keys, episodes, strict=True):
+        rows.append({"key": key, **columns, **episode.summary(), **diagnosis.columns(episode)})
+    return rows
+
+
+def _records(job: Job) -> bool:
+    """Whether any episode of the job may be recorded."""
+    if isinstance(job.record, int):
+        return not job.chosen.isdisjoint(job.keys)
+    return job.record != "none"
+
+
+def _recorders(job: Job) -> Callable[[EpisodeHeader], "Recorder | DeferredRecorder"]:
+    """The function that begins the recording of an episode of the job. Raises: BadOutput."""
+    from vap_core.recording import (
+        DeferredRecorder,
+        Recorder,
+        is_failure_or_sampled,
+        recording_name,
+    )
+
+    folder = job.folder / "recordings"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadOutput(
+            f"engine: {folder} cannot be written ({error.strerror}); make room and run the same "
+            "command again."
+        ) from error
+    keys = {}
+    for row, key in zip(job.rows, job.keys, strict=True):
+        keys[row.key, row.seed] = key
+
+    def begin(header: EpisodeHeader) -> "Recorder | DeferredRecorder":
+        row = header.row
+        path = folder / recording_name(row, job.method)
+        # A run that was killed may have recorded an episode and not stored its result.
+        path.unlink(missing_ok=True)
+        if job.record == "all":
+            return Recorder(path, header, video=job.video, explain=diagnosis.explain)
+
+        def is_wanted(outcome: Outcome) -> bool:
+            if job.record == "failures":
+                return is_failure_or_sampled(outcome, row, job.method)
+            return keys[row.key, row.seed] in job.chosen
+
+        return DeferredRecorder(path, header, is_wanted, video=job.video, explain=diagnosis.explain)
+
+    return begin
+
+
+def _index_recordings(job: Job) -> None:
+    """Index the job's recordings, so that a query need not read them whole."""
+    from vap_core.recording import ensure_index, recording_name
+
+    for row in job.rows:
+        path = job.folder / "recordings" / recording_name(row, job.method)
+        if path.exists():
+            # An episode that ended before its first step has nothing to index.
+            with suppress(BadRecording):
+                ensure_index(path)

@@ -1,0 +1,85 @@
+"""The methods that the paper compares, by name, and the prompter of each (P 5.2)."""
+
+from pathlib import Path
+
+from vap_core.associate import PAIRINGS
+from vap_core.attend import Attender, Prompting
+from vap_core.memory import load_bank
+from vap_core.perception.protocols import Stack
+from vap_core.policies.mini_pi0.learned_token import WORD
+from vap_core.rollout.prompters.oracle import Oracle, OraclePrompter
+from vap_core.rollout.prompters.protocol import Prompter
+from vap_core.rollout.prompters.text import (
+    HardPrompt,
+    SoftPrompt,
+    generic,
+    hard_prompt,
+    soft_prompt,
+)
+from vap_core.rollout.prompters.tint import TintPrompter
+from vap_core.simulation.assets.objects import get_object
+from vap_core.simulation.scenes import Scene
+from vap_core.simulation.types import EpisodeRow
+
+type Method = Prompting | HardPrompt | SoftPrompt | Oracle | None
+
+METHODS: dict[str, Method] = {
+    "generic": None,
+    "hard-short": HardPrompt("short"),
+    "hard-long": HardPrompt("long"),
+    "soft": SoftPrompt(),
+    "vap": Prompting(),
+    "mask-only": Prompting(rewrite=False),
+    "rewrite-only": Prompting(highlight=False),
+    "vap-associated": Prompting(associate=PAIRINGS["geometry"]),
+    "oracle-box": Oracle("box"),
+    "oracle-mask": Oracle("mask"),
+    "oracle-track": Oracle("track"),
+    "wrong-mask": Oracle("track", of="look-alike"),
+}
+"""What each method changes in the policy's inputs; None changes nothing. Association is not the
+paper's, nor are the last four: they read the simulator, and bound what results can be."""
+
+
+def needs_memory(method: str) -> bool:
+    """Whether the method refers to remembered objects."""
+    return METHODS[method] is not None
+
+
+def needs_description(method: str) -> bool:
+    return isinstance(METHODS[method], HardPrompt)
+
+
+def needs_token(method: str) -> bool:
+    return isinstance(METHODS[method], SoftPrompt)
+
+
+def needs_stack(method: str) -> bool:
+    return isinstance(METHODS[method], Prompting | Oracle)
+
+
+def make_prompter(
+    method: str, row: EpisodeRow, bank: Path, scene: Scene, stack: Stack | None
+) -> Prompter:
+    """The prompter of a method for the row's target; `stack` is there where `needs_stack`.
+
+    Raises: BadMemory.
+    """
+    match METHODS[method]:
+        case None:
+            return generic()
+        case HardPrompt() as how:
+            return hard_prompt(load_bank(bank)[row.target], how)
+        case SoftPrompt():
+            return soft_prompt(WORD)
+        case Prompting() as how:
+            return TintPrompter(_attender(how, row, bank, stack))
+        case Oracle() as oracle:
+            alike = frozenset(n for n in scene.objects if get_object(n).category == row.category)
+            return OraclePrompter(_attender(oracle.prompting, row, bank, stack), oracle, alike)
+
+
+def _attender(how: Prompting, row: EpisodeRow, bank: Path, stack: Stack | None) -> Attender:
+    assert stack is not None, "a method that prompts needs a stack"
+    target = load_bank(bank, stack.encoder.name)[row.target]
+    return Attender(stack, {row.target: target}, how)

@@ -1,0 +1,56 @@
+"""Policies by name, as studies and commands name them."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from vap_core.base.errors import one_of
+from vap_core.perception.protocols import Detector, Stack
+from vap_core.policies.mini_pi0.teach_token import MODEL
+from vap_core.policies.protocol import Policy, PrivilegedPolicy
+from vap_core.policies.scripted.expert import Expert
+from vap_core.policies.scripted.random import Random
+from vap_core.policies.scripted.scripted import Scripted
+from vap_core.simulation.env import Env
+from vap_core.simulation.scenes import Scene
+from vap_core.simulation.suites import Suite
+
+MINI, SHIPPED = "mini-pi0", MODEL.parent
+"""The shipped frozen policy, one checkpoint a suite, and the folder of the checkpoints."""
+
+
+def scripted(detector: Detector, scene: Scene, suite: Suite) -> Scripted:
+    """The scripted policy, calibrated to the suite's first camera."""
+    (camera,) = Env(scene, cameras=suite.cameras[:1]).cameras()
+    return Scripted(detector, camera, scene.robot, suite.hz, suite.control)
+
+
+POLICIES = ("scripted", "expert", "random")
+"""Policies without weights; each is built for one scene."""
+PRIVILEGED = ("expert", "random")
+"""Policies that read the simulator, or nothing at all: bounds, never results."""
+
+
+def make_policy(
+    name: str, scene: Scene, suite: Suite, stack: Stack | None
+) -> Policy[Any] | PrivilegedPolicy[Any]:
+    """One of `POLICIES`; only the scripted one needs a stack."""
+    match name:
+        case "scripted":
+            assert stack is not None, "the scripted policy needs a detector"
+            return scripted(stack.detector, scene, suite)
+        case "expert":
+            return Expert()
+        case "random":
+            return Random()
+    raise one_of("make_policy: policy", name, POLICIES)
+
+
+def shipped(suite: str) -> Path:
+    """Where the shipped policy of a suite is, if there is one."""
+    return SHIPPED / f"{MINI}-{suite}"
+
+
+def default_policy(suites: Iterable[str]) -> str:
+    """The shipped frozen policy where every suite has one, else the scripted one."""
+    return MINI if all(shipped(suite).is_dir() for suite in suites) else "scripted"

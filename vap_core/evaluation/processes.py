@@ -1,0 +1,61 @@
+"""Runs jobs in local processes of one thread each, which end when their parent ends."""
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context, parent_process
+from threading import Thread
+
+from vap_core.base.errors import WorkerDied
+
+
+def results[J, R](
+    work: Callable[[J], R], jobs: Sequence[J], workers: int, remedy: str
+) -> Iterator[tuple[J, R]]:
+    """Each job with the result of `work`, in the order in which the jobs finish.
+
+    `remedy` is the option that lowers the load, for the error message.
+
+    Raises: WorkerDied when a process was killed; what `work` raises.
+    """
+    if not jobs:
+        return
+    # Workers inherit these: two threads in each would compete for the cores.
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    with ProcessPoolExecutor(
+        max_workers=min(workers, len(jobs)),
+        mp_context=get_context("spawn"),
+        initializer=end_with_parent,
+    ) as pool:
+        done = 0
+        try:
+            futures = {pool.submit(work, job): job for job in jobs}
+            for future in as_completed(futures):
+                done += 1
+                yield futures[future], future.result()
+        except BrokenProcessPool as error:
+            raise WorkerDied(
+                "a worker process died, perhaps for lack of memory; run the same command again, "
+                f"with fewer {remedy}."
+            ) from error
+        finally:
+            processes = list((pool._processes or {}).values())
+            pool.shutdown(wait=False, cancel_futures=True)
+            if done < len(jobs):
+                # Interrupted: no result of a running job is used, and files are written atomically.
+                for process in processes:
+                    process.kill()
+
+
+def end_with_parent() -> None:
+    """End this worker process when its parent ends: an orphan would write into a resumed run."""
+    parent = parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    Thread(target=watch, daemon=True).start()

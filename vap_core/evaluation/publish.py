@@ -1,0 +1,134 @@
+"""Keeps the results of finished runs as one small table, with their manifests (run.json)."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vap_core.base.errors import BadOutput
+from vap_core.base.files import write_atomic
+from vap_core.evaluation.store import KEY, read, read_manifest
+from vap_core.simulation import suites
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+
+def read_published(path: Path) -> "list[tuple[dict[str, Any], pd.DataFrame]]":
+    """Every run in a table that `publish` wrote: its manifest, and its episodes.
+
+    Raises: BadOutput when `publish` did not write it.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        arrow = pq.read_table(path)
+        manifests = json.loads((arrow.schema.metadata or {})[b"runs"])
+        table = arrow.to_pandas()
+        runs = []
+        for manifest in manifests:
+            episodes = table[table["configuration"] == manifest["digest"]]
+            runs.append((manifest, episodes.drop(columns="configuration")))
+    except (OSError, pa.ArrowInvalid, KeyError, ValueError) as error:
+        raise BadOutput(
+            f"published: {path} is no table of finished runs ({type(error).__name__}); publish "
+            "writes one."
+        ) from error
+    return runs
+
+
+def read_runs(source: Path) -> "list[tuple[dict[str, Any], pd.DataFrame]]":
+    """The run of a folder, or every run of a published table: its manifest, and its episodes.
+
+    Raises: BadOutput.
+    """
+    if source.suffix == ".parquet":
+        return read_published(source)
+    return [(read_manifest(source), read(source))]
+
+
+def publish(sources: Sequence[Path], target: Path, *, replace: bool = False) -> int:
+    """Write every episode of the runs, with their manifests in the file's metadata.
+
+    A source is a run's folder, or a table that `publish` wrote, whose runs are taken as they are.
+    Tracebacks, wall times and memory use are left out.
+
+    Returns: the number of episodes.
+
+    Raises: BadOutput for a folder that holds no run or an unfinished one, for two runs of the same
+        episodes, or a target that is no new Parquet file.
+    """
+    import pyarrow as pa
+
+    if target.suffix != ".parquet" or target.is_dir():
+        raise BadOutput(f"publish: {target} is no name of a table; end it with .parquet.")
+    if target.exists() and not replace:
+        raise BadOutput(
+            f"publish: {target} exists; choose another name with --to, or pass --replace."
+        )
+    tables, manifests = [], []
+    for source in sources:
+        for manifest, episodes in read_runs(source):
+            wanted = _count_wanted(manifest["configuration"])
+            if len(episodes) < wanted:
+                raise BadOutput(
+                    f"publish: {source} holds {len(episodes)} of {wanted} episodes; run the same "
+                    "command again to finish it."
+                )
+            kept = episodes[_published_columns(episodes)].assign(configuration=manifest["digest"])
+            tables.append(pa.Table.from_pandas(kept, preserve_index=False))
+            manifests.append(manifest)
+    whole = pa.concat_tables(tables, promote_options="permissive")
+    if whole.select([*KEY, "policy"]).to_pandas().duplicated().any():
+        raise BadOutput(
+            f"publish: two of {', '.join(map(str, sources))} hold the same episodes; name each run "
+            "once."
+        )
+    metadata = {
+        **(whole.schema.metadata or {}),
+        b"runs": json.dumps(manifests, sort_keys=True).encode(),
+    }
+    _write(whole.replace_schema_metadata(metadata), target)
+    return whole.num_rows
+
+
+def _count_wanted(study: dict[str, Any]) -> int:
+    """How many episodes a finished run of a configuration has."""
+    rows = 0
+    for suite, task in study["tasks"]:
+        rows += len(
+            suites.listed(
+                suite,
+                task,
+                n=study["episodes"],
+                seed=study["seed"],
+                seeds=study.get("seeds", 1),
+            )
+        )
+    return len(study["methods"]) * rows
+
+
+def _published_columns(episodes: "pd.DataFrame") -> list[str]:
+    columns = []
+    for name in episodes.columns:
+        if name not in ("detail", "peak_mb") and not name.startswith("seconds_"):
+            columns.append(name)
+    return columns
+
+
+def _write(table: "pa.Table", target: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, compression="zstd")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(target, sink.getvalue().to_pybytes())
+    except OSError as error:
+        raise BadOutput(
+            f"publish: {target} cannot be written ({error.strerror}); choose another place with "
+            "--to."
+        ) from error

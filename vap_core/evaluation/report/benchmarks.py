@@ -1,0 +1,59 @@
+"""The benchmarks as tables."""
+
+from collections import Counter
+
+from vap_core.base.tables import align
+from vap_core.simulation import suites
+
+MATCHED = (
+    "protocol-matched in MuJoCo: other physics, renderings and objects than SIMPLER's and "
+    "VLABench's own."
+)
+
+
+def suites_table() -> str:
+    """The benchmarks as their hashed lists hold them, by track and by task; the warm-up suites."""
+    parts = [align(_track_rows()), align(_task_rows()), "\n".join([MATCHED, *_warm_ups()])]
+    return "\n\n".join(parts)
+
+
+def _track_rows() -> list[list[str]]:
+    rows = [
+        ["suite", "robot", "cameras", "Hz", "control", "track", "episodes", "sha256 of the list"]
+    ]
+    for name, suite in suites.BENCHMARKS.items():
+        columns = [name, suite.robot, " ".join(suite.cameras), f"{suite.hz:g}", suite.control]
+        digest = suites.lists.digest(name)[:12]
+        tracks = Counter(row.split for row in suites.lists.read(name))
+        for split, count in tracks.items():
+            rows.append([*columns, split or "-", str(count), digest])
+    return rows
+
+
+def _task_rows() -> list[list[str]]:
+    rows = [["suite", "task", "instruction", "success when", "max steps", "episodes"]]
+    for name, suite in suites.BENCHMARKS.items():
+        for task in suite.tasks:
+            listed = suites.rows(name, task.name)
+            counts = Counter(row.split for row in listed).values()
+            rows.append(
+                [
+                    name,
+                    task.name,
+                    task.instruction,
+                    task.rule,
+                    str(task.max_steps),
+                    " + ".join(map(str, counts)),
+                ]
+            )
+    return rows
+
+
+def _warm_ups() -> list[str]:
+    lines = []
+    for name, suite in suites.WARM_UPS.items():
+        lines.append(
+            f"warm-up {name}: {suite.robot}, {len(suite.tasks)} picks of "
+            f"{suite.tasks[0].max_steps} steps, any number of episodes"
+        )
+    return lines

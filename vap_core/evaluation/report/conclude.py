@@ -1,0 +1,150 @@
+"""The end of a run: a table, the time of a step by part, summary.json and one figure."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vap_core.base.errors import BadOutput
+from vap_core.base.figures import write_png
+from vap_core.base.files import write_atomic
+from vap_core.base.tables import align
+from vap_core.evaluation.metrics import Score, rate, score, step_times
+from vap_core.evaluation.report.pictures import scores_figure
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from vap_core.evaluation.study import Study
+
+
+def conclude(study: "Study", table: "pd.DataFrame", folder: Path) -> str:
+    """Write `summary.json` and `figure.png` into the run's folder, and return the text to print.
+
+    Raises: BadOutput.
+    """
+    scores = ordered(score(table), study.tasks, study.methods)
+    summary, figure = folder / "summary.json", folder / "figure.png"
+    lines = []
+    for each in scores:
+        lines.append({**each.to_json(), "seed": study.seed, "seeds": study.seeds})
+    try:
+        write_atomic(summary, json.dumps(lines, indent=1).encode())
+        write_png(scores_figure(scores), figure)
+    except OSError as error:
+        raise BadOutput(
+            f"conclude: {folder} cannot be written ({error.strerror}); make room and run the same "
+            "command again."
+        ) from error
+    text = [
+        results_table(scores),
+        *_totals(scores),
+        "",
+        "time per control step, ms by part:",
+        _times_table(scores, table),
+        "",
+        *_written(folder, f"wrote {summary}, {figure}"),
+    ]
+    if table["outcome"].eq("failure").any():
+        text.append(f"why they failed: python -m vap_core diagnose {folder}")
+    return "\n".join(text)
+
+
+def results_table(scores: Sequence[Score]) -> str:
+    """Aligned text; every rate with its 95 % Wilson interval."""
+    rows = [
+        [
+            "suite",
+            "task",
+            "method",
+            "policy",
+            "n",
+            "errors",
+            "SR % [95 %]",
+            "CMR % [95 %]",
+            "wrong object % [95 %]",
+        ]
+    ]
+    for each in scores:
+        task = f"{each.task} ({each.split})" if each.split else each.task
+        counts = [str(each.n), str(each.errors)]
+        rates = [str(each.sr), str(each.cmr), str(each.wrong_object)]
+        rows.append([each.suite, task, each.method, each.policy, *counts, *rates])
+    return align(rows)
+
+
+def ordered(
+    scores: Sequence[Score], tasks: Sequence[Sequence[str]], methods: Sequence[str]
+) -> list[Score]:
+    """In the order in which a study names its tasks and methods."""
+    places: dict[tuple[str, str], int] = {}
+    for suite, task in tasks:
+        places.setdefault((suite, task), len(places))
+
+    def place(each: Score) -> tuple[int, int]:
+        return places[each.suite, each.task], methods.index(each.method)
+
+    return sorted(scores, key=place)
+
+
+def _totals(scores: Sequence[Score]) -> list[str]:
+    """Success over all tasks of a track per method, where there are several.
+
+    Begins with an empty line.
+    """
+    by_track: dict[tuple[str, str, str], list[Score]] = {}
+    for each in scores:
+        by_track.setdefault((each.suite, each.split, each.method), []).append(each)
+    lines = []
+    for (suite, split, method), part in by_track.items():
+        if len(part) == 1:
+            continue
+        k = n = 0
+        for each in part:
+            k, n = k + each.sr.k, n + each.n
+        total = rate(k, n)
+        least = min(part, key=lambda each: each.sr.value)
+        track = f"{suite} ({split})" if split else suite
+        lines.append(
+            f"{track} {method}: {total.k} of {total.n} succeed, SR {total}; least {least.task} "
+            f"{least.sr}"
+        )
+    if lines:
+        lines.insert(0, "")
+    return lines
+
+
+def _times_table(scores: Sequence[Score], table: "pd.DataFrame") -> str:
+    """Milliseconds of one control step by part, one row per suite and method."""
+    times: dict[tuple[str, str], Mapping[str, float]] = {}
+    for each in scores:
+        episodes = table[(table["suite"] == each.suite) & (table["method"] == each.method)]
+        times[each.suite, each.method] = step_times(episodes)
+    parts: dict[str, None] = {}
+    for times_ms in times.values():
+        parts |= dict.fromkeys(times_ms)
+    rows = [["suite", "method", *parts, "total"]]
+    for (suite, method), times_ms in times.items():
+        cells = [f"{times_ms.get(part, 0.0):.1f}" for part in parts]
+        rows.append([suite, method, *cells, f"{sum(times_ms.values()):.1f}"])
+    return align(rows)
+
+
+def _written(folder: Path, written: str) -> list[str]:
+    """What was written, and how to look at a recording of a prompted episode."""
+    recordings = sorted((folder / "recordings").glob("*.rrd"))
+    if not recordings:
+        return [written]
+    size_mb = sum(path.stat().st_size for path in recordings) / 1e6
+    return [
+        f"{written}, {len(recordings)} recordings ({size_mb:.0f} MB) in {folder / 'recordings'}",
+        f"look at one: .venv/bin/rerun --bind 127.0.0.1 {_example(recordings)}",
+    ]
+
+
+def _example(recordings: Sequence[Path]) -> Path:
+    """The first recording of VAP, else the first of all."""
+    for path in recordings:
+        if ".vap." in path.name:
+            return path
+    return recordings[0]

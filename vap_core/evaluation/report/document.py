@@ -1,0 +1,100 @@
+"""The report over finished runs: Markdown to read and print, CSV and LaTeX tables, two pictures."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vap_core.base.errors import BadOutput
+from vap_core.base.figures import write_png
+from vap_core.base.files import write_atomic
+from vap_core.base.tables import latex
+from vap_core.evaluation.metrics import RATES
+from vap_core.evaluation.report import sections
+from vap_core.evaluation.report.cells import comparison_rows, outcome_rows
+from vap_core.evaluation.report.latex import main_tables
+from vap_core.evaluation.report.pictures import differences_figure, forest_figure
+from vap_core.evaluation.report.provenance import provenance
+from vap_core.evaluation.report.results import comparisons, outcomes, results
+from vap_core.evaluation.report.runs import load
+from vap_core.evaluation.statistics import compare
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+COMPARISON_FILES = ("paired.png", "comparisons.csv", "comparisons.tex")
+"""What only a report that compares methods has."""
+
+
+def report(sources: Sequence[Path], out: Path) -> str:
+    """Write report.md, its tables as CSV and LaTeX, forest.png and paired.png; return report.md.
+
+    `sources` are run folders or published tables. An unfinished run is reported as it is, and
+    marked. Rates in the CSV tables are fractions, as the names of their columns say.
+
+    Raises: BadOutput for a run that is damaged or an `out` that cannot be written.
+    """
+    runs = load(sources)
+    lines, ends, origins = results(runs), outcomes(runs), provenance(runs)
+    compared = compare(runs.table, runs.methods)
+    differences = comparisons(compared)
+    parts = [
+        "# Report",
+        sections.opening_section(runs),
+        sections.results_section(lines),
+        sections.outcomes_section(runs, ends),
+        sections.failures_section(runs),
+        sections.comparisons_section(differences),
+        sections.pictures_section(with_differences=bool(compared)),
+        sections.provenance_section(origins),
+    ]
+    text = "\n\n".join(part for part in parts if part)
+    files = {
+        "report.md": f"{text}\n",
+        "results.csv": _csv_text(lines, fractions=_rate_columns()),
+        "results.tex": main_tables(lines),
+        "outcomes.csv": _csv_text(ends),
+        "outcomes.tex": latex(outcome_rows(ends)),
+        "provenance.csv": _csv_text(origins),
+    }
+    figures = {"forest.png": forest_figure(lines)}
+    if compared:
+        files["comparisons.csv"] = _csv_text(differences, fractions=["difference", "low", "high"])
+        files["comparisons.tex"] = latex(comparison_rows(differences))
+        against_first = [c for c in compared if c.one == compared[0].one]
+        figures["paired.png"] = differences_figure(against_first)
+    _write(out, files, figures)
+    return text
+
+
+def _csv_text(table: "pd.DataFrame", fractions: Sequence[str] = ()) -> str:
+    """A table as CSV; the names of columns that hold fractions end with "_fraction"."""
+    names = {name: f"{name}_fraction" for name in fractions}
+    return table.rename(columns=names).to_csv(index=False)
+
+
+def _rate_columns() -> list[str]:
+    """The columns of `results.results` that hold fractions."""
+    columns = ["sr_layout_low", "sr_layout_high", "paper_sr", "paper_cmr"]
+    for name in RATES:
+        columns.append(name)
+        for interval in ("", "_cp"):
+            columns += [f"{name}{interval}_low", f"{name}{interval}_high"]
+    return columns
+
+
+def _write(out: Path, files: dict[str, str], figures: "dict[str, Figure]") -> None:
+    """Write a report, and remove the comparisons of an earlier one that this one has not."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for name, content in files.items():
+            write_atomic(out / name, content.encode())
+        for name, figure in figures.items():
+            write_png(figure, out / name)
+        for name in COMPARISON_FILES:
+            if name not in files and name not in figures:
+                (out / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise BadOutput(
+            f"report: {out} cannot be written ({error.strerror}); choose another folder with --out."
+        ) from error

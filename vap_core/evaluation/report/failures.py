@@ -1,0 +1,124 @@
+"""How failures divide into cases (P tab:error_case_breakdown), and the funnel of stages."""
+
+from typing import TYPE_CHECKING
+
+from vap_core.base.errors import BadOutput
+from vap_core.base.types import value
+from vap_core.evaluation.diagnosis import STAGES
+from vap_core.evaluation.metrics import rate
+from vap_core.rollout.failure import CASES
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+BY = ["suite", "method"]
+"""The columns that name a group of episodes here."""
+
+
+def diagnosed(table: "pd.DataFrame") -> "pd.DataFrame":
+    """The episodes whose failures were diagnosed.
+
+    Raises: BadOutput when the table is older than the diagnosis.
+    """
+    if "case" not in table:
+        raise BadOutput(
+            "diagnose: this run was made before failures were diagnosed; run the same eval again "
+            "in another folder."
+        )
+    return table[table["case"].notna()].astype({"deciding_frame": int})
+
+
+def breakdown(table: "pd.DataFrame") -> "pd.DataFrame":
+    """One row per suite and method: how many episodes failed, by case and sub-case.
+
+    `n` episodes, `failed`, a column of counts for each case (`case 1`, ...) and sub-case
+    (`case 1: drift`, ...), and `mean_confidence`. The cases of a row sum to `failed`; errors are in
+    `n` alone.
+    """
+    episodes = diagnosed(table)
+    flat = episodes[BY].assign(n=1, failed=episodes["outcome"].eq("failure").astype(int))
+    for case, sub_cases in CASES.items():
+        of_case = episodes["case"].eq(case)
+        flat[case] = of_case.astype(int)
+        for sub_case in sub_cases:
+            both = of_case & episodes["sub_case"].eq(sub_case)
+            flat[f"{case}: {sub_case}"] = both.astype(int)
+    counts = flat.groupby(BY, sort=False).sum().reset_index()
+    with_case = episodes[episodes["case"].ne("")].groupby(BY, sort=False)
+    confidence = with_case["case_confidence"].mean().rename("mean_confidence").reset_index()
+    return counts.merge(confidence, on=BY, how="left")
+
+
+def breakdown_rows(counts: "pd.DataFrame") -> list[list[str]]:
+    """`breakdown` as text cells, cases that never occurred left out.
+
+    Failures in percent of all episodes, cases in percent of failures, each with its 95 % Wilson
+    interval.
+    """
+    cases = [case for case in CASES if counts[case].any()]
+    titles = [f"{case} % of failures" for case in cases]
+    rows = [["suite", "method", "n", "fail % [95 %]", *titles, "confidence"]]
+    for line in counts.to_dict("records"):
+        failed = int(line["failed"])
+        cells = [str(line["suite"]), str(line["method"]), str(line["n"])]
+        cells.append(str(rate(failed, int(line["n"]))))
+        for case in cases:
+            cells.append(str(rate(int(line[case]), failed)))
+        confidence = line["mean_confidence"]
+        cells.append("-" if confidence != confidence else f"{confidence:.2f}")
+        rows.append(cells)
+    return rows
+
+
+def sub_cases_text(counts: "pd.DataFrame") -> str:
+    """How often each sub-case occurred, most frequent first, one line per suite and method."""
+    lines = []
+    for line in counts.to_dict("records"):
+        occurred = []
+        for case, sub_cases in CASES.items():
+            for sub_case in sub_cases:
+                name = f"{case}: {sub_case}"
+                if line[name]:
+                    occurred.append((int(line[name]), name))
+        occurred.sort(reverse=True)
+        text = ", ".join(f"{n} x {name}" for n, name in occurred)
+        lines.append(f"{line['suite']} {line['method']}: {text or 'no failure'}")
+    return "\n".join(lines)
+
+
+@value
+class FunnelRow:
+    """How many of `n` episodes are left after each of STAGES.
+
+    None where a method has no such stage.
+    """
+
+    suite: str
+    method: str
+    n: int
+    left: tuple[int | None, ...]
+
+
+type FunnelTable = list[FunnelRow]
+"""A row per suite and method."""
+
+
+def funnel_table(table: "pd.DataFrame") -> FunnelTable:
+    """How many episodes are left after each stage.
+
+    An episode counts up to the first stage that it does not pass.
+    """
+    rows = []
+    for (suite, method), part in diagnosed(table).groupby(BY, sort=False):
+        left: list[int | None] = []
+        passing = part["outcome"].ne("error")
+        for stage in STAGES:
+            passed = part[f"stage_{stage}"]
+            if passed.isna().all():
+                left.append(None)
+                continue
+            passing &= passed.eq(True)
+            left.append(int(passing.sum()))
+        row = FunnelRow(suite=str(suite), method=str(method), n=len(part), left=tuple(left))
+        rows.append(row)
+    return rows

@@ -1,0 +1,232 @@
+"""The pictures of a report: success rates with intervals, and differences on the same episodes."""
+
+from collections.abc import Sequence
+from itertools import cycle
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vap_core.base.figures import METHOD_COLOURS, empty_figure
+from vap_core.evaluation.metrics import Score
+from vap_core.evaluation.report.cells import track_title
+from vap_core.evaluation.statistics import Comparison
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+OKABE_ITO = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#000000")
+MARKERS = "osD^vPX*"
+MEASURES = {
+    "sr": "success rate",
+    "cmr": "correct movement\nratio (CMR)",
+    "wrong_object": "wrong object\nmoved",
+}
+"""The rates of `scores_figure` and their titles."""
+Line = tuple[str, ...]
+"""What a line of a forest plot is about: the words of its heading, then the task."""
+
+
+def method_marks(methods: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """A colour and a marker per method, each of them unique."""
+    others = cycle(OKABE_ITO)
+    marks = {}
+    for i, method in enumerate(methods):
+        colour = METHOD_COLOURS.get(method) or next(others)
+        marks[method] = colour, MARKERS[i % len(MARKERS)]
+    return marks
+
+
+def forest_figure(results: "pd.DataFrame") -> "Figure":
+    """Success rates of every suite, track and task, a mark per method and policy.
+
+    `results` is a table of `results.results`.
+    """
+    series = list(dict.fromkeys(zip(results["method"], results["policy"], strict=True)))
+    methods, policies = _unique(results["method"]), _unique(results["policy"])
+    marks = method_marks(methods)
+    lines = list(zip(results["suite"], results["split"], results["task"], strict=True))
+    figure, axes, places = _forest_axes(lines, per_line=len(series), heading_x=0.0)
+    for i, (method, policy) in enumerate(series):
+        of_series = (results["method"] == method) & (results["policy"] == policy)
+        shown = results[of_series & (results["n"] > 0)]
+        low = 100 * shown["sr_layout_low"].fillna(shown["sr_low"]).to_numpy()
+        high = 100 * shown["sr_layout_high"].fillna(shown["sr_high"]).to_numpy()
+        middle = 100 * shown["sr"].to_numpy()
+        shown_lines = zip(shown["suite"], shown["split"], shown["task"], strict=True)
+        at = np.array([places[line] for line in shown_lines])
+        colour, marker = marks[method]
+        axes.errorbar(
+            middle,
+            at + _offset(i, len(series)),
+            xerr=np.maximum([middle - low, high - middle], 0),
+            label=method if len(policies) == 1 else f"{method}, {policy} policy",
+            **_mark_style(colour, marker, filled=policy == policies[0]),
+        )
+    axes.set(xlim=(-2, 102), xlabel="% of episodes that succeed, 95 % interval")
+    figure.legend(
+        *axes.get_legend_handles_labels(),
+        loc="outside upper center",
+        ncols=min(3, len(series)),
+        frameon=False,
+    )
+    return figure
+
+
+def differences_figure(comparisons: Sequence[Comparison]) -> "Figure":
+    """Differences on the same episodes with their 95 % cluster bootstrap.
+
+    A mark per pair of methods, filled where Holm's p is below 0.05. Colours and markers are those
+    of the methods in `forest_figure`.
+    """
+    lines: list[Line] = []
+    contrasts: list[tuple[str, str]] = []
+    for c in comparisons:
+        lines.append((c.suite, c.split, f"{c.policy} policy", c.task))
+        if (c.other, c.one) not in contrasts:
+            contrasts.append((c.other, c.one))
+    marks = method_marks([comparisons[0].one, *(other for other, _ in contrasts)])
+    figure, axes, places = _forest_axes(lines, per_line=len(contrasts), heading_x=-100.0)
+    axes.axvline(0, color="#555555", linewidth=1)
+    for line, c in zip(lines, comparisons, strict=True):
+        colour, marker = marks[c.other]
+        i = contrasts.index((c.other, c.one))
+        spread = np.maximum([[c.difference - c.low], [c.high - c.difference]], 0)
+        axes.errorbar(
+            100 * c.difference,
+            places[line] + _offset(i, len(contrasts)),
+            xerr=100 * spread,
+            **_mark_style(colour, marker, filled=c.p_holm < 0.05),
+        )
+    for other, one in contrasts:
+        colour, marker = marks[other]
+        axes.plot([], [], marker, color=colour, label=f"{other} minus {one}")
+    axes.set_xlim(-102, 102)
+    axes.set_xlabel(
+        "difference of success rates in points, same episodes, 95 % interval over layouts\n"
+        "filled: p < 0.05 after Holm's correction"
+    )
+    figure.legend(
+        *axes.get_legend_handles_labels(),
+        loc="outside upper center",
+        ncols=min(3, len(contrasts)),
+        frameon=False,
+    )
+    return figure
+
+
+def scores_figure(scores: Sequence[Score]) -> "Figure":
+    """SR, CMR and wrong-object rate of every method with 95 % Wilson intervals.
+
+    One panel per task and track, four in a row.
+    """
+    panels: dict[tuple[str, str, str], list[Score]] = {}
+    for score in scores:
+        panels.setdefault((score.suite, score.task, score.split), []).append(score)
+    columns = min(4, len(panels))
+    rows = -(-len(panels) // columns)
+    figure = empty_figure(4.6 * columns + 0.8, 3.4 * rows + 0.4)
+    grid = np.atleast_2d(figure.subplots(rows, columns, sharey=True, squeeze=False))
+    for axes in grid.ravel()[len(panels) :]:
+        axes.set_axis_off()
+    for axes, shown in zip(grid.ravel(), panels.values(), strict=False):
+        _draw_scores(axes, shown)
+    for axes in grid[:, 0]:
+        axes.set_ylabel("% of episodes, 95 % interval")
+    figure.legend(
+        *grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False
+    )
+    return figure
+
+
+def _draw_scores(axes: "Axes", scores: Sequence[Score]) -> None:
+    """The panel of one task and track: a group of bars per measure, a bar per method."""
+    for i, score in enumerate(scores):
+        at, heights, low, high = [], [], [], []
+        for j, name in enumerate(MEASURES):
+            rate = getattr(score, name)
+            if rate.n:
+                at.append(j)
+                heights.append(100 * rate.value)
+                low.append(100 * rate.low)
+                high.append(100 * rate.high)
+        x = np.array(at) + (i - (len(scores) - 1) / 2) * 0.8 / len(scores)
+        colour = METHOD_COLOURS.get(score.method, f"C{i}")
+        axes.bar(x, heights, 0.72 / len(scores), color=colour, label=score.method)
+        axes.errorbar(
+            x,
+            heights,
+            np.maximum([np.subtract(heights, low), np.subtract(high, heights)], 0),
+            fmt="none",
+            ecolor="black",
+            capsize=3,
+            linewidth=1,
+        )
+    first = scores[0]
+    axes.set_xticks(range(len(MEASURES)), list(MEASURES.values()))
+    axes.set_title(
+        f"{track_title(f'{first.suite} / {first.task}', first.split)}\n"
+        f"n = {first.n} each, {first.policy} policy",
+        fontsize=9,
+    )
+    axes.set_ylim(0, 105)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _forest_axes(
+    lines: Sequence[Line], per_line: int, heading_x: float
+) -> "tuple[Figure, Axes, dict[Line, float]]":
+    """An empty figure, its axes, and the height of each line.
+
+    A labelled line per task has room for `per_line` marks. Over each group of lines stands its
+    heading, written from x = `heading_x`.
+    """
+    groups: list[Line] = []
+    places: dict[Line, float] = {}
+    headings: dict[Line, float] = {}
+    for i, line in enumerate(dict.fromkeys(lines)):
+        group = line[:-1]
+        if group not in groups:
+            groups.append(group)
+        places[line] = i + 0.8 * (groups.index(group) + 1)
+        headings.setdefault(group, places[line])
+    bottom = max(places.values())
+    figure = empty_figure(8.5, (0.2 + 0.13 * per_line) * (bottom + 1) + 1.2)
+    axes = figure.subplots()
+    for group, first in headings.items():
+        axes.text(
+            heading_x,
+            first - 0.65,
+            ", ".join(word for word in group if word),
+            fontsize=9,
+            fontweight="bold",
+            va="center",
+            backgroundcolor="white",
+        )
+    axes.set_yticks(list(places.values()), [line[-1] for line in places], fontsize=9)
+    axes.set_ylim(bottom + 0.6, -0.2)
+    axes.grid(axis="x", color="#e6e6e6")
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure, axes, places
+
+
+def _mark_style(colour: str, marker: str, filled: bool) -> dict[str, Any]:
+    return {
+        "color": colour,
+        "markerfacecolor": colour if filled else "white",
+        "fmt": marker,
+        "markersize": 5,
+        "capsize": 2.5,
+        "linewidth": 1.2,
+    }
+
+
+def _offset(i: int, n: int) -> float:
+    """How far below the middle of its line the i-th of n marks stands."""
+    return min(0.24, 0.8 / n) * (i - (n - 1) / 2)
+
+
+def _unique(column: "pd.Series") -> list[str]:
+    return list(dict.fromkeys(column))

@@ -1,0 +1,92 @@
+"""Where the numbers of a report come from: digests, versions, and the commands of the runs."""
+
+import shlex
+from typing import TYPE_CHECKING, Any
+
+from vap_core.evaluation.report.runs import Runs
+from vap_core.simulation import suites
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def provenance(runs: Runs) -> "pd.DataFrame":
+    """One row per run: its digest, versions, seed, checksums, and the command that makes it."""
+    import pandas as pd
+
+    lines = []
+    for name, manifest in runs.manifests.items():
+        study: dict[str, Any] = manifest["configuration"]
+        lines.append(
+            {
+                "run": str(name),
+                "digest": manifest["digest"],
+                "version": study.get("version", ""),
+                "policy": study["policy"],
+                "seed": _seeds(study),
+                "stack": study.get("stack", ""),
+                "robots": study.get("robots", ""),
+                "world": study.get("world", ""),
+                "weights": _shortened(study.get("weights", {})),
+                "lists": _shortened(study.get("lists", {})),
+                "command": str(manifest.get("command") or command_line(study)),
+            }
+        )
+    return pd.DataFrame(lines)
+
+
+def command_line(study: dict[str, Any]) -> str:
+    """The command line that runs a configuration, without --out."""
+    tasks_by_suite: dict[str, list[str]] = {}
+    for suite, task in study["tasks"]:
+        tasks_by_suite.setdefault(suite, []).append(task)
+    whole = _are_whole_suites(tasks_by_suite)
+    if not whole and len(tasks_by_suite) > 1:
+        # Only the demo runs some tasks of several suites.
+        return f"python -m vap_core demo --episodes {study.get('episodes')} --seed {study['seed']}"
+    words = ["eval" if whole else "rollout"]
+    for suite, tasks in tasks_by_suite.items():
+        words += ["--suite", suite]
+        if not whole:
+            for task in tasks:
+                words += ["--task", task]
+    for method in study["methods"]:
+        words += ["--method", method]
+    for name, setting in _options(study, whole).items():
+        if setting is not None:
+            words += [f"--{name}", str(setting)]
+    if study.get("audit"):
+        words.append("--audit")
+    return "python -m vap_core " + shlex.join(words)
+
+
+def _are_whole_suites(tasks_by_suite: dict[str, list[str]]) -> bool:
+    for suite, tasks in tasks_by_suite.items():
+        if tasks != [task.name for task in suites.suite(suite).tasks]:
+            return False
+    return True
+
+
+def _options(study: dict[str, Any], whole: bool) -> dict[str, Any]:
+    """The options of a command and their settings, None where the default holds."""
+    options = {name: study.get(name) for name in ("episodes", "seed", "policy", "stack", "robots")}
+    if whole:
+        options["seeds"] = None
+        if study.get("seeds", 1) > 1:
+            options["seeds"] = study["seeds"]
+        options["follow"] = study.get("follow")
+        options["images-every"] = study.get("images_every") or None
+    return options
+
+
+def _seeds(study: dict[str, Any]) -> str:
+    first, count = study["seed"], study.get("seeds", 1)
+    if count == 1:
+        return str(first)
+    return f"{first}..{first + count - 1}"
+
+
+def _shortened(checksums: Any) -> str:
+    if not isinstance(checksums, dict):
+        return str(checksums)
+    return " ".join(f"{name}:{str(digest)[:12]}" for name, digest in checksums.items())

@@ -1,0 +1,210 @@
+"""Finished, unfinished and damaged runs, read for a report.
+
+What is missing is counted, nothing is dropped.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vap_core.base.errors import BadOutput
+from vap_core.evaluation.layouts import layout_names
+from vap_core.evaluation.metrics import MEASURES, SCORE_KEY, TRACK
+from vap_core.evaluation.publish import read_runs
+from vap_core.evaluation.statistics import PAIR_KEY
+from vap_core.evaluation.store import ROW_KEY
+from vap_core.simulation import suites
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+NEEDED_SETTINGS = {"tasks", "methods", "episodes", "seed", "policy"}
+"""What the configuration of a run of eval, rollout or demo holds."""
+NEEDED_COLUMNS = list(dict.fromkeys((*PAIR_KEY, *SCORE_KEY, "outcome", "steps", *MEASURES)))
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Every episode of some runs, and what there should be.
+
+    `table` has one row per episode (`Episode.summary`, `attempt` nan where it was not kept) and its
+    starting `layout`. `wanted` has one row per run, suite, task, split, method, policy and seed,
+    with the episodes `asked` for and `listed` in the suite's whole list. `manifests` are the runs'
+    run.json by name, `unfinished` a sentence for each unfinished run.
+    """
+
+    table: "pd.DataFrame"
+    wanted: "pd.DataFrame"
+    manifests: Mapping[Path, dict[str, Any]]
+    unfinished: tuple[str, ...]
+
+    @property
+    def methods(self) -> list[str]:
+        return list(dict.fromkeys(self.wanted["method"]))
+
+
+def load(sources: Sequence[Path]) -> Runs:
+    """Read runs of eval, rollout or demo: their folders, or tables that `publish` made of them.
+
+    Raises: BadOutput for a folder that holds no run, no episode, damaged parts or episodes it was
+        not asked for, for two runs of the same episodes, and for a run whose episode list has
+        changed since; BadSuite.
+    """
+    import pandas as pd
+
+    tables, wanted, unfinished, manifests = [], [], [], {}
+    for name, manifest, table in _named_runs(sources):
+        manifests[name], study = manifest, manifest["configuration"]
+        _check_run(name, study, table)
+        # A checkpoint goes by its label, not by its path.
+        labels = dict(table.groupby("suite")["policy"].first())
+        asked = _count_asked(study, labels)
+        _check_rows(name, study, table)
+        total = asked["asked"].sum()
+        if len(table) < total:
+            unfinished.append(
+                f"{name} is unfinished: {len(table)} of {total} episodes; run the same command "
+                "again to finish it."
+            )
+        tables.append(table)
+        wanted.append(asked.assign(run=str(name)))
+    whole = _joined(tables)
+    if whole.duplicated([*PAIR_KEY, "method"]).any():
+        raise BadOutput(
+            f"report: two of {', '.join(map(str, manifests))} hold the same episodes; name each "
+            "run once, or report them one by one."
+        )
+    expected = _in_order(pd.concat(wanted, ignore_index=True))
+    return Runs(_sorted_as(whole, expected), expected, manifests, tuple(unfinished))
+
+
+def _named_runs(sources: Sequence[Path]) -> "Iterator[tuple[Path, dict[str, Any], pd.DataFrame]]":
+    """Every run with a name of its own: its folder, or the published table and the run's digest."""
+    for source in dict.fromkeys(sources):
+        for manifest, table in read_runs(source):
+            name = source
+            if source.suffix == ".parquet":
+                name = Path(f"{source}@{manifest['digest'][:8]}")
+            yield name, manifest, table
+
+
+def _check_run(name: Path, study: Any, table: "pd.DataFrame") -> None:
+    """Refuse what is no run, what is empty or too old, and a run of other episode lists."""
+    if not isinstance(study, dict) or not study.keys() >= NEEDED_SETTINGS:
+        raise BadOutput(
+            f"report: {name} holds no run of eval, rollout or demo; name the folder that one of "
+            "them wrote."
+        )
+    for suite, digest in study.get("lists", {}).items():
+        if suites.lists.digest(suite) != digest:
+            raise BadOutput(
+                f"report: the list of {suite} has changed since {name} was run; use the version "
+                "that ran it, or run it again."
+            )
+    if table.empty:
+        raise BadOutput(
+            f"report: {name} holds no finished episode yet; run the same command again, it goes on "
+            "where it stopped."
+        )
+    missing = [column for column in NEEDED_COLUMNS if column not in table]
+    if missing:
+        raise BadOutput(
+            f"report: {name} lacks the columns {', '.join(missing)}; an older version wrote it. "
+            "Run it again in another folder."
+        )
+
+
+def _check_rows(name: Path, study: dict[str, Any], table: "pd.DataFrame") -> None:
+    """Refuse rows that the configuration does not explain."""
+    import pandas as pd
+
+    known = []
+    for suite, task, seed, rows in _asked_rows(study):
+        for episode, _ in rows:
+            known.append((suite, task, seed, episode))
+    strange = ~pd.MultiIndex.from_frame(table[ROW_KEY]).isin(pd.MultiIndex.from_tuples(known))
+    strange |= ~table["method"].isin(study["methods"]).to_numpy()
+    if strange.any():
+        first = table[strange].iloc[0]
+        raise BadOutput(
+            f"report: {name} is damaged: it was never asked for {strange.sum()} of its episodes, "
+            f"the first {first.suite}/{first.task} episode {first.episode} seed {first.seed} of "
+            f"method {first.method}. Run it again."
+        )
+
+
+def _count_asked(study: dict[str, Any], labels: Mapping[str, str]) -> "pd.DataFrame":
+    """How many episodes a run was asked for, and how many the whole lists hold.
+
+    `labels` are the labels of the policy by suite.
+    """
+    import pandas as pd
+
+    lines = []
+    for suite, task, seed, rows in _asked_rows(study):
+        asked = whole = _count_by_split(rows)
+        if suite in suites.BENCHMARKS:
+            whole = _count_by_split(_episodes(suite, task, None, 0))
+        policy = labels.get(suite, study["policy"])
+        for method in study["methods"]:
+            for split, n in asked.items():
+                lines.append((suite, task, split, method, policy, seed, n, whole[split]))
+    return pd.DataFrame(lines, columns=[*SCORE_KEY, "seed", "asked", "listed"])
+
+
+def _count_by_split(rows: Sequence[tuple[int, str]]) -> Counter[str]:
+    return Counter(split for _, split in rows)
+
+
+def _asked_rows(
+    study: dict[str, Any],
+) -> Iterator[tuple[str, str, int, tuple[tuple[int, str], ...]]]:
+    """Suite, task, seed, and the episode and split of all rows that a run was asked for."""
+    for suite, task in study["tasks"]:
+        for seed in range(study["seed"], study["seed"] + study.get("seeds", 1)):
+            # The rows of a benchmark do not depend on the seed.
+            drawn_from = 0 if suite in suites.BENCHMARKS else seed
+            yield suite, task, seed, _episodes(suite, task, study["episodes"], drawn_from)
+
+
+@cache
+def _episodes(suite: str, task: str, n: int | None, seed: int) -> tuple[tuple[int, str], ...]:
+    """The episode and split of the rows of a task."""
+    return tuple((row.episode, row.split) for row in suites.rows(suite, task, n, seed))
+
+
+def _joined(tables: "Sequence[pd.DataFrame]") -> "pd.DataFrame":
+    """The episodes of all runs; columns that a run lacks are None."""
+    import pandas as pd
+
+    kept = [table.dropna(axis="columns", how="all") for table in tables]
+    whole = pd.concat(kept, ignore_index=True)
+    for column in (*NEEDED_COLUMNS, "attempt", "detail"):
+        if column not in whole:
+            whole[column] = None
+    whole[["split", "variant"]] = whole[["split", "variant"]].fillna("")
+    return whole
+
+
+def _in_order(wanted: "pd.DataFrame") -> "pd.DataFrame":
+    """Suite by suite and track by track; tasks and methods in the order of the runs."""
+    ranks = []
+    for by in (["suite"], TRACK, ["suite", "task"]):
+        rank = "rank of " + " and ".join(by)
+        wanted = wanted.assign(**{rank: wanted.groupby(by, sort=False).ngroup()})
+        ranks.append(rank)
+    return wanted.sort_values(ranks, kind="stable", ignore_index=True).drop(columns=ranks)
+
+
+def _sorted_as(episodes: "pd.DataFrame", wanted: "pd.DataFrame") -> "pd.DataFrame":
+    """The episodes in the order of the lines of `wanted`, with their layouts."""
+    import pandas as pd
+
+    key = list(SCORE_KEY)
+    lines = pd.MultiIndex.from_frame(wanted[key]).drop_duplicates()
+    order = lines.get_indexer(pd.MultiIndex.from_frame(episodes[key])).argsort(kind="stable")
+    episodes = episodes.assign(layout=layout_names(episodes))
+    return episodes.iloc[order].reset_index(drop=True)

@@ -1,0 +1,231 @@
+"""Comparisons of methods on the same episodes: exact tests, cluster bootstrap, Holm's correction.
+
+A pair is one episode (PAIR_KEY) under two methods; an error counts as no success. The independent
+unit is the starting layout (`layouts`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from vap_core.base.types import value
+from vap_core.evaluation.layouts import layout_names
+from vap_core.evaluation.metrics import rate
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+PAIR_KEY = ["suite", "task", "split", "variant", "episode", "seed", "policy"]
+"""The columns that both halves of a pair share."""
+ALL_TASKS = "all tasks"
+RESAMPLES = 4999
+SEED = 5
+PerCluster = Float64[np.ndarray, " c"]
+
+
+@value
+class Comparison:
+    """Success of `other` against `one` on the same episodes of one task (or ALL_TASKS) and track.
+
+    `difference` is SR of `other` minus SR of `one`; `low` and `high` are its 95 % cluster
+    bootstrap. `p_mcnemar` is exact and takes every pair for independent. `p` takes only layouts for
+    independent (the same number where no layout returns). `p_holm` is `p` corrected for all
+    comparisons of its kind (single tasks, or all tasks together) in one table.
+    """
+
+    suite: str
+    task: str
+    split: str
+    policy: str
+    one: str
+    other: str
+    pairs: int
+    layouts: int
+    both: int
+    only_one: int
+    only_other: int
+    neither: int
+    difference: float
+    low: float
+    high: float
+    p_mcnemar: float
+    p: float
+    p_holm: float
+
+
+def compare(episodes: "pd.DataFrame", methods: Sequence[str] = ()) -> list[Comparison]:
+    """Every pair of methods on the episodes that both ran.
+
+    Per task and track, and over all tasks of a track where there are several. `methods` gives their
+    order (default: of appearance); the later is compared against the earlier. Episodes are one row
+    each (`Episode.summary`); the column `layout` is added where it is absent.
+    """
+    order = list(methods or dict.fromkeys(episodes["method"]))
+    won = (episodes["success"].eq(True) & episodes["outcome"].ne("error")).astype(int)
+    table = episodes[[*PAIR_KEY, "method"]].assign(layout=_layouts_of(episodes), won=won)
+    comparisons = []
+    for (suite, split, policy), track in table.groupby(["suite", "split", "policy"], sort=False):
+        for task, part in _by_task(track):
+            wide = part.pivot(index=[*PAIR_KEY, "layout"], columns="method", values="won")
+            present = [name for name in order if name in wide]
+            for one, other in combinations(present, 2):
+                pairs = wide[[one, other]].dropna()
+                if pairs.empty:
+                    continue
+                names = {
+                    "suite": str(suite),
+                    "task": task,
+                    "split": str(split),
+                    "policy": str(policy),
+                    "one": one,
+                    "other": other,
+                }
+                comparisons.append(_compare_pairs(pairs, names))
+    return _holm_corrected(comparisons)
+
+
+def mcnemar(only_one: int, only_other: int) -> float:
+    """The exact two-sided p of McNemar's test from the discordant pairs; 1 where there are none."""
+    from statsmodels.stats.contingency_tables import mcnemar as test
+
+    if only_one + only_other == 0:
+        return 1.0
+    return min(1.0, float(test([[0, only_one], [only_other, 0]], exact=True).pvalue))
+
+
+def holm(p: Sequence[float]) -> list[float]:
+    """Holm's step-down correction of a family of p values."""
+    from statsmodels.stats.multitest import multipletests
+
+    if not p:
+        return []
+    corrected: list[float] = multipletests(list(p), method="holm")[1].tolist()
+    return corrected
+
+
+def ratio(slow: Sequence[float], fast: Sequence[float]) -> tuple[float, float, float]:
+    """Geometric mean of the ratios within each repeat, and its 95 % interval.
+
+    The interval is Student's, of the logarithms.
+    """
+    from scipy import stats
+
+    logs = np.log(np.array(slow) / np.array(fast))
+    half = stats.t.ppf(0.975, len(logs) - 1) * logs.std(ddof=1) / np.sqrt(len(logs))
+    return (
+        float(np.exp(logs.mean())),
+        float(np.exp(logs.mean() - half)),
+        float(np.exp(logs.mean() + half)),
+    )
+
+
+def bootstrap_interval(gain: PerCluster, n: PerCluster, least: float = -1.0) -> tuple[float, float]:
+    """95 % interval of sum(gain) / sum(n) when whole clusters are resampled (BCa).
+
+    `gain` sums the gains of a cluster's `n` episodes: from `least` (-1 for a difference, 0 for a
+    rate) to 1 each. Where all clusters are alike, resampling would give an interval of no width;
+    then the interval allows for clusters of another kind, `least` or 1, that c draws may have
+    missed: as large a share of them as Clopper and Pearson allow for 0 of c.
+    """
+    from scipy.stats import bootstrap
+
+    means = gain / n
+    if np.ptp(means) == 0:
+        centre = float(means[0])
+        unseen = rate(0, len(means), conservative=True).high
+        return centre - unseen * (centre - least), centre + unseen * (1 - centre)
+
+    def mean_gain(gains: np.ndarray, counts: np.ndarray, axis: int = -1) -> Any:
+        return gains.sum(axis=axis) / counts.sum(axis=axis)
+
+    interval = bootstrap(
+        (gain, n),
+        mean_gain,
+        n_resamples=RESAMPLES,
+        paired=True,
+        vectorized=True,
+        method="BCa",
+        rng=np.random.default_rng(SEED),
+    ).confidence_interval
+    return float(interval.low), float(interval.high)
+
+
+def sign_flip(gain: PerCluster) -> float:
+    """Exact two-sided p of no difference: a cluster's gain is as likely to have the other sign.
+
+    Gains are whole numbers. It is McNemar's test where every gain is -1, 0 or 1. The chances of all
+    sums come from one convolution per cluster: 2^c patterns cannot be enumerated, and sampled ones
+    are too coarse for Holm's correction of hundreds of comparisons.
+    """
+    steps = np.abs(gain).astype(int)
+    chance, middle = np.ones(1), int(steps.sum())
+    for step in steps[steps > 0].tolist():
+        longer = np.zeros(len(chance) + 2 * step)
+        longer[: len(chance)] += 0.5 * chance
+        longer[2 * step :] += 0.5 * chance
+        chance = longer
+    extreme = np.abs(np.arange(len(chance)) - middle) >= abs(round(float(gain.sum())))
+    return min(1.0, float(chance[extreme].sum()))
+
+
+def _layouts_of(episodes: "pd.DataFrame") -> "pd.Series":
+    if "layout" in episodes:
+        return episodes["layout"]
+    return layout_names(episodes)
+
+
+def _by_task(track: "pd.DataFrame") -> "list[tuple[str, pd.DataFrame]]":
+    """The tasks of a track with their episodes; ALL_TASKS at the end where there are several."""
+    parts = []
+    for task in dict.fromkeys(track["task"]):
+        parts.append((task, track[track["task"] == task]))
+    if len(parts) > 1:
+        parts.append((ALL_TASKS, track))
+    return parts
+
+
+def _compare_pairs(pairs: "pd.DataFrame", names: dict[str, str]) -> Comparison:
+    """One comparison; `pairs` has a column of 0 and 1 for each of the two methods."""
+    first = pairs[names["one"]].to_numpy(int)
+    second = pairs[names["other"]].to_numpy(int)
+    neither, only_other, only_one, both = np.bincount(2 * first + second, minlength=4).tolist()
+    per_pair = pairs.assign(gain=second - first, n=1)
+    clusters = per_pair.groupby("layout", sort=True)[["gain", "n"]].sum()
+    gain, n = clusters["gain"].to_numpy(float), clusters["n"].to_numpy(float)
+    low, high = bootstrap_interval(gain, n)
+    p_mcnemar = p = mcnemar(only_one, only_other)
+    if len(gain) < len(pairs):
+        p = sign_flip(gain)
+    return Comparison(
+        **names,
+        pairs=len(pairs),
+        layouts=len(gain),
+        both=both,
+        only_one=only_one,
+        only_other=only_other,
+        neither=neither,
+        difference=(only_other - only_one) / len(pairs),
+        low=low,
+        high=high,
+        p_mcnemar=p_mcnemar,
+        p=p,
+        p_holm=p,
+    )
+
+
+def _holm_corrected(comparisons: Sequence[Comparison]) -> list[Comparison]:
+    """With `p_holm` corrected within single tasks, and within ALL_TASKS."""
+    corrected = list(comparisons)
+    for whole in (True, False):
+        family = []
+        for i, comparison in enumerate(comparisons):
+            if (comparison.task == ALL_TASKS) == whole:
+                family.append(i)
+        p_holm = holm([comparisons[i].p for i in family])
+        for i, p in zip(family, p_holm, strict=True):
+            corrected[i] = replace(comparisons[i], p_holm=p)
+    return corrected

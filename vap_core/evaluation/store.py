@@ -1,0 +1,211 @@
+"""Append-only results: Parquet parts written atomically, one run per folder.
+
+A run's folder holds `run.json` (its manifest: configuration and digest) and the tables `parts`
+(episodes), `traces` (state_log) and `audit` (input_audit), each as a folder of Parquet parts.
+"""
+
+import fcntl
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from uuid import uuid4
+
+from vap_core.base.errors import BadOutput
+from vap_core.base.files import write_atomic
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+KEY = ["suite", "task", "method", "seed", "episode"]
+"""The columns that name an episode of a run; the table is in this order."""
+ROW_KEY = ["suite", "task", "seed", "episode"]
+"""The columns that name a row of an episode list: KEY without the method."""
+
+
+def key_of(row: Mapping[Any, Any]) -> tuple[Any, ...]:
+    """KEY of a row of a run's table."""
+    return tuple(row[name] for name in KEY)
+
+
+def digest(configuration: Mapping[str, Any]) -> str:
+    """A short hash of anything that JSON can express; equal configurations, equal digests."""
+    return hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def open_run(folder: Path, configuration: Mapping[str, Any]) -> Path:
+    """Begin a run in `folder`, or go on with the one that is there.
+
+    Raises:
+        BadOutput: the folder cannot be written, holds something else, or a run of another
+            configuration.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise BadOutput(f"open_run: {folder} is a file; choose another folder with --out.")
+    path = folder / "run.json"
+    if path.exists():
+        manifest = read_manifest(folder)
+        if manifest["digest"] != digest(configuration):
+            raise BadOutput(
+                f"open_run: {folder} holds another run ({differences(manifest, configuration)}); "
+                "choose another folder with --out."
+            )
+        return folder
+    if folder.exists():
+        for present in folder.iterdir():
+            if not present.name.startswith(".run.json"):
+                raise BadOutput(
+                    f"open_run: {folder} is not empty and holds no run; choose another folder "
+                    "with --out."
+                )
+    manifest = {"digest": digest(configuration), "configuration": dict(configuration)}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, json.dumps(manifest, indent=1, sort_keys=True).encode())
+    except OSError as error:
+        raise BadOutput(
+            f"open_run: {folder} cannot be written ({error.strerror}); choose another folder with "
+            "--out."
+        ) from error
+    return folder
+
+
+def differences(manifest: Mapping[str, Any], configuration: Mapping[str, Any]) -> str:
+    """Where a run's configuration differs from the one that is wanted now, in words."""
+    before = manifest["configuration"]
+    now = json.loads(json.dumps(dict(configuration)))
+    changed, parts = [], []
+    for name in {**before, **now}:
+        if before.get(name) == now.get(name):
+            continue
+        changed.append(name)
+        if not isinstance(now.get(name), dict | list):
+            parts.append(f"{name} {before.get(name, 'unset')} there, {now.get(name, 'unset')} now")
+    return "; ".join(parts or [f"other {', '.join(changed)}"])
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """A run's `digest` and `configuration`.
+
+    Raises: BadOutput when run.json is absent or damaged.
+    """
+    path = folder / "run.json"
+    damaged = f"run: {path} is absent or damaged; choose another folder, or run again with --out."
+    try:
+        manifest = json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise BadOutput(damaged) from error
+    if not isinstance(manifest, dict) or not {"digest", "configuration"} <= manifest.keys():
+        raise BadOutput(damaged)
+    return manifest
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keep other processes out of a run while this one works on it.
+
+    Raises: BadOutput when another process holds it.
+    """
+    with (folder / "run.json").open() as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise BadOutput(
+                f"locked: another process is working in {folder}; wait for it, or choose another "
+                "folder with --out."
+            ) from error
+        yield
+
+
+def append(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Add finished episodes as one new part. Raises: BadOutput when the disk is full."""
+    write_part(folder, "parts", rows, caller="append")
+
+
+def write_part(folder: Path, kind: str, rows: Sequence[Mapping[str, Any]], caller: str) -> None:
+    """Add `rows` as one new part to the table `kind` of a run.
+
+    Raises: BadOutput, which names the `caller`, when the disk is full.
+    """
+    import pandas as pd
+
+    try:
+        (folder / kind).mkdir(exist_ok=True)
+        table = pd.DataFrame(list(rows))
+        data = table.to_parquet(index=False, compression="zstd")
+        write_atomic(folder / kind / f"{uuid4().hex}.parquet", data)
+    except OSError as error:
+        raise BadOutput(
+            f"{caller}: {folder} cannot be written ({error.strerror}); make room and run the same "
+            "command again."
+        ) from error
+
+
+def compact(folder: Path) -> None:
+    """Join all parts into one; every attempt is kept.
+
+    Killed in between, it leaves rows in two parts, which `read` counts once.
+
+    Raises: BadOutput.
+    """
+    from pyarrow import concat_tables
+
+    paths = sorted((folder / "parts").glob("*.parquet"))
+    if len(paths) < 2:
+        return
+    parts = [_read_part(path) for path in paths]
+    table = concat_tables(parts, promote_options="permissive").to_pandas()
+    key = table.columns.intersection([*KEY, "attempt"]).tolist()
+    append(folder, table.drop_duplicates(key).to_dict("records"))
+    for path in paths:
+        path.unlink()
+
+
+def read(folder: Path) -> "pd.DataFrame":
+    """Every finished episode, in the order of KEY; of several attempts the last one."""
+    import pandas as pd
+    from pyarrow import concat_tables
+
+    parts = _read_parts(folder)
+    if not parts:
+        return pd.DataFrame(columns=KEY)
+    table = concat_tables(parts, promote_options="permissive").to_pandas()
+    if not {*KEY, "attempt"} <= set(table.columns):
+        raise BadOutput(
+            f"read: {folder} was written by an older version; run the same command again with "
+            "another --out."
+        )
+    table = table.sort_values([*KEY, "attempt"], ignore_index=True)
+    return table.drop_duplicates(KEY, keep="last", ignore_index=True)
+
+
+def _read_parts(folder: Path) -> "list[pa.Table]":
+    """All parts of a run.
+
+    They are listed again when one has disappeared: another process has just joined them.
+
+    Raises: BadOutput.
+    """
+    while True:
+        paths = sorted((folder / "parts").glob("*.parquet"))
+        try:
+            return [_read_part(path) for path in paths]
+        except BadOutput:
+            if all(path.exists(follow_symlinks=False) for path in paths):
+                raise
+
+
+def _read_part(path: Path) -> "pa.Table":
+    from pyarrow import ArrowException
+    from pyarrow.parquet import read_table
+
+    try:
+        return read_table(path)
+    except (ArrowException, OSError) as error:
+        raise BadOutput(
+            f"read: {path} is damaged; delete it and run the same command again, its episodes run "
+            "anew."
+        ) from error

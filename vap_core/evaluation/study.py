@@ -1,0 +1,264 @@
+"""A study: which tasks, methods and policy, how many episodes; and what a batch of it needs."""
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vap_core import __version__
+from vap_core.base.errors import BadStudy, one_of
+from vap_core.evaluation.methods import (
+    METHODS,
+    make_prompter,
+    needs_description,
+    needs_memory,
+    needs_stack,
+    needs_token,
+)
+from vap_core.evaluation.policy_names import (
+    MINI,
+    POLICIES,
+    PRIVILEGED,
+    SHIPPED,
+    make_policy,
+    shipped,
+)
+from vap_core.memory import load_bank, register, save
+from vap_core.perception.describe import AttributeCaptioner, Captioner, with_description
+from vap_core.perception.embedded.weights import weights_sha256
+from vap_core.perception.protocols import Stack
+from vap_core.perception.stacks import STACKS, load_stack
+from vap_core.policies.lerobot import adapter, checkpoints
+from vap_core.policies.mini_pi0 import learned_token
+from vap_core.policies.mini_pi0.teach_token import MODEL, teach
+from vap_core.policies.protocol import Policy, PrivilegedPolicy
+from vap_core.rollout.loop import Follow, Trial
+from vap_core.simulation import robots, suites
+from vap_core.simulation.assets.objects import get_object
+from vap_core.simulation.cameras import RIGS
+from vap_core.simulation.scenes import Meshes, Scene
+from vap_core.simulation.studio import reference_views
+from vap_core.simulation.suites import lists
+from vap_core.simulation.suites.open_row import build_scene
+from vap_core.simulation.suites.variants import VARIANTS
+from vap_core.simulation.types import EpisodeRow
+
+MESHES = ("plain", "menagerie")
+
+
+@dataclass(frozen=True)
+class Study:
+    """The same episodes of every task, once per method and seed.
+
+    `episodes` None takes whole lists. `images_every`, `follow` and `audit` are rollout.Trial's.
+
+    Raises: UnknownName, BadStudy, when it is built from what does not fit together.
+    """
+
+    tasks: tuple[tuple[str, str], ...]
+    methods: tuple[str, ...]
+    episodes: int | None = None
+    seed: int = 0
+    seeds: int = 1
+    policy: str = "scripted"
+    stack: str = "embedded"
+    robots: Meshes = "plain"
+    images_every: int = 0
+    follow: Follow = "step"
+    audit: bool = False
+
+    def __post_init__(self) -> None:
+        _check_names(self)
+        _check_policy(self)
+
+    def rows(self, suite: str, task: str) -> tuple[EpisodeRow, ...]:
+        return suites.listed(suite, task, n=self.episodes, seed=self.seed, seeds=self.seeds)
+
+    def checkpoint(self, suite: str) -> str:
+        """The folder or hub id of the policy's weights for a suite; "" where it has none."""
+        if self.policy == MINI:
+            return str(shipped(suite))
+        return "" if self.policy in POLICIES else self.policy
+
+    def configuration(self) -> dict[str, Any]:
+        """What the results depend on, as JSON.
+
+        Weights, episode lists, and the world (robots, objects, styles, sensors) enter by checksum.
+        """
+        digests = {}
+        for suite, _ in self.tasks:
+            if suite in suites.BENCHMARKS:
+                digests[suite] = lists.digest(suite)
+        names = sorted({self.checkpoint(suite) for suite, _ in self.tasks} - {""})
+        fingerprints = [checkpoints.fingerprint(name) for name in names]
+        about = asdict(self)
+        if names == [self.policy]:
+            about["checkpoint"] = fingerprints[0]
+        elif names:
+            about["checkpoints"] = fingerprints
+        about |= {"version": __version__, "weights": weights_sha256(), "lists": digests}
+        return {**about, "world": _world_digest(self)}
+
+
+def _check_names(study: Study) -> None:
+    for method in study.methods:
+        if method not in METHODS:
+            raise one_of("Study: method", method, METHODS)
+    if study.policy not in (*POLICIES, MINI) and not checkpoints.named(study.policy):
+        what = "Study: policy (or a lerobot checkpoint's folder or hub id)"
+        raise one_of(what, study.policy, [*POLICIES, MINI])
+    if study.robots not in MESHES:
+        raise one_of("Study: robots", study.robots, MESHES)
+    if study.stack not in STACKS:
+        raise one_of("Study: stack", study.stack, STACKS)
+    for suite, task in study.tasks:
+        suites.rows(suite, task, n=1)
+
+
+def _check_policy(study: Study) -> None:
+    policy = study.policy
+    for suite, _ in study.tasks:
+        if policy == MINI and not shipped(suite).is_dir():
+            there = ", ".join(sorted(path.name for path in SHIPPED.glob(f"{MINI}-*"))) or "none"
+            raise BadStudy(
+                f"Study: no {MINI} for {suite} ships (there is {there}); run: python -m vap_core "
+                f"train policy --suite {suite}"
+            )
+    if policy in PRIVILEGED and study.audit:
+        raise BadStudy(
+            f"Study: policy {policy!r} consumes no prompt; there is nothing to audit. Leave "
+            "--audit out."
+        )
+    if policy in PRIVILEGED and study.methods != ("generic",):
+        raise BadStudy(
+            f"Study: policy {policy!r} reads the simulator, not pictures; no method can prompt "
+            "it. Use --method generic."
+        )
+    if policy in POLICIES and _any_method(study, needs_token):
+        raise BadStudy(
+            f"Study: policy {policy!r} has no words that could be learned; leave soft out, or take "
+            f"--policy {MINI}."
+        )
+
+
+def _any_method(study: Study, needs: Callable[[str], bool]) -> bool:
+    return any(needs(method) for method in study.methods)
+
+
+def _world_digest(study: Study) -> str:
+    found = hashlib.sha256(_canonical((RIGS, VARIANTS)))
+    for suite, task in study.tasks:
+        known = suites.suite(suite)
+        robot = robots.get(known.robot)
+        placed = set()
+        for row in study.rows(suite, task):
+            for place in row.placements:
+                placed.add(place.model)
+        models = [get_object(name) for name in sorted(placed)]
+        found.update(_canonical((known, robot, models)) + robot.xml.read_bytes())
+    return found.hexdigest()[:16]
+
+
+def _canonical(value: Any) -> bytes:
+    """Every number in a value, whatever NumPy's print options are; of files their names."""
+
+    def plain(part: Any) -> Any:
+        if is_dataclass(part) and not isinstance(part, type):
+            held = {field.name: getattr(part, field.name) for field in fields(part)}
+            return {"kind": type(part).__name__, **held}
+        if isinstance(part, np.ndarray | np.generic):
+            return part.tolist()
+        if isinstance(part, Path):
+            return part.name
+        raise TypeError(
+            f"Study: {type(part).__name__} cannot be hashed; give it fields, or add its kind here."
+        )
+
+    return json.dumps(value, default=plain, sort_keys=True).encode()
+
+
+DEMO = Study(
+    tasks=(("widowx-pick", "pick-straw-cup"), ("franka-pick", "pick-cup")),
+    methods=("generic", "vap"),
+    episodes=20,
+)
+"""The main job: one task on each of two robots, generic against VAP."""
+
+
+def register_personal(study: Study, bank: Path, captioner: Captioner | None = None) -> None:
+    """Remember the personal object of every task from five rendered reference views.
+
+    An object that is in memory stays. Where a method needs its description, it is described too, by
+    `captioner`, or offline; for the soft prompt its token is learned. A study that prompts nothing
+    needs no memory.
+    """
+    if not _any_method(study, needs_memory):
+        return
+    stack, known = load_stack(study.stack), load_bank(bank)
+    for suite, task in study.tasks:
+        rows = study.rows(suite, task)
+        target, category = rows[0].target, rows[0].category
+        obj = known.get(target)
+        if obj is None:
+            views = reference_views(get_object(target))
+            obj, _ = register(target, category, views, stack.detector, stack.encoder)
+        if _any_method(study, needs_description) and obj.description is None:
+            obj = with_description(obj, captioner or AttributeCaptioner(stack.segmenter))
+        if _any_method(study, needs_token):
+            initialised_from = checkpoints.setting(study.checkpoint(suite), "vlm")
+            teach(rows, bank, initialised_from, MODEL)
+        if obj is not known.get(target):
+            save(bank, obj, replace=True)
+            known[target] = obj
+
+
+def make_trial(study: Study, rows: Sequence[EpisodeRow], method: str, bank: Path) -> Trial:
+    """The scene, models and policy of some rows of one task and variant, built or cached."""
+    first = rows[0]
+    suite = suites.suite(first.suite)
+    scene = _scene(study, first.suite, first.task, first.variant)
+    stack = _stack(study.stack) if needs_stack(method) or study.policy == "scripted" else None
+    return Trial(
+        method=method,
+        scene=scene,
+        policy=_policy(study, method, first, bank, scene, stack),
+        prompter=make_prompter(method, first, bank, scene, stack),
+        control=suite.control,
+        sensor=suite.sensor,
+        images_every=study.images_every,
+        follow=study.follow,
+        audit=study.audit,
+    )
+
+
+_stack = cache(load_stack)
+
+
+def _policy(
+    study: Study, method: str, row: EpisodeRow, bank: Path, scene: Scene, stack: Stack | None
+) -> Policy[Any] | PrivilegedPolicy[Any]:
+    """The frozen policy of the study; for the soft prompt with the learned token's embedding."""
+    suite = suites.suite(row.suite)
+    if study.policy in POLICIES:
+        return make_policy(study.policy, scene, suite, stack)
+    policy = adapter.load_for_suite(study.checkpoint(row.suite), scene, suite)
+    if not needs_token(method):
+        return policy
+    model = getattr(policy.policy.config, "vlm", "")
+    token = learned_token.load(bank, row.target, model)
+    return policy.with_tokens({learned_token.WORD: token.embedding})
+
+
+@lru_cache(maxsize=4)
+def _scene(study: Study, suite: str, task: str, variant: str) -> Scene:
+    names: dict[str, None] = {}
+    for row in study.rows(suite, task):
+        if row.variant == variant:
+            for place in row.placements:
+                names[place.model] = None
+    return build_scene(suite, list(names), variant, study.robots)

@@ -1,1 +1,0 @@
-"""The benchmarks in other people's clothes."""

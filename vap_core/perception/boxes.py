@@ -1,0 +1,70 @@
+"""Boxes and masks as arrays: overlap, bounds, and how crops are cut.
+
+Boxes are `x0 y0 x1 y1` in pixels, far corner exclusive.
+"""
+
+import numpy as np
+from jaxtyping import Float, Float32, Int64
+
+from vap_core.base.types import Mask, Rgb
+
+MARGIN = 0.03
+"""Context kept around a crop on each side, as a fraction of the box's longer side; look-alikes
+share their background, so it is small."""
+NMS_IOU = 0.5
+"""A box that overlaps a better one by more than this IoU is suppressed."""
+MAX_BOXES = 10
+"""Boxes that a detector returns for one phrase in one view."""
+
+
+def crop(image: Rgb, box_xyxy: Float[np.ndarray, "4"], margin: float = MARGIN) -> Rgb:
+    """The box with `margin` context, clipped to the image.
+
+    References and candidates are cut alike.
+    """
+    x0, y0, x1, y1 = box_xyxy.tolist()
+    extra = margin * max(x1 - x0, y1 - y0)
+    h, w = image.shape[:2]
+    left = int(np.clip(np.floor(x0 - extra), 0, w - 1))
+    top = int(np.clip(np.floor(y0 - extra), 0, h - 1))
+    right = int(np.clip(np.ceil(x1 + extra), left + 1, w))
+    bottom = int(np.clip(np.ceil(y1 + extra), top + 1, h))
+    return image[top:bottom, left:right].copy()
+
+
+def box_iou(a: Float[np.ndarray, "n 4"], b: Float[np.ndarray, "m 4"]) -> Float[np.ndarray, "n m"]:
+    """Intersection over union of every pair of boxes."""
+    near = np.maximum(a[:, None, :2], b[None, :, :2])
+    far = np.minimum(a[:, None, 2:], b[None, :, 2:])
+    both = np.clip(far - near, 0, None).prod(-1)
+    area_a = (a[:, 2:] - a[:, :2]).prod(-1)
+    area_b = (b[:, 2:] - b[:, :2]).prod(-1)
+    return both / np.maximum(area_a[:, None] + area_b[None] - both, 1e-9)
+
+
+def suppress_overlaps(
+    xyxy: Float32[np.ndarray, "n 4"], score: Float32[np.ndarray, " n"]
+) -> Int64[np.ndarray, " k"]:
+    """Non-maximum suppression: indices of at most `MAX_BOXES` boxes, best first."""
+    import torch
+    from torchvision.ops import nms  # imported late: it takes 1.7 s of CPU time
+
+    kept = nms(torch.from_numpy(xyxy), torch.from_numpy(score), NMS_IOU)
+    return kept[:MAX_BOXES].numpy()
+
+
+def mask_iou(one: Mask, other: Mask) -> float:
+    """Intersection over union of two masks; two empty masks agree."""
+    union = int((one | other).sum())
+    if union == 0:
+        return 1.0
+    return int((one & other).sum()) / union
+
+
+def mask_box(mask: Mask) -> Float32[np.ndarray, "4"] | None:
+    """The box of a mask; None when it is empty."""
+    rows = np.flatnonzero(mask.any(axis=1))
+    cols = np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return None
+    return np.array([cols[0], rows[0], cols[-1] + 1, rows[-1] + 1], np.float32)

@@ -1,0 +1,68 @@
+"""The candidates of one phrase in one view: boxes, embeddings, masks and identities.
+
+Identities are the indices that the view's tracker gives to what it follows.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from vap_core.base.types import Boxes, Rgb, value
+from vap_core.perception.boxes import box_iou, crop
+from vap_core.perception.protocols import Stack
+
+SAME_BOX_IOU = 0.7
+"""Boxes of two phrases that overlap by more than this IoU are the same object."""
+
+
+@value
+class Candidates:
+    """Candidate i has identity `ids[i]` in its view's tracker."""
+
+    boxes: Boxes
+    embeddings: Float32[np.ndarray, "n d"]
+    masks: Bool[np.ndarray, "n h w"]
+    ids: tuple[int, ...]
+
+
+def describe(rgb: Rgb, boxes: Boxes, stack: Stack, known: Sequence[Candidates] = ()) -> Candidates:
+    """Embed and segment every box of one view.
+
+    A box that an earlier phrase proposed too keeps its identity.
+    """
+    embeddings = stack.encoder([crop(rgb, box) for box in boxes.xyxy])
+    masks = stack.segmenter(rgb, boxes)
+    return Candidates(boxes, embeddings, masks, _assign_ids(boxes, known))
+
+
+def masks_by_id(parts: Sequence[Candidates]) -> Bool[np.ndarray, "n h w"]:
+    """One mask per identity of a view, in the order of identities."""
+    masks = np.concatenate([part.masks for part in parts])
+    first_rows: dict[int, int] = {}
+    for row, identity in enumerate(_ids(parts)):
+        first_rows.setdefault(identity, row)
+    return masks[[first_rows[identity] for identity in sorted(first_rows)]]
+
+
+def _ids(parts: Sequence[Candidates]) -> list[int]:
+    """The identities of several phrases' candidates, one after the other."""
+    ids: list[int] = []
+    for part in parts:
+        ids += part.ids
+    return ids
+
+
+def _assign_ids(boxes: Boxes, known: Sequence[Candidates]) -> tuple[int, ...]:
+    """A known identity for each box that is known already, the next free one for every other."""
+    known_xyxy = np.concatenate([np.zeros((0, 4), np.float32), *(c.boxes.xyxy for c in known)])
+    known_ids = _ids(known)
+    next_id = 1 + max(known_ids, default=-1)
+    ids: list[int] = []
+    for overlap in box_iou(boxes.xyxy, known_xyxy):
+        if len(known_xyxy) and overlap.max() > SAME_BOX_IOU:
+            ids.append(known_ids[int(overlap.argmax())])
+        else:
+            ids.append(next_id)
+            next_id += 1
+    return tuple(ids)

@@ -1,0 +1,160 @@
+"""Questions to a vision-language model that serves OpenAI's chat protocol.
+
+Any server does: OpenAI's own, or llama.cpp, vLLM or Ollama on this machine. Answers are parsed,
+never executed.
+"""
+
+import base64
+import json
+import os
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from http.client import HTTPException
+from typing import Any
+from urllib import request
+from urllib.error import HTTPError, URLError
+from urllib.parse import urlsplit
+
+from vap_core.base.errors import BadEndpoint
+from vap_core.base.types import Rgb
+
+URL = "OPENAI_BASE_URL"
+MODEL = "OPENAI_MODEL"
+KEY = "OPENAI_API_KEY"
+"""Environment variables that `endpoint_from_environment` reads."""
+MAX_ANSWER_BYTES = 4_000_000
+
+
+@dataclass(frozen=True)
+class ChatEndpoint:
+    """A server and a model on it.
+
+    `url` is as OpenAI's clients take it, for example https://api.openai.com/v1.
+
+    Raises: BadEndpoint: the address, the model or the key cannot be right.
+    """
+
+    url: str
+    model: str
+    key: str = field(default="", repr=False)
+    timeout_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        if not _is_web_address(self.url):
+            raise BadEndpoint(
+                f"chat: {self.url!r} is no address of a chat endpoint; "
+                "give one like https://api.openai.com/v1."
+            )
+        if not self.model:
+            raise BadEndpoint(f"chat: no model named for {self.url}; set {MODEL}.")
+        if self.key and not (self.key.isascii() and self.key.isprintable()):
+            raise BadEndpoint(
+                f"chat: the key for {self.url} holds a line break or another character "
+                f"that no key has; set {KEY} again."
+            )
+
+
+def endpoint_from_environment(url: str = "") -> ChatEndpoint:
+    """The endpoint at `url`, or at OPENAI_BASE_URL; model and key from the environment.
+
+    Raises: BadEndpoint.
+    """
+    return ChatEndpoint(
+        url=url or os.environ.get(URL, ""),
+        model=os.environ.get(MODEL, ""),
+        key=os.environ.get(KEY, "").strip(),
+    )
+
+
+def request_answer(endpoint: ChatEndpoint, question: str, images: Sequence[Rgb] = ()) -> str:
+    """The model's answer to one question about some images.
+
+    Raises: BadEndpoint: the server cannot be reached, takes too long, refuses, or answers something
+        other than the protocol says.
+    """
+    data = _post(endpoint, _question_body(endpoint.model, question, images))
+    try:
+        text = json.loads(data)["choices"][0]["message"]["content"]
+        if not isinstance(text, str) or not text.strip():
+            raise ValueError("no text")
+    except (ValueError, KeyError, IndexError, TypeError, RecursionError) as error:
+        raise BadEndpoint(
+            f"chat: {endpoint.url} does not answer as a chat endpoint does "
+            f"({type(error).__name__}); give the address that ends in /v1, and a model "
+            f"that sees pictures in {MODEL}."
+        ) from error
+    return text
+
+
+def data_url(rgb: Rgb) -> str:
+    """The image as a PNG data URL."""
+    import cv2
+
+    png = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1].tobytes()
+    return "data:image/png;base64," + base64.b64encode(png).decode()
+
+
+def _is_web_address(url: str) -> bool:
+    try:
+        parts = urlsplit(url)
+        return parts.scheme in ("http", "https") and bool(parts.hostname)
+    except ValueError:
+        return False
+
+
+def _question_body(model: str, question: str, images: Sequence[Rgb]) -> dict[str, Any]:
+    """One user message: the question, then the images."""
+    content: list[dict[str, Any]] = [{"type": "text", "text": question}]
+    for rgb in images:
+        content.append({"type": "image_url", "image_url": {"url": data_url(rgb)}})
+    return {"model": model, "messages": [{"role": "user", "content": content}]}
+
+
+def _post(endpoint: ChatEndpoint, body: dict[str, Any]) -> bytes:
+    """The server's response. Raises: BadEndpoint."""
+    headers = {"Content-Type": "application/json"}
+    if endpoint.key:
+        headers["Authorization"] = f"Bearer {endpoint.key}"
+    post = request.Request(
+        url=f"{endpoint.url.rstrip('/')}/chat/completions",
+        data=json.dumps(body).encode(),
+        headers=headers,
+        method="POST",
+    )
+    try:
+        opener = request.build_opener(_NoRedirects)
+        with opener.open(post, timeout=endpoint.timeout_s) as response:
+            return response.read(MAX_ANSWER_BYTES)
+    except HTTPError as error:
+        with error:
+            raise BadEndpoint(
+                f"chat: {endpoint.url} refuses ({error.code}: {_refusal_reason(error)}); "
+                f"check {URL}, {MODEL} and {KEY}."
+            ) from error
+    except (URLError, HTTPException, OSError) as error:
+        cause: object = error
+        if isinstance(error, URLError):
+            cause = error.reason
+        raise BadEndpoint(
+            f"chat: {endpoint.url} gives no answer ({str(cause) or type(cause).__name__}); "
+            f"is the server up, and {URL} right?"
+        ) from error
+
+
+def _refusal_reason(error: HTTPError) -> str:
+    """What the server says, as one line, whether it follows the protocol or sends plain text."""
+    text = ""
+    with suppress(OSError, HTTPException, ValueError, KeyError, TypeError, RecursionError):
+        text = error.read(2000).decode(errors="replace")
+        text = str(json.loads(text)["error"]["message"])
+    return " ".join(text.split())[:200] or error.reason
+
+
+class _NoRedirects(request.HTTPRedirectHandler):
+    """Follows no redirect: the request would carry the key and the images to another server."""
+
+    def redirect_request(
+        self, req: request.Request, fp: Any, code: int, msg: str, headers: Any, newurl: str
+    ) -> None:
+        return None

@@ -1,0 +1,218 @@
+"""The embedded encoder: an object's appearance as one L2-normalised row per crop (P 3.3, f).
+
+A row joins three descriptors, each L2-normalised and weighted: GeM-pooled Lite0 features (shape and
+texture: what kind of thing it is), a centre-weighted Lab histogram, and the row of a head that was
+trained to distinguish look-alikes (which of them it is). The cosine of two rows is the mean of the
+three cosines, weighted by the squares of their weights.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812
+
+from vap_core.base.types import Rgb
+from vap_core.perception.embedded.backbone import (
+    CHANNELS,
+    GREY,
+    features,
+    normalise,
+    resize_and_pad,
+)
+from vap_core.perception.embedded.weights import PERCEPTION, load_weights
+
+SIDE = 224
+"""Pixels of the square in which a crop is embedded."""
+HISTOGRAM_SIDE = 64
+HISTOGRAM_BINS = (4, 8, 8)
+"""Lightness, green-red, blue-yellow."""
+HISTOGRAM_LENGTH = int(np.prod(HISTOGRAM_BINS))
+HISTOGRAM_SIGMA = 0.4
+"""How fast a pixel's weight falls with its distance from the centre, in half-sides."""
+HISTOGRAM_WEIGHT = 0.5
+INSTANCE_TAPS = ("b4", "b10", "b14")
+INSTANCE_SIDE = 112
+"""The features that the instance head reads, and the side of its pixels."""
+INSTANCE_WEIGHT = 1.0
+"""Weight of the instance head's row. Held-out generic look-alikes: 75.1 % right without it, 84.7 at
+0.7, 86.3 at 1; real photos, which it was not trained on: 98.8, 98.8, 98.0."""
+
+
+class InstanceHead(nn.Module):
+    """Distinguishes look-alikes: a small network on frozen features and the pixels of a crop.
+
+    Features of three depths and the pixels meet on a 14 x 14 grid; eight attention heads weight its
+    cells, so the table can be left out. Trained on generic look-alikes only. The attributes' names
+    are the tensors' names in the weight file.
+    """
+
+    GRID = 14
+    HEADS = 8
+    VALUE_WIDTH = 24
+    WIDTH = 96
+    DIM = 128
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.pixels = nn.Sequential(
+            nn.Conv2d(3, 16, 3, 2, 1),
+            nn.ReLU(),
+            nn.Conv2d(16, 32, 3, 2, 1),
+            nn.ReLU(),
+            nn.Conv2d(32, 48, 3, 2, 1),
+        )
+        self.lateral = nn.ModuleDict(
+            {
+                "b4": nn.Conv2d(CHANNELS["b4"], 32, 1),
+                "b10": nn.Conv2d(CHANNELS["b10"], 48, 1),
+                "b14": nn.Conv2d(CHANNELS["b14"], 48, 1),
+            }
+        )
+        merged = 48 + 32 + 48 + 48
+        self.merge = nn.Conv2d(merged, self.WIDTH, 3, 2, 1)
+        self.norm = nn.ModuleList([nn.GroupNorm(8, merged), nn.GroupNorm(8, self.WIDTH)])
+        self.place = nn.Parameter(torch.zeros(self.WIDTH, self.GRID // 2, self.GRID // 2))
+        self.mix = nn.Conv2d(self.WIDTH, self.WIDTH, 3, padding=1)
+        self.where = nn.Conv2d(self.WIDTH, self.HEADS, 1)
+        self.what = nn.Conv2d(self.WIDTH, self.HEADS * self.VALUE_WIDTH, 1)
+        self.colour = nn.Linear(HISTOGRAM_LENGTH, 64)
+        self.out = nn.Sequential(
+            nn.Linear(self.HEADS * self.VALUE_WIDTH + self.WIDTH + 64, 256),
+            nn.ReLU(),
+            nn.Linear(256, self.DIM),
+        )
+
+    def forward(
+        self,
+        taps: Mapping[str, Tensor],
+        pixels: Float[Tensor, "n 3 s s"],
+        colour: Float[Tensor, "n b"],
+    ) -> Float[Tensor, "n d"]:
+        """Rows of length 1.
+
+        `taps` are maps of 14, 14 and 7 cells a side; `pixels` are 112 x 112 and normalised as for
+        the backbone; `colour` is a normalised Lab histogram.
+        """
+        size = (self.GRID, self.GRID)
+        maps = [self.pixels(pixels)]
+        for tap in INSTANCE_TAPS:
+            maps.append(F.interpolate(self.lateral[tap](taps[tap]), size, mode="nearest"))
+        x = self.norm[1](self.merge(F.relu(self.norm[0](torch.cat(maps, 1))))) + self.place
+        x = x + F.relu(self.mix(F.relu(x)))
+        attention = self.where(x).flatten(2).softmax(-1)
+        values = self.what(x).flatten(2).unflatten(1, (self.HEADS, self.VALUE_WIDTH))
+        attended = torch.einsum("nhp,nhcp->nhc", attention, values).flatten(1)
+        pooled = F.relu(x).pow(3).mean((2, 3)).clamp(min=1e-6).pow(1 / 3)
+        joined = torch.cat([attended, pooled, F.relu(self.colour(colour))], 1)
+        return F.normalize(self.out(joined), dim=1)
+
+
+class LiteEncoder:
+    """The embedded encoder; without a head, its rows have no part that distinguishes look-alikes.
+
+    `tag` ends the name that is stored with every memory.
+    """
+
+    def __init__(self, head: InstanceHead | None = None, tag: str = "") -> None:
+        self.name = f"lite0-gem3-lab{HISTOGRAM_WEIGHT:g}"
+        self.dim = CHANNELS["head"] + HISTOGRAM_LENGTH
+        self.head = head
+        if head is not None:
+            self.name += f"-look{INSTANCE_WEIGHT:g}{tag}"
+            self.dim += head.DIM
+            head.requires_grad_(False).eval()
+
+    def __call__(self, crops: Sequence[Rgb]) -> Float32[np.ndarray, "n d"]:
+        rows = np.zeros((len(crops), self.dim), np.float32)
+        for row, rgb in zip(rows, crops, strict=True):
+            row[:] = self._embed(rgb)
+        return rows
+
+    def _embed(self, rgb: Rgb) -> Float32[np.ndarray, " d"]:
+        whole = pad_to_square(rgb)
+        histogram = _unit(lab_histogram(rgb))
+        if self.head is None:
+            taps = features([whole], ["head"])
+        else:
+            taps = features([whole], [*INSTANCE_TAPS, "head"])
+        parts = [_unit(gem(taps["head"][0].numpy())), HISTOGRAM_WEIGHT * histogram]
+        if self.head is not None:
+            parts.append(INSTANCE_WEIGHT * _instance_row(self.head, taps, whole, histogram))
+        return _unit(np.concatenate(parts)).astype(np.float32)
+
+
+@torch.inference_mode()
+def _instance_row(
+    head: InstanceHead,
+    taps: Mapping[str, Tensor],
+    whole: Rgb,
+    histogram: Float[np.ndarray, " b"],
+) -> Float32[np.ndarray, " d"]:
+    """The instance head's row of one crop."""
+    small = cv2.resize(whole, (INSTANCE_SIDE, INSTANCE_SIDE), interpolation=cv2.INTER_AREA)
+    pixels = normalise(torch.from_numpy(small)[None])
+    colour = torch.from_numpy(histogram.astype(np.float32))[None]
+    return head(halve_b4(taps), pixels, colour)[0].numpy()
+
+
+def halve_b4(taps: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The taps that the instance head reads, b4 at half its resolution."""
+    return {"b4": F.avg_pool2d(taps["b4"], 2), "b10": taps["b10"], "b14": taps["b14"]}
+
+
+def gem(features_chw: Float32[np.ndarray, "c h w"], p: float = 3.0) -> Float32[np.ndarray, " c"]:
+    """Generalised-mean pooling: (mean of x^p)^(1/p) per channel.
+
+    p = 1 is the average, large p the maximum.
+    """
+    return (np.maximum(features_chw, 1e-6) ** p).mean((1, 2)) ** (1 / p)
+
+
+def lab_histogram(rgb: Rgb) -> Float[np.ndarray, " b"]:
+    """Square-rooted histogram over CIE Lab.
+
+    A pixel weighs exp(-r^2 / 2 sigma^2), r its distance from the centre in half-sides.
+    """
+    size = (HISTOGRAM_SIDE, HISTOGRAM_SIDE)
+    small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+    lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB).astype(np.float32)
+    r = np.linspace(-1, 1, HISTOGRAM_SIDE)
+    weight = np.exp(-(r[:, None] ** 2 + r[None] ** 2) / (2 * HISTOGRAM_SIGMA**2))
+    lightness = lab[..., :1] / 255.0
+    chroma = (lab[..., 1:] - 64.0) / 128.0  # chroma beyond +-64 shares the outer bins
+    unit = np.concatenate([lightness, chroma], axis=-1)
+    index = np.clip((unit * HISTOGRAM_BINS).astype(int), 0, np.array(HISTOGRAM_BINS) - 1)
+    flat = np.ravel_multi_index((index[..., 0], index[..., 1], index[..., 2]), HISTOGRAM_BINS)
+    return np.sqrt(np.bincount(flat.ravel(), weight.ravel(), minlength=HISTOGRAM_LENGTH))
+
+
+def pad_to_square(rgb: Rgb) -> Rgb:
+    """The image in a square of `SIDE` pixels, its aspect kept, centred on grey."""
+    small, _ = resize_and_pad(rgb, SIDE, multiple=1)
+    h, w = small.shape[:2]
+    out = np.full((SIDE, SIDE, 3), GREY, np.uint8)
+    top = (SIDE - h) // 2
+    left = (SIDE - w) // 2
+    out[top : top + h, left : left + w] = small
+    return out
+
+
+@cache
+def load() -> LiteEncoder:
+    """The shipped encoder; the backbone itself loads with the first crop.
+
+    Raises: MissingWeights: data/weights/perception.safetensors is absent or damaged.
+    """
+    weights, entry = load_weights(PERCEPTION, "look.")
+    head = InstanceHead()
+    head.load_state_dict(weights)
+    return LiteEncoder(head, f"-{entry['sha256'][:6]}")
+
+
+def _unit(row: np.ndarray) -> np.ndarray:
+    return row / np.maximum(np.linalg.norm(row, axis=-1, keepdims=True), 1e-12)

@@ -1,0 +1,181 @@
+"""Class-agnostic masks: the object inside each box (P 3.3).
+
+The embedded segmenter cuts a square window around the box, passes it through the shallow half of
+frozen Lite0, and decodes a mask from four resolutions. A prompt of two planes says which object is
+meant: the box and, when tracking, a coarse guess of its mask.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, UInt8
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812
+
+from vap_core.base.types import Boxes, Rgb
+from vap_core.perception.embedded.backbone import CHANNELS, GREY, load_backbone, normalise
+from vap_core.perception.embedded.weights import PERCEPTION, load_weights
+
+TAPS = ("b0", "b2", "b4", "b10")
+WIDTHS = (16, 24, 32, 48)
+"""Channels of the head at each tap."""
+FINE_WIDTH = 12
+"""Channels of the head at half the window's resolution."""
+SIDE = 112
+"""Pixels of the square window in which a mask is decoded."""
+CONTEXT = 0.25
+"""The window's extent beyond the box on each side, as a fraction of the box's longer side."""
+Window = tuple[int, int, int]
+"""Left, top and side of a square, pixels; it may reach beyond the image."""
+
+
+class MaskHead(nn.Module):
+    """Four feature maps and the prompt in, one logit per pixel of the window out.
+
+    The attributes' names are the tensors' names in the weight file.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        narrower = (FINE_WIDTH, *WIDTHS[:-1])
+        self.lateral = nn.ModuleList()
+        self.prompt = nn.ModuleList()
+        self.mix = nn.ModuleList()
+        for tap, width in zip(TAPS, WIDTHS, strict=True):
+            self.lateral.append(nn.Conv2d(CHANNELS[tap], width, 1))
+        for width in WIDTHS:
+            self.prompt.append(nn.Conv2d(2, width, 3, padding=1))
+        for width, narrow in zip(WIDTHS, narrower, strict=True):
+            self.mix.append(nn.Conv2d(width, narrow, 3, padding=1))
+        self.fine = nn.Sequential(
+            nn.Conv2d(FINE_WIDTH + 3 + 2, FINE_WIDTH, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(FINE_WIDTH, 1, 3, padding=1),
+        )
+
+    def forward(
+        self,
+        pixels: Float[Tensor, "n 3 h w"],
+        taps: Mapping[str, Tensor],
+        prompt: Float[Tensor, "n 2 h w"],
+    ) -> Float[Tensor, "n h w"]:
+        """Logits of the mask.
+
+        `pixels` are normalised as for the backbone; `prompt` holds the box and the coarse mask,
+        0..1 (all 0 when there is none).
+        """
+        x = self._level(len(TAPS) - 1, taps, prompt)
+        x = F.relu(self.mix[-1](F.relu(x)))
+        for level in reversed(range(len(TAPS) - 1)):
+            larger = F.interpolate(x, scale_factor=2, mode="nearest")
+            x = self._level(level, taps, prompt) + larger
+            x = F.relu(self.mix[level](F.relu(x)))
+        x = F.interpolate(x, scale_factor=2, mode="bilinear")
+        return self.fine(torch.cat([x, pixels, prompt], 1))[:, 0]
+
+    def _level(
+        self, level: int, taps: Mapping[str, Tensor], prompt: Float[Tensor, "n 2 h w"]
+    ) -> Float[Tensor, "n c y x"]:
+        """Features and prompt at the resolution of tap `level`."""
+        reduced = F.avg_pool2d(prompt, 2 ** (level + 1))
+        return self.lateral[level](taps[TAPS[level]]) + self.prompt[level](reduced)
+
+
+class LiteSegmenter:
+    """The embedded segmenter.
+
+    A box always gets a mask: its most likely pixels, where none is likely.
+    """
+
+    def __init__(self, head: MaskHead) -> None:
+        self.head = head.requires_grad_(False).eval()
+
+    def __call__(self, image: Rgb, boxes: Boxes) -> Bool[np.ndarray, "n h w"]:
+        probability = self.mask_probability(image, boxes.xyxy)
+        best = probability.max(axis=(1, 2), initial=0.0)
+        return probability > np.minimum(0.5, 0.5 * best)[:, None, None]
+
+    @torch.inference_mode()
+    def mask_probability(
+        self,
+        image: Rgb,
+        xyxy: Float[np.ndarray, "n 4"],
+        coarse: Float32[np.ndarray, "n h w"] | None = None,
+    ) -> Float32[np.ndarray, "n h w"]:
+        """Probability of every pixel to belong to each box's object; zero outside its window.
+
+        `coarse` guesses the masks, 0..1.
+        """
+        out = np.zeros((len(xyxy), *image.shape[:2]), np.float32)
+        for i, box in enumerate(xyxy):
+            window = window_around(box)
+            pixels = normalise(torch.from_numpy(cut(image, window))[None])
+            planes = np.zeros((2, SIDE, SIDE), np.uint8)
+            planes[0] = cut(box_plane(box, image.shape[:2]), window, fill=0)
+            if coarse is not None:
+                planes[1] = cut((coarse[i] * 255).astype(np.uint8), window, fill=0)
+            prompt = torch.from_numpy(planes.astype(np.float32) / 255)[None]
+            logits = self.head(pixels, load_backbone()(pixels, TAPS), prompt)[0]
+            paste(out[i], logits.sigmoid().numpy(), window)
+        return out
+
+
+def window_around(box_xyxy: Float[np.ndarray, "4"]) -> Window:
+    """The square around a box with context."""
+    x0, y0, x1, y1 = box_xyxy.tolist()
+    side = max(4, round(max(x1 - x0, y1 - y0) * (1 + 2 * CONTEXT)))
+    return round((x0 + x1 - side) / 2), round((y0 + y1 - side) / 2), side
+
+
+def cut(
+    image: UInt8[np.ndarray, "h w *c"], window: Window, fill: int = GREY
+) -> UInt8[np.ndarray, "s s *c"]:
+    """The window resized to `SIDE`; what lies beyond the image is `fill`."""
+    left, top, side = window
+    x0, y0, x1, y1 = _visible_part(window, image.shape[:2])
+    square = np.full((side, side, *image.shape[2:]), fill, np.uint8)
+    if x1 > x0 and y1 > y0:
+        square[y0 - top : y1 - top, x0 - left : x1 - left] = image[y0:y1, x0:x1]
+    interpolation = cv2.INTER_AREA if side > SIDE else cv2.INTER_LINEAR
+    return cv2.resize(square, (SIDE, SIDE), interpolation=interpolation)
+
+
+def paste(
+    image: Float32[np.ndarray, "h w"], patch: Float32[np.ndarray, "s s"], window: Window
+) -> None:
+    """Write a square patch back where its window was cut, in place."""
+    left, top, side = window
+    x0, y0, x1, y1 = _visible_part(window, image.shape)
+    if x1 > x0 and y1 > y0:
+        resized = cv2.resize(patch, (side, side), interpolation=cv2.INTER_LINEAR)
+        image[y0:y1, x0:x1] = resized[y0 - top : y1 - top, x0 - left : x1 - left]
+
+
+def box_plane(box_xyxy: Float[np.ndarray, "4"], hw: Sequence[int]) -> UInt8[np.ndarray, "h w"]:
+    """255 inside the box, 0 outside."""
+    plane = np.zeros(tuple(hw), np.uint8)
+    x0, y0, x1, y1 = np.maximum(np.round(box_xyxy), 0).astype(int).tolist()
+    plane[y0:y1, x0:x1] = 255
+    return plane
+
+
+@cache
+def load() -> LiteSegmenter:
+    """The shipped segmenter.
+
+    Raises: MissingWeights: data/weights/perception.safetensors is absent or damaged.
+    """
+    weights, _ = load_weights(PERCEPTION, "segment.")
+    head = MaskHead()
+    head.load_state_dict(weights)
+    return LiteSegmenter(head)
+
+
+def _visible_part(window: Window, hw: Sequence[int]) -> tuple[int, int, int, int]:
+    """The part of a window that lies in an image of that size: left, top, right and bottom."""
+    left, top, side = window
+    h, w = hw
+    return max(left, 0), max(top, 0), min(left + side, w), min(top + side, h)

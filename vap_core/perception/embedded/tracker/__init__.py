@@ -1,0 +1,18 @@
+"""Following through a video what was segmented at t = 0, every proposal as an identity (P 3.3).
+
+`cells` propagates labels over a grid of frozen features, `components` turns planes of shares into
+masks, `appearance` compares colours and crops, `state` is what is remembered of one view, `update`
+decides which masks are believed, `search` looks for lost identities, and `tracker` joins them.
+"""
+
+from functools import cache
+
+from vap_core.perception.embedded.encoder import load as load_encoder
+from vap_core.perception.embedded.segmenter import load as load_segmenter
+from vap_core.perception.embedded.tracker.tracker import LiteTracker
+
+
+@cache
+def load() -> LiteTracker:
+    """The shipped tracker, with the shipped segmenter and encoder."""
+    return LiteTracker(load_segmenter(), load_encoder())

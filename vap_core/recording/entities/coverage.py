@@ -1,0 +1,89 @@
+"""The prompt of every view, filled with the colour of the object that it covers."""
+
+from collections.abc import Mapping, Sequence
+
+import cv2
+import numpy as np
+import rerun as rr
+
+from vap_core.base.types import Camera, Mask
+from vap_core.recording.colours import SERIES, TARGET, Rgb8
+from vap_core.recording.entities.images import send_class_images
+from vap_core.recording.entities.paths import image_root
+from vap_core.rollout.types import EpisodeHeader, Frame
+
+NO_OBJECT_CLASS = 8
+"""A prompt that covers no object."""
+FIRST_OBJECT_CLASS = 10
+"""Class of the first object's inside. An inside is even; its edge is the number after it."""
+OTHER_COLOURS = [colour for colour in SERIES if colour != TARGET]
+CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
+
+
+def coverage_classes(header: EpisodeHeader) -> list[rr.AnnotationInfo]:
+    """One colour for each object: an inside for the prompt that covers it, an edge for itself."""
+    classes = [rr.AnnotationInfo(id=NO_OBJECT_CLASS, label="no object", color=(255, 255, 255, 190))]
+    for i, (name, colour) in enumerate(_object_colours(header).items()):
+        inside = FIRST_OBJECT_CLASS + 2 * i
+        classes.append(rr.AnnotationInfo(id=inside, label=name, color=(*colour, 170)))
+        classes.append(
+            rr.AnnotationInfo(id=inside + 1, label=f"{name}, edge", color=(*colour, 255))
+        )
+    return classes
+
+
+def send_coverage(
+    rec: rr.RecordingStream,
+    header: EpisodeHeader,
+    index: Sequence[rr.TimeColumn],
+    frames: Sequence[Frame],
+) -> None:
+    """One class image per view and step; the steps are those with truth and pictures."""
+    for i, camera in enumerate(frames[0].cameras):
+        images = [coverage_image(header, frame, frame.cameras[i]) for frame in frames]
+        send_class_images(rec, f"{image_root(camera.name)}/identity", index, images)
+
+
+def coverage_image(header: EpisodeHeader, frame: Frame, camera: Camera) -> np.ndarray:
+    """Class image of one view: the prompt's inside, and over it the edges of all objects."""
+    names = list(header.object_sizes_m)
+    image = np.zeros((camera.height, camera.width), np.uint8)
+    tracks = frame.tracks.get(camera.name, ())
+    covered = _covered_object(frame, camera)
+    if tracks and tracks[0].mask is not None and covered is not None:
+        image[tracks[0].mask] = NO_OBJECT_CLASS
+        if covered in names:
+            image[tracks[0].mask] = FIRST_OBJECT_CLASS + 2 * names.index(covered)
+    edges = _object_edges(frame.truth.masks.get(camera.name, {}), names, image)
+    return np.where(edges > 0, edges, image)
+
+
+def _object_colours(header: EpisodeHeader) -> dict[str, Rgb8]:
+    """The target's orange, and a colour of its own for every other object."""
+    colours = {}
+    n_others = 0
+    for name in header.object_sizes_m:
+        if name == header.row.target:
+            colours[name] = TARGET
+        else:
+            colours[name] = OTHER_COLOURS[n_others % len(OTHER_COLOURS)]
+            n_others += 1
+    return colours
+
+
+def _covered_object(frame: Frame, camera: Camera) -> str | None:
+    for view in frame.coverage:
+        if view.camera == camera.name:
+            return view.object
+    return None
+
+
+def _object_edges(masks: Mapping[str, Mask], names: Sequence[str], like: np.ndarray) -> np.ndarray:
+    """The edge class on the outermost pixels of every object, 0 elsewhere."""
+    owner = np.zeros_like(like)
+    for i, name in enumerate(names):
+        if name in masks:  # every visible pixel belongs to one object
+            owner |= masks[name].view(np.uint8) * np.uint8(FIRST_OBJECT_CLASS + 2 * i + 1)
+    interior = cv2.erode(owner, CROSS) == cv2.dilate(owner, CROSS)
+    owner[interior] = 0
+    return owner

@@ -1,0 +1,175 @@
+"""Ground truth in three dimensions: table, robot, objects and cameras.
+
+Shapes are drawn once; columns of poses move them.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+from scipy.spatial.transform import Rotation
+
+from vap_core.recording.colours import OTHER, TARGET, TRUTH, series_colour
+from vap_core.recording.entities.paths import image_root
+from vap_core.recording.stream import log_row
+from vap_core.rollout.types import EpisodeHeader, Frame
+from vap_core.simulation.types import EpisodeRow, Pose, Truth
+
+ROBOT = (170, 178, 196)
+TABLE = (92, 78, 64)
+JOINT_HALF_SIZE_M = 0.016
+MIN_BONE_M = 5e-3
+"""Shorter bones are not drawn."""
+FRUSTUM_M = 0.14
+"""Distance from a camera to its picture in the scene."""
+FINGERTIPS = ("finger", "jaw", "tip", "grip")
+"""Links whose names contain one of these share the last link before them as their parent."""
+
+
+def link_entity(name: str) -> str:
+    """The entity of a robot link."""
+    if name.startswith("link"):
+        return f"/world/robot/{name}"
+    return f"/world/robot/link_{name}"
+
+
+def log_table(rec: rr.RecordingStream, row: EpisodeRow) -> None:
+    """The table's top is z = 0."""
+    box = rr.Boxes3D(
+        centers=[[*mean_placement(row), -0.01]],
+        half_sizes=[[0.45, 0.55, 0.01]],
+        colors=[TABLE],
+        fill_mode="solid",
+    )
+    log_row(rec, "/world/table", box)
+
+
+def mean_placement(row: EpisodeRow) -> np.ndarray:
+    """The middle of the objects' starting places, x and y in metres."""
+    return np.array([[p.x, p.y] for p in row.placements]).mean(axis=0)
+
+
+def log_objects(rec: rr.RecordingStream, header: EpisodeHeader) -> None:
+    """Bounding boxes; an object's origin is the centre of its base."""
+    for name, size in header.object_sizes_m.items():
+        colour, label = OTHER, name
+        fill_mode = rr.components.FillMode.TransparentFillMajorWireframe
+        if name == header.row.target:
+            colour, label = TARGET, f"target: {name}"
+            fill_mode = rr.components.FillMode.Solid
+        elif name == header.row.goal:
+            colour, label = TRUTH, f"goal: {name}"
+        half = np.asarray(size) / 2
+        box = rr.Boxes3D(
+            centers=[[0, 0, half[2]]],
+            half_sizes=[half],
+            colors=[colour],
+            fill_mode=fill_mode,
+            labels=[label],
+            show_labels=label != name,
+        )
+        log_row(rec, f"/world/objects/{name}", box)
+
+
+def log_links(rec: rr.RecordingStream, truth: Truth) -> None:
+    """A joint at each link's origin and a capsule to the next link.
+
+    Both are rigid in the link's frame, because joints only rotate there.
+    """
+    children = _children(list(truth.links_world))
+    for name, pose in truth.links_world.items():
+        entity = link_entity(name)
+        joint = rr.Boxes3D(half_sizes=[[JOINT_HALF_SIZE_M] * 3], colors=[ROBOT], fill_mode="solid")
+        log_row(rec, f"{entity}/joint", joint)
+        bones = _bones(pose, [truth.links_world[child] for child in children[name]])
+        if len(bones):
+            log_row(rec, entity, _capsules(bones))
+
+
+def send_poses(
+    rec: rr.RecordingStream,
+    entity: str,
+    index: Sequence[rr.TimeColumn],
+    xyz: np.ndarray,
+    quaternion_xyzw: np.ndarray,
+) -> None:
+    """One pose per step."""
+    columns = rr.Transform3D.columns(translation=xyz, quaternion=quaternion_xyzw)
+    rec.send_columns(entity, index, columns)
+
+
+def send_truth(
+    rec: rr.RecordingStream, index: Sequence[rr.TimeColumn], frames: Sequence[Frame]
+) -> None:
+    """Poses of every object and link."""
+    for name in frames[0].truth.objects_world:
+        poses = np.stack([frame.truth.objects_world[name] for frame in frames])
+        send_poses(rec, f"/world/objects/{name}", index, poses[:, :3], poses[:, [4, 5, 6, 3]])
+    for name in frames[0].truth.links_world:
+        poses = np.stack([frame.truth.links_world[name] for frame in frames])
+        send_poses(rec, link_entity(name), index, poses[:, :3], poses[:, [4, 5, 6, 3]])
+
+
+def log_cameras(rec: rr.RecordingStream, frame: Frame) -> None:
+    """Intrinsics, once; `send_camera_poses` sends the rest."""
+    for i, camera in enumerate(frame.cameras):
+        pinhole = rr.Pinhole(
+            image_from_camera=camera.k,
+            resolution=[camera.width, camera.height],
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=FRUSTUM_M,
+            color=series_colour(i),
+        )
+        log_row(rec, image_root(camera.name), pinhole)
+
+
+def send_camera_poses(
+    rec: rr.RecordingStream, index: Sequence[rr.TimeColumn], frames: Sequence[Frame]
+) -> None:
+    """Where every camera was."""
+    for i, camera in enumerate(frames[0].cameras):
+        poses = np.stack([frame.cameras[i].pose_world for frame in frames])
+        quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+        send_poses(rec, image_root(camera.name), index, poses[:, :3, 3], quaternions)
+
+
+def _children(names: Sequence[str]) -> dict[str, list[str]]:
+    """A link's parent is the last link before it that is no fingertip."""
+    children: dict[str, list[str]] = {}
+    parent: str | None = None
+    for name in names:
+        children[name] = []
+        if parent is not None:
+            children[parent].append(name)
+        if not _is_fingertip(name):
+            parent = name
+    return children
+
+
+def _is_fingertip(link: str) -> bool:
+    return any(part in link.lower() for part in FINGERTIPS)
+
+
+def _bones(parent: Pose, children: Sequence[Pose]) -> np.ndarray:
+    """Vectors from a link's origin to its children's, in the link's frame."""
+    rotation = Rotation.from_quat(parent[3:7], scalar_first=True).inv()
+    bones = np.empty((len(children), 3))
+    for i, child in enumerate(children):
+        bones[i] = rotation.apply(child[:3] - parent[:3])
+    return bones[np.linalg.norm(bones, axis=1) > MIN_BONE_M]
+
+
+def _capsules(bones: np.ndarray) -> rr.Capsules3D:
+    """One capsule along each bone; a capsule points along z."""
+    lengths = np.linalg.norm(bones, axis=1)
+    rotations = []
+    for bone in bones:
+        rotation, _ = Rotation.align_vectors([bone], [[0.0, 0.0, 1.0]])
+        rotations.append(rotation.as_quat())
+    return rr.Capsules3D(
+        lengths=lengths,
+        radii=np.clip(lengths / 6, 0.008, 0.035),
+        quaternions=rotations,
+        colors=[ROBOT] * len(bones),
+        fill_mode="solid",
+    )

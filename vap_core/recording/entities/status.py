@@ -1,0 +1,87 @@
+"""The state lanes and the event list: how the episode ended, what the gripper held, events."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import rerun as rr
+
+from vap_core.base.types import Event
+from vap_core.recording.colours import pack_rgba, state_style
+from vap_core.recording.stream import Moment, frame_times, log_row, time_columns
+from vap_core.rollout.types import Frame
+
+OUTCOME_COLOURS = {
+    "success": (40, 140, 85),
+    "failure": (190, 120, 30),
+    "error": (190, 60, 60),
+}
+GRASP_COLOURS = {
+    "free": (70, 78, 92),
+    "touches target": (130, 100, 50),
+    "holds target": (210, 125, 30),
+    "touches other": (80, 95, 150),
+    "holds other": (85, 120, 220),
+}
+LEVEL_COLOURS = {
+    "INFO": (150, 200, 255),
+    "WARN": (255, 190, 60),
+    "ERROR": (255, 95, 95),
+}
+
+
+def log_status_styles(rec: rr.RecordingStream) -> None:
+    """The colours of both lanes."""
+    log_row(rec, "/vap/status/outcome", state_style(OUTCOME_COLOURS))
+    log_row(rec, "/vap/status/grasp", state_style(GRASP_COLOURS))
+
+
+def send_outcome(rec: rr.RecordingStream, first: Frame, status: str) -> None:
+    """The outcome over the whole lane: a state that starts at the last step has no width."""
+    columns = rr.StateChange.columns(state=[status])
+    rec.send_columns("/vap/status/outcome", frame_times([first]), columns)
+
+
+def grasp_state(frame: Frame, target: str) -> str:
+    """What the gripper has to do with the objects at one step."""
+    for verb, names in (("holds", frame.truth.held), ("touches", frame.truth.touched)):
+        if names:
+            return f"{verb} target" if target in names else f"{verb} other"
+    return "free"
+
+
+def send_grasp_changes(
+    rec: rr.RecordingStream, frames: Sequence[Frame], target: str, before: str | None
+) -> str | None:
+    """Send only changes: a state lasts until the next. Returns the last state."""
+    changed = []
+    states = []
+    for frame in frames:
+        state = grasp_state(frame, target)
+        if state != before:
+            changed.append(frame)
+            states.append(state)
+            before = state
+    if changed:
+        columns = rr.StateChange.columns(state=states)
+        rec.send_columns("/vap/status/grasp", frame_times(changed), columns)
+    return before
+
+
+def send_events(
+    rec: rr.RecordingStream, events: Sequence[Event], seconds: Mapping[int, float]
+) -> None:
+    """The events, each at its step; `seconds` has every step's time."""
+    if not events:
+        return
+    last_second = list(seconds.values())[-1]
+    moments: list[Moment] = []
+    colours = []
+    for event in events:
+        moments.append((event.frame_index, seconds.get(event.frame_index, last_second)))
+        colours.append(pack_rgba(LEVEL_COLOURS[event.level]))
+    columns = rr.TextLog.columns(
+        text=[event.text for event in events],
+        level=[event.level for event in events],
+        color=np.array(colours, np.uint32),
+    )
+    rec.send_columns("/vap/events", time_columns(moments), columns)

@@ -1,0 +1,116 @@
+"""The index of a recording: its properties and one row of numbers per step, in a small file.
+
+A query reads these instead of the recordings: a thousand of them in seconds.
+"""
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from rerun.chunk import Chunk, RrdReader
+
+from vap_core.base.errors import BadOutput, BadRecording
+from vap_core.recording.file import temporary_path
+from vap_core.recording.reading import PROPERTIES, property_group
+from vap_core.recording.stream import finish_stream, open_stream
+
+CURVES = {
+    "margin": "/vap/vote_margin/",
+    "track_score": "/vap/track_score/",
+    "gap_cm": "/vap/hand/gripper",
+    "lift_cm": "/vap/hand/target",
+}
+"""Columns of each step, and what their entities begin with; of several views the least counts."""
+STEPS = "/steps"
+"""The entity of an index that holds the columns."""
+STATE = "/observation.state"
+"""What every recording has at every step."""
+INDEXED_ENTITIES = [
+    f"{PROPERTIES}/**",
+    STATE,
+    "/vap/vote_margin/**",
+    "/vap/track_score/**",
+    "/vap/hand/**",
+]
+FOLDER = ".index-1"
+"""Beside recordings; the number grows when the columns of an index change."""
+
+type Samples = list[tuple[np.ndarray, np.ndarray]]
+"""Steps and values, once per chunk."""
+
+
+def ensure_index(recording: Path, folder: Path | None = None) -> Path:
+    """The index of a recording, in FOLDER beside it or in `folder`; written where there is none.
+
+    Its name has the recording's size in bytes, so that another recording gets another index.
+
+    Raises: BadRecording when the recording cannot be read, or is none of an episode.
+    """
+    place = folder or recording.parent / FOLDER
+    try:
+        path = place / f"{recording.stem}.{recording.stat().st_size}.rrd"
+        if not path.exists():
+            temporary_path(path).unlink(missing_ok=True)
+            _write_index(recording, path)
+    except BadOutput:
+        if not path.exists():  # otherwise another process wrote it meanwhile
+            raise
+    except (RuntimeError, ValueError, OSError, Warning) as error:
+        raise BadRecording(str(error).splitlines()[0][:160]) from error
+    return path
+
+
+def _write_index(recording: Path, path: Path) -> None:
+    with warnings.catch_warnings():
+        # Without a footer rerun warns, and can read no single entity.
+        warnings.simplefilter("error")
+        reader = RrdReader(recording)
+    recording_id = reader.recordings()[0].recording_id
+    properties, state, curves = _read_indexed(reader)
+    groups = [property_group(chunk) for chunk in properties]
+    if "rollout" not in groups or not state:
+        raise ValueError("no recording of an episode")
+    steps = np.unique(np.concatenate([frame_indices for frame_indices, _ in state]))
+    columns: dict[str, Any] = {
+        name: _least_per_step(steps, samples) for name, samples in curves.items()
+    }
+    rec = open_stream(path, recording_id)
+    rec.send_chunks(properties)
+    index = [rr.TimeColumn("frame_index", sequence=steps)]
+    rec.send_columns(STEPS, index, rr.AnyValues.columns(**columns))
+    finish_stream(rec, path)
+
+
+def _read_indexed(reader: RrdReader) -> tuple[list[Chunk], Samples, dict[str, Samples]]:
+    """The chunks of properties, the state's samples, and those of every curve."""
+    properties: list[Chunk] = []
+    state: Samples = []
+    curves: dict[str, Samples] = {name: [] for name in CURVES}
+    for chunk in reader.store().stream().filter(content=INDEXED_ENTITIES):
+        if chunk.entity_path.startswith(PROPERTIES):
+            properties.append(chunk)
+        elif chunk.is_static:
+            continue
+        elif chunk.entity_path.startswith(STATE):
+            state.append(_samples(chunk))
+        else:
+            for name, prefix in CURVES.items():
+                if chunk.entity_path.startswith(prefix):
+                    curves[name].append(_samples(chunk))
+    return properties, state, curves
+
+
+def _samples(chunk: Chunk) -> tuple[np.ndarray, np.ndarray]:
+    batch = chunk.to_record_batch()
+    steps = batch["frame_index"].to_numpy(zero_copy_only=False)
+    return steps, batch["Scalars:scalars"].flatten().to_numpy()
+
+
+def _least_per_step(steps: np.ndarray, samples: Samples) -> np.ndarray:
+    """The least of all views at every step, nan where there is none."""
+    least = np.full(len(steps), np.nan)
+    for frame_indices, values in samples:
+        np.fmin.at(least, np.searchsorted(steps, frame_indices), values)
+    return least

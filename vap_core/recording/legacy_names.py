@@ -1,0 +1,33 @@
+"""Names of recording properties in files written before they took the names of results tables."""
+
+from collections.abc import Mapping
+from typing import Any
+
+FORMER_NAMES = {
+    "outcome": {
+        "outcome": "status",
+        "steps": "length",
+        "case": "failure_case",
+        "case_confidence": "confidence",
+        "case_sentence": "why",
+    },
+    "correction": {
+        "case": "failure_case",
+        "case_sentence": "why",
+    },
+}
+"""By property group: the name that a property has now, and the name that it had before."""
+
+
+def former_name(group: str, name: str) -> str | None:
+    """The name that a property had before, None where it was never renamed."""
+    return FORMER_NAMES.get(group, {}).get(name)
+
+
+def with_current_names(group: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """The properties of one group by their current names, whenever they were written."""
+    current = {former: name for name, former in FORMER_NAMES.get(group, {}).items()}
+    renamed = {}
+    for name, value in values.items():
+        renamed[current.get(name, name)] = value
+    return renamed

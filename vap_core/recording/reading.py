@@ -1,0 +1,74 @@
+"""Reading recordings back: their chunks and their properties."""
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+from rerun.chunk import Chunk, LazyChunkStream, RrdReader
+
+from vap_core.base.errors import BadRecording
+from vap_core.recording.legacy_names import with_current_names
+
+PROPERTIES = "/__properties"
+"""Rerun's reserved entity; below it is one entity per property group."""
+
+
+def read_chunks(path: Path) -> LazyChunkStream:
+    """The chunks of a recording, in the order of the file."""
+    return RrdReader(path).stream()
+
+
+def property_group(chunk: Chunk) -> str | None:
+    """The property group that a chunk holds, None for any other chunk."""
+    parent, _, group = chunk.entity_path.rpartition("/")
+    return group if parent == PROPERTIES else None
+
+
+def read_properties(chunk: Chunk) -> dict[str, Any]:
+    """The properties in a chunk of one property group, by their current names."""
+    group = chunk.entity_path.removeprefix(f"{PROPERTIES}/")
+    batch = chunk.to_record_batch()
+    values = {}
+    for name in batch.schema.names:
+        if name.startswith("rerun."):
+            continue
+        cells = batch[name][0].as_py()
+        values[name] = cells[0] if cells else None
+    return with_current_names(group, values)
+
+
+def read_summary(path: Path) -> dict[str, Any]:
+    """What ran and how it ended, by the names of a results table's columns.
+
+    `frames` counts the recorded steps. An unfinished recording has no `outcome`.
+
+    Raises: BadRecording, when the file is missing, damaged, or no recording.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise BadRecording(f"read_summary: there is no recording at {path}.")
+    summary: dict[str, Any] = {}
+    steps: set[int] = set()
+    try:
+        with warnings.catch_warnings():
+            # Rerun only warns when a footer is missing: such a file was never finished.
+            warnings.simplefilter("error")
+            for chunk in read_chunks(path):
+                if property_group(chunk) in ("rollout", "outcome"):
+                    summary |= read_properties(chunk)
+                    continue
+                batch = chunk.to_record_batch()
+                if "frame_index" in batch.schema.names:
+                    steps.update(batch["frame_index"].to_pylist())
+    except (RuntimeError, ValueError, OSError, Warning) as err:
+        raise unreadable(path, err) from err
+    return {**summary, "frames": len(steps)}
+
+
+def unreadable(path: Path, reason: object) -> BadRecording:
+    """The error of a file that is no readable recording."""
+    line = " ".join(str(reason).split())[-160:]
+    return BadRecording(
+        f"{path} cannot be read as a recording ({line}); "
+        f"`rerun rrd optimize {path} -o mended.rrd` saves what can be saved."
+    )

@@ -1,0 +1,294 @@
+"""Episode -> .rrd: one Rerun recording per rollout, streamed to disk while it happens.
+
+Timelines are `frame_index` and `timestamp`. Entities have the names of LeRobot's features:
+
+- `/observation.images.<camera>`: the raw picture. Below it `/prompted` is what the policy saw,
+  `/candidates` the boxes over the picture that the vote was held on, `/mask/{target,gt}` track and
+  truth, `/identity` the prompt in the colour of the object it covers, `/attention` an overlay.
+- `/observation.state`, `/action`, `/next.reward`, `/next.success`.
+- `/vap/votes/<camera>`: `counts`, with `/winner` and `/others` as bars.
+- `/vap/{candidates,similarity,crops}/<camera>`: what the vote compared.
+- `/vap/association`: what the views agreed on, where they were associated.
+- `/vap/{vote_margin,track_score,attention}/<camera>`, `/vap/hand/*`: curves and tensors.
+- `/vap/{instruction,events}`, `/vap/status/{outcome,grasp}`: text and states.
+- `/world/{table,robot/link*,objects/*}`: simulator truth.
+
+Evidence of a further target j ends in `_j`. Recording properties are in module `properties`.
+Pictures are JPEG or AV1, at the steps that have them; everything that changes travels in columns.
+"""
+
+from pathlib import Path
+from types import TracebackType
+from typing import Literal
+
+import rerun as rr
+
+from vap_core.base.errors import BadOutput
+from vap_core.base.types import Event
+from vap_core.recording.blueprint import episode_blueprint
+from vap_core.recording.entities.attention import send_attention
+from vap_core.recording.entities.comparison import log_crops, log_similarity
+from vap_core.recording.entities.coverage import coverage_classes, send_coverage
+from vap_core.recording.entities.curves import (
+    log_method_styles,
+    log_robot_styles,
+    send_gripper,
+    send_method,
+    send_reward,
+    send_robot,
+)
+from vap_core.recording.entities.images import encode_jpeg, jpeg_image
+from vap_core.recording.entities.masks import CLASSES, send_masks
+from vap_core.recording.entities.paths import image_root
+from vap_core.recording.entities.pictures import (
+    JPEG_QUALITY,
+    Pictures,
+    StillPictures,
+    VideoPictures,
+)
+from vap_core.recording.entities.scene import (
+    log_cameras,
+    log_links,
+    log_objects,
+    log_table,
+    send_camera_poses,
+    send_truth,
+)
+from vap_core.recording.entities.status import (
+    log_status_styles,
+    send_events,
+    send_grasp_changes,
+    send_outcome,
+)
+from vap_core.recording.entities.votes import log_association, log_vote
+from vap_core.recording.file import temporary_path
+from vap_core.recording.properties import outcome_properties, rollout_properties
+from vap_core.recording.stream import (
+    finish_stream,
+    frame_times,
+    log_properties,
+    log_row,
+    open_stream,
+)
+from vap_core.recording.texts import (
+    describe_diagnosis,
+    describe_outcome,
+    instruction_document,
+)
+from vap_core.rollout.failure import Diagnosis, Explain, Explanation
+from vap_core.rollout.types import Episode, EpisodeHeader, Frame
+from vap_core.simulation.types import Outcome
+
+OUTCOME_LEVELS: dict[str, Literal["INFO", "WARN", "ERROR"]] = {
+    "success": "INFO",
+    "failure": "WARN",
+    "error": "ERROR",
+}
+"""The level of the event that ends an episode."""
+
+
+class Recorder:
+    """Streams one episode to disk; what was flushed outlives the process (`recover`).
+
+    `frame` buffers; every `flush_every` frames the buffered columns go to the file. `close` writes
+    the outcome and renames the file. `video` keeps pictures as AV1, much smaller for more time.
+    Left through an exception, the context manager keeps the unfinished file under its temporary
+    name.
+
+    Raises: BadOutput, when `path` exists or its folder cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        header: EpisodeHeader,
+        *,
+        flush_every: int = 10,
+        video: bool = False,
+        explain: Explain | None = None,
+    ) -> None:
+        row = header.row
+        self.path = Path(path)
+        self._header = header
+        self._flush_every = flush_every
+        self._explain = explain
+        self._pictures: Pictures = VideoPictures(header.hz) if video else StillPictures()
+        self._frames: list[Frame] = []
+        """All frames, without images."""
+        self._unsent: list[Frame] = []
+        self._grasp_state: str | None = None
+        self._has_attention = False
+        recording_id = f"{row.key}.s{row.seed}.{header.method}.{header.policy}"
+        self._rec: rr.RecordingStream | None = open_stream(self.path, recording_id)
+        self._log_header(self._rec)
+
+    def __enter__(self) -> "Recorder":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        err: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._rec is not None:
+            self._flush()
+            self._rec.flush()
+            self._rec.disconnect()
+            self._rec = None
+
+    def frame(self, frame: Frame) -> None:
+        """Record one control step."""
+        if not self._frames:
+            self._log_first_frame(frame)
+        self._pictures.add(frame)
+        self._frames.append(frame.without_images())
+        self._unsent.append(frame)
+        if len(self._unsent) >= self._flush_every:
+            self._flush()
+
+    def close(self, outcome: Outcome) -> None:
+        """Flush, write outcome, diagnosis and footer, and give the recording its name.
+
+        Raises: BadOutput, when a file of that name appeared meanwhile.
+        """
+        rec = self._open_stream()
+        self._flush()
+        self._pictures.send(rec, last=True)
+        explanation = self._explain_episode(outcome)
+        if self._frames:
+            self._send_ending(outcome, explanation)
+        diagnosis = explanation.diagnosis
+        document = instruction_document(
+            self._header,
+            describe_outcome(outcome),
+            "" if diagnosis is None else describe_diagnosis(diagnosis),
+        )
+        log_row(rec, "/vap/instruction", document)
+        log_properties(rec, "outcome", outcome_properties(outcome, diagnosis))
+        self._rec = None
+        finish_stream(rec, self.path)
+
+    def discard(self) -> None:
+        """End without a recording; what was flushed is deleted."""
+        self._open_stream().disconnect()
+        self._rec = None
+        temporary_path(self.path).unlink(missing_ok=True)
+
+    def _open_stream(self) -> rr.RecordingStream:
+        if self._rec is None:
+            raise BadOutput(
+                f"record: {self.path} is closed; open another Recorder for another episode."
+            )
+        return self._rec
+
+    def _log_header(self, rec: rr.RecordingStream) -> None:
+        """What is known before the first step."""
+        header = self._header
+        rec.send_recording_name(f"{header.row.key} · {header.method}")
+        log_properties(rec, "rollout", rollout_properties(header))
+        classes = rr.AnnotationContext([*CLASSES, *coverage_classes(header)])
+        log_row(rec, "/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, classes)
+        log_row(rec, "/vap/instruction", instruction_document(header))
+        log_table(rec, header.row)
+        log_objects(rec, header)
+
+    def _log_first_frame(self, frame: Frame) -> None:
+        """What only the first step shows: shapes, links, and the pictures of the vote."""
+        rec = self._open_stream()
+        log_robot_styles(rec, self._header, frame)
+        log_method_styles(rec, self._header)
+        log_cameras(rec, frame)
+        log_status_styles(rec)
+        log_links(rec, frame.truth)
+        for camera in frame.images:
+            self._log_votes(frame, camera)
+        for j, association in enumerate(self._header.associations):
+            if association is not None:
+                log_association(rec, association, j, frame_times([frame]))
+        self._has_attention = bool(frame.attention)
+        episode_blueprint(self._header, has_attention=self._has_attention).send(rec)
+
+    def _log_votes(self, frame: Frame, camera: str) -> None:
+        """The votes of one view, over the first one's picture."""
+        rec = self._open_stream()
+        at = frame_times([frame])
+        rgb = frame.images[camera]
+        jpeg = encode_jpeg(rgb, JPEG_QUALITY)
+        groundings = self._header.groundings.get(camera, ())
+        if not groundings:
+            log_row(rec, f"{image_root(camera)}/candidates", jpeg_image(jpeg), at=at)
+            return
+        first = groundings[0]
+        log_vote(rec, first, 0, jpeg, at)
+        log_similarity(rec, first, at)
+        log_crops(rec, first, rgb, self._header.references.get(first.object, ()), at)
+        for j, grounding in enumerate(groundings[1:], start=1):
+            log_vote(rec, grounding, j, None, at)
+
+    def _flush(self) -> None:
+        """Send the buffered frames as columns and write them to the file."""
+        rec = self._open_stream()
+        frames = self._unsent
+        if not frames:
+            return
+        index = frame_times(frames)
+        self._pictures.send(rec)
+        self._send_views(frames)
+        send_camera_poses(rec, index, frames)
+        send_robot(rec, index, frames)
+        send_method(rec, self._header, index, frames)
+        send_truth(rec, index, frames)
+        self._grasp_state = send_grasp_changes(
+            rec, frames, self._header.row.target, self._grasp_state
+        )
+        self._send_events([event for frame in frames for event in frame.events])
+        rec.flush()
+        self._unsent = []
+
+    def _send_views(self, frames: list[Frame]) -> None:
+        """Masks, coverage and attention of the frames that have them."""
+        rec = self._open_stream()
+        pictured = [frame for frame in frames if frame.images]
+        if pictured:
+            index = frame_times(pictured)
+            send_masks(rec, self._header, index, pictured)
+            if any(frame.coverage for frame in pictured):
+                send_coverage(rec, self._header, index, pictured)
+        attended = [frame for frame in frames if frame.attention]
+        if attended:
+            send_attention(rec, attended, JPEG_QUALITY)
+
+    def _send_events(self, events: list[Event]) -> None:
+        seconds = {frame.frame_index: frame.timestamp_s for frame in self._frames}
+        send_events(self._open_stream(), events, seconds)
+
+    def _explain_episode(self, outcome: Outcome) -> Explanation:
+        if self._explain is None:
+            return Explanation(None, None)
+        return self._explain(Episode(self._header, tuple(self._frames), outcome, {}))
+
+    def _send_ending(self, outcome: Outcome, explanation: Explanation) -> None:
+        """How the episode ended, at its last step, and why."""
+        rec = self._open_stream()
+        index = frame_times(self._frames)
+        send_reward(rec, index, len(self._frames), outcome.success)
+        send_outcome(rec, self._frames[0], outcome.status)
+        self._send_events(self._ending_events(outcome, explanation.diagnosis))
+        if explanation.trace is not None:
+            send_gripper(rec, explanation.trace, index)
+        if explanation.diagnosis is not None:
+            blueprint = episode_blueprint(
+                self._header, explanation.diagnosis, has_attention=self._has_attention
+            )
+            blueprint.send(rec)
+
+    def _ending_events(self, outcome: Outcome, diagnosis: Diagnosis | None) -> list[Event]:
+        """The deciding moment of a failure, and the end."""
+        events = []
+        if diagnosis is not None:
+            events.append(Event(diagnosis.frame_index, "ERROR", describe_diagnosis(diagnosis)))
+        text = f"episode ends: {describe_outcome(outcome)}"
+        last = self._frames[-1].frame_index
+        events.append(Event(last, OUTCOME_LEVELS[outcome.status], text))
+        return events

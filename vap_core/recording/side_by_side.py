@@ -1,0 +1,101 @@
+"""Several methods on the same episode, in one recording with one timeline."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from vap_core.base.errors import BadStudy
+from vap_core.recording.blueprint import full_window
+from vap_core.recording.colours import BACKGROUND
+from vap_core.recording.reading import read_chunks, read_summary
+from vap_core.recording.stream import finish_stream, open_stream
+
+EPISODE_COLUMNS = ("suite", "task", "episode", "seed")
+"""What recordings of one episode share."""
+
+
+def combine_recordings(recordings: Mapping[str, Path], out: Path) -> None:
+    """Copy recordings of one episode into `out`, each below its own name.
+
+    `/vap/...` of "generic" becomes `/generic/vap/...`.
+
+    Raises: BadStudy, when they are not of the same episode; BadRecording, when one cannot be read;
+        BadOutput, when `out` exists.
+    """
+    summaries = {name: read_summary(path) for name, path in recordings.items()}
+    suite, task, episode, seed = _common_episode(summaries)
+    recording_id = ".".join(["together", suite, task, episode, seed, *recordings])
+    rec = open_stream(out, recording_id)
+    rec.send_recording_name(" · ".join([suite, task, episode, " against ".join(recordings)]))
+    columns = []
+    for name, path in recordings.items():
+        image_roots = _copy_below(rec, name, path)
+        columns.append(_method_column(name, image_roots))
+    fps = next(iter(summaries.values())).get("hz") or 1.0
+    full_window(rrb.Horizontal(*columns), float(fps)).send(rec)
+    finish_stream(rec, out)
+
+
+def _common_episode(summaries: Mapping[str, dict[str, Any]]) -> list[str]:
+    """EPISODE_COLUMNS of all recordings. Raises: BadStudy."""
+    episodes = {}
+    for name, summary in summaries.items():
+        episodes[name] = [str(summary.get(column)) for column in EPISODE_COLUMNS]
+    first = next(iter(episodes.values()))
+    if list(episodes.values()).count(first) < len(episodes):
+        parts = [" ".join([name, *episode]) for name, episode in episodes.items()]
+        raise BadStudy(f"together: these are not recordings of one episode: {'; '.join(parts)}.")
+    return first
+
+
+def _copy_below(rec: rr.RecordingStream, name: str, path: Path) -> list[str]:
+    """Copy a recording below `/name`; returns the camera entities with prompted pictures."""
+    roots = []
+    for chunk in read_chunks(path):
+        if chunk.entity_path.startswith("/__"):
+            continue
+        parent, _, entity = chunk.entity_path.rpartition("/")
+        image_root = parent.removeprefix("/")
+        is_prompted = image_root.startswith("observation.images.") and entity == "prompted"
+        if is_prompted and image_root not in roots:
+            roots.append(image_root)
+        rec.send_chunks(chunk.with_entity_path(f"/{name}{chunk.entity_path.rstrip('/')}"))
+    return roots
+
+
+def _method_column(name: str, image_roots: list[str]) -> rrb.Container:
+    """One method: text, views as the policy saw them, the scene, the gripper, the states."""
+    views = [_prompted_view(name, root) for root in image_roots]
+    scene = rrb.Spatial3DView(
+        origin=f"/{name}",
+        contents=[f"/{name}/world/**"],
+        name=f"{name} · scene",
+        background=BACKGROUND,
+        line_grid=rrb.LineGrid3D(visible=False),
+    )
+    text = rrb.TextDocumentView(origin=f"/{name}/vap/instruction", name=f"{name} · instruction")
+    gripper = rrb.TimeSeriesView(
+        origin=f"/{name}/vap/hand",
+        name=f"{name} · hand",
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
+    )
+    status = rrb.StateTimelineView(origin=f"/{name}/vap/status", name=f"{name} · course")
+    return rrb.Vertical(
+        text,
+        rrb.Horizontal(*views, scene),
+        rrb.Horizontal(gripper, status),
+        row_shares=[0.9, 2.2, 1.1],
+    )
+
+
+def _prompted_view(name: str, image_root: str) -> rrb.Spatial2DView:
+    camera = image_root.removeprefix("observation.images.")
+    return rrb.Spatial2DView(
+        origin=f"/{name}/{image_root}",
+        contents=[f"/{name}/{image_root}/prompted"],
+        name=f"{name} · {camera}",
+        background=BACKGROUND,
+    )

@@ -1,0 +1,120 @@
+"""Writing to a recording: the stream into its file, one row, and time columns."""
+
+from collections.abc import Sequence
+from datetime import timedelta
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+import rerun_bindings
+
+from vap_core.base.errors import BadOutput
+from vap_core.recording.file import temporary_path
+from vap_core.rollout.types import Frame
+
+type Moment = tuple[int, float]
+"""Control step and seconds since the episode's start."""
+
+
+def open_stream(path: Path, recording_id: str) -> rr.RecordingStream:
+    """A stream into `temporary_path(path)`.
+
+    It flushes only on request, so that equal runs give equal chunks.
+
+    Raises: BadOutput, when `path` exists or its folder cannot be written.
+    """
+    if path.exists():
+        raise BadOutput(
+            f"record: {path} already exists and is never overwritten; "
+            "choose another folder or remove it."
+        )
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary_path(path).write_bytes(b"")
+    except OSError as err:
+        raise BadOutput(
+            f"record: cannot write in {path.parent} ({err.strerror}); "
+            "choose a folder you may write to."
+        ) from err
+    # Otherwise every finished recording keeps its threads and some megabytes.
+    rerun_bindings.flush_and_cleanup_orphaned_recordings()
+    config = rr.ChunkBatcherConfig(
+        flush_tick=timedelta(days=365),
+        flush_num_bytes=2**40,
+        flush_num_rows=2**40,
+    )
+    rec = rr.RecordingStream(
+        "vap", recording_id=recording_id, send_properties=False, batcher_config=config
+    )
+    rec.set_log_time_enabled(False)
+    rec.save(temporary_path(path))
+    return rec
+
+
+def finish_stream(rec: rr.RecordingStream, path: Path) -> None:
+    """Write the footer, then give the recording its name."""
+    rec.flush()
+    rec.disconnect()
+    if path.exists():
+        raise BadOutput(
+            f"record: {path} appeared meanwhile; "
+            f"this run's recording is kept as {temporary_path(path)}."
+        )
+    temporary_path(path).replace(path)
+
+
+class StoredBlueprint(rrb.Blueprint):
+    """A blueprint that ends the stream it is sent through.
+
+    Rerun would keep one stream for each, with its threads, until the process ends.
+    """
+
+    def _log_to_stream(self, stream: rr.RecordingStream) -> None:
+        super()._log_to_stream(stream)
+        self._stream = stream
+
+    def send(self, rec: rr.RecordingStream) -> None:
+        """Make it the layout that the recording opens with."""
+        rec.send_blueprint(self)
+        self._stream.disconnect()
+
+
+def log_row(
+    rec: rr.RecordingStream,
+    entity: str,
+    *archetypes: rr.AsComponents,
+    at: Sequence[rr.TimeColumn] = (),
+) -> None:
+    """Write one row, static without `at`.
+
+    As a column of its own it keeps its place in the file; `rec.log` may move it.
+    """
+    columns = []
+    for archetype in archetypes:
+        for batch in archetype.as_component_batches():
+            columns.append(batch.partition([len(batch.as_arrow_array())]))
+    rec.send_columns(entity, at, columns)
+
+
+def log_properties(rec: rr.RecordingStream, group: str, values: rr.AnyValues) -> None:
+    """Recording properties are static components of a reserved entity."""
+    log_row(rec, f"/__properties/{group}", values)
+
+
+def time_columns(moments: Sequence[Moment]) -> list[rr.TimeColumn]:
+    """The two timelines of a recording."""
+    steps = []
+    seconds = []
+    for step, second in moments:
+        steps.append(step)
+        seconds.append(second)
+    return [
+        rr.TimeColumn("frame_index", sequence=steps),
+        rr.TimeColumn("timestamp", duration=np.array(seconds, np.float64)),
+    ]
+
+
+def frame_times(frames: Sequence[Frame]) -> list[rr.TimeColumn]:
+    """The time columns of frames."""
+    return time_columns([(frame.frame_index, frame.timestamp_s) for frame in frames])

@@ -1,0 +1,1 @@
+"""The closed loop, and the episodes that it makes."""

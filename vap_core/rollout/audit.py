@@ -1,0 +1,57 @@
+"""Does the prompt reach the policy? Every call is made twice, with the prompted and with the raw
+input, and what was consumed is compared.
+
+The second call's chunks are discarded: an audited run ends as the same run without audit does.
+"""
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from vap_core.base.errors import BadPolicy
+from vap_core.policies.hooks import TEXT, observe_inputs
+from vap_core.policies.protocol import Chunk, Policy, PolicyInput
+from vap_core.rollout.types import ConsumedInput
+
+Digests = tuple[Mapping[str, str], Mapping[str, str]]
+"""By camera or TEXT: digests of what was consumed of the prompted, and of the raw input."""
+
+
+def plan(
+    policy: Policy[Any],
+    states: Sequence[Any],
+    prompted: Sequence[PolicyInput],
+    raw: Sequence[PolicyInput],
+) -> tuple[list[Any], list[Chunk], list[Digests]]:
+    """The policy's chunks for the prompted inputs, and what it consumed in each episode.
+
+    Raises: BadPolicy when the policy reports nothing.
+    """
+    spare = copy.deepcopy(list(states))
+    with observe_inputs() as of_prompted:
+        after, chunks = policy.plan(states, prompted)
+    with observe_inputs() as of_raw:
+        policy.plan(spare, raw)
+    if len(of_prompted) != len(prompted):
+        raise BadPolicy(
+            f"audit: {policy.label} does not report what it consumes; call "
+            "vap_core.policies.hooks.report_input where it uses its inputs."
+        )
+    digests: list[Digests] = [(of_prompted[i], of_raw[i]) for i in range(len(prompted))]
+    return after, chunks, digests
+
+
+def compare(
+    step: int, prompted: PolicyInput, raw: PolicyInput, digests: Digests
+) -> list[ConsumedInput]:
+    """What one episode consumed in one call; views that the policy does not read are left out."""
+    of_prompted, of_raw = digests
+    found = []
+    for name, digest in of_prompted.items():
+        if name == TEXT:
+            pixels, changed = 0, prompted.text != raw.text
+        else:
+            differs = (prompted.images[name] != raw.images[name]).any(axis=2)
+            pixels, changed = int(differs.sum()), bool(differs.any())
+        found.append(ConsumedInput(step, name, changed, pixels, digest, of_raw[name]))
+    return found

@@ -1,0 +1,427 @@
+"""The closed loop for a batch of episodes: observe, prompt, plan, act, until every episode is over.
+
+Nothing here records, or measures success beyond the suite's judge; sinks and tables read the values
+that it yields.
+"""
+
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+
+from vap_core.base.errors import BadAction, OutOfReach, VapError
+from vap_core.base.types import Attended
+from vap_core.policies.hooks import AttentionMap, AttentionMaps, observe_attention
+from vap_core.policies.protocol import Chunk, Policy, PolicyInput, PrivilegedPolicy
+from vap_core.rollout import audit
+from vap_core.rollout.coverage import mask_coverage
+from vap_core.rollout.prompters.protocol import PromptContext, Prompter, SceneTruth, unchanged
+from vap_core.rollout.types import ConsumedInput, Episode, EpisodeHeader, Frame, MaskCoverage
+from vap_core.simulation.env import Control, Env
+from vap_core.simulation.occluder import Occlusion
+from vap_core.simulation.scenes import Scene
+from vap_core.simulation.sensor import PERFECT, Sensor
+from vap_core.simulation.suites.rules import Judge
+from vap_core.simulation.types import EpisodeRow, Observation, Outcome
+
+
+@runtime_checkable
+class Sink(Protocol):
+    """Where the frames of one episode stream to, a recording for example."""
+
+    def frame(self, frame: Frame) -> None: ...
+
+    def close(self, outcome: Outcome) -> None: ...
+
+
+OpenSink = Callable[[EpisodeHeader], Sink]
+Follow = Literal["call", "step"]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a batch of episodes shares.
+
+    A privileged policy needs no images; it gets them every `images_every` control steps (0: never),
+    for their cost or for show. `follow` is when images are taken and targets tracked: when the
+    policy is called, which is all that it ever sees, or at every control step. `audit` keeps what
+    the policy consumed in every call (rollout.audit), `attention` where it looked (policies.hooks).
+    """
+
+    method: str
+    scene: Scene
+    policy: Policy[Any] | PrivilegedPolicy[Any]
+    prompter: Prompter[Any]
+    control: Control = "ee"
+    sensor: Sensor = PERFECT
+    images_every: int = 0
+    occlusion: Occlusion | None = None
+    follow: Follow = "step"
+    audit: bool = False
+    attention: bool = False
+
+    @property
+    def bound(self) -> bool:
+        """Whether the policy or the prompter reads the simulator: then results are bounds."""
+        return isinstance(self.policy, PrivilegedPolicy) or self.prompter.needs_truth != "never"
+
+
+@dataclass
+class RunningEpisode:
+    """One episode under way; the only mutable value of the loop."""
+
+    row: EpisodeRow
+    env: Env
+    judge: Judge
+    keeps_images: bool
+    policy_state: Any = None
+    prompter_state: Any = None
+    header: EpisodeHeader | None = None
+    sink: Sink | None = None
+    queue: deque[np.ndarray] = field(default_factory=deque)
+    """Actions of the last chunk that are still to be executed."""
+    frames: list[Frame] = field(default_factory=list)
+    consumed: list[ConsumedInput] = field(default_factory=list)
+    attention: dict[str, AttentionMap] = field(default_factory=dict)
+    """Where the policy looked in this step's call."""
+    seconds: dict[str, float] = field(
+        default_factory=lambda: {"attend": 0.0, "policy": 0.0, "record": 0.0}
+    )
+    outcome: Outcome | None = None
+
+    @property
+    def over(self) -> bool:
+        """Whether no action is left to take."""
+        return self.judge.done or self.judge.steps >= self.row.max_steps
+
+
+Step = tuple[Observation, Attended]
+"""What one episode observed in this step, and what its prompter made of it."""
+
+
+def rollout(
+    trial: Trial,
+    rows: Sequence[EpisodeRow],
+    sink: OpenSink | None = None,
+    *,
+    batch: int = 4,
+    keep_images: bool = False,
+) -> Iterator[Episode]:
+    """Run every row once and yield its episode; the result does not depend on `batch`.
+
+    An exception inside an episode ends that episode with status "error" and its traceback in
+    `detail`; the others go on. Frames keep their images only with `keep_images`; a sink always gets
+    them.
+    """
+    keeps_images = sink is not None or keep_images
+    for first in range(0, len(rows), batch):
+        running = [_begin(trial, row, keeps_images) for row in rows[first : first + batch]]
+        while live := [episode for episode in running if episode.outcome is None]:
+            steps = _observe_and_prompt(trial, live, sink)
+            live = [episode for episode in live if episode.outcome is None]
+            _plan(trial, live, steps)
+            for episode in live:
+                if episode.outcome is None:
+                    observation, attended = steps[id(episode)]
+                    _guard(episode, _act, trial, episode, observation, attended, keep_images)
+        for episode in running:
+            yield _end(trial, episode)
+
+
+def _begin(trial: Trial, row: EpisodeRow, keeps_images: bool) -> RunningEpisode:
+    env = Env(
+        trial.scene,
+        cameras=row.cameras or None,
+        control=trial.control,
+        sensor=trial.sensor,
+        occlusion=trial.occlusion,
+    )
+    env.reset(row)
+    judge = Judge.start(row, trial.scene.sizes_m, env.truth())
+    episode = RunningEpisode(row, env, judge, keeps_images)
+    rng = np.random.default_rng([row.seed, row.episode])
+    episode.policy_state = _guard(episode, trial.policy.start, rng)
+    return episode
+
+
+def _observe_and_prompt(
+    trial: Trial, live: Sequence[RunningEpisode], sink: OpenSink | None
+) -> dict[int, Step]:
+    """Render and prompt every episode; at t = 0 open its sink. An episode that fails here ends and
+    is left out."""
+    observations: dict[int, Observation] = {}
+    for episode in live:
+        observation = _guard(episode, _observe, trial, episode)
+        if observation is not None:
+            observations[id(episode)] = observation
+
+    following = []
+    for episode in live:
+        observation = observations.get(id(episode))
+        if episode.prompter_state is not None and observation is not None and observation.images:
+            following.append(episode)
+    prompted = _prompt_batch(trial, following, observations)
+
+    steps: dict[int, Step] = {}
+    for episode in live:
+        if episode.outcome is not None:
+            continue
+        observation = observations[id(episode)]
+        attended = prompted.get(id(episode))
+        if attended is None:
+            attended = _guard(episode, _start_prompting, trial, episode, observation)
+        if attended is None:
+            continue
+        if episode.header is None:
+            _guard(episode, _open_sink, trial, episode, attended, sink)
+        if episode.outcome is None:
+            steps[id(episode)] = observation, attended
+    return steps
+
+
+def _observe(trial: Trial, episode: RunningEpisode) -> Observation:
+    if _takes_images(trial, episode):
+        return episode.env.observe()
+    return Observation({}, episode.env.state())
+
+
+def _takes_images(trial: Trial, episode: RunningEpisode) -> bool:
+    """Whether this control step renders: always the first; else when the policy is called, or every
+    step is wanted."""
+    if isinstance(trial.policy, PrivilegedPolicy):
+        every = trial.images_every
+        return episode.keeps_images or bool(every and episode.judge.steps % every == 0)
+    if trial.follow == "step" or episode.header is None:
+        return True
+    return not episode.queue or episode.over
+
+
+def _start_prompting(trial: Trial, episode: RunningEpisode, observation: Observation) -> Attended:
+    """Start the prompter at the first step with images; a step without images passes unchanged."""
+    if not observation.images:
+        return unchanged(observation.images, episode.row.instruction)
+    context = _context(trial, episode)
+    with _timed(episode.seconds, "attend"):
+        state, attended = trial.prompter.start(observation, context)
+    episode.prompter_state = state
+    return attended
+
+
+def _prompt_batch(
+    trial: Trial,
+    following: Sequence[RunningEpisode],
+    observations: dict[int, Observation],
+) -> dict[int, Attended]:
+    """Prompt in one batch; when that fails, retry one at a time to isolate the failing episode."""
+    if not following:
+        return {}
+    start = time.perf_counter()
+    try:
+        results = trial.prompter.steps(
+            [episode.prompter_state for episode in following],
+            [observations[id(episode)] for episode in following],
+            [_context(trial, episode) for episode in following],
+        )
+    except Exception as error:
+        if _ends_the_run(error):
+            raise
+        if len(following) == 1:
+            _fail(following[0])
+            return {}
+        one_by_one: dict[int, Attended] = {}
+        for episode in following:
+            one_by_one |= _prompt_batch(trial, [episode], observations)
+        return one_by_one
+    share = (time.perf_counter() - start) / len(following)
+    attended = {}
+    for episode, (state, of_episode) in zip(following, results, strict=True):
+        episode.prompter_state = state
+        episode.seconds["attend"] += share
+        attended[id(episode)] = of_episode
+    return attended
+
+
+def _context(trial: Trial, episode: RunningEpisode) -> PromptContext:
+    """What the prompter may know; ground truth only if it declares that it needs it now."""
+    started = episode.prompter_state is not None
+    needs = trial.prompter.needs_truth
+    truth = None
+    if needs == "always" or (needs == "start" and not started):
+        truth = SceneTruth(episode.row, episode.env.truth(masks=True).masks)
+    cameras = {camera.name: camera for camera in episode.env.cameras()}
+    return PromptContext(episode.row.instruction, cameras, truth)
+
+
+def _open_sink(
+    trial: Trial, episode: RunningEpisode, attended: Attended, sink: OpenSink | None
+) -> None:
+    episode.header = _header(trial, episode, attended)
+    with _timed(episode.seconds, "record"):
+        episode.sink = sink(episode.header) if sink is not None else None
+
+
+def _header(trial: Trial, episode: RunningEpisode, attended: Attended) -> EpisodeHeader:
+    row, env = episode.row, episode.env
+    return EpisodeHeader(
+        row=row,
+        method=trial.method,
+        policy=trial.policy.label,
+        hz=env.hz,
+        cameras=env.cameras(),
+        instruction=row.instruction,
+        rewritten=attended.text,
+        groundings=attended.groundings,
+        object_sizes_m={place.model: trial.scene.sizes_m[place.model] for place in row.placements},
+        action_names=env.action_names,
+        associations=attended.associations,
+        references=trial.prompter.references,
+    )
+
+
+def _plan(trial: Trial, live: Sequence[RunningEpisode], steps: dict[int, Step]) -> None:
+    """Call the policy, in one batch, for every episode that goes on and whose chunk is used up."""
+    calling = [episode for episode in live if not episode.queue and not episode.over]
+    if not calling:
+        return
+    start = time.perf_counter()
+    try:
+        states, chunks = _call_policy(trial, calling, [steps[id(episode)] for episode in calling])
+    except Exception as error:
+        if _ends_the_run(error):
+            raise
+        if len(calling) == 1:
+            _fail(calling[0])
+            return
+        for episode in calling:  # one at a time, to isolate the failing episode
+            _plan(trial, [episode], steps)
+        return
+    share = (time.perf_counter() - start) / len(calling)
+    for episode, state, chunk in zip(calling, states, chunks, strict=True):
+        episode.policy_state = state
+        episode.queue.extend(chunk[: trial.policy.execute])
+        episode.seconds["policy"] += share
+
+
+def _call_policy(
+    trial: Trial, calling: Sequence[RunningEpisode], steps: Sequence[Step]
+) -> tuple[list[Any], list[Chunk]]:
+    policy, states = trial.policy, [episode.policy_state for episode in calling]
+    if isinstance(policy, PrivilegedPolicy):
+        return policy.plan_from_simulation(states, [episode.env for episode in calling])
+
+    raw, prompted = [], []
+    for episode, (observation, attended) in zip(calling, steps, strict=True):
+        state = observation.state
+        raw.append(PolicyInput(observation.images, episode.row.instruction, state))
+        prompted.append(PolicyInput(attended.images, attended.text, state))
+
+    observer: AbstractContextManager[AttentionMaps] = nullcontext({})
+    if trial.attention:
+        observer = observe_attention()
+    with observer as maps:
+        if trial.audit:
+            after, chunks, consumed = audit.plan(policy, states, prompted, raw)
+            for episode, of_prompted, of_raw, digests in zip(
+                calling, prompted, raw, consumed, strict=True
+            ):
+                step = episode.judge.steps
+                episode.consumed += audit.compare(step, of_prompted, of_raw, digests)
+        else:
+            after, chunks = policy.plan(states, prompted)
+    for i, episode in enumerate(calling):
+        episode.attention = maps.get(i, {})
+    return after, chunks
+
+
+def _act(
+    trial: Trial,
+    episode: RunningEpisode,
+    observation: Observation,
+    attended: Attended,
+    keep_images: bool,
+) -> None:
+    """Pass the frame on and execute one action, or none when the episode is over."""
+    action = None if episode.over else episode.queue.popleft()
+    prompts = trial.prompter.highlights and bool(attended.tracks)
+    needs_masks = bool(observation.images) and (episode.sink is not None or prompts)
+    truth = episode.env.truth(masks=needs_masks)
+    coverage: tuple[MaskCoverage, ...] = ()
+    if prompts:
+        opening = not episode.frames
+        coverage = mask_coverage(attended, truth, episode.row.target, opening=opening)
+    frame = Frame(
+        frame_index=episode.judge.steps,
+        timestamp_s=episode.env.time_s,
+        images=observation.images,
+        prompted=attended.images,
+        tracks=attended.tracks,
+        cameras=episode.env.cameras(),
+        state=observation.state,
+        action=action,
+        truth=truth,
+        events=(*attended.events, *episode.judge.events),
+        coverage=coverage,
+        attention=episode.attention,
+    )
+    if episode.over:
+        episode.outcome = episode.judge.outcome()
+    episode.attention = {}
+    with _timed(episode.seconds, "record"):
+        if episode.sink is not None:
+            episode.sink.frame(frame)
+    episode.frames.append(frame if keep_images else frame.without_images())
+    if action is not None:
+        episode.env.step(action)
+        episode.judge = episode.judge.step(episode.env.truth())
+
+
+def _end(trial: Trial, episode: RunningEpisode) -> Episode:
+    assert episode.outcome is not None
+    with _timed(episode.seconds, "record"):
+        if episode.sink is not None:
+            _guard(episode, episode.sink.close, episode.outcome)
+    header = episode.header
+    if header is None:
+        header = _header(trial, episode, unchanged({}, episode.row.instruction))
+    seconds = {**episode.env.seconds, **episode.seconds}
+    consumed = tuple(episode.consumed)
+    return Episode(header, tuple(episode.frames), episode.outcome, seconds, consumed)
+
+
+def _guard[**P, R](
+    episode: RunningEpisode, work: Callable[P, R], *args: P.args, **kwargs: P.kwargs
+) -> R | None:
+    """Do one episode's share of a step; its failure ends that episode alone, as an error with its
+    traceback."""
+    try:
+        return work(*args, **kwargs)
+    except Exception as error:
+        if _ends_the_run(error):
+            raise
+        _fail(episode)
+        return None
+
+
+def _fail(episode: RunningEpisode) -> None:
+    """End an episode with the exception that is being handled."""
+    episode.outcome = episode.judge.outcome("error", traceback.format_exc(limit=8))
+
+
+def _ends_the_run(error: Exception) -> bool:
+    """Whether the user has to act (a full disk, an absent weight); a bad action fails its own
+    episode only."""
+    return isinstance(error, VapError) and not isinstance(error, OutOfReach | BadAction)
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], part: str) -> Iterator[None]:
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        seconds[part] += time.perf_counter() - start

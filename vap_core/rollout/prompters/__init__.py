@@ -1,0 +1,1 @@
+"""What stands between the cameras and the policy under one method."""

@@ -1,0 +1,86 @@
+"""Prompters that change words only: the images pass unchanged (P 5.2; SPEC section 4)."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Literal
+
+from vap_core.base.errors import BadMemory
+from vap_core.base.types import Attended, PersonalObject, Rgb
+from vap_core.instruction import parse
+from vap_core.rollout.prompters.protocol import PromptContext, unchanged
+from vap_core.simulation.types import Observation
+
+
+@dataclass(frozen=True)
+class HardPrompt:
+    """The object's description, short or long, is appended to the instruction."""
+
+    length: Literal["short", "long"]
+
+
+@dataclass(frozen=True)
+class SoftPrompt:
+    """The personal span is replaced by a reserved word whose embedding was learned (SPEC section
+    4)."""
+
+
+class TextPrompter:
+    """Passes images unchanged; the policy reads `rewrite(instruction)` in every step of an
+    episode."""
+
+    needs_truth: Literal["never", "start", "always"] = "never"
+    highlights = False
+    references: Mapping[str, tuple[Rgb, ...]] = MappingProxyType({})
+
+    def __init__(self, rewrite: Callable[[str], str]) -> None:
+        self.rewrite = rewrite
+
+    def start(self, observation: Observation, context: PromptContext) -> tuple[str, Attended]:
+        """The state of an episode is its text."""
+        text = self.rewrite(context.instruction)
+        return text, unchanged(observation.images, text)
+
+    def steps(
+        self,
+        states: Sequence[str],
+        observations: Sequence[Observation],
+        contexts: Sequence[PromptContext],
+    ) -> list[tuple[str, Attended]]:
+        results = []
+        for text, observation in zip(states, observations, strict=True):
+            results.append((text, unchanged(observation.images, text)))
+        return results
+
+
+def generic() -> TextPrompter:
+    """The generic policy: raw images, raw instruction."""
+    return TextPrompter(str)
+
+
+def hard_prompt(obj: PersonalObject, how: HardPrompt) -> TextPrompter:
+    """ "pick up my cup" -> "pick up my cup. My cup is white with blue spots."
+
+    Raises: BadMemory when the object was never described.
+    """
+    if obj.description is None:
+        raise BadMemory(
+            f"hard_prompt: {obj.name!r} has no description; register it again with --replace, or "
+            "delete its file."
+        )
+    phrase = obj.description.short if how.length == "short" else obj.description.long
+
+    def append(instruction: str) -> str:
+        return f"{instruction.rstrip(' .')}. My {obj.category} is {phrase}."
+
+    return TextPrompter(append)
+
+
+def soft_prompt(word: str) -> TextPrompter:
+    """ "pick up my cup" -> "pick up <my_0>", where `word` is "<my_0>"."""
+
+    def replace_span(instruction: str) -> str:
+        target = parse(instruction).targets[0]
+        return instruction[: target.start] + word + instruction[target.stop :]
+
+    return TextPrompter(replace_span)

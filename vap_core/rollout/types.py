@@ -1,0 +1,148 @@
+"""What a rollout yields: episodes, their frames, and what the prompts covered."""
+
+from collections.abc import Mapping
+from dataclasses import field, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+from vap_core.base.types import Association, Camera, Event, Grounding, Rgb, Track, Views, value
+from vap_core.simulation.types import EE_ACTION, Action, EpisodeRow, Outcome, Truth
+
+
+@value
+class EpisodeHeader:
+    """What is known before the first action: written once at the head of a recording."""
+
+    row: EpisodeRow
+    method: str
+    policy: str
+    hz: float
+    cameras: tuple[Camera, ...]
+    instruction: str
+    rewritten: str
+    groundings: Mapping[str, tuple[Grounding, ...]]
+    object_sizes_m: Mapping[str, tuple[float, float, float]]
+    """Full extents of every object's bounding box, by model name."""
+    action_names: tuple[str, ...] = EE_ACTION
+    associations: tuple[Association | None, ...] = ()
+    """Those of `Attended`."""
+    references: Mapping[str, tuple[Rgb, ...]] = field(default_factory=dict)
+    """The remembered crops of every object that the instruction may refer to, by name."""
+
+
+@value
+class MaskCoverage:
+    """What the prompt covered in one view at one control step, by ground truth. Only the diagnosis
+    reads it.
+
+    `object` is the object that the mask lies on: its name, "" for none in particular, None where
+    nothing is highlighted.
+    `iou` compares the mask with the target's visible pixels, of which there are `pixels`.
+    `proposal`, at t = 0, is the best box IoU of any candidate with the target; nan later."""
+
+    camera: str
+    object: str | None
+    iou: float
+    pixels: int
+    proposal: float
+
+
+@value
+class Frame:
+    """One control step: what was seen, what the policy was shown, what it did.
+
+    `action` was decided from `images`; the terminal frame has none (None), because nothing is
+    executed after it. `coverage` has an entry per view at steps whose images were prompted.
+    `attention`, at steps in which the policy was observed while it planned, is the share of its
+    attention on every image patch."""
+
+    frame_index: int
+    timestamp_s: float
+    images: Views
+    prompted: Views
+    tracks: Mapping[str, tuple[Track, ...]]
+    cameras: tuple[Camera, ...]
+    state: Float32[np.ndarray, " s"]
+    action: Action | None
+    truth: Truth
+    events: tuple[Event, ...]
+    coverage: tuple[MaskCoverage, ...] = ()
+    attention: Mapping[str, Float32[np.ndarray, "_ _"]] = field(default_factory=dict)
+
+    def without_images(self) -> "Frame":
+        """The same step without pictures, masks and attention, to keep in memory."""
+        truth = replace(self.truth, masks={})
+        return replace(self, images={}, prompted={}, tracks={}, truth=truth, attention={})
+
+
+@value
+class ConsumedInput:
+    """One thing that the policy consumed in one call of one episode: a camera's image, or the text.
+
+    `changed` says whether the prompt changes it: pixels tinted in that view, or words rewritten.
+    `consumed` and `raw` are digests of what the policy consumed of the prompted and of the raw
+    input."""
+
+    step: int
+    name: str
+    changed: bool
+    pixels: int
+    consumed: str
+    raw: str
+
+    @property
+    def sound(self) -> bool:
+        """What the prompt changes is consumed differently, and nothing else is."""
+        return (self.consumed != self.raw) == self.changed
+
+
+@value
+class Episode:
+    """A finished episode. `seconds` sums wall time by part: physics, render, attend, policy,
+    record, ...
+
+    `consumed` is empty unless the rollout was audited.
+    """
+
+    header: EpisodeHeader
+    frames: tuple[Frame, ...]
+    outcome: Outcome
+    seconds: Mapping[str, float]
+    consumed: tuple[ConsumedInput, ...] = ()
+
+    @property
+    def key(self) -> tuple[str, str, str, int, int]:
+        """Suite, task, method, seed and episode: its name within a run."""
+        row = self.header.row
+        return row.suite, row.task, self.header.method, row.seed, row.episode
+
+    def summary(self) -> dict[str, Any]:
+        """One flat row of a results table."""
+        row, outcome = self.header.row, self.outcome
+        groundings = [g for per_view in self.header.groundings.values() for g in per_view]
+        margins = [g.ballot.margin for g in groundings]
+        timings = {f"seconds_{part}": seconds for part, seconds in self.seconds.items()}
+        return {
+            "suite": row.suite,
+            "task": row.task,
+            "split": row.split,
+            "variant": row.variant,
+            "episode": row.episode,
+            "seed": row.seed,
+            "method": self.header.method,
+            "policy": self.header.policy,
+            "outcome": outcome.status,
+            "success": outcome.success,
+            "success_once": outcome.success_once,
+            "held_steps": outcome.held_steps,
+            "cmr": outcome.cmr,
+            "wrong_object": outcome.wrong_object,
+            "first_object_correct": outcome.first_object_correct,
+            "touched": outcome.touched,
+            "steps": outcome.steps,
+            "margin": min(margins) if margins else None,
+            "detail": outcome.detail,
+            **timings,
+        }

@@ -1,1 +1,0 @@
-"""Parametric bodies, a module a kind: frozen lengths that give a mesh and its collision solids (shapes.Shape)."""

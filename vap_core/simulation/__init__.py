@@ -1,0 +1,1 @@
+"""MuJoCo scenes, robots, cameras, and the benchmark suites."""

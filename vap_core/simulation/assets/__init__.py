@@ -1,0 +1,1 @@
+"""The objects of the scenes: parametric meshes and textures, and imported scans."""

@@ -1,0 +1,289 @@
+"""Potted plants, and scrubbers knitted as fruit."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from vap_core.simulation.assets.bodies.plants import Plant
+from vap_core.simulation.assets.bodies.scrubber import Scrubber
+from vap_core.simulation.assets.catalogue.colours import (
+    AVOCADO,
+    BERRY,
+    CLAY,
+    EUCALYPTUS,
+    LEMON,
+    MULBERRY,
+    PORCELAIN,
+    SALMON,
+    SEED,
+    SKY,
+    STALK,
+    VIOLET,
+    VIVID_COLOURS,
+)
+from vap_core.simulation.assets.catalogue.family import Family
+from vap_core.simulation.assets.catalogue.sampling import choose
+from vap_core.simulation.assets.textures import Srgb, Texture
+
+LEAF_COLOURS: tuple[Srgb, ...] = (
+    (72, 128, 64),
+    (96, 150, 84),
+    (56, 104, 72),
+    (130, 160, 90),
+    (84, 132, 108),
+    (112, 140, 60),
+)
+POT_COLOURS: tuple[Srgb, ...] = (
+    (178, 102, 72),
+    (226, 222, 212),
+    (110, 116, 122),
+    (196, 162, 120),
+    (84, 108, 140),
+    (208, 176, 72),
+    (160, 84, 92),
+)
+
+
+def _draw_plant(rng: np.random.Generator) -> Plant:
+    pot, spread, rise, pot_height = rng.uniform(
+        (0.0175, 0.0235, 0.024, 0.036), (0.0205, 0.0285, 0.036, 0.041)
+    ).tolist()
+    return Plant(
+        kind=choose(rng, ("rosette", "aloe", "cactus", "bush")),
+        pot=pot,
+        pot_height=pot_height,
+        height=pot_height + rise,
+        spread=spread,
+        leaves=int(rng.integers(6, 10)),
+        blunt=float(rng.uniform(0.45, 0.9)),
+        tips=choose(rng, ("ink", "accent")),
+        rim=choose(rng, ("base", "accent", "none")),
+    )
+
+
+def _draw_scrubber(rng: np.random.Generator) -> Scrubber:
+    radius, body, bump, leaf, loop = rng.uniform(
+        (0.0195, 0.044, 0.010, 0.014, 0.0085), (0.0220, 0.054, 0.030, 0.020, 0.0105)
+    ).tolist()
+    return Scrubber(
+        outline=choose(rng, ("pear", "drum", "ball")),
+        radius=radius,
+        body=body,
+        rows=int(rng.integers(5, 9)),
+        bump=bump,
+        leaves=choose(rng, (0, 4, 5, 8)),
+        leaf=leaf,
+        loop=loop,
+    )
+
+
+def _recolour_plant(texture: Texture, index: int) -> Texture:
+    """A pot in the base colour, leaves in the ink; every other plant has vivid tips."""
+    accent = texture.accent
+    if index % 2:
+        accent = VIVID_COLOURS[(3 * index) % len(VIVID_COLOURS)]
+    return replace(
+        texture,
+        base=POT_COLOURS[index % len(POT_COLOURS)],
+        ink=LEAF_COLOURS[index % len(LEAF_COLOURS)],
+        accent=accent,
+    )
+
+
+def _recolour_scrubber(texture: Texture, index: int) -> Texture:
+    """A vivid body with a soft motif; two in three have a green crown."""
+    accent = texture.accent
+    if index % 3:
+        accent = LEAF_COLOURS[index % len(LEAF_COLOURS)]
+    rng = np.random.default_rng(index)
+    return Texture(
+        base=VIVID_COLOURS[(3 * index + 1) % len(VIVID_COLOURS)],
+        ink=texture.base,
+        accent=accent,
+        motif=choose(rng, ("crochet", "crochet", "waves", "speckle")),
+        layout="whole",
+        repeats=8 + index % 6,
+    )
+
+
+PLANT = Family(
+    category="plant",
+    mass_kg=0.12,
+    draw=_draw_plant,
+    instances=(
+        (
+            Plant(),
+            Texture(
+                base=CLAY, ink=EUCALYPTUS, accent=SALMON, motif="hoops", layout="full", repeats=4
+            ),
+        ),
+        (
+            Plant(
+                kind="rosette",
+                pot=0.02,
+                pot_height=0.038,
+                height=0.06,
+                spread=0.0265,
+                leaves=6,
+                blunt=0.95,
+                tips="ink",
+                rim="accent",
+            ),
+            Texture(
+                base=CLAY, ink=EUCALYPTUS, accent=SALMON, motif="leaf", layout="brick", repeats=7
+            ),
+        ),
+        (
+            Plant(
+                kind="aloe",
+                pot=0.019,
+                pot_height=0.037,
+                height=0.066,
+                spread=0.027,
+                leaves=8,
+                blunt=0.8,
+                tips="accent",
+            ),
+            Texture(
+                base=CLAY,
+                ink=EUCALYPTUS,
+                accent=PORCELAIN,
+                motif="chevron",
+                layout="full",
+                repeats=7,
+            ),
+        ),
+        (
+            Plant(
+                kind="rosette",
+                pot=0.0205,
+                pot_height=0.036,
+                height=0.063,
+                spread=0.027,
+                leaves=7,
+                blunt=0.85,
+                tips="ink",
+            ),
+            Texture(
+                base=CLAY, ink=MULBERRY, accent=PORCELAIN, motif="dots", layout="full", repeats=8
+            ),
+        ),
+        (
+            Plant(
+                kind="rosette",
+                pot=0.019,
+                pot_height=0.036,
+                height=0.06,
+                spread=0.0255,
+                leaves=9,
+                blunt=0.6,
+                tips="ink",
+                rim="none",
+            ),
+            Texture(
+                base=PORCELAIN,
+                ink=EUCALYPTUS,
+                accent=CLAY,
+                motif="stripes",
+                layout="full",
+                repeats=10,
+            ),
+        ),
+        (
+            Plant(
+                kind="bush",
+                pot=0.019,
+                pot_height=0.038,
+                height=0.066,
+                spread=0.0265,
+                leaves=9,
+                blunt=0.8,
+                tips="ink",
+                rim="none",
+            ),
+            Texture(base=PORCELAIN, ink=STALK, accent=CLAY, motif="heart", layout="row", repeats=5),
+        ),
+        (
+            Plant(
+                kind="cactus", pot=0.0195, pot_height=0.037, height=0.07, spread=0.0265, leaves=9
+            ),
+            Texture(base=SKY, ink=AVOCADO, accent=SALMON, motif="star", layout="brick", repeats=6),
+        ),
+    ),
+    recolour=_recolour_plant,
+)
+SCRUBBER = Family(
+    category="scrubber",
+    mass_kg=0.07,
+    draw=_draw_scrubber,
+    instances=(
+        (
+            Scrubber(),
+            Texture(base=BERRY, ink=SEED, accent=STALK, motif="seeds", layout="full", repeats=9),
+        ),
+        (
+            Scrubber(
+                outline="apple", radius=0.022, body=0.046, rows=6, bump=0.03, leaves=4, leaf=0.016
+            ),
+            Texture(base=BERRY, ink=SEED, accent=STALK, motif="dots", layout="full", repeats=12),
+        ),
+        (
+            Scrubber(
+                outline="strawberry",
+                radius=0.021,
+                body=0.05,
+                rows=9,
+                bump=0.015,
+                leaves=8,
+                leaf=0.016,
+            ),
+            Texture(base=BERRY, ink=SEED, accent=STALK, motif="knit", layout="full", repeats=10),
+        ),
+        (
+            Scrubber(
+                outline="strawberry",
+                radius=0.0215,
+                body=0.046,
+                rows=7,
+                bump=0.025,
+                leaves=5,
+                leaf=0.02,
+            ),
+            Texture(base=BERRY, ink=VIOLET, accent=STALK, motif="hoops", layout="full", repeats=11),
+        ),
+        (
+            Scrubber(
+                outline="acorn", radius=0.0215, body=0.048, rows=7, bump=0.025, leaves=6, leaf=0.018
+            ),
+            Texture(base=LEMON, ink=SEED, accent=STALK, motif="chevron", layout="full", repeats=8),
+        ),
+        (
+            Scrubber(
+                outline="strawberry",
+                radius=0.0215,
+                body=0.048,
+                rows=7,
+                bump=0.025,
+                leaves=6,
+                leaf=0.018,
+            ),
+            Texture(
+                base=SKY, ink=PORCELAIN, accent=BERRY, motif="stripes", layout="full", repeats=8
+            ),
+        ),
+        (
+            Scrubber(
+                outline="apple",
+                radius=0.0215,
+                body=0.048,
+                rows=7,
+                bump=0.025,
+                leaves=0,
+                leaf=0.0,
+                loop=0.01,
+            ),
+            Texture(base=VIOLET, ink=LEMON, accent=STALK, motif="star", layout="brick", repeats=6),
+        ),
+    ),
+    recolour=_recolour_scrubber,
+)

@@ -1,0 +1,1 @@
+"""A user's own scans: read from a file, repaired, textured, stored and loaded again."""

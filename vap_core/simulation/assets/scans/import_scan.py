@@ -1,0 +1,252 @@
+"""A 3-D file of the user's becomes an object.
+
+The file is read, checked, set upright, reduced, textured, and split into convex parts. The result
+stands on z = 0, centred on the z axis, z up, metres; its collision solids are the hulls of a convex
+decomposition.
+"""
+
+import re
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from vap_core import __version__
+from vap_core.base.errors import BadObject
+from vap_core.memory import CATEGORY, NAME
+from vap_core.simulation.assets import objects
+from vap_core.simulation.assets.scans.bake import (
+    ColouredPoints,
+    bake_texture,
+    creased_mesh,
+    shrink_image,
+)
+from vap_core.simulation.assets.scans.mesh_file import ScannedSurface, read_mesh_file
+from vap_core.simulation.assets.scans.mesh_repair import close_surface, count_edge_flaws
+from vap_core.simulation.assets.scans.storage import Scan, ScanMetadata
+from vap_core.simulation.assets.shapes import Hull
+from vap_core.simulation.assets.triangles import Faces, Vertices, area_vectors, decimate
+
+VISUAL_FACES, TEXTURE_PX, HULLS, HULL_CORNERS = 3000, 1024, 16, 160
+SMALLEST_M, LARGEST_M, THINNEST_M = 0.01, 0.6, 0.002
+SLIVER_M3 = 1e-9
+"""A convex part of less volume is dropped."""
+DENSITY_KG_M3, MASS_KG = 400.0, (0.03, 0.5)
+HEAVIEST_KG = 5
+UpAxis = Literal["y", "z"]
+OBJECT_FROM_FILE: dict[UpAxis, np.ndarray] = {
+    "z": np.eye(3),
+    "y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+}
+"""Rotation to the object's axes (z up, front towards -y), by the file's axis that points up."""
+Y_UP_SUFFIXES = (".glb", ".obj")
+SOLIDIFY = "give it thickness in your 3-D tool (solidify)"
+
+
+def import_scan(
+    path: Path,
+    name: str,
+    category: str,
+    *,
+    height_cm: float | None = None,
+    up: UpAxis | None = None,
+    mass_kg: float | None = None,
+    colour: str | None = None,
+    repair: bool = False,
+    licence: str = "",
+    report: Callable[[str], None] = print,
+) -> tuple[ScanMetadata, Scan]:
+    """Make a registry object of a GLB, OBJ, PLY or STL file; the decomposition takes some seconds.
+
+    Without `height_cm` the file's units are metres; without `up` it is y for GLB and OBJ and z for
+    PLY and STL; without `mass_kg` the mass follows from the hulls' volume. `report` is called with
+    a line for every slow step.
+
+    Raises:
+        BadObject: the names or the file will not do; the message says what is wrong and how to
+            mend it.
+    """
+    _check_arguments(name, category, mass_kg)
+    surface = read_mesh_file(path, colour)
+    if repair:
+        vertex, face = close_surface(surface.vertex, surface.face)
+        surface = ScannedSurface(vertex, face, surface.samples)
+    _check_closed(surface, path, repair)
+    if up is None:
+        up = "z"
+        if path.suffix.lower() in Y_UP_SUFFIXES:
+            up = "y"
+    surface = _set_upright(surface, path, up, height_cm)
+    scan = _build_scan(surface, report)
+    if mass_kg is None:
+        volume_m3 = sum(hull.volume for hull in scan.hulls)
+        mass_kg = float(np.clip(DENSITY_KG_M3 * volume_m3, *MASS_KG))
+    metadata = ScanMetadata(
+        name=name,
+        category=" ".join(category.lower().split()),
+        mass_kg=round(mass_kg, 4),
+        source=path.name,
+        source_sha256=sha256(path.read_bytes()).hexdigest(),
+        licence=licence,
+        vap=__version__,
+    )
+    return metadata, scan
+
+
+def default_name(path: Path) -> str:
+    """A name for the object in a file."""
+    return re.sub(r"[^A-Za-z0-9]+", "-", path.stem).strip("-")[:64]
+
+
+def _check_arguments(name: str, category: str, mass_kg: float | None) -> None:
+    if not NAME.fullmatch(name):
+        raise BadObject(
+            f"objects: {name!r} cannot name an object; use letters, digits, space, dot, dash or "
+            "underscore, for example --name my-mug."
+        )
+    if name in objects.OBJECTS or "-generic-" in name:
+        raise BadObject(
+            f"objects: {name!r} is one of the workspace's own objects; choose another --name, for "
+            f"example my-{name}."
+        )
+    if not CATEGORY.fullmatch(category.strip()):
+        raise BadObject(
+            f"objects: {category!r} cannot be a category; name the kind of thing in words, for "
+            "example --category cup."
+        )
+    if mass_kg is not None and not 0 < mass_kg <= HEAVIEST_KG:
+        raise BadObject(
+            f"objects: a mass of {mass_kg:g} kg is beyond what the arms lift; give --mass-kg "
+            f"between 0 and {HEAVIEST_KG}."
+        )
+
+
+def _check_closed(surface: ScannedSurface, path: Path, repaired: bool) -> None:
+    remedy = "pass --repair, or close the surface in your 3-D tool"
+    if repaired:
+        remedy = "close the surface in your 3-D tool (--repair was not enough)"
+    open_edges, facing_apart = count_edge_flaws(surface.face)
+    if open_edges:
+        raise BadObject(
+            f"objects: {path} is not watertight: {open_edges:,} open edges (edges that do not join "
+            f"exactly two triangles); {remedy}."
+        )
+    if facing_apart:
+        raise BadObject(
+            f"objects: {path} has triangles that face opposite ways along {facing_apart:,} edges; "
+            f"{remedy}."
+        )
+
+
+def _set_upright(
+    surface: ScannedSurface, path: Path, up: UpAxis, height_cm: float | None
+) -> ScannedSurface:
+    """Turned z up, scaled, and set down on the origin, its triangles facing outwards."""
+    rotation = OBJECT_FROM_FILE[up]
+    turned = surface.vertex @ rotation.T
+    low, high = turned.min(axis=0), turned.max(axis=0)
+    scale = 1.0
+    if height_cm is not None:
+        scale = 0.01 * height_cm / max(float((high - low)[2]), 1e-30)
+    size = scale * (high - low)
+    _check_size(size, path, height_cm)
+    base = np.array([*(low + high)[:2] / 2, low[2]])
+    vertex = scale * (turned - base)
+    volume_m3 = _enclosed_volume(vertex[surface.face])
+    if abs(volume_m3) < 1e-4 * float(np.prod(size)) or abs(volume_m3) < 1e-9:
+        raise BadObject(
+            f"objects: {path} encloses no volume ({1e6 * abs(volume_m3):.3g} cm3); {SOLIDIFY}."
+        )
+    samples = ColouredPoints(
+        point=scale * (surface.samples.point @ rotation.T - base), rgb=surface.samples.rgb
+    )
+    upright = replace(surface, vertex=vertex, samples=samples)
+    if volume_m3 > 0:
+        return upright
+    uv = surface.uv
+    if uv is not None:
+        uv = uv[:, ::-1].copy()
+    return replace(upright, face=surface.face[:, ::-1].copy(), uv=uv)
+
+
+def _check_size(size: np.ndarray, path: Path, height_cm: float | None) -> None:
+    if not SMALLEST_M <= size.max() <= LARGEST_M:
+        remedy = "check --height-cm and --up"
+        if height_cm is None:
+            remedy = "give the real height with --height-cm"
+        raise BadObject(
+            f"objects: {path} would be {_format_length(size.max())} long; an object is "
+            f"{_format_length(SMALLEST_M)} to {_format_length(LARGEST_M)}, so its units are most "
+            f"likely not metres; {remedy}."
+        )
+    if size.min() < THINNEST_M:
+        raise BadObject(
+            f"objects: {path} would be only {_format_length(size.min())} thick, less than "
+            f"{_format_length(THINNEST_M)}; {SOLIDIFY}."
+        )
+
+
+def _enclosed_volume(corner: np.ndarray) -> float:
+    """Cubic metres inside a closed surface; negative where its triangles face inwards."""
+    return float((corner[:, 0] * area_vectors(corner)).sum() / 6)
+
+
+def _format_length(metres: float) -> str:
+    if metres >= 1000:
+        return f"{metres / 1000:.3g} km"
+    if metres >= 1:
+        return f"{metres:.3g} m"
+    return f"{100 * metres:.3g} cm"
+
+
+def _build_scan(surface: ScannedSurface, report: Callable[[str], None]) -> Scan:
+    """The surface reduced, textured, and split into convex parts."""
+    vertex, face = surface.vertex, surface.face
+    if len(face) > VISUAL_FACES:
+        report(f"reducing {len(face):,} faces to {VISUAL_FACES:,} ...")
+        vertex, face = decimate(vertex, face, VISUAL_FACES)
+        vertex = np.clip(vertex, surface.vertex.min(axis=0), surface.vertex.max(axis=0))
+    unchanged = len(face) == len(surface.face)
+    if unchanged and surface.uv is not None and surface.picture is not None:
+        form = creased_mesh(vertex, face, surface.uv)
+        image = shrink_image(surface.picture, TEXTURE_PX)
+    else:
+        report("painting a texture ...")
+        form, image = bake_texture(vertex, face, surface.samples, TEXTURE_PX)
+    report("splitting into convex parts, about 15 s ...")
+    return Scan(form=form, hulls=_convex_parts(vertex, face), image=image)
+
+
+def _convex_parts(vertex: Vertices, face: Faces) -> tuple[Hull, ...]:
+    """Convex parts that cover the body.
+
+    They stay inside its bounding box, so that it stands where its mesh stands.
+    """
+    import coacd
+
+    coacd.set_log_level("off")
+    parts = coacd.run_coacd(
+        coacd.Mesh(vertex, face),
+        threshold=0.1,
+        preprocess_resolution=30,
+        mcts_iterations=60,
+        max_convex_hull=HULLS,
+        decimate=True,
+        max_ch_vertex=HULL_CORNERS,
+        seed=0,
+    )
+    hulls = []
+    for corners, _ in parts:
+        inside = np.clip(corners, vertex.min(axis=0), vertex.max(axis=0))
+        with suppress(QhullError):  # a part as flat as paper
+            convex = ConvexHull(inside)
+            if convex.volume > SLIVER_M3:
+                hulls.append(Hull(inside[convex.vertices], float(convex.volume)))
+    if not hulls:
+        raise BadObject(f"objects: no convex part of this object has a volume; {SOLIDIFY}.")
+    return tuple(hulls)

@@ -1,0 +1,255 @@
+"""A user's own objects on disk, one folder each: how a scan is written, read back and checked.
+
+`object.json` says what it is and holds the SHA-256 of the other files: `mesh.npz`, `hulls.npz` and
+`texture.png`. All are parsed, none is executed. The folder of folders is `data/objects`, or the
+environment variable VAP_OBJECTS.
+"""
+
+import io
+import json
+import os
+import shutil
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from functools import lru_cache
+from hashlib import sha256
+from pathlib import Path
+from tempfile import mkdtemp
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+from vap_core.base.errors import BadObject, BadOutput
+from vap_core.base.types import Rgb, value
+from vap_core.simulation.assets.shapes import Hull, Mesh
+
+FORMAT, VERSION = "vap-object", 1
+MESH_FILE, HULLS_FILE, TEXTURE_FILE = FILES = ("mesh.npz", "hulls.npz", "texture.png")
+METADATA_FILE = "object.json"
+REMEDY = "import the object again with --replace, or delete its folder"
+
+
+@value
+class Scan:
+    """An imported shape: its mesh, its convex parts, and its texture."""
+
+    form: Mesh
+    hulls: tuple[Hull, ...]
+    image: Rgb
+
+    def mesh(self) -> Mesh:
+        return self.form
+
+    def solids(self) -> tuple[Hull, ...]:
+        return self.hulls
+
+    def aspect(self) -> float:
+        return self.image.shape[1] / self.image.shape[0]
+
+
+@value
+class ScanMetadata:
+    """What is known of a scan: its names, its mass (kg), its source file and its licence.
+
+    `vap` is the version of this package that imported it.
+    """
+
+    name: str
+    category: str
+    mass_kg: float
+    source: str
+    source_sha256: str
+    licence: str
+    vap: str
+    split: str = "personal"
+
+
+def scans_folder() -> Path:
+    """The folder that holds the scans."""
+    return Path(os.environ.get("VAP_OBJECTS", "data/objects"))
+
+
+def scan_folders() -> dict[str, Path]:
+    """The folder of every scan by its name."""
+    folders = {}
+    for path in sorted(scans_folder().glob(f"[!.]*/{METADATA_FILE}")):
+        folders[path.parent.name] = path.parent
+    return folders
+
+
+def target_folder(folder: Path, name: str, replace: bool) -> Path:
+    """Where a scan of that name goes. Raises: BadOutput if it exists and `replace` is off."""
+    if (folder / name).exists() and not replace:
+        raise BadOutput(
+            f"objects: {folder / name} exists; choose another --name or pass --replace."
+        )
+    return folder / name
+
+
+def save_scan(folder: Path, metadata: ScanMetadata, scan: Scan, *, replace: bool = False) -> Path:
+    """Write a scan into `folder/<name>`, whole or not at all.
+
+    Raises:
+        BadOutput: the folder cannot be written, or holds that name and `replace` is off.
+    """
+    target = target_folder(folder, metadata.name, replace)
+    files = _encode_scan(scan)
+    digests = {name: sha256(data).hexdigest() for name, data in files.items()}
+    about = {"format": FORMAT, "version": VERSION, **asdict(metadata), "sha256": digests}
+    files[METADATA_FILE] = json.dumps(about, indent=1, ensure_ascii=False).encode()
+    try:
+        _write_folder(target, files)
+    except OSError as error:
+        raise BadOutput(
+            f"objects: {folder} cannot be written ({error.strerror}); choose another folder with "
+            "--out."
+        ) from error
+    return target
+
+
+def _encode_scan(scan: Scan) -> dict[str, bytes]:
+    """The contents of `FILES`."""
+    form = scan.form
+    hull_arrays: dict[str, np.ndarray] = {}
+    for i, hull in enumerate(scan.hulls):
+        hull_arrays[f"{i:02d}.vertex"] = np.asarray(hull.vertex)
+        hull_arrays[f"{i:02d}.volume"] = np.asarray(hull.volume)
+    picture = io.BytesIO()
+    Image.fromarray(scan.image).save(picture, "PNG")
+    return {
+        MESH_FILE: _encode_arrays(
+            {"vertex": form.vertex, "normal": form.normal, "uv": form.uv, "face": form.face}
+        ),
+        HULLS_FILE: _encode_arrays(hull_arrays),
+        TEXTURE_FILE: picture.getvalue(),
+    }
+
+
+def _write_folder(target: Path, files: Mapping[str, bytes]) -> None:
+    """Write the files into a new folder, then put it in place of the target."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    stage = Path(mkdtemp(prefix=".", dir=target.parent))
+    for name, data in files.items():
+        (stage / name).write_bytes(data)
+    stage.chmod(0o755)
+    if target.exists():
+        os.replace(target, stage.with_suffix(".old"))
+    os.replace(stage, target)
+    shutil.rmtree(stage.with_suffix(".old"), ignore_errors=True)
+
+
+def load_scan(folder: Path) -> tuple[ScanMetadata, Scan]:
+    """Read a scan from its folder, checked.
+
+    Raises:
+        BadObject: a file is missing, damaged or of another version; the message names it.
+    """
+    about = folder / METADATA_FILE
+    if not about.is_file():
+        raise BadObject(f"objects: {about} is not a file; {REMEDY}.")
+    return _load_version(folder, about.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=64)
+def _load_version(folder: Path, written_ns: int) -> tuple[ScanMetadata, Scan]:
+    """The scan as it was written at that time."""
+    metadata, digests = _read_metadata(folder)
+    contents = {}
+    for name in FILES:
+        contents[name] = _read_checked(folder / name, digests.get(name))
+    form = _parse(folder / MESH_FILE, contents[MESH_FILE], _decode_mesh)
+    hulls = _parse(folder / HULLS_FILE, contents[HULLS_FILE], _decode_hulls)
+    image = _parse(folder / TEXTURE_FILE, contents[TEXTURE_FILE], _decode_picture)
+    return metadata, Scan(form=form, hulls=hulls, image=image)
+
+
+def _read_checked(path: Path, digest: str | None) -> bytes:
+    """The file's contents. Raises: BadObject when they do not have that SHA-256."""
+    data = b""
+    if path.is_file():
+        data = path.read_bytes()
+    if sha256(data).hexdigest() == digest:
+        return data
+    flaw = "missing or empty"
+    if data:
+        flaw = "damaged (its SHA-256 differs)"
+    raise BadObject(f"objects: {path} is {flaw}; {REMEDY}.")
+
+
+def _parse[T](path: Path, data: bytes, decode: Callable[[bytes], T]) -> T:
+    try:
+        return decode(data)
+    except (
+        KeyError,
+        ValueError,
+        TypeError,
+        OSError,
+        zipfile.BadZipFile,
+        UnidentifiedImageError,
+    ) as error:
+        raise BadObject(
+            f"objects: {path} lacks what an object needs ({error}); {REMEDY}."
+        ) from error
+
+
+def _decode_mesh(data: bytes) -> Mesh:
+    arrays = _decode_arrays(data)
+    mesh = Mesh(
+        vertex=arrays["vertex"], normal=arrays["normal"], uv=arrays["uv"], face=arrays["face"]
+    )
+    count = len(mesh.vertex)
+    if not count == len(mesh.normal) == len(mesh.uv) or not (
+        0 <= mesh.face.min() <= mesh.face.max() < count
+    ):
+        raise ValueError("faces name vertices that are not there")
+    return mesh
+
+
+def _decode_hulls(data: bytes) -> tuple[Hull, ...]:
+    arrays = _decode_arrays(data)
+    hulls = []
+    for i in range(len(arrays) // 2):
+        hulls.append(Hull(arrays[f"{i:02d}.vertex"], float(arrays[f"{i:02d}.volume"])))
+    if not hulls:
+        raise ValueError("no hulls")
+    return tuple(hulls)
+
+
+def _decode_picture(data: bytes) -> Rgb:
+    with Image.open(io.BytesIO(data)) as picture:
+        return np.array(picture.convert("RGB"))
+
+
+def _read_metadata(folder: Path) -> tuple[ScanMetadata, dict[str, str]]:
+    """What `object.json` says, and the SHA-256 of the other files by their names."""
+    path = folder / METADATA_FILE
+    try:
+        about = json.loads(path.read_text(encoding="utf-8"))
+        if (about.pop("format"), about.pop("version")) != (FORMAT, VERSION):
+            raise BadObject(
+                f"objects: {path} is of another version than {FORMAT} {VERSION}; {REMEDY}."
+            )
+        digests = about.pop("sha256")
+        metadata = ScanMetadata(**about)
+        if (
+            metadata.name != folder.name
+            or not np.isfinite(metadata.mass_kg)
+            or metadata.mass_kg <= 0
+            or not isinstance(digests, dict)
+        ):
+            raise ValueError(f"name {metadata.name!r}, mass {metadata.mass_kg} kg")
+    except (KeyError, ValueError, TypeError, AttributeError) as error:
+        raise BadObject(f"objects: {path} is damaged ({error}); {REMEDY}.") from error
+    return metadata, digests
+
+
+def _encode_arrays(arrays: Mapping[str, np.ndarray]) -> bytes:
+    file = io.BytesIO()
+    np.savez_compressed(file, allow_pickle=False, **arrays)
+    return file.getvalue()
+
+
+def _decode_arrays(data: bytes) -> dict[str, np.ndarray]:
+    with np.load(io.BytesIO(data), allow_pickle=False) as file:
+        return dict(file)

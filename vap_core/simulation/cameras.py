@@ -1,0 +1,220 @@
+"""Where the cameras stand, the pinhole they are, and the eyes that see through them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from types import TracebackType
+
+import numpy as np
+from jaxtyping import Float64
+
+from vap_core.base.errors import one_of
+from vap_core.base.types import Camera, Mask, Rgb, value
+from vap_core.simulation.gl import ensure_gl
+
+ensure_gl()
+import mujoco  # noqa: E402
+
+from vap_core.simulation.occluder import Screen, draw  # noqa: E402
+
+HIDDEN_GROUP = 5
+"""Geom group that is never drawn."""
+_FLIP = np.diag([1.0, -1.0, -1.0])
+"""OpenGL camera axes (y up, looking along -z) to OpenCV's (y down, looking along +z)."""
+
+
+@value
+class Rig:
+    """A camera fixed to `body`: it stands at `pos_m` and looks at `aim_m`, both in the body's frame; `up` points up in the picture."""
+
+    name: str
+    body: str
+    pos_m: tuple[float, float, float]
+    aim_m: tuple[float, float, float]
+    fovy_rad: float
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+    def rotation(self) -> Float64[np.ndarray, "3 3"]:
+        """Body from camera, OpenGL axes."""
+        back = np.subtract(self.pos_m, self.aim_m)
+        back /= np.linalg.norm(back)
+        right = np.cross(self.up, back)
+        right /= np.linalg.norm(right)
+        return np.stack([right, np.cross(back, right), back], axis=1)
+
+
+RIGS: dict[str, tuple[Rig, ...]] = {
+    "wx250s": (Rig("front", "world", (0.76, 0.0, 0.35), (0.24, 0.0, 0.105), np.deg2rad(44.0)),),
+    "panda": (
+        Rig("front", "world", (0.98, 0.0, 0.37), (0.44, 0.0, 0.12), np.deg2rad(44.0)),
+        Rig("side", "world", (0.68, -0.46, 0.42), (0.47, -0.01, 0.05), np.deg2rad(44.0)),
+        Rig(
+            "wrist",
+            "hand",
+            (0.09, 0.0, 0.045),
+            (0.03, 0.0, 0.20),
+            np.deg2rad(72.0),
+            up=(-1.0, 0.0, 0.0),
+        ),
+    ),
+    "so101": (
+        Rig("front", "world", (0.66, 0.0, 0.38), (0.20, 0.0, 0.055), np.deg2rad(49.0)),
+        Rig("side", "world", (0.30, -0.46, 0.33), (0.18, 0.0, 0.06), np.deg2rad(48.0)),
+        Rig(
+            "wrist",
+            "gripper",
+            (0.0, 0.055, -0.045),
+            (0.008, -0.006, -0.118),
+            np.deg2rad(80.0),
+            up=(0.0, 1.0, 0.0),
+        ),
+    ),
+    "google": (Rig("head", "base_link", (0.165, 0.0, 1.195), (0.50, 0.0, 0.61), np.deg2rad(50.0)),),
+}
+
+
+def add_rigs(
+    spec: mujoco.MjSpec, robot: str, shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> tuple[str, ...]:
+    """Mount the cameras of `robot` in `spec`, all but a wrist camera moved by `shift_m`; returns their names."""
+    if robot not in RIGS:
+        raise one_of("cameras.add_rigs: robot", robot, RIGS)
+    for rig in RIGS[robot]:
+        if rig.name != "wrist":
+            (x, y, z), (dx, dy, dz) = rig.pos_m, shift_m
+            rig = replace(rig, pos_m=(x + dx, y + dy, z + dz))
+        quat = np.zeros(4)
+        mujoco.mju_mat2Quat(quat, rig.rotation().ravel())
+        spec.body(rig.body).add_camera(
+            name=rig.name, pos=rig.pos_m, quat=quat, fovy=np.rad2deg(rig.fovy_rad)
+        )
+    return tuple(rig.name for rig in RIGS[robot])
+
+
+def intrinsics(
+    model: mujoco.MjModel, name: str, size: tuple[int, int]
+) -> Float64[np.ndarray, "3 3"]:
+    """K in pixels for a picture of `size` = (height, width): pixel (u, v) covers u..u+1, v..v+1, so the centre is (width/2, height/2)."""
+    height, width = size
+    focal = 0.5 * height / np.tan(0.5 * np.deg2rad(float(model.camera(name).fovy[0])))
+    return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+
+
+def camera(model: mujoco.MjModel, data: mujoco.MjData, name: str, size: tuple[int, int]) -> Camera:
+    """The calibrated camera `name` where it is now; `size` = (height, width) in pixels."""
+    pose = np.eye(4)
+    pose[:3, :3] = data.camera(name).xmat.reshape(3, 3) @ _FLIP
+    pose[:3, 3] = data.camera(name).xpos
+    return Camera(name, size[1], size[0], intrinsics(model, name, size), pose)
+
+
+def project(cam: Camera, points_world: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
+    """Pixels (u right, v down) of world points, metres; NaN for points that are not in front of the camera."""
+    local = (points_world - cam.pose_world[:3, 3]) @ cam.pose_world[:3, :3]
+    depth = np.where(local[:, 2] > 1e-6, local[:, 2], np.nan)
+    return (local @ cam.k.T)[:, :2] / depth[:, None]
+
+
+def backproject_to_plane(
+    cam: Camera, pixels: Float64[np.ndarray, "n 2"], z_world: float
+) -> Float64[np.ndarray, "n 3"]:
+    """World points, metres, where the pixels' rays meet the level plane z = `z_world`; NaN for rays that never do."""
+    homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
+    rays = homogeneous @ np.linalg.inv(cam.k).T @ cam.pose_world[:3, :3].T
+    eye = cam.pose_world[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = (z_world - eye[2]) / rays[:, 2]
+    return eye + rays * np.where(along > 0, along, np.nan)[:, None]
+
+
+class Renderer:
+    """Sees a model through its cameras: colour always, object masks when asked. One renderer per picture size, shared by every episode.
+
+    `objects` names the bodies whose masks can be asked for; a hidden object is not drawn at all.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, objects: Sequence[str], shadows: bool = False
+    ) -> None:
+        self.model = model
+        self.objects = tuple(objects)
+        self.shadows = shadows
+        self._renderers: dict[int, mujoco.Renderer] = {}
+        self._groups = model.geom_group.copy()
+        body_of = {model.body(name).id: i for i, name in enumerate(self.objects)}
+        self._owner = np.array(
+            [body_of.get(int(model.body_rootid[body]), -1) for body in model.geom_bodyid], np.int64
+        )
+        """Index into `objects` of each geom's object, -1 for the rest of the scene."""
+
+    def __enter__(self) -> "Renderer":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        for renderer in self._renderers.values():
+            renderer.close()
+        self._renderers.clear()
+
+    def rgb(
+        self,
+        data: mujoco.MjData,
+        name: str,
+        size: int,
+        hidden: frozenset[str] = frozenset(),
+        before: Sequence[Screen] = (),
+    ) -> Rgb:
+        """What camera `name` sees, `size` x `size` pixels; `before` stands in its way."""
+        renderer = self._look(data, name, size, hidden, before)
+        return np.ascontiguousarray(renderer.render())
+
+    def masks(
+        self,
+        data: mujoco.MjData,
+        name: str,
+        size: int,
+        hidden: frozenset[str] = frozenset(),
+        before: Sequence[Screen] = (),
+    ) -> Mapping[str, Mask]:
+        """Visible pixels of every object that is not hidden, in camera `name`; `before` stands in its way."""
+        renderer = self._look(data, name, size, hidden, before)
+        renderer.enable_segmentation_rendering()
+        try:
+            drawn = renderer.render()
+        finally:
+            renderer.disable_segmentation_rendering()
+        geom = np.where(drawn[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM), drawn[..., 0], -1)
+        owner = np.where(geom >= 0, self._owner[geom], -1)
+        return {each: owner == i for i, each in enumerate(self.objects) if each not in hidden}
+
+    def _look(
+        self,
+        data: mujoco.MjData,
+        name: str,
+        size: int,
+        hidden: frozenset[str],
+        before: Sequence[Screen],
+    ) -> mujoco.Renderer:
+        renderer = self._renderers.get(size)
+        if renderer is None:
+            renderer = self._renderers[size] = mujoco.Renderer(
+                self.model, size, size, max_geom=self.model.ngeom + 64
+            )
+        unseen = np.isin(self._owner, [i for i, each in enumerate(self.objects) if each in hidden])
+        self.model.geom_group[:] = np.where(unseen, HIDDEN_GROUP, self._groups)
+        renderer.update_scene(data, camera=name)
+        draw(renderer.scene, before)
+        for flag in (
+            mujoco.mjtRndFlag.mjRND_REFLECTION,
+            mujoco.mjtRndFlag.mjRND_SKYBOX,
+            mujoco.mjtRndFlag.mjRND_HAZE,
+        ):
+            renderer.scene.flags[flag] = 0
+        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = int(self.shadows)
+        return renderer

@@ -1,0 +1,220 @@
+"""From end-effector deltas to joint targets: mink's differential inverse kinematics on the bare robot, base frame = world frame."""
+
+from functools import cache
+
+import mink
+import mujoco
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from vap_core.base.errors import BadAction, OutOfReach
+from vap_core.base.types import value
+from vap_core.simulation import robots
+from vap_core.simulation.robots import Robot
+
+ROUNDS = 12
+"""Most iterations of one solution; it stops as soon as the pose is met."""
+NEAR_M, NEAR_RAD = 2e-5, 2e-4
+TWIST_RAD = 0.05
+"""Furthest that a hand that leans may be turned about its own axis."""
+LEASH_M, LEASH_RAD = 0.05, 0.5
+"""Furthest that the commanded pose may lead the measured one."""
+LEASH = 0.25
+"""Furthest that a commanded joint may lead the measured one under joint control, rad."""
+
+
+@value
+class Setpoint:
+    """Where the gripper is told to be: `tcp_base` (4 x 4, metres, robot base frame), the joint angles that put it there (rad), opening 0..1."""
+
+    tcp_base: Float64[np.ndarray, "4 4"]
+    joints: Float64[np.ndarray, " n"]
+    gripper: float
+
+
+@value
+class MotionLimits:
+    """How fast an action may move the gripper: metres and radians per second."""
+
+    speed_m_s: float = 0.25
+    turn_rad_s: float = 1.5
+
+
+MOTION_LIMITS = MotionLimits()
+
+
+class Arm:
+    """The kinematics of one robot; holds mink's buffers and nothing of an episode: every answer depends on the arguments alone."""
+
+    def __init__(self, robot: Robot) -> None:
+        spec = mujoco.MjSpec.from_file(str(robot.xml))
+        for finger in robot.fingers:
+            spec.delete(spec.actuator(finger))
+        for equality in list(spec.equalities):
+            spec.delete(equality)
+        for finger in robot.fingers:
+            spec.delete(spec.joint(finger))
+        self.robot = robot
+        self.model = spec.compile()
+        self.configuration = mink.Configuration(self.model)
+        self.task = mink.FrameTask(
+            "tcp",
+            "site",
+            position_cost=1.0,
+            orientation_cost=robot.turn_cost,
+            gain=1.0,
+            lm_damping=1e-6,
+        )
+        self.posture = mink.PostureTask(self.model, cost=1e-4)
+        self.posture.set_target(robot.home)
+        speeds = dict(zip(robot.joints, robot.speed_rad_s.tolist(), strict=True))
+        self.limits = [mink.ConfigurationLimit(self.model), mink.VelocityLimit(self.model, speeds)]
+
+    def forward(self, joints: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "4 4"]:
+        """The tcp's pose in the robot base frame at `joints` (rad)."""
+        self.configuration.update(joints)
+        return np.asarray(
+            self.configuration.get_transform_frame_to_world("tcp", "site").as_matrix()
+        )
+
+    def solve(
+        self,
+        joints: Float64[np.ndarray, " n"],
+        tcp_base: Float64[np.ndarray, "4 4"],
+        seconds: float,
+    ) -> Float64[np.ndarray, " n"]:
+        """Joint angles nearest to `tcp_base` that can be reached from `joints` within `seconds` at the joints' rated speeds."""
+        self.configuration.update(joints)
+        self.task.set_target(mink.SE3.from_matrix(tcp_base))
+        for _ in range(ROUNDS):
+            error = self.task.compute_error(self.configuration)
+            if np.linalg.norm(error[:3]) < NEAR_M and np.linalg.norm(error[3:]) < NEAR_RAD:
+                break
+            dt = seconds / ROUNDS
+            velocity = mink.solve_ik(
+                self.configuration,
+                [self.task, self.posture],
+                dt,
+                "daqp",
+                damping=1e-9,
+                limits=self.limits,
+            )
+            self.configuration.integrate_inplace(velocity, dt)
+        return self.configuration.q.copy()
+
+    def reach(
+        self, tcp_base: Float64[np.ndarray, "4 4"], tolerance_m: float = 1e-3
+    ) -> Float64[np.ndarray, " n"]:
+        """Joint angles for a pose, from home, taking all the time it needs; the hand may lean by the robot's `lean_rad`. Raises: OutOfReach."""
+        joints = self.robot.home
+        for _ in range(8):
+            joints = self.solve(joints, tcp_base, 2.0)
+        found = self.forward(joints)
+        off = float(np.linalg.norm(found[:3, 3] - tcp_base[:3, 3]))
+        turn = float(np.linalg.norm(rotation_vector(found[:3, :3] @ tcp_base[:3, :3].T)))
+        lean, twist = _lean_and_twist(tcp_base[:3, :3], found[:3, :3])
+        leans = self.robot.lean_rad > 0.0 and lean <= self.robot.lean_rad and twist <= TWIST_RAD
+        if off > tolerance_m or (turn > 10 * tolerance_m and not leans):
+            where = tcp_base[:3, 3].round(3).tolist()
+            raise OutOfReach(
+                f"Arm.reach: {self.robot.name} stays {1000 * off:.0f} mm and {turn:.2f} rad away from {where} m; move it closer."
+            )
+        return joints
+
+
+@cache
+def arm(robot: str) -> Arm:
+    """The kinematics of the robot called `robot`, built once per process."""
+    return Arm(robots.get(robot))
+
+
+def follow(
+    arm: Arm,
+    command: Setpoint,
+    measured_base: Float64[np.ndarray, "4 4"],
+    action: Float32[np.ndarray, "7"],
+    seconds: float,
+    limits: MotionLimits = MOTION_LIMITS,
+) -> Setpoint:
+    """The command after one action (a row of values.Chunk) that lasts `seconds`.
+
+    The delta applies to the *commanded* pose, so that the arm's droop does not add up; the command is first pulled back to
+    within 5 cm and 0.5 rad of the measured pose, so that it cannot run away from an arm that is held up.
+    """
+    start = _leashed(command.tcp_base, measured_base)
+    delta = action.astype(np.float64)
+    goal = start.copy()
+    goal[:3, 3] += _capped(delta[:3], limits.speed_m_s * seconds)
+    goal[:3, :3] = rotation(_capped(delta[3:6], limits.turn_rad_s * seconds)) @ start[:3, :3]
+    joints = arm.solve(command.joints, goal, seconds)
+    reached = arm.forward(joints)
+    off, turn = (
+        np.linalg.norm(reached[:3, 3] - goal[:3, 3]),
+        np.linalg.norm(rotation_vector(reached[:3, :3] @ goal[:3, :3].T)),
+    )
+    return Setpoint(
+        goal if off < 1e-3 and turn < 1e-2 else reached, joints, float(np.clip(delta[6], 0.0, 1.0))
+    )
+
+
+def follow_joints(
+    arm: Arm,
+    command: Setpoint,
+    measured: Float64[np.ndarray, " n"],
+    action: Float32[np.ndarray, " m"],
+    seconds: float,
+) -> Setpoint:
+    """The command after one action of joint deltas (rad, in the order of Robot.joints) and the gripper (0..1) that lasts `seconds`.
+
+    The deltas apply to the *commanded* joints, no faster than their rated speeds; the result stays within the joints' limits
+    and leads the `measured` joints (rad) by at most LEASH. Raises: BadAction.
+    """
+    if len(action) != len(arm.robot.joints) + 1:
+        raise BadAction(
+            f"follow_joints: {len(action)} numbers, but {arm.robot.name} takes {len(arm.robot.joints)} joint deltas and the gripper."
+        )
+    fastest = arm.robot.speed_rad_s * seconds
+    delta = action.astype(np.float64)
+    asked = command.joints + np.clip(delta[:-1], -fastest, fastest)
+    low, high = arm.model.jnt_range.T
+    led = np.clip(np.clip(asked, measured - LEASH, measured + LEASH), low, high)
+    joints = command.joints + np.clip(led - command.joints, -fastest, fastest)
+    return Setpoint(arm.forward(joints), joints, float(np.clip(delta[-1], 0.0, 1.0)))
+
+
+def rotation(vector: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
+    """The rotation matrix of a rotation vector, rad."""
+    return np.asarray(mink.SO3.exp(vector).as_matrix())
+
+
+def rotation_vector(matrix: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3"]:
+    """The rotation vector, rad, of a rotation matrix; its length is at most pi."""
+    return np.asarray(mink.SO3.from_matrix(np.ascontiguousarray(matrix)).log())
+
+
+def _lean_and_twist(
+    asked: Float64[np.ndarray, "3 3"], found: Float64[np.ndarray, "3 3"]
+) -> tuple[float, float]:
+    """How far the hand's z axis is from the one asked for, and how far it is then turned about it, rad."""
+    axis = np.cross(asked[:, 2], found[:, 2])
+    sine = float(np.linalg.norm(axis))
+    lean = float(np.arctan2(sine, asked[:, 2] @ found[:, 2]))
+    leant = rotation(axis * (lean / sine)) @ asked if sine > 1e-9 else asked
+    return lean, float(np.linalg.norm(rotation_vector(found @ leant.T)))
+
+
+def _capped(vector: Float64[np.ndarray, "3"], longest: float) -> Float64[np.ndarray, "3"]:
+    length = float(np.linalg.norm(vector))
+    return vector if length <= longest else vector * (longest / length)
+
+
+def _leashed(
+    commanded: Float64[np.ndarray, "4 4"], measured: Float64[np.ndarray, "4 4"]
+) -> Float64[np.ndarray, "4 4"]:
+    ahead = commanded[:3, 3] - measured[:3, 3]
+    turned = rotation_vector(commanded[:3, :3] @ measured[:3, :3].T)
+    pulled = commanded.copy()
+    pulled[:3, 3] = measured[:3, 3] + _capped(ahead, LEASH_M)
+    if np.linalg.norm(turned) > LEASH_RAD:
+        pulled[:3, :3] = rotation(_capped(turned, LEASH_RAD)) @ measured[:3, :3]
+    return pulled

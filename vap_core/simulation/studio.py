@@ -1,0 +1,155 @@
+"""Photographs of single objects on a plain table, the reference views of a personal object among them."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from jaxtyping import Float64
+from PIL import Image
+
+from vap_core.base.errors import BadOutput
+from vap_core.base.types import Mask, Rgb, value
+from vap_core.simulation.assets.mujoco_object import VISUAL_GROUP, add_object
+from vap_core.simulation.assets.objects import ObjectModel, extent_m
+from vap_core.simulation.cameras import HIDDEN_GROUP
+
+import mujoco  # isort: skip  (cameras has chosen a GL back end)
+
+FOVY_DEG = 30.0
+
+
+@value
+class Shot:
+    """Where the camera and the lamp stand: angles in radians; `fill` is the object's share of the frame; `table` is sRGB 0..1."""
+
+    azimuth: float
+    elevation: float
+    fill: float = 0.55
+    lamp: float = 0.6
+    bright: float = 0.7
+    table: tuple[float, float, float] = (0.62, 0.58, 0.53)
+
+
+PORTRAIT = Shot(0.45, 0.4, 0.85, bright=0.95, table=(0.86, 0.85, 0.83))
+
+
+class Stage:
+    """Objects that take turns on a plain table under one lamp, compiled once for all objects and shots.
+
+    A context manager, because it holds a GL context.
+    """
+
+    def __init__(self, models: Sequence[ObjectModel], size: int = 160) -> None:
+        self.models = {model.name: model for model in models}
+        spec = mujoco.MjSpec()
+        glow = spec.visual.headlight
+        glow.ambient, glow.diffuse, glow.specular = [0.38] * 3, [0.12] * 3, [0] * 3
+        spec.visual.global_.offwidth = spec.visual.global_.offheight = size
+        spec.visual.global_.fovy = FOVY_DEG
+        spec.visual.quality.shadowsize = 2048
+        spec.visual.map.znear, spec.visual.map.zfar, spec.visual.map.shadowclip = 0.01, 20.0, 0.3
+        spec.stat.extent, spec.stat.center = 1.0, (0, 0, 0)
+        spec.worldbody.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(8, 8, 0.1))
+        spec.worldbody.add_light(
+            name="lamp",
+            type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+            specular=[0.2] * 3,
+            castshadow=True,
+        )
+        for model in self.models.values():
+            add_object(spec, model)
+        self._model = spec.compile()
+        self._data = mujoco.MjData(self._model)
+        self._renderer = mujoco.Renderer(self._model, size, size)
+
+    def __enter__(self) -> "Stage":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._renderer.close()
+
+    def picture(self, name: str, shot: Shot = PORTRAIT) -> Rgb:
+        """One object alone on the table."""
+        self._turn_to(name, shot)
+        return np.ascontiguousarray(self._renderer.render())
+
+    def box(self, name: str, shot: Shot = PORTRAIT) -> Float64[np.ndarray, "4"]:
+        """The object's true outline in that picture, x0 y0 x1 y1 in pixels."""
+        rows, cols = np.nonzero(self.mask(name, shot))
+        return np.array([cols.min(), rows.min(), cols.max() + 1, rows.max() + 1], np.float64)
+
+    def mask(self, name: str, shot: Shot = PORTRAIT) -> Mask:
+        """The object's pixels in that picture."""
+        self._turn_to(name, shot)
+        self._renderer.enable_segmentation_rendering()
+        drawn = self._renderer.render()
+        self._renderer.disable_segmentation_rendering()
+        return (drawn[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM)) & (
+            drawn[..., 0] == self._model.geom(f"{name}/visual").id
+        )
+
+    def _turn_to(self, name: str, shot: Shot) -> None:
+        model, (x, y, z) = self._model, extent_m(self.models[name])
+        lamp = np.array([np.sin(shot.lamp), -np.cos(shot.lamp), 1.6])
+        model.geom_group[:] = HIDDEN_GROUP
+        model.geom("table").group, model.geom(f"{name}/visual").group = 0, VISUAL_GROUP
+        model.geom("table").rgba = (*shot.table, 1)
+        model.light("lamp").pos, model.light("lamp").dir, model.light("lamp").diffuse = (
+            0.8 * lamp,
+            -lamp / np.linalg.norm(lamp),
+            shot.bright,
+        )
+        mujoco.mj_kinematics(model, self._data)
+        mujoco.mj_camlight(model, self._data)
+        camera = mujoco.MjvCamera()
+        camera.lookat[:] = 0, 0, 0.48 * z
+        camera.azimuth, camera.elevation = (
+            90 + np.degrees(shot.azimuth),
+            -np.degrees(shot.elevation),
+        )
+        camera.distance = (
+            0.5 * max(z, float(np.hypot(x, y))) / (shot.fill * np.tan(np.radians(FOVY_DEG / 2)))
+        )
+        self._renderer.update_scene(self._data, camera)
+
+
+def photograph(model: ObjectModel, shots: Sequence[Shot], size: int = 320) -> list[Rgb]:
+    """One picture, size x size, per shot; azimuth 0 looks at the object's front."""
+    with Stage([model], size) as stage:
+        return [stage.picture(model.name, shot) for shot in shots]
+
+
+def reference_views(model: ObjectModel, n: int = 5, seed: int = 0, size: int = 320) -> list[Rgb]:
+    """K reference photos (P 3.1), as one walks around the object: azimuths evenly apart, elevations 18 to 50 degrees.
+
+    Lamp, table and framing differ from view to view.
+    """
+    rng = np.random.default_rng([seed, n, *model.name.encode()])
+    around = 2 * np.pi * np.arange(n) / n
+    tints = rng.uniform(0.45, 0.75, (n, 1)) + rng.uniform(-0.04, 0.04, (n, 3))
+    shots = [
+        Shot(float(a + rng.uniform(-0.2, 0.2)), float(np.radians(rng.uniform(18, 50))), float(rng.uniform(0.52, 0.66)), float(rng.uniform(-1.2, 1.2)),
+             float(rng.uniform(0.5, 0.75)), (float(red), float(green), float(blue)))
+        for a, (red, green, blue) in zip(rng.permutation(around), tints, strict=True)
+    ]  # fmt: skip
+    return photograph(model, shots, size)
+
+
+def write_views(model: ObjectModel, folder: Path, n: int = 5) -> list[Path]:
+    """Reference photos as `<name>-<i>.png`. Raises: BadOutput."""
+    paths = [folder / f"{model.name}-{i}.png" for i in range(n)]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for path, rgb in zip(paths, reference_views(model, n), strict=True):
+            Image.fromarray(rgb).save(path)
+    except OSError as error:
+        raise BadOutput(
+            f"photograph: {folder} cannot be written ({error.strerror}); choose another folder with --out."
+        ) from error
+    return paths

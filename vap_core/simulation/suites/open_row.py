@@ -1,0 +1,68 @@
+"""From an episode row to an environment: the one place where a row's suite, variant and objects become a scene."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from vap_core.simulation.assets.objects import ObjectModel
+from vap_core.simulation.env import Env
+from vap_core.simulation.occluder import Occlusion
+from vap_core.simulation.scenes import Meshes, Scene, build
+from vap_core.simulation.suites import suite as suite_called
+from vap_core.simulation.suites.variants import VARIANTS
+from vap_core.simulation.types import EpisodeRow
+
+
+def build_scene(
+    suite: str,
+    models: Sequence[str | ObjectModel],
+    variant: str = "base",
+    meshes: Meshes = "plain",
+) -> Scene:
+    """The suite's robot and cameras with `models` (names in the object registry, or models themselves), in a variant's style.
+
+    Raises: UnknownName.
+    """
+    robot = suite_called(suite).robot
+    return build(robot, models, style=VARIANTS[variant].style, meshes=meshes)
+
+
+def make_env(
+    scene: Scene,
+    suite: str,
+    *,
+    image_size: int = 224,
+    cameras: Sequence[str] | None = None,
+    occlusion: Occlusion | None = None,
+) -> Env:
+    """An environment in `scene` with the suite's control, sensors and cameras (or fewer of them)."""
+    known = suite_called(suite)
+    return Env(
+        scene,
+        image_size=image_size,
+        cameras=known.cameras if cameras is None else cameras,
+        control=known.control,
+        sensor=known.sensor,
+        occlusion=occlusion,
+    )
+
+
+@contextmanager
+def open_row(
+    row: EpisodeRow,
+    *,
+    image_size: int = 224,
+    occlusion: Occlusion | None = None,
+    meshes: Meshes = "plain",
+) -> Iterator[Env]:
+    """An environment at the start of the row's episode; its scene is closed with the block.
+
+    Raises: UnknownName, for a suite, an object or a camera that does not exist.
+    """
+    models = [place.model for place in row.placements]
+    with build_scene(row.suite, models, row.variant, meshes) as scene:
+        cameras = row.cameras or None
+        env = make_env(
+            scene, row.suite, image_size=image_size, cameras=cameras, occlusion=occlusion
+        )
+        env.reset(row)
+        yield env

@@ -1,0 +1,1 @@
+"""Rendered views and filmed demonstrations of generic objects."""

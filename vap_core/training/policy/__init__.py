@@ -1,0 +1,1 @@
+"""Training of mini-pi0 policies on filmed demonstrations."""

@@ -1,0 +1,1 @@
+"""Training of the mini-PaliGemma that policies and learned tokens start from."""
