@@ -243,7 +243,7 @@ def test_who_cannot_tell_is_refused_in_one_line(tmp_path: Path) -> None:
     )
     done = vap(*words)
     assert done.returncode == 2
-    assert "does not tell where it looks" in done.stderr
+    assert "gives no attention maps" in done.stderr
     assert "Traceback" not in done.stderr
     assert not list((tmp_path / "run").rglob("*.rrd"))
     done = vap(*words, "--record", "none")

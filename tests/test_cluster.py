@@ -8,6 +8,7 @@ import pytest
 
 from vap_core.base.errors import BadCluster, WorkerDied
 from vap_core.evaluation import cluster, engine
+from vap_core.evaluation.jobs import Job, Rows
 from vap_core.evaluation.processes import results
 from vap_core.evaluation.state_log import read as read_traces
 from vap_core.evaluation.store import open_run
@@ -34,9 +35,13 @@ def address() -> Iterator[str]:
 )
 def test_a_cluster_gives_what_local_processes_give(address: str, tmp_path: Path) -> None:
     there = engine.run(
-        STUDY, tmp_path / "ray", record="all", progress=False, spread=cluster.spread(address)
+        STUDY,
+        tmp_path / "ray",
+        record="all",
+        progress=False,
+        executor=cluster.ray_executor(address),
     )
-    here = engine.run(STUDY, tmp_path / "local", record="all", progress=False, spread=results)
+    here = engine.run(STUDY, tmp_path / "local", record="all", progress=False, executor=results)
     columns = [
         name for name in here.columns if name != "peak_mb" and not name.startswith("seconds_")
     ]
@@ -58,26 +63,26 @@ def test_a_cluster_gives_what_local_processes_give(address: str, tmp_path: Path)
         for name in ("ray", "local")
     ] == [6, 6]
     again = engine.run(
-        STUDY, tmp_path / "ray", progress=False, spread=cluster.spread("127.0.0.1:1")
+        STUDY, tmp_path / "ray", progress=False, executor=cluster.ray_executor("127.0.0.1:1")
     )
     pd.testing.assert_frame_equal(again, there)  # nothing is missing, nobody is asked
 
-    def dies(job: engine.Job) -> engine.Rows:
+    def dies(job: Job) -> Rows:
         import os
 
         os.kill(os.getpid(), 9)
         return []
 
-    jobs = list(engine.missing(STUDY, open_run(tmp_path / "dies", STUDY.configuration())))[:1]
+    jobs = list(engine.missing_jobs(STUDY, open_run(tmp_path / "dies", STUDY.configuration())))[:1]
     with pytest.raises(WorkerDied, match="a worker of the cluster died"):
-        list(cluster.spread(address)(dies, jobs, 1, ""))
+        list(cluster.ray_executor(address)(dies, jobs, 1, ""))
     strange = list(
-        engine.missing(
+        engine.missing_jobs(
             STUDY, open_run(tmp_path / "strange", {**STUDY.configuration(), "version": "9.9"})
         )
     )[:1]
     with pytest.raises(BadCluster, match=r"is not like this machine \(version 9.9 there"):
-        list(cluster.spread(address)(dies, strange, 1, ""))
+        list(cluster.ray_executor(address)(dies, strange, 1, ""))
 
 
 def test_no_cluster_is_said_in_one_line(tmp_path: Path) -> None:
@@ -85,4 +90,6 @@ def test_no_cluster_is_said_in_one_line(tmp_path: Path) -> None:
         BadCluster,
         match=r"no Ray cluster answers at 'nowhere' .*; start one with `ray start --head",
     ):
-        engine.run(STUDY, tmp_path / "run", progress=False, spread=cluster.spread("nowhere"))
+        engine.run(
+            STUDY, tmp_path / "run", progress=False, executor=cluster.ray_executor("nowhere")
+        )

@@ -248,7 +248,7 @@ def test_a_dead_worker_is_said_and_what_was_done_stays(tmp_path: Path) -> None:
         "import os, vap_core.evaluation.engine as e, vap_core.evaluation.study as x\n"
         "from dataclasses import replace; from pathlib import Path\n"
         "def work(job): os.kill(os.getpid(), 9)\n"
-        "e.work = work\n"
+        "e.run_job = work\n"
         f"\nif __name__ == '__main__': e.run(replace(x.DEMO, episodes=1), Path({str(out)!r}), progress=False)\n"
     )
     (tmp_path / "die.py").write_text(code)

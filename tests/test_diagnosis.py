@@ -89,7 +89,7 @@ def test_the_cases_of_a_row_sum_to_its_failures() -> None:
     assert (counts[list(CASES)].sum(axis=1) == counts["failed"]).all()
     for case, parts in CASES.items():
         assert (counts[[f"{case}: {part}" for part in parts]].sum(axis=1) == counts[case]).all()
-    assert counts.loc["vap", "sure"] == 0.5
+    assert counts.loc["vap", "mean_confidence"] == 0.5
 
 
 def test_as_text_every_share_has_its_interval() -> None:
@@ -105,7 +105,7 @@ def test_as_text_every_share_has_its_interval() -> None:
 
 def test_the_road_narrows_and_ends_with_the_successes() -> None:
     vap, generic = funnel_table(TABLE)
-    assert (vap.n, vap.left) == (9, (8, 5, 5, 5, 4, 4, 4))
+    assert (vap.n, vap.left, vap.succeeded) == (9, (8, 5, 5, 5, 4, 4, 4), 4)
     assert (generic.n, generic.left) == (2, (None, None, None, None, 2, 0, 0))
     assert all(a >= b for a, b in zip(vap.left, vap.left[1:], strict=False))  # type: ignore[operator]
 
@@ -123,7 +123,7 @@ def test_a_run_lists_its_failures_with_their_reasons(run: Path) -> None:
 def test_several_places_are_one_list(run: Path, tmp_path: Path) -> None:
     publish([run], tmp_path / "mine.parquet")
     both = list_failures(run, tmp_path / "mine.parquet")
-    assert both.table["place"].tolist() == [str(run)] * 3 + [str(tmp_path / "mine.parquet")] * 3
+    assert both.table["source"].tolist() == [str(run)] * 3 + [str(tmp_path / "mine.parquet")] * 3
 
 
 def test_a_condition_narrows_them_down(run: Path) -> None:

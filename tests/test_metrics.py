@@ -25,6 +25,13 @@ def test_sixteen_of_twenty() -> None:
     assert str(rate(16, 20)) == "80 % [58, 92]"
 
 
+def test_only_all_of_them_are_printed_as_a_hundred_percent() -> None:
+    assert str(rate(1683, 1685)) == "99.9 % [99.6, >99.9]"
+    assert str(rate(2, 1685)) == "0.1 % [<0.1, 0.4]"
+    assert str(rate(40, 40)) == "100 % [91, 100]"
+    assert str(rate(0, 40)) == "0 % [0, 9]"
+
+
 def test_nothing_is_not_a_number() -> None:
     assert math.isnan(rate(0, 0).value)
 

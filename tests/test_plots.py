@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.test_diagnosis import TABLE
+from tests.test_diagnosis import TABLE, row
 from tests.toys import TOYS, personal, scene
 from vap_core.analysis.inspection import grounding_table
 from vap_core.analysis.plots import (
@@ -69,7 +69,7 @@ def test_the_winner_is_drawn_apart() -> None:
 
 
 def test_scores_and_film_draw() -> None:
-    row = {
+    episode = {
         "suite": "s",
         "task": "t",
         "split": "",
@@ -80,20 +80,25 @@ def test_scores_and_film_draw() -> None:
         "wrong_object": False,
     }
     rows = [
-        {**row, "method": m, "first_object_correct": True, "steps": 3} for m in ("generic", "vap")
+        {**episode, "method": m, "first_object_correct": True, "steps": 3}
+        for m in ("generic", "vap")
     ]
     assert len(scores_figure(score(rows)).axes) == 1
     assert len(film({"raw": [LINE, LINE]}, ["a", "b"]).axes) == 2
 
 
 def test_the_funnel_has_a_panel_per_suite_and_a_line_per_method() -> None:
+    table = pd.concat([TABLE, pd.DataFrame([row(stages=2, outcome="success")])])
     several = pd.concat(
-        [TABLE, TABLE.assign(suite="tabletop"), TABLE.assign(suite="simpler-bridge")]
+        [table, table.assign(suite="tabletop"), table.assign(suite="simpler-bridge")]
     )
     figure = funnel_figure(funnel_table(several), {"vap": "red", "generic": "grey"})
-    assert [len(axes.lines) for axes in figure.axes] == [2, 2, 2, 0]
-    assert figure.axes[0].lines[0].get_ydata()[-1] == pytest.approx(100 * 4 / 9)
-    assert list(figure.axes[0].lines[1].get_xdata()) == [4, 5, 6], (
+    assert [len(axes.lines) for axes in figure.axes] == [5, 4, 4, 0]
+    every_stage, success, _, generic_success = figure.axes[1].lines[:4]
+    assert every_stage.get_ydata()[-1] == pytest.approx(40.0)
+    assert list(success.get_ydata()) == pytest.approx([50.0]), "SR has a mark of its own"
+    assert list(generic_success.get_ydata()) == [0.0]
+    assert list(figure.axes[1].lines[2].get_xdata()) == [4, 5, 6], (
         "nothing is said of stages that a method does not have"
     )
 
@@ -131,3 +136,17 @@ def test_rates_are_bars_as_high_as_they_are_with_their_intervals() -> None:
     assert {(round(low, 6), round(high, 6)) for low, high in spread} == {
         (round(100 * r.low, 6), round(100 * r.high, 6)) for r in (half, all_)
     }
+
+
+def test_groups_and_colours_have_one_order_in_every_panel() -> None:
+    some = rate(1, 2)
+    panels = {
+        "first": {"cup": {"vap": some, "generic": some}, "shoe": {"vap": some, "generic": some}},
+        "second": {"shoe": {"generic": some, "vap": some}, "cup": {"generic": some, "vap": some}},
+    }
+    figure = rates_figure(panels, "% of episodes")
+    colours = []
+    for axes in figure.axes:
+        assert [tick.get_text() for tick in axes.get_xticklabels()] == ["cup", "shoe"]
+        colours.append([patch.get_facecolor() for patch in axes.patches])
+    assert colours[0] == colours[1]

@@ -11,6 +11,7 @@ from lerobot.policies import make_pre_post_processors
 from vap_core.base.errors import BadMemory, BadStudy
 from vap_core.evaluation import engine
 from vap_core.evaluation import study as experiments
+from vap_core.evaluation.jobs import run_job
 from vap_core.evaluation.study import Study
 from vap_core.policies.mini_pi0 import learned_token, teach_token
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
@@ -88,8 +89,8 @@ def test_it_runs_as_a_method_and_the_policy_stays(
     study = Study(((SUITE, TASK),), ("generic", "soft"), episodes=1, policy=str(far))
     engine.store.open_run(tmp_path, study.configuration())
     experiments.register_personal(study, tmp_path / "memory")
-    jobs = list(engine.missing(study, tmp_path))
-    rows = {job.method: engine.work(job)[0] for job in jobs}
+    jobs = list(engine.missing_jobs(study, tmp_path))
+    rows = {job.method: run_job(job)[0] for job in jobs}
     assert {row["outcome"] for row in rows.values()} == {"failure"}
     assert rows["soft"]["policy_sha256"] == rows["generic"]["policy_sha256"] != ""
     row, bank = study.rows(SUITE, TASK)[0], tmp_path / "memory"

@@ -14,6 +14,7 @@ from vap_core.simulation.types import EpisodeRow
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -366,39 +367,55 @@ def learning_figure(
 
 
 def rates_figure(panels: Mapping[str, Mapping[str, Mapping[str, "Rate"]]], label: str) -> "Figure":
-    """A panel per key, of grouped bars: a group per inner key, a colour per innermost one; rates in percent with their intervals."""
+    """Grouped bars: a panel per key, a group per inner key, a colour per innermost key.
+
+    Rates are drawn in percent with their intervals. Groups and colours keep one order over all
+    panels, that in which they first appear.
+    """
+    groups: dict[str, None] = {}
+    names: dict[str, None] = {}
+    for panel in panels.values():
+        groups |= dict.fromkeys(panel)
+        for rates in panel.values():
+            names |= dict.fromkeys(rates)
     figure = empty_figure(0.9 + 2.9 * len(panels), 3.2)
-    for axes, (title, groups) in zip(
-        figure.subplots(1, len(panels), squeeze=False, sharey=True)[0], panels.items(), strict=True
-    ):
-        inner = list(dict.fromkeys(name for rates in groups.values() for name in rates))
-        for i, name in enumerate(inner):
-            held = [(at, rates[name]) for at, rates in enumerate(groups.values()) if name in rates]
-            x = np.array([at for at, _ in held]) + (i - (len(inner) - 1) / 2) * 0.84 / len(inner)
-            value, low, high = (
-                100 * np.array([(rate.value, rate.low, rate.high) for _, rate in held]).T
-            )
-            axes.bar(x, value, 0.76 / len(inner), color=f"C{i}", label=name)
-            axes.errorbar(
-                x,
-                value,
-                np.maximum([value - low, high - value], 0),
-                fmt="none",
-                ecolor="black",
-                capsize=2,
-                linewidth=0.9,
-            )
-        axes.set_xticks(range(len(groups)), list(groups), fontsize=8)
+    all_axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
+    drawn: dict[str, Artist] = {}
+    for axes, (title, panel) in zip(all_axes, panels.items(), strict=True):
+        own = [group for group in groups if group in panel]
+        for i, name in enumerate(names):
+            at = [x for x, group in enumerate(own) if name in panel[group]]
+            rates_of_name = [panel[own[x]][name] for x in at]
+            offset = (i - (len(names) - 1) / 2) * 0.84 / len(names)
+            bars = _draw_rates(axes, np.array(at) + offset, rates_of_name, i, 0.76 / len(names))
+            if at:
+                drawn.setdefault(name, bars)
+        axes.set_xticks(range(len(own)), own, fontsize=8)
         axes.set(title=title, ylim=(0, 105))
         axes.spines[["top", "right"]].set_visible(False)
-    figure.axes[0].set_ylabel(label)
-    figure.legend(
-        *figure.axes[0].get_legend_handles_labels(),
-        loc="outside lower center",
-        ncols=4,
-        frameon=False,
-    )
+    all_axes[0].set_ylabel(label)
+    figure.legend(drawn.values(), drawn.keys(), loc="outside lower center", ncols=4, frameon=False)
     return figure
+
+
+def _draw_rates(
+    axes: "Axes", x: np.ndarray, rates: "Sequence[Rate]", colour: int, width: float
+) -> "Artist":
+    """Bars of rates with their intervals, in percent."""
+    value = 100 * np.array([rate.value for rate in rates])
+    low = 100 * np.array([rate.low for rate in rates])
+    high = 100 * np.array([rate.high for rate in rates])
+    bars = axes.bar(x, value, width, color=f"C{colour}")
+    axes.errorbar(
+        x,
+        value,
+        np.maximum([value - low, high - value], 0),
+        fmt="none",
+        ecolor="black",
+        capsize=2,
+        linewidth=0.9,
+    )
+    return bars
 
 
 def keep(

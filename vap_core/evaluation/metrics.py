@@ -41,7 +41,8 @@ class Rate:
     def __str__(self) -> str:
         if self.n == 0:
             return "-"
-        return f"{100 * self.value:.0f} % [{100 * self.low:.0f}, {100 * self.high:.0f}]"
+        low, high = _whole_percent(self.low), _whole_percent(self.high)
+        return f"{_whole_percent(self.value)} % [{low}, {high}]"
 
 
 def intervals(k: Counts, n: Counts, *, conservative: bool = False) -> tuple[Bounds, Bounds]:
@@ -168,6 +169,16 @@ def step_times(episodes: "Iterable[Mapping[str, Any]] | pd.DataFrame") -> dict[s
             seconds = float(table[column].astype(float).sum())
             times_ms[column.removeprefix("seconds_")] = 1e3 * seconds / steps
     return times_ms
+
+
+def _whole_percent(fraction: float) -> str:
+    """A fraction as whole percent; only 0 is printed as 0 and only 1 as 100."""
+    whole = f"{100 * fraction:.0f}"
+    if whole == "100" and fraction < 1 - 1e-9:
+        return f"{100 * fraction:.1f}" if fraction < 0.9995 else ">99.9"
+    if whole == "0" and fraction > 1e-9:
+        return f"{100 * fraction:.1f}" if fraction >= 0.0005 else "<0.1"
+    return whole
 
 
 def _rate_of(line: Mapping[Any, Any], measure: str) -> Rate:

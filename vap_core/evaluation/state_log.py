@@ -82,8 +82,8 @@ def _truths(row: Mapping[str, Any]) -> list[Truth]:
             objects_world=dict(zip(names, step, strict=True)),
             links_world={},
             touched=tuple(touched),
-            pressed_s=_pressed_from_text(pressed),
-            contacts=_contacts_from_text(contacts),
+            pressed_s=_pressed_from_text(pressed.tolist()),
+            contacts=_contacts_from_text(contacts.tolist()),
         )
         truths.append(truth)
     return truths

@@ -90,13 +90,15 @@ def sub_cases_text(counts: "pd.DataFrame") -> str:
 class FunnelRow:
     """How many of `n` episodes are left after each of STAGES.
 
-    None where a method has no such stage.
+    None where a method has no such stage. `succeeded` counts every success, also one that failed
+    an earlier stage.
     """
 
     suite: str
     method: str
     n: int
     left: tuple[int | None, ...]
+    succeeded: int
 
 
 type FunnelTable = list[FunnelRow]
@@ -119,6 +121,12 @@ def funnel_table(table: "pd.DataFrame") -> FunnelTable:
                 continue
             passing &= passed.eq(True)
             left.append(int(passing.sum()))
-        row = FunnelRow(suite=str(suite), method=str(method), n=len(part), left=tuple(left))
+        row = FunnelRow(
+            suite=str(suite),
+            method=str(method),
+            n=len(part),
+            left=tuple(left),
+            succeeded=int(part["outcome"].eq("success").sum()),
+        )
         rows.append(row)
     return rows

@@ -23,6 +23,7 @@ CASE_SHADES = {
     "unprompted": "Greys",
     "unlabelled": "Greens",
 }
+SUCCESS_MARK = "D"
 LABEL_APART = 6.0
 """Percent between two numbers at the ends of lines, so that both can be read."""
 
@@ -31,7 +32,8 @@ def funnel_figure(rows: Sequence[FunnelRow], colours: Mapping[str, str]) -> "Fig
     """Per suite, the share of episodes that are left after each stage of the funnel.
 
     A line per method of `colours`, methods that read the simulator dashed. A method that highlights
-    nothing begins with the stage "touched".
+    nothing begins with the stage "touched". The last tick has two marks: a dot for episodes that
+    succeed with every stage right, a diamond for all that succeed (SR).
     """
     by_suite: dict[str, list[FunnelRow]] = {}
     for row in rows:
@@ -45,6 +47,7 @@ def funnel_figure(rows: Sequence[FunnelRow], colours: Mapping[str, str]) -> "Fig
         shown = [row for row in of_suite if row.method in colours]
         drawn |= _draw_funnel(axes, shown, colours)
         axes.set_xticks(range(len(STAGES)), STAGES, fontsize=8, rotation=20)
+        axes.set_xlim(-0.25, len(STAGES) - 0.4)
         axes.set(title=f"{suite} (n {of_suite[0].n})", ylim=(0, 104))
         axes.grid(color="#eeeeee")
         axes.spines[["top", "right"]].set_visible(False)
@@ -52,6 +55,8 @@ def funnel_figure(rows: Sequence[FunnelRow], colours: Mapping[str, str]) -> "Fig
         axes.set_axis_off()
     for axes in panels[::columns]:
         axes.set_ylabel("% of episodes left after the stage", fontsize=8)
+    (success,) = panels[0].plot([], [], SUCCESS_MARK, color="#555555", fillstyle="none")
+    drawn["SR (every success)"] = success
     figure.legend(drawn.values(), drawn.keys(), loc="outside lower center", ncols=6, frameon=False)
     return figure
 
@@ -114,14 +119,21 @@ def _draw_funnel(
             color=colour,
             linewidth=1.8,
         )
-        ends.append((percent[-1], colour))
+        success = 100 * row.succeeded / row.n
+        axes.plot(
+            len(STAGES) - 1, success, SUCCESS_MARK, color=colour, fillstyle="none", markersize=7
+        )
+        ends.append((percent[-1], success, colour))
     lowest = -LABEL_APART
-    for percent_left, colour in sorted(ends):
-        lowest = max(percent_left, lowest + LABEL_APART)
+    for percent_left, success, colour in sorted(ends):
+        lowest = max(success, lowest + LABEL_APART)
+        text = f"{success:.0f}"
+        if round(percent_left) != round(success):
+            text += f" (every stage {percent_left:.0f})"
         axes.annotate(
-            f"{percent_left:.0f}",
+            text,
             (len(STAGES) - 1, lowest),
-            (5, 0),
+            (7, 0),
             textcoords="offset points",
             fontsize=8,
             color=colour,

@@ -5,6 +5,7 @@ import json
 import re
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from vap_core.base.errors import BadPolicy
 
@@ -13,6 +14,8 @@ WEIGHTS, CONFIG, PIPELINES = (
     "config.json",
     ("policy_preprocessor.json", "policy_postprocessor.json"),
 )
+STEP_NAME = "vap_prompt"
+"""The registered name of the step that prompts inside lerobot's own loops."""
 WANTED_FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
 
 
@@ -87,33 +90,44 @@ def fingerprint(checkpoint: str | Path) -> str:
 
 
 def refuse_code(folder: Path) -> None:
-    """A pipeline may only name lerobot's own steps: lerobot would import, and call, whatever stands there."""
+    """Check that the pipelines of a checkpoint name steps of lerobot only.
+
+    lerobot imports and calls whatever a pipeline names.
+
+    Raises: BadPolicy for another step, or for a checkpoint with VAP attached.
+    """
+    for file in PIPELINES:
+        for step in _steps(folder / file):
+            if step.get("registry_name") == STEP_NAME:
+                raise BadPolicy(
+                    f"load: {folder} has VAP attached for lerobot's own loops; here give the plain "
+                    "checkpoint, and the method by --method."
+                )
+            name = str(step.get("class", ""))
+            if step.get("registry_name") is None and not _is_lerobot_step(name):
+                raise BadPolicy(
+                    f"load: {folder / file} asks to run {name!r}, which is no step of lerobot; "
+                    "files are parsed here, never executed."
+                )
+
+
+def _steps(file: Path) -> list[dict[str, Any]]:
+    """The steps of a processor pipeline. Raises: BadPolicy."""
+    try:
+        steps = json.loads(file.read_text())["steps"]
+        return [dict(step) for step in steps]
+    except (ValueError, KeyError, TypeError) as error:
+        raise BadPolicy(
+            f"load: {file} is no processor pipeline ({type(error).__name__}); save it again with "
+            "lerobot 0.6."
+        ) from error
+
+
+def _is_lerobot_step(name: str) -> bool:
     from lerobot.processor import ProcessorStep
 
-    for file in PIPELINES:
-        try:
-            steps = json.loads((folder / file).read_text())["steps"]
-            foreign = [
-                step.get("class", "vap_core.policies.lerobot.")
-                for step in steps
-                if step.get("registry_name") in (None, "vap_prompt")
-            ]
-        except (ValueError, KeyError, TypeError) as error:
-            raise BadPolicy(
-                f"load: {folder / file} is no processor pipeline ({type(error).__name__}); save it again with lerobot 0.6."
-            ) from error
-        for name in foreign:
-            if str(name).startswith("vap_core.policies.lerobot."):
-                raise BadPolicy(
-                    f"load: {folder} has VAP attached for lerobot's own loops; here give the plain checkpoint, and the method by --method."
-                )
-            module, _, attribute = str(name).rpartition(".")
-            found = (
-                getattr(import_module(module), attribute, None)
-                if module.startswith("lerobot.processor")
-                else None
-            )
-            if not (isinstance(found, type) and issubclass(found, ProcessorStep)):
-                raise BadPolicy(
-                    f"load: {folder / file} asks to run {name!r}, which is no step of lerobot; files are parsed here, never executed."
-                )
+    module, _, attribute = name.rpartition(".")
+    if not module.startswith("lerobot.processor"):
+        return False
+    found = getattr(import_module(module), attribute, None)
+    return isinstance(found, type) and issubclass(found, ProcessorStep)

@@ -31,7 +31,7 @@ from vap_core.base.errors import BadMemory, BadOutput, BadViews, one_of
 from vap_core.base.types import Rgb, Views
 from vap_core.memory import load_bank
 from vap_core.perception.stacks import STACKS, load_stack
-from vap_core.policies.lerobot.checkpoints import PIPELINES, locate
+from vap_core.policies.lerobot.checkpoints import PIPELINES, STEP_NAME, locate
 from vap_core.simulation import suites
 from vap_core.simulation.gym_env import VapEnv, env_id
 
@@ -48,7 +48,7 @@ class Following:
     text: str
 
 
-@ProcessorStepRegistry.register(name="vap_prompt")
+@ProcessorStepRegistry.register(name=STEP_NAME)
 @dataclass
 class VapPrompt(ProcessorStep):
     """Tints the remembered object in every `observation.images.*` and rewrites `task`; the views that show it not pass bit for bit.
