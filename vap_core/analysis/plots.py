@@ -14,8 +14,8 @@ from vap_core.simulation.types import EpisodeRow
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
+    from matplotlib.container import BarContainer
     from matplotlib.figure import Figure
 
 
@@ -380,7 +380,7 @@ def rates_figure(panels: Mapping[str, Mapping[str, Mapping[str, "Rate"]]], label
             names |= dict.fromkeys(rates)
     figure = empty_figure(0.9 + 2.9 * len(panels), 3.2)
     all_axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
-    drawn: dict[str, Artist] = {}
+    drawn: dict[str, BarContainer] = {}
     for axes, (title, panel) in zip(all_axes, panels.items(), strict=True):
         own = [group for group in groups if group in panel]
         for i, name in enumerate(names):
@@ -394,13 +394,19 @@ def rates_figure(panels: Mapping[str, Mapping[str, Mapping[str, "Rate"]]], label
         axes.set(title=title, ylim=(0, 105))
         axes.spines[["top", "right"]].set_visible(False)
     all_axes[0].set_ylabel(label)
-    figure.legend(drawn.values(), drawn.keys(), loc="outside lower center", ncols=4, frameon=False)
+    figure.legend(
+        handles=list(drawn.values()),
+        labels=list(drawn),
+        loc="outside lower center",
+        ncols=4,
+        frameon=False,
+    )
     return figure
 
 
 def _draw_rates(
     axes: "Axes", x: np.ndarray, rates: "Sequence[Rate]", colour: int, width: float
-) -> "Artist":
+) -> "BarContainer":
     """Bars of rates with their intervals, in percent."""
     value = 100 * np.array([rate.value for rate in rates])
     low = 100 * np.array([rate.low for rate in rates])
