@@ -111,12 +111,15 @@ def test_the_golden_numbers_by_hand(tmp_path: Path) -> None:
         "3",
     ]
     assert [both[name] for name in ("n", "listed", "errors", "sr_k")] == ["12", "48", "2", "6"]
-    assert float(shaver["sr"]) == 50.0
-    assert (float(shaver["sr_cp_low"]), float(shaver["sr_cp_high"])) == (
-        pytest.approx(11.8, abs=0.05),
-        pytest.approx(88.2, abs=0.05),
+    assert float(shaver["sr_fraction"]) == 0.5
+    assert (float(shaver["sr_cp_low_fraction"]), float(shaver["sr_cp_high_fraction"])) == (
+        pytest.approx(0.118, abs=0.0005),
+        pytest.approx(0.882, abs=0.0005),
     )
-    assert (float(shaver["paper_sr"]), float(shaver["paper_cmr"])) == (71.3, 82.9)
+    assert (
+        float(shaver["paper_sr_fraction"]),
+        float(shaver["paper_cmr_fraction"]),
+    ) == pytest.approx((0.713, 0.829))
     (pair,) = (
         pd.read_csv(tmp_path / "comparisons.csv").query("task == 'pick-shaver'").to_dict("records")
     )

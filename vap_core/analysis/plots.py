@@ -433,15 +433,24 @@ def keep(
 
 
 def keep_png(drawn: bytes, path: Path, limit: int = 480_000, small: int = 115_000) -> bytes:
-    """The same for a picture: what is too large is saved with coarser colours (6 or 5 bits a channel), then with fewer pixels."""
-    from PIL import Image
+    """The same for a picture, with its text chunks.
 
-    full = Image.open(BytesIO(drawn)).convert("RGB")
+    What is too large is saved with coarser colours (6 or 5 bits a channel), then with fewer pixels.
+    """
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    source = Image.open(BytesIO(drawn))
+    texts = PngInfo()
+    for name, text in source.info.items():
+        if isinstance(text, str):
+            texts.add_text(name, text)
+    full = source.convert("RGB")
     for share, bits in ((1.0, 8), (1.0, 6), (1.0, 5), (0.8, 6), (0.8, 5), (0.6, 5)):
         size = round(share * full.width), round(share * full.height)
         coarse = [round(round(v / 255 * (2**bits - 1)) * 255 / (2**bits - 1)) for v in range(256)]
         full.resize(size, Image.Resampling.LANCZOS).point(coarse * 3).save(
-            png := BytesIO(), "PNG", optimize=True
+            png := BytesIO(), "PNG", optimize=True, pnginfo=texts
         )
         if png.tell() <= limit:
             break

@@ -79,7 +79,7 @@ def _method_column(name: str, image_roots: list[str]) -> rrb.Container:
     text = rrb.TextDocumentView(origin=f"/{name}/vap/instruction", name=f"{name} · instruction")
     gripper = rrb.TimeSeriesView(
         origin=f"/{name}/vap/hand",
-        name=f"{name} · hand",
+        name=f"{name} · gripper and target",
         plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
     )
     status = rrb.StateTimelineView(origin=f"/{name}/vap/status", name=f"{name} · course")

@@ -113,7 +113,7 @@ def mask_view(camera: str) -> Part:
 
 def status_view() -> Part:
     """The state lanes."""
-    return rrb.StateTimelineView(origin="/vap/status", name="course")
+    return rrb.StateTimelineView(origin="/vap/status", name="status")
 
 
 def events_view() -> Part:
@@ -148,7 +148,7 @@ def method_curve_views() -> list[Part]:
 
 def gripper_view() -> Part:
     """The gripper's distance from the target, and the target's lift."""
-    return _curve_view("/vap/hand", "hand")
+    return _curve_view("/vap/hand", "gripper and target")
 
 
 def _image_view(camera: str, title: str, suffixes: Sequence[str]) -> rrb.Spatial2DView:

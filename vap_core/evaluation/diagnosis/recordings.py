@@ -16,6 +16,7 @@ from vap_core.evaluation.diagnosis.failures import (
     deciding_frame,
     failure_row,
 )
+from vap_core.evaluation.stills import write_provenance
 from vap_core.evaluation.store import ROW_KEY
 from vap_core.evaluation.study import Study, make_trial, register_personal
 from vap_core.simulation.types import EpisodeRow
@@ -60,7 +61,8 @@ def side_by_side_recording(failures: Failures, number: int, method: str) -> Path
 def save_screenshot(failures: Failures, number: int, png: Path, against: str | None = None) -> str:
     """Save the viewer's picture of a listed failure at its deciding frame; return why it failed.
 
-    `against` is another method on the same episode, to be shown next to it.
+    `against` is another method on the same episode, to be shown next to it. The PNG keeps what it
+    shows (`stills`).
 
     Raises: as `side_by_side_recording`; MissingGL.
     """
@@ -71,7 +73,9 @@ def save_screenshot(failures: Failures, number: int, png: Path, against: str | N
     else:
         path = side_by_side_recording(failures, number, against)
     screenshot(path, png, frame_index=deciding_frame(failures, number), size=(1920, 1080))
-    return str(failure_row(failures, number)["case_sentence"])
+    row = failure_row(failures, number)
+    write_provenance(png, _study_of(failures.manifests[row["configuration"]], row))
+    return str(row["case_sentence"])
 
 
 def correct_failure(failures: Failures, number: int, case: str, note: str = "") -> Path:

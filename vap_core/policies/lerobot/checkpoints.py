@@ -16,6 +16,8 @@ WEIGHTS, CONFIG, PIPELINES = (
 )
 STEP_NAME = "vap_prompt"
 """The registered name of the step that prompts inside lerobot's own loops."""
+STEP_CLASS = re.compile(r"vap_core\.(\w+\.)*VapPrompt")
+"""Its class, in this version or an earlier one."""
 WANTED_FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
 
 
@@ -98,12 +100,12 @@ def refuse_code(folder: Path) -> None:
     """
     for file in PIPELINES:
         for step in _steps(folder / file):
-            if step.get("registry_name") == STEP_NAME:
+            name = str(step.get("class", ""))
+            if step.get("registry_name") == STEP_NAME or STEP_CLASS.fullmatch(name):
                 raise BadPolicy(
                     f"load: {folder} has VAP attached for lerobot's own loops; here give the plain "
                     "checkpoint, and the method by --method."
                 )
-            name = str(step.get("class", ""))
             if step.get("registry_name") is None and not _is_lerobot_step(name):
                 raise BadPolicy(
                     f"load: {folder / file} asks to run {name!r}, which is no step of lerobot; "
