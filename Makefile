@@ -1,14 +1,18 @@
-.PHONY: setup demo test lab lock clean
+.PHONY: setup demo lint check test test-all lab lock clean
 .DEFAULT_GOAL := help
 
 RUN := OMP_NUM_THREADS=1 .venv/bin/python
+PYTEST := $(RUN) -m pytest -n 2 --dist loadfile
 
 help:
-	@echo "make demo    set up what is missing, then the main job: VAP against generic on two robots, with recordings"
-	@echo "make test    set up what is missing, then lint, types, tests and notebooks"
-	@echo "make lab     open the notebooks in JupyterLab"
-	@echo "make setup   only set up .venv      make lock   renew environment.txt from pyproject.toml"
-	@echo "make clean   remove .venv and caches; data/ stays"
+	@echo "make demo      set up what is missing, then the main job: VAP against generic on two robots, with recordings"
+	@echo "make check     for every day: lint, types and unit tests, in three minutes"
+	@echo "make test      lint, types, all tests and notebooks, in ten minutes"
+	@echo "make test-all  make test, and the long sweeps"
+	@echo "make lab       open the notebooks in JupyterLab"
+	@echo "make setup     only set up .venv"
+	@echo "make lock      renew environment.txt from pyproject.toml"
+	@echo "make clean     remove .venv and caches; data/ stays"
 
 setup: .venv/.ready
 
@@ -18,13 +22,20 @@ setup: .venv/.ready
 demo: setup
 	@$(RUN) -m vap_core demo
 
-test: setup
+lint: setup
 	$(RUN) -m ruff check .
 	$(RUN) -m ruff format --check .
 	$(RUN) -m mypy
-	$(RUN) -m pytest -n 2 --dist loadfile -m "not alone"
+
+check: lint
+	$(PYTEST) -m "not slow and not alone and not sweep"
+
+test: lint
+	$(PYTEST) -m "not alone and not sweep" --nbval-lax notebooks tests
 	$(RUN) -m pytest -m alone
-	$(RUN) -m pytest --nbval-lax notebooks
+
+test-all: test
+	$(RUN) -m pytest -m sweep
 
 lab: setup
 	.venv/bin/jupyter lab --ip 127.0.0.1 notebooks

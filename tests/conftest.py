@@ -39,7 +39,7 @@ def _one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def stage(tmp_path_factory: pytest.TempPathFactory) -> "tuple[Path, list[Film]]":
     """A folder that keeps a stage of two episodes of simpler-bridge, and its films."""
     from vap_core.training.films import demonstrations

@@ -10,8 +10,8 @@ import torch
 from rerun.chunk import RrdReader
 
 from tests import tiny_lerobot as tiny
+from tests.command import process, vap
 from tests.drawn import SUCCESS, columns, entities, frame, opening, rerun
-from tests.test_cli import vap
 from tests.test_why import tabs
 from vap_core.evaluation.methods import METHODS
 from vap_core.evaluation.policy_names import shipped
@@ -221,7 +221,7 @@ def test_a_glow_is_brightest_where_attention_is_most_and_never_leaves_the_pictur
 
 @pytest.mark.slow
 def test_the_real_command_records_it(tmp_path: Path) -> None:
-    done = vap("rollout", "--suite", "simpler-bridge", "--task", "pick-shaver", "--policy", "mini-pi0", "--methods", "generic", "--episodes", "1",
+    done = process("rollout", "--suite", "simpler-bridge", "--task", "pick-shaver", "--policy", "mini-pi0", "--methods", "generic", "--episodes", "1",
                "--record", "all", "--attention", "--out", tmp_path / "run")  # fmt: skip
     assert done.returncode == 0, done.stderr
     (path,) = (tmp_path / "run" / "recordings").glob("*.rrd")

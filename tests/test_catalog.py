@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.command import vap
 from tests.drawn import ROW, SUCCESS, columns, entities, frame, opening, rerun
-from tests.test_cli import vap
 from tests.test_why import fail
 from vap_core.base.errors import BadOutput, BadRecording, BadStudy, UnknownName
 from vap_core.evaluation.diagnosis import explain

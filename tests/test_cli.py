@@ -1,4 +1,4 @@
-"""The real commands, in processes of their own: what they print, what they refuse, and how they mend."""
+"""The commands: what they print, what they refuse, and what they say to do."""
 
 import json
 import subprocess
@@ -12,30 +12,12 @@ import typer
 from PIL import Image
 from typer.testing import CliRunner
 
+from tests.command import process, refused, vap
 from vap_core.cli import app
 from vap_core.memory import load_bank
 from vap_core.perception.describe import WORDS
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.studio import reference_views
-
-
-def vap(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "vap_core", *map(str, words)],
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-
-
-def refused(*words: str | Path) -> str:
-    """Run a command that must fail with one line the user can act on."""
-    done = vap(*words)
-    assert done.returncode == 2, done.stdout + done.stderr
-    last = done.stderr.strip().splitlines()[-1]
-    assert last.startswith("error: ")
-    assert "Traceback" not in done.stderr
-    return last
 
 
 @pytest.fixture(scope="module")
@@ -263,7 +245,7 @@ def test_show_refuses_what_is_no_recording(tmp_path: Path) -> None:
 
 
 def test_doctor_finds_this_machine_able() -> None:
-    done = vap("doctor")
+    done = process("doctor")
     assert done.returncode == 0, done.stdout
     assert "MISSING" not in done.stdout
     assert "stack foundation" in done.stdout

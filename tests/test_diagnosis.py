@@ -1,7 +1,5 @@
 """From a run's table to the frame: failures divided, listed, narrowed down, run again and opened; what is refused, in one line."""
 
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +7,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
+from tests.command import vap
 from vap_core.base.errors import BadOutput, BadStudy
 from vap_core.base.tables import align
 from vap_core.evaluation import engine
@@ -227,22 +226,13 @@ def test_other_refusals(run: Path, tmp_path: Path) -> None:
         recording_of(failures, 0)
 
 
-def command(*words: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "vap_core", *map(str, words)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-
-
 def test_the_command_lists_and_refuses(run: Path) -> None:
-    done = command("diagnose", run, "--limit", 1)
+    done = vap("diagnose", run, "--limit", 1)
     assert done.returncode == 0, done.stderr
     assert "fail % [95 %]" in done.stdout
-    refused = command("diagnose", run, "--case", 7)
+    refused = vap("diagnose", run, "--case", 7)
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
-    refused = command(
+    refused = vap(
         "eval", "--suite", "widowx-pick", "--record", "some", "--out", run.parent / "other"
     )
     assert (refused.returncode, refused.stderr) == (

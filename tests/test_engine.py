@@ -11,7 +11,6 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import pandas as pd
@@ -32,16 +31,13 @@ STUDY = Study(
     seeds=2,
 )
 ENV = {**os.environ, "OMP_NUM_THREADS": "1"}
-LONGEST_S = 15.0
-"""Longest life of a run that is to be killed."""
 
 
-def command(out: Path, episodes: int) -> list[str]:
+def command(out: Path, episodes: int, several: bool = False) -> list[str]:
     asked = [
         "--suite",
         "simpler-bridge",
-        "--suite",
-        "tabletop",
+        *(("--suite", "tabletop") if several else ()),
         "--policy",
         "random",
         "--episodes",
@@ -59,8 +55,13 @@ def told(out: Path) -> pd.DataFrame:
     ]
 
 
-def kills(out: Path, episodes: int, times: int, rng: random.Random) -> tuple[int, list[int]]:
-    """Start the same command again and again and kill it after a while, whole or its parent alone; kills done and rows seen after each."""
+def kills(
+    words: list[str], out: Path, times: int, longest_s: float, rng: random.Random
+) -> tuple[int, list[int]]:
+    """Start the same command again and again and kill it after `longest_s` at most.
+
+    Returns: the kills done, and the rows that were there after each.
+    """
     done, rows = 0, []
     while done < times:
         quiet = {
@@ -68,11 +69,9 @@ def kills(out: Path, episodes: int, times: int, rng: random.Random) -> tuple[int
             "stderr": subprocess.DEVNULL,
             "start_new_session": True,
         }
-        with subprocess.Popen(
-            command(out, episodes), env=ENV, preexec_fn=hear_interrupts, **quiet
-        ) as run:
+        with subprocess.Popen(words, env=ENV, preexec_fn=hear_interrupts, **quiet) as run:
             try:
-                run.wait(rng.uniform(0.5, LONGEST_S))
+                run.wait(rng.uniform(0.5, longest_s))
                 assert run.returncode == 0, f"status {run.returncode}"
                 break
             except subprocess.TimeoutExpired:
@@ -95,12 +94,14 @@ def hear_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def check(folder: Path, episodes: int, times: int, seed: int = 0) -> str:
+def check(folder: Path, episodes: int, times: int, longest_s: float, several: bool = False) -> None:
+    """A run that was killed again and again ends with the rows of an undisturbed one."""
     whole, torn = folder / "whole", folder / "torn"
-    done, rows = kills(torn, episodes, times, random.Random(seed))
+    words = command(torn, episodes, several)
+    done, rows = kills(words, torn, times, longest_s, random.Random(0))
     for out in (torn, whole):
         subprocess.run(
-            command(out, episodes),
+            command(out, episodes, several),
             env=ENV,
             check=True,
             stdout=subprocess.DEVNULL,
@@ -112,14 +113,19 @@ def check(folder: Path, episodes: int, times: int, seed: int = 0) -> str:
     assert done == times, "the run ended before it was killed so often; give it more episodes"
     assert rows == sorted(rows), "rows were lost"
     assert {k for k, _ in read_traces(torn)} == {k for k, _ in read_traces(whole)}
-    return f"killed {done} times, with {rows} rows after each; then {len(told(torn))} rows, as in the undisturbed run"
 
 
 @pytest.mark.slow
 def test_killed_at_random_moments_it_ends_with_the_rows_of_an_undisturbed_run(
     tmp_path: Path,
 ) -> None:
-    check(tmp_path, episodes=2, times=3)
+    check(tmp_path, episodes=2, times=2, longest_s=10.0)
+
+
+@pytest.mark.sweep
+@pytest.mark.timeout(3600)
+def test_killed_twenty_times_it_ends_with_the_rows_of_an_undisturbed_run(tmp_path: Path) -> None:
+    check(tmp_path, episodes=12, times=20, longest_s=15.0, several=True)
 
 
 def test_keys_tell_row_method_and_run_apart() -> None:
@@ -238,8 +244,3 @@ def test_an_episode_that_always_breaks_is_an_error_with_its_recording(
     ]
     assert read_manifest(tmp_path / "run")["configuration"]["seeds"] == 1
     assert not table.success[0]
-
-
-if __name__ == "__main__":
-    with TemporaryDirectory() as folder:
-        print(check(Path(folder), episodes=12, times=int(sys.argv[1]) if len(sys.argv) > 1 else 20))

@@ -1,7 +1,6 @@
 """The benchmark commands from end to end: a suite evaluated, resumed, judged again and recorded; what they refuse, in one line."""
 
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -11,6 +10,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from tests.command import process, vap
 from vap_core.base.errors import BadOutput, VapError
 from vap_core.evaluation.rescore import rescore
 from vap_core.evaluation.store import read
@@ -20,19 +20,8 @@ SUITE = "simpler-bridge"
 TASKS = [task.name for task in BENCHMARKS[SUITE].tasks]
 
 
-def vap(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    env = {**os.environ, "OMP_NUM_THREADS": "1"}
-    return subprocess.run(
-        [sys.executable, "-m", "vap_core", *map(str, words)],
-        env=env,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-
-
 def evaluate(out: Path) -> subprocess.CompletedProcess[str]:
-    return vap("eval", "--suite", SUITE, "--policy", "expert", "--episodes", "2", "--out", out)
+    return process("eval", "--suite", SUITE, "--policy", "expert", "--episodes", "2", "--out", out)
 
 
 @pytest.fixture(scope="module")

@@ -2,9 +2,6 @@
 
 import hashlib
 import json
-import os
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests import tiny_foundation
+from tests.command import vap
 from vap_core.base.errors import MissingWeights, UnknownName
 from vap_core.perception.foundation import downloads, sources, store
 from vap_core.perception.foundation.downloads import pull
@@ -302,17 +300,6 @@ def test_pins_are_commits_and_hashes_of_safe_files() -> None:
         sources.models_of("embedded")
 
 
-def vap(*words: str | Path, place: Path) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, store.VARIABLE: str(place)}
-    return subprocess.run(
-        [sys.executable, "-m", "vap_core", *map(str, words)],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        env=environment,
-    )
-
-
 def test_commands_pull_and_list(tmp_path: Path) -> None:
     for name in sources.KINDS["foundation-small"]:
         tiny_foundation.placeholder(
@@ -327,13 +314,13 @@ def test_commands_pull_and_list(tmp_path: Path) -> None:
         "--from",
         tmp_path / "usb",
         "--unpinned",
-        place=place,
+        env={store.VARIABLE: str(place)},
     )
     assert done.returncode == 0, done.stderr
     assert [line.split(":")[0] for line in done.stdout.splitlines()] == list(
         sources.KINDS["foundation-small"]
     )
-    listed = vap("weights", "list", place=place)
+    listed = vap("weights", "list", env={store.VARIABLE: str(place)})
     assert listed.stdout == store.weights_table(place) + "\n"
     assert (
         "facebook/sam2.1-hiera-large@665f8e2a: lacks config.json, model.safetensors"

@@ -1,14 +1,12 @@
 """A scan imported by the command is an object like any other; its files are checked on loading."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from tests.command import vap
 from tests.scanned import mug, put
 from vap_core.base.errors import BadObject, BadOutput, UnknownName
 from vap_core.simulation.assets import objects
@@ -23,15 +21,6 @@ ensure_gl()
 import mujoco  # noqa: E402
 
 
-def vap(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "vap_core", "objects", *map(str, words)],
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-
-
 @pytest.fixture(scope="module")
 def shelf(tmp_path_factory):
     """A folder of objects that holds one scanned mug, brought in by the command; all lookups go there."""
@@ -40,6 +29,7 @@ def shelf(tmp_path_factory):
         patch.setenv("VAP_OBJECTS", str(folder / "objects"))
         file = put(folder, "mug.glb", mug())
         done = vap(
+            "objects",
             "import",
             file,
             "--category",
@@ -102,7 +92,7 @@ def test_its_photos_show_the_texture_the_right_way_up(shelf):
 
 
 def test_list_shows_it_beside_the_workspaces_own(shelf):
-    done = vap("list")
+    done = vap("objects", "list")
     assert done.returncode == 0, done.stderr
     line = next(line for line in done.stdout.splitlines() if line.startswith("my-mug"))
     assert line.split()[1:4] == ["cup", "personal", "-"]
@@ -114,7 +104,7 @@ def test_list_shows_it_beside_the_workspaces_own(shelf):
 
 def test_a_name_that_is_taken_needs_replace(shelf):
     file = shelf / "mug.glb"
-    again = vap("import", file, "--category", "cup", "--name", "my-mug")
+    again = vap("objects", "import", file, "--category", "cup", "--name", "my-mug")
     assert again.returncode == 2
     assert again.stderr.strip().endswith("choose another --name or pass --replace.")
     with pytest.raises(
@@ -175,7 +165,7 @@ def test_what_was_saved_is_what_is_loaded(shelf, tmp_path):
 
 
 def test_photograph_writes_the_reference_views(shelf):
-    done = vap("photograph", "my-mug", "--out", shelf / "photos", "--views", "2")
+    done = vap("objects", "photograph", "my-mug", "--out", shelf / "photos", "--views", "2")
     assert done.returncode == 0, done.stderr
     assert "register 'my-mug' --category 'cup'" in done.stdout
     for i in range(2):

@@ -205,19 +205,20 @@ class LetsGo(Drops):
         return np.array([0.0] * (env.action_size - 1) + [1.0], np.float32)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def world() -> Iterator[Callable[[str, str], tuple[Scene, tuple[EpisodeRow, ...]]]]:
-    """Scene and first rows of a task, the scene closed in the end."""
-    held: list[Scene] = []
+    """Scene and first rows of a task, the scene built once and closed in the end."""
+    scenes: dict[tuple[str, str], Scene] = {}
 
     def of(suite: str, task: str) -> tuple[Scene, tuple[EpisodeRow, ...]]:
         rows = suites.rows(suite, task, n=3 * N)
-        names = tuple(dict.fromkeys(place.model for row in rows for place in row.placements))
-        held.append(build(suites.suite(suite).robot, names))
-        return held[-1], rows
+        if (suite, task) not in scenes:
+            names = tuple(dict.fromkeys(place.model for row in rows for place in row.placements))
+            scenes[suite, task] = build(suites.suite(suite).robot, names)
+        return scenes[suite, task], rows
 
     yield of
-    for scene in held:
+    for scene in scenes.values():
         scene.close()
 
 

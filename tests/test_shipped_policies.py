@@ -7,7 +7,7 @@ import pytest
 import torch
 from lerobot.policies import get_policy_class, make_pre_post_processors
 
-from tests.test_cli import vap
+from tests.command import vap
 from vap_core.evaluation.policy_names import MINI, SHIPPED, default_policy, shipped
 from vap_core.evaluation.store import read
 from vap_core.policies.lerobot.adapter import load
