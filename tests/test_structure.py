@@ -113,7 +113,7 @@ def test_heavy_libraries_have_their_place() -> None:
 def test_lines_are_near_the_anchors() -> None:
     found = measure(list(modules().values()))
     assert found.line_length_p95 <= 98, found
-    assert found.per_100_lines(found.comprehensions) <= 2.0, found
+    assert found.per_100_lines(found.comprehensions) <= 2.6, found
 
 
 def test_style_counts_what_it_says(tmp_path: Path) -> None:
