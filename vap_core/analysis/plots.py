@@ -443,7 +443,7 @@ def keep_png(drawn: bytes, path: Path, limit: int = 480_000, small: int = 115_00
     source = Image.open(BytesIO(drawn))
     texts = PngInfo()
     for name, text in source.info.items():
-        if isinstance(text, str):
+        if isinstance(name, str) and isinstance(text, str):
             texts.add_text(name, text)
     full = source.convert("RGB")
     for share, bits in ((1.0, 8), (1.0, 6), (1.0, 5), (0.8, 6), (0.8, 5), (0.6, 5)):
