@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vap_core.base.errors import BadAction
-from vap_core.simulation.control import LEASH, Setpoint, arm, follow_joints
+from vap_core.simulation.control import LEAD_JOINT_RAD, Setpoint, arm, follow_joints
 from vap_core.simulation.robots import ROBOTS
 
 SECONDS = 1 / 30
@@ -39,7 +39,9 @@ def test_a_deaf_arm_is_led_by_no_more_than_the_leash_nor_the_rated_speed(name: s
         after = follow_joints(arm(name), command, start.joints, push, SECONDS)
         assert (np.abs(after.joints - command.joints) <= robot.speed_rad_s * SECONDS + 1e-9).all()
         command = after
-    assert np.abs(command.joints - start.joints) == pytest.approx(np.full(len(robot.joints), LEASH))
+    assert np.abs(command.joints - start.joints) == pytest.approx(
+        np.full(len(robot.joints), LEAD_JOINT_RAD)
+    )
     assert command.gripper == 0.0
 
 

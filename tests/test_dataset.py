@@ -26,8 +26,8 @@ from vap_core.training.films.dataset import (
     about,
     data_sha256,
     film_sha256,
+    generic_instruction,
     read,
-    said,
     write,
 )
 from vap_core.training.films.demonstrations import PARTS, Film, after_a_miss, cached
@@ -192,7 +192,7 @@ def through_lerobot(folder: Path, films: list[Film]) -> None:
         assert (frame["episode_index"], frame["frame_index"], frame["task"]) == (
             episode,
             t,
-            said(known, film.task),
+            generic_instruction(known, film.task),
         )
         for c, camera in enumerate(known.cameras):
             seen = (
@@ -221,9 +221,9 @@ def through_lerobot(folder: Path, films: list[Film]) -> None:
 
 
 def test_tasks_are_said_of_anybodys_thing() -> None:
-    assert said(suite(SUITE), "pick-shaver") == "pick up the shaver"
+    assert generic_instruction(suite(SUITE), "pick-shaver") == "pick up the shaver"
     assert (
-        said(suite("simpler-fractal"), "move-bottle-near-coke-can")
+        generic_instruction(suite("simpler-fractal"), "move-bottle-near-coke-can")
         == "move the bottle near coke can"
     )
 

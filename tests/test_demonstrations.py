@@ -22,14 +22,21 @@ from vap_core.training.films.demonstrations import (
     Film,
     after_a_miss,
     cached,
-    cast,
+    draw_objects,
     row,
 )
 from vap_core.training.policy import train as policy
 from vap_core.training.policy.batches import SPIN_Z, Frames, statistics
-from vap_core.training.policy.commands import command, near, painted, rough, say, tinted
+from vap_core.training.policy.commands import (
+    command,
+    near,
+    painted,
+    phrase_instruction,
+    roughen_mask,
+    tinted,
+)
 from vap_core.training.vlm.questions import LEAST_PX, ask, place
-from vap_core.training.words import PAINTS, akin, looks, phrases, vocabulary
+from vap_core.training.words import PAINTS, appearance_words, phrases, similar_colours, vocabulary
 
 SUITE = "simpler-bridge"
 
@@ -139,7 +146,7 @@ def test_casts_are_generic_and_of_one_category() -> None:
     for known in BENCHMARKS.values():
         for task in known.tasks:
             for i in range(6):
-                names = cast(known, task, np.random.default_rng(i))
+                names = draw_objects(known, task, np.random.default_rng(i))
                 things = names[: len(names) - bool(task.goal)]
                 assert {objects.get_object(name).category for name in things} == {task.category}
                 assert {objects.get_object(name).split for name in things} == {"generic"}
@@ -151,7 +158,7 @@ def test_every_stage_finds_room_for_its_objects() -> None:
     for known in BENCHMARKS.values():
         for n, task in enumerate(known.tasks * 3):
             rng = np.random.default_rng([5, n])
-            names = cast(known, task, rng)
+            names = draw_objects(known, task, rng)
             placed = row(known, task, names, n, "base", rng).placements
             assert {one.model for one in placed} == set(names)
             for one, other in itertools.combinations(placed, 2):
@@ -175,7 +182,7 @@ def test_a_command_says_what_its_picture_shows(stage: tuple[Path, list[Film]]) -
         ways[made.way] += 1
         assert set(re.findall(r"[\w']+", made.text.lower())) <= words
         mask, rivals = film.ids[t, 0] == 1, [i for i in range(1, len(film.names)) if i != film.goal]
-        mine, *others = (looks(film.names[i]) for i in (0, *rivals))
+        mine, *others = (appearance_words(film.names[i]) for i in (0, *rivals))
         if made.way == "plain":
             assert near(film, t, SUITE, rivals)
         elif made.way == "described":
@@ -192,7 +199,7 @@ def test_a_command_says_what_its_picture_shows(stage: tuple[Path, list[Film]]) -
                 key=lambda colour: len(colour.name),
             )
             assert made.way == "painted" or colour in PALETTE
-            assert not any(akin(colour.name) & other for other in others)
+            assert not any(similar_colours(colour.name) & other for other in others)
             if colour in PALETTE and mask.sum() > 60:
                 assert has_colour(made.images[0][mask], colour).mean() > 0.15, made.text
     assert min(ways[way] for way in ("tinted", "painted", "described", "plain")) > 5
@@ -200,9 +207,9 @@ def test_a_command_says_what_its_picture_shows(stage: tuple[Path, list[Film]]) -
 
 def test_my_is_said_of_a_generic_thing_too_and_once() -> None:
     rng, task = np.random.default_rng(0), BENCHMARKS["simpler-bridge"].task("put-camera")
-    said = {say(task, "", rng) for _ in range(40)}
+    said = {phrase_instruction(task, "", rng) for _ in range(40)}
     assert said == {f"put {word} camera on the plate" for word in ("my", "the", "a")}
-    said = {say(task, "blue", rng) for _ in range(40)}
+    said = {phrase_instruction(task, "blue", rng) for _ in range(40)}
     assert said == {
         "put the blue camera on the plate",
         "put my camera on the plate. My camera is blue.",
@@ -222,7 +229,7 @@ def test_only_what_is_masked_changes_colour(seed: int, share: float) -> None:
     )
     assert np.abs(tinted(images, masks, PALETTE[0], share)[masks] - exact).max() <= 0.51
     empty = np.zeros((12, 12), bool)
-    assert not rough(empty, rng).any()
+    assert not roughen_mask(empty, rng).any()
 
 
 def test_training_hears_every_word_that_the_captioner_says() -> None:
@@ -263,7 +270,7 @@ def test_questions_are_true_of_their_views(stage: tuple[Path, list[Film]]) -> No
                     .removeprefix("can you recognize the ")
                     .removesuffix(" in this image")
                 )
-                assert not any(asked_for in (objects.get_object(name).category, *(f"{word} {objects.get_object(name).category}" for word in looks(name)))
+                assert not any(asked_for in (objects.get_object(name).category, *(f"{word} {objects.get_object(name).category}" for word in appearance_words(name)))
                                for i, name in enumerate(film.names) if (film.ids[t, 0] == i + 1).sum() >= LEAST_PX)  # fmt: skip
             ends[
                 question.answer[:1]

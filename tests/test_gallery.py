@@ -62,9 +62,9 @@ def test_a_cut_is_the_object_and_little_else(stage):
 def test_every_personal_object_has_a_row_from_hard_to_easy():
     assert len(STEMS) == len(set(STEMS)) == 19
     for stem in STEMS:
-        ranks = [TIERS.index(gallery.tier(model)) for model in gallery.graded(stem)]
+        ranks = [TIERS.index(gallery.tier(model)) for model in gallery.lookalikes_by_tier(stem)]
         assert ranks == sorted(ranks)
-        assert {model.name for model in gallery.graded(stem)} == {
+        assert {model.name for model in gallery.lookalikes_by_tier(stem)} == {
             model.name for model in lookalikes(stem)
         }
     assert {model.name for model in GOALS} >= {
@@ -81,7 +81,7 @@ def test_generics_are_in_rows():
 
 def test_hardness_is_the_mean_cosine(stage, monkeypatch):
     monkeypatch.setattr(gallery, "STEMS", ("cup",))
-    monkeypatch.setattr(gallery, "graded", lambda stem: lookalikes(stem)[:2])
+    monkeypatch.setattr(gallery, "lookalikes_by_tier", lambda stem: lookalikes(stem)[:2])
     table = gallery.hardness(stage, Mean())
     references = Mean()([gallery.cut(stage, CUP.name, shot) for shot in gallery.REFERENCES])
     one = Mean()([gallery.cut(stage, table.lookalike[0], shot) for shot in gallery.QUERIES])
@@ -134,9 +134,9 @@ def test_what_is_seen_moves_with_the_expert():
         lists.read("simpler-bridge")[0], placements=lists.read("simpler-bridge")[0].placements[:1]
     )
     before, again, after = (
-        gallery.seen(row, size=64),
-        gallery.seen(row, size=64),
-        gallery.seen(row, steps=6, size=64),
+        gallery.camera_images(row, size=64),
+        gallery.camera_images(row, size=64),
+        gallery.camera_images(row, steps=6, size=64),
     )
     assert list(before) == ["front"]
     assert np.array_equal(before["front"], again["front"])

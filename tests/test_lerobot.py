@@ -14,7 +14,7 @@ from tests import tiny_lerobot as tiny
 from vap_core.base.errors import BadPolicy
 from vap_core.policies.hooks import TEXT
 from vap_core.policies.lerobot.adapter import LeRobot, compare, load, load_for_suite
-from vap_core.policies.lerobot.checkpoints import fingerprint, named
+from vap_core.policies.lerobot.checkpoints import fingerprint, is_checkpoint_name
 from vap_core.policies.lerobot.toy_pi0 import toy_sizes
 from vap_core.policies.protocol import Policy, PolicyInput
 from vap_core.rollout import audit
@@ -375,8 +375,8 @@ def test_a_rollout_in_a_real_suite(policies, rows, scene, name):
 
 
 def test_a_name_that_means_a_checkpoint_is_fitted_to_the_suite(folders, scene):
-    assert all(map(named, (str(folders["act"]), "lerobot/pi0_base")))
-    assert not any(map(named, ("scripted", "expert", "a/b/c", "/no/such/folder")))
+    assert all(map(is_checkpoint_name, (str(folders["act"]), "lerobot/pi0_base")))
+    assert not any(map(is_checkpoint_name, ("scripted", "expert", "a/b/c", "/no/such/folder")))
     name = str(folders["act"])
     policy = load_for_suite(name, scene, suites.suite(SUITE))
     assert load_for_suite(name, scene, suites.suite(SUITE)) is policy

@@ -19,6 +19,7 @@ from vap_core import memory
 from vap_core.attend import Attender
 from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadViews, UnknownName
 from vap_core.cli.bench import eval as bench_eval
+from vap_core.cli.bench import eval_report
 from vap_core.perception.stacks import STACKS, load_stack
 from vap_core.policies.lerobot.adapter import load
 from vap_core.policies.lerobot.step import LeRobotEnv, VapEnvConfig, VapPrompt, attach
@@ -288,4 +289,4 @@ def test_the_bench_runs_both_loops_over_the_same_steps():
         bench_eval.Arm("a", dict, [6.0, 3.0], {}),
         bench_eval.Arm("b", dict, [3.0, 1.0], {}),
     )
-    assert bench_eval._ratio(slow, fast)[0] == f"{6**0.5:.2f}"
+    assert eval_report.times_as_fast(slow, fast)[0] == f"{6**0.5:.2f}"

@@ -8,7 +8,7 @@ import pytest
 from vap_core.base.errors import MissingMeshes
 from vap_core.simulation.gl import ensure_gl
 from vap_core.simulation.robots import ROBOTS
-from vap_core.simulation.robots.menagerie import MODELS, dress
+from vap_core.simulation.robots.menagerie import MODELS, replace_visuals
 from vap_core.simulation.scenes import build
 
 ensure_gl()
@@ -170,7 +170,7 @@ def test_without_meshes_the_error_says_both_ways_to_get_them(name, monkeypatch, 
     monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path))
     ways = rf"no meshes of '{name}'.*go online once.*set MENAGERIE_ROOT to a folder that holds {MODELS[name]}/"
     with pytest.raises(MissingMeshes, match=ways) as caught:
-        dress(mujoco.MjSpec.from_file(str(ROBOTS[name].xml)), ROBOTS[name])
+        replace_visuals(mujoco.MjSpec.from_file(str(ROBOTS[name].xml)), ROBOTS[name])
     assert "\n" not in str(caught.value)
 
 

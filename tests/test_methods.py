@@ -25,7 +25,7 @@ from vap_core.evaluation.study import Study, make_trial, register_personal
 from vap_core.memory import load_bank
 from vap_core.policies.lerobot.toy_pi0 import toy_sizes
 from vap_core.policies.protocol import PolicyInput
-from vap_core.policies.weight_guard import checksum, frozen
+from vap_core.policies.weight_guard import checksum, unchanged_weights
 from vap_core.prompt import PALETTE, tint
 from vap_core.rollout.loop import rollout
 from vap_core.rollout.prompters.oracle import Oracle, OraclePrompter
@@ -441,7 +441,7 @@ def test_the_checksum_is_in_every_row_and_a_policy_that_changes_is_refused(
 
 
 def test_what_has_no_parameters_has_no_checksum() -> None:
-    with frozen(object()) as found:
+    with unchanged_weights(object()) as found:
         assert found == ""
     assert checksum(Soft(False)) == Soft(False).sha256()[:16]
 

@@ -10,14 +10,13 @@ from hypothesis import strategies as st
 
 from vap_core.simulation.assets import crafts, fabrics, objects, phrases, textures
 from vap_core.training.films import scenes
-from vap_core.training.perception import detector, evaluation, segmenter
-from vap_core.training.perception import instance_head as looks
+from vap_core.training.perception import detector, evaluation, instance_head, segmenter
 from vap_core.training.perception import train as perception
 
 
 @given(st.integers(0, 10**6), st.booleans())
 def test_no_evaluation_object_is_ever_cast(seed: int, held_out: bool) -> None:
-    models, crew = scenes.cast(np.random.default_rng(seed), held_out)
+    models, crew = scenes.draw_objects(np.random.default_rng(seed), held_out)
     assert {model.split for model in models} == {"generic"}
     assert not {model.name for model in models} & set(objects.OBJECTS)
     numbers = [int(model.name.partition("-generic-")[2].partition("-")[0]) for model in models]
@@ -85,20 +84,22 @@ def test_contrast_is_the_cross_entropy_of_every_pair_against_the_others() -> Non
         torch.tensor([[0.9, 0.1, -0.2], [0.0, 0.5, 0.4]]),
         torch.tensor([[True, False, False], [False, True, True]]),
     )
-    e = np.exp(cosine.numpy() / looks.TEMPERATURE)
+    e = np.exp(cosine.numpy() / instance_head.TEMPERATURE)
     slow = [
         -np.log(e[0, 0] / (e[0, 0] + e[0, 1] + e[0, 2])),
         -np.log(e[1, 1] / (e[1, 1] + e[1, 0])),
         -np.log(e[1, 2] / (e[1, 2] + e[1, 0])),
     ]
-    assert looks.contrast(cosine, same).item() == pytest.approx(np.mean(slow), rel=1e-4)
+    assert instance_head.contrastive_loss(cosine, same).item() == pytest.approx(
+        np.mean(slow), rel=1e-4
+    )
 
 
 def test_losses_vanish_when_right() -> None:
     view = [("cup", np.array([2.0, 2, 6, 8]))]
     heat, weight, owns, box = detector.targets([view], ["cup"], 16)
     sure = torch.where(heat == 1, 20.0, -20.0)
-    assert detector.focal(sure, heat, weight) < 1e-6
+    assert detector.focal_loss(sure, heat, weight) < 1e-6
     rows, cols = torch.meshgrid(torch.arange(16) + 0.5, torch.arange(16) + 0.5, indexing="ij")
     exact = torch.stack([cols - 2, rows - 2, 6 - cols, 8 - rows])[None]
     assert detector.giou_loss(exact, owns, box).abs() < 1e-6

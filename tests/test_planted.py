@@ -17,10 +17,10 @@ from vap_core.policies.scripted.expert import (
     Expert,
     ExpertState,
     Waypoint,
-    _above,
-    _over,
+    _action_towards,
+    _clear_pose,
+    _raised_within_reach,
     _reached,
-    _towards,
 )
 from vap_core.rollout.failure import Diagnosis
 from vap_core.rollout.loop import Trial, rollout
@@ -127,12 +127,12 @@ class Plans(Still, ABC):
             plan, waited = plan[1:], 0.0
         else:
             waited = state.waited_s + 0.2 / env.hz
-        return ExpertState("planned", plan, waited), _towards(plan[0], env)
+        return ExpertState("planned", plan, waited), _action_towards(plan[0], env)
 
 
 class Misses(Plans):
     def plan(self, env: Env) -> tuple[Waypoint, ...]:
-        over, low, *_ = Expert().astray(env, np.random.default_rng(env.row.episode)).plan
+        over, low, *_ = Expert().start_with_miss(env, np.random.default_rng(env.row.episode)).plan
         return over, replace(low, gripper=1.0), replace(low, gripper=0.0, stay_s=1.0)
 
 
@@ -152,12 +152,12 @@ class Knocks(Plans):
         top = low.copy()
         top[2, 3] += 0.03
         path = [
-            _over(env, truth, before),
+            _clear_pose(env, truth, before),
             before,
             after,
             before,
-            _over(env, truth, before),
-            _over(env, truth, low),
+            _clear_pose(env, truth, before),
+            _clear_pose(env, truth, low),
             top,
         ]
         return tuple(Waypoint(pose, 0.0) for pose in path)
@@ -196,8 +196,8 @@ class Slips(Drops):
         model.geom_friction[geoms] = 1e-5
 
     def after(self, env: Env) -> Action:
-        up = Waypoint(_above(env, env.command.tcp_base, 0.02), 0.0)
-        return _towards(up, env)
+        up = Waypoint(_raised_within_reach(env, env.command.tcp_base, 0.02), 0.0)
+        return _action_towards(up, env)
 
 
 class LetsGo(Drops):

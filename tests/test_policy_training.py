@@ -14,7 +14,7 @@ from torch.nn import functional as F  # noqa: N812
 from vap_core.base.errors import BadOutput, BadPolicy
 from vap_core.policies.lerobot.adapter import load
 from vap_core.policies.lerobot.checkpoints import fingerprint
-from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy, fused
+from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy, fused_attention
 from vap_core.policies.mini_pi0.vlm import load as load_vlm
 from vap_core.simulation.control import arm, rotation_vector
 from vap_core.simulation.suites import suite
@@ -26,11 +26,11 @@ from vap_core.training.policy.batches import (
     SPIN_Z,
     Batch,
     Frames,
-    ahead,
     emphasis,
-    spun,
     statistics,
+    target_chunk,
     turn,
+    turn_otherwise,
     waits,
 )
 from vap_core.training.vlm import train as vlm
@@ -187,8 +187,8 @@ def test_a_hand_that_is_shown_turned_otherwise_turns_back_in_time_and_does_all_e
     reach = min(np.pi / 2, 0.8 * rate * close)
     seen = []
     for i in range(20):
-        chunk = ahead(film, 0, close)
-        state, back = spun(film, 0, chunk, rate, np.random.default_rng(i))
+        chunk = target_chunk(film, 0, close)
+        state, back = turn_otherwise(film, 0, chunk, rate, np.random.default_rng(i))
         assert (np.delete(back, SPIN_Z, axis=1) == np.delete(chunk, SPIN_Z, axis=1)).all()
         assert (
             np.delete(state, [SPIN_Z, -1]) == np.delete(film.state[0], [SPIN_Z, len(state) - 1])
@@ -207,9 +207,11 @@ def test_a_hand_that_is_shown_turned_otherwise_turns_back_in_time_and_does_all_e
         )
     assert min(seen) < -0.4 * reach, "either way"
     assert max(seen) > 0.4 * reach, "either way"
-    state, back = spun(film, close, ahead(film, close, 4), rate, np.random.default_rng(0))
+    state, back = turn_otherwise(
+        film, close, target_chunk(film, close, 4), rate, np.random.default_rng(0)
+    )
     assert (state == film.state[close]).all(), "a hand that closes stays as it is"
-    assert (back == ahead(film, close, 4)).all(), "a hand that closes stays as it is"
+    assert (back == target_chunk(film, close, 4)).all(), "a hand that closes stays as it is"
 
 
 def test_waiting_is_not_taught_but_for_the_end(stage: tuple[Path, list[Film]]) -> None:
@@ -243,12 +245,12 @@ def test_waiting_is_not_taught_but_for_the_end(stage: tuple[Path, list[Film]]) -
     assert (chances[20:24] == 0).all()
     assert (np.delete(chances, range(20, 24)) == np.delete(shown, range(20, 24))).all()
     waiting = replace(films[0], action=closing, **still)
-    assert (ahead(waiting, 18, 5) == closing[[18, 19, 21, 24, 25]]).all(), (
+    assert (target_chunk(waiting, 18, 5) == closing[[18, 19, 21, 24, 25]]).all(), (
         "the chunk goes on behind the wait, from the closed jaw"
     )
-    assert (ahead(waiting, 18, 2) == closing[18:20]).all()
-    assert (ahead(waiting, 38, 4)[:, :-1] == 0).all()
-    assert (ahead(waiting, 38, 4)[:, -1] == closing[-1, -1]).all()
+    assert (target_chunk(waiting, 18, 2) == closing[18:20]).all()
+    assert (target_chunk(waiting, 38, 4)[:, :-1] == 0).all()
+    assert (target_chunk(waiting, 38, 4)[:, -1] == closing[-1, -1]).all()
 
 
 def test_how_the_hand_will_close_is_asked_until_it_does(stage: tuple[Path, list[Film]]) -> None:
@@ -342,7 +344,7 @@ def test_attention_that_is_fused_gives_the_same_losses_and_gradients(
 ) -> None:
     model, asked, batch = small_policy(stage[1], 4)
     found = []
-    for context in (nullcontext, fused):
+    for context in (nullcontext, fused_attention):
         with (
             context(),
             patch.object(

@@ -14,7 +14,7 @@ from vap_core.prompt import PALETTE
 from vap_core.rollout.prompters.protocol import PromptContext, SceneTruth
 from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
-from vap_core.training.films.demonstrations import cast, row
+from vap_core.training.films.demonstrations import draw_objects, row
 from vap_core.training.policy import probe
 from vap_core.training.policy.probe import WAYS, ProbePrompter, conclude, keep
 
@@ -25,7 +25,7 @@ from .toys import observation
 def test_the_ways_differ_in_what_is_shown_and_said() -> None:
     known = suites.suite(SUITE)
     task = known.task("put-camera")
-    names = cast(known, task, np.random.default_rng(3), held_out=True)
+    names = draw_objects(known, task, np.random.default_rng(3), held_out=True)
     start = row(known, task, names, 0, "base", np.random.default_rng(0))
     rgb, mask = np.full((8, 8, 3), 120, np.uint8), np.zeros((8, 8), bool)
     mask[2:5, 2:5] = True
@@ -54,11 +54,11 @@ def test_the_ways_differ_in_what_is_shown_and_said() -> None:
 def test_held_out_objects_are_in_no_film() -> None:
     known = suites.suite(SUITE)
     task = known.tasks[0]
-    seen = {name for i in range(20) for name in cast(known, task, np.random.default_rng(i))}
+    seen = {name for i in range(20) for name in draw_objects(known, task, np.random.default_rng(i))}
     unseen = {
         name
         for i in range(20)
-        for name in cast(known, task, np.random.default_rng(i), held_out=True)
+        for name in draw_objects(known, task, np.random.default_rng(i), held_out=True)
     }
     assert not seen & unseen
     assert {objects.get_object(name).split for name in unseen} == {"generic"}

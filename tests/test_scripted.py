@@ -86,7 +86,7 @@ def test_reads_what_is_asked_for(
 def test_places_an_upright_object_to_within_a_finger(
     x: float, y: float, radius: float, height: float
 ) -> None:
-    place = policy([]).eye.place(box_of(x, y, radius, height), 0.021)
+    place = policy([]).localizer.place(box_of(x, y, radius, height), 0.021)
     assert np.hypot(place[0] - x, place[1] - y) < 0.003
     assert abs(place[3] - height) < 0.005
 

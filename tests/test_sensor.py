@@ -10,7 +10,7 @@ from vap_core.simulation import scenes
 from vap_core.simulation.assets import objects
 from vap_core.simulation.cameras import project
 from vap_core.simulation.env import Env
-from vap_core.simulation.sensor import DESK, PERFECT, Sensor, exposed, stray
+from vap_core.simulation.sensor import DESK, PERFECT, Sensor, apply_sensor, draw_disturbance
 from vap_core.simulation.types import EpisodeRow, Placement
 
 MODEL = "cup-personal"
@@ -44,8 +44,8 @@ def env(scene, sensor, row=ROW, image_size=224):
 
 
 def test_a_perfect_sensor_changes_nothing(scene):
-    still = stray(PERFECT, ROW, "front")
-    assert exposed(PERFECT, GREY, still, ROW, "front", 0) is GREY
+    still = draw_disturbance(PERFECT, ROW, "front")
+    assert apply_sensor(PERFECT, GREY, still, ROW, "front", 0) is GREY
     assert (still.shift_m == 0).all()
     assert (still.turn == np.eye(3)).all()
     assert (still.gain == 1).all()
@@ -78,20 +78,20 @@ def test_looking_twice_is_seeing_the_same_and_every_step_has_its_own_grain(scene
 
 
 def test_cameras_of_one_episode_stray_each_its_own_way():
-    front, side = (stray(DESK, ROW, name) for name in ("front", "side"))
+    front, side = (draw_disturbance(DESK, ROW, name) for name in ("front", "side"))
     assert not np.allclose(front.shift_m, side.shift_m)
     assert not np.allclose(front.gain, side.gain)
 
 
 def test_noise_and_gain_of_a_picture_are_the_specified_ones():
-    astray = stray(DESK, ROW, "front")
-    seen = exposed(DESK, GREY, astray, ROW, "front", 0).astype(float)
+    disturbance = draw_disturbance(DESK, ROW, "front")
+    seen = apply_sensor(DESK, GREY, disturbance, ROW, "front", 0).astype(float)
     expected_sd = np.sqrt(DESK.noise**2 + 1 / 12)  # rounding to whole grey levels adds a twelfth
     n = GREY[..., 0].size
     for channel in range(3):
         values = seen[..., channel]
         assert values.mean() == pytest.approx(
-            120 * astray.gain[channel], abs=4 * expected_sd / np.sqrt(n)
+            120 * disturbance.gain[channel], abs=4 * expected_sd / np.sqrt(n)
         )
         assert values.std() == pytest.approx(expected_sd, rel=4 / np.sqrt(2 * n))
     grain = seen - seen.mean(axis=(0, 1))
@@ -100,16 +100,18 @@ def test_noise_and_gain_of_a_picture_are_the_specified_ones():
 
 
 def test_black_and_white_stay_within_bounds():
-    astray = replace(stray(DESK, ROW, "front"), gain=np.array([1.5, 1.0, 0.5]))
+    disturbance = replace(draw_disturbance(DESK, ROW, "front"), gain=np.array([1.5, 1.0, 0.5]))
     for level in (0, 255):
-        seen = exposed(DESK, np.full((64, 64, 3), level, np.uint8), astray, ROW, "front", 0)
+        seen = apply_sensor(
+            DESK, np.full((64, 64, 3), level, np.uint8), disturbance, ROW, "front", 0
+        )
         assert seen.dtype == np.uint8
         assert abs(float(np.median(seen[..., 1])) - level) <= 2
 
 
 def test_over_many_episodes_the_spreads_are_the_specified_ones():
     """A sample's standard deviation is within 4 / sqrt(2 n) of the true one, and its mean within 4 / sqrt(n) of zero."""
-    drawn = [stray(DESK, row, "front") for row in EPISODES]
+    drawn = [draw_disturbance(DESK, row, "front") for row in EPISODES]
     shift = np.array([one.shift_m for one in drawn])
     turn = np.array([Rotation.from_matrix(one.turn).as_rotvec() for one in drawn])
     gain = np.array([one.gain for one in drawn])
@@ -154,9 +156,9 @@ def test_the_reported_camera_is_the_one_that_took_the_picture(sensor, scene):
     }
     moved = []
     for episode in range(6):
-        astray = env(scene, sensor, replace(ROW, episode=episode))
-        seen = astray.truth(masks=True)
-        for cam, home in zip(astray.cameras(), usual.cameras(), strict=True):
+        disturbance = env(scene, sensor, replace(ROW, episode=episode))
+        seen = disturbance.truth(masks=True)
+        for cam, home in zip(disturbance.cameras(), usual.cameras(), strict=True):
             assert centre(seen, cam.name) - project(cam, middle(seen))[0] == pytest.approx(
                 offset[cam.name], abs=1.0
             )
@@ -177,7 +179,9 @@ def test_a_knock_moves_a_point_by_focal_length_over_distance(scene):
     for episode in range(5):
         row = replace(ROW, episode=episode)
         turned = env(scene, Sensor(jitter_rad=0.01), row).cameras()[0]
-        about = Rotation.from_matrix(stray(Sensor(jitter_rad=0.01), row, "front").turn).as_rotvec()
+        about = Rotation.from_matrix(
+            draw_disturbance(Sensor(jitter_rad=0.01), row, "front").turn
+        ).as_rotvec()
         expected = focal * np.array(
             [about[1], about[0]]
         )  # OpenGL axes: y up; a turn to the left moves things right
@@ -185,7 +189,7 @@ def test_a_knock_moves_a_point_by_focal_length_over_distance(scene):
             expected, abs=0.1
         )
         shifted = env(scene, Sensor(jitter_m=0.004), row).cameras()[0]
-        shift = stray(Sensor(jitter_m=0.004), row, "front").shift_m
+        shift = draw_disturbance(Sensor(jitter_m=0.004), row, "front").shift_m
         expected = focal * np.array([-shift[0], shift[1]]) / 0.4
         assert project(shifted, point)[0] - project(home, point)[0] == pytest.approx(
             expected, abs=0.1

@@ -15,10 +15,10 @@ from vap_core.evaluation.jobs import run_job
 from vap_core.evaluation.study import Study
 from vap_core.policies.mini_pi0 import learned_token, teach_token
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
-from vap_core.policies.mini_pi0.learned_token import WORD, Lesson
+from vap_core.policies.mini_pi0.learned_token import WORD, TokenTraining
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
 from vap_core.policies.mini_pi0.teach_token import photographs
-from vap_core.policies.mini_pi0.vlm import MiniVlm, grow
+from vap_core.policies.mini_pi0.vlm import MiniVlm, initialise_policy
 from vap_core.policies.mini_pi0.vlm import load as load_vlm
 from vap_core.rollout.prompters.text import TextPrompter, soft_prompt
 from vap_core.simulation import suites
@@ -47,7 +47,7 @@ def grown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
         MiniVlm(config()).save(home)
         vlm = load_vlm(home)
         policy = MiniPI0Policy(config(vlm.sha256()))
-    grow(vlm, policy)
+    initialise_policy(vlm, policy)
     policy.save_pretrained(far)
     stats = {
         name: {"mean": torch.zeros(n), "std": torch.ones(n)}
@@ -85,7 +85,9 @@ def test_it_runs_as_a_method_and_the_policy_stays(
     home, far = grown
     monkeypatch.setattr(experiments, "MODEL", home)
     monkeypatch.setattr(teach_token, "VIEWS", 2)
-    monkeypatch.setattr(learned_token, "Lesson", lambda: Lesson(epochs=2, looks=1))
+    monkeypatch.setattr(
+        learned_token, "TokenTraining", lambda: TokenTraining(epochs=2, augmentations=1)
+    )
     study = Study(((SUITE, TASK),), ("generic", "soft"), episodes=1, policy=str(far))
     engine.store.open_run(tmp_path, study.configuration())
     experiments.register_personal(study, tmp_path / "memory")

@@ -14,13 +14,13 @@ from vap_core.base.types import Boxes, PersonalObject, Rgb
 from vap_core.evaluation.perception.episodes import OFF, agreements, survey
 from vap_core.evaluation.perception.first_frames import (
     RULES,
-    Looked,
+    EmbeddedBoxes,
     Tables,
     View,
-    look,
+    find_candidates,
     match,
     openings,
-    remembered,
+    registered_object,
 )
 from vap_core.evaluation.perception.first_frames import survey_view as survey_one
 from vap_core.perception.protocols import Stack
@@ -58,7 +58,7 @@ def memory(*colours: tuple[int, int, int]) -> dict[int, PersonalObject]:
 
 
 def survey_view(seen: View, stack: Stack, known: dict[int, PersonalObject]) -> Tables:
-    return survey_one(seen, stack, known, look(seen, stack))
+    return survey_one(seen, stack, known, find_candidates(seen, stack))
 
 
 def test_tiers_of_the_toys() -> None:
@@ -204,10 +204,10 @@ def test_agreements_tell_contradiction_and_what_geometry_makes_of_it() -> None:
     names = [name for name in episode[0].masks if objects.get_object(name).category == "shoe"]
     assert all(name in v.visible() for v in episode for name in names)
 
-    def told(view: View, favourite: str) -> Looked:
+    def embedded_boxes(view: View, favourite: str) -> EmbeddedBoxes:
         side = np.array([0.45 if name == favourite else 0.40 for name in names])
         rows = np.stack([side, np.sqrt(1 - side**2)], axis=1).astype(np.float32)
-        return Looked(
+        return EmbeddedBoxes(
             Boxes(
                 np.stack([view.boxes()[name] for name in names]),
                 np.ones(len(names), np.float32),
@@ -219,7 +219,7 @@ def test_agreements_tell_contradiction_and_what_geometry_makes_of_it() -> None:
     mine = replace(personal(target, "shoe", RED), embeddings=np.array([[1.0, 0.0]], np.float32))
     honest = {
         line["associate"]: line
-        for line in agreements(episode, [told(v, target) for v in episode], mine)
+        for line in agreements(episode, [embedded_boxes(v, target) for v in episode], mine)
     }
     assert list(honest) == [OFF, *PAIRINGS]
     assert all(
@@ -229,7 +229,9 @@ def test_agreements_tell_contradiction_and_what_geometry_makes_of_it() -> None:
     torn = {
         line["associate"]: line
         for line in agreements(
-            episode, [told(v, other if v.camera == "side" else target) for v in episode], mine
+            episode,
+            [embedded_boxes(v, other if v.camera == "side" else target) for v in episode],
+            mine,
         )
     }
     assert (torn[OFF]["case"], torn[OFF]["right"]) == ("case 2", 2)
@@ -263,5 +265,5 @@ def test_survey_fills_every_table_and_keys_every_line() -> None:
         assert all(
             line["suite"] == "simpler-bridge" and line["camera"] == "front" for line in lines
         )
-    mine, _ = remembered(stack, "shaver-personal", 5)
+    mine, _ = registered_object(stack, "shaver-personal", 5)
     assert len(mine.crops) == 5

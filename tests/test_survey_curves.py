@@ -158,8 +158,8 @@ def test_abstention_covers_more_and_more_and_never_a_view_without_candidates() -
     assert len(curves.abstention(tables()["choices"], "margin")) == 3
 
 
-def test_duels_pair_a_look_alike_with_the_target_beside_it() -> None:
-    found = curves.duels(tables()["objects"])
+def test_lookalike_pairs_match_a_look_alike_with_the_target_beside_it() -> None:
+    found = curves.lookalike_pairs(tables()["objects"])
     assert len(found) == 9
     assert sorted(found.ahead.round(6).unique()) == [-0.1, 0.3]
     assert (found.ahead < 0).sum() == 1

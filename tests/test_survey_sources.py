@@ -24,14 +24,14 @@ TEXT_ONLY = re.compile("Tokenizer|Processor|Config|get_policy_class")
 
 
 def test_training_draws_no_object_that_a_benchmark_places() -> None:
-    cast = {
+    drawn = {
         model.name
         for i in range(40)
         for held_out in (False, True)
-        for model in scenes.cast(np.random.default_rng(i), held_out)[0]
+        for model in scenes.draw_objects(np.random.default_rng(i), held_out)[0]
     }
-    assert len(cast) > 200
-    assert not cast & set(PLACED)
+    assert len(drawn) > 200
+    assert not drawn & set(PLACED)
 
 
 def test_whatever_a_benchmark_places_lies_outside_the_numbers_that_training_draws_from() -> None:

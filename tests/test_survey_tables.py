@@ -15,8 +15,7 @@ from pyarrow.parquet import read_schema
 
 from vap_core.base.errors import BadOutput, UnknownName
 from vap_core.evaluation.metrics import rate
-from vap_core.evaluation.perception import run
-from vap_core.evaluation.perception import tracking as following
+from vap_core.evaluation.perception import run, tracking
 from vap_core.evaluation.perception.estimates import (
     NONE,
     Estimate,
@@ -81,8 +80,8 @@ def test_share_ignores_what_is_not_known_and_has_wilsons_interval() -> None:
     found = share([True, None, False, float("nan"), True])
     assert (found.value, found.n) == (pytest.approx(2 / 3), 3)
     assert (found.low, found.high) == (rate(2, 3).low, rate(2, 3).high)
-    assert share([]).told() == NONE.told() == "-"
-    assert Estimate(0.5, float("nan"), float("nan"), 1).told() == "50.0 [?, ?] 1"
+    assert share([]).text() == NONE.text() == "-"
+    assert Estimate(0.5, float("nan"), float("nan"), 1).text() == "50.0 [?, ?] 1"
 
 
 def frame(episodes: list[int], values: list[float | None]) -> pd.DataFrame:
@@ -134,13 +133,11 @@ def test_the_plan_is_the_same_every_time_and_every_part_has_its_own_name() -> No
     jobs = plan(Survey())
     assert [job.name for job in jobs] == [job.name for job in plan(Survey())]
     assert len({job.name for job in jobs}) == len(jobs)
-    opened = [
-        row.key for job in jobs if not isinstance(job.what, following.Job) for row in job.what
-    ]
+    opened = [row.key for job in jobs if not isinstance(job.what, tracking.Job) for row in job.what]
     wanted = sum(n * len(BENCHMARKS[suite].tasks) for suite, n in run.EPISODES.items())
     assert len(opened) == len(set(opened)) == wanted > 200
-    assert [isinstance(job.what, following.Job) for job in jobs] == sorted(
-        (isinstance(job.what, following.Job) for job in jobs), reverse=True
+    assert [isinstance(job.what, tracking.Job) for job in jobs] == sorted(
+        (isinstance(job.what, tracking.Job) for job in jobs), reverse=True
     )
 
 

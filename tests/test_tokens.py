@@ -13,13 +13,13 @@ from vap_core.policies.mini_pi0 import learned_token
 from vap_core.policies.mini_pi0.learned_token import (
     SUFFIX,
     WORD,
-    Lesson,
     Photos,
     Token,
-    framed,
+    TokenTraining,
+    augment,
     learn,
 )
-from vap_core.policies.mini_pi0.vlm import MiniVlm, grow
+from vap_core.policies.mini_pi0.vlm import MiniVlm, initialise_policy
 from vap_core.policies.mini_pi0.vlm import load as load_vlm
 from vap_core.policies.protocol import PolicyInput
 from vap_core.training.words import vocabulary
@@ -44,14 +44,14 @@ def vlm() -> MiniVlm:
             / 255
         )
         colours = rng.choice(["red", "blue"], 16)
-        tokens, there = model.ask(
+        tokens, there = model.tokenize(
             [f"can you recognize the {colour} cup in this image" for colour in colours]
         )
         right = [
-            model.number["yes" if (i < 8) == (colour == "red") else "no"]
+            model.vocabulary["yes" if (i < 8) == (colour == "red") else "no"]
             for i, colour in enumerate(colours)
         ]
-        said, _ = model(model.look(views), tokens, there, torch.tensor(right)[:, None])
+        said, _ = model(model.embed_images(views), tokens, there, torch.tensor(right)[:, None])
         loss = torch.nn.functional.cross_entropy(said[:, 0], torch.tensor(right))
         optimiser.zero_grad()
         loss.backward()
@@ -80,11 +80,11 @@ def photos(rng: np.random.Generator, n: int) -> Photos:
 def test_one_embedding_is_learned_and_nothing_else_moves(vlm: MiniVlm) -> None:
     before, rng = vlm.sha256(), np.random.default_rng(0)
     taught, unseen = photos(rng, 6), photos(rng, 6)
-    token = learn(vlm, "disc", taught, unseen, Lesson(epochs=40, looks=3, rate=0.05))
+    token = learn(vlm, "disc", taught, unseen, TokenTraining(epochs=40, augmentations=3, rate=0.05))
     assert vlm.sha256() == before == token.model
     assert token.embedding.shape == (32,)
     assert token.accuracy > 0.95
-    again = learn(vlm, "disc", taught, unseen, Lesson(epochs=40, looks=3, rate=0.05))
+    again = learn(vlm, "disc", taught, unseen, TokenTraining(epochs=40, augmentations=3, rate=0.05))
     assert np.array_equal(again.embedding, token.embedding)
 
 
@@ -93,7 +93,11 @@ def test_what_cannot_be_told_apart_is_not_learned(vlm: MiniVlm) -> None:
     rng = np.random.default_rng(1)
     one, two, three, four = (photos(rng, 8).own for _ in range(4))
     token = learn(
-        vlm, "disc", Photos(one, two, ()), Photos(three, four, ()), Lesson(epochs=4, looks=2)
+        vlm,
+        "disc",
+        Photos(one, two, ()),
+        Photos(three, four, ()),
+        TokenTraining(epochs=4, augmentations=2),
     )
     assert token.accuracy < 0.85
 
@@ -106,7 +110,7 @@ def test_photos_of_both_kinds_are_needed(vlm: MiniVlm) -> None:
 
 def test_framing_keeps_size_and_type() -> None:
     photo = photos(np.random.default_rng(3), 1).own[0]
-    out = framed(photo, np.random.default_rng(0))
+    out = augment(photo, np.random.default_rng(0))
     assert out.shape == photo.shape
     assert out.dtype == np.uint8
     assert not np.array_equal(out, photo)
@@ -168,7 +172,7 @@ def test_the_model_answers_after_a_round_trip_and_a_policy_grows_from_it(
     )
     assert all(word in vocabulary() for answer in back.answer(looks, asked) for word in answer)
     policy = load_policy(checkpoint).policy
-    grow(back, policy)
+    initialise_policy(back, policy)
     grown = policy.state_dict()
     assert all(
         torch.equal(tensor, grown[f"model.paligemma_with_expert.{name}"])
@@ -182,8 +186,8 @@ def test_the_model_answers_after_a_round_trip_and_a_policy_grows_from_it(
 def test_an_answer_does_not_hear_what_comes_after_it(vlm: MiniVlm) -> None:
     """Prefix attention: the first word depends on view and question alone, and padding changes nothing."""
     looks, (asked, there) = (
-        vlm.look(torch.rand(1, 3, SIDE, SIDE)),
-        vlm.ask(["where is the red cup"]),
+        vlm.embed_images(torch.rand(1, 3, SIDE, SIDE)),
+        vlm.tokenize(["where is the red cup"]),
     )
     one, two = (vlm(looks, asked, there, torch.tensor([[5, word, 7]]))[0] for word in (8, 9))
     assert torch.allclose(one[:, :2], two[:, :2], atol=1e-5)

@@ -1,8 +1,7 @@
-"""Visual Attentive Prompting: steer a frozen policy to the user's own object, and see why it worked
-or failed.
+"""Visual Attentive Prompting: steer a frozen policy to the user's own object.
 
-The public names below load when they are first used: importing this package loads no torch, mujoco
-or rerun. Start reading at attend.py.
+It also says why an episode worked or failed. The public names below load when they are first used:
+importing this package loads no torch, mujoco or rerun. Start reading at attend.py.
 """
 
 from importlib import import_module

@@ -1,5 +1,4 @@
-"""Cross-view association: the candidate of each view, or none, that are most probably the same
-object.
+"""Cross-view association: the candidates of all views that are most probably one object.
 
 Grounded one by one, views can elect different instances, and the policy sees contradictory tints (P
 appendix, Case 2; left there as future work). Here one choice per view is made for all views at
@@ -14,7 +13,6 @@ the other scores are relative to it.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from math import prod
 from typing import Literal
 
 import numpy as np
@@ -27,10 +25,13 @@ from vap_core.perception.candidates import Candidates
 Term = Literal["embedding", "hungarian", "geometry"]
 Scores = Float64[np.ndarray, "_ _"]
 """One row per candidate of one view, one column per candidate of another."""
+PairScores = dict[tuple[int, int], Scores]
+"""The scores of one term by the numbers of the two views, a last row and column for none."""
 ViewScores = Float64[np.ndarray, " _"]
 """One score per candidate of a view, and last that of none."""
 
-MOST_VIEWS, MOST_COMBINATIONS = 4, 10_000_000
+MOST_VIEWS = 4
+MOST_COMBINATIONS = 10_000_000
 """Limits of the enumeration: views, and combinations of their candidates."""
 NEAREST = 1e-3
 """Cosine distances below this count as equal to it, so that their logarithm stays finite."""
@@ -70,8 +71,10 @@ class Pairing:
 
 @value
 class Sighting:
-    """One view's candidates for one target: cosines with its k references, embeddings and boxes
-    (pixels)."""
+    """One view's candidates for one target.
+
+    They have cosines with its k references, embeddings, and boxes (pixels).
+    """
 
     cosine: Float32[np.ndarray, "n k"]
     embeddings: Float32[np.ndarray, "n d"]
@@ -93,7 +96,7 @@ def associate_targets(
 
     Raises: as `associate`; BadViews, when a camera is calibrated for another image size.
     """
-    chosen: dict[str, list[Grounding]] = {camera: [] for camera in groundings}
+    chosen: dict[str, tuple[Grounding, ...]] = dict.fromkeys(groundings, ())
     associations: list[Association | None] = []
     for j, phrase in enumerate(phrases):
         sightings = {}
@@ -112,8 +115,8 @@ def associate_targets(
             grounding = per_target[j]
             if association is not None:
                 grounding = overrule(grounding, association.chosen[camera])
-            chosen[camera].append(grounding)
-    return {camera: tuple(found) for camera, found in chosen.items()}, tuple(associations)
+            chosen[camera] = (*chosen[camera], grounding)
+    return chosen, tuple(associations)
 
 
 def associate(views: Mapping[str, Sighting], pairing: Pairing) -> Association | None:
@@ -125,57 +128,63 @@ def associate(views: Mapping[str, Sighting], pairing: Pairing) -> Association | 
     Raises: BadViews, for more views or candidates than can be enumerated, or for geometry without
         calibrated cameras.
     """
-    names, sightings = list(views), list(views.values())
-    if sum(len(view.xyxy) > 0 for view in sightings) < 2:
+    sightings = list(views.values())
+    n_seen = sum(len(view.xyxy) > 0 for view in sightings)
+    if n_seen < 2:
         return None
     _check_size(sightings)
 
     singles = references(sightings, pairing)
-    pairs: dict[str, dict[tuple[int, int], Scores]] = {term: {} for term in pairing.terms}
-    for v, w in combinations(range(len(sightings)), 2):
-        for term in pairing.terms:
-            scores = TERMS[term](sightings[v], sightings[w], pairing) / len(pairing.terms)
-            pairs[term][v, w] = np.pad(scores, ((0, 1), (0, 1)))  # none scores 0
-    totals = add_up(singles, [item for of_term in pairs.values() for item in of_term.items()])
-    best = tuple(int(i) for i in np.unravel_index(totals.argmax(), totals.shape))
-
-    terms = {"references": float(sum(single[i] for single, i in zip(singles, best, strict=True)))}
-    for name, of_term in pairs.items():
-        terms[name] = float(sum(scores[best[v], best[w]] for (v, w), scores in of_term.items()))
+    pairs = {term: _score_pairs(sightings, term, pairing) for term in pairing.terms}
+    totals = total_scores(singles, list(pairs.values()))
+    place = np.unravel_index(totals.argmax(), totals.shape)
+    best = tuple(map(int, place))
 
     chosen: dict[str, int | None] = {}
     support: dict[str, ViewScores] = {}
     rival = -np.inf
-    for v, (name, view, i) in enumerate(zip(names, sightings, best, strict=True)):
-        chosen[name] = None if i == len(view.xyxy) else i
-        support[name] = totals.max(axis=tuple(axis for axis in range(totals.ndim) if axis != v))
-        rival = max(rival, float(np.delete(support[name], i).max(initial=-np.inf)))
+    for v, (name, view) in enumerate(views.items()):
+        choice = best[v]
+        chosen[name] = None if choice == len(view.xyxy) else choice
+        of_view = np.moveaxis(totals, v, 0).reshape(totals.shape[v], -1)
+        support[name] = of_view.max(axis=1)
+        others = np.delete(support[name], choice)
+        best_other = float(others.max(initial=-np.inf))
+        rival = max(rival, best_other)
     total = float(totals[best])
-    return Association(chosen, total, total - rival, terms, support)
+    return Association(
+        chosen=chosen,
+        total=total,
+        margin=total - rival,
+        terms=_scores_of_choice(singles, pairs, best),
+        support=support,
+    )
 
 
-def add_up(
-    singles: Sequence[ViewScores], pairs: Sequence[tuple[tuple[int, int], Scores]]
+def total_scores(
+    singles: Sequence[ViewScores], terms: Sequence[PairScores]
 ) -> Float64[np.ndarray, "..."]:
     """The total of every combination: one axis per view, each candidate in turn and none last."""
-    totals = np.zeros([len(single) for single in singles])
+    sizes = list(map(len, singles))
+    totals = np.zeros(sizes)
     for v, single in enumerate(singles):
         shape = np.ones(totals.ndim, int)
         shape[v] = -1
         totals += single.reshape(shape)
-    for (v, w), scores in pairs:
-        shape = np.ones(totals.ndim, int)
-        shape[[v, w]] = scores.shape
-        totals += scores.reshape(shape)
+    for of_term in terms:
+        for (v, w), scores in of_term.items():
+            shape = np.ones(totals.ndim, int)
+            shape[[v, w]] = scores.shape
+            totals += scores.reshape(shape)
     return totals
 
 
 def references(views: Sequence[Sighting], pairing: Pairing) -> list[ViewScores]:
-    """The references' evidence, per view: `evidence` (log(d_v / d_i) + max(log(d / d_v) + `absent`,
-    0)); 0 for none.
+    """The references' evidence for the candidates of every view.
 
-    d_i is 1 - the mean cosine of candidate i with the references, d_v the least in its view, d the
-    least in all views.
+    It is `evidence` (log(d_v / d_i) + max(log(d / d_v) + `absent`, 0)), and 0 for none. d_i is 1 -
+    the mean cosine of candidate i with the references, d_v the least in its view, d the least in
+    all views.
     """
     distances = []
     for view in views:
@@ -184,18 +193,20 @@ def references(views: Sequence[Sighting], pairing: Pairing) -> list[ViewScores]:
     least = min(float(d.min()) for d in distances if len(d))
     scores = []
     for d in distances:
-        visible = max(float(np.log(least / d.min())) + pairing.absent, 0.0) if len(d) else 0.0
+        visible = 0.0
+        if len(d):
+            lead = float(np.log(least / d.min()))
+            visible = max(lead + pairing.absent, 0.0)
         of_view = pairing.evidence * (np.log(d.min(initial=np.inf) / d) + visible)
         scores.append(np.append(of_view, 0.0))
     return scores
 
 
 def embedding(a: Sighting, b: Sighting, pairing: Pairing) -> Scores:
-    """How much likelier than by chance each candidate would pick the other: log-softmax of their
-    cosines, both ways, halved.
+    """How much likelier than by chance each candidate would pick the other.
 
-    The cosine is that of centred embeddings: the mean of a view's candidates (category, light,
-    viewpoint) is subtracted first.
+    It is the log-softmax of their cosines, both ways, halved. The cosine is that of centred
+    embeddings: the mean of a view's candidates (category, light, viewpoint) is subtracted first.
     """
     cosine = pairing.likeness * (_centred(a.embeddings) @ _centred(b.embeddings).T)
     if not cosine.size:
@@ -206,8 +217,7 @@ def embedding(a: Sighting, b: Sighting, pairing: Pairing) -> Scores:
 
 
 def hungarian(a: Sighting, b: Sighting, pairing: Pairing) -> Scores:
-    """`matched` for the pairs of the one-to-one matching of greatest total cosine, minus that for
-    others."""
+    """`matched` for pairs of the one-to-one matching of greatest total cosine, else minus it."""
     from scipy.optimize import linear_sum_assignment
 
     cosine = a.embeddings.astype(np.float64) @ b.embeddings.astype(np.float64).T
@@ -234,20 +244,24 @@ def geometry(a: Sighting, b: Sighting, pairing: Pairing) -> Scores:
 
 
 def ray_distance_m(a: Sighting, b: Sighting) -> Scores:
-    """Least distance, at one height within `HEIGHTS_M`, between the rays through the centres of two
-    boxes.
+    """Least distance between the rays through the centres of two boxes, in metres.
 
-    Metres; inf for a ray that never meets the table. Of 2020 candidates visible in two views (true
-    boxes, first frames of vlabench, tabletop and generic scenes), the nearest candidate of the
-    other view was the same object for 2019; by the rays' least distance at any height for 1953, as
-    rays also meet in mid-air or below the table; by the feet of the boxes on the table for 2016,
-    but those lie 2 to 4 cm apart for the same object, and these rays 2 to 4 mm (medians)."""
-    foot_a, lean_a = _rays(a)
-    foot_b, lean_b = _rays(b)
-    foot, lean = foot_a[:, None] - foot_b, lean_a[:, None] - lean_b
-    best = -(foot * lean).sum(-1) / np.maximum((lean**2).sum(-1), 1e-12)
-    apart = np.linalg.norm(foot + np.clip(best, *HEIGHTS_M)[..., None] * lean, axis=-1)
-    return np.where(np.isfinite(apart), apart, np.inf)
+    Both rays are taken at one height within `HEIGHTS_M`; inf for a ray that never meets the table.
+
+    Of 2020 candidates visible in two views (true boxes, first frames of vlabench, tabletop and
+    generic scenes), the nearest candidate of the other view was the same object for 2019; by the
+    rays' least distance at any height for 1953, as rays also meet in mid-air or below the table; by
+    the feet of the boxes on the table for 2016, but those lie 2 to 4 cm apart for the same object,
+    and these rays 2 to 4 mm (medians).
+    """
+    foot_a, slope_a = _rays(a)
+    foot_b, slope_b = _rays(b)
+    foot = foot_a[:, None] - foot_b
+    slope = slope_a[:, None] - slope_b
+    best = -(foot * slope).sum(-1) / np.maximum((slope**2).sum(-1), 1e-12)
+    height = np.clip(best, *HEIGHTS_M)
+    distance = np.linalg.norm(foot + height[..., None] * slope, axis=-1)
+    return np.where(np.isfinite(distance), distance, np.inf)
 
 
 TERMS: dict[Term, Callable[[Sighting, Sighting, Pairing], Scores]] = {
@@ -289,6 +303,30 @@ def compare_views(prompted: Mapping[str, str | None], target: str) -> ViewsVerdi
     return "right" if shown == {target} else "case 1"
 
 
+def _score_pairs(sightings: Sequence[Sighting], term: Term, pairing: Pairing) -> PairScores:
+    """The share of one term in the evidence of every pair of views; none scores 0."""
+    pairs = {}
+    for v, w in combinations(range(len(sightings)), 2):
+        scores = TERMS[term](sightings[v], sightings[w], pairing) / len(pairing.terms)
+        pairs[v, w] = np.pad(scores, ((0, 1), (0, 1)))
+    return pairs
+
+
+def _scores_of_choice(
+    singles: Sequence[ViewScores], pairs: Mapping[Term, PairScores], choice: Sequence[int]
+) -> dict[str, float]:
+    """What the references and every term contribute to the score of one combination."""
+    of_references = 0.0
+    for single, i in zip(singles, choice, strict=True):
+        of_references += float(single[i])
+    terms = {"references": of_references}
+    for term, of_term in pairs.items():
+        terms[term] = 0.0
+        for (v, w), scores in of_term.items():
+            terms[term] += float(scores[choice[v], choice[w]])
+    return terms
+
+
 def _check_calibration(camera: str, grounding: Grounding, cameras: Mapping[str, Camera]) -> None:
     if camera not in cameras:
         return
@@ -302,7 +340,9 @@ def _check_calibration(camera: str, grounding: Grounding, cameras: Mapping[str, 
 
 
 def _check_size(sightings: Sequence[Sighting]) -> None:
-    size = prod(len(view.xyxy) + 1 for view in sightings)
+    size = 1
+    for view in sightings:
+        size *= len(view.xyxy) + 1
     if len(sightings) > MOST_VIEWS or size > MOST_COMBINATIONS:
         raise BadViews(
             f"associate: {len(sightings)} views with {size} combinations; at most {MOST_VIEWS} "
@@ -312,24 +352,25 @@ def _check_size(sightings: Sequence[Sighting]) -> None:
 
 
 def _rays(view: Sighting) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n 2"]]:
-    """Of the ray through each box's centre: the x, y where it meets the table (m), and its x, y
-    slope per metre of height.
+    """The ray through each box's centre: where it meets the table, and its slope.
 
-    NaN where it never meets the table.
+    The first are x, y (m), the second x, y per metre of height. NaN where it never meets the table.
     """
     assert view.camera is not None
     centre = 0.5 * (view.xyxy[:, :2] + view.xyxy[:, 2:]).astype(np.float64)
-    pixels = np.concatenate([centre, np.ones((len(centre), 1))], axis=1)
+    ones = np.ones((len(centre), 1))
+    pixels = np.concatenate([centre, ones], axis=1)
     rays = pixels @ np.linalg.inv(view.camera.k).T @ view.camera.pose_world[:3, :3].T
     eye = view.camera.pose_world[:3, 3]
     down = np.where(rays[:, 2:] * eye[2] < 0, rays[:, 2:], np.nan)
-    lean = rays[:, :2] / down
-    return eye[:2] - eye[2] * lean, lean
+    slope = rays[:, :2] / down
+    return eye[:2] - eye[2] * slope, slope
 
 
 def _centred(embeddings: Float32[np.ndarray, "n d"]) -> Float64[np.ndarray, "n d"]:
     """Rows minus their mean, of length 1; a row that equals the mean stays 0."""
     rows = embeddings.astype(np.float64)
-    rows -= rows.mean(axis=0) if len(rows) else 0.0
+    if len(rows):
+        rows -= rows.mean(axis=0)
     length = np.linalg.norm(rows, axis=1, keepdims=True)
     return np.where(length > 1e-6, rows / np.maximum(length, 1e-6), 0.0)

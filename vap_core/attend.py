@@ -1,5 +1,6 @@
-"""START HERE. The method: from an instruction and camera views to what a frozen policy can follow
-(P 3.2, 3.3).
+"""START HERE. The method: an instruction and camera views become what a policy can follow.
+
+It is that of P 3.2 and 3.3; the policy stays frozen.
 
     attender = Attender(load_stack("embedded"), memory)
     state, attended = attender.start({"front": rgb}, "bring my cup")  # t = 0: detect, vote, segment
@@ -34,6 +35,7 @@ from vap_core.base.types import (
     Grounding,
     Instruction,
     PersonalObject,
+    Rgb,
     Track,
     Views,
     value,
@@ -51,11 +53,10 @@ PerTarget = tuple[Grounding, ...]
 
 @dataclass(frozen=True)
 class Prompting:
-    """What is changed in the policy's inputs: by default the paper's method; the switches are
-    ablations.
+    """What is changed in the policy's inputs: by default the paper's method.
 
-    `associate` goes beyond the paper: views agree on one candidate each (associate.PAIRINGS by
-    name); None grounds them one by one.
+    The switches are ablations. `associate` goes beyond the paper: views agree on one candidate each
+    (associate.PAIRINGS by name); None grounds them one by one.
     """
 
     alpha: float = ALPHA
@@ -103,6 +104,11 @@ class Attender:
         self.prompting = prompting or Prompting()
         self.parser = parser
 
+    @property
+    def references(self) -> Mapping[str, tuple[Rgb, ...]]:
+        """The remembered crops of every object, by name."""
+        return {name: obj.crops for name, obj in self.memory.items()}
+
     def start(
         self,
         views: Views,
@@ -136,7 +142,11 @@ class Attender:
         associations: tuple[Association | None, ...] = ()
         if self.prompting.associate is not None:
             groundings, associations = associate_targets(
-                groundings, candidates, phrases, cameras or {}, self.prompting.associate
+                groundings=groundings,
+                candidates=candidates,
+                phrases=phrases,
+                cameras=cameras or {},
+                pairing=self.prompting.associate,
             )
         return self.begin(parsed, views, candidates, groundings, associations)
 
@@ -195,10 +205,13 @@ class Attender:
         tracks: dict[str, tuple[Track, ...]] = {}
         for camera in views:
             ids[camera] = _winner_ids(candidates[camera], groundings[camera], phrases)
-            masks[camera] = masks_by_id(tuple(candidates[camera].values()))
+            of_view = tuple(candidates[camera].values())
+            masks[camera] = masks_by_id(of_view)
             tracks[camera] = tuple(map(_first_track, groundings[camera]))
 
-        scenes = [(views[camera], list(masks[camera])) for camera in views]
+        scenes = []
+        for camera, rgb in views.items():
+            scenes.append((rgb, list(masks[camera])))
         colours = choose_colours(len(phrases), scenes, self.prompting.palette)
         text = parsed.text
         if self.prompting.rewrite:
@@ -232,27 +245,29 @@ class Attender:
 
         The result for one episode does not depend on the others.
         """
-        for state, seen in zip(states, views, strict=True):
-            if set(seen) != set(state.groundings):
+        trackers = []
+        images = []
+        for state, images_now in zip(states, views, strict=True):
+            if set(images_now) != set(state.groundings):
                 raise ValueError(
-                    f"Attender.step: views of {sorted(seen)}, but the episode started with "
+                    f"Attender.step: views of {sorted(images_now)}, but the episode started with "
                     f"{sorted(state.groundings)}; give the same cameras."
                 )
-        where, trackers, images = [], [], []
-        for i, state in enumerate(states):
+        for state, images_now in zip(states, views, strict=True):
             for camera, tracker in state.trackers.items():
-                where.append((i, camera))
                 trackers.append(tracker)
-                images.append(views[i][camera])
+                images.append(images_now[camera])
         trackers, tracks = self.stack.tracker.step(trackers, images)
 
-        of_episode: list[dict[str, tuple[Any, tuple[Track, ...]]]] = [{} for _ in states]
-        for (i, camera), tracker, of_view in zip(where, trackers, tracks, strict=True):
-            of_episode[i][camera] = tracker, of_view
         results = []
-        for state, seen, parts in zip(states, views, of_episode, strict=True):
-            after = {camera: tracker for camera, (tracker, _) in parts.items()}
-            results.append(self.follow(state, seen, _tracks_of_targets(state, parts), after))
+        first = 0
+        for state, images_now in zip(states, views, strict=True):
+            stop = first + len(state.trackers)
+            next_trackers = dict(zip(state.trackers, trackers[first:stop], strict=True))
+            by_camera = dict(zip(state.trackers, tracks[first:stop], strict=True))
+            targets = _tracks_of_targets(state, by_camera)
+            results.append(self.follow(state, images_now, targets, next_trackers))
+            first = stop
         return results
 
     def follow(
@@ -263,7 +278,8 @@ class Attender:
         trackers: Mapping[str, Any],
     ) -> tuple[AttendState, Attended]:
         """Advance one step and prompt, with every target where `tracks` has it."""
-        frame_index, visible = state.frame_index + 1, _visible(tracks)
+        frame_index = state.frame_index + 1
+        visible = _visible(tracks)
         events = visibility_events(frame_index, state.visible, visible)
         state = replace(state, frame_index=frame_index, trackers=trackers, visible=visible)
         return state, self._prompt(state, views, tracks, events)
@@ -272,25 +288,34 @@ class Attender:
         self, views: Views, phrases: Sequence[str], given: Mapping[str, Boxes] | None
     ) -> dict[str, dict[str, Candidates]]:
         """Candidates by camera and phrase; each phrase is detected once."""
-        candidates: dict[str, dict[str, Candidates]] = {camera: {} for camera in views}
+        candidates: dict[str, dict[str, Candidates]] = {}
+        for camera in views:
+            candidates[camera] = {}
+        images = list(views.values())
         for phrase in dict.fromkeys(phrases):
-            if given is not None:
-                boxes = [given[camera] for camera in views]
-            else:
-                boxes = self.stack.detector(list(views.values()), phrase)
-            for (camera, rgb), of_view in zip(views.items(), boxes, strict=True):
-                known = tuple(candidates[camera].values())
-                candidates[camera][phrase] = describe(rgb, of_view, self.stack, known)
+            boxes = given
+            if boxes is None:
+                detected = self.stack.detector(images, phrase)
+                boxes = dict(zip(views, detected, strict=True))
+            for camera, rgb in views.items():
+                of_view = candidates[camera]
+                known = tuple(of_view.values())
+                of_view[phrase] = describe(rgb, boxes[camera], self.stack, known)
         return candidates
 
     def _start_trackers(
         self, views: Views, masks: Mapping[str, Bool[np.ndarray, "n h w"]]
     ) -> dict[str, Any]:
         """One tracker state for every view that has candidates."""
-        tracked = [camera for camera in views if len(masks[camera])]
-        states = self.stack.tracker.start(
-            [views[camera] for camera in tracked], [masks[camera] for camera in tracked]
-        )
+        tracked = []
+        images = []
+        starts = []
+        for camera, rgb in views.items():
+            if len(masks[camera]):
+                tracked.append(camera)
+                images.append(rgb)
+                starts.append(masks[camera])
+        states = self.stack.tracker.start(images, starts)
         return dict(zip(tracked, states, strict=True))
 
     def _prompt(
@@ -300,15 +325,11 @@ class Attender:
         tracks: Mapping[str, tuple[Track, ...]],
         events: tuple[Event, ...],
     ) -> Attended:
+        """The prompted images and text, and the evidence for them."""
         images = dict(views)
         if self.prompting.highlight:
             for camera, per_target in tracks.items():
-                free = np.ones(views[camera].shape[:2], bool)  # two targets never tint one pixel
-                for track, colour in zip(per_target, state.colours, strict=True):
-                    if track.mask is not None:
-                        mask = track.mask & free
-                        images[camera] = tint(images[camera], mask, colour, self.prompting.alpha)
-                        free &= ~track.mask
+                images[camera] = self._tint(views[camera], per_target, state.colours)
         return Attended(
             images=images,
             text=state.text,
@@ -318,6 +339,15 @@ class Attender:
             events=events,
             associations=state.associations,
         )
+
+    def _tint(self, rgb: Rgb, tracks: Sequence[Track], colours: Sequence[Colour]) -> Rgb:
+        """One view with every tracked target in its colour; two never tint one pixel."""
+        free = np.ones(rgb.shape[:2], bool)
+        for track, colour in zip(tracks, colours, strict=True):
+            if track.mask is not None:
+                rgb = tint(rgb, track.mask & free, colour, self.prompting.alpha)
+                free &= ~track.mask
+        return rgb
 
 
 def _winner_ids(
@@ -348,9 +378,9 @@ def _first_track(grounding: Grounding) -> Track:
 
 
 def _tracks_of_targets(
-    state: AttendState, parts: Mapping[str, tuple[Any, tuple[Track, ...]]]
+    state: AttendState, by_camera: Mapping[str, Sequence[Track]]
 ) -> dict[str, tuple[Track, ...]]:
-    """From one track per identity (second in `parts`) to one per target, in every view."""
+    """From one track per identity to one per target, in every view."""
     tracks: dict[str, tuple[Track, ...]] = {}
     for camera, ids in state.ids.items():
         per_target = []
@@ -358,7 +388,7 @@ def _tracks_of_targets(
             if identity is None:
                 per_target.append(Track(None, 0.0))
             else:
-                per_target.append(parts[camera][1][identity])
+                per_target.append(by_camera[camera][identity])
         tracks[camera] = tuple(per_target)
     return tracks
 

@@ -1,8 +1,7 @@
-"""Personalised instructions: find "my cup", and rewrite it to "the red cup" (P 3.3, appendix
-"Instruction Rewriting Logic").
+"""Personalised instructions: find "my cup", and rewrite it to "the red cup".
 
-A parser is any function `(text, categories) -> Instruction`; `parse` is the deterministic rule of
-the paper's main results.
+The logic is that of P 3.3 and its appendix "Instruction Rewriting Logic". A parser is any function
+`(text, categories) -> Instruction`; `parse` is the deterministic rule of the paper's main results.
 """
 
 import re
@@ -31,11 +30,11 @@ class Parser(Protocol):
 
 
 def parse(text: str, categories: Collection[str] = ()) -> Instruction:
-    """Parse by rule: every "my <category>" or "my <person>'s <category>" becomes a target, left to
-    right.
+    """Parse by rule, left to right.
 
-    The longest of `categories` (a plural s allowed) that follows the trigger wins; otherwise the
-    words up to punctuation or the first stop word are the category, so unseen nouns work too.
+    Every "my <category>" or "my <person>'s <category>" becomes a target. The longest of
+    `categories` (a plural s allowed) that follows the trigger wins; otherwise the words up to
+    punctuation or the first stop word are the category, so unseen nouns work too.
 
     Raises:
         BadInstruction: the text holds no possessive span.
@@ -46,8 +45,10 @@ def parse(text: str, categories: Collection[str] = ()) -> Instruction:
             continue
         category, length = leading_category(text[trigger.end() :], categories)
         if category:
+            start, stop = trigger.span()
             owner = trigger.group().strip()
-            targets.append(Target(trigger.start(), trigger.end() + length, owner, category))
+            target = Target(start=start, stop=stop + length, owner=owner, category=category)
+            targets.append(target)
     if not targets:
         raise BadInstruction(
             f'parse: no personal object in {text!r}; name one as "my <category>", '
@@ -57,10 +58,10 @@ def parse(text: str, categories: Collection[str] = ()) -> Instruction:
 
 
 def rewrite(instruction: Instruction, colours: Sequence[Colour | None]) -> str:
-    """Replace each target's span by "the <colour> <category>"; a None colour leaves its span as it
-    is.
+    """Replace each target's span by "the <colour> <category>".
 
-    One colour per target. The rest of the text is unchanged, character for character.
+    There is one colour per target; None leaves its span as it is. The rest of the text is
+    unchanged, character for character.
     """
     n = len(instruction.targets)
     if len(colours) != n:
@@ -79,8 +80,7 @@ def rewrite(instruction: Instruction, colours: Sequence[Colour | None]) -> str:
 
 
 def leading_category(rest: str, categories: Collection[str] = ()) -> tuple[str, int]:
-    """The category phrase that `rest` begins with, lower case, and how many characters of `rest` it
-    spans."""
+    """The category phrase that `rest` begins with, lower case, and its length in characters."""
     for known in sorted(categories, key=len, reverse=True):
         pattern = r"\s+".join(re.escape(word) for word in known.split())
         match = re.match(rf"{pattern}s?\b", rest, re.IGNORECASE)

@@ -1,5 +1,7 @@
-"""The visual memory: reference photos of a personal object, their embeddings Z_o, and the bank on
-disk (P 3.3)."""
+"""The visual memory: references of personal objects, and the bank on disk (P 3.3).
+
+References are crops of photos, and their embeddings Z_o.
+"""
 
 import json
 import re
@@ -18,7 +20,8 @@ from vap_core.base.types import Description, PersonalObject, Rgb, Target
 from vap_core.perception.boxes import crop
 from vap_core.perception.protocols import Detector, Encoder
 
-FORMAT, VERSION = "vap-personal-object", 1
+FORMAT = "vap-personal-object"
+VERSION = 1
 SUFFIX = ".object.safetensors"
 REFERENCE_THRESHOLD = 0.05
 """A photo of the object shows one of its category, so a reference's box needs a lower score than a
@@ -43,7 +46,8 @@ def register(
     box; where none scores `threshold`, the whole photo is the crop. Also returns the indices of
     those photos.
     """
-    crops, whole = [], []
+    crops = []
+    whole = []
     for i, photo in enumerate(photos):
         (boxes,) = detector([photo], category, threshold)
         if len(boxes):
@@ -73,14 +77,21 @@ def remember(name: str, category: str, crops: Sequence[Rgb], encoder: Encoder) -
     if not crops:
         raise BadPhoto(f"remember: {name!r} has no photos; give at least one, five are best.")
     category = " ".join(category.lower().split())
-    return PersonalObject(name, category, encoder(crops), tuple(crops), encoder.name)
+    return PersonalObject(
+        name=name,
+        category=category,
+        embeddings=encoder(crops),
+        crops=tuple(crops),
+        encoder=encoder.name,
+    )
 
 
 def recall(
     memory: Mapping[str, PersonalObject], target: Target, name: str | None = None
 ) -> PersonalObject:
-    """The remembered object that a target means: by name when given, else the only one of its
-    category.
+    """The remembered object that a target means.
+
+    It is found by name when given, else it is the only one of its category.
 
     Raises:
         UnknownName: nothing, or more than one object, fits.
@@ -89,7 +100,12 @@ def recall(
         if name not in memory:
             raise one_of("recall: object", name, memory)
         return memory[name]
-    fitting = [obj for obj in memory.values() if obj.category == target.category]
+    fitting = []
+    known = []
+    for obj in memory.values():
+        known.append(f"{obj.name} ({obj.category})")
+        if obj.category == target.category:
+            fitting.append(obj)
     if len(fitting) == 1:
         return fitting[0]
     if fitting:
@@ -98,10 +114,10 @@ def recall(
             f"recall: {len(fitting)} objects are a {target.category!r}: {names}; choose with "
             "--object."
         )
-    known = sorted(f"{obj.name} ({obj.category})" for obj in memory.values())
+    contents = ", ".join(sorted(known)) or "nothing yet"
     raise UnknownName(
-        f"recall: no {target.category!r} is remembered; the memory holds "
-        f"{', '.join(known) or 'nothing yet'}. Register one, or point --memory at its folder."
+        f"recall: no {target.category!r} is remembered; the memory holds {contents}. Register one, "
+        "or point --memory at its folder."
     )
 
 
@@ -157,7 +173,10 @@ def load(path: Path, encoder: str | None = None) -> PersonalObject:
             f"{AGAIN}."
         )
     try:
-        crops = tuple(tensors[key] for key in sorted(tensors) if key.startswith("crop."))
+        crops = []
+        for key in sorted(tensors):
+            if key.startswith("crop."):
+                crops.append(tensors[key])
         description = None
         if "description" in header:
             description = Description(**json.loads(header["description"]))
@@ -165,7 +184,7 @@ def load(path: Path, encoder: str | None = None) -> PersonalObject:
             name=header["name"],
             category=header["category"],
             embeddings=tensors["embeddings"],
-            crops=crops,
+            crops=tuple(crops),
             encoder=header["encoder"],
             description=description,
         )
@@ -177,8 +196,11 @@ def load(path: Path, encoder: str | None = None) -> PersonalObject:
 
 def load_bank(bank: Path, encoder: str | None = None) -> dict[str, PersonalObject]:
     """Every object of a bank by name; a bank that does not exist yet is empty."""
-    objects = [load(path, encoder) for path in sorted(bank.glob(f"*{SUFFIX}"))]
-    return {obj.name: obj for obj in objects}
+    objects = {}
+    for path in sorted(bank.glob(f"*{SUFFIX}")):
+        obj = load(path, encoder)
+        objects[obj.name] = obj
+    return objects
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -203,4 +225,6 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         tensors = decode(data)
     except damaged as error:
         raise BadMemory(f"load: {path} is damaged ({type(error).__name__}); {AGAIN}.") from error
-    return (header if isinstance(header, dict) else {}), tensors
+    if not isinstance(header, dict):
+        header = {}
+    return header, tensors

@@ -1,5 +1,7 @@
-"""Visual prompts: tint a mask, and choose a colour that can be named and seen (P 3.3,
-tab:ablation_prompt)."""
+"""Visual prompts: tint a mask, and choose a colour that can be named and seen.
+
+The paper's are in P 3.3 and tab:ablation_prompt.
+"""
 
 from collections.abc import Iterable, Sequence
 
@@ -26,7 +28,9 @@ VIEW_SHARE = 0.01
 """A tint is free while fewer than these shares of every candidate's, and of every view's, pixels
 have its colour."""
 
-HUE_WIDTH_DEG, LEAST_SATURATION, LEAST_VALUE = 25.0, 0.35, 60.0
+HUE_WIDTH_DEG = 25.0
+LEAST_SATURATION = 0.35
+LEAST_VALUE = 60.0
 """A pixel has a tint's colour when its hue is that near, and it is saturated and bright enough."""
 
 
@@ -48,9 +52,11 @@ def tint(rgb: Rgb, mask: Mask, colour: Colour, alpha: float = ALPHA) -> Rgb:
 def has_colour(rgb: np.ndarray, colour: Colour) -> np.ndarray:
     """Which pixels (... x 3, uint8) a person would call `colour`."""
     pixels = rgb.astype(np.float32)
-    top, low = pixels.max(axis=-1), pixels.min(axis=-1)
+    top = pixels.max(axis=-1)
+    low = pixels.min(axis=-1)
     saturation = (top - low) / np.maximum(top, 1.0)
-    hue = float(_hue_deg(np.asarray([colour.rgb], np.float32))[0])
+    named = np.asarray([colour.rgb], np.float32)
+    hue = float(_hue_deg(named)[0])
     off = np.abs((_hue_deg(pixels) - hue + 180.0) % 360.0 - 180.0)
     return (off <= HUE_WIDTH_DEG) & (saturation >= LEAST_SATURATION) & (top >= LEAST_VALUE)
 
@@ -76,14 +82,16 @@ def choose_colours(
     for rgb, masks in scenes:
         inside = [rgb[mask] for mask in masks if mask.any()]
         for index, colour in enumerate(palette):
-            shares = [float(has_colour(rgb, colour).mean()) / VIEW_SHARE]
+            share = has_colour(rgb, colour).mean()
+            presence[index] = max(presence[index], float(share) / VIEW_SHARE)
             for pixels in inside:
-                shares.append(float(has_colour(pixels, colour).mean()) / OBJECT_SHARE)
-            presence[index] = max(presence[index], *shares)
-    ranked = sorted(range(len(palette)), key=lambda i: (max(presence[i], 1.0), i))
-    return tuple(palette[i] for i in ranked[:count])
+                share = has_colour(pixels, colour).mean()
+                presence[index] = max(presence[index], float(share) / OBJECT_SHARE)
+    order = np.argsort(np.maximum(presence, 1.0), kind="stable")
+    return tuple(palette[i] for i in order[:count])
 
 
 def _hue_deg(pixels: np.ndarray) -> np.ndarray:
-    r, g, b = pixels[..., 0], pixels[..., 1], pixels[..., 2]
-    return np.degrees(np.arctan2(np.sqrt(3.0) * (g - b), 2.0 * r - g - b)) % 360.0
+    r, g, b = np.moveaxis(pixels, -1, 0)
+    angle = np.arctan2(np.sqrt(3.0) * (g - b), 2.0 * r - g - b)
+    return np.degrees(angle) % 360.0

@@ -1,5 +1,4 @@
-"""Which candidate is the user's object: each reference votes for its most similar candidate (P
-3.3)."""
+"""Which candidate is the user's object: each reference votes for its most similar one (P 3.3)."""
 
 from typing import Literal
 
@@ -33,7 +32,13 @@ def vote(cosine: Float32[np.ndarray, "n k"], rule: VoteRule = "vote") -> Ballot:
     """
     n, k = cosine.shape
     if n == 0:
-        return Ballot(np.zeros(0, np.int64), np.zeros(0, bool), None, 0.0, 0.0)
+        return Ballot(
+            votes=np.zeros(0, np.int64),
+            tied=np.zeros(0, bool),
+            winner=None,
+            margin=0.0,
+            cosine_margin=0.0,
+        )
     if k == 0:
         raise ValueError("vote: no references; a personal object has at least one")
     best_of_reference = (cosine >= cosine.max(axis=0) - SAME).argmax(axis=0)

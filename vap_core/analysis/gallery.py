@@ -1,6 +1,11 @@
-"""Pictures of the benchmarks, as notebook 01 shows them: objects taking turns on one table, opening frames, and how alike look-alikes are."""
+"""Pictures and tables of the benchmarks, as notebook 01 shows them.
 
+Contact sheets of the objects, opening frames of episodes, and how similar the look-alikes are.
+"""
+
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,113 +39,139 @@ if TYPE_CHECKING:
 STEMS = tuple(name.removesuffix("-personal") for name in OBJECTS if name.endswith("-personal"))
 """One per personal object: "pen-holder"."""
 GOALS = tuple(model for model in OBJECTS.values() if model.split == "prop")
-REFERENCES = tuple(
-    Shot(0.4 * np.pi * i, float(np.radians(18 + 8 * (2 * i % 5))), 0.6) for i in range(5)
+"""The models that serve as goals of tasks."""
+
+
+def _shot(azimuth: float, elevation_deg: float) -> Shot:
+    """A view from 0.6 m; `azimuth` in radians."""
+    return Shot(azimuth, float(np.radians(elevation_deg)), 0.6)
+
+
+REFERENCES = (
+    _shot(0.0, 18.0),
+    _shot(0.4 * np.pi, 34.0),
+    _shot(0.4 * np.pi * 2, 50.0),
+    _shot(0.4 * np.pi * 3, 26.0),
+    _shot(0.4 * np.pi * 4, 42.0),
 )
-"""Five views as one walks around an object, like studio.reference_views but under one lamp, so that only the object differs."""
-QUERIES = tuple(
-    Shot(azimuth, float(np.radians(elevation)), 0.6)
-    for azimuth, elevation in ((0.6, 40), (2.5, 30), (4.4, 35))
-)
+"""Five views from around an object, under one lamp, so that only the object differs."""
+QUERIES = (_shot(0.6, 40.0), _shot(2.5, 30.0), _shot(4.4, 35.0))
 """Views from between those."""
 
 
 def cut(stage: Stage, name: str, shot: Shot) -> Rgb:
-    """A picture of one object, cut around it as grounding cuts its candidates, but by its true outline."""
+    """A picture of one object, cropped to its true outline as grounding crops its candidates."""
     return crop(stage.picture(name, shot), stage.box(name, shot))
 
 
-def _label(stem: str) -> str:
-    return stem.removesuffix("-personal").replace("-", "\n").replace(" ", "\n")
-
-
-def graded(stem: str) -> tuple[ObjectModel, ...]:
+def lookalikes_by_tier(stem: str) -> tuple[ObjectModel, ...]:
     """A personal object's look-alikes, hard ones first."""
-    return tuple(sorted(lookalikes(stem), key=lambda model: TIERS.index(tier(model))))
+
+    def rank(model: ObjectModel) -> int:
+        return TIERS.index(tier(model))
+
+    return tuple(sorted(lookalikes(stem), key=rank))
 
 
 def lookalike_sheet(stage: Stage) -> dict[str, list[Tile]]:
-    """One row per personal object: itself, then its look-alikes from hard to easy: tier, and number in the name."""
-    return {
-        _label(stem): [
-            Tile(stage.picture(personal_instance(stem).name), "personal", TIER_COLOURS["personal"]),
-            *(
-                Tile(
-                    stage.picture(m.name),
-                    f"{tier(m)}, {m.name.rpartition('-')[2]}",
-                    TIER_COLOURS[tier(m)],
-                )
-                for m in graded(stem)
-            ),
-        ]
-        for stem in STEMS
-    }
+    """One row per personal object: itself, then its look-alikes from hard to easy.
+
+    The title of a look-alike is its tier and the number in its name.
+    """
+    sheet = {}
+    for stem in STEMS:
+        picture = stage.picture(personal_instance(stem).name)
+        tiles = [Tile(picture, "personal", TIER_COLOURS["personal"])]
+        for model in lookalikes_by_tier(stem):
+            tiles.append(_lookalike_tile(stage, model))
+        sheet[_label(stem)] = tiles
+    return sheet
 
 
 def generic_sheet(kinds: Sequence[str], n: int = 6, size: int = 160) -> dict[str, list[Tile]]:
-    """One row per kind (a category, or a family's stem): its first `n` generic instances, which training draws from."""
-    models = {kind: [generic_instance(kind, i) for i in range(n)] for kind in kinds}
-    with Stage([model for row in models.values() for model in row], size) as stage:
-        return {
-            _label(kind): [Tile(stage.picture(model.name)) for model in row]
-            for kind, row in models.items()
-        }
+    """One row per kind: its first `n` generic instances, which training draws from.
+
+    A kind is a category, or the stem of a family.
+    """
+    models: dict[str, list[ObjectModel]] = {}
+    for kind in kinds:
+        models[kind] = [generic_instance(kind, i) for i in range(n)]
+    sheet = {}
+    with Stage(list(chain.from_iterable(models.values())), size) as stage:
+        for kind, row in models.items():
+            tiles = []
+            for model in row:
+                tiles.append(Tile(stage.picture(model.name)))
+            sheet[_label(kind)] = tiles
+    return sheet
 
 
 def reference_sheet(
     memory: Mapping[str, tuple[PersonalObject, tuple[int, ...]]],
 ) -> dict[str, list[Tile]]:
-    """One row per remembered object: its crops; those that no detector cut are marked as whole photos."""
-    return {
-        _label(stem): [
-            Tile(
-                picture,
-                "whole photo" if i in whole else "",
-                TIER_COLOURS["hard"] if i in whole else TIER_COLOURS["easy"],
-            )
-            for i, picture in enumerate(obj.crops)
-        ]
-        for stem, (obj, whole) in memory.items()
-    }
+    """One row per remembered object: its crops; undetected ones are marked as whole photos."""
+    sheet = {}
+    for stem, (obj, whole) in memory.items():
+        tiles = []
+        for i, picture in enumerate(obj.crops):
+            if i in whole:
+                tiles.append(Tile(picture, "whole photo", TIER_COLOURS["hard"]))
+            else:
+                tiles.append(Tile(picture, "", TIER_COLOURS["easy"]))
+        sheet[_label(stem)] = tiles
+    return sheet
 
 
 def hardness(stage: Stage, encoder: Encoder) -> "pd.DataFrame":
-    """How near the encoder finds each look-alike to five references of the personal object, next to new views of that object itself.
+    """How similar the encoder finds each look-alike to its personal object.
 
-    One line per look-alike: `cosine`, mean over queries and references; `own`, the same for the personal object's queries; `fooled`, the
-    share of votes that the look-alike would win, over every reference, view of the look-alike and view of the personal object.
+    The personal object is given by five references. One line per look-alike: `cosine`, the mean
+    over queries and references; `own`, the same for the personal object's own queries; `fooled`,
+    the share of votes that the look-alike would win, over every reference, view of the look-alike
+    and view of the personal object.
     """
     import pandas as pd
 
     lines = []
     for stem in STEMS:
-        mine = personal_instance(stem).name
-        references = encoder([cut(stage, mine, shot) for shot in REFERENCES])
-        own = encoder([cut(stage, mine, shot) for shot in QUERIES]) @ references.T
-        for model in graded(stem):
-            theirs = encoder([cut(stage, model.name, shot) for shot in QUERIES]) @ references.T
+        personal = personal_instance(stem).name
+        references = _encode_shots(stage, encoder, personal, REFERENCES)
+        own = _encode_shots(stage, encoder, personal, QUERIES) @ references.T
+        for model in lookalikes_by_tier(stem):
+            cosines = _encode_shots(stage, encoder, model.name, QUERIES) @ references.T
+            wins = cosines[:, None] > own[None]
             lines.append(
                 {
-                    "object": stem.replace("-", " "), "lookalike": model.name, "tier": tier(model), "cosine": float(theirs.mean()),
-                    "own": float(own.mean()), "fooled": float((theirs[:, None] > own[None]).mean()),
+                    "object": stem.replace("-", " "),
+                    "lookalike": model.name,
+                    "tier": tier(model),
+                    "cosine": float(cosines.mean()),
+                    "own": float(own.mean()),
+                    "fooled": float(wins.mean()),
                 }
-            )  # fmt: skip
+            )
     return pd.DataFrame(lines)
 
 
 def out_of_order(table: "pd.DataFrame") -> "pd.DataFrame":
-    """Of `hardness`: pairs of one object's look-alikes of which the easier tier has the higher cosine, the widest gap first."""
+    """Of `hardness`: pairs of one object's look-alikes whose tiers contradict their cosines.
+
+    The easier one has the higher cosine. The widest gap comes first.
+    """
     rank = table.assign(rank=table.tier.map(TIERS.index))
     pairs = rank.merge(rank, on="object", suffixes=("", "_easier"))
     wrong = pairs[(pairs["rank"] < pairs.rank_easier) & (pairs.cosine < pairs.cosine_easier)]
     wrong = wrong.assign(gap=wrong.cosine_easier - wrong.cosine).sort_values("gap", ascending=False)
-    return wrong[["lookalike", "tier", "lookalike_easier", "tier_easier", "gap"]].reset_index(
-        drop=True
-    )
+    columns = ["lookalike", "tier", "lookalike_easier", "tier_easier", "gap"]
+    return wrong[columns].reset_index(drop=True)
 
 
 def census(lists: Mapping[str, Sequence[EpisodeRow]]) -> "pd.DataFrame":
-    """One line per task and track: robot, cameras, control rate, instruction, rule, step limit, and how many looks of the room and episodes."""
+    """One line per task and track of the suites' episode lists.
+
+    Robot, cameras, control rate, instruction, rule, step limit, and the numbers of variants of the
+    room and of episodes.
+    """
     import pandas as pd
 
     tracks: dict[tuple[str, str, str], list[EpisodeRow]] = {}
@@ -149,18 +180,31 @@ def census(lists: Mapping[str, Sequence[EpisodeRow]]) -> "pd.DataFrame":
             tracks.setdefault((name, row.task, row.split), []).append(row)
     lines = []
     for (name, _, split), rows in tracks.items():
-        suite, row = BENCHMARKS[name], rows[0]
+        suite = BENCHMARKS[name]
+        row = rows[0]
+        variants = {row.variant for row in rows}
         lines.append(
             {
-                "suite": name, "robot": suite.robot, "cameras": len(suite.cameras), "Hz": suite.hz, "instruction": row.instruction, "rule": row.rule,
-                "steps": row.max_steps, "track": split or "-", "looks": len({row.variant for row in rows}), "episodes": len(rows),
+                "suite": name,
+                "robot": suite.robot,
+                "cameras": len(suite.cameras),
+                "Hz": suite.hz,
+                "instruction": row.instruction,
+                "rule": row.rule,
+                "steps": row.max_steps,
+                "track": split or "-",
+                "looks": len(variants),
+                "episodes": len(rows),
             }
-        )  # fmt: skip
+        )
     return pd.DataFrame(lines)
 
 
-def seen(row: EpisodeRow, steps: int = 0, size: int = 224) -> dict[str, Rgb]:
-    """What the cameras of the row's suite see after `steps` control steps of the expert, with the variant's look and the suite's sensor."""
+def camera_images(row: EpisodeRow, steps: int = 0, size: int = 224) -> dict[str, Rgb]:
+    """The images of the suite's cameras after `steps` control steps of the expert.
+
+    The room is that of the row's variant, and the images pass the suite's sensor.
+    """
     expert = Expert()
     with open_row(row, image_size=size) as env:
         state = expert.start(np.random.default_rng([row.seed, row.episode]))
@@ -170,67 +214,91 @@ def seen(row: EpisodeRow, steps: int = 0, size: int = 224) -> dict[str, Rgb]:
         return dict(env.observe().images)
 
 
-def frame_sheet(shown: Sequence[Sequence[EpisodeRow]]) -> dict[str, list[Tile]]:
-    """One row per suite: the opening frame of each of its episodes in `shown`, by every camera."""
-    return {
-        rows[0].suite: [
-            Tile(rgb, f"{camera}: {row.instruction}" if i == 0 else camera)
-            for row in rows
-            for i, (camera, rgb) in enumerate(seen(row).items())
-        ]
-        for rows in shown
-    }
+def frame_sheet(episodes: Sequence[Sequence[EpisodeRow]]) -> dict[str, list[Tile]]:
+    """One row per suite: the opening frame of each of its `episodes`, by every camera."""
+    sheet = {}
+    for rows in episodes:
+        tiles = []
+        for row in rows:
+            for i, (camera, rgb) in enumerate(camera_images(row).items()):
+                title = f"{camera}: {row.instruction}" if i == 0 else camera
+                tiles.append(Tile(rgb, title))
+        sheet[rows[0].suite] = tiles
+    return sheet
 
 
 def same_layout(rows: Sequence[EpisodeRow], like: EpisodeRow) -> dict[str, EpisodeRow]:
-    """One row per variant in which everything that `like` places stands as it does there; distractors may join it."""
-    held = [
-        place
-        for place in rows
-        if place.task == like.task and _spots(place)[: len(like.placements)] == _spots(like)
-    ]
-    return {
-        variant: next(row for row in held if row.variant == variant)
-        for variant in VARIANTS
-        if any(row.variant == variant for row in held)
-    }
+    """The first row of every variant that places the objects of `like` as `like` does.
 
-
-def _spots(row: EpisodeRow) -> list[tuple[str, float, float, float]]:
-    return [(place.model, place.x, place.y, place.yaw) for place in row.placements]
+    Distractors may be added.
+    """
+    poses = _model_poses(like)
+    first_rows: dict[str, EpisodeRow] = {}
+    for row in rows:
+        if row.task == like.task and _model_poses(row)[: len(poses)] == poses:
+            first_rows.setdefault(row.variant, row)
+    layouts = {}
+    for variant in VARIANTS:
+        if variant in first_rows:
+            layouts[variant] = first_rows[variant]
+    return layouts
 
 
 def bounds(path: Path) -> list[Score]:
-    """The scores of the episodes in a parquet file, one line each, in the order of the suites and their tasks."""
+    """The scores of the episodes in a parquet file, in the order of the suites and their tasks."""
     import pandas as pd
 
-    order = {
-        (suite.name, task.name): i
-        for i, (suite, task) in enumerate(
-            (suite, task) for suite in BENCHMARKS.values() for task in suite.tasks
-        )
-    }
-    return sorted(
-        score(pd.read_parquet(path).to_dict("records")),
-        key=lambda s: (order[s.suite, s.task], s.split == "variant aggregation", s.policy),
-    )
+    positions: dict[tuple[str, str], int] = {}
+    for suite in BENCHMARKS.values():
+        for task in suite.tasks:
+            positions[suite.name, task.name] = len(positions)
+
+    def rank(line: Score) -> tuple[int, bool, str]:
+        position = positions[line.suite, line.task]
+        return position, line.split == "variant aggregation", line.policy
+
+    records = pd.read_parquet(path).to_dict("records")
+    return sorted(score(records), key=rank)
 
 
 def pooled(scores: Sequence[Score]) -> "pd.DataFrame":
-    """Success of every policy per suite, all its tasks and tracks taken together, with its 95 % Wilson interval."""
+    """Success of every policy per suite, over all its tasks and tracks.
+
+    With its 95 % Wilson interval.
+    """
     import pandas as pd
 
-    keys = dict.fromkeys((s.suite, s.policy) for s in scores)
-    rates = {
-        key: rate(
-            sum(s.sr.k for s in scores if (s.suite, s.policy) == key),
-            sum(s.n for s in scores if (s.suite, s.policy) == key),
+    successes: Counter[tuple[str, str]] = Counter()
+    episodes: Counter[tuple[str, str]] = Counter()
+    for line in scores:
+        successes[line.suite, line.policy] += line.sr.k
+        episodes[line.suite, line.policy] += line.n
+    lines = []
+    for (suite, policy), n in episodes.items():
+        success = rate(successes[suite, policy], n)
+        lines.append(
+            {"suite": suite, "policy": policy, "episodes": success.n, "SR % [95 %]": str(success)}
         )
-        for key in keys
-    }
-    return pd.DataFrame(
-        [
-            {"suite": suite, "policy": policy, "episodes": r.n, "SR % [95 %]": str(r)}
-            for (suite, policy), r in rates.items()
-        ]
-    )
+    return pd.DataFrame(lines)
+
+
+def _label(stem: str) -> str:
+    return stem.removesuffix("-personal").replace("-", "\n").replace(" ", "\n")
+
+
+def _lookalike_tile(stage: Stage, model: ObjectModel) -> Tile:
+    number = model.name.rpartition("-")[2]
+    picture = stage.picture(model.name)
+    return Tile(picture, f"{tier(model)}, {number}", TIER_COLOURS[tier(model)])
+
+
+def _encode_shots(stage: Stage, encoder: Encoder, name: str, shots: Sequence[Shot]) -> np.ndarray:
+    """The embeddings of one object's crops, (len(shots), D)."""
+    return encoder([cut(stage, name, shot) for shot in shots])
+
+
+def _model_poses(row: EpisodeRow) -> list[tuple[str, float, float, float]]:
+    poses = []
+    for place in row.placements:
+        poses.append((place.model, place.x, place.y, place.yaw))
+    return poses

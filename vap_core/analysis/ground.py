@@ -1,4 +1,7 @@
-"""Ground one picture: candidates, votes, margin and the rewritten instruction, as text, JSON, a picture and a recording."""
+"""Ground one picture, and give the answer as text, JSON, a picture and a recording.
+
+The answer is the candidates, the votes, the margin and the rewritten instruction.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,14 +10,17 @@ from typing import Any
 import numpy as np
 
 from vap_core.base.errors import BadInstruction, BadOutput
-from vap_core.base.types import Attended, Boxes, PersonalObject, Rgb, value
+from vap_core.base.types import Attended, Boxes, Grounding, PersonalObject, Rgb, value
 
 CAMERA = "image"
 
 
 @value
 class Found:
-    """What was asked of one picture, and what the method answered; `objects[j]` is what target j was matched with."""
+    """An instruction for one picture, and the method's answer.
+
+    `objects[j]` is the object that target j was matched with.
+    """
 
     rgb: Rgb
     instruction: str
@@ -23,36 +29,22 @@ class Found:
     domain: str
 
     def __str__(self) -> str:
-        return "\n".join(
-            [
-                *(line for g in self.attended.groundings[CAMERA] for line in _lines(g)),
-                f"instruction: {self.attended.text}",
-            ]
-        )
+        lines = []
+        for grounding in self.attended.groundings[CAMERA]:
+            lines.extend(_format_grounding(grounding))
+        lines.append(f"instruction: {self.attended.text}")
+        return "\n".join(lines)
 
 
 def parse_boxes(boxes: Sequence[str], rgb: Rgb) -> Boxes:
     """Candidates given by hand as "x0,y0,x1,y1" in pixels, clipped to the picture.
 
-    Raises:
-        BadInstruction: not four numbers, or no area inside the picture.
+    Raises: BadInstruction for a text without four numbers, or without area inside the picture.
     """
     height, width = rgb.shape[:2]
-    rows = []
-    for text in boxes:
-        try:
-            x0, y0, x1, y1 = (float(part) for part in text.split(","))
-        except ValueError as error:
-            raise BadInstruction(
-                f"--box {text!r} is not x0,y0,x1,y1; for example --box 40,60,180,220."
-            ) from error
-        row = [max(x0, 0.0), max(y0, 0.0), min(x1, float(width)), min(y1, float(height))]
-        if not (row[2] - row[0] >= 1 and row[3] - row[1] >= 1):
-            raise BadInstruction(
-                f"--box {text!r} has no area inside the {width}x{height} picture; x to the right, y down, far corner last."
-            )
-        rows.append(row)
-    return Boxes(np.asarray(rows, np.float32), np.ones(len(rows), np.float32), "by hand")
+    rows = [_parse_box(text, width, height) for text in boxes]
+    scores = np.ones(len(rows), np.float32)
+    return Boxes(np.asarray(rows, np.float32), scores, "by hand")
 
 
 def ground_image(
@@ -71,37 +63,27 @@ def ground_image(
 
     models = load_stack(stack)
     bank = load_bank(memory, models.encoder.name)
-    _, attended = Attender(models, bank).start(
-        {CAMERA: rgb},
-        instruction,
-        objects=objects,
-        boxes=None if boxes is None else {CAMERA: boxes},
-    )
+    attender = Attender(models, bank)
+    boxes_by_camera = None if boxes is None else {CAMERA: boxes}
+    _, attended = attender.start({CAMERA: rgb}, instruction, objects=objects, boxes=boxes_by_camera)
+    matched = tuple(bank[grounding.object] for grounding in attended.groundings[CAMERA])
     return Found(
-        rgb,
-        instruction,
-        tuple(bank[g.object] for g in attended.groundings[CAMERA]),
-        attended,
-        models.domain,
+        rgb=rgb,
+        instruction=instruction,
+        objects=matched,
+        attended=attended,
+        domain=models.domain,
     )
 
 
 def to_json(found: Found) -> dict[str, Any]:
-    """The first target's evidence at the top level, every target's under "targets"; `instruction` is the rewritten one."""
-    targets = [
-        {
-            "object": g.object,
-            "winner": g.winner,
-            "votes": g.ballot.votes.tolist(),
-            "similarity": np.round(g.similarity, 6).tolist(),
-            "margin": g.ballot.margin,
-            "cosine_margin": g.ballot.cosine_margin if len(g.candidates) > 1 else None,
-            "tied": g.ballot.tied.tolist(),
-            "candidates": np.round(g.candidates.xyxy, 2).tolist(),
-            "scores": np.round(g.candidates.score, 4).tolist(),
-        }
-        for g in found.attended.groundings[CAMERA]
-    ]
+    """The evidence of the first target at the top level, that of every target under "targets".
+
+    `instruction` is the rewritten one, `said` the given one.
+    """
+    targets = []
+    for grounding in found.attended.groundings[CAMERA]:
+        targets.append(_grounding_to_json(grounding))
     return {
         **targets[0],
         "instruction": found.attended.text,
@@ -111,63 +93,110 @@ def to_json(found: Found) -> dict[str, Any]:
 
 
 def write_evidence(folder: Path, stem: str, found: Found) -> tuple[Path, Path]:
-    """Write the overlay PNG (every target) and the .rrd (the first one); an earlier answer is kept, the new one gets a number."""
+    """Write the overlay PNG of every target and the .rrd of the first one; return their paths.
+
+    An earlier answer is kept, and the new one gets a number. Raises: BadOutput.
+    """
     from vap_core.analysis.plots import grounding_figure
     from vap_core.base.figures import write_png
     from vap_core.recording import record_grounding
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        number = next(
-            n
-            for n in range(1, 100_000)
-            if not any(
-                (folder / f"{_numbered(stem, n)}.{kind}").exists() for kind in ("png", "rrd")
-            )
-        )
-        png, rrd = (folder / f"{_numbered(stem, number)}.{suffix}" for suffix in ("png", "rrd"))
-        write_png(grounding_figure(found.rgb, found.attended, found.objects, CAMERA), png)
+        png, rrd = _free_paths(folder, stem)
+        figure = grounding_figure(found.rgb, found.attended, found.objects, CAMERA)
+        write_png(figure, png)
     except OSError as error:
         raise BadOutput(
-            f"write_evidence: {folder} cannot be written ({error.strerror}); choose another folder with --out."
+            f"write_evidence: {folder} cannot be written ({error.strerror}); "
+            "choose another folder with --out."
         ) from error
     first = found.attended.groundings[CAMERA][0]
     record_grounding(
-        rrd,
-        found.rgb,
-        first,
-        found.objects[0],
-        found.instruction,
-        found.attended.text,
-        found.attended.images[CAMERA],
+        path=rrd,
+        image=found.rgb,
+        grounding=first,
+        obj=found.objects[0],
+        instruction=found.instruction,
+        rewritten=found.attended.text,
+        prompted=found.attended.images[CAMERA],
     )
     return png, rrd
 
 
-def _numbered(stem: str, number: int) -> str:
-    return stem if number == 1 else f"{stem}-{number}"
-
-
-def _lines(g: Any) -> list[str]:
-    if g.winner is None:
-        return [
-            f"no {g.candidates.phrase} found for {g.object}; nothing is highlighted. Give candidates with --box, or another picture."
-        ]
-    k = g.similarity.shape[1]
-    rows = [f"{g.object} against {len(g.candidates)} candidates, {k} references vote:"]
-    for i, (box, score) in enumerate(zip(g.candidates.xyxy, g.candidates.score, strict=True)):
-        mark = "->" if i == g.winner else "  "
-        corner = " ".join(f"{v:4.0f}" for v in box)
-        rows.append(
-            f" {mark} #{i}  box {corner}  score {score:.2f}  votes {g.ballot.votes[i]}/{k}  mean cosine {g.similarity[i].mean():.3f}"
+def _parse_box(text: str, width: int, height: int) -> list[float]:
+    """One box "x0,y0,x1,y1", clipped to a picture of `width` x `height` pixels."""
+    try:
+        x0, y0, x1, y1 = map(float, text.split(","))
+    except ValueError as error:
+        raise BadInstruction(
+            f"--box {text!r} is not x0,y0,x1,y1; for example --box 40,60,180,220."
+        ) from error
+    box = [max(x0, 0.0), max(y0, 0.0), min(x1, float(width)), min(y1, float(height))]
+    if not (box[2] - box[0] >= 1 and box[3] - box[1] >= 1):
+        raise BadInstruction(
+            f"--box {text!r} has no area inside the {width}x{height} picture; "
+            "x to the right, y down, far corner last."
         )
-    if len(g.candidates) == 1:
+    return box
+
+
+def _grounding_to_json(grounding: Grounding) -> dict[str, Any]:
+    ballot = grounding.ballot
+    candidates = grounding.candidates
+    return {
+        "object": grounding.object,
+        "winner": grounding.winner,
+        "votes": ballot.votes.tolist(),
+        "similarity": np.round(grounding.similarity, 6).tolist(),
+        "margin": ballot.margin,
+        "cosine_margin": ballot.cosine_margin if len(candidates) > 1 else None,
+        "tied": ballot.tied.tolist(),
+        "candidates": np.round(candidates.xyxy, 2).tolist(),
+        "scores": np.round(candidates.score, 4).tolist(),
+    }
+
+
+def _free_paths(folder: Path, stem: str) -> tuple[Path, Path]:
+    """A PNG and an .rrd of the same number, of which neither exists."""
+    number = 1
+    while True:
+        name = stem if number == 1 else f"{stem}-{number}"
+        png = folder / f"{name}.png"
+        rrd = folder / f"{name}.rrd"
+        if not (png.exists() or rrd.exists()):
+            return png, rrd
+        number += 1
+
+
+def _format_grounding(grounding: Grounding) -> list[str]:
+    """One line per candidate, and one for the winner and its margin."""
+    candidates = grounding.candidates
+    ballot = grounding.ballot
+    winner = grounding.winner
+    if winner is None:
         return [
-            *rows,
-            f"winner #{g.winner}, the only candidate: no margin, it wins however unlike it is",
+            f"no {candidates.phrase} found for {grounding.object}; nothing is highlighted. "
+            "Give candidates with --box, or another picture."
         ]
-    tie = ", tie broken by mean cosine" if g.ballot.tied[g.winner] else ""
-    return [
-        *rows,
-        f"winner #{g.winner}, margin {g.ballot.margin:.2f} of the votes, {g.ballot.cosine_margin:.3f} in cosine{tie}",
-    ]
+    k = grounding.similarity.shape[1]
+    lines = [f"{grounding.object} against {len(candidates)} candidates, {k} references vote:"]
+    for i, (box, score) in enumerate(zip(candidates.xyxy, candidates.score, strict=True)):
+        mark = "->" if i == winner else "  "
+        x0, y0, x1, y1 = box
+        cosine = grounding.similarity[i].mean()
+        lines.append(
+            f" {mark} #{i}  box {x0:4.0f} {y0:4.0f} {x1:4.0f} {y1:4.0f}  score {score:.2f}  "
+            f"votes {ballot.votes[i]}/{k}  mean cosine {cosine:.3f}"
+        )
+    if len(candidates) == 1:
+        lines.append(
+            f"winner #{winner}, the only candidate: no margin, it wins however unlike it is"
+        )
+        return lines
+    tie = ", tie broken by mean cosine" if ballot.tied[winner] else ""
+    lines.append(
+        f"winner #{winner}, margin {ballot.margin:.2f} of the votes, "
+        f"{ballot.cosine_margin:.3f} in cosine{tie}"
+    )
+    return lines

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from io import BytesIO
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,12 +18,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.container import BarContainer
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+
+ROLES = {"other objects": "#c9ccd1", "look-alike": OTHER, "target": WINNER, "goal": "#59a14f"}
+"""The colours of the objects in `layouts_figure`, by role."""
 
 
 def grounding_figure(
     rgb: Rgb, attended: Attended, objects: Sequence[PersonalObject], camera: str
 ) -> "Figure":
-    """One row per target: the candidates, what the policy would see, the references, and the similarity matrix."""
+    """One row per target: the candidates, the policy's image, the references, the similarities."""
     figure = empty_figure(13.0, 3.9 * len(objects))
     rows = figure.subfigures(len(objects), 1, squeeze=False)[:, 0]
     for row, grounding, obj in zip(rows, attended.groundings[camera], objects, strict=True):
@@ -45,17 +51,15 @@ def candidates(axes: "Axes", rgb: Rgb, grounding: Grounding) -> None:
 
     axes.imshow(rgb)
     for i, (x0, y0, x1, y1) in enumerate(grounding.candidates.xyxy):
-        colour = WINNER if i == grounding.winner else OTHER
-        axes.add_patch(
-            Rectangle(
-                (x0, y0),
-                x1 - x0,
-                y1 - y0,
-                fill=False,
-                edgecolor=colour,
-                linewidth=2.5 if i == grounding.winner else 1.5,
-            )
+        colour = OTHER
+        line_width = 1.5
+        if i == grounding.winner:
+            colour = WINNER
+            line_width = 2.5
+        box = Rectangle(
+            (x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=colour, linewidth=line_width
         )
+        axes.add_patch(box)
         axes.text(
             x0,
             max(y0 - 2, 0),
@@ -104,9 +108,8 @@ def similarity_matrix(axes: "Axes", grounding: Grounding) -> None:
     best = grounding.similarity.argmax(axis=0)
     axes.scatter(np.arange(k) + 0.33, best - 0.3, s=22, color=WINNER, zorder=3)
     axes.set_xticks(range(k), [f"ref {j}" for j in range(k)], fontsize=8)
-    axes.set_yticks(
-        range(n), [f"#{i}: {v} votes" for i, v in enumerate(grounding.ballot.votes)], fontsize=8
-    )
+    votes = [f"#{i}: {v} votes" for i, v in enumerate(grounding.ballot.votes)]
+    axes.set_yticks(range(n), votes, fontsize=8)
     axes.set_title(f"cosine, dot = vote; margin {grounding.ballot.margin:.2f}")
 
 
@@ -126,7 +129,7 @@ def film(images: Mapping[str, Sequence[Rgb]], titles: Sequence[str]) -> "Figure"
 
 @value
 class Tile:
-    """One picture of a sheet, what is written under it, and the colour of its frame ("" for none)."""
+    """One picture of a sheet, the text under it, and the colour of its frame ("" for none)."""
 
     picture: Rgb
     title: str = ""
@@ -139,67 +142,43 @@ def sheet(
     label_in: float = 0.85,
     columns: int = 1,
 ) -> "Figure":
-    """A contact sheet: one labelled row of square tiles per key, the rows dealt into `columns` side by side; inches."""
+    """A contact sheet: one labelled row of square tiles per key.
+
+    The rows are distributed over `columns` side by side. Sizes are in inches.
+    """
     from matplotlib.figure import Figure
-    from matplotlib.patches import Rectangle
 
     most = max(map(len, rows.values()))
-    caption = max(
-        0.05 + 0.11 * len(tile.title.splitlines()) if tile.title else 0.0
-        for row in rows.values()
-        for tile in row
-    )
-    deep, gap, width = -(-len(rows) // columns), 0.06, label_in + (side := side_in) * most
-    figure = Figure(figsize=(columns * width, deep * (side + caption + gap)))
+    caption = _caption_height_in(rows)
+    gap = 0.06
+    rows_per_column = -(-len(rows) // columns)
+    width = label_in + side_in * most
+    height = side_in + caption + gap
+    figure = Figure(figsize=(columns * width, rows_per_column * height))
     axes = figure.add_axes((0, 0, 1, 1))
     axes.set_axis_off()
     for i, (label, tiles) in enumerate(rows.items()):
-        left, top = i // deep * width, i % deep * (side + caption + gap) + gap / 2
+        left = i // rows_per_column * width
+        top = i % rows_per_column * height + gap / 2
         axes.text(
-            left + label_in - 0.08, top + side / 2, label, ha="right", va="center", fontsize=9
+            left + label_in - 0.08, top + side_in / 2, label, ha="right", va="center", fontsize=9
         )
         for j, tile in enumerate(tiles):
-            x = left + label_in + j * side
-            tall, wide = (
-                (side - 0.06) / 2 / max(tile.picture.shape[:2]) * np.array(tile.picture.shape[:2])
-            )
-            extent = (
-                x + side / 2 - wide,
-                x + side / 2 + wide,
-                top + side / 2 + tall,
-                top + side / 2 - tall,
-            )
-            axes.imshow(tile.picture, extent=extent, aspect="auto", interpolation="antialiased")
-            if tile.edge:
-                axes.add_patch(
-                    Rectangle(
-                        (x + 0.03, top + 0.03),
-                        side - 0.06,
-                        side - 0.06,
-                        fill=False,
-                        edgecolor=tile.edge,
-                        linewidth=1.8,
-                    )
-                )
-            axes.text(
-                x + side / 2,
-                top + side + caption / 2 - 0.02,
-                tile.title,
-                ha="center",
-                va="center",
-                fontsize=7,
-                color=tile.edge or "black",
-            )
-    axes.set(xlim=(0, columns * width), ylim=(deep * (side + caption + gap), 0))
+            x = left + label_in + j * side_in
+            _draw_tile(axes, tile, x=x, y=top, side_in=side_in, caption_in=caption)
+    axes.set(xlim=(0, columns * width), ylim=(rows_per_column * height, 0))
     return figure
 
 
 def hardness_figure(table: "pd.DataFrame", colours: Mapping[str, str]) -> "Figure":
-    """Cosines of look-alikes by tier, one line per personal object, a diamond for its own new views (columns of `gallery.hardness`)."""
+    """Cosines of look-alikes by tier, one line per personal object, of `gallery.hardness`.
+
+    A diamond marks the object's own new views.
+    """
     figure = empty_figure(8.5, 5.6)
     axes = figure.subplots()
     names = list(dict.fromkeys(table.object))
-    place = {name: i for i, name in enumerate(names)}
+    place = dict(zip(names, range(len(names)), strict=True))
     for tier, part in table.groupby("tier", sort=False):
         axes.scatter(
             part.cosine,
@@ -212,7 +191,7 @@ def hardness_figure(table: "pd.DataFrame", colours: Mapping[str, str]) -> "Figur
     own = table.groupby("object", sort=False).own.first()
     axes.scatter(
         own,
-        [place[str(name)] for name in own.index],
+        own.index.map(place),
         marker="D",
         s=34,
         facecolor="white",
@@ -233,51 +212,14 @@ def layouts_figure(
     lists: Mapping[str, Sequence[EpisodeRow]],
     tables_m: Mapping[str, tuple[float, float, float, float]],
 ) -> "Figure":
-    """Where things stand at the start, seen from above with the robot at the bottom: one panel per suite; `tables_m` are its table's x0 y0 x1 y1."""
-    from matplotlib.patches import Rectangle
+    """Where objects stand at the start, seen from above with the robot at the bottom.
 
+    One panel per suite; `tables_m` are the x0 y0 x1 y1 of its table.
+    """
     figure = empty_figure(3.4 * len(lists), 3.9)
     grid = figure.subplots(1, len(lists), squeeze=False)[0]
-    roles = {"other objects": "#c9ccd1", "look-alike": OTHER, "target": WINNER, "goal": "#59a14f"}
     for axes, (name, rows) in zip(grid, lists.items(), strict=True):
-        spots: dict[str, set[tuple[float, float]]] = {role: set() for role in roles}
-        for row in rows:
-            for i, p in enumerate(row.placements):
-                role = (
-                    "target"
-                    if i == 0
-                    else "goal"
-                    if p.model == row.goal
-                    else "look-alike"
-                    if "-lookalike-" in p.model
-                    else "other objects"
-                )
-                spots[role].add((-p.y, p.x))
-        x0, y0, x1, y1 = tables_m[name]
-        axes.add_patch(
-            Rectangle((-y1, x0), y1 - y0, x1 - x0, facecolor="#f3ede4", edgecolor="#cdbfa8")
-        )
-        few = (
-            len(set().union(*spots.values())) < 10
-        )  # everything shares these places: nest the marks
-        for role, places in spots.items():
-            size = (
-                {"look-alike": 90, "goal": 190}.get(role, 14) if few else {"goal": 45}.get(role, 6)
-            )
-            fill, line = ("none", 1.6) if role == "goal" else (roles[role], 0.0)
-            xy = np.array(sorted(places)).reshape(-1, 2)
-            axes.scatter(
-                xy[:, 0],
-                xy[:, 1],
-                s=size,
-                facecolor=fill,
-                edgecolor=roles[role],
-                linewidths=line,
-                label=role,
-            )
-        axes.plot(
-            0, 0, marker="s", markersize=9, color="#444444", linestyle="none", label="robot's base"
-        )
+        _draw_layouts(axes, rows, tables_m[name])
         axes.set(
             xlim=(-0.36, 0.36),
             ylim=(-0.06, 0.72),
@@ -287,45 +229,43 @@ def layouts_figure(
         )
         axes.spines[["top", "right"]].set_visible(False)
     grid[0].set_ylabel("away from the robot, m")
-    figure.legend(
-        *grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False
-    )
+    handles, labels = grid[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
     return figure
 
 
 def bounds_figure(scores: Sequence[Score]) -> "Figure":
-    """Success rates with 95 % Wilson intervals, one line per task and track, one colour per policy."""
-    lines = list(dict.fromkeys((s.suite, s.task, s.split) for s in scores))
-    policies = {policy: f"C{i}" for i, policy in enumerate(dict.fromkeys(s.policy for s in scores))}
-    figure = empty_figure(8.5, 0.27 * len(lines) + 1.1)
+    """Success rates with 95 % Wilson intervals: a line per task and track, a colour per policy."""
+    positions: dict[tuple[str, str, str], int] = {}
+    by_policy: dict[str, list[Score]] = {}
+    for score in scores:
+        positions.setdefault((score.suite, score.task, score.split), len(positions))
+        by_policy.setdefault(score.policy, []).append(score)
+    figure = empty_figure(8.5, 0.27 * len(positions) + 1.1)
     axes = figure.subplots()
-    for policy, colour in policies.items():
-        shown = [s for s in scores if s.policy == policy]
-        middle = np.array([100 * s.sr.value for s in shown])
-        spread = np.abs(
-            [middle - [100 * s.sr.low for s in shown], [100 * s.sr.high for s in shown] - middle]
-        )
-        at = [
-            lines.index((s.suite, s.task, s.split))
-            + 0.24 * (list(policies).index(policy) - (len(policies) - 1) / 2)
-            for s in shown
-        ]
+    for i, (policy, policy_scores) in enumerate(by_policy.items()):
+        lines = []
+        policy_rates = []
+        for score in policy_scores:
+            lines.append(positions[score.suite, score.task, score.split])
+            policy_rates.append(score.sr)
+        offset = 0.24 * (i - (len(by_policy) - 1) / 2)
+        rates = _percentages(policy_rates)
         axes.errorbar(
-            middle,
-            at,
-            xerr=spread,
+            rates.value,
+            np.array(lines) + offset,
+            xerr=np.abs([rates.value - rates.low, rates.high - rates.value]),
             fmt="o",
-            color=colour,
+            color=f"C{i}",
             markersize=4,
             capsize=2.5,
             linewidth=1,
             label=f"{policy} policy",
         )
-    axes.set_yticks(
-        range(len(lines)),
-        [f"{suite} / {task}{f' ({split})' if split else ''}" for suite, task, split in lines],
-        fontsize=8,
-    )
+    labels = []
+    for suite, task, split in positions:
+        labels.append(f"{suite} / {task} ({split})" if split else f"{suite} / {task}")
+    axes.set_yticks(range(len(labels)), labels, fontsize=8)
     axes.invert_yaxis()
     axes.set(xlim=(-2, 102), xlabel="% of episodes that succeed, 95 % interval")
     axes.grid(axis="y", color="#eeeeee")
@@ -333,7 +273,7 @@ def bounds_figure(scores: Sequence[Score]) -> "Figure":
     figure.legend(
         *axes.get_legend_handles_labels(),
         loc="outside upper center",
-        ncols=len(policies),
+        ncols=len(by_policy),
         frameon=False,
     )
     return figure
@@ -342,26 +282,30 @@ def bounds_figure(scores: Sequence[Score]) -> "Figure":
 def learning_figure(
     logs: Mapping[str, Sequence[Mapping[str, int | float]]], panels: Mapping[str, str]
 ) -> "Figure":
-    """What trainings logged, over their steps: a panel per figure of the log (its name there, and its title), a line per training that has it."""
-    figure, shown = empty_figure(3.1 * len(panels) + 0.4, 3.0 + 0.3 * (len(logs) > 1)), {}
-    for axes, (name, title) in zip(
-        figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True
-    ):
+    """What trainings logged, over their optimiser steps.
+
+    A panel per quantity of the log, of which `panels` holds the name in the log and the title; a
+    line per training that logs it.
+    """
+    figure = empty_figure(3.1 * len(panels) + 0.4, 3.0 + 0.3 * (len(logs) > 1))
+    drawn: dict[str, Line2D] = {}
+    grid = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axes, (name, title) in zip(grid, panels.items(), strict=True):
         for i, (label, log) in enumerate(logs.items()):
             if log and name in log[0]:
-                (shown[label],) = axes.plot(
-                    [line["step"] for line in log],
-                    [line[name] for line in log],
-                    color=f"C{i}",
-                    linewidth=1.4,
-                )
+                steps = []
+                values = []
+                for entry in log:
+                    steps.append(entry["step"])
+                    values.append(entry[name])
+                (drawn[label],) = axes.plot(steps, values, color=f"C{i}", linewidth=1.4)
         axes.set(title=title, xlabel="optimiser steps")
         axes.set_ylim(bottom=0)
         axes.grid(color="#eeeeee")
         axes.spines[["top", "right"]].set_visible(False)
     if len(logs) > 1:
         figure.legend(
-            shown.values(), shown.keys(), loc="outside lower center", ncols=5, frameon=False
+            drawn.values(), drawn.keys(), loc="outside lower center", ncols=5, frameon=False
         )
     return figure
 
@@ -384,10 +328,20 @@ def rates_figure(panels: Mapping[str, Mapping[str, Mapping[str, "Rate"]]], label
     for axes, (title, panel) in zip(all_axes, panels.items(), strict=True):
         own = [group for group in groups if group in panel]
         for i, name in enumerate(names):
-            at = [x for x, group in enumerate(own) if name in panel[group]]
-            rates_of_name = [panel[own[x]][name] for x in at]
+            at = []
+            rates_of_name = []
+            for x, group in enumerate(own):
+                if name in panel[group]:
+                    at.append(x)
+                    rates_of_name.append(panel[group][name])
             offset = (i - (len(names) - 1) / 2) * 0.84 / len(names)
-            bars = _draw_rates(axes, np.array(at) + offset, rates_of_name, i, 0.76 / len(names))
+            bars = _draw_rates(
+                axes=axes,
+                x=np.array(at) + offset,
+                rates=rates_of_name,
+                colour=i,
+                width=0.76 / len(names),
+            )
             if at:
                 drawn.setdefault(name, bars)
         axes.set_xticks(range(len(own)), own, fontsize=8)
@@ -404,32 +358,16 @@ def rates_figure(panels: Mapping[str, Mapping[str, Mapping[str, "Rate"]]], label
     return figure
 
 
-def _draw_rates(
-    axes: "Axes", x: np.ndarray, rates: "Sequence[Rate]", colour: int, width: float
-) -> "BarContainer":
-    """Bars of rates with their intervals, in percent."""
-    value = 100 * np.array([rate.value for rate in rates])
-    low = 100 * np.array([rate.low for rate in rates])
-    high = 100 * np.array([rate.high for rate in rates])
-    bars = axes.bar(x, value, width, color=f"C{colour}")
-    axes.errorbar(
-        x,
-        value,
-        np.maximum([value - low, high - value], 0),
-        fmt="none",
-        ecolor="black",
-        capsize=2,
-        linewidth=0.9,
-    )
-    return bars
-
-
 def keep(
     figure: "Figure", path: Path, dpi: int = 110, limit: int = 480_000, small: int = 115_000
 ) -> bytes:
-    """Save a figure as a PNG of `limit` bytes at most, and return a JPEG of it for a notebook, `small` bytes at most."""
-    figure.savefig(drawn := BytesIO(), dpi=dpi, metadata={"Software": None})
-    return keep_png(drawn.getvalue(), path, limit, small)
+    """Save a figure as a PNG of at most `limit` bytes; return a JPEG of at most `small` bytes.
+
+    The JPEG is for a notebook.
+    """
+    drawn = BytesIO()
+    figure.savefig(drawn, dpi=dpi, metadata={"Software": None})
+    return keep_png(drawn.getvalue(), path, limit=limit, small=small)
 
 
 def keep_png(drawn: bytes, path: Path, limit: int = 480_000, small: int = 115_000) -> bytes:
@@ -447,20 +385,168 @@ def keep_png(drawn: bytes, path: Path, limit: int = 480_000, small: int = 115_00
             texts.add_text(name, text)
     full = source.convert("RGB")
     for share, bits in ((1.0, 8), (1.0, 6), (1.0, 5), (0.8, 6), (0.8, 5), (0.6, 5)):
-        size = round(share * full.width), round(share * full.height)
-        coarse = [round(round(v / 255 * (2**bits - 1)) * 255 / (2**bits - 1)) for v in range(256)]
-        full.resize(size, Image.Resampling.LANCZOS).point(coarse * 3).save(
-            png := BytesIO(), "PNG", optimize=True, pnginfo=texts
-        )
+        size = (round(share * full.width), round(share * full.height))
+        resized = full.resize(size, Image.Resampling.LANCZOS)
+        png = BytesIO()
+        resized.point(_coarse_levels(bits) * 3).save(png, "PNG", optimize=True, pnginfo=texts)
         if png.tell() <= limit:
             break
     path.write_bytes(png.getvalue())
     for width in (1100, 1000, 880, 760, 640, 520, 400):
         full.thumbnail((width, 4 * width), Image.Resampling.LANCZOS)
-        full.save(jpeg := BytesIO(), "JPEG", quality=84)
+        jpeg = BytesIO()
+        full.save(jpeg, "JPEG", quality=84)
         if jpeg.tell() <= small:
             break
     return jpeg.getvalue()
+
+
+@value
+class _Percentages:
+    """Rates and the ends of their intervals, in percent."""
+
+    value: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+def _percentages(rates: Sequence[Rate]) -> _Percentages:
+    values = []
+    lows = []
+    highs = []
+    for rate in rates:
+        values.append(rate.value)
+        lows.append(rate.low)
+        highs.append(rate.high)
+    return _Percentages(100 * np.array(values), 100 * np.array(lows), 100 * np.array(highs))
+
+
+def _draw_rates(
+    axes: "Axes", x: np.ndarray, rates: Sequence[Rate], colour: int, width: float
+) -> "BarContainer":
+    """Bars of rates with their intervals, in percent."""
+    percent = _percentages(rates)
+    bars = axes.bar(x, percent.value, width, color=f"C{colour}")
+    axes.errorbar(
+        x,
+        percent.value,
+        np.maximum([percent.value - percent.low, percent.high - percent.value], 0),
+        fmt="none",
+        ecolor="black",
+        capsize=2,
+        linewidth=0.9,
+    )
+    return bars
+
+
+def _caption_height_in(rows: Mapping[str, Sequence[Tile]]) -> float:
+    """The height of the longest title of a sheet, in inches."""
+    height = 0.0
+    for tile in chain.from_iterable(rows.values()):
+        if tile.title:
+            n_lines = len(tile.title.splitlines())
+            height = max(height, 0.05 + 0.11 * n_lines)
+    return height
+
+
+def _draw_tile(
+    axes: "Axes", tile: Tile, *, x: float, y: float, side_in: float, caption_in: float
+) -> None:
+    """One tile of a sheet with its top left corner at (x, y)."""
+    from matplotlib.patches import Rectangle
+
+    shape = tile.picture.shape[:2]
+    half_height, half_width = (side_in - 0.06) / 2 / max(shape) * np.array(shape)
+    extent = (
+        x + side_in / 2 - half_width,
+        x + side_in / 2 + half_width,
+        y + side_in / 2 + half_height,
+        y + side_in / 2 - half_height,
+    )
+    axes.imshow(tile.picture, extent=extent, aspect="auto", interpolation="antialiased")
+    if tile.edge:
+        frame = Rectangle(
+            (x + 0.03, y + 0.03),
+            side_in - 0.06,
+            side_in - 0.06,
+            fill=False,
+            edgecolor=tile.edge,
+            linewidth=1.8,
+        )
+        axes.add_patch(frame)
+    axes.text(
+        x + side_in / 2,
+        y + side_in + caption_in / 2 - 0.02,
+        tile.title,
+        ha="center",
+        va="center",
+        fontsize=7,
+        color=tile.edge or "black",
+    )
+
+
+def _draw_layouts(
+    axes: "Axes", rows: Sequence[EpisodeRow], table_m: tuple[float, float, float, float]
+) -> None:
+    """The table, the robot's base and every place an object starts from, coloured by role."""
+    from matplotlib.patches import Rectangle
+
+    spots: dict[str, set[tuple[float, float]]] = {}
+    for role in ROLES:
+        spots[role] = set()
+    for row in rows:
+        for i, placement in enumerate(row.placements):
+            role = _role(row, i)
+            spots[role].add((-placement.y, placement.x))
+    x0, y0, x1, y1 = table_m
+    table = Rectangle((-y1, x0), y1 - y0, x1 - x0, facecolor="#f3ede4", edgecolor="#cdbfa8")
+    axes.add_patch(table)
+    sizes = {"goal": 45}
+    default_size = 6
+    if len(set().union(*spots.values())) < 10:  # the roles share these places: nest the marks
+        sizes = {"look-alike": 90, "goal": 190}
+        default_size = 14
+    for role, places in spots.items():
+        fill = ROLES[role]
+        line_width = 0.0
+        if role == "goal":
+            fill = "none"
+            line_width = 1.6
+        xy = np.array(sorted(places)).reshape(-1, 2)
+        axes.scatter(
+            xy[:, 0],
+            xy[:, 1],
+            s=sizes.get(role, default_size),
+            facecolor=fill,
+            edgecolor=ROLES[role],
+            linewidths=line_width,
+            label=role,
+        )
+    axes.plot(
+        0, 0, marker="s", markersize=9, color="#444444", linestyle="none", label="robot's base"
+    )
+
+
+def _role(row: EpisodeRow, number: int) -> str:
+    """The role in ROLES of the object that `row` places as number `number`."""
+    model = row.placements[number].model
+    if number == 0:
+        return "target"
+    if model == row.goal:
+        return "goal"
+    if "-lookalike-" in model:
+        return "look-alike"
+    return "other objects"
+
+
+def _coarse_levels(bits: int) -> list[int]:
+    """A table from 8 bits to the nearest of 2**bits levels."""
+    top = 2**bits - 1
+    levels = []
+    for v in range(256):
+        level = round(v / 255 * top)
+        levels.append(round(level * 255 / top))
+    return levels
 
 
 def _strip(crops: Sequence[Rgb], side: int = 96) -> Rgb:
@@ -469,12 +555,14 @@ def _strip(crops: Sequence[Rgb], side: int = 96) -> Rgb:
 
     tiles = []
     for crop in crops:
-        tile, small = Image.new("RGB", (side, side), (235, 235, 235)), Image.fromarray(crop)
+        tile = Image.new("RGB", (side, side), (235, 235, 235))
+        small = Image.fromarray(crop)
         small.thumbnail((side - 6, side - 6))
         tile.paste(small, ((side - small.width) // 2, (side - small.height) // 2))
         tiles.append(np.asarray(tile))
     if len(tiles) % 2:
         tiles.append(np.full((side, side, 3), 255, np.uint8))
-    return np.concatenate(
-        [np.concatenate(tiles[i : i + 2], axis=1) for i in range(0, len(tiles), 2)]
-    )
+    rows = []
+    for i in range(0, len(tiles), 2):
+        rows.append(np.concatenate(tiles[i : i + 2], axis=1))
+    return np.concatenate(rows)

@@ -1,4 +1,8 @@
-"""The commands. Each parses, calls one function of the house, and prints; errors the user can mend are one line, status 2."""
+"""The commands.
+
+Each parses its options, calls one function of the package, and prints. An error that the user can
+correct is one line, with status 2.
+"""
 
 import inspect
 import os
@@ -7,13 +11,13 @@ import sys
 import typer
 
 from vap_core.base.errors import VapError
-from vap_core.cli import evaluate as runs
-from vap_core.cli import objects as own
-from vap_core.cli import setup as machine
+from vap_core.cli import evaluate, objects, results, setup, train, weights
 
-HELP = """Visual Attentive Prompting: steer a frozen policy to your own object, and see why it worked or failed.
+HELP = """Visual Attentive Prompting: steer a frozen policy to your own object, and see why it
+worked or failed.
 
 Start with: python -m vap_core doctor, then python -m vap_core demo."""
+INTERRUPTED = 130
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -22,17 +26,22 @@ app = typer.Typer(
     rich_markup_mode=None,
     help=HELP,
 )
-for room in (own, runs, machine):
-    app.add_typer(room.app)
-INTERRUPTED = 130
+for module in (objects, evaluate, results, setup):
+    app.add_typer(module.app)
+app.add_typer(train.app, name="train")
+app.add_typer(weights.app, name="weights")
 
 
 def keep_examples(app: typer.Typer) -> None:
-    """Have --help print every example on a line of its own, to be copied: click would fill them into one paragraph."""
+    """Have --help print every example on a line of its own, to be copied.
+
+    Click would fill them into one paragraph. In a docstring, the further lines of a long example
+    are indented.
+    """
     for command in app.registered_commands:
-        command.help = (inspect.getdoc(command.callback) or "").replace(
-            "\n\nExample:", "\n\n\b\nExample:"
-        )
+        text = inspect.getdoc(command.callback) or ""
+        text = text.replace("\n    ", " ")
+        command.help = text.replace("\n\nExample:", "\n\n\b\nExample:")
     for group in app.registered_groups:
         if group.typer_instance is not None:
             keep_examples(group.typer_instance)
@@ -42,7 +51,7 @@ keep_examples(app)
 
 
 def main() -> None:
-    """Run the command line; what the user can mend is printed as one line."""
+    """Run the command line; an error that the user can correct is printed as one line."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     try:
         app()

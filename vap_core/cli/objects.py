@@ -1,4 +1,7 @@
-"""Commands about your own objects: remember them from photos, find them in a picture, bring them as 3-D scans."""
+"""Commands about your own objects.
+
+Remember them from photos, find them in a picture, import them as 3-D scans.
+"""
 
 import json
 import sys
@@ -17,7 +20,6 @@ app.add_typer(objects_app, name="objects")
 
 Memory = Annotated[Path, typer.Option(help="Folder of remembered objects.")]
 BANK = Path("data/memory")
-NOTE = "note: the embedded detector knows {domain} only, not real photos; {mend}."
 
 
 @app.command()
@@ -41,7 +43,8 @@ def register(
     describe: Annotated[
         str,
         typer.Option(
-            help="Who puts it into words: offline, chat (OPENAI_BASE_URL, _MODEL, _API_KEY), or a URL."
+            help="Who puts it into words: offline, chat (OPENAI_BASE_URL, _MODEL, _API_KEY), "
+            "or a URL."
         ),
     ] = "offline",
     replace: Annotated[
@@ -53,29 +56,29 @@ def register(
     Example: python -m vap_core register mug --category cup photos/mug-*.jpg
     """
     from vap_core.memory import load_photo, remember, save
-    from vap_core.memory import register as learn
+    from vap_core.memory import register as find_and_remember
     from vap_core.perception.describe import load_captioner, with_description
     from vap_core.perception.stacks import load_stack
 
     pictures = [load_photo(photo) for photo in photos]
     models = load_stack(stack)
-    _note(
-        models.domain,
-        whole,
-        "look at what it cropped, or cut the photos out yourself and pass --whole",
-    )
+    if models.domain and not whole:
+        remedy = "look at what it cropped, or cut the photos out yourself and pass --whole"
+        _warn_of_domain(models.domain, remedy)
     if whole:
         obj = remember(name, category, pictures, models.encoder)
     else:
-        obj, uncropped = learn(name, category, pictures, models.detector, models.encoder)
+        obj, uncropped = find_and_remember(
+            name, category, pictures, models.detector, models.encoder
+        )
         for index in uncropped:
             print(
                 f"note: no sure {obj.category} found in {photos[index]}; the whole photo is used.",
                 file=sys.stderr,
             )
-    path = save(
-        memory, with_description(obj, load_captioner(models.segmenter, describe)), replace=replace
-    )
+    captioner = load_captioner(models.segmenter, describe)
+    obj = with_description(obj, captioner)
+    path = save(memory, obj, replace=replace)
     print(f"{obj.name}: a {obj.category} with {len(obj.crops)} references, saved to {path}")
     print(f'next: python -m vap_core ground IMAGE "bring my {obj.category}" --memory {memory}')
 
@@ -110,7 +113,8 @@ def ground(
 ) -> None:
     """Find a remembered object in a picture, and show why that box won.
 
-    Example: python -m vap_core ground desk.jpg "bring my cup" --box 40,60,180,220 --box 300,80,420,230
+    Example: python -m vap_core ground desk.jpg "bring my cup" --box 40,60,180,220
+        --box 300,80,420,230
     """
     from vap_core.analysis.ground import ground_image, parse_boxes, to_json, write_evidence
     from vap_core.memory import load_photo
@@ -118,17 +122,15 @@ def ground(
     rgb = load_photo(image, long_side=None)
     boxes = parse_boxes(box, rgb) if box else None
     found = ground_image(rgb, instruction, memory, stack, objects=object, boxes=boxes)
-    _note(found.domain, boxes is not None, "on a real photo give the candidates with --box")
+    if found.domain and boxes is None:
+        _warn_of_domain(found.domain, "on a real photo give the candidates with --box")
     written = write_evidence(out, image.stem, found)
     if as_json:
         print(json.dumps(to_json(found)))
         return
     print(found)
-    print(
-        "wrote "
-        + " and ".join(str(path) for path in written)
-        + f"; look: .venv/bin/rerun --bind 127.0.0.1 {written[1]}"
-    )
+    paths = " and ".join(map(str, written))
+    print(f"wrote {paths}; look: .venv/bin/rerun --bind 127.0.0.1 {written[1]}")
 
 
 @objects_app.command("import")
@@ -180,7 +182,8 @@ def import_object(
     from vap_core.simulation.assets import objects
     from vap_core.simulation.assets.scans import import_scan, storage
 
-    folder, name = out or storage.scans_folder(), name or import_scan.default_name(file)
+    folder = out or storage.scans_folder()
+    name = name or import_scan.default_name(file)
     storage.target_folder(folder, name, replace)
     metadata, scan = import_scan.import_scan(
         file,
@@ -195,13 +198,16 @@ def import_object(
         report=lambda line: print(line, file=sys.stderr),
     )
     saved = storage.save_scan(folder, metadata, scan, replace=replace)
-    extent_m = objects.extent_m(objects.load_scanned_object(saved))
-    size = " x ".join(f"{100 * side:.1f}" for side in extent_m)
+    model = objects.load_scanned_object(saved)
+    x_m, y_m, z_m = objects.extent_m(model)
+    size = f"{100 * x_m:.1f} x {100 * y_m:.1f} x {100 * z_m:.1f}"
     print(
         f"{metadata.name}: a {metadata.category}, {size} cm, {metadata.mass_kg:g} kg, "
         f"{len(scan.hulls)} convex parts, saved to {saved}"
     )
-    setting = "" if folder == storage.scans_folder() else f"VAP_OBJECTS={folder} "
+    setting = ""
+    if folder != storage.scans_folder():
+        setting = f"VAP_OBJECTS={folder} "
     print(
         f"next: {setting}python -m vap_core objects photograph '{metadata.name}', or in Python "
         f"scenes.build('wx250s', ['{metadata.name}'])"
@@ -235,11 +241,13 @@ def photograph(
     model = get_object(name)
     paths = write_views(model, out, views)
     print(f"wrote {views} pictures to {out}")
+    photos = " ".join(f"'{path}'" for path in paths)
+    print(f"next: python -m vap_core register '{name}' --category '{model.category}' {photos}")
+
+
+def _warn_of_domain(domain: str, remedy: str) -> None:
+    """Note that the embedded detector finds things in pictures of its domain only."""
     print(
-        f"next: python -m vap_core register '{name}' --category '{model.category}' {' '.join(f"'{path}'" for path in paths)}"
+        f"note: the embedded detector knows {domain} only, not real photos; {remedy}.",
+        file=sys.stderr,
     )
-
-
-def _note(domain: str, by_hand: bool, mend: str) -> None:
-    if domain and not by_hand:
-        print(NOTE.format(domain=domain, mend=mend), file=sys.stderr)

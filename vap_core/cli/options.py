@@ -8,12 +8,13 @@ StackName = Annotated[
     str,
     typer.Option(
         "--stack",
-        help="Perception stack: embedded (offline, CPU), foundation or foundation-small (see weights).",
+        help="Perception stack: embedded (offline, CPU), foundation or foundation-small "
+        "(see weights).",
     ),
 ]
 Workers = Annotated[int, typer.Option(min=1, help="Processes.")]
 
 
-def names(given: str) -> list[str]:
-    """The names in "a,b,c"."""
-    return [name for name in given.split(",") if name]
+def names(text: str) -> list[str]:
+    """The names in "a,b,c"; empty ones are left out."""
+    return [name for name in text.split(",") if name]

@@ -1,6 +1,10 @@
-"""Commands about this machine and what it measures: doctor, weights, bench, eval-perception, train, show."""
+"""Commands about this machine and what it measures.
 
-import json
+They are eval-perception, eval-policy, show, doctor and bench.
+"""
+
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -9,16 +13,6 @@ import typer
 from vap_core.cli.options import StackName, Workers, names
 
 app = typer.Typer()
-train_app = typer.Typer(
-    no_args_is_help=True,
-    help="Train shipped parts again; every training resumes after an interruption.",
-)
-app.add_typer(train_app, name="train")
-weights_app = typer.Typer(
-    no_args_is_help=True,
-    help="The foundation stack's weights: what is there, and how to get the rest.",
-)
-app.add_typer(weights_app, name="weights")
 
 
 @app.command("eval-perception")
@@ -48,19 +42,23 @@ def eval_perception(
         typer.Option(help="Keep the tables in this folder too, as perception_NAME.parquet."),
     ] = None,
 ) -> None:
-    """Measure perception against the simulator: opening frames, tracks through whole expert episodes, and time. Interrupted, it goes on.
+    """Measure perception against the simulator: opening frames, tracks through whole expert
+    episodes, and time. Interrupted, it goes on.
 
     Example: python -m vap_core eval-perception --suite simpler-bridge --quick
     """
     from vap_core.evaluation.perception.report import conclude
     from vap_core.evaluation.perception.run import Survey, run
-    from vap_core.evaluation.perception.run import publish as keep
-    from vap_core.simulation import suites as known
+    from vap_core.evaluation.perception.run import publish as write_tables
+    from vap_core.simulation.suites import BENCHMARKS
 
-    asked = Survey(stack, tuple(dict.fromkeys(suite or known.BENCHMARKS)), episodes, quick)
-    print(conclude(run(asked, out, jobs=jobs), asked.stack, out))
+    suite_names = tuple(dict.fromkeys(suite or BENCHMARKS))
+    survey = Survey(stack, suite_names, episodes, quick)
+    tables = run(survey, out, jobs=jobs)
+    print(conclude(tables, survey.stack, out))
     if publish is not None:
-        print("wrote " + ", ".join(map(str, keep(out, publish))))
+        written = ", ".join(map(str, write_tables(out, publish)))
+        print(f"wrote {written}")
 
 
 @app.command("eval-policy")
@@ -83,7 +81,8 @@ def eval_policy(
         int | None,
         typer.Option(
             min=1,
-            help="Actions of each chunk to carry out before the policy is asked again. Default as the checkpoint says.",
+            help="Actions of each chunk to carry out before the policy is asked again. Default as "
+            "the checkpoint says.",
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
@@ -95,25 +94,27 @@ def eval_policy(
         ),
     ] = None,
 ) -> None:
-    """Measure what a policy can do with generic objects that no film has shown, told by a tint, by paint, by words, or not at all.
+    """Measure what a policy can do with generic objects that no film has shown, told by a tint, by
+    paint, by words, or not at all.
 
     Example: python -m vap_core eval-policy --suite simpler-bridge --scenes 4
     Example: python -m vap_core eval-policy --suite tabletop --ways tinted --execute 10
     """
     from vap_core.base.errors import BadStudy
     from vap_core.evaluation.study import Study
-    from vap_core.simulation import suites as known
+    from vap_core.simulation import suites
     from vap_core.training.policy.probe import conclude, keep, probe
 
-    study = Study(
-        tuple((suite, task.name) for task in known.suite(suite).tasks), ("generic",), policy=policy
-    )
-    if not study.checkpoint(suite):
+    tasks = tuple((suite, task.name) for task in suites.suite(suite).tasks)
+    study = Study(tasks, ("generic",), policy=policy)
+    checkpoint = study.checkpoint(suite)
+    if not checkpoint:
         raise BadStudy(
-            f"eval-policy: {policy!r} has no weights; take mini-pi0, or a lerobot checkpoint's folder or hub id."
+            f"eval-policy: {policy!r} has no weights; "
+            "take mini-pi0, or a lerobot checkpoint's folder or hub id."
         )
     table = probe(
-        study.checkpoint(suite),
+        checkpoint,
         suite,
         scenes=scenes,
         ways=names(ways),
@@ -147,16 +148,19 @@ def show(
 
 @app.command()
 def doctor() -> None:
-    """Say what works on this machine, and how to mend what does not; status 1 when the main job cannot run.
+    """Say what works on this machine, and how to mend what does not; status 1 when the main job
+    cannot run.
 
     Example: python -m vap_core doctor
     """
     from vap_core.cli.doctor import examine
 
-    findings = examine()
-    for finding in findings:
+    able = True
+    for finding in examine():
         print(finding)
-    if any(finding.needed and not finding.works for finding in findings):
+        if finding.needed and not finding.works:
+            able = False
+    if not able:
         raise typer.Exit(1)
 
 
@@ -165,8 +169,10 @@ def bench(
     what: Annotated[
         str,
         typer.Argument(
-            help="loop: the prompted control loop; suites: every benchmark's simulator; stack: a stack's models; policy: the shipped policies; "
-            "eval: episodes per hour against lerobot's own loop; engine: a Ray cluster on this machine against local processes; "
+            help="loop: the prompted control loop; suites: every benchmark's simulator; "
+            "stack: a stack's models; policy: the shipped policies; "
+            "eval: episodes per hour against lerobot's own loop; "
+            "engine: a Ray cluster on this machine against local processes; "
             "query: a question to a thousand recordings; style: how the source reads."
         ),
     ] = "loop",
@@ -187,232 +193,36 @@ def bench(
         bool,
         typer.Option(
             "--quick",
-            help="policy, eval, engine, query: a few steps, to see that it runs; its numbers mean nothing.",
+            help="policy, eval, engine, query: a few steps, to see that it runs; its numbers mean "
+            "nothing.",
         ),
     ] = False,
 ) -> None:
-    """Time a control step by part, as shares and ratios within one run: of the prompted loop, every benchmark's simulator, the models.
+    """Time a control step by part, as shares and ratios within one run: of the prompted loop, every
+    benchmark's simulator, the models.
 
     Example: python -m vap_core bench suites
     """
     from vap_core.base.errors import one_of
     from vap_core.cli.bench import engine as bench_engine
     from vap_core.cli.bench import eval as bench_eval
-    from vap_core.cli.bench import loop as loop
+    from vap_core.cli.bench import loop as bench_loop
     from vap_core.cli.bench import policy as bench_policy
     from vap_core.cli.bench import query as bench_query
     from vap_core.cli.bench import stack as bench_stack
     from vap_core.cli.bench import style as bench_style
     from vap_core.cli.bench import suites as bench_suites
 
-    runs = {
-        "loop": lambda: loop.run(steps),
-        "suites": lambda: bench_suites.run(workers),
-        "stack": lambda: bench_stack.run(stack, random=random_weights, device=device),
-        "policy": lambda: bench_policy.run(quick),
-        "eval": lambda: bench_eval.run(workers, quick),
-        "engine": lambda: bench_engine.run(workers, quick),
-        "query": lambda: bench_query.run(quick=quick),
+    benchmarks: dict[str, Callable[[], str]] = {
+        "loop": partial(bench_loop.run, steps),
+        "suites": partial(bench_suites.run, workers),
+        "stack": partial(bench_stack.run, stack, random=random_weights, device=device),
+        "policy": partial(bench_policy.run, quick),
+        "eval": partial(bench_eval.run, workers, quick),
+        "engine": partial(bench_engine.run, workers, quick),
+        "query": partial(bench_query.run, quick=quick),
         "style": bench_style.run,
     }
-    if what not in runs:
-        raise one_of("bench:", what, runs)
-    print(runs[what]())
-
-
-@weights_app.command("list")
-def list_weights() -> None:
-    """What is on this machine, what is missing, and how to get it.
-
-    Example: python -m vap_core weights list
-    """
-    from vap_core.perception.foundation.store import weights_table
-
-    print(weights_table())
-
-
-@weights_app.command("pull")
-def pull_weights(
-    stack: Annotated[
-        str, typer.Option("--stack", help="foundation, or foundation-small.")
-    ] = "foundation",
-    origin: Annotated[
-        Path | None,
-        typer.Option("--from", help="Without internet: a folder with a copy of another machine's."),
-    ] = None,
-    unpinned: Annotated[
-        bool,
-        typer.Option(
-            "--unpinned", help="Take other weights of the same architecture, for example your own."
-        ),
-    ] = False,
-) -> None:
-    """Get a stack's weights at their pinned revisions and check them. Interrupted, the same command goes on.
-
-    Example: python -m vap_core weights pull --stack foundation-small
-    """
-    from vap_core.perception.foundation.downloads import pull
-    from vap_core.perception.foundation.sources import models_of
-    from vap_core.perception.foundation.store import store_folder
-
-    pull(models_of(stack), store_folder(), origin=origin, unpinned=unpinned)
-
-
-@train_app.command()
-def perception(
-    out: Annotated[Path, typer.Option(help="Folder of the weights and their manifest.")] = Path(
-        "data/weights"
-    ),
-    scenes: Annotated[int, typer.Option(min=1, help="Rendered training views.")] = 6480,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
-    minutes: Annotated[float | None, typer.Option(help="Stop training after this long.")] = None,
-) -> None:
-    """Train the heads of detector, segmenter and encoder on rendered generic objects, and evaluate them on unseen ones.
-
-    Example: python -m vap_core train perception --out data/runs/weights --scenes 400
-    """
-    from vap_core.training.perception.train import train
-
-    print(json.dumps(train(out, scenes=scenes, seed=seed, minutes=minutes), indent=1))
-
-
-@train_app.command()
-def demonstrations(
-    suite: Annotated[
-        str, typer.Option(help="The benchmark whose robot, cameras and kinds of task are shown.")
-    ],
-    stages: Annotated[
-        int,
-        typer.Option(
-            min=1, help="Scenes with generic objects, of about eight demonstrations each."
-        ),
-    ] = 400,
-    out: Annotated[
-        Path | None,
-        typer.Option(help="Folder of the dataset. Default data/runs/demonstrations-SUITE."),
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
-    jobs: Annotated[
-        int | None, typer.Option(min=1, help="Processes that film. Default one a core.")
-    ] = None,
-) -> None:
-    """Film the scripted expert with generic objects, as a LeRobotDataset v3. Interrupted, the same command goes on.
-
-    Example: python -m vap_core train demonstrations --suite simpler-bridge --stages 2 --out data/runs/small-demonstrations
-    """
-    from vap_core.base.errors import one_of
-    from vap_core.simulation.suites import BENCHMARKS
-    from vap_core.training.films.dataset import ABOUT, write
-    from vap_core.training.policy.train import CACHE
-
-    if suite not in BENCHMARKS:
-        raise one_of("train demonstrations: suite", suite, BENCHMARKS)
-    folder = out or Path(f"data/runs/demonstrations-{suite}")
-    whole = (folder / ABOUT).exists()
-    made = write(suite, stages, folder, cache=CACHE, seed=seed, jobs=jobs)
-    print(
-        f"{folder}: {len(made['episodes'])} episodes of {stages} stages, sha256 {made['data_sha256']}"
-        + ("; it was whole already." if whole else "")
-    )
-
-
-@train_app.command()
-def vlm(
-    out: Annotated[
-        Path, typer.Option(help="Folder of the model; a training found there goes on.")
-    ] = Path("data/runs/mini-paligemma"),
-    stages: Annotated[
-        int,
-        typer.Option(
-            min=2, help="Scenes with generic objects, of about sixteen views each; rendered first."
-        ),
-    ] = 540,
-    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps.")] = 1600,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
-    minutes: Annotated[
-        float | None, typer.Option(help="Stop after this long; the same command goes on.")
-    ] = None,
-) -> None:
-    """Train the mini-PaliGemma that policies grow from, on questions about generic objects. Interrupted, the same command goes on.
-
-    Example: python -m vap_core train vlm --stages 20 --steps 100 --out data/runs/small-vlm
-    """
-    from vap_core.training.vlm.train import Recipe, train
-
-    print(
-        json.dumps(
-            train(Recipe(stages, steps, seed=seed), out, minutes=minutes)["held_out"], indent=1
-        )
-    )
-    print(f"next: python -m vap_core train policy --suite simpler-bridge --vlm {out}")
-
-
-@train_app.command()
-def policy(
-    suite: Annotated[
-        str, typer.Option(help="The benchmark whose robot, cameras and kinds of task it learns.")
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of the checkpoint; a training found there goes on. Default data/runs/trained/mini-pi0-SUITE."
-        ),
-    ] = None,
-    stages: Annotated[
-        int,
-        typer.Option(
-            min=2,
-            help="Scenes with generic objects, of about eight demonstrations each; filmed first.",
-        ),
-    ] = 400,
-    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps.")] = 12_000,
-    batch: Annotated[int, typer.Option(min=1, help="Frames of one optimiser step.")] = 64,
-    vlm: Annotated[
-        Path | None,
-        typer.Option(help="The mini-PaliGemma that it grows from. Default the shipped one."),
-    ] = None,
-    start: Annotated[
-        Path | None,
-        typer.Option(help="A mini-pi0 to go on from instead, of the same suite or of another."),
-    ] = None,
-    demonstrations: Annotated[
-        Path | None,
-        typer.Option(
-            "--demonstrations",
-            help="A dataset of train demonstrations to learn from, instead of filming.",
-        ),
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
-    minutes: Annotated[
-        float | None, typer.Option(help="Stop after this long; the same command goes on.")
-    ] = None,
-) -> None:
-    """Train a mini-pi0, the small frozen policy, on demonstrations with generic objects. Interrupted, the same command goes on.
-
-    Example: python -m vap_core train policy --suite simpler-bridge --stages 40 --steps 500 --out data/runs/small-policy
-    """
-    from vap_core.base.errors import one_of
-    from vap_core.policies.mini_pi0.teach_token import MODEL
-    from vap_core.simulation.suites import BENCHMARKS
-    from vap_core.training.policy.train import Recipe, train
-
-    if suite not in BENCHMARKS:
-        raise one_of("train policy: suite", suite, BENCHMARKS)
-    folder = out or Path(f"data/runs/trained/mini-pi0-{suite}")
-    recipe = Recipe(suite, stages, steps, batch, seed=seed)
-    print(
-        json.dumps(
-            train(
-                recipe,
-                folder,
-                vlm=vlm or MODEL,
-                start=start,
-                demonstrations=demonstrations,
-                minutes=minutes,
-            )["held_out"],
-            indent=1,
-        )
-    )
-    print(
-        f"next: python -m vap_core eval --suite {suite} --policy {folder} --methods generic,vap --episodes 4 --out {folder}-eval"
-    )
+    if what not in benchmarks:
+        raise one_of("bench:", what, benchmarks)
+    print(benchmarks[what]())

@@ -41,7 +41,8 @@ def read(folder: Path) -> "pd.DataFrame":
 
 def verdict(folder: Path) -> str:
     """A line per method: what the policy consumed, and where it is not as the prompt says."""
-    table, lines = read(folder), []
+    table = read(folder)
+    lines = []
     for method, of_method in table.groupby("method"):
         images = of_method[of_method.name != TEXT]
         texts = of_method[of_method.name == TEXT]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from vap_core.base.errors import BadOutput, BadRecording, BadStudy
 from vap_core.evaluation import diagnosis, input_audit, state_log
 from vap_core.evaluation.study import Study, make_trial
-from vap_core.policies.weight_guard import frozen
+from vap_core.policies.weight_guard import unchanged_weights
 from vap_core.rollout.types import EpisodeHeader
 from vap_core.simulation.types import EpisodeRow, Outcome
 
@@ -20,8 +20,11 @@ if TYPE_CHECKING:
 BATCH = 5
 """Episodes of one job: a killed run loses few, and they share one policy call."""
 Record = Literal["all", "failures", "none"] | int
-"""Which episodes are recorded: every one; every failure and one success in ten to compare with;
-none; or so many per task and method, at equal distances."""
+"""Which episodes are recorded.
+
+Every one; every failure and one success in ten to compare with; none; or so many per task and
+method, at equal distances.
+"""
 Rows = list[dict[str, Any]]
 """Rows of a results table."""
 
@@ -68,7 +71,7 @@ def run_job(job: Job) -> Rows:
             "leave --attention out."
         )
     trial = replace(trial, attention=job.attention and begin is not None)
-    with frozen(trial.policy) as checksum:
+    with unchanged_weights(trial.policy) as checksum:
         episodes = list(rollout(trial, job.rows, begin, batch=BATCH))
     if begin is not None:
         _index_recordings(job)

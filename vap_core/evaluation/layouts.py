@@ -30,7 +30,8 @@ def layout_names(episodes: "pd.DataFrame") -> "pd.Series":
     listed = pd.DataFrame(lines, columns=[*keys, "layout"])
     layout = episodes[keys].merge(listed, on=keys, how="left")["layout"].set_axis(episodes.index)
     # A warm-up suite has no list: its layouts are drawn from the seed.
-    episode, seed = episodes["episode"].astype(str), episodes["seed"].astype(str)
+    episode = episodes["episode"].astype(str)
+    seed = episodes["seed"].astype(str)
     drawn = "episode " + episode + " seed " + seed
     return episodes["suite"] + " " + episodes["task"] + " " + layout.where(layout.notna(), drawn)
 

@@ -41,7 +41,8 @@ class Rate:
     def __str__(self) -> str:
         if self.n == 0:
             return "-"
-        low, high = _whole_percent(self.low), _whole_percent(self.high)
+        low = _whole_percent(self.low)
+        high = _whole_percent(self.high)
         return f"{_whole_percent(self.value)} % [{low}, {high}]"
 
 
@@ -53,7 +54,8 @@ def intervals(k: Counts, n: Counts, *, conservative: bool = False) -> tuple[Boun
     """
     from statsmodels.stats.proportion import proportion_confint
 
-    low, high = np.full(len(n), np.nan), np.full(len(n), np.nan)
+    low = np.full(len(n), np.nan)
+    high = np.full(len(n), np.nan)
     some = n > 0
     if some.any():
         method = "beta" if conservative else "wilson"
@@ -143,7 +145,8 @@ def count(
     """
     import pandas as pd
 
-    names, table = list(by), _as_table(episodes)
+    names = list(by)
+    table = _as_table(episodes)
     if table.empty:
         columns = [*names, "n", "errors", "steps"]
         for measure in MEASURES:

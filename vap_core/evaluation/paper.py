@@ -17,12 +17,10 @@ if TYPE_CHECKING:
 
 LEDGER = DATA / "paper_tables.csv"
 COLUMNS = ["table", "row", "column", "metric", "value", "unit", "n", "note"]
-FRACTAL, BRIDGE, VLABENCH, REAL = (
-    "simpler-google-robot",
-    "simpler-widowx",
-    "vlabench",
-    "real_world_results",
-)
+FRACTAL = "simpler-google-robot"
+BRIDGE = "simpler-widowx"
+VLABENCH = "vlabench"
+REAL = "real_world_results"
 TASKS: dict[tuple[str, str], tuple[str, str, str]] = {
     (FRACTAL, "visual matching / pick pen holder"): (
         "simpler-fractal",
@@ -186,7 +184,9 @@ def real_arm() -> str:
     facts = facts[(facts["table"] == REAL) & facts["row"].isin(["pi0.5", "pi0.5 + VAP"])]
     parts = []
     for column, part in facts.groupby("column", sort=False):
-        rates = [f"{line.row} {line.value:.1f}" for line in part.itertuples()]
+        rates = []
+        for line in part.itertuples():
+            rates.append(f"{line.row} {line.value:.1f}")
         parts.append(f"{column}: {', '.join(rates)}")
     return f"The paper's real arm, SR % as means of four tasks each: {'; '.join(parts)}."
 

@@ -15,14 +15,22 @@ from vap_core.simulation.env import Env
 from vap_core.simulation.scenes import Scene
 from vap_core.simulation.suites import Suite
 
-MINI, SHIPPED = "mini-pi0", MODEL.parent
-"""The shipped frozen policy, one checkpoint a suite, and the folder of the checkpoints."""
+MINI = "mini-pi0"
+"""The shipped frozen policy, one checkpoint a suite."""
+SHIPPED = MODEL.parent
+"""The folder of the checkpoints."""
 
 
 def scripted(detector: Detector, scene: Scene, suite: Suite) -> Scripted:
     """The scripted policy, calibrated to the suite's first camera."""
     (camera,) = Env(scene, cameras=suite.cameras[:1]).cameras()
-    return Scripted(detector, camera, scene.robot, suite.hz, suite.control)
+    return Scripted(
+        detector=detector,
+        camera=camera,
+        robot=scene.robot,
+        hz=suite.hz,
+        control=suite.control,
+    )
 
 
 POLICIES = ("scripted", "expert", "random")

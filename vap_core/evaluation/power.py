@@ -49,9 +49,11 @@ def minimum_detectable_effect(
 
 def detectable_effect_text(rows: Sequence[EpisodeRow]) -> str:
     """One line to print before a run: what a comparison of two methods on `rows` can detect."""
-    pairs, units = len(rows), _count_layouts(rows)
+    pairs = len(rows)
+    units = _count_layouts(rows)
     effect = minimum_detectable_effect(units)
-    where, assumed = f"{pairs} paired episodes", "half of the pairs discordant"
+    where = f"{pairs} paired episodes"
+    assumed = "half of the pairs discordant"
     if units < pairs:
         where += f" on {units} layouts"
     if np.isnan(effect):

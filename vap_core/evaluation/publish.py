@@ -68,7 +68,8 @@ def publish(sources: Sequence[Path], target: Path, *, replace: bool = False) -> 
         raise BadOutput(
             f"publish: {target} exists; choose another name with --to, or pass --replace."
         )
-    tables, manifests = [], []
+    tables = []
+    manifests = []
     for source in sources:
         for manifest, episodes in read_runs(source):
             wanted = _count_wanted(manifest["configuration"])

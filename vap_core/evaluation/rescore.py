@@ -101,7 +101,9 @@ def _rows_by_key(study: Mapping[str, Any]) -> dict[Key, EpisodeRow]:
 
 
 def _judge(row: EpisodeRow, truths: list[Truth]) -> Outcome:
-    sizes_m = {place.model: extent_m(get_object(place.model)) for place in row.placements}
+    sizes_m = {}
+    for place in row.placements:
+        sizes_m[place.model] = extent_m(get_object(place.model))
     return rejudge(row, sizes_m, truths).outcome()
 
 

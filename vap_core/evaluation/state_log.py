@@ -53,7 +53,10 @@ def read(folder: Path) -> Iterator[tuple[tuple[Any, ...], list[Truth]]]:
 
 def _to_row(episode: Episode) -> dict[str, Any]:
     names = [place.model for place in episode.header.row.placements]
-    poses, touched, pressed, contacts = [], [], [], []
+    poses = []
+    touched = []
+    pressed = []
+    contacts = []
     for frame in episode.frames:
         truth = frame.truth
         for name in names:
@@ -90,7 +93,10 @@ def _truths(row: Mapping[str, Any]) -> list[Truth]:
 
 
 def _pressed_to_text(pressed_s: Mapping[str, float]) -> list[str]:
-    return [f"{name}={seconds!r}" for name, seconds in pressed_s.items()]
+    texts = []
+    for name, seconds in pressed_s.items():
+        texts.append(f"{name}={seconds!r}")
+    return texts
 
 
 def _pressed_from_text(texts: Sequence[str]) -> dict[str, float]:

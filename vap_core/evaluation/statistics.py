@@ -162,7 +162,8 @@ def sign_flip(gain: PerCluster) -> float:
     are too coarse for Holm's correction of hundreds of comparisons.
     """
     steps = np.abs(gain).astype(int)
-    chance, middle = np.ones(1), int(steps.sum())
+    chance = np.ones(1)
+    middle = int(steps.sum())
     for step in steps[steps > 0].tolist():
         longer = np.zeros(len(chance) + 2 * step)
         longer[: len(chance)] += 0.5 * chance
@@ -195,7 +196,8 @@ def _compare_pairs(pairs: "pd.DataFrame", names: dict[str, str]) -> Comparison:
     neither, only_other, only_one, both = np.bincount(2 * first + second, minlength=4).tolist()
     per_pair = pairs.assign(gain=second - first, n=1)
     clusters = per_pair.groupby("layout", sort=True)[["gain", "n"]].sum()
-    gain, n = clusters["gain"].to_numpy(float), clusters["n"].to_numpy(float)
+    gain = clusters["gain"].to_numpy(float)
+    n = clusters["n"].to_numpy(float)
     low, high = bootstrap_interval(gain, n)
     p_mcnemar = p = mcnemar(only_one, only_other)
     if len(gain) < len(pairs):

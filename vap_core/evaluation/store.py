@@ -77,7 +77,8 @@ def differences(manifest: Mapping[str, Any], configuration: Mapping[str, Any]) -
     """Where a run's configuration differs from the one that is wanted now, in words."""
     before = manifest["configuration"]
     now = json.loads(json.dumps(dict(configuration)))
-    changed, parts = [], []
+    changed = []
+    parts = []
     for name in {**before, **now}:
         if before.get(name) == now.get(name):
             continue

@@ -94,7 +94,10 @@ class Study:
         for suite, _ in self.tasks:
             if suite in suites.BENCHMARKS:
                 digests[suite] = lists.digest(suite)
-        names = sorted({self.checkpoint(suite) for suite, _ in self.tasks} - {""})
+        checkpoints_used = set()
+        for suite, _ in self.tasks:
+            checkpoints_used.add(self.checkpoint(suite))
+        names = sorted(checkpoints_used - {""})
         fingerprints = [checkpoints.fingerprint(name) for name in names]
         about = asdict(self)
         if names == [self.policy]:
@@ -105,11 +108,59 @@ class Study:
         return {**about, "world": _world_digest(self)}
 
 
+def register_personal(study: Study, bank: Path, captioner: Captioner | None = None) -> None:
+    """Remember the personal object of every task from five rendered reference views.
+
+    An object that is in memory stays. Where a method needs its description, it is described too, by
+    `captioner`, or offline; for the soft prompt its token is learned. A study that prompts nothing
+    needs no memory.
+    """
+    if not _any_method(study, needs_memory):
+        return
+    stack = load_stack(study.stack)
+    known = load_bank(bank)
+    for suite, task in study.tasks:
+        rows = study.rows(suite, task)
+        target = rows[0].target
+        category = rows[0].category
+        obj = known.get(target)
+        if obj is None:
+            views = reference_views(get_object(target))
+            obj, _ = register(target, category, views, stack.detector, stack.encoder)
+        if _any_method(study, needs_description) and obj.description is None:
+            obj = with_description(obj, captioner or AttributeCaptioner(stack.segmenter))
+        if _any_method(study, needs_token):
+            initialised_from = checkpoints.config_field(study.checkpoint(suite), "vlm")
+            teach(rows, bank, initialised_from, MODEL)
+        if obj is not known.get(target):
+            save(bank, obj, replace=True)
+            known[target] = obj
+
+
+def make_trial(study: Study, rows: Sequence[EpisodeRow], method: str, bank: Path) -> Trial:
+    """The scene, models and policy of some rows of one task and variant, built or cached."""
+    first = rows[0]
+    suite = suites.suite(first.suite)
+    scene = _scene(study, first.suite, first.task, first.variant)
+    stack = _stack(study.stack) if needs_stack(method) or study.policy == "scripted" else None
+    return Trial(
+        method=method,
+        scene=scene,
+        policy=_policy(study=study, method=method, row=first, bank=bank, scene=scene, stack=stack),
+        prompter=make_prompter(method, first, bank=bank, scene=scene, stack=stack),
+        control=suite.control,
+        sensor=suite.sensor,
+        images_every=study.images_every,
+        follow=study.follow,
+        audit=study.audit,
+    )
+
+
 def _check_names(study: Study) -> None:
     for method in study.methods:
         if method not in METHODS:
             raise one_of("Study: method", method, METHODS)
-    if study.policy not in (*POLICIES, MINI) and not checkpoints.named(study.policy):
+    if study.policy not in (*POLICIES, MINI) and not checkpoints.is_checkpoint_name(study.policy):
         what = "Study: policy (or a lerobot checkpoint's folder or hub id)"
         raise one_of(what, study.policy, [*POLICIES, MINI])
     if study.robots not in MESHES:
@@ -124,7 +175,8 @@ def _check_policy(study: Study) -> None:
     policy = study.policy
     for suite, _ in study.tasks:
         if policy == MINI and not shipped(suite).is_dir():
-            there = ", ".join(sorted(path.name for path in SHIPPED.glob(f"{MINI}-*"))) or "none"
+            names = sorted(path.name for path in SHIPPED.glob(f"{MINI}-*"))
+            there = ", ".join(names) or "none"
             raise BadStudy(
                 f"Study: no {MINI} for {suite} ships (there is {there}); run: python -m vap_core "
                 f"train policy --suite {suite}"
@@ -169,8 +221,10 @@ def _canonical(value: Any) -> bytes:
 
     def plain(part: Any) -> Any:
         if is_dataclass(part) and not isinstance(part, type):
-            held = {field.name: getattr(part, field.name) for field in fields(part)}
-            return {"kind": type(part).__name__, **held}
+            parts = {"kind": type(part).__name__}
+            for field in fields(part):
+                parts[field.name] = getattr(part, field.name)
+            return parts
         if isinstance(part, np.ndarray | np.generic):
             return part.tolist()
         if isinstance(part, Path):
@@ -180,60 +234,6 @@ def _canonical(value: Any) -> bytes:
         )
 
     return json.dumps(value, default=plain, sort_keys=True).encode()
-
-
-DEMO = Study(
-    tasks=(("widowx-pick", "pick-straw-cup"), ("franka-pick", "pick-cup")),
-    methods=("generic", "vap"),
-    episodes=20,
-)
-"""The main job: one task on each of two robots, generic against VAP."""
-
-
-def register_personal(study: Study, bank: Path, captioner: Captioner | None = None) -> None:
-    """Remember the personal object of every task from five rendered reference views.
-
-    An object that is in memory stays. Where a method needs its description, it is described too, by
-    `captioner`, or offline; for the soft prompt its token is learned. A study that prompts nothing
-    needs no memory.
-    """
-    if not _any_method(study, needs_memory):
-        return
-    stack, known = load_stack(study.stack), load_bank(bank)
-    for suite, task in study.tasks:
-        rows = study.rows(suite, task)
-        target, category = rows[0].target, rows[0].category
-        obj = known.get(target)
-        if obj is None:
-            views = reference_views(get_object(target))
-            obj, _ = register(target, category, views, stack.detector, stack.encoder)
-        if _any_method(study, needs_description) and obj.description is None:
-            obj = with_description(obj, captioner or AttributeCaptioner(stack.segmenter))
-        if _any_method(study, needs_token):
-            initialised_from = checkpoints.setting(study.checkpoint(suite), "vlm")
-            teach(rows, bank, initialised_from, MODEL)
-        if obj is not known.get(target):
-            save(bank, obj, replace=True)
-            known[target] = obj
-
-
-def make_trial(study: Study, rows: Sequence[EpisodeRow], method: str, bank: Path) -> Trial:
-    """The scene, models and policy of some rows of one task and variant, built or cached."""
-    first = rows[0]
-    suite = suites.suite(first.suite)
-    scene = _scene(study, first.suite, first.task, first.variant)
-    stack = _stack(study.stack) if needs_stack(method) or study.policy == "scripted" else None
-    return Trial(
-        method=method,
-        scene=scene,
-        policy=_policy(study, method, first, bank, scene, stack),
-        prompter=make_prompter(method, first, bank, scene, stack),
-        control=suite.control,
-        sensor=suite.sensor,
-        images_every=study.images_every,
-        follow=study.follow,
-        audit=study.audit,
-    )
 
 
 _stack = cache(load_stack)
@@ -262,3 +262,11 @@ def _scene(study: Study, suite: str, task: str, variant: str) -> Scene:
             for place in row.placements:
                 names[place.model] = None
     return build_scene(suite, list(names), variant, study.robots)
+
+
+DEMO = Study(
+    tasks=(("widowx-pick", "pick-straw-cup"), ("franka-pick", "pick-cup")),
+    methods=("generic", "vap"),
+    episodes=20,
+)
+"""The main job: one task on each of two robots, generic against VAP."""

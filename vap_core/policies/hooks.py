@@ -1,4 +1,6 @@
-"""What a policy consumed and where it looked, observed while it plans. Without an observer a policy does no extra work.
+"""What a policy consumed and what it attended to, observed while it plans.
+
+Without an observer a policy does no extra work.
 
     with observe_inputs() as digests:
         policy.plan(states, inputs)
@@ -6,7 +8,7 @@
 
     with observe_attention() as maps:
         policy.plan(states, inputs)
-    maps[0]["front"]          # first episode: height x width of patches, each the share of attention that it gets
+    maps[0]["front"]          # first episode: the share of attention of every patch, h x w
 
 A policy that reports nothing leaves `digests` or `maps` empty.
 """
@@ -20,7 +22,10 @@ import numpy as np
 from jaxtyping import Float32
 
 TEXT = "text"
-"""The name under which a policy reports its text or tokens; images are reported under their camera's name."""
+"""The name under which a policy reports its text or tokens.
+
+Images are reported under their camera's name.
+"""
 InputDigests = dict[int, dict[str, str]]
 """By episode of the batch, then by TEXT or camera: hexadecimal SHA-256."""
 AttentionMap = Float32[np.ndarray, "h w"]
@@ -56,10 +61,12 @@ class Hook[T]:
 
 
 _inputs: Hook[str] = Hook("inputs")
-observe_inputs, inputs_observed = _inputs.observe, _inputs.observed
+observe_inputs = _inputs.observe
+inputs_observed = _inputs.observed
 
 _attention: Hook[AttentionMap] = Hook("attention")
-observe_attention, attention_observed = _attention.observe, _attention.observed
+observe_attention = _attention.observe
+attention_observed = _attention.observed
 report_attention = _attention.report
 
 

@@ -27,9 +27,10 @@ class PolicyInput:
 
 @runtime_checkable
 class Policy[S](Protocol):
-    """A frozen policy over a batch of episodes; what one episode carries is state, an argument and a result.
+    """A frozen policy over a batch of episodes.
 
-    `label` names it wherever its numbers appear. `execute` rows of every chunk are executed before it is called again.
+    What one episode carries is state, an argument and a result. `label` names it wherever its
+    numbers appear. `execute` rows of every chunk are executed before it is called again.
     """
 
     label: str
@@ -48,9 +49,9 @@ class Policy[S](Protocol):
 
 @runtime_checkable
 class PrivilegedPolicy[S](Protocol):
-    """A stand-in for a policy that reads the simulator instead of images: the expert and the random control.
+    """A stand-in for a policy that reads the simulator instead of images.
 
-    Its results are bounds, never results of a method.
+    The expert and the random control are such. Their results are bounds, never results of a method.
     """
 
     label: str

@@ -1,4 +1,7 @@
-"""The policy stays frozen: the checksum of all its parameters is in every result, and taken again when the episodes are over."""
+"""The policy stays frozen: its weights are compared before and after the episodes.
+
+The checksum of all its parameters is in every result.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,32 +22,37 @@ class Weighted(Protocol):
         ...
 
 
-_first: WeakKeyDictionary[Any, str] = WeakKeyDictionary()
+_first_checksums: WeakKeyDictionary[Any, str] = WeakKeyDictionary()
 """Of every policy in this process, the checksum that it had when its first episodes began."""
 
 
 def checksum(policy: object) -> str:
-    """The first 16 hex digits of a policy's checksum as it stands; "" of one that has no parameters."""
-    return policy.sha256()[:16] if isinstance(policy, Weighted) else ""
+    """The first 16 hex digits of a policy's checksum; "" of one that has no parameters."""
+    if not isinstance(policy, Weighted):
+        return ""
+    return policy.sha256()[:16]
 
 
 @contextmanager
-def frozen(policy: object) -> Iterator[str]:
-    """Inside, episodes run; gives the checksum that the policy had when this process ran its first ones.
+def unchanged_weights(policy: object) -> Iterator[str]:
+    """Inside, episodes run; gives the checksum that the policy had when the first ones began.
+
+    The first ones are those of this process.
 
     Raises: BadPolicy, on leaving, when it has another one now.
     """
     if not isinstance(policy, Weighted):
         yield ""
         return
-    inner = getattr(policy, "policy", policy)  # one set of parameters, however many speak for it
-    if inner not in _first:
-        _first[inner] = checksum(policy)
-    before = _first[inner]
+    parameters = getattr(policy, "policy", policy)  # several policies may share one set of them
+    if parameters not in _first_checksums:
+        _first_checksums[parameters] = checksum(policy)
+    before = _first_checksums[parameters]
     yield before
     after = checksum(policy)
     if after != before:
         raise BadPolicy(
-            f"frozen: the parameters of {policy.label} changed while episodes ran ({before} before, {after} now); these are no results. "
-            "Find out what trains it or writes to it, and run the same command again."
+            f"unchanged_weights: the parameters of {policy.label} changed while episodes ran "
+            f"({before} before, {after} now); these are no results. Find out what trains it or "
+            "writes to it, and run the same command again."
         )

@@ -1,7 +1,8 @@
-"""Does the prompt reach the policy? Every call is made twice, with the prompted and with the raw
-input, and what was consumed is compared.
+"""Whether the prompt reaches the policy.
 
-The second call's chunks are discarded: an audited run ends as the same run without audit does.
+Every call is made twice, with the prompted and with the raw input, and what was consumed is
+compared. The second call's chunks are discarded: an audited run ends as the same run without audit
+does.
 """
 
 import copy
@@ -37,7 +38,9 @@ def plan(
             f"audit: {policy.label} does not report what it consumes; call "
             "vap_core.policies.hooks.report_input where it uses its inputs."
         )
-    digests: list[Digests] = [(of_prompted[i], of_raw[i]) for i in range(len(prompted))]
+    digests: list[Digests] = []
+    for i in range(len(prompted)):
+        digests.append((of_prompted[i], of_raw[i]))
     return after, chunks, digests
 
 
@@ -49,9 +52,19 @@ def compare(
     found = []
     for name, digest in of_prompted.items():
         if name == TEXT:
-            pixels, changed = 0, prompted.text != raw.text
+            pixels = 0
+            changed = prompted.text != raw.text
         else:
             differs = (prompted.images[name] != raw.images[name]).any(axis=2)
-            pixels, changed = int(differs.sum()), bool(differs.any())
-        found.append(ConsumedInput(step, name, changed, pixels, digest, of_raw[name]))
+            pixels = int(differs.sum())
+            changed = bool(differs.any())
+        consumed = ConsumedInput(
+            step=step,
+            name=name,
+            changed=changed,
+            pixels=pixels,
+            consumed=digest,
+            raw=of_raw[name],
+        )
+        found.append(consumed)
     return found

@@ -1,5 +1,7 @@
-"""What the prompts of one control step cover, by ground truth: kept beside every frame, so that a
-failure can be explained."""
+"""What the prompts of one control step cover, by ground truth.
+
+It is kept beside every frame, so that a failure can be explained.
+"""
 
 from collections.abc import Mapping
 
@@ -23,7 +25,8 @@ def mask_coverage(
     """
     found = []
     for camera, tracks in attended.tracks.items():
-        mask, masks = tracks[0].mask, truth.masks[camera]
+        mask = tracks[0].mask
+        masks = truth.masks[camera]
         true = masks.get(target)
         pixels = 0 if true is None else int(true.sum())
         overlap = 0.0
@@ -32,19 +35,34 @@ def mask_coverage(
         proposal = float("nan")
         if opening and true is not None and pixels:
             proposal = best_proposal(attended.groundings[camera][0], true)
-        name = covered_object(mask, masks)
-        found.append(MaskCoverage(camera, name, overlap, pixels, proposal))
+        coverage = MaskCoverage(
+            camera=camera,
+            object=covered_object(mask, masks),
+            iou=overlap,
+            pixels=pixels,
+            proposal=proposal,
+        )
+        found.append(coverage)
     return tuple(found)
 
 
 def covered_object(mask: Mask | None, masks: Mapping[str, Mask]) -> str | None:
-    """The object on which most of a mask lies, "" when there is none such; None for no mask, or an
-    empty one."""
+    """The object on which most of a mask lies, "" when there is none such.
+
+    None for no mask, or an empty one.
+    """
     if mask is None or not mask.any():
         return None
-    pixels = {name: int((mask & other).sum()) for name, other in masks.items()}
-    best = max(pixels, key=lambda name: pixels[name], default="")
-    return best if best and pixels[best] >= MAJORITY * int(mask.sum()) else ""
+    best = ""
+    most = 0
+    for name, of_object in masks.items():
+        pixels = int((mask & of_object).sum())
+        if pixels > most:
+            best = name
+            most = pixels
+    if most >= MAJORITY * int(mask.sum()):
+        return best
+    return ""
 
 
 def best_proposal(grounding: Grounding, true: Mask) -> float:
@@ -52,4 +70,5 @@ def best_proposal(grounding: Grounding, true: Mask) -> float:
     box = mask_box(true)
     if box is None or not len(grounding.candidates):
         return 0.0
-    return float(np.max(box_iou(grounding.candidates.xyxy, box[None])))
+    overlap = box_iou(grounding.candidates.xyxy, box[None])
+    return float(np.max(overlap))

@@ -1,4 +1,4 @@
-"""An episode of the scripted expert, step by step, for whoever films or measures it."""
+"""An episode of the scripted expert, step by step, to film or measure it."""
 
 from collections.abc import Callable, Iterator
 
@@ -24,7 +24,9 @@ def expert_steps(
 
     Raises: OutOfReach.
     """
-    sizes = {place.model: env.scene.sizes_m[place.model] for place in row.placements}
+    sizes = {}
+    for place in row.placements:
+        sizes[place.model] = env.scene.sizes_m[place.model]
     judge = Judge.start(row, sizes, env.truth())
     while not judge.done and judge.steps < row.max_steps:
         (state,), (chunk,) = expert.plan_from_simulation([state], [env])

@@ -1,5 +1,7 @@
-"""What can be said of a failed episode: its case, and the trace of the episode that explains it.
-The rules are in evaluation.diagnosis."""
+"""The diagnosis of a failed episode: its case, and the trace that explains it.
+
+The rules are in evaluation.diagnosis.
+"""
 
 import json
 from collections.abc import Callable, Mapping
@@ -25,8 +27,11 @@ CASES: dict[Case, tuple[str, ...]] = {
 
 @value
 class Diagnosis:
-    """Why one episode failed: the deciding frame and camera ("" where none decides), a sentence,
-    and evidence in numbers and names."""
+    """Why one episode failed.
+
+    It has the deciding frame and camera ("" where none decides), a sentence, and evidence in
+    numbers and names.
+    """
 
     case: Case
     sub_case: str
@@ -66,13 +71,13 @@ NO_DIAGNOSIS: dict[str, Any] = {
 
 @value
 class EpisodeTrace:
-    """What the diagnosis reads, one entry per recorded step; nothing in it depends on a threshold.
+    """What the diagnosis reads, one entry per recorded step.
 
-    `others` are the objects other than target and goal that the robot touched in a step, `touches`
-    says whether the target was one. `gap_m` is the distance of the tcp from the target's bounding
-    box, `lift_m` how much higher each object is than at first, `moved_m` how far it has moved.
-    `grip` is the gripper's command, 0 closed .. 1 open, nan at the terminal frame, which has none.
-    `candidates` counts proposals by camera.
+    Nothing in it depends on a threshold. `others` are the objects other than target and goal that
+    the robot touched in a step, `touches` says whether the target was one. `gap_m` is the distance
+    of the tcp from the target's bounding box, `lift_m` how much higher each object is than at
+    first, `moved_m` how far it has moved. `grip` is the gripper's command, 0 closed .. 1 open, nan
+    at the terminal frame, which has none. `candidates` counts proposals by camera.
     """
 
     target: str

@@ -120,17 +120,25 @@ def rollout(
     """
     keeps_images = sink is not None or keep_images
     for first in range(0, len(rows), batch):
-        running = [_begin(trial, row, keeps_images) for row in rows[first : first + batch]]
-        while live := [episode for episode in running if episode.outcome is None]:
+        running = []
+        for row in rows[first : first + batch]:
+            running.append(_begin(trial, row, keeps_images))
+        live = _live(running)
+        while live:
             steps = _observe_and_prompt(trial, live, sink)
-            live = [episode for episode in live if episode.outcome is None]
+            live = _live(live)
             _plan(trial, live, steps)
-            for episode in live:
-                if episode.outcome is None:
-                    observation, attended = steps[id(episode)]
-                    _guard(episode, _act, trial, episode, observation, attended, keep_images)
+            for episode in _live(live):
+                observation, attended = steps[id(episode)]
+                _guard(episode, _act, trial, episode, observation, attended, keep_images)
+            live = _live(running)
         for episode in running:
             yield _end(trial, episode)
+
+
+def _live(episodes: Sequence[RunningEpisode]) -> list[RunningEpisode]:
+    """The episodes that have not ended."""
+    return [episode for episode in episodes if episode.outcome is None]
 
 
 def _begin(trial: Trial, row: EpisodeRow, keeps_images: bool) -> RunningEpisode:
@@ -152,8 +160,10 @@ def _begin(trial: Trial, row: EpisodeRow, keeps_images: bool) -> RunningEpisode:
 def _observe_and_prompt(
     trial: Trial, live: Sequence[RunningEpisode], sink: OpenSink | None
 ) -> dict[int, Step]:
-    """Render and prompt every episode; at t = 0 open its sink. An episode that fails here ends and
-    is left out."""
+    """Render and prompt every episode; at t = 0 open its sink.
+
+    An episode that fails here ends and is left out.
+    """
     observations: dict[int, Observation] = {}
     for episode in live:
         observation = _guard(episode, _observe, trial, episode)
@@ -191,8 +201,10 @@ def _observe(trial: Trial, episode: RunningEpisode) -> Observation:
 
 
 def _takes_images(trial: Trial, episode: RunningEpisode) -> bool:
-    """Whether this control step renders: always the first; else when the policy is called, or every
-    step is wanted."""
+    """Whether this control step renders.
+
+    The first always does; the others when the policy is called, or every step is wanted.
+    """
     if isinstance(trial.policy, PrivilegedPolicy):
         every = trial.images_every
         return episode.keeps_images or bool(every and episode.judge.steps % every == 0)
@@ -222,11 +234,7 @@ def _prompt_batch(
         return {}
     start = time.perf_counter()
     try:
-        results = trial.prompter.steps(
-            [episode.prompter_state for episode in following],
-            [observations[id(episode)] for episode in following],
-            [_context(trial, episode) for episode in following],
-        )
+        results = _call_prompter(trial, following, observations)
     except Exception as error:
         if _ends_the_run(error):
             raise
@@ -244,6 +252,21 @@ def _prompt_batch(
         episode.seconds["attend"] += share
         attended[id(episode)] = of_episode
     return attended
+
+
+def _call_prompter(
+    trial: Trial,
+    following: Sequence[RunningEpisode],
+    observations: dict[int, Observation],
+) -> list[tuple[Any, Attended]]:
+    states = []
+    images = []
+    contexts = []
+    for episode in following:
+        states.append(episode.prompter_state)
+        images.append(observations[id(episode)])
+        contexts.append(_context(trial, episode))
+    return trial.prompter.steps(states, images, contexts)
 
 
 def _context(trial: Trial, episode: RunningEpisode) -> PromptContext:
@@ -266,7 +289,11 @@ def _open_sink(
 
 
 def _header(trial: Trial, episode: RunningEpisode, attended: Attended) -> EpisodeHeader:
-    row, env = episode.row, episode.env
+    row = episode.row
+    env = episode.env
+    sizes_m = {}
+    for place in row.placements:
+        sizes_m[place.model] = trial.scene.sizes_m[place.model]
     return EpisodeHeader(
         row=row,
         method=trial.method,
@@ -276,7 +303,7 @@ def _header(trial: Trial, episode: RunningEpisode, attended: Attended) -> Episod
         instruction=row.instruction,
         rewritten=attended.text,
         groundings=attended.groundings,
-        object_sizes_m={place.model: trial.scene.sizes_m[place.model] for place in row.placements},
+        object_sizes_m=sizes_m,
         action_names=env.action_names,
         associations=attended.associations,
         references=trial.prompter.references,
@@ -290,7 +317,7 @@ def _plan(trial: Trial, live: Sequence[RunningEpisode], steps: dict[int, Step]) 
         return
     start = time.perf_counter()
     try:
-        states, chunks = _call_policy(trial, calling, [steps[id(episode)] for episode in calling])
+        states, chunks = _call_policy(trial, calling, steps)
     except Exception as error:
         if _ends_the_run(error):
             raise
@@ -308,14 +335,17 @@ def _plan(trial: Trial, live: Sequence[RunningEpisode], steps: dict[int, Step]) 
 
 
 def _call_policy(
-    trial: Trial, calling: Sequence[RunningEpisode], steps: Sequence[Step]
+    trial: Trial, calling: Sequence[RunningEpisode], steps: dict[int, Step]
 ) -> tuple[list[Any], list[Chunk]]:
-    policy, states = trial.policy, [episode.policy_state for episode in calling]
+    policy = trial.policy
+    states = [episode.policy_state for episode in calling]
     if isinstance(policy, PrivilegedPolicy):
         return policy.plan_from_simulation(states, [episode.env for episode in calling])
 
-    raw, prompted = [], []
-    for episode, (observation, attended) in zip(calling, steps, strict=True):
+    raw = []
+    prompted = []
+    for episode in calling:
+        observation, attended = steps[id(episode)]
         state = observation.state
         raw.append(PolicyInput(observation.images, episode.row.instruction, state))
         prompted.append(PolicyInput(attended.images, attended.text, state))
@@ -326,11 +356,9 @@ def _call_policy(
     with observer as maps:
         if trial.audit:
             after, chunks, consumed = audit.plan(policy, states, prompted, raw)
-            for episode, of_prompted, of_raw, digests in zip(
-                calling, prompted, raw, consumed, strict=True
-            ):
+            for i, episode in enumerate(calling):
                 step = episode.judge.steps
-                episode.consumed += audit.compare(step, of_prompted, of_raw, digests)
+                episode.consumed += audit.compare(step, prompted[i], raw[i], consumed[i])
         else:
             after, chunks = policy.plan(states, prompted)
     for i, episode in enumerate(calling):
@@ -388,16 +416,22 @@ def _end(trial: Trial, episode: RunningEpisode) -> Episode:
     header = episode.header
     if header is None:
         header = _header(trial, episode, unchanged({}, episode.row.instruction))
-    seconds = {**episode.env.seconds, **episode.seconds}
-    consumed = tuple(episode.consumed)
-    return Episode(header, tuple(episode.frames), episode.outcome, seconds, consumed)
+    return Episode(
+        header=header,
+        frames=tuple(episode.frames),
+        outcome=episode.outcome,
+        seconds={**episode.env.seconds, **episode.seconds},
+        consumed=tuple(episode.consumed),
+    )
 
 
 def _guard[**P, R](
     episode: RunningEpisode, work: Callable[P, R], *args: P.args, **kwargs: P.kwargs
 ) -> R | None:
-    """Do one episode's share of a step; its failure ends that episode alone, as an error with its
-    traceback."""
+    """Do one episode's share of a step.
+
+    Its failure ends that episode alone, as an error with its traceback.
+    """
     try:
         return work(*args, **kwargs)
     except Exception as error:
@@ -413,8 +447,10 @@ def _fail(episode: RunningEpisode) -> None:
 
 
 def _ends_the_run(error: Exception) -> bool:
-    """Whether the user has to act (a full disk, an absent weight); a bad action fails its own
-    episode only."""
+    """Whether the user has to act (a full disk, an absent weight).
+
+    A bad action fails its own episode only.
+    """
     return isinstance(error, VapError) and not isinstance(error, OutOfReach | BadAction)
 
 

@@ -34,13 +34,13 @@ class EpisodeHeader:
 
 @value
 class MaskCoverage:
-    """What the prompt covered in one view at one control step, by ground truth. Only the diagnosis
-    reads it.
+    """What the prompt covered in one view at one control step, by ground truth.
 
-    `object` is the object that the mask lies on: its name, "" for none in particular, None where
-    nothing is highlighted.
-    `iou` compares the mask with the target's visible pixels, of which there are `pixels`.
-    `proposal`, at t = 0, is the best box IoU of any candidate with the target; nan later."""
+    Only the diagnosis reads it. `object` is the object that the mask lies on: its name, "" for none
+    in particular, None where nothing is highlighted. `iou` compares the mask with the target's
+    visible pixels, of which there are `pixels`. `proposal`, at t = 0, is the best box IoU of any
+    candidate with the target; nan later.
+    """
 
     camera: str
     object: str | None
@@ -56,7 +56,8 @@ class Frame:
     `action` was decided from `images`; the terminal frame has none (None), because nothing is
     executed after it. `coverage` has an entry per view at steps whose images were prompted.
     `attention`, at steps in which the policy was observed while it planned, is the share of its
-    attention on every image patch."""
+    attention on every image patch.
+    """
 
     frame_index: int
     timestamp_s: float
@@ -83,7 +84,8 @@ class ConsumedInput:
 
     `changed` says whether the prompt changes it: pixels tinted in that view, or words rewritten.
     `consumed` and `raw` are digests of what the policy consumed of the prompted and of the raw
-    input."""
+    input.
+    """
 
     step: int
     name: str
@@ -100,10 +102,10 @@ class ConsumedInput:
 
 @value
 class Episode:
-    """A finished episode. `seconds` sums wall time by part: physics, render, attend, policy,
-    record, ...
+    """A finished episode.
 
-    `consumed` is empty unless the rollout was audited.
+    `seconds` sums wall time by part: physics, render, attend, policy, record, ... `consumed` is
+    empty unless the rollout was audited.
     """
 
     header: EpisodeHeader
@@ -120,9 +122,12 @@ class Episode:
 
     def summary(self) -> dict[str, Any]:
         """One flat row of a results table."""
-        row, outcome = self.header.row, self.outcome
-        groundings = [g for per_view in self.header.groundings.values() for g in per_view]
-        margins = [g.ballot.margin for g in groundings]
+        row = self.header.row
+        outcome = self.outcome
+        margins = []
+        for per_view in self.header.groundings.values():
+            for grounding in per_view:
+                margins.append(grounding.ballot.margin)
         timings = {f"seconds_{part}": seconds for part, seconds in self.seconds.items()}
         return {
             "suite": row.suite,

@@ -1,4 +1,4 @@
-"""Where the cameras stand, the pinhole they are, and the eyes that see through them."""
+"""The cameras: where they stand, their pinhole geometry, and how they render."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -14,7 +14,7 @@ from vap_core.simulation.gl import ensure_gl
 ensure_gl()
 import mujoco  # noqa: E402
 
-from vap_core.simulation.occluder import Screen, draw  # noqa: E402
+from vap_core.simulation.occluder import Screen, draw_screens  # noqa: E402
 
 HIDDEN_GROUP = 5
 """Geom group that is never drawn."""
@@ -24,7 +24,11 @@ _FLIP = np.diag([1.0, -1.0, -1.0])
 
 @value
 class Rig:
-    """A camera fixed to `body`: it stands at `pos_m` and looks at `aim_m`, both in the body's frame; `up` points up in the picture."""
+    """A camera fixed to `body`.
+
+    It stands at `pos_m` and looks at `aim_m`, both in the body's frame; `up` points up in the
+    picture.
+    """
 
     name: str
     body: str
@@ -48,11 +52,11 @@ RIGS: dict[str, tuple[Rig, ...]] = {
         Rig("front", "world", (0.98, 0.0, 0.37), (0.44, 0.0, 0.12), np.deg2rad(44.0)),
         Rig("side", "world", (0.68, -0.46, 0.42), (0.47, -0.01, 0.05), np.deg2rad(44.0)),
         Rig(
-            "wrist",
-            "hand",
-            (0.09, 0.0, 0.045),
-            (0.03, 0.0, 0.20),
-            np.deg2rad(72.0),
+            name="wrist",
+            body="hand",
+            pos_m=(0.09, 0.0, 0.045),
+            aim_m=(0.03, 0.0, 0.20),
+            fovy_rad=np.deg2rad(72.0),
             up=(-1.0, 0.0, 0.0),
         ),
     ),
@@ -60,11 +64,11 @@ RIGS: dict[str, tuple[Rig, ...]] = {
         Rig("front", "world", (0.66, 0.0, 0.38), (0.20, 0.0, 0.055), np.deg2rad(49.0)),
         Rig("side", "world", (0.30, -0.46, 0.33), (0.18, 0.0, 0.06), np.deg2rad(48.0)),
         Rig(
-            "wrist",
-            "gripper",
-            (0.0, 0.055, -0.045),
-            (0.008, -0.006, -0.118),
-            np.deg2rad(80.0),
+            name="wrist",
+            body="gripper",
+            pos_m=(0.0, 0.055, -0.045),
+            aim_m=(0.008, -0.006, -0.118),
+            fovy_rad=np.deg2rad(80.0),
             up=(0.0, 1.0, 0.0),
         ),
     ),
@@ -75,12 +79,16 @@ RIGS: dict[str, tuple[Rig, ...]] = {
 def add_rigs(
     spec: mujoco.MjSpec, robot: str, shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> tuple[str, ...]:
-    """Mount the cameras of `robot` in `spec`, all but a wrist camera moved by `shift_m`; returns their names."""
+    """Mount the cameras of `robot` in `spec`, and return their names.
+
+    All but a wrist camera are moved by `shift_m`. Raises: UnknownName.
+    """
     if robot not in RIGS:
         raise one_of("cameras.add_rigs: robot", robot, RIGS)
     for rig in RIGS[robot]:
         if rig.name != "wrist":
-            (x, y, z), (dx, dy, dz) = rig.pos_m, shift_m
+            x, y, z = rig.pos_m
+            dx, dy, dz = shift_m
             rig = replace(rig, pos_m=(x + dx, y + dy, z + dz))
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, rig.rotation().ravel())
@@ -93,9 +101,13 @@ def add_rigs(
 def intrinsics(
     model: mujoco.MjModel, name: str, size: tuple[int, int]
 ) -> Float64[np.ndarray, "3 3"]:
-    """K in pixels for a picture of `size` = (height, width): pixel (u, v) covers u..u+1, v..v+1, so the centre is (width/2, height/2)."""
+    """K in pixels for a picture of `size` = (height, width).
+
+    Pixel (u, v) covers u..u+1, v..v+1, so the centre is (width/2, height/2).
+    """
     height, width = size
-    focal = 0.5 * height / np.tan(0.5 * np.deg2rad(float(model.camera(name).fovy[0])))
+    fovy_rad = np.deg2rad(float(model.camera(name).fovy[0]))
+    focal = 0.5 * height / np.tan(0.5 * fovy_rad)
     return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
 
 
@@ -104,11 +116,14 @@ def camera(model: mujoco.MjModel, data: mujoco.MjData, name: str, size: tuple[in
     pose = np.eye(4)
     pose[:3, :3] = data.camera(name).xmat.reshape(3, 3) @ _FLIP
     pose[:3, 3] = data.camera(name).xpos
-    return Camera(name, size[1], size[0], intrinsics(model, name, size), pose)
+    height, width = size
+    return Camera(
+        name=name, width=width, height=height, k=intrinsics(model, name, size), pose_world=pose
+    )
 
 
 def project(cam: Camera, points_world: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
-    """Pixels (u right, v down) of world points, metres; NaN for points that are not in front of the camera."""
+    """Pixels (u right, v down) of world points, metres; NaN for points behind the camera."""
     local = (points_world - cam.pose_world[:3, 3]) @ cam.pose_world[:3, :3]
     depth = np.where(local[:, 2] > 1e-6, local[:, 2], np.nan)
     return (local @ cam.k.T)[:, :2] / depth[:, None]
@@ -117,7 +132,10 @@ def project(cam: Camera, points_world: Float64[np.ndarray, "n 3"]) -> Float64[np
 def backproject_to_plane(
     cam: Camera, pixels: Float64[np.ndarray, "n 2"], z_world: float
 ) -> Float64[np.ndarray, "n 3"]:
-    """World points, metres, where the pixels' rays meet the level plane z = `z_world`; NaN for rays that never do."""
+    """World points, metres, where the pixels' rays meet the level plane z = `z_world`.
+
+    NaN for rays that never do.
+    """
     homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
     rays = homogeneous @ np.linalg.inv(cam.k).T @ cam.pose_world[:3, :3].T
     eye = cam.pose_world[:3, 3]
@@ -127,9 +145,10 @@ def backproject_to_plane(
 
 
 class Renderer:
-    """Sees a model through its cameras: colour always, object masks when asked. One renderer per picture size, shared by every episode.
+    """Renders a model's cameras: colours, and object masks on demand.
 
-    `objects` names the bodies whose masks can be asked for; a hidden object is not drawn at all.
+    One renderer per picture size, shared by every episode. `objects` names the bodies whose masks
+    can be asked for; a hidden object is not drawn at all.
     """
 
     def __init__(
@@ -140,11 +159,7 @@ class Renderer:
         self.shadows = shadows
         self._renderers: dict[int, mujoco.Renderer] = {}
         self._groups = model.geom_group.copy()
-        body_of = {model.body(name).id: i for i, name in enumerate(self.objects)}
-        self._owner = np.array(
-            [body_of.get(int(model.body_rootid[body]), -1) for body in model.geom_bodyid], np.int64
-        )
-        """Index into `objects` of each geom's object, -1 for the rest of the scene."""
+        self._owner = _object_of_geoms(model, self.objects)
 
     def __enter__(self) -> "Renderer":
         return self
@@ -170,8 +185,8 @@ class Renderer:
         hidden: frozenset[str] = frozenset(),
         before: Sequence[Screen] = (),
     ) -> Rgb:
-        """What camera `name` sees, `size` x `size` pixels; `before` stands in its way."""
-        renderer = self._look(data, name, size, hidden, before)
+        """The picture of camera `name`, `size` x `size` pixels, with `before` in front of it."""
+        renderer = self._update(data, name, size, hidden=hidden, before=before)
         return np.ascontiguousarray(renderer.render())
 
     def masks(
@@ -182,8 +197,8 @@ class Renderer:
         hidden: frozenset[str] = frozenset(),
         before: Sequence[Screen] = (),
     ) -> Mapping[str, Mask]:
-        """Visible pixels of every object that is not hidden, in camera `name`; `before` stands in its way."""
-        renderer = self._look(data, name, size, hidden, before)
+        """Visible pixels of every object that is not hidden; `before` is in front of the camera."""
+        renderer = self._update(data, name, size, hidden=hidden, before=before)
         renderer.enable_segmentation_rendering()
         try:
             drawn = renderer.render()
@@ -191,30 +206,43 @@ class Renderer:
             renderer.disable_segmentation_rendering()
         geom = np.where(drawn[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM), drawn[..., 0], -1)
         owner = np.where(geom >= 0, self._owner[geom], -1)
-        return {each: owner == i for i, each in enumerate(self.objects) if each not in hidden}
+        masks = {}
+        for i, each in enumerate(self.objects):
+            if each not in hidden:
+                masks[each] = owner == i
+        return masks
 
-    def _look(
+    def _update(
         self,
         data: mujoco.MjData,
         name: str,
         size: int,
+        *,
         hidden: frozenset[str],
         before: Sequence[Screen],
     ) -> mujoco.Renderer:
+        """The renderer of this size, its scene as camera `name` sees it now."""
         renderer = self._renderers.get(size)
         if renderer is None:
-            renderer = self._renderers[size] = mujoco.Renderer(
-                self.model, size, size, max_geom=self.model.ngeom + 64
-            )
-        unseen = np.isin(self._owner, [i for i, each in enumerate(self.objects) if each in hidden])
-        self.model.geom_group[:] = np.where(unseen, HIDDEN_GROUP, self._groups)
+            max_geom = self.model.ngeom + 64
+            renderer = mujoco.Renderer(self.model, size, size, max_geom=max_geom)
+            self._renderers[size] = renderer
+        hidden_objects = [i for i, each in enumerate(self.objects) if each in hidden]
+        hidden_geoms = np.isin(self._owner, hidden_objects)
+        self.model.geom_group[:] = np.where(hidden_geoms, HIDDEN_GROUP, self._groups)
         renderer.update_scene(data, camera=name)
-        draw(renderer.scene, before)
-        for flag in (
-            mujoco.mjtRndFlag.mjRND_REFLECTION,
-            mujoco.mjtRndFlag.mjRND_SKYBOX,
-            mujoco.mjtRndFlag.mjRND_HAZE,
-        ):
-            renderer.scene.flags[flag] = 0
-        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = int(self.shadows)
+        draw_screens(renderer.scene, before)
+        flags = renderer.scene.flags
+        flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+        flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 0
+        flags[mujoco.mjtRndFlag.mjRND_HAZE] = 0
+        flags[mujoco.mjtRndFlag.mjRND_SHADOW] = int(self.shadows)
         return renderer
+
+
+def _object_of_geoms(model: mujoco.MjModel, objects: Sequence[str]) -> np.ndarray:
+    """Index into `objects` of each geom's object, -1 for the rest of the scene."""
+    owners = np.full(model.nbody, -1, np.int64)
+    for i, name in enumerate(objects):
+        owners[model.body(name).id] = i
+    return owners[model.body_rootid[model.geom_bodyid]]

@@ -1,4 +1,7 @@
-"""From end-effector deltas to joint targets: mink's differential inverse kinematics on the bare robot, base frame = world frame."""
+"""From actions to joint targets, by mink's differential inverse kinematics.
+
+It runs on a model of the robot alone, whose base frame is the world frame.
+"""
 
 from functools import cache
 
@@ -14,18 +17,25 @@ from vap_core.simulation.robots import Robot
 
 ROUNDS = 12
 """Most iterations of one solution; it stops as soon as the pose is met."""
-NEAR_M, NEAR_RAD = 2e-5, 2e-4
+NEAR_M = 2e-5
+NEAR_RAD = 2e-4
+"""A pose is met within these errors."""
 TWIST_RAD = 0.05
-"""Furthest that a hand that leans may be turned about its own axis."""
-LEASH_M, LEASH_RAD = 0.05, 0.5
-"""Furthest that the commanded pose may lead the measured one."""
-LEASH = 0.25
-"""Furthest that a commanded joint may lead the measured one under joint control, rad."""
+"""Largest turn of a leaning hand about its own axis."""
+LEAD_M = 0.05
+LEAD_RAD = 0.5
+"""Largest lead of the commanded pose over the measured one."""
+LEAD_JOINT_RAD = 0.25
+"""Largest lead of a commanded joint over the measured one under joint control."""
 
 
 @value
 class Setpoint:
-    """Where the gripper is told to be: `tcp_base` (4 x 4, metres, robot base frame), the joint angles that put it there (rad), opening 0..1."""
+    """The commanded state of the arm and its gripper.
+
+    `tcp_base` (4 x 4, metres, robot base frame), the joint angles (rad) of that pose, and the
+    gripper's opening 0..1.
+    """
 
     tcp_base: Float64[np.ndarray, "4 4"]
     joints: Float64[np.ndarray, " n"]
@@ -44,7 +54,10 @@ MOTION_LIMITS = MotionLimits()
 
 
 class Arm:
-    """The kinematics of one robot; holds mink's buffers and nothing of an episode: every answer depends on the arguments alone."""
+    """The kinematics of one robot.
+
+    It holds mink's buffers and nothing of an episode: every answer depends on the arguments alone.
+    """
 
     def __init__(self, robot: Robot) -> None:
         spec = mujoco.MjSpec.from_file(str(robot.xml))
@@ -73,9 +86,8 @@ class Arm:
     def forward(self, joints: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "4 4"]:
         """The tcp's pose in the robot base frame at `joints` (rad)."""
         self.configuration.update(joints)
-        return np.asarray(
-            self.configuration.get_transform_frame_to_world("tcp", "site").as_matrix()
-        )
+        pose = self.configuration.get_transform_frame_to_world("tcp", "site")
+        return np.asarray(pose.as_matrix())
 
     def solve(
         self,
@@ -83,7 +95,10 @@ class Arm:
         tcp_base: Float64[np.ndarray, "4 4"],
         seconds: float,
     ) -> Float64[np.ndarray, " n"]:
-        """Joint angles nearest to `tcp_base` that can be reached from `joints` within `seconds` at the joints' rated speeds."""
+        """Joint angles nearest to `tcp_base` that are reached from `joints` within `seconds`.
+
+        The joints move at their rated speeds at most.
+        """
         self.configuration.update(joints)
         self.task.set_target(mink.SE3.from_matrix(tcp_base))
         for _ in range(ROUNDS):
@@ -95,7 +110,7 @@ class Arm:
                 self.configuration,
                 [self.task, self.posture],
                 dt,
-                "daqp",
+                solver="daqp",
                 damping=1e-9,
                 limits=self.limits,
             )
@@ -105,7 +120,10 @@ class Arm:
     def reach(
         self, tcp_base: Float64[np.ndarray, "4 4"], tolerance_m: float = 1e-3
     ) -> Float64[np.ndarray, " n"]:
-        """Joint angles for a pose, from home, taking all the time it needs; the hand may lean by the robot's `lean_rad`. Raises: OutOfReach."""
+        """Joint angles for a pose, from home, without a limit of time.
+
+        The hand may lean by the robot's `lean_rad`. Raises: OutOfReach.
+        """
         joints = self.robot.home
         for _ in range(8):
             joints = self.solve(joints, tcp_base, 2.0)
@@ -117,7 +135,8 @@ class Arm:
         if off > tolerance_m or (turn > 10 * tolerance_m and not leans):
             where = tcp_base[:3, 3].round(3).tolist()
             raise OutOfReach(
-                f"Arm.reach: {self.robot.name} stays {1000 * off:.0f} mm and {turn:.2f} rad away from {where} m; move it closer."
+                f"Arm.reach: {self.robot.name} stays {1000 * off:.0f} mm and {turn:.2f} rad away "
+                f"from {where} m; move it closer."
             )
         return joints
 
@@ -138,22 +157,24 @@ def follow(
 ) -> Setpoint:
     """The command after one action (a row of values.Chunk) that lasts `seconds`.
 
-    The delta applies to the *commanded* pose, so that the arm's droop does not add up; the command is first pulled back to
-    within 5 cm and 0.5 rad of the measured pose, so that it cannot run away from an arm that is held up.
+    The delta applies to the *commanded* pose, so that the arm's droop does not add up; the command
+    is first limited to within 5 cm and 0.5 rad of the measured pose, so that it does not run away
+    from an arm that is blocked.
     """
-    start = _leashed(command.tcp_base, measured_base)
+    start = _limit_lead(command.tcp_base, measured_base)
     delta = action.astype(np.float64)
     goal = start.copy()
     goal[:3, 3] += _capped(delta[:3], limits.speed_m_s * seconds)
     goal[:3, :3] = rotation(_capped(delta[3:6], limits.turn_rad_s * seconds)) @ start[:3, :3]
     joints = arm.solve(command.joints, goal, seconds)
     reached = arm.forward(joints)
-    off, turn = (
-        np.linalg.norm(reached[:3, 3] - goal[:3, 3]),
-        np.linalg.norm(rotation_vector(reached[:3, :3] @ goal[:3, :3].T)),
-    )
+    off = np.linalg.norm(reached[:3, 3] - goal[:3, 3])
+    turn = np.linalg.norm(rotation_vector(reached[:3, :3] @ goal[:3, :3].T))
+    met = off < 1e-3 and turn < 1e-2
     return Setpoint(
-        goal if off < 1e-3 and turn < 1e-2 else reached, joints, float(np.clip(delta[6], 0.0, 1.0))
+        tcp_base=goal if met else reached,
+        joints=joints,
+        gripper=float(np.clip(delta[6], 0.0, 1.0)),
     )
 
 
@@ -164,21 +185,24 @@ def follow_joints(
     action: Float32[np.ndarray, " m"],
     seconds: float,
 ) -> Setpoint:
-    """The command after one action of joint deltas (rad, in the order of Robot.joints) and the gripper (0..1) that lasts `seconds`.
+    """The command after one action of joint deltas and the gripper that lasts `seconds`.
 
-    The deltas apply to the *commanded* joints, no faster than their rated speeds; the result stays within the joints' limits
-    and leads the `measured` joints (rad) by at most LEASH. Raises: BadAction.
+    The deltas (rad, in the order of Robot.joints) apply to the *commanded* joints, no faster than
+    their rated speeds; the gripper is 0..1. The result stays within the joints' limits and leads
+    the `measured` joints (rad) by at most LEAD_JOINT_RAD. Raises: BadAction.
     """
     if len(action) != len(arm.robot.joints) + 1:
         raise BadAction(
-            f"follow_joints: {len(action)} numbers, but {arm.robot.name} takes {len(arm.robot.joints)} joint deltas and the gripper."
+            f"follow_joints: {len(action)} numbers, but {arm.robot.name} takes "
+            f"{len(arm.robot.joints)} joint deltas and the gripper."
         )
     fastest = arm.robot.speed_rad_s * seconds
     delta = action.astype(np.float64)
     asked = command.joints + np.clip(delta[:-1], -fastest, fastest)
     low, high = arm.model.jnt_range.T
-    led = np.clip(np.clip(asked, measured - LEASH, measured + LEASH), low, high)
-    joints = command.joints + np.clip(led - command.joints, -fastest, fastest)
+    near = np.clip(asked, measured - LEAD_JOINT_RAD, measured + LEAD_JOINT_RAD)
+    allowed = np.clip(near, low, high)
+    joints = command.joints + np.clip(allowed - command.joints, -fastest, fastest)
     return Setpoint(arm.forward(joints), joints, float(np.clip(delta[-1], 0.0, 1.0)))
 
 
@@ -189,13 +213,14 @@ def rotation(vector: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
 
 def rotation_vector(matrix: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3"]:
     """The rotation vector, rad, of a rotation matrix; its length is at most pi."""
-    return np.asarray(mink.SO3.from_matrix(np.ascontiguousarray(matrix)).log())
+    turn = mink.SO3.from_matrix(np.ascontiguousarray(matrix))
+    return np.asarray(turn.log())
 
 
 def _lean_and_twist(
     asked: Float64[np.ndarray, "3 3"], found: Float64[np.ndarray, "3 3"]
 ) -> tuple[float, float]:
-    """How far the hand's z axis is from the one asked for, and how far it is then turned about it, rad."""
+    """The angle between the hand's z axis and the one asked for, and its turn about it, rad."""
     axis = np.cross(asked[:, 2], found[:, 2])
     sine = float(np.linalg.norm(axis))
     lean = float(np.arctan2(sine, asked[:, 2] @ found[:, 2]))
@@ -208,13 +233,14 @@ def _capped(vector: Float64[np.ndarray, "3"], longest: float) -> Float64[np.ndar
     return vector if length <= longest else vector * (longest / length)
 
 
-def _leashed(
+def _limit_lead(
     commanded: Float64[np.ndarray, "4 4"], measured: Float64[np.ndarray, "4 4"]
 ) -> Float64[np.ndarray, "4 4"]:
+    """The commanded pose, at most LEAD_M and LEAD_RAD from the measured one."""
     ahead = commanded[:3, 3] - measured[:3, 3]
-    turned = rotation_vector(commanded[:3, :3] @ measured[:3, :3].T)
-    pulled = commanded.copy()
-    pulled[:3, 3] = measured[:3, 3] + _capped(ahead, LEASH_M)
-    if np.linalg.norm(turned) > LEASH_RAD:
-        pulled[:3, :3] = rotation(_capped(turned, LEASH_RAD)) @ measured[:3, :3]
-    return pulled
+    turn = rotation_vector(commanded[:3, :3] @ measured[:3, :3].T)
+    limited = commanded.copy()
+    limited[:3, 3] = measured[:3, 3] + _capped(ahead, LEAD_M)
+    if np.linalg.norm(turn) > LEAD_RAD:
+        limited[:3, :3] = rotation(_capped(turn, LEAD_RAD)) @ measured[:3, :3]
+    return limited

@@ -1,4 +1,7 @@
-"""Choose an off-screen OpenGL back end before MuJoCo draws; a missing one is a clear error, never a dead kernel."""
+"""Choose an off-screen OpenGL back end before MuJoCo draws.
+
+A missing one raises a clear error and does not end the process.
+"""
 
 import importlib
 import importlib.util
@@ -28,27 +31,29 @@ os._exit(0)
 
 @cache
 def works(backend: str) -> bool:
-    """Whether `backend` can make a context here; asked of a child process, so that a crash in a driver cannot reach this one."""
+    """Whether `backend` can make a context here.
+
+    A child process tries it, so that a crash in a driver does not end this one.
+    """
     if importlib.util.find_spec("mujoco") is None:
         raise MissingGL(
             "ensure_gl: the package mujoco is not installed. Run: pip install -r environment.txt"
         )
-    return (
-        subprocess.run(
-            [sys.executable, "-c", _PROBE.format(backend=backend)],
-            capture_output=True,
-            check=False,
-            timeout=120,
-        ).returncode
-        == 0
+    probe = subprocess.run(
+        [sys.executable, "-c", _PROBE.format(backend=backend)],
+        capture_output=True,
+        check=False,
+        timeout=120,
     )
+    return probe.returncode == 0
 
 
 def ensure_gl() -> str:
-    """Make mujoco draw without a display: set `MUJOCO_GL` to a back end that works here and return its name.
+    """Set `MUJOCO_GL` to a back end that draws without a display here, and return its name.
 
-    Call it before importing mujoco where possible; a mujoco that is already imported is switched over. A back end that the user
-    set is probed and kept; one that this process or its parent found to work is not probed again.
+    Call it before importing mujoco where possible; a mujoco that is already imported is switched
+    over. A back end that the user set is probed and kept; one that this process or its parent found
+    to work is not probed again.
 
     Raises: MissingGL with the line to run.
     """
@@ -62,12 +67,15 @@ def ensure_gl() -> str:
         )
     for backend in BACKENDS:
         if works(backend):
-            os.environ["MUJOCO_GL"] = os.environ[PROVEN] = backend
+            os.environ["MUJOCO_GL"] = backend
+            os.environ[PROVEN] = backend
             if "mujoco" in sys.modules:
-                importlib.reload(importlib.import_module("mujoco.rendering.classic.gl_context"))
+                context = importlib.import_module("mujoco.rendering.classic.gl_context")
+                importlib.reload(context)
             return backend
     raise MissingGL(
-        f"ensure_gl: no OpenGL back end of {', '.join(BACKENDS)} can draw without a display. Run: {REMEDY}"
+        f"ensure_gl: no OpenGL back end of {', '.join(BACKENDS)} can draw without a display. "
+        f"Run: {REMEDY}"
     )
 
 

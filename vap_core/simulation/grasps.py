@@ -1,4 +1,7 @@
-"""Where two fingers that point straight down may take an object: cuts through its collision solids, and what stands in the hand's way."""
+"""Where two fingers that point straight down may grasp an object.
+
+From cross sections of its collision solids, and the other objects near the hand.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
@@ -16,23 +19,30 @@ YAWS = np.deg2rad(np.arange(0.0, 180.0, 15.0))
 SHARES = (0.55, 0.65, 0.45, 0.75, 0.35)
 """Heights tried, as shares of the object's."""
 TIGHT_M = 0.008
-"""The open gripper is at least this much wider than what it takes."""
+"""The open gripper is at least this much wider than what it grasps."""
 TIP_M = 0.016
 """Lowest height of the tcp: the fingertips stay off the table."""
-ROOM_M, TAPER_M = 0.02, 0.02
-"""Clearance beyond this counts for nothing; a taper of 1 counts like so much less of it."""
+ROOM_M = 0.02
+"""Clearance beyond this makes a grasp no better."""
+TAPER_M = 0.02
+"""A taper of 1 counts like so much less clearance."""
 RIM_M = 0.005
+"""Distance of the points along the edges of other objects, at most."""
 HALF_PAD_M = 0.006
 """Half the height of a finger's pad."""
-FINGER_M, PAD_M = 0.022, 0.012
-"""Outward thickness of a finger, and half its width."""
+FINGER_M = 0.022
+"""Outward thickness of a finger."""
+PAD_M = 0.012
+"""Half the width of a finger."""
 
 
 @value
 class Grasp:
-    """One way to take an object: the tcp (metres, world), the opening axis' angle in the world (radians), the width between the fingers and
-    the whole object's along that axis (m), how much the width changes with height (a taper slips), and the least distance of the open
-    fingers to anything else (m).
+    """One way to grasp an object.
+
+    The tcp (metres, world), the opening axis' angle in the world (radians), the width between the
+    fingers and the whole object's along that axis (m), how much the width changes with height (a
+    taper slips), and the least distance of the open fingers to anything else (m).
     """
 
     tcp_world: Float64[np.ndarray, "3"]
@@ -41,6 +51,41 @@ class Grasp:
     span_m: float
     taper: float
     clear_m: float
+
+
+def points_world(name: str, pose: Pose) -> Float64[np.ndarray, "n 3"]:
+    """The corners of the object's collision solids where it stands now."""
+    return np.concatenate([_in_world(vertex, pose) for vertex, _ in _hull_edges(name)])
+
+
+def cut(name: str, pose: Pose, z_world: float) -> Float64[np.ndarray, "n 2"]:
+    """Points on the outline of the object at height `z_world`; none above or below it."""
+    outlines = []
+    for vertex, edge in _hull_edges(name):
+        start, end = _in_world(vertex, pose)[edge.astype(int).T]
+        below = start[:, 2] - z_world
+        above = end[:, 2] - z_world
+        crossing = (below < 0) != (above < 0)
+        share = (below / np.where(crossing, below - above, 1.0))[crossing, None]
+        points = start[crossing] + share * (end - start)[crossing]
+        outlines.append(points[:, :2])
+    return np.concatenate(outlines)
+
+
+def grasps(robot: Robot, target: str, poses: Mapping[str, Pose]) -> list[Grasp]:
+    """Every grasp of `target` that fits the gripper, the clearest first.
+
+    Those that hit nothing come before those that do.
+    """
+    points = points_world(target, poses[target])
+    others = [_rims(name, pose) for name, pose in poses.items() if name != target]
+    candidates = _candidates(robot, target, poses[target], points=points, others=others)
+    return sorted(candidates, key=_grasp_cost)
+
+
+def _grasp_cost(grasp: Grasp) -> tuple[float, float]:
+    missing_room = max(ROOM_M - grasp.clear_m, 0.0)
+    return round(missing_room + TAPER_M * grasp.taper, 6), round(grasp.width_m, 6)
 
 
 @lru_cache(maxsize=256)
@@ -71,42 +116,11 @@ def _hull_edges(
     return tuple(parts)
 
 
-def points_world(name: str, pose: Pose) -> Float64[np.ndarray, "n 3"]:
-    """The corners of the object's collision solids where it stands now."""
-    return np.concatenate([_place(vertex, pose) for vertex, _ in _hull_edges(name)])
-
-
-def cut(name: str, pose: Pose, z_world: float) -> Float64[np.ndarray, "n 2"]:
-    """Points on the outline of the object at height `z_world`; none above or below it."""
-    found = []
-    for vertex, edge in _hull_edges(name):
-        start, end = _place(vertex, pose)[edge.astype(int).T]
-        below, above = start[:, 2] - z_world, end[:, 2] - z_world
-        crossing = (below < 0) != (above < 0)
-        share = (below / np.where(crossing, below - above, 1.0))[crossing, None]
-        found.append((start[crossing] + share * (end - start)[crossing])[:, :2])
-    return np.concatenate(found)
-
-
-def grasps(robot: Robot, target: str, poses: Mapping[str, Pose]) -> list[Grasp]:
-    """Every grasp of `target` that fits the gripper and hits nothing, the clearest first; then those that hit something, should none be clear."""
-    points = points_world(target, poses[target])
-    others = [_rims(name, pose) for name, pose in poses.items() if name != target]
-    found = list(_candidates(robot, target, poses[target], points, others))
-    return sorted(
-        found,
-        key=lambda grasp: (
-            round(max(ROOM_M - grasp.clear_m, 0.0) + TAPER_M * grasp.taper, 6),
-            round(grasp.width_m, 6),
-        ),
-    )
-
-
 def _rims(name: str, pose: Pose) -> Float64[np.ndarray, "n 3"]:
     """Points along every edge of the object's collision solids, at most `RIM_M` apart."""
     points = []
     for vertex, edge in _hull_edges(name):
-        start, end = _place(vertex, pose)[edge.astype(int).T]
+        start, end = _in_world(vertex, pose)[edge.astype(int).T]
         steps = 1 + int(np.linalg.norm(end - start, axis=1).max() / RIM_M)
         share = np.linspace(0.0, 1.0, steps + 1)[:, None, None]
         points.append((start + share * (end - start)).reshape(-1, 3))
@@ -117,38 +131,47 @@ def _candidates(
     robot: Robot,
     target: str,
     pose: Pose,
+    *,
     points: Float64[np.ndarray, "n 3"],
     others: Sequence[Float64[np.ndarray, "_ 3"]],
 ) -> Iterator[Grasp]:
+    """Grasps at several heights of the object and from several directions."""
     tried: set[float] = set()
-    foot, top = float(points[:, 2].min()), float(points[:, 2].max())
+    foot = float(points[:, 2].min())
+    top = float(points[:, 2].max())
     for share in SHARES:
         z = float(max(foot + share * (top - foot), top - 0.9 * robot.palm_m, TIP_M))
         outline = cut(target, pose, min(z, top - 0.002))
         if round(z, 3) in tried or not len(outline):
             continue
         tried.add(round(z, 3))
-        higher, lower = cut(target, pose, z + HALF_PAD_M), cut(target, pose, z - HALF_PAD_M)
+        higher = cut(target, pose, z + HALF_PAD_M)
+        lower = cut(target, pose, z - HALF_PAD_M)
         for yaw in YAWS:
             axis = np.array([np.cos(yaw), np.sin(yaw)])
-            along, across = outline @ axis, outline @ [-axis[1], axis[0]]
+            normal = np.array([-axis[1], axis[0]])
+            along = outline @ axis
+            across = outline @ normal
             width = float(np.ptp(along))
             if width > robot.opening_m - TIGHT_M:
                 continue
-            spans = [np.ptp(part @ axis) if len(part) else 0.0 for part in (higher, lower)]
             middle = (
-                axis * (along.min() + along.max()) / 2
-                + np.array([-axis[1], axis[0]]) * (across.min() + across.max()) / 2
+                axis * (along.min() + along.max()) / 2 + normal * (across.min() + across.max()) / 2
             )
-            taper = abs(float(spans[1] - spans[0])) / (2 * HALF_PAD_M)
+            change = float(_width_along(lower, axis) - _width_along(higher, axis))
             yield Grasp(
-                np.array([*middle, z]),
-                float(yaw),
-                width,
-                float(np.ptp(points[:, :2] @ axis)),
-                taper,
-                _clearance(robot, middle, axis, z, others),
+                tcp_world=np.array([*middle, z]),
+                axis_rad=float(yaw),
+                width_m=width,
+                span_m=float(np.ptp(points[:, :2] @ axis)),
+                taper=abs(change) / (2 * HALF_PAD_M),
+                clear_m=_clearance(robot, middle, axis, z, others),
             )
+
+
+def _width_along(outline: Float64[np.ndarray, "n 2"], axis: np.ndarray) -> float:
+    """The extent of an outline along `axis`, 0 for none."""
+    return float(np.ptp(outline @ axis)) if len(outline) else 0.0
 
 
 def _clearance(
@@ -158,25 +181,29 @@ def _clearance(
     z: float,
     others: Sequence[Float64[np.ndarray, "_ 3"]],
 ) -> float:
-    """Least distance, across the table, of the open fingers (and of the palm above them) to anything that reaches their height."""
+    """Least distance of the open fingers, and of the palm above them, to any other object.
+
+    Across the table, to the points that reach their height.
+    """
     least = 1.0
     across = np.array([-axis[1], axis[0]])
     reach = robot.opening_m / 2 + FINGER_M
+    fingers = (z - 0.012, reach, PAD_M)
+    palm = (z + robot.palm_m, robot.hand_m[0], robot.hand_m[1])
     for points in others:
-        for low, long, wide in (
-            (z - 0.012, reach, PAD_M),
-            (z + robot.palm_m, robot.hand_m[0], robot.hand_m[1]),
-        ):
+        for low, long, wide in (fingers, palm):
             high = points[points[:, 2] > low][:, :2] - middle
             if not len(high):
                 continue
-            u, v = np.abs(high @ axis) - long, np.abs(high @ across) - wide
-            apart = np.hypot(np.maximum(u, 0), np.maximum(v, 0)) + np.minimum(np.maximum(u, v), 0)
+            u = np.abs(high @ axis) - long
+            v = np.abs(high @ across) - wide
+            outside = np.hypot(np.maximum(u, 0), np.maximum(v, 0))
+            apart = outside + np.minimum(np.maximum(u, v), 0)
             least = min(least, float(apart.min()))
     return least
 
 
-def _place(vertex: Float64[np.ndarray, "n 3"], pose: Pose) -> Float64[np.ndarray, "n 3"]:
+def _in_world(vertex: Float64[np.ndarray, "n 3"], pose: Pose) -> Float64[np.ndarray, "n 3"]:
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_quat(pose[3:], scalar_first=True).apply(vertex) + pose[:3]

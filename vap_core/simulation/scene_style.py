@@ -1,4 +1,4 @@
-"""How the room looks: what a variant of an episode may change without touching the task."""
+"""The style of the room: what a variant of an episode may change apart from the task."""
 
 from vap_core.base.types import value
 
@@ -7,11 +7,13 @@ Colour3 = tuple[float, float, float]
 
 @value
 class SceneStyle:
-    """Linear 0..1 colours; `planks` are the table's light and dark wood, or one colour twice for a plain top.
+    """The look of the room; colours are linear 0..1.
 
-    `lamp_pos_m` and `lamp` place and dim the one lamp, `ambient` is the fill light; `shadows` are off because they triple the frame time.
-    `robot` multiplies every colour of the robot; `camera_shift_m` moves the fixed cameras, in the frame of the body that carries them,
-    while they go on looking at the same point.
+    `planks` are the table's light and dark wood, or one colour twice for a plain top. `lamp_pos_m`
+    and `lamp` place and dim the one lamp, `ambient` is the fill light; `shadows` are off because
+    they triple the frame time. `robot` multiplies every colour of the robot; `camera_shift_m` moves
+    the fixed cameras, in the frame of the body that carries them, while they look at the same
+    point.
     """
 
     planks: tuple[Colour3, Colour3] = ((0.80, 0.69, 0.55), (0.70, 0.58, 0.44))

@@ -1,4 +1,7 @@
-"""What a real desk does to a picture: cameras knocked a little out of place, exposures that differ, and noise; all drawn from the episode."""
+"""The errors of real cameras: displaced mounts, different exposures and noise.
+
+All are drawn from the episode.
+"""
 
 import zlib
 
@@ -11,8 +14,11 @@ from vap_core.simulation.types import EpisodeRow
 
 @value
 class Sensor:
-    """Standard deviations: `jitter_m` and `jitter_rad` of a camera's place and direction, `exposure` in stops, `balance` as a share of the red
-    and blue gain, `noise` in grey levels of 255. All zero is a perfect camera that changes nothing.
+    """Standard deviations of a camera's errors.
+
+    `jitter_m` and `jitter_rad` of its place and direction, `exposure` in stops, `balance` as a
+    share of the red and blue gain, `noise` in grey levels of 255. All zero is a perfect camera that
+    changes nothing.
     """
 
     jitter_m: float = 0.0
@@ -24,49 +30,50 @@ class Sensor:
 
 PERFECT = Sensor()
 DESK = Sensor(jitter_m=0.004, jitter_rad=0.012, exposure=0.18, balance=0.03, noise=2.5)
-"""A webcam on a clamp, set up again every morning."""
+"""A webcam on a clamp that is mounted again every day."""
 
 
 @value
-class Stray:
-    """How one camera strays in one episode: `shift_m` and `turn` in its own frame (OpenGL axes), and the gains of red, green and blue."""
+class Disturbance:
+    """The errors of one camera in one episode.
+
+    `shift_m` and `turn` in its own frame (OpenGL axes), and the gains of red, green and blue.
+    """
 
     shift_m: Float64[np.ndarray, "3"]
     turn: Float64[np.ndarray, "3 3"]
     gain: Float64[np.ndarray, "3"]
 
 
-def stray(sensor: Sensor, row: EpisodeRow, camera: str) -> Stray:
-    """The same row and camera, the same stray."""
+def draw_disturbance(sensor: Sensor, row: EpisodeRow, camera: str) -> Disturbance:
+    """The disturbance that `row` and `camera` determine."""
     from scipy.spatial.transform import Rotation
 
-    rng = np.random.default_rng(
-        [row.seed, row.episode, zlib.crc32(f"{row.suite}.{row.task}.{camera}".encode())]
-    )
-    shift, turn, exposure, tones = (
-        rng.standard_normal(3),
-        rng.standard_normal(3),
-        rng.standard_normal(),
-        rng.standard_normal(2),
-    )
-    gain = 2.0 ** (sensor.exposure * exposure) * (
-        1.0 + sensor.balance * np.array([tones[0], 0.0, tones[1]])
-    )
-    return Stray(
-        sensor.jitter_m * shift, Rotation.from_rotvec(sensor.jitter_rad * turn).as_matrix(), gain
+    name = zlib.crc32(f"{row.suite}.{row.task}.{camera}".encode())
+    rng = np.random.default_rng([row.seed, row.episode, name])
+    shift = rng.standard_normal(3)
+    turn = rng.standard_normal(3)
+    exposure = rng.standard_normal()
+    tones = rng.standard_normal(2)
+    balance = 1.0 + sensor.balance * np.array([tones[0], 0.0, tones[1]])
+    return Disturbance(
+        shift_m=sensor.jitter_m * shift,
+        turn=Rotation.from_rotvec(sensor.jitter_rad * turn).as_matrix(),
+        gain=2.0 ** (sensor.exposure * exposure) * balance,
     )
 
 
-def exposed(
-    sensor: Sensor, rgb: Rgb, astray: Stray, row: EpisodeRow, camera: str, step: int
+def apply_sensor(
+    sensor: Sensor, rgb: Rgb, disturbance: Disturbance, row: EpisodeRow, camera: str, step: int
 ) -> Rgb:
     """The picture as the sensor delivers it at control step `step`."""
     if sensor == PERFECT:
         return rgb
-    stream = np.random.SFC64(
-        [row.seed, row.episode, step, zlib.crc32(f"{row.task}.{camera}".encode())]
-    )
-    seen = np.random.Generator(stream).standard_normal(rgb.shape, np.float32)
-    seen *= np.float32(sensor.noise)
-    seen += rgb * astray.gain.astype(np.float32)
-    return np.clip(np.rint(seen, out=seen), 0, 255, out=seen).astype(np.uint8)
+    name = zlib.crc32(f"{row.task}.{camera}".encode())
+    stream = np.random.SFC64([row.seed, row.episode, step, name])
+    picture = np.random.Generator(stream).standard_normal(rgb.shape, np.float32)
+    picture *= np.float32(sensor.noise)
+    picture += rgb * disturbance.gain.astype(np.float32)
+    np.rint(picture, out=picture)
+    np.clip(picture, 0, 255, out=picture)
+    return picture.astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Photographs of single objects on a plain table, the reference views of a personal object among them."""
+"""Photographs of single objects on a plain table, such as a personal object's reference views."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +21,10 @@ FOVY_DEG = 30.0
 
 @value
 class Shot:
-    """Where the camera and the lamp stand: angles in radians; `fill` is the object's share of the frame; `table` is sRGB 0..1."""
+    """Where the camera and the lamp stand; angles in radians.
+
+    `fill` is the object's share of the frame; `table` is sRGB 0..1.
+    """
 
     azimuth: float
     elevation: float
@@ -35,28 +38,15 @@ PORTRAIT = Shot(0.45, 0.4, 0.85, bright=0.95, table=(0.86, 0.85, 0.83))
 
 
 class Stage:
-    """Objects that take turns on a plain table under one lamp, compiled once for all objects and shots.
+    """A plain table under one lamp, which shows one of its objects at a time.
 
-    A context manager, because it holds a GL context.
+    Compiled once for all objects and shots. A context manager, because it holds a GL context.
     """
 
     def __init__(self, models: Sequence[ObjectModel], size: int = 160) -> None:
         self.models = {model.name: model for model in models}
         spec = mujoco.MjSpec()
-        glow = spec.visual.headlight
-        glow.ambient, glow.diffuse, glow.specular = [0.38] * 3, [0.12] * 3, [0] * 3
-        spec.visual.global_.offwidth = spec.visual.global_.offheight = size
-        spec.visual.global_.fovy = FOVY_DEG
-        spec.visual.quality.shadowsize = 2048
-        spec.visual.map.znear, spec.visual.map.zfar, spec.visual.map.shadowclip = 0.01, 20.0, 0.3
-        spec.stat.extent, spec.stat.center = 1.0, (0, 0, 0)
-        spec.worldbody.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(8, 8, 0.1))
-        spec.worldbody.add_light(
-            name="lamp",
-            type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-            specular=[0.2] * 3,
-            castshadow=True,
-        )
+        _set_up_table(spec, size)
         for model in self.models.values():
             add_object(spec, model)
         self._model = spec.compile()
@@ -76,47 +66,48 @@ class Stage:
 
     def picture(self, name: str, shot: Shot = PORTRAIT) -> Rgb:
         """One object alone on the table."""
-        self._turn_to(name, shot)
+        self._show(name, shot)
         return np.ascontiguousarray(self._renderer.render())
 
     def box(self, name: str, shot: Shot = PORTRAIT) -> Float64[np.ndarray, "4"]:
         """The object's true outline in that picture, x0 y0 x1 y1 in pixels."""
-        rows, cols = np.nonzero(self.mask(name, shot))
-        return np.array([cols.min(), rows.min(), cols.max() + 1, rows.max() + 1], np.float64)
+        rows, columns = np.nonzero(self.mask(name, shot))
+        corners = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+        return np.array(corners, np.float64)
 
     def mask(self, name: str, shot: Shot = PORTRAIT) -> Mask:
         """The object's pixels in that picture."""
-        self._turn_to(name, shot)
+        self._show(name, shot)
         self._renderer.enable_segmentation_rendering()
         drawn = self._renderer.render()
         self._renderer.disable_segmentation_rendering()
-        return (drawn[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM)) & (
-            drawn[..., 0] == self._model.geom(f"{name}/visual").id
-        )
+        is_geom = drawn[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM)
+        return is_geom & (drawn[..., 0] == self._model.geom(f"{name}/visual").id)
 
-    def _turn_to(self, name: str, shot: Shot) -> None:
-        model, (x, y, z) = self._model, extent_m(self.models[name])
-        lamp = np.array([np.sin(shot.lamp), -np.cos(shot.lamp), 1.6])
+    def _show(self, name: str, shot: Shot) -> None:
+        """Make one object visible, and place the lamp and the camera of `shot`."""
+        model = self._model
         model.geom_group[:] = HIDDEN_GROUP
-        model.geom("table").group, model.geom(f"{name}/visual").group = 0, VISUAL_GROUP
+        model.geom("table").group = 0
+        model.geom(f"{name}/visual").group = VISUAL_GROUP
         model.geom("table").rgba = (*shot.table, 1)
-        model.light("lamp").pos, model.light("lamp").dir, model.light("lamp").diffuse = (
-            0.8 * lamp,
-            -lamp / np.linalg.norm(lamp),
-            shot.bright,
-        )
+        lamp = np.array([np.sin(shot.lamp), -np.cos(shot.lamp), 1.6])
+        model.light("lamp").pos = 0.8 * lamp
+        model.light("lamp").dir = -lamp / np.linalg.norm(lamp)
+        model.light("lamp").diffuse = shot.bright
         mujoco.mj_kinematics(model, self._data)
         mujoco.mj_camlight(model, self._data)
+        self._renderer.update_scene(self._data, self._camera(name, shot))
+
+    def _camera(self, name: str, shot: Shot) -> mujoco.MjvCamera:
+        x, y, z = extent_m(self.models[name])
+        extent = max(z, float(np.hypot(x, y)))
         camera = mujoco.MjvCamera()
         camera.lookat[:] = 0, 0, 0.48 * z
-        camera.azimuth, camera.elevation = (
-            90 + np.degrees(shot.azimuth),
-            -np.degrees(shot.elevation),
-        )
-        camera.distance = (
-            0.5 * max(z, float(np.hypot(x, y))) / (shot.fill * np.tan(np.radians(FOVY_DEG / 2)))
-        )
-        self._renderer.update_scene(self._data, camera)
+        camera.azimuth = 90 + np.degrees(shot.azimuth)
+        camera.elevation = -np.degrees(shot.elevation)
+        camera.distance = 0.5 * extent / (shot.fill * np.tan(np.radians(FOVY_DEG / 2)))
+        return camera
 
 
 def photograph(model: ObjectModel, shots: Sequence[Shot], size: int = 320) -> list[Rgb]:
@@ -126,18 +117,27 @@ def photograph(model: ObjectModel, shots: Sequence[Shot], size: int = 320) -> li
 
 
 def reference_views(model: ObjectModel, n: int = 5, seed: int = 0, size: int = 320) -> list[Rgb]:
-    """K reference photos (P 3.1), as one walks around the object: azimuths evenly apart, elevations 18 to 50 degrees.
+    """K reference photos (P 3.1), from around the object.
 
-    Lamp, table and framing differ from view to view.
+    Azimuths are evenly spaced, elevations 18 to 50 degrees. Lamp, table and framing differ from
+    view to view.
     """
     rng = np.random.default_rng([seed, n, *model.name.encode()])
-    around = 2 * np.pi * np.arange(n) / n
+    azimuths = 2 * np.pi * np.arange(n) / n
     tints = rng.uniform(0.45, 0.75, (n, 1)) + rng.uniform(-0.04, 0.04, (n, 3))
-    shots = [
-        Shot(float(a + rng.uniform(-0.2, 0.2)), float(np.radians(rng.uniform(18, 50))), float(rng.uniform(0.52, 0.66)), float(rng.uniform(-1.2, 1.2)),
-             float(rng.uniform(0.5, 0.75)), (float(red), float(green), float(blue)))
-        for a, (red, green, blue) in zip(rng.permutation(around), tints, strict=True)
-    ]  # fmt: skip
+    shots = []
+    for azimuth, (red, green, blue) in zip(rng.permutation(azimuths), tints, strict=True):
+        turn = rng.uniform(-0.2, 0.2)
+        elevation_deg = rng.uniform(18, 50)
+        shot = Shot(
+            azimuth=float(azimuth + turn),
+            elevation=float(np.radians(elevation_deg)),
+            fill=float(rng.uniform(0.52, 0.66)),
+            lamp=float(rng.uniform(-1.2, 1.2)),
+            bright=float(rng.uniform(0.5, 0.75)),
+            table=(float(red), float(green), float(blue)),
+        )
+        shots.append(shot)
     return photograph(model, shots, size)
 
 
@@ -150,6 +150,31 @@ def write_views(model: ObjectModel, folder: Path, n: int = 5) -> list[Path]:
             Image.fromarray(rgb).save(path)
     except OSError as error:
         raise BadOutput(
-            f"photograph: {folder} cannot be written ({error.strerror}); choose another folder with --out."
+            f"photograph: {folder} cannot be written ({error.strerror}); "
+            "choose another folder with --out."
         ) from error
     return paths
+
+
+def _set_up_table(spec: mujoco.MjSpec, size: int) -> None:
+    """The table and the lamp, and how they are rendered, `size` x `size` pixels."""
+    headlight = spec.visual.headlight
+    headlight.ambient = [0.38] * 3
+    headlight.diffuse = [0.12] * 3
+    headlight.specular = [0] * 3
+    spec.visual.global_.offwidth = size
+    spec.visual.global_.offheight = size
+    spec.visual.global_.fovy = FOVY_DEG
+    spec.visual.quality.shadowsize = 2048
+    spec.visual.map.znear = 0.01
+    spec.visual.map.zfar = 20.0
+    spec.visual.map.shadowclip = 0.3
+    spec.stat.extent = 1.0
+    spec.stat.center = (0, 0, 0)
+    spec.worldbody.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(8, 8, 0.1))
+    spec.worldbody.add_light(
+        name="lamp",
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        specular=[0.2] * 3,
+        castshadow=True,
+    )

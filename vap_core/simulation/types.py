@@ -1,4 +1,7 @@
-"""What an episode starts from, what the simulator returns, and how an episode ends. Poses are `x y z qw qx qy qz` in the world frame, z up."""
+"""What an episode starts from, what the simulator returns, and how an episode ends.
+
+Poses are `x y z qw qx qy qz` in the world frame, z up.
+"""
 
 from collections.abc import Mapping
 from dataclasses import field
@@ -11,21 +14,27 @@ from vap_core.base.types import Mask, Views, value
 
 Pose = Float64[np.ndarray, "7"]
 Action = Float32[np.ndarray, " a"]
-"""One control step. End-effector control, a = 7: `dx dy dz` (m) and the rotation vector `drx dry drz` (rad) in the robot
-base frame, then `gripper` 0 closed .. 1 open. Joint control, a = n + 1: the change of every joint angle (rad), then
-`gripper`."""
+"""One control step.
+
+End-effector control, a = 7: `dx dy dz` (m) and the rotation vector `drx dry drz` (rad) in the robot
+base frame, then `gripper` 0 closed .. 1 open. Joint control, a = n + 1: the change of every joint
+angle (rad), then `gripper`.
+"""
 EE_ACTION = ("dx", "dy", "dz", "drx", "dry", "drz", "gripper")
 
-ROBOT, REST = "robot", "rest"
-"""Contact partners that are no object: the arm with its gripper; the table, floor and walls."""
+ROBOT = "robot"
+"""As a contact partner: the arm with its gripper."""
+REST = "rest"
+"""As a contact partner: the table, floor and walls."""
 
 
 @value
 class Observation:
     """What the robot's sensors give at one control step.
 
-    `state` is `x y z` (m) of the gripper in the robot base frame, its rotation vector `rx ry rz` (rad) relative to pointing
-    straight down (a turn about the vertical reads (0, 0, yaw)), gripper opening 0..1, then the joint angles (rad).
+    `state` is `x y z` (m) of the gripper in the robot base frame, its rotation vector `rx ry rz`
+    (rad) relative to pointing straight down (a turn about the vertical reads (0, 0, yaw)), gripper
+    opening 0..1, then the joint angles (rad).
     """
 
     images: Views
@@ -34,28 +43,38 @@ class Observation:
 
 @value
 class Truth:
-    """Simulator ground truth after one control step: for metrics, recordings and tests, never for an evaluated policy."""
+    """Simulator ground truth after one control step.
+
+    For metrics, recordings and tests, never for an evaluated policy.
+    """
 
     objects_world: Mapping[str, Pose]
     links_world: Mapping[str, Pose]
     touched: tuple[str, ...]
-    """Objects that the robot touched during this control step, in the order of their first contact in it."""
+    """Objects that the robot touched during this control step, in the order of first contact."""
     pressed_s: Mapping[str, float]
-    """Objects that the gripper touched in this step: longest unbroken contact up to now, seconds."""
+    """Objects that the gripper touched in this step: longest unbroken contact so far, seconds."""
     contacts: Mapping[str, frozenset[str]]
-    """At the end of the step: the partners of every touching object (other objects, ROBOT, REST)."""
+    """At the end of the step: the partners of every touching object (objects, ROBOT, REST)."""
     masks: Mapping[str, Mapping[str, Mask]] = field(default_factory=dict)
     """`masks[camera][object]`: visible pixels; empty when masks were not asked for."""
 
     @property
     def held(self) -> frozenset[str]:
         """Objects that touch the robot and nothing else."""
-        return frozenset(name for name, partners in self.contacts.items() if partners == {ROBOT})
+        held = set()
+        for name, partners in self.contacts.items():
+            if partners == {ROBOT}:
+                held.add(name)
+        return frozenset(held)
 
 
 @value
 class Placement:
-    """An object of an episode: `model` is its name in the object registry; it starts at (x, y) metres, turned by `yaw` radians."""
+    """An object of an episode.
+
+    `model` is its name in the object registry; it starts at (x, y) metres, turned by `yaw` radians.
+    """
 
     model: str
     x: float
@@ -69,10 +88,11 @@ SuccessRule = Literal["picked", "near", "put", "selected"]
 
 @value
 class EpisodeRow:
-    """One row of an episode list: everything that decides how an episode starts, and when it has succeeded.
+    """One row of an episode list: how an episode starts, and when it has succeeded.
 
-    `placements[0]` is the target; `goal` names the placed object that it goes to ("" when there is none). `split` is the
-    track within the suite, `variant` the scene style (suites.VARIANTS), `cameras` the views that the policy gets.
+    `placements[0]` is the target; `goal` names the placed object that it goes to ("" when there is
+    none). `split` is the track within the suite, `variant` the scene style (suites.VARIANTS),
+    `cameras` the views that the policy gets.
     """
 
     suite: str
@@ -100,9 +120,10 @@ class EpisodeRow:
 
 @value
 class Outcome:
-    """How an episode ended (P 5.1): `success` at the end, `success_once` at any step, `held_steps` the longest run of steps in which the rule held.
+    """How an episode ended (P 5.1).
 
-    `cmr` is None where the paper defines none (selection).
+    `success` at the end, `success_once` at any step, `held_steps` the longest run of steps in which
+    the rule held. `cmr` is None where the paper defines none (selection).
     """
 
     status: Literal["success", "failure", "error"]

@@ -1,4 +1,4 @@
-"""One loop for what is trained by steps, not epochs: warm-up and cosine, clipped steps, a moving average of the weights, resumed bit for bit."""
+"""Training by steps, not epochs: a schedule of the rate, averaged weights, resumed bit for bit."""
 
 import copy
 import json
@@ -19,11 +19,12 @@ KEEP = 0.999
 """Of the moving average of the weights, a step; the average is what is saved."""
 WARM = 300
 """Steps until the full rate."""
-Told = dict[str, float]
+Figures = dict[str, float]
+"""Figures to log, by name."""
 
 
 @dataclass(frozen=True)
-class Descent:
+class Schedule:
     """How long and how fast; a checkpoint and a line of the log every so many steps."""
 
     name: str
@@ -35,74 +36,97 @@ class Descent:
     """Recipe and data, as JSON: a training of something else is not gone on with."""
 
 
-def descend[M: nn.Module](
-    model: M, losses: Callable[[M, int], tuple[Tensor, Told]], run: Descent, out: Path
+def train_steps[M: nn.Module](
+    model: M, losses: Callable[[M, int], tuple[Tensor, Figures]], run: Schedule, out: Path
 ) -> tuple[M, list[Any]]:
-    """Train `model`, or go on where an earlier call stopped; returns the average of its weights, and the log.
+    """Train `model`, or go on where an earlier call stopped.
 
-    `losses` gives the loss of one step, drawn from streams of its number, and figures to log. Raises: BadOutput when `out` holds another training.
+    The rate warms up over WARM steps and then falls with a cosine; gradients are clipped. Returns
+    the moving average of the weights, and the log. `losses` gives the loss of one step, drawn from
+    streams of its number, and figures to log.
+
+    Raises: BadOutput when `out` holds another training.
     """
     from tqdm import tqdm
 
     optimiser = torch.optim.AdamW(
-        model.parameters(), run.rate, betas=(0.9, 0.95), weight_decay=1e-4
+        params=model.parameters(), lr=run.rate, betas=(0.9, 0.95), weight_decay=1e-4
     )
-    mean, begun, log = copy.deepcopy(model), 0, []
+    mean = copy.deepcopy(model)
+    parts: dict[str, Any] = {"model": model, "mean": mean, "optimiser": optimiser}
     out.mkdir(parents=True, exist_ok=True)
-    state, keep = checkpoint(out / "training.pt", resume=True)
+    state, save = checkpoint(out / "training.pt", resume=True)
     made_of = json.dumps(run.made_of, sort_keys=True)
-    if state and state.get("made_of") != made_of:
-        raise BadOutput(
-            f"train: {out} holds a training with another recipe or other data; go on with those, or choose another --out."
-        )
     if state:
-        for part, name in ((model, "model"), (mean, "mean"), (optimiser, "optimiser")):
+        _require_same_training(state, made_of, out)
+        for name, part in parts.items():
             part.load_state_dict(state[name])
-        begun, log = state["step"], state["log"]
-    started, recent = time.monotonic(), []
-    for step in tqdm(range(begun, run.steps), run.name, run.steps, initial=begun, mininterval=10):
-        for group in optimiser.param_groups:
-            group["lr"] = (
-                run.rate
-                * min(1.0, (step + 1) / WARM)
-                * 0.5
-                * (1 + float(np.cos(np.pi * step / run.steps)))
-            )
-        loss, told = losses(model, step)
+    first_step = state.get("step", 0)
+    log = state.get("log", [])
+    started = time.monotonic()
+    recent: list[Figures] = []
+    numbers = range(first_step, run.steps)
+    for step in tqdm(numbers, desc=run.name, total=run.steps, initial=first_step, mininterval=10):
+        _set_rate(optimiser, run, step)
+        loss, figures = losses(model, step)
         optimiser.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimiser.step()
-        with torch.no_grad():
-            share = min(KEEP, (step + 1) / (step + 10))
-            for average, now in zip(mean.parameters(), model.parameters(), strict=True):
-                average.lerp_(now, 1 - share)
-        recent.append(told)
-        last = step + 1 == run.steps or (
-            run.minutes is not None and time.monotonic() - started > 60 * run.minutes
-        )
+        _update_average(mean, model, step)
+        recent.append(figures)
+        last = step + 1 == run.steps or _is_time_up(run, started)
         if last or (step + 1) % run.every == 0:
             log.append({"step": step + 1, **average_of(recent)})
             recent = []
-            keep(
-                {
-                    "model": model.state_dict(),
-                    "mean": mean.state_dict(),
-                    "optimiser": optimiser.state_dict(),
-                    "step": step + 1,
-                    "log": log,
-                    "made_of": made_of,
-                }
-            )
+            saved: dict[str, Any] = {"step": step + 1, "log": log, "made_of": made_of}
+            for name, part in parts.items():
+                saved[name] = part.state_dict()
+            save(saved)
         if last:
             break
     return mean, log
 
 
-def average_of(told: list[Told]) -> Told:
-    """The mean of every figure over the batches that could measure it (not NaN); what none could is left out."""
-    held = {
-        name: [one[name] for one in told if not np.isnan(one[name])]
-        for name in (told[0] if told else ())
-    }
-    return {name: float(np.mean(values)) for name, values in held.items() if values}
+def average_of(batches: list[Figures]) -> Figures:
+    """The mean of every figure over the batches that could measure it (not NaN).
+
+    What no batch could measure is left out.
+    """
+    means: Figures = {}
+    if not batches:
+        return means
+    for name in batches[0]:
+        values = [figures[name] for figures in batches if not np.isnan(figures[name])]
+        if values:
+            means[name] = float(np.mean(values))
+    return means
+
+
+def _require_same_training(state: dict[str, Any], made_of: str, out: Path) -> None:
+    """Raises: BadOutput when a checkpoint is of another recipe or other data."""
+    if state.get("made_of") != made_of:
+        raise BadOutput(
+            f"train: {out} holds a training with another recipe or other data; "
+            "go on with those, or choose another --out."
+        )
+
+
+def _set_rate(optimiser: torch.optim.Optimizer, run: Schedule, step: int) -> None:
+    """The rate of a step: a warm-up, then a cosine."""
+    warm_up = min(1.0, (step + 1) / WARM)
+    cosine = 1 + float(np.cos(np.pi * step / run.steps))
+    for group in optimiser.param_groups:
+        group["lr"] = run.rate * warm_up * 0.5 * cosine
+
+
+def _update_average(mean: nn.Module, model: nn.Module, step: int) -> None:
+    """Move the average of the weights towards those of a step, faster in the beginning."""
+    share = min(KEEP, (step + 1) / (step + 10))
+    with torch.no_grad():
+        for average, weight in zip(mean.parameters(), model.parameters(), strict=True):
+            average.lerp_(weight, 1 - share)
+
+
+def _is_time_up(run: Schedule, started: float) -> bool:
+    return run.minutes is not None and time.monotonic() - started > 60 * run.minutes

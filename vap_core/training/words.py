@@ -1,4 +1,4 @@
-"""The words of the small models: what they are instructed with, asked and answered in, and what describes an object."""
+"""The words of the small models: of instructions, questions and answers, and of appearance."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -19,10 +19,11 @@ from vap_core.simulation.suites import BENCHMARKS
 DETERMINERS = ("my", "the", "a")
 FIRST = ("<pad>", "<unk>", "\n")
 RESERVED = tuple(f"<my_{i}>" for i in range(8))
-"""Words that nothing is said with yet: a soft prompt learns one."""
+"""Words without a meaning: a soft prompt learns one."""
 QUESTIONS = re.findall(
     r"\w+",
-    "where is there can you recognize in this image what colour yes no left right top bottom middle near far it point to at",
+    "where is there can you recognize in this image what colour yes no "
+    "left right top bottom middle near far it point to at",
 )
 """Words that a vision-language model is asked and answers with."""
 PATTERNS = {
@@ -35,9 +36,15 @@ PATTERNS = {
 }
 """Words for motifs of generic objects; every other one is "patterned"."""
 PAINTS = (
-    *PALETTE, Colour("orange", (255, 140, 0)), Colour("purple", (130, 30, 170)), Colour("pink", (255, 150, 180)), Colour("teal", (0, 128, 128)),
-    Colour("brown", (120, 72, 32)), Colour("white", (250, 250, 250)), Colour("black", (15, 15, 15)),
-)  # fmt: skip
+    *PALETTE,
+    Colour("orange", (255, 140, 0)),
+    Colour("purple", (130, 30, 170)),
+    Colour("pink", (255, 150, 180)),
+    Colour("teal", (0, 128, 128)),
+    Colour("brown", (120, 72, 32)),
+    Colour("white", (250, 250, 250)),
+    Colour("black", (15, 15, 15)),
+)
 """Colours that something may have by nature; a tint has one of the palette's."""
 SPREAD = {
     "plain": "",
@@ -47,85 +54,114 @@ SPREAD = {
     "tiles": "patches",
     "gradient": "parts",
 }
-"""How a motif lies on an object, in the captioner's words; every other one is spots or, in the middle or a column, patches."""
+"""How a motif lies on an object, in the captioner's words.
+
+Every other motif is spots or, in the middle or a column, patches.
+"""
 NEAR = {
-    "red": {"pink", "orange", "brown"}, "blue": {"teal", "purple", "cyan"}, "green": {"teal", "cyan", "yellow"},
-    "magenta": {"pink", "purple"}, "cyan": {"teal", "blue", "green"}, "yellow": {"orange", "beige", "green"},
-}  # fmt: skip
-"""Colours that something tinted or painted may be taken for, or be taken for it."""
+    "red": {"pink", "orange", "brown"},
+    "blue": {"teal", "purple", "cyan"},
+    "green": {"teal", "cyan", "yellow"},
+    "magenta": {"pink", "purple"},
+    "cyan": {"teal", "blue", "green"},
+    "yellow": {"orange", "beige", "green"},
+}
+"""Colours that a tint or a paint may be confused with."""
 
 
 def vocabulary() -> tuple[str, ...]:
-    """Every word of the benchmarks' instructions, of categories, colours, questions and descriptions; token i is word i."""
-    said = [task.instruction for known in BENCHMARKS.values() for task in known.tasks] + [
-        colour.name for colour in PALETTE
-    ]
-    words = [
-        word
-        for text in (*said, *CATEGORIES, *CLUTTER)
-        for word in re.findall(r"[\w']+", text.lower())
-    ]
-    looks = [*describe.WORDS, *PATTERNS.values(), "patterned"]
-    return (*FIRST, *dict.fromkeys([*words, *DETERMINERS, "up", *QUESTIONS, *looks]), *RESERVED)
+    """Every word that is known to the small models; token i is word i.
+
+    They are the words of the benchmarks' instructions, of categories, colours, questions and
+    descriptions.
+    """
+    texts = []
+    for benchmark in BENCHMARKS.values():
+        for task in benchmark.tasks:
+            texts.append(task.instruction)
+    for colour in PALETTE:
+        texts.append(colour.name)
+    words = []
+    for text in (*texts, *CATEGORIES, *CLUTTER):
+        words += re.findall(r"[\w']+", text.lower())
+    appearance = [*describe.WORDS, *PATTERNS.values(), "patterned"]
+    known = dict.fromkeys([*words, *DETERMINERS, "up", *QUESTIONS, *appearance])
+    return (*FIRST, *known, *RESERVED)
 
 
 @cache
-def looks(name: str) -> frozenset[str]:
-    """An object's own colour and pattern, a word each."""
+def appearance_words(name: str) -> frozenset[str]:
+    """An object's own colour and pattern, a word each; nothing for one without a texture."""
     texture = objects.get_object(name).texture
-    return (
-        frozenset({colour_word(texture.base), PATTERNS.get(texture.motif, "patterned")})
-        if isinstance(texture, Texture)
-        else frozenset()
-    )
+    if not isinstance(texture, Texture):
+        return frozenset()
+    return frozenset({colour_word(texture.base), PATTERNS.get(texture.motif, "patterned")})
 
 
 @cache
 def phrases(name: str) -> tuple[str, str]:
-    """What the captioner would say of it at its best, short and long: what hard prompts are made of is heard in training, too."""
+    """The captioner's descriptions of an object at their best, short and long.
+
+    Hard prompts are made of such phrases, so a policy hears them in training, too.
+    """
     model = objects.get_object(name)
     texture = model.texture
     assert isinstance(texture, Texture)
     main = add_shade(colour_word(texture.base), _lightness(texture.base))
-    kind = SPREAD.get(
-        texture.motif, "patches" if texture.layout in ("middle", "column") else "spots"
-    )
-    told = f"{colour_word(texture.ink)} {kind}" if kind else ""
-    x, y, z = objects.extent_m(model)
-    shape = "tall" if z > 1.6 * max(x, y) else "wide" if z < 0.9 * max(x, y) else "compact"
-    ending = (
-        f" with {told} and a little {colour_word(texture.accent)}"
-        if told
-        else f" with a little {colour_word(texture.accent)}"
-    )
-    busy = (
-        ", patterned all over"
-        if texture.layout in ("grid", "scatter", "whole") and told
-        else ""
-        if told
-        else ", plain"
-    )
-    return (
-        f"{main} with {told}" if told else main,
-        f"a {shape} {model.category}, mostly {main}{ending}{busy}",
-    )
+    motif = _motif_phrase(texture)
+    accent = f"a little {colour_word(texture.accent)}"
+    shape = _shape_word(objects.extent_m(model))
+    if not motif:
+        return main, f"a {shape} {model.category}, mostly {main} with {accent}, plain"
+    extent = ""
+    if texture.layout in ("grid", "scatter", "whole"):
+        extent = ", patterned all over"
+    long = f"a {shape} {model.category}, mostly {main} with {motif} and {accent}{extent}"
+    return f"{main} with {motif}", long
 
 
-def akin(word: str) -> set[str]:
+def similar_colours(word: str) -> set[str]:
     """The word, and colours that it may be taken for."""
-    return {word} | NEAR.get(word, set()) | {other for other, near in NEAR.items() if word in near}
+    similar = {word} | NEAR.get(word, set())
+    for colour, near in NEAR.items():
+        if word in near:
+            similar.add(colour)
+    return similar
 
 
-def free(taken: Iterable[str], colours: Sequence[Colour] = PALETTE) -> list[Colour]:
+def distinct_colours(taken: Iterable[str], colours: Sequence[Colour] = PALETTE) -> list[Colour]:
     """The colours that nobody takes for one of these words; all of them when none is left."""
     words = set(taken)
-    return [colour for colour in colours if not akin(colour.name) & words] or list(colours)
+    distinct = [colour for colour in colours if not similar_colours(colour.name) & words]
+    return distinct or list(colours)
 
 
 def colour_word(rgb: Srgb) -> str:
     """What a person calls a colour, sRGB 0..255."""
-    return COLOURS[int(colour_indices(np.array([[rgb]], np.uint8), np.ones((1, 1), bool))[0, 0])]
+    pixel = np.array([[rgb]], np.uint8)
+    indices = colour_indices(pixel, np.ones((1, 1), bool))
+    return COLOURS[int(indices[0, 0])]
+
+
+def _motif_phrase(texture: Texture) -> str:
+    """The colour and the shape of a motif; "" where there is none."""
+    default = "spots"
+    if texture.layout in ("middle", "column"):
+        default = "patches"
+    kind = SPREAD.get(texture.motif, default)
+    return f"{colour_word(texture.ink)} {kind}" if kind else ""
+
+
+def _shape_word(extent_m: tuple[float, float, float]) -> str:
+    x, y, z = extent_m
+    if z > 1.6 * max(x, y):
+        return "tall"
+    if z < 0.9 * max(x, y):
+        return "wide"
+    return "compact"
 
 
 def _lightness(rgb: Srgb) -> float:
-    return float(cv2.cvtColor(np.array([[rgb]], np.float32) / 255, cv2.COLOR_RGB2LAB)[0, 0, 0])
+    """CIE L* of a colour, sRGB 0..255."""
+    pixel = np.array([[rgb]], np.float32) / 255
+    return float(cv2.cvtColor(pixel, cv2.COLOR_RGB2LAB)[0, 0, 0])

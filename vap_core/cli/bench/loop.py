@@ -1,4 +1,7 @@
-"""Where the time goes, measured in one run: shares of a control step, and each cost in units of one backbone pass."""
+"""What each part of a control step costs, measured in one run.
+
+Shares of a control step, and each cost in units of one backbone pass.
+"""
 
 import subprocess
 import sys
@@ -20,7 +23,9 @@ from vap_core.rollout.types import Episode
 from vap_core.simulation.env import Env
 from vap_core.simulation.types import EpisodeRow
 
-REPEAT, PLAYS = 15, 5
+REPEAT = 15
+RECORDINGS = 5
+"""Rollouts that are timed and then recorded."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +39,7 @@ class Limit:
     ratio: str
 
     def row(self) -> list[str]:
+        """The cells of a table."""
         verdict = "ok" if self.measured <= self.budget else "OVER"
         return [
             self.what,
@@ -44,79 +50,13 @@ class Limit:
         ]
 
 
-def run(steps: int = 60) -> str:
-    """Measure everything and say it; takes about a minute."""
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
-        trial, row = demo_trial(folder, steps)
-        unit = _pass_ms(trial)
-        recorded = _record(trial, row, folder)
-        limits = [*_attend_limits(trial, row, unit), *_record_limits(recorded), _import_limit(unit)]
-    steps_run, views = recorded.episode.outcome.steps, len(trial.scene.cameras)
-    return "\n".join(
-        [
-            f"{row.suite}/{row.task}, {views} cameras, {steps_run} steps, one thread; one backbone pass takes {unit:.1f} ms",
-            "",
-            align([["part of a control step", "ms", "share"], *_shares(recorded.episode)]),
-            "",
-            beside_budgets(limits),
-        ]
-    )
-
-
-def demo_trial(folder: Path, steps: int) -> tuple[Trial, EpisodeRow]:
-    """The demo's last task under VAP, its object remembered in `folder`, and an episode of so many steps at most."""
-    register_personal(DEMO, folder / "memory")
-    rows = DEMO.rows(*DEMO.tasks[-1])
-    return make_trial(DEMO, rows, "vap", folder / "memory"), replace(rows[0], max_steps=steps)
-
-
-def beside_budgets(limits: Sequence[Limit]) -> str:
-    """A line per figure."""
-    return align([["what", "measured", "budget", "", "ratio"], *(limit.row() for limit in limits)])
-
-
-def _pass_ms(trial: Trial) -> float:
-    env = Env(trial.scene)
-    rgb = next(iter(env.observe().images.values()))
-    return median_ms(lambda: features([rgb], ["head"]))
-
-
-def _attend_limits(trial: Trial, row: EpisodeRow, unit: float) -> list[Limit]:
-    assert isinstance(trial.prompter, TintPrompter)
-    attender, camera = (
-        trial.prompter.attender,
-        trial.scene.cameras[-1],
-    )  # on the wrist: it moves, and what stays as it was costs nothing
-    frames = next(rollout(trial, [replace(row, max_steps=REPEAT + 1)], keep_images=True)).frames
-    films = iter([{camera: frame.images[camera]} for frame in frames])
-    views = next(films)
-    start = median_ms(lambda: attender.start(views, row.instruction))
-    state, _ = attender.start(views, row.instruction)
-
-    def step() -> None:
-        nonlocal state
-        state, _ = attender.step(state, next(films))
-
-    track = median_ms(step)
-    return [
-        Limit(
-            "attend step (track + prompt), the wrist's view",
-            track,
-            60,
-            "ms",
-            f"{track / unit:.2f} backbone passes",
-        ),
-        Limit(
-            "start-up grounding, one view", start, 350, "ms", f"{start / unit:.2f} backbone passes"
-        ),
-    ]
-
-
 @dataclass(frozen=True)
-class Recorded:
-    """What it takes to keep the steps of a rollout as is done by default where the episode fails: CPU of the whole process, rerun's threads too, in
-    percent of the rollout's, once per repeat; and the file's megabytes as JPEGs and as AV1."""
+class RecordingCost:
+    """What it takes to keep the steps of a rollout, as is done by default for failures.
+
+    `over` is CPU of the whole process, rerun's threads too, in percent of the rollout's, once per
+    repeat; the file's megabytes are with JPEGs and with AV1.
+    """
 
     episode: Episode
     over: tuple[float, ...]
@@ -124,90 +64,187 @@ class Recorded:
     video_mb: float
 
 
-def _record(trial: Trial, row: EpisodeRow, folder: Path) -> Recorded:
-    def keep(episode: Episode, name: str, video: bool = False) -> float:
-        start = time.process_time()
-        sink = DeferredRecorder(
-            folder / f"{name}.rrd", episode.header, lambda outcome: True, video=video
-        )
-        for frame in episode.frames:
-            sink.frame(frame)
-        sink.close(episode.outcome)
-        return time.process_time() - start
-
-    def played() -> tuple[float, Episode]:
-        start = time.process_time()
-        episode = next(rollout(trial, [row], keep_images=True))
-        return time.process_time() - start, episode
-
-    first = played()[1]
-    keep(first, "warm")  # rerun's first call imports pandas
-    over = []
-    for i in range(PLAYS):
-        cpu_s, episode = played()
-        over.append(100 * keep(episode, str(i)) / cpu_s)
-    keep(first, "video", video=True)
-    jpeg_mb, video_mb = ((folder / f"{name}.rrd").stat().st_size / 1e6 for name in ("0", "video"))
-    return Recorded(first, tuple(over), jpeg_mb, video_mb)
+def run(steps: int = 60) -> str:
+    """Measure everything and report it; takes about a minute."""
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        trial, row = demo_trial(folder, steps)
+        unit = _pass_ms(trial)
+        cost = _recording_cost(trial, row, folder)
+        limits = _attend_limits(trial, row, unit)
+        limits += _record_limits(cost)
+        limits.append(_import_limit(unit))
+    n_steps = cost.episode.outcome.steps
+    n_cameras = len(trial.scene.cameras)
+    title = (
+        f"{row.suite}/{row.task}, {n_cameras} cameras, {n_steps} steps, one thread; "
+        f"one backbone pass takes {unit:.1f} ms"
+    )
+    shares = align([["part of a control step", "ms", "share"], *_shares(cost.episode)])
+    return "\n".join([title, "", shares, "", beside_budgets(limits)])
 
 
-def _record_limits(recorded: Recorded) -> list[Limit]:
-    steps, over = max(recorded.episode.outcome.steps, 1), sorted(recorded.over)
-    told = f"{over[0]:.1f} to {over[-1]:.1f} % in {len(over)} repeats"
+def demo_trial(folder: Path, steps: int) -> tuple[Trial, EpisodeRow]:
+    """The demo's last task under VAP, and an episode of so many steps at most.
+
+    Its object is remembered in `folder`.
+    """
+    register_personal(DEMO, folder / "memory")
+    suite, task = DEMO.tasks[-1]
+    rows = DEMO.rows(suite, task)
+    trial = make_trial(DEMO, rows, "vap", folder / "memory")
+    return trial, replace(rows[0], max_steps=steps)
+
+
+def beside_budgets(limits: Sequence[Limit]) -> str:
+    """A line per figure."""
+    rows = [["what", "measured", "budget", "", "ratio"]]
+    for limit in limits:
+        rows.append(limit.row())
+    return align(rows)
+
+
+def median_ms(work: Callable[[], object]) -> float:
+    """Of REPEAT times, after a first one that does not count."""
+    work()
+    seconds = []
+    for _ in range(REPEAT):
+        start = time.perf_counter()
+        work()
+        seconds.append(time.perf_counter() - start)
+    return 1e3 * float(np.median(seconds))
+
+
+def _pass_ms(trial: Trial) -> float:
+    """A pass of the backbone."""
+    env = Env(trial.scene)
+    rgb = next(iter(env.observe().images.values()))
+    return median_ms(lambda: features([rgb], ["head"]))
+
+
+def _attend_limits(trial: Trial, row: EpisodeRow, unit: float) -> list[Limit]:
+    assert isinstance(trial.prompter, TintPrompter)
+    attender = trial.prompter.attender
+    # The camera on the wrist moves; what stays as it was costs nothing.
+    camera = trial.scene.cameras[-1]
+    longer = replace(row, max_steps=REPEAT + 1)
+    episode = next(rollout(trial, [longer], keep_images=True))
+    views = iter([{camera: frame.images[camera]} for frame in episode.frames])
+    first = next(views)
+    start_ms = median_ms(lambda: attender.start(first, row.instruction))
+    state, _ = attender.start(first, row.instruction)
+
+    def step() -> None:
+        nonlocal state
+        state, _ = attender.step(state, next(views))
+
+    step_ms = median_ms(step)
     return [
-        Limit("recording, over the CPU of the rollout", float(np.median(over)), 8, "%", told),
         Limit(
-            "60 steps of 3 cameras, as JPEGs",
-            recorded.jpeg_mb * 60 / steps,
-            4,
-            "MB",
-            f"{recorded.jpeg_mb:.2f} MB for {steps} steps",
+            what="attend step (track + prompt), the wrist's view",
+            measured=step_ms,
+            budget=60,
+            unit="ms",
+            ratio=f"{step_ms / unit:.2f} backbone passes",
         ),
         Limit(
-            "60 steps of 3 cameras, as AV1",
-            recorded.video_mb * 60 / steps,
-            2,
-            "MB",
-            f"{recorded.video_mb:.2f} MB for {steps} steps",
+            what="start-up grounding, one view",
+            measured=start_ms,
+            budget=350,
+            unit="ms",
+            ratio=f"{start_ms / unit:.2f} backbone passes",
+        ),
+    ]
+
+
+def _recording_cost(trial: Trial, row: EpisodeRow, folder: Path) -> RecordingCost:
+    _, first = _timed_rollout(trial, row)
+    # rerun's first call imports pandas.
+    _record_seconds(first, folder / "warm.rrd")
+    over = []
+    for i in range(RECORDINGS):
+        rollout_s, episode = _timed_rollout(trial, row)
+        record_s = _record_seconds(episode, folder / f"{i}.rrd")
+        over.append(100 * record_s / rollout_s)
+    _record_seconds(first, folder / "video.rrd", video=True)
+    return RecordingCost(
+        episode=first,
+        over=tuple(over),
+        jpeg_mb=(folder / "0.rrd").stat().st_size / 1e6,
+        video_mb=(folder / "video.rrd").stat().st_size / 1e6,
+    )
+
+
+def _timed_rollout(trial: Trial, row: EpisodeRow) -> tuple[float, Episode]:
+    """CPU seconds of an episode, and the episode."""
+    start = time.process_time()
+    episode = next(rollout(trial, [row], keep_images=True))
+    return time.process_time() - start, episode
+
+
+def _record_seconds(episode: Episode, path: Path, video: bool = False) -> float:
+    """CPU seconds of recording an episode."""
+    start = time.process_time()
+    sink = DeferredRecorder(path, episode.header, lambda outcome: True, video=video)
+    for frame in episode.frames:
+        sink.frame(frame)
+    sink.close(episode.outcome)
+    return time.process_time() - start
+
+
+def _record_limits(cost: RecordingCost) -> list[Limit]:
+    n_steps = max(cost.episode.outcome.steps, 1)
+    over = sorted(cost.over)
+    return [
+        Limit(
+            what="recording, over the CPU of the rollout",
+            measured=float(np.median(over)),
+            budget=8,
+            unit="%",
+            ratio=f"{over[0]:.1f} to {over[-1]:.1f} % in {len(over)} repeats",
+        ),
+        Limit(
+            what="60 steps of 3 cameras, as JPEGs",
+            measured=cost.jpeg_mb * 60 / n_steps,
+            budget=4,
+            unit="MB",
+            ratio=f"{cost.jpeg_mb:.2f} MB for {n_steps} steps",
+        ),
+        Limit(
+            what="60 steps of 3 cameras, as AV1",
+            measured=cost.video_mb * 60 / n_steps,
+            budget=2,
+            unit="MB",
+            ratio=f"{cost.video_mb:.2f} MB for {n_steps} steps",
         ),
     ]
 
 
 def _import_limit(unit: float) -> Limit:
     code = "import time; t = time.perf_counter(); import vap_core; print(time.perf_counter() - t)"
-    took = [
-        float(
-            subprocess.run(
-                [sys.executable, "-c", code], capture_output=True, text=True, check=True
-            ).stdout
+    seconds = []
+    for _ in range(3):
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
         )
-        for _ in range(3)
-    ]
+        seconds.append(float(done.stdout))
+    fastest_ms = 1e3 * min(seconds)
     return Limit(
-        "import vap_core",
-        1e3 * min(took),
-        300,
-        "ms",
-        f"{1e3 * min(took) / unit:.2f} backbone passes",
+        what="import vap_core",
+        measured=fastest_ms,
+        budget=300,
+        unit="ms",
+        ratio=f"{fastest_ms / unit:.2f} backbone passes",
     )
 
 
 def _shares(episode: Episode) -> list[list[str]]:
-    total, steps = sum(episode.seconds.values()), max(episode.outcome.steps, 1)
-    ranked = sorted(episode.seconds.items(), key=lambda item: -item[1])
-    return [
-        [part, f"{1e3 * seconds / steps:.1f}", f"{100 * seconds / total:.0f} %"]
-        for part, seconds in ranked
-        if 1e3 * seconds >= 0.05 * steps
-    ]
-
-
-def median_ms(work: Callable[[], object]) -> float:
-    """Of REPEAT times, after a first one that does not count."""
-    work()
-    took = []
-    for _ in range(REPEAT):
-        start = time.perf_counter()
-        work()
-        took.append(time.perf_counter() - start)
-    return 1e3 * float(np.median(took))
+    """Milliseconds and share of every part of a step, the largest first."""
+    total = sum(episode.seconds.values())
+    n_steps = max(episode.outcome.steps, 1)
+    rows = []
+    for part, seconds in sorted(episode.seconds.items(), key=lambda item: -item[1]):
+        ms = 1e3 * seconds / n_steps
+        if 1e3 * seconds >= 0.05 * n_steps:
+            rows.append([part, f"{ms:.1f}", f"{100 * seconds / total:.0f} %"])
+    return rows

@@ -1,8 +1,12 @@
-"""What the shipped frozen policies cost: a call for one episode, and what is gained by asking for many episodes at once."""
+"""What the shipped frozen policies cost.
+
+A call for one episode, and what is gained by asking for many episodes at once.
+"""
 
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -15,75 +19,104 @@ from vap_core.policies.lerobot.adapter import IMAGE, STATE, LeRobot, load
 from vap_core.policies.protocol import PolicyInput
 from vap_core.simulation.suites import BENCHMARKS
 
-SIDE, BATCHES, REPEAT, WARM = 224, (1, 4, 16), 12, 2
-CALL_MS, GAIN = 60.0, 4.0
-"""Targets: of one call with one view, and of the throughput of the largest batch over that of the smallest."""
+SIDE = 224
+BATCHES = (1, 4, 16)
+REPEAT = 12
+WARM = 2
+"""First repeats, which do not count."""
+CALL_MS = 60.0
+"""Target of one call with one view."""
+GAIN = 4.0
+"""Target of the throughput of the largest batch over that of the smallest."""
 
 
 def run(quick: bool = False) -> str:
-    """Time calls of every shipped policy, batch sizes in turn within each repeat; CPU time of one thread. Raises: BadStudy when none ships."""
-    folders = {name: shipped(name) for name in BENCHMARKS if shipped(name).is_dir()}
+    """Time calls of every shipped policy; CPU time of one thread.
+
+    Batch sizes follow each other within each repeat. Raises: BadStudy when no policy ships.
+    """
+    folders = _shipped_folders()
     if not folders:
         raise BadStudy(
-            f"bench policy: no {MINI} ships; train one: python -m vap_core train policy --suite simpler-bridge"
+            f"bench policy: no {MINI} ships; "
+            "train one: python -m vap_core train policy --suite simpler-bridge"
         )
-    rng, rows, repeat = np.random.default_rng(0), [], 2 if quick else REPEAT
-    view = rng.integers(0, 256, (SIDE, SIDE, 3), dtype=np.uint8)
-    unit = float(
-        np.median(
-            [
-                _seconds(partial(features, [view + np.uint8(i)], ["head"]))
-                for i in range(WARM + repeat)
-            ][WARM:]
-        )
-    )
+    rng = np.random.default_rng(0)
+    repeat = 2 if quick else REPEAT
+    unit = _backbone_seconds(rng, repeat)
+    header = ["policy", "views", "one call, ms", "units"]
+    for batch in BATCHES[1:]:
+        header.append(f"throughput at batch {batch} [95 %]")
+    rows = [header]
     for name, folder in folders.items():
-        took = _took(load(folder), rng, repeat)
-        gains = [
-            ratio(took[1], [seconds / batch for seconds in took[batch]]) for batch in BATCHES[1:]
-        ]
-        call, views = float(np.median(took[1])), len(BENCHMARKS[name].cameras)
-        told = [f"{middle:.1f} [{low:.1f}, {high:.1f}]" for middle, low, high in gains]
-        rows.append([name, str(views), f"{1e3 * call:.1f}", f"{call / unit:.1f}", *told])
-    return "\n".join(
-        [
-            f"one thread, CPU time, {repeat} repeats; unit: one EfficientNet-Lite0 pass of a {SIDE} px view in the same run, {1e3 * unit:.1f} ms",
-            f"targets: a call with one view in {CALL_MS:.0f} ms at most, batch {BATCHES[-1]} at {GAIN:.0f} times the throughput of batch 1",
-            "",
-            align(
-                [
-                    [
-                        "policy",
-                        "views",
-                        "one call, ms",
-                        "units",
-                        *(f"throughput at batch {batch} [95 %]" for batch in BATCHES[1:]),
-                    ],
-                    *rows,
-                ]
-            ),
-        ]
+        seconds = _call_seconds(load(folder), rng, repeat)
+        call = float(np.median(seconds[1]))
+        n_views = len(BENCHMARKS[name].cameras)
+        gains = [_gain_text(seconds, batch) for batch in BATCHES[1:]]
+        rows.append([name, str(n_views), f"{1e3 * call:.1f}", f"{call / unit:.1f}", *gains])
+    about = (
+        f"one thread, CPU time, {repeat} repeats; unit: one EfficientNet-Lite0 pass of a "
+        f"{SIDE} px view in the same run, {1e3 * unit:.1f} ms"
     )
+    wanted = (
+        f"targets: a call with one view in {CALL_MS:.0f} ms at most, "
+        f"batch {BATCHES[-1]} at {GAIN:.0f} times the throughput of batch 1"
+    )
+    return "\n".join([about, wanted, "", align(rows)])
 
 
-def _took(policy: LeRobot, rng: np.random.Generator, repeat: int) -> dict[int, list[float]]:
+def _shipped_folders() -> dict[str, Path]:
+    """The folders of the shipped policies, by benchmark."""
+    folders = {}
+    for name in BENCHMARKS:
+        folder = shipped(name)
+        if folder.is_dir():
+            folders[name] = folder
+    return folders
+
+
+def _backbone_seconds(rng: np.random.Generator, repeat: int) -> float:
+    """The median of the backbone's passes, each of a new view."""
+    view = rng.integers(0, 256, (SIDE, SIDE, 3), dtype=np.uint8)
+    seconds = []
+    for i in range(WARM + repeat):
+        seconds.append(_seconds(partial(features, [view + np.uint8(i)], ["head"])))
+    return float(np.median(seconds[WARM:]))
+
+
+def _gain_text(seconds: dict[int, list[float]], batch: int) -> str:
+    """How many times the throughput of batch 1 a batch has, and the interval."""
+    per_episode = [s / batch for s in seconds[batch]]
+    middle, low, high = ratio(seconds[1], per_episode)
+    return f"{middle:.1f} [{low:.1f}, {high:.1f}]"
+
+
+def _call_seconds(policy: LeRobot, rng: np.random.Generator, repeat: int) -> dict[int, list[float]]:
     """Seconds of a call, by batch size."""
-    shapes = policy.wanted
-    views = [key.removeprefix(IMAGE) for key in shapes if key != STATE]
-    inputs = [
-        PolicyInput(
-            {name: rng.integers(0, 256, (SIDE, SIDE, 3), dtype=np.uint8) for name in views}, "pick up the red cup",
-            rng.normal(size=shapes[STATE]).astype(np.float32),
-        ) for _ in range(max(BATCHES))
-    ]  # fmt: skip
-    states = [policy.start(np.random.default_rng(i)) for i in range(max(BATCHES))]
-    took: dict[int, list[float]] = {batch: [] for batch in BATCHES}
+    inputs = []
+    states = []
+    for i in range(max(BATCHES)):
+        inputs.append(_draw_input(policy, rng))
+        states.append(policy.start(np.random.default_rng(i)))
+    seconds: dict[int, list[float]] = {batch: [] for batch in BATCHES}
     for i in range(WARM + repeat):
         for batch in BATCHES:
-            seconds = _seconds(partial(policy.plan, states[:batch], inputs[:batch]))
+            call = partial(policy.plan, states[:batch], inputs[:batch])
+            call_seconds = _seconds(call)
             if i >= WARM:
-                took[batch].append(seconds)
-    return took
+                seconds[batch].append(call_seconds)
+    return seconds
+
+
+def _draw_input(policy: LeRobot, rng: np.random.Generator) -> PolicyInput:
+    """Noise as pictures and state."""
+    images = {}
+    for key in policy.wanted:
+        if key != STATE:
+            name = key.removeprefix(IMAGE)
+            images[name] = rng.integers(0, 256, (SIDE, SIDE, 3), dtype=np.uint8)
+    state = rng.normal(size=policy.wanted[STATE]).astype(np.float32)
+    return PolicyInput(images, "pick up the red cup", state)
 
 
 def _seconds(work: Callable[[], object]) -> float:

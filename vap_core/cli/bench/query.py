@@ -1,4 +1,8 @@
-"""What it costs to find a frame: the index of a recording, a query over very many recordings, and opening one of them without a display."""
+"""What it costs to find a frame.
+
+The index of a recording, a query over very many recordings, and opening one of them without a
+display.
+"""
 
 import subprocess
 import sys
@@ -17,7 +21,7 @@ from vap_core.recording import DeferredRecorder, ensure_index, read_chunks, scre
 from vap_core.rollout.loop import rollout
 
 STEPS = 30
-ASKED = """
+QUERY = """
 import resource, sys, time
 from pathlib import Path
 from vap_core.recording.query import run_query
@@ -25,74 +29,101 @@ start = time.perf_counter()
 found = len(run_query(Path(sys.argv[1]), "margin < 2 and success = false").matches)
 print(time.perf_counter() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6, found)
 """
-"""In a process of its own: seconds of a query, the most gigabytes it took, and how many recordings it found."""
+"""In a process of its own: a query's seconds, its most gigabytes, and the recordings it found."""
 
 
 def run(recordings: int = 1000, quick: bool = False) -> str:
-    """Record a failure in the simulator, copy it under so many names, and ask all of them at once; takes a minute or two."""
+    """Copy the recording of a failure under so many names, and query all of them at once.
+
+    Takes a minute or two.
+    """
     n = 20 if quick else recordings
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "recordings"
-        first = _recorded(Path(scratch))
-        whole = median_ms(lambda: list(read_chunks(first))) / 1e3
-        folder.mkdir()
-        took = []
-        for i in tqdm(range(n), "record", unit="recording", leave=False, mininterval=1):
-            path = folder / f"{i:05d}.rrd"
-            read_chunks(first).write_rrd(path, application_id="vap", recording_id=path.stem)
-            took.append(_seconds(partial(ensure_index, path)))
-        asked_s, asked_gb, found = (float(word) for word in _python(ASKED, str(folder)).split())
-        megabytes = sum(path.stat().st_size for path in folder.rglob("*.rrd")) / 1e6
-        limits = [
+        first = _record_failure(Path(scratch))
+        whole_s = median_ms(lambda: list(read_chunks(first))) / 1e3
+        index_s = _copy_and_index(first, folder, n)
+        limits = _query_limits(folder, n, whole_s)
+        limits.append(
             Limit(
-                f"query over {n} recordings ({megabytes:.0f} MB)",
-                asked_s,
-                5,
-                "s",
-                f"{asked_s / whole:.0f} recordings read whole",
-            ),
-            Limit("memory of that process", asked_gb, 2, "GB", f"{found:.0f} found"),
-            Limit(
-                "index of a recording, once",
-                1e3 * float(np.median(took)),
-                50,
-                "ms",
-                f"{np.median(took) / whole:.2f} recordings read whole",
-            ),
-        ]
+                what="index of a recording, once",
+                measured=1e3 * index_s,
+                budget=50,
+                unit="ms",
+                ratio=f"{index_s / whole_s:.2f} recordings read whole",
+            )
+        )
+        note = ""
         try:
-            opened = _seconds(
-                lambda: screenshot(first, Path(scratch) / "one.png", size=(1920, 1080))
-            )
-            limits.append(
-                Limit(
-                    "opening a frame without a display",
-                    opened,
-                    15,
-                    "s",
-                    f"{opened / whole:.0f} recordings read whole",
-                )
-            )
-            note = ""
+            limits.append(_open_limit(first, whole_s))
         except MissingGL as error:
             note = f"\nopening a frame was not measured: {error}"
-    return f"{STEPS} steps of 3 cameras; to read such a recording whole takes {1e3 * whole:.0f} ms\n\n{beside_budgets(limits)}{note}"
+    title = (
+        f"{STEPS} steps of 3 cameras; to read such a recording whole takes {1e3 * whole_s:.0f} ms"
+    )
+    return f"{title}\n\n{beside_budgets(limits)}{note}"
 
 
-def _recorded(scratch: Path) -> Path:
+def _record_failure(folder: Path) -> Path:
     """STEPS steps of three cameras, too few to reach anything."""
-    trial, row = demo_trial(scratch, STEPS)
-    path = scratch / "one.rrd"
+    trial, row = demo_trial(folder, STEPS)
+    path = folder / "one.rrd"
     next(
         rollout(trial, [row], lambda opening: DeferredRecorder(path, opening, lambda outcome: True))
     )
     return path
 
 
-def _python(code: str, *words: str) -> str:
-    return subprocess.run(
-        [sys.executable, "-c", code, *words], capture_output=True, text=True, check=True
-    ).stdout
+def _copy_and_index(recording: Path, folder: Path, n: int) -> float:
+    """Copy a recording n times into a new folder; returns the median seconds of an index."""
+    folder.mkdir()
+    seconds = []
+    for i in tqdm(range(n), "record", unit="recording", leave=False, mininterval=1):
+        path = folder / f"{i:05d}.rrd"
+        read_chunks(recording).write_rrd(path, application_id="vap", recording_id=path.stem)
+        seconds.append(_seconds(partial(ensure_index, path)))
+    return float(np.median(seconds))
+
+
+def _query_limits(folder: Path, n: int, whole_s: float) -> list[Limit]:
+    """Time and memory of a query over the recordings of a folder."""
+    seconds, gigabytes, found = map(float, _python(QUERY, str(folder)).split())
+    megabytes = sum(path.stat().st_size for path in folder.rglob("*.rrd")) / 1e6
+    return [
+        Limit(
+            what=f"query over {n} recordings ({megabytes:.0f} MB)",
+            measured=seconds,
+            budget=5,
+            unit="s",
+            ratio=f"{seconds / whole_s:.0f} recordings read whole",
+        ),
+        Limit(
+            what="memory of that process",
+            measured=gigabytes,
+            budget=2,
+            unit="GB",
+            ratio=f"{found:.0f} found",
+        ),
+    ]
+
+
+def _open_limit(recording: Path, whole_s: float) -> Limit:
+    """Raises: MissingGL."""
+    png = recording.with_name("one.png")
+    seconds = _seconds(partial(screenshot, recording, png, size=(1920, 1080)))
+    return Limit(
+        what="opening a frame without a display",
+        measured=seconds,
+        budget=15,
+        unit="s",
+        ratio=f"{seconds / whole_s:.0f} recordings read whole",
+    )
+
+
+def _python(code: str, *arguments: str) -> str:
+    """What a program prints, in a process of its own."""
+    command = [sys.executable, "-c", code, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
 def _seconds(work: Callable[[], object]) -> float:

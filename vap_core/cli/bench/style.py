@@ -31,17 +31,23 @@ class Style:
     longest_file: int
 
     def per_100_lines(self, count: int) -> float:
+        """A count of something per 100 lines."""
         return 100 * count / max(self.lines, 1)
 
 
 def measure(paths: list[Path]) -> Style:
+    """The figures of some source files together."""
     lengths: list[int] = []
-    comprehensions = ternaries = longest = 0
+    comprehensions = 0
+    ternaries = 0
+    longest = 0
     for path in paths:
         text = path.read_text()
         lines = text.splitlines()
         longest = max(longest, len(lines))
-        lengths += [len(line) for line in lines if line.strip()]
+        for line in lines:
+            if line.strip():
+                lengths.append(len(line))
         for node in ast.walk(ast.parse(text)):
             comprehensions += isinstance(node, COMPREHENSIONS)
             ternaries += isinstance(node, ast.IfExp)
@@ -59,14 +65,14 @@ def run() -> str:
     root = Path(vap_core.__file__).parent
     header = ["", "files", "lines", "p95 of line length", "comprehensions", "ternaries", "longest"]
     rows = [header]
-    for folder in sorted(path for path in root.iterdir() if path.name != "__pycache__"):
-        if folder.is_dir():
+    for folder in sorted(root.iterdir()):
+        if folder.is_dir() and folder.name != "__pycache__":
             rows.append(_row(f"{folder.name}/", sorted(folder.rglob("*.py"))))
     rows.append(_row("the method", sorted(root.glob("*.py"))))
     rows.append(_row("vap_core", sorted(root.rglob("*.py"))))
     for name, (length, comprehensions, ternaries) in ANCHORS.items():
         rows.append([name, "", "", str(length), f"{comprehensions:.1f}", f"{ternaries:.1f}", ""])
-    return align(rows) + "\n\nComprehensions and ternaries are counts per 100 lines."
+    return f"{align(rows)}\n\nComprehensions and ternaries are counts per 100 lines."
 
 
 def _row(name: str, paths: list[Path]) -> list[str]:

@@ -21,17 +21,26 @@ def has_truth(episode: Episode) -> bool:
 
 def trace_episode(episode: Episode) -> EpisodeTrace:
     """The trace of an episode that has ground truth."""
-    header, frames = episode.header, episode.frames
+    header = episode.header
+    frames = episode.frames
     row = header.row
     judge = Judge.start(row, header.object_sizes_m, frames[0].truth)
     names = _without(judge.start_world, row.goal)
     base = robots.get(suite(row.suite).robot).base_world
     size = header.object_sizes_m[row.target]
 
-    others, touches, held, gap_m, grip = [], [], [], [], []
+    steps = []
+    coverage = []
+    others = []
+    touches = []
+    held = []
+    gap_m = []
+    grip = []
     lift_m, moved_m = np.zeros((2, len(names), len(frames)))
     for step, frame in enumerate(frames):
         truth = frame.truth
+        steps.append(frame.frame_index)
+        coverage.append(frame.coverage)
         touched = _without(truth.touched, row.goal)
         others.append(tuple(_without(touched, row.target)))
         touches.append(row.target in touched)
@@ -45,12 +54,11 @@ def trace_episode(episode: Episode) -> EpisodeTrace:
     candidates = {}
     for camera, per_target in header.groundings.items():
         candidates[camera] = len(per_target[0].candidates) if per_target else 0
-    coverage = tuple(frame.coverage for frame in frames)
     return EpisodeTrace(
         target=row.target,
         rule=row.rule,
-        steps=tuple(frame.frame_index for frame in frames),
-        coverage=coverage,
+        steps=tuple(steps),
+        coverage=tuple(coverage),
         others=tuple(others),
         touches=tuple(touches),
         held=tuple(held),
@@ -73,8 +81,9 @@ def first_true(flags: Sequence[object]) -> int | None:
 
 def true_runs(flags: Sequence[bool]) -> list[tuple[int, int]]:
     """Start and stop of every unbroken run of True."""
-    edges = np.flatnonzero(np.diff(np.array([False, *flags, False]).astype(int)))
-    return [(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
+    padded = np.array([False, *flags, False]).astype(int)
+    edges = np.flatnonzero(np.diff(padded)).tolist()
+    return list(zip(edges[::2], edges[1::2], strict=True))
 
 
 def carried(trace: EpisodeTrace, thresholds: Thresholds, name: str) -> list[bool]:

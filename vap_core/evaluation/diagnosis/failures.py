@@ -69,7 +69,8 @@ def list_failures(
     """
     import pandas as pd
 
-    manifests, tables = {}, []
+    manifests = {}
+    tables = []
     for source in sources:
         for manifest, episodes in read_runs(source):
             manifests[manifest["digest"]] = manifest
@@ -89,7 +90,12 @@ def list_failures(
     table = _select(table, "sub_case", sub_case)
     if where is not None:
         table = rows_matching(table, where)
-    return Failures(manifests, all_episodes, selected, table.reset_index(drop=True))
+    return Failures(
+        manifests=manifests,
+        all_episodes=all_episodes,
+        episodes=selected,
+        table=table.reset_index(drop=True),
+    )
 
 
 def failures_text(failures: Failures, limit: int = 20) -> str:
@@ -140,7 +146,8 @@ def _with_corrections(table: "pd.DataFrame") -> "pd.DataFrame":
 
     table = table.assign(corrected=False)
     for source, part in table.groupby("source", sort=False):
-        corrections = read_corrections(artifacts_folder(Path(str(source))))
+        folder = artifacts_folder(Path(str(source)))
+        corrections = read_corrections(folder)
         if not corrections:
             continue
         for index, row in part[["suite", "task", "episode", "seed", "method"]].iterrows():

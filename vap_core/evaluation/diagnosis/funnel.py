@@ -16,8 +16,10 @@ from vap_core.rollout.failure import EpisodeTrace
 from vap_core.rollout.types import Episode
 
 STAGES = ("proposed", "voted", "masked", "tracked", "touched", "lifted", "success")
-"""The stages of one episode in order. The first four are of prompts, and None for a method that
-highlights nothing."""
+"""The stages of one episode in order.
+
+The first four are of prompts, and None for a method that highlights nothing.
+"""
 
 TRACKED = 0.9
 """Share of judged steps in which the prompts are right, from which on the track counts as held."""
@@ -33,8 +35,11 @@ def stages(
     Tracked: right in 9 of 10 steps up to the touch. Then: the target touched; carried, or selected;
     success. `trace` is the episode's, where it is known already.
     """
-    names = [f"stage_{name}" for name in STAGES]
-    columns: dict[str, Any] = dict.fromkeys([*names, "mask_iou", "track_right"])
+    columns: dict[str, Any] = {}
+    for name in STAGES:
+        columns[f"stage_{name}"] = None
+    columns["mask_iou"] = None
+    columns["track_right"] = None
     if episode.outcome.status == "error" or not has_truth(episode):
         return columns
     trace = trace or trace_episode(episode)
@@ -50,7 +55,10 @@ def stages(
 
 
 def _prompt_stages(trace: EpisodeTrace, thresholds: Thresholds) -> dict[str, Any]:
-    proposed, voted, masked, ious = [], [], [], []
+    proposed = []
+    voted = []
+    masked = []
+    ious = []
     for view in trace.coverage[0]:
         if view.pixels >= thresholds.pixels:
             proposed.append(view.proposal >= thresholds.proposal)
@@ -61,7 +69,8 @@ def _prompt_stages(trace: EpisodeTrace, thresholds: Thresholds) -> dict[str, Any
         return {}
     touched = first_true(trace.touches)
     until = len(trace.steps) if touched is None else touched
-    right, judged = 0.0, verdicts(trace, thresholds, until)
+    right = 0.0
+    judged = verdicts(trace, thresholds, until)
     if judged:
         right = float(np.mean([verdict == "right" for _, verdict in judged]))
     return {

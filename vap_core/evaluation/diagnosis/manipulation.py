@@ -27,7 +27,8 @@ def failed_manipulation(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosi
 
 def _lost_target(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | None:
     """A target that was carried is still held, let go in the wrong place, or has slipped."""
-    held, target = carried(trace, thresholds, trace.target), trace.target
+    held = carried(trace, thresholds, trace.target)
+    target = trace.target
     if True not in held:
         return None
     last = len(held) - 1 - held[::-1].index(True)
@@ -43,7 +44,8 @@ def _lost_target(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | Non
 
 
 def _wrong_object(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | None:
-    target, touched = trace.target, first_true(trace.touches)
+    target = trace.target
+    touched = first_true(trace.touches)
     picked = {name: _picked(trace, thresholds, name) for name in _others(trace)}
     taken = _earliest(picked)
     if taken is not None and (touched is None or taken[0] <= touched):
@@ -61,11 +63,14 @@ def _wrong_object(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | No
 
 
 def _collision(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | None:
-    target, touched, strayed = trace.target, first_true(trace.touches), first_true(trace.others)
+    target = trace.target
+    touched = first_true(trace.touches)
+    strayed = first_true(trace.others)
     moves: dict[str, int | None] = {}
     for name in _others(trace):
         moves[name] = first_true((trace.moved_m[name] >= thresholds.moved_m).tolist())
-    knocked, verb = _earliest(moves), "knocks"
+    knocked = _earliest(moves)
+    verb = "knocks"
     if trace.rule == "selected":
         verb = "touches"
         if strayed is not None and touched is not None and strayed <= touched:
@@ -84,9 +89,11 @@ def _missed_grasp(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | No
     touched = first_true(trace.touches)
     closing = first_true((near & (trace.grip < thresholds.closed)).tolist())
     if closing is not None and (touched is None or closing < touched):
-        at, what = closing, "closes beside"
+        at = closing
+        what = "closes beside"
     elif touched is not None:
-        at, what = touched, "touches but does not grasp"
+        at = touched
+        what = "touches but does not grasp"
     else:
         return None
     sentence = f"{what} {trace.target} ({1000 * trace.gap_m[at]:.0f} mm away)"

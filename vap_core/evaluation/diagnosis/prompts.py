@@ -68,7 +68,8 @@ def _deciding_steps(trace: EpisodeTrace, thresholds: Thresholds) -> tuple[list[J
     Those up to the first touch of any object, when they are wrong in enough steps; else those up to
     the touch of another object that a prompt is on.
     """
-    touched, strayed = first_true(trace.touches), first_true(trace.others)
+    touched = first_true(trace.touches)
+    strayed = first_true(trace.others)
     until = len(trace.steps)
     for at in (touched, strayed):
         if at is not None:
@@ -81,10 +82,11 @@ def _deciding_steps(trace: EpisodeTrace, thresholds: Thresholds) -> tuple[list[J
     judged = verdicts(trace, thresholds, strayed)
     if not judged or judged[-1][1] == "right":
         return [], False
-    prompted = {view.object for view in trace.coverage[judged[-1][0]]}
-    if prompted.isdisjoint(trace.others[strayed]):
-        return [], False
-    return judged, False
+    last, _ = judged[-1]
+    for view in trace.coverage[last]:
+        if view.object in trace.others[strayed]:
+            return judged, False
+    return [], False
 
 
 def _wrong_flags(judged: Sequence[Judged]) -> list[bool]:
@@ -119,10 +121,12 @@ def _verdict_on_target(
     thresholds: Thresholds,
 ) -> Verdict:
     """Of a step whose prompts are all on the target: are they good enough in any view?"""
-    iou, pixels = 0.0, 0
+    iou = 0.0
+    pixels = 0
     for view in coverage:
         if labels.get(view.camera) == target:
-            iou, pixels = max(iou, view.iou), max(pixels, view.pixels)
+            iou = max(iou, view.iou)
+            pixels = max(pixels, view.pixels)
     if iou >= thresholds.iou or pixels < thresholds.pixels:
         return "right"
     return "case 1"
@@ -151,7 +155,8 @@ def _most_wrong(
         label = labels[view.camera]
         return label not in (target, None), label is None, -view.iou
 
-    return max((view for view in coverage if view.camera in labels), key=wrongness)
+    counting = [view for view in coverage if view.camera in labels]
+    return max(counting, key=wrongness)
 
 
 def _opening_sub_case(
@@ -187,9 +192,14 @@ def _evidence(
 def _sentence(
     sub_case: str, view: MaskCoverage, labels: Mapping[str, str | None], step: int
 ) -> str:
-    camera, iou, proposal = view.camera, f"{view.iou:.2f}", f"{view.proposal:.2f}"
+    camera = view.camera
+    iou = f"{view.iou:.2f}"
+    proposal = f"{view.proposal:.2f}"
     name = _named(view.object)
-    shown = ", ".join(f"{of_view} {_named(label)}" for of_view, label in labels.items())
+    parts = []
+    for of_view, label in labels.items():
+        parts.append(f"{of_view} {_named(label)}")
+    shown = ", ".join(parts)
     match sub_case:
         case "no proposal":
             return f"{camera}: no candidate was found, the target passes unmarked"

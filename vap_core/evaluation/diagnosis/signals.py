@@ -10,7 +10,9 @@ NARROW = 0.25
 
 def unlabelled(episode: Episode) -> Diagnosis:
     """The narrowest vote, lost tracks, and how differently similar the views' choices are."""
-    found, similarities, views_without = [], [], 0
+    found = []
+    similarities = []
+    views_without = 0
     for groundings in episode.header.groundings.values():
         if not groundings:
             continue
@@ -20,26 +22,34 @@ def unlabelled(episode: Episode) -> Diagnosis:
         else:
             found.append(grounding)
             similarities.append(float(grounding.similarity[grounding.winner].mean()))
-    margin, camera, disagreement = 0.0, "", 0.0
+    margin = 0.0
+    camera = ""
+    disagreement = 0.0
     if found:
         narrowest = min(found, key=lambda grounding: grounding.ballot.margin)
-        margin, camera = narrowest.ballot.margin, narrowest.camera
+        margin = narrowest.ballot.margin
+        camera = narrowest.camera
         disagreement = max(similarities) - min(similarities)
     lost = []
     for frame in episode.frames:
-        lost += [event.frame_index for event in frame.events if is_lost(event)]
+        for event in frame.events:
+            if is_lost(event):
+                lost.append(event.frame_index)
 
     at = 0
     if not found:
-        sub_case, sentence = "nothing found", "no view has a candidate"
+        sub_case = "nothing found"
+        sentence = "no view has a candidate"
     elif margin < NARROW:
         sub_case = "narrow vote"
         sentence = f"{camera}: the vote was won by {margin:.2f} of the references only"
     elif lost:
-        sub_case, at = "lost track", lost[0]
+        sub_case = "lost track"
+        at = lost[0]
         sentence = f"the target was lost {len(lost)} times, first at step {lost[0]}"
     else:
-        sub_case, at = "no signal", episode.frames[-1].frame_index
+        sub_case = "no signal"
+        at = episode.frames[-1].frame_index
         sentence = "votes and tracks give no sign of the cause"
     return Diagnosis(
         case="unlabelled",

@@ -1,1 +1,4 @@
-"""How well perception does on the benchmarks: what it saw, followed and cost, measured against the simulator and told as tables and curves."""
+"""How well perception does on the benchmarks, measured against the simulator.
+
+What it found, tracked and cost, as tables and curves.
+"""

@@ -1,9 +1,14 @@
-"""Curves of a survey: the tables behind them, and the figures. A table in, a table or a figure out; nothing is measured here."""
+"""The curves of a survey: the tables behind them, and the figures.
 
-from collections.abc import Sequence
+Every function takes a table of the survey (`run.read`) and returns a table or a figure; nothing is
+measured here.
+"""
+
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float64
 
 from vap_core.base.figures import OTHER, TIER_COLOURS, WINNER, empty_figure
 from vap_core.evaluation.perception.estimates import Estimate, mean, share
@@ -18,24 +23,31 @@ if TYPE_CHECKING:
 
 MARGINS = {"margin": "margin of votes", "cosine_margin": "margin of mean cosines"}
 SUITE_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7")
-"""Told apart by colour-blind eyes, too."""
+"""The colours of the suites, which colour-blind readers can distinguish."""
 RULE_COLOURS = {"vote": WINNER, "average": OTHER}
+OCCLUDERS = {"plate": "a plate hides it fully", "arm": "an arm moves in front"}
+RECALLS = {
+    "recalled": ("among the 10 best boxes", WINNER),
+    "proposed": ("above the detector's own threshold", OTHER),
+}
+"""Columns of the table of objects, each with its label and colour in `size_figure`."""
 
 
 def abstention(choices: "pd.DataFrame", margin: str = "margin", k: int = USUAL_K) -> "pd.DataFrame":
-    """Share of right instances among the views whose margin is at least a threshold, one line per threshold that changes it, with Wilson's interval.
+    """Share of right instances among the views whose margin is at least a threshold.
 
-    `coverage` is their share of all views that show the target; a view without candidates is never among them.
+    One row per threshold that changes the share, with Wilson's interval. `coverage` is the share of
+    these views among all views that show the target; a view without candidates is never among them.
     """
     import pandas as pd
 
     usual = choices[(choices.k == k) & (choices.rule == "vote")]
     answered = usual[usual.elected != ""]
-    lines = []
+    rows = []
     for threshold in sorted(answered[margin].unique(), reverse=True):
         kept = answered[answered[margin] >= threshold]
         right = share(kept.right)
-        lines.append(
+        rows.append(
             {
                 "threshold": threshold,
                 "coverage": len(kept) / len(usual),
@@ -45,215 +57,244 @@ def abstention(choices: "pd.DataFrame", margin: str = "margin", k: int = USUAL_K
                 "n": right.n,
             }
         )
-    return pd.DataFrame(lines)
+    return pd.DataFrame(rows)
 
 
-def duels(objects: "pd.DataFrame") -> "pd.DataFrame":
-    """One line per look-alike and view that shows the target too: its tier, and by how much the target's true crop is nearer to the references."""
+def lookalike_pairs(objects: "pd.DataFrame") -> "pd.DataFrame":
+    """One row per look-alike and view that shows the target too.
+
+    `tier` is the look-alike's; `ahead` is by how much the target's true crop is nearer to the
+    references.
+    """
     key = ["suite", "task", "episode", "camera"]
-    mine = objects.loc[objects.role == "target", [*key, "cosine"]]
-    both = objects[objects.role != "target"].merge(mine, on=key, suffixes=("", "_target"))
-    return both.assign(ahead=both.cosine_target - both.cosine)
+    is_target = objects.role == "target"
+    targets = objects.loc[is_target, [*key, "cosine"]]
+    lookalikes = objects[objects.role != "target"]
+    pairs = lookalikes.merge(targets, on=key, suffixes=("", "_target"))
+    return pairs.assign(ahead=pairs.cosine_target - pairs.cosine)
 
 
 def abstention_figure(choices: "pd.DataFrame") -> "Figure":
-    """Right instances against coverage when views of small margin pass unmodified; bands are 95 % Wilson intervals."""
-    figure, axes = _panel(6.4, 4.0)
-    n = len(choices[(choices.k == USUAL_K) & (choices.rule == "vote")])
+    """Right instances against coverage when views of small margin pass unmodified.
+
+    Bands are 95 % Wilson intervals.
+    """
+    figure, axes = _make_panel(6.4, 4.0)
+    n_views = len(choices[(choices.k == USUAL_K) & (choices.rule == "vote")])
     for (margin, label), colour in zip(MARGINS.items(), (WINNER, OTHER), strict=True):
         curve = abstention(choices, margin)
-        mark = "o" if len(curve) <= 2 * USUAL_K else None
+        coverage = 100 * curve.coverage
         axes.plot(
-            100 * curve.coverage,
+            coverage,
             100 * curve.right,
             color=colour,
-            marker=mark,
+            marker="o" if len(curve) <= 2 * USUAL_K else None,
             markersize=4,
             label=f"abstain below a {label}",
         )
-        axes.fill_between(
-            100 * curve.coverage,
-            100 * curve.low,
-            100 * curve.high,
-            color=colour,
-            alpha=0.15,
-            linewidth=0,
-        )
-    axes.set(
-        xlabel=f"% of {n} views answered", ylabel="% right instance", xlim=(0, 101), ylim=(0, 101)
-    )
+        _draw_band(axes, x=coverage, low=100 * curve.low, high=100 * curve.high, colour=colour)
+    axes.set(xlabel=f"% of {n_views} views answered", ylabel="% right instance")
+    axes.set(xlim=(0, 101), ylim=(0, 101))
     axes.legend(frameon=False, loc="lower left", fontsize=9)
     return figure
 
 
 def hardness_figure(objects: "pd.DataFrame") -> "Figure":
-    """How near the encoder finds the target and its look-alikes to the references; and how often a look-alike is nearer than the target beside it."""
-    figure, grid = _panels(9.0, 3.8, 2)
-    groups = {
-        "target": objects[objects.role == "target"],
-        **{
-            f"{tier}": objects[(objects.role != "target") & (objects.tier == tier)]
-            for tier in TIERS
-        },
-    }
-    colours = [TIER_COLOURS["personal"], *(TIER_COLOURS[tier] for tier in TIERS)]
-    shown = [
-        (f"{name}\nn = {len(part)}", part.cosine.to_numpy(), colour)
-        for (name, part), colour in zip(groups.items(), colours, strict=True)
-        if len(part)
-    ]
-    drawn = grid[0].boxplot([cosine for _, cosine, _ in shown], tick_labels=[name for name, _, _ in shown], widths=0.55, patch_artist=True,
-                            flierprops={"markersize": 2.5, "markeredgecolor": "#999999"}, medianprops={"color": "black"})  # fmt: skip
-    for box, (_, _, colour) in zip(drawn["boxes"], shown, strict=True):
-        box.set(facecolor=colour, alpha=0.75)
-    grid[0].set(
+    """The encoder's cosines of the target and of its look-alikes, by hardness.
+
+    The second panel shows how often a look-alike is nearer to the references than the target beside
+    it.
+    """
+    figure, (left, right) = _make_panels(9.0, 3.8, n=2)
+    _draw_cosines(left, objects)
+    left.set(
         ylabel=f"mean cosine with {USUAL_K} references", xlabel="object in view, by its true box"
     )
-    pairs = duels(objects)
-    tiers = [tier for tier in TIERS if (pairs.tier == tier).any()]
-    _bars(
-        grid[1],
-        tiers,
-        [share(pairs[pairs.tier == tier].ahead < 0) for tier in tiers],
-        [TIER_COLOURS[tier] for tier in tiers],
-    )
-    grid[1].set(ylabel="% of views: nearer than the target", xlabel="look-alike beside the target")
+    pairs = lookalike_pairs(objects)
+    shares: dict[str, Estimate] = {}
+    for tier in TIERS:
+        same_tier = pairs[pairs.tier == tier]
+        if len(same_tier):
+            shares[tier] = share(same_tier.ahead < 0)
+    _draw_bars(right, shares, TIER_COLOURS)
+    right.set(ylabel="% of views: nearer than the target", xlabel="look-alike beside the target")
     return figure
 
 
 def references_figure(choices: "pd.DataFrame") -> "Figure":
-    """Right instance against the number of reference photos, by rule, with 95 % Wilson intervals: one panel per suite and one of all views."""
-    suites = [*_suites(choices), "all"]
-    figure, grid = _panels(2.7 * len(suites), 3.4, len(suites), sharey=True)
-    for axes, suite in zip(grid, suites, strict=True):
-        here = choices if suite == "all" else choices[choices.suite == suite]
+    """Right instance against the number of reference photos, by rule.
+
+    One panel per suite and one of all views, with 95 % Wilson intervals.
+    """
+    suites = [*_suite_colours(choices), "all"]
+    figure, panels = _make_panels(2.7 * len(suites), 3.4, n=len(suites), sharey=True)
+    for axes, suite in zip(panels, suites, strict=True):
+        rows = choices
+        if suite != "all":
+            rows = choices[choices.suite == suite]
         for i, rule in enumerate(RULES):
-            found = [share(here[(here.k == k) & (here.rule == rule)].right) for k in KS]
-            _line(axes, [k + 0.25 * (i - 0.5) for k in KS], found, RULE_COLOURS[rule], rule)
-        axes.set(
-            title=f"{suite}\n{len(here) // (len(KS) * len(RULES))} views",
-            xlabel="reference photos",
-            xticks=KS,
-            ylim=(0, 103),
-        )
-    grid[0].set_ylabel("% right instance")
-    grid[0].legend(frameon=False, loc="lower left")
+            by_rule = rows[rows.rule == rule]
+            shares = [share(by_rule[by_rule.k == k].right) for k in KS]
+            x = np.array(KS) + 0.25 * (i - 0.5)
+            _draw_line(axes, x, shares, colour=RULE_COLOURS[rule], label=rule)
+        n_views = len(rows) // (len(KS) * len(RULES))
+        axes.set(title=f"{suite}\n{n_views} views", xlabel="reference photos")
+        axes.set(xticks=KS, ylim=(0, 103))
+    panels[0].set_ylabel("% right instance")
+    panels[0].legend(frameon=False, loc="lower left")
     return figure
 
 
 def time_figure(tracks: "pd.DataFrame") -> "Figure":
-    """Mean IoU of the targets' undisturbed tracks over the episode, start to end, one line per suite; bands are bootstrapped by episode."""
-    figure, axes = _panel(7.0, 3.8)
-    free = tracks[tracks.target & (tracks.hidden == 0)]
-    for suite, colour in _suites(free).items():
-        part = free[free.suite == suite]
-        bins = len(part.iou_over_time.iloc[0])
-        found = [
-            mean(part.assign(x=[curve[b] for curve in part.iou_over_time]), "x")
-            for b in range(bins)
-        ]
-        time = np.linspace(0, 100, bins)
-        axes.plot(
-            time, [e.value for e in found], color=colour, label=f"{suite}, {len(part)} tracks"
-        )
-        axes.fill_between(
-            time,
-            [e.low for e in found],
-            [e.high for e in found],
-            color=colour,
-            alpha=0.15,
-            linewidth=0,
-        )
+    """Mean IoU of the targets' undisturbed tracks over the episode, from start to end.
+
+    One line per suite; bands are bootstrapped by episode.
+    """
+    figure, axes = _make_panel(7.0, 3.8)
+    undisturbed = tracks[tracks.target & (tracks.hidden == 0)]
+    for suite, colour in _suite_colours(undisturbed).items():
+        part = undisturbed[undisturbed.suite == suite]
+        means = _mean_iou_over_time(part)
+        time = np.linspace(0, 100, len(means))
+        middle, low, high = _bounds(means)
+        axes.plot(time, middle, color=colour, label=f"{suite}, {len(part)} tracks")
+        _draw_band(axes, x=time, low=low, high=high, colour=colour)
     axes.axhline(0.8, color="#999999", linewidth=0.8, linestyle=":")
-    axes.set(
-        xlabel="% of the episode",
-        ylabel="IoU with the visible target",
-        ylim=(0, 1.02),
-        xlim=(0, 100),
-    )
+    axes.set(xlabel="% of the episode", ylabel="IoU with the visible target")
+    axes.set(ylim=(0, 1.02), xlim=(0, 100))
     axes.legend(frameon=False, fontsize=9, loc="lower left")
     return figure
 
 
 def hidden_figure(tracks: "pd.DataFrame") -> "Figure":
-    """Identity of the target kept to the episode's end against the frames for which it is hidden, with 95 % Wilson intervals."""
-    figure, axes = _panel(6.4, 3.8)
-    target = tracks[tracks.target]
-    kinds = {"plate": "a plate hides it fully", "arm": "an arm moves in front"}
-    for i, (kind, label) in enumerate(
-        (kind, label) for kind, label in kinds.items() if (target.kind == kind).any()
-    ):
-        part = target[(target.hidden == 0) | (target.kind == kind)]
+    """Identity of the target kept to the episode's end, against the frames for which it is hidden.
+
+    Bars are 95 % Wilson intervals.
+    """
+    figure, axes = _make_panel(6.4, 3.8)
+    targets = tracks[tracks.target]
+    n_lines = 0
+    for kind, label in OCCLUDERS.items():
+        if not (targets.kind == kind).any():
+            continue
+        part = targets[(targets.hidden == 0) | (targets.kind == kind)]
         hidden = sorted(part.hidden.unique())
-        found = [share(part[part.hidden == n].kept) for n in hidden]
-        _line(
+        _draw_line(
             axes,
-            [n + 0.12 * (i - 0.5) for n in hidden],
-            found,
-            (WINNER, OTHER)[i],
-            label,
-            counts=i == 0,
+            x=np.array(hidden) + 0.12 * (n_lines - 0.5),
+            estimates=[share(part[part.hidden == n].kept) for n in hidden],
+            colour=(WINNER, OTHER)[n_lines],
+            label=label,
+            counts=n_lines == 0,
         )
-    axes.set(
-        xlabel="frames hidden (below: tracks behind the plate)",
-        ylabel="% of targets tracked at the end",
-        ylim=(0, 103),
-        xticks=range(7),
-    )
+        n_lines += 1
+    axes.set(xlabel="frames hidden (below: tracks behind the plate)")
+    axes.set(ylabel="% of targets tracked at the end", ylim=(0, 103), xticks=range(7))
     axes.set_xlim(-0.4, 6.4)
     axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 0.06))
     return figure
 
 
 def size_figure(objects: "pd.DataFrame", bins: int = 7) -> "Figure":
-    """Recall of the detector against the visible size of an object, in bins of equally many, with 95 % Wilson intervals."""
-    figure, axes = _panel(6.4, 3.8)
-    edges = np.unique(np.quantile(objects.px, np.linspace(0, 1, bins + 1)))
-    place = np.clip(np.searchsorted(edges, objects.px, side="right") - 1, 0, len(edges) - 2)
-    parts = [objects[place == i] for i in range(len(edges) - 1)]
-    middles = [float(part.px.median()) for part in parts]
-    for column, label, colour in (
-        ("recalled", "among the 10 best boxes", WINNER),
-        ("proposed", "above the detector's own threshold", OTHER),
-    ):
-        _line(axes, middles, [share(part[column]) for part in parts], colour, label)
-    axes.set(
-        xlabel=f"visible pixels ({len(objects)} objects in view, {len(parts)} bins)",
-        ylabel="% found (IoU 0.5)",
-        xscale="log",
-        ylim=(0, 103),
-    )
+    """Recall of the detector against the visible size of an object, in bins of equally many.
+
+    Bars are 95 % Wilson intervals.
+    """
+    figure, axes = _make_panel(6.4, 3.8)
+    parts = _split_by_size(objects, bins)
+    middles = np.empty(len(parts))
+    for i, part in enumerate(parts):
+        middles[i] = part.px.median()
+    for column, (label, colour) in RECALLS.items():
+        shares = [share(part[column]) for part in parts]
+        _draw_line(axes, middles, shares, colour=colour, label=label)
+    axes.set(xlabel=f"visible pixels ({len(objects)} objects in view, {len(parts)} bins)")
+    axes.set(ylabel="% found (IoU 0.5)", xscale="log", ylim=(0, 103))
     axes.xaxis.set_major_formatter("{x:.0f}")
     axes.xaxis.set_minor_formatter("{x:.0f}")
     axes.legend(frameon=False, loc="best")
     return figure
 
 
-def _suites(table: "pd.DataFrame") -> dict[str, str]:
+def _suite_colours(table: "pd.DataFrame") -> dict[str, str]:
     """The suites of a table in their usual order, each with its colour."""
-    return {
-        name: colour
-        for name, colour in zip(BENCHMARKS, SUITE_COLOURS, strict=True)
-        if (table.suite == name).any()
-    }
+    colours = {}
+    for suite, colour in zip(BENCHMARKS, SUITE_COLOURS, strict=True):
+        if (table.suite == suite).any():
+            colours[suite] = colour
+    return colours
 
 
-def _line(
+def _mean_iou_over_time(tracks: "pd.DataFrame") -> list[Estimate]:
+    """The mean IoU of tracks at each point of their normalised time."""
+    n_points = len(tracks.iou_over_time.iloc[0])
+    means = []
+    for i in range(n_points):
+        point = [curve[i] for curve in tracks.iou_over_time]
+        at_point = tracks.assign(x=point)
+        means.append(mean(at_point, "x"))
+    return means
+
+
+def _split_by_size(objects: "pd.DataFrame", bins: int) -> "list[pd.DataFrame]":
+    """Objects in bins of equally many, by their visible pixels; fewer bins where sizes repeat."""
+    quantiles = np.linspace(0, 1, bins + 1)
+    edges = np.unique(np.quantile(objects.px, quantiles))
+    above = np.searchsorted(edges, objects.px, side="right")
+    bin_of = np.clip(above - 1, 0, len(edges) - 2)
+    return [objects[bin_of == i] for i in range(len(edges) - 1)]
+
+
+def _bounds(
+    estimates: Sequence[Estimate],
+) -> tuple[
+    Float64[np.ndarray, " n"],
+    Float64[np.ndarray, " n"],
+    Float64[np.ndarray, " n"],
+]:
+    """The values, the lower and the upper bounds of estimates."""
+    bounds = np.empty((3, len(estimates)))
+    for i, estimate in enumerate(estimates):
+        bounds[:, i] = estimate.value, estimate.low, estimate.high
+    return bounds[0], bounds[1], bounds[2]
+
+
+def _percentages(
+    estimates: Sequence[Estimate],
+) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "2 n"]]:
+    """The values in %, and their distances to the lower and to the upper bound."""
+    middle, low, high = _bounds(estimates)
+    middle = 100 * middle
+    distances = np.stack([middle - 100 * low, 100 * high - middle])
+    return middle, np.maximum(distances, 0)
+
+
+def _draw_band(
     axes: "Axes",
-    x: Sequence[float],
-    found: Sequence[Estimate],
+    *,
+    x: "np.ndarray | pd.Series",
+    low: "np.ndarray | pd.Series",
+    high: "np.ndarray | pd.Series",
+    colour: str,
+) -> None:
+    axes.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
+
+
+def _draw_line(
+    axes: "Axes",
+    x: Float64[np.ndarray, " n"],
+    estimates: Sequence[Estimate],
+    *,
     colour: str,
     label: str,
     counts: bool = False,
 ) -> None:
-    middle = np.array([100 * e.value for e in found])
-    spread = np.maximum(
-        [middle - [100 * e.low for e in found], [100 * e.high for e in found] - middle], 0
-    )
+    """Estimates in % at `x` with their intervals; `counts` writes n below each."""
+    middle, spread = _percentages(estimates)
     axes.errorbar(
         x,
         middle,
-        spread,
+        yerr=spread,
         color=colour,
         marker="o",
         markersize=4,
@@ -262,37 +303,65 @@ def _line(
         elinewidth=1,
         label=label,
     )
-    for place, e in zip(x, found, strict=True):
-        if counts:
-            axes.text(place, 1.5, f"{e.n}", ha="center", fontsize=8, color="#666666")
+    if not counts:
+        return
+    for place, estimate in zip(x, estimates, strict=True):
+        axes.text(place, 1.5, f"{estimate.n}", ha="center", fontsize=8, color="#666666")
 
 
-def _bars(
-    axes: "Axes", names: Sequence[str], found: Sequence[Estimate], colours: Sequence[str]
-) -> None:
-    middle = np.array([100 * e.value for e in found])
-    spread = np.maximum(
-        [middle - [100 * e.low for e in found], [100 * e.high for e in found] - middle], 0
+def _draw_bars(axes: "Axes", estimates: Mapping[str, Estimate], colours: Mapping[str, str]) -> None:
+    """A bar in % per name, with its interval and n."""
+    middle, spread = _percentages(list(estimates.values()))
+    places = range(len(estimates))
+    labels = []
+    bar_colours = []
+    for name, estimate in estimates.items():
+        labels.append(f"{name}\nn = {estimate.n}")
+        bar_colours.append(colours[name])
+    axes.bar(places, middle, width=0.55, color=bar_colours, alpha=0.85)
+    axes.errorbar(places, middle, yerr=spread, fmt="none", ecolor="black", capsize=3, linewidth=1)
+    axes.set_xticks(places, labels)
+
+
+def _draw_cosines(axes: "Axes", objects: "pd.DataFrame") -> None:
+    """A box plot of the cosines of the target, and of its look-alikes of each tier."""
+    is_target = objects.role == "target"
+    parts = [("target", objects[is_target], TIER_COLOURS["personal"])]
+    for tier in TIERS:
+        lookalikes = objects[~is_target & (objects.tier == tier)]
+        parts.append((tier, lookalikes, TIER_COLOURS[tier]))
+    cosines = []
+    labels = []
+    colours = []
+    for name, part, colour in parts:
+        if len(part):
+            cosines.append(part.cosine.to_numpy())
+            labels.append(f"{name}\nn = {len(part)}")
+            colours.append(colour)
+    drawn = axes.boxplot(
+        cosines,
+        tick_labels=labels,
+        widths=0.55,
+        patch_artist=True,
+        flierprops={"markersize": 2.5, "markeredgecolor": "#999999"},
+        medianprops={"color": "black"},
     )
-    axes.bar(range(len(found)), middle, 0.55, color=list(colours), alpha=0.85)
-    axes.errorbar(
-        range(len(found)), middle, spread, fmt="none", ecolor="black", capsize=3, linewidth=1
-    )
-    axes.set_xticks(
-        range(len(found)), [f"{name}\nn = {e.n}" for name, e in zip(names, found, strict=True)]
-    )
+    for box, colour in zip(drawn["boxes"], colours, strict=True):
+        box.set(facecolor=colour, alpha=0.75)
 
 
-def _panel(width: float, height: float) -> "tuple[Figure, Axes]":
-    figure, grid = _panels(width, height, 1)
-    return figure, grid[0]
+def _make_panel(width: float, height: float) -> "tuple[Figure, Axes]":
+    figure, panels = _make_panels(width, height, n=1)
+    return figure, panels[0]
 
 
-def _panels(
-    width: float, height: float, n: int, sharey: bool = False
+def _make_panels(
+    width: float, height: float, *, n: int, sharey: bool = False
 ) -> "tuple[Figure, list[Axes]]":
+    """A figure of that size (inches) with `n` panels beside each other."""
     figure = empty_figure(width, height)
-    grid = figure.subplots(1, n, squeeze=False, sharey=sharey)[0].tolist()
-    for axes in grid:
+    grid = figure.subplots(1, n, squeeze=False, sharey=sharey)
+    panels = grid[0].tolist()
+    for axes in panels:
         axes.spines[["top", "right"]].set_visible(False)
-    return figure, grid
+    return figure, panels

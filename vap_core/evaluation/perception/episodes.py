@@ -1,4 +1,7 @@
-"""The survey of one episode's opening: its views one by one, and whether they agree, with and without association."""
+"""The survey of one episode's opening: its views one by one, and whether they agree.
+
+Views are compared with and without association.
+"""
 
 from collections.abc import Mapping, Sequence
 
@@ -7,14 +10,14 @@ from vap_core.base.types import PersonalObject
 from vap_core.evaluation.perception.first_frames import (
     KS,
     USUAL_K,
-    Line,
-    Looked,
+    EmbeddedBoxes,
+    TableRow,
     Tables,
     View,
-    look,
-    remembered,
+    find_candidates,
+    object_under_box,
+    registered_object,
     survey_view,
-    under,
 )
 from vap_core.perception.protocols import Stack
 from vap_core.vote import similarity, vote
@@ -24,52 +27,110 @@ OFF = "off"
 
 
 def survey(episode: Sequence[View], stack: Stack, ks: Sequence[int] = KS) -> Tables:
-    """Every table of survey_view, keyed; and "agreements", a line per way to associate the views, where there are several."""
-    memory = {k: remembered(stack, episode[0].row.target, k)[0] for k in ks}
-    looked = [look(view, stack) for view in episode]
+    """Every table of `survey_view` with its keys, and "agreements".
+
+    "agreements" has a row per way to associate the views; none for a single view.
+    """
+    target = episode[0].row.target
+    memory = {}
+    for k in ks:
+        memory[k], _ = registered_object(stack, target, k)
+    candidates = [find_candidates(view, stack) for view in episode]
     tables: Tables = {"views": [], "objects": [], "detections": [], "choices": [], "agreements": []}
-    for view, seen in zip(episode, looked, strict=True):
-        for name, lines in survey_view(view, stack, memory, seen).items():
-            tables[name] += [{**view.key, **line} for line in lines]
+    for view, of_view in zip(episode, candidates, strict=True):
+        of_tables = survey_view(view=view, stack=stack, memory=memory, candidates=of_view)
+        for name, rows in of_tables.items():
+            tables[name] += [{**view.key, **row} for row in rows]
     if len(episode) > 1:
-        tables["agreements"] = agreements(episode, looked, memory[USUAL_K])
+        tables["agreements"] = agreements(episode, candidates, memory[USUAL_K])
     return tables
 
 
 def agreements(
-    episode: Sequence[View], looked: Sequence[Looked], mine: PersonalObject
-) -> list[Line]:
-    """What is highlighted in the views together (case, SPEC section 7), and in how many of those that show the target it is the target.
+    episode: Sequence[View], candidates: Sequence[EmbeddedBoxes], personal: PersonalObject
+) -> list[TableRow]:
+    """What the views of an episode highlight together, by every way to associate them.
 
-    A box on no object is another thing in every view.
+    `case` is the comparison of the views (SPEC section 7); `right` is in how many of the `views`
+    that show the target it is highlighted. A box on no object is another thing in every view.
     """
-    sights = {
-        view.camera: Sighting(
-            similarity(seen.rows, mine.embeddings), seen.rows, seen.found.xyxy, view.optics
-        )
-        for view, seen in zip(episode, looked, strict=True)
-    }
-    alone = {camera: vote(sight.cosine).winner for camera, sight in sights.items()}
-    ways: Mapping[str, Pairing | None] = {OFF: None, **PAIRINGS}
-    lines = []
-    for name, pairing in ways.items():
-        together = None if pairing is None else associate(sights, pairing)
-        chosen = alone if together is None else together.chosen
-        shown = {}
-        for view, seen in zip(episode, looked, strict=True):
-            i = chosen[view.camera]
-            shown[view.camera] = None if i is None else under(view, seen.found.xyxy[i])
-        distinct = {
-            camera: f"nothing in {camera}" if what == "nothing" else what
-            for camera, what in shown.items()
+    sightings = _sightings(episode, candidates, personal)
+    single = {camera: vote(sighting.cosine).winner for camera, sighting in sightings.items()}
+    pairings: Mapping[str, Pairing | None] = {OFF: None, **PAIRINGS}
+    row = episode[0].row
+    table = []
+    for name, pairing in pairings.items():
+        association = None
+        if pairing is not None:
+            association = associate(sightings, pairing)
+        chosen: Mapping[str, int | None] = single
+        margin = None
+        if association is not None:
+            chosen = association.chosen
+            margin = association.margin
+        highlighted = _highlighted_objects(episode, candidates, chosen)
+        n_right, n_views = _count_right(episode, highlighted)
+        agreement: TableRow = {
+            "suite": row.suite,
+            "task": row.task,
+            "episode": row.episode,
+            "target": row.target,
+            "associate": name,
+            "case": compare_views(_distinguish_nothing(highlighted), row.target),
+            "right": n_right,
+            "views": n_views,
+            "margin": margin,
         }
-        row = episode[0].row
-        counts = [view.camera for view in episode if row.target in view.visible()]
-        lines.append(
-            {
-                "suite": row.suite, "task": row.task, "episode": row.episode, "target": row.target, "associate": name,
-                "case": compare_views(distinct, row.target), "right": sum(shown[camera] == row.target for camera in counts), "views": len(counts),
-                "margin": None if together is None else together.margin,
-            }
-        )  # fmt: skip
-    return lines
+        table.append(agreement)
+    return table
+
+
+def _sightings(
+    episode: Sequence[View], candidates: Sequence[EmbeddedBoxes], personal: PersonalObject
+) -> dict[str, Sighting]:
+    """The candidates of each view, by camera, as `associate` takes them."""
+    sightings = {}
+    for view, of_view in zip(episode, candidates, strict=True):
+        sightings[view.camera] = Sighting(
+            cosine=similarity(of_view.embeddings, personal.embeddings),
+            embeddings=of_view.embeddings,
+            xyxy=of_view.boxes.xyxy,
+            camera=view.optics,
+        )
+    return sightings
+
+
+def _highlighted_objects(
+    episode: Sequence[View],
+    candidates: Sequence[EmbeddedBoxes],
+    chosen: Mapping[str, int | None],
+) -> dict[str, str | None]:
+    """The object under the chosen box of each camera; None where none is chosen."""
+    highlighted: dict[str, str | None] = {}
+    for view, of_view in zip(episode, candidates, strict=True):
+        i = chosen[view.camera]
+        highlighted[view.camera] = None
+        if i is not None:
+            highlighted[view.camera] = object_under_box(view, of_view.boxes.xyxy[i])
+    return highlighted
+
+
+def _count_right(episode: Sequence[View], highlighted: Mapping[str, str | None]) -> tuple[int, int]:
+    """In how many views the target is highlighted, and how many show it."""
+    target = episode[0].row.target
+    n_right = 0
+    n_views = 0
+    for view in episode:
+        if target in view.visible():
+            n_views += 1
+            n_right += highlighted[view.camera] == target
+    return n_right, n_views
+
+
+def _distinguish_nothing(highlighted: Mapping[str, str | None]) -> dict[str, str | None]:
+    """The same objects, with "nothing" as another thing in every camera."""
+    distinct = dict(highlighted)
+    for camera, name in highlighted.items():
+        if name == "nothing":
+            distinct[camera] = f"nothing in {camera}"
+    return distinct

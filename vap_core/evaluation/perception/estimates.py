@@ -1,14 +1,14 @@
 """Shares, means and average precisions with their 95 % intervals.
 
-Views of one episode show the same objects, so means and average precisions are bootstrapped by episode (percentiles, seeded); shares
-carry Wilson's interval over views, objects or tracks.
+Views of one episode show the same objects, so means and average precisions are bootstrapped by
+episode (percentiles, seeded); shares carry Wilson's interval over views, objects or tracks.
 """
 
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
 from vap_core.base.types import value
 from vap_core.evaluation.metrics import rate
@@ -17,37 +17,47 @@ if TYPE_CHECKING:
     import pandas as pd
 
 EPISODE = ["suite", "task", "episode"]
+"""The columns that name an episode."""
 RESAMPLES = 1000
+Weights = Float64[np.ndarray, " e"]
+"""How often each episode counts."""
 
 
 @value
 class Estimate:
-    """A figure over n cases with its 95 % interval; with n = 0 it is nan, and the interval of a single episode's mean is nan."""
+    """A value over n cases with its 95 % interval.
+
+    With n = 0 all three are nan; the interval of a single episode's mean is nan.
+    """
 
     value: float
     low: float
     high: float
     n: int
 
-    def told(self, scale: float = 100.0, digits: int = 1) -> str:
-        """ "97.2 [94.0, 98.7] 180": value, interval, n."""
+    def text(self, scale: float = 100.0, digits: int = 1) -> str:
+        """Value, interval and n: "97.2 [94.0, 98.7] 180"."""
         if not self.n:
             return "-"
-        middle, low, high = (
-            "?" if np.isnan(x) else f"{scale * x:.{digits}f}"
-            for x in (self.value, self.low, self.high)
-        )
+        middle = _format_number(scale * self.value, digits)
+        low = _format_number(scale * self.low, digits)
+        high = _format_number(scale * self.high, digits)
         return f"{middle} [{low}, {high}] {self.n}"
 
 
-NONE = Estimate(float("nan"), float("nan"), float("nan"), 0)
+NONE = Estimate(value=float("nan"), low=float("nan"), high=float("nan"), n=0)
 
 
 def share(hits: Iterable[Any]) -> Estimate:
-    """Of those that are known, how many hold, with Wilson's interval."""
-    known = [bool(hit) for hit in hits if hit is not None and hit == hit]
-    found = rate(sum(known), len(known))
-    return Estimate(found.value, found.low, found.high, found.n)
+    """The share of the known hits that hold, with Wilson's interval; None and nan are unknown."""
+    n_known = 0
+    n_right = 0
+    for hit in hits:
+        if hit is not None and hit == hit:
+            n_known += 1
+            n_right += bool(hit)
+    found = rate(n_right, n_known)
+    return Estimate(value=found.value, low=found.low, high=found.high, n=found.n)
 
 
 def mean(table: "pd.DataFrame", column: str) -> Estimate:
@@ -55,54 +65,39 @@ def mean(table: "pd.DataFrame", column: str) -> Estimate:
     known = table.dropna(subset=[column])
     if not len(known):
         return NONE
-    per_episode = (
-        known.assign(_value=known[column].astype(float))
-        .groupby(EPISODE)
-        ._value.agg(["sum", "count"])
-    )
-    total, count = per_episode["sum"].to_numpy(), per_episode["count"].to_numpy().astype(np.float64)
-    low, high = _percentiles(len(per_episode), lambda times: times @ total / (times @ count))
-    return Estimate(float(total.sum() / count.sum()), low, high, len(known))
+    values = known.assign(_value=known[column].astype(float))
+    per_episode = values.groupby(EPISODE)._value.agg(["sum", "count"])
+    total = per_episode["sum"].to_numpy()
+    count = per_episode["count"].to_numpy().astype(np.float64)
+
+    def weighted_means(times: Float64[np.ndarray, "r e"]) -> Float64[np.ndarray, " r"]:
+        return times @ total / (times @ count)
+
+    low, high = _percentiles(len(per_episode), weighted_means)
+    middle = float(total.sum() / count.sum())
+    return Estimate(value=middle, low=low, high=high, n=len(known))
 
 
 def precision(detections: "pd.DataFrame", wanted: "pd.DataFrame") -> Estimate:
-    """AP50: the mean over tasks, each with its own phrase, of their average precision; n counts wanted objects (a line each in `wanted`)."""
+    """AP50: the mean over tasks, each with its own phrase, of their average precision.
+
+    `wanted` has one row per object to find, and n counts them; bootstrapped by episode.
+    """
     if not len(wanted):
         return NONE
-    episodes = {
-        key: i
-        for i, key in enumerate(
-            wanted[EPISODE].drop_duplicates().itertuples(index=False, name=None)
-        )
-    }
-    extra = [
-        key
-        for key in detections[EPISODE].drop_duplicates().itertuples(index=False, name=None)
-        if key not in episodes
-    ]
-    episodes |= {key: len(episodes) + i for i, key in enumerate(extra)}
-    parts = []
-    for task, objects in wanted.groupby(["suite", "task"], sort=False):
-        found = detections[(detections.suite == task[0]) & (detections.task == task[1])]
-        owner, owned = (
-            np.array(
-                [episodes[key] for key in part[EPISODE].itertuples(index=False, name=None)],
-                np.int64,
-            )
-            for part in (found, objects)
-        )
-        parts.append((found.score.to_numpy(np.float64), found.hit.to_numpy(bool), owner, owned))
+    numbers = _number_episodes(wanted, detections)
+    tasks = []
+    for (suite, task), objects in wanted.groupby(["suite", "task"], sort=False):
+        found = detections[(detections.suite == suite) & (detections.task == task)]
+        tasks.append(_TaskDetections(found, objects, numbers))
 
-    def once(times: Float64[np.ndarray, " e"]) -> float:
-        every = [
-            average_precision(score, hit, float(times[owned].sum()), times[owner])
-            for score, hit, owner, owned in parts
-        ]
-        drawn = [one for one in every if one == one]  # a resample may lack a task
-        return float(np.mean(drawn)) if drawn else float("nan")
+    def mean_precisions(resamples: Float64[np.ndarray, "r e"]) -> Float64[np.ndarray, " r"]:
+        return np.array([_mean_precision(tasks, times) for times in resamples])
 
-    low, high = _percentiles(len(episodes), lambda times: np.array([once(one) for one in times]))
-    return Estimate(once(np.ones(len(episodes))), low, high, len(wanted))
+    low, high = _percentiles(len(numbers), mean_precisions)
+    once = np.ones(len(numbers))
+    middle = _mean_precision(tasks, once)
+    return Estimate(value=middle, low=low, high=high, n=len(wanted))
 
 
 def average_precision(
@@ -111,24 +106,96 @@ def average_precision(
     wanted: float,
     times: Float64[np.ndarray, " n"] | None = None,
 ) -> float:
-    """Area under the interpolated precision-recall curve of detections, of which `wanted` should have been found; nan when none.
+    """Area under the interpolated precision-recall curve of detections.
 
-    `times` counts every detection so often.
+    `wanted` objects should have been found; nan when there are none. `times` counts every detection
+    so often (None: once).
     """
     if wanted <= 0:
         return float("nan")
+    if times is None:
+        times = np.ones(len(score))
     order = np.argsort(-score, kind="stable")
-    weight = (np.ones(len(score)) if times is None else times)[order]
+    weight = times[order]
     right = weight * hit[order]
-    precision = np.cumsum(right) / np.maximum(np.cumsum(weight), 1e-9)
-    return float((np.maximum.accumulate(precision[::-1])[::-1] * right).sum() / wanted)
+    precisions = np.cumsum(right) / np.maximum(np.cumsum(weight), 1e-9)
+    interpolated = np.maximum.accumulate(precisions[::-1])[::-1]
+    return float((interpolated * right).sum() / wanted)
+
+
+class _TaskDetections:
+    """The detections of one task, and the episodes of its detections and of its objects.
+
+    `found` has a row per detection, `objects` one per object to find; `numbers` are the episodes'.
+    """
+
+    def __init__(
+        self,
+        found: "pd.DataFrame",
+        objects: "pd.DataFrame",
+        numbers: dict[tuple[Any, ...], int],
+    ) -> None:
+        self.score = found.score.to_numpy(np.float64)
+        self.hit = found.hit.to_numpy(bool)
+        self.episode_of_detection = _episode_numbers(found, numbers)
+        self.episode_of_object = _episode_numbers(objects, numbers)
+
+    def average_precision(self, times: Weights) -> float:
+        """Their average precision when each episode counts as often as `times` says."""
+        wanted = float(times[self.episode_of_object].sum())
+        return average_precision(
+            score=self.score,
+            hit=self.hit,
+            wanted=wanted,
+            times=times[self.episode_of_detection],
+        )
+
+
+def _mean_precision(tasks: Iterable[_TaskDetections], times: Weights) -> float:
+    """The mean of the tasks' average precisions, without the tasks that a resample lacks."""
+    known = []
+    for task in tasks:
+        area = task.average_precision(times)
+        if not np.isnan(area):
+            known.append(area)
+    if not known:
+        return float("nan")
+    return float(np.mean(known))
+
+
+def _number_episodes(*tables: "pd.DataFrame") -> dict[tuple[Any, ...], int]:
+    """A number for each episode of the tables, in the order of their first rows."""
+    numbers: dict[tuple[Any, ...], int] = {}
+    for table in tables:
+        for episode in _episodes(table.drop_duplicates(EPISODE)):
+            numbers.setdefault(episode, len(numbers))
+    return numbers
+
+
+def _episode_numbers(
+    table: "pd.DataFrame", numbers: dict[tuple[Any, ...], int]
+) -> Int64[np.ndarray, " n"]:
+    """The number of each row's episode."""
+    return np.array([numbers[episode] for episode in _episodes(table)], np.int64)
+
+
+def _episodes(table: "pd.DataFrame") -> Iterable[tuple[Any, ...]]:
+    """The suite, task and episode of each row."""
+    return table[EPISODE].itertuples(index=False, name=None)
 
 
 def _percentiles(n: int, statistic: Callable[[np.ndarray], np.ndarray]) -> tuple[float, float]:
     """The 2.5th and 97.5th percentile of a statistic of how often each of n episodes is drawn."""
     if n < 2:
         return float("nan"), float("nan")
-    times = np.random.default_rng(0).multinomial(n, np.full(n, 1 / n), RESAMPLES).astype(np.float64)
-    drawn = statistic(times)
+    rng = np.random.default_rng(0)
+    counts = rng.multinomial(n, np.full(n, 1 / n), RESAMPLES)
+    drawn = statistic(counts.astype(np.float64))
     low, high = np.nanpercentile(drawn, [2.5, 97.5])
     return float(low), float(high)
+
+
+def _format_number(number: float, digits: int) -> str:
+    if np.isnan(number):
+        return "?"
+    return f"{number:.{digits}f}"

@@ -1,11 +1,15 @@
-"""Grounding on the benchmarks' opening frames, view by view, against the simulator: what was found, who was elected, and whose mistake it was.
+"""Grounding on the benchmarks' opening frames, view by view, against the simulator.
+
+It says what was found, which candidate was elected, and which model was wrong.
 
     for episode in openings(suites.rows("vlabench", "select-shoe", 12)):
         for view in episode:
-            tables = survey_view(view, stack, memory, look(view, stack))
+            candidates = find_candidates(view, stack)
+            tables = survey_view(view, stack, memory, candidates)
 
-Rows are flat, one list per table: "views" (a line per view), "objects" (per visible object of the target's category), "detections" (per box
-and phrase), "choices" (per view, K references and rule). Every line carries the keys of `View.key`. Boxes that overlap by IoU 0.5 agree.
+Rows are flat, one list per table: "views" (a row per view), "objects" (per visible object of the
+target's category), "detections" (per box and phrase), "choices" (per view, K references and rule).
+Every row carries the keys of `View.key`. Boxes that overlap by IoU 0.5 agree.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,14 +17,15 @@ from functools import cache
 from typing import Any, get_args
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
-from vap_core.base.types import Boxes, Camera, Mask, PersonalObject, Rgb, value
+from vap_core.base.types import Ballot, Boxes, Camera, Mask, PersonalObject, Rgb, value
 from vap_core.memory import register
 from vap_core.perception.boxes import box_iou, crop, mask_box, mask_iou
 from vap_core.perception.protocols import Stack
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.phrases import AMBIGUOUS, UNSEEN
+from vap_core.simulation.env import Env
 from vap_core.simulation.studio import reference_views
 from vap_core.simulation.suites.open_row import build_scene, make_env
 from vap_core.simulation.types import EpisodeRow
@@ -29,19 +34,24 @@ from vap_core.vote import VoteRule, similarity, vote
 LEAST_PX = 100
 """Visible pixels, of a view of 224 x 224, from which on an object counts."""
 SAME_BOX = 0.5
-FLOOR, TOP = 0.03, 10
-"""Score from which on a box enters average precision, and how many of the best count for recall."""
+"""IoU from which on two boxes agree."""
+FLOOR = 0.03
+"""Score from which on a box enters average precision."""
+TOP = 10
+"""How many of the best boxes count for recall."""
 KS = (1, 3, 5, 7)
 """Numbers of reference photos; each set is taken anew, as a user would take so many."""
 USUAL_K = 5
 RULES: tuple[VoteRule, ...] = get_args(VoteRule)
-Line = dict[str, Any]
-Tables = dict[str, list[Line]]
+TableRow = dict[str, Any]
+"""A row of a table of the survey."""
+Tables = dict[str, list[TableRow]]
+Box = Float32[np.ndarray, "4"]
 
 
 @value
 class View:
-    """One camera's opening frame, and what the simulator knows about it: the visible pixels of every object placed."""
+    """One camera's opening frame, and the visible pixels of every object placed."""
 
     row: EpisodeRow
     camera: str
@@ -50,198 +60,150 @@ class View:
     optics: Camera | None = None
 
     @property
-    def key(self) -> Line:
-        row, size = self.row, self.rgb.shape[0]
-        return {"suite": row.suite, "task": row.task, "episode": row.episode, "split": row.split, "variant": row.variant, "camera": self.camera,
-                "size": size, "category": row.category, "target": row.target}  # fmt: skip
+    def key(self) -> TableRow:
+        """The columns that name this view in every table."""
+        return {
+            "suite": self.row.suite,
+            "task": self.row.task,
+            "episode": self.row.episode,
+            "split": self.row.split,
+            "variant": self.row.variant,
+            "camera": self.camera,
+            "size": self.rgb.shape[0],
+            "category": self.row.category,
+            "target": self.row.target,
+        }
 
     @property
     def least_px(self) -> float:
+        """LEAST_PX in a view of this size."""
         return LEAST_PX * self.rgb.shape[0] * self.rgb.shape[1] / 224**2
 
-    def boxes(self) -> dict[str, Float32[np.ndarray, "4"]]:
-        """Around every object of which anything shows."""
-        return {name: _box(mask) for name, mask in self.masks.items() if mask.any()}
+    def boxes(self) -> dict[str, Box]:
+        """The box of every object of which anything shows."""
+        boxes = {}
+        for name, mask in self.masks.items():
+            box = mask_box(mask)
+            if box is not None:
+                boxes[name] = box
+        return boxes
 
     def visible(self) -> dict[str, Mask]:
         """The masks large enough to count."""
         return {name: mask for name, mask in self.masks.items() if mask.sum() >= self.least_px}
 
 
+@value
+class EmbeddedBoxes:
+    """The boxes of the target's category that the stack found in a view, and their embeddings."""
+
+    boxes: Boxes
+    embeddings: Float32[np.ndarray, "n d"]
+
+
 def openings(rows: Sequence[EpisodeRow], size: int = 224) -> Iterator[list[View]]:
-    """The views of each row in turn, by the cameras, look, control and sensor of its suite; rows of one task share scenes by variant."""
-    for name, variant in dict.fromkeys((row.suite, row.variant) for row in rows):
-        alike = [row for row in rows if (row.suite, row.variant) == (name, variant)]
-        models = list(dict.fromkeys(place.model for row in alike for place in row.placements))
-        with build_scene(name, models, variant) as scene:
-            env = make_env(scene, name, image_size=size)
-            for row in alike:
+    """The views of each row in turn, by the cameras, look, control and sensor of its suite.
+
+    Rows of one suite and variant share a scene and come together. Pictures are `size` pixels wide
+    and high.
+    """
+    groups: dict[tuple[str, str], list[EpisodeRow]] = {}
+    for row in rows:
+        groups.setdefault((row.suite, row.variant), []).append(row)
+    for (suite, variant), group in groups.items():
+        with build_scene(suite, _models(group), variant) as scene:
+            env = make_env(scene, suite, image_size=size)
+            for row in group:
                 env.reset(row)
-                masks, optics = (
-                    env.truth(masks=True).masks,
-                    {camera.name: camera for camera in env.cameras()},
-                )
-                yield [
-                    View(row, camera, rgb, masks[camera], optics[camera])
-                    for camera, rgb in env.observe().images.items()
-                ]
+                yield _opening_views(env, row)
 
 
 @cache
-def remembered(stack: Stack, target: str, k: int) -> tuple[PersonalObject, tuple[int, ...]]:
-    """The personal object from k rendered reference photos, and which of them no detector cut; once per process."""
+def registered_object(stack: Stack, target: str, k: int) -> tuple[PersonalObject, tuple[int, ...]]:
+    """The personal object from `k` rendered reference photos; rendered once per process.
+
+    The second value names the photos that no detector cut.
+    """
     model = objects.get_object(target)
+    photos = reference_views(model, k)
     return register(
-        target, model.category, reference_views(model, k), stack.detector, stack.encoder
+        name=target,
+        category=model.category,
+        photos=photos,
+        detector=stack.detector,
+        encoder=stack.encoder,
     )
 
 
-@value
-class Looked:
-    """What the stack made of a view before anyone was asked for: candidates of the target's category and their embeddings."""
-
-    found: Boxes
-    rows: Float32[np.ndarray, "n d"]
-
-
-def look(view: View, stack: Stack) -> Looked:
-    found = stack.detector([view.rgb], view.row.category)[0]
-    return Looked(found, stack.encoder([crop(view.rgb, box) for box in found.xyxy]))
+def find_candidates(view: View, stack: Stack) -> EmbeddedBoxes:
+    """The candidates that do not depend on which personal object is asked for."""
+    boxes = stack.detector([view.rgb], view.row.category)[0]
+    crops = [crop(view.rgb, box) for box in boxes.xyxy]
+    return EmbeddedBoxes(boxes, stack.encoder(crops))
 
 
 def survey_view(
-    view: View, stack: Stack, memory: Mapping[int, PersonalObject], looked: Looked
+    view: View, stack: Stack, memory: Mapping[int, PersonalObject], candidates: EmbeddedBoxes
 ) -> Tables:
-    """The lines of one view, without its key. `memory` holds the target as remembered from each number of photos; the usual one must be there.
+    """The rows of one view, without its key.
 
-    "choices" and the mask's figures are told of views that show the target; "detections" and "objects" of all.
+    `memory` holds the target as registered from each number of photos; USUAL_K must be among them.
+    "choices" and the figures of the mask are given for views that show the target; "detections" and
+    "objects" for all.
     """
-    seen, category = view.visible(), view.row.category
-    alike = {
-        name: mask for name, mask in seen.items() if objects.get_object(name).category == category
-    }
-    boxes, found = view.boxes(), looked.found
-    true = _stack([boxes[name] for name in alike])
-    best = stack.detector([view.rgb], category, FLOOR)[0]
-    detections = _detections(best, category, "category", view, boxes, alike)
-    unseen = _turn(UNSEEN.get(category, ()), view.row.episode)
-    asked: Line = {"unseen_phrase": unseen, "unseen_proposed": None}
-    if unseen:
-        other = stack.detector([view.rgb], unseen, FLOOR)[0]
-        detections += _detections(other, unseen, "unseen", view, boxes, alike)
-        asked["unseen_proposed"] = (
-            _any_on(other.xyxy[:TOP], boxes[view.row.target]) if view.row.target in seen else None
+    boxes = view.boxes()
+    alike = _same_category(view)
+    best = _best_boxes(view, stack)
+    detections = []
+    for kind, found in best.items():
+        detections += _detections(found, kind=kind, view=view, boxes=boxes, alike=alike)
+    false_alarm = _false_alarm(view, stack)
+    true_boxes = _stack_boxes([boxes[name] for name in alike])
+    true_embeddings = stack.encoder([crop(view.rgb, box) for box in true_boxes])
+    object_rows = _object_rows(
+        view=view,
+        cosine=similarity(true_embeddings, memory[USUAL_K].embeddings),
+        best=best,
+        candidates=candidates,
+        boxes=boxes,
+        alike=alike,
+    )
+    view_row = _view_row(view, candidates, object_rows)
+    view_row |= _unseen_phrase(view, best, boxes) | false_alarm
+    view_row |= {"proposed": None, "mask_iou_true_box": None}
+    choices: list[TableRow] = []
+    if view_row["counts"]:
+        target_box = boxes[view.row.target]
+        true_box = Boxes(target_box[None], np.ones(1, np.float32), view.row.category)
+        view_row["proposed"] = _is_found(candidates.boxes.xyxy, target_box)
+        view_row["mask_iou_true_box"] = _segmented_iou(view, stack, true_box)
+        choices = _choices(
+            view=view,
+            stack=stack,
+            memory=memory,
+            candidates=candidates,
+            true_embeddings=true_embeddings,
+            alike=list(alike),
         )
-    absent = _turn(_absent(view), view.row.episode)
-    asked |= {
-        "absent_phrase": absent,
-        "false_alarm": len(stack.detector([view.rgb], absent)[0]) > 0,
-    }
-    rows = stack.encoder([crop(view.rgb, box) for box in true])
-    near = similarity(rows, memory[USUAL_K].embeddings)
-    lines: list[Line] = [
-        {
-            "object": name, "role": "target" if name == view.row.target else "look-alike",
-            "tier": "personal" if name == view.row.target else objects.tier(objects.get_object(name)), "px": int(mask.sum()),
-            "recalled": _any_on(best.xyxy[:TOP], boxes[name]), "proposed": _any_on(found.xyxy, boxes[name]), "cosine": float(near[i].mean()),
-            "recalled_unseen": _any_on(other.xyxy[:TOP], boxes[name]) if unseen else None,
-        }
-        for i, (name, mask) in enumerate(alike.items())
-    ]  # fmt: skip
-    here: Line = {
-        "target_px": int(view.masks[view.row.target].sum()), "counts": view.row.target in seen, "visible_alike": len(alike),
-        "tier": "hard" if any(line["tier"] == "hard" for line in lines) else "standard", "candidates": len(found), **asked,
-        "proposed": None, "mask_iou_true_box": None,
-    }  # fmt: skip
-    choices: list[Line] = []
-    if here["counts"]:
-        goal = view.masks[view.row.target]
-        box = boxes[view.row.target]
-        exact = Boxes(box[None], np.ones(1, np.float32), category)
-        here |= {
-            "proposed": _any_on(found.xyxy, box),
-            "mask_iou_true_box": mask_iou(stack.segmenter(view.rgb, exact)[0], goal),
-        }
-        choices = _choices(view, stack, memory, looked, rows, list(alike))
     return {
-        "views": [here],
-        "objects": lines,
+        "views": [view_row],
+        "objects": object_rows,
         "detections": detections,
-        "choices": [{"tier": here["tier"], **line} for line in choices],
+        "choices": [{"tier": view_row["tier"], **choice} for choice in choices],
     }
 
 
-def _choices(
-    view: View,
-    stack: Stack,
-    memory: Mapping[int, PersonalObject],
-    looked: Looked,
-    true_rows: Float32[np.ndarray, "m d"],
-    alike: Sequence[str],
-) -> list[Line]:
-    """Who is elected of the candidates, and of the true boxes of the same objects; a line per number of references and rule."""
-    target, found = view.row.target, looked.found
-    masks: dict[int, float] = {}
-    lines = []
-    for k, mine in memory.items():
-        cosine, ideal = (
-            similarity(looked.rows, mine.embeddings),
-            similarity(true_rows, mine.embeddings),
-        )
-        for rule in RULES:
-            b, ideal_winner = vote(cosine, rule), vote(ideal, rule).winner
-            assert ideal_winner is not None, "the target's true box is among them"
-            elected, overlap = "", None
-            if (i := b.winner) is not None:
-                elected = under(view, found.xyxy[i])
-                if elected == target and i not in masks:
-                    one = Boxes(found.xyxy[[i]], found.score[[i]], found.phrase)
-                    masks[i] = mask_iou(stack.segmenter(view.rgb, one)[0], view.masks[target])
-                overlap = masks[i] if elected == target else None
-            lines.append(
-                {
-                    "k": k, "rule": rule, "right": elected == target, "right_given_boxes": alike[ideal_winner] == target, "elected": elected,
-                    "margin": b.margin, "cosine_margin": b.cosine_margin, "tie": i is not None and bool(b.tied[i]), "mask_iou": overlap,
-                }
-            )  # fmt: skip
-    return lines
-
-
-def under(view: View, box: Float32[np.ndarray, "4"]) -> str:
+def object_under_box(view: View, box: Box) -> str:
     """The object that a box lies on, the target before others; "nothing" when it lies on none."""
     boxes = view.boxes()
-    if view.row.target in boxes and _any_on(box[None], boxes[view.row.target]):
-        return view.row.target
-    overlap = box_iou(
-        box[None].astype(np.float64), _stack(list(boxes.values())).astype(np.float64)
-    )[0]
-    return list(boxes)[int(overlap.argmax())] if overlap.max(initial=0.0) >= SAME_BOX else "nothing"
-
-
-def _detections(
-    found: Boxes,
-    phrase: str,
-    kind: str,
-    view: View,
-    boxes: Mapping[str, Float32[np.ndarray, "4"]],
-    alike: Mapping[str, Mask],
-) -> list[Line]:
-    """Score and hit of every box that counts: not those on objects too small, or on kinds that one might call so too."""
-    category = view.row.category
-    also = {category, *AMBIGUOUS.get(category, ())}
-    ignored = [
-        name for name in boxes if name not in alike and objects.get_object(name).category in also
-    ]
-    hits = match(
-        found.xyxy,
-        _stack([boxes[name] for name in alike]),
-        _stack([boxes[name] for name in ignored]),
-    )
-    return [
-        {"asked": kind, "phrase": phrase, "score": float(s), "hit": hit}
-        for s, hit in zip(found.score, hits, strict=True)
-        if hit is not None
-    ]
+    target = view.row.target
+    if target in boxes and _is_found(box[None], boxes[target]):
+        return target
+    all_boxes = _stack_boxes(list(boxes.values()))
+    overlap = _box_ious(box[None], all_boxes)[0]
+    if overlap.max(initial=0.0) < SAME_BOX:
+        return "nothing"
+    return list(boxes)[int(overlap.argmax())]
 
 
 def match(
@@ -250,44 +212,273 @@ def match(
     ignored: Float32[np.ndarray, "i 4"],
     at: float = SAME_BOX,
 ) -> list[bool | None]:
-    """Of boxes, best first, whether each takes a wanted one that is still free, as in average precision; None for one that counts neither way."""
-    overlap, near = (
-        box_iou(found.astype(np.float64), wanted.astype(np.float64)),
-        box_iou(found.astype(np.float64), ignored.astype(np.float64)),
-    )
-    free, hits = np.ones(len(wanted), bool), list[bool | None]()
-    for mine, other in zip(overlap, near, strict=True):
-        chosen = int(np.where(free, mine, -1).argmax()) if len(wanted) else -1
-        if chosen >= 0 and free[chosen] and mine[chosen] >= at:
+    """Whether each box, best first, takes a wanted box that is still free.
+
+    As in average precision. None for a box that overlaps an ignored one: it counts neither way.
+    """
+    with_wanted = _box_ious(found, wanted)
+    with_ignored = _box_ious(found, ignored)
+    free = np.ones(len(wanted), bool)
+    hits: list[bool | None] = []
+    for overlap, ignored_overlap in zip(with_wanted, with_ignored, strict=True):
+        chosen = -1
+        if len(wanted):
+            chosen = int(np.where(free, overlap, -1).argmax())
+        if chosen >= 0 and free[chosen] and overlap[chosen] >= at:
             free[chosen] = False
             hits.append(True)
+        elif ignored_overlap.max(initial=0.0) >= at:
+            hits.append(None)
         else:
-            hits.append(None if other.max(initial=0.0) >= at else False)
+            hits.append(False)
     return hits
 
 
-def _absent(view: View) -> list[str]:
-    """Categories of which nothing is placed, and nothing that one might call so."""
+def _models(rows: Sequence[EpisodeRow]) -> list[str]:
+    """The objects that the rows place, in the order of their first places."""
+    models: list[str] = []
+    for row in rows:
+        for place in row.placements:
+            if place.model not in models:
+                models.append(place.model)
+    return models
+
+
+def _opening_views(env: Env, row: EpisodeRow) -> list[View]:
+    """The view of every camera of an environment that was just reset."""
+    masks = env.truth(masks=True).masks
+    optics = {}
+    for calibrated in env.cameras():
+        optics[calibrated.name] = calibrated
+    views = []
+    for camera, rgb in env.observe().images.items():
+        view = View(
+            row=row,
+            camera=camera,
+            rgb=rgb,
+            masks=masks[camera],
+            optics=optics[camera],
+        )
+        views.append(view)
+    return views
+
+
+def _same_category(view: View) -> dict[str, Mask]:
+    """The masks of the visible objects of the target's category."""
+    alike = {}
+    for name, mask in view.visible().items():
+        if objects.get_object(name).category == view.row.category:
+            alike[name] = mask
+    return alike
+
+
+def _best_boxes(view: View, stack: Stack) -> dict[str, Boxes]:
+    """The boxes down to FLOOR, best first, of the category and of its unseen phrase, if any."""
+    best = {"category": stack.detector([view.rgb], view.row.category, FLOOR)[0]}
+    phrase = _take_turn(UNSEEN.get(view.row.category, ()), view.row.episode)
+    if phrase:
+        best["unseen"] = stack.detector([view.rgb], phrase, FLOOR)[0]
+    return best
+
+
+def _false_alarm(view: View, stack: Stack) -> TableRow:
+    """Whether anything is found of a category that is absent."""
+    phrase = _take_turn(_absent_categories(view), view.row.episode)
+    found = stack.detector([view.rgb], phrase)[0]
+    return {"absent_phrase": phrase, "false_alarm": len(found) > 0}
+
+
+def _unseen_phrase(view: View, best: Mapping[str, Boxes], boxes: Mapping[str, Box]) -> TableRow:
+    """Whether the unseen phrase finds the target; None without such a phrase or visible target."""
+    if "unseen" not in best:
+        return {"unseen_phrase": "", "unseen_proposed": None}
+    target = view.row.target
+    proposed = None
+    if target in view.visible():
+        proposed = _is_found(best["unseen"].xyxy[:TOP], boxes[target])
+    return {"unseen_phrase": best["unseen"].phrase, "unseen_proposed": proposed}
+
+
+def _object_rows(
+    *,
+    view: View,
+    cosine: Float32[np.ndarray, "m k"],
+    best: Mapping[str, Boxes],
+    candidates: EmbeddedBoxes,
+    boxes: Mapping[str, Box],
+    alike: Mapping[str, Mask],
+) -> list[TableRow]:
+    """A row per object of `alike`: whether it was found, and its cosine with the references.
+
+    `best` are the boxes of each phrase, best first (`_best_boxes`).
+    """
+    rows = []
+    for i, (name, mask) in enumerate(alike.items()):
+        role = "look-alike"
+        if name == view.row.target:
+            role = "target"
+        recalled_unseen = None
+        if "unseen" in best:
+            recalled_unseen = _is_found(best["unseen"].xyxy[:TOP], boxes[name])
+        row: TableRow = {
+            "object": name,
+            "role": role,
+            "tier": _tier_in_view(name, view),
+            "px": int(mask.sum()),
+            "recalled": _is_found(best["category"].xyxy[:TOP], boxes[name]),
+            "proposed": _is_found(candidates.boxes.xyxy, boxes[name]),
+            "cosine": float(cosine[i].mean()),
+            "recalled_unseen": recalled_unseen,
+        }
+        rows.append(row)
+    return rows
+
+
+def _view_row(view: View, candidates: EmbeddedBoxes, object_rows: Sequence[TableRow]) -> TableRow:
+    """What a view shows, and how many candidates were found in it."""
+    target = view.row.target
+    tier = "standard"
+    for row in object_rows:
+        if row["tier"] == "hard":
+            tier = "hard"
+    return {
+        "target_px": int(view.masks[target].sum()),
+        "counts": target in view.visible(),
+        "visible_alike": len(object_rows),
+        "tier": tier,
+        "candidates": len(candidates.boxes),
+    }
+
+
+def _tier_in_view(name: str, view: View) -> str:
+    if name == view.row.target:
+        return "personal"
+    return objects.tier(objects.get_object(name))
+
+
+def _segmented_iou(view: View, stack: Stack, box: Boxes) -> float:
+    """The IoU of the target's mask with the one that the segmenter draws from a single box."""
+    mask = stack.segmenter(view.rgb, box)[0]
+    return mask_iou(mask, view.masks[view.row.target])
+
+
+def _choices(
+    *,
+    view: View,
+    stack: Stack,
+    memory: Mapping[int, PersonalObject],
+    candidates: EmbeddedBoxes,
+    true_embeddings: Float32[np.ndarray, "m d"],
+    alike: Sequence[str],
+) -> list[TableRow]:
+    """Which candidate is elected, and which of the true boxes of the same objects.
+
+    A row per number of references and rule. `alike` names the rows of `true_embeddings`.
+    """
+    target = view.row.target
+    target_ious: dict[int, float] = {}
+    rows = []
+    for k, personal in memory.items():
+        cosine = similarity(candidates.embeddings, personal.embeddings)
+        true_cosine = similarity(true_embeddings, personal.embeddings)
+        for rule in RULES:
+            ballot = vote(cosine, rule)
+            true_winner = vote(true_cosine, rule).winner
+            assert true_winner is not None, "the target's true box is among them"
+            elected = _elected_object(view, candidates, ballot)
+            overlap = None
+            if elected == target and ballot.winner is not None:
+                if ballot.winner not in target_ious:
+                    candidate = _select_box(candidates.boxes, ballot.winner)
+                    target_ious[ballot.winner] = _segmented_iou(view, stack, candidate)
+                overlap = target_ious[ballot.winner]
+            row: TableRow = {
+                "k": k,
+                "rule": rule,
+                "right": elected == target,
+                "right_given_boxes": alike[true_winner] == target,
+                "elected": elected,
+                "margin": ballot.margin,
+                "cosine_margin": ballot.cosine_margin,
+                "tie": _is_tie(ballot),
+                "mask_iou": overlap,
+            }
+            rows.append(row)
+    return rows
+
+
+def _elected_object(view: View, candidates: EmbeddedBoxes, ballot: Ballot) -> str:
+    """The object under the winner's box; "" when there are no candidates."""
+    if ballot.winner is None:
+        return ""
+    return object_under_box(view, candidates.boxes.xyxy[ballot.winner])
+
+
+def _is_tie(ballot: Ballot) -> bool:
+    return ballot.winner is not None and bool(ballot.tied[ballot.winner])
+
+
+def _select_box(boxes: Boxes, i: int) -> Boxes:
+    return Boxes(boxes.xyxy[[i]], boxes.score[[i]], boxes.phrase)
+
+
+def _detections(
+    found: Boxes,
+    *,
+    kind: str,
+    view: View,
+    boxes: Mapping[str, Box],
+    alike: Mapping[str, Mask],
+) -> list[TableRow]:
+    """Score and hit of every box that counts.
+
+    Boxes on objects that are too small do not count, nor boxes on kinds that the phrase may name
+    too.
+    """
+    category = view.row.category
+    ambiguous = {category, *AMBIGUOUS.get(category, ())}
+    wanted = [boxes[name] for name in alike]
+    ignored = []
+    for name, box in boxes.items():
+        if name not in alike and objects.get_object(name).category in ambiguous:
+            ignored.append(box)
+    hits = match(found.xyxy, _stack_boxes(wanted), _stack_boxes(ignored))
+    rows: list[TableRow] = []
+    for score, hit in zip(found.score, hits, strict=True):
+        if hit is not None:
+            rows.append({"asked": kind, "phrase": found.phrase, "score": float(score), "hit": hit})
+    return rows
+
+
+def _absent_categories(view: View) -> list[str]:
+    """Categories of which nothing is placed, and nothing that the same word may name."""
     placed = {objects.get_object(place.model).category for place in view.row.placements}
-    return [kind for kind in objects.CATEGORIES if not placed & {kind, *AMBIGUOUS.get(kind, ())}]
+    absent = []
+    for category in objects.CATEGORIES:
+        ambiguous = {category, *AMBIGUOUS.get(category, ())}
+        if not placed & ambiguous:
+            absent.append(category)
+    return absent
 
 
-def _turn(names: Sequence[str], number: int) -> str:
+def _take_turn(names: Sequence[str], number: int) -> str:
     """Each name in turn; "" when there is none."""
-    return names[number % len(names)] if names else ""
+    if not names:
+        return ""
+    return names[number % len(names)]
 
 
-def _any_on(found: Float32[np.ndarray, "n 4"], box: Float32[np.ndarray, "4"]) -> bool:
-    return bool(
-        box_iou(found.astype(np.float64), box[None].astype(np.float64)).max(initial=0.0) >= SAME_BOX
-    )
+def _is_found(found: Float32[np.ndarray, "n 4"], box: Box) -> bool:
+    """Whether any of the boxes found agrees with `box`."""
+    overlap = _box_ious(found, box[None])
+    return bool(overlap.max(initial=0.0) >= SAME_BOX)
 
 
-def _box(mask: Mask) -> Float32[np.ndarray, "4"]:
-    box = mask_box(mask)
-    assert box is not None, "only masks that show something have a box"
-    return box
+def _box_ious(
+    a: Float32[np.ndarray, "n 4"], b: Float32[np.ndarray, "m 4"]
+) -> Float64[np.ndarray, "n m"]:
+    return box_iou(a.astype(np.float64), b.astype(np.float64))
 
 
-def _stack(boxes: Sequence[Float32[np.ndarray, "4"]]) -> Float32[np.ndarray, "n 4"]:
+def _stack_boxes(boxes: Sequence[Box]) -> Float32[np.ndarray, "n 4"]:
     return np.array(boxes, np.float32).reshape(-1, 4)

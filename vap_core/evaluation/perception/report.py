@@ -1,7 +1,10 @@
-"""The survey as text: every measure with its target, per suite, with n and 95 % intervals; then by camera, by K and rule, and what it costs."""
+"""The survey as text: every measure with its target, per suite, with n and 95 % intervals.
+
+Then right instances by number of references and rule, by association, by camera; and the times.
+"""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,254 +20,438 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Survey = Mapping[str, "pd.DataFrame"]
+"""The tables of a survey by name."""
+Statistic = Callable[["pd.DataFrame"], Estimate]
+Cells = Sequence[str]
 ALL = "all"
 HIDDEN = 3
+"""Frames for which the target is hidden in the measures of identity."""
+CASES = ("right", "case 1", "case 2", "nothing")
+TIERS = ("standard", "hard")
 NOTE = (
-    f"value [95 % interval] n; K = {USUAL_K}, vote, unless said otherwise. Shares: Wilson over views (objects for recall, tracks for identity);"
-    " IoU and AP50: bootstrap by episode.\nViews that show less of the target than 100 px of 224 x 224 do not count. 'hard': a look-alike of the"
-    " target's own base and ink colours is in view."
+    f"value [95 % interval] n; K = {USUAL_K}, vote, unless said otherwise. Shares: Wilson over "
+    "views (objects for recall, tracks for identity); IoU and AP50: bootstrap by episode.\n"
+    "Views that show less of the target than 100 px of 224 x 224 do not count. 'hard': a "
+    "look-alike of the target's own base and ink colours is in view."
 )
 
 
 @value
 class Measure:
-    """One figure per suite and over all of them, and the least it should be (None: it only explains the others)."""
+    """One estimate per suite and over all of them, and the least it should be.
+
+    `target` is a fraction; None for a measure that only explains the others.
+    """
 
     name: str
     target: float | None
     cells: Mapping[str, Estimate]
 
     @property
-    def short(self) -> list[str]:
+    def missed_suites(self) -> list[str]:
         """The suites whose value misses the target."""
-        return [
-            name
-            for name, e in self.cells.items()
-            if name != ALL and e.n and self.target is not None and e.value < self.target
-        ]
+        missed: list[str] = []
+        if self.target is None:
+            return missed
+        for name, estimate in self.cells.items():
+            if name != ALL and estimate.n and estimate.value < self.target:
+                missed.append(name)
+        return missed
 
     @property
     def verdict(self) -> str:
+        """Either "met", "short: " and the suites, or "not measured"; "" without a target."""
         if self.target is None:
             return ""
-        if not any(e.n for e in self.cells.values()):
+        if not any(estimate.n for estimate in self.cells.values()):
             return "not measured"
-        return f"short: {', '.join(self.short)}" if self.short else "met"
+        if self.missed_suites:
+            return f"short: {', '.join(self.missed_suites)}"
+        return "met"
 
     def row(self) -> list[str]:
-        return [
-            self.name,
-            "" if self.target is None else f">= {100 * self.target:.0f}",
-            *(e.told() for e in self.cells.values()),
-            self.verdict,
-        ]
+        """Name, target, every estimate and the verdict as text."""
+        target = ""
+        if self.target is not None:
+            target = f">= {100 * self.target:.0f}"
+        estimates = [estimate.text() for estimate in self.cells.values()]
+        return [self.name, target, *estimates, self.verdict]
 
 
 def measures(tables: Survey) -> list[Measure]:
     """Every measure of perception by suite, in %."""
-    views, seen, choices, tracks = (
-        _counted(tables[name]) for name in ("views", "objects", "choices", "tracks")
-    )
-    names = [name for name in suites.BENCHMARKS if (views.suite == name).any()]
-
-    def by_suite(
-        name: str,
-        target: float | None,
-        table: "pd.DataFrame",
-        figure: "Callable[[pd.DataFrame], Estimate]",
-    ) -> Measure:
-        parts = {suite: table[table.suite == suite] if len(table) else table for suite in names} | {
-            ALL: table
-        }
-        return Measure(
-            name,
-            target,
-            {suite: figure(part) if len(part) else NONE for suite, part in parts.items()},
-        )
-
-    def ap(asked: str) -> "Callable[[pd.DataFrame], Estimate]":
-        found = tables["detections"]
-        mine = found[found.asked == asked] if len(found) else found
-        return lambda wanted: precision(
-            mine[mine.suite.isin(wanted.suite.unique())] if len(mine) else mine, wanted
-        )
-
-    def of(column: str) -> "Callable[[pd.DataFrame], Estimate]":
-        return lambda table: share(table[column])
-
-    usual = choices[(choices.k == USUAL_K) & (choices.rule == "vote")]
-    standard, hard = usual[usual.tier == "standard"], usual[usual.tier == "hard"]
-    unseen = seen.dropna(subset=["recalled_unseen"])
-    target = tracks[tracks.target] if len(tracks) else tracks
-    free, after = (target[target.hidden == n] if len(target) else target for n in (0, HIDDEN))
-    plate, arm = (after[after.kind == kind] if len(after) else after for kind in ("plate", "arm"))
-    rest = tracks[~tracks.target & (tracks.hidden == 0)] if len(tracks) else tracks
-    return [
-        by_suite("detection recall@10, IoU .5", 0.97, seen, of("recalled")),
-        by_suite("detection AP50", 0.85, seen, ap("category")),
-        by_suite("right instance, standard", 0.97, standard, of("right")),
-        by_suite("right instance, hard", 0.90, hard, of("right")),
-        by_suite("mask IoU of the right instance", 0.88, usual, lambda t: mean(t, "mask_iou")),
-        by_suite("identity kept, never hidden", 0.98, free, of("kept")),
-        by_suite(f"identity kept, {HIDDEN} frames fully hidden", 0.95, plate, of("kept")),
-        by_suite("track IoU, whole episodes", 0.80, free, lambda t: mean(t, "mean_iou")),
-        by_suite("recall at the detector's own threshold", None, seen, of("proposed")),
-        by_suite("target proposed", None, views, of("proposed")),
-        by_suite("right given true boxes, standard", None, standard, of("right_given_boxes")),
-        by_suite("right given true boxes, hard", None, hard, of("right_given_boxes")),
-        by_suite("right where proposed, all", None, _where_proposed(usual, views), of("right")),
-        by_suite("mask IoU from the true box", None, views, lambda t: mean(t, "mask_iou_true_box")),
-        by_suite("recall@10, unseen phrase", None, unseen, of("recalled_unseen")),
-        by_suite("AP50, unseen phrase", None, unseen, ap("unseen")),
-        by_suite("false alarm, absent category", None, views, of("false_alarm")),
-        by_suite("look-alikes: identity kept, never hidden", None, rest, of("kept")),
-        by_suite("look-alikes: track IoU", None, rest, lambda t: mean(t, "mean_iou")),
-        by_suite(f"identity kept, {HIDDEN} frames behind an arm", None, arm, of("kept")),
+    names = _suite_names(_counting_views(tables["views"]))
+    parts = [
+        *_requirements(tables),
+        *_detector_measures(tables),
+        *_unseen_measures(tables),
+        *_tracker_measures(tables),
     ]
+    found = []
+    for name, target, table, statistic in parts:
+        cells = _estimate_by_suite(names, table, statistic)
+        found.append(Measure(name, target, cells))
+    return found
 
 
 def report(tables: Survey, stack: str) -> str:
     """What the command prints."""
     found = measures(tables)
-    head = ["measure, %", "target", *found[0].cells, "verdict"]
-    views, references, names = (
-        tables["views"],
-        tables["references"],
-        [name for name in found[0].cells if name != ALL],
+    cells = list(found[0].cells)
+    views = _text_of_views_without_target(tables["views"], cells)
+    cut = _share_of_cut_photos(tables["references"])
+    note = (
+        f"stack {stack}. {NOTE}\n"
+        f"Views without target, left out: {views}. "
+        f"Reference photos cut by the detector: {cut.text()}."
     )
-    unseen = ", ".join(
-        f"{name} {int((~part.counts).sum())} of {len(part)}"
-        for name in names
-        for part in [views[views.suite == name]]
-    )
-    whole = share([i >= line.whole for line in references.itertuples() for i in range(line.k)])
-    return "\n".join(
-        [
-            align([head, *(m.row() for m in found if m.target), [""] * len(head), *(m.row() for m in found if not m.target)]),
-            "",
-            f"stack {stack}. {NOTE}",
-            f"Views without target, left out: {unseen}. Reference photos cut by the detector: {whole.told()}.",
-            "",
-            align([["right instance, %", *found[0].cells], *_by_k(tables["choices"], list(found[0].cells))]),
-            "",
-            *([align(_by_association(tables["agreements"])), ""] if len(tables["agreements"]) else []),
-            align([["by camera, %", "views", "recall@10", "AP50", "right, standard", "right, hard", "mask IoU"], *_by_camera(tables)]),
-            "",
-            align(_speed(tables["speed"])),
-        ]
-    )  # fmt: skip
+    later_tables = [_rows_by_k(tables["choices"], cells)]
+    if len(tables["agreements"]):
+        later_tables.append(_rows_by_association(tables["agreements"]))
+    later_tables.append(_rows_by_camera(tables))
+    later_tables.append(_speed_rows(tables["speed"]))
+    paragraphs = [align(_measure_rows(found)), note]
+    for rows in later_tables:
+        paragraphs.append(align(rows))
+    return "\n\n".join(paragraphs)
 
 
-def summary(found: list[Measure]) -> list[dict[str, object]]:
+def summary(found: Iterable[Measure]) -> list[dict[str, object]]:
     """The measures as JSON."""
-    return [
-        {"measure": m.name, "target": m.target, "verdict": m.verdict,
-         "cells": {name: {"value": e.value, "low": e.low, "high": e.high, "n": e.n} if e.n else None for name, e in m.cells.items()}}
-        for m in found
-    ]  # fmt: skip
-
-
-def _by_k(choices: "pd.DataFrame", cells: list[str]) -> list[list[str]]:
-    rows = []
-    for k in KS:
-        for rule in RULES:
-            part = choices[(choices.k == k) & (choices.rule == rule)]
-            rows.append(
-                [
-                    f"K = {k}, {rule}",
-                    *(
-                        share((part if name == ALL else part[part.suite == name]).right).told()
-                        for name in cells
-                    ),
-                ]
-            )
-    return rows
-
-
-def _by_association(agreements: "pd.DataFrame") -> list[list[str]]:
-    """Head and a line per suite and way to associate: what its episodes' views show together, and how many views show the target highlighted."""
-    cases = ("right", "case 1", "case 2", "nothing")
-    rows = [["views associated, % of episodes", "by", *cases, "% of views right"]]
-    for (suite, way), part in agreements.groupby(["suite", "associate"], sort=False):
-        views = share([i < line.right for line in part.itertuples() for i in range(line.views)])
+    rows: list[dict[str, object]] = []
+    for measure in found:
         rows.append(
-            [
-                str(suite),
-                str(way),
-                *(share(part.case == name).told() for name in cases),
-                views.told(),
-            ]
+            {
+                "measure": measure.name,
+                "target": measure.target,
+                "verdict": measure.verdict,
+                "cells": _summarize_cells(measure.cells),
+            }
         )
     return rows
-
-
-def _by_camera(tables: Survey) -> list[list[str]]:
-    rows = []
-    for suite, camera in (
-        tables["views"][["suite", "camera"]].drop_duplicates().itertuples(index=False, name=None)
-    ):
-        views, seen, found, choices = (
-            _of(tables[name], suite, camera)
-            for name in ("views", "objects", "detections", "choices")
-        )
-        usual = choices[(choices.k == USUAL_K) & (choices.rule == "vote")]
-        right = [share(usual[usual.tier == tier].right).told() for tier in ("standard", "hard")]
-        detected = [
-            share(seen.recalled).told(),
-            precision(found[found.asked == "category"], seen).told(),
-        ]
-        rows.append(
-            [
-                f"{suite} {camera}",
-                str(int(views.counts.sum())),
-                *detected,
-                *right,
-                mean(usual, "mask_iou").told(),
-            ]
-        )
-    return rows
-
-
-def _of(table: "pd.DataFrame", suite: str, camera: str) -> "pd.DataFrame":
-    return table[(table.suite == suite) & (table.camera == camera)]
-
-
-def _speed(speed: "pd.DataFrame") -> list[list[str]]:
-    """Head and a line per piece of work, with its ratio to each that has no budget of its own."""
-    ms = {str(line.what): float(line.ms) for line in speed.itertuples()}
-    others = [name for name in ms if name not in LIMITS_MS]
-    rows = [
-        [
-            "one thread, 224 px view",
-            "ms (quartiles)",
-            "budget",
-            *(f"x {name}" for name in others),
-            "verdict",
-        ]
-    ]
-    for line in speed.itertuples():
-        limit = LIMITS_MS.get(line.what)
-        told = [
-            f"{line.what}, {line.rounds} rounds",
-            f"{line.ms:.1f} ({line.low_ms:.1f}, {line.high_ms:.1f})",
-            f"<= {limit:g}" if limit else "",
-        ]
-        verdict = "" if limit is None else "met" if line.ms <= limit else "short"
-        rows.append([*told, *(f"{line.ms / ms[name]:.2f}" for name in others), verdict])
-    return rows
-
-
-def _counted(table: "pd.DataFrame") -> "pd.DataFrame":
-    """Lines of views that count: the others have no figure of the target."""
-    return table[table.counts] if "counts" in table.columns else table
-
-
-def _where_proposed(choices: "pd.DataFrame", views: "pd.DataFrame") -> "pd.DataFrame":
-    key = ["suite", "task", "episode", "camera"]
-    return choices.merge(views[[*key, "proposed"]], on=key).query("proposed == True")
 
 
 def conclude(tables: Survey, stack: str, folder: Path) -> str:
     """Write `summary.json` into the run's folder, and return the text to print."""
-    write_atomic(folder / "summary.json", json.dumps(summary(measures(tables)), indent=1).encode())
-    return f"{report(tables, stack)}\n\nwrote {folder / 'summary.json'} and the tables beside it"
+    path = folder / "summary.json"
+    rows = summary(measures(tables))
+    content = json.dumps(rows, indent=1)
+    write_atomic(path, content.encode())
+    return f"{report(tables, stack)}\n\nwrote {path} and the tables beside it"
+
+
+Part = tuple[str, float | None, "pd.DataFrame", Statistic]
+"""Name and target of a measure, the rows that it is about, and what it takes of them."""
+
+
+def _requirements(tables: Survey) -> list[Part]:
+    """The measures that have a target."""
+    objects = _counting_views(tables["objects"])
+    choices = _usual_choices(_counting_views(tables["choices"]))
+    standard = choices[choices.tier == "standard"]
+    hard = choices[choices.tier == "hard"]
+    undisturbed = _target_tracks(tables, hidden=0)
+    plate = _of_kind(_target_tracks(tables, hidden=HIDDEN), "plate")
+    kept = _share_of("kept")
+    right = _share_of("right")
+    mask_iou = _mean_of("mask_iou")
+    ap50 = _ap50_of("category", tables["detections"])
+    return [
+        ("detection recall@10, IoU .5", 0.97, objects, _share_of("recalled")),
+        ("detection AP50", 0.85, objects, ap50),
+        ("right instance, standard", 0.97, standard, right),
+        ("right instance, hard", 0.90, hard, right),
+        ("mask IoU of the right instance", 0.88, choices, mask_iou),
+        ("identity kept, never hidden", 0.98, undisturbed, kept),
+        (f"identity kept, {HIDDEN} frames fully hidden", 0.95, plate, kept),
+        ("track IoU, whole episodes", 0.80, undisturbed, _mean_of("mean_iou")),
+    ]
+
+
+def _detector_measures(tables: Survey) -> list[Part]:
+    """What the detector and the segmenter contribute, without targets."""
+    objects = _counting_views(tables["objects"])
+    views = _counting_views(tables["views"])
+    choices = _usual_choices(_counting_views(tables["choices"]))
+    standard = choices[choices.tier == "standard"]
+    hard = choices[choices.tier == "hard"]
+    where_proposed = _where_proposed(choices, views)
+    proposed = _share_of("proposed")
+    ideal = _share_of("right_given_boxes")
+    mask_iou = _mean_of("mask_iou_true_box")
+    return [
+        ("recall at the detector's own threshold", None, objects, proposed),
+        ("target proposed", None, views, proposed),
+        ("right given true boxes, standard", None, standard, ideal),
+        ("right given true boxes, hard", None, hard, ideal),
+        ("right where proposed, all", None, where_proposed, _share_of("right")),
+        ("mask IoU from the true box", None, views, mask_iou),
+    ]
+
+
+def _unseen_measures(tables: Survey) -> list[Part]:
+    """The detector on phrases that it was not trained with, and on absent categories."""
+    views = _counting_views(tables["views"])
+    objects = _counting_views(tables["objects"])
+    asked = objects.dropna(subset=["recalled_unseen"])
+    ap50 = _ap50_of("unseen", tables["detections"])
+    return [
+        ("recall@10, unseen phrase", None, asked, _share_of("recalled_unseen")),
+        ("AP50, unseen phrase", None, asked, ap50),
+        ("false alarm, absent category", None, views, _share_of("false_alarm")),
+    ]
+
+
+def _tracker_measures(tables: Survey) -> list[Part]:
+    """The tracker on look-alikes and behind an arm, without targets."""
+    tracks = _counting_views(tables["tracks"])
+    lookalikes = tracks
+    if len(tracks):
+        lookalikes = tracks[~tracks.target & (tracks.hidden == 0)]
+    arm = _of_kind(_target_tracks(tables, hidden=HIDDEN), "arm")
+    kept = _share_of("kept")
+    return [
+        ("look-alikes: identity kept, never hidden", None, lookalikes, kept),
+        ("look-alikes: track IoU", None, lookalikes, _mean_of("mean_iou")),
+        (f"identity kept, {HIDDEN} frames behind an arm", None, arm, kept),
+    ]
+
+
+def _share_of(column: str) -> Statistic:
+    """The share of rows where a column holds."""
+
+    def share_of_column(table: "pd.DataFrame") -> Estimate:
+        return share(table[column])
+
+    return share_of_column
+
+
+def _mean_of(column: str) -> Statistic:
+    """The mean of a column."""
+
+    def mean_of_column(table: "pd.DataFrame") -> Estimate:
+        return mean(table, column)
+
+    return mean_of_column
+
+
+def _ap50_of(asked: str, detections: "pd.DataFrame") -> Statistic:
+    """AP50 of the detections of one kind of phrase, on the objects of the table."""
+    found = detections
+    if len(detections):
+        found = detections[detections.asked == asked]
+
+    def ap50(wanted: "pd.DataFrame") -> Estimate:
+        of_suites = found
+        if len(found):
+            of_suites = found[found.suite.isin(wanted.suite.unique())]
+        return precision(of_suites, wanted)
+
+    return ap50
+
+
+def _estimate_by_suite(
+    names: Sequence[str], table: "pd.DataFrame", statistic: Statistic
+) -> dict[str, Estimate]:
+    """A statistic of the rows of each suite, and of all rows; NONE where there are no rows."""
+    cells = {}
+    for name in [*names, ALL]:
+        rows = _of_suite(table, name)
+        cells[name] = NONE
+        if len(rows):
+            cells[name] = statistic(rows)
+    return cells
+
+
+def _of_suite(table: "pd.DataFrame", name: str) -> "pd.DataFrame":
+    """The rows of a suite; every row for ALL."""
+    if name == ALL or not len(table):
+        return table
+    return table[table.suite == name]
+
+
+def _suite_names(views: "pd.DataFrame") -> list[str]:
+    """The suites of a table in their usual order."""
+    names = []
+    for name in suites.BENCHMARKS:
+        if (views.suite == name).any():
+            names.append(name)
+    return names
+
+
+def _counting_views(table: "pd.DataFrame") -> "pd.DataFrame":
+    """The rows of views that count: the others have no figures of the target."""
+    if "counts" not in table.columns:
+        return table
+    return table[table.counts]
+
+
+def _usual_choices(choices: "pd.DataFrame") -> "pd.DataFrame":
+    """The choices by USUAL_K references and vote."""
+    return choices[(choices.k == USUAL_K) & (choices.rule == "vote")]
+
+
+def _target_tracks(tables: Survey, hidden: int) -> "pd.DataFrame":
+    """The tracks of targets that were hidden for so many frames."""
+    tracks = _counting_views(tables["tracks"])
+    if len(tracks):
+        tracks = tracks[tracks.target]
+    if len(tracks):
+        tracks = tracks[tracks.hidden == hidden]
+    return tracks
+
+
+def _of_kind(tracks: "pd.DataFrame", kind: str) -> "pd.DataFrame":
+    """The tracks behind one kind of occluder."""
+    if not len(tracks):
+        return tracks
+    return tracks[tracks.kind == kind]
+
+
+def _where_proposed(choices: "pd.DataFrame", views: "pd.DataFrame") -> "pd.DataFrame":
+    """The choices of the views in which the target was proposed."""
+    key = ["suite", "task", "episode", "camera"]
+    with_views = choices.merge(views[[*key, "proposed"]], on=key)
+    return with_views.query("proposed == True")
+
+
+def _summarize_cells(cells: Mapping[str, Estimate]) -> dict[str, dict[str, float] | None]:
+    """The estimates as JSON; None without cases."""
+    summaries: dict[str, dict[str, float] | None] = {}
+    for name, estimate in cells.items():
+        summaries[name] = None
+        if estimate.n:
+            summaries[name] = {
+                "value": estimate.value,
+                "low": estimate.low,
+                "high": estimate.high,
+                "n": estimate.n,
+            }
+    return summaries
+
+
+def _measure_rows(found: Sequence[Measure]) -> list[list[str]]:
+    """Head, the measures with a target, an empty row, and the measures without."""
+    head = ["measure, %", "target", *found[0].cells, "verdict"]
+    with_target = []
+    without_target = []
+    for measure in found:
+        if measure.target:
+            with_target.append(measure.row())
+        else:
+            without_target.append(measure.row())
+    return [head, *with_target, [""] * len(head), *without_target]
+
+
+def _text_of_views_without_target(views: "pd.DataFrame", cells: Cells) -> str:
+    """How many views of each suite do not count."""
+    texts = []
+    for name in cells:
+        if name != ALL:
+            part = views[views.suite == name]
+            n_left_out = int((~part.counts).sum())
+            texts.append(f"{name} {n_left_out} of {len(part)}")
+    return ", ".join(texts)
+
+
+def _share_of_cut_photos(references: "pd.DataFrame") -> Estimate:
+    """The share of reference photos that the detector cut; `whole` counts the others."""
+    cut: list[bool] = []
+    for row in references.itertuples():
+        cut += [False] * row.whole + [True] * (row.k - row.whole)
+    return share(cut)
+
+
+def _rows_by_k(choices: "pd.DataFrame", cells: Cells) -> list[list[str]]:
+    """Head and a row per number of references and rule: right instances by suite."""
+    rows = [["right instance, %", *cells]]
+    for k in KS:
+        for rule in RULES:
+            part = choices[(choices.k == k) & (choices.rule == rule)]
+            row = [f"K = {k}, {rule}"]
+            for name in cells:
+                of_suite = part
+                if name != ALL:
+                    of_suite = part[part.suite == name]
+                row.append(share(of_suite.right).text())
+            rows.append(row)
+    return rows
+
+
+def _rows_by_association(agreements: "pd.DataFrame") -> list[list[str]]:
+    """Head and a row per suite and way to associate.
+
+    What the views of an episode highlight together, and in how many views it is the target.
+    """
+    rows = [["views associated, % of episodes", "by", *CASES, "% of views right"]]
+    for (suite, way), part in agreements.groupby(["suite", "associate"], sort=False):
+        row = [str(suite), str(way)]
+        for case in CASES:
+            row.append(share(part.case == case).text())
+        right: list[bool] = []
+        for episode in part.itertuples():
+            right += [True] * episode.right + [False] * (episode.views - episode.right)
+        row.append(share(right).text())
+        rows.append(row)
+    return rows
+
+
+def _rows_by_camera(tables: Survey) -> list[list[str]]:
+    """Head and a row per suite and camera."""
+    head = ["by camera, %", "views", "recall@10", "AP50"]
+    head += ["right, standard", "right, hard", "mask IoU"]
+    rows = [head]
+    cameras = tables["views"][["suite", "camera"]].drop_duplicates()
+    for suite, camera in cameras.itertuples(index=False, name=None):
+        views = _of_camera(tables["views"], suite, camera)
+        objects = _of_camera(tables["objects"], suite, camera)
+        detections = _of_camera(tables["detections"], suite, camera)
+        choices = _usual_choices(_of_camera(tables["choices"], suite, camera))
+        ap50 = precision(detections[detections.asked == "category"], objects)
+        n_views = int(views.counts.sum())
+        row = [f"{suite} {camera}", str(n_views)]
+        row.append(share(objects.recalled).text())
+        row.append(ap50.text())
+        for tier in TIERS:
+            of_tier = choices[choices.tier == tier]
+            row.append(share(of_tier.right).text())
+        row.append(mean(choices, "mask_iou").text())
+        rows.append(row)
+    return rows
+
+
+def _of_camera(table: "pd.DataFrame", suite: str, camera: str) -> "pd.DataFrame":
+    return table[(table.suite == suite) & (table.camera == camera)]
+
+
+def _speed_rows(speed: "pd.DataFrame") -> list[list[str]]:
+    """Head and a row per piece of work, with its ratio to each that has no budget of its own."""
+    others_ms = {}
+    for work in speed.itertuples():
+        if work.what not in LIMITS_MS:
+            others_ms[str(work.what)] = float(work.ms)
+    head = ["one thread, 224 px view", "ms (quartiles)", "budget"]
+    for name in others_ms:
+        head.append(f"x {name}")
+    head.append("verdict")
+    rows = [head]
+    for work in speed.itertuples():
+        limit_ms = LIMITS_MS.get(work.what)
+        row = [
+            f"{work.what}, {work.rounds} rounds",
+            f"{work.ms:.1f} ({work.low_ms:.1f}, {work.high_ms:.1f})",
+            f"<= {limit_ms:g}" if limit_ms else "",
+        ]
+        for ms in others_ms.values():
+            row.append(f"{work.ms / ms:.2f}")
+        row.append(_verdict_on_time(work.ms, limit_ms))
+        rows.append(row)
+    return rows
+
+
+def _verdict_on_time(ms: float, limit_ms: float | None) -> str:
+    if limit_ms is None:
+        return ""
+    if ms <= limit_ms:
+        return "met"
+    return "short"

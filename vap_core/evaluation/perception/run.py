@@ -1,4 +1,7 @@
-"""Runs the whole survey in local processes; what a killed run had finished is found again in its folder."""
+"""Runs the whole survey in local processes.
+
+What a killed run had finished is found again in its folder.
+"""
 
 import json
 from collections.abc import Sequence
@@ -10,9 +13,15 @@ from typing import TYPE_CHECKING, Any
 from vap_core.base.errors import BadOutput, one_of
 from vap_core.base.files import write_atomic
 from vap_core.evaluation import store
-from vap_core.evaluation.perception import tracking as following
+from vap_core.evaluation.perception import tracking
 from vap_core.evaluation.perception.episodes import survey
-from vap_core.evaluation.perception.first_frames import KS, Tables, openings, remembered
+from vap_core.evaluation.perception.first_frames import (
+    KS,
+    TableRow,
+    Tables,
+    openings,
+    registered_object,
+)
 from vap_core.evaluation.processes import results
 from vap_core.evaluation.study import Study
 from vap_core.perception.stacks import STACKS, load_stack
@@ -21,11 +30,18 @@ from vap_core.simulation.types import EpisodeRow
 
 if TYPE_CHECKING:
     import pandas as pd
+    import pyarrow as pa
 
 EPISODES = {"simpler-fractal": 30, "simpler-bridge": 16, "vlabench": 8, "tabletop": 5}
-"""Opening frames a task, as episodes spread evenly over its list; suites with three cameras need fewer."""
+"""Opening frames a task, as episodes spread evenly over its list.
+
+Suites with three cameras need fewer.
+"""
 QUICK = 2
-"""Episodes a task of a quick survey; it tracks one episode of each suite, and hides its target once."""
+"""Episodes a task of a quick survey.
+
+It tracks one episode of each suite, and hides its target once.
+"""
 HIDDEN = 3
 CHUNK = 6
 """Episodes of one job: little is lost when a run is killed."""
@@ -39,11 +55,16 @@ TABLES = (
     "tracks",
     "speed",
 )
+WORLD = ("version", "weights", "lists", "world")
+"""What a survey's configuration takes from a study's."""
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What is asked for. `episodes` None takes `EPISODES` opening frames a task, and following.plan's episodes."""
+    """What is asked for.
+
+    `episodes` None takes `EPISODES` opening frames a task, and tracking.plan's episodes.
+    """
 
     stack: str = "embedded"
     suites: tuple[str, ...] = tuple(suites.BENCHMARKS)
@@ -57,89 +78,82 @@ class Survey:
         if self.stack not in STACKS:
             raise one_of("Survey: stack", self.stack, STACKS)
 
-    def opened(self, suite: str) -> int:
+    def n_openings(self, suite: str) -> int:
         """Opening frames a task."""
-        return self.episodes or (QUICK if self.quick else EPISODES[suite])
+        if self.episodes:
+            return self.episodes
+        return QUICK if self.quick else EPISODES[suite]
 
-    def followed(self, suite: str) -> int:
+    def n_tracked(self, suite: str) -> int:
         """Episodes a task that are tracked to their end."""
-        usual = 1 if self.quick else following.EPISODES[suite]
+        usual = 1 if self.quick else tracking.EPISODES[suite]
         return min(usual, self.episodes or usual)
 
     def configuration(self) -> dict[str, Any]:
         """What the results depend on, as JSON: the world, weights and lists by their checksums."""
-        tasks = tuple(
-            (name, task.name) for name in self.suites for task in suites.suite(name).tasks
+        tasks = []
+        counts = {}
+        for name in self.suites:
+            counts[name] = {"openings": self.n_openings(name), "tracks": self.n_tracked(name)}
+            for task in suites.suite(name).tasks:
+                tasks.append((name, task.name))
+        study = Study(
+            tasks=tuple(tasks),
+            methods=("generic",),
+            policy="expert",
+            stack=self.stack,
         )
-        world = Study(tasks, ("generic",), policy="expert", stack=self.stack).configuration()
-        counts = {
-            name: {"openings": self.opened(name), "tracks": self.followed(name)}
-            for name in self.suites
+        of_study = study.configuration()
+        configuration: dict[str, Any] = {
+            "survey": "perception",
+            "stack": self.stack,
+            "episodes": counts,
+            "ks": list(KS),
+            "seed": 0,
         }
-        return {"survey": "perception", "stack": self.stack, "episodes": counts, "ks": list(KS), "seed": 0,
-                **{name: world[name] for name in ("version", "weights", "lists", "world")}}  # fmt: skip
+        for key in WORLD:
+            configuration[key] = of_study[key]
+        return configuration
 
 
 @dataclass(frozen=True)
 class Job:
-    """A piece of work for one process; its name is its file's."""
+    """A piece of work for one process; its name is its file's.
+
+    `what` are the episodes whose opening frames are surveyed, or an episode to track.
+    """
 
     name: str
     stack: str
-    what: tuple[EpisodeRow, ...] | following.Job
+    what: tuple[EpisodeRow, ...] | tracking.Job
 
 
 def plan(asked: Survey) -> list[Job]:
     """Every job, the long ones first, so that processes finish together."""
-    tracks = following.plan({name: asked.followed(name) for name in asked.suites}, asked.suites)
-    if asked.quick:
-        tracks = [
-            replace(next(j for j in tracks if j.row.suite == name), hidden=(HIDDEN,))
-            for name in asked.suites
-        ]
-    jobs = [
-        Job(
-            f"tracks.{j.row.suite}.{j.row.task}.{j.row.episode}.{j.kind}.{j.every}.{'-'.join(map(str, j.hidden))}",
-            asked.stack,
-            j,
-        )
-        for j in tracks
-    ]
-    for name in asked.suites:
-        for task in suites.suite(name).tasks:
-            rows = suites.rows(name, task.name, asked.opened(name))
-            for first in range(0, len(rows), CHUNK):
-                part = rows[first : first + CHUNK]
-                jobs.append(
-                    Job(
-                        f"openings.{name}.{task.name}.{part[0].episode}-{part[-1].episode}",
-                        asked.stack,
-                        part,
-                    )
-                )
-    return jobs
+    return [*_tracking_jobs(asked), *_opening_jobs(asked)]
 
 
-def work(job: Job) -> Tables:
-    """Do one job in this process."""
-    stack = _stack(job.stack)
-    if isinstance(job.what, following.Job):
-        return {"tracks": following.follow(job.what, stack)}
+def run_job(job: Job) -> Tables:
+    """Do one job in this process, and return its part of the tables."""
+    stack = _load_stack(job.stack)
+    if isinstance(job.what, tracking.Job):
+        return {"tracks": tracking.track_episode(job.what, stack)}
     tables: Tables = {}
     for episode in openings(job.what):
-        for name, lines in survey(episode, stack).items():
-            tables.setdefault(name, []).extend(lines)
+        for name, rows in survey(episode, stack).items():
+            tables.setdefault(name, []).extend(rows)
     first = job.what[0]
-    tables["references"] = [
-        {
+    tables["references"] = []
+    for k in KS:
+        _, whole_photos = registered_object(stack, first.target, k)
+        reference: TableRow = {
             "suite": first.suite,
             "task": first.task,
             "target": first.target,
             "k": k,
-            "whole": len(remembered(stack, first.target, k)[1]),
+            "whole": len(whole_photos),
         }
-        for k in KS
-    ]
+        tables["references"].append(reference)
     return tables
 
 
@@ -149,115 +163,209 @@ def run(
     """Do what `folder` lacks of the survey, write a parquet table each and return them.
 
     Speed is measured last and alone, so that nothing of this run disturbs it.
+
     Raises: BadOutput when the folder holds another run, or is in use; WorkerDied.
     """
-    from vap_core.evaluation.perception import speed
-
     store.open_run(folder, asked.configuration())
     with store.locked(folder):
-        planned, parts = plan(asked), folder / "parts"
+        planned = plan(asked)
+        parts = folder / "parts"
         parts.mkdir(exist_ok=True)
-        left = [job for job in planned if not _part(parts, job.name).exists()]
-        _work(left, len(planned), parts, jobs, progress)
-        if not _part(parts, "speed").exists():
-            _keep(
-                parts,
-                "speed",
-                {"speed": speed.measure(_stack(asked.stack), repeat=5 if asked.quick else 25)},
-            )
-        return _write(
-            folder, [_part(parts, name) for name in (*(job.name for job in planned), "speed")]
-        )
+        missing = []
+        paths = []
+        for job in planned:
+            path = _part_path(parts, job.name)
+            paths.append(path)
+            if not path.exists():
+                missing.append(job)
+        _run_missing(missing, parts=parts, total=len(planned), jobs=jobs, progress=progress)
+        speed_path = _part_path(parts, "speed")
+        paths.append(speed_path)
+        if not speed_path.exists():
+            _write_part(speed_path, {"speed": _measure_speed(asked)})
+        return _write_tables(folder, paths)
 
 
 def read(folder: Path) -> "dict[str, pd.DataFrame]":
     """The tables of a finished survey. Raises: BadOutput."""
-    import pandas as pd
-
     store.read_manifest(folder)
-    missing = [name for name in TABLES if not (folder / f"{name}.parquet").exists()]
+    missing = [name for name in TABLES if not _table_path(folder, name).exists()]
     if missing:
         raise BadOutput(
-            f"survey: {folder} lacks {', '.join(missing)}; run the same eval-perception again to finish it."
+            f"survey: {folder} lacks {', '.join(missing)}; run the same eval-perception again to "
+            "finish it."
         )
-    return {name: pd.read_parquet(folder / f"{name}.parquet") for name in TABLES}
+    return _read_tables(folder)
 
 
 def publish(folder: Path, to: Path) -> list[Path]:
-    """Keep the tables of a finished survey in `to` as perception_NAME.parquet, with its configuration in their metadata. Raises: BadOutput."""
+    """Keep the tables of a finished survey in `to` as perception_NAME.parquet.
+
+    Their configuration is in their metadata. Raises: BadOutput.
+    """
     read(folder)
     stack = store.read_manifest(folder)["configuration"]["stack"]
-    kept = [
-        to / f"perception{'' if stack == 'embedded' else f'_{stack}'}_{name}.parquet"
-        for name in TABLES
-    ]
+    prefix = "perception"
+    if stack != "embedded":
+        prefix = f"perception_{stack}"
+    published = []
     try:
         to.mkdir(parents=True, exist_ok=True)
-        for name, path in zip(TABLES, kept, strict=True):
-            write_atomic(path, (folder / f"{name}.parquet").read_bytes())
+        for name in TABLES:
+            path = to / f"{prefix}_{name}.parquet"
+            write_atomic(path, _table_path(folder, name).read_bytes())
+            published.append(path)
     except OSError as error:
         raise BadOutput(
-            f"survey: {to} cannot be written ({error.strerror}); choose another folder with --publish."
+            f"survey: {to} cannot be written ({error.strerror}); choose another folder with "
+            "--publish."
         ) from error
-    return kept
+    return published
 
 
-_stack = cache(load_stack)
+_load_stack = cache(load_stack)
 
 
-def _work(left: Sequence[Job], total: int, parts: Path, jobs: int, progress: bool) -> None:
+def _tracking_jobs(asked: Survey) -> list[Job]:
+    """A job per episode to track."""
+    counts = {}
+    for suite in asked.suites:
+        counts[suite] = asked.n_tracked(suite)
+    tracked = tracking.plan(counts, asked.suites)
+    if asked.quick:
+        tracked = _first_of_each_suite(tracked, asked.suites)
+    jobs = []
+    for what in tracked:
+        row = what.row
+        hidden = "-".join(map(str, what.hidden))
+        name = f"tracks.{row.suite}.{row.task}.{row.episode}.{what.kind}.{what.every}.{hidden}"
+        jobs.append(Job(name, asked.stack, what))
+    return jobs
+
+
+def _first_of_each_suite(
+    tracked: Sequence[tracking.Job], names: Sequence[str]
+) -> list[tracking.Job]:
+    """The first episode of each suite, with its target hidden once."""
+    first: dict[str, tracking.Job] = {}
+    for job in tracked:
+        first.setdefault(job.row.suite, job)
+    return [replace(first[name], hidden=(HIDDEN,)) for name in names]
+
+
+def _opening_jobs(asked: Survey) -> list[Job]:
+    """A job per CHUNK opening frames of one task."""
+    jobs = []
+    for suite in asked.suites:
+        for task in suites.suite(suite).tasks:
+            rows = suites.rows(suite, task.name, asked.n_openings(suite))
+            for first in range(0, len(rows), CHUNK):
+                part = rows[first : first + CHUNK]
+                episodes = f"{part[0].episode}-{part[-1].episode}"
+                jobs.append(Job(f"openings.{suite}.{task.name}.{episodes}", asked.stack, part))
+    return jobs
+
+
+def _run_missing(
+    missing: Sequence[Job], *, parts: Path, total: int, jobs: int, progress: bool
+) -> None:
+    """Do the jobs in `jobs` processes, and write each one's part when it is finished."""
     from tqdm import tqdm
 
     with tqdm(
-        total=total, initial=total - len(left), unit="job", desc="perception", disable=not progress
+        total=total,
+        initial=total - len(missing),
+        unit="job",
+        desc="perception",
+        disable=not progress,
     ) as bar:
-        for job, tables in results(work, left, jobs, "--jobs"):
-            _keep(parts, job.name, tables)
+        for job, tables in results(run_job, missing, workers=jobs, remedy="--jobs"):
+            _write_part(_part_path(parts, job.name), tables)
             bar.update()
 
 
-def _part(parts: Path, name: str) -> Path:
+def _measure_speed(asked: Survey) -> list[TableRow]:
+    from vap_core.evaluation.perception import speed
+
+    return speed.measure(_load_stack(asked.stack), repeat=5 if asked.quick else 25)
+
+
+def _part_path(parts: Path, name: str) -> Path:
     return parts / f"{name}.json"
 
 
-def _keep(parts: Path, name: str, tables: Tables) -> None:
+def _table_path(folder: Path, name: str) -> Path:
+    return folder / f"{name}.parquet"
+
+
+def _write_part(path: Path, tables: Tables) -> None:
+    content = json.dumps(tables, default=_to_number)
     try:
-        write_atomic(
-            _part(parts, name), json.dumps(tables, default=lambda number: number.item()).encode()
-        )
+        write_atomic(path, content.encode())
     except OSError as error:
         raise BadOutput(
-            f"survey: {parts} cannot be written ({error.strerror}); make room and run the same command again."
+            f"survey: {path.parent} cannot be written ({error.strerror}); make room and run the "
+            "same command again."
         ) from error
 
 
-def _write(folder: Path, parts: Sequence[Path]) -> "dict[str, pd.DataFrame]":
-    """All parts as one table of each kind, with the run's configuration in every file's metadata."""
-    import pandas as pd
+def _to_number(scalar: Any) -> Any:
+    """A NumPy scalar as a Python number."""
+    return scalar.item()
+
+
+def _write_tables(folder: Path, parts: Sequence[Path]) -> "dict[str, pd.DataFrame]":
+    """All parts as one table of each kind, with the run's configuration in every file's metadata.
+
+    Raises: BadOutput for a damaged part.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    lines: Tables = {name: [] for name in TABLES}
-    for part in parts:
-        try:
-            held = json.loads(part.read_bytes())
-        except ValueError as error:
-            raise BadOutput(
-                f"survey: {part} is damaged; delete it and run the same command again."
-            ) from error
-        for name, of_part in held.items():
-            lines[name] += of_part
-    note = json.dumps(store.read_manifest(folder), sort_keys=True).encode()
-    for name, held in lines.items():
-        unique = [
-            line for i, line in enumerate(held) if name != "references" or line not in held[:i]
-        ]
-        table = (
-            pa.Table.from_pylist(unique)
-            if unique
-            else pa.table({"suite": pa.array([], pa.string())})
-        )
+    tables: Tables = {name: [] for name in TABLES}
+    for path in parts:
+        for name, rows in _read_part(path).items():
+            tables[name] += rows
+    tables["references"] = _unique_rows(tables["references"])
+    manifest = json.dumps(store.read_manifest(folder), sort_keys=True)
+    for name, rows in tables.items():
+        table = _arrow_table(rows).replace_schema_metadata({b"run": manifest.encode()})
         sink = pa.BufferOutputStream()
-        pq.write_table(table.replace_schema_metadata({b"run": note}), sink, compression="zstd")
-        write_atomic(folder / f"{name}.parquet", sink.getvalue().to_pybytes())
-    return {name: pd.read_parquet(folder / f"{name}.parquet") for name in TABLES}
+        pq.write_table(table, sink, compression="zstd")
+        write_atomic(_table_path(folder, name), sink.getvalue().to_pybytes())
+    return _read_tables(folder)
+
+
+def _read_part(path: Path) -> Tables:
+    try:
+        return json.loads(path.read_bytes())
+    except ValueError as error:
+        raise BadOutput(
+            f"survey: {path} is damaged; delete it and run the same command again."
+        ) from error
+
+
+def _unique_rows(rows: Sequence[TableRow]) -> list[TableRow]:
+    unique: list[TableRow] = []
+    for row in rows:
+        if row not in unique:
+            unique.append(row)
+    return unique
+
+
+def _arrow_table(rows: list[TableRow]) -> "pa.Table":
+    """The rows as a table; one without rows has a column of suites nevertheless."""
+    import pyarrow as pa
+
+    if rows:
+        return pa.Table.from_pylist(rows)
+    return pa.table({"suite": pa.array([], pa.string())})
+
+
+def _read_tables(folder: Path) -> "dict[str, pd.DataFrame]":
+    import pandas as pd
+
+    tables = {}
+    for name in TABLES:
+        tables[name] = pd.read_parquet(_table_path(folder, name))
+    return tables

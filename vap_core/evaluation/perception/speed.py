@@ -1,18 +1,19 @@
-"""What perception costs on one thread: start-up grounding and one tracked step of a 224 px view, in milliseconds and against other work.
+"""What perception costs on one thread, in milliseconds and against other work.
 
-Everything is timed in turn within each round, so that whatever else the machine does falls on all alike; ratios are of medians. The tracker
-follows the expert's episode frame by frame, three objects at once: a view in which nothing moves would cost it next to nothing.
+Timed are start-up grounding and one tracked step of a 224 px view. Everything is timed in turn
+within each round, so that whatever else the machine does falls on all alike; ratios are of medians.
+The tracker tracks through the expert's episode frame by frame, three objects at once: a view in
+which nothing moves would cost it next to nothing.
 """
 
 import time
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from vap_core.attend import Attender
-from vap_core.evaluation.perception.first_frames import USUAL_K, remembered
-from vap_core.evaluation.perception.tracking import Job, shoot
+from vap_core.evaluation.perception.first_frames import USUAL_K, TableRow, registered_object
+from vap_core.evaluation.perception.tracking import Frame, Job, record_film
 from vap_core.evaluation.policy_names import scripted
 from vap_core.perception.embedded.backbone import features
 from vap_core.perception.protocols import Stack
@@ -22,80 +23,101 @@ from vap_core.simulation.env import Env
 from vap_core.simulation.scenes import Scene
 from vap_core.simulation.suites.open_row import build_scene
 
-SUITE, TASK = "simpler-bridge", "pick-shaver"
+SUITE = "simpler-bridge"
+TASK = "pick-shaver"
 Work = Callable[[], object]
-START, STEP, PASS, POLICY = (
-    "start-up grounding",
-    "track step",
-    "backbone pass",
-    "scripted policy's plan",
-)
+START = "start-up grounding"
+STEP = "track step"
+PASS = "backbone pass"
+POLICY = "scripted policy's plan"
 LIMITS_MS = {START: 300.0, STEP: 45.0}
 
 
 def measure(
     stack: Stack, repeat: int = 25, against: Mapping[str, Work] | None = None
-) -> list[dict[str, Any]]:
-    """A line per piece of work: its median, quartiles, and how many rounds. `against` names more work to compare with, such as another policy's
-    step; a step of the scripted policy (a 224 px view of its own) and a pass of the backbone are always there.
+) -> list[TableRow]:
+    """A row per piece of work: its median, its quartiles, and how many rounds.
+
+    `against` names more work to compare with, such as another policy's step; a step of the scripted
+    policy (a 224 px view of its own) and a pass of the backbone are always there.
     """
     import torch
 
+    row = suites.rows(SUITE, TASK, 1)[0]
+    models = [place.model for place in row.placements]
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with build_scene(
-            SUITE, [place.model for place in suites.rows(SUITE, TASK, 1)[0].placements]
-        ) as scene:
+        with build_scene(SUITE, models) as scene:
             works = {**_works(stack, scene), **(against or {})}
-            for work in works.values():
-                work()
-            took: dict[str, list[float]] = {name: [] for name in works}
-            for _ in range(repeat):
-                for name, work in works.items():
-                    start = time.perf_counter()
-                    work()
-                    took[name].append(1e3 * (time.perf_counter() - start))
+            times_ms = _time_in_turn(works, repeat)
     finally:
         torch.set_num_threads(threads)
-    lines = []
-    for name, all_ms in took.items():
-        low, middle, high = np.percentile(all_ms, [25, 50, 75])
-        lines.append(
-            {
-                "what": name,
-                "ms": float(middle),
-                "low_ms": float(low),
-                "high_ms": float(high),
-                "rounds": repeat,
-            }
-        )
-    return lines
+    rows = []
+    for name, of_work_ms in times_ms.items():
+        low, middle, high = np.percentile(of_work_ms, [25, 50, 75])
+        row_of_work: TableRow = {
+            "what": name,
+            "ms": float(middle),
+            "low_ms": float(low),
+            "high_ms": float(high),
+            "rounds": repeat,
+        }
+        rows.append(row_of_work)
+    return rows
+
+
+def _time_in_turn(works: Mapping[str, Work], repeat: int) -> dict[str, list[float]]:
+    """Milliseconds of every piece of work in each round, after one round to warm up."""
+    times_ms: dict[str, list[float]] = {}
+    for name, work in works.items():
+        work()
+        times_ms[name] = []
+    for _ in range(repeat):
+        for name, work in works.items():
+            start = time.perf_counter()
+            work()
+            times_ms[name].append(1e3 * (time.perf_counter() - start))
+    return times_ms
 
 
 def _works(stack: Stack, scene: Scene) -> dict[str, Work]:
+    """The work that is always timed, by its name."""
     row = suites.rows(SUITE, TASK, 1)[0]
-    film = shoot(Job(row, 1, (), "plate"), scene).frames
-    env, policy = Env(scene), scripted(stack.detector, scene, suites.suite(SUITE))
+    film = record_film(Job(row=row, every=1, hidden=(), kind="plate"), scene).frames
+    env = Env(scene)
+    policy = scripted(stack.detector, scene, suites.suite(SUITE))
     env.reset(row)
-    seen = env.observe()
+    observation = env.observe()
     camera = env.camera_names[0]
-    views = {camera: seen.images[camera]}
-    attender = Attender(stack, {row.target: remembered(stack, row.target, USUAL_K)[0]})
-    first = np.stack(list(film[0][camera][1].values()))
-    states, at = stack.tracker.start([film[0][camera][0]], [first]), 0
-    asked = policy.start(np.random.default_rng(0))
+    views = {camera: observation.images[camera]}
+    personal, _ = registered_object(stack, row.target, USUAL_K)
+    attender = Attender(stack, {row.target: personal})
+    track_step = _track_step(stack, film, camera)
+    state = policy.start(np.random.default_rng(0))
 
-    def step() -> None:
-        nonlocal states, at
-        at = (at + 1) % len(film)
-        states, _ = stack.tracker.step(states, [film[at][camera][0]])
+    def plan() -> object:
+        policy_input = PolicyInput(observation.images, row.instruction, observation.state)
+        return policy.plan([state], [policy_input])
 
     return {
         START: lambda: attender.start(views, row.instruction),
-        STEP: step,
+        STEP: track_step,
         PASS: lambda: features([views[camera]], ["head"]),
-        POLICY: lambda: policy.plan(
-            [asked], [PolicyInput(seen.images, row.instruction, seen.state)]
-        ),
+        POLICY: plan,
     }
+
+
+def _track_step(stack: Stack, film: Sequence[Frame], camera: str) -> Work:
+    """A step of the tracker on the next frame of a film, which begins again at its end."""
+    rgb, masks = film[0][camera]
+    all_masks = list(masks.values())
+    states = stack.tracker.start([rgb], [np.stack(all_masks)])
+    t = 0
+
+    def step() -> None:
+        nonlocal states, t
+        t = (t + 1) % len(film)
+        states, _ = stack.tracker.step(states, [film[t][camera][0]])
+
+    return step

@@ -1,24 +1,27 @@
-"""Tracking through whole expert episodes, against the simulator: is the same object followed to the end, how well, and what hiding it costs.
+"""Tracking through whole expert episodes, against the simulator.
+
+It says whether the same object is tracked to the end, how well, and what hiding it costs.
 
     for job in plan():
-        lines += follow(job, stack)
+        rows += track_episode(job, stack)
 
-Every object of the target's category that shows at t = 0 is followed, in every camera, from the mask that the segmenter draws from its true
-box: the tracker alone is judged. A line is one object in one camera, once undisturbed through the whole episode (`hidden` 0), and once for
-each number of frames for which an occluder hides the target (vap_core.simulation.occluder), from the moment it is hidden to the end. A frame
-counts for an object when it shows at least LEAST_PX pixels.
+Every object of the target's category that shows at t = 0 is tracked, in every camera, from the mask
+that the segmenter draws from its true box: the tracker alone is judged. A row is one object in one
+camera, once undisturbed through the whole episode (`hidden` 0), and once for each number of frames
+for which an occluder hides the target (vap_core.simulation.occluder), from the moment it is hidden
+to the end. A frame counts for an object when it shows at least LEAST_PX pixels.
 """
 
 import copy
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float64
 
 from vap_core.base.types import Boxes, Mask, Rgb, Track, value
-from vap_core.evaluation.perception.first_frames import LEAST_PX
+from vap_core.evaluation.perception.first_frames import LEAST_PX, TableRow
 from vap_core.perception.boxes import mask_box, mask_iou
 from vap_core.perception.protocols import Stack
 from vap_core.policies.scripted.expert import Expert
@@ -33,23 +36,36 @@ from vap_core.simulation.types import EpisodeRow
 
 KEPT = 0.5
 """IoU above which a track is on its object."""
+WRONG = 0.1
+"""IoU below which a track is on something else."""
 MOST_HIDDEN = 6
 BINS = 20
 """Points of the IoU over normalised time."""
 EPISODES = {"simpler-fractal": 8, "simpler-bridge": 5, "vlabench": 2, "tabletop": 1}
 """Episodes a task in the default plan; suites with three cameras need fewer."""
 AFTER = 40
-"""Frames that are followed after the target is shown again; an undisturbed episode is followed to its end."""
+"""Frames that are tracked after the target is shown again.
+
+An undisturbed episode is tracked to its end.
+"""
 ALL_HIDDEN = 1
-"""Episodes a task of the default plan that are hidden for every number of frames; the others for 3 only. One camera counts as a third."""
-Line = dict[str, Any]
+"""Episodes a task of the default plan that are hidden for every number of frames.
+
+The others are hidden for 3 only. One camera counts as a third.
+"""
 Frame = Mapping[str, tuple[Rgb, Mapping[str, Mask]]]
 """Per camera the picture and every object's visible pixels."""
+Tracks = list[tuple[Track, ...]]
+"""The tracks of one frame: a tuple per camera, a track per object."""
 
 
 @value
 class Job:
-    """One episode. The tracker sees every `every`-th control step; `hidden` are the numbers of such frames for which the target is hidden."""
+    """One episode to track.
+
+    The tracker sees every `every`-th control step; `hidden` are the numbers of such frames for
+    which the target is hidden.
+    """
 
     row: EpisodeRow
     every: int
@@ -59,7 +75,10 @@ class Job:
 
 @value
 class Film:
-    """An episode as its cameras saw it, and the frames `start` .. of the same moments with the target hidden."""
+    """An episode as its cameras saw it.
+
+    `covered` are the frames `start` .. of the same moments with the target hidden.
+    """
 
     frames: tuple[Frame, ...]
     start: int
@@ -69,190 +88,267 @@ class Film:
 def plan(
     episodes: Mapping[str, int] | None = None, suite_names: Sequence[str] | None = None
 ) -> list[Job]:
-    """The default survey: every task of the benchmarks (or of `suite_names`), `episodes` of each by suite, spread evenly over its list."""
+    """The default survey: every task of the benchmarks, or of `suite_names`.
+
+    `episodes` overrides how many of each task's list, spread evenly over it, by suite.
+    """
     count = {**EPISODES, **(episodes or {})}
+    if suite_names is None:
+        suite_names = list(suites.BENCHMARKS)
     jobs = []
-    for suite in (
-        suites.BENCHMARKS.values() if suite_names is None else map(suites.suite, suite_names)
-    ):
+    for name in suite_names:
+        suite = suites.suite(name)
+        n_all_hidden = ALL_HIDDEN * 3 // len(suite.cameras)
         for task in suite.tasks:
-            for i, row in enumerate(suites.rows(suite.name, task.name, count[suite.name])):
-                whole = i < ALL_HIDDEN * 3 // len(suite.cameras)
-                jobs.append(
-                    Job(
-                        row,
-                        every(row),
-                        tuple(range(1, MOST_HIDDEN + 1)) if whole else (3,),
-                        "arm" if i % 4 == 3 else "plate",
-                    )
-                )
+            rows = suites.rows(suite.name, task.name, count[suite.name])
+            for i, row in enumerate(rows):
+                hidden: tuple[int, ...] = (3,)
+                if i < n_all_hidden:
+                    hidden = tuple(range(1, MOST_HIDDEN + 1))
+                kind: Literal["plate", "arm"] = "arm" if i % 4 == 3 else "plate"
+                job = Job(row=row, every=steps_per_frame(row), hidden=hidden, kind=kind)
+                jobs.append(job)
     return jobs
 
 
-def every(row: EpisodeRow) -> int:
-    """Control steps from one tracked frame to the next: 2 for the long put tasks on the tabletop, at 30 a second, else each one."""
-    return 2 if suites.suite(row.suite).hz >= 30 and row.rule == "put" else 1
+def steps_per_frame(row: EpisodeRow) -> int:
+    """Control steps from one tracked frame to the next.
+
+    Two for the long put tasks on the tabletop, at 30 a second, else one.
+    """
+    if suites.suite(row.suite).hz >= 30 and row.rule == "put":
+        return 2
+    return 1
 
 
-def follow(job: Job, stack: Stack) -> list[Line]:
-    """Run the episode's expert, track, and compare. The same job gives the same lines but for their times."""
+def track_episode(job: Job, stack: Stack) -> list[TableRow]:
+    """Run the episode's expert, track, and compare.
+
+    The same job gives the same rows but for their times.
+    """
     models = [place.model for place in job.row.placements]
     with build_scene(job.row.suite, models, job.row.variant) as scene:
-        film = shoot(job, scene)
-    return follow_film(film, job, stack)
+        film = record_film(job, scene)
+    return track_film(film, job, stack)
 
 
-def shoot(job: Job, scene: Scene, size: int = 224) -> Film:
-    """The expert's episode, to its end, in pictures and masks; hidden from a moment that the episode's number decides."""
-    row, expert = job.row, Expert()
+def record_film(job: Job, scene: Scene, size: int = 224) -> Film:
+    """The expert's episode, to its end, in pictures and masks.
+
+    The target is hidden from a moment that the episode's number decides.
+    """
+    row = job.row
+    expert = Expert()
     env = make_env(scene, row.suite, image_size=size, cameras=row.cameras)
     env.reset(row)
     state = expert.start(np.random.default_rng([row.seed, row.episode]))
-    frames, moments = [], []
-    for judge, action in expert_steps(env, row, expert, state):
+    frames = []
+    moments = []
+    for judge, action in expert_steps(env=env, row=row, expert=expert, state=state):
         if judge.steps % job.every == 0 or action is None:
-            frames.append(_seen(env))
+            frames.append(_take_frame(env))
             moments.append(env.snapshot())
-    start = round(len(frames) * float(np.random.default_rng([13, row.episode]).uniform(0.2, 0.45)))
+    fraction = float(np.random.default_rng([13, row.episode]).uniform(0.2, 0.45))
+    start = round(len(frames) * fraction)
     occlusion = Occlusion(0, row.max_steps + 1, job.kind)
     screened = make_env(scene, row.suite, image_size=size, cameras=row.cameras, occlusion=occlusion)
     covered = []
     for moment in moments[start : start + max(job.hidden, default=0)]:
         screened.restore(moment)
-        covered.append(_seen(screened))
+        covered.append(_take_frame(screened))
     return Film(tuple(frames), start, tuple(covered))
 
 
-def follow_film(film: Film, job: Job, stack: Stack) -> list[Line]:
-    """Track every same-category object that shows in the first frame, once undisturbed and once for each number of hidden frames."""
-    named: dict[str, tuple[str, ...]] = {}
-    for camera, (rgb, masks) in film.frames[0].items():
-        showing = tuple(
-            name
-            for name, mask in masks.items()
-            if get_object(name).category == job.row.category and _shows(mask, rgb)
-        )
-        if showing:
-            named[camera] = showing
-    if not named:
+def track_film(film: Film, job: Job, stack: Stack) -> list[TableRow]:
+    """Track every object of the target's category that shows in the first frame.
+
+    Once undisturbed and once for each number of hidden frames.
+    """
+    names = _shown_objects(film.frames[0], job.row.category)
+    if not names:
         return []
-    images = [film.frames[0][camera][0] for camera in named]
-    begun = [
-        _first_masks(rgb, film.frames[0][camera][1], names, stack)
-        for rgb, (camera, names) in zip(images, named.items(), strict=True)
-    ]
-    states = stack.tracker.start(images, begun)
-    lines: list[Line] = []
-    forked: list[Any] = []
-    found: list[list[tuple[Track, ...]]] = []
-    took: list[float] = []
+    states = _start_tracker(film.frames[0], names, stack)
+    states_before: list[Any] | None = None
+    undisturbed = _TrackerRun(stack, names, job, hidden=0)
     for t, frame in enumerate(film.frames[1:], start=1):
         if t == film.start and job.hidden:
-            forked = [copy.deepcopy(states) for _ in job.hidden]
-        states, tracks, ms = _step(stack, states, frame, named)
-        found.append(tracks)
-        took.append(ms)
-    lines += _lines(job, named, film.frames[1:], found, took, 0)
-    for n, after in zip(job.hidden, forked, strict=False):
+            states_before = copy.deepcopy(states)
+        states = undisturbed.add(states, frame)
+    rows = undisturbed.rows()
+    if states_before is None:
+        return rows
+    for n in job.hidden:
         if film.start + n >= len(film.frames):
             continue  # the episode was over before the target was shown again
-        shown = (*film.covered[:n], *film.frames[film.start + n : film.start + n + AFTER])
-        found, took = [], []
-        for frame in shown:
-            after, tracks, ms = _step(stack, after, frame, named)
-            found.append(tracks)
-            took.append(ms)
-        lines += _lines(job, named, shown, found, took, n)
-    return lines
+        disturbed = _TrackerRun(stack, names, job, hidden=n)
+        states = copy.deepcopy(states_before)
+        shown_again = film.frames[film.start + n : film.start + n + AFTER]
+        for frame in (*film.covered[:n], *shown_again):
+            states = disturbed.add(states, frame)
+        rows += disturbed.rows()
+    return rows
 
 
-def _lines(
-    job: Job,
-    named: Mapping[str, Sequence[str]],
-    frames: Sequence[Frame],
-    found: Sequence[Sequence[tuple[Track, ...]]],
-    took: Sequence[float],
-    n: int,
-) -> list[Line]:
-    """One line per object and camera."""
-    row = job.row
-    lines = []
-    for v, (camera, names) in enumerate(named.items()):
-        for i, name in enumerate(names):
-            scores = _compare(
-                [frame[camera] for frame in frames], name, [tracks[v][i] for tracks in found], n
-            )
-            lines.append(
-                {
-                    "suite": row.suite, "task": row.task, "episode": row.episode, "variant": row.variant, "camera": camera, "object": name,
-                    "target": name == row.target, "hidden": n, "kind": job.kind if n else "", "every": job.every, **scores,
-                    "step_ms": float(np.median(took)), "objects": len(names), "frames": len(frames),
-                }
-            )  # fmt: skip
-    return lines
+class _TrackerRun:
+    """The tracks of one run of the tracker, frame by frame.
 
-
-def _compare(
-    frames: Sequence[tuple[Rgb, Mapping[str, Mask]]],
-    name: str,
-    tracks: Sequence[Track],
-    hidden: int,
-) -> Line:
-    """What became of one track: `mean_iou` and `kept` (IoU > KEPT in the last frame that shows the object) are None when none shows it.
-
-    `lost` counts frames that show the object and have no track, `wrong` those whose track lies on less than a tenth of it; `back_after` how
-    many of the frames that show the object, once the first `hidden` are over, pass before the track is on it again (None: never).
+    `names` are the tracked objects of each camera; the target is hidden in the first `hidden`
+    frames.
     """
-    shown, overlap, false_px, lost, wrong = [], [], [], 0, 0
-    for (rgb, masks), track in zip(frames, tracks, strict=True):
-        true = masks[name]
-        mask = np.zeros_like(true) if track.mask is None else track.mask
-        counts = _shows(true, rgb)
-        shown.append(counts)
-        overlap.append(mask_iou(mask, true) if counts else np.nan)
-        if not true.any():
-            false_px.append(int(mask.sum()))
-        lost += counts and track.mask is None
-        wrong += counts and track.mask is not None and overlap[-1] < 0.1
-    seen, of = np.array(shown), np.array(overlap)
-    again = np.flatnonzero(of[hidden:][seen[hidden:]] > KEPT)
-    return {
-        "shown": int(seen.sum()),
-        "mean_iou": float(of[seen].mean()) if seen.any() else None,
-        "kept": bool(of[seen][-1] > KEPT) if seen.any() else None,
-        "lost": int(lost),
-        "wrong": int(wrong),
-        "gone": len(false_px),
-        "false_px": float(np.mean(false_px)) if false_px else None,
-        "back_after": int(again[0]) if len(again) else None,
-        "iou_over_time": [
-            None if np.isnan(x) else float(x)
-            for x in of[np.linspace(0, len(of) - 1, BINS).round().astype(int)]
-        ],
-    }
+
+    def __init__(
+        self, stack: Stack, names: Mapping[str, Sequence[str]], job: Job, *, hidden: int
+    ) -> None:
+        self.stack = stack
+        self.names = names
+        self.job = job
+        self.hidden = hidden
+        self.frames: list[Frame] = []
+        self.tracks: list[Tracks] = []
+        self.times_ms: list[float] = []
+
+    def add(self, states: list[Any], frame: Frame) -> list[Any]:
+        """Track the next frame of every camera, and return the tracker's states after it."""
+        images = [frame[camera][0] for camera in self.names]
+        start = time.perf_counter()
+        states, tracks = self.stack.tracker.step(states, images)
+        took_ms = 1e3 * (time.perf_counter() - start)
+        self.frames.append(frame)
+        self.tracks.append(tracks)
+        self.times_ms.append(took_ms / len(images))
+        return states
+
+    def rows(self) -> list[TableRow]:
+        """One row per camera and object."""
+        rows = []
+        for v, (camera, names) in enumerate(self.names.items()):
+            views = [frame[camera] for frame in self.frames]
+            for i, name in enumerate(names):
+                tracks = [of_frame[v][i] for of_frame in self.tracks]
+                scores = _compare_track(views=views, name=name, tracks=tracks, hidden=self.hidden)
+                rows.append(self._row(camera, name, scores))
+        return rows
+
+    def _row(self, camera: str, name: str, scores: TableRow) -> TableRow:
+        episode = self.job.row
+        return {
+            "suite": episode.suite,
+            "task": episode.task,
+            "episode": episode.episode,
+            "variant": episode.variant,
+            "camera": camera,
+            "object": name,
+            "target": name == episode.target,
+            "hidden": self.hidden,
+            "kind": self.job.kind if self.hidden else "",
+            "every": self.job.every,
+            **scores,
+            "step_ms": float(np.median(self.times_ms)),
+            "objects": len(self.names[camera]),
+            "frames": len(self.frames),
+        }
 
 
-def _step(
-    stack: Stack, states: list[Any], frame: Frame, cameras: Mapping[str, Sequence[str]]
-) -> tuple[list[Any], list[tuple[Track, ...]], float]:
-    """One frame of every camera, and the milliseconds a view took."""
-    images = [frame[camera][0] for camera in cameras]
-    start = time.perf_counter()
-    states, tracks = stack.tracker.step(states, images)
-    return states, tracks, 1e3 * (time.perf_counter() - start) / len(images)
+def _shown_objects(frame: Frame, category: str) -> dict[str, tuple[str, ...]]:
+    """The objects of a category that a frame shows, by camera; cameras without any are left out."""
+    shown = {}
+    for camera, (rgb, masks) in frame.items():
+        names = []
+        for name, mask in masks.items():
+            if get_object(name).category == category and _counts(mask, rgb):
+                names.append(name)
+        if names:
+            shown[camera] = tuple(names)
+    return shown
+
+
+def _start_tracker(frame: Frame, names: Mapping[str, Sequence[str]], stack: Stack) -> list[Any]:
+    """The tracker's states for the objects of each camera, from their true boxes."""
+    images = []
+    first_masks = []
+    for camera, tracked in names.items():
+        rgb, masks = frame[camera]
+        images.append(rgb)
+        first_masks.append(_first_masks(rgb=rgb, masks=masks, names=tracked, stack=stack))
+    return stack.tracker.start(images, first_masks)
 
 
 def _first_masks(
-    rgb: Rgb, masks: Mapping[str, Mask], names: Sequence[str], stack: Stack
+    *, rgb: Rgb, masks: Mapping[str, Mask], names: Iterable[str], stack: Stack
 ) -> Bool[np.ndarray, "n h w"]:
-    boxes = np.stack([box for name in names if (box := mask_box(masks[name])) is not None])
-    return stack.segmenter(rgb, Boxes(boxes, np.ones(len(boxes), np.float32), "object"))
+    """The masks that the segmenter draws from the true boxes of objects."""
+    boxes = []
+    for name in names:
+        box = mask_box(masks[name])
+        if box is not None:
+            boxes.append(box)
+    scores = np.ones(len(boxes), np.float32)
+    true_boxes = Boxes(np.stack(boxes), scores, "object")
+    return stack.segmenter(rgb, true_boxes)
 
 
-def _shows(mask: Mask, rgb: Rgb) -> bool:
+def _compare_track(
+    *,
+    views: Sequence[tuple[Rgb, Mapping[str, Mask]]],
+    name: str,
+    tracks: Sequence[Track],
+    hidden: int,
+) -> TableRow:
+    """What became of one track.
+
+    `mean_iou` and `kept` (IoU > KEPT in the last frame that shows the object) are None when none
+    shows it. `lost` counts frames that show the object and have no track, `wrong` those whose track
+    has an IoU below WRONG; `back_after` how many of the frames that show the object, once the first
+    `hidden` are over, pass before the track is on it again (None: never). `gone` counts the frames
+    in which nothing of the object shows, and `false_px` is the mean size of the track in them.
+    """
+    shown = np.zeros(len(views), bool)
+    iou = np.full(len(views), np.nan)
+    false_px = []
+    n_lost = 0
+    n_wrong = 0
+    for t, ((rgb, masks), track) in enumerate(zip(views, tracks, strict=True)):
+        true = masks[name]
+        mask = np.zeros_like(true) if track.mask is None else track.mask
+        if not true.any():
+            n_px = int(mask.sum())
+            false_px.append(n_px)
+        if _counts(true, rgb):
+            shown[t] = True
+            iou[t] = mask_iou(mask, true)
+            n_lost += track.mask is None
+            n_wrong += track.mask is not None and iou[t] < WRONG
+    shown_iou = iou[shown]
+    again = np.flatnonzero(iou[hidden:][shown[hidden:]] > KEPT)
+    return {
+        "shown": int(shown.sum()),
+        "mean_iou": float(shown_iou.mean()) if len(shown_iou) else None,
+        "kept": bool(shown_iou[-1] > KEPT) if len(shown_iou) else None,
+        "lost": n_lost,
+        "wrong": int(n_wrong),
+        "gone": len(false_px),
+        "false_px": float(np.mean(false_px)) if false_px else None,
+        "back_after": int(again[0]) if len(again) else None,
+        "iou_over_time": _sample_over_time(iou),
+    }
+
+
+def _sample_over_time(iou: Float64[np.ndarray, " t"]) -> list[float | None]:
+    """The IoU at BINS points of normalised time; None in frames that do not show the object."""
+    points = np.linspace(0, len(iou) - 1, BINS)
+    samples: list[float | None] = []
+    for sample in iou[points.round().astype(int)]:
+        samples.append(None if np.isnan(sample) else float(sample))
+    return samples
+
+
+def _counts(mask: Mask, rgb: Rgb) -> bool:
+    """Whether a view shows at least LEAST_PX of an object, for a view of 224 x 224."""
     return bool(mask.sum() >= LEAST_PX * rgb.shape[0] * rgb.shape[1] / 224**2)
 
 
-def _seen(env: Env) -> Frame:
-    images, masks = env.observe().images, env.truth(masks=True).masks
+def _take_frame(env: Env) -> Frame:
+    """What every camera of an environment shows now."""
+    images = env.observe().images
+    masks = env.truth(masks=True).masks
     return {camera: (rgb, masks[camera]) for camera, rgb in images.items()}

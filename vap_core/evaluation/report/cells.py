@@ -117,7 +117,8 @@ def _result_head(with_layouts: bool, with_paper: bool) -> Row:
 
 
 def _result_cells(line: Any, with_layouts: bool, with_paper: bool) -> Row:
-    method, n = line.method, f"{line.n} of {line.listed}"
+    method = line.method
+    n = f"{line.n} of {line.listed}"
     if line.bound:
         method += " (bound)"
     if line.seeds > 1:

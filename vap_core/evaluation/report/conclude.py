@@ -24,7 +24,8 @@ def conclude(study: "Study", table: "pd.DataFrame", folder: Path) -> str:
     Raises: BadOutput.
     """
     scores = ordered(score(table), study.tasks, study.methods)
-    summary, figure = folder / "summary.json", folder / "figure.png"
+    summary = folder / "summary.json"
+    figure = folder / "figure.png"
     lines = []
     for each in scores:
         lines.append({**each.to_json(), "seed": study.seed, "seeds": study.seeds})
@@ -101,7 +102,8 @@ def _totals(scores: Sequence[Score]) -> list[str]:
             continue
         k = n = 0
         for each in part:
-            k, n = k + each.sr.k, n + each.n
+            k += each.sr.k
+            n += each.n
         total = rate(k, n)
         least = min(part, key=lambda each: each.sr.value)
         track = f"{suite} ({split})" if split else suite
@@ -125,8 +127,11 @@ def _times_table(scores: Sequence[Score], table: "pd.DataFrame") -> str:
         parts |= dict.fromkeys(times_ms)
     rows = [["suite", "method", *parts, "total"]]
     for (suite, method), times_ms in times.items():
-        cells = [f"{times_ms.get(part, 0.0):.1f}" for part in parts]
-        rows.append([suite, method, *cells, f"{sum(times_ms.values()):.1f}"])
+        row = [suite, method]
+        for part in parts:
+            row.append(f"{times_ms.get(part, 0.0):.1f}")
+        total_ms = sum(times_ms.values())
+        rows.append([*row, f"{total_ms:.1f}"])
     return align(rows)
 
 

@@ -35,7 +35,9 @@ def report(sources: Sequence[Path], out: Path) -> str:
     Raises: BadOutput for a run that is damaged or an `out` that cannot be written.
     """
     runs = load(sources)
-    lines, ends, origins = results(runs), outcomes(runs), provenance(runs)
+    lines = results(runs)
+    ends = outcomes(runs)
+    origins = provenance(runs)
     compared = compare(runs.table, runs.methods)
     differences = comparisons(compared)
     parts = [
@@ -48,7 +50,7 @@ def report(sources: Sequence[Path], out: Path) -> str:
         sections.pictures_section(with_differences=bool(compared)),
         sections.provenance_section(origins),
     ]
-    text = "\n\n".join(part for part in parts if part)
+    text = "\n\n".join(filter(None, parts))
     files = {
         "report.md": f"{text}\n",
         "results.csv": _csv_text(lines, fractions=_rate_columns()),
@@ -69,7 +71,9 @@ def report(sources: Sequence[Path], out: Path) -> str:
 
 def _csv_text(table: "pd.DataFrame", fractions: Sequence[str] = ()) -> str:
     """A table as CSV; the names of columns that hold fractions end with "_fraction"."""
-    names = {name: f"{name}_fraction" for name in fractions}
+    names = {}
+    for name in fractions:
+        names[name] = f"{name}_fraction"
     return table.rename(columns=names).to_csv(index=False)
 
 

@@ -55,15 +55,21 @@ def breakdown_rows(counts: "pd.DataFrame") -> list[list[str]]:
     Failures in percent of all episodes, cases in percent of failures, each with its 95 % Wilson
     interval.
     """
-    cases = [case for case in CASES if counts[case].any()]
-    titles = [f"{case} % of failures" for case in cases]
+    cases = []
+    titles = []
+    for case in CASES:
+        if counts[case].any():
+            cases.append(case)
+            titles.append(f"{case} % of failures")
     rows = [["suite", "method", "n", "fail % [95 %]", *titles, "confidence"]]
     for line in counts.to_dict("records"):
+        n = int(line["n"])
         failed = int(line["failed"])
-        cells = [str(line["suite"]), str(line["method"]), str(line["n"])]
-        cells.append(str(rate(failed, int(line["n"]))))
+        failure_rate = rate(failed, n)
+        cells = [str(line["suite"]), str(line["method"]), str(line["n"]), str(failure_rate)]
         for case in cases:
-            cells.append(str(rate(int(line[case]), failed)))
+            case_rate = rate(int(line[case]), failed)
+            cells.append(str(case_rate))
         confidence = line["mean_confidence"]
         cells.append("-" if confidence != confidence else f"{confidence:.2f}")
         rows.append(cells)

@@ -104,7 +104,8 @@ def _draw_funnel(
     drawn: dict[str, Line2D] = {}
     ends = []
     for row in rows:
-        stages, percent = [], []
+        stages = []
+        percent = []
         for i, left in enumerate(row.left):
             if left is not None:
                 stages.append(i)
@@ -155,9 +156,12 @@ def _draw_bars(
         linewidth=0.6,
         label=label,
     )
+    labels = []
+    for each in percent:
+        labels.append(f"{each:.0f}" if each >= 4 else "")
     axes.bar_label(
         bars,
-        [f"{each:.0f}" if each >= 4 else "" for each in percent],
+        labels,
         label_type="center",
         fontsize=7.5,
         color="white" if sum(colour[:3]) < 1.7 else "black",

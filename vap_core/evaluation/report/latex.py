@@ -6,6 +6,8 @@ The paper's own numbers stand below a rule.
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from vap_core.base.tables import escape
 from vap_core.evaluation import paper
 from vap_core.evaluation.metrics import TRACK
@@ -56,7 +58,9 @@ def _measures(lines: "pd.DataFrame") -> Measures:
 
 def _head(measures: Measures) -> list[str]:
     """The tabular's beginning: tasks, and below each n and its rates."""
-    tasks, rules, columns = [], [], []
+    tasks = []
+    rules = []
+    columns = []
     first = 2
     for task, of_task in measures.items():
         width = 1 + len(of_task)
@@ -90,7 +94,8 @@ def _our_rows(lines: "pd.DataFrame", measures: Measures) -> list[str]:
                 cells += ["", *["--"] * len(of_task)]
                 continue
             cells.append(f"{line.n}/{line.listed}")
-            cells += [_rate_with_interval(line, rate) for rate in of_task]
+            for rate in of_task:
+                cells.append(_rate_with_interval(line, rate))
         rows.append(_row(cells))
     return rows
 
@@ -102,14 +107,18 @@ def _paper_rows(published: "pd.DataFrame", measures: Measures) -> list[str]:
         cells = [escape(str(method))]
         for task, of_task in measures.items():
             cells.append("")
+            line = by_task.get(task)
             for rate in of_task:
-                cells.append(_rate(getattr(by_task.get(task), rate, float("nan"))))
+                cells.append(_rate(getattr(line, rate, np.nan)))
         rows.append(_row(cells))
     return rows
 
 
 def _lines_by_task(part: "pd.DataFrame") -> dict[str, Any]:
-    return {line.task: line for line in part.itertuples()}
+    lines = {}
+    for line in part.itertuples():
+        lines[line.task] = line
+    return lines
 
 
 def _row(cells: list[str]) -> str:
@@ -117,7 +126,8 @@ def _row(cells: list[str]) -> str:
 
 
 def _rate_with_interval(line: Any, name: str) -> str:
-    low, high = getattr(line, f"{name}_low"), getattr(line, f"{name}_high")
+    low = getattr(line, f"{name}_low")
+    high = getattr(line, f"{name}_high")
     if low != low:
         return "--"
     return rf"{100 * getattr(line, name):.1f} {{\scriptsize [{100 * low:.1f}, {100 * high:.1f}]}}"

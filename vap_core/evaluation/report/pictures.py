@@ -44,7 +44,8 @@ def forest_figure(results: "pd.DataFrame") -> "Figure":
     `results` is a table of `results.results`.
     """
     series = list(dict.fromkeys(zip(results["method"], results["policy"], strict=True)))
-    methods, policies = _unique(results["method"]), _unique(results["policy"])
+    methods = _unique(results["method"])
+    policies = _unique(results["policy"])
     marks = method_marks(methods)
     lines = list(zip(results["suite"], results["split"], results["task"], strict=True))
     figure, axes, places = _forest_axes(lines, per_line=len(series), heading_x=0.0)
@@ -54,8 +55,10 @@ def forest_figure(results: "pd.DataFrame") -> "Figure":
         low = 100 * shown["sr_layout_low"].fillna(shown["sr_low"]).to_numpy()
         high = 100 * shown["sr_layout_high"].fillna(shown["sr_high"]).to_numpy()
         middle = 100 * shown["sr"].to_numpy()
-        shown_lines = zip(shown["suite"], shown["split"], shown["task"], strict=True)
-        at = np.array([places[line] for line in shown_lines])
+        heights = []
+        for line in zip(shown["suite"], shown["split"], shown["task"], strict=True):
+            heights.append(places[line])
+        at = np.array(heights)
         colour, marker = marks[method]
         axes.errorbar(
             middle,
@@ -143,7 +146,10 @@ def scores_figure(scores: Sequence[Score]) -> "Figure":
 def _draw_scores(axes: "Axes", scores: Sequence[Score]) -> None:
     """The panel of one task and track: a group of bars per measure, a bar per method."""
     for i, score in enumerate(scores):
-        at, heights, low, high = [], [], [], []
+        at = []
+        heights = []
+        low = []
+        high = []
         for j, name in enumerate(MEASURES):
             rate = getattr(score, name)
             if rate.n:
@@ -198,7 +204,7 @@ def _forest_axes(
         axes.text(
             heading_x,
             first - 0.65,
-            ", ".join(word for word in group if word),
+            ", ".join(filter(None, group)),
             fontsize=9,
             fontweight="bold",
             va="center",

@@ -69,7 +69,9 @@ def _are_whole_suites(tasks_by_suite: dict[str, list[str]]) -> bool:
 
 def _options(study: dict[str, Any], whole: bool) -> dict[str, Any]:
     """The options of a command and their settings, None where the default holds."""
-    options = {name: study.get(name) for name in ("episodes", "seed", "policy", "stack", "robots")}
+    options = {}
+    for name in ("episodes", "seed", "policy", "stack", "robots"):
+        options[name] = study.get(name)
     if whole:
         options["seeds"] = None
         if study.get("seeds", 1) > 1:
@@ -80,7 +82,8 @@ def _options(study: dict[str, Any], whole: bool) -> dict[str, Any]:
 
 
 def _seeds(study: dict[str, Any]) -> str:
-    first, count = study["seed"], study.get("seeds", 1)
+    first = study["seed"]
+    count = study.get("seeds", 1)
     if count == 1:
         return str(first)
     return f"{first}..{first + count - 1}"
@@ -89,4 +92,7 @@ def _seeds(study: dict[str, Any]) -> str:
 def _shortened(checksums: Any) -> str:
     if not isinstance(checksums, dict):
         return str(checksums)
-    return " ".join(f"{name}:{str(digest)[:12]}" for name, digest in checksums.items())
+    parts = []
+    for name, digest in checksums.items():
+        parts.append(f"{name}:{str(digest)[:12]}")
+    return " ".join(parts)

@@ -77,7 +77,9 @@ def errors(runs: Runs, limit: int = 5) -> list[str]:
     details = runs.table.loc[runs.table["outcome"].eq("error"), "detail"].fillna("").astype(str)
     last_lines = details.str.strip().str.rsplit("\n", n=1).str[-1].str.slice(0, 160)
     counts = last_lines.replace("", "(no traceback was kept)").value_counts(sort=True)
-    lines = [f"{n} x {text}" for text, n in counts.head(limit).items()]
+    lines = []
+    for text, n in counts.head(limit).items():
+        lines.append(f"{n} x {text}")
     if len(counts) > limit:
         rest = counts.iloc[limit:].sum()
         lines.append(f"and {rest} of {len(counts) - limit} other kinds")
@@ -103,7 +105,8 @@ def _count_columns() -> dict[str, str]:
 
 def _add_rate(lines: "pd.DataFrame", name: str) -> None:
     """Add a rate with Wilson's, and with Clopper and Pearson's interval."""
-    k, n = lines[f"{name}_k"].to_numpy(), lines[f"{name}_n"].to_numpy()
+    k = lines[f"{name}_k"].to_numpy()
+    n = lines[f"{name}_n"].to_numpy()
     lines[name] = np.divide(k, n, out=np.full(len(k), np.nan), where=n > 0)
     lines[f"{name}_low"], lines[f"{name}_high"] = intervals(k, n)
     lines[f"{name}_cp_low"], lines[f"{name}_cp_high"] = intervals(k, n, conservative=True)

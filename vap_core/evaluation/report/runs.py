@@ -55,9 +55,13 @@ def load(sources: Sequence[Path]) -> Runs:
     """
     import pandas as pd
 
-    tables, wanted, unfinished, manifests = [], [], [], {}
+    tables = []
+    wanted = []
+    unfinished = []
+    manifests = {}
     for name, manifest, table in _named_runs(sources):
-        manifests[name], study = manifest, manifest["configuration"]
+        manifests[name] = manifest
+        study = manifest["configuration"]
         _check_run(name, study, table)
         # A checkpoint goes by its label, not by its path.
         labels = dict(table.groupby("suite")["policy"].first())
@@ -78,7 +82,12 @@ def load(sources: Sequence[Path]) -> Runs:
             "run once, or report them one by one."
         )
     expected = _in_order(pd.concat(wanted, ignore_index=True))
-    return Runs(_sorted_as(whole, expected), expected, manifests, tuple(unfinished))
+    return Runs(
+        table=_sorted_as(whole, expected),
+        wanted=expected,
+        manifests=manifests,
+        unfinished=tuple(unfinished),
+    )
 
 
 def _named_runs(sources: Sequence[Path]) -> "Iterator[tuple[Path, dict[str, Any], pd.DataFrame]]":
@@ -156,7 +165,10 @@ def _count_asked(study: dict[str, Any], labels: Mapping[str, str]) -> "pd.DataFr
 
 
 def _count_by_split(rows: Sequence[tuple[int, str]]) -> Counter[str]:
-    return Counter(split for _, split in rows)
+    counts: Counter[str] = Counter()
+    for _, split in rows:
+        counts[split] += 1
+    return counts
 
 
 def _asked_rows(
@@ -173,7 +185,10 @@ def _asked_rows(
 @cache
 def _episodes(suite: str, task: str, n: int | None, seed: int) -> tuple[tuple[int, str], ...]:
     """The episode and split of the rows of a task."""
-    return tuple((row.episode, row.split) for row in suites.rows(suite, task, n, seed))
+    episodes = []
+    for row in suites.rows(suite, task, n=n, seed=seed):
+        episodes.append((row.episode, row.split))
+    return tuple(episodes)
 
 
 def _joined(tables: "Sequence[pd.DataFrame]") -> "pd.DataFrame":

@@ -73,12 +73,15 @@ def results_section(lines: "pd.DataFrame") -> str:
         for (_, split), part in of_suite.groupby(TRACK, sort=False):
             of_track = (published["suite"] == suite) & (published["split"] == split)
             parts.append(f"### {track_title(str(suite), str(split))}")
-            parts.append(markdown(result_rows(part, published[of_track])))
+            rows = result_rows(part, published[of_track])
+            parts.append(markdown(rows))
         notes = paper.footnotes(str(suite))
         if suite == "tabletop":
             notes = [paper.real_arm(), *notes]
         if notes:
-            numbered = [f"{i}. {note}" for i, note in enumerate(notes, 1)]
+            numbered = []
+            for i, note in enumerate(notes, 1):
+                numbered.append(f"{i}. {note}")
             parts.append("Footnotes to the paper's numbers:\n\n" + "\n".join(numbered))
     return "\n\n".join(parts)
 

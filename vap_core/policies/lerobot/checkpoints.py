@@ -1,4 +1,4 @@
-"""A policy's checkpoint as files: where it lies, what it says of itself, and that nothing in it would be executed."""
+"""A policy's checkpoint as files: where it lies, what it builds on, and no code in it runs."""
 
 import hashlib
 import json
@@ -9,86 +9,77 @@ from typing import Any
 
 from vap_core.base.errors import BadPolicy
 
-WEIGHTS, CONFIG, PIPELINES = (
-    "model.safetensors",
-    "config.json",
-    ("policy_preprocessor.json", "policy_postprocessor.json"),
-)
+WEIGHTS = "model.safetensors"
+CONFIG = "config.json"
+PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
 STEP_NAME = "vap_prompt"
 """The registered name of the step that prompts inside lerobot's own loops."""
 STEP_CLASS = re.compile(r"vap_core\.(\w+\.)*VapPrompt")
 """Its class, in this version or an earlier one."""
+TRAINING_CARD = "training.json"
+"""How a checkpoint was trained, which does not decide what it does."""
 WANTED_FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
 
 
-def named(policy: str) -> bool:
+def is_checkpoint_name(policy: str) -> bool:
     """Whether a policy's name means a checkpoint: a folder that exists, or owner/name."""
-    return (
-        Path(policy).expanduser().is_dir() or re.fullmatch(r"[\w.-]+/[\w.-]+", policy) is not None
-    )
+    if Path(policy).expanduser().is_dir():
+        return True
+    return re.fullmatch(r"[\w.-]+/[\w.-]+", policy) is not None
 
 
 def locate(checkpoint: str | Path) -> Path:
     """The folder of a checkpoint on this machine. Raises: BadPolicy when a file is missing."""
-    from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError
-
     folder = Path(checkpoint).expanduser()
     if not folder.is_dir():
-        try:
-            folder = Path(
-                snapshot_download(
-                    str(checkpoint), allow_patterns=list(WANTED_FILES), local_files_only=True
-                )
-            )
-        except (HFValidationError, LocalEntryNotFoundError) as error:
-            raise BadPolicy(
-                f"load: {checkpoint} is no folder and no model on this machine; download it with `hf download {checkpoint}`, or give a folder."
-            ) from error
+        folder = _downloaded(str(checkpoint))
     missing = [name for name in (CONFIG, WEIGHTS, *PIPELINES) if not (folder / name).is_file()]
     if missing:
         raise BadPolicy(
-            f"load: {folder} lacks {', '.join(missing)}; give the folder that lerobot's save_pretrained wrote, processors included."
+            f"load: {folder} lacks {', '.join(missing)}; give the folder that lerobot's "
+            "save_pretrained wrote, processors included."
         )
     return folder
 
 
-def setting(checkpoint: str | Path, name: str) -> str:
-    """What a checkpoint's config.json says there; "" when it says nothing. Raises: BadPolicy."""
+def config_field(checkpoint: str | Path, name: str) -> str:
+    """A field of a checkpoint's config.json; "" when it is not there. Raises: BadPolicy."""
     file = locate(checkpoint) / CONFIG
     try:
         return str(json.loads(file.read_text()).get(name, ""))
     except (ValueError, AttributeError) as error:
         raise BadPolicy(
-            f"load: {file} is no configuration ({type(error).__name__}); save the checkpoint again with lerobot 0.6."
+            f"load: {file} is no configuration ({type(error).__name__}); save the checkpoint again "
+            "with lerobot 0.6."
         ) from error
 
 
-def foundations(folder: Path) -> list[str]:
-    """Models of the hub that a checkpoint builds on: the backbone whose sizes it takes, the tokenizer that reads its commands."""
-    steps = json.loads((folder / PIPELINES[0]).read_text())["steps"]
-    names = [
-        setting(folder, "vlm_model_name"),
-        *(step.get("config", {}).get("tokenizer_name", "") for step in steps),
-    ]
-    return list(dict.fromkeys(name for name in names if name and not Path(name).is_dir()))
+def base_models(folder: Path) -> list[str]:
+    """Models of the hub that a checkpoint builds on.
+
+    These are the backbone whose sizes it takes, and the tokenizer that reads its commands.
+    """
+    names = [config_field(folder, "vlm_model_name")]
+    for step in json.loads((folder / PIPELINES[0]).read_text())["steps"]:
+        names.append(step.get("config", {}).get("tokenizer_name", ""))
+    found: list[str] = []
+    for name in names:
+        if name and name not in found and not Path(name).is_dir():
+            found.append(name)
+    return found
 
 
 def fingerprint(checkpoint: str | Path) -> str:
     """SHA-256 of everything in a checkpoint that decides what it does, without loading it."""
-    found, folder = hashlib.sha256(), locate(checkpoint)
-    kept = [
-        file
-        for file in folder.rglob("*")
-        if file.is_file() and any(file.match(pattern) for pattern in WANTED_FILES)
-    ]
-    for file in sorted(
-        file for file in kept if file.name != "training.json"
-    ):  # how it was made decides nothing
-        found.update(file.relative_to(folder).as_posix().encode())
+    folder = locate(checkpoint)
+    digest = hashlib.sha256()
+    for file in sorted(folder.rglob("*")):
+        if not _decides(file):
+            continue
+        digest.update(file.relative_to(folder).as_posix().encode())
         with file.open("rb") as stream:
-            found.update(hashlib.file_digest(stream, "sha256").digest())
-    return found.hexdigest()
+            digest.update(hashlib.file_digest(stream, "sha256").digest())
+    return digest.hexdigest()
 
 
 def refuse_code(folder: Path) -> None:
@@ -111,6 +102,28 @@ def refuse_code(folder: Path) -> None:
                     f"load: {folder / file} asks to run {name!r}, which is no step of lerobot; "
                     "files are parsed here, never executed."
                 )
+
+
+def _downloaded(name: str) -> Path:
+    """The folder of a model that was downloaded before. Raises: BadPolicy."""
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError
+
+    try:
+        folder = snapshot_download(name, allow_patterns=list(WANTED_FILES), local_files_only=True)
+    except (HFValidationError, LocalEntryNotFoundError) as error:
+        raise BadPolicy(
+            f"load: {name} is no folder and no model on this machine; download it with "
+            f"`hf download {name}`, or give a folder."
+        ) from error
+    return Path(folder)
+
+
+def _decides(file: Path) -> bool:
+    """Whether a file of a checkpoint decides what it does."""
+    if not file.is_file() or file.name == TRAINING_CARD:
+        return False
+    return any(file.match(pattern) for pattern in WANTED_FILES)
 
 
 def _steps(file: Path) -> list[dict[str, Any]]:

@@ -1,16 +1,18 @@
-"""VAP inside lerobot: a processor step that personalises any of its policies, and our suites as one of its environments.
+"""VAP inside lerobot: a processor step for any of its policies, and our suites as an environment.
 
-    attach("checkpoint", "personalised", memory="data/memory")             # links the frozen files, adds one step to the preprocessor
+    attach("checkpoint", "personalised", memory="data/memory")
     lerobot-eval --policy.path=personalised --env.type=vap --env.task=simpler-bridge/put-camera \\
         --env.discover_packages_path=vap_core.policies.lerobot --seed=0
 
-The step tints every view and rewrites the task before anything else reads them. It must know where an episode begins: lerobot-eval never resets
-its pipelines, so our environments number their steps in the observation `vap_step`; robot loops reset theirs (`episodes="reset"`).
+`attach` links the frozen files, and adds one step to the preprocessor. The step tints every view
+and rewrites the task before anything else reads them. It must know where an episode begins:
+lerobot-eval never resets its pipelines, so our environments number their steps in the observation
+`vap_step`; robot loops reset theirs (`episodes="reset"`).
 """
 
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -31,16 +33,20 @@ from vap_core.base.errors import BadMemory, BadOutput, BadViews, one_of
 from vap_core.base.types import Rgb, Views
 from vap_core.memory import load_bank
 from vap_core.perception.stacks import STACKS, load_stack
-from vap_core.policies.lerobot.checkpoints import PIPELINES, STEP_NAME, locate
+from vap_core.policies.lerobot.checkpoints import PIPELINES, STEP_CLASS, STEP_NAME, locate
 from vap_core.simulation import suites
 from vap_core.simulation.gym_env import VapEnv, env_id
+from vap_core.simulation.types import EpisodeRow
 
-IMAGES, STEP, AFTER = "observation.images.", "observation.vap_step", "rename_observations_processor"
+IMAGES = "observation.images."
+STEP = "observation.vap_step"
+RENAMING_STEP = "rename_observations_processor"
+"""The step of lerobot's preprocessors behind which the prompting step stands."""
 
 
 @dataclass
-class Following:
-    """One environment's episode under way: its number of steps, what attending carries, and the last answer."""
+class OngoingEpisode:
+    """One environment's episode: its last step, the method's state, and the prompted input."""
 
     step: int
     state: AttendState
@@ -51,10 +57,12 @@ class Following:
 @ProcessorStepRegistry.register(name=STEP_NAME)
 @dataclass
 class VapPrompt(ProcessorStep):
-    """Tints the remembered object in every `observation.images.*` and rewrites `task`; the views that show it not pass bit for bit.
+    """Tints the remembered object in every `observation.images.*`, and rewrites `task`.
 
-    `memory` is the folder of remembered objects, `objects` names those meant where the category alone does not decide.
-    `episodes` says how an episode's beginning is known: by `observation.vap_step` being 0, or by `reset()` (then of one environment only).
+    Views in which it is not seen pass bit for bit. `memory` is the folder of remembered objects,
+    `objects` names those meant where the category alone does not decide. `episodes` says how an
+    episode's beginning is known: by `observation.vap_step` being 0, or by `reset()` (then of one
+    environment only).
     """
 
     memory: str
@@ -65,7 +73,7 @@ class VapPrompt(ProcessorStep):
     alpha: float = 0.5
     episodes: Literal["vap_step", "reset"] = "vap_step"
     _attender: Attender | None = field(default=None, init=False, repr=False)
-    _following: dict[int, Following] = field(default_factory=dict, init=False, repr=False)
+    _ongoing: dict[int, OngoingEpisode] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.stack not in STACKS:
@@ -74,56 +82,53 @@ class VapPrompt(ProcessorStep):
             raise one_of("VapPrompt: episodes", self.episodes, ("vap_step", "reset"))
         if not Path(self.memory).is_dir():
             raise BadMemory(
-                f"VapPrompt: {self.memory} is no folder of remembered objects; register one, or attach again."
+                f"VapPrompt: {self.memory} is no folder of remembered objects; register one, or "
+                "attach again."
             )
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
-        """Raises: BadViews when it cannot be known which episode a picture belongs to."""
-        out = transition.copy()
-        observation = dict(out.get(TransitionKey.OBSERVATION) or {})
-        said = dict(out.get(TransitionKey.COMPLEMENTARY_DATA) or {})
-        if out.get(TransitionKey.ACTION) is not None:
+        """Prompt every view and the task of a batch.
+
+        Raises: BadViews when it cannot be known which episode a picture belongs to.
+        """
+        prompted = transition.copy()
+        observation = dict(prompted.get(TransitionKey.OBSERVATION) or {})
+        extra = dict(prompted.get(TransitionKey.COMPLEMENTARY_DATA) or {})
+        if prompted.get(TransitionKey.ACTION) is not None:
             raise BadViews(
-                "VapPrompt: this batch holds actions, so it is for training, and its frames are shuffled; train the plain checkpoint."
+                "VapPrompt: this batch holds actions, so it is for training, and its frames are "
+                "shuffled; train the plain checkpoint."
             )
-        views = {key: tensor for key, tensor in observation.items() if key.startswith(IMAGES)}
-        task = said.get("task")
+        views = _views(observation)
+        task = extra.get("task")
         if not views or task is None:
+            missing = "task" if views else f"{IMAGES}*"
             raise BadViews(
-                f"VapPrompt: no {'task' if views else IMAGES + '*'} among {sorted({*observation, *said})}; give both."
+                f"VapPrompt: no {missing} among {sorted({*observation, *extra})}; give both."
             )
-        single = next(iter(views.values())).ndim == 3
-        pictures = {
-            key: _pixels(tensor[None] if single else tensor) for key, tensor in views.items()
-        }
         texts = [task] if isinstance(task, str) else list(task)
         steps = self._steps(observation.pop(STEP, None), len(texts))
-        for key in views:
-            observation[key] = views[key].clone()
-        for i, (step, text) in enumerate(zip(steps, texts, strict=True)):
-            seen = {key.removeprefix(IMAGES): rgb[i] for key, rgb in pictures.items()}
-            shown = self._following[i] = self._follow(i, step, seen, text)
-            texts[i] = shown.text
-            for camera, rgb in shown.images.items():
-                if rgb is not seen[camera] and (rgb != seen[camera]).any():
-                    target = (
-                        observation[IMAGES + camera] if single else observation[IMAGES + camera][i]
-                    )
-                    target.copy_(torch.from_numpy(rgb).permute(2, 0, 1).float() / 255)
-        said["task"] = texts[0] if isinstance(task, str) else texts
-        out[TransitionKey.OBSERVATION], out[TransitionKey.COMPLEMENTARY_DATA] = observation, said
-        return out
+        tensors, texts = self._prompt(views, texts, steps)
+        observation.update(tensors)
+        extra["task"] = texts[0] if isinstance(task, str) else texts
+        prompted[TransitionKey.OBSERVATION] = observation
+        prompted[TransitionKey.COMPLEMENTARY_DATA] = extra
+        return prompted
 
     def get_config(self) -> dict[str, Any]:
-        return {one.name: getattr(self, one.name) for one in fields(self) if one.init}
+        config = {}
+        for option in fields(self):
+            if option.init:
+                config[option.name] = getattr(self, option.name)
+        return config
 
     def reset(self) -> None:
         """The next pictures begin an episode."""
-        self._following.clear()
+        self._ongoing.clear()
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:  # fmt: skip
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
         return features
 
     def _steps(self, signal: torch.Tensor | None, n: int) -> list[int]:
@@ -131,58 +136,85 @@ class VapPrompt(ProcessorStep):
         if self.episodes == "reset":
             if n > 1:
                 raise BadViews(
-                    f"VapPrompt: {n} environments but episodes='reset', which knows one; give the observation vap_step and attach again."
+                    f"VapPrompt: {n} environments but episodes='reset', which knows one; give the "
+                    "observation vap_step and attach again."
                 )
-            return [self._following[0].step + 1 if self._following else 0]
+            return [self._ongoing[0].step + 1 if self._ongoing else 0]
         if signal is None:
             raise BadViews(
-                f"VapPrompt: {STEP} is missing, so a new episode cannot be told from an old one; let the environment give vap_step (0 = new), "
-                "or attach with episodes='reset' where the caller resets the preprocessor."
+                f"VapPrompt: {STEP} is missing, so a new episode cannot be told from an old one; "
+                "let the environment give vap_step (0 = new), or attach with episodes='reset' "
+                "where the caller resets the preprocessor."
             )
         return [round(step) for step in signal.reshape(-1).tolist()]
 
-    def _follow(self, i: int, step: int, seen: Views, text: str) -> Following:
-        held = self._following.get(i)
+    def _prompt(
+        self, views: Mapping[str, torch.Tensor], texts: Sequence[str], steps: Sequence[int]
+    ) -> tuple[dict[str, torch.Tensor], list[str]]:
+        """The prompted views and texts, one per environment; pixels that stay are not touched."""
+        single = next(iter(views.values())).ndim == 3
+        pixels = {}
+        prompted = {}
+        for key, tensor in views.items():
+            pixels[key.removeprefix(IMAGES)] = _pixels(tensor[None] if single else tensor)
+            prompted[key] = tensor.clone()
+        new_texts = []
+        for i, (step, text) in enumerate(zip(steps, texts, strict=True)):
+            images = {camera: rgb[i] for camera, rgb in pixels.items()}
+            episode = self._follow(i, step, images, text)
+            self._ongoing[i] = episode
+            new_texts.append(episode.text)
+            for camera, rgb in episode.images.items():
+                if rgb is images[camera] or not (rgb != images[camera]).any():
+                    continue
+                batch = prompted[IMAGES + camera]
+                tensor = batch if single else batch[i]
+                tensor.copy_(torch.from_numpy(rgb).permute(2, 0, 1).float() / 255)
+        return prompted, new_texts
+
+    def _follow(self, i: int, step: int, images: Views, text: str) -> OngoingEpisode:
+        """The episode of environment `i` after its next images."""
+        episode = self._ongoing.get(i)
         if step == 0:
-            state, attended = self._load().start(seen, text, objects=self.objects)
-        elif held is None or step not in (held.step, held.step + 1):
+            state, attended = self._load().start(images, text, objects=self.objects)
+        elif episode is None or step not in (episode.step, episode.step + 1):
+            last = "nothing" if episode is None else episode.step
             raise BadViews(
-                f"VapPrompt: environment {i} is at step {step} after {'nothing' if held is None else held.step}; give every picture, in order."
+                f"VapPrompt: environment {i} is at step {step} after {last}; give every picture, "
+                "in order."
             )
-        elif (
-            step == held.step
-        ):  # an episode that is over stands still until its neighbours are done
-            return held
+        elif step == episode.step:
+            return episode  # it is over, and stands still until the others are done
         else:
-            state, attended = self._load().step(held.state, seen)
-        return Following(step, state, attended.images, attended.text)
+            state, attended = self._load().step(episode.state, images)
+        return OngoingEpisode(step=step, state=state, images=attended.images, text=attended.text)
 
     def _load(self) -> Attender:
         if self._attender is None:
             stack = load_stack(self.stack)
             memory = load_bank(Path(self.memory), stack.encoder.name)
-            self._attender = Attender(
-                stack, memory, Prompting(self.alpha, highlight=self.highlight, rewrite=self.rewrite)
-            )
+            prompting = Prompting(self.alpha, highlight=self.highlight, rewrite=self.rewrite)
+            self._attender = Attender(stack, memory, prompting)
         return self._attender
 
 
-def attach(checkpoint: str | Path, out: Path, memory: Path, **how: Any) -> Path:
-    """A checkpoint beside the frozen one: every file linked, one step added to the preprocessor right after the renaming of observations.
+def attach(checkpoint: str | Path, out: Path, memory: Path, **options: Any) -> Path:
+    """Write a checkpoint with VAP beside the frozen one; returns its folder.
 
-    `how` are VapPrompt's other fields. Raises: BadOutput when `out` exists; BadPolicy, BadMemory, UnknownName when the parts do not fit.
+    Every file is linked, and one step is added to the preprocessor, right after the renaming of
+    observations. `options` are VapPrompt's other fields.
+
+    Raises: BadOutput when `out` exists; BadPolicy, BadMemory, UnknownName when the parts do not
+        fit.
     """
     source = locate(checkpoint).resolve()
-    step = VapPrompt(str(Path(memory).resolve()), **how)
+    memory = Path(memory).resolve()
+    step = VapPrompt(str(memory), **options)
     if out.exists():
         raise BadOutput(f"attach: {out} exists; choose another folder.")
     pipeline = json.loads((source / PIPELINES[0]).read_text())
-    names = [entry.get("registry_name") for entry in pipeline["steps"]]
-    place = names.index(AFTER) + 1 if AFTER in names else 0
-    pipeline["steps"].insert(
-        place,
-        {"class": f"{VapPrompt.__module__}.{VapPrompt.__name__}", "config": step.get_config()},
-    )
+    entry = {"class": STEP_CLASS, "config": step.get_config()}
+    pipeline["steps"].insert(_place_of_step(pipeline["steps"]), entry)
     out.mkdir(parents=True)
     for file in source.iterdir():
         if file.name != PIPELINES[0]:
@@ -192,9 +224,10 @@ def attach(checkpoint: str | Path, out: Path, memory: Path, **how: Any) -> Path:
 
 
 class LeRobotEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
-    """One task in lerobot's shape: pixels by camera, `agent_pos`, and `vap_step`, the number of steps since the episode began.
+    """One task in lerobot's shape: pixels by camera, `agent_pos`, and `vap_step`.
 
-    Seed s starts episode s of the task's list, modulo its length, exactly as our own rollout does; `max_steps` shortens it.
+    `vap_step` is the number of steps since the episode began. Seed s starts episode s of the task's
+    list, modulo its length, exactly as our own rollout does; `max_steps` shortens it.
     """
 
     def __init__(
@@ -206,21 +239,20 @@ class LeRobotEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         max_steps: int | None = None,
     ) -> None:
         self.inner = VapEnv(suite, task, image_size, robots, render_mode="rgb_array")
-        self.render_mode, self.metadata = (
-            "rgb_array",
-            {**self.inner.metadata, "render_fps": round(self.inner.suite.hz)},
-        )
-        self.rows = [
-            replace(row, max_steps=min(row.max_steps, max_steps or row.max_steps))
-            for row in self.inner.rows
-        ]
-        self.task, self.task_description = env_id(suite, task), self.rows[0].instruction
+        self.render_mode = "rgb_array"
+        self.metadata = {**self.inner.metadata, "render_fps": round(self.inner.suite.hz)}
+        self.rows = _shorten(self.inner.rows, max_steps)
+        self.task = env_id(suite, task)
+        self.task_description = self.rows[0].instruction
         self._max_episode_steps = max(row.max_steps for row in self.rows)
-        seen = self.inner.observation_space
-        assert isinstance(seen, spaces.Dict)
-        count = spaces.Box(0, np.inf, (1,), np.float32)
+        inner_space = self.inner.observation_space
+        assert isinstance(inner_space, spaces.Dict)
         self.observation_space = spaces.Dict(
-            {"pixels": seen["images"], "agent_pos": seen["state"], "vap_step": count}
+            {
+                "pixels": inner_space["images"],
+                "agent_pos": inner_space["state"],
+                "vap_step": spaces.Box(0, np.inf, (1,), np.float32),
+            }
         )
         self.action_space = self.inner.action_space
 
@@ -228,23 +260,19 @@ class LeRobotEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         super().reset(seed=seed)
-        row = self.rows[
-            (int(self.np_random.integers(len(self.rows))) if seed is None else seed)
-            % len(self.rows)
-        ]
+        number = seed
+        if number is None:
+            number = int(self.np_random.integers(len(self.rows)))
+        row = self.rows[number % len(self.rows)]
         self.task_description = row.instruction
-        seen, info = self.inner.reset(options={"row": row})
-        return _shaped(seen, 0), {**info, "is_success": False}
+        observation, info = self.inner.reset(options={"row": row})
+        return _lerobot_observation(observation, 0), {**info, "is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        seen, reward, terminated, truncated, info = self.inner.step(action)
-        return (
-            _shaped(seen, info["steps"]),
-            reward,
-            terminated,
-            truncated,
-            {**info, "is_success": bool(info["success"])},
-        )
+        observation, reward, terminated, truncated, info = self.inner.step(action)
+        shaped = _lerobot_observation(observation, info["steps"])
+        info = {**info, "is_success": bool(info["success"])}
+        return shaped, reward, terminated, truncated, info
 
     def render(self) -> Rgb | None:
         return self.inner.render()
@@ -264,24 +292,21 @@ class VapEnvConfig(EnvConfig):
     max_steps: int | None = None
 
     def __post_init__(self) -> None:
-        name, *task = (self.task or "").split("/")
-        self.suite = suites.suite(name)
-        self.tasks = tuple(self.suite.task(one).name for one in task) or tuple(
-            one.name for one in self.suite.tasks
-        )
+        suite_name, *task_names = (self.task or "").split("/")
+        self.suite = suites.suite(suite_name)
+        tasks = tuple(map(self.suite.task, task_names)) or self.suite.tasks
+        self.tasks = tuple(task.name for task in tasks)
         self.fps = round(self.suite.hz)
-        inner = VapEnv(name, self.tasks[0], self.image_size, self.robots)  # type: ignore[arg-type]
-        state, side = inner.observation_space["state"].shape, self.image_size  # type: ignore[index]
-        self.features = {
-            "action": PolicyFeature(FeatureType.ACTION, inner.action_space.shape or ())
-        }
-        self.features |= {
-            f"pixels/{name}": PolicyFeature(FeatureType.VISUAL, (side, side, 3))
-            for name in self.suite.cameras
-        }
-        self.features["agent_pos"] = PolicyFeature(FeatureType.STATE, state)
+        inner = VapEnv(suite_name, self.tasks[0], self.image_size, self.robots)  # type: ignore[arg-type]
+        state_shape = inner.observation_space["state"].shape  # type: ignore[index]
+        action_shape = inner.action_space.shape or ()
+        image_shape = (self.image_size, self.image_size, 3)
+        self.features = {"action": PolicyFeature(FeatureType.ACTION, action_shape)}
         self.features_map = {"action": "action", "agent_pos": "observation.state"}
-        self.features_map |= {f"pixels/{name}": IMAGES + name for name in self.suite.cameras}
+        for camera in self.suite.cameras:
+            self.features[f"pixels/{camera}"] = PolicyFeature(FeatureType.VISUAL, image_shape)
+            self.features_map[f"pixels/{camera}"] = IMAGES + camera
+        self.features["agent_pos"] = PolicyFeature(FeatureType.STATE, state_shape)
         inner.close()
 
     @property
@@ -291,39 +316,62 @@ class VapEnvConfig(EnvConfig):
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, VectorEnv]]:
-        """One vector environment per task; an environment whose episode is over stands still, as in lerobot's own."""
-        return {
-            self.suite.name: {
-                i: self._vector(task, n_envs, use_async_envs) for i, task in enumerate(self.tasks)
-            }
-        }
+        """One vector environment per task.
 
-    def _vector(self, task: str, n_envs: int, use_async_envs: bool) -> Any:
-        make: list[Callable[[], gymnasium.Env]] = [
-            lambda: LeRobotEnv(self.suite.name, task, **self.gym_kwargs)
-        ] * n_envs
+        An environment whose episode is over stands still, as in lerobot's own.
+        """
+        envs = {}
+        for i, task in enumerate(self.tasks):
+            envs[i] = self._vector_env(task, n_envs, use_async_envs)
+        return {self.suite.name: envs}
+
+    def _vector_env(self, task: str, n_envs: int, use_async_envs: bool) -> Any:
+        def make_env() -> gymnasium.Env:
+            return LeRobotEnv(self.suite.name, task, **self.gym_kwargs)
+
+        makers: list[Callable[[], gymnasium.Env]] = [make_env] * n_envs
         if use_async_envs and n_envs > 1:
-            return _LazyAsyncVectorEnv(make)
-        return SyncVectorEnv(
-            [freeze_after_episode_end(one) for one in make], autoreset_mode=AutoresetMode.NEXT_STEP
-        )
+            return _LazyAsyncVectorEnv(makers)
+        makers = list(map(freeze_after_episode_end, makers))
+        return SyncVectorEnv(makers, autoreset_mode=AutoresetMode.NEXT_STEP)
 
 
-def _shaped(seen: Mapping[str, Any], step: int) -> dict[str, Any]:
+def _views(observation: Mapping[str, Any]) -> dict[str, torch.Tensor]:
+    """The images of an observation, by their key."""
+    views = {}
+    for key, tensor in observation.items():
+        if key.startswith(IMAGES):
+            views[key] = tensor
+    return views
+
+
+def _place_of_step(steps: Sequence[Mapping[str, Any]]) -> int:
+    """Where the prompting step goes: behind the renaming of observations, else first."""
+    for i, step in enumerate(steps):
+        if step.get("registry_name") == RENAMING_STEP:
+            return i + 1
+    return 0
+
+
+def _shorten(rows: Iterable[EpisodeRow], max_steps: int | None) -> list[EpisodeRow]:
+    """The rows, with `max_steps` at most where it is given."""
+    shortened = []
+    for row in rows:
+        limit = min(row.max_steps, max_steps or row.max_steps)
+        shortened.append(replace(row, max_steps=limit))
+    return shortened
+
+
+def _lerobot_observation(observation: Mapping[str, Any], step: int) -> dict[str, Any]:
+    """An observation of our environment under lerobot's names."""
     return {
-        "pixels": seen["images"],
-        "agent_pos": seen["state"],
+        "pixels": observation["images"],
+        "agent_pos": observation["state"],
         "vap_step": np.array([step], np.float32),
     }
 
 
 def _pixels(images: torch.Tensor) -> np.ndarray:
     """lerobot's floats in 0..1, B x C x H x W, as the RGB bytes that they were."""
-    return np.ascontiguousarray(
-        (images.detach().cpu().float() * 255)
-        .round()
-        .clamp(0, 255)
-        .to(torch.uint8)
-        .permute(0, 2, 3, 1)
-        .numpy()
-    )
+    levels = (images.detach().cpu().float() * 255).round().clamp(0, 255).to(torch.uint8)
+    return np.ascontiguousarray(levels.permute(0, 2, 3, 1).numpy())

@@ -1,4 +1,5 @@
-"""mini-pi0: lerobot's own PI0 at a size that a CPU can train and run; a registered lerobot policy like any other.
+"""mini-pi0: lerobot's own PI0 at a size that a CPU can train and run.
 
-The three modules are named as lerobot's factory wants them: importing the configuration registers the policy and its tokenizer.
+It is a registered lerobot policy like any other. Three modules are named as lerobot's factory wants
+them: importing the configuration registers the policy and its tokenizer.
 """

@@ -12,9 +12,11 @@ HEADS = 8
 @PreTrainedConfig.register_subclass("mini_pi0")
 @dataclass
 class MiniPI0Config(PI0Config):
-    """PI0's options, and numbers where it has variants: a SigLIP tower and a Gemma decoder (together a small PaliGemma), and the action expert.
+    """PI0's options, and numbers where it has variants.
 
-    Widths are features, `patch` pixels. Decoder and expert have the same depth and the same `head_dim`.
+    They are those of a SigLIP tower and a Gemma decoder (together a small PaliGemma), and of the
+    action expert. Widths are features, `patch` pixels. Decoder and expert have the same depth and
+    the same `head_dim`.
     """
 
     image_resolution: tuple[int, int] = (112, 112)
@@ -30,9 +32,11 @@ class MiniPI0Config(PI0Config):
     tokenizer_max_length: int = 40
     num_inference_steps: int = 5
     temperature: float = 1.0
-    """Of the sampling noise, that it is scaled by when actions are drawn: below 1 they keep closer to what was demonstrated most, 0 draws none."""
+    """Scale of the sampling noise: below 1 the actions keep closer to what was demonstrated most, 0
+    draws none."""
     vlm: str = ""
-    """SHA-256 of the mini-PaliGemma that it grew from; learned words mean the same in both."""
+    """SHA-256 of the mini-PaliGemma that it was initialised from; learned words mean the same in
+    both."""
     words: tuple[str, ...] = ()
     """The vocabulary: token i is word i; see processor_mini_pi0."""
 
@@ -41,5 +45,6 @@ class MiniPI0Config(PI0Config):
         self.words = tuple(self.words)
         if self.image_resolution[0] % self.patch or self.vision_width % HEADS:
             raise ValueError(
-                f"MiniPI0Config: {self.image_resolution} pixels do not part into patches of {self.patch}, or {self.vision_width} features by {HEADS}"
+                f"MiniPI0Config: {self.image_resolution} pixels do not part into patches of "
+                f"{self.patch}, or {self.vision_width} features by {HEADS}"
             )

@@ -1,9 +1,13 @@
-"""The soft prompt: one new word for a personal object, learned in a frozen vision-language model by yes/no questions (SPEC section 4, P appendix).
+"""The soft prompt: a new word for a personal object, learned in a frozen vision-language model.
 
-    token = learn(vlm, "red-mug", photos, unseen)     # "can you recognize <my_0> in this image": only <my_0>'s embedding is trained
-    token.accuracy                                                  # on photos that it never saw
+It is learned by yes/no questions (SPEC section 4, P appendix).
 
-Photos of the actual distractors are its hard negatives, in the baseline's favour. The word is then spoken to the policy that grew from the model.
+    token = learn(vlm, "red-mug", photos, unseen)
+    token.accuracy                                    # on photos that it never saw
+
+The question is "can you recognize <my_0> in this image", and only the embedding of <my_0> is
+trained. Photos of the actual distractors are its hard negatives, in the baseline's favour. The word
+is then given to the policy that was initialised from the model.
 """
 
 import json
@@ -25,15 +29,20 @@ if TYPE_CHECKING:
 
     from vap_core.policies.mini_pi0.vlm import MiniVlm
 
-WORD, QUESTION = "<my_0>", "can you recognize <my_0> in this image"
+WORD = "<my_0>"
+QUESTION = "can you recognize <my_0> in this image"
 SUFFIX = ".token.safetensors"
+SHARES = (0.5, 0.35, 0.15)
+"""Shares of own photos, look-alikes and other objects in a batch."""
+EMBEDDED_AT_ONCE = 64
 
 
 @value
 class Token:
-    """A learned word: its embedding in the model's space, and its share of right answers on held-out photos, positives and negatives alike weighty.
+    """A learned word: its embedding in the model's space, and its accuracy on held-out photos.
 
-    `model` is the SHA-256 of the model that it was learned in: it means nothing in another.
+    In `accuracy` positives and negatives have equal weight. `model` is the SHA-256 of the model in
+    which it was learned: it means nothing in another.
     """
 
     object: str
@@ -44,7 +53,7 @@ class Token:
 
 @value
 class Photos:
-    """Pictures of the object, of its look-alikes (hard negatives), and of other objects (easy ones)."""
+    """Pictures of the object, of its look-alikes (hard negatives), and of other objects."""
 
     own: tuple[Rgb, ...]
     rivals: tuple[Rgb, ...]
@@ -52,131 +61,214 @@ class Photos:
 
 
 @dataclass(frozen=True)
-class Lesson:
-    """How a token is learned: so many passes over the photos, each photo in `looks` framings."""
+class TokenTraining:
+    """How a token is learned: so many passes over so many augmentations of every photo."""
 
     epochs: int = 20
     rate: float = 0.02
     batch: int = 32
-    looks: int = 8
+    augmentations: int = 8
     seed: int = 0
 
 
 def learn(
-    vlm: "MiniVlm", name: str, taught: Photos, held: Photos, lesson: Lesson | None = None
+    vlm: "MiniVlm",
+    name: str,
+    taught: Photos,
+    unseen: Photos,
+    training: TokenTraining | None = None,
 ) -> Token:
-    """Train one embedding on `taught`, as many yes as no, and measure it on `held`. Nothing else changes.
+    """Train one embedding on `taught`, as many yes as no, and measure it on `unseen`.
+
+    Nothing else changes.
 
     Raises: BadMemory when a kind of photo is missing.
     """
-    import torch
-    from torch.nn import functional as F  # noqa: N812
-
-    how = lesson or Lesson()
-    rng = np.random.default_rng([77, how.seed, *name.encode()])
-    for part in (taught, held):
-        if not part.own or not (part.rivals or part.others):
+    options = training or TokenTraining()
+    rng = np.random.default_rng([77, options.seed, *name.encode()])
+    for photos in (taught, unseen):
+        if not photos.own or not (photos.rivals or photos.others):
             raise BadMemory(
-                f"tokens.learn: {name}: photos of the object and of others are both needed, to learn from and to measure by."
+                f"tokens.learn: {name}: photos of the object and of others are both needed, to "
+                "learn from and to measure by."
             )
-    tokens, there = vlm.ask([QUESTION])
-    words = vlm.towers.embed_language_tokens(tokens).detach()[0]
-    at = (tokens[0] == vlm.number[WORD])[:, None]
-    learned = words[tokens[0] == vlm.number[WORD]][0].clone().requires_grad_(True)
-    optimiser = torch.optim.AdamW([learned], how.rate, weight_decay=0.0)
-    side, answers = vlm.config.image_resolution[0], [vlm.number["yes"], vlm.number["no"]]
-
-    def patches(photos: Sequence[Rgb]) -> "torch.Tensor":
-        with torch.no_grad():
-            return torch.cat(
-                [vlm.look(_tensor(photos[i : i + 64], side)) for i in range(0, len(photos), 64)]
-            )
-
-    def yes(seen: "torch.Tensor") -> "torch.Tensor":
-        n = len(seen)
-        said, _ = vlm.read(
-            seen,
-            torch.where(at, learned, words).expand(n, -1, -1),
-            there.expand(n, -1),
-            torch.zeros((n, 1), dtype=torch.long),
-        )
-        return said[:, 0, answers[0]] - said[:, 0, answers[1]]
-
-    seen = [
-        patches([framed(photo, rng) for photo in part for _ in range(how.looks)])
-        for part in (taught.own, taught.rivals, taught.others)
-        if part
-    ]
-    shares = np.array([0.5, 0.35, 0.15])[: len(seen)] if len(seen) == 3 else np.array([0.5, 0.5])
-    steps = max(1, sum(len(part) for part in seen) // how.batch)
-    for epoch in range(how.epochs):
-        for group in optimiser.param_groups:
-            group["lr"] = how.rate * 0.5 * (1 + float(np.cos(np.pi * epoch / how.epochs)))
-        for _ in range(steps):
-            drawn = rng.choice(len(seen), how.batch, p=shares)
-            views = torch.stack([seen[kind][rng.integers(len(seen[kind]))] for kind in drawn])
-            loss = F.binary_cross_entropy_with_logits(
-                yes(views), torch.from_numpy((drawn == 0).astype(np.float32))
-            )
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-    with torch.no_grad():
-        right = [yes(patches(held.own)) > 0, yes(patches([*held.rivals, *held.others])) <= 0]
-    accuracy = float(np.mean([part.float().mean().item() for part in right]))
-    return Token(name, learned.detach().numpy().astype(np.float32), accuracy, vlm.sha256())
-
-
-def framed(photo: Rgb, rng: np.random.Generator) -> Rgb:
-    """The photo as another camera might have taken it: nearer or farther, off centre, mirrored never, brighter or darker."""
-    import cv2
-
-    size, zoom = photo.shape[0], float(rng.uniform(0.6, 1.3))
-    turn = cv2.getRotationMatrix2D((size / 2, size / 2), float(rng.uniform(-12, 12)), zoom)
-    turn[:, 2] = turn[:, 2] + rng.uniform(-0.15, 0.15, 2) * size
-    moved = cv2.warpAffine(photo, turn, (size, size), borderMode=cv2.BORDER_REPLICATE)
-    return np.clip(moved * rng.uniform(0.8, 1.2) * rng.uniform(0.95, 1.05, 3), 0, 255).astype(
-        np.uint8
+    question = _Question(vlm)
+    patches = []
+    for kind in (taught.own, taught.rivals, taught.others):
+        if kind:
+            augmented = _augmentations(kind, options.augmentations, rng)
+            patches.append(question.embed(augmented))
+    _train(question, patches, options, rng)
+    embedding = question.embedding.detach().numpy().astype(np.float32)
+    return Token(
+        object=name,
+        embedding=embedding,
+        accuracy=_accuracy(question, unseen),
+        model=vlm.sha256(),
     )
 
 
-def _tensor(images: Sequence[Rgb], side: int) -> "torch.Tensor":
-    import torch
+def augment(photo: Rgb, rng: np.random.Generator) -> Rgb:
+    """The photo as another camera might have taken it; it is never mirrored.
 
-    made = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).float() / 255
-    return torch.nn.functional.interpolate(made, (side, side), mode="bilinear", antialias=True)
+    It is nearer or farther, off centre, turned, and brighter or darker.
+    """
+    import cv2
+
+    size = photo.shape[0]
+    zoom = float(rng.uniform(0.6, 1.3))
+    angle_deg = float(rng.uniform(-12, 12))
+    turn = cv2.getRotationMatrix2D((size / 2, size / 2), angle_deg, zoom)
+    turn[:, 2] = turn[:, 2] + rng.uniform(-0.15, 0.15, 2) * size
+    moved = cv2.warpAffine(photo, turn, (size, size), borderMode=cv2.BORDER_REPLICATE)
+    lit = moved * rng.uniform(0.8, 1.2) * rng.uniform(0.95, 1.05, 3)
+    return np.clip(lit, 0, 255).astype(np.uint8)
 
 
 def save(folder: Path, token: Token) -> Path:
     """Write `<object>.token.safetensors`."""
-    from safetensors.numpy import save as packed
+    from safetensors.numpy import save as encode
 
-    about = {"object": token.object, "accuracy": repr(token.accuracy), "model": token.model}
+    header = {"object": token.object, "accuracy": repr(token.accuracy), "model": token.model}
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{token.object}{SUFFIX}"
-    write_atomic(path, packed({"embedding": token.embedding}, metadata=about))
+    write_atomic(path, encode({"embedding": token.embedding}, metadata=header))
     return path
 
 
 def load(folder: Path, name: str, model: str) -> Token:
-    """The word of that object. Raises: BadMemory when it is absent, damaged, or was learned in another model."""
+    """The word of that object.
+
+    Raises: BadMemory when it is absent, damaged, or was learned in another model.
+    """
     from safetensors import SafetensorError
-    from safetensors.numpy import load as unpacked
 
     path = folder / f"{name}{SUFFIX}"
     try:
-        data = path.read_bytes()
-        (length,) = struct.unpack("<Q", data[:8])
-        about = json.loads(data[8 : 8 + length])["__metadata__"]
-        token = Token(
-            about["object"], unpacked(data)["embedding"], float(about["accuracy"]), about["model"]
-        )
+        token = _read(path)
     except (OSError, SafetensorError, struct.error, ValueError, KeyError) as error:
         raise BadMemory(
             f"tokens.load: {path} holds no learned word ({type(error).__name__}); learn it again."
         ) from error
     if token.model != model:
         raise BadMemory(
-            f"tokens.load: {path} was learned in model {token.model[:8]}, this is {model[:8]}; learn it again."
+            f"tokens.load: {path} was learned in model {token.model[:8]}, this is {model[:8]}; "
+            "learn it again."
         )
     return token
+
+
+class _Question:
+    """The yes/no question about one object, with a trainable embedding for its word."""
+
+    def __init__(self, vlm: "MiniVlm") -> None:
+        import torch
+
+        self.vlm = vlm
+        tokens, self.mask = vlm.tokenize([QUESTION])
+        self.words = vlm.towers.embed_language_tokens(tokens).detach()[0]
+        self.is_word = tokens[0] == vlm.vocabulary[WORD]
+        self.embedding = self.words[self.is_word][0].clone().requires_grad_(True)
+        self.answer = torch.zeros((1, 1), dtype=torch.long)
+
+    def embed(self, photos: Sequence[Rgb]) -> "torch.Tensor":
+        """The patch features of photos."""
+        import torch
+
+        side = self.vlm.config.image_resolution[0]
+        parts = []
+        with torch.no_grad():
+            for first in range(0, len(photos), EMBEDDED_AT_ONCE):
+                images = _tensor(photos[first : first + EMBEDDED_AT_ONCE], side)
+                parts.append(self.vlm.embed_images(images))
+            return torch.cat(parts)
+
+    def ask(self, patches: "torch.Tensor") -> "torch.Tensor":
+        """By how much "yes" scores higher than "no", for every photo."""
+        import torch
+
+        n = len(patches)
+        words = torch.where(self.is_word[:, None], self.embedding, self.words)
+        scores, _ = self.vlm.read(
+            patches,
+            words.expand(n, -1, -1),
+            self.mask.expand(n, -1),
+            self.answer.expand(n, -1),
+        )
+        vocabulary = self.vlm.vocabulary
+        return scores[:, 0, vocabulary["yes"]] - scores[:, 0, vocabulary["no"]]
+
+
+def _augmentations(photos: Sequence[Rgb], n: int, rng: np.random.Generator) -> list[Rgb]:
+    """`n` augmentations of every photo."""
+    augmented = []
+    for photo in photos:
+        for _ in range(n):
+            augmented.append(augment(photo, rng))
+    return augmented
+
+
+def _train(
+    question: _Question,
+    patches: Sequence["torch.Tensor"],
+    options: TokenTraining,
+    rng: np.random.Generator,
+) -> None:
+    """Train the question's embedding; the photos of the object come first in `patches`."""
+    import torch
+    from torch.nn import functional as F  # noqa: N812
+
+    optimiser = torch.optim.AdamW([question.embedding], options.rate, weight_decay=0.0)
+    shares = np.array([0.5, 0.5])
+    if len(patches) == len(SHARES):
+        shares = np.array(SHARES)
+    n_patches = sum(map(len, patches))
+    n_steps = max(1, n_patches // options.batch)
+    for epoch in range(options.epochs):
+        for group in optimiser.param_groups:
+            cosine = float(np.cos(np.pi * epoch / options.epochs))
+            group["lr"] = options.rate * 0.5 * (1 + cosine)
+        for _ in range(n_steps):
+            kinds = rng.choice(len(patches), options.batch, p=shares)
+            drawn = [patches[kind][rng.integers(len(patches[kind]))] for kind in kinds]
+            right = torch.from_numpy((kinds == 0).astype(np.float32))
+            answers = question.ask(torch.stack(drawn))
+            loss = F.binary_cross_entropy_with_logits(answers, right)
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+
+
+def _accuracy(question: _Question, photos: Photos) -> float:
+    """The share of right answers, positives and negatives with equal weight."""
+    import torch
+
+    with torch.no_grad():
+        positives = question.embed(photos.own)
+        negatives = question.embed([*photos.rivals, *photos.others])
+        said_yes = (question.ask(positives) > 0).float().mean()
+        said_no = (question.ask(negatives) <= 0).float().mean()
+    return float(np.mean([said_yes.item(), said_no.item()]))
+
+
+def _tensor(images: Sequence[Rgb], side: int) -> "torch.Tensor":
+    """Images with values in 0..1, B x 3 x side x side."""
+    import torch
+
+    tensor = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).float() / 255
+    return torch.nn.functional.interpolate(tensor, (side, side), mode="bilinear", antialias=True)
+
+
+def _read(path: Path) -> Token:
+    """The token in a file that `save` wrote."""
+    from safetensors.numpy import load as decode
+
+    data = path.read_bytes()
+    (length,) = struct.unpack("<Q", data[:8])
+    header = json.loads(data[8 : 8 + length])["__metadata__"]
+    return Token(
+        object=header["object"],
+        embedding=decode(data)["embedding"],
+        accuracy=float(header["accuracy"]),
+        model=header["model"],
+    )

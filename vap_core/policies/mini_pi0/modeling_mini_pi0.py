@@ -1,4 +1,7 @@
-"""PI0's model with small towers. Masks, prefix and suffix, flow matching and sampling are lerobot's, unchanged."""
+"""PI0's model with small towers.
+
+Masks, prefix and suffix, flow matching and sampling are lerobot's, unchanged.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,12 +26,10 @@ class MiniTowers(PaliGemmaWithExpertModel):
 
     def __init__(self, config: MiniPI0Config) -> None:
         nn.Module.__init__(self)
-        self.freeze_vision_encoder, self.train_expert_only = (
-            config.freeze_vision_encoder,
-            config.train_expert_only,
-        )
+        self.freeze_vision_encoder = config.freeze_vision_encoder
+        self.train_expert_only = config.train_expert_only
         self.paligemma = PaliGemmaForConditionalGenerationWithPiGemma(config=vlm_config(config))
-        self.gemma_expert = PiGemmaForCausalLM(config=_gemma(config, config.expert_width))
+        self.gemma_expert = PiGemmaForCausalLM(config=_gemma_config(config, config.expert_width))
         self.gemma_expert.model.embed_tokens = None
         self.to_bfloat16_for_selected_params(cast(Any, config.dtype))
         self._set_requires_grad()
@@ -39,18 +40,15 @@ class MiniPI0Pytorch(PI0Pytorch):
 
     def __init__(self, config: MiniPI0Config, rtc_processor: Any = None) -> None:
         nn.Module.__init__(self)
-        wide = config.expert_width
-        self.config, self.rtc_processor = config, rtc_processor
+        width = config.expert_width
+        self.config = config
+        self.rtc_processor = rtc_processor
         self.paligemma_with_expert = MiniTowers(config)
-        self.action_in_proj, self.action_out_proj = (
-            nn.Linear(config.max_action_dim, wide),
-            nn.Linear(wide, config.max_action_dim),
-        )
-        self.state_proj = nn.Linear(config.max_state_dim, wide)
-        self.action_time_mlp_in, self.action_time_mlp_out = (
-            nn.Linear(2 * wide, wide),
-            nn.Linear(wide, wide),
-        )
+        self.action_in_proj = nn.Linear(config.max_action_dim, width)
+        self.action_out_proj = nn.Linear(width, config.max_action_dim)
+        self.state_proj = nn.Linear(config.max_state_dim, width)
+        self.action_time_mlp_in = nn.Linear(2 * width, width)
+        self.action_time_mlp_out = nn.Linear(width, width)
         self.gradient_checkpointing_enabled = False
 
     def sample_actions(
@@ -63,11 +61,10 @@ class MiniPI0Pytorch(PI0Pytorch):
         noise: Any = None,
         **kwargs: Any,
     ) -> Tensor:
-        """PI0's, from cooler noise."""
+        """PI0's, from noise that is scaled by the configuration's `temperature`."""
         if noise is None:
-            noise = self.sample_noise(
-                (len(state), self.config.chunk_size, self.config.max_action_dim), state.device
-            )
+            shape = (len(state), self.config.chunk_size, self.config.max_action_dim)
+            noise = self.sample_noise(shape, state.device)
         return super().sample_actions(
             images,
             img_masks,
@@ -97,17 +94,17 @@ class MiniPI0Policy(PI0Policy):
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: Any, **kwargs: Any) -> "MiniPI0Policy":
         """The checkpoint, tensor for tensor. Raises: RuntimeError when names or shapes differ."""
-        return cast(
-            MiniPI0Policy,
-            PreTrainedPolicy.from_pretrained.__func__(
-                cls, pretrained_name_or_path, **{**kwargs, "strict": True}
-            ),
-        )
+        from_pretrained = PreTrainedPolicy.from_pretrained.__func__
+        options = {**kwargs, "strict": True}
+        return cast(MiniPI0Policy, from_pretrained(cls, pretrained_name_or_path, **options))
 
 
 @contextmanager
-def fused() -> Iterator[None]:
-    """A context in which the eager attention that lerobot's PI0 asks for is PyTorch's fused one: the same numbers, a third less time a step."""
+def fused_attention() -> Iterator[None]:
+    """Inside, the eager attention that lerobot's PI0 asks for is PyTorch's fused one.
+
+    The numbers are the same, and a step takes a third less time.
+    """
     ALL_ATTENTION_FUNCTIONS["eager"] = sdpa_attention_forward
     try:
         yield
@@ -116,29 +113,52 @@ def fused() -> Iterator[None]:
 
 
 def vlm_config(config: MiniPI0Config) -> Any:
-    """Of the small PaliGemma: its language head answers questions in the same words that instruct the policy."""
-    tower = {
-        "model_type": "siglip_vision_model", "image_size": config.image_resolution[0], "patch_size": config.patch, "hidden_size": config.vision_width,
-        "intermediate_size": 2 * config.vision_width, "num_hidden_layers": config.vision_depth, "num_attention_heads": HEADS,
-        "projection_dim": config.width, "projector_hidden_act": "gelu_fast", "vision_use_head": False,
-    }  # fmt: skip
+    """The configuration of the small PaliGemma.
+
+    Its language head answers questions in the same words that instruct the policy.
+    """
+    vision = {
+        "model_type": "siglip_vision_model",
+        "image_size": config.image_resolution[0],
+        "patch_size": config.patch,
+        "hidden_size": config.vision_width,
+        "intermediate_size": 2 * config.vision_width,
+        "num_hidden_layers": config.vision_depth,
+        "num_attention_heads": HEADS,
+        "projection_dim": config.width,
+        "projector_hidden_act": "gelu_fast",
+        "vision_use_head": False,
+    }
     parts: dict[str, Any] = {
-        "text_config": _gemma(config, config.width).to_dict(),
-        "vision_config": tower,
+        "text_config": _gemma_config(config, config.width).to_dict(),
+        "vision_config": vision,
         "projection_dim": config.width,
     }
-    made: Any = PaliGemmaConfig(**parts)
-    made.image_token_index = made._vocab_size = len(config.words)
-    made.text_config.use_adarms, made.text_config.adarms_cond_dim = False, None
-    return made
+    paligemma: Any = PaliGemmaConfig(**parts)
+    paligemma.image_token_index = len(config.words)
+    paligemma._vocab_size = len(config.words)
+    _switch_off_adarms(paligemma.text_config)
+    return paligemma
 
 
-def _gemma(config: MiniPI0Config, width: int) -> Any:
+def _gemma_config(config: MiniPI0Config, width: int) -> Any:
+    """The configuration of the decoder, or of the action expert, which differ in width."""
     sizes: dict[str, Any] = {
-        "vocab_size": len(config.words), "hidden_size": width, "intermediate_size": 2 * width, "num_hidden_layers": config.depth,
-        "num_attention_heads": HEADS, "num_key_value_heads": 1, "head_dim": config.head_dim,
-        "hidden_activation": "gelu_pytorch_tanh", "pad_token_id": 0,
-    }  # fmt: skip
-    made: Any = GemmaConfig(**sizes)
-    made.use_adarms, made.adarms_cond_dim = False, None
-    return made
+        "vocab_size": len(config.words),
+        "hidden_size": width,
+        "intermediate_size": 2 * width,
+        "num_hidden_layers": config.depth,
+        "num_attention_heads": HEADS,
+        "num_key_value_heads": 1,
+        "head_dim": config.head_dim,
+        "hidden_activation": "gelu_pytorch_tanh",
+        "pad_token_id": 0,
+    }
+    gemma: Any = GemmaConfig(**sizes)
+    _switch_off_adarms(gemma)
+    return gemma
+
+
+def _switch_off_adarms(gemma: Any) -> None:
+    gemma.use_adarms = False
+    gemma.adarms_cond_dim = None

@@ -1,6 +1,10 @@
-"""Words to tokens, and PI0's order of processing around them. The vocabulary lies in the checkpoint; no tokenizer is asked for anywhere else."""
+"""Words to tokens, and PI0's order of processing around them.
+
+The vocabulary lies in the checkpoint; no tokenizer is asked for anywhere else.
+"""
 
 import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +21,9 @@ from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TO
 
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 
-PAD, UNKNOWN, END = "<pad>", "<unk>", "\n"
+PAD = "<pad>"
+UNKNOWN = "<unk>"
+END = "\n"
 """The first three words of every vocabulary; an instruction ends with END, as PaliGemma's do."""
 Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 SPLIT = re.compile(r"<\w+>|[\w']+|\n")
@@ -26,24 +32,29 @@ SPLIT = re.compile(r"<\w+>|[\w']+|\n")
 @ProcessorStepRegistry.register(name="mini_pi0_words")
 @dataclass
 class Words(ProcessorStep):
-    """Tokenizes `task` by words, lower case; what the vocabulary lacks becomes UNKNOWN, what is longer than `longest` is cut."""
+    """Tokenizes `task` by words, in lower case.
+
+    What the vocabulary lacks becomes UNKNOWN, what is longer than `longest` is cut.
+    """
 
     words: list[str]
     longest: int
 
     def __post_init__(self) -> None:
         self.words = list(self.words)
-        self.number = {word: i for i, word in enumerate(self.words)}
+        self._vocabulary = vocabulary(self.words)
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
-        out = dict(transition)
-        task = (transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}).get("task")
+        processed = dict(transition)
+        extra = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
+        task = extra.get("task")
         texts = [task] if isinstance(task, str) else list(task or [""])
-        tokens, mask = encode(texts, self.number, self.longest)
-        out[TransitionKey.OBSERVATION] = {
-            **(transition.get(TransitionKey.OBSERVATION) or {}), OBS_LANGUAGE_TOKENS: tokens, OBS_LANGUAGE_ATTENTION_MASK: mask,
-        }  # fmt: skip
-        return out
+        tokens, mask = encode(texts, self._vocabulary, self.longest)
+        observation = dict(transition.get(TransitionKey.OBSERVATION) or {})
+        observation[OBS_LANGUAGE_TOKENS] = tokens
+        observation[OBS_LANGUAGE_ATTENTION_MASK] = mask
+        processed[TransitionKey.OBSERVATION] = observation
+        return processed
 
     def get_config(self) -> dict[str, Any]:
         return {"words": self.words, "longest": self.longest}
@@ -59,15 +70,25 @@ class Words(ProcessorStep):
         return features
 
 
+def vocabulary(words: Iterable[str]) -> dict[str, int]:
+    """The token of every word."""
+    return {word: token for token, word in enumerate(words)}
+
+
 def encode(
-    texts: list[str], number: dict[str, int], longest: int
+    texts: list[str], tokens_of: Mapping[str, int], longest: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Token numbers, one row a text, as many as the longest has but at most `longest`, padded on the right; and where there are any."""
-    said = [[*SPLIT.findall(text.lower().rstrip("\n"))[: longest - 1], END] for text in texts]
-    tokens = torch.zeros((len(texts), max(map(len, said))), dtype=torch.long)
-    for row, words in zip(tokens, said, strict=True):
-        row[: len(words)] = torch.tensor([number.get(word, number[UNKNOWN]) for word in words])
-    return tokens, tokens != number[PAD]
+    """Tokens, one row per text, and a mask of those that do not pad it.
+
+    A row is as long as the longest text, `longest` at most, padded on the right. `tokens_of` is the
+    `vocabulary`.
+    """
+    rows = [_encode_text(text, tokens_of, longest) for text in texts]
+    width = max(map(len, rows))
+    tokens = torch.zeros((len(rows), width), dtype=torch.long)
+    for i, row in enumerate(rows):
+        tokens[i, : len(row)] = torch.tensor(row)
+    return tokens, tokens != tokens_of[PAD]
 
 
 def make_mini_pi0_pre_post_processors(
@@ -76,13 +97,20 @@ def make_mini_pi0_pre_post_processors(
     """The two pipelines of a mini-pi0; lerobot's factory asks for them by this name."""
     steps = make_default_policy_processor_steps(config, dataset_stats)
     words = Words(list(config.words), config.tokenizer_max_length)
-    before = [
+    input_steps = [
         steps.rename_observations,
         steps.add_batch_dim,
         words,
         steps.to_device,
         steps.normalize,
     ]
-    return make_policy_processor_pipelines(
-        input_steps=before, output_steps=[steps.unnormalize, steps.to_cpu]
-    )
+    output_steps = [steps.unnormalize, steps.to_cpu]
+    return make_policy_processor_pipelines(input_steps=input_steps, output_steps=output_steps)
+
+
+def _encode_text(text: str, tokens_of: Mapping[str, int], longest: int) -> list[int]:
+    words = SPLIT.findall(text.lower().rstrip("\n"))[: longest - 1]
+    tokens = []
+    for word in [*words, END]:
+        tokens.append(tokens_of.get(word, tokens_of[UNKNOWN]))
+    return tokens

@@ -1,11 +1,15 @@
-"""Teaching the learned token of a personal object: which photos it is learned from, and where it is kept (P appendix; SPEC section 4)."""
+"""Teaching the learned token of a personal object (P appendix; SPEC section 4).
+
+It says which photos the token is learned from, and where it is kept.
+"""
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from vap_core.base.errors import BadStudy
 from vap_core.base.files import DATA
+from vap_core.base.types import Rgb
 from vap_core.policies.mini_pi0 import learned_token
 from vap_core.policies.mini_pi0.learned_token import Photos, Token
 from vap_core.simulation.assets import objects
@@ -14,27 +18,31 @@ from vap_core.simulation.types import EpisodeRow
 
 MODEL = DATA / "policies" / "mini-paligemma"
 """The shipped vision-language model that the shipped policies were initialised from."""
-K, VIEWS, OTHERS = 5, 12, 4
-"""Photos of the object to learn from; of every look-alike (the paper: more than ten), and to measure
-by; and the number of objects of other categories."""
-ENOUGH = 0.95
+K = 5
+"""Photos of the object to learn from."""
+VIEWS = 12
+"""Photos of every look-alike (the paper: more than ten), and of the object to measure by."""
+OTHERS = 4
+"""The number of objects of other categories."""
+LEAST_ACCURACY = 0.95
 """Share of right answers that the paper asks of a token."""
 
 
 def photographs(rows: Iterable[EpisodeRow], seed: int, k: int) -> Photos:
-    """Photos of the rows' target as its owner takes them (k), of every look-alike beside it, and of other objects."""
+    """Photos of the rows' target, of every look-alike beside it, and of other objects.
+
+    There are `k` of the target, as its owner takes them.
+    """
     rows = list(rows)
     target = objects.get_object(rows[0].target)
-    goals = {row.goal for row in rows}
-    placed = {place.model for row in rows for place in row.placements}
-    rivals = []
-    for name in sorted(placed - {target.name} - goals):
+    rivals: list[Rgb] = []
+    for name in sorted(_placed(rows) - {target.name}):
         model = objects.get_object(name)
         if model.category == target.category:
             rivals += reference_views(model, VIEWS, seed)
     kinds = [kind for kind in objects.CATEGORIES if kind != target.category]
     first = objects.CATEGORIES.index(target.category)
-    others = []
+    others: list[Rgb] = []
     for i in range(OTHERS):
         other = objects.personal_instance(kinds[(first + 5 * i) % len(kinds)])
         others += reference_views(other, seed=seed)
@@ -45,10 +53,11 @@ def photographs(rows: Iterable[EpisodeRow], seed: int, k: int) -> Photos:
 def teach(
     rows: Iterable[EpisodeRow], folder: Path, initialised_from: str, model: Path = MODEL
 ) -> Token:
-    """Learn the token of the rows' target from K = 5 photos, measure it on others, and keep it in `folder`.
+    """Learn the token of the rows' target from K photos, and keep it in `folder`.
 
-    A token that is there already stays. `initialised_from` is the SHA-256 of the model that the
-    policy was initialised from. A token that is not learned well is noted on stderr.
+    It is measured on other photos. A token that is there already stays. `initialised_from` is the
+    SHA-256 of the model that the policy was initialised from. A token that is not learned well is
+    noted on stderr.
 
     Raises: BadPolicy without the model; BadStudy when the policy was initialised from another one.
     """
@@ -65,13 +74,25 @@ def teach(
     name = rows[0].target
     if (folder / f"{name}{learned_token.SUFFIX}").exists():
         return learned_token.load(folder, name, teacher.sha256())
-    taught, held_out = photographs(rows, 0, K), photographs(rows, 1, VIEWS)
-    token = learned_token.learn(teacher, name, taught, held_out)
-    if token.accuracy < ENOUGH:
+    taught = photographs(rows, 0, K)
+    unseen = photographs(rows, 1, VIEWS)
+    token = learned_token.learn(teacher, name, taught, unseen)
+    if token.accuracy < LEAST_ACCURACY:
         print(
             f"note: the learned token of {name} is right in {100 * token.accuracy:.0f} % of unseen "
-            f"photos, less than {100 * ENOUGH:.0f} %.",
+            f"photos, less than {100 * LEAST_ACCURACY:.0f} %.",
             file=sys.stderr,
         )
     learned_token.save(folder, token)
     return token
+
+
+def _placed(rows: Sequence[EpisodeRow]) -> set[str]:
+    """The objects that the rows place, without the goals."""
+    placed = set()
+    goals = set()
+    for row in rows:
+        goals.add(row.goal)
+        for place in row.placements:
+            placed.add(place.model)
+    return placed - goals

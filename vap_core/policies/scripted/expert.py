@@ -1,7 +1,8 @@
-"""The scripted expert: it reads the simulator's state, not pictures, and proves that a task can be done; later it makes demonstrations.
+"""The scripted expert: it reads the simulator's state, and proves that a task can be done.
 
-A plan is a list of waypoints of the gripper. It moves the commanded pose along them within the speed limits, in whichever control the
-suite has, and plans anew when a grasp came up empty.
+It makes demonstrations, too. A plan is a list of waypoints of the gripper. The expert moves the
+commanded pose along them within the speed limits, in whichever control the suite has, and plans
+anew when a grasp came up empty. Poses are of the tcp in the robot's base frame, in metres.
 """
 
 from collections.abc import Sequence
@@ -17,36 +18,49 @@ from vap_core.simulation.env import Env
 from vap_core.simulation.grasps import Grasp, grasps, points_world
 from vap_core.simulation.types import Action, Truth
 
-SPEED_M_S, TURN_RAD_S = 0.22, 1.4
+SPEED_M_S = 0.22
+TURN_RAD_S = 1.4
 GRIP_S = 3.0
 """Share of the gripper's travel in a second: a jaw that slams knocks light things over."""
 ABOVE_M = 0.04
 """Clearance over whatever stands lower than the path."""
-ARRIVED_M, ARRIVED_RAD = 0.006, 0.06
+ARRIVED_M = 0.006
+ARRIVED_RAD = 0.06
 PATIENCE_S = 1.2
 """Longest wait at a waypoint that is not quite reached."""
 JAW_GAP_M = 0.003
 """Room between an object and the jaw that does not move."""
-ELSEWHERE = 5
-"""After an empty grasp the next one is tried so many places down the list: its neighbours differ too little."""
-MISS_M, MISS_RAD = (0.015, 0.04), 1.2
+GRASP_STRIDE = 5
+"""After an empty grasp the next one is tried so many places down the list, as neighbours differ too
+little."""
+MISS_M = (0.015, 0.04)
+MISS_RAD = 1.2
 """How far beside the target a grasp goes that is to miss, and how far it is turned, either way."""
 BESIDE_M = 0.035
 """How far inside the limit of the near rule a thing is set down."""
+LIFT_STEP_M = 0.015
+"""By how much less a pose is raised in every further attempt, when the arm cannot follow."""
+PUT_DOWN_YAWS_DEG = (0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 180)
+"""Turns of the held object in which its goal is tried, in this order."""
+
+TcpPose = Float64[np.ndarray, "4 4"]
 
 
 @value
 class Waypoint:
-    """A pose of the tcp (robot base frame), the gripper on the way there (0 closed .. 1 open), and seconds to stay."""
+    """A pose of the tcp (robot base frame), the gripper on the way there, and seconds to stay.
 
-    tcp_base: Float64[np.ndarray, "4 4"]
+    The gripper is 0 closed .. 1 open.
+    """
+
+    tcp_base: TcpPose
     gripper: float
     stay_s: float = 0.0
 
 
 @value
 class ExpertState:
-    """What is left of the plan, seconds spent at its first waypoint, and whether the plan was to grasp or to carry."""
+    """What is left of the plan, seconds spent at its first waypoint, and the phase planned for."""
 
     phase: str = "grasp"
     plan: tuple[Waypoint, ...] = ()
@@ -63,289 +77,372 @@ class Expert:
     def start(self, rng: np.random.Generator) -> ExpertState:
         return ExpertState()
 
-    def astray(self, env: Env, rng: np.random.Generator) -> ExpertState:
-        """As if its first grasp went beside the target, open or closed; what it does once its phase is no longer "miss" shows how to begin again.
+    def start_with_miss(self, env: Env, rng: np.random.Generator) -> ExpertState:
+        """The state before a first grasp that goes beside the target, open or closed.
+
+        What the expert does once its phase is no longer "miss" shows how to begin again.
 
         Raises: OutOfReach.
         """
-        return ExpertState("miss", tuple(_miss(env, env.truth(), rng)))
+        plan = _plan_miss(env, env.truth(), rng)
+        return ExpertState("miss", plan)
 
     def plan_from_simulation(
         self, states: Sequence[ExpertState], envs: Sequence[Env]
     ) -> tuple[list[ExpertState], list[Chunk]]:
-        after = [self._advance(state, env) for state, env in zip(states, envs, strict=True)]
-        return after, [
-            _towards(state.plan[0], env)[None] for state, env in zip(after, envs, strict=True)
-        ]
+        next_states = []
+        for state, env in zip(states, envs, strict=True):
+            next_states.append(self._advance(state, env))
+        chunks = []
+        for state, env in zip(next_states, envs, strict=True):
+            chunks.append(_action_towards(state.plan[0], env)[None])
+        return next_states, chunks
 
     def _advance(self, state: ExpertState, env: Env) -> ExpertState:
         """Drop the waypoints that are reached; when none is left, plan the next phase."""
-        plan, waited = state.plan, state.waited_s
+        plan = state.plan
+        waited = state.waited_s
         if plan and _reached(plan[0], env, waited):
-            plan, waited = plan[1:], 0.0
+            plan = plan[1:]
+            waited = 0.0
         elif plan:
             waited += _dwell(plan[0], env)
         if plan:
             return ExpertState(state.phase, plan, waited, state.attempt)
-        return self._next(state, env)
+        return self._plan_phase(state, env)
 
-    def _next(self, state: ExpertState, env: Env) -> ExpertState:
-        truth, row = env.truth(), env.row
+    def _plan_phase(self, state: ExpertState, env: Env) -> ExpertState:
+        """The state at the beginning of the next phase."""
+        truth = env.truth()
+        row = env.row
+        attempt = state.attempt
+        plan: tuple[Waypoint, ...]
         if row.rule == "selected":
-            return ExpertState(
-                "touch", tuple(_touch(env, truth, state.attempt)), 0.0, state.attempt + 1
-            )
+            plan = _plan_touch(env, truth, attempt)
+            return ExpertState("touch", plan, attempt=attempt + 1)
         if state.phase == "carry" and row.target in truth.held:
             if row.rule == "picked":
-                return ExpertState("carry", (_hold(env),), 0.0, state.attempt)
-            return ExpertState("leave", tuple(_set_down(env, truth)), 0.0, state.attempt)
+                return ExpertState("carry", (_hold_waypoint(env),), attempt=attempt)
+            plan = _plan_set_down(env, truth)
+            return ExpertState("leave", plan, attempt=attempt)
         if state.phase == "grasp":
-            return ExpertState(
-                "carry", tuple(_take(env, truth, state.attempt)), 0.0, state.attempt + 1
-            )
-        return ExpertState("grasp", (_retreat(env),), 0.0, state.attempt)
+            plan = _plan_take(env, truth, attempt)
+            return ExpertState("carry", plan, attempt=attempt + 1)
+        return ExpertState("grasp", (_retreat_waypoint(env),), attempt=attempt)
 
 
-def _towards(waypoint: Waypoint, env: Env) -> Action:
-    """One step from the commanded pose to the waypoint, as fast as allowed, in the control that the suite has."""
-    seconds, now, goal = 1.0 / env.hz, env.command.tcp_base, waypoint.tcp_base
-    move, turn = goal[:3, 3] - now[:3, 3], rotation_vector(goal[:3, :3] @ now[:3, :3].T)
-    move *= min(1.0, SPEED_M_S * seconds / max(float(np.linalg.norm(move)), 1e-9))
-    turn *= min(1.0, TURN_RAD_S * seconds / max(float(np.linalg.norm(turn)), 1e-9))
-    squeeze = env.command.gripper + float(
-        np.clip(waypoint.gripper - env.command.gripper, -GRIP_S * seconds, GRIP_S * seconds)
-    )
+def _action_towards(waypoint: Waypoint, env: Env) -> Action:
+    """One step from the commanded pose to the waypoint, as fast as allowed.
+
+    It is in the control that the suite has.
+    """
+    seconds = 1.0 / env.hz
+    now = env.command.tcp_base
+    goal = waypoint.tcp_base
+    move = goal[:3, 3] - now[:3, 3]
+    turn = rotation_vector(goal[:3, :3] @ now[:3, :3].T)
+    move *= _share_of_step(move, SPEED_M_S * seconds)
+    turn *= _share_of_step(turn, TURN_RAD_S * seconds)
+    grip = waypoint.gripper - env.command.gripper
+    grip = float(np.clip(grip, -GRIP_S * seconds, GRIP_S * seconds))
+    gripper = env.command.gripper + grip
     if env.control == "ee":
-        return np.array([*move, *turn, squeeze], np.float32)
+        return np.array([*move, *turn, gripper], np.float32)
     step = np.eye(4)
-    step[:3, :3], step[:3, 3] = rotation(turn) @ now[:3, :3], now[:3, 3] + move
+    step[:3, :3] = rotation(turn) @ now[:3, :3]
+    step[:3, 3] = now[:3, 3] + move
     joints = arm(env.robot.name).solve(env.command.joints, step, seconds)
-    return np.array([*(joints - env.command.joints), squeeze], np.float32)
+    return np.array([*(joints - env.command.joints), gripper], np.float32)
+
+
+def _share_of_step(way: Float64[np.ndarray, "3"], longest: float) -> float:
+    """The share of a way that one step covers when it is `longest` at most."""
+    length = float(np.linalg.norm(way))
+    return min(1.0, longest / max(length, 1e-9))
 
 
 def _reached(waypoint: Waypoint, env: Env, waited_s: float) -> bool:
-    off, turned = _off(waypoint.tcp_base, env.tcp_base())
+    """Whether the arm is at a waypoint and has stayed, or has waited too long."""
+    distance, angle = _pose_error(waypoint.tcp_base, env.tcp_base())
     if waited_s > PATIENCE_S + waypoint.stay_s:
         return True
     return (
-        off < ARRIVED_M
-        and turned < ARRIVED_RAD
+        distance < ARRIVED_M
+        and angle < ARRIVED_RAD
         and waited_s >= waypoint.stay_s
         and abs(env.command.gripper - waypoint.gripper) < 0.01
     )
 
 
 def _dwell(waypoint: Waypoint, env: Env) -> float:
-    """Time counts at a waypoint once the command is there, and slowly before, so that nothing waits for ever."""
-    off, turned = _off(waypoint.tcp_base, env.command.tcp_base)
-    there = off < 0.003 and turned < 0.02 and abs(env.command.gripper - waypoint.gripper) < 0.01
+    """The seconds that one step counts at a waypoint.
+
+    They count in full once the command is there, and less before, so that nothing waits for ever.
+    """
+    distance, angle = _pose_error(waypoint.tcp_base, env.command.tcp_base)
+    gripper_there = abs(env.command.gripper - waypoint.gripper) < 0.01
+    there = distance < 0.003 and angle < 0.02 and gripper_there
     return (1.0 if there else 0.1) / env.hz
 
 
-def _off(one: Float64[np.ndarray, "4 4"], other: Float64[np.ndarray, "4 4"]) -> tuple[float, float]:
-    return float(np.linalg.norm(one[:3, 3] - other[:3, 3])), float(
-        np.linalg.norm(rotation_vector(one[:3, :3] @ other[:3, :3].T))
-    )
+def _pose_error(pose: TcpPose, reference: TcpPose) -> tuple[float, float]:
+    """Distance (m) and angle (rad) between two poses."""
+    distance = np.linalg.norm(pose[:3, 3] - reference[:3, 3])
+    turn = rotation_vector(pose[:3, :3] @ reference[:3, :3].T)
+    return float(distance), float(np.linalg.norm(turn))
 
 
-def _take(env: Env, truth: Truth, attempt: int) -> list[Waypoint]:
+def _plan_take(env: Env, truth: Truth, attempt: int) -> tuple[Waypoint, ...]:
     """Over the target, down, close, and up until it is clear of everything."""
-    low = _low(env, truth, attempt)
-    above = _over(env, truth, low)
-    lift = _above(env, low, max(0.09, _ceiling(env, truth) - _foot(truth, env.row.target) + 0.015))
-    return [Waypoint(above, 1.0), Waypoint(low, 1.0), Waypoint(low, 0.0, 0.3), Waypoint(lift, 0.0)]
-
-
-def _miss(env: Env, truth: Truth, rng: np.random.Generator) -> list[Waypoint]:
-    """Over a place beside the best grasp and turned away from it, down, and as often as not closed."""
-    angle, away = rng.uniform(0, 2 * np.pi), rng.uniform(*MISS_M)
-    low = _low(env, truth, 0)
-    low[:3, 3] += _into_base(env) @ np.array(
-        [away * np.cos(angle), away * np.sin(angle), rng.uniform(0.0, 0.02)]
+    low = _grasp_pose(env, truth, attempt)
+    above = _clear_pose(env, truth, low)
+    lift_m = _height_of_others(env, truth) - _foot_height(truth, env.row.target) + 0.015
+    lift = _raised_within_reach(env, low, max(0.09, lift_m))
+    return (
+        Waypoint(above, 1.0),
+        Waypoint(low, 1.0),
+        Waypoint(low, 0.0, 0.3),
+        Waypoint(lift, 0.0),
     )
-    low[:3, :3] = rotation(np.array([0.0, 0.0, rng.uniform(-MISS_RAD, MISS_RAD)])) @ low[:3, :3]
-    plan = [Waypoint(_over(env, truth, low), 1.0), Waypoint(low, 1.0), Waypoint(low, 0.0, 0.2)]
+
+
+def _plan_miss(env: Env, truth: Truth, rng: np.random.Generator) -> tuple[Waypoint, ...]:
+    """Over a place beside the best grasp and turned away from it, and down.
+
+    The gripper is then closed as often as not.
+    """
+    angle = rng.uniform(0, 2 * np.pi)
+    distance = rng.uniform(*MISS_M)
+    low = _grasp_pose(env, truth, 0)
+    height = rng.uniform(0.0, 0.02)
+    shift = np.array([distance * np.cos(angle), distance * np.sin(angle), height])
+    low[:3, 3] += _base_from_world(env) @ shift
+    yaw = rng.uniform(-MISS_RAD, MISS_RAD)
+    low[:3, :3] = rotation(np.array([0.0, 0.0, yaw])) @ low[:3, :3]
+    above = _clear_pose(env, truth, low)
+    plan = (Waypoint(above, 1.0), Waypoint(low, 1.0), Waypoint(low, 0.0, 0.2))
     return plan[: int(rng.integers(2, 4))]
 
 
-def _low(env: Env, truth: Truth, attempt: int) -> Float64[np.ndarray, "4 4"]:
+def _plan_set_down(env: Env, truth: Truth) -> tuple[Waypoint, ...]:
+    """Carry the held target to its goal, lower it, let go, and draw back."""
+    points = points_world(env.row.target, truth.objects_world[env.row.target])
+    centre = (points.min(axis=0) + points.max(axis=0))[:2] / 2
+    foot = float(points[:, 2].min())
+    spot, floor = _put_down_spot(env, truth)
+    base = _base_from_world(env)
+    shift = base @ np.array([*(spot - centre), floor - foot])
+    about = base @ np.array([*centre, 0.0]) - base @ env.robot.base_world[:3]
+    now = env.tcp_base()
+    poses = []
+    for yaw in np.deg2rad(PUT_DOWN_YAWS_DEG).tolist():
+        poses.append(_turned(now, about, shift, yaw))
+    down = _first_within_reach(env, poses, 0.006)
+    if down is None:
+        raise OutOfReach(
+            f"Expert: {env.row.key}: {env.robot.name} cannot reach {env.row.goal} with "
+            f"{env.row.target} in its hand; move it closer."
+        )
+    above = _raised_within_reach(env, down, foot - floor)
+    away = _raised_within_reach(env, down, 0.08)
+    return (
+        Waypoint(above, 0.0, 0.1),
+        Waypoint(down, 0.0, 0.15),
+        Waypoint(down, 1.0, 0.1),
+        Waypoint(away, 1.0, 0.8),
+    )
+
+
+def _plan_touch(env: Env, truth: Truth, attempt: int) -> tuple[Waypoint, ...]:
+    """From straight above onto the middle of the target, with the gripper closed.
+
+    Every second attempt goes for its highest part instead.
+    """
+    points = points_world(env.row.target, truth.objects_world[env.row.target])
+    top = float(points[:, 2].max())
+    place = (points.min(axis=0) + points.max(axis=0)) / 2
+    if attempt % 2:
+        place = points[points[:, 2] > top - 0.006].mean(axis=0)
+    tip = np.array([place[0], place[1], top - 0.025])
+    poses = []
+    for yaw in np.deg2rad(np.arange(0.0, 360.0, 30.0)).tolist():
+        poses.append(_pointing_down(env, tip, yaw))
+    pose = _first_within_reach(env, _nearest_turn_first(env, poses), 0.02)
+    if pose is None:
+        raise OutOfReach(
+            f"Expert: {env.row.key}: {env.robot.name} cannot reach {env.row.target}; move it "
+            "closer."
+        )
+    height = _height_of_others(env, truth) + ABOVE_M - (top - 0.025)
+    above = _raised_within_reach(env, pose, height)
+    return Waypoint(above, 0.0), Waypoint(pose, 0.0, 0.2), Waypoint(above, 0.0)
+
+
+def _hold_waypoint(env: Env) -> Waypoint:
+    return Waypoint(_raised_within_reach(env, env.command.tcp_base, 0.02), 0.0, 0.5)
+
+
+def _retreat_waypoint(env: Env) -> Waypoint:
+    return Waypoint(_raised_within_reach(env, env.command.tcp_base, 0.06), 1.0, 0.1)
+
+
+def _grasp_pose(env: Env, truth: Truth, attempt: int) -> TcpPose:
     """Where the hand closes. Raises: OutOfReach."""
     found = grasps(env.robot, env.row.target, truth.objects_world)
     if not found:
         raise OutOfReach(
-            f"Expert: {env.row.target} is too wide for {1000 * env.robot.opening_m:.0f} mm of {env.robot.name}; choose another object or robot."
+            f"Expert: {env.row.target} is too wide for {1000 * env.robot.opening_m:.0f} mm of "
+            f"{env.robot.name}; choose another object or robot."
         )
-    order = found[ELSEWHERE * attempt % len(found) :] + found
-    low = next((pose for grasp in order if (pose := _reachable(env, grasp)) is not None), None)
-    if low is None:
-        raise OutOfReach(
-            f"Expert: {env.row.key}: no grasp of {env.row.target} can be reached by {env.robot.name}; move it closer."
-        )
-    return low
-
-
-def _over(env: Env, truth: Truth, low: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
-    """Straight over a pose, clear of everything."""
-    return _above(
-        env, low, _ceiling(env, truth) + ABOVE_M - float(low[2, 3] + env.robot.base_world[2])
+    first = GRASP_STRIDE * attempt % len(found)
+    for grasp in found[first:] + found:
+        pose = _pose_of_grasp(env, grasp)
+        if pose is not None:
+            return pose
+    raise OutOfReach(
+        f"Expert: {env.row.key}: no grasp of {env.row.target} can be reached by {env.robot.name}; "
+        "move it closer."
     )
 
 
-def _reachable(env: Env, grasp: Grasp) -> Float64[np.ndarray, "4 4"] | None:
-    """The tcp's pose for a grasp, the hand turned the shorter way, as the arm gets there; None when it does not."""
-    now = env.command.tcp_base
-    poses = [_pose(env, grasp.tcp_world, grasp.axis_rad + turn) for turn in (0.0, np.pi)]
-    for pose in sorted(poses, key=lambda pose: _off(pose, now)[1]):
-        pose[:3, 3] -= pose[:3, 1] * _beside_jaw(env, grasp)
-        if (reached := _try(env, pose, 0.003)) is not None and _try(
-            env, _raised(pose, 0.04), 0.006
-        ) is not None:
+def _pose_of_grasp(env: Env, grasp: Grasp) -> TcpPose | None:
+    """The tcp's pose for a grasp, as the arm takes it; None when it is out of reach.
+
+    The hand turns the shorter way.
+    """
+    poses = []
+    for turn in (0.0, np.pi):
+        poses.append(_pointing_down(env, grasp.tcp_world, grasp.axis_rad + turn))
+    for pose in _nearest_turn_first(env, poses):
+        pose[:3, 3] -= pose[:3, 1] * _shift_to_fixed_jaw(env, grasp)
+        reached = _within_reach(env, pose, 0.003)
+        if reached is None:
+            continue
+        if _within_reach(env, _raised(pose, 0.04), 0.006) is not None:
             return reached
     return None
 
 
-def _beside_jaw(env: Env, grasp: Grasp) -> float:
-    """How far along the opening axis the hand moves so that a jaw that does not move stands close by: what is swept far topples."""
+def _shift_to_fixed_jaw(env: Env, grasp: Grasp) -> float:
+    """How far along the opening axis the hand moves so that a fixed jaw stands close by.
+
+    What the other jaw pushes far topples.
+    """
     jaw = env.robot.fixed_jaw_m
-    return float(np.sign(jaw) * max(abs(jaw) - grasp.span_m / 2 - JAW_GAP_M, 0.0))
+    gap = abs(jaw) - grasp.span_m / 2 - JAW_GAP_M
+    return float(np.sign(jaw) * max(gap, 0.0))
 
 
-def _try(
-    env: Env, pose: Float64[np.ndarray, "4 4"], tolerance_m: float
-) -> Float64[np.ndarray, "4 4"] | None:
-    """The pose that the arm really takes for `pose` (an arm of five joints may lean a little), or None when it is out of reach."""
+def _clear_pose(env: Env, truth: Truth, low: TcpPose) -> TcpPose:
+    """Straight over a pose, clear of everything."""
+    height = float(low[2, 3] + env.robot.base_world[2])
+    return _raised_within_reach(env, low, _height_of_others(env, truth) + ABOVE_M - height)
+
+
+def _within_reach(env: Env, pose: TcpPose, tolerance_m: float) -> TcpPose | None:
+    """The pose that the arm really takes for `pose`, or None when it is out of reach.
+
+    An arm of five joints may lean a little.
+    """
     kinematics = arm(env.robot.name)
     try:
-        return kinematics.forward(kinematics.reach(pose, tolerance_m))
+        joints = kinematics.reach(pose, tolerance_m)
     except OutOfReach:
         return None
+    return kinematics.forward(joints)
 
 
-def _above(
-    env: Env, pose: Float64[np.ndarray, "4 4"], height_m: float
-) -> Float64[np.ndarray, "4 4"]:
+def _first_within_reach(env: Env, poses: Sequence[TcpPose], tolerance_m: float) -> TcpPose | None:
+    """The first of several poses that the arm can take, as it takes it."""
+    for pose in poses:
+        reached = _within_reach(env, pose, tolerance_m)
+        if reached is not None:
+            return reached
+    return None
+
+
+def _raised_within_reach(env: Env, pose: TcpPose, height_m: float) -> TcpPose:
     """`pose` raised by `height_m`, or by as much of it as the arm can do."""
-    tries = (
-        _try(env, _raised(pose, height_m - float(less)), 0.006)
-        for less in np.arange(0.0, max(height_m, 0.0), 0.015)
-    )
-    return next((met for met in tries if met is not None), pose)
+    for less in np.arange(0.0, max(height_m, 0.0), LIFT_STEP_M).tolist():
+        raised = _raised(pose, height_m - less)
+        reached = _within_reach(env, raised, 0.006)
+        if reached is not None:
+            return reached
+    return pose
 
 
-def _set_down(env: Env, truth: Truth) -> list[Waypoint]:
-    """Carry the held target to its goal, lower it, let go, and draw back."""
-    now, low = env.tcp_base(), points_world(env.row.target, truth.objects_world[env.row.target])
-    centre, foot = (low.min(axis=0) + low.max(axis=0))[:2] / 2, float(low[:, 2].min())
-    spot, floor = _spot(env, truth)
-    shift = _into_base(env) @ np.array([*(spot - centre), floor - foot])
-    about = _into_base(env) @ np.array([*centre, 0.0]) - _into_base(env) @ env.robot.base_world[:3]
-    turns = [
-        _turned(now, about, shift, float(yaw))
-        for yaw in np.deg2rad([0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 180])
-    ]
-    down = next((met for pose in turns if (met := _try(env, pose, 0.006)) is not None), None)
-    if down is None:
-        raise OutOfReach(
-            f"Expert: {env.row.key}: {env.robot.name} cannot reach {env.row.goal} with {env.row.target} in its hand; move it closer."
-        )
-    over = _above(env, down, foot - floor)
-    return [
-        Waypoint(over, 0.0, 0.1),
-        Waypoint(down, 0.0, 0.15),
-        Waypoint(down, 1.0, 0.1),
-        Waypoint(_above(env, down, 0.08), 1.0, 0.8),
-    ]
+def _nearest_turn_first(env: Env, poses: Sequence[TcpPose]) -> list[TcpPose]:
+    """Poses in the order of the turn that leads to them from the commanded one."""
+    now = env.command.tcp_base
+    return sorted(poses, key=lambda pose: _pose_error(pose, now)[1])
 
 
 def _turned(
-    pose: Float64[np.ndarray, "4 4"],
-    about: Float64[np.ndarray, "3"],
-    shift: Float64[np.ndarray, "3"],
-    yaw: float,
-) -> Float64[np.ndarray, "4 4"]:
-    """`pose` turned by `yaw` about the vertical through `about`, then moved by `shift` (base frame)."""
-    turn, out = rotation(np.array([0.0, 0.0, yaw])), np.eye(4)
-    out[:3, :3] = turn @ pose[:3, :3]
-    out[:3, 3] = np.array([*about[:2], 0.0]) + turn @ (pose[:3, 3] - [*about[:2], 0.0]) + shift
-    return out
+    pose: TcpPose, about: Float64[np.ndarray, "3"], shift: Float64[np.ndarray, "3"], yaw: float
+) -> TcpPose:
+    """`pose` turned by `yaw` about the vertical through `about`, then moved by `shift`."""
+    turn = rotation(np.array([0.0, 0.0, yaw]))
+    axis = np.array([*about[:2], 0.0])
+    turned = np.eye(4)
+    turned[:3, :3] = turn @ pose[:3, :3]
+    turned[:3, 3] = axis + turn @ (pose[:3, 3] - axis) + shift
+    return turned
 
 
-def _spot(env: Env, truth: Truth) -> tuple[Float64[np.ndarray, "2"], float]:
+def _put_down_spot(env: Env, truth: Truth) -> tuple[Float64[np.ndarray, "2"], float]:
     """Where the target's centre goes, and the height at which it is let go."""
-    row, goal = env.row, truth.objects_world[env.row.goal]
-    points = points_world(row.goal, goal)
+    row = env.row
+    goal = truth.objects_world[row.goal]
     if row.rule == "put":
         return goal[:2].copy(), float(goal[2]) + 0.016
-    mine = points_world(row.target, truth.objects_world[row.target])
-    reach = (
-        0.5 * (np.hypot(*np.ptp(points, axis=0)[:2]) + np.hypot(*np.ptp(mine, axis=0)[:2]))
-        + 0.10
-        - BESIDE_M
-    )
-    others = [
-        pose[:2] for name, pose in truth.objects_world.items() if name not in (row.target, row.goal)
-    ]
+    target = truth.objects_world[row.target]
+    goal_size = _diagonal(row.goal, goal)
+    reach = 0.5 * (goal_size + _diagonal(row.target, target)) + 0.10 - BESIDE_M
     angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     spots = goal[:2] + reach * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    room = np.array(
-        [min([float(np.hypot(*(spot - other))) for other in others], default=1.0) for spot in spots]
-    )
-    here = np.hypot(*(spots - truth.objects_world[row.target][:2]).T)
-    return spots[int(np.argmax(np.minimum(room, 0.13) - 0.1 * here))], float(goal[2]) + 0.004
+    room = np.array([_distance_to_others(spot, env, truth) for spot in spots])
+    way = np.hypot(*(spots - target[:2]).T)
+    worth = np.minimum(room, 0.13) - 0.1 * way
+    best = int(np.argmax(worth))
+    return spots[best], float(goal[2]) + 0.004
 
 
-def _touch(env: Env, truth: Truth, attempt: int) -> list[Waypoint]:
-    """From straight above onto the middle of the target, with the gripper closed."""
-    points = points_world(env.row.target, truth.objects_world[env.row.target])
-    top, middle = float(points[:, 2].max()), (points.min(axis=0) + points.max(axis=0)) / 2
-    highest = points[points[:, 2] > top - 0.006].mean(axis=0)
-    x, y = (highest if attempt % 2 else middle)[:2]
-    now = env.command.tcp_base
-    turns = [
-        _pose(env, np.array([x, y, top - 0.025]), yaw)
-        for yaw in np.deg2rad(np.arange(0.0, 360.0, 30.0)).tolist()
-    ]
-    pose = next(
-        (
-            met
-            for turn in sorted(turns, key=lambda turn: _off(turn, now)[1])
-            if (met := _try(env, turn, 0.02)) is not None
-        ),
-        None,
-    )
-    if pose is None:
-        raise OutOfReach(
-            f"Expert: {env.row.key}: {env.robot.name} cannot reach {env.row.target}; move it closer."
-        )
-    over = _above(env, pose, _ceiling(env, truth) + ABOVE_M - (top - 0.025))
-    return [Waypoint(over, 0.0), Waypoint(pose, 0.0, 0.2), Waypoint(over, 0.0)]
+def _diagonal(name: str, pose: Float64[np.ndarray, "7"]) -> np.floating:
+    """The horizontal diagonal of an object's bounding box."""
+    extent = np.ptp(points_world(name, pose), axis=0)
+    return np.hypot(*extent[:2])
 
 
-def _hold(env: Env) -> Waypoint:
-    return Waypoint(_above(env, env.command.tcp_base, 0.02), 0.0, 0.5)
+def _distance_to_others(spot: Float64[np.ndarray, "2"], env: Env, truth: Truth) -> float:
+    """The least distance of a spot from an object other than target and goal; 1 m without any."""
+    distances = []
+    for name, pose in truth.objects_world.items():
+        if name not in (env.row.target, env.row.goal):
+            distance = np.hypot(*(spot - pose[:2]))
+            distances.append(float(distance))
+    return min(distances, default=1.0)
 
 
-def _retreat(env: Env) -> Waypoint:
-    return Waypoint(_above(env, env.command.tcp_base, 0.06), 1.0, 0.1)
+def _height_of_others(env: Env, truth: Truth) -> float:
+    """The height of the tallest object on the table, metres in the world.
+
+    The target counts as long as it is not in the hand.
+    """
+    heights = []
+    for name, pose in truth.objects_world.items():
+        if name != env.row.target or name not in truth.held:
+            points = points_world(name, pose)
+            heights.append(float(points[:, 2].max()))
+    return max(heights)
 
 
-def _ceiling(env: Env, truth: Truth) -> float:
-    """The height of the tallest thing on the table that is not the target or in the hand, metres in the world."""
-    names = [name for name in truth.objects_world if name != env.row.target] + [env.row.target] * (
-        env.row.target not in truth.held
-    )
-    return max(float(points_world(name, truth.objects_world[name])[:, 2].max()) for name in names)
-
-
-def _foot(truth: Truth, name: str) -> float:
+def _foot_height(truth: Truth, name: str) -> float:
     return float(points_world(name, truth.objects_world[name])[:, 2].min())
 
 
-def _pose(
-    env: Env, tcp_world: Float64[np.ndarray, "3"], axis_rad: float
-) -> Float64[np.ndarray, "4 4"]:
-    """The tcp's pose (base frame) pointing straight down with its opening axis at `axis_rad` in the world."""
-    base = _into_base(env)
+def _pointing_down(env: Env, tcp_world: Float64[np.ndarray, "3"], axis_rad: float) -> TcpPose:
+    """The tcp's pose pointing straight down, its opening axis at `axis_rad` in the world."""
+    base = _base_from_world(env)
     opening = base.T @ env.robot.down_base[:, 1]
     yaw = axis_rad - float(np.arctan2(opening[1], opening[0]))
     pose = np.eye(4)
@@ -354,14 +451,14 @@ def _pose(
     return pose
 
 
-def _into_base(env: Env) -> Float64[np.ndarray, "3 3"]:
+def _base_from_world(env: Env) -> Float64[np.ndarray, "3 3"]:
     """The rotation from world to robot base axes."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_quat(env.robot.base_world[3:], scalar_first=True).as_matrix().T
 
 
-def _raised(pose: Float64[np.ndarray, "4 4"], height_m: float) -> Float64[np.ndarray, "4 4"]:
-    up = pose.copy()
-    up[2, 3] += height_m
-    return up
+def _raised(pose: TcpPose, height_m: float) -> TcpPose:
+    raised = pose.copy()
+    raised[2, 3] += height_m
+    return raised

@@ -1,9 +1,12 @@
-"""The random control: smooth random actions, blind and deaf. What it solves, the task gives away."""
+"""The random control: smooth random actions, without images or text.
+
+What it solves, the task gives away.
+"""
 
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
 from vap_core.base.types import value
 from vap_core.policies.protocol import Chunk
@@ -11,7 +14,9 @@ from vap_core.simulation.env import Env
 
 KEEP = 0.8
 """Share of one action that goes on in the next."""
-MOVE_M_S, TURN_RAD_S, JOINT_RAD_S = 0.20, 0.6, 0.6
+MOVE_M_S = 0.20
+TURN_RAD_S = 0.6
+JOINT_RAD_S = 0.6
 
 
 @value
@@ -23,7 +28,7 @@ class RandomState:
 
 
 class Random:
-    """Wanders at the speed of the expert, the gripper opening and closing."""
+    """Moves at random at the speed of the expert, the gripper opening and closing."""
 
     label = "random"
     execute = 1
@@ -34,22 +39,30 @@ class Random:
     def plan_from_simulation(
         self, states: Sequence[RandomState], envs: Sequence[Env]
     ) -> tuple[list[RandomState], list[Chunk]]:
-        after = [
-            RandomState(state.rng, _wander(state, env))
-            for state, env in zip(states, envs, strict=True)
-        ]
-        return after, [state.last[None] for state in after]
+        next_states = []
+        chunks = []
+        for state, env in zip(states, envs, strict=True):
+            action = _draw_action(state, env)
+            next_states.append(RandomState(state.rng, action))
+            chunks.append(action[None])
+        return next_states, chunks
 
 
-def _wander(state: RandomState, env: Env) -> Float32[np.ndarray, " a"]:
-    moves = (
-        [MOVE_M_S] * 3 + [TURN_RAD_S] * 3
-        if env.control == "ee"
-        else [JOINT_RAD_S] * (env.action_size - 1)
-    )
-    last = state.last if len(state.last) else np.zeros(env.action_size, np.float32)
-    fresh = state.rng.standard_normal(env.action_size) * np.array(
-        [*(rate / env.hz for rate in moves), 1.0]
-    )
+def _draw_action(state: RandomState, env: Env) -> Float32[np.ndarray, " a"]:
+    """The next action: a share of the last one and fresh noise."""
+    last = state.last
+    if not len(last):
+        last = np.zeros(env.action_size, np.float32)
+    fresh = state.rng.standard_normal(env.action_size) * _scales(env)
     action = KEEP * last + np.sqrt(1 - KEEP**2) * fresh
-    return np.array([*action[:-1], np.clip(0.5 + action[-1], 0.0, 1.0)], np.float32)
+    gripper = np.clip(0.5 + action[-1], 0.0, 1.0)
+    return np.array([*action[:-1], gripper], np.float32)
+
+
+def _scales(env: Env) -> Float64[np.ndarray, " a"]:
+    """The deviation of every number of an action."""
+    if env.control == "ee":
+        rates = [MOVE_M_S] * 3 + [TURN_RAD_S] * 3
+    else:
+        rates = [JOINT_RAD_S] * (env.action_size - 1)
+    return np.array([*(rate / env.hz for rate in rates), 1.0])

@@ -34,11 +34,11 @@ class Oracle:
 
 
 class OraclePrompter:
-    """An Attender whose grounding is the simulator's; `alike` are the scene's objects of the
-    target's category.
+    """An Attender whose grounding is the simulator's.
 
-    Every visible object of the category is a candidate, as if detected; the vote is held and kept,
-    and then overruled. A view in which the prompted object is invisible passes unmodified.
+    `alike` are the scene's objects of the target's category. Every visible object of the category
+    is a candidate, as if detected; the vote is held and kept, and then overruled. A view in which
+    the prompted object is invisible passes unmodified.
     """
 
     def __init__(self, attender: Attender, oracle: Oracle, alike: frozenset[str]) -> None:
@@ -54,7 +54,7 @@ class OraclePrompter:
 
     @property
     def references(self) -> Mapping[str, tuple[Rgb, ...]]:
-        return {name: obj.crops for name, obj in self.attender.memory.items()}
+        return self.attender.references
 
     def prompted_object(self, row: EpisodeRow) -> str:
         """The object that is prompted. Raises: BadStudy when the episode places no look-alike."""
@@ -71,24 +71,26 @@ class OraclePrompter:
     def start(
         self, observation: Observation, context: PromptContext
     ) -> tuple[AttendState, Attended]:
-        """Ground by ground truth (t = 0). Raises: BadInstruction, unless the instruction has one
-        target."""
-        truth, text = _truth(context), context.instruction
+        """Ground by ground truth (t = 0).
+
+        Raises: BadInstruction, unless the instruction has one target.
+        """
+        truth = _truth(context)
+        text = context.instruction
         parsed, wanted = self.attender.understand(text)
         if len(wanted) != 1:
             raise BadInstruction(
                 f"OraclePrompter.start: {len(wanted)} targets in {text!r}, but the truth is about "
                 "one; name one."
             )
-        phrase, prompted = parsed.targets[0].category, self.prompted_object(truth.row)
+        phrase = parsed.targets[0].category
+        prompted = self.prompted_object(truth.row)
         candidates: dict[str, dict[str, Candidates]] = {}
         groundings: dict[str, tuple[Grounding, ...]] = {}
         for camera, rgb in observation.images.items():
-            visible: dict[str, Mask] = {}
-            for name, mask in truth.masks[camera].items():
-                if name in self.alike and mask.any():
-                    visible[name] = mask
-            found = self._describe(rgb, phrase, list(visible.values()))
+            visible = self._visible(truth.masks[camera])
+            masks = list(visible.values())
+            found = self._describe(rgb, phrase, masks)
             elected = self.attender.ground(camera, wanted[0], found)
             choice = list(visible).index(prompted) if prompted in visible else None
             candidates[camera] = {phrase: found}
@@ -120,17 +122,29 @@ class OraclePrompter:
             results.append(self.attender.follow(state, observation.images, tracks, state.trackers))
         return results
 
+    def _visible(self, masks: Mapping[str, Mask]) -> dict[str, Mask]:
+        """The visible objects of the category, by name."""
+        visible = {}
+        for name, mask in masks.items():
+            if name in self.alike and mask.any():
+                visible[name] = mask
+        return visible
+
     def _describe(self, rgb: Rgb, phrase: str, masks: Sequence[Mask]) -> Candidates:
-        """The candidates of one view: true boxes, and true masks unless the segmenter is to find
-        them."""
+        """The candidates of one view: true boxes, and true masks.
+
+        The masks are the segmenter's where only the boxes are revealed.
+        """
         xyxy = np.array([mask_box(mask) for mask in masks], np.float32).reshape(-1, 4)
-        boxes = Boxes(xyxy, np.ones(len(xyxy), np.float32), phrase)
+        scores = np.ones(len(xyxy), np.float32)
+        boxes = Boxes(xyxy, scores, phrase)
         if self.oracle.reveal == "box":
             drawn = self.attender.stack.segmenter(rgb, boxes)
         else:
             drawn = np.array(masks, bool).reshape(-1, *rgb.shape[:2])
         embeddings = self.attender.stack.encoder([crop(rgb, box) for box in xyxy])
-        return Candidates(boxes, embeddings, drawn, tuple(range(len(xyxy))))
+        ids = tuple(range(len(xyxy)))
+        return Candidates(boxes=boxes, embeddings=embeddings, masks=drawn, ids=ids)
 
 
 def _truth(context: PromptContext) -> SceneTruth:

@@ -1,5 +1,4 @@
-"""What a prompter is: it stands between the cameras and the frozen policy, and decides what the
-policy sees and reads."""
+"""What a prompter is: it decides what the frozen policy sees and reads."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import field
@@ -35,13 +34,13 @@ class PromptContext:
 
 @runtime_checkable
 class Prompter[S](Protocol):
-    """Turns observations into what the policy sees and reads. What one episode carries is state, an
-    argument and a result.
+    """Turns observations into what the policy sees and reads.
 
-    `needs_truth` says when it reads the simulator: "never", at the "start", or "always"; one that
-    does is a bound on results, never a result. `highlights` says whether it changes pixels inside
-    tracked masks, so that the masks' coverage is recorded. `references` are the remembered crops of
-    its objects, by name, for recordings.
+    What one episode carries is state, an argument and a result. `needs_truth` says when it reads
+    the simulator: "never", at the "start", or "always"; one that does is a bound on results, never
+    a result. `highlights` says whether it changes pixels inside tracked masks, so that the masks'
+    coverage is recorded. `references` are the remembered crops of its objects, by name, for
+    recordings.
     """
 
     needs_truth: Literal["never", "start", "always"]
@@ -62,8 +61,10 @@ class Prompter[S](Protocol):
         observations: Sequence[Observation],
         contexts: Sequence[PromptContext],
     ) -> list[tuple[S, Attended]]:
-        """The next step of every episode of a batch; the result for one does not depend on the
-        others."""
+        """The next step of every episode of a batch.
+
+        The result for one does not depend on the others.
+        """
         ...
 
 

@@ -21,13 +21,11 @@ class HardPrompt:
 
 @dataclass(frozen=True)
 class SoftPrompt:
-    """The personal span is replaced by a reserved word whose embedding was learned (SPEC section
-    4)."""
+    """The personal span is replaced by a reserved, learned word (SPEC section 4)."""
 
 
 class TextPrompter:
-    """Passes images unchanged; the policy reads `rewrite(instruction)` in every step of an
-    episode."""
+    """Passes images unchanged; the policy reads `rewrite(instruction)` in every step."""
 
     needs_truth: Literal["never", "start", "always"] = "never"
     highlights = False
@@ -59,7 +57,9 @@ def generic() -> TextPrompter:
 
 
 def hard_prompt(obj: PersonalObject, how: HardPrompt) -> TextPrompter:
-    """ "pick up my cup" -> "pick up my cup. My cup is white with blue spots."
+    """The object's description is appended to the instruction.
+
+    "pick up my cup" -> "pick up my cup. My cup is white with blue spots."
 
     Raises: BadMemory when the object was never described.
     """
@@ -77,7 +77,7 @@ def hard_prompt(obj: PersonalObject, how: HardPrompt) -> TextPrompter:
 
 
 def soft_prompt(word: str) -> TextPrompter:
-    """ "pick up my cup" -> "pick up <my_0>", where `word` is "<my_0>"."""
+    """The personal span is replaced: "pick up my cup" -> "pick up <my_0>" for `word` "<my_0>"."""
 
     def replace_span(instruction: str) -> str:
         target = parse(instruction).targets[0]

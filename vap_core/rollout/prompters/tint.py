@@ -23,7 +23,7 @@ class TintPrompter:
 
     @property
     def references(self) -> Mapping[str, tuple[Rgb, ...]]:
-        return {name: obj.crops for name, obj in self.attender.memory.items()}
+        return self.attender.references
 
     def start(
         self, observation: Observation, context: PromptContext
@@ -36,4 +36,5 @@ class TintPrompter:
         observations: Sequence[Observation],
         contexts: Sequence[PromptContext],
     ) -> list[tuple[AttendState, Attended]]:
-        return self.attender.steps(states, [observation.images for observation in observations])
+        views = [observation.images for observation in observations]
+        return self.attender.steps(states, views)

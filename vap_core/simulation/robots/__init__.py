@@ -1,4 +1,4 @@
-"""The robots of the workspace: MJCF with the real kinematics and plain geometry, and what a controller must know of each."""
+"""The robots: MJCF with the real kinematics and plain geometry, and the parameters of each."""
 
 from pathlib import Path
 
@@ -15,19 +15,26 @@ ORIGIN = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
 @value
 class Robot:
-    """One arm with a parallel gripper. Every joint has a position actuator of the same name and a site `tcp` lies between the fingertips.
+    """One arm with a parallel gripper.
 
-    The site's z points out of the gripper and its y along the opening axis. `home` and `speed_rad_s` follow `joints`;
-    `fingers_open` and `fingers_closed` follow `fingers`, metres or radians of travel (so101: one jaw that swings); `opening_m` is the clear width
-    between open pads, and `palm_m` how far an object between them may reach above the tcp before it meets the palm (narrow necks and
-    straws may go deeper).
-    `down_base` is the tcp's rotation in the robot base frame when the gripper points straight down, its opening axis across the table:
-    the state's rotation vector is counted from it, so that a turn about the vertical reads (0, 0, yaw).
-    `fixed_jaw_m` is where, along the tcp's y, the pad of a jaw that does not move stands; 0 when both fingers close alike.
-    `hand_m` is half the palm's length along the opening axis and half its width across it, for what may stand beside a grasp.
-    `turn_cost` is what one radian of error costs the inverse kinematics beside one metre: where both cannot be met, little makes the hand
-    lean and keeps its place. `lean_rad` is how far the hand of an arm of five joints may lean before a pose counts as out of reach.
-    `table_m` is the table top's (x0, y0, x1, y1) and `floor_z_m` the floor below it, metres in the world frame.
+    Every joint has a position actuator of the same name, and a site `tcp` lies between the
+    fingertips. The site's z points out of the gripper and its y along the opening axis. `home` and
+    `speed_rad_s` follow `joints`; `fingers_open` and `fingers_closed` follow `fingers`, metres or
+    radians of travel (so101: one jaw that swings); `opening_m` is the clear width between open
+    pads, and `palm_m` how far an object between them may reach above the tcp before it meets the
+    palm (narrow necks and straws may go deeper).
+    `down_base` is the tcp's rotation in the robot base frame when the gripper points straight down,
+    its opening axis across the table: the state's rotation vector is counted from it, so that a
+    turn about the vertical reads (0, 0, yaw).
+    `fixed_jaw_m` is where, along the tcp's y, the pad of a jaw that does not move stands; 0 when
+    both fingers close alike. `hand_m` is half the palm's length along the opening axis and half its
+    width across it, for the clearance of a grasp. `turn_cost` is the cost in the inverse kinematics
+    of one radian of error beside that of one metre: where both cannot be met, a small value makes
+    the hand lean and keep its place. `lean_rad` is how far the hand of an arm of five joints may
+    lean before a pose counts as out of reach.
+    `table_m` is the table top's (x0, y0, x1, y1) and `floor_z_m` the floor below it, metres in the
+    world frame.
+    Raises: ValueError when joints, home angles and speeds differ in number.
     """
 
     name: str
@@ -54,7 +61,8 @@ class Robot:
     def __post_init__(self) -> None:
         if not len(self.joints) == len(self.home) == len(self.speed_rad_s):
             raise ValueError(
-                f"Robot {self.name!r}: {len(self.joints)} joints, {len(self.home)} home angles, {len(self.speed_rad_s)} speeds; one each"
+                f"Robot {self.name!r}: {len(self.joints)} joints, {len(self.home)} home angles, "
+                f"{len(self.speed_rad_s)} speeds; one each"
             )
 
 

@@ -1,6 +1,7 @@
-"""Another coat for a robot: the meshes of MuJoCo Menagerie, hung on our bodies. What can be touched, moved or measured stays ours.
+"""The meshes of MuJoCo Menagerie as the visuals of our robots.
 
-The package mujoco-menagerie downloads a model on first use, or takes it from the folder that MENAGERIE_ROOT names.
+Collisions, joints and measures stay those of our models. The package mujoco-menagerie downloads a
+model on first use, or takes it from the folder that MENAGERIE_ROOT names.
 """
 
 from collections.abc import Iterator
@@ -19,50 +20,53 @@ MODELS = {
     "google": "google_robot",
     "so101": "robotstudio_so101",
 }
-"""Our robots by their names in Menagerie; bodies have the same names there, behind a prefix at most."""
+"""The names of our robots in Menagerie; bodies have the same names there, with a prefix at most."""
 SHELL = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-SHOWN, UNSEEN = 2, 3
-"""Geom groups: the first is drawn, the second is not."""
+SHOWN = 2
+"""A geom group that is drawn."""
+UNSEEN = 3
+"""A geom group that is not drawn."""
 Frame = Float64[np.ndarray, "4 4"]
 """A pose relative to the robot's first link at the zero configuration."""
 
 
-def dress(spec: mujoco.MjSpec, robot: Robot) -> None:
-    """Show Menagerie's visual meshes in place of our own geoms, which go on colliding unseen.
+def replace_visuals(spec: mujoco.MjSpec, robot: Robot) -> None:
+    """Show Menagerie's visual meshes in place of our own geoms, which still collide unseen.
 
-    Raises:
-        MissingMeshes: they are not on this machine, and cannot be downloaded.
+    Raises: MissingMeshes when they are not on this machine, and cannot be downloaded.
     """
-    theirs = mujoco.MjSpec.from_file(str(_model(robot.name)))
-    assets = Path(theirs.modelfiledir) / theirs.meshdir
-    ours = {_short(body): frame for body, frame in _frames(spec.body(robot.links[0]))}
-    root = next(body for body in theirs.bodies if _short(body) == robot.links[0])
-    for body in (spec.body(name) for name in ours):
+    source = mujoco.MjSpec.from_file(str(_model(robot.name)))
+    frames = {}
+    for body, frame in _frames(spec.body(robot.links[0])):
+        frames[_short(body)] = frame
         for geom in body.geoms:
             geom.group = UNSEEN
-    _paint(spec, theirs)
-    hung: set[str] = set()
+    _copy_materials(spec, source)
+    root = next(body for body in source.bodies if _short(body) == robot.links[0])
+    copied: set[str] = set()
     for body, frame in _frames(root):
         name = _short(body)
-        for i, geom in enumerate(
-            geom for geom in body.geoms if geom.meshname and geom.group == SHOWN
-        ):
-            if geom.meshname not in hung:
-                mesh = theirs.mesh(geom.meshname)
-                spec.add_mesh(
-                    name=_ours(mesh.name),
-                    file=str(assets / mesh.file),
-                    scale=mesh.scale,
-                    inertia=SHELL,
-                )
-                hung.add(geom.meshname)
-            pose = np.linalg.inv(ours[name]) @ frame @ _matrix(geom.pos, geom.quat)
+        meshes = [geom for geom in body.geoms if geom.meshname and geom.group == SHOWN]
+        for i, geom in enumerate(meshes):
+            if geom.meshname not in copied:
+                _copy_mesh(spec, source, geom.meshname)
+                copied.add(geom.meshname)
+            pose = np.linalg.inv(frames[name]) @ frame @ _matrix(geom.pos, geom.quat)
             quat = np.zeros(4)
             mujoco.mju_mat2Quat(quat, pose[:3, :3].ravel())
             spec.body(name).add_geom(
-                name=_ours(f"{name}/{i}"), type=mujoco.mjtGeom.mjGEOM_MESH, meshname=_ours(geom.meshname), material=_ours(geom.material),
-                pos=pose[:3, 3], quat=quat, group=SHOWN, contype=0, conaffinity=0, density=0, mass=0,
-            )  # fmt: skip
+                name=_copied_name(f"{name}/{i}"),
+                type=mujoco.mjtGeom.mjGEOM_MESH,
+                meshname=_copied_name(geom.meshname),
+                material=_copied_name(geom.material),
+                pos=pose[:3, 3],
+                quat=quat,
+                group=SHOWN,
+                contype=0,
+                conaffinity=0,
+                density=0,
+                mass=0,
+            )
 
 
 def _model(name: str) -> Path:
@@ -75,33 +79,44 @@ def _model(name: str) -> Path:
     try:
         return Path(model.xml(model.default_model, mujoco_menagerie.Cache()))
     except (mujoco_menagerie.MenagerieError, OSError) as error:
+        reason = " ".join(str(error).split())
         raise MissingMeshes(
-            f"menagerie: no meshes of {name!r} ({' '.join(str(error).split())}); go online once, so that the mujoco-menagerie package can fetch "
-            f"{MODELS[name]}, or set MENAGERIE_ROOT to a folder that holds {MODELS[name]}/, or keep the plain robots."
+            f"menagerie: no meshes of {name!r} ({reason}); go online once, so that the "
+            f"mujoco-menagerie package can fetch {MODELS[name]}, or set MENAGERIE_ROOT to a folder "
+            f"that holds {MODELS[name]}/, or keep the plain robots."
         ) from error
 
 
-def _paint(spec: mujoco.MjSpec, theirs: mujoco.MjSpec) -> None:
-    """Their materials and pictures, under names of their own."""
-    folder = Path(theirs.modelfiledir) / theirs.texturedir
-    for texture in theirs.textures:
+def _copy_materials(spec: mujoco.MjSpec, source: mujoco.MjSpec) -> None:
+    """Copy materials and textures of `source` under other names."""
+    folder = Path(source.modelfiledir) / source.texturedir
+    for texture in source.textures:
         if texture.file:
             spec.add_texture(
-                name=_ours(texture.name), type=texture.type, file=str(folder / texture.file)
+                name=_copied_name(texture.name),
+                type=texture.type,
+                file=str(folder / texture.file),
             )
-    for material in theirs.materials:
+    for material in source.materials:
         copy = spec.add_material(
-            name=_ours(material.name),
+            name=_copied_name(material.name),
             rgba=material.rgba,
             specular=material.specular,
             shininess=material.shininess,
         )
         for role, texture in enumerate(material.textures):
             if texture:
-                copy.textures[role] = _ours(texture)
+                copy.textures[role] = _copied_name(texture)
 
 
-def _ours(name: str) -> str:
+def _copy_mesh(spec: mujoco.MjSpec, source: mujoco.MjSpec, name: str) -> None:
+    """Copy a mesh of `source` under another name."""
+    mesh = source.mesh(name)
+    file = Path(source.modelfiledir) / source.meshdir / mesh.file
+    spec.add_mesh(name=_copied_name(mesh.name), file=str(file), scale=mesh.scale, inertia=SHELL)
+
+
+def _copied_name(name: str) -> str:
     return f"menagerie/{name}"
 
 
@@ -112,7 +127,7 @@ def _short(body: mujoco.MjsBody) -> str:
 def _frames(
     body: mujoco.MjsBody, here: Frame | None = None
 ) -> Iterator[tuple[mujoco.MjsBody, Frame]]:
-    """A body, taken as the origin, and all that hangs on it, with their frames."""
+    """A body, taken as the origin, and all bodies below it, with their frames."""
     here = np.eye(4) if here is None else here
     yield body, here
     for child in body.bodies:
@@ -123,5 +138,6 @@ def _matrix(pos: np.ndarray, quat: np.ndarray) -> Frame:
     turn = np.zeros(9)
     mujoco.mju_quat2Mat(turn, np.asarray(quat) / np.linalg.norm(quat))
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = turn.reshape(3, 3), pos
+    pose[:3, :3] = turn.reshape(3, 3)
+    pose[:3, 3] = pos
     return pose

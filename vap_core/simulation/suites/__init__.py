@@ -1,4 +1,7 @@
-"""Suites: the four personalised benchmarks, whose episode lists are hashed files, and the demo's warm-up suites, made on the spot."""
+"""Suites: the four personalised benchmarks, and the demo's warm-up suites.
+
+The episode lists of the benchmarks are hashed files; those of the warm-up suites are generated.
+"""
 
 from dataclasses import replace
 from functools import cache
@@ -36,52 +39,61 @@ def suite(name: str) -> Suite:
 
 @cache
 def benchmark(name: str) -> tuple[EpisodeRow, ...]:
-    """The whole list of a benchmark. Raises: BadSuite, naming row and field, also for a task, camera or object that does not exist."""
-    listed, known = lists.read(name), suite(name)
-    for i, row in enumerate(listed, 1):
-        for field, odd, names in (
-            ("task", {row.task}, {task.name for task in known.tasks}),
-            ("cameras", set(row.cameras), set(known.cameras)),
-        ):
-            if odd - names:
-                raise BadSuite(
-                    f"suites: {name}.jsonl row {i}, field {field!r}: unknown {sorted(odd - names)}; known: {', '.join(sorted(names))}."
-                )
+    """The whole list of a benchmark.
+
+    Raises: BadSuite, naming row and field, also for a task, camera or object that does not exist.
+    """
+    episodes = lists.read(name)
+    known = suite(name)
+    tasks = {task.name for task in known.tasks}
+    cameras = set(known.cameras)
+    for i, row in enumerate(episodes, 1):
+        where = f"{name}.jsonl row {i}"
+        _check_names({row.task}, tasks, f"{where}, field 'task'")
+        _check_names(set(row.cameras), cameras, f"{where}, field 'cameras'")
         for place in row.placements:
             try:
                 objects.get_object(place.model)
             except UnknownName as error:
                 raise BadSuite(
-                    f"suites: {name}.jsonl row {i}, field 'placements': no object {place.model!r}."
+                    f"suites: {where}, field 'placements': no object {place.model!r}."
                 ) from error
-    return listed
+    return episodes
 
 
 def rows(
     suite_name: str, task_name: str, n: int | None = None, seed: int = 0
 ) -> tuple[EpisodeRow, ...]:
-    """Episodes of a task: the whole list, or `n` of it spread evenly; of a warm-up suite the first `n` (20) of `seed`.
+    """Episodes of a task: the whole list, or `n` of it spread evenly.
 
-    A benchmark's list is the same for every seed; the seed reaches the policy and the sensor noise.
-    Raises: UnknownName for a suite or a task that no registry holds; BadSuite for a list that is damaged.
+    Of a warm-up suite the first `n` (20) of `seed`. A benchmark's list is the same for every seed;
+    the seed reaches the policy and the sensor noise.
+    Raises: UnknownName for a suite or a task that no registry holds; BadSuite for a damaged list.
     """
-    found = suite(suite_name)
-    task = found.task(task_name)
+    known = suite(suite_name)
+    task = known.task(task_name)
     if suite_name in WARM_UPS:
-        return pick.rows(found, task, 20 if n is None else n, seed)
-    listed = [row for row in benchmark(suite_name) if row.task == task_name]
-    chosen = (
-        range(len(listed))
-        if n is None or n >= len(listed)
-        else np.unique(np.linspace(0, len(listed) - 1, n).astype(int)).tolist()
-    )
-    return tuple(replace(listed[i], seed=seed) for i in chosen)
+        return pick.rows(known, task, 20 if n is None else n, seed)
+    episodes = [row for row in benchmark(suite_name) if row.task == task_name]
+    if n is not None and n < len(episodes):
+        spread = np.linspace(0, len(episodes) - 1, n).astype(int)
+        episodes = [episodes[i] for i in np.unique(spread)]
+    return tuple(replace(row, seed=seed) for row in episodes)
 
 
 def listed(
     suite_name: str, task_name: str, n: int | None = None, seed: int = 0, seeds: int = 1
 ) -> tuple[EpisodeRow, ...]:
     """`rows` of `seeds` seeds from `seed` on, one seed after the other."""
-    return tuple(
-        row for one in range(seed, seed + seeds) for row in rows(suite_name, task_name, n, one)
-    )
+    episodes: list[EpisodeRow] = []
+    for row_seed in range(seed, seed + seeds):
+        episodes.extend(rows(suite_name, task_name, n, row_seed))
+    return tuple(episodes)
+
+
+def _check_names(names: set[str], known: set[str], where: str) -> None:
+    unknown = names - known
+    if unknown:
+        raise BadSuite(
+            f"suites: {where}: unknown {sorted(unknown)}; known: {', '.join(sorted(known))}."
+        )

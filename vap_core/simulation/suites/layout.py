@@ -1,4 +1,4 @@
-"""Where things stand at the start of an episode: drawn places that keep clear of each other."""
+"""Where objects stand at the start of an episode: random places at a distance from each other."""
 
 from collections.abc import Sequence
 
@@ -34,39 +34,19 @@ def scatter(
     gap_m: float = 0.05,
     tries: int = TRIES,
 ) -> list[Spot]:
-    """One spot in `area` per radius in `reach_m`, so that discs of those radii keep `gap_m` apart, and from the `fixed` (spot, radius).
+    """One spot in `area` per radius in `reach_m`, with discs of those radii `gap_m` apart.
 
+    They keep the same distance from the `fixed` (spot, radius).
     Raises: ValueError when the area is too small for that, or `tries` too few.
     """
     for _ in range(tries):
-        taken, found = list(fixed), dict.fromkeys(range(len(reach_m)), (0.0, 0.0))
-        for i in rng.permutation(
-            len(reach_m)
-        ).tolist():  # whoever is placed last gets the rim more often
-            spot = _free(rng, area, reach_m[i], taken, gap_m)
-            if spot is None:
-                break
-            found[i] = spot
-            taken.append((spot, reach_m[i]))
-        else:
-            return list(found.values())
+        spots = _try_spots(rng, area, reach_m, fixed, gap_m)
+        if spots is not None:
+            return spots
     raise ValueError(
-        f"layout.scatter: {len(reach_m)} objects and {len(fixed)} fixed ones do not fit {area} with {gap_m} m between them"
+        f"layout.scatter: {len(reach_m)} objects and {len(fixed)} fixed ones do not fit {area} "
+        f"with {gap_m} m between them"
     )
-
-
-def _free(
-    rng: np.random.Generator,
-    area: Area,
-    radius: float,
-    taken: Sequence[tuple[Spot, float]],
-    gap_m: float,
-) -> Spot | None:
-    for _ in range(30):
-        x, y = area.at(*rng.random(2).tolist())
-        if all(np.hypot(x - a, y - b) > radius + other + gap_m for (a, b), other in taken):
-            return x, y
-    return None
 
 
 def radius_m(model: str) -> float:
@@ -76,20 +56,75 @@ def radius_m(model: str) -> float:
 
 
 def place(model: str, spot: Spot, yaw: float) -> Placement:
-    """To a tenth of a millimetre and of a milliradian, as the lists keep it."""
+    """A placement rounded as in the lists, to 0.1 mm and 0.1 mrad."""
     return Placement(
-        model, round(float(spot[0]), 4), round(float(spot[1]), 4), round(float(yaw), 4)
+        model=model,
+        x=round(float(spot[0]), 4),
+        y=round(float(spot[1]), 4),
+        yaw=round(float(yaw), 4),
     )
 
 
-def turned(rng: np.random.Generator) -> float:
+def random_yaw(rng: np.random.Generator) -> float:
     """Any yaw, radians."""
     return float(rng.uniform(-np.pi, np.pi))
 
 
-def rivals(rng: np.random.Generator, stem: str, n: int = 2) -> list[str]:
+def place_at_random_yaws(
+    rng: np.random.Generator, models: Sequence[str], spots: Sequence[Spot]
+) -> list[Placement]:
+    """Each model on its spot, at a random yaw."""
+    placements = []
+    for model, spot in zip(models, spots, strict=True):
+        placements.append(place(model, spot, random_yaw(rng)))
+    return placements
+
+
+def draw_lookalikes(rng: np.random.Generator, stem: str, n: int = 2) -> list[str]:
     """The names of `n` of the personal object's look-alikes, drawn without repeats."""
-    return [
-        str(name)
-        for name in rng.permutation([model.name for model in objects.lookalikes(stem)])[:n]
-    ]
+    names = [model.name for model in objects.lookalikes(stem)]
+    return list(map(str, rng.permutation(names)[:n]))
+
+
+def _try_spots(
+    rng: np.random.Generator,
+    area: Area,
+    reach_m: Sequence[float],
+    fixed: Sequence[tuple[Spot, float]],
+    gap_m: float,
+) -> list[Spot] | None:
+    """Spots drawn one after the other, or None when no free one is found.
+
+    The order is random, because the objects that are placed last are more often at the rim.
+    """
+    taken = list(fixed)
+    spots = [(0.0, 0.0)] * len(reach_m)
+    for i in rng.permutation(len(reach_m)).tolist():
+        spot = _draw_free_spot(rng, area, reach_m[i], taken, gap_m)
+        if spot is None:
+            return None
+        spots[i] = spot
+        taken.append((spot, reach_m[i]))
+    return spots
+
+
+def _draw_free_spot(
+    rng: np.random.Generator,
+    area: Area,
+    radius: float,
+    taken: Sequence[tuple[Spot, float]],
+    gap_m: float,
+) -> Spot | None:
+    for _ in range(30):
+        spot = area.at(*rng.random(2).tolist())
+        if _is_free(spot, radius, taken, gap_m):
+            return spot
+    return None
+
+
+def _is_free(spot: Spot, radius: float, taken: Sequence[tuple[Spot, float]], gap_m: float) -> bool:
+    x, y = spot
+    for (a, b), other_radius in taken:
+        if not np.hypot(x - a, y - b) > radius + other_radius + gap_m:
+            return False
+    return True

@@ -1,4 +1,7 @@
-"""Episode lists on disk: one JSON row a line, one file a suite, their hashes in the manifest; whatever is wrong is said by row and field."""
+"""Episode lists on disk: one JSON row per line, one file per suite, their hashes in the manifest.
+
+Errors name row and field.
+"""
 
 import hashlib
 import json
@@ -14,8 +17,9 @@ from vap_core.simulation.types import EpisodeRow, Placement, SuccessRule
 
 FOLDER = DATA / "suites"
 CLOSE_M = 0.02
+"""Objects keep at least this far apart."""
 FAR = 1e6
-"""No honest number in a row is larger; nan and inf are not smaller either."""
+"""Every number of a placement is smaller; nan and inf are not."""
 _TEXT = ("suite", "task", "instruction", "category", "rule", "goal", "split", "variant")
 _COUNT = ("episode", "seed", "max_steps")
 _FIELDS = {*_TEXT, *_COUNT, "placements", "cameras"}
@@ -24,16 +28,16 @@ _FIELDS = {*_TEXT, *_COUNT, "placements", "cameras"}
 def write(name: str, rows: Sequence[EpisodeRow], folder: Path = FOLDER) -> str:
     """Write a suite's list and enter it in the manifest; returns the file's sha256."""
     folder.mkdir(parents=True, exist_ok=True)
-    data = "".join(json.dumps(_to_json(row), separators=(",", ":")) + "\n" for row in rows).encode()
+    lines = []
+    for row in rows:
+        lines.append(json.dumps(_to_json(row), separators=(",", ":")) + "\n")
+    data = "".join(lines).encode()
     digest = hashlib.sha256(data).hexdigest()
     write_atomic(folder / f"{name}.jsonl", data)
-    listed = {
-        **_manifest(folder, missing_is_empty=True),
-        name: {"sha256": digest, "episodes": len(rows)},
-    }
-    write_atomic(
-        folder / "manifest.json", (json.dumps(listed, indent=1, sort_keys=True) + "\n").encode()
-    )
+    manifest = _manifest(folder, missing_is_empty=True)
+    manifest[name] = {"sha256": digest, "episodes": len(rows)}
+    text = json.dumps(manifest, indent=1, sort_keys=True) + "\n"
+    write_atomic(folder / "manifest.json", text.encode())
     read.cache_clear()
     return digest
 
@@ -42,36 +46,40 @@ def write(name: str, rows: Sequence[EpisodeRow], folder: Path = FOLDER) -> str:
 def read(name: str, folder: Path = FOLDER) -> tuple[EpisodeRow, ...]:
     """Every row of a suite's list, in order.
 
-    Raises:
-        BadSuite: the file is absent, differs from its hash in the manifest, or holds a malformed row; the message names row and field.
+    Raises: BadSuite when the file is absent, differs from its hash in the manifest, or holds a
+        malformed row; the message names row and field.
     """
     path = folder / f"{name}.jsonl"
     try:
         data = path.read_bytes()
     except OSError as error:
         raise BadSuite(
-            f"suites: {path} cannot be read ({error.strerror}); notebooks/01_benchmark_building.ipynb makes it."
+            f"suites: {path} cannot be read ({error.strerror}); "
+            "notebooks/01_benchmark_building.ipynb makes it."
         ) from error
     wanted = digest(name, folder)
     if hashlib.sha256(data).hexdigest() != wanted:
         raise BadSuite(
-            f"suites: {path} changed since its hash {wanted[:12]} was taken; restore it (git checkout), or enter it anew with suites.lists.write."
+            f"suites: {path} changed since its hash {wanted[:12]} was taken; "
+            "restore it (git checkout), or enter it anew with suites.lists.write."
         )
-    rows = tuple(
-        _row(line, f"{path.name} row {i}")
-        for i, line in enumerate(data.decode(errors="replace").splitlines(), 1)
-    )
-    seen: dict[str, int] = {}
+    rows = []
+    numbers: dict[str, int] = {}
+    lines = data.decode(errors="replace").splitlines()
+    for i, line in enumerate(lines, 1):
+        rows.append(_parse_row(line, f"{path.name} row {i}"))
     for i, row in enumerate(rows, 1):
         if row.suite != name:
             raise BadSuite(
-                f"suites: {path.name} row {i}, field 'suite': {row.suite!r} in the list of {name!r}."
+                f"suites: {path.name} row {i}, field 'suite': "
+                f"{row.suite!r} in the list of {name!r}."
             )
-        if seen.setdefault(row.key, i) != i:
+        if numbers.setdefault(row.key, i) != i:
             raise BadSuite(
-                f"suites: {path.name} row {i}, field 'episode': {row.episode} of task {row.task!r} is already row {seen[row.key]}."
+                f"suites: {path.name} row {i}, field 'episode': {row.episode} of task "
+                f"{row.task!r} is already row {numbers[row.key]}."
             )
-    return rows
+    return tuple(rows)
 
 
 def digest(name: str, folder: Path = FOLDER) -> str:
@@ -80,14 +88,16 @@ def digest(name: str, folder: Path = FOLDER) -> str:
         return str(_manifest(folder)[name]["sha256"])
     except (KeyError, TypeError) as error:
         raise BadSuite(
-            f"suites: {folder / 'manifest.json'} has no hash of {name!r}; notebooks/01_benchmark_building.ipynb enters it."
+            f"suites: {folder / 'manifest.json'} has no hash of {name!r}; "
+            "notebooks/01_benchmark_building.ipynb enters it."
         ) from error
 
 
 def check(rows: Iterable[EpisodeRow]) -> None:
     """Refuse rows that could not be run. Raises: BadSuite, naming row and field."""
     for i, row in enumerate(rows, 1):
-        _row(json.dumps(_to_json(row)), f"row {i}")
+        text = json.dumps(_to_json(row))
+        _parse_row(text, f"row {i}")
 
 
 def _manifest(folder: Path, missing_is_empty: bool = False) -> dict[str, Any]:
@@ -95,91 +105,129 @@ def _manifest(folder: Path, missing_is_empty: bool = False) -> dict[str, Any]:
     if missing_is_empty and not path.exists():
         return {}
     try:
-        held = json.loads(path.read_bytes())
+        manifest = json.loads(path.read_bytes())
     except (OSError, ValueError) as error:
         raise BadSuite(
-            f"suites: {path} cannot be read; restore it, or run notebooks/01_benchmark_building.ipynb."
+            f"suites: {path} cannot be read; "
+            "restore it, or run notebooks/01_benchmark_building.ipynb."
         ) from error
-    if not isinstance(held, dict):
+    if not isinstance(manifest, dict):
         raise BadSuite(
-            f"suites: {path} holds no table of hashes; restore it, or run notebooks/01_benchmark_building.ipynb."
+            f"suites: {path} holds no table of hashes; "
+            "restore it, or run notebooks/01_benchmark_building.ipynb."
         )
-    return held
+    return manifest
 
 
 def _to_json(row: EpisodeRow) -> dict[str, Any]:
-    plain = {name: getattr(row, name) for name in (*_TEXT, *_COUNT)}
-    return {
-        **plain,
-        "cameras": list(row.cameras),
-        "placements": [[p.model, p.x, p.y, p.yaw] for p in row.placements],
-    }
+    fields: dict[str, Any] = {}
+    for name in (*_TEXT, *_COUNT):
+        fields[name] = getattr(row, name)
+    fields["cameras"] = list(row.cameras)
+    fields["placements"] = []
+    for place in row.placements:
+        fields["placements"].append([place.model, place.x, place.y, place.yaw])
+    return fields
 
 
-def _row(line: str, where: str) -> EpisodeRow:
+def _parse_row(line: str, where: str) -> EpisodeRow:
     """One line as a row, every field checked."""
-
-    def bad(field: str, why: str) -> BadSuite:
-        return BadSuite(f"suites: {where}, field {field!r}: {why}.")
-
     try:
-        raw = json.loads(line)
+        fields = json.loads(line)
     except ValueError as error:
         raise BadSuite(f"suites: {where} is not JSON ({error}).") from error
-    if not isinstance(raw, Mapping) or set(raw) != _FIELDS:
-        odd = sorted(_FIELDS ^ set(raw)) if isinstance(raw, Mapping) else ["everything"]
-        raise bad(odd[0], f"missing or unknown; a row has {', '.join(sorted(_FIELDS))}")
+    try:
+        _check_fields(fields)
+        _check_placements(fields["placements"])
+        _check_goal(fields)
+    except _BadField as error:
+        raise BadSuite(f"suites: {where}, field {error.field!r}: {error.reason}.") from None
+    placements = []
+    for model, x, y, yaw in fields["placements"]:
+        placements.append(Placement(model=model, x=float(x), y=float(y), yaw=float(yaw)))
+    fields["placements"] = tuple(placements)
+    fields["cameras"] = tuple(fields["cameras"])
+    return EpisodeRow(**fields)
+
+
+class _BadField(Exception):
+    """A field that a row may not have."""
+
+    def __init__(self, field: str, reason: str) -> None:
+        super().__init__(field, reason)
+        self.field = field
+        self.reason = reason
+
+
+def _check_fields(fields: Any) -> None:
+    """The names of the fields, and the values of all but the placements and the goal."""
+    expected = ", ".join(sorted(_FIELDS))
+    if not isinstance(fields, Mapping):
+        raise _BadField("everything", f"missing or unknown; a row has {expected}")
+    if set(fields) != _FIELDS:
+        odd = sorted(_FIELDS ^ set(fields))
+        raise _BadField(odd[0], f"missing or unknown; a row has {expected}")
     for name in _TEXT:
-        if not isinstance(raw[name], str):
-            raise bad(name, f"{raw[name]!r} is no text")
+        if not isinstance(fields[name], str):
+            raise _BadField(name, f"{fields[name]!r} is no text")
     for name in _COUNT:
-        if type(raw[name]) is not int or raw[name] < (name == "max_steps"):
-            raise bad(
-                name,
-                f"{raw[name]!r} is no {'positive ' if name == 'max_steps' else ''}whole number",
-            )
-    if raw["rule"] not in get_args(SuccessRule):
-        raise bad("rule", f"{raw['rule']!r} is unknown; known: {', '.join(get_args(SuccessRule))}")
-    if raw["variant"] not in VARIANTS:
-        raise bad("variant", f"{raw['variant']!r} is unknown; known: {', '.join(VARIANTS)}")
-    if not isinstance(raw["cameras"], list) or not all(
-        isinstance(name, str) for name in raw["cameras"]
-    ):
-        raise bad("cameras", f"{raw['cameras']!r} is no list of camera names")
-    places = raw["placements"]
-    if not isinstance(places, list) or not places:
-        raise bad("placements", "empty; the first one is the target")
-    for i, place in enumerate(places):
+        least = 1 if name == "max_steps" else 0
+        if type(fields[name]) is not int or fields[name] < least:
+            kind = "positive whole number" if least else "whole number"
+            raise _BadField(name, f"{fields[name]!r} is no {kind}")
+    rules = get_args(SuccessRule)
+    if fields["rule"] not in rules:
+        raise _BadField("rule", f"{fields['rule']!r} is unknown; known: {', '.join(rules)}")
+    if fields["variant"] not in VARIANTS:
+        known = ", ".join(VARIANTS)
+        raise _BadField("variant", f"{fields['variant']!r} is unknown; known: {known}")
+    cameras = fields["cameras"]
+    if not isinstance(cameras, list) or not all(isinstance(name, str) for name in cameras):
+        raise _BadField("cameras", f"{cameras!r} is no list of camera names")
+
+
+def _check_placements(placements: Any) -> None:
+    if not isinstance(placements, list) or not placements:
+        raise _BadField("placements", "empty; the first one is the target")
+    for i, place in enumerate(placements):
         if not (isinstance(place, list) and len(place) == 4 and isinstance(place[0], str)):
-            raise bad("placements", f"number {i} is {place!r}, not [model, x, y, yaw]")
-        if not all(type(number) in (int, float) and abs(number) < FAR for number in place[1:]):
-            raise bad(
+            raise _BadField("placements", f"number {i} is {place!r}, not [model, x, y, yaw]")
+        model, x, y, yaw = place
+        if not (_is_number(x) and _is_number(y) and _is_number(yaw)):
+            raise _BadField(
                 "placements",
-                f"{place[0]!r} stands at {place[1:]}; x, y (m) and yaw (rad) must be finite numbers",
+                f"{model!r} stands at {place[1:]}; x, y (m) and yaw (rad) must be finite numbers",
             )
-        if max(abs(place[1]), abs(place[2])) > 2.0:
-            raise bad(
+        away_m = max(abs(x), abs(y))
+        if away_m > 2.0:
+            raise _BadField(
                 "placements",
-                f"{place[0]!r} stands {max(abs(place[1]), abs(place[2])):g} m away; metres, within 2 of the robot",
+                f"{model!r} stands {away_m:g} m away; metres, within 2 of the robot",
             )
-        for other in places[:i]:
-            if (
-                place[0] != other[0]
-                and max(abs(place[1] - other[1]), abs(place[2] - other[2])) < CLOSE_M
-            ):
-                raise bad(
+        for other_model, other_x, other_y, _ in placements[:i]:
+            apart_m = max(abs(x - other_x), abs(y - other_y))
+            if model != other_model and apart_m < CLOSE_M:
+                raise _BadField(
                     "placements",
-                    f"{place[0]!r} and {other[0]!r} stand in the same place; objects keep at least {CLOSE_M} m apart",
+                    f"{model!r} and {other_model!r} stand in the same place; "
+                    f"objects keep at least {CLOSE_M} m apart",
                 )
-    names = [place[0] for place in places]
+
+
+def _is_number(number: Any) -> bool:
+    """Whether it is an int or a float, and finite."""
+    return type(number) in (int, float) and abs(number) < FAR
+
+
+def _check_goal(fields: Mapping[str, Any]) -> None:
+    names = [place[0] for place in fields["placements"]]
     if len(set(names)) < len(names):
-        raise bad("placements", f"an object is placed twice in {names}")
-    if bool(raw["goal"]) != (raw["rule"] in ("near", "put")) or (
-        raw["goal"] and raw["goal"] not in names[1:]
-    ):
-        raise bad(
+        raise _BadField("placements", f"an object is placed twice in {names}")
+    goal = fields["goal"]
+    needs_goal = fields["rule"] in ("near", "put")
+    if bool(goal) != needs_goal or (goal and goal not in names[1:]):
+        raise _BadField(
             "goal",
-            f"{raw['goal']!r} for rule {raw['rule']!r}; near and put name a placed object other than the target, the others none",
+            f"{goal!r} for rule {fields['rule']!r}; near and put name a placed object "
+            "other than the target, the others none",
         )
-    placed = tuple(Placement(model, float(x), float(y), float(yaw)) for model, x, y, yaw in places)
-    return EpisodeRow(**{**raw, "placements": placed, "cameras": tuple(raw["cameras"])})

@@ -1,4 +1,4 @@
-"""From an episode row to an environment: the one place where a row's suite, variant and objects become a scene."""
+"""From an episode row to a scene and an environment: with its suite, variant and objects."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -18,9 +18,9 @@ def build_scene(
     variant: str = "base",
     meshes: Meshes = "plain",
 ) -> Scene:
-    """The suite's robot and cameras with `models` (names in the object registry, or models themselves), in a variant's style.
+    """The suite's robot and cameras with `models`, in a variant's style.
 
-    Raises: UnknownName.
+    `models` are names in the object registry, or models themselves. Raises: UnknownName.
     """
     robot = suite_called(suite).robot
     return build(robot, models, style=VARIANTS[variant].style, meshes=meshes)
@@ -34,7 +34,7 @@ def make_env(
     cameras: Sequence[str] | None = None,
     occlusion: Occlusion | None = None,
 ) -> Env:
-    """An environment in `scene` with the suite's control, sensors and cameras (or fewer of them)."""
+    """An environment in `scene` with the suite's control and sensors, and (some of) its cameras."""
     known = suite_called(suite)
     return Env(
         scene,

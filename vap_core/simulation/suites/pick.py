@@ -1,4 +1,7 @@
-"""The warm-up suites of the demo: pick up one of three same-category objects; any number of episodes, made on the spot from the seed."""
+"""The warm-up suites of the demo: pick up one of three objects of the same category.
+
+Any number of episodes is generated from the seed.
+"""
 
 import zlib
 
@@ -6,8 +9,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from vap_core.base.types import value
+from vap_core.simulation.suites.layout import place_at_random_yaws
 from vap_core.simulation.suites.suite import Suite, Task
-from vap_core.simulation.types import EpisodeRow, Placement
+from vap_core.simulation.types import EpisodeRow
 
 CATEGORIES = (
     "cup",
@@ -25,8 +29,9 @@ CATEGORIES = (
 class Arrangement:
     """Three places in a row across the table, as the front camera sees it: metres, world frame.
 
-    Places lie `spread_m` apart around (`x_m`, 0); the row as a whole shifts by up to `shift_m` sideways and every object by up
-    to `jitter_m` = (x, y); centres stay `clearance_m` apart, room for a gripper between them.
+    Places lie `spread_m` apart around (`x_m`, 0); the row as a whole shifts by up to `shift_m`
+    sideways and every object by up to `jitter_m` = (x, y); centres stay `clearance_m` apart, room
+    for a gripper between them.
     """
 
     x_m: float
@@ -38,18 +43,36 @@ class Arrangement:
     def __post_init__(self) -> None:
         if self.spread_m - 2 * self.jitter_m[1] < self.clearance_m - 1e-9:
             raise ValueError(
-                f"Arrangement: places {self.spread_m} m apart that jitter by {self.jitter_m[1]} m cannot keep {self.clearance_m} m clear"
+                f"Arrangement: places {self.spread_m} m apart that jitter by {self.jitter_m[1]} m "
+                f"cannot keep {self.clearance_m} m clear"
             )
 
 
-def _picks(max_steps: int) -> tuple[Task, ...]:
-    return tuple(
-        Task(f"pick-{c.replace(' ', '-')}", c, f"pick up my {c}", max_steps) for c in CATEGORIES
-    )
+def _pick_tasks(max_steps: int) -> tuple[Task, ...]:
+    tasks = []
+    for category in CATEGORIES:
+        slug = category.replace(" ", "-")
+        tasks.append(
+            Task(
+                name=f"pick-{slug}",
+                category=category,
+                instruction=f"pick up my {category}",
+                max_steps=max_steps,
+            )
+        )
+    return tuple(tasks)
 
 
-WIDOWX = Suite("widowx-pick", "wx250s", 5.0, ("front",), _picks(60))
-FRANKA = Suite("franka-pick", "panda", 10.0, ("front", "side", "wrist"), _picks(100))
+WIDOWX = Suite(
+    name="widowx-pick", robot="wx250s", hz=5.0, cameras=("front",), tasks=_pick_tasks(60)
+)
+FRANKA = Suite(
+    name="franka-pick",
+    robot="panda",
+    hz=10.0,
+    cameras=("front", "side", "wrist"),
+    tasks=_pick_tasks(100),
+)
 ARRANGEMENTS = {
     WIDOWX.name: Arrangement(
         x_m=0.27, spread_m=0.13, shift_m=0.015, jitter_m=(0.025, 0.02), clearance_m=0.09
@@ -61,9 +84,10 @@ ARRANGEMENTS = {
 
 
 def rows(suite: Suite, task: Task, n: int, seed: int) -> tuple[EpisodeRow, ...]:
-    """The first `n` episodes: the target stands in each of the three places equally often, in an order drawn by `seed`.
+    """The first `n` episodes; the target stands in each of the three places equally often.
 
-    Episode i depends on (suite, task, seed, i) alone: asking for more episodes leaves the first ones as they were.
+    The order is drawn by `seed`. Episode i depends on (suite, task, seed, i) alone: asking for more
+    episodes leaves the first ones as they were.
     """
     return tuple(_row(suite, task, episode, seed) for episode in range(n))
 
@@ -75,24 +99,16 @@ def _row(suite: Suite, task: Task, episode: int, seed: int) -> EpisodeRow:
     target = int(block[episode % 3])
     others = rng.permutation([slot for slot in range(3) if slot != target])
     places = _places(ARRANGEMENTS[suite.name], rng)
-    order = (target, *(int(slot) for slot in others))
-    models = task.personal, f"{task.stem}-lookalike-1", f"{task.stem}-lookalike-2"
-    placements = tuple(
-        Placement(
-            model,
-            round(float(places[slot, 0]), 4),
-            round(float(places[slot, 1]), 4),
-            round(float(rng.uniform(-np.pi, np.pi)), 4),
-        )
-        for model, slot in zip(models, order, strict=True)
-    )
-    return suite.row(task, episode, placements, seed=seed)
+    slots = [target, *others.tolist()]
+    models = [task.personal, f"{task.stem}-lookalike-1", f"{task.stem}-lookalike-2"]
+    spots = [(places[slot, 0], places[slot, 1]) for slot in slots]
+    placements = place_at_random_yaws(rng, models, spots)
+    return suite.row(task, episode, tuple(placements), seed=seed)
 
 
 def _places(arrangement: Arrangement, rng: np.random.Generator) -> Float64[np.ndarray, "3 2"]:
     """The three places of one episode, from the camera's left to its right (x, y metres)."""
-    row = arrangement.spread_m * np.array([-1.0, 0.0, 1.0]) + rng.uniform(
-        -arrangement.shift_m, arrangement.shift_m
-    )
+    shift = rng.uniform(-arrangement.shift_m, arrangement.shift_m)
+    row = arrangement.spread_m * np.array([-1.0, 0.0, 1.0]) + shift
     jitter = rng.uniform(-1.0, 1.0, (3, 2)) * arrangement.jitter_m
     return np.stack([arrangement.x_m + jitter[:, 0], row + jitter[:, 1]], axis=1)

@@ -1,16 +1,25 @@
-"""When an episode has succeeded, and who was moved: pure functions over the ground truth of every step (SPEC 6, SIMPLER's thresholds).
+"""When an episode has succeeded, and who was moved (SPEC 6, SIMPLER's thresholds).
 
-*Picked*: raised more than 1 cm above where it settled and touching nothing but the robot, for at least 5 steps in a row.
-*Near*: moved more than 3 cm and more than any other object, its centre within both half-diagonals + 10 cm of the goal's, the goal its
-nearest neighbour, on the table or in the hand, and nobody dropped by 2 cm. *Put*: its centre within the receptacle's half-diagonal (+ 3 mm)
-of the receptacle's, which stands upright, its middle above the receptacle's foot, its underside no more than 2 cm above the rim, touching
-the receptacle and besides it at most the robot. *Selected*: pressed by the gripper for more than 10 ms, no other object touched by the robot before.
-The goal of a task is no object to be confused with: touching or moving it is neither right nor wrong.
-*CMR* (P 5.1): the target moved more than 3 cm from where it settled, at least once, whatever the outcome; undefined for selection.
+Pure functions over the ground truth of every step.
+
+*Picked*: raised more than 1 cm above where it settled and touching nothing but the robot, for at
+least 5 steps in a row.
+*Near*: moved more than 3 cm and more than any other object, its centre within both half-diagonals
++ 10 cm of the goal's, the goal its nearest neighbour, on the table or in the gripper, and no object
+dropped by 2 cm.
+*Put*: its centre within the receptacle's half-diagonal (+ 3 mm) of the receptacle's, which stands
+upright, its middle above the receptacle's foot, its underside no more than 2 cm above the rim,
+touching the receptacle and besides it at most the robot.
+*Selected*: pressed by the gripper for more than 10 ms, no other object touched by the robot before.
+The goal of a task is no object to be confused with: touching or moving it is neither right nor
+wrong.
+*CMR* (P 5.1): the target moved more than 3 cm from where it settled, at least once, whatever the
+outcome; undefined for selection.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -23,11 +32,13 @@ LIFT_M = 0.01
 MOVED_M = 0.03
 NEAR_M = 0.10
 DROPPED_M = 0.02
-OVER_M, GAP_M = 0.003, 0.02
+OVER_M = 0.003
+GAP_M = 0.02
 PRESSED_S = 0.010
 UPRIGHT = 0.8
-STILL_M, STILL_STEPS = 0.001, 5
-"""Let go, and moved less than this in the last of so many steps at the goal: the episode may end."""
+STILL_M = 0.001
+STILL_STEPS = 5
+"""Released at the goal for STILL_STEPS, and moved less than STILL_M in the last: it may end."""
 LIFTED_M = 0.05
 """A held target this high is clear of the table: the lift is done and the episode may end."""
 HELD_STEPS: Mapping[SuccessRule, int] = {"picked": 5, "near": 1, "put": 1, "selected": 1}
@@ -38,11 +49,13 @@ Sizes = Mapping[str, tuple[float, float, float]]
 
 @value
 class Judge:
-    """What is known of one episode so far. `step` returns the next state; `events` are those of the last step alone.
+    """What is known of one episode so far; `step` returns the next state.
 
-    `run` counts the current unbroken run of steps in which the rule's condition held, `held_steps` the longest; `order` names the
-    objects in the order in which the robot touched or moved them (`earlier`: before the last step); it begins with the target, or the first
-    object was not the right one. `step_m` is how far the target moved in the last step.
+    `events` are those of the last step alone. `run` counts the current unbroken run of steps in
+    which the rule's condition held, `held_steps` the longest; `order` names the objects in the
+    order in which the robot touched or moved them (`earlier`: before the last step); it begins with
+    the target, or the first object was not the right one. `step_m` is how far the target moved in
+    the last step.
     """
 
     row: EpisodeRow
@@ -62,27 +75,31 @@ class Judge:
     @staticmethod
     def start(row: EpisodeRow, sizes_m: Sizes, truth: Truth) -> "Judge":
         """Before the first action, with everything settled."""
-        return Judge(
-            row,
-            sizes_m,
-            {place.model: truth.objects_world[place.model].copy() for place in row.placements},
-            truth,
-        )
+        start_world = {}
+        for place in row.placements:
+            start_world[place.model] = truth.objects_world[place.model].copy()
+        return Judge(row=row, sizes_m=sizes_m, start_world=start_world, now=truth)
 
     def step(self, truth: Truth) -> "Judge":
         """The state after one more control step."""
-        moved = self.moved | {
-            name for name in self.start_world if self.travel_m(name, truth) > MOVED_M
-        }
-        news = [
-            name
-            for name in (*truth.touched, *sorted(moved))
-            if name in self.start_world and name not in (*self.order, self.row.goal)
-        ]
+        moved = set(self.moved)
+        for name in self.start_world:
+            if self.travel_m(name, truth) > MOVED_M:
+                moved.add(name)
+        order = list(self.order)
+        for name in (*truth.touched, *sorted(moved)):
+            if name in self.start_world and name not in (*order, self.row.goal):
+                order.append(name)
         after = replace(
-            self, now=truth, steps=self.steps + 1, step_m=_distance(self, self.row.target, truth), earlier=self.order,
-            order=(*self.order, *dict.fromkeys(news)), moved=moved, events=(),
-        )  # fmt: skip
+            self,
+            now=truth,
+            steps=self.steps + 1,
+            step_m=_distance(self, self.row.target, truth),
+            earlier=self.order,
+            order=tuple(order),
+            moved=frozenset(moved),
+            events=(),
+        )
         run = self.run + 1 if CONDITIONS[self.row.rule](after) else 0
         after = replace(
             after,
@@ -90,29 +107,24 @@ class Judge:
             held_steps=max(self.held_steps, run),
             success_once=self.success_once or run >= HELD_STEPS[self.row.rule],
         )
-        return replace(after, events=_news(self, after))
+        return replace(after, events=_events(self, after))
 
     def travel_m(self, name: str, truth: Truth | None = None) -> float:
         """How far the middle of an object is from where it settled: toppling is moving."""
         middle = _box(truth or self.now, self.sizes_m, name).mean(axis=0)
-        return float(
-            np.linalg.norm(
-                middle - _corners(self.start_world[name], self.sizes_m[name]).mean(axis=0)
-            )
-        )
+        start = _corners(self.start_world[name], self.sizes_m[name]).mean(axis=0)
+        return float(np.linalg.norm(middle - start))
 
     @property
     def success(self) -> bool:
         """The rule holds now; a selection, once made, stands."""
-        return (
-            self.success_once
-            if self.row.rule == "selected"
-            else self.run >= HELD_STEPS[self.row.rule]
-        )
+        if self.row.rule == "selected":
+            return self.success_once
+        return self.run >= HELD_STEPS[self.row.rule]
 
     @property
     def done(self) -> bool:
-        """Nothing is left to do: lifted clear of the table, let go at the goal, or selected."""
+        """Nothing is left to do: lifted clear of the table, released at the goal, or selected."""
         if self.row.rule == "picked":
             return self.success and _lift_m(self) > LIFTED_M
         if self.row.rule == "selected":
@@ -126,15 +138,19 @@ class Judge:
         """How it ended; without `status` the rule decides. An error is never a success."""
         if status is None:
             status = "success" if self.success else "failure"
-        target, selecting = self.row.target, self.row.rule == "selected"
+        target = self.row.target
+        selecting = self.row.rule == "selected"
         others = set(self.start_world) - {target, self.row.goal}
+        handled = set(self.moved)
+        if selecting:
+            handled.update(self.order)
         return Outcome(
             status=status,
             success=status == "success",
             success_once=self.success_once,
             held_steps=self.held_steps,
             cmr=None if selecting else target in self.moved,
-            wrong_object=bool(others & (self.moved | set(self.order if selecting else ()))),
+            wrong_object=bool(others & handled),
             first_object_correct=self.order[:1] == (target,),
             steps=self.steps,
             detail=detail,
@@ -143,7 +159,10 @@ class Judge:
 
 
 def rejudge(row: EpisodeRow, sizes_m: Sizes, truths: Sequence[Truth]) -> Judge:
-    """The judge's last word over a saved episode: the settled start, then one truth per control step."""
+    """The judge at the end of a saved episode.
+
+    `truths` are the settled start, then one truth per control step.
+    """
     judge = Judge.start(row, sizes_m, truths[0])
     for truth in truths[1:]:
         judge = judge.step(truth)
@@ -155,24 +174,27 @@ def _picked(judge: Judge) -> bool:
 
 
 def _near(judge: Judge) -> bool:
-    target, goal = judge.row.target, judge.row.goal
-    others = [name for name in judge.start_world if name not in (target, goal)]
+    target = judge.row.target
+    goal = judge.row.goal
     gap = _apart_m(judge, target, goal)
     limit = _half_diagonal_m(judge.sizes_m[target]) + _half_diagonal_m(judge.sizes_m[goal]) + NEAR_M
-    return (
-        judge.travel_m(target) > max(MOVED_M, *(judge.travel_m(name) for name in (*others, goal)))
-        and gap < limit
-        and all(gap < _apart_m(judge, target, name) for name in others)
-        and all(
-            judge.start_world[name][2] - judge.now.objects_world[name][2] < DROPPED_M
-            for name in judge.start_world
-        )
-        and bool(judge.now.contacts.get(target, frozenset()) & {REST, ROBOT})
-    )
+    travel = judge.travel_m(target)
+    if not (travel > MOVED_M and gap < limit):
+        return False
+    for name in judge.start_world:
+        dropped = judge.start_world[name][2] - judge.now.objects_world[name][2]
+        if not dropped < DROPPED_M:
+            return False
+        if name != target and not travel > judge.travel_m(name):
+            return False
+        if name not in (target, goal) and not gap < _apart_m(judge, target, name):
+            return False
+    return bool(judge.now.contacts.get(target, frozenset()) & {REST, ROBOT})
 
 
 def _put(judge: Judge) -> bool:
-    target, goal = judge.row.target, judge.row.goal
+    target = judge.row.target
+    goal = judge.row.goal
     partners = judge.now.contacts.get(target, frozenset())
     stand = judge.now.objects_world[goal]
     box = _box(judge.now, judge.sizes_m, target)
@@ -202,28 +224,25 @@ CONDITIONS: Mapping[SuccessRule, Callable[[Judge], bool]] = {
 
 
 def _lift_m(judge: Judge) -> float:
-    return float(
-        judge.now.objects_world[judge.row.target][2] - judge.start_world[judge.row.target][2]
-    )
+    target = judge.row.target
+    return float(judge.now.objects_world[target][2] - judge.start_world[target][2])
 
 
 def _half_diagonal_m(size: tuple[float, float, float]) -> float:
     return 0.5 * float(np.hypot(size[0], size[1]))
 
 
-def _apart_m(judge: Judge, one: str, other: str) -> float:
+def _apart_m(judge: Judge, first: str, second: str) -> float:
     """Between two objects' centres, across the table."""
-    middle = [_box(judge.now, judge.sizes_m, name).mean(axis=0) for name in (one, other)]
-    return float(np.linalg.norm((middle[0] - middle[1])[:2]))
+    first_middle = _box(judge.now, judge.sizes_m, first).mean(axis=0)
+    second_middle = _box(judge.now, judge.sizes_m, second).mean(axis=0)
+    return float(np.linalg.norm((first_middle - second_middle)[:2]))
 
 
 def _distance(judge: Judge, name: str, truth: Truth) -> float:
     """How far the middle of an object is from where it was a step ago."""
-    return float(
-        np.linalg.norm(
-            (_box(truth, judge.sizes_m, name) - _box(judge.now, judge.sizes_m, name)).mean(axis=0)
-        )
-    )
+    shift = _box(truth, judge.sizes_m, name) - _box(judge.now, judge.sizes_m, name)
+    return float(np.linalg.norm(shift.mean(axis=0)))
 
 
 def _box(truth: Truth, sizes_m: Sizes, name: str) -> Float64[np.ndarray, "8 3"]:
@@ -235,28 +254,28 @@ def _corners(pose: Pose, size: tuple[float, float, float]) -> Float64[np.ndarray
     from scipy.spatial.transform import Rotation
 
     x, y, z = size
-    local = np.array(
-        [(i * x / 2, j * y / 2, k * z) for i in (-1, 1) for j in (-1, 1) for k in (0, 1)]
-    )
+    local = np.array(list(product((-x / 2, x / 2), (-y / 2, y / 2), (0.0, z))))
     return Rotation.from_quat(pose[3:], scalar_first=True).apply(local) + pose[:3]
 
 
-def _news(before: Judge, after: Judge) -> tuple[Event, ...]:
-    target, at, rule = after.row.target, after.steps, after.row.rule
-    fine: Mapping[bool, Literal["INFO", "WARN"]] = {True: "INFO", False: "WARN"}
-    first = (
-        [Event(at, fine[after.order[0] == target], f"first object: {after.order[0]}")]
-        if after.order and not before.order
-        else []
-    )
-    moved = [
-        Event(at, fine[name in (target, after.row.goal)], f"moved: {name}")
-        for name in sorted(after.moved - before.moved)
-    ]
-    met = [Event(at, "INFO", f"{rule}: {target}")] if after.run == HELD_STEPS[rule] else []
-    lost = (
-        [Event(at, "WARN", f"lost after {before.run} held steps: {target}")]
-        if before.run and not after.run and not after.success
-        else []
-    )
-    return (*first, *moved, *met, *lost)
+def _events(before: Judge, after: Judge) -> tuple[Event, ...]:
+    """What happened in the last step."""
+    target = after.row.target
+    rule = after.row.rule
+    events = []
+    if after.order and not before.order:
+        level = _level(after.order[0] == target)
+        events.append(Event(after.steps, level, f"first object: {after.order[0]}"))
+    for name in sorted(after.moved - before.moved):
+        level = _level(name in (target, after.row.goal))
+        events.append(Event(after.steps, level, f"moved: {name}"))
+    if after.run == HELD_STEPS[rule]:
+        events.append(Event(after.steps, "INFO", f"{rule}: {target}"))
+    if before.run and not after.run and not after.success:
+        text = f"lost after {before.run} held steps: {target}"
+        events.append(Event(after.steps, "WARN", text))
+    return tuple(events)
+
+
+def _level(expected: bool) -> Literal["INFO", "WARN"]:
+    return "INFO" if expected else "WARN"

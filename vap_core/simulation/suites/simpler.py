@@ -1,17 +1,28 @@
-"""Personalised SIMPLER, protocol-matched in MuJoCo (P 4, tab:object_specs): Google Robot (Fractal) and WidowX (Bridge).
+"""Personalised SIMPLER, protocol-matched in MuJoCo (P 4, tab:object_specs).
 
-Fractal, pick: 3 orientations x 5 x 5 places x 4 robot colours = 300, and x 11 variants = 825; an orientation is a turn about the vertical
-(SIMPLER also lays its can down). Move near: 40 layouts x 4 = 160, and x 10 variants = 400. The split 300 + 160 and 825 + 400 is inferred
-from SIMPLER's scripts; the paper gives 460 and 1225. Bridge: 12 ordered pairs of the corners of a 15 cm square x 2 rotations = 24; look-alikes
-take the other corners.
+Google Robot (Fractal), pick: 3 orientations x 5 x 5 places x 4 robot colours = 300, and x 11
+variants = 825; an orientation is a turn about the vertical (SIMPLER also lays its can down). Move
+near: 40 layouts x 4 = 160, and x 10 variants = 400. The split 300 + 160 and 825 + 400 is inferred
+from SIMPLER's scripts; the paper gives 460 and 1225. WidowX (Bridge): 12 ordered pairs of the
+corners of a 15 cm square x 2 rotations = 24; look-alikes take the other corners.
 """
 
-from itertools import permutations
+from collections.abc import Sequence
+from itertools import permutations, product
 
 import numpy as np
 
 from vap_core.simulation.assets import objects
-from vap_core.simulation.suites.layout import Area, Spot, place, radius_m, rivals, scatter, turned
+from vap_core.simulation.suites.layout import (
+    Area,
+    Spot,
+    draw_lookalikes,
+    place,
+    place_at_random_yaws,
+    radius_m,
+    random_yaw,
+    scatter,
+)
 from vap_core.simulation.suites.suite import Suite, Task
 from vap_core.simulation.suites.variants import AGGREGATION, MATCHING, VARIANTS
 from vap_core.simulation.types import EpisodeRow, Placement
@@ -22,14 +33,19 @@ FRACTAL = Suite(
     hz=3.0,
     cameras=("head",),
     tasks=(
-        Task("pick-pen-holder", "pen holder", "pick my pen holder", 80),
         Task(
-            "move-bottle-near-coke-can",
-            "bottle",
-            "move my bottle near coke can",
-            80,
-            "near",
-            "coke-can-prop",
+            name="pick-pen-holder",
+            category="pen holder",
+            instruction="pick my pen holder",
+            max_steps=80,
+        ),
+        Task(
+            name="move-bottle-near-coke-can",
+            category="bottle",
+            instruction="move my bottle near coke can",
+            max_steps=80,
+            rule="near",
+            goal="coke-can-prop",
         ),
     ),
 )
@@ -39,30 +55,45 @@ BRIDGE = Suite(
     hz=5.0,
     cameras=("front",),
     tasks=(
-        Task("pick-shaver", "shaver", "pick up my shaver", 60),
-        Task("put-camera", "camera", "put my camera on the plate", 60, "put", "plate-prop"),
         Task(
-            "put-owl-figurine",
-            "owl figurine",
-            "put my owl figurine on the plate",
-            60,
-            "put",
-            "plate-prop",
+            name="pick-shaver",
+            category="shaver",
+            instruction="pick up my shaver",
+            max_steps=60,
         ),
         Task(
-            "put-straw-cup",
-            "straw cup",
-            "put my straw cup in the basket",
-            120,
-            "put",
-            "basket-prop",
+            name="put-camera",
+            category="camera",
+            instruction="put my camera on the plate",
+            max_steps=60,
+            rule="put",
+            goal="plate-prop",
+        ),
+        Task(
+            name="put-owl-figurine",
+            category="owl figurine",
+            instruction="put my owl figurine on the plate",
+            max_steps=60,
+            rule="put",
+            goal="plate-prop",
+        ),
+        Task(
+            name="put-straw-cup",
+            category="straw cup",
+            instruction="put my straw cup in the basket",
+            max_steps=120,
+            rule="put",
+            goal="basket-prop",
         ),
     ),
 )
-DESK = Area(0.40, 0.63, -0.22, 0.22)
+DESK = Area(x0=0.40, x1=0.63, y0=-0.22, y1=0.22)
 """The Google Robot's grid: 23 cm deep, 44 cm wide."""
-GRID, ORIENTATIONS, LAYOUTS = 5, 3, 40
-CENTRE, CORNER_M = (0.265, 0.0), 0.075
+GRID = 5
+ORIENTATIONS = 3
+LAYOUTS = 40
+CENTRE = (0.265, 0.0)
+CORNER_M = 0.075
 APART_M = 0.22
 """Every bottle starts at least this far from the can."""
 BESIDE_M = 0.10
@@ -72,114 +103,133 @@ NOVEL = 9000
 
 
 def fractal_rows() -> tuple[EpisodeRow, ...]:
-    """All 460 + 1225 episodes. The same layouts return under every variant, so that variants compare pairwise."""
+    """All 460 + 1225 episodes.
+
+    The layouts are the same under every variant, so that variants compare pairwise.
+    """
     pick, near = FRACTAL.tasks
-    picks = [_pick(pick, turn, i) for turn in range(ORIENTATIONS) for i in range(GRID * GRID)]
-    nears = [_near(near, i) for i in range(LAYOUTS)]
+    pick_layouts = []
+    for turn, cell in product(range(ORIENTATIONS), range(GRID * GRID)):
+        pick_layouts.append(_pick(pick, turn, cell))
+    near_layouts = []
+    for i in range(LAYOUTS):
+        near_layouts.append(_near(near, i))
+    near_variants = list(AGGREGATION)
+    near_variants.remove("distractors-many")
     return (
-        *_tracks(pick, picks, AGGREGATION),
-        *_tracks(near, nears, tuple(name for name in AGGREGATION if name != "distractors-many")),
+        *_rows_of_variants(pick, pick_layouts, AGGREGATION),
+        *_rows_of_variants(near, near_layouts, near_variants),
     )
 
 
 def bridge_rows() -> tuple[EpisodeRow, ...]:
     """All 4 x 24 episodes."""
-    return tuple(BRIDGE.row(task, i, _square(task, i)) for task in BRIDGE.tasks for i in range(24))
+    rows = []
+    for task, i in product(BRIDGE.tasks, range(24)):
+        rows.append(BRIDGE.row(task, i, _square(task, i)))
+    return tuple(rows)
 
 
-def _tracks(
-    task: Task, layouts: list[tuple[Placement, ...]], aggregation: tuple[str, ...]
+def _rows_of_variants(
+    task: Task, layouts: Sequence[tuple[Placement, ...]], aggregation: Sequence[str]
 ) -> list[EpisodeRow]:
-    settings = [("visual matching", name) for name in MATCHING] + [
-        ("variant aggregation", name) for name in aggregation
-    ]
-    return [
-        FRACTAL.row(
-            task,
-            i * len(layouts) + j,
-            _crowded(task, j, layout, VARIANTS[variant].distractors),
-            split=split,
-            variant=variant,
-        )
-        for i, (split, variant) in enumerate(settings)
-        for j, layout in enumerate(layouts)
-    ]
+    """Every layout under every variant of visual matching, then of variant aggregation."""
+    settings = []
+    for variant in MATCHING:
+        settings.append(("visual matching", variant))
+    for variant in aggregation:
+        settings.append(("variant aggregation", variant))
+    rows: list[EpisodeRow] = []
+    for split, variant in settings:
+        n_distractors = VARIANTS[variant].distractors
+        for i, layout in enumerate(layouts):
+            placements = _add_distractors(task, i, layout, n_distractors)
+            rows.append(FRACTAL.row(task, len(rows), placements, split=split, variant=variant))
+    return rows
 
 
 def _pick(task: Task, turn: int, cell: int) -> tuple[Placement, ...]:
-    """The look-alikes stand on other places of the grid, so that neither place nor yaw tells the target."""
-    rng, spin = np.random.default_rng([41, turn, cell]), turned(np.random.default_rng([45, cell]))
-    grid = [DESK.at(i / (GRID - 1), j / (GRID - 1)) for i in range(GRID) for j in range(GRID)]
-    others: list[Spot] = []
+    """The target in one cell of the grid, the look-alikes in others.
+
+    So neither place nor yaw reveals the target.
+    """
+    rng = np.random.default_rng([41, turn, cell])
+    yaw = random_yaw(np.random.default_rng([45, cell])) + 2 * np.pi / ORIENTATIONS * turn
+    grid = []
+    for i, j in product(range(GRID), range(GRID)):
+        grid.append(DESK.at(i / (GRID - 1), j / (GRID - 1)))
+    taken = [grid[cell]]
     for i in rng.permutation(len(grid)).tolist():
-        if len(others) < 2 and all(
-            np.hypot(grid[i][0] - x, grid[i][1] - y) > BESIDE_M for x, y in (grid[cell], *others)
-        ):
-            others.append(grid[i])
-    rest = (
-        place(name, at, turned(rng))
-        for name, at in zip(rivals(rng, task.stem), others, strict=True)
-    )
-    return place(task.personal, grid[cell], spin + 2 * np.pi / ORIENTATIONS * turn), *rest
+        if len(taken) < 3 and _nearest_m(grid[i], taken) > BESIDE_M:
+            taken.append(grid[i])
+    target = place(task.personal, grid[cell], yaw)
+    return (target, *place_at_random_yaws(rng, draw_lookalikes(rng, task.stem), taken[1:]))
+
+
+def _nearest_m(spot: Spot, spots: Sequence[Spot]) -> float:
+    """The distance to the nearest of `spots`."""
+    distances = np.array(spots) - spot
+    return float(np.hypot(distances[:, 0], distances[:, 1]).min())
 
 
 def _near(task: Task, layout: int) -> tuple[Placement, ...]:
-    """The can keeps clear all around, so that there is room beside it; the target is the nearest to it, the middle one and the farthest in turn."""
+    """The can with free space around it, and three bottles.
+
+    The target is the nearest one to the can, the middle one and the farthest in turn.
+    """
     rng = np.random.default_rng([42, layout])
-    names = rivals(rng, task.stem)
-    wide = max(radius_m(name) for name in (task.personal, *names))
+    names = draw_lookalikes(rng, task.stem)
+    wide = max(map(radius_m, [task.personal, *names]))
     while True:
         can, *bottles = scatter(rng, DESK, [0.06, wide, wide, wide], gap_m=0.065)
-        far = sorted((float(np.hypot(can[0] - x, can[1] - y)), (x, y)) for x, y in bottles)
-        if far[0][0] > APART_M and DESK.x0 + 0.03 < can[0] < DESK.x1 - 0.03:
+        distances = []
+        for x, y in bottles:
+            distances.append((float(np.hypot(can[0] - x, can[1] - y)), (x, y)))
+        distances.sort()
+        if distances[0][0] > APART_M and DESK.x0 + 0.03 < can[0] < DESK.x1 - 0.03:
             break
-    mine = far.pop(layout % 3)[1]
-    others = [far[i][1] for i in rng.permutation(2)]
-    placed = zip((task.personal, task.goal, *names), (mine, can, *others), strict=True)
-    return tuple(place(name, spot, turned(rng)) for name, spot in placed)
+    _, target = distances.pop(layout % 3)
+    first, second = rng.permutation(2)
+    spots = [target, can, distances[first][1], distances[second][1]]
+    return tuple(place_at_random_yaws(rng, [task.personal, task.goal, *names], spots))
 
 
-def _crowded(
-    task: Task, layout: int, placements: tuple[Placement, ...], distractors: int
+def _add_distractors(
+    task: Task, layout: int, placements: tuple[Placement, ...], n_distractors: int
 ) -> tuple[Placement, ...]:
     """The same layout with more objects of other kinds around."""
-    if not distractors:
+    if not n_distractors:
         return placements
-    rng = np.random.default_rng([43, layout, distractors, len(placements)])
-    kinds = [
-        kind
-        for kind in ("cup", "straw cup", "owl figurine", "camera", "vase")
-        if kind != task.category
-    ]
-    models = [
-        objects.generic_instance(str(kind), NOVEL + int(rng.integers(20)))
-        for kind in rng.permutation(kinds)[:distractors]
-    ]
-    fixed = [((p.x, p.y), 0.06 if p.model == task.goal else radius_m(p.model)) for p in placements]
-    spots = scatter(rng, DESK, [radius_m(model.name) for model in models], fixed, gap_m=0.05)
-    return (
-        *placements,
-        *(place(model.name, spot, turned(rng)) for model, spot in zip(models, spots, strict=True)),
-    )
+    rng = np.random.default_rng([43, layout, n_distractors, len(placements)])
+    kinds = ["cup", "straw cup", "owl figurine", "camera", "vase"]
+    if task.category in kinds:
+        kinds.remove(task.category)
+    names = []
+    for kind in rng.permutation(kinds)[:n_distractors]:
+        number = NOVEL + int(rng.integers(20))
+        names.append(objects.generic_instance(str(kind), number).name)
+    fixed = []
+    for placed in placements:
+        radius = 0.06 if placed.model == task.goal else radius_m(placed.model)
+        fixed.append(((placed.x, placed.y), radius))
+    radii = list(map(radius_m, names))
+    spots = scatter(rng, DESK, radii, fixed=fixed, gap_m=0.05)
+    return (*placements, *place_at_random_yaws(rng, names, spots))
 
 
 def _square(task: Task, episode: int) -> tuple[Placement, ...]:
-    rng = np.random.default_rng([44, *task.name.encode(), episode])
-    mine, goal = list(permutations(range(4), 2))[episode % 12]
-    corners = [
-        (CENTRE[0] + CORNER_M * i, CENTRE[1] + CORNER_M * j) for i in (-1, 1) for j in (-1, 1)
-    ]
-    others = [i for i in range(4) if i not in (mine, goal)]
-    yaw = turned(np.random.default_rng([46, *task.name.encode(), episode % 12])) + 0.5 * np.pi * (
-        episode // 12
-    )
-    placed = [place(task.personal, corners[mine], yaw)]
+    """The target and the goal on two corners of a square, the look-alikes on the others."""
+    name = task.name.encode()
+    rng = np.random.default_rng([44, *name, episode])
+    corners = []
+    for i, j in product((-1, 1), (-1, 1)):
+        corners.append((CENTRE[0] + CORNER_M * i, CENTRE[1] + CORNER_M * j))
+    orders = list(permutations(range(4), 2))
+    target, goal = orders[episode % 12]
+    others = [corners[i] for i in range(4) if i not in (target, goal)]
+    turn = random_yaw(np.random.default_rng([46, *name, episode % 12]))
+    yaw = turn + 0.5 * np.pi * (episode // 12)
+    placements = [place(task.personal, corners[target], yaw)]
     if task.goal:
-        placed.append(place(task.goal, corners[goal], 0.0))
-    return (
-        *placed,
-        *(
-            place(name, corners[i], turned(rng))
-            for name, i in zip(rivals(rng, task.stem), others, strict=True)
-        ),
-    )
+        placements.append(place(task.goal, corners[goal], 0.0))
+    return (*placements, *place_at_random_yaws(rng, draw_lookalikes(rng, task.stem), others))

@@ -1,4 +1,7 @@
-"""What a suite is: which robot, cameras and control, which tasks and how long they may take. Reading one loads no simulator."""
+"""What a suite is: a robot, its cameras and control, the tasks and how long they may take.
+
+This module loads no simulator.
+"""
 
 from typing import Literal
 
@@ -10,9 +13,10 @@ from vap_core.simulation.types import EpisodeRow, Placement, SuccessRule
 
 @value
 class Task:
-    """One task: a category, its personalised instruction, when it has succeeded, and how many control steps it may take.
+    """One task: a category, its personalised instruction, its rule of success and step limit.
 
-    `stem` begins the names of its objects in the registry; `goal` names the object that the target goes to.
+    `max_steps` are control steps; `stem` begins the names of its objects in the registry; `goal`
+    names the object that the target goes to.
     """
 
     name: str
@@ -34,7 +38,10 @@ class Task:
 
 @value
 class Suite:
-    """A set of tasks on one robot. `control` says what an action is (values.Action), `sensor` what the cameras do to what they see."""
+    """A set of tasks on one robot.
+
+    `control` says what an action is (values.Action), `sensor` how the cameras change their images.
+    """
 
     name: str
     robot: str
@@ -49,13 +56,32 @@ class Suite:
         for task in self.tasks:
             if task.name == name:
                 return task
-        raise one_of(f"suite {self.name}: task", name, [task.name for task in self.tasks])
+        names = [task.name for task in self.tasks]
+        raise one_of(f"suite {self.name}: task", name, names)
 
     def row(
-        self, task: Task, episode: int, placements: tuple[Placement, ...], *, seed: int = 0, split: str = "", variant: str = "base"
-    ) -> EpisodeRow:  # fmt: skip
+        self,
+        task: Task,
+        episode: int,
+        placements: tuple[Placement, ...],
+        *,
+        seed: int = 0,
+        split: str = "",
+        variant: str = "base",
+    ) -> EpisodeRow:
         """An episode of `task` that starts with `placements`, the target first."""
         return EpisodeRow(
-            self.name, task.name, episode, seed, task.instruction, task.category, placements, task.max_steps, task.rule, task.goal, split, variant,
-            self.cameras,
-        )  # fmt: skip
+            suite=self.name,
+            task=task.name,
+            episode=episode,
+            seed=seed,
+            instruction=task.instruction,
+            category=task.category,
+            placements=placements,
+            max_steps=task.max_steps,
+            rule=task.rule,
+            goal=task.goal,
+            split=split,
+            variant=variant,
+            cameras=self.cameras,
+        )

@@ -1,12 +1,21 @@
-"""The simulated twin of the paper's real desk (P 4): SO-101 with three cameras, four selections and four pick-and-places, 8 x 20.
+"""The paper's real desk (P 4) in simulation: SO-101 with three cameras, 8 tasks x 20 episodes.
 
-Sensor noise, exposure and knocked cameras are drawn per episode (sim.sensor.DESK).
+Four selections and four pick-and-places. Sensor noise, exposure and displaced cameras are drawn per
+episode (sensor.DESK).
 """
 
 import numpy as np
 
 from vap_core.simulation.sensor import DESK
-from vap_core.simulation.suites.layout import Area, place, radius_m, rivals, scatter, turned
+from vap_core.simulation.suites.layout import (
+    Area,
+    Spot,
+    draw_lookalikes,
+    place,
+    place_at_random_yaws,
+    radius_m,
+    scatter,
+)
 from vap_core.simulation.suites.suite import Suite, Task
 from vap_core.simulation.types import EpisodeRow, Placement
 
@@ -14,17 +23,23 @@ BOWL = "plastic-bowl-prop"
 
 
 def _select(category: str) -> Task:
-    return Task(f"select-{category}", category, f"select my {category}", 150, "selected")
+    return Task(
+        name=f"select-{category}",
+        category=category,
+        instruction=f"select my {category}",
+        max_steps=150,
+        rule="selected",
+    )
 
 
 def _put(category: str) -> Task:
     return Task(
-        f"put-{category.replace(' ', '-')}",
-        category,
-        f"put my {category} into the plastic bowl",
-        300,
-        "put",
-        BOWL,
+        name=f"put-{category.replace(' ', '-')}",
+        category=category,
+        instruction=f"put my {category} into the plastic bowl",
+        max_steps=300,
+        rule="put",
+        goal=BOWL,
     )
 
 
@@ -40,9 +55,12 @@ TABLETOP = Suite(
         *map(_put, ("plant", "stuffed toy", "pouch", "scrubber")),
     ),
 )
-TABLE = Area(0.15, 0.30, -0.19, 0.19)
-REACH = Area(0.165, 0.275, -0.145, 0.145)
-"""Where the SO-101 takes things from above: all three objects of a put stand here, so that their places tell nothing."""
+TABLE = Area(x0=0.15, x1=0.30, y0=-0.19, y1=0.19)
+REACH = Area(x0=0.165, x1=0.275, y0=-0.145, y1=0.145)
+"""Where the SO-101 grasps from above.
+
+All three objects of a put stand here, so that their places do not reveal the target.
+"""
 BOWLS = ((0.215, 0.16), (0.215, -0.16))
 """The bowl stands on one side or the other."""
 EPISODES = 20
@@ -50,22 +68,27 @@ EPISODES = 20
 
 def rows() -> tuple[EpisodeRow, ...]:
     """All 8 x 20 episodes."""
-    return tuple(
-        TABLETOP.row(task, i, _scene(task, i)) for task in TABLETOP.tasks for i in range(EPISODES)
-    )
+    episodes = []
+    for task in TABLETOP.tasks:
+        for i in range(EPISODES):
+            episodes.append(TABLETOP.row(task, i, _placements(task, i)))
+    return tuple(episodes)
 
 
-def _scene(task: Task, episode: int) -> tuple[Placement, ...]:
+def _placements(task: Task, episode: int) -> tuple[Placement, ...]:
     rng = np.random.default_rng([61, *task.name.encode(), episode])
-    names = [task.personal, *rivals(rng, task.stem)]
+    names = [task.personal, *draw_lookalikes(rng, task.stem)]
     bowl = BOWLS[int(rng.integers(2))]
-    fixed = [(bowl, radius_m(BOWL) / np.sqrt(2))] if task.goal else []
-    spots = scatter(
-        rng,
-        REACH if task.goal else TABLE,
-        [radius_m(name) for name in names],
-        fixed,
-        gap_m=0.03 if task.goal else 0.035,
-    )
-    placed = [place(name, spot, turned(rng)) for name, spot in zip(names, spots, strict=True)]
-    return (placed[0], *([place(BOWL, bowl, 0.0)] if task.goal else []), *placed[1:])
+    area = TABLE
+    gap_m = 0.035
+    fixed: list[tuple[Spot, float]] = []
+    goal = []
+    if task.goal:
+        area = REACH
+        gap_m = 0.03
+        fixed = [(bowl, radius_m(BOWL) / np.sqrt(2))]
+        goal = [place(BOWL, bowl, 0.0)]
+    radii = list(map(radius_m, names))
+    spots = scatter(rng, area, radii, fixed=fixed, gap_m=gap_m)
+    target, *lookalikes = place_at_random_yaws(rng, names, spots)
+    return (target, *goal, *lookalikes)

@@ -1,4 +1,4 @@
-"""How the room of an episode may differ from the usual one: SIMPLER's axes of visual matching and variant aggregation."""
+"""Variants of the room: SIMPLER's axes of visual matching and variant aggregation."""
 
 from vap_core.base.types import value
 from vap_core.simulation.scene_style import DEFAULT_STYLE, SceneStyle
@@ -13,7 +13,8 @@ class Variant:
     distractors: int = 0
 
 
-MARBLE, SLATE = ((0.86, 0.86, 0.84), (0.86, 0.86, 0.84)), ((0.33, 0.36, 0.40), (0.29, 0.32, 0.36))
+MARBLE = ((0.86, 0.86, 0.84), (0.86, 0.86, 0.84))
+SLATE = ((0.33, 0.36, 0.40), (0.29, 0.32, 0.36))
 VARIANTS: dict[str, Variant] = {
     "base": Variant("base"),
     "robot-dark": Variant("robot colour", SceneStyle(robot=(0.45, 0.47, 0.52))),

@@ -1,19 +1,28 @@
-"""Personalised VLABench, protocol-matched in MuJoCo (P 4): select the personal object by touching it, three cameras, joint control, 5 x 50."""
+"""Personalised VLABench, protocol-matched in MuJoCo (P 4): 5 tasks x 50 episodes.
+
+The personal object is selected by touching it; three cameras, joint control.
+"""
 
 import numpy as np
 
-from vap_core.simulation.suites.layout import Area, place, radius_m, rivals, scatter, turned
+from vap_core.simulation.suites.layout import (
+    Area,
+    draw_lookalikes,
+    place_at_random_yaws,
+    radius_m,
+    scatter,
+)
 from vap_core.simulation.suites.suite import Suite, Task
 from vap_core.simulation.types import EpisodeRow, Placement
 
 
 def _select(category: str, max_steps: int, slug: str = "") -> Task:
     return Task(
-        f"select-{category.replace(' ', '-')}",
-        category,
-        f"select my {category}",
-        max_steps,
-        "selected",
+        name=f"select-{category.replace(' ', '-')}",
+        category=category,
+        instruction=f"select my {category}",
+        max_steps=max_steps,
+        rule="selected",
         slug=slug,
     )
 
@@ -32,19 +41,22 @@ VLABENCH = Suite(
         _select("cup", 200, "paper-cup"),
     ),
 )
-TABLE = Area(0.38, 0.54, -0.17, 0.17)
+TABLE = Area(x0=0.38, x1=0.54, y0=-0.17, y1=0.17)
 EPISODES = 50
 
 
 def rows() -> tuple[EpisodeRow, ...]:
     """All 5 x 50 episodes."""
-    return tuple(
-        VLABENCH.row(task, i, _scene(task, i)) for task in VLABENCH.tasks for i in range(EPISODES)
-    )
+    episodes = []
+    for task in VLABENCH.tasks:
+        for i in range(EPISODES):
+            episodes.append(VLABENCH.row(task, i, _placements(task, i)))
+    return tuple(episodes)
 
 
-def _scene(task: Task, episode: int) -> tuple[Placement, ...]:
+def _placements(task: Task, episode: int) -> tuple[Placement, ...]:
     rng = np.random.default_rng([51, *task.name.encode(), episode])
-    names = [task.personal, *rivals(rng, task.stem)]
-    spots = scatter(rng, TABLE, [radius_m(name) for name in names], gap_m=0.05)
-    return tuple(place(name, spot, turned(rng)) for name, spot in zip(names, spots, strict=True))
+    names = [task.personal, *draw_lookalikes(rng, task.stem)]
+    radii = list(map(radius_m, names))
+    spots = scatter(rng, TABLE, radii, gap_m=0.05)
+    return tuple(place_at_random_yaws(rng, names, spots))

@@ -1,7 +1,9 @@
-"""Demonstrations of the scripted expert with generic objects: what a frozen policy has learned from before it meets a user (P 5.1).
+"""Demonstrations of the scripted expert with generic objects (P 5.1).
 
-A stage is one compiled scene of one task: some generic objects of its category, seen in `EPISODES` episodes from new places. Stages are numbered;
-the same suite, seed and number give the same films. Personal objects and their look-alikes never appear (`only_generic` refuses them).
+They are what a frozen policy has learned from before it meets a user. A stage is one compiled scene
+of one task: some generic objects of its category, seen in EPISODES episodes from new places. Stages
+are numbered; the same suite, seed and number give the same films. Personal objects and their
+look-alikes never appear (`only_generic` refuses them).
 """
 
 import io
@@ -23,44 +25,65 @@ from vap_core.simulation.assets import objects
 from vap_core.simulation.env import Env
 from vap_core.simulation.scenes import Scene
 from vap_core.simulation.suites import VARIANTS, Suite, Task, simpler, suite, tabletop, vlabench
-from vap_core.simulation.suites.layout import Area, Spot, place, radius_m, scatter, turned
+from vap_core.simulation.suites.layout import Area, Spot, place, radius_m, random_yaw, scatter
 from vap_core.simulation.suites.open_row import build_scene, make_env
 from vap_core.simulation.types import EpisodeRow, Placement
 from vap_core.training.films.scenes import HELD_OUT, TRAIN_INSTANCES, only_generic
 
-SIDE, SEEN = 112, 224
-"""Pixels of a film, and of the views that it is made of: a policy sees views of SEEN pixels scaled down to SIDE."""
+SIDE = 112
+"""Pixels of a film: a policy sees views of SEEN pixels scaled down to SIDE."""
+SEEN = 224
+"""Pixels of the views that a film is made of."""
 EPISODES = 8
 """Episodes of one stage."""
-JOLT, JOLT_M, JOLT_RAD = 0.15, 0.012, 0.2
-"""Share of steps in which the hand is knocked off its way, so that recovering is shown, too; and how far, metres (deviation)."""
+JOLT = 0.15
+"""Share of steps in which the hand is knocked off its way, so that films show how to recover."""
+JOLT_M = 0.012
+"""Standard deviation of how far the hand is knocked, metres."""
+JOLT_RAD = 0.2
+"""Standard deviation of how far the hand is turned by a knock, radians."""
 LOW_M = 0.05
 """A hand that begins so far below its highest point begins after a miss."""
 EVERY = {"tabletop": 3}
-"""Control steps from one picture to the next; elsewhere each has its own. At 30 Hz neighbours hardly differ, and pictures are what a film costs."""
+"""Control steps from one picture to the next; 1 in the other suites.
+
+At 30 Hz neighbours hardly differ, and pictures are what a film costs.
+"""
 MISSES = 0.5
-"""Share of the grasping films that begin where a first grasp has missed: a policy that has not seen that presses on for ever."""
+"""Share of the grasping films that begin where a first grasp has missed.
+
+A policy that has not seen that presses on for ever.
+"""
 AREAS = {
     "simpler-fractal": simpler.DESK,
     "simpler-bridge": Area(0.18, 0.35, -0.095, 0.095),
     "vlabench": vlabench.TABLE,
     "tabletop": tabletop.TABLE,
 }
-"""Where the objects of each suite stand in training; a put on the tabletop keeps to tabletop.REACH."""
-GAPS_M, TRIES = (0.05, 0.035, 0.02), 400
-"""Room between objects, tried in turn, so many times each."""
+"""Where the objects of each suite stand in training; a put on the tabletop uses tabletop.REACH."""
+GAPS_M = (0.05, 0.035, 0.02)
+"""Room between objects, tried in turn."""
+TRIES = 400
+"""How many times each gap is tried."""
 MOST = {"simpler-bridge": 4}
 """Objects of a stage where an area has no room for every number: one to a corner."""
 CORNER_M = 0.01
-"""What finds no room at random stands so far from an area's corners, in x and in y, give or take as much."""
+"""Distance from an area's corners, in x and in y, of what finds no room at random.
+
+It is jittered by up to as much.
+"""
+PARTS = ("images", "ids", "state", "action", "places", "names", "task", "goal")
+"""The fields of a Film, as files keep them."""
 
 
 @value
 class Film:
-    """One successful episode. Frame f is what the cameras saw before action f x `every(suite)`, and `ids` are 0 there for the scene, 1 for the
-    target, i + 1 for object i; state t and places t are those before action t.
+    """One successful episode.
 
-    `places` are the objects' x, y, z in the world, metres; `names[0]` is the target, `goal` the index of its goal or -1.
+    Frame f is what the cameras saw before action f x `every(suite)`, and `ids` are 0 there for the
+    scene, 1 for the target, i + 1 for object i; state t and places t are those before action t.
+    `places` are the objects' x, y, z in the world, metres; `names[0]` is the target, `goal` the
+    index of its goal or -1.
     """
 
     images: UInt8[np.ndarray, "f c s s 3"]
@@ -78,27 +101,33 @@ def every(suite_name: str) -> int:
     return EVERY.get(suite_name, 1)
 
 
-def cast(known: Suite, task: Task, rng: np.random.Generator, held_out: bool = False) -> list[str]:
-    """The target and its rivals, generic and of the task's category, then the task's goal if it has one. Half the rivals are look-alikes.
+def draw_objects(
+    known: Suite, task: Task, rng: np.random.Generator, held_out: bool = False
+) -> list[str]:
+    """The target and its rivals, then the task's goal if it has one.
 
-    Those `held_out` are in no film.
+    Target and rivals are generic and of the task's category; half the rivals are look-alikes. Those
+    `held_out` are in no film.
     """
-    pool = range(HELD_OUT, HELD_OUT + TRAIN_INSTANCES) if held_out else range(TRAIN_INSTANCES)
-    first, rivals = (
-        pool[int(rng.integers(len(pool)))],
-        int(rng.choice([1, 2, 3], p=[0.15, 0.7, 0.15])),
-    )
+    pool = range(TRAIN_INSTANCES)
+    if held_out:
+        pool = range(HELD_OUT, HELD_OUT + TRAIN_INSTANCES)
+    first = pool[int(rng.integers(len(pool)))]
+    rivals = int(rng.choice([1, 2, 3], p=[0.15, 0.7, 0.15]))
     rivals = min(rivals, MOST.get(known.name, 5) - 1 - bool(task.goal))
+    models = []
     if rng.random() < 0.5:
-        models = [
-            objects.generic_instance(task.stem, first, int(twin))
-            for twin in rng.permutation(6)[: rivals + 1]
-        ]
+        for twin in rng.permutation(6)[: rivals + 1]:
+            models.append(objects.generic_instance(task.stem, first, int(twin)))
     else:
-        others = rng.choice([i for i in pool if i != first], rivals, replace=False)
-        models = [objects.generic_instance(task.stem, int(i)) for i in (first, *others)]
+        others = [i for i in pool if i != first]
+        for i in (first, *rng.choice(others, rivals, replace=False)):
+            models.append(objects.generic_instance(task.stem, int(i)))
     only_generic(models)
-    return [model.name for model in models] + ([task.goal] if task.goal else [])
+    names = [model.name for model in models]
+    if task.goal:
+        names.append(task.goal)
+    return names
 
 
 def row(
@@ -109,79 +138,60 @@ def row(
     variant: str,
     rng: np.random.Generator,
 ) -> EpisodeRow:
-    """An episode of the task with these objects in new places; any of the category may be its target. Raises: ValueError when they do not fit."""
-    things = [names[i] for i in rng.permutation(len(names) - bool(task.goal))]
-    goal = [task.goal] if task.goal else []
-    fixed = (
-        {task.goal: tabletop.BOWLS[int(rng.integers(2))]}
-        if goal and known.name == "tabletop"
-        else {}
-    )
-    area = tabletop.REACH if fixed else AREAS[known.name]
-    loose = [name for name in things + goal if name not in fixed]
-    at = {**dict(zip(loose, _spots(rng, area, loose, fixed), strict=True)), **fixed}
-    placed = [
-        place(name, at[name], 0.0 if name == task.goal else turned(rng)) for name in things + goal
-    ]
-    order: tuple[Placement, ...] = (placed[0], *placed[len(things) :], *placed[1 : len(things)])
-    return replace(
-        known.row(task, number, order, seed=number, variant=variant), instruction=task.instruction
-    )
+    """An episode of the task with these objects in new places; any of the category is its target.
 
-
-def _spots(
-    rng: np.random.Generator, area: Area, loose: Sequence[str], fixed: Mapping[str, Spot]
-) -> list[Spot]:
-    """Anywhere in the area, clear of each other; where no such places are found, in its corners. Raises: ValueError."""
-    radii, kept = (
-        [radius_m(name) for name in loose],
-        [(spot, radius_m(name) / 2**0.5) for name, spot in fixed.items()],
-    )
-    for gap in GAPS_M:
-        try:
-            return scatter(rng, area, radii, kept, gap_m=gap, tries=TRIES)
-        except ValueError:
-            if gap == GAPS_M[-1] and (fixed or len(loose) > 4):
-                raise
-    corners = rng.permutation(
-        [
-            (x, y)
-            for x in (area.x0 + CORNER_M, area.x1 - CORNER_M)
-            for y in (area.y0 + CORNER_M, area.y1 - CORNER_M)
-        ]
-    )
-    return [
-        (float(x), float(y))
-        for x, y in corners[: len(loose)] + rng.uniform(-CORNER_M, CORNER_M, (len(loose), 2))
-    ]
+    Raises: ValueError when they do not fit.
+    """
+    n_things = len(names) - bool(task.goal)
+    things = [names[i] for i in rng.permutation(n_things)]
+    goals = [task.goal] if task.goal else []
+    fixed: dict[str, Spot] = {}
+    area = AREAS[known.name]
+    if task.goal and known.name == "tabletop":
+        fixed[task.goal] = tabletop.BOWLS[int(rng.integers(2))]
+        area = tabletop.REACH
+    loose = [name for name in things + goals if name not in fixed]
+    spots = dict(zip(loose, _spots(rng, area, loose, fixed), strict=True))
+    spots.update(fixed)
+    placed = []
+    for name in things + goals:
+        yaw = 0.0 if name == task.goal else random_yaw(rng)
+        placed.append(place(name, spots[name], yaw))
+    placements: tuple[Placement, ...] = (placed[0], *placed[n_things:], *placed[1:n_things])
+    drawn = known.row(task, number, placements, seed=number, variant=variant)
+    return replace(drawn, instruction=task.instruction)
 
 
 def films(suite_name: str, seed: int, number: int) -> list[Film]:
     """The successful episodes of one stage."""
-    known, rng = suite(suite_name), np.random.default_rng([71, seed, *suite_name.encode(), number])
-    slips = np.random.default_rng([72, seed, *suite_name.encode(), number])
+    known = suite(suite_name)
+    rng = np.random.default_rng([71, seed, *suite_name.encode(), number])
+    miss_rng = np.random.default_rng([72, seed, *suite_name.encode(), number])
     task = known.tasks[number % len(known.tasks)]
-    variant = str(rng.choice(list(VARIANTS))) if suite_name == "simpler-fractal" else "base"
-    names = cast(known, task, rng)
+    variant = "base"
+    if suite_name == "simpler-fractal":
+        variant = str(rng.choice(list(VARIANTS)))
+    names = draw_objects(known, task, rng)
     found = []
     with build_scene(suite_name, names, variant) as scene:
         for i in range(EPISODES):
             try:
-                start = row(known, task, names, number * EPISODES + i, variant, rng)
-                shot = shoot(
-                    known,
-                    scene,
-                    start,
-                    rng,
-                    slips if start.rule != "selected" and slips.random() < MISSES else None,
+                start = row(
+                    known=known,
+                    task=task,
+                    names=names,
+                    number=number * EPISODES + i,
+                    variant=variant,
+                    rng=rng,
                 )
-            except (
-                OutOfReach,
-                ValueError,
-            ):  # no grasp from here, or no room: another place will do
+                misses = start.rule != "selected" and miss_rng.random() < MISSES
+                slips = miss_rng if misses else None
+                film = shoot(known=known, scene=scene, start=start, rng=rng, slips=slips)
+            except (OutOfReach, ValueError):
+                # No grasp from here, or no room: another place will do.
                 continue
-            if shot is not None:
-                found.append(shot)
+            if film is not None:
+                found.append(film)
     return found
 
 
@@ -192,39 +202,48 @@ def shoot(
     rng: np.random.Generator,
     slips: np.random.Generator | None = None,
 ) -> Film | None:
-    """The expert's episode, filmed; None when it fails. With `slips`, the film begins where a first grasp has missed."""
-    env, expert = make_env(scene, known.name, image_size=SEEN), Expert()
+    """The expert's episode, filmed; None when it fails.
+
+    With `slips`, the film begins where a first grasp has missed.
+    """
+    env = make_env(scene, known.name, image_size=SEEN)
+    expert = Expert()
     env.reset(start)
     names = [placed.model for placed in start.placements]
     state = expert.start(rng) if slips is None else _missed(env, expert, slips)
-    pictures, steps = [], []
+
+    def knock(action: Float32[np.ndarray, " a"]) -> Float32[np.ndarray, " a"]:
+        return _knock(action, known, rng)
+
+    pictures = []
+    pictures_ids = []
+    states = []
+    actions = []
+    places = []
     for judge, action in expert_steps(
-        env, start, expert, state, lambda planned: _knocked(planned, known, rng)
+        env=env, row=start, expert=expert, state=state, disturb=knock
     ):
         if action is None:
             break
-        shown = judge.steps % every(known.name) == 0
-        truth = env.truth(masks=shown)
-        if shown:
-            seen = np.stack([small(rgb) for rgb in env.observe().images.values()])
-            pictures.append(
-                (seen, np.stack([_ids(truth.masks[camera], names) for camera in known.cameras]))
-            )
-        spots = np.array([truth.objects_world[name][:3] for name in names], np.float32)
-        steps.append((env.state(), action, spots))
+        has_picture = judge.steps % every(known.name) == 0
+        truth = env.truth(masks=has_picture)
+        if has_picture:
+            pictures.append(_stack_views(env.observe().images))
+            pictures_ids.append(_stack_ids(known, truth.masks, names))
+        states.append(env.state())
+        actions.append(action)
+        places.append(_stack_places(truth.objects_world, names))
     if not judge.outcome().success:
         return None
-    views, masks = (np.stack(part) for part in zip(*pictures, strict=True))
-    states, actions, places = (np.stack(part) for part in zip(*steps, strict=True))
     return Film(
-        views,
-        masks,
-        states,
-        actions,
-        places,
-        tuple(names),
-        start.task,
-        names.index(start.goal) if start.goal else -1,
+        images=np.stack(pictures),
+        ids=np.stack(pictures_ids),
+        state=np.stack(states),
+        action=np.stack(actions),
+        places=np.stack(places),
+        names=tuple(names),
+        task=start.task,
+        goal=names.index(start.goal) if start.goal else -1,
     )
 
 
@@ -234,9 +253,92 @@ def after_a_miss(film: Film) -> bool:
     return bool(height[0] + LOW_M < height.max())
 
 
+def small(rgb: Rgb) -> UInt8[np.ndarray, "s s 3"]:
+    """As policies.lerobot scales a view for its policy: bilinear, antialiased."""
+    image = Image.fromarray(rgb)
+    return np.asarray(image.resize((SIDE, SIDE), Image.Resampling.BILINEAR))
+
+
+def cached(folder: Path, suite_name: str, seed: int, number: int) -> list[Film]:
+    """The stage's films from `folder`, shot first if they are not there."""
+    path = folder / f"{suite_name}-{seed}-{number:05d}.npz"
+    if not path.exists():
+        _write_stage(path, films(suite_name, seed, number))
+    with np.load(path) as arrays:
+        found = []
+        for i in range(int(arrays["n"])):
+            found.append(_read_film(arrays, i))
+        return found
+
+
+def _spots(
+    rng: np.random.Generator, area: Area, loose: Sequence[str], fixed: Mapping[str, Spot]
+) -> list[Spot]:
+    """Anywhere in the area, clear of each other; where no such places are found, in its corners.
+
+    Raises: ValueError when there are no corners to spare.
+    """
+    radii = [radius_m(name) for name in loose]
+    kept = []
+    for name, spot in fixed.items():
+        kept.append((spot, radius_m(name) / 2**0.5))
+    for gap in GAPS_M:
+        try:
+            return scatter(rng=rng, area=area, reach_m=radii, fixed=kept, gap_m=gap, tries=TRIES)
+        except ValueError:
+            if gap == GAPS_M[-1] and (fixed or len(loose) > 4):
+                raise
+    return _corner_spots(rng, area, len(loose))
+
+
+def _corner_spots(rng: np.random.Generator, area: Area, n: int) -> list[Spot]:
+    """`n` of the area's corners, jittered."""
+    corners = []
+    for x in (area.x0 + CORNER_M, area.x1 - CORNER_M):
+        for y in (area.y0 + CORNER_M, area.y1 - CORNER_M):
+            corners.append((x, y))
+    chosen = rng.permutation(corners)[:n]
+    jittered = chosen + rng.uniform(-CORNER_M, CORNER_M, (n, 2))
+    spots = []
+    for x, y in jittered:
+        spots.append((float(x), float(y)))
+    return spots
+
+
+def _stack_views(images: Mapping[str, Rgb]) -> UInt8[np.ndarray, "c s s 3"]:
+    """The views of all cameras, scaled down."""
+    views = []
+    for rgb in images.values():
+        views.append(small(rgb))
+    return np.stack(views)
+
+
+def _stack_ids(
+    known: Suite, masks: Mapping[str, Mapping[str, Mask]], names: Sequence[str]
+) -> UInt8[np.ndarray, "c s s"]:
+    """The object of every pixel of every camera, scaled down."""
+    ids = []
+    for camera in known.cameras:
+        ids.append(_ids(masks[camera], names))
+    return np.stack(ids)
+
+
+def _stack_places(
+    poses: Mapping[str, np.ndarray], names: Sequence[str]
+) -> Float32[np.ndarray, "n 3"]:
+    """x, y and z of every object in the world, metres."""
+    places = []
+    for name in names:
+        places.append(poses[name][:3])
+    return np.array(places, np.float32)
+
+
 def _missed(env: Env, expert: Expert, rng: np.random.Generator) -> ExpertState:
-    """Go astray, unfilmed, as far as the moment of beginning again. What was held by luck is put back: that is no miss."""
-    state = expert.astray(env, rng)
+    """Miss once, unfilmed, as far as the moment of beginning again.
+
+    If the object is grasped by luck, that is no miss: the episode is reset.
+    """
+    state = expert.start_with_miss(env, rng)
     while True:
         (state,), (chunk,) = expert.plan_from_simulation([state], [env])
         if state.phase != "miss":
@@ -248,61 +350,50 @@ def _missed(env: Env, expert: Expert, rng: np.random.Generator) -> ExpertState:
     return expert.start(rng)
 
 
-def small(rgb: Rgb) -> UInt8[np.ndarray, "s s 3"]:
-    """As policies.lerobot scales a view for its policy: bilinear, antialiased."""
-    return np.asarray(Image.fromarray(rgb).resize((SIDE, SIDE), Image.Resampling.BILINEAR))
-
-
 def _ids(masks: Mapping[str, Mask], names: Sequence[str]) -> UInt8[np.ndarray, "s s"]:
-    out = np.zeros((SEEN, SEEN), np.uint8)
+    """The object of every pixel of one camera, scaled down."""
+    ids = np.zeros((SEEN, SEEN), np.uint8)
     for i, name in enumerate(names):
-        out[masks[name]] = i + 1
-    return cv2.resize(out, (SIDE, SIDE), interpolation=cv2.INTER_NEAREST)
+        ids[masks[name]] = i + 1
+    return cv2.resize(ids, (SIDE, SIDE), interpolation=cv2.INTER_NEAREST)
 
 
-def _knocked(
+def _knock(
     action: Float32[np.ndarray, " a"], known: Suite, rng: np.random.Generator
 ) -> Float32[np.ndarray, " a"]:
     """The action, now and then with a jolt that the expert did not ask for and corrects next."""
     if rng.random() > JOLT:
         return action
-    jolt, out = rng.normal(size=len(action) - 1), action.copy()
+    jolt = rng.normal(size=len(action) - 1)
+    knocked = action.copy()
     if known.control == "ee":
-        out[:3] += jolt[:3] * JOLT_M
-        out[5] += jolt[5] * JOLT_RAD
+        knocked[:3] += jolt[:3] * JOLT_M
+        knocked[5] += jolt[5] * JOLT_RAD
     else:
-        out[: len(jolt)] += jolt * 2 * JOLT_M
-    return out
+        knocked[: len(jolt)] += jolt * 2 * JOLT_M
+    return knocked
 
 
-PARTS = ("images", "ids", "state", "action", "places", "names", "task", "goal")
+def _write_stage(path: Path, made: Sequence[Film]) -> None:
+    """Keep the films of a stage in one file: arrays `<part><number>`, and their count `n`."""
+    arrays = {}
+    for i, film in enumerate(made):
+        for part in PARTS:
+            arrays[f"{part}{i}"] = getattr(film, part)
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, n=len(made), **arrays)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, buffer.getvalue())
 
 
-def cached(folder: Path, suite_name: str, seed: int, number: int) -> list[Film]:
-    """The stage's films from `folder`, shot first if they are not there."""
-    path = folder / f"{suite_name}-{seed}-{number:05d}.npz"
-    if not path.exists():
-        made, buffer = films(suite_name, seed, number), io.BytesIO()
-        np.savez_compressed(
-            buffer,
-            n=len(made),
-            **{f"{part}{i}": getattr(film, part) for i, film in enumerate(made) for part in PARTS},
-        )
-        folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, buffer.getvalue())
-    with np.load(path) as held:
-        return [_film({part: held[f"{part}{i}"] for part in PARTS}) for i in range(int(held["n"]))]
-
-
-def _film(parts: dict[str, np.ndarray]) -> Film:
-    names, task, goal = tuple(map(str, parts["names"])), str(parts["task"]), int(parts["goal"])
+def _read_film(arrays: Mapping[str, np.ndarray], i: int) -> Film:
     return Film(
-        parts["images"],
-        parts["ids"],
-        parts["state"],
-        parts["action"],
-        parts["places"],
-        names,
-        task,
-        goal,
+        images=arrays[f"images{i}"],
+        ids=arrays[f"ids{i}"],
+        state=arrays[f"state{i}"],
+        action=arrays[f"action{i}"],
+        places=arrays[f"places{i}"],
+        names=tuple(map(str, arrays[f"names{i}"])),
+        task=str(arrays[f"task{i}"]),
+        goal=int(arrays[f"goal{i}"]),
     )

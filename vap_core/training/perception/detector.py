@@ -1,4 +1,7 @@
-"""Training the detector's head: frozen features once per view, then CenterNet's focal loss and a box loss (GIoU) on them."""
+"""Training the detector's head on frozen features.
+
+Features are computed once per view. The losses are CenterNet's focal loss and a box loss (GIoU).
+"""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -18,78 +21,83 @@ from vap_core.perception.embedded.detector import SIDE, STRIDE, TAPS, DetectHead
 from vap_core.perception.text_encoder import embed_text
 from vap_core.simulation.assets.phrases import AMBIGUOUS, NEGATIVES, training_phrases
 from vap_core.training.films.scenes import POSES, Shots, boxes_of
-from vap_core.training.perception.fitting import Run, fit, halved
+from vap_core.training.perception.fitting import Run, fit, half_precision
 
 BATCH = 16
 Objects = list[tuple[str, np.ndarray]]
 """Category and box, `x0 y0 x1 y1` in cells, of every object in a view."""
 
 
-def disturb(rng: np.random.Generator, rgb: Rgb) -> Rgb:
-    """Exposure, tint, blur and sensor noise, so that no renderer's look is learned."""
-    x: np.ndarray = rgb.astype(np.float32)
-    x = (x - 127) * rng.uniform(0.75, 1.25) + 127 + rng.uniform(-25, 25) + rng.normal(0, 6, 3)
+def augment(rng: np.random.Generator, rgb: Rgb) -> Rgb:
+    """Other exposure, tint, blur and sensor noise, so that no renderer's style is learned."""
+    pixels: np.ndarray = rgb.astype(np.float32)
+    contrast = rng.uniform(0.75, 1.25)
+    brightness = rng.uniform(-25, 25)
+    pixels = (pixels - 127) * contrast + 127 + brightness + rng.normal(0, 6, 3)
     if rng.random() < 0.3:
-        x = cv2.GaussianBlur(x, (0, 0), float(rng.uniform(0.3, 1.0)))
+        sigma = float(rng.uniform(0.3, 1.0))
+        pixels = cv2.GaussianBlur(pixels, (0, 0), sigma)
     if rng.random() < 0.5:
-        x = x + rng.normal(0, rng.uniform(1, 7), x.shape)
-    return np.clip(x, 0, 255).astype(np.uint8)
+        deviation = rng.uniform(1, 7)
+        pixels = pixels + rng.normal(0, deviation, pixels.shape)
+    return np.clip(pixels, 0, 255).astype(np.uint8)
 
 
 def featurise(
     folder: Path, name: str, shots: Shots, rng: np.random.Generator
 ) -> tuple[UInt16[np.ndarray, "v f"], list[Objects]]:
-    """Half-precision features (their bits) and objects of one stage's views, and of one portrait of each of its crew.
+    """Half-precision features (their bits) and objects of one stage's pictures.
 
-    Pictures are disturbed and half of them mirrored. Features are kept in `folder` under `name` and read from there as they are needed.
+    They are the stage's views, and one portrait of each member of its crew. Pictures are augmented
+    and half of them mirrored. Features are kept in `folder` under `name` and read from there as
+    they are needed.
     """
-    pictures = [
-        *zip(shots.rgb, shots.ids, strict=True),
-        *zip(shots.portraits[::POSES], shots.portrait_ids[::POSES], strict=True),
-    ]
-    rgb, ids = [], []
-    for view, index in pictures:
-        mirrored = rng.random() < 0.5
-        rgb.append(disturb(rng, view[:, ::-1] if mirrored else view))
-        ids.append(index[:, ::-1] if mirrored else index)
+    views = zip(shots.rgb, shots.ids, strict=True)
+    portraits = zip(shots.portraits[::POSES], shots.portrait_ids[::POSES], strict=True)
+    pictures: list[Rgb] = []
+    seen: list[Objects] = []
+    for rgb, ids in (*views, *portraits):
+        if rng.random() < 0.5:
+            rgb = rgb[:, ::-1]
+            ids = ids[:, ::-1]
+        pictures.append(augment(rng, rgb))
+        seen.append(objects_of(ids, shots))
     path = folder / f"{name}.detector.npy"
     if not path.exists():
-        found = [features([resize_for_search(view)[0]], TAPS) for view in rgb]
-        keep(
-            path,
-            np.stack(
-                [
-                    np.concatenate([each[tap].numpy().astype(np.float16).ravel() for tap in TAPS])
-                    for each in found
-                ]
-            ).view(np.uint16),
-        )
-    return np.load(path, mmap_mode="r"), [objects_of(view, shots) for view in ids]
+        rows = []
+        for picture in pictures:
+            rows.append(_flatten_features(picture))
+        save_array(path, np.stack(rows).view(np.uint16))
+    return np.load(path, mmap_mode="r"), seen
 
 
-def keep(path: Path, rows: np.ndarray) -> None:
+def save_array(path: Path, array: np.ndarray) -> None:
     """Write an array so that an interrupted run never leaves half of it."""
     part = path.with_suffix(".part.npy")
-    np.save(part, rows)
+    np.save(part, array)
     os.replace(part, path)
 
 
-def taps_of(rows: Sequence[UInt16[np.ndarray, " f"]]) -> dict[str, Float[Tensor, "n c h w"]]:
-    """The feature maps in rows of `featurise`."""
-    flat, start, maps = torch.from_numpy(np.stack(rows).view(np.float16)).float(), 0, {}
+def stack_taps(rows: Sequence[UInt16[np.ndarray, " f"]]) -> dict[str, Float[Tensor, "n c h w"]]:
+    """The feature maps in rows of `featurise`, by tap."""
+    flat = torch.from_numpy(np.stack(rows).view(np.float16)).float()
+    start = 0
+    maps = {}
     for tap in TAPS:
-        shape = (CHANNELS[tap], SIDE // STRIDES[tap], SIDE // STRIDES[tap])
-        maps[tap] = flat[:, start : start + int(np.prod(shape))].unflatten(1, shape)
-        start += int(np.prod(shape))
+        side = SIDE // STRIDES[tap]
+        size = CHANNELS[tap] * side * side
+        maps[tap] = flat[:, start : start + size].unflatten(1, (CHANNELS[tap], side, side))
+        start += size
     return maps
 
 
 def objects_of(ids: UInt8[np.ndarray, "h w"], shots: Shots) -> Objects:
+    """The objects of a picture, with their boxes in cells."""
     cells = SIDE / max(ids.shape) / STRIDE
-    return [
-        (shots.categories[i], np.array(box, np.float32) * cells)
-        for i, box in boxes_of(ids, len(shots.names))
-    ]
+    objects = []
+    for i, box in boxes_of(ids, len(shots.names)):
+        objects.append((shots.categories[i], np.array(box, np.float32) * cells))
+    return objects
 
 
 def targets(
@@ -100,37 +108,40 @@ def targets(
     Float[Tensor, "n h w"],
     Float[Tensor, "n 4 h w"],
 ]:
-    """Heat (1 at centres, Gaussian around), its weight (0 where ambiguous), how much a cell must know its box, and that box."""
-    n, p = len(views), len(asked)
-    heat, weight = np.zeros((n, p, grid, grid), np.float32), np.ones((n, p, grid, grid), np.float32)
-    owns, box = np.zeros((n, grid, grid), np.float32), np.zeros((n, 4, grid, grid), np.float32)
+    """Heat, its weight, how much each cell must know its box, and that box.
+
+    Heat is 1 at the centres of what is asked for and Gaussian around them; its weight is 0 where
+    it is ambiguous. `asked` is a category, or None for a phrase that names nothing.
+    """
+    n = len(views)
+    heat = np.zeros((n, len(asked), grid, grid), np.float32)
+    weight = np.ones((n, len(asked), grid, grid), np.float32)
+    owns = np.zeros((n, grid, grid), np.float32)
+    boxes = np.zeros((n, 4, grid, grid), np.float32)
     rows, cols = np.mgrid[0:grid, 0:grid] + 0.5
     for v, seen in enumerate(views):
-        for category, (x0, y0, x1, y1) in seen:
-            cx, cy = (
-                int(min((x0 + x1) / 2, grid - 0.01)) + 0.5,
-                int(min((y0 + y1) / 2, grid - 0.01)) + 0.5,
-            )
-            sx, sy = max((x1 - x0) / 6, 0.5), max((y1 - y0) / 6, 0.5)
-            bump = np.exp(-((cols - cx) ** 2 / (2 * sx**2) + (rows - cy) ** 2 / (2 * sy**2)))
-            mine = (bump > 0.3) & (bump > owns[v])
-            owns[v][mine] = bump[mine]
-            box[v][:, mine] = np.array([x0, y0, x1, y1], np.float32)[:, None]
+        for category, box in seen:
+            x0, y0, x1, y1 = box
+            gaussian = _draw_gaussian(rows, cols, box)
+            own = (gaussian > 0.3) & (gaussian > owns[v])
+            owns[v][own] = gaussian[own]
+            boxes[v][:, own] = np.array([x0, y0, x1, y1], np.float32)[:, None]
+            inside = (cols > x0) & (cols < x1) & (rows > y0) & (rows < y1)
             for q, wanted in enumerate(asked):
                 if wanted == category:
-                    heat[v, q] = np.maximum(heat[v, q], bump)
+                    heat[v, q] = np.maximum(heat[v, q], gaussian)
                 elif wanted is not None and category in AMBIGUOUS.get(wanted, ()):
-                    weight[v, q][(cols > x0) & (cols < x1) & (rows > y0) & (rows < y1)] = 0
-    heat_t = torch.from_numpy(heat)
+                    weight[v, q][inside] = 0
+    weight = np.maximum(weight, heat == 1)
     return (
-        heat_t,
-        torch.from_numpy(np.maximum(weight, heat == 1)),
+        torch.from_numpy(heat),
+        torch.from_numpy(weight),
         torch.from_numpy(owns),
-        torch.from_numpy(box),
+        torch.from_numpy(boxes),
     )
 
 
-def focal(
+def focal_loss(
     logits: Float[Tensor, "n p h w"],
     heat: Float[Tensor, "n p h w"],
     weight: Float[Tensor, "n p h w"],
@@ -138,37 +149,53 @@ def focal(
     """CenterNet's penalty-reduced focal loss, per object."""
     chance = logits.sigmoid()
     hit = (heat == 1).float()
-    loss = hit * (1 - chance) ** 2 * F.logsigmoid(logits) + (1 - hit) * (
-        1 - heat
-    ) ** 4 * chance**2 * F.logsigmoid(-logits)
+    at_centres = hit * (1 - chance) ** 2 * F.logsigmoid(logits)
+    elsewhere = (1 - hit) * (1 - heat) ** 4 * chance**2 * F.logsigmoid(-logits)
+    loss = at_centres + elsewhere
     return -(loss * weight).sum() / hit.sum().clamp(min=1)
 
 
 def giou_loss(
     edges: Float[Tensor, "n 4 h w"], owns: Float[Tensor, "n h w"], box: Float[Tensor, "n 4 h w"]
 ) -> Tensor:
-    """1 - generalised IoU between the box a cell predicts and the box it belongs to, weighted by nearness to its centre."""
-    at = owns > 0
-    v, r, c = torch.nonzero(at, as_tuple=True)
+    """1 - generalised IoU between the box a cell predicts and the box it belongs to.
+
+    Cells are weighted by their nearness to the centre of that box.
+    """
+    owned = owns > 0
+    v, r, c = torch.nonzero(owned, as_tuple=True)
     centre = torch.stack([c, r], 1) + 0.5
-    reach, want = edges[v, :, r, c], box[v, :, r, c]
-    near, far = centre - reach[:, :2], centre + reach[:, 2:]
-    both = (torch.minimum(far, want[:, 2:]) - torch.maximum(near, want[:, :2])).clamp(min=0).prod(1)
-    hull = (torch.maximum(far, want[:, 2:]) - torch.minimum(near, want[:, :2])).prod(1)
-    union = (far - near).prod(1) + (want[:, 2:] - want[:, :2]).prod(1) - both
-    giou = both / union - (hull - union) / hull
-    return ((1 - giou) * owns[at]).sum() / owns[at].sum().clamp(min=1)
+    reach = edges[v, :, r, c]
+    wanted = box[v, :, r, c]
+    low = centre - reach[:, :2]
+    high = centre + reach[:, 2:]
+    wanted_low = wanted[:, :2]
+    wanted_high = wanted[:, 2:]
+    shared_sides = torch.minimum(high, wanted_high) - torch.maximum(low, wanted_low)
+    shared = shared_sides.clamp(min=0).prod(1)
+    hull = (torch.maximum(high, wanted_high) - torch.minimum(low, wanted_low)).prod(1)
+    union = (high - low).prod(1) + (wanted_high - wanted_low).prod(1) - shared
+    giou = shared / union - (hull - union) / hull
+    weight = owns[owned]
+    return ((1 - giou) * weight).sum() / weight.sum().clamp(min=1)
 
 
-def ask(
+def sample_phrases(
     rng: np.random.Generator, categories: Sequence[str], negatives: int = 16
 ) -> tuple[list[str | None], Float32[np.ndarray, "p 384"]]:
-    """One phrase per category and some that name nothing, with a little noise on their embeddings."""
-    asked: list[str | None] = list(categories) + [None] * negatives
-    words = [str(rng.choice(training_phrases(category))) for category in categories] + [
-        str(word) for word in rng.choice(NEGATIVES, negatives, replace=False)
-    ]
-    rows = embed_text(words) + rng.normal(0, 0.01, (len(words), 384)).astype(np.float32)
+    """One phrase per category and some that name nothing: what each names, and its embedding.
+
+    The embeddings carry a little noise.
+    """
+    asked: list[str | None] = [*categories]
+    asked += [None] * negatives
+    phrases = []
+    for category in categories:
+        phrases.append(str(rng.choice(training_phrases(category))))
+    for phrase in rng.choice(NEGATIVES, negatives, replace=False):
+        phrases.append(str(phrase))
+    noise = rng.normal(0, 0.01, (len(phrases), 384)).astype(np.float32)
+    rows = embed_text(phrases) + noise
     return asked, rows / np.linalg.norm(rows, axis=1, keepdims=True)
 
 
@@ -176,26 +203,55 @@ def fit_detector(
     views: Sequence[tuple[UInt16[np.ndarray, " f"], Objects]], categories: Sequence[str], run: Run
 ) -> DetectHead:
     """Train the head on `views`: features, as `featurise` keeps them, and objects."""
-    names = [
-        *(phrase for category in categories for phrase in training_phrases(category)),
-        *NEGATIVES,
-    ]
-    torch.manual_seed(
-        run.seed
-    )  # initial weights only; every other draw comes from the epoch's stream
-    head = DetectHead(len(names))
-    head.known.copy_(torch.from_numpy(embed_text(names)))
+    phrases: list[str] = []
+    for category in categories:
+        phrases += training_phrases(category)
+    phrases += NEGATIVES
+    # Initial weights only; every other draw comes from the epoch's stream.
+    torch.manual_seed(run.seed)
+    head = DetectHead(len(phrases))
+    head.known.copy_(torch.from_numpy(embed_text(phrases)))
 
     def losses(rng: np.random.Generator) -> Iterator[Tensor]:
         order = rng.permutation(len(views))
-        for batch in range(0, len(views), BATCH):
-            chosen = [views[i] for i in order[batch : batch + BATCH]]
-            asked, rows = ask(rng, categories)
-            with halved():
-                found = head(taps_of([features for features, _ in chosen]), torch.from_numpy(rows))
-            logits, edges = (part.float() for part in found)
-            heat, weight, owns, box = targets([seen for _, seen in chosen], asked, logits.shape[-1])
-            yield focal(logits, heat, weight) + 2 * giou_loss(edges, owns, box)
+        for first in range(0, len(views), BATCH):
+            maps: list[np.ndarray] = []
+            seen: list[Objects] = []
+            for i in order[first : first + BATCH]:
+                view_features, view_objects = views[i]
+                maps.append(view_features)
+                seen.append(view_objects)
+            asked, rows = sample_phrases(rng, categories)
+            with half_precision():
+                logits, edges = head(stack_taps(maps), torch.from_numpy(rows))
+            logits = logits.float()
+            edges = edges.float()
+            heat, weight, owns, box = targets(seen, asked, logits.shape[-1])
+            yield focal_loss(logits, heat, weight) + 2 * giou_loss(edges, owns, box)
 
-    fit(head, losses, -(-len(views) // BATCH), run)
+    batches = -(-len(views) // BATCH)
+    fit(head, losses, batches, run)
     return head
+
+
+def _flatten_features(picture: Rgb) -> np.ndarray:
+    """The features of a picture in one row, in half precision."""
+    resized, _ = resize_for_search(picture)
+    maps = features([resized], TAPS)
+    parts = []
+    for tap in TAPS:
+        parts.append(maps[tap].numpy().astype(np.float16).ravel())
+    return np.concatenate(parts)
+
+
+def _draw_gaussian(rows: np.ndarray, cols: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """1 at the cell of a box's centre, falling with the box's size; `rows`, `cols` are cells."""
+    x0, y0, x1, y1 = box
+    grid = len(rows)
+    centre_x = int(min((x0 + x1) / 2, grid - 0.01)) + 0.5
+    centre_y = int(min((y0 + y1) / 2, grid - 0.01)) + 0.5
+    sigma_x = max((x1 - x0) / 6, 0.5)
+    sigma_y = max((y1 - y0) / 6, 0.5)
+    across = (cols - centre_x) ** 2 / (2 * sigma_x**2)
+    down = (rows - centre_y) ** 2 / (2 * sigma_y**2)
+    return np.exp(-(across + down))

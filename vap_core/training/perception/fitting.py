@@ -1,4 +1,7 @@
-"""One loop for every head: epochs that can be interrupted, a warm-up and a cosine of the rate, the loss on a bar."""
+"""The training loop of every head.
+
+Epochs can be interrupted; the rate warms up and falls with a cosine; a bar shows the loss.
+"""
 
 import os
 from collections.abc import Callable, Iterator
@@ -14,7 +17,11 @@ from tqdm import tqdm
 
 @dataclass(frozen=True)
 class Run:
-    """How long and how fast. `state` is what an earlier run saved, or nothing; `save` keeps each epoch; training stops early once `expired`."""
+    """How long and how fast.
+
+    `state` is what an earlier run saved, or nothing; `save` keeps each epoch; training stops early
+    once `expired`.
+    """
 
     name: str
     seed: int
@@ -26,8 +33,11 @@ class Run:
     expired: Callable[[], bool]
 
 
-def halved() -> torch.autocast:
-    """A context in which heads compute in bfloat16 where that is safe: three times as fast on processors that have it in hardware."""
+def half_precision() -> torch.autocast:
+    """A context in which heads compute in bfloat16 where that is safe.
+
+    Three times as fast on processors that have it in hardware.
+    """
     return torch.autocast("cpu", dtype=torch.bfloat16)
 
 
@@ -37,7 +47,11 @@ def fit(
     per_epoch: int,
     run: Run,
 ) -> None:
-    """Train `head` in place; `losses` yields the loss of each of an epoch's `per_epoch` batches, drawn from the stream it is given."""
+    """Train `head` in place.
+
+    `losses` yields the loss of each of an epoch's `per_epoch` batches, drawn from the stream it is
+    given.
+    """
     optimiser = torch.optim.AdamW(head.parameters(), run.rate, weight_decay=run.decay)
     if run.state:
         head.load_state_dict(run.state["head"])
@@ -45,19 +59,14 @@ def fit(
     for epoch in range(run.state.get("epoch", 0), run.epochs):
         if run.expired():
             return
-        rng, total, batch = np.random.default_rng([run.seed, *run.name.encode(), epoch]), 0.0, 0
-        bar = tqdm(
-            losses(rng),
-            total=per_epoch,
-            desc=f"{run.name} {epoch + 1}/{run.epochs}",
-            mininterval=10,
-        )
+        rng = np.random.default_rng([run.seed, *run.name.encode(), epoch])
+        total = 0.0
+        batch = 0
+        title = f"{run.name} {epoch + 1}/{run.epochs}"
+        bar = tqdm(losses(rng), total=per_epoch, desc=title, mininterval=10)
         for batch, loss in enumerate(bar, start=1):
             done = (epoch * per_epoch + batch) / (run.epochs * per_epoch)
-            for group in optimiser.param_groups:
-                group["lr"] = float(
-                    run.rate * min(1.0, done * 50 + 0.05) * 0.5 * (1 + np.cos(np.pi * done))
-                )
+            _set_rate(optimiser, run.rate, done)
             optimiser.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(head.parameters(), 5.0)
@@ -75,11 +84,25 @@ def fit(
 
 
 def checkpoint(path: Path, resume: bool) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
-    """What an interrupted run left at `path`, or nothing; and a function that replaces it atomically."""
+    """What an interrupted run left at `path`, and a function that replaces it atomically.
+
+    The first is empty where there is nothing, or without `resume`.
+    """
 
     def save(state: dict[str, Any]) -> None:
         part = path.with_suffix(".part")
         torch.save(state, part)
         os.replace(part, path)
 
-    return torch.load(path, weights_only=True) if resume and path.exists() else {}, save
+    state: dict[str, Any] = {}
+    if resume and path.exists():
+        state = torch.load(path, weights_only=True)
+    return state, save
+
+
+def _set_rate(optimiser: torch.optim.Optimizer, rate: float, done: float) -> None:
+    """The rate when a share `done` of the training is over: a warm-up, then a cosine."""
+    warm_up = min(1.0, done * 50 + 0.05)
+    cosine = 1 + np.cos(np.pi * done)
+    for group in optimiser.param_groups:
+        group["lr"] = float(rate * warm_up * 0.5 * cosine)

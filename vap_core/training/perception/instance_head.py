@@ -1,4 +1,7 @@
-"""Training the encoder's look head: reference photos of an object must find it among its look-alikes, as in the vote (P 3.3)."""
+"""Training the encoder's instance head, which distinguishes look-alikes.
+
+As in the vote (P 3.3), reference photos of an object must find it among its look-alikes.
+"""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -24,25 +27,34 @@ from vap_core.perception.embedded.encoder import (
     pad_to_square,
 )
 from vap_core.training.films.scenes import POSES, Shots, boxes_of
-from vap_core.training.perception.detector import disturb, keep
-from vap_core.training.perception.fitting import Run, fit, halved
+from vap_core.training.perception.detector import augment, save_array
+from vap_core.training.perception.fitting import Run, fit, half_precision
 from vap_core.training.perception.segmenter import jitter
 
-STAGES_PER_BATCH, TEMPERATURE = 16, 0.07
-MIXED, DROPPED = 0.5, 0.1
-"""Share of crops whose features take on another's style (MixStyle, Zhou et al. 2021), and of channels left out: no renderer's look is learned."""
-MOST, FEWEST_PX = 5, 60
-"""Crops of one object that one stage gives, from its views, and the visible pixels of each."""
+STAGES_PER_BATCH = 16
+TEMPERATURE = 0.07
+MIXED = 0.5
+"""Share of crops whose features take on another's style (MixStyle, Zhou et al. 2021)."""
+DROPPED = 0.1
+"""Share of channels left out; with MIXED, it keeps the head from learning a renderer's style."""
+MOST_OF_CREW = 5
+"""Crops of one member of the crew that a stage gives, from its views."""
+MOST_OF_OTHERS = 2
+"""Crops of any other object."""
+LEAST_PX = 60
+"""Visible pixels of an object that is cropped from a view."""
 GRIDS = {"b4": 14, "b10": 14, "b14": 7}
-COLOURS = HISTOGRAM_LENGTH
-MAPS = sum(CHANNELS[tap] * GRIDS[tap] ** 2 for tap in INSTANCE_TAPS)
+"""Sides of the feature maps."""
+MAPS_LENGTH = sum(CHANNELS[tap] * GRIDS[tap] ** 2 for tap in INSTANCE_TAPS)
 
 
 @value
-class Looks:
-    """Crops of one stage: `rows` are features (the look head's maps, colours, GeM; half precision), `pixels` what the head sees of each.
+class StageCrops:
+    """Crops of one stage.
 
-    `who` is the object, `portrait` whether the crop is from a reference photo. Arrays may lie on disk.
+    `rows` are features in half precision (the instance head's maps, colours, GeM); `pixels` are
+    what the head sees of each crop; `who` is the object, and `portrait` whether the crop is from a
+    reference photo. Arrays may lie on disk.
     """
 
     rows: Float[np.ndarray, "n f"]
@@ -52,168 +64,213 @@ class Looks:
 
 
 def crops(shots: Shots, rng: np.random.Generator) -> tuple[list[Rgb], list[int], list[int]]:
-    """Crops of the crew's portraits and of every object in the views, from boxes that are a little off; who, and whether it is a portrait."""
-    found: list[tuple[Rgb, int, int]] = []
+    """Crops of the crew's portraits and of objects in the views, from boxes a little off.
+
+    Also of whom each is, and whether it is of a portrait (1 or 0).
+    """
+    pictures: list[Rgb] = []
+    who: list[int] = []
+    portrait: list[int] = []
+    n_objects = len(shots.names)
     for rgb, ids in zip(shots.portraits, shots.portrait_ids, strict=True):
-        found += [(_cut(rgb, box, rng), i, 1) for i, box in boxes_of(ids, len(shots.names))]
-    seen = [
-        (v, i, box)
-        for v, ids in enumerate(shots.ids)
-        for i, box in boxes_of(ids, len(shots.names), FEWEST_PX)
-    ]
-    taken = dict.fromkeys(range(len(shots.names)), 0)
+        for i, box in boxes_of(ids, n_objects):
+            pictures.append(_cut(rgb, box, rng))
+            who.append(i)
+            portrait.append(1)
+    seen = []
+    for v, ids in enumerate(shots.ids):
+        for i, box in boxes_of(ids, n_objects, LEAST_PX):
+            seen.append((v, i, box))
+    taken = [0] * n_objects
     crew = len(shots.portraits) // POSES
     for n in rng.permutation(len(seen)):
         v, i, box = seen[n]
-        if taken[i] < (MOST if i < crew else 2):
+        most = MOST_OF_CREW if i < crew else MOST_OF_OTHERS
+        if taken[i] < most:
             taken[i] += 1
-            found.append((_cut(shots.rgb[v], box, rng), i, 0))
-    pictures, who, portrait = zip(*found, strict=True)
-    return list(pictures), list(who), list(portrait)
+            pictures.append(_cut(shots.rgb[v], box, rng))
+            who.append(i)
+            portrait.append(0)
+    return pictures, who, portrait
 
 
-def featurise(folder: Path, name: str, shots: Shots, rng: np.random.Generator) -> Looks:
+def featurise(folder: Path, name: str, shots: Shots, rng: np.random.Generator) -> StageCrops:
     """The crops of a stage with their frozen features, kept in `folder` under `name`."""
     pictures, who, portrait = crops(shots, rng)
-    path, seen = folder / f"{name}.looks.npy", folder / f"{name}.pixels.npy"
-    if not path.exists() or not seen.exists():
-        squares = [pad_to_square(rgb) for rgb in pictures]
-        keep(
-            seen,
-            np.stack(
-                [
-                    cv2.resize(
-                        picture, (INSTANCE_SIDE, INSTANCE_SIDE), interpolation=cv2.INTER_AREA
-                    )
-                    for picture in squares
-                ]
-            ),
-        )
-        keep(
-            path,
-            np.stack(
-                [_row(picture, whole) for picture, whole in zip(pictures, squares, strict=True)]
-            ),
-        )
-    return Looks(
-        np.load(path, mmap_mode="r"),
-        np.load(seen, mmap_mode="r"),
-        np.array(who, np.int64),
-        np.array(portrait, np.int64),
+    rows_path = folder / f"{name}.looks.npy"
+    pixels_path = folder / f"{name}.pixels.npy"
+    if not rows_path.exists() or not pixels_path.exists():
+        size = (INSTANCE_SIDE, INSTANCE_SIDE)
+        pixels = []
+        rows = []
+        for picture in pictures:
+            square = pad_to_square(picture)
+            pixels.append(cv2.resize(square, size, interpolation=cv2.INTER_AREA))
+            rows.append(_row(picture, square))
+        save_array(pixels_path, np.stack(pixels))
+        save_array(rows_path, np.stack(rows))
+    return StageCrops(
+        rows=np.load(rows_path, mmap_mode="r"),
+        pixels=np.load(pixels_path, mmap_mode="r"),
+        who=np.array(who, np.int64),
+        portrait=np.array(portrait, np.int64),
     )
 
 
-def _row(rgb: Rgb, whole: Rgb) -> np.ndarray:
-    taps = features([whole], [*INSTANCE_TAPS, "head"])
-    colour = lab_histogram(rgb)
-    parts = [
-        *(maps[0].numpy().ravel() for maps in halve_b4(taps).values()),
-        colour / np.linalg.norm(colour),
-        gem(taps["head"][0].numpy()),
-    ]
-    return np.concatenate(parts).astype(np.float16)
-
-
-def look(
+def embed_crops(
     head: InstanceHead, rows: np.ndarray, pixels: np.ndarray, rng: np.random.Generator | None = None
 ) -> Float[Tensor, "n d"]:
-    """The head's answer to crops as `featurise` keeps them; with `rng`, restyled as in training."""
-    flat, start, maps = torch.from_numpy(np.asarray(rows[:, : MAPS + COLOURS])).float(), 0, {}
+    """The head's rows for crops as `featurise` keeps them; with `rng`, restyled as in training."""
+    flat = torch.from_numpy(np.asarray(rows[:, : MAPS_LENGTH + HISTOGRAM_LENGTH])).float()
+    start = 0
+    maps = {}
     for tap in INSTANCE_TAPS:
-        shape = (CHANNELS[tap], GRIDS[tap], GRIDS[tap])
-        seen = flat[:, start : start + int(np.prod(shape))].unflatten(1, shape)
-        maps[tap] = seen if rng is None else _restyled(rng, seen)
-        start += int(np.prod(shape))
-    return head(maps, normalise(torch.from_numpy(np.asarray(pixels))), flat[:, start:])
+        side = GRIDS[tap]
+        size = CHANNELS[tap] * side * side
+        tap_maps = flat[:, start : start + size].unflatten(1, (CHANNELS[tap], side, side))
+        if rng is not None:
+            tap_maps = _restyle(rng, tap_maps)
+        maps[tap] = tap_maps
+        start += size
+    images = normalise(torch.from_numpy(np.asarray(pixels)))
+    return head(maps, images, flat[:, start:])
 
 
-def contrast(cosine: Float[Tensor, "a k"], same: Bool[Tensor, "a k"]) -> Tensor:
-    """Mean over every pair that is the same of -log exp(c/t) / (exp(c/t) + the sum of exp over the anchor's others)."""
+def contrastive_loss(cosine: Float[Tensor, "a k"], same: Bool[Tensor, "a k"]) -> Tensor:
+    """The mean of -log exp(c/t) / (exp(c/t) + others) over every pair that is the same.
+
+    `others` is the sum of exp(c/t) over those that are not the same as the pair's anchor.
+    """
     logits = cosine / TEMPERATURE
     others = logits.masked_fill(same, -torch.inf).logsumexp(1, keepdim=True)
-    return ((torch.logaddexp(logits, others) - logits) * same).sum() / same.sum().clamp(min=1)
+    losses = torch.logaddexp(logits, others) - logits
+    return (losses * same).sum() / same.sum().clamp(min=1)
 
 
-def fit_looks(stages: Sequence[Looks], run: Run) -> InstanceHead:
-    """Train the head: portraits find the views' crops of their object, and the crops their portraits."""
-    torch.manual_seed(
-        run.seed
-    )  # initial weights only; every other draw comes from the epoch's stream
+def fit_instance_head(stages: Sequence[StageCrops], run: Run) -> InstanceHead:
+    """Train the head: portraits find crops of their object in views, and these find portraits."""
+    # Initial weights only; every other draw comes from the epoch's stream.
+    torch.manual_seed(run.seed)
     head = InstanceHead()
 
     def losses(rng: np.random.Generator) -> Iterator[Tensor]:
         order = rng.permutation(len(stages))
-        for batch in range(0, len(order), STAGES_PER_BATCH):
-            picked = [(s, *_pick(rng, stages[s])) for s in order[batch : batch + STAGES_PER_BATCH]]
-            where = [(s, np.concatenate([portraits, views])) for s, portraits, views in picked]
-            frozen = np.concatenate([stages[s].rows[at] for s, at in where])
-            pixels = np.concatenate([_turned(rng, stages[s].pixels[at]) for s, at in where])
-            with halved():
-                rows = look(head, frozen, pixels, rng)
+        for first in range(0, len(order), STAGES_PER_BATCH):
+            batch = _draw_batch(rng, stages, order[first : first + STAGES_PER_BATCH])
+            with half_precision():
+                rows = embed_crops(head, batch.rows, batch.pixels, rng)
             rows = F.normalize(rows.float(), dim=1)
-            who = torch.from_numpy(np.concatenate([stages[s].who[at] + 100 * s for s, at in where]))
-            portrait = (
-                torch.from_numpy(np.concatenate([stages[s].portrait[at] for s, at in where])) > 0
-            )
-            cosine, same = (
-                rows[portrait] @ rows[~portrait].T,
-                who[portrait][:, None] == who[~portrait],
-            )
-            yield contrast(cosine, same) + contrast(cosine.T, same.T)
+            who = torch.from_numpy(batch.who)
+            portrait = torch.from_numpy(batch.portrait) > 0
+            cosine = rows[portrait] @ rows[~portrait].T
+            same = who[portrait][:, None] == who[~portrait]
+            yield contrastive_loss(cosine, same) + contrastive_loss(cosine.T, same.T)
 
-    fit(head, losses, -(-len(stages) // STAGES_PER_BATCH), run)
+    batches = -(-len(stages) // STAGES_PER_BATCH)
+    fit(head, losses, batches, run)
     return head
 
 
-def _pick(rng: np.random.Generator, looks: Looks) -> tuple[np.ndarray, np.ndarray]:
+def _row(rgb: Rgb, square: Rgb) -> np.ndarray:
+    """The features of a crop, `square` the same padded."""
+    taps = features([square], [*INSTANCE_TAPS, "head"])
+    colour = lab_histogram(rgb)
+    parts = []
+    for maps in halve_b4(taps).values():
+        parts.append(maps[0].numpy().ravel())
+    parts.append(colour / np.linalg.norm(colour))
+    parts.append(gem(taps["head"][0].numpy()))
+    return np.concatenate(parts).astype(np.float16)
+
+
+def _draw_batch(
+    rng: np.random.Generator, stages: Sequence[StageCrops], numbers: Int64[np.ndarray, " k"]
+) -> StageCrops:
+    """Some crops of the stages of these numbers, augmented; objects are numbered anew."""
+    picks = []
+    for s in numbers:
+        portraits, views = _pick(rng, stages[s])
+        picks.append(np.concatenate([portraits, views]))
+    rows = []
+    pixels = []
+    who = []
+    portrait = []
+    for s, at in zip(numbers, picks, strict=True):
+        rows.append(stages[s].rows[at])
+        pixels.append(_augment_pixels(rng, stages[s].pixels[at]))
+        who.append(stages[s].who[at] + 100 * s)
+        portrait.append(stages[s].portrait[at])
+    return StageCrops(
+        rows=np.concatenate(rows),
+        pixels=np.concatenate(pixels),
+        who=np.concatenate(who),
+        portrait=np.concatenate(portrait),
+    )
+
+
+def _pick(rng: np.random.Generator, crops: StageCrops) -> tuple[np.ndarray, np.ndarray]:
     """Two portraits of every object that has some, and up to three crops of every object."""
     portraits: list[int] = []
     views: list[int] = []
-    for who in np.unique(looks.who):
-        for kind, most, into in ((1, 2, portraits), (0, 3, views)):
-            mine = np.flatnonzero((looks.who == who) & (looks.portrait == kind))
-            into += rng.permutation(mine)[:most].tolist()
+    for who in np.unique(crops.who):
+        own = crops.who == who
+        own_portraits = np.flatnonzero(own & (crops.portrait == 1))
+        own_views = np.flatnonzero(own & (crops.portrait == 0))
+        portraits += rng.permutation(own_portraits)[:2].tolist()
+        views += rng.permutation(own_views)[:3].tolist()
     return np.array(portraits, np.int64), np.array(views, np.int64)
 
 
-def _restyled(rng: np.random.Generator, maps: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
-    """Some crops get the channels' means and deviations of a mixture with another crop; some channels of each are left out."""
+def _restyle(rng: np.random.Generator, maps: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
+    """MixStyle and dropped channels.
+
+    Some crops get the channels' means and deviations of a mixture with another crop; some channels
+    of each are left out.
+    """
     n, channels = maps.shape[:2]
-    mean, deviation = maps.mean((2, 3), keepdim=True), maps.std((2, 3), keepdim=True) + 1e-5
-    other, drawn = rng.permutation(n), rng.beta(0.3, 0.3, (n, 1, 1, 1))
-    share = torch.from_numpy(
-        np.where(rng.random((n, 1, 1, 1)) < MIXED, np.maximum(drawn, 1 - drawn), 1.0)
-    ).float()
-    styled = (
-        (maps - mean) / deviation * (share * deviation + (1 - share) * deviation[other])
-        + share * mean
-        + (1 - share) * mean[other]
-    )
-    return styled * torch.from_numpy(rng.random((n, channels, 1, 1)) > DROPPED) / (1 - DROPPED)
+    mean = maps.mean((2, 3), keepdim=True)
+    deviation = maps.std((2, 3), keepdim=True) + 1e-5
+    other = rng.permutation(n)
+    drawn = rng.beta(0.3, 0.3, (n, 1, 1, 1))
+    mixed = rng.random((n, 1, 1, 1)) < MIXED
+    own_share = np.where(mixed, np.maximum(drawn, 1 - drawn), 1.0)
+    share = torch.from_numpy(own_share).float()
+    mixed_deviation = share * deviation + (1 - share) * deviation[other]
+    restyled = (maps - mean) / deviation * mixed_deviation
+    restyled = restyled + share * mean + (1 - share) * mean[other]
+    kept = torch.from_numpy(rng.random((n, channels, 1, 1)) > DROPPED)
+    return restyled * kept / (1 - DROPPED)
 
 
-def _turned(
+def _augment_pixels(
     rng: np.random.Generator, pixels: UInt8[np.ndarray, "n s s 3"]
 ) -> UInt8[np.ndarray, "n s s 3"]:
-    """Other contrast, exposure and tint; some blurred, half with a rectangle painted over. The frozen features stay."""
-    n, side = len(pixels), pixels.shape[1]
-    x = np.asarray(pixels, np.float32)
-    mean = x.mean((1, 2, 3), keepdims=True)
-    x = (x - mean) * rng.uniform(0.6, 1.4, (n, 1, 1, 1)) + mean * rng.uniform(
-        0.7, 1.3, (n, 1, 1, 1)
-    )
-    x = x * rng.uniform(0.85, 1.15, (n, 1, 1, 3))
-    for picture in x:
+    """Other contrast, exposure and tint; some blurred, half with a rectangle painted over.
+
+    The frozen features stay.
+    """
+    n, side = pixels.shape[:2]
+    images = np.asarray(pixels, np.float32)
+    mean = images.mean((1, 2, 3), keepdims=True)
+    contrast = rng.uniform(0.6, 1.4, (n, 1, 1, 1))
+    exposure = rng.uniform(0.7, 1.3, (n, 1, 1, 1))
+    images = (images - mean) * contrast + mean * exposure
+    images = images * rng.uniform(0.85, 1.15, (n, 1, 1, 3))
+    for image in images:
         if rng.random() < 0.3:
-            picture[:] = cv2.GaussianBlur(picture, (0, 0), float(rng.uniform(0.4, 1.6)))
+            sigma = float(rng.uniform(0.4, 1.6))
+            image[:] = cv2.GaussianBlur(image, (0, 0), sigma)
         if rng.random() < 0.5:
-            high, wide = rng.integers(10, 50, 2)
-            top, left = rng.integers(0, side - high), rng.integers(0, side - wide)
-            picture[top : top + high, left : left + wide] = rng.uniform(0, 255, 3)
-    return np.clip(x, 0, 255).astype(np.uint8)
+            height, width = rng.integers(10, 50, 2)
+            top = rng.integers(0, side - height)
+            left = rng.integers(0, side - width)
+            image[top : top + height, left : left + width] = rng.uniform(0, 255, 3)
+    return np.clip(images, 0, 255).astype(np.uint8)
 
 
 def _cut(rgb: Rgb, box: tuple[int, int, int, int], rng: np.random.Generator) -> Rgb:
-    off = jitter(rng, np.array(box, np.float64), 0.06)
-    low, high = np.maximum(off[:2], 0), np.maximum(off[2:], off[:2] + 2)
-    return disturb(rng, crop(rgb, np.concatenate([low, high])))
+    """An augmented crop, from a box that is a little off."""
+    jittered = jitter(rng, np.array(box, np.float64), 0.06)
+    low = np.maximum(jittered[:2], 0)
+    high = np.maximum(jittered[2:], jittered[:2] + 2)
+    return augment(rng, crop(rgb, np.concatenate([low, high])))

@@ -1,8 +1,10 @@
-"""Train the embedded stack's heads: render generic objects, fit detector, segmenter and look head on frozen features, test on unseen instances.
+"""Train the embedded stack's heads on rendered generic objects.
 
     python -m vap_core train perception --out data/runs/weights --scenes 6480 --seed 0
 
-Everything lands in data/cache/perception and is found again after an interruption: stages, features, and each head after every epoch.
+Detector, segmenter and instance head are fitted to frozen features and tested on unseen instances.
+Everything is kept in data/cache/perception and found again after an interruption: stages, features,
+and each head after every epoch.
 """
 
 import os
@@ -14,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 from tqdm import tqdm
 
 from vap_core.base.files import DATA
@@ -21,8 +24,7 @@ from vap_core.evaluation.processes import results
 from vap_core.perception.embedded.weights import save_weights
 from vap_core.simulation.assets import objects
 from vap_core.training.films.scenes import VIEWS, Shots, cached, only_generic
-from vap_core.training.perception import detector, segmenter
-from vap_core.training.perception import instance_head as looks
+from vap_core.training.perception import detector, instance_head, segmenter
 from vap_core.training.perception.fitting import Run, checkpoint
 
 CACHE = DATA / "cache" / "perception"
@@ -42,88 +44,139 @@ def train(
     cache: Path = CACHE,
     jobs: int | None = None,
 ) -> dict[str, Any]:
-    """Train the heads on about `scenes` rendered views, write `out`/perception.safetensors and its manifest entry, return the entry.
+    """Train the heads on about `scenes` rendered views; returns the manifest's entry.
 
-    `minutes` stops training after the epoch that runs then; `resume` off forgets earlier epochs but keeps the rendered stages. `jobs`
+    Writes `out`/perception.safetensors and its manifest entry. `minutes` stops training after the
+    epoch that runs then; `resume` off forgets earlier epochs but keeps the rendered stages. `jobs`
     processes (all cores) render.
     """
     from vap_core.training.perception.evaluation import evaluate
 
     started = time.monotonic()
 
-    def run(name: str, rate: float, decay: float) -> Run:
-        def expired() -> bool:
-            return minutes is not None and time.monotonic() - started > 60 * minutes
+    def expired() -> bool:
+        return minutes is not None and time.monotonic() - started > 60 * minutes
 
+    def run(name: str, rate: float, decay: float) -> Run:
+        state, save = checkpoint(cache / f"{name}-{seed}-{n}.pt", resume)
         return Run(
-            name,
-            seed,
-            EPOCHS[name],
-            rate,
-            decay,
-            *checkpoint(cache / f"{name}-{seed}-{n}.pt", resume),
-            expired,
+            name=name,
+            seed=seed,
+            epochs=EPOCHS[name],
+            rate=rate,
+            decay=decay,
+            state=state,
+            save=save,
+            expired=expired,
         )
 
     n = -(-scenes // VIEWS)
     stages = prepare(cache, seed, n, jobs=jobs)
-    views = [
-        view
-        for number, shots in enumerate(stages)
-        for view in detector_views(cache, seed, number, shots)
-    ]
-    kept = [looks_of(cache, seed, number, shots) for number, shots in enumerate(stages)]
-    detect = detector.fit_detector(
-        views, objects.CATEGORIES + objects.CLUTTER, run("detector", 2e-3, 1e-3)
-    )
-    look = looks.fit_looks(kept, run("looks", 2e-3, 1e-2))
+    views, crops = _load_features(cache, seed, stages)
+    categories = objects.CATEGORIES + objects.CLUTTER
+    detect = detector.fit_detector(views, categories, run("detector", 2e-3, 1e-3))
+    look = instance_head.fit_instance_head(crops, run("looks", 2e-3, 1e-2))
     segment = segmenter.fit_segmenter(stages, CROPS_PER_EPOCH, run("segmenter", 2e-3, 1e-4))
-    unseen = prepare(cache, seed, min(HELD_OUT_STAGES, max(1, n // 10)), held_out=True, jobs=jobs)
-    about = {
-        "command": f"python -m vap_core train perception --scenes {scenes} --seed {seed}",
-        "trained_on": f"{sum(len(s.rgb) for s in stages)} views of generic objects in {n} rendered scenes, and portraits; no evaluation object",
-        "seed": seed,
-        "views": sum(len(s.rgb) for s in stages),
-        "measured": evaluate(detect, segment, look, unseen),
-    }
-    heads = {"detect": detect, "look": look, "segment": segment}
-    save_weights(
-        FILE,
-        {
-            f"{part}.{key}": value
-            for part, head in heads.items()
-            for key, value in head.state_dict().items()
-        },
-        about,
-        out,
-    )
+    n_held_out = min(HELD_OUT_STAGES, max(1, n // 10))
+    unseen = prepare(cache, seed, n_held_out, held_out=True, jobs=jobs)
+    about = _describe_training(scenes, seed, stages)
+    about["measured"] = evaluate(detect, segment, look, unseen)
+    tensors = _name_tensors({"detect": detect, "look": look, "segment": segment})
+    save_weights(FILE, tensors, about, out)
     return about
 
 
 def prepare(
     cache: Path, seed: int, n: int, *, held_out: bool = False, jobs: int | None = None
 ) -> list[Shots]:
-    """The first n stages with their features, rendered where they are missing; refuses any that shows an object of the evaluation."""
-    todo = [number for number in range(n) if not _ready(cache, seed, number, held_out)]
-    if todo:
-        work = results(
-            partial(_prepare, cache, seed, held_out), todo, jobs or os.cpu_count() or 1, "jobs"
-        )
-        list(tqdm(work, "held-out scenes" if held_out else "scenes", len(todo), mininterval=10))
-    stages = [cached(cache, seed, number, held_out=held_out) for number in range(n)]
+    """The first n stages with their features, rendered where they are missing.
+
+    Raises: ValueError for a stage that shows an object of the evaluation.
+    """
+    missing = []
+    for number in range(n):
+        if not _is_ready(cache, seed, number, held_out):
+            missing.append(number)
+    if missing:
+        work = partial(_prepare, cache, seed, held_out)
+        finished = results(work, missing, jobs or os.cpu_count() or 1, "jobs")
+        title = "held-out scenes" if held_out else "scenes"
+        for _ in tqdm(finished, title, len(missing), mininterval=10):
+            pass
+    stages = []
+    for number in range(n):
+        stages.append(cached(cache, seed, number, held_out=held_out))
     for shots in stages:
         only_generic([objects.get_object(name) for name in shots.names])
     return stages
 
 
-def _ready(cache: Path, seed: int, number: int, held_out: bool) -> bool:
-    name = f"{'held' if held_out else 'train'}-{seed}-{number:05d}"
-    return all(
-        (cache / f"{name}{kind}").exists()
-        for kind in (
-            (".npz",) if held_out else (".npz", ".detector.npy", ".looks.npy", ".pixels.npy")
-        )
-    )
+def detector_views(
+    cache: Path, seed: int, number: int, shots: Shots
+) -> Sequence[tuple[np.ndarray, detector.Objects]]:
+    """Per picture of a stage, its frozen features and its objects."""
+    rng = stream(seed, number, "detector")
+    rows, seen = detector.featurise(cache, _stage_name(seed, number), shots, rng)
+    return list(zip(rows, seen, strict=True))
+
+
+def instance_crops(cache: Path, seed: int, number: int, shots: Shots) -> instance_head.StageCrops:
+    """The crops of a stage, with their frozen features."""
+    rng = stream(seed, number, "looks")
+    return instance_head.featurise(cache, _stage_name(seed, number), shots, rng)
+
+
+def stream(seed: int, number: int, part: str) -> np.random.Generator:
+    """The randomness of one part of one stage."""
+    return np.random.default_rng([seed, *part.encode(), number])
+
+
+def _load_features(
+    cache: Path, seed: int, stages: Sequence[Shots]
+) -> tuple[list[tuple[np.ndarray, detector.Objects]], list[instance_head.StageCrops]]:
+    """The detector's views of all stages, and the crops of each."""
+    views: list[tuple[np.ndarray, detector.Objects]] = []
+    crops = []
+    for number, shots in enumerate(stages):
+        views += detector_views(cache, seed, number, shots)
+        crops.append(instance_crops(cache, seed, number, shots))
+    return views, crops
+
+
+def _describe_training(scenes: int, seed: int, stages: Sequence[Shots]) -> dict[str, Any]:
+    """What the manifest says of the training."""
+    n_views = sum(len(shots.rgb) for shots in stages)
+    return {
+        "command": f"python -m vap_core train perception --scenes {scenes} --seed {seed}",
+        "trained_on": f"{n_views} views of generic objects in {len(stages)} rendered scenes, "
+        "and portraits; no evaluation object",
+        "seed": seed,
+        "views": n_views,
+    }
+
+
+def _name_tensors(heads: dict[str, nn.Module]) -> dict[str, torch.Tensor]:
+    """The tensors of all heads, as the weight file names them."""
+    tensors = {}
+    for part, head in heads.items():
+        for key, tensor in head.state_dict().items():
+            tensors[f"{part}.{key}"] = tensor
+    return tensors
+
+
+def _stage_name(seed: int, number: int, held_out: bool = False) -> str:
+    """The name of a stage's files, without their endings."""
+    kind = "held" if held_out else "train"
+    return f"{kind}-{seed}-{number:05d}"
+
+
+def _is_ready(cache: Path, seed: int, number: int, held_out: bool) -> bool:
+    """Whether a stage is rendered; a training stage needs its features as well."""
+    name = _stage_name(seed, number, held_out)
+    endings = [".npz"]
+    if not held_out:
+        endings += [".detector.npy", ".looks.npy", ".pixels.npy"]
+    return all((cache / f"{name}{ending}").exists() for ending in endings)
 
 
 def _prepare(cache: Path, seed: int, held_out: bool, number: int) -> None:
@@ -131,26 +184,4 @@ def _prepare(cache: Path, seed: int, held_out: bool, number: int) -> None:
     shots = cached(cache, seed, number, held_out=held_out)
     if not held_out:
         detector_views(cache, seed, number, shots)
-        looks_of(cache, seed, number, shots)
-
-
-def detector_views(
-    cache: Path, seed: int, number: int, shots: Shots
-) -> Sequence[tuple[np.ndarray, detector.Objects]]:
-    """Per picture of a stage, its frozen features and its objects."""
-    rows, seen = detector.featurise(
-        cache, f"train-{seed}-{number:05d}", shots, stream(seed, number, "detector")
-    )
-    return list(zip(rows, seen, strict=True))
-
-
-def looks_of(cache: Path, seed: int, number: int, shots: Shots) -> looks.Looks:
-    """The crops of a stage, with their frozen features."""
-    return looks.featurise(
-        cache, f"train-{seed}-{number:05d}", shots, stream(seed, number, "looks")
-    )
-
-
-def stream(seed: int, number: int, part: str) -> np.random.Generator:
-    """The randomness of one part of one stage."""
-    return np.random.default_rng([seed, *part.encode(), number])
+        instance_crops(cache, seed, number, shots)

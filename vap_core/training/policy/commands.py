@@ -1,8 +1,10 @@
-"""What is said beside a filmed frame, and how it is coloured to fit: one demonstration teaches many commands.
+"""Commands for filmed frames, and the colours that fit them: one demonstration teaches many.
 
-*Tinted*: the target carries a tint, as VAP's policy will see it, and is called by the colour. *Painted*: it has the colour by nature.
-*Described*: nothing is coloured, and what it looks like is said, where that tells it from its rivals. *Plain*: nothing tells it; only frames in
-which the hand is nearer to the target than to any rival, so that a plain command means what the hand already nears. Rivals are often painted.
+*Tinted*: the target carries a tint, as VAP's policy will see it, and is called by the colour.
+*Painted*: it has the colour by nature. *Described*: nothing is coloured, and the command describes
+the target's own look, where that differs from its rivals'. *Plain*: the command does not say which
+object is meant; only frames in which the hand is nearer to the target than to any rival, so that a
+plain command means what the hand already nears. Rivals are often painted.
 """
 
 from collections.abc import Sequence
@@ -16,125 +18,132 @@ from vap_core.prompt import PALETTE
 from vap_core.simulation import robots
 from vap_core.simulation.suites import Task, suite
 from vap_core.training.films.demonstrations import Film, every
-from vap_core.training.words import DETERMINERS, PAINTS, akin, free, looks, phrases
+from vap_core.training.words import (
+    DETERMINERS,
+    PAINTS,
+    appearance_words,
+    distinct_colours,
+    phrases,
+    similar_colours,
+)
 
-TINTED, PAINTED, DESCRIBED = 0.5, 0.15, 0.1
-"""Shares of the commands; the rest is plain where it can be, and what cannot be plain or described is tinted."""
+TINTED = 0.5
+"""Share of tinted commands; what cannot be plain or described is tinted, too."""
+PAINTED = 0.15
+"""Share of painted commands."""
+DESCRIBED = 0.1
+"""Share of described commands; the rest is plain where it can be."""
 AFTERWARDS = 0.15
-"""How often the word that tells the target comes in a sentence of its own, as a description does."""
-ALPHA, COAT = (0.3, 0.7), (0.7, 0.95)
-"""Opacity of a tint, and of paint."""
-OTHERS, LOST = 0.3, 0.12
-"""How often a rival is painted, and a view's tint is missing (a tracker that lost its target); one view keeps it."""
+"""How often the word for the target comes in a sentence of its own, as a description does."""
+ALPHA = (0.3, 0.7)
+"""Range of the opacity of a tint."""
+COAT = (0.7, 0.95)
+"""Range of the opacity of paint."""
+OTHERS = 0.3
+"""How often a rival is painted."""
+LOST = 0.12
+"""How often a view's tint is missing (a tracker that lost its target); one view keeps it."""
 NEAR_M = 0.02
 """A hand that is nearer to its target than to any rival by this much gives its choice away."""
 
 
 Way = Literal["tinted", "painted", "described", "plain"]
+Images = UInt8[np.ndarray, "c s s 3"]
+"""The views of one frame."""
 
 
 @value
 class Command:
     """One training sample: views and words, and how the two name the target, which is object 0."""
 
-    images: UInt8[np.ndarray, "c s s 3"]
+    images: Images
     text: str
     way: Way
 
 
 def command(film: Film, t: int, suite_name: str, rng: np.random.Generator) -> Command:
-    """Step t of a film, which has a picture, with something said that its action answers."""
+    """Step t of a film, which has a picture, with a command that its action answers."""
     task = suite(suite_name).task(film.task)
     rivals = [i for i in range(1, len(film.names)) if i != film.goal]
-    images, ids = (part[t // every(suite_name)] for part in (film.images, film.ids))
+    picture = t // every(suite_name)
+    images = film.images[picture]
+    ids = film.ids[picture]
     drawn = rng.random()
-    natural = 1 - TINTED - PAINTED < drawn < 1 - TINTED
-    usable = free(
-        {word for i in rivals for word in looks(film.names[i])}, PAINTS if natural else PALETTE
-    )
-    mine = usable[int(rng.integers(len(usable)))]
-    others = [colour for colour in PAINTS if not akin(colour.name) & akin(mine.name)]
-    others = [others[i] for i in rng.permutation(len(others))]
-    for rival, colour in zip(rivals, others, strict=False):
-        if rng.random() < OTHERS:
-            images = painted(images, ids == rival + 1, colour, float(rng.uniform(*COAT)))
-    word = mine.name
+    may_paint = 1 - TINTED - PAINTED < drawn < 1 - TINTED
+    colour = _draw_colour(film, rivals, PAINTS if may_paint else PALETTE, rng)
+    images = _paint_rivals(images=images, ids=ids, rivals=rivals, target_colour=colour, rng=rng)
+    phrase = ""
+    if drawn < DESCRIBED:
+        names = [film.names[i] for i in (0, *rivals)]
+        phrase = draw_description(names, rng)
     way: Way = "tinted"
-    if drawn < DESCRIBED and (told := telling([film.names[i] for i in (0, *rivals)], rng)):
-        images, way, word = film.images[t // every(suite_name)], "described", told
+    word = colour.name
+    if phrase:
+        way = "described"
+        word = phrase
+        images = film.images[picture]
     elif DESCRIBED < drawn < 1 - TINTED - PAINTED and near(film, t, suite_name, rivals):
-        way, word = "plain", ""
-    elif natural:
-        images, way = painted(images, ids == 1, mine, float(rng.uniform(*COAT))), "painted"
-    if way == "tinted":
-        seen = rng.random(len(images)) > LOST
-        seen[rng.integers(len(images))] = True
-        masks = np.stack([rough(ids[c] == 1, rng) & bool(seen[c]) for c in range(len(images))])
-        images = tinted(images, masks, mine, float(rng.uniform(*ALPHA)))
+        way = "plain"
+        word = ""
+    elif may_paint:
+        way = "painted"
+        coat = float(rng.uniform(*COAT))
+        images = painted(images, ids == 1, colour, coat)
+    else:
+        images = _tint_target(images, ids == 1, colour, rng)
     gain = rng.uniform(0.9, 1.1) * rng.uniform(0.96, 1.04, 3)
-    return Command(np.clip(images * gain, 0, 255).astype(np.uint8), say(task, word, rng), way)
+    lit = np.clip(images * gain, 0, 255).astype(np.uint8)
+    return Command(images=lit, text=phrase_instruction(task, word, rng), way=way)
 
 
 def near(film: Film, t: int, suite_name: str, rivals: Sequence[int]) -> bool:
     """Whether the hand is nearer to the target than to every rival, seen from above."""
-    hand = film.state[t, :2] + robots.get(suite(suite_name).robot).base_world[:2]
-    away = np.linalg.norm(film.places[t, :, :2] - hand, axis=1)
-    return bool(all(away[0] + NEAR_M < away[i] for i in rivals))
+    robot = robots.get(suite(suite_name).robot)
+    hand = film.state[t, :2] + robot.base_world[:2]
+    distances = np.linalg.norm(film.places[t, :, :2] - hand, axis=1)
+    return bool((distances[0] + NEAR_M < distances[list(rivals)]).all())
 
 
-def telling(names: Sequence[str], rng: np.random.Generator) -> str:
-    """A word, or a captioner's phrase, that fits names[0] and none of the others; "" when there is none."""
-    mine, *others = (looks(name) for name in names)
-    words = sorted(mine.difference(*others))
+def draw_description(names: Sequence[str], rng: np.random.Generator) -> str:
+    """A word, or a captioner's phrase, that fits names[0] and no other; "" when there is none."""
+    rivals = map(appearance_words, names[1:])
+    words = sorted(appearance_words(names[0]).difference(*rivals))
     if not words:
         return ""
-    return str(rng.choice(phrases(names[0]))) if rng.random() < 0.5 else str(rng.choice(words))
+    if rng.random() < 0.5:
+        return str(rng.choice(phrases(names[0])))
+    return str(rng.choice(words))
 
 
-def say(task: Task, word: str, rng: np.random.Generator) -> str:
-    """The task's instruction with its "my" replaced: by "the" and a word, or by any determiner; a phrase, and now and then a word, comes
-    afterwards, as a description does."""
+def phrase_instruction(task: Task, word: str, rng: np.random.Generator) -> str:
+    """The task's instruction with its "my" replaced: by "the" and a word, or by any determiner.
+
+    A phrase, and now and then a word, comes afterwards, as a description does.
+    """
     if " " in word or (word and rng.random() < AFTERWARDS):
         return f"{task.instruction}. My {task.category} is {word}."
-    return task.instruction.replace(
-        "my ", f"the {word} " if word else f"{rng.choice(DETERMINERS)} ", 1
-    )
+    if word:
+        determiner = f"the {word} "
+    else:
+        determiner = f"{rng.choice(DETERMINERS)} "
+    return task.instruction.replace("my ", determiner, 1)
 
 
-def tinted(
-    images: UInt8[np.ndarray, "c s s 3"], masks: np.ndarray, colour: Colour, alpha: float
-) -> UInt8[np.ndarray, "c s s 3"]:
+def tinted(images: Images, masks: np.ndarray, colour: Colour, alpha: float) -> Images:
     """As prompt.tint does it."""
-    return _blend(
-        images, masks, np.broadcast_to(np.asarray(colour.rgb, np.float32), images.shape), alpha
-    )
+    rgb = np.asarray(colour.rgb, np.float32)
+    return _blend(images, masks, np.broadcast_to(rgb, images.shape), alpha)
 
 
-def painted(
-    images: UInt8[np.ndarray, "c s s 3"], masks: np.ndarray, colour: Colour, coat: float
-) -> UInt8[np.ndarray, "c s s 3"]:
+def painted(images: Images, masks: np.ndarray, colour: Colour, coat: float) -> Images:
     """Coloured by nature: light and shade of the object stay."""
     light = images.astype(np.float32).mean(axis=-1, keepdims=True) / 255.0
-    return _blend(
-        images,
-        masks,
-        np.asarray(colour.rgb, np.float32) * (0.25 + 0.75 * light) + 40.0 * light,
-        coat,
-    )
+    rgb = np.asarray(colour.rgb, np.float32)
+    paint = rgb * (0.25 + 0.75 * light) + 40.0 * light
+    return _blend(images, masks, paint, coat)
 
 
-def _blend(
-    images: UInt8[np.ndarray, "c s s 3"],
-    masks: np.ndarray,
-    paint: Float32[np.ndarray, "c s s 3"],
-    share: float,
-) -> np.ndarray:
-    out = images.astype(np.float32)
-    out[masks] = (1 - share) * out[masks] + share * paint[masks]
-    return np.clip(np.rint(out), 0, 255).astype(np.uint8)
-
-
-def rough(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def roughen_mask(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """A mask as a tracker draws it: now and then a little off, swollen or shrunk."""
     import cv2
 
@@ -145,3 +154,56 @@ def rough(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         return np.roll(mask, rng.integers(-2, 3, 2), axis=(0, 1))
     change = cv2.dilate if kind < 0.85 else cv2.erode
     return change(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+
+
+def _draw_colour(
+    film: Film, rivals: Sequence[int], colours: Sequence[Colour], rng: np.random.Generator
+) -> Colour:
+    """A colour for the target that nobody takes for the look of a rival."""
+    taken: set[str] = set()
+    for i in rivals:
+        taken |= appearance_words(film.names[i])
+    usable = distinct_colours(taken, colours)
+    return usable[int(rng.integers(len(usable)))]
+
+
+def _paint_rivals(
+    images: Images,
+    ids: UInt8[np.ndarray, "c s s"],
+    rivals: Sequence[int],
+    target_colour: Colour,
+    rng: np.random.Generator,
+) -> Images:
+    """Paint some rivals in colours that nobody takes for the target's."""
+    colours = [
+        paint
+        for paint in PAINTS
+        if not similar_colours(paint.name) & similar_colours(target_colour.name)
+    ]
+    order = rng.permutation(len(colours))
+    for rival, i in zip(rivals, order, strict=False):
+        if rng.random() < OTHERS:
+            coat = float(rng.uniform(*COAT))
+            images = painted(images, ids == rival + 1, colours[i], coat)
+    return images
+
+
+def _tint_target(
+    images: Images, masks: np.ndarray, colour: Colour, rng: np.random.Generator
+) -> Images:
+    """Tint the target by masks as a tracker draws them, at least in one view."""
+    kept = rng.random(len(images)) > LOST
+    kept[rng.integers(len(images))] = True
+    tracked = []
+    for mask, keep in zip(masks, kept, strict=True):
+        tracked.append(roughen_mask(mask, rng) & bool(keep))
+    return tinted(images, np.stack(tracked), colour, float(rng.uniform(*ALPHA)))
+
+
+def _blend(
+    images: Images, masks: np.ndarray, paint: Float32[np.ndarray, "c s s 3"], share: float
+) -> Images:
+    """Mix paint into the masked pixels."""
+    mixed = images.astype(np.float32)
+    mixed[masks] = (1 - share) * mixed[masks] + share * paint[masks]
+    return np.clip(np.rint(mixed), 0, 255).astype(np.uint8)

@@ -1,11 +1,14 @@
-"""What a trained policy can do before anybody's own object is in play: closed-loop episodes with generic objects that no film has shown.
+"""Closed-loop episodes of a trained policy with generic objects that no film has shown.
 
-Four ways to say which of them is meant: a tint from the simulator's masks and the colour's word (VAP at its best), paint (it has the colour by
-nature), a description of its own look, or nothing. When nothing is said, any of its kind is right, and what counts is whether the hand commits.
+They show what it can do before any user's object is involved. Four ways to say which object is
+meant: a tint from the simulator's masks and the colour's word (VAP at its best), paint (it has the
+colour by nature), a description of its own look, or nothing. When nothing is said, any of its kind
+is right, and what counts is whether the hand commits.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
@@ -22,19 +25,25 @@ from vap_core.policies.lerobot import adapter as lerobot
 from vap_core.prompt import ALPHA
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters.protocol import PromptContext, unchanged
-from vap_core.simulation.suites import suite
+from vap_core.simulation.suites import Suite, Task, suite
 from vap_core.simulation.suites.open_row import build_scene
 from vap_core.simulation.types import EpisodeRow, Observation
-from vap_core.training.films.demonstrations import cast, row
-from vap_core.training.policy.commands import Way, painted, say, telling, tinted
-from vap_core.training.words import free, looks
+from vap_core.training.films.demonstrations import draw_objects, row
+from vap_core.training.policy.commands import (
+    Way,
+    draw_description,
+    painted,
+    phrase_instruction,
+    tinted,
+)
+from vap_core.training.words import appearance_words, distinct_colours
 
 if TYPE_CHECKING:
     import pandas as pd
 
 WAYS: tuple[Way, ...] = ("tinted", "painted", "described", "plain")
 EACH = 4
-"""Episodes of one scene, each said in every way."""
+"""Episodes of one scene, each run in every way."""
 COAT = 0.85
 """Opacity of paint."""
 ProbeState = tuple[Colour, str]
@@ -59,14 +68,23 @@ class ProbePrompter:
         row = context.truth.row
         rng = np.random.default_rng([79, row.seed, row.episode])
         names = _same_kind(row)
-        usable = free({word for name in names[1:] for word in looks(name)})
+        taken: set[str] = set()
+        for name in names[1:]:
+            taken |= appearance_words(name)
+        usable = distinct_colours(taken)
         colour = usable[int(rng.integers(len(usable)))]
-        word = {"plain": "", "described": telling(names, rng)}.get(self.way, colour.name)
+        phrase = draw_description(names, rng)  # Drawn in every way, so that all ways draw alike.
+        if self.way == "plain":
+            word = ""
+        elif self.way == "described":
+            word = phrase
+        else:
+            word = colour.name
         if word:
-            text = say(suite(row.suite).task(row.task), word, rng)
+            text = phrase_instruction(suite(row.suite).task(row.task), word, rng)
         else:
             text = context.instruction.replace("my ", "the ", 1)
-        state = colour, text
+        state = (colour, text)
         return state, self._prompt(state, observation, context)
 
     def steps(
@@ -75,16 +93,17 @@ class ProbePrompter:
         observations: Sequence[Observation],
         contexts: Sequence[PromptContext],
     ) -> list[tuple[ProbeState, Attended]]:
-        results = []
+        prompted = []
         for state, observation, context in zip(states, observations, contexts, strict=True):
-            results.append((state, self._prompt(state, observation, context)))
-        return results
+            prompted.append((state, self._prompt(state, observation, context)))
+        return prompted
 
     def _prompt(
         self, state: ProbeState, observation: Observation, context: PromptContext
     ) -> Attended:
         assert context.truth is not None
-        (colour, text), images = state, dict(observation.images)
+        colour, text = state
+        images = dict(observation.images)
         for camera, rgb in observation.images.items():
             mask = context.truth.masks[camera].get(context.truth.row.target)
             if mask is None:
@@ -105,9 +124,14 @@ def probe(
     execute: int | None = None,
     seed: int = 0,
     workers: int = 2,
-) -> "pd.DataFrame":  # fmt: skip
-    """One row per episode: suite, task, way, and how it ended. Scenes are spread over the suite's tasks; `execute` is the number of actions of
-    each chunk that are carried out, None as the checkpoint says. Raises: UnknownName, BadStudy, BadPolicy."""
+) -> "pd.DataFrame":
+    """One row per episode: suite, task, way, and how it ended.
+
+    Scenes are spread over the suite's tasks; `execute` is the number of actions of each chunk that
+    are carried out, None as the checkpoint says.
+
+    Raises: UnknownName, BadStudy, BadPolicy.
+    """
     import pandas as pd
     from tqdm import tqdm
 
@@ -116,17 +140,61 @@ def probe(
             raise one_of("probe: way", way, WAYS)
     work = partial(_scene, checkpoint, suite_name, tuple(ways), execute, seed)
     done = tqdm(
-        results(work, list(range(scenes)), workers, "--workers"),
-        f"episodes of {suite_name}",
-        scenes,
+        results(work=work, jobs=range(scenes), workers=workers, remedy="--workers"),
+        desc=f"episodes of {suite_name}",
+        total=scenes,
         unit="scene",
     )
-    lines = [line for _, part in sorted(done, key=lambda found: found[0]) for line in part]
+    lines = []
+    for _, part in sorted(done, key=itemgetter(0)):
+        lines += part
     if not lines:
         raise BadStudy(
-            f"probe: nothing fits on the table of {suite_name} in {scenes} scenes; ask for more --scenes."
+            f"probe: nothing fits on the table of {suite_name} in {scenes} scenes; "
+            "ask for more --scenes."
         )
     return pd.DataFrame(lines)
+
+
+def conclude(table: "pd.DataFrame") -> str:
+    """Rates by suite, policy and way: n, and percent with Wilson's 95 % interval."""
+    header = ["suite", "policy", "way", "n", "succeeds", "moves a wrong object"]
+    lines = [[*header, "touches something"]]
+    for (known, policy, way), part in table.groupby(["suite", "policy", "method"], sort=False):
+        n = len(part)
+        line = [str(known), str(policy), str(way), str(n)]
+        for name in ("success", "wrong_object", "touched"):
+            count = int(part[name].sum())
+            line.append(str(rate(count, n)))
+        lines.append(line)
+    return align(lines)
+
+
+def keep(table: "pd.DataFrame", path: Path) -> None:
+    """Add the episodes to a table; those of the same suite and policy in it are replaced.
+
+    Raises: BadOutput.
+    """
+    import pandas as pd
+
+    columns = [name for name in table if name != "detail" and not name.startswith("seconds_")]
+    policies = table[["suite", "policy"]].drop_duplicates()
+    keys = list(policies.itertuples(index=False, name=None))
+    try:
+        old = pd.read_parquet(path) if path.exists() else table[:0]
+        old_keys = pd.MultiIndex.from_frame(old[["suite", "policy"]])
+        parts = []
+        for part in (old[~old_keys.isin(keys)], table[columns]):
+            if len(part):
+                parts.append(part)
+        whole = pd.concat(parts, ignore_index=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, whole.to_parquet(compression="zstd", index=False))
+    except (OSError, ValueError, KeyError) as error:
+        raise BadOutput(
+            f"probe: {path} cannot be added to ({type(error).__name__}); "
+            "name another table with --out."
+        ) from error
 
 
 def _scene(
@@ -137,22 +205,21 @@ def _scene(
     seed: int,
     number: int,
 ) -> list[dict[str, Any]]:
-    known, rng = suite(suite_name), np.random.default_rng([78, seed, *suite_name.encode(), number])
+    """The episodes of scene `number`, said in every way."""
+    known = suite(suite_name)
+    rng = np.random.default_rng([78, seed, *suite_name.encode(), number])
     task = known.tasks[number % len(known.tasks)]
-    names = cast(known, task, rng, held_out=True)
-    rows = list(_rows(known, task, names, number, rng))
+    names = draw_objects(known, task, rng, held_out=True)
+    rows = _rows(known=known, task=task, names=names, number=number, rng=rng)
     lines = []
     with build_scene(suite_name, names) as scene:
         policy = lerobot.load_for_suite(checkpoint, scene, known)
         if execute is not None:
             policy = policy.with_execute(execute)
         for way in ways:
-            played = [
-                row
-                for row in rows
-                if way != "described"
-                or looks(row.target).difference(*map(looks, _same_kind(row)[1:]))
-            ]
+            played = rows
+            if way == "described":
+                played = [row for row in rows if _can_describe(row)]
             trial = Trial(
                 method=way,
                 scene=scene,
@@ -167,50 +234,30 @@ def _scene(
     return lines
 
 
+def _can_describe(row: EpisodeRow) -> bool:
+    """Whether the target's look differs from its rivals'."""
+    rivals = map(appearance_words, _same_kind(row)[1:])
+    return bool(appearance_words(row.target).difference(*rivals))
+
+
 def _same_kind(row: EpisodeRow) -> list[str]:
     """The target, then its rivals."""
     return [place.model for place in row.placements if place.model != row.goal]
 
 
 def _rows(
-    known: Any, task: Any, names: Sequence[str], number: int, rng: np.random.Generator
-) -> Iterator[EpisodeRow]:
+    known: Suite, task: Task, names: Sequence[str], number: int, rng: np.random.Generator
+) -> list[EpisodeRow]:
+    """Episodes with these objects in new places; fewer than EACH where they do not fit."""
+    rows = []
     for i in range(EACH):
+        episode = number * EACH + i
         try:
-            yield row(known, task, names, number * EACH + i, "base", rng)
-        except ValueError:  # no room for these: the next draw may have it
+            drawn = row(
+                known=known, task=task, names=names, number=episode, variant="base", rng=rng
+            )
+        except ValueError:
+            # No room for these: the next draw may have it.
             continue
-
-
-def conclude(table: "pd.DataFrame") -> str:
-    """Rates by suite, task and way: n, and percent with Wilson's 95 % interval."""
-    lines = [
-        ["suite", "policy", "way", "n", "succeeds", "moves a wrong object", "touches something"]
-    ]
-    for (known, policy, way), part in table.groupby(["suite", "policy", "method"], sort=False):
-        shown = [
-            rate(int(part[name].sum()), len(part))
-            for name in ("success", "wrong_object", "touched")
-        ]
-        lines.append([str(known), str(policy), str(way), str(len(part)), *map(str, shown)])
-    return align(lines)
-
-
-def keep(table: "pd.DataFrame", path: Path) -> None:
-    """Add the episodes to a table; those of the same suite and policy in it are replaced. Raises: BadOutput."""
-    import pandas as pd
-
-    columns = [name for name in table if name != "detail" and not name.startswith("seconds_")]
-    keys = table[["suite", "policy"]].drop_duplicates().itertuples(index=False, name=None)
-    try:
-        old = pd.read_parquet(path) if path.exists() else table[:0]
-        others = old[~pd.MultiIndex.from_frame(old[["suite", "policy"]]).isin(list(keys))]
-        whole = pd.concat(
-            [part for part in (others, table[columns]) if len(part)], ignore_index=True
-        )
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, whole.to_parquet(compression="zstd", index=False))
-    except (OSError, ValueError, KeyError) as error:
-        raise BadOutput(
-            f"probe: {path} cannot be added to ({type(error).__name__}); name another table with --out."
-        ) from error
+        rows.append(drawn)
+    return rows

@@ -1,12 +1,17 @@
-"""Questions about training views, and their answers in words: what a mini-PaliGemma learns before it is anybody's policy (P 5.1, SPEC section 4).
+"""Questions about training views, and their answers in words (P 5.1, SPEC section 4).
 
-*Where is the red cup*: top left. *Is there a red cup in this image*, *can you recognize the striped cup in this image*: yes or no, as often; the
-hard no's name a colour that no cup has. *What colour is the cup*: red. *Pick up the red cup*, *pick up my cup. My cup is white with blue spots*: no
-words; only the patches that show it are asked for. Colours are a tint, paint, or an object's own; an object is named by its colour or pattern where
-that tells it from its kind, and by its kind where it is the only one.
+A mini-PaliGemma learns to answer them before any policy grows from it.
+
+*Where is the red cup*: top left. *Is there a red cup in this image*, *can you recognize the striped
+cup in this image*: yes or no, equally often; the hard no's name a colour that no cup has. *What
+colour is the cup*: red. *Pick up the red cup*, *pick up my cup. My cup is white with blue spots*:
+no words; only the patches that show it are asked for. Colours are a tint, paint, or an object's
+own; an object is named by its colour or pattern where that distinguishes it from others of its
+kind, and by its kind where it is the only one.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from itertools import chain
 
 import numpy as np
 from jaxtyping import UInt8
@@ -16,18 +21,30 @@ from vap_core.prompt import PALETTE
 from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import BENCHMARKS
 from vap_core.training.policy.commands import ALPHA, COAT, painted, tinted
-from vap_core.training.words import DETERMINERS, PAINTS, akin, free, looks, phrases
+from vap_core.training.words import (
+    DETERMINERS,
+    PAINTS,
+    appearance_words,
+    distinct_colours,
+    phrases,
+    similar_colours,
+)
 
-COLOURED, TINTED = 0.45, 0.5
-"""How often a view's object is coloured, and how often that is a tint rather than paint."""
+COLOURED = 0.45
+"""How often a view's object is coloured."""
+TINTED = 0.5
+"""How often that is a tint rather than paint."""
 LEAST_PX = 20
 """Visible pixels of an object that is asked about."""
-TASKS = tuple(task for suite in BENCHMARKS.values() for task in suite.tasks)
+TASKS = tuple(chain.from_iterable(suite.tasks for suite in BENCHMARKS.values()))
 
 
 @value
 class Question:
-    """What is asked of one view, the answer's words (none where only patches are asked for), and the index of the object meant, or -1."""
+    """A question about one view, the answer's words, and the index of the object meant, or -1.
+
+    There is no answer where only patches are asked for.
+    """
 
     text: str
     answer: tuple[str, ...]
@@ -35,7 +52,7 @@ class Question:
 
 
 @value
-class Asked:
+class QuestionedView:
     """One view, coloured, and questions about it."""
 
     image: UInt8[np.ndarray, "s s 3"]
@@ -43,17 +60,22 @@ class Asked:
 
 
 @value
-class Thing:
-    """An object in view: its kind, the words that name it, all that it shows (a tint hides no pattern), and the colour it was given, or ""."""
+class VisibleObject:
+    """An object in view.
+
+    `words` may name it; `appearance` is all that it shows (a tint hides no pattern); `given` is
+    the colour that it was given, or "".
+    """
 
     name: str
     kind: str
-    said: frozenset[str]
-    shows: frozenset[str]
+    words: frozenset[str]
+    appearance: frozenset[str]
     given: str
 
 
-Things = Mapping[int, Thing]
+VisibleObjects = Mapping[int, VisibleObject]
+"""By their index among the view's names."""
 
 
 def ask(
@@ -62,130 +84,193 @@ def ask(
     names: Sequence[str],
     n: int,
     rng: np.random.Generator,
-) -> Asked:
-    """Colour some objects of a view, where `ids` is i + 1 at names[i], and ask `n` questions about it."""
-    seen = [i for i in range(len(names)) if (ids == i + 1).sum() >= LEAST_PX]
-    things = {
-        i: Thing(
-            names[i], objects.get_object(names[i]).category, looks(names[i]), looks(names[i]), ""
-        )
-        for i in seen
-    }
-    images, left = image[None], set(PAINTS)
-    for i in seen:
+) -> QuestionedView:
+    """Colour some objects of a view, where `ids` is i + 1 at names[i], and ask `n` questions."""
+    images = image[None]
+    visible = _visible_objects(ids, names)
+    unused = set(PAINTS)
+    for i in visible:
         tint = rng.random() < TINTED
-        pool = [colour for colour in (PALETTE if tint else PAINTS) if colour in left]
+        palette = PALETTE if tint else PAINTS
+        pool = [colour for colour in palette if colour in unused]
         if pool and rng.random() < COLOURED:
-            colour, mask = pool[int(rng.integers(len(pool)))], (ids == i + 1)[None]
-            left.discard(colour)
-            change, span = (tinted, ALPHA) if tint else (painted, COAT)
-            images = change(images, mask, colour, float(rng.uniform(*span)))
-            things[i] = Thing(
-                names[i],
-                things[i].kind,
-                frozenset({colour.name}),
-                things[i].shows | {colour.name},
-                colour.name,
+            colour = pool[int(rng.integers(len(pool)))]
+            unused.discard(colour)
+            mask = (ids == i + 1)[None]
+            if tint:
+                images = tinted(images, mask, colour, float(rng.uniform(*ALPHA)))
+            else:
+                images = painted(images, mask, colour, float(rng.uniform(*COAT)))
+            visible[i] = VisibleObject(
+                name=names[i],
+                kind=visible[i].kind,
+                words=frozenset({colour.name}),
+                appearance=visible[i].appearance | {colour.name},
+                given=colour.name,
             )
     gain = rng.uniform(0.9, 1.1) * rng.uniform(0.96, 1.04, 3)
     shown = np.clip(images[0] * gain, 0, 255).astype(np.uint8)
-    return Asked(shown, tuple(_question(ids, things, rng) for _ in range(n)))
-
-
-def _question(ids: UInt8[np.ndarray, "s s"], things: Things, rng: np.random.Generator) -> Question:
-    named = {i: phrase for i in things if (phrase := _phrase(i, things, rng))}
-    way = rng.random()
-    if not named:
-        return _absent(things, rng)
-    target = int(rng.choice(list(named)))
-    phrase, kind = named[target], things[target].kind
-    if way < 0.28:
-        return Question(f"where is the {phrase}", place(ids == target + 1), target)
-    if way < 0.46:
-        return Question(_recognise(phrase, rng), ("yes",), target)
-    if way < 0.64:
-        return _wrong(kind, things, rng) if rng.random() < 0.7 else _absent(things, rng)
-    if (
-        way < 0.74
-        and things[target].given
-        and [thing.kind for thing in things.values()].count(kind) == 1
-    ):
-        return Question(f"what colour is the {kind}", (things[target].given,), target)
-    told = str(
-        rng.choice(
-            [task.instruction for task in TASKS if task.category == kind] or [f"pick up my {kind}"]
-        )
-    )
-    if not things[target].given and phrase != kind and rng.random() < 0.5:
-        return Question(
-            f"{told}. My {kind} is {rng.choice(phrases(things[target].name))}.", (), target
-        )
-    return Question(
-        told.replace(f"my {kind}", f"{rng.choice(DETERMINERS[1:])} {phrase}"), (), target
-    )
-
-
-def _phrase(i: int, things: Things, rng: np.random.Generator) -> str | None:
-    """What tells object i from its kind: "red cup", or "cup" when there is one only; None when nothing does."""
-    others = [thing for j, thing in things.items() if j != i and _alike(thing.kind, things[i].kind)]
-    telling = sorted(
-        word for word in things[i].said if not any(akin(word) & thing.shows for thing in others)
-    )
-    if telling and (others or rng.random() < 0.7):
-        return f"{rng.choice(telling)} {things[i].kind}"
-    return None if others else things[i].kind
-
-
-def _recognise(phrase: str, rng: np.random.Generator) -> str:
-    return (
-        f"is there a {phrase} in this image"
-        if rng.random() < 0.5
-        else f"can you recognize the {phrase} in this image"
-    )
-
-
-def _wrong(kind: str, things: Things, rng: np.random.Generator) -> Question:
-    """A kind that is there, in a colour or pattern that none of it has."""
-    has = {word for thing in things.values() if _alike(thing.kind, kind) for word in thing.shows}
-    foreign = sorted(
-        {word for thing in things.values() for word in thing.said if not akin(word) & has}
-    )
-    pool = (
-        foreign
-        if foreign and rng.random() < 0.5
-        else [colour.name for colour in free(has) if colour.name not in has]
-    )
-    return (
-        Question(_recognise(f"{rng.choice(pool)} {kind}", rng), ("no",), -1)
-        if pool
-        else _absent(things, rng)
-    )
-
-
-def _absent(things: Things, rng: np.random.Generator) -> Question:
-    """A kind that is not there, by a word that something wears or may wear."""
-    pool = sorted(
-        kind
-        for kind in objects.CATEGORIES
-        if not any(_alike(kind, thing.kind) for thing in things.values())
-    )
-    worn = sorted(
-        {word for thing in things.values() for word in thing.said}
-        | {colour.name for colour in PALETTE}
-    )
-    kind = str(rng.choice(pool))
-    return Question(
-        _recognise(f"{rng.choice(worn)} {kind}" if rng.random() < 0.7 else kind, rng), ("no",), -1
-    )
-
-
-def _alike(one: str, other: str) -> bool:
-    """A straw cup is a cup."""
-    return one == other or one.endswith(f" {other}") or other.endswith(f" {one}")
+    questions = []
+    for _ in range(n):
+        questions.append(_question(ids, visible, rng))
+    return QuestionedView(shown, tuple(questions))
 
 
 def place(mask: np.ndarray) -> tuple[str, str]:
     """Which of nine parts of the view holds the middle of a mask: its row, then its column."""
     ys, xs = np.nonzero(mask)
-    thirds = (3 * np.array([ys.mean(), xs.mean()]) / mask.shape[0]).astype(int)
-    return ("top", "middle", "bottom")[thirds[0]], ("left", "middle", "right")[thirds[1]]
+    middle = np.array([ys.mean(), xs.mean()])
+    row, column = (3 * middle / mask.shape[0]).astype(int)
+    return ("top", "middle", "bottom")[row], ("left", "middle", "right")[column]
+
+
+def _visible_objects(
+    ids: UInt8[np.ndarray, "s s"], names: Sequence[str]
+) -> dict[int, VisibleObject]:
+    """The objects with enough visible pixels, as they are."""
+    visible = {}
+    for i, name in enumerate(names):
+        if (ids == i + 1).sum() >= LEAST_PX:
+            visible[i] = VisibleObject(
+                name=name,
+                kind=objects.get_object(name).category,
+                words=appearance_words(name),
+                appearance=appearance_words(name),
+                given="",
+            )
+    return visible
+
+
+def _question(
+    ids: UInt8[np.ndarray, "s s"], visible: VisibleObjects, rng: np.random.Generator
+) -> Question:
+    """A question of any type about one of the objects that a phrase distinguishes, if any."""
+    named = {}
+    for i in visible:
+        phrase = _phrase(i, visible, rng)
+        if phrase:
+            named[i] = phrase
+    drawn = rng.random()
+    if not named:
+        return _ask_absent(visible, rng)
+    target = int(rng.choice(list(named)))
+    phrase = named[target]
+    kind = visible[target].kind
+    if drawn < 0.28:
+        return Question(f"where is the {phrase}", place(ids == target + 1), target)
+    if drawn < 0.46:
+        return Question(_recognition_text(phrase, rng), ("yes",), target)
+    if drawn < 0.64:
+        if rng.random() < 0.7:
+            return _ask_wrong_colour(kind, visible, rng)
+        return _ask_absent(visible, rng)
+    given = visible[target].given
+    if drawn < 0.74 and given and _is_only(kind, visible):
+        return Question(f"what colour is the {kind}", (given,), target)
+    return _ask_for_patches(target, phrase, visible[target], rng)
+
+
+def _phrase(i: int, visible: VisibleObjects, rng: np.random.Generator) -> str | None:
+    """What distinguishes object i from others of its kind; None when nothing does.
+
+    It is "red cup", or "cup" when there is one only.
+    """
+    kind = visible[i].kind
+    others = 0
+    distinctive = set(visible[i].words)
+    for j, rival in visible.items():
+        if j != i and _is_same_kind(rival.kind, kind):
+            others += 1
+            distinctive = _without_akin(distinctive, rival.appearance)
+    if distinctive and (others or rng.random() < 0.7):
+        return f"{rng.choice(sorted(distinctive))} {kind}"
+    return None if others else kind
+
+
+def _ask_wrong_colour(kind: str, visible: VisibleObjects, rng: np.random.Generator) -> Question:
+    """Is there a kind that is there, in a colour or pattern that none of it has?"""
+    own: set[str] = set()
+    all_words: set[str] = set()
+    for rival in visible.values():
+        all_words |= rival.words
+        if _is_same_kind(rival.kind, kind):
+            own |= rival.appearance
+    pool = sorted(_without_akin(all_words, own))
+    if not pool or rng.random() >= 0.5:
+        pool = [colour.name for colour in distinct_colours(own) if colour.name not in own]
+    if not pool:
+        return _ask_absent(visible, rng)
+    text = _recognition_text(f"{rng.choice(pool)} {kind}", rng)
+    return Question(text, ("no",), -1)
+
+
+def _ask_absent(visible: VisibleObjects, rng: np.random.Generator) -> Question:
+    """Is there a kind that is not there, mostly with a colour or pattern of something?"""
+    words = {colour.name for colour in PALETTE}
+    for seen in visible.values():
+        words |= seen.words
+    phrase = str(rng.choice(_absent_kinds(visible)))
+    if rng.random() < 0.7:
+        phrase = f"{rng.choice(sorted(words))} {phrase}"
+    return Question(_recognition_text(phrase, rng), ("no",), -1)
+
+
+def _ask_for_patches(
+    target: int, phrase: str, meant: VisibleObject, rng: np.random.Generator
+) -> Question:
+    """An instruction about an object; only the patches that show it answer."""
+    kind = meant.kind
+    text = str(rng.choice(_instructions(kind)))
+    if not meant.given and phrase != kind and rng.random() < 0.5:
+        description = rng.choice(phrases(meant.name))
+        return Question(f"{text}. My {kind} is {description}.", (), target)
+    determiner = rng.choice(DETERMINERS[1:])
+    return Question(text.replace(f"my {kind}", f"{determiner} {phrase}"), (), target)
+
+
+def _recognition_text(phrase: str, rng: np.random.Generator) -> str:
+    """A question that yes or no answers."""
+    if rng.random() < 0.5:
+        return f"is there a {phrase} in this image"
+    return f"can you recognize the {phrase} in this image"
+
+
+def _instructions(kind: str) -> list[str]:
+    """What the benchmarks' tasks tell a robot to do with a kind, or to pick it up."""
+    instructions = []
+    for task in TASKS:
+        if task.category == kind:
+            instructions.append(task.instruction)
+    return instructions or [f"pick up my {kind}"]
+
+
+def _absent_kinds(visible: VisibleObjects) -> list[str]:
+    """The kinds that nothing in view is of, in alphabetical order."""
+    absent = set(objects.CATEGORIES)
+    for kind in objects.CATEGORIES:
+        for seen in visible.values():
+            if _is_same_kind(kind, seen.kind):
+                absent.discard(kind)
+    return sorted(absent)
+
+
+def _is_same_kind(kind: str, other: str) -> bool:
+    """Whether one kind is the other; a straw cup is a cup."""
+    return kind == other or kind.endswith(f" {other}") or other.endswith(f" {kind}")
+
+
+def _is_only(kind: str, visible: VisibleObjects) -> bool:
+    """Whether exactly one object of this very kind is in view."""
+    count = 0
+    for seen in visible.values():
+        count += seen.kind == kind
+    return count == 1
+
+
+def _without_akin(words: set[str], appearance: Collection[str]) -> set[str]:
+    """The words that cannot be taken for one of an appearance's."""
+    kept = set()
+    for word in words:
+        if similar_colours(word).isdisjoint(appearance):
+            kept.add(word)
+    return kept

@@ -1,14 +1,16 @@
-"""Train a mini-PaliGemma on questions about rendered views of generic objects, before any policy grows from it (P 5.1, SPEC section 4).
+"""Train a mini-PaliGemma on questions about rendered views (P 5.1, SPEC section 4).
 
     python -m vap_core train vlm --out data/runs/mini-paligemma
 
-The answers' words are its loss, and, while training only, which patches show the object that is meant, asked of the penultimate layer.
+The views show generic objects; policies grow from the model. Its loss is of the answers' words and,
+in training only, of the patches that show the object meant, asked of the penultimate layer.
 """
 
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +25,12 @@ from vap_core.base.files import DATA
 from vap_core.base.types import Rgb, value
 from vap_core.evaluation.processes import results
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
-from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused
+from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
 from vap_core.policies.mini_pi0.vlm import ANSWER, MiniVlm, load
 from vap_core.training.films.demonstrations import SIDE, small
 from vap_core.training.films.scenes import Shots, cached
-from vap_core.training.looking import Shown, Sizes, looking, shares
-from vap_core.training.step import Descent, Told, average_of, descend
+from vap_core.training.patches import PatchScores, Sizes, patch_loss, patch_shares
+from vap_core.training.step import Figures, Schedule, average_of, train_steps
 from vap_core.training.vlm.questions import Question, ask
 
 CACHE = DATA / "cache" / "perception"
@@ -38,6 +40,8 @@ SEEN = 0.5
 KINDS = ("where", "yes", "no", "colour")
 HELD_OUT = 30
 """Stages with unseen objects that the result is measured on."""
+HELD_OUT_BATCHES = 16
+"""Batches of questions about them."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +67,11 @@ class View:
 
 @dataclass
 class Batch:
-    """Views (b x 3 x s x s in 0..1), the questions of each in turn (q), answers (q x ANSWER tokens; 0 counts nothing), patches (q x p)."""
+    """Views, questions, answers and patches.
+
+    Views are b x 3 x s x s in 0..1; the questions of each view follow each other (q in all);
+    answers are q x ANSWER tokens, of which 0 does not count; patches are q x p.
+    """
 
     images: Tensor
     questions: list[Question]
@@ -72,53 +80,46 @@ class Batch:
 
 
 class Learner(nn.Module):
-    """What is trained: the model, and the question beside it."""
+    """What is trained: the model, and the score of its patches."""
 
     def __init__(self, config: MiniPI0Config) -> None:
         super().__init__()
-        self.vlm, self.shown = MiniVlm(config), Shown(config.width)
+        self.vlm = MiniVlm(config)
+        self.shown = PatchScores(config.width)
 
 
 def configuration(recipe: Recipe) -> MiniPI0Config:
+    """The configuration of the model."""
     return MiniPI0Config(**recipe.configuration())
 
 
 def views(
     stages: int, seed: int, cache: Path, *, held_out: bool = False, jobs: int = 2
 ) -> list[View]:
-    """Views and every other portrait of so many stages, scaled down; rendered in processes where they are missing."""
+    """Views and every other portrait of so many stages, scaled down.
+
+    `jobs` processes render the stages that are missing.
+    """
     from tqdm import tqdm
 
     kind = "held" if held_out else "train"
-    missing = [n for n in range(stages) if not (cache / f"{kind}-{seed}-{n:05d}.npz").exists()]
+    missing = []
+    for number in range(stages):
+        if not (cache / f"{kind}-{seed}-{number:05d}.npz").exists():
+            missing.append(number)
     if missing:
-        list(
-            tqdm(
-                results(partial(_render, cache, seed, held_out), missing, jobs, "jobs"),
-                "scenes",
-                len(missing),
-                mininterval=10,
-            )
-        )
+        render = partial(_render, cache, seed, held_out)
+        finished = results(render, missing, jobs, "jobs")
+        for _ in tqdm(finished, "scenes", len(missing), mininterval=10):
+            pass
     found = []
-    for n in range(stages):
-        shots = cached(cache, seed, n, held_out=held_out)
-        found += [_view(rgb, ids, shots) for rgb, ids in zip(shots.rgb, shots.ids, strict=True)]
-        found += [
-            _view(rgb, ids, shots)
-            for rgb, ids in zip(shots.portraits[::2], shots.portrait_ids[::2], strict=True)
-        ]
+    for number in range(stages):
+        shots = cached(cache, seed, number, held_out=held_out)
+        pictures = zip(shots.rgb, shots.ids, strict=True)
+        portraits = zip(shots.portraits[::2], shots.portrait_ids[::2], strict=True)
+        for rgb, ids in chain(pictures, portraits):
+            found.append(_view(rgb, ids, shots))
     return found
-
-
-def _view(rgb: Rgb, ids: UInt8[np.ndarray, "h w"], shots: Shots) -> View:
-    return View(
-        small(rgb), cv2.resize(ids, (SIDE, SIDE), interpolation=cv2.INTER_NEAREST), shots.names
-    )
-
-
-def _render(cache: Path, seed: int, held_out: bool, number: int) -> None:
-    cached(cache, seed, number, held_out=held_out)
 
 
 def collate(
@@ -128,96 +129,132 @@ def collate(
     rng: np.random.Generator,
     config: MiniPI0Config,
 ) -> Batch:
-    """One batch: views drawn anew, coloured anew, with questions of their own."""
-    images, questions, shown = [], [], []
+    """One batch: views drawn anew, coloured anew, with questions of their own.
+
+    `number` gives the token of each word.
+    """
+    images = []
+    questions = []
+    patches = []
     for i in rng.integers(len(pool), size=recipe.batch):
         view = pool[i]
-        asked = ask(view.image, view.ids, view.names, recipe.questions, rng)
-        images.append(asked.image)
-        for question in asked.questions:
+        questioned = ask(view.image, view.ids, view.names, recipe.questions, rng)
+        images.append(questioned.image)
+        for question in questioned.questions:
             questions.append(question)
             meant = (view.ids == question.target + 1) & (question.target >= 0)
-            shown.append(shares(meant, config.patch))
-    answers = torch.zeros((len(questions), ANSWER), dtype=torch.long)
-    for row, question in zip(answers, questions, strict=True):
-        if question.answer:
-            said = [number[word] for word in (*question.answer, "\n")]
-            row[: len(said)] = torch.tensor(said)
-    pictures = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).float() / 255
-    return Batch(pictures, questions, answers, torch.from_numpy(np.stack(shown)).float())
+            patches.append(patch_shares(meant, config.patch))
+    return Batch(
+        images=torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).float() / 255,
+        questions=questions,
+        answers=_tokenize_answers(questions, number),
+        patches=torch.from_numpy(np.stack(patches)).float(),
+    )
 
 
-def losses(learner: Learner, batch: Batch) -> tuple[Tensor, Told]:
-    """Cross-entropy of the answers' words and of the patches; shares of right answers by kind of question (NaN: none was asked)."""
+def losses(learner: Learner, batch: Batch) -> tuple[Tensor, Figures]:
+    """Cross-entropy of the answers' words and of the patches, and figures to log.
+
+    Among the figures are shares of right answers by kind of question (NaN: none was asked).
+    """
     vlm = learner.vlm
-    tokens, there = vlm.ask([question.text for question in batch.questions])
-    patches = vlm.look(batch.images).repeat_interleave(len(batch.questions) // len(batch.images), 0)
+    texts = [question.text for question in batch.questions]
+    tokens, there = vlm.tokenize(texts)
+    per_view = len(batch.questions) // len(batch.images)
+    patches = vlm.embed_images(batch.images).repeat_interleave(per_view, 0)
     scores, hidden = vlm(patches, tokens, there, batch.answers)
     words = F.cross_entropy(scores.flatten(0, 1), batch.answers.flatten(), ignore_index=0)
-    heat, hit = looking(learner.shown(hidden), batch.patches)
-    right = ((scores.argmax(-1) == batch.answers) | (batch.answers == 0)).all(1)
-    kinds = [_kind(question) for question in batch.questions]
-    told = {
-        kind: _share([bool(good) for good, each in zip(right, kinds, strict=True) if each == kind])
-        for kind in KINDS
-    }
-    return words + SEEN * heat, {
-        "words": float(words.detach()),
-        "heat": float(heat.detach()),
-        "hit": float(hit),
-        **told,
-    }
-
-
-def _kind(question: Question) -> str:
-    """What was asked, and, of yes and no, what is right: a model that always says the same is half right at most."""
-    if not question.answer:
-        return ""
-    return {"where": "where", "what": "colour"}.get(question.text.split()[0], question.answer[0])
-
-
-def _share(good: list[bool]) -> float:
-    return float(np.mean(good)) if good else float("nan")
+    heat, hit = patch_loss(learner.shown(hidden), batch.patches)
+    matches = (scores.argmax(-1) == batch.answers) | (batch.answers == 0)
+    figures = {"words": float(words.detach()), "heat": float(heat.detach()), "hit": float(hit)}
+    figures |= _shares_right(matches.all(1), batch.questions)
+    return words + SEEN * heat, figures
 
 
 def train(
     recipe: Recipe, out: Path, *, minutes: float | None = None, cache: Path = CACHE, jobs: int = 2
 ) -> dict[str, Any]:
-    """Train, or go on where an earlier call stopped; write the model and what was measured on unseen objects."""
-    pool, config = views(recipe.stages, recipe.seed, cache, jobs=jobs), configuration(recipe)
-    torch.manual_seed(
-        recipe.seed
-    )  # initial weights only; every other draw comes from the step's stream
+    """Train, or go on where an earlier call stopped.
+
+    Writes the model to `out`, and what was measured on unseen objects, which it returns.
+    """
+    pool = views(recipe.stages, recipe.seed, cache, jobs=jobs)
+    config = configuration(recipe)
+    # Initial weights only; every other draw comes from the step's stream.
+    torch.manual_seed(recipe.seed)
     learner = Learner(config)
-    number = learner.vlm.number
+    number = learner.vlm.vocabulary
 
-    def step(model: Learner, at: int) -> tuple[Tensor, Told]:
-        with fused():
-            return losses(
-                model,
-                collate(recipe, pool, number, np.random.default_rng([75, recipe.seed, at]), config),
-            )
+    def step_losses(model: Learner, step: int) -> tuple[Tensor, Figures]:
+        rng = np.random.default_rng([75, recipe.seed, step])
+        with fused_attention():
+            batch = collate(recipe, pool, number, rng, config)
+            return losses(model, batch)
 
-    mean, log = descend(
-        learner,
-        step,
-        Descent(
-            "mini-paligemma",
-            recipe.steps,
-            recipe.rate,
-            minutes,
-            made_of={"recipe": vars(recipe), "words": config.words},
-        ),
-        out,
+    run = Schedule(
+        name="mini-paligemma",
+        steps=recipe.steps,
+        rate=recipe.rate,
+        minutes=minutes,
+        made_of={"recipe": vars(recipe), "words": config.words},
     )
-    held = views(min(HELD_OUT, recipe.stages), recipe.seed, cache, held_out=True, jobs=jobs)
+    mean, log = train_steps(learner, step_losses, run, out)
+    n_held_out = min(HELD_OUT, recipe.stages)
+    held_out = views(n_held_out, recipe.seed, cache, held_out=True, jobs=jobs)
     mean.vlm.save(out)
-    mean.vlm = load(out)  # what is measured is what was saved
+    # What is measured is what was saved.
+    mean.vlm = load(out)
+    figures = []
     with torch.no_grad():
-        told = [
-            losses(mean, collate(recipe, held, number, np.random.default_rng([76, i]), config))[1]
-            for i in range(16)
-        ]
-    about = {"recipe": vars(recipe), "held_out": average_of(told), "log": log}
+        for i in range(HELD_OUT_BATCHES):
+            rng = np.random.default_rng([76, i])
+            batch = collate(recipe, held_out, number, rng, config)
+            figures.append(losses(mean, batch)[1])
+    about = {"recipe": vars(recipe), "held_out": average_of(figures), "log": log}
     (out / "training.json").write_text(json.dumps(about, indent=1))
     return about
+
+
+def _view(rgb: Rgb, ids: UInt8[np.ndarray, "h w"], shots: Shots) -> View:
+    small_ids = cv2.resize(ids, (SIDE, SIDE), interpolation=cv2.INTER_NEAREST)
+    return View(small(rgb), small_ids, shots.names)
+
+
+def _render(cache: Path, seed: int, held_out: bool, number: int) -> None:
+    cached(cache, seed, number, held_out=held_out)
+
+
+def _tokenize_answers(questions: Sequence[Question], number: dict[str, int]) -> Tensor:
+    """The tokens of the answers (q x ANSWER); each ends with a new line, then zeros."""
+    answers = torch.zeros((len(questions), ANSWER), dtype=torch.long)
+    for row, question in zip(answers, questions, strict=True):
+        if question.answer:
+            tokens = [number[word] for word in (*question.answer, "\n")]
+            row[: len(tokens)] = torch.tensor(tokens)
+    return answers
+
+
+def _shares_right(right: Tensor, questions: Sequence[Question]) -> Figures:
+    """The share of right answers by kind of question, NaN where none was asked."""
+    by_kind: dict[str, list[bool]] = {"": []}
+    for kind in KINDS:
+        by_kind[kind] = []
+    for is_right, question in zip(right, questions, strict=True):
+        by_kind[_kind(question)].append(bool(is_right))
+    figures = {}
+    for kind in KINDS:
+        figures[kind] = float("nan")
+        if by_kind[kind]:
+            figures[kind] = float(np.mean(by_kind[kind]))
+    return figures
+
+
+def _kind(question: Question) -> str:
+    """What was asked, and, of yes and no, what is right.
+
+    So a model that always says the same is half right at most.
+    """
+    if not question.answer:
+        return ""
+    first_word = question.text.split()[0]
+    return {"where": "where", "what": "colour"}.get(first_word, question.answer[0])

@@ -1,0 +1,234 @@
+"""Commands that read the results of runs: diagnose, query, rescore, report, publish."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer()
+
+
+@app.command()
+def diagnose(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(help="Run folders of eval, rollout or demo, or tables that publish wrote."),
+    ],
+    suite: Annotated[str | None, typer.Option(help="Only failures of this suite.")] = None,
+    task: Annotated[str | None, typer.Option(help="Only failures of this task.")] = None,
+    method: Annotated[
+        str | None, typer.Option("--method", help="Only failures of this method.")
+    ] = None,
+    case: Annotated[
+        str | None,
+        typer.Option(
+            help="1 wrong mask, 2 views disagree, 3 right prompt but failed hand; unprompted; "
+            "unlabelled."
+        ),
+    ] = None,
+    sub_case: Annotated[
+        str | None,
+        typer.Option(help='Only this sub-case, for example "distractor vote" or "slip".'),
+    ] = None,
+    where: Annotated[
+        str | None,
+        typer.Option(
+            help='SQL condition on the columns of the table: "margin < 0.3 and steps > 20".'
+        ),
+    ] = None,
+    limit: Annotated[int, typer.Option(min=1, help="Failures to list.")] = 20,
+    show: Annotated[
+        int | None,
+        typer.Option(
+            "--open",
+            min=0,
+            help="Open this one of the list in the Rerun viewer, at its deciding frame.",
+        ),
+    ] = None,
+    png: Annotated[
+        Path | None,
+        typer.Option(help="With --open: save a picture of it instead, without a display."),
+    ] = None,
+    against: Annotated[
+        str | None,
+        typer.Option(
+            help="With --open: another method on the same episode beside it, on one time line."
+        ),
+    ] = None,
+    correct: Annotated[
+        str | None,
+        typer.Option(
+            help='With --open: what it really is, "case 3: slip"; kept as a layer beside the '
+            "recording."
+        ),
+    ] = None,
+    note: Annotated[str, typer.Option(help="With --correct: why you think so.")] = "",
+) -> None:
+    """Say why episodes failed, list them, and open one at the frame that decided it; one that was
+    not recorded is run again.
+
+    Example: python -m vap_core diagnose data/results/mini_pi0.parquet --method vap
+    Example: python -m vap_core diagnose data/results/mini_pi0.parquet --suite vlabench --case 2
+        --open 0
+    Example: python -m vap_core diagnose data/results/mini_pi0.parquet --method generic --open 0
+        --against vap --png beside.png
+    Example: python -m vap_core diagnose data/runs/demo --where "margin < 0.3" --open 0
+        --png why.png
+    Example: python -m vap_core diagnose data/runs/demo --open 0 --correct "case 3: slip"
+        --note "it held for a moment"
+    """
+    from vap_core.evaluation.diagnosis.failures import (
+        deciding_frame,
+        failures_text,
+        list_failures,
+    )
+    from vap_core.evaluation.diagnosis.recordings import (
+        correct_failure,
+        recording_of,
+        side_by_side_recording,
+    )
+
+    failures = list_failures(
+        *runs, suite=suite, task=task, method=method, case=case, sub_case=sub_case, where=where
+    )
+    number = show or 0
+    if correct is not None:
+        layer = correct_failure(failures, number, correct, note)
+        print(f"wrote {layer}")
+        return
+    if show is None and png is None:
+        print(failures_text(failures, limit))
+        return
+    if against:
+        path = side_by_side_recording(failures, number, against)
+    else:
+        path = recording_of(failures, number)
+    frame = deciding_frame(failures, number)
+    print(f"{path}, frame {frame}: {failures.table['case_sentence'].iloc[number]}")
+    _show_frame(path, frame, png)
+
+
+@app.command()
+def query(
+    run: Annotated[Path, typer.Argument(help="Run folder with recordings.")],
+    where: Annotated[
+        str,
+        typer.Argument(
+            help="SQL condition on steps: margin, track_score, gap_cm, lift_cm, frame_index, "
+            "method, outcome, case, steps, ..."
+        ),
+    ],
+    limit: Annotated[int, typer.Option(min=1, help="Recordings to list.")] = 20,
+    show: Annotated[
+        int | None,
+        typer.Option(
+            "--open",
+            min=0,
+            help="Open this one of the list in the Rerun viewer, at the first such step.",
+        ),
+    ] = None,
+    png: Annotated[
+        Path | None,
+        typer.Option(help="With --open: save a picture of it instead, without a display."),
+    ] = None,
+) -> None:
+    """Ask all recordings of a run at once: in which of them, and at which steps, does a
+    condition hold?
+
+    Example: python -m vap_core query data/runs/demo "margin < 0.05 and success = false"
+    Example: python -m vap_core query data/runs/demo
+        "gap_cm < 1 and lift_cm < 1 and frame_index > 20" --open 0 --png near.png
+    """
+    from vap_core.recording.query import first_match, format_result, run_query
+
+    result = run_query(run, where)
+    if show is None and png is None:
+        print(format_result(result, limit))
+        return
+    path, frame = first_match(result, show or 0)
+    print(f"{path}, frame {frame}")
+    _show_frame(path, frame, png)
+
+
+@app.command()
+def rescore(
+    run: Annotated[Path, typer.Argument(help="Run folder of eval, rollout or demo.")],
+) -> None:
+    """Judge a finished run again from its saved states, without a simulator, and say what changed.
+
+    Example: python -m vap_core rescore data/runs/expert-simpler-bridge
+    """
+    from vap_core.evaluation.rescore import rescore as judge_again
+
+    print(judge_again(run))
+
+
+@app.command()
+def report(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Run folders of eval, rollout or demo, or published tables; several make one "
+            "report."
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for report.md, CSV and LaTeX tables and pictures. Default RUN/report."
+        ),
+    ] = None,
+) -> None:
+    """Print and write what runs found: tables with intervals beside the paper's, paired
+    comparisons, errors, provenance, pictures.
+
+    Example: python -m vap_core report data/runs/demo
+    Example: python -m vap_core report data/results/scripted.parquet --out data/runs/scripted-report
+    """
+    from vap_core.evaluation.report import report as conclude
+
+    folder = out or _report_folder(runs[0])
+    print(conclude(runs, folder))
+    print(f"\nwrote {folder}: report.md, tables as CSV and LaTeX, pictures")
+
+
+@app.command()
+def publish(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(help="Run folders of eval, rollout or demo, or tables that publish wrote."),
+    ],
+    to: Annotated[
+        Path, typer.Option(help="The table to write, for example data/results/mine.parquet.")
+    ],
+    replace: Annotated[bool, typer.Option("--replace", help="Overwrite that table.")] = False,
+) -> None:
+    """Keep the results of finished runs as one small table, with their configurations.
+
+    Example: python -m vap_core publish data/runs/expert-all data/runs/random-all
+        --to data/results/bounds.parquet --replace
+    Example: python -m vap_core publish data/results/mine.parquet data/runs/more
+        --to data/results/mine.parquet --replace
+    """
+    from vap_core.evaluation.publish import publish as write_table
+
+    n_episodes = write_table(runs, to, replace=replace)
+    print(f"wrote {to}: {n_episodes} episodes")
+
+
+def _report_folder(first_run: Path) -> Path:
+    """Where a report goes: into the first run, or beside the runs where that is a table."""
+    if first_run.suffix == ".parquet":
+        return Path("data/runs") / f"{first_run.stem}-report"
+    return first_run / "report"
+
+
+def _show_frame(recording: Path, frame: int, png: Path | None) -> None:
+    """Open a recording in the viewer at one step, or picture it."""
+    from vap_core.recording import open_viewer, screenshot
+
+    if png is None:
+        open_viewer(recording, frame_index=frame)
+    else:
+        screenshot(recording, png, frame_index=frame, size=(1920, 1080))
+        print(f"wrote {png}")

@@ -1,0 +1,176 @@
+"""Commands that train shipped parts again: train perception, demonstrations, vlm, policy."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(
+    no_args_is_help=True,
+    help="Train shipped parts again; every training resumes after an interruption.",
+)
+
+
+@app.command()
+def perception(
+    out: Annotated[Path, typer.Option(help="Folder of the weights and their manifest.")] = Path(
+        "data/weights"
+    ),
+    scenes: Annotated[int, typer.Option(min=1, help="Rendered training views.")] = 6480,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    minutes: Annotated[float | None, typer.Option(help="Stop training after this long.")] = None,
+) -> None:
+    """Train the heads of detector, segmenter and encoder on rendered generic objects, and evaluate
+    them on unseen ones.
+
+    Example: python -m vap_core train perception --out data/runs/weights --scenes 400
+    """
+    from vap_core.training.perception.train import train
+
+    entry = train(out, scenes=scenes, seed=seed, minutes=minutes)
+    print(json.dumps(entry, indent=1))
+
+
+@app.command()
+def demonstrations(
+    suite: Annotated[
+        str, typer.Option(help="The benchmark whose robot, cameras and kinds of task are shown.")
+    ],
+    stages: Annotated[
+        int,
+        typer.Option(
+            min=1, help="Scenes with generic objects, of about eight demonstrations each."
+        ),
+    ] = 400,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the dataset. Default data/runs/demonstrations-SUITE."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Processes that film. Default one a core.")
+    ] = None,
+) -> None:
+    """Film the scripted expert with generic objects, as a LeRobotDataset v3. Interrupted, the same
+    command goes on.
+
+    Example: python -m vap_core train demonstrations --suite simpler-bridge --stages 2
+        --out data/runs/small-demonstrations
+    """
+    from vap_core.base.errors import one_of
+    from vap_core.simulation.suites import BENCHMARKS
+    from vap_core.training.films.dataset import ABOUT, write
+    from vap_core.training.policy.train import CACHE
+
+    if suite not in BENCHMARKS:
+        raise one_of("train demonstrations: suite", suite, BENCHMARKS)
+    folder = out or Path(f"data/runs/demonstrations-{suite}")
+    was_complete = (folder / ABOUT).exists()
+    made = write(suite, stages, folder, cache=CACHE, seed=seed, jobs=jobs)
+    digest = made["data_sha256"]
+    text = f"{folder}: {len(made['episodes'])} episodes of {stages} stages, sha256 {digest}"
+    if was_complete:
+        text += "; it was whole already."
+    print(text)
+
+
+@app.command()
+def vlm(
+    out: Annotated[
+        Path, typer.Option(help="Folder of the model; a training found there goes on.")
+    ] = Path("data/runs/mini-paligemma"),
+    stages: Annotated[
+        int,
+        typer.Option(
+            min=2, help="Scenes with generic objects, of about sixteen views each; rendered first."
+        ),
+    ] = 540,
+    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps.")] = 1600,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    minutes: Annotated[
+        float | None, typer.Option(help="Stop after this long; the same command goes on.")
+    ] = None,
+) -> None:
+    """Train the mini-PaliGemma that policies grow from, on questions about generic objects.
+    Interrupted, the same command goes on.
+
+    Example: python -m vap_core train vlm --stages 20 --steps 100 --out data/runs/small-vlm
+    """
+    from vap_core.training.vlm.train import Recipe, train
+
+    recipe = Recipe(stages=stages, steps=steps, seed=seed)
+    about = train(recipe, out, minutes=minutes)
+    print(json.dumps(about["held_out"], indent=1))
+    print(f"next: python -m vap_core train policy --suite simpler-bridge --vlm {out}")
+
+
+@app.command()
+def policy(
+    suite: Annotated[
+        str, typer.Option(help="The benchmark whose robot, cameras and kinds of task it learns.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the checkpoint; a training found there goes on. Default "
+            "data/runs/trained/mini-pi0-SUITE."
+        ),
+    ] = None,
+    stages: Annotated[
+        int,
+        typer.Option(
+            min=2,
+            help="Scenes with generic objects, of about eight demonstrations each; filmed first.",
+        ),
+    ] = 400,
+    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps.")] = 12_000,
+    batch: Annotated[int, typer.Option(min=1, help="Frames of one optimiser step.")] = 64,
+    vlm: Annotated[
+        Path | None,
+        typer.Option(help="The mini-PaliGemma that it grows from. Default the shipped one."),
+    ] = None,
+    start: Annotated[
+        Path | None,
+        typer.Option(help="A mini-pi0 to go on from instead, of the same suite or of another."),
+    ] = None,
+    demonstrations: Annotated[
+        Path | None,
+        typer.Option(
+            "--demonstrations",
+            help="A dataset of train demonstrations to learn from, instead of filming.",
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    minutes: Annotated[
+        float | None, typer.Option(help="Stop after this long; the same command goes on.")
+    ] = None,
+) -> None:
+    """Train a mini-pi0, the small frozen policy, on demonstrations with generic objects.
+    Interrupted, the same command goes on.
+
+    Example: python -m vap_core train policy --suite simpler-bridge --stages 40 --steps 500
+        --out data/runs/small-policy
+    """
+    from vap_core.base.errors import one_of
+    from vap_core.policies.mini_pi0.teach_token import MODEL
+    from vap_core.simulation.suites import BENCHMARKS
+    from vap_core.training.policy.train import Recipe, train
+
+    if suite not in BENCHMARKS:
+        raise one_of("train policy: suite", suite, BENCHMARKS)
+    folder = out or Path(f"data/runs/trained/mini-pi0-{suite}")
+    recipe = Recipe(suite=suite, stages=stages, steps=steps, batch=batch, seed=seed)
+    about = train(
+        recipe,
+        folder,
+        vlm=vlm or MODEL,
+        start=start,
+        demonstrations=demonstrations,
+        minutes=minutes,
+    )
+    print(json.dumps(about["held_out"], indent=1))
+    print(
+        f"next: python -m vap_core eval --suite {suite} --policy {folder} "
+        f"--methods generic,vap --episodes 4 --out {folder}-eval"
+    )

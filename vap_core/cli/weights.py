@@ -1,0 +1,50 @@
+"""Commands about the foundation stack's weights: weights list, weights pull."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(
+    no_args_is_help=True,
+    help="The foundation stack's weights: what is there, and how to get the rest.",
+)
+
+
+@app.command("list")
+def list_weights() -> None:
+    """What is on this machine, what is missing, and how to get it.
+
+    Example: python -m vap_core weights list
+    """
+    from vap_core.perception.foundation.store import weights_table
+
+    print(weights_table())
+
+
+@app.command("pull")
+def pull_weights(
+    stack: Annotated[
+        str, typer.Option("--stack", help="foundation, or foundation-small.")
+    ] = "foundation",
+    origin: Annotated[
+        Path | None,
+        typer.Option("--from", help="Without internet: a folder with a copy of another machine's."),
+    ] = None,
+    unpinned: Annotated[
+        bool,
+        typer.Option(
+            "--unpinned", help="Take other weights of the same architecture, for example your own."
+        ),
+    ] = False,
+) -> None:
+    """Get a stack's weights at their pinned revisions and check them. Interrupted, the same command
+    goes on.
+
+    Example: python -m vap_core weights pull --stack foundation-small
+    """
+    from vap_core.perception.foundation.downloads import pull
+    from vap_core.perception.foundation.sources import models_of
+    from vap_core.perception.foundation.store import store_folder
+
+    pull(models_of(stack), store_folder(), origin=origin, unpinned=unpinned)

@@ -1,0 +1,73 @@
+"""What the trainings of the small models share: sizes, and scores of patches."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from vap_core.training.films.demonstrations import SIDE
+from vap_core.training.words import vocabulary
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sizes:
+    """Features and layers of a mini-PaliGemma and of the action expert that grows from it."""
+
+    width: int = 128
+    depth: int = 4
+    vision_width: int = 128
+    vision_depth: int = 4
+    expert_width: int = 96
+
+    def configuration(self) -> dict[str, Any]:
+        """As MiniPI0Config takes them, with words and pictures."""
+        return {
+            "words": vocabulary(),
+            "device": "cpu",
+            "width": self.width,
+            "depth": self.depth,
+            "head_dim": self.width // 8,
+            "vision_width": self.vision_width,
+            "vision_depth": self.vision_depth,
+            "expert_width": self.expert_width,
+            "image_resolution": (SIDE, SIDE),
+        }
+
+
+class PatchScores(nn.Module):
+    """Scores how well patches show the object that is meant; in training only."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(width)
+        self.patch = nn.Linear(width, 1)
+
+    def forward(self, hidden: Tensor) -> Any:
+        """Scores (b x p) of the patches, from hidden states (b x p x d)."""
+        return self.patch(self.norm(hidden)).squeeze(-1)
+
+
+def patch_shares(mask: np.ndarray, patch: int) -> np.ndarray:
+    """Of every patch, view after view, the share that a mask (... x s x s) covers."""
+    side = mask.shape[-1] // patch
+    patches = mask.reshape(-1, side, patch, side, patch)
+    return patches.mean((2, 4)).reshape(-1)
+
+
+def patch_loss(scores: Tensor, patches: Tensor) -> tuple[Tensor, Tensor]:
+    """Cross-entropy of scores with shares of patches (both b x p), and the share of hits.
+
+    A hit is a best patch that shows some of the object. Both are over the rows in which anything
+    is shown; where nothing is, the cross-entropy is 0 and the share of hits NaN.
+    """
+    shown = patches.sum(1) > 0
+    target = patches / patches.sum(1, keepdim=True).clamp(min=1e-6)
+    if shown.any():
+        loss = -(target * scores.log_softmax(-1)).sum(1)[shown].mean()
+    else:
+        loss = torch.zeros(())
+    best = scores.argmax(1, keepdim=True)
+    hits = patches.gather(1, best).squeeze(1) > 0
+    return loss, hits[shown].float().mean()
