@@ -17,7 +17,7 @@ from vap_core.evaluation.methods import METHODS
 from vap_core.evaluation.policy_names import shipped
 from vap_core.evaluation.study import Study, make_trial, register_personal
 from vap_core.policies.hooks import attention_observed, observe_attention, report_attention
-from vap_core.policies.lerobot.adapter import LeRobot, load
+from vap_core.policies.lerobot.adapter import LeRobot, load_policy
 from vap_core.policies.lerobot.toy_pi0 import toy_sizes
 from vap_core.policies.protocol import PolicyInput
 from vap_core.recording import Recorder
@@ -35,9 +35,9 @@ def toys(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LeRobot]:
     root = tmp_path_factory.mktemp("checkpoints")
     with toy_sizes(tiny.TOY):
         return {
-            "pi0": load(tiny.pi0(root / "pi0", CAMERAS)),
-            "pi05": load(tiny.pi05(root / "pi05")),
-            "act": load(tiny.act(root / "act")),
+            "pi0": load_policy(tiny.pi0(root / "pi0", CAMERAS)),
+            "pi05": load_policy(tiny.pi05(root / "pi05")),
+            "act": load_policy(tiny.act(root / "act")),
         }
 
 

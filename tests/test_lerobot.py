@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 from tests import tiny_lerobot as tiny
 from vap_core.base.errors import BadPolicy
 from vap_core.policies.hooks import TEXT
-from vap_core.policies.lerobot.adapter import LeRobot, compare, load, load_for_suite
+from vap_core.policies.lerobot.adapter import LeRobot, compare, load_policy, load_for_suite
 from vap_core.policies.lerobot.checkpoints import fingerprint, is_checkpoint_name
 from vap_core.policies.lerobot.toy_pi0 import toy_sizes
 from vap_core.policies.protocol import Policy, PolicyInput
@@ -41,7 +41,7 @@ def folders(tmp_path_factory):
 @pytest.fixture(scope="module")
 def policies(folders):
     with toy_sizes(tiny.TOY):
-        return {name: load(folder) for name, folder in folders.items()}
+        return {name: load_policy(folder) for name, folder in folders.items()}
 
 
 def look(i, text="put my camera on the plate", side=64):
@@ -208,12 +208,12 @@ def test_names_are_mapped_by_the_checkpoints_own_rename_map(folders, tmp_path):
         "observation.images.head": "observation.images.front"
     }
     file.write_text(json.dumps(pipeline))
-    policy, seen = load(folder), look(0)
+    policy, seen = load_policy(folder), look(0)
     assert set(policy.wanted) == {"observation.images.head", "observation.state"}
     headed = replace(seen, images={"head": seen.images["front"]})
     assert (
         run(policy, begin(policy, 1), [headed])
-        == run(load(folders["act"]), begin(policy, 1), [seen])
+        == run(load_policy(folders["act"]), begin(policy, 1), [seen])
     ).all()
 
 
@@ -234,7 +234,7 @@ def test_weights_that_are_not_the_files_are_refused(folders, tmp_path, name, fau
         toy_sizes(tiny.TOY),
         pytest.raises(BadPolicy, match=r"load: \d+ of \d+ tensors differ|cannot become a policy"),
     ):
-        load(folder)
+        load_policy(folder)
 
 
 def test_one_number_that_differs_is_found(folders, policies, tmp_path):
@@ -260,7 +260,7 @@ def test_a_toy_without_its_sizes_is_refused_not_random(folders):
             BadPolicy, match=r"load: \d+ of \d+ tensors differ from .*another architecture"
         ),
     ):
-        load(folders["pi0"])
+        load_policy(folders["pi0"])
     assert modeling_pi0.get_gemma_config("gemma_2b").width == 2048  # nothing small is left behind
 
 
@@ -271,7 +271,7 @@ def test_a_toy_without_its_sizes_is_refused_not_random(folders):
         "lerobot.processor.pipeline.importlib",
         "os.system",
         3,
-        "vap_core.policies.lerobot.adapter.load",
+        "vap_core.policies.lerobot.adapter.load_policy",
     ],
 )
 def test_files_are_parsed_never_executed(folders, tmp_path, step):
@@ -285,7 +285,7 @@ def test_files_are_parsed_never_executed(folders, tmp_path, step):
     with pytest.raises(
         BadPolicy, match="which is no step of lerobot; files are parsed here, never executed"
     ):
-        load(folder)
+        load_policy(folder)
     assert not (tmp_path / "owned").exists()
 
 
@@ -294,11 +294,11 @@ def test_what_is_missing_or_damaged_is_one_line(folders, tmp_path):
         BadPolicy,
         match=r"no/such-model is no folder and no model on this machine; download it with `hf download no/such-model`",
     ):
-        load("no/such-model")
+        load_policy("no/such-model")
     with pytest.raises(
         BadPolicy, match=r"lacks config.json, model.safetensors, policy_preprocessor.json"
     ):
-        load(tmp_path)
+        load_policy(tmp_path)
     for name, text, said in (
         ("policy_preprocessor.json", "[", "is no processor pipeline"),
         ("config.json", "{}", r"cannot become a policy \(ValueError: Missing 'type'"),
@@ -308,7 +308,7 @@ def test_what_is_missing_or_damaged_is_one_line(folders, tmp_path):
         folder = copy_of(folders["act"], tmp_path / f"{name}-{len(text)}")
         (folder / name).write_text(text)
         with pytest.raises(BadPolicy, match=said):
-            load(folder)
+            load_policy(folder)
 
 
 @pytest.mark.parametrize(
@@ -333,7 +333,7 @@ def test_a_backbone_that_was_not_downloaded_is_named(
             match=r"cannot become a policy \(.*get what it builds on: `hf download owner/backbone`\.$",
         ),
     ):
-        load(folder)
+        load_policy(folder)
 
 
 def test_a_fingerprint_tells_checkpoints_apart(folders, tmp_path):

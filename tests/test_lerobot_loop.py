@@ -21,7 +21,7 @@ from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadViews, Unkn
 from vap_core.cli.bench import eval as bench_eval
 from vap_core.cli.bench import eval_report
 from vap_core.perception.stacks import STACKS, load_stack
-from vap_core.policies.lerobot.adapter import load
+from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.lerobot.step import LeRobotEnv, VapEnvConfig, VapPrompt, attach
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters.text import generic
@@ -222,12 +222,12 @@ def test_attaching_links_the_frozen_files_and_adds_one_step(whole):
     with pytest.raises(BadOutput, match="personal exists; choose another folder"):
         attach(whole / "act", whole / "personal", whole / "memory")
     with pytest.raises(BadPolicy, match="has VAP attached for lerobot's own loops"):
-        load(whole / "personal")
+        load_policy(whole / "personal")
 
 
 def test_lerobots_own_loop_and_our_rollout_do_the_same(whole):
     """Same frozen policy, episodes and per-step VAP: every action is the same in both."""
-    policy, config = load(whole / "act"), VapEnvConfig(task=f"{SUITE}/{TASK}", max_steps=3)
+    policy, config = load_policy(whole / "act"), VapEnvConfig(task=f"{SUITE}/{TASK}", max_steps=3)
     before = policy.sha256()
     env = config.create_envs(2)[SUITE][0]
     pipelines = (

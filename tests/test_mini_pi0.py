@@ -10,7 +10,7 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies import get_policy_class, make_pre_post_processors
 from lerobot.policies.pi0.modeling_pi0 import PI0Policy
 
-from vap_core.policies.lerobot.adapter import load
+from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
 from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
@@ -79,7 +79,7 @@ def test_weights_of_another_size_are_refused(checkpoint: Path, tmp_path: Path) -
 
 
 def test_it_drives_our_rollouts_and_hears_words_and_pictures(checkpoint: Path) -> None:
-    policy = load(checkpoint)
+    policy = load_policy(checkpoint)
     assert policy.label.startswith(f"mini_pi0:{checkpoint.name}@")
     states = [policy.start(np.random.default_rng(i)) for i in range(3)]
     said = [

@@ -12,10 +12,10 @@ from safetensors.torch import load_file
 from torch.nn import functional as F  # noqa: N812
 
 from vap_core.base.errors import BadOutput, BadPolicy
-from vap_core.policies.lerobot.adapter import load
+from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.lerobot.checkpoints import fingerprint
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy, fused_attention
-from vap_core.policies.mini_pi0.vlm import load as load_vlm
+from vap_core.policies.mini_pi0.vlm import load_vlm
 from vap_core.simulation.control import arm, rotation_vector
 from vap_core.simulation.suites import suite
 from vap_core.training.films import demonstrations
@@ -80,7 +80,7 @@ def test_a_training_that_was_stopped_ends_like_one_that_was_not(
     )
     with pytest.raises(BadOutput, match="another recipe or other data"):
         policy.train(replace(recipe, rate=0.1), tmp_path / "torn", cache=folder)
-    trained = load(tmp_path / "whole")
+    trained = load_policy(tmp_path / "whole")
     assert trained.execute == 4
     assert (trained.action_size, set(trained.wanted)) == (
         7,
@@ -128,7 +128,7 @@ def test_a_vision_language_model_learns_and_resumes(
     )
     monkeypatch.setattr(demonstrations, "EPISODES", 2)
     about = policy.train(grown, tmp_path / "policy", vlm=tmp_path / "whole", cache=stage[0])
-    assert about["vlm"] == one == load(tmp_path / "policy").policy.config.vlm
+    assert about["vlm"] == one == load_policy(tmp_path / "policy").policy.config.vlm
     further = policy.train(
         replace(grown, rate=0.0), tmp_path / "further", start=tmp_path / "policy", cache=stage[0]
     )

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from vap_core.base.errors import BadPolicy, UnknownName
-from vap_core.policies.lerobot.adapter import load
+from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.protocol import PolicyInput
 from vap_core.prompt import PALETTE
 from vap_core.rollout.prompters.protocol import PromptContext, SceneTruth
@@ -88,11 +88,11 @@ def test_what_cannot_be_asked_for_is_told_in_a_line(grown: tuple[Path, Path]) ->
     with pytest.raises(UnknownName, match="way 'shouted' is unknown"):
         probe.probe(str(grown[1]), SUITE, ways=("shouted",))
     with pytest.raises(BadPolicy, match="decides on 4 actions at a time; ask for 1 to 4"):
-        load(str(grown[1])).with_execute(5)
+        load_policy(str(grown[1])).with_execute(5)
 
 
 def test_fewer_actions_of_a_chunk_are_its_first(grown: tuple[Path, Path]) -> None:  # noqa: F811
-    policy = load(str(grown[1]))
+    policy = load_policy(str(grown[1]))
     seen = PolicyInput(
         {"front": np.full((224, 224, 3), 90, np.uint8)},
         "pick up the red shaver",

@@ -8,7 +8,7 @@ import pytest
 from vap_core.evaluation.diagnosis.failures import list_failures
 from vap_core.evaluation.report.failures import breakdown
 from vap_core.evaluation.report.results import results
-from vap_core.evaluation.report.runs import load
+from vap_core.evaluation.report.runs import load_runs
 from vap_core.evaluation.statistics import ALL_TASKS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -27,7 +27,7 @@ def rows(heading: str) -> list[list[str]]:
 def test_success_rates() -> None:
     (head, *body), whole = (
         rows("| method | simpler-fractal"),
-        results(load([RESULTS / "mini_pi0.parquet"])),
+        results(load_runs([RESULTS / "mini_pi0.parquet"])),
     )
     whole = whole[whole.task == ALL_TASKS]
     quoted = {}

@@ -27,7 +27,7 @@ from vap_core.evaluation.report.pictures import (
 )
 from vap_core.evaluation.report.provenance import command_line
 from vap_core.evaluation.report.results import errors, results
-from vap_core.evaluation.report.runs import load
+from vap_core.evaluation.report.runs import load_runs
 from vap_core.evaluation.statistics import ALL_TASKS, compare
 from vap_core.evaluation.store import append, open_run
 from vap_core.simulation import suites
@@ -91,7 +91,7 @@ def test_a_tiny_run_is_reported_to_the_letter(tmp_path: Path) -> None:
 
 def test_a_checkpoint_goes_by_its_label_not_by_its_path(tmp_path: Path) -> None:
     lines = results(
-        load([run(tmp_path / "run", policy="some/where/last", label="pi0:last@0123abcd")])
+        load_runs([run(tmp_path / "run", policy="some/where/last", label="pi0:last@0123abcd")])
     )
     assert set(lines.policy) == {"pi0:last@0123abcd"}
     assert lines[lines.task != ALL_TASKS].n.tolist() == [6] * 4
@@ -160,18 +160,18 @@ def test_a_published_table_is_reported_like_its_runs(tmp_path: Path) -> None:
         run(tmp_path / "two", tasks=(("tabletop", "put-plant"),), seeds=1),
     ]
     publish(folders, tmp_path / "kept.parquet")
-    one, two = load(folders), load([tmp_path / "kept.parquet"])
+    one, two = load_runs(folders), load_runs([tmp_path / "kept.parquet"])
     columns = [name for name in one.table if name != "detail"]
     pd.testing.assert_frame_equal(one.table[columns], two.table[columns], check_dtype=False)
     pd.testing.assert_frame_equal(results(one), results(two))
     (tmp_path / "kept.parquet").write_bytes((tmp_path / "kept.parquet").read_bytes()[:100])
     with pytest.raises(BadOutput, match="no table of finished runs"):
-        load([tmp_path / "kept.parquet"])
+        load_runs([tmp_path / "kept.parquet"])
 
 
 def test_what_reads_the_simulator_is_marked(tmp_path: Path) -> None:
     folder = run(tmp_path / "run")
-    runs = load([folder])
+    runs = load_runs([folder])
     assert not results(runs)["bound"].any()
     runs.table["bound"] = runs.table["method"].eq("vap")
     marked = results(runs).groupby("method")["bound"].agg(["all", "any"])
@@ -187,23 +187,23 @@ def test_an_unfinished_run_is_reported_as_it_is(tmp_path: Path) -> None:
         f"**Unfinished**: {folder} is unfinished: 18 of 24 episodes; run the same command again to finish it."
         in text
     )
-    lines = results(load([folder])).set_index(["task", "method"])
+    lines = results(load_runs([folder])).set_index(["task", "method"])
     assert lines.loc["put-camera", "n"].tolist() == [3, 3]
     early = run(tmp_path / "early", keep=0.5)  # one task is not there at all
-    lines = results(load([early])).set_index(["task", "method"])
+    lines = results(load_runs([early])).set_index(["task", "method"])
     assert lines.loc["put-camera", "n"].tolist() == [0, 0]
     assert "0 of 24" in report([early], tmp_path / "out")
 
 
 def test_seeds_of_a_benchmark_are_one_report_with_layouts_for_units(tmp_path: Path) -> None:
-    runs = load([run(tmp_path / str(seed), seed=seed) for seed in range(3)])
+    runs = load_runs([run(tmp_path / str(seed), seed=seed) for seed in range(3)])
     lines = results(runs).set_index(["task", "method"])
     shaver = lines.loc[("pick-shaver", "vap")]
     assert (shaver.n, shaver.listed, shaver.seeds, shaver.layouts) == (18, 72, 3, 6)
     assert shaver.sr_layout_low < shaver.sr_low, "Wilson's 18 independent episodes claim too much"
     (c,) = (c for c in compare(runs.table, runs.methods) if c.task == "pick-shaver")
     assert (c.pairs, c.layouts) == (18, 6)
-    once = results(load([tmp_path / "0"])).set_index(["task", "method"]).loc["pick-shaver"]
+    once = results(load_runs([tmp_path / "0"])).set_index(["task", "method"]).loc["pick-shaver"]
     assert once["sr_layout_low"].isna().all(), "no layout returns: Wilson alone"
 
 
@@ -219,7 +219,7 @@ def test_one_run_of_several_seeds_is_several_runs_of_one(tmp_path: Path) -> None
             for row in pd.read_parquet(next((folder / "parts").iterdir())).to_dict("records")
         ],
     )
-    pd.testing.assert_frame_equal(results(load([both])), results(load(apart)))
+    pd.testing.assert_frame_equal(results(load_runs([both])), results(load_runs(apart)))
     assert "seed 0..1" in report([both], tmp_path / "out")
 
 
@@ -227,14 +227,14 @@ def test_the_order_of_runs_and_rows_changes_no_number(tmp_path: Path) -> None:
     one, two = run(tmp_path / "one"), run(tmp_path / "two", seed=1)
     keys = ["task", "method"]
     there, back = (
-        results(load(folders)).sort_values(keys, ignore_index=True)
+        results(load_runs(folders)).sort_values(keys, ignore_index=True)
         for folders in ([one, two], [two, one])
     )
     pd.testing.assert_frame_equal(there, back)
 
 
 def test_errors_are_counted_by_their_last_line(tmp_path: Path) -> None:
-    runs = load([run(tmp_path / "run")])
+    runs = load_runs([run(tmp_path / "run")])
     assert errors(runs) == ["2 x RuntimeError: the arm | fell off"]
     table = runs.table.assign(outcome="error", detail=[f"E{i}" for i in range(len(runs.table))])
     assert (
@@ -307,8 +307,8 @@ def test_the_same_episodes_twice_are_refused_and_a_run_named_twice_counts_once(
 ) -> None:
     one, other = run(tmp_path / "one"), run(tmp_path / "other")
     with pytest.raises(BadOutput, match="hold the same episodes; name each run once"):
-        load([one, other])
-    assert len(load([one, one]).table) == len(load([one]).table)
+        load_runs([one, other])
+    assert len(load_runs([one, one]).table) == len(load_runs([one]).table)
 
 
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
@@ -363,7 +363,7 @@ def test_pictures_show_every_line_and_overlap_nothing(tmp_path: Path) -> None:
     tasks = tuple(
         (name, task.name) for name in suites.BENCHMARKS for task in suites.suite(name).tasks
     )
-    runs = load([run(tmp_path / "run", tasks)])
+    runs = load_runs([run(tmp_path / "run", tasks)])
     lines, compared = results(runs), compare(runs.table, runs.methods)
     for figure, count in (
         (forest_figure(lines), len(lines) // 2),

@@ -10,9 +10,9 @@ from lerobot.policies import get_policy_class, make_pre_post_processors
 from tests.command import vap
 from vap_core.evaluation.policy_names import MINI, SHIPPED, default_policy, shipped
 from vap_core.evaluation.store import read
-from vap_core.policies.lerobot.adapter import load
+from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.mini_pi0.teach_token import MODEL
-from vap_core.policies.mini_pi0.vlm import load as load_vlm
+from vap_core.policies.mini_pi0.vlm import load_vlm
 from vap_core.simulation import suites
 from vap_core.training.policy.probe import probe
 
@@ -22,7 +22,7 @@ BRIDGE = shipped("simpler-bridge")
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
 def test_it_is_whole_small_and_grown_from_the_model_that_ships(folder: Path) -> None:
-    policy = load(folder).policy
+    policy = load_policy(folder).policy
     again = get_policy_class("mini_pi0").from_pretrained(folder)
     assert all(
         torch.equal(one, other)

@@ -205,13 +205,13 @@ def test_the_command_measures_resumes_and_publishes(tmp_path: Path) -> None:
     }
     lost.unlink()
     asked = Survey(suites=("simpler-fractal",), episodes=1, quick=True)
-    again = run.run(asked, out, jobs=1, progress=False)
+    again = run.run_survey(asked, out, jobs=1, progress=False)
     assert {
         part.name: part.stat().st_mtime_ns for part in (out / "parts").iterdir() if part != lost
     } == kept
     assert all(tables[name].equals(again[name]) for name in run.TABLES)
     lost.write_text("{")
     with pytest.raises(BadOutput, match="is damaged; delete it and run the same command again"):
-        run.run(asked, out, jobs=1, progress=False)
+        run.run_survey(asked, out, jobs=1, progress=False)
     with pytest.raises(BadOutput, match="holds another run"):
-        run.run(replace(asked, suites=("tabletop",)), out, jobs=1, progress=False)
+        run.run_survey(replace(asked, suites=("tabletop",)), out, jobs=1, progress=False)

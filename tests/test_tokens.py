@@ -8,7 +8,7 @@ import torch
 
 from vap_core.base.errors import BadMemory, BadPolicy
 from vap_core.base.types import Rgb
-from vap_core.policies.lerobot.adapter import load as load_policy
+from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.mini_pi0 import learned_token
 from vap_core.policies.mini_pi0.learned_token import (
     SUFFIX,
@@ -20,7 +20,7 @@ from vap_core.policies.mini_pi0.learned_token import (
     learn,
 )
 from vap_core.policies.mini_pi0.vlm import MiniVlm, initialise_policy
-from vap_core.policies.mini_pi0.vlm import load as load_vlm
+from vap_core.policies.mini_pi0.vlm import load_vlm
 from vap_core.policies.protocol import PolicyInput
 from vap_core.training.words import vocabulary
 

@@ -48,13 +48,13 @@ def eval_perception(
     Example: python -m vap_core eval-perception --suite simpler-bridge --quick
     """
     from vap_core.evaluation.perception.report import conclude
-    from vap_core.evaluation.perception.run import Survey, run
+    from vap_core.evaluation.perception.run import Survey, run_survey
     from vap_core.evaluation.perception.run import publish as write_tables
     from vap_core.simulation.suites import BENCHMARKS
 
     suite_names = tuple(dict.fromkeys(suite or BENCHMARKS))
     survey = Survey(stack, suite_names, episodes, quick)
-    tables = run(survey, out, jobs=jobs)
+    tables = run_survey(survey, out, jobs=jobs)
     print(conclude(tables, survey.stack, out))
     if publish is not None:
         written = ", ".join(map(str, write_tables(out, publish)))

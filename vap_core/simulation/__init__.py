@@ -1,1 +1,5 @@
 """MuJoCo scenes, robots, cameras, and the benchmark suites."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

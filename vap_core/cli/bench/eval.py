@@ -82,10 +82,10 @@ def prepare(plan: Plan, folder: Path) -> None:
 
 def _lerobot_arms(plan: Plan, folder: Path, stack: ExitStack) -> list[Arm]:
     """lerobot.scripts.lerobot_eval.eval_policy, called as its command calls it."""
-    from vap_core.policies.lerobot.adapter import load
+    from vap_core.policies.lerobot.adapter import load_policy
     from vap_core.policies.lerobot.step import VapEnvConfig
 
-    policy = load(folder / "pi0", "cpu").policy
+    policy = load_policy(folder / "pi0", "cpu").policy
     config = VapEnvConfig(task=f"{SUITE}/{TASK}", max_steps=plan.steps)
     arms = []
     for n_envs, in_processes in plan.loops:

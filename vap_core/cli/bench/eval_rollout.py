@@ -91,7 +91,7 @@ def _build(plan: Plan, folder: Path) -> None:
     from vap_core.attend import Attender
     from vap_core.memory import load_bank
     from vap_core.perception.stacks import load_stack
-    from vap_core.policies.lerobot.adapter import load
+    from vap_core.policies.lerobot.adapter import load_policy
     from vap_core.rollout.loop import Trial
     from vap_core.rollout.prompters.tint import TintPrompter
     from vap_core.simulation.suites.open_row import build_scene
@@ -102,7 +102,7 @@ def _build(plan: Plan, folder: Path) -> None:
             models[placement.model] = None
     suite = suites.suite(SUITE)
     with toy_sizes(plan.toy):
-        policy = load(folder / "pi0", "cpu")
+        policy = load_policy(folder / "pi0", "cpu")
     attender = Attender(load_stack("embedded"), load_bank(folder / "memory"))
     _trial = Trial(
         method="vap",

@@ -15,7 +15,7 @@ from vap_core.base.tables import align
 from vap_core.evaluation.policy_names import MINI, shipped
 from vap_core.evaluation.statistics import ratio
 from vap_core.perception.embedded.backbone import features
-from vap_core.policies.lerobot.adapter import IMAGE, STATE, LeRobot, load
+from vap_core.policies.lerobot.adapter import IMAGE, STATE, LeRobot, load_policy
 from vap_core.policies.protocol import PolicyInput
 from vap_core.simulation.suites import BENCHMARKS
 
@@ -49,7 +49,7 @@ def run(quick: bool = False) -> str:
         header.append(f"throughput at batch {batch} [95 %]")
     rows = [header]
     for name, folder in folders.items():
-        seconds = _call_seconds(load(folder), rng, repeat)
+        seconds = _call_seconds(load_policy(folder), rng, repeat)
         call = float(np.median(seconds[1]))
         n_views = len(BENCHMARKS[name].cameras)
         gains = [_gain_text(seconds, batch) for batch in BATCHES[1:]]

@@ -1,4 +1,5 @@
-"""How well perception does on the benchmarks, measured against the simulator.
+"""How well perception does on the benchmarks, measured against the simulator."""
 
-What it found, tracked and cost, as tables and curves.
-"""
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -157,7 +157,7 @@ def run_job(job: Job) -> Tables:
     return tables
 
 
-def run(
+def run_survey(
     asked: Survey, folder: Path, *, jobs: int = 2, progress: bool = True
 ) -> "dict[str, pd.DataFrame]":
     """Do what `folder` lacks of the survey, write a parquet table each and return them.

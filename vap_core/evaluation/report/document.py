@@ -15,7 +15,7 @@ from vap_core.evaluation.report.latex import main_tables
 from vap_core.evaluation.report.pictures import differences_figure, forest_figure
 from vap_core.evaluation.report.provenance import provenance
 from vap_core.evaluation.report.results import comparisons, outcomes, results
-from vap_core.evaluation.report.runs import load
+from vap_core.evaluation.report.runs import load_runs
 from vap_core.evaluation.statistics import compare
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def report(sources: Sequence[Path], out: Path) -> str:
 
     Raises: BadOutput for a run that is damaged or an `out` that cannot be written.
     """
-    runs = load(sources)
+    runs = load_runs(sources)
     lines = results(runs)
     ends = outcomes(runs)
     origins = provenance(runs)

@@ -46,7 +46,7 @@ class Runs:
         return list(dict.fromkeys(self.wanted["method"]))
 
 
-def load(sources: Sequence[Path]) -> Runs:
+def load_runs(sources: Sequence[Path]) -> Runs:
     """Read runs of eval, rollout or demo: their folders, or tables that `publish` made of them.
 
     Raises: BadOutput for a folder that holds no run, no episode, damaged parts or episodes it was

@@ -1,6 +1,6 @@
 """Any policy that lerobot can load, as one of ours, with frozen weights and in batches.
 
-    policy = load("path/to/checkpoint")        # or owner/name, already downloaded
+    policy = load_policy("path/to/checkpoint")        # or owner/name, already downloaded
     Trial("generic", scene, policy, ...)
 
 A checkpoint is a folder as lerobot writes it: config.json, model.safetensors, and the two processor
@@ -342,7 +342,7 @@ class LeRobot:
         return torch.stack(noise).to(config.device)
 
 
-def load(checkpoint: str | Path, device: str | None = None) -> LeRobot:
+def load_policy(checkpoint: str | Path, device: str | None = None) -> LeRobot:
     """Load a checkpoint through lerobot's factory.
 
     `checkpoint` is a folder, or the `owner/name` of a model that was downloaded before.

@@ -64,7 +64,7 @@ def teach(
     from vap_core.policies.mini_pi0 import vlm
 
     rows = list(rows)
-    teacher = vlm.load(model)
+    teacher = vlm.load_vlm(model)
     if teacher.sha256() != initialised_from:
         known = f"mini-PaliGemma {initialised_from[:8]}" if initialised_from else "none"
         raise BadStudy(

@@ -139,11 +139,11 @@ class MiniVlm(nn.Module):
         return tuple(words)
 
 
-def load(folder: Path) -> MiniVlm:
+def load_vlm(folder: Path) -> MiniVlm:
     """The frozen model that `save` wrote. Raises: BadPolicy."""
     if not (folder / WEIGHTS).is_file():
         raise BadPolicy(
-            f"vlm.load: {folder} holds no mini-PaliGemma ({WEIGHTS}); make one: "
+            f"load_vlm: {folder} holds no mini-PaliGemma ({WEIGHTS}); make one: "
             "python -m vap_core train vlm"
         )
     try:
@@ -153,7 +153,7 @@ def load(folder: Path) -> MiniVlm:
     except Exception as error:
         reason = (str(error).strip().splitlines() or [""])[0]
         raise BadPolicy(
-            f"vlm.load: {folder} is damaged ({type(error).__name__}: {reason:.150}); run: "
+            f"load_vlm: {folder} is damaged ({type(error).__name__}: {reason:.150}); run: "
             "python -m vap_core train vlm"
         ) from error
     return vlm.eval().requires_grad_(False)

@@ -26,7 +26,7 @@ from vap_core.base.types import Rgb, value
 from vap_core.evaluation.processes import results
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
-from vap_core.policies.mini_pi0.vlm import ANSWER, MiniVlm, load
+from vap_core.policies.mini_pi0.vlm import ANSWER, MiniVlm, load_vlm
 from vap_core.training.films.demonstrations import SIDE, small
 from vap_core.training.films.scenes import Shots, cached
 from vap_core.training.patches import PatchScores, Sizes, patch_loss, patch_shares
@@ -203,7 +203,7 @@ def train(
     held_out = views(n_held_out, recipe.seed, cache, held_out=True, jobs=jobs)
     mean.vlm.save(out)
     # What is measured is what was saved.
-    mean.vlm = load(out)
+    mean.vlm = load_vlm(out)
     figures = []
     with torch.no_grad():
         for i in range(HELD_OUT_BATCHES):

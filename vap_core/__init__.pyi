@@ -1,0 +1,34 @@
+from .attend import Attender as Attender
+from .attend import Prompting as Prompting
+from .base.errors import VapError as VapError
+from .base.photos import load_photo as load_photo
+from .evaluation.methods import METHODS as METHODS
+from .evaluation.policy_names import shipped as shipped
+from .evaluation.study import DEMO as DEMO
+from .evaluation.study import Study as Study
+from .evaluation.study import make_trial as make_trial
+from .evaluation.study import register_personal as register_personal
+from .instruction import parse as parse
+from .instruction import rewrite as rewrite
+from .memory import load as load
+from .memory import load_bank as load_bank
+from .memory import register as register
+from .memory import save as save
+from .perception.protocols import Stack as Stack
+from .perception.stacks import load_stack as load_stack
+from .prompt import PALETTE as PALETTE
+from .prompt import choose_colours as choose_colours
+from .prompt import tint as tint
+from .recording import Recorder as Recorder
+from .recording import recording_name as recording_name
+from .recording import screenshot as screenshot
+from .recording import view as view
+from .rollout.loop import Trial as Trial
+from .simulation.assets.objects import get_object as get_object
+from .simulation.env import Env as Env
+from .simulation.studio import reference_views as reference_views
+from .simulation.suites import BENCHMARKS as BENCHMARKS
+from .simulation.suites.open_row import open_row as open_row
+from .vote import similarity as similarity
+
+__version__: str

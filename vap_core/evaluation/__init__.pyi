@@ -1,0 +1,12 @@
+from . import engine as engine
+from . import paper as paper
+from .diagnosis import explain as explain
+from .diagnosis.failures import list_failures as list_failures
+from .diagnosis.recordings import save_screenshot as save_screenshot
+from .metrics import rate as rate
+from .report.failures import breakdown as breakdown
+from .report.failures import funnel_table as funnel_table
+from .report.failures import sub_cases_text as sub_cases_text
+from .report.funnel import cases_figure as cases_figure
+from .report.funnel import funnel_figure as funnel_figure
+from .stills import write_provenance as write_provenance

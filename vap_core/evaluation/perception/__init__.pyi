@@ -1,0 +1,13 @@
+from .curves import abstention as abstention
+from .curves import abstention_figure as abstention_figure
+from .curves import hardness_figure as hardness_figure
+from .curves import hidden_figure as hidden_figure
+from .curves import lookalike_pairs as lookalike_pairs
+from .curves import references_figure as references_figure
+from .curves import time_figure as time_figure
+from .estimates import share as share
+from .first_frames import openings as openings
+from .first_frames import registered_object as registered_object
+from .report import measures as measures
+from .run import Survey as Survey
+from .run import run_survey as run_survey

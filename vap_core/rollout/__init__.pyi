@@ -1,0 +1,2 @@
+from .loop import Trial as Trial
+from .loop import rollout as rollout
