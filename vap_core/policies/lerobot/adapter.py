@@ -485,7 +485,9 @@ def _names_in_file(
 
     openpi's names are mapped by the policy itself; numbers stand in for the tensors meanwhile.
     """
-    numbered = {name: torch.tensor(i) for i, name in enumerate(names)}
+    numbered = {}
+    for i, name in enumerate(names):
+        numbered[name] = torch.tensor(i)
     rename: Callable[..., dict[str, Any]] | None
     rename = getattr(policy, "_fix_pytorch_state_dict_keys", None)
     if rename is not None:
