@@ -208,4 +208,4 @@ def test_layouts_and_hardness_draw():
     table = pd.DataFrame(
         {"object": ["cup"] * 2, "tier": ["hard", "easy"], "cosine": [0.9, 0.5], "own": [0.95] * 2}
     )
-    assert len(hardness_figure(table, gallery.TIER_COLOURS).axes[0].collections) == 3
+    assert len(hardness_figure(table).axes[0].collections) == 3

@@ -18,8 +18,7 @@ from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.learned_token import WORD, TokenTraining
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
 from vap_core.policies.mini_pi0.teach_token import photographs
-from vap_core.policies.mini_pi0.vlm import MiniVlm, initialise_policy
-from vap_core.policies.mini_pi0.vlm import load_vlm
+from vap_core.policies.mini_pi0.vlm import MiniVlm, initialise_policy, load_vlm
 from vap_core.rollout.prompters.text import TextPrompter, soft_prompt
 from vap_core.simulation import suites
 from vap_core.simulation.assets import objects

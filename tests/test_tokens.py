@@ -19,8 +19,7 @@ from vap_core.policies.mini_pi0.learned_token import (
     augment,
     learn,
 )
-from vap_core.policies.mini_pi0.vlm import MiniVlm, initialise_policy
-from vap_core.policies.mini_pi0.vlm import load_vlm
+from vap_core.policies.mini_pi0.vlm import MiniVlm, initialise_policy, load_vlm
 from vap_core.policies.protocol import PolicyInput
 from vap_core.training.words import vocabulary
 

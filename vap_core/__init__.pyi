@@ -3,6 +3,7 @@ from .attend import Prompting as Prompting
 from .base.errors import VapError as VapError
 from .base.photos import load_photo as load_photo
 from .evaluation.methods import METHODS as METHODS
+from .evaluation.metrics import rate as rate
 from .evaluation.policy_names import shipped as shipped
 from .evaluation.study import DEMO as DEMO
 from .evaluation.study import Study as Study
@@ -16,6 +17,9 @@ from .memory import register as register
 from .memory import save as save
 from .perception.protocols import Stack as Stack
 from .perception.stacks import load_stack as load_stack
+from .policies.lerobot.adapter import load_policy as load_policy
+from .policies.lerobot.checkpoints import fingerprint as fingerprint
+from .policies.mini_pi0.vlm import load_vlm as load_vlm
 from .prompt import PALETTE as PALETTE
 from .prompt import choose_colours as choose_colours
 from .prompt import tint as tint

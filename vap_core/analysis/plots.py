@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vap_core.base.figures import OTHER, WINNER, empty_figure
+from vap_core.base.figures import OTHER, TIER_COLOURS, WINNER, empty_figure
 from vap_core.base.types import Attended, Grounding, PersonalObject, Rgb, value
 from vap_core.evaluation.metrics import Rate, Score
 from vap_core.simulation.types import EpisodeRow
@@ -170,7 +170,7 @@ def sheet(
     return figure
 
 
-def hardness_figure(table: "pd.DataFrame", colours: Mapping[str, str]) -> "Figure":
+def hardness_figure(table: "pd.DataFrame") -> "Figure":
     """Cosines of look-alikes by tier, one line per personal object, of `gallery.hardness`.
 
     A diamond marks the object's own new views.
@@ -184,7 +184,7 @@ def hardness_figure(table: "pd.DataFrame", colours: Mapping[str, str]) -> "Figur
             part.cosine,
             part.object.map(place),
             s=26,
-            color=colours[str(tier)],
+            color=TIER_COLOURS[str(tier)],
             alpha=0.85,
             label=f"look-alike, {tier}",
         )

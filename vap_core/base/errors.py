@@ -1,4 +1,4 @@
-"""Errors that carry their remedy: one line that says where, what was possible and what to do next."""
+"""Errors with their remedy: one line that says where, what was possible and what to do next."""
 
 from collections.abc import Iterable
 

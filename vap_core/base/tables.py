@@ -1,4 +1,4 @@
-"""Rows of text cells as aligned text, Markdown and LaTeX (booktabs); the first row is the header."""
+"""Rows of text cells as aligned text, Markdown and LaTeX (booktabs); the first is the header."""
 
 from collections.abc import Sequence
 

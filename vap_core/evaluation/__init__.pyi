@@ -3,10 +3,15 @@ from . import paper as paper
 from .diagnosis import explain as explain
 from .diagnosis.failures import list_failures as list_failures
 from .diagnosis.recordings import save_screenshot as save_screenshot
-from .metrics import rate as rate
+from .report.cells import percent_interval as percent_interval
 from .report.failures import breakdown as breakdown
 from .report.failures import funnel_table as funnel_table
 from .report.failures import sub_cases_text as sub_cases_text
 from .report.funnel import cases_figure as cases_figure
 from .report.funnel import funnel_figure as funnel_figure
+from .report.pictures import differences_figure as differences_figure
+from .report.pictures import forest_figure as forest_figure
+from .report.runs import load_runs as load_runs
+from .statistics import ALL_TASKS as ALL_TASKS
+from .statistics import compare as compare
 from .stills import write_provenance as write_provenance

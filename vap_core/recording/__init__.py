@@ -20,6 +20,8 @@ from vap_core.recording.file import recording_name as recording_name
 from vap_core.recording.file import recover as recover
 from vap_core.recording.grounding import record_grounding as record_grounding
 from vap_core.recording.index import ensure_index as ensure_index
+from vap_core.recording.query import format_result as format_result
+from vap_core.recording.query import run_query as run_query
 from vap_core.recording.reading import read_chunks as read_chunks
 from vap_core.recording.reading import read_summary as read_summary
 from vap_core.recording.recorder import Recorder as Recorder

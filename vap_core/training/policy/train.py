@@ -30,8 +30,7 @@ from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.lerobot.checkpoints import fingerprint
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy, fused_attention
-from vap_core.policies.mini_pi0.vlm import initialise_policy, store_in_bfloat16
-from vap_core.policies.mini_pi0.vlm import load_vlm
+from vap_core.policies.mini_pi0.vlm import initialise_policy, load_vlm, store_in_bfloat16
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import suite
 from vap_core.training.films.dataset import about, data_sha256, read, shoot_stages
