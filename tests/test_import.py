@@ -1,7 +1,10 @@
 """The front door opens fast and loads nothing heavy."""
 
+import ast
 import subprocess
 import sys
+from importlib import import_module
+from pathlib import Path
 
 import pytest
 
@@ -37,3 +40,23 @@ def test_import_is_fast() -> None:
 def test_every_exported_name_exists() -> None:
     for name in vap_core.__all__:
         assert getattr(vap_core, name) is not None
+
+
+def test_type_checkers_see_the_names_that_load() -> None:
+    tree = ast.parse(Path(vap_core.__file__).read_text())
+    seen = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("vap_core."):
+            for alias in node.names:
+                seen.add(alias.name)
+    assert seen == set(vap_core.__all__)
+
+
+@pytest.mark.parametrize(
+    "package",
+    ["analysis", "evaluation", "evaluation.perception", "rollout", "simulation", "training"],
+)
+def test_every_name_of_a_package_exists(package: str) -> None:
+    module = import_module(f"vap_core.{package}")
+    for name in module.__all__:
+        assert getattr(module, name) is not None

@@ -1,12 +1,79 @@
 """Visual Attentive Prompting: steer a frozen policy to the user's own object, and see why it worked
 or failed.
 
-The public names stand in `__init__.pyi` and load when they are first used: importing this package
-loads no torch, mujoco or rerun. Start reading at attend.py.
+The public names below load when they are first used: importing this package loads no torch, mujoco
+or rerun. Start reading at attend.py.
 """
+
+from typing import TYPE_CHECKING
 
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+if TYPE_CHECKING:
+    from vap_core.attend import Attender as Attender
+    from vap_core.attend import Prompting as Prompting
+    from vap_core.base.errors import VapError as VapError
+    from vap_core.base.photos import load_photo as load_photo
+    from vap_core.evaluation.methods import METHODS as METHODS
+    from vap_core.evaluation.metrics import rate as rate
+    from vap_core.evaluation.policy_names import shipped as shipped
+    from vap_core.evaluation.study import DEMO as DEMO
+    from vap_core.evaluation.study import Study as Study
+    from vap_core.evaluation.study import make_trial as make_trial
+    from vap_core.evaluation.study import register_personal as register_personal
+    from vap_core.instruction import parse as parse
+    from vap_core.instruction import rewrite as rewrite
+    from vap_core.memory import load as load
+    from vap_core.memory import load_bank as load_bank
+    from vap_core.memory import register as register
+    from vap_core.memory import save as save
+    from vap_core.perception.protocols import Stack as Stack
+    from vap_core.perception.stacks import load_stack as load_stack
+    from vap_core.policies.lerobot.adapter import load_policy as load_policy
+    from vap_core.policies.lerobot.checkpoints import fingerprint as fingerprint
+    from vap_core.policies.mini_pi0.vlm import load_vlm as load_vlm
+    from vap_core.prompt import PALETTE as PALETTE
+    from vap_core.prompt import choose_colours as choose_colours
+    from vap_core.prompt import tint as tint
+    from vap_core.recording import Recorder as Recorder
+    from vap_core.recording import recording_name as recording_name
+    from vap_core.recording import screenshot as screenshot
+    from vap_core.recording import view as view
+    from vap_core.rollout.loop import Trial as Trial
+    from vap_core.simulation.assets.objects import get_object as get_object
+    from vap_core.simulation.env import Env as Env
+    from vap_core.simulation.studio import reference_views as reference_views
+    from vap_core.simulation.suites import BENCHMARKS as BENCHMARKS
+    from vap_core.simulation.suites.open_row import open_row as open_row
+    from vap_core.vote import similarity as similarity
 
 __version__ = "0.1.0"
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "attend": ["Attender", "Prompting"],
+        "base.errors": ["VapError"],
+        "base.photos": ["load_photo"],
+        "evaluation.methods": ["METHODS"],
+        "evaluation.metrics": ["rate"],
+        "evaluation.policy_names": ["shipped"],
+        "evaluation.study": ["DEMO", "Study", "make_trial", "register_personal"],
+        "instruction": ["parse", "rewrite"],
+        "memory": ["load", "load_bank", "register", "save"],
+        "perception.protocols": ["Stack"],
+        "perception.stacks": ["load_stack"],
+        "policies.lerobot.adapter": ["load_policy"],
+        "policies.lerobot.checkpoints": ["fingerprint"],
+        "policies.mini_pi0.vlm": ["load_vlm"],
+        "prompt": ["PALETTE", "choose_colours", "tint"],
+        "recording": ["Recorder", "recording_name", "screenshot", "view"],
+        "rollout.loop": ["Trial"],
+        "simulation.assets.objects": ["get_object"],
+        "simulation.env": ["Env"],
+        "simulation.studio": ["reference_views"],
+        "simulation.suites": ["BENCHMARKS"],
+        "simulation.suites.open_row": ["open_row"],
+        "vote": ["similarity"],
+    },
+)

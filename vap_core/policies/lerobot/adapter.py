@@ -372,7 +372,7 @@ def load_policy(checkpoint: str | Path, device: str | None = None) -> LeRobot:
     )
 
 
-_load_cached = cache(load)
+_load_cached = cache(load_policy)
 
 
 def load_for_suite(checkpoint: str, scene: Scene, suite: Suite) -> LeRobot:
