@@ -82,7 +82,7 @@ def _method_column(name: str, image_roots: list[str]) -> rrb.Container:
         name=f"{name} · gripper and target",
         plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
     )
-    status = rrb.StateTimelineView(origin=f"/{name}/vap/status", name=f"{name} · course")
+    status = rrb.StateTimelineView(origin=f"/{name}/vap/status", name=f"{name} · status")
     return rrb.Vertical(
         text,
         rrb.Horizontal(*views, scene),

@@ -39,7 +39,7 @@ def vote_view(camera: str, title: str = "vote at t = 0", n_targets: int = 1) -> 
 
 def coverage_view(camera: str) -> Part:
     """The prompt in the colour of the object that it covers."""
-    return _image_view(camera, "prompt by whom it covers", ["", "/identity"])
+    return _image_view(camera, "prompt, coloured by object", ["", "/identity"])
 
 
 def attention_view(camera: str) -> Part:

@@ -1,0 +1,78 @@
+"""Stills of recordings say what they show, and none that is committed shows something else than what ships."""
+
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from vap_core.analysis.plots import keep_png
+from vap_core.base.errors import BadOutput
+from vap_core.evaluation import stills
+from vap_core.evaluation.study import Study
+
+FIGURES = Path(__file__).parents[1] / "figures"
+COMMITTED = {
+    "00_tour_recording.png",
+    "08_error_taxonomy_beside.png",
+    "08_error_taxonomy_case1.png",
+    "08_error_taxonomy_case2.png",
+    "08_error_taxonomy_case3.png",
+}
+STUDY = Study((("widowx-pick", "pick-straw-cup"),), ("vap",), episodes=1)
+
+
+@pytest.fixture
+def still(tmp_path: Path) -> Path:
+    path = tmp_path / "still.png"
+    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(path)
+    stills.write_provenance(path, STUDY)
+    return path
+
+
+def test_every_committed_still_shows_what_ships() -> None:
+    found = {path.name for path in FIGURES.glob("*.png") if stills.read_provenance(path)}
+    assert found == COMMITTED
+    differences = {name: stills.stale(FIGURES / name) for name in sorted(COMMITTED)}
+    assert not any(differences.values()), (
+        f"{differences}; set RECOMPUTE in the notebook and execute it again"
+    )
+
+
+def test_another_world_or_recorder_makes_a_still_stale(
+    still: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert stills.stale(still) == ""
+    with monkeypatch.context() as patch:
+        patch.setattr(stills, "recorder_digest", lambda: "another")
+        assert "recorder" in stills.stale(still)
+    monkeypatch.setattr(Study, "configuration", lambda study: {"weights": "another"})
+    assert "weights" in stills.stale(still)
+
+
+def test_a_smaller_copy_keeps_what_it_shows(still: Path) -> None:
+    before = stills.read_provenance(still)
+    jpeg = keep_png(still.read_bytes(), still)
+    assert stills.read_provenance(still) == before
+    assert Image.open(BytesIO(jpeg)).format == "JPEG"
+
+
+def test_docstrings_are_not_part_of_the_recorder() -> None:
+    import ast
+
+    one, other = (
+        ast.dump(stills._without_docstrings(ast.parse(text)))
+        for text in ('def f():\n    "a"\n    return 1', 'def f():\n    "b"\n    return 1  # c')
+    )
+    assert one == other
+
+
+def test_a_picture_that_says_nothing_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "plain.png"
+    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(path)
+    with pytest.raises(BadOutput, match="does not say what it shows; take the picture again"):
+        stills.stale(path)
+    path.write_bytes(b"no picture")
+    with pytest.raises(BadOutput, match="is no PNG"):
+        stills.write_provenance(path, STUDY)
