@@ -19,6 +19,23 @@ os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = (
     "0"  # read when ray is first imported: the tests' cluster stays on loopback
 )
 
+END_TO_END = {
+    "test_attention", "test_benchmarks", "test_catalog", "test_cli", "test_cluster", "test_dataset",
+    "test_demo", "test_demonstrations", "test_diagnosis", "test_engine", "test_eval_cli",
+    "test_foundation", "test_gallery", "test_imported", "test_lerobot", "test_lerobot_loop",
+    "test_methods", "test_mini_pi0", "test_perception_training", "test_planted",
+    "test_policy_training", "test_probe", "test_record", "test_record_files", "test_shipped_policies",
+    "test_sim", "test_soft_prompt", "test_survey_tables", "test_tokens",
+}  # fmt: skip
+"""Modules that run whole episodes, trainings or commands: slow, so `make check` leaves them out."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.path.stem in END_TO_END:
+            item.add_marker(pytest.mark.slow)
+
+
 settings.register_profile("vap", deadline=None, derandomize=True)
 settings.load_profile("vap")
 

@@ -157,7 +157,7 @@ def test_a_folder_that_cannot_be_written_is_asked_all_the_same(
     assert not (run / "recordings" / FOLDER).exists()
 
 
-@pytest.mark.slow
+@pytest.mark.sweep
 def test_what_a_query_costs_is_told() -> None:
     done = vap("bench", "query", "--quick")
     assert done.returncode == 0, done.stderr

@@ -275,6 +275,7 @@ def test_lerobot_eval_runs_it_from_the_command_line(whole, tmp_path, monkeypatch
     assert list((tmp_path / "out" / "videos").rglob("*.mp4"))
 
 
+@pytest.mark.sweep
 def test_the_bench_runs_both_loops_over_the_same_steps():
     plan, theirs, ours = bench_eval.measure(bench_eval.QUICK)
     assert len(theirs) == len(ours) == 2

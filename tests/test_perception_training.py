@@ -119,7 +119,7 @@ def test_average_precision_of_known_rankings() -> None:
     assert evaluation.precision_of_views([((none, score[:0]), none, none)], 0.5) is None
 
 
-@pytest.mark.slow
+@pytest.mark.sweep
 def test_training_is_a_command_that_resumes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -49,6 +49,7 @@ def test_it_is_taken_when_nobody_names_another() -> None:
     assert default_policy(["simpler-bridge", "widowx-pick"]) == "scripted"
 
 
+@pytest.mark.sweep
 def test_the_cost_of_a_call_is_told_for_every_policy_that_ships() -> None:
     done = vap("bench", "policy", "--quick")
     assert done.returncode == 0, done.stderr

@@ -244,6 +244,7 @@ def take(env: Env, row: EpisodeRow) -> tuple[Judge, float]:
     return judge, float(abs(env.truth().objects_world[row.target][2] - env.state()[2] - rest))
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("name", sorted(WARM_UPS))
 def test_grasps_hold(name):
     """Every category, the personal object and two look-alikes, any yaw: at least 95 % are picked, and creep stays under 2 mm."""

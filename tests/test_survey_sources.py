@@ -19,7 +19,7 @@ PLACED = sorted(
 NUMBER = re.compile(r"-generic-(\d+)")
 SOURCES = sorted(Path(vap_core.__file__).parent.rglob("*.py"))
 EXECUTES = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"}
-TEXT_ONLY = re.compile("Tokenizer|Processor|Config|get_policy_class")
+TEXT_ONLY = re.compile("Tokenizer|Processor|Config|policy_class")
 """What reads no weights, and lerobot's policies, which read model.safetensors and no other file."""
 
 

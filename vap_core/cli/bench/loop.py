@@ -143,14 +143,14 @@ def _attend_limits(trial: Trial, row: EpisodeRow, unit: float) -> list[Limit]:
         Limit(
             what="attend step (track + prompt), the wrist's view",
             measured=step_ms,
-            budget=60,
+            budget=60.0,
             unit="ms",
             ratio=f"{step_ms / unit:.2f} backbone passes",
         ),
         Limit(
             what="start-up grounding, one view",
             measured=start_ms,
-            budget=350,
+            budget=350.0,
             unit="ms",
             ratio=f"{start_ms / unit:.2f} backbone passes",
         ),
@@ -199,21 +199,21 @@ def _record_limits(cost: RecordingCost) -> list[Limit]:
         Limit(
             what="recording, over the CPU of the rollout",
             measured=float(np.median(over)),
-            budget=8,
+            budget=8.0,
             unit="%",
             ratio=f"{over[0]:.1f} to {over[-1]:.1f} % in {len(over)} repeats",
         ),
         Limit(
             what="60 steps of 3 cameras, as JPEGs",
             measured=cost.jpeg_mb * 60 / n_steps,
-            budget=4,
+            budget=4.0,
             unit="MB",
             ratio=f"{cost.jpeg_mb:.2f} MB for {n_steps} steps",
         ),
         Limit(
             what="60 steps of 3 cameras, as AV1",
             measured=cost.video_mb * 60 / n_steps,
-            budget=2,
+            budget=2.0,
             unit="MB",
             ratio=f"{cost.video_mb:.2f} MB for {n_steps} steps",
         ),
@@ -232,7 +232,7 @@ def _import_limit(unit: float) -> Limit:
     return Limit(
         what="import vap_core",
         measured=fastest_ms,
-        budget=300,
+        budget=300.0,
         unit="ms",
         ratio=f"{fastest_ms / unit:.2f} backbone passes",
     )

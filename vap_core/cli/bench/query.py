@@ -48,7 +48,7 @@ def run(recordings: int = 1000, quick: bool = False) -> str:
             Limit(
                 what="index of a recording, once",
                 measured=1e3 * index_s,
-                budget=50,
+                budget=50.0,
                 unit="ms",
                 ratio=f"{index_s / whole_s:.2f} recordings read whole",
             )
@@ -93,14 +93,14 @@ def _query_limits(folder: Path, n: int, whole_s: float) -> list[Limit]:
         Limit(
             what=f"query over {n} recordings ({megabytes:.0f} MB)",
             measured=seconds,
-            budget=5,
+            budget=5.0,
             unit="s",
             ratio=f"{seconds / whole_s:.0f} recordings read whole",
         ),
         Limit(
             what="memory of that process",
             measured=gigabytes,
-            budget=2,
+            budget=2.0,
             unit="GB",
             ratio=f"{found:.0f} found",
         ),
@@ -114,7 +114,7 @@ def _open_limit(recording: Path, whole_s: float) -> Limit:
     return Limit(
         what="opening a frame without a display",
         measured=seconds,
-        budget=15,
+        budget=15.0,
         unit="s",
         ratio=f"{seconds / whole_s:.0f} recordings read whole",
     )

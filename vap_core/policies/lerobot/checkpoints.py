@@ -14,8 +14,10 @@ CONFIG = "config.json"
 PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
 STEP_NAME = "vap_prompt"
 """The registered name of the step that prompts inside lerobot's own loops."""
-STEP_CLASS = re.compile(r"vap_core\.(\w+\.)*VapPrompt")
-"""Its class, in this version or an earlier one."""
+STEP_CLASS = "vap_core.policies.lerobot.step.VapPrompt"
+"""Its class."""
+ANY_STEP_CLASS = re.compile(r"vap_core\.(\w+\.)*VapPrompt")
+"""Its class in this version or an earlier one."""
 TRAINING_CARD = "training.json"
 """How a checkpoint was trained, which does not decide what it does."""
 WANTED_FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
@@ -92,7 +94,7 @@ def refuse_code(folder: Path) -> None:
     for file in PIPELINES:
         for step in _steps(folder / file):
             name = str(step.get("class", ""))
-            if step.get("registry_name") == STEP_NAME or STEP_CLASS.fullmatch(name):
+            if step.get("registry_name") == STEP_NAME or ANY_STEP_CLASS.fullmatch(name):
                 raise BadPolicy(
                     f"load: {folder} has VAP attached for lerobot's own loops; here give the plain "
                     "checkpoint, and the method by --method."
