@@ -35,7 +35,7 @@ from vap_core.training.policy.commands import (
     roughen_mask,
     tinted,
 )
-from vap_core.training.vlm.questions import LEAST_PX, ask, place
+from vap_core.training.vlm.questions import MIN_ASKED_PX, ask, place
 from vap_core.training.words import PAINTS, appearance_words, phrases, similar_colours, vocabulary
 
 SUITE = "simpler-bridge"
@@ -271,7 +271,7 @@ def test_questions_are_true_of_their_views(stage: tuple[Path, list[Film]]) -> No
                     .removesuffix(" in this image")
                 )
                 assert not any(asked_for in (objects.get_object(name).category, *(f"{word} {objects.get_object(name).category}" for word in appearance_words(name)))
-                               for i, name in enumerate(film.names) if (film.ids[t, 0] == i + 1).sum() >= LEAST_PX)  # fmt: skip
+                               for i, name in enumerate(film.names) if (film.ids[t, 0] == i + 1).sum() >= MIN_ASKED_PX)  # fmt: skip
             ends[
                 question.answer[:1]
                 if question.answer[:1] in (("yes",), ("no",))

@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from vap_core.evaluation.diagnosis.failures import list_failures
@@ -61,3 +62,11 @@ def test_cases_of_failure(suite: str) -> None:
     ]
     assert quoted is not None
     assert quoted.groups() == (*shares, str(counts.failed), str(counts.n))
+
+
+def test_no_hand_of_the_published_table_closes_after_the_last_action() -> None:
+    """A terminal frame has no action: 65 time-outs were once missed grasps that it decided."""
+    table = pd.read_parquet(RESULTS / "mini_pi0.parquet")
+    missed = table[table["sub_case"] == "missed grasp"]
+    assert len(missed) == 1876
+    assert (missed["deciding_frame"] < missed["steps"]).all()

@@ -19,7 +19,7 @@ from vap_core.evaluation.perception.first_frames import (
     View,
     find_candidates,
     match,
-    openings,
+    opening_views,
     registered_object,
 )
 from vap_core.evaluation.perception.first_frames import survey_view as survey_one
@@ -188,7 +188,7 @@ def test_match_agrees_with_a_slow_reference(
 
 def test_openings_show_each_row_as_its_suite_does() -> None:
     rows = suites.rows("tabletop", "select-vase", 1)
-    (first,), (again,) = list(openings(rows)), list(openings(rows))
+    (first,), (again,) = list(opening_views(rows)), list(opening_views(rows))
     assert [v.camera for v in first] == ["front", "side", "wrist"]
     assert all(np.array_equal(a.rgb, b.rgb) for a, b in zip(first, again, strict=True))
     for v in first:
@@ -199,7 +199,7 @@ def test_openings_show_each_row_as_its_suite_does() -> None:
 
 def test_agreements_tell_contradiction_and_what_geometry_makes_of_it() -> None:
     """True boxes, and embeddings that say who is who by a hair, but for one view in which they name a look-alike."""
-    (episode,) = openings(suites.rows("vlabench", "select-shoe", 1))
+    (episode,) = opening_views(suites.rows("vlabench", "select-shoe", 1))
     target = episode[0].row.target
     names = [name for name in episode[0].masks if objects.get_object(name).category == "shoe"]
     assert all(name in v.visible() for v in episode for name in names)
@@ -249,7 +249,7 @@ def test_the_list_is_spread_over_splits_and_variants() -> None:
 def test_survey_fills_every_table_and_keys_every_line() -> None:
     from vap_core.perception.stacks import load_stack
 
-    (episode,) = openings(suites.rows("simpler-bridge", "pick-shaver", 1))
+    (episode,) = opening_views(suites.rows("simpler-bridge", "pick-shaver", 1))
     stack = load_stack("embedded")
     tables = survey(episode, stack, ks=(1, 5))
     assert len(tables["views"]) == 1

@@ -17,7 +17,7 @@ from vap_core.base.errors import BadOutput, UnknownName
 from vap_core.base.figures import GENERIC, OTHER, WINNER, empty_figure
 from vap_core.base.types import Grounding, Mask, PersonalObject
 from vap_core.evaluation.perception.episodes import OFF
-from vap_core.evaluation.perception.first_frames import LEAST_PX, View, object_under_box
+from vap_core.evaluation.perception.first_frames import VISIBLE_PX, View, object_under_box
 from vap_core.evaluation.perception.run import TABLES
 from vap_core.evaluation.perception.tracking import KEPT
 from vap_core.perception.boxes import mask_box, mask_iou
@@ -187,7 +187,7 @@ def track_table(frames: Sequence[Frame], target: str) -> "pd.DataFrame":
         for camera, (track, *_) in frame.tracks.items():
             masks = frame.truth.masks[camera]
             true = masks[target]
-            shown = bool(true.sum() >= LEAST_PX * true.size / 224**2)
+            shown = bool(true.sum() >= VISIBLE_PX * true.size / 224**2)
             iou = np.nan
             if shown:
                 iou = 0.0 if track.mask is None else mask_iou(track.mask, true)

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 
 class VapError(Exception):
-    """Base of every error that the user can mend; the command line prints it and exits with 2."""
+    """Base of every error that the user can remedy; the command line prints it and exits with 2."""
 
 
 class BadPhoto(VapError):

@@ -74,7 +74,7 @@ def eval_policy(
     ways: Annotated[
         str,
         typer.Option(
-            help="How the target is told, with commas: tinted, painted, described, plain."
+            help="How the target is named, with commas: tinted, painted, described, plain."
         ),
     ] = "tinted,painted,described,plain",
     execute: Annotated[
@@ -148,7 +148,7 @@ def show(
 
 @app.command()
 def doctor() -> None:
-    """Say what works on this machine, and how to mend what does not; status 1 when the main job
+    """Say what works on this machine, and how to repair what does not; status 1 when the main job
     cannot run.
 
     Example: python -m vap_core doctor

@@ -112,8 +112,10 @@ def rollout(
     batch: int = 4,
     keep_images: bool = False,
 ) -> Iterator[Episode]:
-    """Run every row once and yield its episode; the result does not depend on `batch`.
+    """Run every row once and yield its episode.
 
+    Episodes do not depend on each other. Only the rounding of a policy that is called for several
+    episodes at once depends on `batch`: `batch` 1 and 5 can differ in the last bits of an action.
     An exception inside an episode ends that episode with status "error" and its traceback in
     `detail`; the others go on. Frames keep their images only with `keep_images`; a sink always gets
     them.

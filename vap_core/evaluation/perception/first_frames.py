@@ -2,7 +2,7 @@
 
 It says what was found, which candidate was elected, and which model was wrong.
 
-    for episode in openings(suites.rows("vlabench", "select-shoe", 12)):
+    for episode in opening_views(suites.rows("vlabench", "select-shoe", 12)):
         for view in episode:
             candidates = find_candidates(view, stack)
             tables = survey_view(view, stack, memory, candidates)
@@ -31,7 +31,7 @@ from vap_core.simulation.suites.open_row import build_scene, make_env
 from vap_core.simulation.types import EpisodeRow
 from vap_core.vote import VoteRule, similarity, vote
 
-LEAST_PX = 100
+VISIBLE_PX = 100
 """Visible pixels, of a view of 224 x 224, from which on an object counts."""
 SAME_BOX = 0.5
 """IoU from which on two boxes agree."""
@@ -76,8 +76,8 @@ class View:
 
     @property
     def least_px(self) -> float:
-        """LEAST_PX in a view of this size."""
-        return LEAST_PX * self.rgb.shape[0] * self.rgb.shape[1] / 224**2
+        """VISIBLE_PX in a view of this size."""
+        return VISIBLE_PX * self.rgb.shape[0] * self.rgb.shape[1] / 224**2
 
     def boxes(self) -> dict[str, Box]:
         """The box of every object of which anything shows."""
@@ -101,7 +101,7 @@ class EmbeddedBoxes:
     embeddings: Float32[np.ndarray, "n d"]
 
 
-def openings(rows: Sequence[EpisodeRow], size: int = 224) -> Iterator[list[View]]:
+def opening_views(rows: Sequence[EpisodeRow], size: int = 224) -> Iterator[list[View]]:
     """The views of each row in turn, by the cameras, look, control and sensor of its suite.
 
     Rows of one suite and variant share a scene and come together. Pictures are `size` pixels wide

@@ -19,7 +19,7 @@ from vap_core.evaluation.perception.first_frames import (
     KS,
     TableRow,
     Tables,
-    openings,
+    opening_views,
     registered_object,
 )
 from vap_core.evaluation.processes import results
@@ -139,7 +139,7 @@ def run_job(job: Job) -> Tables:
     if isinstance(job.what, tracking.Job):
         return {"tracks": tracking.track_episode(job.what, stack)}
     tables: Tables = {}
-    for episode in openings(job.what):
+    for episode in opening_views(job.what):
         for name, rows in survey(episode, stack).items():
             tables.setdefault(name, []).extend(rows)
     first = job.what[0]

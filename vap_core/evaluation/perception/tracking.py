@@ -9,7 +9,7 @@ Every object of the target's category that shows at t = 0 is tracked, in every c
 that the segmenter draws from its true box: the tracker alone is judged. A row is one object in one
 camera, once undisturbed through the whole episode (`hidden` 0), and once for each number of frames
 for which an occluder hides the target (vap_core.simulation.occluder), from the moment it is hidden
-to the end. A frame counts for an object when it shows at least LEAST_PX pixels.
+to the end. A frame counts for an object when it shows at least VISIBLE_PX pixels.
 """
 
 import copy
@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from vap_core.base.types import Boxes, Mask, Rgb, Track, value
-from vap_core.evaluation.perception.first_frames import LEAST_PX, TableRow
+from vap_core.evaluation.perception.first_frames import VISIBLE_PX, TableRow
 from vap_core.perception.boxes import mask_box, mask_iou
 from vap_core.perception.protocols import Stack
 from vap_core.policies.scripted.expert import Expert
@@ -343,8 +343,8 @@ def _sample_over_time(iou: Float64[np.ndarray, " t"]) -> list[float | None]:
 
 
 def _counts(mask: Mask, rgb: Rgb) -> bool:
-    """Whether a view shows at least LEAST_PX of an object, for a view of 224 x 224."""
-    return bool(mask.sum() >= LEAST_PX * rgb.shape[0] * rgb.shape[1] / 224**2)
+    """Whether a view shows at least VISIBLE_PX of an object, for a view of 224 x 224."""
+    return bool(mask.sum() >= VISIBLE_PX * rgb.shape[0] * rgb.shape[1] / 224**2)
 
 
 def _take_frame(env: Env) -> Frame:

@@ -42,7 +42,7 @@ TRAIN_INSTANCES = 400
 HELD_OUT = 100_000
 BURIED_M = -5.0
 """Height of the objects that a view leaves out."""
-LEAST_PX = 60
+MIN_SHOT_PX = 60
 """Pixels of objects that a view shows."""
 ANGLES = ((-0.3, 0.3), (0.26, 0.96), (0.45, 0.75), (-1.3, 1.3), (0.45, 0.8))
 """Ranges of a portrait's turn, elevation (radians), share of the frame, lamp's place and strength.
@@ -142,7 +142,7 @@ def stage(
         while len(rgb) < views:
             view_rgb, view_ids = _view(rng, scene, data, renderer)
             # An empty view is kept now and then.
-            if (view_ids > 0).sum() >= LEAST_PX or rng.random() < 0.1:
+            if (view_ids > 0).sum() >= MIN_SHOT_PX or rng.random() < 0.1:
                 rgb.append(view_rgb)
                 ids.append(view_ids)
     portraits, portrait_ids = _portraits(rng, models[:crew])

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from vap_core.base.types import value
 from vap_core.evaluation.metrics import rate
 from vap_core.evaluation.perception.estimates import average_precision
-from vap_core.evaluation.perception.first_frames import FLOOR, LEAST_PX
+from vap_core.evaluation.perception.first_frames import FLOOR, VISIBLE_PX
 from vap_core.perception.boxes import box_iou, crop, mask_iou
 from vap_core.perception.embedded.backbone import features
 from vap_core.perception.embedded.detector import (
@@ -118,7 +118,7 @@ def segmenter_figures(segmenter: LiteSegmenter, stages: Sequence[Shots]) -> Figu
     jittered: list[float] = []
     for shots in tqdm(stages, desc="evaluating masks", mininterval=10):
         for rgb, ids in zip(shots.rgb, shots.ids, strict=True):
-            for i, corners in boxes_of(ids, len(shots.names), LEAST_PX):
+            for i, corners in boxes_of(ids, len(shots.names), VISIBLE_PX):
                 box = np.array(corners, np.float64)
                 box_off = jitter(rng, box)
                 truth = ids == i + 1
@@ -142,7 +142,7 @@ def encoder_figures(encoder: LiteEncoder, stages: Sequence[Shots]) -> Figures:
         crew = len(shots.portraits) // POSES
         references = encoder(portraits)
         for rgb, ids in zip(shots.rgb, shots.ids, strict=True):
-            seen = list(boxes_of(ids, crew, LEAST_PX))
+            seen = list(boxes_of(ids, crew, VISIBLE_PX))
             if len(seen) < 2:
                 continue
             rows = encoder([crop(rgb, np.array(box, np.float64)) for _, box in seen])
@@ -216,7 +216,7 @@ def _views(stages: Sequence[Shots]) -> Iterator[View]:
         for rgb, ids in zip(shots.rgb, shots.ids, strict=True):
             by_category: dict[str, list[tuple[int, int, int, int]]] = {}
             large = set()
-            for i, box in boxes_of(ids, len(shots.names), LEAST_PX):
+            for i, box in boxes_of(ids, len(shots.names), VISIBLE_PX):
                 by_category.setdefault(shots.categories[i], []).append(box)
                 large.add(i)
             small = []

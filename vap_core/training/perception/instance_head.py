@@ -41,7 +41,7 @@ MOST_OF_CREW = 5
 """Crops of one member of the crew that a stage gives, from its views."""
 MOST_OF_OTHERS = 2
 """Crops of any other object."""
-LEAST_PX = 60
+MIN_TRAINED_PX = 60
 """Visible pixels of an object that is cropped from a view."""
 GRIDS = {"b4": 14, "b10": 14, "b14": 7}
 """Sides of the feature maps."""
@@ -79,7 +79,7 @@ def crops(shots: Shots, rng: np.random.Generator) -> tuple[list[Rgb], list[int],
             portrait.append(1)
     seen = []
     for v, ids in enumerate(shots.ids):
-        for i, box in boxes_of(ids, n_objects, LEAST_PX):
+        for i, box in boxes_of(ids, n_objects, MIN_TRAINED_PX):
             seen.append((v, i, box))
     taken = [0] * n_objects
     crew = len(shots.portraits) // POSES

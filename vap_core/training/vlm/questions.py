@@ -34,7 +34,7 @@ COLOURED = 0.45
 """How often a view's object is coloured."""
 TINTED = 0.5
 """How often that is a tint rather than paint."""
-LEAST_PX = 20
+MIN_ASKED_PX = 20
 """Visible pixels of an object that is asked about."""
 TASKS = tuple(chain.from_iterable(suite.tasks for suite in BENCHMARKS.values()))
 
@@ -130,7 +130,7 @@ def _visible_objects(
     """The objects with enough visible pixels, as they are."""
     visible = {}
     for i, name in enumerate(names):
-        if (ids == i + 1).sum() >= LEAST_PX:
+        if (ids == i + 1).sum() >= MIN_ASKED_PX:
             visible[i] = VisibleObject(
                 name=name,
                 kind=objects.get_object(name).category,

@@ -69,7 +69,7 @@ def import_scan(
 
     Raises:
         BadObject: the names or the file will not do; the message says what is wrong and how to
-            mend it.
+            repair it.
     """
     _check_arguments(name, category, mass_kg)
     surface = read_mesh_file(path, colour)
