@@ -142,7 +142,7 @@ class VapPrompt(ProcessorStep):
             return [self._ongoing[0].step + 1 if self._ongoing else 0]
         if signal is None:
             raise BadViews(
-                f"VapPrompt: {STEP} is missing, so a new episode cannot be distinguished from an old one; "
+                f"VapPrompt: {STEP} is missing, so the start of an episode is not known; "
                 "let the environment give vap_step (0 = new), or attach with episodes='reset' "
                 "where the caller resets the preprocessor."
             )
