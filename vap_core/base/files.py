@@ -1,6 +1,8 @@
 """Files that are complete or absent, and where the files that ship with the package are."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from uuid import uuid4
 
@@ -8,11 +10,21 @@ DATA = Path(__file__).resolve().parents[2] / "data"
 """Weights, policies, episode lists and results that ship beside the package."""
 
 
-def write_atomic(path: Path, data: bytes) -> None:
-    """Write the whole file, or nothing. Raises: OSError."""
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A path to write to, which replaces `path` when the block ends without an error.
+
+    Raises: OSError.
+    """
     scratch = path.with_name(f".{path.name}.{uuid4().hex}.tmp")
     try:
-        scratch.write_bytes(data)
+        yield scratch
         os.replace(scratch, path)
     finally:
         scratch.unlink(missing_ok=True)
+
+
+def write_atomic(path: Path, data: bytes) -> None:
+    """Write the whole file, or nothing. Raises: OSError."""
+    with replacing(path) as scratch:
+        scratch.write_bytes(data)

@@ -4,17 +4,18 @@ A mini-pi0 is initialised from it; a token is learned in it (SPEC section 4).
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from lerobot.configs import PreTrainedConfig
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from vap_core.base.errors import BadPolicy
+from vap_core.base.files import write_atomic
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniTowers
 from vap_core.policies.mini_pi0.processor_mini_pi0 import END, encode, vocabulary
@@ -122,11 +123,7 @@ class MiniVlm(nn.Module):
         """Write `folder`: sizes and words as config.json, weights as safetensors in bfloat16."""
         folder.mkdir(parents=True, exist_ok=True)
         self.config.save_pretrained(folder)
-        tensors = {}
-        for name, tensor in self.towers.state_dict().items():
-            tensors[name] = tensor.contiguous()
-        save_file(tensors, folder / WEIGHTS)
-        store_in_bfloat16(folder / WEIGHTS)
+        _write_bfloat16(self.towers.state_dict(), folder / WEIGHTS)
 
     def _words(self, tokens: Int64[Tensor, " a"]) -> tuple[str, ...]:
         """The words of an answer, before END."""
@@ -161,10 +158,14 @@ def load_vlm(folder: Path) -> MiniVlm:
 
 def store_in_bfloat16(file: Path) -> None:
     """Keep a file's tensors in bfloat16; a model that loads them computes in its own precision."""
-    tensors = load_file(file)
+    _write_bfloat16(load_file(file), file)
+
+
+def _write_bfloat16(tensors: Mapping[str, Tensor], file: Path) -> None:
+    halves = {}
     for name, tensor in tensors.items():
-        tensors[name] = tensor.bfloat16()
-    save_file(tensors, file, metadata={"format": "pt"})
+        halves[name] = tensor.bfloat16().contiguous()
+    write_atomic(file, save(halves, metadata={"format": "pt"}))
 
 
 def initialise_policy(vlm: MiniVlm, policy: Any) -> None:

@@ -7,13 +7,13 @@ are numbered; the same seed and number give the same pixels. Training stages dra
 look-alikes never appear (`only_generic` refuses them).
 """
 
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Int64, UInt8
 
+from vap_core.base.files import replacing
 from vap_core.base.types import value
 from vap_core.simulation import robots, scenes
 from vap_core.simulation.assets import objects
@@ -218,9 +218,8 @@ def cached(folder: Path, seed: int, number: int, *, held_out: bool = False) -> S
         for name in PARTS:
             arrays[name] = getattr(shots, name)
         folder.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(".part.npz")
-        np.savez(part, **arrays)
-        os.replace(part, path)
+        with replacing(path) as part, part.open("wb") as file:
+            np.savez(file, **arrays)
     with np.load(path) as file:
         return Shots(
             rgb=file["rgb"],

@@ -3,7 +3,6 @@
 Features are computed once per view. The losses are CenterNet's focal loss and a box loss (GIoU).
 """
 
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from jaxtyping import Float, Float32, UInt8, UInt16
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
+from vap_core.base.files import replacing
 from vap_core.base.types import Rgb
 from vap_core.perception.embedded.backbone import CHANNELS, features
 from vap_core.perception.embedded.backbone import STRIDE as STRIDES
@@ -73,9 +73,8 @@ def featurise(
 
 def save_array(path: Path, array: np.ndarray) -> None:
     """Write an array so that an interrupted run never leaves half of it."""
-    part = path.with_suffix(".part.npy")
-    np.save(part, array)
-    os.replace(part, path)
+    with replacing(path) as part, part.open("wb") as file:
+        np.save(file, array)
 
 
 def stack_taps(rows: Sequence[UInt16[np.ndarray, " f"]]) -> dict[str, Float[Tensor, "n c h w"]]:

@@ -3,7 +3,6 @@
 Epochs can be interrupted; the rate warms up and falls with a cosine; a bar shows the loss.
 """
 
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 from tqdm import tqdm
+
+from vap_core.base.files import replacing
 
 
 @dataclass(frozen=True)
@@ -90,9 +91,8 @@ def checkpoint(path: Path, resume: bool) -> tuple[dict[str, Any], Callable[[dict
     """
 
     def save(state: dict[str, Any]) -> None:
-        part = path.with_suffix(".part")
-        torch.save(state, part)
-        os.replace(part, path)
+        with replacing(path) as part:
+            torch.save(state, part)
 
     state: dict[str, Any] = {}
     if resume and path.exists():

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
 from vap_core.base.errors import BadOutput, BadPolicy
-from vap_core.base.files import DATA
+from vap_core.base.files import DATA, write_atomic
 from vap_core.base.version import code_version
 from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.lerobot.checkpoints import fingerprint
@@ -363,7 +363,7 @@ def save(
         "written_by": code_version(),
         "held_out": average_of(measured),
     }
-    (out / "training.json").write_text(json.dumps(card, indent=1))
+    write_atomic(out / "training.json", json.dumps(card, indent=1).encode())
     return card
 
 

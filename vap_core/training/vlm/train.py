@@ -21,7 +21,7 @@ from jaxtyping import UInt8
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
-from vap_core.base.files import DATA
+from vap_core.base.files import DATA, write_atomic
 from vap_core.base.types import Rgb, value
 from vap_core.evaluation.processes import results
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
@@ -211,7 +211,7 @@ def train(
             batch = collate(recipe, held_out, number, rng, config)
             figures.append(losses(mean, batch)[1])
     about = {"recipe": vars(recipe), "held_out": average_of(figures), "log": log}
-    (out / "training.json").write_text(json.dumps(about, indent=1))
+    write_atomic(out / "training.json", json.dumps(about, indent=1).encode())
     return about
 
 
