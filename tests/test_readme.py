@@ -70,3 +70,17 @@ def test_no_hand_of_the_published_table_closes_after_the_last_action() -> None:
     missed = table[table["sub_case"] == "missed grasp"]
     assert len(missed) == 1876
     assert (missed["deciding_frame"] < missed["steps"]).all()
+
+
+def test_what_the_true_mask_at_every_step_reaches() -> None:
+    found = results(load_runs([RESULTS / "oracle_track.parquet"]))
+    cells = []
+    for line in found[found.task == ALL_TASKS].itertuples():
+        assert (line.n, line.errors) == (line.listed, 0)
+        cells.append(f"{100 * line.sr:.0f} [{100 * line.sr_low:.0f}, {100 * line.sr_high:.0f}]")
+    matching, variants, bridge, vlabench, tabletop = cells
+    text = " ".join(README.split())
+    assert (
+        f"simpler-fractal {matching} and {variants}, simpler-bridge {bridge}, "
+        f"vlabench {vlabench}, tabletop {tabletop} %." in text
+    )
