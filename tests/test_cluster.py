@@ -29,7 +29,7 @@ def address() -> Iterator[str]:
     nodes.shutdown()
 
 
-@pytest.mark.slow
+@pytest.mark.sweep
 @pytest.mark.filterwarnings(
     "ignore::ResourceWarning", "ignore::DeprecationWarning", "ignore::FutureWarning"
 )
