@@ -6,9 +6,12 @@ The paper's are in P 3.3 and tab:ablation_prompt.
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from jaxtyping import Bool, UInt8
 
 from vap_core.base.errors import BadInstruction
 from vap_core.base.types import Colour, Mask, Rgb
+
+Pixels = UInt8[np.ndarray, "*n 3"]
 
 PALETTE: tuple[Colour, ...] = (
     Colour("red", (255, 0, 0)),
@@ -49,16 +52,23 @@ def tint(rgb: Rgb, mask: Mask, colour: Colour, alpha: float = ALPHA) -> Rgb:
     return out
 
 
-def has_colour(rgb: np.ndarray, colour: Colour) -> np.ndarray:
-    """Which pixels (... x 3, uint8) a person would call `colour`."""
+def has_colour(rgb: Pixels, colour: Colour) -> Bool[np.ndarray, "*n"]:
+    """Which pixels a person would call `colour`."""
+    return colour_maps(rgb, [colour])[0]
+
+
+def colour_maps(rgb: Pixels, colours: Sequence[Colour]) -> Bool[np.ndarray, "c *n"]:
+    """`has_colour` for several colours; the hue of every pixel is computed once."""
     pixels = rgb.astype(np.float32)
     top = pixels.max(axis=-1)
-    low = pixels.min(axis=-1)
-    saturation = (top - low) / np.maximum(top, 1.0)
-    named = np.asarray([colour.rgb], np.float32)
-    hue = float(_hue_deg(named)[0])
-    off = np.abs((_hue_deg(pixels) - hue + 180.0) % 360.0 - 180.0)
-    return (off <= HUE_WIDTH_DEG) & (saturation >= LEAST_SATURATION) & (top >= LEAST_VALUE)
+    saturation = (top - pixels.min(axis=-1)) / np.maximum(top, 1.0)
+    vivid = (saturation >= LEAST_SATURATION) & (top >= LEAST_VALUE)
+    hue = _hue_deg(pixels[vivid])
+    found = np.zeros((len(colours), *vivid.shape), bool)
+    for has, colour in zip(found, colours, strict=True):
+        named = float(_hue_deg(np.asarray([colour.rgb], np.float32))[0])
+        has[vivid] = np.abs((hue - named + 180.0) % 360.0 - 180.0) <= HUE_WIDTH_DEG
+    return found
 
 
 def choose_colours(
@@ -80,13 +90,11 @@ def choose_colours(
         )
     presence = np.zeros(len(palette))
     for rgb, masks in scenes:
-        inside = [rgb[mask] for mask in masks if mask.any()]
-        for index, colour in enumerate(palette):
-            share = has_colour(rgb, colour).mean()
-            presence[index] = max(presence[index], float(share) / VIEW_SHARE)
-            for pixels in inside:
-                share = has_colour(pixels, colour).mean()
-                presence[index] = max(presence[index], float(share) / OBJECT_SHARE)
+        found = colour_maps(rgb, palette)
+        presence = np.maximum(presence, found.mean(axis=(1, 2)) / VIEW_SHARE)
+        for mask in masks:
+            if mask.any():
+                presence = np.maximum(presence, found[:, mask].mean(axis=1) / OBJECT_SHARE)
     order = np.argsort(np.maximum(presence, 1.0), kind="stable")
     return tuple(palette[i] for i in order[:count])
 

@@ -4,7 +4,7 @@ import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, is_dataclass
-from functools import cache, lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -138,10 +138,13 @@ def register_personal(study: Study, bank: Path, captioner: Captioner | None = No
 
 
 def make_trial(study: Study, rows: Sequence[EpisodeRow], method: str, bank: Path) -> Trial:
-    """The scene, models and policy of some rows of one task and variant, built or cached."""
+    """The scene, models and policy of some rows of one task and variant, built or cached.
+
+    The scene holds only what the rows place. It is closed when the next one is built.
+    """
     first = rows[0]
     suite = suites.suite(first.suite)
-    scene = _scene(study, first.suite, first.task, first.variant)
+    scene = _scene(study, rows)
     stack = _stack(study.stack) if needs_stack(method) or study.policy == "scripted" else None
     return Trial(
         method=method,
@@ -254,15 +257,40 @@ def _policy(
     return policy.with_tokens({learned_token.WORD: token.embedding})
 
 
-@lru_cache(maxsize=4)
-def _scene(study: Study, suite: str, task: str, variant: str) -> Scene:
-    names: dict[str, None] = {}
-    for row in study.rows(suite, task):
-        if row.variant == variant:
-            for place in row.placements:
-                names[place.model] = None
-    return build_scene(suite, list(names), variant, study.robots)
+def _scene(study: Study, rows: Sequence[EpisodeRow]) -> Scene:
+    """The scene of what some rows of one task and variant place; the last one is kept.
 
+    Objects are in the order of the variant's whole list, so that the physics of an episode does not
+    depend on the rows beside it. Physics among 100 parked objects takes 2.6 times as long as among
+    6.
+    """
+    first = rows[0]
+    listed = []
+    for row in study.rows(first.suite, first.task):
+        if row.variant == first.variant:
+            listed.append(row)
+    placed = _models(rows)
+    names = [name for name in _models([*listed, *rows]) if name in placed]
+    key = (first.suite, tuple(names), first.variant, study.robots)
+    if key not in _last_scene:
+        for scene in _last_scene.values():
+            scene.close()
+        _last_scene.clear()
+        _last_scene[key] = build_scene(*key)
+    return _last_scene[key]
+
+
+def _models(rows: Sequence[EpisodeRow]) -> dict[str, None]:
+    """The objects that rows place, in order of first appearance."""
+    names: dict[str, None] = {}
+    for row in rows:
+        for place in row.placements:
+            names[place.model] = None
+    return names
+
+
+_last_scene: dict[tuple[str, tuple[str, ...], str, Meshes], Scene] = {}
+"""The scene that was built last, by suite, objects, variant and meshes."""
 
 DEMO = Study(
     tasks=(("widowx-pick", "pick-straw-cup"), ("franka-pick", "pick-cup")),

@@ -60,15 +60,26 @@ def search(
     drawn, box = _draw(frame, segmenter, box, free, taken)
     if box is None or evidence_for(state, frame, identity, drawn > 0.5) < FOUND_EVIDENCE:
         return state, absence
-    appearances = state.appearances
-    if appearances is None:
-        appearances = embed_appearances(encoder, state.first_crops, state.background)
-        state = replace(state, appearances=appearances)
-    row, last = encoder([crop(frame.image, box), state.last_crops[identity]])
-    if appearances.accept(row, last, identity):
+    state = _with_embeddings(state, identity, encoder)
+    last = state.last_rows[identity]
+    assert state.appearances is not None and last is not None
+    row = encoder([crop(frame.image, box)])[0]
+    if state.appearances.accept(row, last, identity):
         probability[:, own & (drawn > 0.5)] = 0
         probability[identity] = drawn
     return state, absence
+
+
+def _with_embeddings(state: TrackState, identity: int, encoder: Encoder) -> TrackState:
+    """The state with all first crops and one identity's last crop embedded."""
+    if state.appearances is None:
+        appearances = embed_appearances(encoder, state.first_crops, state.background)
+        state = replace(state, appearances=appearances)
+    if state.last_rows[identity] is None:
+        last_rows = list(state.last_rows)
+        last_rows[identity] = encoder([state.last_crops[identity]])[0]
+        state = replace(state, last_rows=tuple(last_rows))
+    return state
 
 
 def _seed_box(

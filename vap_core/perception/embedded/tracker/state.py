@@ -58,6 +58,8 @@ class TrackState:
     """From the last frame that showed the identity well."""
     background: Rgb
     """A crop of the bare background at t = 0."""
+    last_rows: tuple[Float32[np.ndarray, " d"] | None, ...]
+    """Embeddings of `last_crops`, made when a search first needs them."""
     appearances: Appearances | None = None
     """Made when an identity is searched for the first time."""
 
@@ -102,6 +104,7 @@ def initial_state(image: Rgb, masks: Bool[np.ndarray, "n h w"]) -> TrackState:
         first_crops=tuple(crops),
         last_crops=tuple(crops),
         background=background_crop(image, boxes[visible]),
+        last_rows=(None,) * n,
     )
 
 

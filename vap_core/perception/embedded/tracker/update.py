@@ -71,6 +71,7 @@ def update_state(
     scores = state.scores.copy()
     thumbnails = list(state.thumbnails)
     last_crops = list(state.last_crops)
+    last_rows = list(state.last_rows)
     masks = _compete(state, probability, judged)
     for i in judged:
         box = mask_box(masks[i])
@@ -92,6 +93,7 @@ def update_state(
             shown = blur_shares(colour_shares(frame.image, masks[i]))
             colours[1, i] = COLOUR_DECAY * colours[1, i] + 0.1 * shown
             last_crops[i] = crop(frame.image, box)
+            last_rows[i] = None
 
     memory = FrameMemory(frame.keys, to_cells(masks, frame.grid))
     last_seen = list(state.last_seen)
@@ -109,6 +111,7 @@ def update_state(
         lost=lost,
         colours=colours,
         last_crops=tuple(last_crops),
+        last_rows=tuple(last_rows),
     )
 
 
