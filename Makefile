@@ -40,8 +40,8 @@ test-all: test
 lab: setup
 	.venv/bin/jupyter lab --ip 127.0.0.1 notebooks
 
-lock:
-	uv pip compile --quiet pyproject.toml --extra dev --universal --python-version 3.12 --generate-hashes --no-annotate --output-file environment.txt
+lock: setup
+	.venv/bin/uv pip compile --quiet pyproject.toml --extra dev --universal --python-version 3.12 --generate-hashes --no-annotate --output-file environment.txt
 
 clean:
 	rm -rf .venv build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
