@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 from vap_core.base.errors import WorkerDied
 from vap_core.evaluation import store
 from vap_core.evaluation.jobs import BATCH, Job, Record, Rows, run_job
-from vap_core.evaluation.processes import results
-from vap_core.evaluation.study import Study, register_personal
+from vap_core.evaluation.processes import prepare, results
+from vap_core.evaluation.study import Study, register_personal, worker_modules
 from vap_core.simulation.types import EpisodeRow
 
 if TYPE_CHECKING:
@@ -56,6 +56,8 @@ def run(
     store.open_run(folder, study.configuration())
     with store.locked(folder):
         store.compact(folder)
+        if executor is results and missing():
+            prepare(worker_modules(study))
         register_personal(study, folder / "memory")
         table = store.read(folder)
         with tqdm(

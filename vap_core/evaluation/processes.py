@@ -1,13 +1,29 @@
-"""Runs jobs in local processes of one thread each, which end when their parent ends."""
+"""Runs jobs in local processes of one thread each, which end when their parent ends.
+
+They are forked from a server process that has imported what they need. There is one server per
+parent process; it starts with the first call of `prepare` or `results`.
+"""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context, parent_process
+from multiprocessing import forkserver, get_context, parent_process
 from threading import Thread
 
 from vap_core.base.errors import WorkerDied
+
+IGNORE_INTERRUPTS = "vap_core.evaluation.ignore_interrupts"
+
+
+def prepare(modules: Sequence[str]) -> None:
+    """Start the server; it imports `modules` while this process goes on.
+
+    A server that runs already stays as it is.
+    """
+    _limit_threads()
+    get_context("forkserver").set_forkserver_preload([IGNORE_INTERRUPTS, *modules])
+    forkserver.ensure_running()
 
 
 def results[J, R](
@@ -21,13 +37,12 @@ def results[J, R](
     """
     if not jobs:
         return
-    # Workers inherit these: two threads in each would compete for the cores.
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
+    _limit_threads()
     with ProcessPoolExecutor(
         max_workers=min(workers, len(jobs)),
-        mp_context=get_context("spawn"),
-        initializer=end_with_parent,
+        mp_context=get_context("forkserver"),
+        initializer=_begin_worker,
+        initargs=(dict(os.environ),),
     ) as pool:
         done = 0
         try:
@@ -47,6 +62,19 @@ def results[J, R](
                 # Interrupted: no result of a running job is used, and files are written atomically.
                 for process in processes:
                     process.kill()
+
+
+def _limit_threads() -> None:
+    """One thread per worker: workers inherit this, and two threads in each compete for the cores."""
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+
+
+def _begin_worker(environment: dict[str, str]) -> None:
+    """Take over the parent's environment, which may have changed since the server started."""
+    os.environ.clear()
+    os.environ.update(environment)
+    end_with_parent()
 
 
 def end_with_parent() -> None:
