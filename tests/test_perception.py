@@ -261,10 +261,10 @@ def test_gem_lies_between_mean_and_maximum() -> None:
 
 
 def test_decode_reads_peaks_exactly_and_drops_overlaps() -> None:
-    logits, edges = torch.full((8, 8), -9.0), torch.ones(4, 8, 8)
+    logits, edges = np.full((8, 8), -9, np.float32), np.ones((4, 8, 8), np.float32)
     logits[2, 3], logits[6, 6], logits[2, 5] = 4.0, 2.0, 3.0
-    edges[:, 2, 3] = edges[:, 2, 5] = torch.tensor([3.0, 1.0, 3.0, 1.0])
-    edges[:, 2, 5] -= torch.tensor([-2.0, 0, 2.0, 0])
+    edges[:, 2, 3] = edges[:, 2, 5] = [3.0, 1.0, 3.0, 1.0]
+    edges[:, 2, 5] -= np.array([-2.0, 0, 2.0, 0], np.float32)
     xyxy, score = detect.decode(logits, edges, 0.3)
     assert xyxy.tolist() == [[4, 12, 52, 28], [44, 44, 60, 60]]
     assert np.allclose(score, 1 / (1 + np.exp([-4, -2])))
@@ -291,7 +291,7 @@ def test_cut_and_paste_return_what_the_window_shows(corner: np.ndarray, side: in
 def test_labels_of_the_same_frame_come_back() -> None:
     masks = np.zeros((2, 224, 224), bool)
     masks[0, 40:80, 40:80], masks[1, 120:160, 96:168] = True, True
-    keys, grid = cells.embed_cells(noise(0, 224, 224))
+    keys, grid = cells.embed_cells(noise(0, 224, 224), track.load().network)
     labels = cells.to_cells(masks, grid)
     assert np.allclose(labels.sum(axis=0), 1)
     found = cells.propagate(keys, [cells.FrameMemory(keys, labels)], grid, local=False)
