@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 from vap_core.base.errors import MissingWeights
 from vap_core.base.types import Boxes
 from vap_core.perception import text_encoder as text
-from vap_core.perception.boxes import box_iou, crop
+from vap_core.perception.boxes import MAX_BOXES, NMS_IOU, box_iou, crop, suppress_overlaps
 from vap_core.perception.embedded import backbone as features
 from vap_core.perception.embedded import detector as detect
 from vap_core.perception.embedded import encoder as embed
@@ -276,6 +276,18 @@ def test_box_iou_of_known_boxes() -> None:
     assert box_iou(a, np.array([[0.0, 0, 4, 4], [2, 0, 6, 4], [5, 5, 6, 6]])).tolist() == [
         [1.0, 8 / 24, 0.0]
     ]
+
+
+@given(st.integers(0, 10**6), st.integers(0, 60))
+def test_suppression_is_torchvisions(seed: int, n: int) -> None:
+    from torchvision.ops import nms
+
+    rng = np.random.default_rng(seed)
+    corner = rng.integers(0, 40, (n, 2))
+    xyxy = np.concatenate([corner, corner + rng.integers(1, 40, (n, 2))], 1).astype(np.float32)
+    score = (rng.integers(0, 20, n) / 20).astype(np.float32)  # some of them equal
+    kept = nms(torch.from_numpy(xyxy), torch.from_numpy(score), NMS_IOU)[:MAX_BOXES]
+    assert suppress_overlaps(xyxy, score).tolist() == kept.tolist()
 
 
 @given(hnp.arrays(np.float32, (2,), elements=st.floats(-20, 60, width=32)), st.integers(8, 50))
