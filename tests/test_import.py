@@ -10,7 +10,7 @@ import pytest
 
 import vap_core
 
-HEAVY = ("torch", "mujoco", "rerun", "transformers", "matplotlib", "pandas", "cv2")
+HEAVY = ("torch", "mujoco", "rerun", "transformers", "matplotlib", "pandas", "cv2", "onnxruntime")
 
 
 def test_import_loads_nothing_heavy() -> None:

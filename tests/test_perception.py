@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 from vap_core.base.errors import MissingWeights
 from vap_core.base.types import Boxes
 from vap_core.perception import text_encoder as text
-from vap_core.perception.boxes import box_iou, crop
+from vap_core.perception.boxes import MAX_BOXES, NMS_IOU, box_iou, crop, suppress_overlaps
 from vap_core.perception.embedded import backbone as features
 from vap_core.perception.embedded import detector as detect
 from vap_core.perception.embedded import encoder as embed
@@ -261,10 +261,10 @@ def test_gem_lies_between_mean_and_maximum() -> None:
 
 
 def test_decode_reads_peaks_exactly_and_drops_overlaps() -> None:
-    logits, edges = torch.full((8, 8), -9.0), torch.ones(4, 8, 8)
+    logits, edges = np.full((8, 8), -9, np.float32), np.ones((4, 8, 8), np.float32)
     logits[2, 3], logits[6, 6], logits[2, 5] = 4.0, 2.0, 3.0
-    edges[:, 2, 3] = edges[:, 2, 5] = torch.tensor([3.0, 1.0, 3.0, 1.0])
-    edges[:, 2, 5] -= torch.tensor([-2.0, 0, 2.0, 0])
+    edges[:, 2, 3] = edges[:, 2, 5] = [3.0, 1.0, 3.0, 1.0]
+    edges[:, 2, 5] -= np.array([-2.0, 0, 2.0, 0], np.float32)
     xyxy, score = detect.decode(logits, edges, 0.3)
     assert xyxy.tolist() == [[4, 12, 52, 28], [44, 44, 60, 60]]
     assert np.allclose(score, 1 / (1 + np.exp([-4, -2])))
@@ -276,6 +276,18 @@ def test_box_iou_of_known_boxes() -> None:
     assert box_iou(a, np.array([[0.0, 0, 4, 4], [2, 0, 6, 4], [5, 5, 6, 6]])).tolist() == [
         [1.0, 8 / 24, 0.0]
     ]
+
+
+@given(st.integers(0, 10**6), st.integers(0, 60))
+def test_suppression_is_torchvisions(seed: int, n: int) -> None:
+    from torchvision.ops import nms
+
+    rng = np.random.default_rng(seed)
+    corner = rng.integers(0, 40, (n, 2))
+    xyxy = np.concatenate([corner, corner + rng.integers(1, 40, (n, 2))], 1).astype(np.float32)
+    score = (rng.integers(0, 20, n) / 20).astype(np.float32)  # some of them equal
+    kept = nms(torch.from_numpy(xyxy), torch.from_numpy(score), NMS_IOU)[:MAX_BOXES]
+    assert suppress_overlaps(xyxy, score).tolist() == kept.tolist()
 
 
 @given(hnp.arrays(np.float32, (2,), elements=st.floats(-20, 60, width=32)), st.integers(8, 50))
@@ -291,7 +303,7 @@ def test_cut_and_paste_return_what_the_window_shows(corner: np.ndarray, side: in
 def test_labels_of_the_same_frame_come_back() -> None:
     masks = np.zeros((2, 224, 224), bool)
     masks[0, 40:80, 40:80], masks[1, 120:160, 96:168] = True, True
-    keys, grid = cells.embed_cells(noise(0, 224, 224))
+    keys, grid = cells.embed_cells(noise(0, 224, 224), track.load().network)
     labels = cells.to_cells(masks, grid)
     assert np.allclose(labels.sum(axis=0), 1)
     found = cells.propagate(keys, [cells.FrameMemory(keys, labels)], grid, local=False)

@@ -125,12 +125,15 @@ def test_training_is_a_command_that_resumes(
 ) -> None:
     monkeypatch.setattr(perception, "EPOCHS", {"detector": 2, "segmenter": 1, "looks": 2})
     monkeypatch.setattr(perception, "CROPS_PER_EPOCH", 32)
+    exported: list[Path] = []  # test_runtime exports: code whose shapes are checked is not traced
+    monkeypatch.setattr(perception, "export_graphs", exported.append)
     cache = tmp_path / "cache"
     perception.train(tmp_path / "halted", scenes=12, seed=1, minutes=0.0, cache=cache, jobs=1)
     resumed = perception.train(tmp_path / "out", scenes=12, seed=1, cache=cache)
     straight = perception.train(tmp_path / "again", scenes=12, seed=1, resume=False, cache=cache)
+    assert exported == [tmp_path / name for name in ("halted", "out", "again")]
     assert resumed["measured"] == straight["measured"]
     assert resumed["views"] == 12
-    assert (tmp_path / "out" / perception.FILE).read_bytes() == (
-        tmp_path / "again" / perception.FILE
+    assert (tmp_path / "out" / perception.PERCEPTION).read_bytes() == (
+        tmp_path / "again" / perception.PERCEPTION
     ).read_bytes()

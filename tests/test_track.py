@@ -215,7 +215,7 @@ def test_cells_lead_where_they_belong() -> None:
 
 def test_changes_near_an_identity_are_noticed() -> None:
     image, masks = paint((RED, 40, 60))
-    begun = state.initial_state(image, masks)
+    begun = state.initial_state(image, masks, track.load().network)
     assert not state.changed_nearby(begun, state.thumbnail_of(image)).any()
     assert not state.changed_nearby(
         begun, state.thumbnail_of(np.clip(image.astype(int) + 5, 0, 255).astype(np.uint8))

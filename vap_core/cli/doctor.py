@@ -74,11 +74,12 @@ def _torch() -> tuple[str, str]:
 
 
 def _weights() -> tuple[str, str]:
-    from vap_core.perception.embedded.weights import PACKAGED, load_weights, weights_sha256
+    from vap_core.perception.embedded.weights import PACKAGED, read_manifest, weights_sha256
+    from vap_core.perception.stacks import load_embedded
 
-    load_weights("perception.safetensors")
+    load_embedded()
     digests = weights_sha256()
-    if len(digests) < len(PACKAGED) + 1:
+    if len(digests) < len(PACKAGED) + len(read_manifest()):
         raise VapError(f"only {', '.join(digests)} found; run: pip install -r environment.txt")
     return "weights", ", ".join(f"{name} {digest[:8]}" for name, digest in digests.items())
 

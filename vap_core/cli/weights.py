@@ -1,4 +1,4 @@
-"""Commands about the foundation stack's weights: weights list, weights pull."""
+"""Commands about the stacks' weights: weights list, weights pull, weights export."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,7 +7,8 @@ import typer
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="The foundation stack's weights: what is there, and how to get the rest.",
+    help="The foundation stack's weights: what is there, and how to get the rest; the embedded "
+    "stack's graphs.",
 )
 
 
@@ -48,3 +49,21 @@ def pull_weights(
     from vap_core.perception.foundation.store import store_folder
 
     pull(models_of(stack), store_folder(), origin=origin, unpinned=unpinned)
+
+
+@app.command("export")
+def export_weights(
+    folder: Annotated[
+        Path, typer.Option(help="Folder of perception.safetensors and its manifest.")
+    ] = Path("data/weights"),
+) -> None:
+    """Write the graphs of the embedded stack's networks beside their weights, for ONNX Runtime.
+
+    Training does this by itself; needed again when a network's structure changes.
+
+    Example: python -m vap_core weights export --folder data/runs/weights
+    """
+    from vap_core.perception.embedded.export import export_graphs
+
+    for path in export_graphs(folder):
+        print(f"{path}  {path.stat().st_size:,} bytes")

@@ -46,11 +46,16 @@ def suppress_overlaps(
     xyxy: Float32[np.ndarray, "n 4"], score: Float32[np.ndarray, " n"]
 ) -> Int64[np.ndarray, " k"]:
     """Non-maximum suppression: indices of at most `MAX_BOXES` boxes, best first."""
-    import torch
-    from torchvision.ops import nms  # imported late: it takes 1.7 s of CPU time
-
-    kept = nms(torch.from_numpy(xyxy), torch.from_numpy(score), NMS_IOU)
-    return kept[:MAX_BOXES].numpy()
+    kept: list[int] = []
+    suppressed = np.zeros(len(score), bool)
+    for i in np.argsort(-score, kind="stable"):
+        if suppressed[i]:
+            continue
+        kept.append(int(i))
+        if len(kept) == MAX_BOXES:
+            break
+        suppressed |= box_iou(xyxy[[i]], xyxy)[0] > NMS_IOU
+    return np.array(kept, np.int64)
 
 
 def mask_iou(one: Mask, other: Mask) -> float:

@@ -74,6 +74,27 @@ class Backbone(nn.Module):
         return maps
 
 
+class Trunk(nn.Module):
+    """The shared backbone up to the deepest of some taps, and nothing that it does not need."""
+
+    def __init__(self, taps: Sequence[str]) -> None:
+        super().__init__()
+        backbone = load_backbone()
+        depth = 1 + max(map(backbone.names.index, taps))
+        self.taps = frozenset(taps)
+        self.names = backbone.names[:depth]
+        self.stages = backbone.stages[:depth]
+
+    def forward(self, x: Float[Tensor, "n 3 h w"]) -> dict[str, Tensor]:
+        """As `Backbone.forward`."""
+        maps: dict[str, Tensor] = {}
+        for name, stage in zip(self.names, self.stages, strict=True):
+            x = stage(x)
+            if name in self.taps:
+                maps[name] = x
+        return maps
+
+
 def normalise(rgb: UInt8[Tensor, "n h w 3"]) -> Float[Tensor, "n 3 h w"]:
     """Pixels as the backbone was trained on them: (x - 127) / 128, channels last in memory."""
     return rgb.permute(0, 3, 1, 2).float().sub_(float(GREY)).div_(128.0)

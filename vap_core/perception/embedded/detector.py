@@ -9,19 +9,22 @@ in CenterNet and FCOS). The head was trained on rendered tabletop scenes alone.
 from collections.abc import Mapping, Sequence
 from functools import cache
 
+import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, UInt8
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
 from vap_core.base.types import Boxes, Rgb
 from vap_core.perception.boxes import suppress_overlaps
-from vap_core.perception.embedded.backbone import CHANNELS, features, resize_and_pad
+from vap_core.perception.embedded.backbone import CHANNELS, Trunk, normalise, resize_and_pad
+from vap_core.perception.embedded.runtime import Network, load_network
 from vap_core.perception.embedded.weights import PERCEPTION, load_weights
 from vap_core.perception.text_encoder import WIDTH as TEXT_WIDTH
 from vap_core.perception.text_encoder import embed_text
 
+GRAPH = "detector.onnx"
 TAPS = ("b4", "b10", "b14")
 STRIDE = 8
 TRAINED_SIDE = 224
@@ -109,15 +112,36 @@ class ResidualConvolutions(nn.Module):
         return x
 
 
-class LiteDetector:
-    """The embedded detector.
+class DetectNetwork(nn.Module):
+    """Backbone and head: a view and embedded phrases in, what `DetectHead` gives out."""
 
-    A phrase whose cosine to a trained one reaches `snap` is searched for as that one; None never
-    does.
+    def __init__(self, head: DetectHead) -> None:
+        super().__init__()
+        self.trunk = Trunk(TAPS)
+        self.head = head
+
+    def forward(
+        self, rgb: UInt8[Tensor, "n h w 3"], text: Float[Tensor, "p 384"]
+    ) -> tuple[Float[Tensor, "n p y x"], Float[Tensor, "n 4 y x"]]:
+        return self.head(self.trunk(normalise(rgb)), text)
+
+
+class LiteDetector:
+    """The embedded detector; `network` computes a `DetectNetwork`.
+
+    `known` are the embeddings of the trained phrases. A phrase whose cosine to one of them reaches
+    `snap` is searched for as that one; None never does.
     """
 
-    def __init__(self, head: DetectHead, *, snap: float | None = SNAP_COSINE) -> None:
-        self.head = head.requires_grad_(False).eval()
+    def __init__(
+        self,
+        network: Network,
+        known: Float32[np.ndarray, "k 384"],
+        *,
+        snap: float | None = SNAP_COSINE,
+    ) -> None:
+        self.network = network
+        self.known = known
         self.snap = snap
 
     def embed_phrase(self, phrase: str) -> Float32[np.ndarray, "1 384"]:
@@ -125,23 +149,21 @@ class LiteDetector:
         row = embed_text([phrase])
         if self.snap is None:
             return row
-        known = self.head.known.numpy()
-        cosine = (known @ row[0]).round(6)
+        cosine = (self.known @ row[0]).round(6)
         if cosine.max() >= self.snap:
-            return known[[cosine.argmax()]]
+            return self.known[[cosine.argmax()]]
         return row
 
-    @torch.inference_mode()
     def __call__(
         self, images: Sequence[Rgb], phrase: str, threshold: float | None = None
     ) -> list[Boxes]:
         if threshold is None:
             threshold = THRESHOLD
-        text = torch.from_numpy(self.embed_phrase(phrase))
+        text = self.embed_phrase(phrase)
         proposals: list[Boxes] = []
         for image in images:
             small, scale = resize_for_search(image)
-            logits, edges = self.head(features([small], TAPS), text)
+            logits, edges = self.network(small[None], text)
             xyxy, score = decode(logits[0, 0], edges[0], threshold)
             h, w = image.shape[:2]
             xyxy = np.clip(xyxy / scale, 0, (w, h, w, h)).astype(np.float32)
@@ -160,19 +182,20 @@ def resize_for_search(image: Rgb) -> tuple[Rgb, float]:
 
 
 def decode(
-    logits: Float[Tensor, "h w"], edges: Float[Tensor, "4 h w"], threshold: float
+    logits: Float32[np.ndarray, "h w"], edges: Float32[np.ndarray, "4 h w"], threshold: float
 ) -> tuple[Float32[np.ndarray, "n 4"], Float32[np.ndarray, " n"]]:
     """Peaks of one score map as boxes and scores, best first, overlaps removed.
 
     Boxes are in pixels of the searched image.
     """
-    peak = F.max_pool2d(logits[None], 3, 1, 1)[0] == logits
-    rows, cols = torch.nonzero(peak & (logits.sigmoid() >= threshold), as_tuple=True)
-    score = logits[rows, cols].sigmoid().numpy()
-    centre = torch.stack([cols, rows], 1) + 0.5
+    probability = 1 / (1 + np.exp(-np.maximum(logits, -80)))
+    peak = cv2.dilate(logits, np.ones((3, 3), np.uint8)) == logits
+    rows, cols = np.nonzero(peak & (probability >= threshold))
+    score = probability[rows, cols]
+    centre = np.stack([cols, rows], axis=1).astype(np.float32) + np.float32(0.5)
     reach = edges[:, rows, cols].T
-    corners = torch.cat([centre - reach[:, :2], centre + reach[:, 2:]], 1)
-    xyxy = corners.numpy() * STRIDE
+    corners = np.concatenate([centre - reach[:, :2], centre + reach[:, 2:]], axis=1)
+    xyxy = corners * np.float32(STRIDE)
     kept = suppress_overlaps(xyxy, score)
     return xyxy[kept], score[kept]
 
@@ -181,9 +204,10 @@ def decode(
 def load() -> LiteDetector:
     """The shipped detector.
 
-    Raises: MissingWeights: data/weights/perception.safetensors is absent or damaged.
+    Raises: MissingWeights: a file of data/weights is absent or damaged.
     """
-    weights, _ = load_weights(PERCEPTION, "detect.")
+    weights, entry = load_weights(PERCEPTION, "detect.")
     head = DetectHead(len(weights["known"]))
     head.load_state_dict(weights)
-    return LiteDetector(head)
+    network = load_network(GRAPH, DetectNetwork(head), entry["sha256"])
+    return LiteDetector(network, head.known.numpy())

@@ -12,7 +12,7 @@ from functools import cache
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, UInt8
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
@@ -20,12 +20,14 @@ from vap_core.base.types import Rgb
 from vap_core.perception.embedded.backbone import (
     CHANNELS,
     GREY,
-    features,
+    Trunk,
     normalise,
     resize_and_pad,
 )
+from vap_core.perception.embedded.runtime import Network, load_network
 from vap_core.perception.embedded.weights import PERCEPTION, load_weights
 
+GRAPH = "encoder.onnx"
 SIDE = 224
 """Pixels of the square in which a crop is embedded."""
 HISTOGRAM_SIDE = 64
@@ -112,20 +114,41 @@ class InstanceHead(nn.Module):
         return F.normalize(self.out(joined), dim=1)
 
 
-class LiteEncoder:
-    """The embedded encoder; without a head, its rows have no part that distinguishes look-alikes.
+class EncodeNetwork(nn.Module):
+    """Backbone and head: a crop in, its deepest features and the instance head's row out."""
 
-    `tag` ends the name that is stored with every memory.
+    def __init__(self, head: InstanceHead | None) -> None:
+        super().__init__()
+        self.trunk = Trunk([*INSTANCE_TAPS, "head"])
+        self.head = head
+
+    def forward(
+        self,
+        rgb: UInt8[Tensor, "n _s _s 3"],
+        small: UInt8[Tensor, "n _t _t 3"],
+        colour: Float[Tensor, "n b"],
+    ) -> tuple[Tensor, ...]:
+        """`small` is the same crop, `INSTANCE_SIDE` pixels wide; without a head there is no row."""
+        taps = self.trunk(normalise(rgb))
+        if self.head is None:
+            return (taps["head"],)
+        return taps["head"], self.head(halve_b4(taps), normalise(small), colour)
+
+
+class LiteEncoder:
+    """The embedded encoder; `network` computes an `EncodeNetwork`.
+
+    Without an instance head, rows have no part that distinguishes look-alikes. `tag` ends the name
+    that is stored with every memory.
     """
 
-    def __init__(self, head: InstanceHead | None = None, tag: str = "") -> None:
+    def __init__(self, network: Network, *, has_head: bool = True, tag: str = "") -> None:
+        self.network = network
         self.name = f"lite0-gem3-lab{HISTOGRAM_WEIGHT:g}"
         self.dim = CHANNELS["head"] + HISTOGRAM_LENGTH
-        self.head = head
-        if head is not None:
+        if has_head:
             self.name += f"-look{INSTANCE_WEIGHT:g}{tag}"
-            self.dim += head.DIM
-            head.requires_grad_(False).eval()
+            self.dim += InstanceHead.DIM
 
     def __call__(self, crops: Sequence[Rgb]) -> Float32[np.ndarray, "n d"]:
         rows = np.zeros((len(crops), self.dim), np.float32)
@@ -135,29 +158,14 @@ class LiteEncoder:
 
     def _embed(self, rgb: Rgb) -> Float32[np.ndarray, " d"]:
         whole = pad_to_square(rgb)
+        small = cv2.resize(whole, (INSTANCE_SIDE, INSTANCE_SIDE), interpolation=cv2.INTER_AREA)
         histogram = _unit(lab_histogram(rgb))
-        if self.head is None:
-            taps = features([whole], ["head"])
-        else:
-            taps = features([whole], [*INSTANCE_TAPS, "head"])
-        parts = [_unit(gem(taps["head"][0].numpy())), HISTOGRAM_WEIGHT * histogram]
-        if self.head is not None:
-            parts.append(INSTANCE_WEIGHT * _instance_row(self.head, taps, whole, histogram))
+        colour = histogram.astype(np.float32)
+        deepest, *instance = self.network(whole[None], small[None], colour[None])
+        parts = [_unit(gem(deepest[0])), HISTOGRAM_WEIGHT * histogram]
+        for rows in instance:
+            parts.append(INSTANCE_WEIGHT * rows[0])
         return _unit(np.concatenate(parts)).astype(np.float32)
-
-
-@torch.inference_mode()
-def _instance_row(
-    head: InstanceHead,
-    taps: Mapping[str, Tensor],
-    whole: Rgb,
-    histogram: Float[np.ndarray, " b"],
-) -> Float32[np.ndarray, " d"]:
-    """The instance head's row of one crop."""
-    small = cv2.resize(whole, (INSTANCE_SIDE, INSTANCE_SIDE), interpolation=cv2.INTER_AREA)
-    pixels = normalise(torch.from_numpy(small)[None])
-    colour = torch.from_numpy(histogram.astype(np.float32))[None]
-    return head(halve_b4(taps), pixels, colour)[0].numpy()
 
 
 def halve_b4(taps: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -204,14 +212,15 @@ def pad_to_square(rgb: Rgb) -> Rgb:
 
 @cache
 def load() -> LiteEncoder:
-    """The shipped encoder; the backbone itself loads with the first crop.
+    """The shipped encoder.
 
-    Raises: MissingWeights: data/weights/perception.safetensors is absent or damaged.
+    Raises: MissingWeights: a file of data/weights is absent or damaged.
     """
     weights, entry = load_weights(PERCEPTION, "look.")
     head = InstanceHead()
     head.load_state_dict(weights)
-    return LiteEncoder(head, f"-{entry['sha256'][:6]}")
+    network = load_network(GRAPH, EncodeNetwork(head), entry["sha256"])
+    return LiteEncoder(network, tag=f"-{entry['sha256'][:6]}")
 
 
 def _unit(row: np.ndarray) -> np.ndarray:

@@ -16,9 +16,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
 from vap_core.base.types import Boxes, Rgb
-from vap_core.perception.embedded.backbone import CHANNELS, GREY, load_backbone, normalise
+from vap_core.perception.embedded.backbone import CHANNELS, GREY, Trunk, normalise
+from vap_core.perception.embedded.runtime import Network, load_network
 from vap_core.perception.embedded.weights import PERCEPTION, load_weights
 
+GRAPH = "segmenter.onnx"
 TAPS = ("b0", "b2", "b4", "b10")
 WIDTHS = (16, 24, 32, 48)
 """Channels of the head at each tap."""
@@ -84,21 +86,37 @@ class MaskHead(nn.Module):
         return self.lateral[level](taps[TAPS[level]]) + self.prompt[level](reduced)
 
 
+class MaskNetwork(nn.Module):
+    """Backbone and head: a window and its prompt in, the probability of each of its pixels out."""
+
+    def __init__(self, head: MaskHead) -> None:
+        super().__init__()
+        self.trunk = Trunk(TAPS)
+        self.head = head
+
+    def forward(
+        self, rgb: UInt8[Tensor, "n s s 3"], planes: UInt8[Tensor, "n 2 s s"]
+    ) -> tuple[Float[Tensor, "n s s"]]:
+        """`planes` are those of the prompt, 0..255."""
+        pixels = normalise(rgb)
+        logits = self.head(pixels, self.trunk(pixels), planes.float() / 255)
+        return (logits.sigmoid(),)
+
+
 class LiteSegmenter:
-    """The embedded segmenter.
+    """The embedded segmenter; `network` computes a `MaskNetwork`.
 
     A box always gets a mask: its most likely pixels, where none is likely.
     """
 
-    def __init__(self, head: MaskHead) -> None:
-        self.head = head.requires_grad_(False).eval()
+    def __init__(self, network: Network) -> None:
+        self.network = network
 
     def __call__(self, image: Rgb, boxes: Boxes) -> Bool[np.ndarray, "n h w"]:
         probability = self.mask_probability(image, boxes.xyxy)
         best = probability.max(axis=(1, 2), initial=0.0)
         return probability > np.minimum(0.5, 0.5 * best)[:, None, None]
 
-    @torch.inference_mode()
     def mask_probability(
         self,
         image: Rgb,
@@ -112,14 +130,12 @@ class LiteSegmenter:
         out = np.zeros((len(xyxy), *image.shape[:2]), np.float32)
         for i, box in enumerate(xyxy):
             window = window_around(box)
-            pixels = normalise(torch.from_numpy(cut(image, window))[None])
             planes = np.zeros((2, SIDE, SIDE), np.uint8)
             planes[0] = cut(box_plane(box, image.shape[:2]), window, fill=0)
             if coarse is not None:
                 planes[1] = cut((coarse[i] * 255).astype(np.uint8), window, fill=0)
-            prompt = torch.from_numpy(planes.astype(np.float32) / 255)[None]
-            logits = self.head(pixels, load_backbone()(pixels, TAPS), prompt)[0]
-            paste(out[i], logits.sigmoid().numpy(), window)
+            (probability,) = self.network(cut(image, window)[None], planes[None])
+            paste(out[i], probability[0], window)
         return out
 
 
@@ -166,12 +182,12 @@ def box_plane(box_xyxy: Float[np.ndarray, "4"], hw: Sequence[int]) -> UInt8[np.n
 def load() -> LiteSegmenter:
     """The shipped segmenter.
 
-    Raises: MissingWeights: data/weights/perception.safetensors is absent or damaged.
+    Raises: MissingWeights: a file of data/weights is absent or damaged.
     """
-    weights, _ = load_weights(PERCEPTION, "segment.")
+    weights, entry = load_weights(PERCEPTION, "segment.")
     head = MaskHead()
     head.load_state_dict(weights)
-    return LiteSegmenter(head)
+    return LiteSegmenter(load_network(GRAPH, MaskNetwork(head), entry["sha256"]))
 
 
 def _visible_part(window: Window, hw: Sequence[int]) -> tuple[int, int, int, int]:

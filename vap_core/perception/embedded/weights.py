@@ -1,4 +1,4 @@
-"""Shipped weights: safetensors files under data/weights.
+"""Shipped weights, and the graphs of the networks that use them: files under data/weights.
 
 manifest.json there lists each file with its SHA-256 and provenance.
 """
@@ -40,25 +40,36 @@ def load_weights(
     """
     from safetensors.torch import load
 
+    data, entry = read_checked(name, folder)
+    tensors: dict[str, Tensor] = {}
+    for key, tensor in load(data).items():
+        if key.startswith(prefix):
+            tensors[key.removeprefix(prefix)] = tensor.float()
+    return tensors, entry
+
+
+def read_checked(
+    name: str, folder: Path = FOLDER, remedy: str = "restore it with git, or train it again"
+) -> tuple[bytes, Mapping[str, Any]]:
+    """A file of the folder, and its manifest entry.
+
+    Raises:
+        MissingWeights: the file or its entry is absent, or its checksum differs.
+    """
     path = folder / name
     entry = read_manifest(folder).get(name)
     if entry is None or not path.is_file():
         raise MissingWeights(
-            f"load_weights: {path} is not on this machine or not in {MANIFEST}; "
-            "restore it with git, or train it again."
+            f"load_weights: {path} is not on this machine or not in {MANIFEST}; {remedy}."
         )
     data = path.read_bytes()
     digest = hashlib.sha256(data).hexdigest()
     if digest != entry["sha256"]:
         raise MissingWeights(
             f"load_weights: {path} has SHA-256 {digest[:12]}.., "
-            f"{MANIFEST} says {entry['sha256'][:12]}..; restore it with git."
+            f"{MANIFEST} says {entry['sha256'][:12]}..; {remedy}."
         )
-    tensors: dict[str, Tensor] = {}
-    for key, tensor in load(data).items():
-        if key.startswith(prefix):
-            tensors[key.removeprefix(prefix)] = tensor.float()
-    return tensors, entry
+    return data, entry
 
 
 def save_weights(
@@ -67,11 +78,15 @@ def save_weights(
     """Write half-precision weights and their manifest entry; the other entries stay as they are."""
     from safetensors.torch import save
 
-    folder.mkdir(parents=True, exist_ok=True)
     halves: dict[str, Tensor] = {}
     for key, tensor in tensors.items():
         halves[key] = tensor.detach().cpu().half().contiguous()
-    data = save(halves)
+    return write_entry(name, save(halves), about, folder)
+
+
+def write_entry(name: str, data: bytes, about: Mapping[str, Any], folder: Path) -> Path:
+    """Write a file and its manifest entry; the other entries stay as they are."""
+    folder.mkdir(parents=True, exist_ok=True)
     entries = read_manifest(folder)
     entries[name] = {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data), **about}
     write_atomic(folder / name, data)

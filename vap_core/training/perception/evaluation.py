@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import torch
 from tqdm import tqdm
 
 from vap_core.base.types import value
@@ -15,17 +14,17 @@ from vap_core.evaluation.metrics import rate
 from vap_core.evaluation.perception.estimates import average_precision
 from vap_core.evaluation.perception.first_frames import FLOOR, VISIBLE_PX
 from vap_core.perception.boxes import box_iou, crop, mask_iou
-from vap_core.perception.embedded.backbone import features
 from vap_core.perception.embedded.detector import (
-    TAPS,
     THRESHOLD,
     DetectHead,
+    DetectNetwork,
     LiteDetector,
     decode,
     resize_for_search,
 )
-from vap_core.perception.embedded.encoder import InstanceHead, LiteEncoder
-from vap_core.perception.embedded.segmenter import LiteSegmenter, MaskHead
+from vap_core.perception.embedded.encoder import EncodeNetwork, InstanceHead, LiteEncoder
+from vap_core.perception.embedded.runtime import TorchNetwork
+from vap_core.perception.embedded.segmenter import LiteSegmenter, MaskHead, MaskNetwork
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.phrases import AMBIGUOUS, NEGATIVES, UNSEEN, UNSEEN_NEGATIVES
 from vap_core.training.films.scenes import POSES, Shots, boxes_of
@@ -62,12 +61,16 @@ def evaluate(
     detect: DetectHead, segment: MaskHead, look: InstanceHead, stages: Sequence[Shots]
 ) -> Figures:
     """Every figure that the manifest carries."""
+    detector = LiteDetector(TorchNetwork(DetectNetwork(detect)), detect.known.numpy())
+    segmenter = LiteSegmenter(TorchNetwork(MaskNetwork(segment)))
+    encoder = LiteEncoder(TorchNetwork(EncodeNetwork(look)))
+    frozen = LiteEncoder(TorchNetwork(EncodeNetwork(None)), has_head=False)
     return {
-        "detector": detector_figures(LiteDetector(detect), stages),
-        "segmenter": segmenter_figures(LiteSegmenter(segment), stages),
+        "detector": detector_figures(detector, stages),
+        "segmenter": segmenter_figures(segmenter, stages),
         "encoder": {
-            "with_look_head": encoder_figures(LiteEncoder(look), stages),
-            "frozen_features_alone": encoder_figures(LiteEncoder(), stages),
+            "with_look_head": encoder_figures(encoder, stages),
+            "frozen_features_alone": encoder_figures(frozen, stages),
         },
     }
 
@@ -93,7 +96,7 @@ def detector_figures(detector: LiteDetector, stages: Sequence[Shots]) -> Figures
     categories = objects.CATEGORIES + objects.CLUTTER
     phrases = _all_phrases(categories)
     snapped = _embed_phrases(detector, phrases)
-    plain = _embed_phrases(LiteDetector(detector.head, snap=None), phrases)
+    plain = _embed_phrases(LiteDetector(detector.network, detector.known, snap=None), phrases)
     results = []
     for view in tqdm(_views(stages), desc="evaluating", mininterval=10):
         found_snapped = _detect(detector, view.rgb, snapped)
@@ -341,15 +344,12 @@ def _is_present(view: View, category: str) -> bool:
     return not view.truth.keys().isdisjoint(similar)
 
 
-@torch.inference_mode()
 def _detect(
     detector: LiteDetector, rgb: np.ndarray, rows: Mapping[str, np.ndarray]
 ) -> dict[str, Found]:
     """Every phrase at once, down to FLOOR."""
     resized, scale = resize_for_search(rgb)
-    maps = features([resized], TAPS)
-    phrases = torch.from_numpy(np.concatenate(list(rows.values())))
-    logits, edges = detector.head(maps, phrases)
+    logits, edges = detector.network(resized[None], np.concatenate(list(rows.values())))
     found = {}
     for phrase, phrase_logits in zip(rows, logits[0], strict=True):
         xyxy, scores = decode(phrase_logits, edges[0], FLOOR)

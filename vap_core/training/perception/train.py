@@ -21,14 +21,14 @@ from tqdm import tqdm
 
 from vap_core.base.files import DATA
 from vap_core.evaluation.processes import results
-from vap_core.perception.embedded.weights import save_weights
+from vap_core.perception.embedded.export import export_graphs, require_onnx
+from vap_core.perception.embedded.weights import PERCEPTION, save_weights
 from vap_core.simulation.assets import objects
 from vap_core.training.films.scenes import VIEWS, Shots, cached, only_generic
 from vap_core.training.perception import detector, instance_head, segmenter
 from vap_core.training.perception.fitting import Run, checkpoint
 
 CACHE = DATA / "cache" / "perception"
-FILE = "perception.safetensors"
 HELD_OUT_STAGES = 30
 EPOCHS = {"detector": 6, "segmenter": 6, "looks": 40}
 CROPS_PER_EPOCH = 8000
@@ -46,12 +46,15 @@ def train(
 ) -> dict[str, Any]:
     """Train the heads on about `scenes` rendered views; returns the manifest's entry.
 
-    Writes `out`/perception.safetensors and its manifest entry. `minutes` stops training after the
-    epoch that runs then; `resume` off forgets earlier epochs but keeps the rendered stages. `jobs`
-    processes (all cores) render.
+    Writes `out`/perception.safetensors, the networks' graphs, and their manifest entries. `minutes`
+    stops training after the epoch that runs then; `resume` off forgets earlier epochs but keeps the
+    rendered stages. `jobs` processes (all cores) render.
+
+    Raises: MissingWeights: `onnx`, which writes the graphs, is not installed.
     """
     from vap_core.training.perception.evaluation import evaluate
 
+    require_onnx()
     started = time.monotonic()
 
     def expired() -> bool:
@@ -82,7 +85,8 @@ def train(
     about = _describe_training(scenes, seed, stages)
     about["measured"] = evaluate(detect, segment, look, unseen)
     tensors = _name_tensors({"detect": detect, "look": look, "segment": segment})
-    save_weights(FILE, tensors, about, out)
+    save_weights(PERCEPTION, tensors, about, out)
+    export_graphs(out)
     return about
 
 

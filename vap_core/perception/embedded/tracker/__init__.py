@@ -8,11 +8,19 @@ decides which masks are believed, `search` looks for lost identities, and `track
 from functools import cache
 
 from vap_core.perception.embedded.encoder import load as load_encoder
+from vap_core.perception.embedded.runtime import load_network
 from vap_core.perception.embedded.segmenter import load as load_segmenter
+from vap_core.perception.embedded.tracker.cells import GRAPH, CellNetwork
 from vap_core.perception.embedded.tracker.tracker import LiteTracker
+from vap_core.perception.embedded.weights import PERCEPTION, read_manifest
 
 
 @cache
 def load() -> LiteTracker:
-    """The shipped tracker, with the shipped segmenter and encoder."""
-    return LiteTracker(load_segmenter(), load_encoder())
+    """The shipped tracker, with the shipped segmenter and encoder.
+
+    Raises: MissingWeights: a file of data/weights is absent or damaged.
+    """
+    sha256 = read_manifest()[PERCEPTION]["sha256"]
+    network = load_network(GRAPH, CellNetwork(), sha256)
+    return LiteTracker(network, load_segmenter(), load_encoder())

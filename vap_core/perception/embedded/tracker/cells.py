@@ -9,12 +9,21 @@ from functools import cache
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Int64, UInt8
+from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
 from vap_core.base.types import Rgb, value
-from vap_core.perception.embedded.backbone import CHANNELS, STRIDE, features, resize_and_pad
+from vap_core.perception.embedded.backbone import (
+    CHANNELS,
+    STRIDE,
+    Trunk,
+    normalise,
+    resize_and_pad,
+)
+from vap_core.perception.embedded.runtime import Network
 
+GRAPH = "tracker.onnx"
 TAP = "b4"
 CELL_PX = STRIDE[TAP]
 SIDE = 224
@@ -40,13 +49,27 @@ class FrameMemory:
     labels: Labels
 
 
-def embed_cells(image: Rgb) -> tuple[Float32[np.ndarray, "p c"], Grid]:
-    """Unit-length features of every cell, row by row, and the grid."""
+class CellNetwork(nn.Module):
+    """The shallow backbone: an image in, unit-length features of every cell out, row by row."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.trunk = Trunk([TAP])
+
+    def forward(self, rgb: UInt8[Tensor, "1 h w 3"]) -> tuple[Float[Tensor, "p c"]]:
+        maps = self.trunk(normalise(rgb))[TAP][0]
+        keys = maps.reshape(CHANNELS[TAP], -1).T
+        return (F.normalize(keys, dim=1).contiguous(),)
+
+
+def embed_cells(image: Rgb, network: Network) -> tuple[Float32[np.ndarray, "p c"], Grid]:
+    """Unit-length features of every cell, row by row, and the grid.
+
+    `network` computes a `CellNetwork`.
+    """
     resized, _ = resize_and_pad(image, SIDE)
-    maps = features([resized], [TAP])[TAP][0]
-    rows, cols = maps.shape[1:]
-    keys = F.normalize(maps.reshape(CHANNELS[TAP], -1).T, dim=1)
-    return keys.contiguous().numpy(), (rows, cols)
+    (keys,) = network(resized[None])
+    return keys, (resized.shape[0] // CELL_PX, resized.shape[1] // CELL_PX)
 
 
 def propagate(

@@ -62,7 +62,8 @@ def search(
         return state, absence
     state = _with_embeddings(state, identity, encoder)
     last = state.last_rows[identity]
-    assert state.appearances is not None and last is not None
+    assert state.appearances is not None
+    assert last is not None
     row = encoder([crop(frame.image, box)])[0]
     if state.appearances.accept(row, last, identity):
         probability[:, own & (drawn > 0.5)] = 0

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float32, Int64
 
 from vap_core.base.types import Rgb, Track, value
 from vap_core.perception.boxes import crop, mask_box
+from vap_core.perception.embedded.runtime import Network
 from vap_core.perception.embedded.tracker.appearance import (
     N_BINS,
     Appearances,
@@ -74,10 +75,10 @@ class FrameFeatures:
     grid: Grid
 
 
-def initial_state(image: Rgb, masks: Bool[np.ndarray, "n h w"]) -> TrackState:
-    """The state at t = 0; row i of the masks is identity i."""
+def initial_state(image: Rgb, masks: Bool[np.ndarray, "n h w"], network: Network) -> TrackState:
+    """The state at t = 0; row i of the masks is identity i. `network` embeds cells."""
     n = len(masks)
-    keys, grid = embed_cells(image)
+    keys, grid = embed_cells(image, network)
     area = masks.sum(axis=(1, 2))
     visible: Bool[np.ndarray, " n"] = area > 0
     boxes = np.tile(np.array([0, 0, 1, 1], np.float32), (n, 1))

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float32, Int64
 
 from vap_core.base.types import Mask, Rgb, Track
 from vap_core.perception.boxes import mask_box
+from vap_core.perception.embedded.runtime import Network
 from vap_core.perception.embedded.segmenter import LiteSegmenter
 from vap_core.perception.embedded.tracker.cells import (
     Labels,
@@ -51,9 +52,13 @@ HINT_GROWTH_PX = 9
 
 
 class LiteTracker:
-    """The embedded tracker. Views are independent; the same frames give the same bits."""
+    """The embedded tracker. Views are independent; the same frames give the same bits.
 
-    def __init__(self, segmenter: LiteSegmenter, encoder: Encoder) -> None:
+    `network` computes a `CellNetwork`.
+    """
+
+    def __init__(self, network: Network, segmenter: LiteSegmenter, encoder: Encoder) -> None:
+        self.network = network
         self.segmenter = segmenter
         self.encoder = encoder
 
@@ -67,7 +72,7 @@ class LiteTracker:
                     f"LiteTracker.start: masks of {of_view.shape[1:]} pixels for an image of "
                     f"{image.shape[:2]}; they must agree"
                 )
-            states.append(initial_state(image, of_view))
+            states.append(initial_state(image, of_view, self.network))
         return states
 
     def step(
@@ -87,7 +92,7 @@ class LiteTracker:
         lost = np.flatnonzero(state.lost > 0)
         if not len(moving) and not len(lost):
             return state
-        keys, grid = embed_cells(image)
+        keys, grid = embed_cells(image, self.network)
         frame = FrameFeatures(image, thumbnail, keys, grid)
         probability = np.where(state.masks, state.scores[:, None, None], np.float32(0))
         if len(moving):
