@@ -13,8 +13,9 @@ from safetensors.torch import load_file, save_file
 from tests import tiny_lerobot as tiny
 from vap_core.base.errors import BadPolicy
 from vap_core.policies.hooks import TEXT
-from vap_core.policies.lerobot.adapter import LeRobot, compare, load_for_suite, load_policy
+from vap_core.policies.lerobot.adapter import LeRobot, load_for_suite, load_policy
 from vap_core.policies.lerobot.checkpoints import fingerprint, is_checkpoint_name
+from vap_core.policies.lerobot.loading import compare
 from vap_core.policies.lerobot.toy_pi0 import toy_sizes
 from vap_core.policies.protocol import Policy, PolicyInput
 from vap_core.rollout import audit

@@ -1,13 +1,15 @@
 """Every success rule just met and just missed; CMR, wrong object and first object; re-judging a saved episode."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from vap_core.evaluation import state_log as traces
 from vap_core.rollout.types import Episode, EpisodeHeader, Frame
-from vap_core.simulation.suites.rules import Judge, rejudge
+from vap_core.simulation.suites.rules import Judge, _lowest_m, _middle, rejudge
 from vap_core.simulation.types import REST, ROBOT, EpisodeRow, Placement, Truth
 
 TARGET, OTHER, GOAL = "cup-personal", "cup-lookalike-1", "plate-prop"
@@ -72,6 +74,17 @@ def up(height, by=(ROBOT,)):
 )
 def test_picked(steps, won):
     assert judged(PICK, *steps).outcome().success == won
+
+
+def test_middle_and_lowest_corner_are_those_of_the_eight_turned_corners():
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        pose = np.concatenate([rng.normal(size=3), rng.normal(size=4)])
+        x, y, z = size = tuple(rng.uniform(0.01, 0.3, 3).tolist())
+        corners = np.array(list(product((-x / 2, x / 2), (-y / 2, y / 2), (0.0, z))))
+        box = Rotation.from_quat(pose[3:], scalar_first=True).apply(corners) + pose[:3]
+        assert np.allclose(_middle(pose, size), box.mean(axis=0), rtol=0, atol=1e-12)
+        assert abs(_lowest_m(pose, size) - box[:, 2].min()) < 1e-12
 
 
 def test_an_episode_may_end_once_the_lift_is_done():

@@ -12,15 +12,11 @@ has an effect on a chunk.
 import copy
 import hashlib
 import inspect
-import io
-import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import cache
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -28,21 +24,11 @@ from jaxtyping import Float32
 
 from vap_core.base.errors import BadPolicy
 from vap_core.base.types import value
-from vap_core.policies.hooks import (
-    TEXT,
-    attention_observed,
-    inputs_observed,
-    report_attention,
-    report_input,
-)
-from vap_core.policies.lerobot.checkpoints import (
-    PIPELINES,
-    WEIGHTS,
-    base_models,
-    fingerprint,
-    locate,
-    refuse_code,
-)
+from vap_core.policies.hooks import TEXT, attention_observed, inputs_observed, report_input
+from vap_core.policies.lerobot.checkpoints import PIPELINES, fingerprint, locate
+from vap_core.policies.lerobot.loading import build
+from vap_core.policies.lerobot.module_hooks import overriding_tokens, reporting_attention
+from vap_core.policies.lerobot.traced import ChunkPredictor
 from vap_core.policies.protocol import Chunk, PolicyInput
 from vap_core.simulation.env import Env
 from vap_core.simulation.scenes import Scene
@@ -119,6 +105,7 @@ class LeRobot:
         model = getattr(policy, "model", None)
         self.attends = self.batched and hasattr(model, "paligemma_with_expert")
         """Whether it reports its attention (module hooks)."""
+        self.predict = ChunkPredictor(policy, label)
 
     def with_tokens(self, words: Mapping[str, Float32[np.ndarray, " d"]]) -> "LeRobot":
         """The same frozen policy, in which some reserved words have learned embeddings.
@@ -210,15 +197,18 @@ class LeRobot:
     def _plan_batch(
         self, states: Sequence[LeRobotState], inputs: Sequence[PolicyInput]
     ) -> list[Chunk]:
+        config: Any = self.policy.config
         batch = self.preprocessor(self._observation(inputs))
         episodes = range(len(inputs))
         self._report_inputs(batch, episodes)
-        options = {}
-        if self.noisy:
-            options["noise"] = self._noise(states)
-        with self._overriding_tokens(), self._reporting_attention():
-            planned = self.policy.predict_action_chunk(batch, **options)
-            actions = self.postprocessor(planned[:, : self.execute])
+        noise = self._noise(states) if self.noisy else None
+        watching: AbstractContextManager[None] = nullcontext()
+        if self.attends and attention_observed():
+            keys = [key for key in config.image_features if not key.startswith(EMPTY)]
+            watching = reporting_attention(self.policy, [self._camera(key) for key in keys])
+        with overriding_tokens(self.policy, self.learned), watching:
+            planned = self.predict(batch, noise)
+        actions = self.postprocessor(planned[:, : self.execute])
         return list(actions.float().cpu().numpy())
 
     def _plan_step(self, episode: int, state: LeRobotState, policy_input: PolicyInput) -> Chunk:
@@ -272,66 +262,6 @@ class LeRobot:
         """The name of our camera whose image the checkpoint reads under `key`."""
         return self.renamed.get(key, key).removeprefix(IMAGE)
 
-    @contextmanager
-    def _overriding_tokens(self) -> Iterator[None]:
-        """Inside, the embeddings of learned words are the learned ones."""
-        if not self.learned:
-            yield
-            return
-
-        def replace_embeddings(module: Any, args: Any, embeddings: torch.Tensor) -> torch.Tensor:
-            for token, embedding in self.learned.items():
-                is_token = (args[0] == token)[..., None]
-                embeddings = torch.where(is_token, embedding.to(embeddings), embeddings)
-            return embeddings
-
-        model: Any = self.policy.model
-        table = model.paligemma_with_expert.paligemma.model.language_model.embed_tokens
-        hook = table.register_forward_hook(replace_embeddings)
-        try:
-            yield
-        finally:
-            hook.remove()
-
-    @contextmanager
-    def _reporting_attention(self) -> Iterator[None]:
-        """Inside, a pi0 reports its attention to image patches, where somebody observes it.
-
-        It is that of the last layer of the action expert, in the mean over heads, actions and
-        denoising steps.
-        """
-        if not self.attends or not attention_observed():
-            yield
-            return
-        policy: Any = self.policy
-        chunk_size = policy.config.chunk_size
-        weights: list[torch.Tensor] = []
-
-        def keep_weights(module: Any, args: Any, output: Any) -> None:
-            of_actions = output[1][:, :, -chunk_size:]
-            weights.append(of_actions.mean(dim=(1, 2)))
-
-        expert = policy.model.paligemma_with_expert.gemma_expert.model
-        hook = expert.layers[-1].self_attn.register_forward_hook(keep_weights)
-        try:
-            yield
-        finally:
-            hook.remove()
-        self._report_attention(torch.stack(weights).mean(0))
-
-    def _report_attention(self, weights: torch.Tensor) -> None:
-        """Report a map per camera of every episode; `weights` is episodes x attention keys."""
-        policy: Any = self.policy
-        vision = policy.model.paligemma_with_expert.paligemma.config.vision_config
-        side = policy.config.image_resolution[0] // vision.patch_size
-        keys = [key for key in policy.config.image_features if not key.startswith(EMPTY)]
-        n_cameras = len(keys)  # lerobot puts empty cameras behind them
-        patches = weights[:, : n_cameras * side**2]
-        maps = patches.unflatten(1, (n_cameras, side, side)).float().cpu().numpy()
-        for i, key in enumerate(keys):
-            for episode, attention in enumerate(maps[:, i]):
-                report_attention(episode, self._camera(key), attention)
-
     def _noise(self, states: Sequence[LeRobotState]) -> torch.Tensor:
         config: Any = self.policy.config
         shape = (config.chunk_size, config.max_action_dim)
@@ -350,21 +280,8 @@ def load_policy(checkpoint: str | Path, device: str | None = None) -> LeRobot:
     Raises: BadPolicy when it is not there, would execute code, cannot be built, or does not end
         with exactly the file's weights.
     """
-    # registers our own type of policy and its step
-    import_module("vap_core.policies.mini_pi0.processor_mini_pi0")
     folder = locate(checkpoint)
-    refuse_code(folder)
-    try:
-        policy, preprocessor, postprocessor = _build(folder, device)
-    except Exception as error:
-        reason = str(error).strip().splitlines() or [""]
-        remedy = _remedy(folder, error)
-        raise BadPolicy(
-            f"load: {folder} cannot become a policy "
-            f"({type(error).__name__}: {reason[0]:.200}); {remedy}."
-        ) from error
-    with _silence():
-        compare(policy, folder / WEIGHTS)
+    policy, preprocessor, postprocessor = build(folder, device)
     name = folder.name if Path(checkpoint).is_dir() else checkpoint
     label = f"{policy.config.type}:{name}@{fingerprint(folder)[:8]}"
     return LeRobot(
@@ -385,36 +302,6 @@ def load_for_suite(checkpoint: str, scene: Scene, suite: Suite) -> LeRobot:
     state_size = len(env.state())
     policy.check(suite.cameras, state_size, env.action_size)
     return policy
-
-
-def compare(policy: "PreTrainedPolicy", file: Path) -> None:
-    """Check that the policy's weights are the file's, tensor for tensor, cast to its precision.
-
-    lerobot's PI0 prints a failed load and goes on with random weights; other policies skip what
-    they miss.
-
-    Raises: BadPolicy.
-    """
-    from safetensors import safe_open
-
-    weights = policy.state_dict()
-    different = []
-    tied = set()
-    with safe_open(file, "pt") as stored:
-        names = _names_in_file(policy, stored.keys(), weights)
-        for key, name in names.items():
-            if key in weights and _equal(stored.get_tensor(name), weights[key]):
-                tied.add(weights[key].data_ptr())
-            else:
-                different.append(key)
-    for key, tensor in weights.items():
-        if key not in names and tensor.data_ptr() not in tied:
-            different.append(key)
-    if different:
-        raise BadPolicy(
-            f"load: {len(different)} of {len(weights)} tensors differ from {file}, {different[0]} "
-            "for one; the file belongs to another architecture or size."
-        )
 
 
 def _takes_noise(policy: "PreTrainedPolicy") -> bool:
@@ -443,66 +330,6 @@ def _copy_policy(policy: "PreTrainedPolicy") -> "PreTrainedPolicy":
     return own
 
 
-def _build(folder: Path, device: str | None) -> tuple["PreTrainedPolicy", Any, Any]:
-    """The policy of a checkpoint, its preprocessor and its postprocessor."""
-    from lerobot import policies
-    from lerobot.configs import PreTrainedConfig
-
-    # some policies trust any repository
-    no_code = patch("transformers.dynamic_module_utils.get_class_in_module", _no_code)
-    with _silence(), no_code:
-        config: Any = PreTrainedConfig.from_pretrained(folder)
-        config.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
-        # the file's weights replace those that these options load
-        if getattr(config, "pretrained_backbone_weights", None):
-            config.pretrained_backbone_weights = None
-        if getattr(config, "load_vlm_weights", None):
-            config.load_vlm_weights = False
-        policy_class: Any = policies.factory.get_policy_class(config.type)
-        policy = policy_class.from_pretrained(folder, config=config)
-        preprocessor, postprocessor = policies.make_pre_post_processors(
-            config,
-            str(folder),
-            preprocessor_overrides={"device_processor": {"device": config.device}},
-        )
-    return policy, preprocessor, postprocessor
-
-
-def _remedy(folder: Path, error: Exception) -> str:
-    """What to do about a checkpoint that cannot be built."""
-    if "huggingface.co" in str(error):
-        models = base_models(folder)
-        if models:
-            commands = ", ".join(f"`hf download {name}`" for name in models)
-            return f"get what it builds on: {commands}"
-    return "check its files, or save it again with lerobot 0.6"
-
-
-def _names_in_file(
-    policy: "PreTrainedPolicy", names: Sequence[str], weights: Mapping[str, torch.Tensor]
-) -> dict[str, str]:
-    """The name of a tensor in the file, by its key in the policy's `weights`.
-
-    openpi's names are mapped by the policy itself; numbers stand in for the tensors meanwhile.
-    """
-    numbered = {}
-    for i, name in enumerate(names):
-        numbered[name] = torch.tensor(i)
-    rename: Callable[..., dict[str, Any]] | None
-    rename = getattr(policy, "_fix_pytorch_state_dict_keys", None)
-    if rename is not None:
-        numbered = rename(numbered, policy.config)
-    found = {}
-    for key, number in numbered.items():
-        known = key if key in weights else f"model.{key}"
-        found[known] = names[int(number)]
-    return found
-
-
-def _equal(stored: torch.Tensor, loaded: torch.Tensor) -> bool:
-    return torch.equal(stored.to(loaded.dtype), loaded.cpu())
-
-
 def _resize(images: torch.Tensor, shape: tuple[int, ...]) -> torch.Tensor:
     """Scaled to the height and width that the checkpoint was trained on."""
     size = shape[-2:]
@@ -517,21 +344,3 @@ def _format_shapes(features: Shapes) -> str:
     for key, shape in sorted(features.items()):
         parts.append(f"{key} ({shape[0]})" if len(shape) == 1 else key)
     return ", ".join(parts) or "nothing"
-
-
-@contextmanager
-def _silence() -> Iterator[None]:
-    """Loading prints and logs a page; what matters of it is checked afterwards."""
-    level = logging.root.manager.disable
-    logging.disable(logging.WARNING)
-    try:
-        with redirect_stdout(io.StringIO()):
-            yield
-    finally:
-        logging.disable(level)
-
-
-def _no_code(*args: Any, **kwargs: Any) -> Any:
-    raise BadPolicy(
-        "its tokenizer or backbone is Python from the hub, which is never executed here"
-    )

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, cast
 
+import torch
 from lerobot.policies.pi0.modeling_pi0 import PaliGemmaWithExpertModel, PI0Policy, PI0Pytorch
 from lerobot.policies.pi_gemma import (
     PaliGemmaForConditionalGenerationWithPiGemma,
@@ -50,6 +51,16 @@ class MiniPI0Pytorch(PI0Pytorch):
         self.action_time_mlp_in = nn.Linear(2 * width, width)
         self.action_time_mlp_out = nn.Linear(width, width)
         self.gradient_checkpointing_enabled = False
+
+    def embed_prefix(
+        self, images: Any, img_masks: Any, lang_tokens: Any, lang_masks: Any
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """PI0's, whose last mask is as long as the prefix also where a trace is given another.
+
+        PI0 makes it of a list, which a trace would take for a constant.
+        """
+        embedded, present, _ = super().embed_prefix(images, img_masks, lang_tokens, lang_masks)
+        return embedded, present, torch.zeros_like(present)
 
     def sample_actions(
         self,

@@ -17,13 +17,10 @@ wrong.
 outcome; undefined for selection.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from itertools import product
 from typing import Literal
-
-import numpy as np
-from jaxtyping import Float64
 
 from vap_core.base.types import Event, value
 from vap_core.simulation.types import REST, ROBOT, EpisodeRow, Outcome, Pose, SuccessRule, Truth
@@ -43,8 +40,14 @@ LIFTED_M = 0.05
 """A held target this high is clear of the table: the lift is done and the episode may end."""
 HELD_STEPS: Mapping[SuccessRule, int] = {"picked": 5, "near": 1, "put": 1, "selected": 1}
 """Steps in a row for which a rule's condition must hold."""
-Sizes = Mapping[str, tuple[float, float, float]]
-"""Full extents of every object, metres, by model name."""
+Size = tuple[float, float, float]
+"""Full extents of an object, metres."""
+Sizes = Mapping[str, Size]
+"""By model name."""
+Point = tuple[float, float, float]
+"""In the world, metres."""
+Names = tuple[str, ...]
+"""Objects in the order in which the robot touched or moved them."""
 
 
 @value
@@ -82,6 +85,7 @@ class Judge:
 
     def step(self, truth: Truth) -> "Judge":
         """The state after one more control step."""
+        target = self.row.target
         moved = set(self.moved)
         for name in self.start_world:
             if self.travel_m(name, truth) > MOVED_M:
@@ -90,30 +94,28 @@ class Judge:
         for name in (*truth.touched, *sorted(moved)):
             if name in self.start_world and name not in (*order, self.row.goal):
                 order.append(name)
+        held = CONDITIONS[self.row.rule](self, truth, tuple(order))
+        run = self.run + 1 if held else 0
         after = replace(
             self,
             now=truth,
             steps=self.steps + 1,
-            step_m=_distance(self, self.row.target, truth),
+            step_m=math.dist(_middle_of(self, truth, target), _middle_of(self, self.now, target)),
+            run=run,
+            held_steps=max(self.held_steps, run),
+            success_once=self.success_once or run >= HELD_STEPS[self.row.rule],
             earlier=self.order,
             order=tuple(order),
             moved=frozenset(moved),
             events=(),
         )
-        run = self.run + 1 if CONDITIONS[self.row.rule](after) else 0
-        after = replace(
-            after,
-            run=run,
-            held_steps=max(self.held_steps, run),
-            success_once=self.success_once or run >= HELD_STEPS[self.row.rule],
-        )
-        return replace(after, events=_events(self, after))
+        events = _events(self, after)
+        return replace(after, events=events) if events else after
 
     def travel_m(self, name: str, truth: Truth | None = None) -> float:
         """How far the middle of an object is from where it settled: toppling is moving."""
-        middle = _box(truth or self.now, self.sizes_m, name).mean(axis=0)
-        start = _corners(self.start_world[name], self.sizes_m[name]).mean(axis=0)
-        return float(np.linalg.norm(middle - start))
+        start = _middle(self.start_world[name], self.sizes_m[name])
+        return math.dist(_middle_of(self, truth or self.now, name), start)
 
     @property
     def success(self) -> bool:
@@ -126,7 +128,7 @@ class Judge:
     def done(self) -> bool:
         """Nothing is left to do: lifted clear of the table, released at the goal, or selected."""
         if self.row.rule == "picked":
-            return self.success and _lift_m(self) > LIFTED_M
+            return self.success and _lift_m(self, self.now) > LIFTED_M
         if self.row.rule == "selected":
             return self.success
         free = ROBOT not in self.now.contacts.get(self.row.target, ())
@@ -169,93 +171,108 @@ def rejudge(row: EpisodeRow, sizes_m: Sizes, truths: Sequence[Truth]) -> Judge:
     return judge
 
 
-def _picked(judge: Judge) -> bool:
-    return _lift_m(judge) > LIFT_M and judge.row.target in judge.now.held
+def _picked(judge: Judge, truth: Truth, order: Names) -> bool:
+    return _lift_m(judge, truth) > LIFT_M and judge.row.target in truth.held
 
 
-def _near(judge: Judge) -> bool:
+def _near(judge: Judge, truth: Truth, order: Names) -> bool:
     target = judge.row.target
     goal = judge.row.goal
-    gap = _apart_m(judge, target, goal)
+    gap = _apart_m(judge, truth, target, goal)
     limit = _half_diagonal_m(judge.sizes_m[target]) + _half_diagonal_m(judge.sizes_m[goal]) + NEAR_M
-    travel = judge.travel_m(target)
+    travel = judge.travel_m(target, truth)
     if not (travel > MOVED_M and gap < limit):
         return False
     for name in judge.start_world:
-        dropped = judge.start_world[name][2] - judge.now.objects_world[name][2]
+        dropped = judge.start_world[name][2] - truth.objects_world[name][2]
         if not dropped < DROPPED_M:
             return False
-        if name != target and not travel > judge.travel_m(name):
+        if name != target and not travel > judge.travel_m(name, truth):
             return False
-        if name not in (target, goal) and not gap < _apart_m(judge, target, name):
+        if name not in (target, goal) and not gap < _apart_m(judge, truth, target, name):
             return False
-    return bool(judge.now.contacts.get(target, frozenset()) & {REST, ROBOT})
+    return bool(truth.contacts.get(target, frozenset()) & {REST, ROBOT})
 
 
-def _put(judge: Judge) -> bool:
+def _put(judge: Judge, truth: Truth, order: Names) -> bool:
     target = judge.row.target
     goal = judge.row.goal
-    partners = judge.now.contacts.get(target, frozenset())
-    stand = judge.now.objects_world[goal]
-    box = _box(judge.now, judge.sizes_m, target)
-    foot = float(box[:, 2].min() - stand[2])
+    partners = truth.contacts.get(target, frozenset())
+    stand = truth.objects_world[goal]
+    pose = truth.objects_world[target]
+    foot = _lowest_m(pose, judge.sizes_m[target]) - float(stand[2])
+    middle = _middle_of(judge, truth, target)
+    reach = _half_diagonal_m(judge.sizes_m[goal]) + OVER_M
     return (
         goal in partners
         and partners <= {goal, ROBOT}
-        and _apart_m(judge, target, goal) <= _half_diagonal_m(judge.sizes_m[goal]) + OVER_M
+        and _apart_m(judge, truth, target, goal) <= reach
         and foot <= judge.sizes_m[goal][2] + GAP_M
-        and bool(box[:, 2].mean() > stand[2])
+        and bool(middle[2] > stand[2])
         and bool(1 - 2 * (stand[4] ** 2 + stand[5] ** 2) > UPRIGHT)
     )
 
 
-def _selected(judge: Judge) -> bool:
+def _selected(judge: Judge, truth: Truth, order: Names) -> bool:
     target = judge.row.target
-    clean = judge.order[:1] == (target,) and set(judge.earlier) <= {target}
-    return clean and judge.now.pressed_s.get(target, 0.0) > PRESSED_S
+    clean = order[:1] == (target,) and set(judge.order) <= {target}
+    return clean and truth.pressed_s.get(target, 0.0) > PRESSED_S
 
 
-CONDITIONS: Mapping[SuccessRule, Callable[[Judge], bool]] = {
+CONDITIONS: Mapping[SuccessRule, Callable[[Judge, Truth, Names], bool]] = {
     "picked": _picked,
     "near": _near,
     "put": _put,
     "selected": _selected,
 }
+"""Whether a rule's condition holds: of the judge before a step, the truth after it, and `order`."""
 
 
-def _lift_m(judge: Judge) -> float:
+def _lift_m(judge: Judge, truth: Truth) -> float:
     target = judge.row.target
-    return float(judge.now.objects_world[target][2] - judge.start_world[target][2])
+    return float(truth.objects_world[target][2] - judge.start_world[target][2])
 
 
-def _half_diagonal_m(size: tuple[float, float, float]) -> float:
-    return 0.5 * float(np.hypot(size[0], size[1]))
+def _half_diagonal_m(size: Size) -> float:
+    return 0.5 * math.hypot(size[0], size[1])
 
 
-def _apart_m(judge: Judge, first: str, second: str) -> float:
+def _apart_m(judge: Judge, truth: Truth, first: str, second: str) -> float:
     """Between two objects' centres, across the table."""
-    first_middle = _box(judge.now, judge.sizes_m, first).mean(axis=0)
-    second_middle = _box(judge.now, judge.sizes_m, second).mean(axis=0)
-    return float(np.linalg.norm((first_middle - second_middle)[:2]))
+    return math.dist(_middle_of(judge, truth, first)[:2], _middle_of(judge, truth, second)[:2])
 
 
-def _distance(judge: Judge, name: str, truth: Truth) -> float:
-    """How far the middle of an object is from where it was a step ago."""
-    shift = _box(truth, judge.sizes_m, name) - _box(judge.now, judge.sizes_m, name)
-    return float(np.linalg.norm(shift.mean(axis=0)))
+def _middle_of(judge: Judge, truth: Truth, name: str) -> Point:
+    return _middle(truth.objects_world[name], judge.sizes_m[name])
 
 
-def _box(truth: Truth, sizes_m: Sizes, name: str) -> Float64[np.ndarray, "8 3"]:
-    return _corners(truth.objects_world[name], sizes_m[name])
+def _middle(pose: Pose, size: Size) -> Point:
+    """The middle of the bounding box; an object's origin is the centre of its base."""
+    x, y, z, *quat = pose.tolist()
+    along_x, along_y, along_z = _axis_z(*quat)
+    half = 0.5 * size[2]
+    return x + half * along_x, y + half * along_y, z + half * along_z
 
 
-def _corners(pose: Pose, size: tuple[float, float, float]) -> Float64[np.ndarray, "8 3"]:
-    """The bounding box's corners in the world; an object's origin is the centre of its base."""
-    from scipy.spatial.transform import Rotation
+def _lowest_m(pose: Pose, size: Size) -> float:
+    """The height of the bounding box's lowest corner."""
+    w, x, y, z = pose[3:].tolist()
+    norm = w * w + x * x + y * y + z * z
+    slope_x = 2 * (x * z - w * y) / norm
+    slope_y = 2 * (y * z + w * x) / norm
+    slope_z = _axis_z(w, x, y, z)[2]
+    sides = 0.5 * (abs(slope_x) * size[0] + abs(slope_y) * size[1])
+    return float(pose[2]) - sides + min(0.0, slope_z * size[2])
 
-    x, y, z = size
-    local = np.array(list(product((-x / 2, x / 2), (-y / 2, y / 2), (0.0, z))))
-    return Rotation.from_quat(pose[3:], scalar_first=True).apply(local) + pose[:3]
+
+def _axis_z(w: float, x: float, y: float, z: float) -> Point:
+    """Where a rotation takes the z axis: the last column of its matrix."""
+    norm = w * w + x * x + y * y + z * z
+    return (
+        2 * (x * z + w * y) / norm,
+        2 * (y * z - w * x) / norm,
+        (w * w - x * x - y * y + z * z) / norm,
+    )
 
 
 def _events(before: Judge, after: Judge) -> tuple[Event, ...]:

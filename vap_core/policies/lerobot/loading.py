@@ -1,0 +1,152 @@
+"""Building a checkpoint's policy through lerobot's factory, with exactly the file's weights.
+
+A checkpoint comes from outside: it is parsed, never executed.
+"""
+
+import io
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from unittest.mock import patch
+
+import torch
+
+from vap_core.base.errors import BadPolicy
+from vap_core.policies.lerobot.checkpoints import WEIGHTS, base_models, refuse_code
+
+if TYPE_CHECKING:
+    from lerobot.policies.pretrained import PreTrainedPolicy
+
+
+def build(folder: Path, device: str | None) -> tuple["PreTrainedPolicy", Any, Any]:
+    """The policy of a checkpoint, its preprocessor and its postprocessor.
+
+    Raises: BadPolicy when it would execute code, cannot be built, or does not end with exactly the
+        file's weights.
+    """
+    # registers our own type of policy and its step
+    import_module("vap_core.policies.mini_pi0.processor_mini_pi0")
+    refuse_code(folder)
+    try:
+        policy, preprocessor, postprocessor = _build(folder, device)
+    except Exception as error:
+        reason = str(error).strip().splitlines() or [""]
+        remedy = _remedy(folder, error)
+        raise BadPolicy(
+            f"load: {folder} cannot become a policy "
+            f"({type(error).__name__}: {reason[0]:.200}); {remedy}."
+        ) from error
+    with _silence():
+        compare(policy, folder / WEIGHTS)
+    return policy, preprocessor, postprocessor
+
+
+def compare(policy: "PreTrainedPolicy", file: Path) -> None:
+    """Check that the policy's weights are the file's, tensor for tensor, cast to its precision.
+
+    lerobot's PI0 prints a failed load and goes on with random weights; other policies skip what
+    they miss.
+
+    Raises: BadPolicy.
+    """
+    from safetensors import safe_open
+
+    weights = policy.state_dict()
+    different = []
+    tied = set()
+    with safe_open(file, "pt") as stored:
+        names = _names_in_file(policy, stored.keys(), weights)
+        for key, name in names.items():
+            if key in weights and _equal(stored.get_tensor(name), weights[key]):
+                tied.add(weights[key].data_ptr())
+            else:
+                different.append(key)
+    for key, tensor in weights.items():
+        if key not in names and tensor.data_ptr() not in tied:
+            different.append(key)
+    if different:
+        raise BadPolicy(
+            f"load: {len(different)} of {len(weights)} tensors differ from {file}, {different[0]} "
+            "for one; the file belongs to another architecture or size."
+        )
+
+
+def _build(folder: Path, device: str | None) -> tuple["PreTrainedPolicy", Any, Any]:
+    """The policy of a checkpoint, its preprocessor and its postprocessor."""
+    from lerobot import policies
+    from lerobot.configs import PreTrainedConfig
+
+    # some policies trust any repository
+    no_code = patch("transformers.dynamic_module_utils.get_class_in_module", _no_code)
+    with _silence(), no_code:
+        config: Any = PreTrainedConfig.from_pretrained(folder)
+        config.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+        # the file's weights replace those that these options load
+        if getattr(config, "pretrained_backbone_weights", None):
+            config.pretrained_backbone_weights = None
+        if getattr(config, "load_vlm_weights", None):
+            config.load_vlm_weights = False
+        policy_class: Any = policies.factory.get_policy_class(config.type)
+        policy = policy_class.from_pretrained(folder, config=config)
+        preprocessor, postprocessor = policies.make_pre_post_processors(
+            config,
+            str(folder),
+            preprocessor_overrides={"device_processor": {"device": config.device}},
+        )
+    return policy, preprocessor, postprocessor
+
+
+def _remedy(folder: Path, error: Exception) -> str:
+    """What to do about a checkpoint that cannot be built."""
+    if "huggingface.co" in str(error):
+        models = base_models(folder)
+        if models:
+            commands = ", ".join(f"`hf download {name}`" for name in models)
+            return f"get what it builds on: {commands}"
+    return "check its files, or save it again with lerobot 0.6"
+
+
+def _names_in_file(
+    policy: "PreTrainedPolicy", names: Sequence[str], weights: Mapping[str, torch.Tensor]
+) -> dict[str, str]:
+    """The name of a tensor in the file, by its key in the policy's `weights`.
+
+    openpi's names are mapped by the policy itself; numbers stand in for the tensors meanwhile.
+    """
+    numbered = {}
+    for i, name in enumerate(names):
+        numbered[name] = torch.tensor(i)
+    rename: Callable[..., dict[str, Any]] | None
+    rename = getattr(policy, "_fix_pytorch_state_dict_keys", None)
+    if rename is not None:
+        numbered = rename(numbered, policy.config)
+    found = {}
+    for key, number in numbered.items():
+        known = key if key in weights else f"model.{key}"
+        found[known] = names[int(number)]
+    return found
+
+
+def _equal(stored: torch.Tensor, loaded: torch.Tensor) -> bool:
+    return torch.equal(stored.to(loaded.dtype), loaded.cpu())
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Loading prints and logs a page; what matters of it is checked afterwards."""
+    level = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        logging.disable(level)
+
+
+def _no_code(*args: Any, **kwargs: Any) -> Any:
+    raise BadPolicy(
+        "its tokenizer or backbone is Python from the hub, which is never executed here"
+    )
