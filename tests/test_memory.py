@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from tests.scanned import EPS, fake_ghostscript
 from tests.toys import TOYS, personal, scene
 from vap_core.base.errors import BadMemory, BadOutput, BadPhoto
 from vap_core.base.types import Description
@@ -173,6 +174,34 @@ def write(path: Path, kind: str) -> Path:
 def test_bad_photos(tmp_path: Path, kind: str, message: str) -> None:
     with pytest.raises(BadPhoto, match=message):
         load_photo(write(tmp_path / "photo.png", kind))
+
+
+def test_a_photo_starts_no_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    marker = fake_ghostscript(tmp_path, monkeypatch)
+    (tmp_path / "a.jpg").write_bytes(EPS)
+    with pytest.raises(BadPhoto, match="is none of JPEG, PNG, WEBP, .*export it as JPEG"):
+        load_photo(tmp_path / "a.jpg")
+    assert not marker.exists()
+
+
+def test_whatever_a_decoder_raises_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Image.new("RGB", (8, 6)).save(tmp_path / "a.png")
+
+    def decode(image: Image.Image) -> None:
+        raise RuntimeError("decoder failed " * 40)
+
+    monkeypatch.setattr("PIL.PngImagePlugin.PngImageFile.load", decode)
+    with pytest.raises(BadPhoto, match="cannot be read as an image .decoder failed") as caught:
+        load_photo(tmp_path / "a.png")
+    assert len(str(caught.value)) < 300 + len(str(tmp_path))
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP", "BMP", "GIF", "TIFF", "AVIF"])
+def test_ordinary_formats_are_read(tmp_path: Path, kind: str) -> None:
+    Image.new("RGB", (8, 6)).save(tmp_path / "a.photo", kind)
+    assert load_photo(tmp_path / "a.photo").shape == (6, 8, 3)
 
 
 def test_photos_are_turned_upright_and_shrunk(tmp_path: Path) -> None:

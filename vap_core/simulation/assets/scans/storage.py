@@ -217,7 +217,7 @@ def _decode_hulls(data: bytes) -> tuple[Hull, ...]:
 
 
 def _decode_picture(data: bytes) -> Rgb:
-    with Image.open(io.BytesIO(data)) as picture:
+    with Image.open(io.BytesIO(data), formats=["PNG"]) as picture:
         return np.array(picture.convert("RGB"))
 
 
