@@ -6,9 +6,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-EPS = (
-    b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 64 64\n%%EndComments\nshowpage\n%%EOF\n"
-)
+EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 64 64\n%%EndComments\nshowpage\n%%EOF\n"
 """A picture that Pillow alone draws by starting Ghostscript."""
 RED, BLUE = (204, 40, 40), (30, 60, 170)
 
