@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.numpy
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -75,6 +76,23 @@ def test_an_object_is_never_overwritten_unasked(tmp_path: Path) -> None:
     with pytest.raises(BadOutput, match="--replace"):
         save(tmp_path, personal("mug", "cup", (9, 9, 9)))
     assert (load_bank(tmp_path)["mug"].crops[0] == TEAL).all()
+
+
+def test_of_two_that_register_one_name_at_once_one_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    encode = safetensors.numpy.save
+
+    def encode_late(*args: object, **kwargs: object) -> bytes:
+        monkeypatch.setattr(safetensors.numpy, "save", encode)
+        save(tmp_path, personal("mug", "cup", TEAL))  # what another process does meanwhile
+        return encode(*args, **kwargs)
+
+    monkeypatch.setattr(safetensors.numpy, "save", encode_late)
+    with pytest.raises(BadOutput, match="exists; choose another name or pass --replace"):
+        save(tmp_path, personal("mug", "cup", (9, 9, 9)))
+    assert (load_bank(tmp_path)["mug"].crops[0] == TEAL).all()
+    assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_a_bank_in_a_file_is_no_bank(tmp_path: Path) -> None:
