@@ -2,6 +2,7 @@
 .DEFAULT_GOAL := help
 
 RUN := OMP_NUM_THREADS=1 .venv/bin/python
+QUIET_LAB := --LabApp.news_url=None --LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate --LabApp.extension_manager=readonly
 PYTEST := $(RUN) -m pytest -n 2 --dist loadfile
 
 help:
@@ -38,7 +39,7 @@ test-all: test
 	$(RUN) -m pytest -m sweep
 
 lab: setup
-	.venv/bin/jupyter lab --ip 127.0.0.1 notebooks
+	.venv/bin/jupyter lab --ip 127.0.0.1 $(QUIET_LAB) notebooks
 
 lock: setup
 	.venv/bin/uv pip compile --quiet pyproject.toml --extra dev --universal --python-version 3.12 --generate-hashes --no-annotate --output-file environment.txt

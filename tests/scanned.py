@@ -6,6 +6,8 @@ import numpy as np
 import trimesh
 from PIL import Image
 
+EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 64 64\n%%EndComments\nshowpage\n%%EOF\n"
+"""A picture that Pillow alone draws by starting Ghostscript."""
 RED, BLUE = (204, 40, 40), (30, 60, 170)
 
 
@@ -50,3 +52,15 @@ def box(**look) -> trimesh.Trimesh:
 def put(folder: Path, name: str, mesh: trimesh.Trimesh | trimesh.Scene) -> Path:
     mesh.export(folder / name)
     return folder / name
+
+
+def fake_ghostscript(folder: Path, monkeypatch) -> Path:
+    """Puts a program named gs first in PATH; the file that it writes when it is started."""
+    marker = folder / "gs-was-started"
+    program = folder / "bin" / "gs"
+    program.parent.mkdir()
+    program.write_text(f"#!/bin/sh\necho \"$@\" >> '{marker}'\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(program.parent), prepend=":")
+    monkeypatch.setattr("PIL.EpsImagePlugin.gs_binary", None)
+    return marker

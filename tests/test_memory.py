@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.numpy
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from tests.scanned import EPS, fake_ghostscript
 from tests.toys import TOYS, personal, scene
 from vap_core.base.errors import BadMemory, BadOutput, BadPhoto
 from vap_core.base.types import Description
@@ -74,6 +76,23 @@ def test_an_object_is_never_overwritten_unasked(tmp_path: Path) -> None:
     with pytest.raises(BadOutput, match="--replace"):
         save(tmp_path, personal("mug", "cup", (9, 9, 9)))
     assert (load_bank(tmp_path)["mug"].crops[0] == TEAL).all()
+
+
+def test_of_two_that_register_one_name_at_once_one_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    encode = safetensors.numpy.save
+
+    def encode_late(*args: object, **kwargs: object) -> bytes:
+        monkeypatch.setattr(safetensors.numpy, "save", encode)
+        save(tmp_path, personal("mug", "cup", TEAL))  # what another process does meanwhile
+        return encode(*args, **kwargs)
+
+    monkeypatch.setattr(safetensors.numpy, "save", encode_late)
+    with pytest.raises(BadOutput, match="exists; choose another name or pass --replace"):
+        save(tmp_path, personal("mug", "cup", (9, 9, 9)))
+    assert (load_bank(tmp_path)["mug"].crops[0] == TEAL).all()
+    assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_a_bank_in_a_file_is_no_bank(tmp_path: Path) -> None:
@@ -173,6 +192,34 @@ def write(path: Path, kind: str) -> Path:
 def test_bad_photos(tmp_path: Path, kind: str, message: str) -> None:
     with pytest.raises(BadPhoto, match=message):
         load_photo(write(tmp_path / "photo.png", kind))
+
+
+def test_a_photo_starts_no_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    marker = fake_ghostscript(tmp_path, monkeypatch)
+    (tmp_path / "a.jpg").write_bytes(EPS)
+    with pytest.raises(BadPhoto, match="is none of JPEG, PNG, WEBP, .*export it as JPEG"):
+        load_photo(tmp_path / "a.jpg")
+    assert not marker.exists()
+
+
+def test_whatever_a_decoder_raises_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Image.new("RGB", (8, 6)).save(tmp_path / "a.png")
+
+    def decode(image: Image.Image) -> None:
+        raise RuntimeError("decoder failed " * 40)
+
+    monkeypatch.setattr("PIL.PngImagePlugin.PngImageFile.load", decode)
+    with pytest.raises(BadPhoto, match="cannot be read as an image .decoder failed") as caught:
+        load_photo(tmp_path / "a.png")
+    assert len(str(caught.value)) < 300 + len(str(tmp_path))
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP", "BMP", "GIF", "TIFF", "AVIF"])
+def test_ordinary_formats_are_read(tmp_path: Path, kind: str) -> None:
+    Image.new("RGB", (8, 6)).save(tmp_path / "a.photo", kind)
+    assert load_photo(tmp_path / "a.photo").shape == (6, 8, 3)
 
 
 def test_photos_are_turned_upright_and_shrunk(tmp_path: Path) -> None:

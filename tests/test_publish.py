@@ -53,6 +53,24 @@ def test_published_results_keep_their_configurations_and_leave_tracebacks_behind
     )
 
 
+def test_of_two_that_publish_one_table_at_once_one_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, target = run(tmp_path / "one", 0), tmp_path / "t.parquet"
+    write = pq.write_table
+
+    def write_late(*args: object, **kwargs: object) -> None:
+        target.write_text("of another process")
+        write(*args, **kwargs)
+
+    monkeypatch.setattr(pq, "write_table", write_late)
+    with pytest.raises(BadOutput, match="exists; choose another name with --to, or pass --replace"):
+        publish([folder], target)
+    assert target.read_text() == "of another process"
+    publish([folder], target, replace=True)
+    assert pq.read_table(target).num_rows == 2
+
+
 def test_what_is_there_is_left_alone(tmp_path: Path) -> None:
     folder, target = run(tmp_path / "one", 0), tmp_path / "t.parquet"
     publish([folder], target)

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
-from tests.scanned import BLUE, RED, box, mug, put
+from tests.scanned import BLUE, EPS, RED, box, fake_ghostscript, mug, put
 from vap_core.base.errors import BadObject
 from vap_core.simulation.assets.scans import import_scan as importing
 from vap_core.simulation.assets.scans.import_scan import import_scan
@@ -43,6 +44,30 @@ def test_unreadable_files_are_refused(tmp_path):
     ):
         with pytest.raises(BadObject, match=message):
             read_mesh_file(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["mug.glb", "mug.obj"])
+def test_a_texture_starts_no_program(tmp_path, monkeypatch, name):
+    file = put(tmp_path, name, mug())
+    marker = fake_ghostscript(tmp_path, monkeypatch)
+    if name == "mug.glb":
+        data = file.read_bytes()
+        start, stop = data.index(b"\x89PNG"), data.index(b"IEND") + 8
+        file.write_bytes(data[:start] + EPS.ljust(stop - start) + data[stop:])
+    else:
+        (tmp_path / "material_0.png").write_bytes(EPS)
+    unchecked = Image.open
+    with pytest.raises(BadObject, match="has a texture that is none of JPEG, .*save it as JPEG"):
+        read_mesh_file(file)
+    assert not marker.exists()
+    assert Image.open is unchecked
+
+
+def test_a_texture_of_too_many_pixels_is_refused(tmp_path):
+    file = put(tmp_path, "mug.obj", mug())
+    Image.new("1", (13000, 4000)).save(tmp_path / "material_0.png")
+    with pytest.raises(BadObject, match="has 13000x4000 pixels, over 50 million; shrink it"):
+        read_mesh_file(file)
 
 
 def test_a_hole_is_counted_and_can_be_repaired(tmp_path, quick):

@@ -1,12 +1,14 @@
 """Results are appended, never mixed and never overwritten."""
 
+from contextlib import ExitStack
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
 from vap_core.base.errors import BadOutput
-from vap_core.evaluation.store import KEY, append, compact, digest, open_run, read
+from vap_core.evaluation import store
+from vap_core.evaluation.store import KEY, append, compact, digest, locked, open_run, read
 
 ROW = {
     "suite": "s",
@@ -65,10 +67,45 @@ def test_an_empty_run_is_an_empty_table(tmp_path: Path) -> None:
     assert read(open_run(tmp_path / "run", {})).empty
 
 
+def test_of_two_that_start_one_run_at_once_one_is_let_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, write, inside = tmp_path / "run", store.write_atomic, []
+    with ExitStack() as held:
+
+        def start() -> None:
+            try:
+                open_run(run, {"seed": 0})
+                held.enter_context(locked(run))
+                inside.append(1)
+            except BadOutput as error:
+                assert "another process is working" in str(error)
+
+        def write_late(path: Path, data: bytes) -> None:
+            monkeypatch.setattr(store, "write_atomic", write)
+            start()  # what another process does meanwhile
+            write(path, data)
+
+        monkeypatch.setattr(store, "write_atomic", write_late)
+        start()
+        assert len(inside) == 1
+    with locked(open_run(run, {"seed": 0})):
+        pass
+
+
+def test_a_run_from_before_the_lock_file_goes_on(tmp_path: Path) -> None:
+    run = open_run(tmp_path / "run", {"seed": 0})
+    (run / ".lock").unlink()
+    with locked(open_run(run, {"seed": 0})):
+        append(run, [ROW])
+    assert len(read(run)) == 1
+
+
 def test_foreign_folders_and_files_are_left_alone(tmp_path: Path) -> None:
     (tmp_path / "precious.txt").write_text("keep")
     with pytest.raises(BadOutput, match="is not empty and holds no run"):
         open_run(tmp_path, {})
+    assert [path.name for path in tmp_path.iterdir()] == ["precious.txt"]
     with pytest.raises(BadOutput, match="is a file"):
         open_run(tmp_path / "precious.txt", {})
     with pytest.raises(BadOutput, match="cannot be written"):

@@ -130,8 +130,6 @@ def save(bank: Path, obj: PersonalObject, *, replace: bool = False) -> Path:
     from safetensors.numpy import save as encode
 
     path = bank / f"{obj.name}{SUFFIX}"
-    if path.exists() and not replace:
-        raise BadOutput(f"save: {path} exists; choose another name or pass --replace.")
     tensors = {"embeddings": obj.embeddings}
     for i, reference in enumerate(obj.crops):
         tensors[f"crop.{i:03d}"] = np.ascontiguousarray(reference)
@@ -146,8 +144,12 @@ def save(bank: Path, obj: PersonalObject, *, replace: bool = False) -> Path:
         header["description"] = json.dumps(asdict(obj.description))
     try:
         bank.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, encode(tensors, metadata=header))
+        write_atomic(path, encode(tensors, metadata=header), replace=replace)
     except OSError as error:
+        if path.exists() and not replace:
+            raise BadOutput(
+                f"save: {path} exists; choose another name or pass --replace."
+            ) from error
         raise BadOutput(
             f"save: {bank} cannot be written ({error.strerror}); choose another folder with "
             "--memory."

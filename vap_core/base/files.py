@@ -11,20 +11,26 @@ DATA = Path(__file__).resolve().parents[2] / "data"
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path, *, replace: bool = True) -> Iterator[Path]:
     """A path to write to, which replaces `path` when the block ends without an error.
 
-    Raises: OSError.
+    Without `replace` it takes the name `path` only if nothing has it at that moment, whatever other
+    processes do.
+
+    Raises: OSError; without `replace` FileExistsError.
     """
     scratch = path.with_name(f".{path.name}.{uuid4().hex}.tmp")
     try:
         yield scratch
-        os.replace(scratch, path)
+        if replace:
+            os.replace(scratch, path)
+        else:
+            os.link(scratch, path)
     finally:
         scratch.unlink(missing_ok=True)
 
 
-def write_atomic(path: Path, data: bytes) -> None:
-    """Write the whole file, or nothing. Raises: OSError."""
-    with replacing(path) as scratch:
+def write_atomic(path: Path, data: bytes, *, replace: bool = True) -> None:
+    """Write the whole file, or nothing. Raises: OSError; without `replace` FileExistsError."""
+    with replacing(path, replace=replace) as scratch:
         scratch.write_bytes(data)

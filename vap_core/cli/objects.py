@@ -130,7 +130,7 @@ def ground(
         return
     print(found)
     paths = " and ".join(map(str, written))
-    print(f"wrote {paths}; look: .venv/bin/rerun --bind 127.0.0.1 {written[1]}")
+    print(f"wrote {paths}; look: python -m vap_core view {written[1]}")
 
 
 @objects_app.command("import")

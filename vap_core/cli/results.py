@@ -151,6 +151,21 @@ def query(
 
 
 @app.command()
+def view(
+    recording: Annotated[Path, typer.Argument(help="A recording (.rrd) of eval, rollout or demo.")],
+    frame: Annotated[int, typer.Option(min=0, help="The step to show first.")] = 0,
+    png: Annotated[
+        Path | None, typer.Option(help="Save a picture of that step instead, without a display.")
+    ] = None,
+) -> None:
+    """Open a recording in Rerun's viewer, with its analytics and its look for updates turned off.
+
+    Example: python -m vap_core view data/runs/demo/recordings/*franka*000*vap.rrd
+    """
+    _show_frame(recording, frame, png)
+
+
+@app.command()
 def rescore(
     run: Annotated[Path, typer.Argument(help="Run folder of eval, rollout or demo.")],
 ) -> None:

@@ -34,6 +34,7 @@ def ray_executor(address: str) -> "Executor":
         # Otherwise Ray connects to this machine's outward address, and a cluster on loopback does
         # not listen there.
         os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
         import ray  # noqa: F401
     except ImportError as error:
@@ -88,7 +89,8 @@ def _connect(address: str) -> None:
         reason = str(error).strip().splitlines()[0]
         raise BadCluster(
             f"cluster: no Ray cluster answers at {address!r} ({reason:.120}); "
-            "start one with `ray start --head --node-ip-address 127.0.0.1 --port 6379`."
+            "start one with `ray start --head --disable-usage-stats --node-ip-address 127.0.0.1 "
+            "--port 6379`."
         ) from error
 
 

@@ -65,9 +65,7 @@ def publish(sources: Sequence[Path], target: Path, *, replace: bool = False) -> 
     if target.suffix != ".parquet" or target.is_dir():
         raise BadOutput(f"publish: {target} is no name of a table; end it with .parquet.")
     if target.exists() and not replace:
-        raise BadOutput(
-            f"publish: {target} exists; choose another name with --to, or pass --replace."
-        )
+        raise _exists(target)
     tables = []
     manifests = []
     for source in sources:
@@ -91,7 +89,7 @@ def publish(sources: Sequence[Path], target: Path, *, replace: bool = False) -> 
         **(whole.schema.metadata or {}),
         b"runs": json.dumps(manifests, sort_keys=True).encode(),
     }
-    _write(whole.replace_schema_metadata(metadata), target)
+    _write(whole.replace_schema_metadata(metadata), target, replace)
     return whole.num_rows
 
 
@@ -119,7 +117,11 @@ def _published_columns(episodes: "pd.DataFrame") -> list[str]:
     return columns
 
 
-def _write(table: "pa.Table", target: Path) -> None:
+def _exists(target: Path) -> BadOutput:
+    return BadOutput(f"publish: {target} exists; choose another name with --to, or pass --replace.")
+
+
+def _write(table: "pa.Table", target: Path, replace: bool) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -127,8 +129,10 @@ def _write(table: "pa.Table", target: Path) -> None:
     pq.write_table(table, sink, compression="zstd")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(target, sink.getvalue().to_pybytes())
+        write_atomic(target, sink.getvalue().to_pybytes(), replace=replace)
     except OSError as error:
+        if target.exists() and not replace:
+            raise _exists(target) from error
         raise BadOutput(
             f"publish: {target} cannot be written ({error.strerror}); choose another place with "
             "--to."

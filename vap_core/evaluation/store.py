@@ -1,7 +1,8 @@
 """Append-only results: Parquet parts written atomically, one run per folder.
 
-A run's folder holds `run.json` (its manifest: configuration and digest) and the tables `parts`
-(episodes), `traces` (state_log) and `audit` (input_audit), each as a folder of Parquet parts.
+A run's folder holds `run.json` (its manifest: configuration and digest), `.lock` (locked by the
+process that works there) and the tables `parts` (episodes), `traces` (state_log) and `audit`
+(input_audit), each as a folder of Parquet parts.
 """
 
 import fcntl
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
+MANIFEST = "run.json"
+LOCK = ".lock"
+"""The file that `locked` locks; it is never renamed or removed, so all processes lock the same."""
 KEY = ["suite", "task", "method", "seed", "episode"]
 """The columns that name an episode of a run; the table is in this order."""
 ROW_KEY = ["suite", "task", "seed", "episode"]
@@ -45,32 +49,50 @@ def open_run(folder: Path, configuration: Mapping[str, Any]) -> Path:
     """
     if folder.exists() and not folder.is_dir():
         raise BadOutput(f"open_run: {folder} is a file; choose another folder with --out.")
-    path = folder / "run.json"
-    if path.exists():
-        manifest = read_manifest(folder)
-        if manifest["digest"] != digest(configuration):
-            raise BadOutput(
-                f"open_run: {folder} holds another run ({differences(manifest, configuration)}); "
-                "choose another folder with --out."
-            )
-        return folder
-    if folder.exists():
-        for present in folder.iterdir():
-            if not present.name.startswith(".run.json"):
-                raise BadOutput(
-                    f"open_run: {folder} is not empty and holds no run; choose another folder "
-                    "with --out."
-                )
-    manifest = {"digest": digest(configuration), "configuration": dict(configuration)}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, json.dumps(manifest, indent=1, sort_keys=True).encode())
-    except OSError as error:
+    if not (folder / MANIFEST).exists():
+        _check_empty(folder)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with locked(folder):
+                _begin_run(folder, configuration)
+        except OSError as error:
+            raise _unwritable(folder, error) from error
+    manifest = read_manifest(folder)
+    if manifest["digest"] != digest(configuration):
         raise BadOutput(
-            f"open_run: {folder} cannot be written ({error.strerror}); choose another folder with "
-            "--out."
-        ) from error
+            f"open_run: {folder} holds another run ({differences(manifest, configuration)}); "
+            "choose another folder with --out."
+        )
     return folder
+
+
+def _check_empty(folder: Path) -> None:
+    """Raises: BadOutput when there is a file in the folder that `open_run` did not write."""
+    if not folder.exists():
+        return
+    for present in folder.iterdir():
+        if present.name == LOCK or present.name.startswith(f".{MANIFEST}"):
+            continue
+        if not (folder / MANIFEST).exists():  # it can have been begun in between
+            raise BadOutput(
+                f"open_run: {folder} is not empty and holds no run; choose another folder with "
+                "--out."
+            )
+
+
+def _begin_run(folder: Path, configuration: Mapping[str, Any]) -> None:
+    """Write the manifest, unless another process has since. Raises: OSError."""
+    if (folder / MANIFEST).exists():
+        return
+    manifest = {"digest": digest(configuration), "configuration": dict(configuration)}
+    write_atomic(folder / MANIFEST, json.dumps(manifest, indent=1, sort_keys=True).encode())
+
+
+def _unwritable(folder: Path, error: OSError) -> BadOutput:
+    return BadOutput(
+        f"open_run: {folder} cannot be written ({error.strerror}); choose another folder with "
+        "--out."
+    )
 
 
 def differences(manifest: Mapping[str, Any], configuration: Mapping[str, Any]) -> str:
@@ -93,7 +115,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
     Raises: BadOutput when run.json is absent or damaged.
     """
-    path = folder / "run.json"
+    path = folder / MANIFEST
     damaged = f"run: {path} is absent or damaged; choose another folder, or run again with --out."
     try:
         manifest = json.loads(path.read_bytes())
@@ -108,9 +130,13 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 def locked(folder: Path) -> Iterator[None]:
     """Keep other processes out of a run while this one works on it.
 
-    Raises: BadOutput when another process holds it.
+    Raises: BadOutput when another process holds it, or the folder cannot be written.
     """
-    with (folder / "run.json").open() as file:
+    try:
+        file = (folder / LOCK).open("ab")
+    except OSError as error:
+        raise _unwritable(folder, error) from error
+    with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:

@@ -1,5 +1,6 @@
 """The file of a recording: its name, the temporary file it grows in, and its rescue."""
 
+import os
 import re
 import subprocess
 import sys
@@ -8,6 +9,9 @@ from pathlib import Path
 from vap_core.base.errors import BadOutput, BadRecording
 from vap_core.recording.reading import read_summary, unreadable
 from vap_core.simulation.types import EpisodeRow
+
+NO_PROXY_THERE = "http://127.0.0.1:9"
+"""Port 9 is the discard service's, and nothing listens on it."""
 
 
 def recording_name(row: EpisodeRow, method: str) -> str:
@@ -29,6 +33,21 @@ def temporary_path(path: Path) -> Path:
 def rerun_command(*arguments: str | Path) -> list[str]:
     """A command line of the rerun that this environment has."""
     return [sys.executable, "-m", "rerun", *map(str, arguments)]
+
+
+def rerun_environment() -> dict[str, str]:
+    """The environment of every process of Rerun's: it sends nothing, and writes no configuration.
+
+    `CI` turns its analytics off; `rerun analytics disable` would write to the user's home. The
+    viewer's look for a newer version has no switch without a window: it goes to a proxy that is not
+    there.
+    """
+    environment = dict(os.environ)
+    for name in ("FORCE_RERUN_ANALYTICS", "NO_PROXY", "no_proxy"):
+        environment.pop(name, None)
+    for name in ("ALL_PROXY", "HTTPS_PROXY", "HTTP_PROXY"):
+        environment[name] = environment[name.lower()] = NO_PROXY_THERE
+    return {**environment, "CI": "1"}
 
 
 def recover(leftover: Path) -> Path:
@@ -55,6 +74,7 @@ def recover(leftover: Path) -> Path:
         rerun_command("rrd", "optimize", leftover, "-o", repaired),
         capture_output=True,
         text=True,
+        env=rerun_environment(),
         check=False,
     )
     try:

@@ -17,7 +17,7 @@ import rerun as rr
 from rerun.experimental import ViewerClient
 
 from vap_core.base.errors import BadOutput, BadRecording, MissingGL
-from vap_core.recording.file import rerun_command
+from vap_core.recording.file import rerun_command, rerun_environment
 from vap_core.recording.reading import read_summary
 
 if TYPE_CHECKING:
@@ -86,6 +86,7 @@ def open_viewer(rrd: Path, *, frame_index: int = 0) -> None:
         _viewer_command(port),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
+        env=rerun_environment(),
         start_new_session=True,
     )
     try:
@@ -101,12 +102,13 @@ def open_viewer(rrd: Path, *, frame_index: int = 0) -> None:
 def view(rrd: Path, *, width: int = 1100, height: int = 680) -> "Viewer":
     """The live viewer as a notebook widget, showing a finished recording.
 
-    It works offline with RERUN_NOTEBOOK_ASSET=serve-local. A saved notebook keeps no widget: show
-    a `screenshot` beside it.
+    Its files come from this machine, unless RERUN_NOTEBOOK_ASSET says otherwise. A saved notebook
+    keeps no widget: show a `screenshot` beside it.
 
     Raises: BadRecording, when `rrd` cannot be read.
     """
     read_summary(rrd)
+    os.environ.setdefault("RERUN_NOTEBOOK_ASSET", "serve-local")  # read when it is imported
     with redirect_stdout(StringIO()):  # rerun announces the port of its asset server
         from rerun.notebook import Viewer
 
@@ -123,7 +125,7 @@ def headless_viewer(size: tuple[int, int]) -> Iterator[ViewerClient]:
     """
     port = free_port()
     command = _viewer_command(port, "--headless", "--window-size", f"{size[0]}x{size[1]}")
-    environment = {**os.environ, "RUST_LOG": "off"}
+    environment = {**rerun_environment(), "RUST_LOG": "off"}
     with (
         tempfile.TemporaryFile("w+") as log,
         subprocess.Popen(

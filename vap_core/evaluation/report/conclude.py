@@ -143,7 +143,7 @@ def _written(folder: Path, written: str) -> list[str]:
     size_mb = sum(path.stat().st_size for path in recordings) / 1e6
     return [
         f"{written}, {len(recordings)} recordings ({size_mb:.0f} MB) in {folder / 'recordings'}",
-        f"look at one: .venv/bin/rerun --bind 127.0.0.1 {_example(recordings)}",
+        f"look at one: python -m vap_core view {_example(recordings)}",
     ]
 
 

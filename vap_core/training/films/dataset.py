@@ -350,7 +350,7 @@ def _encode_png(ids: UInt8[np.ndarray, "s s"]) -> str:
 
 def _decode_png(text: str) -> UInt8[np.ndarray, "s s"]:
     source = io.BytesIO(base64.b64decode(text))
-    return np.asarray(Image.open(source))
+    return np.asarray(Image.open(source, formats=["PNG"]))
 
 
 def _join(known: Suite, recipe: dict[str, Any], folders: Sequence[Path], out: Path) -> None:

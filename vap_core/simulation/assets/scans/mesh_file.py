@@ -1,14 +1,16 @@
 """What a GLB, OBJ, PLY or STL file holds: one welded surface, and the colours on it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from PIL import ImageColor
+from PIL import Image, ImageColor, UnidentifiedImageError
 
 from vap_core.base.errors import BadObject
+from vap_core.base.photos import MAX_PIXELS, PICTURE_FORMATS
 from vap_core.base.types import Rgb, value
 from vap_core.simulation.assets.scans.bake import ColouredPoints, CornerPoints
 from vap_core.simulation.assets.triangles import Faces, Vertices, area_vectors
@@ -84,12 +86,15 @@ def _load_parts(path: Path) -> "list[trimesh.Trimesh]":
     import trimesh
 
     try:
-        geometries = trimesh.load_scene(path).dump()
+        with _checked_pictures() as refused:
+            geometries = trimesh.load_scene(path).dump()
     except Exception as error:  # a damaged file makes the readers raise anything
         raise BadObject(
             f"objects: {path} cannot be read ({type(error).__name__}: {error}); export it again, "
             "without compression."
         ) from error
+    if refused:
+        raise BadObject(f"objects: {path} has a texture that {refused[0]}.")
     parts, count = [], 0
     for geometry in geometries:
         if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
@@ -103,6 +108,40 @@ def _load_parts(path: Path) -> "list[trimesh.Trimesh]":
             "hundred thousand are plenty."
         )
     return parts
+
+
+@contextmanager
+def _checked_pictures() -> Iterator[list[str]]:
+    """Inside the block Pillow opens PICTURE_FORMATS up to MAX_PIXELS alone, whoever calls it.
+
+    The readers of meshes open textures themselves, and go on without those that fail. The list
+    says what was wrong with each.
+    """
+    unchecked = Image.open
+    refused = []
+
+    def checked(file: Any, *_: Any, **__: Any) -> Image.Image:
+        try:
+            image = unchecked(file, formats=PICTURE_FORMATS)
+        except UnidentifiedImageError:
+            refused.append(f"is none of {', '.join(PICTURE_FORMATS)}; save it as JPEG or PNG")
+            raise
+        except (Image.DecompressionBombError, Image.DecompressionBombWarning):
+            refused.append(f"has over {MAX_PIXELS / 1e6:.0f} million pixels; shrink it")
+            raise
+        if image.width * image.height > MAX_PIXELS:
+            refused.append(
+                f"has {image.width}x{image.height} pixels, over {MAX_PIXELS / 1e6:.0f} million; "
+                "shrink it"
+            )
+            raise Image.DecompressionBombError(refused[-1])
+        return image
+
+    Image.open = checked
+    try:
+        yield refused
+    finally:
+        Image.open = unchecked
 
 
 def _weld(

@@ -27,6 +27,7 @@ from vap_core.simulation.assets.shapes import Hull, Mesh
 FORMAT, VERSION = "vap-object", 1
 MESH_FILE, HULLS_FILE, TEXTURE_FILE = FILES = ("mesh.npz", "hulls.npz", "texture.png")
 METADATA_FILE = "object.json"
+FORMER = ".old"
 REMEDY = "import the object again with --replace, or delete its folder"
 
 
@@ -71,20 +72,40 @@ def scans_folder() -> Path:
 
 
 def scan_folders() -> dict[str, Path]:
-    """The folder of every scan by its name."""
+    """The folder of every scan by its name.
+
+    Where a replacement was killed half way, that is the place of the former scan.
+    """
     folders = {}
     for path in sorted(scans_folder().glob(f"[!.]*/{METADATA_FILE}")):
         folders[path.parent.name] = path.parent
-    return folders
+    for path in sorted(scans_folder().glob(f".*{FORMER}/{METADATA_FILE}")):
+        folders.setdefault(_name_of(path.parent), path.parent)
+    return dict(sorted(folders.items()))
 
 
 def target_folder(folder: Path, name: str, replace: bool) -> Path:
     """Where a scan of that name goes. Raises: BadOutput if it exists and `replace` is off."""
-    if (folder / name).exists() and not replace:
-        raise BadOutput(
-            f"objects: {folder / name} exists; choose another --name or pass --replace."
-        )
-    return folder / name
+    target = folder / name
+    if not replace and (target.exists() or _former(target).exists()):
+        raise _exists(target)
+    return target
+
+
+def _former(target: Path) -> Path:
+    """Where the former scan is while a new one takes its place, or a killed process left it."""
+    return target.with_name(f".{target.name}{FORMER}")
+
+
+def _name_of(folder: Path) -> str:
+    """The name of the scan in a folder, `_former` ones included."""
+    if folder.name.startswith("."):
+        return folder.name.removeprefix(".").removesuffix(FORMER)
+    return folder.name
+
+
+def _exists(target: Path) -> BadOutput:
+    return BadOutput(f"objects: {target} exists; choose another --name or pass --replace.")
 
 
 def save_scan(folder: Path, metadata: ScanMetadata, scan: Scan, *, replace: bool = False) -> Path:
@@ -99,8 +120,10 @@ def save_scan(folder: Path, metadata: ScanMetadata, scan: Scan, *, replace: bool
     about = {"format": FORMAT, "version": VERSION, **asdict(metadata), "sha256": digests}
     files[METADATA_FILE] = json.dumps(about, indent=1, ensure_ascii=False).encode()
     try:
-        _write_folder(target, files)
+        _write_folder(target, files, replace)
     except OSError as error:
+        if target.exists() and not replace:
+            raise _exists(target) from error
         raise BadOutput(
             f"objects: {folder} cannot be written ({error.strerror}); choose another folder with "
             "--out."
@@ -126,17 +149,25 @@ def _encode_scan(scan: Scan) -> dict[str, bytes]:
     }
 
 
-def _write_folder(target: Path, files: Mapping[str, bytes]) -> None:
-    """Write the files into a new folder, then put it in place of the target."""
+def _write_folder(target: Path, files: Mapping[str, bytes], replace: bool) -> None:
+    """Write the files into a new folder, then give it the target's name.
+
+    No call exchanges two folders on every system. Between the two renames of a replacement the
+    former scan is at `_former`, where readers find it; it goes when the new one is in place.
+    """
     target.parent.mkdir(parents=True, exist_ok=True)
     stage = Path(mkdtemp(prefix=".", dir=target.parent))
-    for name, data in files.items():
-        (stage / name).write_bytes(data)
-    stage.chmod(0o755)
-    if target.exists():
-        os.replace(target, stage.with_suffix(".old"))
-    os.replace(stage, target)
-    shutil.rmtree(stage.with_suffix(".old"), ignore_errors=True)
+    try:
+        for name, data in files.items():
+            (stage / name).write_bytes(data)
+        stage.chmod(0o755)
+        if replace and target.exists():
+            shutil.rmtree(_former(target), ignore_errors=True)
+            os.replace(target, _former(target))
+        os.replace(stage, target)  # fails where a folder that holds files has that name by now
+        shutil.rmtree(_former(target), ignore_errors=True)
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)
 
 
 def load_scan(folder: Path) -> tuple[ScanMetadata, Scan]:
@@ -217,7 +248,7 @@ def _decode_hulls(data: bytes) -> tuple[Hull, ...]:
 
 
 def _decode_picture(data: bytes) -> Rgb:
-    with Image.open(io.BytesIO(data)) as picture:
+    with Image.open(io.BytesIO(data), formats=["PNG"]) as picture:
         return np.array(picture.convert("RGB"))
 
 
@@ -233,7 +264,7 @@ def _read_metadata(folder: Path) -> tuple[ScanMetadata, dict[str, str]]:
         digests = about.pop("sha256")
         metadata = ScanMetadata(**about)
         if (
-            metadata.name != folder.name
+            metadata.name != _name_of(folder)
             or not np.isfinite(metadata.mass_kg)
             or metadata.mass_kg <= 0
             or not isinstance(digests, dict)

@@ -1,0 +1,144 @@
+"""Nothing that the package starts sends anything out: Rerun, Ray, JupyterLab."""
+
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.drawn import SUCCESS, frame, opening
+from vap_core.base.errors import MissingGL
+from vap_core.evaluation.cluster import ray_executor
+from vap_core.recording import Recorder, file, viewer
+from vap_core.recording.file import rerun_command, rerun_environment
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    path = tmp_path / "one.rrd"
+    with Recorder(path, opening(1)) as recorder:
+        recorder.frame(frame(0, opening(1)))
+        recorder.close(SUCCESS)
+    return path
+
+
+def test_rerun_leaves_no_configuration_in_the_home(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    home = tmp_path / "home"
+    home.mkdir()
+    monkeypatch.setenv("HOME", str(home))
+    monkeypatch.setenv("FORCE_RERUN_ANALYTICS", "1")
+    subprocess.run(
+        rerun_command("rrd", "optimize", tmp_path / "none.rrd", "-o", tmp_path / "out.rrd"),
+        env=rerun_environment(),
+        capture_output=True,
+        check=False,
+    )
+    assert not list(home.iterdir())
+
+
+@pytest.mark.parametrize("start", ["screenshot", "open_viewer", "recover"])
+def test_every_process_of_rerun_gets_that_environment(
+    recording: Path, monkeypatch: pytest.MonkeyPatch, start: str
+) -> None:
+    given = []
+
+    def begin(command: list[str], **options: object) -> None:
+        given.append(options.get("env") or {})
+        raise MissingGL("not started")
+
+    monkeypatch.setattr(viewer.subprocess, "Popen", begin)
+    monkeypatch.setattr(file.subprocess, "run", begin)
+    monkeypatch.setenv("DISPLAY", ":0")
+    leftover = recording.with_name(".two.rrd.tmp")
+    leftover.write_bytes(b"")
+    calls = {
+        "screenshot": lambda: viewer.screenshot(recording, recording.with_suffix(".png")),
+        "open_viewer": lambda: viewer.open_viewer(recording),
+        "recover": lambda: file.recover(leftover),
+    }
+    with pytest.raises(MissingGL):
+        calls[start]()
+    (environment,) = given
+    assert environment["CI"] == "1"
+    assert environment["https_proxy"] == environment["ALL_PROXY"] == "http://127.0.0.1:9"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("strace") is None, reason="needs strace")
+def test_the_viewer_connects_to_nothing_outside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It looks for a newer version whether it can draw or not; that must end at the proxy."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    log = tmp_path / "calls"
+    options = ("--headless", "--window-size", "320x200")
+    process = subprocess.Popen(
+        [
+            *("strace", "-f", "-e", "trace=connect,sendto,sendmmsg", "-o", log),
+            *viewer._viewer_command(viewer.free_port(), *options),
+        ],
+        env=rerun_environment(),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 20
+    calls = ""
+    while "htons(9)" not in calls and time.monotonic() < deadline and process.poll() is None:
+        time.sleep(0.2)
+        calls = log.read_text() if log.exists() else ""
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    if not calls:
+        pytest.skip("strace may not trace here")
+    assert "htons(9)" in calls, "it no longer looks for a newer version, or ignores the proxy"
+    assert set(re.findall(r'inet_addr\("([^"]*)"', calls)) == {"127.0.0.1"}
+    assert not {path.name for path in tmp_path.iterdir()} & {".config", ".local"}
+
+
+@pytest.mark.slow
+def test_the_notebook_widget_is_served_from_this_machine(recording: Path) -> None:
+    program = (
+        "import sys, pathlib; from vap_core.recording import view\n"
+        "view(pathlib.Path(sys.argv[1])); import rerun_notebook; print(rerun_notebook.ESM_MOD)"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "RERUN_NOTEBOOK_ASSET"}
+    done = subprocess.run(
+        [sys.executable, "-c", program, recording],
+        env=environment,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.startswith("http://localhost:")
+
+
+def test_ray_reports_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RAY_USAGE_STATS_ENABLED", raising=False)
+    ray_executor("10.0.0.5:6379")
+    assert os.environ["RAY_USAGE_STATS_ENABLED"] == "0"
+
+
+def test_jupyterlab_fetches_neither_news_nor_versions() -> None:
+    from jupyterlab.handlers.announcements import NeverCheckForUpdate
+    from jupyterlab.labapp import LabApp
+
+    options = re.search(r"^QUIET_LAB := (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert options is not None
+    lab = LabApp()
+    lab.parse_command_line(shlex.split(options[1]))
+    assert lab.news_url is None
+    assert lab.check_for_updates_class is NeverCheckForUpdate
+    assert lab.extension_manager == "readonly"
+    assert "jupyter lab --ip 127.0.0.1 $(QUIET_LAB) notebooks" in (ROOT / "Makefile").read_text()

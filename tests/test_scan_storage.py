@@ -1,0 +1,91 @@
+"""A scan's folder is replaced whole: killed at any moment, the former or the new scan is there."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from vap_core.base.errors import BadOutput
+from vap_core.simulation.assets.scans import storage
+from vap_core.simulation.assets.scans.storage import Scan, ScanMetadata
+from vap_core.simulation.assets.shapes import Hull, Mesh
+
+METADATA = ScanMetadata("mug", "cup", 0.2, "mug.glb", "0" * 64, "", "0")
+KILLED_BETWEEN = """
+import os, pathlib, sys
+from vap_core.simulation.assets.scans import storage
+folder = pathlib.Path(sys.argv[1])
+metadata, scan = storage.load_scan(folder / "mug")
+rename, calls = os.replace, []
+def killed(*paths):
+    calls.append(paths)
+    if len(calls) == 2:
+        os._exit(9)
+    rename(*paths)
+storage.os.replace = killed
+storage.save_scan(folder, metadata, scan, replace=True)
+"""
+
+
+def cube() -> Scan:
+    solid = trimesh.creation.box((0.06, 0.05, 0.08))
+    vertex, normal = np.asarray(solid.vertices), np.asarray(solid.vertex_normals)
+    form = Mesh(vertex=vertex, normal=normal, uv=vertex[:, :2], face=np.asarray(solid.faces))
+    return Scan(form=form, hulls=(Hull(vertex, 2.4e-4),), image=np.zeros((4, 4, 3), np.uint8))
+
+
+@pytest.fixture
+def shelf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("VAP_OBJECTS", str(tmp_path))
+    storage.save_scan(tmp_path, METADATA, cube())
+    return tmp_path
+
+
+def test_a_replacement_killed_between_its_renames_loses_nothing(shelf: Path) -> None:
+    done = subprocess.run([sys.executable, "-c", KILLED_BETWEEN, shelf], check=False)
+    assert done.returncode == 9
+    assert not (shelf / "mug").exists()
+    folders = storage.scan_folders()
+    assert folders.keys() == {"mug"}
+    metadata, _ = storage.load_scan(folders["mug"])
+    assert metadata.name == "mug"
+    with pytest.raises(BadOutput, match="mug exists; choose another --name or pass --replace"):
+        storage.save_scan(shelf, METADATA, cube())
+    heavier = replace(METADATA, mass_kg=0.3)
+    storage.save_scan(shelf, heavier, cube(), replace=True)
+    assert storage.scan_folders() == {"mug": shelf / "mug"}
+    assert storage.load_scan(shelf / "mug")[0].mass_kg == 0.3
+    assert not (shelf / ".mug.old").exists()
+
+
+def test_another_process_may_take_the_name_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    encode = storage._encode_scan
+
+    def encode_late(scan: Scan) -> dict[str, bytes]:
+        monkeypatch.setattr(storage, "_encode_scan", encode)
+        storage.save_scan(tmp_path, replace(METADATA, mass_kg=0.4), cube())
+        return encode(scan)
+
+    monkeypatch.setattr(storage, "_encode_scan", encode_late)
+    with pytest.raises(BadOutput, match="mug exists; choose another --name or pass --replace"):
+        storage.save_scan(tmp_path, METADATA, cube())
+    assert storage.load_scan(tmp_path / "mug")[0].mass_kg == 0.4
+    assert [path.name for path in tmp_path.iterdir()] == ["mug"]
+
+
+def test_a_write_that_fails_leaves_no_scratch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(storage.os, "replace", full)
+    with pytest.raises(BadOutput, match="No space left on device"):
+        storage.save_scan(tmp_path, METADATA, cube())
+    assert not list(tmp_path.iterdir())
