@@ -1,5 +1,6 @@
 """The tables of the evaluation benchmark."""
 
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -8,6 +9,7 @@ from vap_core.cli.bench.eval_plan import FOLLOW
 from vap_core.cli.bench.measurement import Measurement, Table
 from vap_core.evaluation.statistics import ratio
 
+Values = Mapping[str, Any]
 Arm = dict[str, Any]
 """One arm's values (eval_plan.Arm.values)."""
 Clock = Literal["cpu", "wall"]
@@ -32,7 +34,7 @@ def tables(measurement: Measurement) -> list[Table]:
 
 
 def speed_up(
-    values: dict[str, Any], clock: Clock, ours: str, theirs: str, code: str = ""
+    values: Values, clock: Clock, ours: str, theirs: str, code: str = ""
 ) -> tuple[float, float, float]:
     """How many times as fast ours is as lerobot's: mean within repeats, 95 % interval.
 
@@ -44,19 +46,19 @@ def speed_up(
     return ratio(seconds(slow, clock), seconds(fast, clock))
 
 
-def scaling(values: dict[str, Any], ours: str) -> tuple[float, float, float]:
+def scaling(values: Values, ours: str) -> tuple[float, float, float]:
     """How many times as fast ours is with its workers as with one, in wall time."""
     alone = seconds(_ours(values, EQUAL, ours), WALL)
     return ratio(alone, seconds(_ours(values, WALL, ours), WALL))
 
 
-def lerobot_codes(values: dict[str, Any]) -> list[str]:
+def lerobot_codes(values: Values) -> list[str]:
     """The versions whose lerobot loop was measured."""
     codes = [arm["code"] for arm in values["arms"] if arm["loop"] == "lerobot"]
     return list(dict.fromkeys(codes))
 
 
-def lerobot_arm(values: dict[str, Any], clock: Clock, setting: str, code: str) -> Arm:
+def lerobot_arm(values: Values, clock: Clock, setting: str, code: str) -> Arm:
     """lerobot's loop in a setting; of several that may be its best the fastest."""
     found = []
     for arm in values["arms"]:
@@ -77,7 +79,7 @@ def in_brackets(found: tuple[float, float, float]) -> str:
     return f"{middle:.2f} [{low:.2f}, {high:.2f}]"
 
 
-def _ours(values: dict[str, Any], clock: Clock, name: str) -> Arm:
+def _ours(values: Values, clock: Clock, name: str) -> Arm:
     for arm in values["arms"]:
         if arm["loop"] == "ours" and arm[COLUMNS[clock]] == name:
             return dict(arm)
@@ -90,7 +92,7 @@ def _label(arm: Arm) -> str:
     return f"lerobot's loop of {arm['code']}: {arm['name']}"
 
 
-def _equal_cpu(values: dict[str, Any]) -> Table:
+def _equal_cpu(values: Values) -> Table:
     header = ["one process, one thread", "episodes per CPU-hour", "ms a step", *PARTS]
     rows = [header]
     n_steps = values["episodes"] * values["steps"]
@@ -110,7 +112,7 @@ def _equal_cpu(values: dict[str, Any]) -> Table:
     return Table("Equal CPU", rows, note)
 
 
-def _wall(values: dict[str, Any]) -> Table:
+def _wall(values: Values) -> Table:
     rows = [["as each comes on all cores", "episodes per hour", "seconds, every repeat"]]
     for arm in values["arms"]:
         if arm["wall"]:
@@ -121,7 +123,7 @@ def _wall(values: dict[str, Any]) -> Table:
     return Table("Wall time", rows, note)
 
 
-def _ratios(title: str, values: dict[str, Any], clock: Clock) -> Table:
+def _ratios(title: str, values: Values, clock: Clock) -> Table:
     header = ["ours"]
     for code in lerobot_codes(values):
         for setting in SETTINGS:
@@ -140,5 +142,5 @@ def _ratios(title: str, values: dict[str, Any], clock: Clock) -> Table:
     return Table(title, rows, note)
 
 
-def _per_hour(values: dict[str, Any], arm: Arm, clock: Clock) -> str:
+def _per_hour(values: Values, arm: Arm, clock: Clock) -> str:
     return f"{3600 * values['episodes'] / np.median(seconds(arm, clock)):.0f}"

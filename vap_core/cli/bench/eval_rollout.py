@@ -1,9 +1,9 @@
 """The arms of the evaluation benchmark that run this package's rollout."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
@@ -21,7 +21,7 @@ from vap_core.cli.bench.eval_plan import (
     Plan,
     count_of,
 )
-from vap_core.cli.bench.timing import Parts
+from vap_core.cli.bench.profile_parts import ROLLOUT_PARTS, profiled
 from vap_core.evaluation.processes import end_with_parent
 from vap_core.policies.lerobot.toy_pi0 import toy_sizes
 from vap_core.simulation import suites
@@ -125,7 +125,7 @@ def _run_batch(rows: Sequence[EpisodeRow], follow: str) -> Cost:
     from vap_core.rollout.loop import rollout
 
     trial = replace(_trial, follow=follow)
-    with rollout_parts() as parts:
+    with profiled(ROLLOUT_PARTS) as parts:
         wall = time.perf_counter()
         cpu = time.process_time()
         for episode in rollout(trial, rows, batch=BATCH):
@@ -134,28 +134,3 @@ def _run_batch(rows: Sequence[EpisodeRow], follow: str) -> Cost:
         cpu = time.process_time() - cpu
         wall = time.perf_counter() - wall
     return Cost(wall, cpu, parts.with_rest(cpu))
-
-
-@contextmanager
-def rollout_parts() -> Iterator[Parts]:
-    """Inside, the CPU time of rollouts is counted by "environment", "attend" and "policy".
-
-    The environment is what lerobot's loop has in it, too: the simulator, the truth that is read of
-    it, and the judge.
-    """
-    from vap_core.policies.lerobot.adapter import LeRobot
-    from vap_core.rollout.prompters.tint import TintPrompter
-    from vap_core.simulation.env import Env
-    from vap_core.simulation.suites.rules import Judge
-
-    parts = Parts()
-    with ExitStack() as hooks:
-        for owner, names, part in (
-            (Env, ("__init__", "reset", "observe", "state", "step", "truth"), "environment"),
-            (Judge, ("step",), "environment"),
-            (TintPrompter, ("start", "steps"), "attend"),
-            (LeRobot, ("plan",), "policy"),
-        ):
-            for name in names:
-                hooks.enter_context(parts.hooked(owner, name, part, whole=True))
-        yield parts

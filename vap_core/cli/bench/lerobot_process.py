@@ -82,7 +82,7 @@ def _loop(plan: dict[str, Any], folder: Path, stack: ExitStack) -> Callable[...,
     prompt = preprocessor.steps[1]
     envs: dict[tuple[int, bool], Any] = {}
     for n_envs, in_processes in plan["loops"]:
-        env = config.create_envs(n_envs, use_async_envs=in_processes)[plan["suite"]][0]
+        env: Any = config.create_envs(n_envs, use_async_envs=in_processes)[plan["suite"]][0]
         stack.callback(env.close)
         env.reset(seed=list(range(n_envs)))
         n_actions = policy.config.action_feature.shape[0]
@@ -137,7 +137,8 @@ def _timing() -> Any:
     spec = importlib.util.spec_from_file_location(
         "bench_timing", Path(__file__).with_name("timing.py")
     )
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

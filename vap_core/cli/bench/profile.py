@@ -73,11 +73,11 @@ def tables(measurement: Measurement) -> list[Table]:
     columns = measurement.values["columns"]
     header = ["part"]
     steps = ["steps"]
-    total = ["**total**"]
+    total = ["total"]
     for column in columns:
         header.append(f"{column['name']}, {column['method']}")
         steps.append(str(column["steps"]))
-        total.append(f"**{_total_ms(column):.1f}**")
+        total.append(f"{_total_ms(column):.1f}")
     rows = [header, steps, total]
     for part in columns[0]["seconds"]:
         rows.append([part, *[_cell(column, part) for column in columns]])
@@ -100,7 +100,10 @@ def _measure_column(
     register_personal(study, folder / "memory")
     jobs = []
     for suite, task in tasks:
-        jobs += _jobs(study, method, _rows(study, suite, task, column.variant, n, quick), folder)
+        rows = _rows(study.rows(suite, task), column.variant, n)
+        if quick:
+            rows = [replace(row, max_steps=QUICK_STEPS) for row in rows]
+        jobs += _jobs(study, method, rows, folder)
     run_job(_warm_up(jobs[0]))
     summaries: list[dict[str, Any]] = []
     with profiled() as parts:
@@ -120,15 +123,9 @@ def _measure_column(
     }, parts.cost_of_a_call()
 
 
-def _rows(
-    study: Study, suite: str, task: str, variant: str, n: int, quick: bool
-) -> list[EpisodeRow]:
-    """`n` episodes of a task in one variant, spread evenly over its list."""
-    listed = [row for row in study.rows(suite, task) if row.variant == variant]
-    rows = spread_evenly(listed, n)
-    if not quick:
-        return rows
-    return [replace(row, max_steps=QUICK_STEPS) for row in rows]
+def _rows(listed: Sequence[EpisodeRow], variant: str, n: int) -> list[EpisodeRow]:
+    """`n` episodes of a list in one variant, spread evenly."""
+    return spread_evenly([row for row in listed if row.variant == variant], n)
 
 
 def _jobs(study: Study, method: str, rows: Sequence[EpisodeRow], folder: Path) -> list[Job]:

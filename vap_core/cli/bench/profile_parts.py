@@ -1,6 +1,6 @@
-"""Which functions of the running code the profile counts for which part.
+"""Which functions of the running code are counted for which part.
 
-Where a function moves, mend PARTS; a test resolves every name.
+Where a function moves, mend PARTS or ROLLOUT_PARTS; a test resolves every name.
 """
 
 from collections.abc import Iterator, Sequence
@@ -70,6 +70,33 @@ PARTS = (
     ),
 )
 
+ENV = "vap_core.simulation.env:Env"
+ROLLOUT_PARTS = (
+    Part(
+        "environment",
+        (
+            f"{ENV}.__init__",
+            f"{ENV}.reset",
+            f"{ENV}.observe",
+            f"{ENV}.state",
+            f"{ENV}.step",
+            f"{ENV}.truth",
+            "vap_core.simulation.suites.rules:Judge.step",
+        ),
+        whole=True,
+    ),
+    Part(
+        "attend",
+        (
+            "vap_core.rollout.prompters.tint:TintPrompter.start",
+            "vap_core.rollout.prompters.tint:TintPrompter.steps",
+        ),
+        whole=True,
+    ),
+    Part("policy", ("vap_core.policies.lerobot.adapter:LeRobot.plan",), whole=True),
+)
+"""What lerobot's loop can be divided into, too. The environment has the judge in it, as there."""
+
 
 @contextmanager
 def profiled(table: Sequence[Part] = PARTS) -> Iterator[Parts]:
@@ -94,7 +121,7 @@ def resolve(function: str) -> tuple[Any, str]:
         getattr(owner, name)
     except (ImportError, AttributeError) as error:
         raise UnknownName(
-            f"bench profile: there is no {function} ({error}); mend PARTS in "
+            f"bench profile: there is no {function} ({error}); mend the parts in "
             "vap_core/cli/bench/profile_parts.py."
         ) from error
     return owner, name
