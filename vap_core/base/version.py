@@ -7,10 +7,13 @@ from pathlib import Path
 
 
 @cache
-def code_version() -> str:
-    """The commit of this checkout, with `+` when the tree differs; else the installed version."""
+def code_version(folder: Path | None = None) -> str:
+    """The commit of a checkout (default: this one), with `+` when the tree differs.
+
+    Where there is none, the installed version.
+    """
     command = ["git", "describe", "--always", "--dirty=+", "--abbrev=10"]
-    folder = Path(__file__).resolve().parent
+    folder = folder or Path(__file__).resolve().parent
     try:
         done = subprocess.run(
             command, cwd=folder, capture_output=True, text=True, timeout=10, check=True

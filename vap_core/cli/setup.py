@@ -1,10 +1,8 @@
 """Commands about this machine and what it measures.
 
-They are eval-perception, eval-policy, show, doctor and bench.
+They are eval-perception, eval-policy, show and doctor.
 """
 
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -162,67 +160,3 @@ def doctor() -> None:
             able = False
     if not able:
         raise typer.Exit(1)
-
-
-@app.command()
-def bench(
-    what: Annotated[
-        str,
-        typer.Argument(
-            help="loop: the prompted control loop; suites: every benchmark's simulator; "
-            "stack: a stack's models; policy: the shipped policies; "
-            "eval: episodes per hour against lerobot's own loop; "
-            "engine: a Ray cluster on this machine against local processes; "
-            "query: a question to a thousand recordings; style: how the source reads."
-        ),
-    ] = "loop",
-    steps: Annotated[int, typer.Option(min=5, help="loop: control steps to time.")] = 60,
-    workers: Workers = 2,
-    stack: StackName = "foundation",
-    random_weights: Annotated[
-        bool,
-        typer.Option(
-            "--random-weights", help="stack: without weights; they change nothing about speed."
-        ),
-    ] = False,
-    device: Annotated[
-        str | None,
-        typer.Option(help="stack: cpu or cuda; default VAP_DEVICE, or a GPU where there is one."),
-    ] = None,
-    quick: Annotated[
-        bool,
-        typer.Option(
-            "--quick",
-            help="policy, eval, engine, query: a few steps, to see that it runs; its numbers mean "
-            "nothing.",
-        ),
-    ] = False,
-) -> None:
-    """Time a control step by part, as shares and ratios within one run: of the prompted loop, every
-    benchmark's simulator, the models.
-
-    Example: python -m vap_core bench suites
-    """
-    from vap_core.base.errors import one_of
-    from vap_core.cli.bench import engine as bench_engine
-    from vap_core.cli.bench import eval as bench_eval
-    from vap_core.cli.bench import loop as bench_loop
-    from vap_core.cli.bench import policy as bench_policy
-    from vap_core.cli.bench import query as bench_query
-    from vap_core.cli.bench import stack as bench_stack
-    from vap_core.cli.bench import style as bench_style
-    from vap_core.cli.bench import suites as bench_suites
-
-    benchmarks: dict[str, Callable[[], str]] = {
-        "loop": partial(bench_loop.run, steps),
-        "suites": partial(bench_suites.run, workers),
-        "stack": partial(bench_stack.run, stack, random=random_weights, device=device),
-        "policy": partial(bench_policy.run, quick),
-        "eval": partial(bench_eval.run, workers, quick),
-        "engine": partial(bench_engine.run, workers, quick),
-        "query": partial(bench_query.run, quick=quick),
-        "style": bench_style.run,
-    }
-    if what not in benchmarks:
-        raise one_of("bench:", what, benchmarks)
-    print(benchmarks[what]())

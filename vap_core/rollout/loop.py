@@ -51,6 +51,7 @@ class Trial:
     for their cost or for show. `follow` is when images are taken and targets tracked: when the
     policy is called, which is all that it ever sees, or at every control step. `audit` keeps what
     the policy consumed in every call (rollout.audit), `attention` where it looked (policies.hooks).
+    `image_size` is simulation.Env's.
     """
 
     method: str
@@ -64,6 +65,7 @@ class Trial:
     follow: Follow = "step"
     audit: bool = False
     attention: bool = False
+    image_size: int | tuple[int, int] = 224
 
     @property
     def bound(self) -> bool:
@@ -146,6 +148,7 @@ def _live(episodes: Sequence[RunningEpisode]) -> list[RunningEpisode]:
 def _begin(trial: Trial, row: EpisodeRow, keeps_images: bool) -> RunningEpisode:
     env = Env(
         trial.scene,
+        image_size=trial.image_size,
         cameras=row.cameras or None,
         control=trial.control,
         sensor=trial.sensor,

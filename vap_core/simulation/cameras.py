@@ -157,7 +157,7 @@ class Renderer:
         self.model = model
         self.objects = tuple(objects)
         self.shadows = shadows
-        self._renderers: dict[int, mujoco.Renderer] = {}
+        self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
         self._groups = model.geom_group.copy()
         self._owner = _object_of_geoms(model, self.objects)
 
@@ -181,11 +181,14 @@ class Renderer:
         self,
         data: mujoco.MjData,
         name: str,
-        size: int,
+        size: int | tuple[int, int],
         hidden: frozenset[str] = frozenset(),
         before: Sequence[Screen] = (),
     ) -> Rgb:
-        """The picture of camera `name`, `size` x `size` pixels, with `before` in front of it."""
+        """The picture of camera `name`, with `before` in front of it.
+
+        `size` is the side of a square, or the height and width, in pixels.
+        """
         renderer = self._update(data, name, size, hidden=hidden, before=before)
         return np.ascontiguousarray(renderer.render())
 
@@ -193,7 +196,7 @@ class Renderer:
         self,
         data: mujoco.MjData,
         name: str,
-        size: int,
+        size: int | tuple[int, int],
         hidden: frozenset[str] = frozenset(),
         before: Sequence[Screen] = (),
     ) -> Mapping[str, Mask]:
@@ -216,17 +219,18 @@ class Renderer:
         self,
         data: mujoco.MjData,
         name: str,
-        size: int,
+        size: int | tuple[int, int],
         *,
         hidden: frozenset[str],
         before: Sequence[Screen],
     ) -> mujoco.Renderer:
         """The renderer of this size, its scene as camera `name` sees it now."""
-        renderer = self._renderers.get(size)
+        height, width = (size, size) if isinstance(size, int) else size
+        renderer = self._renderers.get((height, width))
         if renderer is None:
             max_geom = self.model.ngeom + 64
-            renderer = mujoco.Renderer(self.model, size, size, max_geom=max_geom)
-            self._renderers[size] = renderer
+            renderer = mujoco.Renderer(self.model, height, width, max_geom=max_geom)
+            self._renderers[height, width] = renderer
         hidden_objects = [i for i, each in enumerate(self.objects) if each in hidden]
         hidden_geoms = np.isin(self._owner, hidden_objects)
         self.model.geom_group[:] = np.where(hidden_geoms, HIDDEN_GROUP, self._groups)

@@ -63,6 +63,7 @@ class Env:
     """One running episode in `scene`.
 
     The same row in the same scene gives bit-identical states and images, whatever else runs.
+    `image_size` is the side of the views, or their height and width, in pixels.
     `control` says what an action is (values.Action); `sensor` how the cameras change their images;
     `occlusion` what hides the target from them, and when. `seconds` sums wall time by part:
     "physics", "ik", "render", "truth". Raises: UnknownName for a camera that the scene lacks.
@@ -72,7 +73,7 @@ class Env:
         self,
         scene: Scene,
         *,
-        image_size: int = 224,
+        image_size: int | tuple[int, int] = 224,
         cameras: Sequence[str] | None = None,
         control: Control = "ee",
         sensor: Sensor = PERFECT,
@@ -81,7 +82,7 @@ class Env:
         self.scene = scene
         self.robot = scene.robot
         self.hz = scene.robot.hz
-        self.image_size = image_size
+        self.image_hw = (image_size, image_size) if isinstance(image_size, int) else image_size
         self.control = control
         self.sensor = sensor
         self.occlusion = occlusion
@@ -174,7 +175,7 @@ class Env:
             for name in self.camera_names:
                 screens = self._screens(name)
                 rgb = self.scene.renderer.rgb(
-                    self._data, name, self.image_size, hidden=hidden, before=screens
+                    self._data, name, self.image_hw, hidden=hidden, before=screens
                 )
                 images[name] = self._disturb(name, rgb)
         return Observation(images, self.state())
@@ -240,7 +241,7 @@ class Env:
                 for name in self.camera_names:
                     screens = self._screens(name)
                     masks_by_camera[name] = self.scene.renderer.masks(
-                        self._data, name, self.image_size, hidden=hidden, before=screens
+                        self._data, name, self.image_hw, hidden=hidden, before=screens
                     )
             return Truth(
                 objects_world=poses,
@@ -253,10 +254,9 @@ class Env:
 
     def cameras(self) -> tuple[Camera, ...]:
         """The calibrated cameras where they are now; a wrist camera moves."""
-        size = (self.image_size, self.image_size)
         cameras = []
         for name in self.camera_names:
-            cameras.append(optics.camera(self._model, self._data, name, size))
+            cameras.append(optics.camera(self._model, self._data, name, self.image_hw))
         return tuple(cameras)
 
     def tcp_base(self) -> Float64[np.ndarray, "4 4"]:

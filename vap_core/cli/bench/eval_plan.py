@@ -1,10 +1,10 @@
 """What the evaluation benchmark runs: the episodes, and the ways to run them."""
 
-import os
-import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
+from vap_core.cli.bench.measurement import n_cores
 from vap_core.policies.lerobot.toy_pi0 import Toy
 from vap_core.simulation import suites
 from vap_core.simulation.types import EpisodeRow
@@ -14,7 +14,7 @@ TASK = "put-camera"
 TOY = Toy(image=128, patch=16, width=128, layers=4, expert=96, chunk=4, denoise=10)
 BATCH = 4
 """Episodes of ours that are run at once in a process."""
-FOLLOW = {"step": "", "call": ", at calls"}
+FOLLOW = {"step": "every step", "call": "at calls"}
 """rollout.Trial's, and how an arm is named.
 
 At every step is the work that lerobot's loop does; at the policy's calls is less, which that loop
@@ -24,73 +24,94 @@ cannot leave out.
 
 @dataclass(frozen=True)
 class Plan:
-    """How much is measured: `episodes` of `steps` control steps, `repeats` times over.
-
-    `workers` of ours run, and one alone; 0: in this process.
-    """
+    """How much is measured: `episodes` of `steps` control steps, `repeats` times over."""
 
     episodes: int = 8
     steps: int = 40
-    repeats: int = 4
+    repeats: int = 5
     workers: int = 2
     toy: Toy = TOY
     loops: tuple[tuple[int, bool], ...] = ((1, False), (4, False), (4, True))
     """lerobot's number of environments, and whether each is a process."""
-    threads: tuple[int, ...] = tuple(sorted({1, len(os.sched_getaffinity(0))}))
-    """torch's, in lerobot's process; its default is one per core. Ours always has one."""
 
     def rows(self) -> list[EpisodeRow]:
         """The episodes, cut to `steps`."""
-        rows = suites.rows(SUITE, TASK)[: self.episodes]
-        return shorten(rows, self.steps)
+        rows = []
+        for row in suites.rows(SUITE, TASK)[: self.episodes]:
+            rows.append(replace(row, max_steps=self.steps))
+        return rows
+
+    def for_lerobot(self) -> dict[str, Any]:
+        """What lerobot_process.py needs of it, as JSON."""
+        return {
+            "suite": SUITE,
+            "task": TASK,
+            "episodes": self.episodes,
+            "steps": self.steps,
+            "toy": asdict(self.toy),
+            "loops": self.loops,
+        }
 
 
 QUICK = Plan(
     episodes=2,
     steps=2,
     repeats=2,
-    workers=0,
+    workers=2,
     toy=Toy(image=64, patch=16, width=32, layers=1, expert=32, denoise=2),
-    loops=((1, False),),
-    threads=(1,),
+    loops=((1, False), (2, False)),
 )
 """A smoke test; its figures mean nothing."""
-Work = Callable[[], Mapping[str, float]]
-"""Runs all episodes once; returns seconds by part."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What running all episodes once took.
+
+    `wall` and `cpu` in seconds, the latter of all processes that ran them, and `parts` of it.
+    """
+
+    wall: float
+    cpu: float
+    parts: Mapping[str, float]
 
 
 @dataclass
 class Arm:
-    """One way to run all episodes.
+    """One way to run all episodes, and what it cost in every repeat.
 
-    Wall seconds of every repeat, and seconds by part summed over all of them.
+    `name` says how it runs. `loop` is "lerobot" or "ours", `code` the version of the package whose
+    loop it is. `equal_cpu` names its part in the table of equal CPU ("" for none): one process, one
+    thread. `wall` likewise in the table of wall time, which takes the fastest of lerobot's "best".
     """
 
     name: str
-    run: Work
-    seconds: list[float]
-    parts: dict[str, float]
+    loop: str
+    code: str
+    run: Callable[[], Cost]
+    equal_cpu: str = ""
+    wall: str = ""
+    costs: list[Cost] = field(default_factory=list)
 
     def repeat(self) -> None:
         """Run all episodes once more."""
-        start = time.perf_counter()
-        parts = self.run()
-        self.seconds.append(time.perf_counter() - start)
-        add_parts(self.parts, parts)
+        self.costs.append(self.run())
+
+    def values(self) -> dict[str, Any]:
+        """As JSON, without the work."""
+        return {
+            "name": self.name,
+            "loop": self.loop,
+            "code": self.code,
+            "equal_cpu": self.equal_cpu,
+            "wall": self.wall,
+            "costs": [asdict(cost) for cost in self.costs],
+        }
 
 
-def shorten(rows: Sequence[EpisodeRow], steps: int) -> list[EpisodeRow]:
-    """The same episodes, over after so many steps."""
-    shortened = []
-    for row in rows:
-        shortened.append(replace(row, max_steps=steps))
-    return shortened
-
-
-def add_parts(total: dict[str, float], parts: Mapping[str, float]) -> None:
-    """Add seconds by part to a total."""
-    for part, seconds in parts.items():
-        total[part] = total.get(part, 0.0) + seconds
+def threads() -> tuple[int, ...]:
+    """torch's threads that lerobot is tried with; its default is one per core."""
+    return tuple(sorted({1, n_cores()}))
 
 
 def count_of(n: int, noun: str) -> str:

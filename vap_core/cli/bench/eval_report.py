@@ -1,96 +1,146 @@
 """The tables of the evaluation benchmark."""
 
-import os
-from collections.abc import Sequence
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import numpy as np
 
-from vap_core.base.tables import align
-from vap_core.cli.bench.eval_plan import FOLLOW, SUITE, TASK, Arm, Plan
+from vap_core.cli.bench.eval_plan import FOLLOW
+from vap_core.cli.bench.measurement import Measurement, Table
 from vap_core.evaluation.statistics import ratio
 
-
-def report(plan: Plan, theirs: Sequence[Arm], ours: Sequence[Arm]) -> str:
-    """Three tables: episodes per hour, ratios, and how long each part of a step takes."""
-    best = min(theirs, key=_median_seconds)
-    default = _default_arm(theirs)
-    arms = [*theirs, *ours]
-    names = _part_names([best, *ours])
-    title = (
-        f"{SUITE}/{TASK}: n = {plan.episodes} episodes of {plan.steps} steps, "
-        f"{plan.repeats} repeats, {len(os.sched_getaffinity(0))} cores"
-    )
-    tables = (
-        _rates_table(plan, arms),
-        _ratios_table(plan, default, best, ours),
-        _parts_table(plan, arms, names),
-    )
-    lines = [title]
-    for table in tables:
-        lines += ["", align(table)]
-    return "\n".join(lines)
+Values = Mapping[str, Any]
+Arm = dict[str, Any]
+"""One arm's values (eval_plan.Arm.values)."""
+Clock = Literal["cpu", "wall"]
+EQUAL: Clock = "cpu"
+WALL: Clock = "wall"
+COLUMNS = {"cpu": "equal_cpu", "wall": "wall"}
+"""The field of an arm that names its part in the table of each clock."""
+PARTS = ("environment", "attend", "policy", "rest")
+SETTINGS = ("as it comes", "best")
+"""Of lerobot's loop."""
 
 
-def times_as_fast(slow: Arm, fast: Arm) -> list[str]:
-    """How many times as fast one arm is as another: the ratio, and its 95 % interval."""
-    middle, low, high = ratio(slow.seconds, fast.seconds)
-    return [f"{middle:.2f}", f"{low:.2f} .. {high:.2f}"]
+def tables(measurement: Measurement) -> list[Table]:
+    """Equal CPU and wall time, each with its ratios."""
+    values = measurement.values
+    return [
+        _equal_cpu(values),
+        _ratios("Times as fast as lerobot's loop on equal CPU", values, EQUAL),
+        _wall(values),
+        _ratios("Times as fast as lerobot's loop in wall time", values, WALL),
+    ]
 
 
-def _rates_table(plan: Plan, arms: Sequence[Arm]) -> list[list[str]]:
-    rows = [["", "episodes/hour", "seconds, every repeat"]]
-    for arm in arms:
-        per_hour = 3600 * plan.episodes / _median_seconds(arm)
-        seconds = " ".join(f"{s:.1f}" for s in arm.seconds)
-        rows.append([arm.name, f"{per_hour:.0f}", seconds])
-    return rows
+def speed_up(
+    values: Values, clock: Clock, ours: str, theirs: str, code: str = ""
+) -> tuple[float, float, float]:
+    """How many times as fast ours is as lerobot's: mean within repeats, 95 % interval.
+
+    `ours` is of FOLLOW's names, `theirs` of SETTINGS, of the checkout `code` (default: the first
+    that was measured, the fixed denominator).
+    """
+    fast = _ours(values, clock, ours)
+    slow = lerobot_arm(values, clock, theirs, code or lerobot_codes(values)[0])
+    return ratio(seconds(slow, clock), seconds(fast, clock))
 
 
-def _ratios_table(plan: Plan, default: Arm, best: Arm, ours: Sequence[Arm]) -> list[list[str]]:
-    """Ours over lerobot's as it comes and at its best, and ours with more workers over one."""
-    at_steps = ours[::2]
-    at_calls = ours[1::2]
-    rows = [["times as fast", "ratio", "95 % interval"]]
-    for fast in (at_steps[-1], at_calls[-1]):
-        rows.append([f"{fast.name} / {default.name}", *times_as_fast(default, fast)])
-        rows.append([f"{fast.name} / {best.name} (its best)", *times_as_fast(best, fast)])
-    if len(at_steps) > 1:
-        alone = at_steps[0]
-        rows.append([f"{alone.name} / {best.name} (its best)", *times_as_fast(best, alone)])
-        for ending, arms in zip(FOLLOW.values(), (at_steps, at_calls), strict=True):
-            name = f"scaling, 1 to {plan.workers} workers{ending}"
-            rows.append([name, *times_as_fast(arms[0], arms[1])])
-    return rows
+def scaling(values: Values, ours: str) -> tuple[float, float, float]:
+    """How many times as fast ours is with its workers as with one, in wall time."""
+    alone = seconds(_ours(values, EQUAL, ours), WALL)
+    return ratio(alone, seconds(_ours(values, WALL, ours), WALL))
 
 
-def _default_arm(theirs: Sequence[Arm]) -> Arm:
-    """lerobot as it comes, with videos; the first arm where none has them."""
-    for arm in theirs:
-        if "videos" in arm.name:
-            return arm
-    return theirs[0]
+def lerobot_codes(values: Values) -> list[str]:
+    """The versions whose lerobot loop was measured."""
+    codes = [arm["code"] for arm in values["arms"] if arm["loop"] == "lerobot"]
+    return list(dict.fromkeys(codes))
 
 
-def _part_names(arms: Sequence[Arm]) -> list[str]:
-    names: dict[str, None] = {}
-    for arm in arms:
-        names |= dict.fromkeys(arm.parts)
-    return list(names)
+def lerobot_arm(values: Values, clock: Clock, setting: str, code: str) -> Arm:
+    """lerobot's loop in a setting; of several that may be its best the fastest."""
+    found = []
+    for arm in values["arms"]:
+        is_code = arm["loop"] == "lerobot" and arm["code"] == code
+        if is_code and arm[COLUMNS[clock]] == setting:
+            found.append(arm)
+    return min(found, key=lambda arm: float(np.median(seconds(arm, clock))))
 
 
-def _parts_table(plan: Plan, arms: Sequence[Arm], names: Sequence[str]) -> list[list[str]]:
-    n_steps = plan.episodes * plan.steps * plan.repeats
-    rows = [["ms a control step (summed over workers)", *names]]
-    for arm in arms:
-        row = [arm.name]
-        for part in names:
-            cell = "-"
-            if part in arm.parts:
-                cell = f"{1e3 * arm.parts[part] / n_steps:.1f}"
-            row.append(cell)
+def seconds(arm: Arm, clock: Clock) -> list[float]:
+    """What the arm took in every repeat."""
+    return [cost[clock] for cost in arm["costs"]]
+
+
+def in_brackets(found: tuple[float, float, float]) -> str:
+    """A ratio and its interval."""
+    middle, low, high = found
+    return f"{middle:.2f} [{low:.2f}, {high:.2f}]"
+
+
+def _ours(values: Values, clock: Clock, name: str) -> Arm:
+    for arm in values["arms"]:
+        if arm["loop"] == "ours" and arm[COLUMNS[clock]] == name:
+            return dict(arm)
+    raise AssertionError(f"no arm of ours {name}")
+
+
+def _label(arm: Arm) -> str:
+    if arm["loop"] == "ours":
+        return f"ours: {arm['name']}"
+    return f"lerobot's loop of {arm['code']}: {arm['name']}"
+
+
+def _equal_cpu(values: Values) -> Table:
+    header = ["one process, one thread", "episodes per CPU-hour", "ms a step", *PARTS]
+    rows = [header]
+    n_steps = values["episodes"] * values["steps"]
+    for arm in values["arms"]:
+        if not arm["equal_cpu"]:
+            continue
+        row = [_label(arm), _per_hour(values, arm, EQUAL)]
+        row.append(f"{1e3 * np.median(seconds(arm, EQUAL)) / n_steps:.1f}")
+        for part in PARTS:
+            spent = np.median([cost["parts"][part] for cost in arm["costs"]])
+            row.append(f"{1e3 * spent / n_steps:.1f}")
         rows.append(row)
-    return rows
+    note = (
+        "Medians of the repeats. The environment is the simulator, its truth and the judge; the "
+        "rest of lerobot's loop is its processors and, as it comes, its videos."
+    )
+    return Table("Equal CPU", rows, note)
 
 
-def _median_seconds(arm: Arm) -> float:
-    return float(np.median(arm.seconds))
+def _wall(values: Values) -> Table:
+    rows = [["as each comes on all cores", "episodes per hour", "seconds, every repeat"]]
+    for arm in values["arms"]:
+        if arm["wall"]:
+            every = " ".join(f"{s:.1f}" for s in seconds(arm, WALL))
+            rows.append([_label(arm), _per_hour(values, arm, WALL), every])
+    texts = [f"{in_brackets(scaling(values, name))} {name}" for name in FOLLOW.values()]
+    note = f"Ours, from one worker to {values['workers']}: times {', '.join(texts)}."
+    return Table("Wall time", rows, note)
+
+
+def _ratios(title: str, values: Values, clock: Clock) -> Table:
+    header = ["ours"]
+    for code in lerobot_codes(values):
+        for setting in SETTINGS:
+            header.append(f"{setting}, {code}")
+    rows = [header]
+    for ours in FOLLOW.values():
+        row = [ours]
+        for code in lerobot_codes(values):
+            for setting in SETTINGS:
+                row.append(in_brackets(speed_up(values, clock, ours, setting, code)))
+        rows.append(row)
+    note = "Geometric means of the ratios within repeats, 95 % intervals."
+    if clock == WALL:
+        best = [lerobot_arm(values, WALL, "best", code)["name"] for code in lerobot_codes(values)]
+        note += f" lerobot's best: {'; '.join(best)}."
+    return Table(title, rows, note)
+
+
+def _per_hour(values: Values, arm: Arm, clock: Clock) -> str:
+    return f"{3600 * values['episodes'] / np.median(seconds(arm, clock)):.0f}"

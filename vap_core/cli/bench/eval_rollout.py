@@ -1,7 +1,7 @@
 """The arms of the evaluation benchmark that run this package's rollout."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
@@ -10,18 +10,18 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+from vap_core.base.version import code_version
 from vap_core.cli.bench.eval_plan import (
     BATCH,
     FOLLOW,
     SUITE,
     TASK,
     Arm,
+    Cost,
     Plan,
-    Work,
-    add_parts,
     count_of,
-    shorten,
 )
+from vap_core.cli.bench.profile_parts import ROLLOUT_PARTS, profiled
 from vap_core.evaluation.processes import end_with_parent
 from vap_core.policies.lerobot.toy_pi0 import toy_sizes
 from vap_core.simulation import suites
@@ -32,21 +32,21 @@ _trial: Any = None
 
 
 def rollout_arms(plan: Plan, folder: Path, stack: ExitStack) -> list[Arm]:
-    """rollout in one warm process, then in several."""
+    """rollout in one warm process, then in several; `folder` is a LoopProcess', prepared."""
     arms = []
-    if not plan.workers:
-        _build(plan, folder)
-        stack.callback(_close)
-        for follow, ending in FOLLOW.items():
-            name = f"ours, batches of {BATCH}, in this process{ending}"
-            work = partial(_run_batch, plan.rows(), follow)
-            arms.append(Arm(name, work, [], {}))
-        return arms
     for workers in sorted({1, plan.workers}):
         pool = _start_pool(plan, folder, workers, stack)
-        for follow, ending in FOLLOW.items():
-            name = f"ours, batches of {BATCH}, {count_of(workers, 'worker')}{ending}"
-            arms.append(Arm(name, _spread(plan, pool, follow), [], {}))
+        for follow, name in FOLLOW.items():
+            arms.append(
+                Arm(
+                    name=f"batches of {BATCH}, {count_of(workers, 'worker')}, {name}",
+                    loop="ours",
+                    code=code_version(),
+                    run=_spread(plan, pool, follow),
+                    equal_cpu=name if workers == 1 else "",
+                    wall=name if workers == plan.workers else "",
+                )
+            )
     return arms
 
 
@@ -64,18 +64,22 @@ def _start_pool(plan: Plan, folder: Path, workers: int, stack: ExitStack) -> Pro
     return pool
 
 
-def _spread(plan: Plan, pool: ProcessPoolExecutor, follow: str) -> Work:
+def _spread(plan: Plan, pool: ProcessPoolExecutor, follow: str) -> Callable[[], Cost]:
     """All episodes, in batches over the processes."""
     rows = plan.rows()
 
-    def run() -> Mapping[str, float]:
+    def run() -> Cost:
         batches = []
         for first in range(0, len(rows), BATCH):
             batches.append(rows[first : first + BATCH])
-        total: dict[str, float] = {}
-        for parts in pool.map(partial(_run_batch, follow=follow), batches):
-            add_parts(total, parts)
-        return total
+        start = time.perf_counter()
+        costs = list(pool.map(partial(_run_batch, follow=follow), batches))
+        wall = time.perf_counter() - start
+        parts: dict[str, float] = {}
+        for cost in costs:
+            for part, seconds in cost.parts.items():
+                parts[part] = parts.get(part, 0.0) + seconds
+        return Cost(wall, sum(cost.cpu for cost in costs), parts)
 
     return run
 
@@ -113,27 +117,20 @@ def _build(plan: Plan, folder: Path) -> None:
         sensor=suite.sensor,
     )
     first_rows = plan.rows()[:BATCH]
-    _run_batch(shorten(first_rows, 2), "step")
+    _run_batch([replace(row, max_steps=2) for row in first_rows], "step")
 
 
-def _close() -> None:
-    global _trial
-    _trial.scene.close()
-    _trial = None
-
-
-def _run_batch(rows: Sequence[EpisodeRow], follow: str) -> Mapping[str, float]:
-    """Run episodes; returns seconds by part, "rest" is what no part counts."""
+def _run_batch(rows: Sequence[EpisodeRow], follow: str) -> Cost:
+    """Run episodes, and say what they took."""
     from vap_core.rollout.loop import rollout
 
-    start = time.perf_counter()
-    parts = dict.fromkeys(("environment", "attend", "policy", "record"), 0.0)
     trial = replace(_trial, follow=follow)
-    for episode in rollout(trial, rows, batch=BATCH):
-        assert episode.outcome.status != "error", episode.outcome.detail
-        assert episode.outcome.steps == episode.header.row.max_steps
-        for part, seconds in episode.seconds.items():
-            known = part if part in parts else "environment"
-            parts[known] += seconds
-    rest = time.perf_counter() - start - sum(parts.values())
-    return {**parts, "rest": rest}
+    with profiled(ROLLOUT_PARTS) as parts:
+        wall = time.perf_counter()
+        cpu = time.process_time()
+        for episode in rollout(trial, rows, batch=BATCH):
+            assert episode.outcome.status != "error", episode.outcome.detail
+            assert episode.outcome.steps == episode.header.row.max_steps
+        cpu = time.process_time() - cpu
+        wall = time.perf_counter() - wall
+    return Cost(wall, cpu, parts.with_rest(cpu))

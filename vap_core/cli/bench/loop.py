@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from vap_core.base.tables import align
+from vap_core.cli.bench.timing import median_seconds, seconds_of
 from vap_core.evaluation.study import DEMO, make_trial, register_personal
 from vap_core.perception.embedded.backbone import features
 from vap_core.recording import DeferredRecorder
@@ -106,13 +107,7 @@ def beside_budgets(limits: Sequence[Limit]) -> str:
 
 def median_ms(work: Callable[[], object]) -> float:
     """Of REPEAT times, after a first one that does not count."""
-    work()
-    seconds = []
-    for _ in range(REPEAT):
-        start = time.perf_counter()
-        work()
-        seconds.append(time.perf_counter() - start)
-    return 1e3 * float(np.median(seconds))
+    return 1e3 * median_seconds(work, REPEAT)
 
 
 def _pass_ms(trial: Trial) -> float:
@@ -184,12 +179,14 @@ def _timed_rollout(trial: Trial, row: EpisodeRow) -> tuple[float, Episode]:
 
 def _record_seconds(episode: Episode, path: Path, video: bool = False) -> float:
     """CPU seconds of recording an episode."""
-    start = time.process_time()
-    sink = DeferredRecorder(path, episode.header, lambda outcome: True, video=video)
-    for frame in episode.frames:
-        sink.frame(frame)
-    sink.close(episode.outcome)
-    return time.process_time() - start
+
+    def record() -> None:
+        sink = DeferredRecorder(path, episode.header, lambda outcome: True, video=video)
+        for frame in episode.frames:
+            sink.frame(frame)
+        sink.close(episode.outcome)
+
+    return seconds_of(record, time.process_time)
 
 
 def _record_limits(cost: RecordingCost) -> list[Limit]:

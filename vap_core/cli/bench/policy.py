@@ -4,7 +4,6 @@ A call for one episode, and what is gained by asking for many episodes at once.
 """
 
 import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import numpy as np
 
 from vap_core.base.errors import BadStudy
 from vap_core.base.tables import align
+from vap_core.cli.bench.timing import seconds_of
 from vap_core.evaluation.policy_names import MINI, shipped
 from vap_core.evaluation.statistics import ratio
 from vap_core.perception.embedded.backbone import features
@@ -80,7 +80,8 @@ def _backbone_seconds(rng: np.random.Generator, repeat: int) -> float:
     view = rng.integers(0, 256, (SIDE, SIDE, 3), dtype=np.uint8)
     seconds = []
     for i in range(WARM + repeat):
-        seconds.append(_seconds(partial(features, [view + np.uint8(i)], ["head"])))
+        work = partial(features, [view + np.uint8(i)], ["head"])
+        seconds.append(seconds_of(work, time.process_time))
     return float(np.median(seconds[WARM:]))
 
 
@@ -102,7 +103,7 @@ def _call_seconds(policy: LeRobot, rng: np.random.Generator, repeat: int) -> dic
     for i in range(WARM + repeat):
         for batch in BATCHES:
             call = partial(policy.plan, states[:batch], inputs[:batch])
-            call_seconds = _seconds(call)
+            call_seconds = seconds_of(call, time.process_time)
             if i >= WARM:
                 seconds[batch].append(call_seconds)
     return seconds
@@ -117,9 +118,3 @@ def _draw_input(policy: LeRobot, rng: np.random.Generator) -> PolicyInput:
             images[name] = rng.integers(0, 256, (SIDE, SIDE, 3), dtype=np.uint8)
     state = rng.normal(size=policy.wanted[STATE]).astype(np.float32)
     return PolicyInput(images, "pick up the red cup", state)
-
-
-def _seconds(work: Callable[[], object]) -> float:
-    start = time.process_time()
-    work()
-    return time.process_time() - start

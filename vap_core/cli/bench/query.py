@@ -7,8 +7,6 @@ display.
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -17,6 +15,7 @@ from tqdm import tqdm
 
 from vap_core.base.errors import MissingGL
 from vap_core.cli.bench.loop import Limit, beside_budgets, demo_trial, median_ms
+from vap_core.cli.bench.timing import seconds_of
 from vap_core.recording import DeferredRecorder, ensure_index, read_chunks, screenshot
 from vap_core.rollout.loop import rollout
 
@@ -81,7 +80,7 @@ def _copy_and_index(recording: Path, folder: Path, n: int) -> float:
     for i in tqdm(range(n), "record", unit="recording", leave=False, mininterval=1):
         path = folder / f"{i:05d}.rrd"
         read_chunks(recording).write_rrd(path, application_id="vap", recording_id=path.stem)
-        seconds.append(_seconds(partial(ensure_index, path)))
+        seconds.append(seconds_of(partial(ensure_index, path)))
     return float(np.median(seconds))
 
 
@@ -110,7 +109,7 @@ def _query_limits(folder: Path, n: int, whole_s: float) -> list[Limit]:
 def _open_limit(recording: Path, whole_s: float) -> Limit:
     """Raises: MissingGL."""
     png = recording.with_name("one.png")
-    seconds = _seconds(partial(screenshot, recording, png, size=(1920, 1080)))
+    seconds = seconds_of(partial(screenshot, recording, png, size=(1920, 1080)))
     return Limit(
         what="opening a frame without a display",
         measured=seconds,
@@ -124,9 +123,3 @@ def _python(code: str, *arguments: str) -> str:
     """What a program prints, in a process of its own."""
     command = [sys.executable, "-c", code, *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
-
-
-def _seconds(work: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    work()
-    return time.perf_counter() - start

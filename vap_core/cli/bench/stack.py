@@ -11,6 +11,7 @@ import numpy as np
 
 from vap_core.base.tables import align
 from vap_core.base.types import Boxes, Rgb
+from vap_core.cli.bench.timing import Clock, median_seconds
 from vap_core.perception import foundation
 from vap_core.perception.embedded.backbone import features
 from vap_core.perception.protocols import Stack
@@ -33,17 +34,12 @@ class Timer:
     """How often work is timed, and by which clock (seconds)."""
 
     repeat: int
-    clock: Callable[[], float]
+    clock: Clock
 
     def seconds(self, work: Callable[[], object]) -> float:
         """The median; work that is timed more than once is warmed up."""
         warm_up = 1 if self.repeat > 1 else 0
-        seconds = []
-        for _ in range(warm_up + self.repeat):
-            start = self.clock()
-            work()
-            seconds.append(self.clock() - start)
-        return float(np.median(seconds[warm_up:]))
+        return median_seconds(work, self.repeat, warm_up=warm_up, clock=self.clock)
 
 
 def run(kind: str, *, random: bool = False, device: str | None = None) -> str:

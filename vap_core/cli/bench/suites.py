@@ -12,6 +12,7 @@ import numpy as np
 
 from vap_core.base.tables import align
 from vap_core.cli.bench.loop import Limit, beside_budgets
+from vap_core.cli.bench.timing import median_seconds
 from vap_core.evaluation.engine import run as run_study
 from vap_core.evaluation.study import Study
 from vap_core.policies.scripted.expert import Expert
@@ -112,10 +113,4 @@ def _list_limit(workers: int) -> Limit:
 
 def _cpu_ms(work: Callable[[], object]) -> float:
     """The median of REPEAT times, after a first one that does not count."""
-    work()
-    seconds = []
-    for _ in range(REPEAT):
-        start = time.process_time()
-        work()
-        seconds.append(time.process_time() - start)
-    return 1e3 * float(np.median(seconds))
+    return 1e3 * median_seconds(work, REPEAT, clock=time.process_time)

@@ -30,7 +30,7 @@ def make_env(
     scene: Scene,
     suite: str,
     *,
-    image_size: int = 224,
+    image_size: int | tuple[int, int] = 224,
     cameras: Sequence[str] | None = None,
     occlusion: Occlusion | None = None,
 ) -> Env:
@@ -50,7 +50,7 @@ def make_env(
 def open_row(
     row: EpisodeRow,
     *,
-    image_size: int = 224,
+    image_size: int | tuple[int, int] = 224,
     occlusion: Occlusion | None = None,
     meshes: Meshes = "plain",
 ) -> Iterator[Env]:

@@ -1,0 +1,48 @@
+"""docs/measured.md and its picture, made from the measurements that ship in data/results."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from vap_core.base.files import DATA, write_atomic
+from vap_core.cli.bench import eval_report, profile, scale_report
+from vap_core.cli.bench.measurement import Measurement, Table, as_markdown, read
+
+ROOT = DATA.parent
+PAGE = ROOT / "docs" / "measured.md"
+PICTURE = ROOT / "figures" / "10_scale.png"
+SECTIONS: dict[str, tuple[str, Callable[[Measurement], list[Table]]]] = {
+    "eval": ("Against lerobot's own loop", eval_report.tables),
+    "profile": ("Where the time of a control step goes", profile.tables),
+    "scale": ("How the cost grows", scale_report.tables),
+}
+"""The benchmarks of the page, in order: a heading, and the tables of a measurement."""
+HEADER = """# What is measured
+
+Made by `python -m vap_core bench measured` from `data/results/bench_*.json`; the commands below
+write these by `--json FILE`. Times are of the machine that is named; compare ratios."""
+
+
+def shipped(bench: str) -> Path:
+    """Where the measurement of a benchmark ships."""
+    return DATA / "results" / f"bench_{bench}.json"
+
+
+def page() -> str:
+    """The text of docs/measured.md. Raises: BadOutput."""
+    parts = [HEADER]
+    for bench, (heading, tables) in SECTIONS.items():
+        measurement = read(shipped(bench))
+        parts += [f"## {heading}", as_markdown(measurement, tables(measurement))]
+        if bench == "scale":
+            parts.append(f"![How the cost grows](../figures/{PICTURE.name})")
+    return "\n\n".join(parts) + "\n"
+
+
+def run() -> str:
+    """Write the page and the picture. Raises: BadOutput."""
+    from vap_core.base.figures import write_png
+
+    PAGE.parent.mkdir(exist_ok=True)
+    write_atomic(PAGE, page().encode())
+    write_png(scale_report.figure(read(shipped("scale"))), PICTURE)
+    return f"wrote {PAGE} and {PICTURE}"

@@ -1,0 +1,120 @@
+"""The command that measures what a step, a start and a query cost."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from vap_core.cli.options import StackName, Workers
+
+if TYPE_CHECKING:
+    from vap_core.cli.bench.measurement import Measurement, Table
+
+app = typer.Typer()
+
+
+@app.command()
+def bench(
+    what: Annotated[
+        str,
+        typer.Argument(
+            help="loop: the prompted control loop; suites: every benchmark's simulator; "
+            "stack: a stack's models; policy: the shipped policies; "
+            "eval: our loop against lerobot's own, on equal CPU and in wall time; "
+            "profile: a control step of eval by part; "
+            "scale: cost against cameras, image size, candidates, batch and workers, and memory; "
+            "engine: a Ray cluster on this machine against local processes; "
+            "query: a question to a thousand recordings; style: how the source reads; "
+            "measured: write docs/measured.md from what ships."
+        ),
+    ] = "loop",
+    steps: Annotated[int, typer.Option(min=5, help="loop: control steps to time.")] = 60,
+    workers: Workers = 2,
+    stack: StackName = "foundation",
+    random_weights: Annotated[
+        bool,
+        typer.Option(
+            "--random-weights", help="stack: without weights; they change nothing about speed."
+        ),
+    ] = False,
+    device: Annotated[
+        str | None,
+        typer.Option(help="stack: cpu or cuda; default VAP_DEVICE, or a GPU where there is one."),
+    ] = None,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick",
+            help="policy, eval, profile, scale, engine, query: a few steps, to see that it runs; "
+            "its numbers mean nothing.",
+        ),
+    ] = False,
+    repeats: Annotated[
+        int, typer.Option(min=2, help="eval: how often every way to run is measured.")
+    ] = 5,
+    lerobot_from: Annotated[
+        Path | None,
+        typer.Option(
+            help="eval: a checkout of this repository at an earlier commit (git worktree add DIR "
+            "COMMIT), whose lerobot loop is measured, too, as the fixed denominator."
+        ),
+    ] = None,
+    episodes: Annotated[
+        int, typer.Option(min=5, help="scale: episodes over which memory is watched.")
+    ] = 200,
+    json: Annotated[
+        Path | None,
+        typer.Option(help="eval, profile, scale: keep the measurement in this file, too."),
+    ] = None,
+) -> None:
+    """Measure what a step, a start and a query cost, as shares and ratios within one run.
+
+    Example: python -m vap_core bench suites
+    Example: python -m vap_core bench profile --json data/results/bench_profile.json
+    """
+    from vap_core.base.errors import one_of
+    from vap_core.cli.bench import engine as bench_engine
+    from vap_core.cli.bench import eval as bench_eval
+    from vap_core.cli.bench import eval_report, measured, scale_report
+    from vap_core.cli.bench import loop as bench_loop
+    from vap_core.cli.bench import policy as bench_policy
+    from vap_core.cli.bench import profile as bench_profile
+    from vap_core.cli.bench import query as bench_query
+    from vap_core.cli.bench import scale as bench_scale
+    from vap_core.cli.bench import stack as bench_stack
+    from vap_core.cli.bench import style as bench_style
+    from vap_core.cli.bench import suites as bench_suites
+
+    def kept(
+        measure: "Callable[[], Measurement]", tables: "Callable[[Measurement], list[Table]]"
+    ) -> str:
+        from vap_core.cli.bench.measurement import as_text, write
+
+        measurement = measure()
+        if json is not None:
+            write(measurement, json)
+        return as_text(measurement, tables(measurement))
+
+    against_lerobot = partial(
+        bench_eval.measure, workers, lerobot_from, repeats=repeats, quick=quick
+    )
+    by_part = partial(bench_profile.measure, quick=quick)
+    scale = partial(bench_scale.measure, episodes, quick)
+    benchmarks: dict[str, Callable[[], str]] = {
+        "loop": partial(bench_loop.run, steps),
+        "suites": partial(bench_suites.run, workers),
+        "stack": partial(bench_stack.run, stack, random=random_weights, device=device),
+        "policy": partial(bench_policy.run, quick),
+        "eval": partial(kept, against_lerobot, eval_report.tables),
+        "profile": partial(kept, by_part, bench_profile.tables),
+        "scale": partial(kept, scale, scale_report.tables),
+        "engine": partial(bench_engine.run, workers, quick),
+        "query": partial(bench_query.run, quick=quick),
+        "style": bench_style.run,
+        "measured": measured.run,
+    }
+    if what not in benchmarks:
+        raise one_of("bench:", what, benchmarks)
+    print(benchmarks[what]())
