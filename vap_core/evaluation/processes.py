@@ -65,7 +65,7 @@ def results[J, R](
 
 
 def _limit_threads() -> None:
-    """One thread per worker: workers inherit this, and two threads in each compete for the cores."""
+    """One thread in each worker: with two, workers compete for the cores."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
 
