@@ -119,7 +119,7 @@ def check(folder: Path, episodes: int, times: int, longest_s: float, several: bo
 def test_killed_at_random_moments_it_ends_with_the_rows_of_an_undisturbed_run(
     tmp_path: Path,
 ) -> None:
-    check(tmp_path, episodes=2, times=2, longest_s=10.0)
+    check(tmp_path, episodes=2, times=2, longest_s=6.0)
 
 
 @pytest.mark.sweep
