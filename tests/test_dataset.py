@@ -111,7 +111,13 @@ def test_films_come_back_bit_for_bit(written: Path, films: list[Film], cache: Pa
     assert alike(read(written, lambda stage: stage % 2 == 0), films[:3])
     assert about(written)["data_sha256"] == data_sha256(films)
     assert [one["stage"] for one in about(written)["episodes"]] == [0, 0, 2, 3, 3]
-    assert not {path.name for path in written.iterdir()} - {".lock", "run.json", "data", "videos", "meta"}
+    assert not {path.name for path in written.iterdir()} - {
+        ".lock",
+        "run.json",
+        "data",
+        "videos",
+        "meta",
+    }
 
 
 def test_so_do_those_with_fewer_pictures_than_steps(
