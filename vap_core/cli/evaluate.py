@@ -58,6 +58,16 @@ Attention = Annotated[
 Retries = Annotated[
     int, typer.Option(min=0, help="How often an episode that ended in an error is tried again.")
 ]
+PolicyTimeout = Annotated[
+    float | None,
+    typer.Option(
+        "--policy-timeout",
+        metavar="SECONDS",
+        min=0.1,
+        help="A call of the policy that takes longer ends its episode as an error. Default: none; "
+        "after a minute a note says which episode waits.",
+    ),
+]
 Meshes = Annotated[
     str,
     typer.Option(
@@ -117,6 +127,7 @@ def rollout(
     video: Video = False,
     attention: Attention = False,
     retries: Retries = 1,
+    policy_timeout: PolicyTimeout = None,
     robots: Meshes = "plain",
     stack: StackName = "embedded",
 ) -> None:
@@ -141,6 +152,7 @@ def rollout(
         workers=workers,
         record_option=record,
         retries=retries,
+        policy_timeout_s=policy_timeout,
         video=video,
         attention=attention,
     )
@@ -196,6 +208,7 @@ def evaluate(
     video: Video = False,
     attention: Attention = False,
     retries: Retries = 1,
+    policy_timeout: PolicyTimeout = None,
     follow: Annotated[
         Literal["call", "step"],
         typer.Option(
@@ -259,6 +272,7 @@ def evaluate(
         workers=workers,
         record_option=record or ("none" if policy in PRIVILEGED else "failures"),
         retries=retries,
+        policy_timeout_s=policy_timeout,
         address=address,
         video=video,
         attention=attention,
@@ -324,6 +338,7 @@ def _run(
     workers: int | None,
     record_option: str,
     retries: int,
+    policy_timeout_s: float | None = None,
     address: str | None = None,
     **recorded: Any,
 ) -> None:
@@ -351,6 +366,7 @@ def _run(
         workers=workers,
         record=record,
         retries=retries,
+        policy_timeout_s=policy_timeout_s,
         executor=ray_executor(address) if address else results,
         **recorded,
     )

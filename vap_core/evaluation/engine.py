@@ -41,6 +41,7 @@ def run(
     executor: Executor = results,
     video: bool = False,
     attention: bool = False,
+    policy_timeout_s: float | None = None,
 ) -> "pd.DataFrame":
     """Run the episodes of `study` that `folder` lacks, and return the table of all its episodes.
 
@@ -51,7 +52,12 @@ def run(
 
     def missing() -> list[Job]:
         jobs = missing_jobs(study, folder, record, retries)
-        return [replace(job, video=video, attention=attention) for job in jobs]
+        complete = []
+        for job in jobs:
+            complete.append(
+                replace(job, video=video, attention=attention, policy_timeout_s=policy_timeout_s)
+            )
+        return complete
 
     store.open_run(folder, study.configuration())
     with store.locked(folder):

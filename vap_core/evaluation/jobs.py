@@ -35,7 +35,7 @@ class Job:
 
     `keys` name the results (engine.result_key); `attempt` 1 is the first. `chosen` are the keys to
     record when `record` is a number. `video` records AV1 instead of JPEGs, `attention` the policy's
-    attention.
+    attention. `policy_timeout_s` is rollout.Trial's.
     """
 
     study: Study
@@ -48,6 +48,7 @@ class Job:
     chosen: frozenset[str] = frozenset()
     video: bool = False
     attention: bool = False
+    policy_timeout_s: float | None = None
 
 
 def run_job(job: Job) -> Rows:
@@ -70,7 +71,11 @@ def run_job(job: Job) -> Rows:
             f"engine: {trial.policy.label} gives no attention maps, as pi0, pi0.5 and mini-pi0 do; "
             "leave --attention out."
         )
-    trial = replace(trial, attention=job.attention and begin is not None)
+    trial = replace(
+        trial,
+        attention=job.attention and begin is not None,
+        policy_timeout_s=job.policy_timeout_s,
+    )
     with unchanged_weights(trial.policy) as checksum:
         episodes = list(rollout(trial, job.rows, begin, batch=BATCH))
     if begin is not None:

@@ -6,7 +6,7 @@ parent process; it starts with the first call of `prepare` or `results`.
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import forkserver, get_context, parent_process
 from threading import Thread
@@ -33,7 +33,7 @@ def results[J, R](
 
     `remedy` is the option that lowers the load, for the error message.
 
-    Raises: WorkerDied when a process was killed; what `work` raises.
+    Raises: WorkerDied when a process was killed or exited; what `work` raises.
     """
     if not jobs:
         return
@@ -49,7 +49,7 @@ def results[J, R](
             futures = {pool.submit(work, job): job for job in jobs}
             for future in as_completed(futures):
                 done += 1
-                yield futures[future], future.result()
+                yield futures[future], _result(future)
         except BrokenProcessPool as error:
             raise WorkerDied(
                 "a worker process died, perhaps for lack of memory; run the same command again, "
@@ -75,6 +75,17 @@ def _begin_worker(environment: dict[str, str]) -> None:
     os.environ.clear()
     os.environ.update(environment)
     end_with_parent()
+
+
+def _result[R](future: Future[R]) -> R:
+    """What the job returned. Its sys.exit() does not end this process."""
+    try:
+        return future.result()
+    except SystemExit as error:
+        raise WorkerDied(
+            f"a worker process called sys.exit({error.code!r}) outside an episode; look for the "
+            "call in the policy's code."
+        ) from error
 
 
 def end_with_parent() -> None:

@@ -12,6 +12,7 @@ from typing import Any
 from vap_core.base.errors import BadPolicy
 from vap_core.policies.hooks import TEXT, observe_inputs
 from vap_core.policies.protocol import Chunk, Policy, PolicyInput
+from vap_core.rollout.policy_call import checked_plan
 from vap_core.rollout.types import ConsumedInput
 
 Digests = tuple[Mapping[str, str], Mapping[str, str]]
@@ -30,7 +31,8 @@ def plan(
     """
     spare = copy.deepcopy(list(states))
     with observe_inputs() as of_prompted:
-        after, chunks = policy.plan(states, prompted)
+        returned = policy.plan(states, prompted)
+        after, chunks = checked_plan(returned, policy.label, len(states))
     with observe_inputs() as of_raw:
         policy.plan(spare, raw)
     if len(of_prompted) != len(prompted):

@@ -20,6 +20,7 @@ from vap_core.policies.hooks import AttentionMap, AttentionMaps, observe_attenti
 from vap_core.policies.protocol import Chunk, Policy, PolicyInput, PrivilegedPolicy
 from vap_core.rollout import audit
 from vap_core.rollout.coverage import mask_coverage
+from vap_core.rollout.policy_call import checked_plan, policy_call
 from vap_core.rollout.prompters.protocol import PromptContext, Prompter, SceneTruth, unchanged
 from vap_core.rollout.types import ConsumedInput, Episode, EpisodeHeader, Frame, MaskCoverage
 from vap_core.simulation.env import Control, Env
@@ -52,6 +53,7 @@ class Trial:
     policy is called, which is all that it ever sees, or at every control step. `audit` keeps what
     the policy consumed in every call (rollout.audit), `attention` where it looked (policies.hooks).
     `image_size` is simulation.Env's.
+    A call of the policy that takes longer than `policy_timeout_s` fails (rollout.policy_call).
     """
 
     method: str
@@ -66,6 +68,7 @@ class Trial:
     audit: bool = False
     attention: bool = False
     image_size: int | tuple[int, int] = 224
+    policy_timeout_s: float | None = None
 
     @property
     def bound(self) -> bool:
@@ -118,9 +121,9 @@ def rollout(
 
     Episodes do not depend on each other. Only the rounding of a policy that is called for several
     episodes at once depends on `batch`: `batch` 1 and 5 can differ in the last bits of an action.
-    An exception inside an episode ends that episode with status "error" and its traceback in
-    `detail`; the others go on. Frames keep their images only with `keep_images`; a sink always gets
-    them.
+    An exception inside an episode, or a call of sys.exit, ends that episode with status "error" and
+    its traceback in `detail`; the others go on. Frames keep their images only with `keep_images`; a
+    sink always gets them.
     """
     keeps_images = sink is not None or keep_images
     for first in range(0, len(rows), batch):
@@ -240,7 +243,7 @@ def _prompt_batch(
     start = time.perf_counter()
     try:
         results = _call_prompter(trial, following, observations)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         if _ends_the_run(error):
             raise
         if len(following) == 1:
@@ -322,7 +325,8 @@ def _plan(trial: Trial, live: Sequence[RunningEpisode], steps: dict[int, Step]) 
         return
     start = time.perf_counter()
     try:
-        states, chunks = _call_policy(trial, calling, steps)
+        with policy_call(trial.policy_timeout_s, [_named(trial, episode) for episode in calling]):
+            states, chunks = _call_policy(trial, calling, steps)
     except Exception as error:
         if _ends_the_run(error):
             raise
@@ -339,13 +343,19 @@ def _plan(trial: Trial, live: Sequence[RunningEpisode], steps: dict[int, Step]) 
         episode.seconds["policy"] += share
 
 
+def _named(trial: Trial, episode: RunningEpisode) -> str:
+    row = episode.row
+    return f"{row.suite} {row.task} episode {row.episode} seed {row.seed} ({trial.method})"
+
+
 def _call_policy(
     trial: Trial, calling: Sequence[RunningEpisode], steps: dict[int, Step]
 ) -> tuple[list[Any], list[Chunk]]:
     policy = trial.policy
     states = [episode.policy_state for episode in calling]
     if isinstance(policy, PrivilegedPolicy):
-        return policy.plan_from_simulation(states, [episode.env for episode in calling])
+        returned = policy.plan_from_simulation(states, [episode.env for episode in calling])
+        return checked_plan(returned, policy.label, len(calling))
 
     raw = []
     prompted = []
@@ -365,7 +375,8 @@ def _call_policy(
                 step = episode.judge.steps
                 episode.consumed += audit.compare(step, prompted[i], raw[i], consumed[i])
         else:
-            after, chunks = policy.plan(states, prompted)
+            returned = policy.plan(states, prompted)
+            after, chunks = checked_plan(returned, policy.label, len(calling))
     for i, episode in enumerate(calling):
         episode.attention = maps.get(i, {})
     return after, chunks
@@ -439,7 +450,7 @@ def _guard[**P, R](
     """
     try:
         return work(*args, **kwargs)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         if _ends_the_run(error):
             raise
         _fail(episode)
@@ -451,7 +462,7 @@ def _fail(episode: RunningEpisode) -> None:
     episode.outcome = episode.judge.outcome("error", traceback.format_exc(limit=8))
 
 
-def _ends_the_run(error: Exception) -> bool:
+def _ends_the_run(error: BaseException) -> bool:
     """Whether the user has to act (a full disk, an absent weight).
 
     A bad action fails its own episode only.

@@ -1,0 +1,178 @@
+"""Whatever a policy does in one episode of a batch, that episode is an error and the others are kept."""
+
+import re
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vap_core.base.errors import BadStudy, WorkerDied
+from vap_core.evaluation import engine
+from vap_core.evaluation import study as experiments
+from vap_core.evaluation.processes import results
+from vap_core.evaluation.study import Study, make_trial
+from vap_core.policies.scripted.random import Random
+from vap_core.rollout import policy_call as calls
+from vap_core.rollout.loop import Trial, rollout
+from vap_core.rollout.policy_call import checked_plan, policy_call
+from vap_core.simulation.types import EpisodeRow
+
+STUDY = Study((("simpler-bridge", "pick-shaver"),), ("generic",), policy="random", episodes=3)
+ROWS = tuple(replace(row, max_steps=3) for row in STUDY.rows("simpler-bridge", "pick-shaver"))
+BAD = ROWS[1]
+Change = Callable[[list, list, int], object]
+
+
+class Faulty(Random):
+    """Plans as Random, then does something wrong where the bad episode is the i-th of the batch."""
+
+    def __init__(self, change: Change) -> None:
+        self.change = change
+
+    def plan_from_simulation(self, states: Sequence, envs: Sequence) -> object:
+        states, chunks = super().plan_from_simulation(states, envs)
+        for i, env in enumerate(envs):
+            if env.row.episode == BAD.episode:
+                return self.change(states, chunks, i)
+        return states, chunks
+
+
+@pytest.fixture(scope="module")
+def trial(tmp_path_factory: pytest.TempPathFactory) -> Trial:
+    return make_trial(STUDY, ROWS, "generic", tmp_path_factory.mktemp("bank"))
+
+
+def with_chunk(chunk: object) -> Change:
+    return lambda states, chunks, i: (states, [*chunks[:i], chunk, *chunks[i + 1 :]])
+
+
+def leave(states: list, chunks: list, i: int) -> object:
+    sys.exit(0)
+
+
+def hang(states: list, chunks: list, i: int) -> object:
+    try:
+        time.sleep(30)
+    except Exception:  # what a policy that retries does
+        time.sleep(30)
+    return states, chunks
+
+
+def check_two_of_three(trial: Trial, rows: Sequence[EpisodeRow], message: str) -> None:
+    one, bad, other = rollout(trial, rows, batch=3)
+    assert [one.outcome.status, bad.outcome.status, other.outcome.status] == [
+        "failure",
+        "error",
+        "failure",
+    ]
+    assert [one.outcome.steps, bad.outcome.steps, other.outcome.steps] == [3, 0, 3]
+    assert re.search(message, bad.outcome.detail)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda states, chunks, i: None, "random: plan returned NoneType; return two lists"),
+        (lambda states, chunks, i: (states, chunks[:-1]), "returned 0 chunks for 1 episodes"),
+        (lambda states, chunks, i: (states, [*chunks, chunks[0]]), "returned 2 chunks for 1 ep"),
+        (lambda states, chunks, i: (states[1:], chunks), "returned 0 states for 1 episodes"),
+        (lambda states, chunks, i: (states, None), "returned NoneType for the chunks"),
+        (with_chunk(None), "returned NoneType as a chunk; return a float32 array"),
+        (with_chunk(np.float32(1)), "returned float32 as a chunk"),
+        (with_chunk(np.zeros(7, np.float32)), r"an array of shape \(7,\) and type float32"),
+        (with_chunk(np.zeros((0, 7), np.float32)), r"an array of shape \(0, 7\)"),
+        (with_chunk(np.full((1, 7), "x")), "and type <U1 as a chunk"),
+        (leave, r"the policy called sys\.exit\(0\)"),
+    ],
+)
+def test_a_fault_is_the_error_of_its_episode(trial: Trial, change: Change, message: str) -> None:
+    check_two_of_three(replace(trial, policy=Faulty(change)), ROWS, message)
+
+
+def test_sys_exit_at_the_start_of_an_episode_is_its_error(trial: Trial) -> None:
+    class Leaves(Random):
+        def start(self, rng: np.random.Generator) -> object:
+            if rng.bit_generator.state == bad:
+                sys.exit(3)
+            return super().start(rng)
+
+    bad = np.random.default_rng([BAD.seed, BAD.episode]).bit_generator.state
+    check_two_of_three(replace(trial, policy=Leaves()), ROWS, "SystemExit: 3")
+
+
+def test_a_call_that_hangs_is_ended(trial: Trial) -> None:
+    limited = replace(trial, policy=Faulty(hang), policy_timeout_s=0.2)
+    start = time.monotonic()
+    check_two_of_three(limited, ROWS, r"TimeoutError: the policy did not answer within 0\.2 s")
+    assert time.monotonic() - start < 10
+
+
+def test_a_call_in_time_is_left_alone() -> None:
+    with policy_call(0.05, ["a"]):
+        pass
+    time.sleep(0.1)
+
+
+def test_a_limit_outside_the_main_thread_is_refused() -> None:
+    caught = []
+
+    def call() -> None:
+        try:
+            with policy_call(1.0, ["a"]):
+                pass
+        except BadStudy as error:
+            caught.append(str(error))
+
+    thread = threading.Thread(target=call)
+    thread.start()
+    thread.join()
+    assert "main thread only" in caught[0]
+
+
+def test_without_a_limit_a_note_says_which_episode_waits(
+    trial: Trial, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def late(states: list, chunks: list, i: int) -> object:
+        time.sleep(0.3)
+        return states, chunks
+
+    monkeypatch.setattr(calls, "NOTE_AFTER_S", 0.1)
+    list(rollout(replace(trial, policy=Faulty(late)), [replace(BAD, max_steps=1)]))
+    (line,) = capfd.readouterr().err.splitlines()
+    name = f"simpler-bridge pick-shaver episode {BAD.episode} seed 0 (generic)"
+    assert f"waiting: {name}; --policy-timeout" in line
+
+
+def test_a_sound_answer_passes() -> None:
+    chunk = np.zeros((2, 7), np.float32)
+    states, chunks = checked_plan(([1, 2], (chunk, chunk)), "mine", 2)
+    assert states == [1, 2]
+    assert chunks[1] is chunk
+
+
+def test_sys_exit_in_a_worker_does_not_end_this_process() -> None:
+    with pytest.raises(WorkerDied, match=r"a worker process called sys.exit\(0\)"):
+        list(results(sys.exit, [0], 1, "--workers"))
+
+
+def test_the_limit_reaches_the_policy_of_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(experiments, "make_policy", lambda *_: Faulty(hang))
+    monkeypatch.setattr(experiments.Study, "rows", lambda *_: ROWS)
+    table = engine.run(
+        STUDY,
+        tmp_path / "run",
+        record="none",
+        retries=0,
+        progress=False,
+        policy_timeout_s=0.2,
+        executor=lambda work, jobs, workers, remedy: ((job, work(job)) for job in jobs),
+    )
+    assert table.outcome.tolist() == ["failure", "error", "failure"]
+    assert "did not answer within 0.2 s" in table.detail[1]

@@ -1,0 +1,123 @@
+"""One call of a policy: it may take a limited time, and what it returns is checked."""
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from vap_core.base.errors import BadAction, BadStudy
+from vap_core.policies.protocol import Chunk
+
+NOTE_AFTER_S = 60.0
+"""A call that takes longer is noted on stderr, with the episodes that wait for it."""
+
+
+class _TimeIsUp(BaseException):
+    """Raised inside the policy. No `except Exception` of the policy's catches it."""
+
+
+@contextmanager
+def policy_call(limit_s: float | None, episodes: Sequence[str]) -> Iterator[None]:
+    """Ends the block with an error after `limit_s` seconds (None: never).
+
+    The limit is a timer signal, whose handler raises in the main thread. It interrupts Python code,
+    sleeping, waiting for a lock and reading from a socket. It does not interrupt a call into C that
+    returns late or never, such as one long kernel of torch: that one ends first. A policy whose own
+    code catches BaseException can go on.
+
+    Raises: TimeoutError; RuntimeError when the policy calls sys.exit; BadStudy for a limit outside
+        the main thread, where no handler runs.
+    """
+    note = threading.Timer(NOTE_AFTER_S, _note_waiting, [episodes])
+    note.daemon = True
+    note.start()
+    try:
+        with _timer(limit_s):
+            yield
+    except SystemExit as error:
+        raise RuntimeError(
+            f"the policy called sys.exit({error.code!r}); raise an error instead."
+        ) from error
+    except _TimeIsUp:
+        raise TimeoutError(
+            f"the policy did not answer within {limit_s:g} s; allow more with --policy-timeout."
+        ) from None
+    finally:
+        note.cancel()
+
+
+def checked_plan(returned: object, label: str, n: int) -> tuple[list[Any], list[Chunk]]:
+    """The states and chunks that the policy `label` returned for `n` episodes.
+
+    Raises: BadAction when it is something else.
+    """
+    if not isinstance(returned, tuple | list) or len(returned) != 2:
+        raise BadAction(
+            f"{label}: plan returned {type(returned).__name__}; return two lists, of states and of "
+            "chunks."
+        )
+    states, chunks = returned
+    for name, parts in (("states", states), ("chunks", chunks)):
+        if not isinstance(parts, list | tuple | np.ndarray):
+            raise BadAction(
+                f"{label}: plan returned {type(parts).__name__} for the {name}; return a list."
+            )
+        if len(parts) != n:
+            raise BadAction(
+                f"{label}: plan returned {len(parts)} {name} for {n} episodes; return one for each."
+            )
+    for chunk in chunks:
+        _check_chunk(chunk, label)
+    return list(states), list(chunks)
+
+
+def _check_chunk(chunk: object, label: str) -> None:
+    if not isinstance(chunk, np.ndarray):
+        found = type(chunk).__name__
+    elif chunk.ndim != 2 or not len(chunk) or chunk.dtype.kind not in "fiu":
+        found = f"an array of shape {chunk.shape} and type {chunk.dtype}"
+    else:
+        return
+    raise BadAction(
+        f"{label}: plan returned {found} as a chunk; return a float32 array with one row of "
+        "numbers for each control step."
+    )
+
+
+@contextmanager
+def _timer(limit_s: float | None) -> Iterator[None]:
+    """Raises _TimeIsUp in the block after that time."""
+    if limit_s is None:
+        yield
+        return
+    if threading.current_thread() is not threading.main_thread():
+        raise BadStudy(
+            "policy_timeout_s works in a process's main thread only; run the rollout there, or "
+            "leave the limit out."
+        )
+
+    def interrupt(*_: object) -> None:
+        raise _TimeIsUp
+
+    handler = signal.signal(signal.SIGALRM, interrupt)
+    delay_s, _ = signal.setitimer(signal.ITIMER_REAL, limit_s)
+    try:
+        yield
+    finally:
+        try:
+            signal.setitimer(signal.ITIMER_REAL, delay_s)
+        finally:
+            signal.signal(signal.SIGALRM, handler)
+
+
+def _note_waiting(episodes: Sequence[str]) -> None:
+    print(
+        f"note: the policy has not answered for {NOTE_AFTER_S:.0f} s; waiting: "
+        f"{', '.join(episodes)}; --policy-timeout SECONDS ends such a call.",
+        file=sys.stderr,
+        flush=True,
+    )
