@@ -113,14 +113,14 @@ class ChunkPredictor:
         if device != "cpu":
             self.stay_eager(f"tracing was tried on the CPU only, not on {device}")
             return
+        others = _shorter_text(inputs)
         try:
             graph = _trace(self.policy, inputs)
+            of_others = _call(self.policy, others)
         except Exception as error:
             self.stay_eager(f"tracing failed ({type(error).__name__}: {_first_line(error)})")
             return
-        others = _shorter_text(inputs)
-        difference = _difference(graph, inputs, chunks)
-        difference = difference or _difference(graph, others, _call(self.policy, others))
+        difference = _difference(graph, inputs, chunks) or _difference(graph, others, of_others)
         if difference:
             self.stay_eager(difference)
             return
