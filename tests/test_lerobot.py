@@ -13,6 +13,7 @@ from safetensors.torch import load_file, save_file
 from tests import tiny_lerobot as tiny
 from vap_core.base.errors import BadPolicy
 from vap_core.policies.hooks import TEXT
+from vap_core.policies.lerobot import traced
 from vap_core.policies.lerobot.adapter import LeRobot, load_for_suite, load_policy
 from vap_core.policies.lerobot.checkpoints import fingerprint, is_checkpoint_name
 from vap_core.policies.lerobot.loading import compare
@@ -101,6 +102,36 @@ def test_a_batch_equals_one_by_one_whatever_the_global_seed(policies, name):
     assert np.allclose(together, alone, atol=1e-6)
     assert np.abs(together[0] - together[1]).max() > 1e-4  # what is seen matters
     assert torch.equal(torch.get_rng_state(), drawn)
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("pi0", ""),
+        ("pi05", ""),
+        ("act", ""),
+        ("smolvla", "tracing failed"),
+        ("ensemble", "it has a memory"),
+    ],
+)
+def test_a_policy_is_traced_or_says_that_it_stays_eager(folders, monkeypatch, capsys, name, reason):
+    monkeypatch.setattr(traced, "CALLS_BEFORE_TRACE", 2)
+    with toy_sizes(tiny.TOY):
+        policy, plain = load_policy(folders[name]), load_policy(folders[name])
+    plain.predict.stays_eager = True
+    state, others = begin(policy, 3), begin(plain, 3)
+    capsys.readouterr()
+    for i, batch in enumerate((3, 3, 3, 2, 2, 1, 1)):
+        looks = [look(10 * i + j) for j in range(batch)]
+        chunks = run(policy, state[:batch], looks)
+        assert np.array_equal(chunks, run(plain, others[:batch], looks))
+    said = [line for line in capsys.readouterr().err.splitlines() if "traced graph" in line]
+    if reason:
+        (line,) = said
+        assert reason in line
+    else:
+        assert said == []
+        assert len(policy.predict._graphs) == 3
 
 
 @pytest.mark.parametrize("name", ["pi0", "smolvla"])

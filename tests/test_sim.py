@@ -75,6 +75,21 @@ def test_projection_and_backprojection_are_inverse(scene, row):
     assert np.isnan(cameras.backproject_to_plane(env.cameras()[0], sky, 0.0)).all()
 
 
+def test_a_camera_is_reported_where_it_is_after_every_step(scene, row):
+    if "wrist" not in scene.cameras:
+        pytest.skip("no camera of this scene moves")
+    env = Env(scene, cameras=("wrist",))
+    env.reset(row)
+    (before,) = env.cameras()
+    kept = env.snapshot()
+    assert env.cameras()[0] is before, "it is computed once a step"
+    env.step(np.array([0.02, 0, 0.02, 0, 0, 0, 1], np.float32))
+    (after,) = env.cameras()
+    assert np.abs(after.pose_world[:3, 3] - before.pose_world[:3, 3]).max() > 1e-3
+    env.restore(kept)
+    assert (env.cameras()[0].pose_world == before.pose_world).all()
+
+
 def test_projected_objects_lie_inside_their_masks(scene, row):
     env = Env(scene)
     env.reset(row)

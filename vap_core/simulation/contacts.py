@@ -46,7 +46,6 @@ class ContactWatch:
         self._geom_roles = geom_roles
         self._on_gripper = on_gripper
         self._pairs: bytes | None = None
-        self._by_robot: dict[int, None] = {}
         self._by_gripper: set[int] = set()
 
     def update(self, geoms: np.ndarray, seconds: float) -> None:
@@ -55,7 +54,9 @@ class ContactWatch:
         if pairs != self._pairs:  # else the contacts are those of the step before
             self._pairs = pairs
             self._find_touched(geoms)
-        self.touched.update(self._by_robot)
+        if not self._by_gripper:
+            self.running_s = {}
+            return
         running_s = {}
         for index in self._by_gripper:
             running_s[index] = self.running_s.get(index, 0.0) + seconds
@@ -64,12 +65,12 @@ class ContactWatch:
         self.running_s = running_s
 
     def _find_touched(self, geoms: np.ndarray) -> None:
-        """The objects in contact with the robot, and those in contact with its gripper."""
+        """Note the objects in contact with the robot, and those in contact with its gripper."""
         pairs = self._geom_roles[geoms]
         objects = pairs.max(axis=1)
         by_robot = (pairs.min(axis=1) == ARM) & (objects >= 0)
         by_gripper = by_robot & self._on_gripper[geoms].any(axis=1)
-        self._by_robot = dict.fromkeys(objects[by_robot].tolist())
+        self.touched.update(dict.fromkeys(objects[by_robot].tolist()))
         self._by_gripper = set(objects[by_gripper].tolist())
 
 

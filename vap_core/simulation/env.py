@@ -106,6 +106,9 @@ class Env:
         self._ctrl = _actuator_ids(self._model, (*self.robot.joints, *self.robot.fingers))
         self._roles = geom_roles(scene)
         self._gripper = gripper_geoms(scene)
+        self._body_ids = {}
+        for name in (*scene.objects, *self.robot.links):
+            self._body_ids[name] = self._model.body(name).id
         base = np.eye(4)
         base[:3, :3] = _matrix(self.robot.base_world[3:])
         base[:3, 3] = self.robot.base_world[:3]
@@ -114,6 +117,8 @@ class Env:
         self._placed: tuple[str, ...] = ()
         self._disturbances: Mapping[str, Disturbance] = {}
         self._touch = Touch()
+        self._cameras: tuple[Camera, ...] | None = None
+        """The calibrated cameras, until the poses change."""
         self._command = self._home_command()
         mujoco.mj_forward(self._model, self._data)
 
@@ -233,8 +238,8 @@ class Env:
     def truth(self, masks: bool = False) -> Truth:
         """Ground truth after the last step, on demand with every camera's visible object masks."""
         with self._timed("truth"):
-            poses = {name: self._pose(name) for name in self._placed}
-            links = {name: self._pose(name) for name in self.robot.links}
+            poses = self._poses(self._placed)
+            links = self._poses(self.robot.links)
             masks_by_camera: dict[str, Mapping[str, Mask]] = {}
             if masks:
                 hidden = self._hidden()
@@ -254,10 +259,12 @@ class Env:
 
     def cameras(self) -> tuple[Camera, ...]:
         """The calibrated cameras where they are now; a wrist camera moves."""
-        cameras = []
-        for name in self.camera_names:
-            cameras.append(optics.camera(self._model, self._data, name, self.image_hw))
-        return tuple(cameras)
+        if self._cameras is None:
+            cameras = []
+            for name in self.camera_names:
+                cameras.append(optics.camera(self._model, self._data, name, self.image_hw))
+            self._cameras = tuple(cameras)
+        return self._cameras
 
     def tcp_base(self) -> Float64[np.ndarray, "4 4"]:
         """The gripper's measured pose in the robot base frame."""
@@ -332,10 +339,11 @@ class Env:
         for name, seconds in self._touch.running_s.items():
             running_s[names.index(name)] = seconds
         watch = ContactWatch(self._roles, self._gripper, running_s)
+        timestep = float(model.opt.timestep)
         for row in np.broadcast_to(ctrl, (steps, len(self._ctrl))):
             data.ctrl[self._ctrl] = row
             mujoco.mj_step(model, data)
-            watch.update(data.contact.geom, model.opt.timestep)
+            watch.update(data.contact.geom, timestep)
         self._touch = Touch(
             touched=tuple(names[i] for i in watch.touched),
             pressed_s={names[i]: seconds for i, seconds in watch.pressed_s.items()},
@@ -364,6 +372,7 @@ class Env:
 
         Contacts and the solver's warm start stay as they are.
         """
+        self._cameras = None
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
         for name, disturbance in self._disturbances.items():
@@ -414,9 +423,11 @@ class Env:
         open_ = np.array(self.robot.fingers_open)
         return np.concatenate([joints, closed + gripper * (open_ - closed)])
 
-    def _pose(self, body: str) -> Float64[np.ndarray, "7"]:
-        data = self._data.body(body)
-        return np.concatenate([data.xpos, data.xquat])
+    def _poses(self, bodies: Sequence[str]) -> dict[str, Float64[np.ndarray, "7"]]:
+        """The poses of bodies in the world, by their names."""
+        ids = [self._body_ids[body] for body in bodies]
+        poses = np.concatenate([self._data.xpos[ids], self._data.xquat[ids]], axis=1)
+        return dict(zip(bodies, poses, strict=True))
 
     def _hidden(self) -> frozenset[str]:
         """The objects that are not part of the episode."""

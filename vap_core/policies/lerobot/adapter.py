@@ -158,6 +158,7 @@ class LeRobot:
         """
         if self.batched:
             return list(states), self._plan_batch(states, inputs)
+        self.predict.stay_eager("it has a memory, which is no input of its calls")
         chunks = []
         for i, (state, policy_input) in enumerate(zip(states, inputs, strict=True)):
             chunks.append(self._plan_step(i, state, policy_input))

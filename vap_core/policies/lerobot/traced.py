@@ -4,7 +4,8 @@ Half of a call of a small pi0 is Python around small layers. `torch.jit.trace` w
 tensor operations of one call, and the graph runs them without that Python. Nothing is fused or
 reordered, so the actions are the same bits.
 
-- A trace costs as much as some forty calls save, so the first CALLS_BEFORE_TRACE calls run eagerly.
+- A trace costs as much as some forty calls save, so it waits for CALLS_BEFORE_TRACE eager calls: a
+  process that runs a job or two does not pay for it.
 - One graph serves every batch size, and every length of text of a mini-pi0. The first call of every
   shape runs eagerly as well and is compared; only then does the graph serve that shape.
 - Sampling noise is an input of the graph. The configuration (temperature, denoising steps) is part
@@ -31,7 +32,7 @@ from vap_core.policies.hooks import attention_observed, inputs_observed
 if TYPE_CHECKING:
     from lerobot.policies.pretrained import PreTrainedPolicy
 
-CALLS_BEFORE_TRACE = 40
+CALLS_BEFORE_TRACE = 20
 """Eager calls before a trace is made; see above."""
 NOISE = "noise"
 """The key of the sampling noise among a graph's inputs."""
@@ -112,14 +113,14 @@ class ChunkPredictor:
         if device != "cpu":
             self.stay_eager(f"tracing was tried on the CPU only, not on {device}")
             return
+        others = _shorter_text(inputs)
         try:
             graph = _trace(self.policy, inputs)
+            of_others = _call(self.policy, others)
         except Exception as error:
             self.stay_eager(f"tracing failed ({type(error).__name__}: {_first_line(error)})")
             return
-        others = _shorter_text(inputs)
-        difference = _difference(graph, inputs, chunks)
-        difference = difference or _difference(graph, others, _call(self.policy, others))
+        difference = _difference(graph, inputs, chunks) or _difference(graph, others, of_others)
         if difference:
             self.stay_eager(difference)
             return
