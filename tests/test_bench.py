@@ -320,8 +320,15 @@ def test_the_page_is_what_ships() -> None:
 
 
 def test_the_pictures_bars_are_the_tables() -> None:
-    shipped = measurement.read(measured.shipped("scale"))
-    figure = scale_report.figure(shipped)
+    conditions = []
+    for i, condition in enumerate(scale.CONDITIONS):
+        parts = {"environment": 1.0 + i, "attend": 2.0, "policy": 0.5, "rest": 0.5}
+        cost = Cost(9.0, sum(parts.values()), parts)
+        conditions.append({**asdict(condition), "costs": [asdict(cost)]})
+    workers = [{"label": "1", "seconds": 30.0, "episode_s": 1.0}]
+    values = {"conditions": conditions, "workers": workers, "memory": [(0, 600.0), (50, 900.0)]}
+    found = Measurement("scale", measurement.provenance("a command"), values)
+    figure = scale_report.figure(found)
     titles = [axes.get_title() for axes in figure.axes]
     assert titles == [
         "cameras",
@@ -332,8 +339,8 @@ def test_the_pictures_bars_are_the_tables() -> None:
         "memory of one process",
     ]
     tops = [bar.get_y() + bar.get_height() for bar in figure.axes[0].containers[-1]]
-    quoted = [float(row[2]) for row in scale_report.tables(shipped)[0].rows[1:4]]
-    assert tops == pytest.approx(quoted, abs=0.02, rel=0.05)
+    quoted = [float(row[2]) for row in scale_report.tables(found)[0].rows[1:4]]
+    assert tops == quoted == [2.0, 2.5, 3.0]
 
 
 @pytest.mark.sweep
