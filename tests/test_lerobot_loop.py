@@ -18,8 +18,6 @@ from tests.toys import TOYS, personal, scene
 from vap_core import memory
 from vap_core.attend import Attender
 from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadViews, UnknownName
-from vap_core.cli.bench import eval as bench_eval
-from vap_core.cli.bench import eval_report
 from vap_core.perception.stacks import STACKS, load_stack
 from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.lerobot.step import LeRobotEnv, VapEnvConfig, VapPrompt, attach
@@ -273,21 +271,3 @@ def test_lerobot_eval_runs_it_from_the_command_line(whole, tmp_path, monkeypatch
     said = json.loads((tmp_path / "out" / "eval_info.json").read_text())
     assert said["per_task"][0]["task_group"] == SUITE
     assert list((tmp_path / "out" / "videos").rglob("*.mp4"))
-
-
-@pytest.mark.sweep
-def test_the_bench_runs_both_loops_over_the_same_steps():
-    plan, theirs, ours = bench_eval.measure(bench_eval.QUICK)
-    assert len(theirs) == len(ours) == 2
-    for arm in (*theirs, *ours):
-        assert len(arm.seconds) == plan.repeats
-        assert 0 < sum(arm.parts.values()) <= sum(arm.seconds)
-        assert arm.parts["attend"] > 0
-        assert arm.parts["policy"] > 0
-    said = bench_eval.report(plan, theirs, ours)
-    assert f"n = {plan.episodes} episodes of {plan.steps} steps, {plan.repeats} repeats" in said
-    slow, fast = (
-        bench_eval.Arm("a", dict, [6.0, 3.0], {}),
-        bench_eval.Arm("b", dict, [3.0, 1.0], {}),
-    )
-    assert eval_report.times_as_fast(slow, fast)[0] == f"{6**0.5:.2f}"

@@ -6,6 +6,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from vap_core.cli.bench import eval_report, measured, measurement
 from vap_core.evaluation.diagnosis.failures import list_failures
 from vap_core.evaluation.report.failures import breakdown
 from vap_core.evaluation.report.results import results
@@ -84,3 +85,25 @@ def test_what_the_true_mask_at_every_step_reaches() -> None:
         f"simpler-fractal {matching} and {variants}, simpler-bridge {bridge}, "
         f"vlabench {vlabench}, tabletop {tabletop} %." in text
     )
+
+
+def test_times_as_fast_as_lerobots_loop() -> None:
+    _, *body = rows("| times as fast as lerobot's loop")
+    quoted = [cells[1:] for cells in body]
+    if not measured.shipped("eval").exists():
+        assert quoted == [["not measured yet"] * 2] * 4
+        return
+    found = measurement.read(measured.shipped("eval"))
+    held = []
+    for clock in (eval_report.EQUAL, eval_report.WALL):
+        for ours in ("every step", "at calls"):
+            cells = []
+            for theirs in ("as it comes", "best"):
+                ratio = eval_report.speed_up(found.values, clock, ours, theirs)
+                cells.append(eval_report.in_brackets(ratio))
+            held.append(cells)
+    assert quoted == held
+    about = found.provenance
+    assert f"({about['task']}, n = {about['n']}, {about['repeats']} repeats)" in README
+    assert eval_report.lerobot_codes(found.values)[0].startswith("c54403c")
+    assert found.values["workers"] == 2

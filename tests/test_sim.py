@@ -57,6 +57,31 @@ def test_a_known_slab_covers_the_computable_number_of_pixels():
     assert centre == pytest.approx([112, 112], abs=0.6)
 
 
+def test_a_view_need_not_be_square():
+    """Half as high at the same angle: half the focal length, and a quarter of the pixels."""
+    model = mujoco.MjModel.from_xml_string(SLAB)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    with cameras.Renderer(model, ("slab",)) as renderer:
+        square = renderer.masks(data, "down", 448)["slab"]
+        seen = renderer.masks(data, "down", (224, 300))["slab"]
+        assert renderer.rgb(data, "down", (224, 300)).shape == (224, 300, 3)
+    assert seen.shape == (224, 300)
+    assert seen.sum() == pytest.approx(square.sum() / 4, rel=0.02)
+    assert np.argwhere(seen).mean(axis=0) + 0.5 == pytest.approx([112, 150], abs=0.6)
+
+
+def test_an_environment_gives_views_of_height_and_width(scene, row):
+    env = Env(scene, image_size=(48, 64))
+    env.reset(row)
+    for camera in env.cameras():
+        assert env.observe().images[camera.name].shape == (48, 64, 3)
+        assert (camera.height, camera.width) == (48, 64)
+        assert camera.k[:2, 2].tolist() == [32, 24]
+        for mask in env.truth(masks=True).masks[camera.name].values():
+            assert mask.shape == (48, 64)
+
+
 def test_projection_and_backprojection_are_inverse(scene, row):
     env = Env(scene)
     env.reset(row)

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from vap_core.base.errors import BadCluster
+from vap_core.base.errors import BadCluster, BadStudy
 from vap_core.base.tables import align
 from vap_core.cli.bench.timing import seconds_of
 from vap_core.evaluation import cluster, engine
@@ -23,6 +23,9 @@ from vap_core.simulation.suites import suite
 
 SUITE = "simpler-bridge"
 REPEATS = 4
+
+Arrival = tuple[float, int]
+"""When a job finished, in seconds, and how many episodes it had."""
 
 
 @contextmanager
@@ -52,18 +55,15 @@ def local_cluster(cpus: int) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class EngineRun:
-    """What a run took: seconds in all, and seconds an episode beyond start-up.
-
-    Beyond start-up is from when every worker has finished a job to the end.
-    """
+    """What a run took: seconds in all, and seconds an episode beyond start-up."""
 
     seconds: float
     episode_s: float
 
 
 def time_run(study: Study, folder: Path, workers: int, executor: engine.Executor) -> EngineRun:
-    """Run a study; its jobs must be more than the workers."""
-    arrivals: list[tuple[float, int]] = []
+    """Run a study. Raises: BadStudy when its jobs are not more than the workers."""
+    arrivals: list[Arrival] = []
 
     def noting(
         work: Callable[[Job], Rows], jobs: Sequence[Job], workers: int, remedy: str
@@ -76,10 +76,20 @@ def time_run(study: Study, folder: Path, workers: int, executor: engine.Executor
         engine.run(study, folder, workers=workers, record="none", progress=False, executor=noting)
 
     seconds = seconds_of(whole_run)
+    return EngineRun(seconds, seconds_beyond_start_up(arrivals, workers))
+
+
+def seconds_beyond_start_up(arrivals: Sequence[Arrival], workers: int) -> float:
+    """Seconds an episode from when as many jobs as workers have finished. Raises: BadStudy."""
+    if len(arrivals) <= workers:
+        raise BadStudy(
+            f"bench: {len(arrivals)} jobs for {workers} workers leave nothing beyond start-up; "
+            "give fewer --workers."
+        )
     first, _ = arrivals[workers - 1]
     last, _ = arrivals[-1]
     episodes = sum(n for _, n in arrivals[workers:])
-    return EngineRun(seconds, (last - first) / episodes)
+    return (last - first) / episodes
 
 
 def run(workers: int = 2, quick: bool = False) -> str:
@@ -105,12 +115,12 @@ def run(workers: int = 2, quick: bool = False) -> str:
 
 
 def _study(quick: bool) -> Study:
-    """Some episodes of every task; `quick`, one episode of one."""
+    """Some episodes of every task; `quick`, a few of two."""
     tasks = tuple((SUITE, task.name) for task in suite(SUITE).tasks)
     study = Study(tasks, ("generic", "vap"), episodes=5, follow="call")
     if not quick:
         return study
-    # Six episodes a task are two jobs, one more than the worker of a smoke test.
+    # Six episodes of each of two tasks are four jobs, more than two workers.
     return replace(study, tasks=tasks[:2], policy="random", methods=("generic",), episodes=6)
 
 

@@ -4,7 +4,7 @@ import json
 import os
 import subprocess
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -71,8 +71,10 @@ class LoopProcess:
     def run(self, **arm: Any) -> Cost:
         """One evaluation of all episodes: n_envs, in_processes, threads, videos."""
         assert self._process.stdin is not None
-        self._process.stdin.write(json.dumps(arm) + "\n")
-        self._process.stdin.flush()
+        # Where the process has died, the answer says why.
+        with suppress(BrokenPipeError):
+            self._process.stdin.write(json.dumps(arm) + "\n")
+            self._process.stdin.flush()
         return Cost(**self._answer())
 
     def _answer(self) -> dict[str, Any]:

@@ -40,9 +40,10 @@ def _run(plan: tuple[int, int, Path]) -> Series:
         run_job(job)
         shutil.rmtree(folder / "recordings", ignore_errors=True)
         done += len(job.rows)
-        if done % every == 0:
+        over = done >= episodes
+        if over or done % every == 0:
             series.append((done, resident_mb()))
-        if done >= episodes:
+        if over:
             return series
     raise AssertionError("a suite has tasks")
 

@@ -38,7 +38,7 @@ from vap_core.simulation.types import EpisodeRow, Placement
 
 SUITE, TASK = "vlabench", "select-cup"
 LOOKALIKES = tuple(f"paper-cup-lookalike-{i}" for i in range(1, 7))
-APART_M = 0.12
+APART_M = 0.09
 """The least distance between two objects."""
 STEPS = 20
 EPISODES = 2
