@@ -19,7 +19,8 @@ SECTIONS: dict[str, tuple[str, Callable[[Measurement], list[Table]]]] = {
 HEADER = """# What is measured
 
 Made by `python -m vap_core bench measured` from `data/results/bench_*.json`; the commands below
-write these by `--json FILE`, and what has not been measured is left out. Times are of the machine that is named; compare ratios."""
+write these by `--json FILE`, and what has not been measured is left out. Times are of the machine
+that is named; compare ratios."""
 
 
 def shipped(bench: str) -> Path:
