@@ -88,6 +88,7 @@ def session_options() -> Any:
     options.inter_op_num_threads = 1
     options.execution_mode = ExecutionMode.ORT_SEQUENTIAL
     options.use_deterministic_compute = True
+    options.enable_cpu_mem_arena = False  # an arena is no faster here, and keeps 35 MB
     options.log_severity_level = 3  # errors only
     return options
 
