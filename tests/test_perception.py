@@ -285,7 +285,7 @@ def test_suppression_is_torchvisions(seed: int, n: int) -> None:
     rng = np.random.default_rng(seed)
     corner = rng.integers(0, 40, (n, 2))
     xyxy = np.concatenate([corner, corner + rng.integers(1, 40, (n, 2))], 1).astype(np.float32)
-    score = (rng.integers(0, 20, n) / 20).astype(np.float32)  # some of them equal
+    score = (rng.integers(1, 21, n) / 20).astype(np.float32)  # some of them equal
     kept = nms(torch.from_numpy(xyxy), torch.from_numpy(score), NMS_IOU)[:MAX_BOXES]
     assert suppress_overlaps(xyxy, score).tolist() == kept.tolist()
 

@@ -3,6 +3,7 @@
 Boxes are `x0 y0 x1 y1` in pixels, far corner exclusive.
 """
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 
@@ -45,17 +46,16 @@ def box_iou(a: Float[np.ndarray, "n 4"], b: Float[np.ndarray, "m 4"]) -> Float[n
 def suppress_overlaps(
     xyxy: Float32[np.ndarray, "n 4"], score: Float32[np.ndarray, " n"]
 ) -> Int64[np.ndarray, " k"]:
-    """Non-maximum suppression: indices of at most `MAX_BOXES` boxes, best first."""
-    kept: list[int] = []
-    suppressed = np.zeros(len(score), bool)
-    for i in np.argsort(-score, kind="stable"):
-        if suppressed[i]:
-            continue
-        kept.append(int(i))
-        if len(kept) == MAX_BOXES:
-            break
-        suppressed |= box_iou(xyxy[[i]], xyxy)[0] > NMS_IOU
-    return np.array(kept, np.int64)
+    """Non-maximum suppression: indices of at most `MAX_BOXES` boxes, best first; scores are above 0."""
+    # OpenCV's, which is imported anyway: torchvision's takes 1.5 s to import, and finds the same.
+    xywh = np.concatenate([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]], axis=1)
+    kept = cv2.dnn.NMSBoxes(
+        bboxes=xywh.tolist(),
+        scores=score.tolist(),
+        score_threshold=0.0,
+        nms_threshold=NMS_IOU,
+    )
+    return np.asarray(kept, np.int64).reshape(-1)[:MAX_BOXES]
 
 
 def mask_iou(one: Mask, other: Mask) -> float:
