@@ -122,6 +122,20 @@ def test_a_memory_from_before_descriptions_still_loads(tmp_path: Path) -> None:
     assert load(path).description is None
 
 
+@pytest.mark.parametrize("where", ["header", "description"])
+def test_json_nested_too_deep_is_said(tmp_path: Path, where: str) -> None:
+    deep = "[" * 100_000
+    path = save(tmp_path, personal("mug", "cup", TEAL))
+    data = path.read_bytes()
+    (size,) = struct.unpack("<Q", data[:8])
+    header = json.loads(data[8 : 8 + size])
+    header["__metadata__"]["description"] = deep
+    text = (deep if where == "header" else json.dumps(header)).encode()
+    path.write_bytes(struct.pack("<Q", len(text)) + text + data[8 + size :])
+    with pytest.raises(BadMemory, match="register the object again"):
+        load(path)
+
+
 @pytest.mark.parametrize(
     "odd", ['"[1]"', '"{}"', '"null"', r'"{\"short\": 3, \"long\": \"x\"}"', '"not json"']
 )

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from vap_core.base.errors import BadMemory, BadOutput, BadPhoto, UnknownName, one_of
-from vap_core.base.files import write_atomic
+from vap_core.base.files import parse_json, write_atomic
 from vap_core.base.photos import load_photo as load_photo
 from vap_core.base.types import Description, PersonalObject, Rgb, Target
 from vap_core.perception.boxes import crop
@@ -181,7 +181,7 @@ def load(path: Path, encoder: str | None = None) -> PersonalObject:
                 crops.append(tensors[key])
         description = None
         if "description" in header:
-            description = Description(**json.loads(header["description"]))
+            description = Description(**parse_json(header["description"]))
         return PersonalObject(
             name=header["name"],
             category=header["category"],
@@ -223,7 +223,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     )
     try:
         (size,) = struct.unpack("<Q", data[:8])
-        header = json.loads(data[8 : 8 + size]).get("__metadata__", {})
+        header = parse_json(data[8 : 8 + size]).get("__metadata__", {})
         tensors = decode(data)
     except damaged as error:
         raise BadMemory(f"load: {path} is damaged ({type(error).__name__}); {AGAIN}.") from error
