@@ -174,6 +174,14 @@ def load(path: Path, encoder: str | None = None) -> PersonalObject:
             f"load: {path} was embedded by {header.get('encoder')!r}, this stack uses {encoder!r}; "
             f"{AGAIN}."
         )
+    name, category = str(header.get("name")), str(header.get("category"))
+    if path.name != f"{name}{SUFFIX}" or not NAME.fullmatch(name):
+        raise BadMemory(
+            f"load: {path} holds an object named {name[:64]!r}, which is not the file's name; "
+            f"{AGAIN}."
+        )
+    if not CATEGORY.fullmatch(category):
+        raise BadMemory(f"load: {path} has the category {category[:64]!r}; {AGAIN}.")
     try:
         crops = []
         for key in sorted(tensors):
@@ -183,8 +191,8 @@ def load(path: Path, encoder: str | None = None) -> PersonalObject:
         if "description" in header:
             description = Description(**parse_json(header["description"]))
         return PersonalObject(
-            name=header["name"],
-            category=header["category"],
+            name=name,
+            category=category,
             embeddings=tensors["embeddings"],
             crops=tuple(crops),
             encoder=header["encoder"],
