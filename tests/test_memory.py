@@ -123,6 +123,37 @@ def test_a_memory_from_before_descriptions_still_loads(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("field", "value"),
+    [("name", "../../x"), ("name", "cup"), ("name", "\x1b[31mmug"), ("category", "a\x1b[2Jb")],
+)
+def test_a_file_is_not_believed_about_its_name(tmp_path: Path, field: str, value: str) -> None:
+    path = save(tmp_path, personal("mug", "cup", TEAL))
+    data = path.read_bytes()
+    (size,) = struct.unpack("<Q", data[:8])
+    header = json.loads(data[8 : 8 + size])
+    header["__metadata__"][field] = value
+    text = json.dumps(header).encode()
+    path.write_bytes(struct.pack("<Q", len(text)) + text + data[8 + size :])
+    with pytest.raises(BadMemory, match="register the object again") as caught:
+        load_bank(tmp_path)
+    assert "\x1b" not in str(caught.value)
+
+
+@pytest.mark.parametrize("where", ["header", "description"])
+def test_json_nested_too_deep_is_said(tmp_path: Path, where: str) -> None:
+    deep = "[" * 100_000
+    path = save(tmp_path, personal("mug", "cup", TEAL))
+    data = path.read_bytes()
+    (size,) = struct.unpack("<Q", data[:8])
+    header = json.loads(data[8 : 8 + size])
+    header["__metadata__"]["description"] = deep
+    text = (deep if where == "header" else json.dumps(header)).encode()
+    path.write_bytes(struct.pack("<Q", len(text)) + text + data[8 + size :])
+    with pytest.raises(BadMemory, match="register the object again"):
+        load(path)
+
+
+@pytest.mark.parametrize(
     "odd", ['"[1]"', '"{}"', '"null"', r'"{\"short\": 3, \"long\": \"x\"}"', '"not json"']
 )
 def test_a_damaged_description_is_said(tmp_path: Path, odd: str) -> None:

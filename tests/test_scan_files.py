@@ -8,6 +8,7 @@ from PIL import Image
 from tests.scanned import BLUE, EPS, RED, box, fake_ghostscript, mug, put
 from vap_core.base.errors import BadObject
 from vap_core.simulation.assets.scans import import_scan as importing
+from vap_core.simulation.assets.scans.bake import _pack_charts
 from vap_core.simulation.assets.scans.import_scan import import_scan
 from vap_core.simulation.assets.scans.mesh_file import read_mesh_file
 from vap_core.simulation.assets.shapes import Hull
@@ -139,6 +140,24 @@ def test_a_colourless_mesh_asks_for_a_colour(tmp_path, quick):
         import_scan(tmp_path / "mug.obj", "mug", "cup", report=ignore)
     _, scan = import_scan(file, "plain", "box", colour="#aa3322", report=ignore)
     assert (scan.image == (0xAA, 0x33, 0x22)).all()
+
+
+def test_a_surface_that_cannot_be_reduced_is_refused(tmp_path, quick, monkeypatch):
+    monkeypatch.setattr(importing, "MOST_VISUAL_FACES", 9_000)
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.05)
+    order = np.random.default_rng(0).permutation(len(ball.vertices))
+    shuffled = trimesh.Trimesh(ball.vertices[order] * (1, 0.9, 0.8), ball.faces, process=False)
+    file = put(tmp_path, "m.stl", shuffled)
+    with pytest.raises(BadObject, match=r"cannot be reduced to 3,000 faces, [\d,]+ remain"):
+        import_scan(file, "m", "cup", colour="#aa3322", height_cm=9.0, report=ignore)
+
+
+def test_more_charts_than_fit_are_refused():
+    corner = np.zeros((22_000, 3, 2))
+    with pytest.raises(BadObject, match="falls into 22,000 pieces .* a texture holds 21,316"):
+        _pack_charts(np.arange(22_000), corner, 1024)
+    uv = _pack_charts(np.arange(400), np.tile([[0.0, 0], [1, 0], [0, 1]], (400, 1, 1)), 256)
+    assert uv.max() <= 256
 
 
 def test_wrong_units_ask_for_the_height(tmp_path, quick):

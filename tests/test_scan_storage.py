@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from vap_core.base.errors import BadOutput
+from vap_core.base.errors import BadObject, BadOutput
 from vap_core.simulation.assets.scans import storage
 from vap_core.simulation.assets.scans.storage import Scan, ScanMetadata
 from vap_core.simulation.assets.shapes import Hull, Mesh
@@ -60,6 +61,26 @@ def test_a_replacement_killed_between_its_renames_loses_nothing(shelf: Path) -> 
     assert storage.scan_folders() == {"mug": shelf / "mug"}
     assert storage.load_scan(shelf / "mug")[0].mass_kg == 0.3
     assert not (shelf / ".mug.old").exists()
+
+
+@pytest.mark.parametrize(
+    "kind", [zlib.error, NotImplementedError, EOFError, SyntaxError, RuntimeError]
+)
+def test_whatever_a_decoder_raises_is_one_line(
+    shelf: Path, monkeypatch: pytest.MonkeyPatch, kind: type[Exception]
+) -> None:
+    def decode(data: bytes) -> None:
+        raise kind("odd")
+
+    monkeypatch.setattr(storage, "_decode_mesh", decode)
+    with pytest.raises(BadObject, match=r"mesh.npz lacks what an object needs \(odd\)"):
+        storage._load_version(shelf / "mug", -1)
+
+
+def test_metadata_nested_too_deep_is_damaged(shelf: Path) -> None:
+    (shelf / "mug" / "object.json").write_bytes(b"[" * 100_000)
+    with pytest.raises(BadObject, match=r"object.json is damaged"):
+        storage._read_metadata(shelf / "mug")
 
 
 def test_another_process_may_take_the_name_first(

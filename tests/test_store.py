@@ -8,7 +8,16 @@ import pytest
 
 from vap_core.base.errors import BadOutput
 from vap_core.evaluation import store
-from vap_core.evaluation.store import KEY, append, compact, digest, locked, open_run, read
+from vap_core.evaluation.store import (
+    KEY,
+    append,
+    compact,
+    digest,
+    locked,
+    open_run,
+    read,
+    read_manifest,
+)
 
 ROW = {
     "suite": "s",
@@ -115,6 +124,13 @@ def test_foreign_folders_and_files_are_left_alone(tmp_path: Path) -> None:
     (tmp_path / "run" / "run.json").write_text("{")
     with pytest.raises(BadOutput, match="damaged"):
         open_run(tmp_path / "run", {})
+
+
+def test_a_manifest_nested_too_deep_is_damaged(tmp_path: Path) -> None:
+    run = open_run(tmp_path / "run", {})
+    (run / "run.json").write_bytes(b"[" * 100_000)
+    with pytest.raises(BadOutput, match="is absent or damaged"):
+        read_manifest(run)
 
 
 def test_a_run_of_an_older_version_is_said_to_be_one(tmp_path: Path) -> None:

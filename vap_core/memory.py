@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from vap_core.base.errors import BadMemory, BadOutput, BadPhoto, UnknownName, one_of
-from vap_core.base.files import write_atomic
+from vap_core.base.files import parse_json, write_atomic
 from vap_core.base.photos import load_photo as load_photo
 from vap_core.base.types import Description, PersonalObject, Rgb, Target
 from vap_core.perception.boxes import crop
@@ -174,6 +174,14 @@ def load(path: Path, encoder: str | None = None) -> PersonalObject:
             f"load: {path} was embedded by {header.get('encoder')!r}, this stack uses {encoder!r}; "
             f"{AGAIN}."
         )
+    name, category = str(header.get("name")), str(header.get("category"))
+    if path.name != f"{name}{SUFFIX}" or not NAME.fullmatch(name):
+        raise BadMemory(
+            f"load: {path} holds an object named {name[:64]!r}, which is not the file's name; "
+            f"{AGAIN}."
+        )
+    if not CATEGORY.fullmatch(category):
+        raise BadMemory(f"load: {path} has the category {category[:64]!r}; {AGAIN}.")
     try:
         crops = []
         for key in sorted(tensors):
@@ -181,10 +189,10 @@ def load(path: Path, encoder: str | None = None) -> PersonalObject:
                 crops.append(tensors[key])
         description = None
         if "description" in header:
-            description = Description(**json.loads(header["description"]))
+            description = Description(**parse_json(header["description"]))
         return PersonalObject(
-            name=header["name"],
-            category=header["category"],
+            name=name,
+            category=category,
             embeddings=tensors["embeddings"],
             crops=tuple(crops),
             encoder=header["encoder"],
@@ -223,7 +231,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     )
     try:
         (size,) = struct.unpack("<Q", data[:8])
-        header = json.loads(data[8 : 8 + size]).get("__metadata__", {})
+        header = parse_json(data[8 : 8 + size]).get("__metadata__", {})
         tensors = decode(data)
     except damaged as error:
         raise BadMemory(f"load: {path} is damaged ({type(error).__name__}); {AGAIN}.") from error

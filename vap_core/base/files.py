@@ -1,9 +1,11 @@
 """Files that are complete or absent, and where the files that ship with the package are."""
 
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 DATA = Path(__file__).resolve().parents[2] / "data"
@@ -34,3 +36,14 @@ def write_atomic(path: Path, data: bytes, *, replace: bool = True) -> None:
     """Write the whole file, or nothing. Raises: OSError; without `replace` FileExistsError."""
     with replacing(path, replace=replace) as scratch:
         scratch.write_bytes(data)
+
+
+def parse_json(text: str | bytes) -> Any:
+    """What JSON from outside holds.
+
+    Raises: ValueError when it is no JSON, or nested deeper than Python recurses.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("JSON that is nested too deep") from error

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import write_atomic
+from vap_core.base.files import parse_json, write_atomic
 from vap_core.evaluation.store import KEY, read, read_manifest
 from vap_core.simulation import suites
 
@@ -25,7 +25,7 @@ def read_published(path: Path) -> "list[tuple[dict[str, Any], pd.DataFrame]]":
 
     try:
         arrow = pq.read_table(path)
-        manifests = json.loads((arrow.schema.metadata or {})[b"runs"])
+        manifests = parse_json((arrow.schema.metadata or {})[b"runs"])
         table = arrow.to_pandas()
         runs = []
         for manifest in manifests:

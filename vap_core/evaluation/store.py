@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import write_atomic
+from vap_core.base.files import parse_json, write_atomic
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -118,7 +118,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     path = folder / MANIFEST
     damaged = f"run: {path} is absent or damaged; choose another folder, or run again with --out."
     try:
-        manifest = json.loads(path.read_bytes())
+        manifest = parse_json(path.read_bytes())
     except (OSError, ValueError) as error:
         raise BadOutput(damaged) from error
     if not isinstance(manifest, dict) or not {"digest", "configuration"} <= manifest.keys():

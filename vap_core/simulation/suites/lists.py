@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from vap_core.base.errors import BadSuite
-from vap_core.base.files import DATA, write_atomic
+from vap_core.base.files import DATA, parse_json, write_atomic
 from vap_core.simulation.suites.variants import VARIANTS
 from vap_core.simulation.types import EpisodeRow, Placement, SuccessRule
 
@@ -105,7 +105,7 @@ def _manifest(folder: Path, missing_is_empty: bool = False) -> dict[str, Any]:
     if missing_is_empty and not path.exists():
         return {}
     try:
-        manifest = json.loads(path.read_bytes())
+        manifest = parse_json(path.read_bytes())
     except (OSError, ValueError) as error:
         raise BadSuite(
             f"suites: {path} cannot be read; "
@@ -133,7 +133,7 @@ def _to_json(row: EpisodeRow) -> dict[str, Any]:
 def _parse_row(line: str, where: str) -> EpisodeRow:
     """One line as a row, every field checked."""
     try:
-        fields = json.loads(line)
+        fields = parse_json(line)
     except ValueError as error:
         raise BadSuite(f"suites: {where} is not JSON ({error}).") from error
     try:

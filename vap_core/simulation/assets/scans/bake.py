@@ -12,6 +12,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from vap_core.base.errors import BadObject
 from vap_core.base.types import Rgb, value
 from vap_core.simulation.assets.shapes import Mesh
 from vap_core.simulation.assets.triangles import Faces, Vertices, area_vectors
@@ -107,8 +108,17 @@ def _unfold(vertex: Vertices, face: Faces) -> tuple[Int[np.ndarray, " f"], Corne
 
 
 def _pack_charts(chart: Int[np.ndarray, " f"], flat: CornerPoints, side: int) -> CornerPoints:
-    """Charts side by side on shelves, as large as fits the square, a gutter around each; pixels."""
-    count = chart.max() + 1
+    """Charts side by side on shelves, as large as fits the square, a gutter around each; pixels.
+
+    Raises: BadObject when there are more of them than fit at any size.
+    """
+    count = int(chart.max()) + 1
+    most = (side // (2 * GUTTER_PX + 1)) ** 2
+    if count > most:
+        raise BadObject(
+            f"objects: the surface falls into {count:,} pieces that face apart, and a texture "
+            f"holds {most:,}; smooth or remesh it in your 3-D tool."
+        )
     low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
     np.minimum.at(low, chart, flat.min(axis=1))
     np.maximum.at(high, chart, flat.max(axis=1))

@@ -33,6 +33,8 @@ from vap_core.simulation.assets.shapes import Hull
 from vap_core.simulation.assets.triangles import Faces, Vertices, area_vectors, decimate
 
 VISUAL_FACES, TEXTURE_PX, HULLS, HULL_CORNERS = 3000, 1024, 16, 160
+MOST_VISUAL_FACES = 5 * VISUAL_FACES
+"""A surface of which more faces remain than this is refused: it crosses itself all over."""
 SMALLEST_M, LARGEST_M, THINNEST_M = 0.01, 0.6, 0.002
 SLIVER_M3 = 1e-9
 """A convex part of less volume is dropped."""
@@ -210,6 +212,11 @@ def _build_scan(surface: ScannedSurface, report: Callable[[str], None]) -> Scan:
     if len(face) > VISUAL_FACES:
         report(f"reducing {len(face):,} faces to {VISUAL_FACES:,} ...")
         vertex, face = decimate(vertex, face, VISUAL_FACES)
+        if len(face) > MOST_VISUAL_FACES:
+            raise BadObject(
+                f"objects: the surface cannot be reduced to {VISUAL_FACES:,} faces, {len(face):,} "
+                "remain; smooth or remesh it in your 3-D tool."
+            )
         vertex = np.clip(vertex, surface.vertex.min(axis=0), surface.vertex.max(axis=0))
     unchanged = len(face) == len(surface.face)
     if unchanged and surface.uv is not None and surface.picture is not None:

@@ -9,7 +9,6 @@ import io
 import json
 import os
 import shutil
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import lru_cache
@@ -18,9 +17,10 @@ from pathlib import Path
 from tempfile import mkdtemp
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from vap_core.base.errors import BadObject, BadOutput
+from vap_core.base.files import parse_json
 from vap_core.base.types import Rgb, value
 from vap_core.simulation.assets.shapes import Hull, Mesh
 
@@ -211,14 +211,7 @@ def _read_checked(path: Path, digest: str | None) -> bytes:
 def _parse[T](path: Path, data: bytes, decode: Callable[[bytes], T]) -> T:
     try:
         return decode(data)
-    except (
-        KeyError,
-        ValueError,
-        TypeError,
-        OSError,
-        zipfile.BadZipFile,
-        UnidentifiedImageError,
-    ) as error:
+    except Exception as error:  # a damaged file makes the decoders raise anything
         raise BadObject(
             f"objects: {path} lacks what an object needs ({error}); {REMEDY}."
         ) from error
@@ -256,7 +249,7 @@ def _read_metadata(folder: Path) -> tuple[ScanMetadata, dict[str, str]]:
     """What `object.json` says, and the SHA-256 of the other files by their names."""
     path = folder / METADATA_FILE
     try:
-        about = json.loads(path.read_text(encoding="utf-8"))
+        about = parse_json(path.read_text(encoding="utf-8"))
         if (about.pop("format"), about.pop("version")) != (FORMAT, VERSION):
             raise BadObject(
                 f"objects: {path} is of another version than {FORMAT} {VERSION}; {REMEDY}."
