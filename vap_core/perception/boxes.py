@@ -46,8 +46,11 @@ def box_iou(a: Float[np.ndarray, "n 4"], b: Float[np.ndarray, "m 4"]) -> Float[n
 def suppress_overlaps(
     xyxy: Float32[np.ndarray, "n 4"], score: Float32[np.ndarray, " n"]
 ) -> Int64[np.ndarray, " k"]:
-    """Non-maximum suppression: indices of at most `MAX_BOXES` boxes, best first; scores are above 0."""
-    # OpenCV's, which is imported anyway: torchvision's takes 1.5 s to import, and finds the same.
+    """Non-maximum suppression: indices of at most `MAX_BOXES` boxes, best first.
+
+    Scores are above 0.
+    """
+    # torchvision's finds the same, but takes 1.5 s to import.
     xywh = np.concatenate([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]], axis=1)
     kept = cv2.dnn.NMSBoxes(
         bboxes=xywh.tolist(),
