@@ -1,7 +1,8 @@
 .PHONY: setup demo lint check test test-all lab lock clean
 .DEFAULT_GOAL := help
 
-RUN := OMP_NUM_THREADS=1 .venv/bin/python
+# An empty PYTHONDONTWRITEBYTECODE lets Python keep what it compiled; uv compiles nothing.
+RUN := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 .venv/bin/python
 QUIET_LAB := --LabApp.news_url=None --LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate --LabApp.extension_manager=readonly
 PYTEST := $(RUN) -m pytest -n 2 --dist loadfile
 
