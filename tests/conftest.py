@@ -31,9 +31,11 @@ END_TO_END = {
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the slow tests; notebooks and slow modules run first, so that workers end together."""
     for item in items:
         if item.path.stem in END_TO_END:
             item.add_marker(pytest.mark.slow)
+    items.sort(key=lambda item: item.path.suffix == ".py" and item.path.stem not in END_TO_END)
 
 
 settings.register_profile("vap", deadline=None, derandomize=True)

@@ -242,7 +242,7 @@ def test_a_loop_that_ends_early_says_why(tmp_path: Path) -> None:
 
 
 def test_lerobots_loop_needs_only_what_an_earlier_checkout_has() -> None:
-    """Names that lerobot_process.py imports of the package: all are in c54403c."""
+    """Names that lerobot_process.py imports of the package: all are in 1cce9d7."""
     names = set()
     for node in ast.walk(ast.parse(Path(lerobot_process.__file__).read_text())):
         if isinstance(node, ast.ImportFrom) and str(node.module).startswith("vap_core"):

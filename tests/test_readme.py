@@ -105,5 +105,5 @@ def test_times_as_fast_as_lerobots_loop() -> None:
     assert quoted == held
     about = found.provenance
     assert f"({about['task']}, n = {about['n']}, {about['repeats']} repeats)" in README
-    assert eval_report.lerobot_codes(found.values)[0].startswith("c54403c")
+    assert eval_report.lerobot_codes(found.values)[0].startswith("1cce9d7")
     assert found.values["workers"] == 2

@@ -29,7 +29,7 @@ class LoopProcess:
         if not package.is_file():
             raise BadStudy(
                 f"bench eval: {checkout} is no checkout of this package; "
-                "make one: git worktree add DIR c54403c"
+                "make one: git worktree add DIR 1cce9d7"
             )
         folder.mkdir(parents=True)
         self.code = code_version(package.parent)

@@ -3,7 +3,7 @@
     python -P lerobot_process.py FOLDER PLAN.json
 
 `vap_core` is whichever the process finds first, so that the loop of an earlier checkout can be
-timed with PYTHONPATH. Therefore this file takes from the package only what it had at c54403c, and
+timed with PYTHONPATH. Therefore this file takes from the package only what it had at 1cce9d7, and
 the timing helper by its path. It prints {"ready": PATH OF THE PACKAGE}; then, for every line of
 standard input that names an arm (n_envs, in_processes, threads, videos), one line of seconds: wall,
 cpu, and CPU by part. Everything is built and warm before the first; what others print goes to
