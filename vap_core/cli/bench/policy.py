@@ -16,6 +16,7 @@ from vap_core.evaluation.policy_names import MINI, shipped
 from vap_core.evaluation.statistics import ratio
 from vap_core.perception.embedded.backbone import features
 from vap_core.policies.lerobot.adapter import IMAGE, STATE, LeRobot, load_policy
+from vap_core.policies.lerobot.traced import CALLS_BEFORE_TRACE
 from vap_core.policies.protocol import PolicyInput
 from vap_core.simulation.suites import BENCHMARKS
 
@@ -93,18 +94,20 @@ def _gain_text(seconds: dict[int, list[float]], batch: int) -> str:
 
 
 def _call_seconds(policy: LeRobot, rng: np.random.Generator, repeat: int) -> dict[int, list[float]]:
-    """Seconds of a call, by batch size."""
+    """Seconds of a call, by batch size, once the policy is traced."""
     inputs = []
     states = []
     for i in range(max(BATCHES)):
         inputs.append(_draw_input(policy, rng))
         states.append(policy.start(np.random.default_rng(i)))
     seconds: dict[int, list[float]] = {batch: [] for batch in BATCHES}
-    for i in range(WARM + repeat):
+    # The trace is made in one round; in the next one every other batch size is compared with it.
+    warm = CALLS_BEFORE_TRACE // len(BATCHES) + 1 + WARM
+    for i in range(warm + repeat):
         for batch in BATCHES:
             call = partial(policy.plan, states[:batch], inputs[:batch])
             call_seconds = seconds_of(call, time.process_time)
-            if i >= WARM:
+            if i >= warm:
                 seconds[batch].append(call_seconds)
     return seconds
 

@@ -48,7 +48,8 @@ PARTS = (
     Part("tint", ("vap_core.attend:Attender.steps",)),
     Part("policy: image tower", (f"{PI0}:PaliGemmaWithExpertModel.embed_image",)),
     Part("policy: denoising", (f"{PI0}:PI0Pytorch.denoise_step",)),
-    Part("policy: prefix, or all if traced", (f"{PI0}:PI0Policy.predict_action_chunk",)),
+    Part("policy: prefix", (f"{PI0}:PI0Policy.predict_action_chunk",)),
+    Part("policy: traced graph", ("vap_core.policies.lerobot.traced:ChunkPredictor.__call__",)),
     Part("policy: before and after", ("vap_core.policies.lerobot.adapter:LeRobot.plan",)),
     Part(
         "poses, judge",
