@@ -10,7 +10,7 @@ import torch
 from rerun.chunk import RrdReader
 
 from tests import tiny_lerobot as tiny
-from tests.command import process, vap
+from tests.command import vap
 from tests.drawn import SUCCESS, columns, entities, frame, opening, rerun
 from tests.test_why import tabs
 from vap_core.evaluation.methods import METHODS
@@ -221,8 +221,8 @@ def test_a_glow_is_brightest_where_attention_is_most_and_never_leaves_the_pictur
 
 @pytest.mark.slow
 def test_the_real_command_records_it(tmp_path: Path) -> None:
-    done = process("rollout", "--suite", "simpler-bridge", "--task", "pick-shaver", "--policy", "mini-pi0", "--methods", "generic", "--episodes", "1",
-               "--record", "all", "--attention", "--out", tmp_path / "run")  # fmt: skip
+    done = vap("rollout", "--suite", "simpler-bridge", "--task", "pick-shaver", "--policy", "mini-pi0", "--methods", "generic", "--episodes", "1",
+               "--record", "all", "--attention", "--workers", "1", "--out", tmp_path / "run")  # fmt: skip
     assert done.returncode == 0, done.stderr
     (path,) = (tmp_path / "run" / "recordings").glob("*.rrd")
     assert "/vap/attention/front" in {chunk.entity_path for chunk in RrdReader(path).stream()}

@@ -45,12 +45,12 @@ def command(out: Path, episodes: int) -> list[str]:
 def test_it_ends_with_the_whole_table_and_goes_on_from_it(tmp_path: Path) -> None:
     """That a killed run goes on is proven in test_engine."""
     out = tmp_path / "demo"
-    done = subprocess.run(command(out, 2), env=ENV, capture_output=True, text=True, timeout=400)
+    done = subprocess.run(command(out, 1), env=ENV, capture_output=True, text=True, timeout=400)
     assert done.returncode == 0, done.stderr
     _complete(out, done.stdout)
-    again = vap(*command(out, 2)[3:])
+    again = vap(*command(out, 1)[3:])
     assert again.stdout == done.stdout
-    other = vap(*command(out, 1)[3:])
+    other = vap(*command(out, 2)[3:])
     assert other.returncode == 2
     assert "holds another run" in other.stderr
 
@@ -58,7 +58,7 @@ def test_it_ends_with_the_whole_table_and_goes_on_from_it(tmp_path: Path) -> Non
 def _complete(out: Path, printed: str) -> None:
     lines = json.loads((out / "summary.json").read_text())
     assert [(s["suite"], s["method"], s["n"]) for s in lines] == [
-        (suite, m, 2) for suite, _ in DEMO.tasks for m in ("generic", "vap")
+        (suite, m, 1) for suite, _ in DEMO.tasks for m in ("generic", "vap")
     ]
     assert all(
         {"task", "sr", "cmr", "wrong_object", "intervals", "errors"} <= s.keys() for s in lines
@@ -68,8 +68,8 @@ def _complete(out: Path, printed: str) -> None:
     assert "scripted" in printed
     assert (out / "figure.png").stat().st_size > 10_000
     recordings = sorted((out / "recordings").glob("*.rrd"))
-    assert len(recordings) == 8
-    for recording in recordings[::4]:
+    assert len(recordings) == 4
+    for recording in recordings[::2]:
         done = subprocess.run(
             [sys.executable, "-m", "rerun", "rrd", "verify", str(recording)],
             capture_output=True,
@@ -79,7 +79,7 @@ def _complete(out: Path, printed: str) -> None:
     told = {
         (r["suite"], r["episode"], r["method"]): r["success"] for r in read(out).to_dict("records")
     }
-    for recording in recordings[::3]:
+    for recording in recordings:
         said = read_summary(recording)
         assert said["success"] == told[said["suite"], said["episode"], said["method"]]
 
@@ -108,7 +108,7 @@ def same(one: Episode, other: Episode) -> None:
 
 def test_neither_batch_nor_order_nor_global_seeds_change_an_episode(bank: Path) -> None:
     trial = make_trial(STUDY, STUDY.rows(SUITE, TASK), "vap", bank)
-    rows = STUDY.rows(SUITE, TASK)
+    rows = [replace(row, max_steps=20) for row in STUDY.rows(SUITE, TASK)]
     together = list(rollout(trial, rows, batch=3))
     np.random.seed(123)  # noqa: NPY002
     torch.manual_seed(123)

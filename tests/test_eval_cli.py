@@ -20,15 +20,15 @@ SUITE = "simpler-bridge"
 TASKS = [task.name for task in BENCHMARKS[SUITE].tasks]
 
 
-def evaluate(out: Path) -> subprocess.CompletedProcess[str]:
-    return process("eval", "--suite", SUITE, "--policy", "expert", "--episodes", "2", "--out", out)
+def words(out: Path) -> tuple[str | Path, ...]:
+    return ("eval", "--suite", SUITE, "--policy", "expert", "--episodes", "2", "--out", out)
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """A finished evaluation and what it printed."""
     out = tmp_path_factory.mktemp("eval") / "run"
-    done = evaluate(out)
+    done = process(*words(out))
     assert done.returncode == 0, done.stderr
     return out, done.stdout
 
@@ -71,7 +71,7 @@ def test_it_prints_every_task_with_its_rates(run: tuple[Path, str]) -> None:
 def test_a_second_call_runs_nothing_more(run: tuple[Path, str]) -> None:
     out, printed = run
     before = files(out)
-    again = evaluate(out)
+    again = vap(*words(out))
     assert (again.returncode, again.stdout) == (0, printed)
     assert "0/8" not in again.stderr
     after = files(out)

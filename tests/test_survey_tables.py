@@ -1,8 +1,6 @@
 """The survey's figures, its table, and the command that makes them."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyarrow.parquet import read_schema
 
+from tests.command import vap
 from vap_core.base.errors import BadOutput, UnknownName
 from vap_core.evaluation.metrics import rate
 from vap_core.evaluation.perception import run, tracking
@@ -163,9 +162,7 @@ def test_the_command_measures_resumes_and_publishes(tmp_path: Path) -> None:
     out = tmp_path / "run"
     small = ["--quick", "--suite", "simpler-fractal", "--episodes", "1", "--jobs", "1"]
     words = ["eval-perception", *small, "--out", str(out), "--publish", str(tmp_path / "kept")]
-    done = subprocess.run(
-        [sys.executable, "-m", "vap_core", *words], capture_output=True, text=True, timeout=500
-    )
+    done = vap(*words)
     assert done.returncode == 0, done.stderr
     for told in (
         "detection AP50",
