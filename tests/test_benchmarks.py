@@ -20,6 +20,12 @@ from vap_core.simulation.suites import BENCHMARKS, VARIANTS, Suite, Task, rows
 from vap_core.simulation.types import REST, EpisodeRow
 
 TASKS = [(suite.name, task.name) for suite in BENCHMARKS.values() for task in suite.tasks]
+TYPICAL = {
+    (suite.name, task.rule): (suite.name, task.name)
+    for suite in BENCHMARKS.values()
+    for task in suite.tasks
+}
+"""One task of each rule of success in each suite."""
 STILL_M, UPRIGHT_COS = 0.005, np.cos(np.deg2rad(5.0))
 SEEN_PX = 40
 """Of a 224 x 224 picture."""
@@ -61,7 +67,26 @@ def opened(suite: str, task: str, chosen: tuple[EpisodeRow, ...]) -> Bench:
     return Bench(BENCHMARKS[suite], BENCHMARKS[suite].task(task), chosen, scene)
 
 
-@pytest.fixture(scope="module", params=TASKS, ids="/".join)
+PLAYED = (
+    "test_the_expert_solves_it_and_touches_the_right_thing_first",
+    "test_chance_does_not_solve_it",
+)
+"""They play whole episodes: of typical tasks every day, of the others in the sweeps."""
+
+
+def pytest_generate_tests(metafunc):
+    if "bench" not in metafunc.fixturenames:
+        return
+    played, params = metafunc.function.__name__ in PLAYED, []
+    for each in TASKS:
+        daily = not played or each in TYPICAL.values()
+        params.append(pytest.param(each, marks=() if daily else pytest.mark.sweep))
+    metafunc.parametrize(
+        "bench", params, indirect=True, scope="module", ids=["/".join(each) for each in TASKS]
+    )
+
+
+@pytest.fixture(scope="module")
 def bench(request):
     suite, task = request.param
     known = [
