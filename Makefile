@@ -1,4 +1,4 @@
-.PHONY: setup demo lint check test test-all lab lock clean
+.PHONY: setup demo lint style types check test suite test-all lab lock clean
 .DEFAULT_GOAL := help
 
 # An empty PYTHONDONTWRITEBYTECODE lets Python keep what it compiled; uv compiles nothing.
@@ -24,17 +24,25 @@ setup: .venv/.ready
 demo: setup
 	@$(RUN) -m vap_core demo
 
-lint: setup
+lint: style types
+
+style: setup
 	$(RUN) -m ruff check .
 	$(RUN) -m ruff format --check .
+
+types: setup
 	$(RUN) -m mypy
 
 check: lint
 	$(PYTEST) -m "not slow and not alone and not sweep"
 
-test: lint
-	$(PYTEST) -m "not alone and not sweep" --nbval-lax notebooks tests
+# Types are checked beside the first tests; what takes times runs last and alone.
+test: style
+	@$(MAKE) --no-print-directory -j 2 types suite
 	$(RUN) -m pytest -m alone
+
+suite: setup
+	$(PYTEST) -m "not alone and not sweep" --nbval-lax notebooks tests
 
 test-all: test
 	$(RUN) -m pytest -m sweep
