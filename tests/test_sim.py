@@ -71,6 +71,28 @@ def test_a_view_need_not_be_square():
     assert np.argwhere(seen).mean(axis=0) + 0.5 == pytest.approx([112, 150], abs=0.6)
 
 
+def test_masks_of_one_sample_a_pixel_are_those_of_several(scene, row):
+    """Masks are drawn with one sample, pictures with four; asked for in turn, neither changes."""
+
+    class SeveralSamples(cameras.Renderer):
+        def _renderer(self, size, *, masks):
+            renderer = super()._renderer((size[0], size[1]), masks=False)
+            renderer.enable_segmentation_rendering()
+            return renderer
+
+    env = Env(scene)
+    env.reset(row)
+    views, masks = env.observe().images, env.truth(masks=True).masks
+    assert scene.model.vis.quality.offsamples > 1
+    again = env.observe().images
+    assert all((views[camera] == again[camera]).all() for camera in views)
+    with SeveralSamples(scene.model, scene.renderer.objects, scene.renderer.shadows) as several:
+        for camera, of_view in masks.items():
+            wanted = several.masks(env._data, camera, env.image_hw, hidden=env._hidden())
+            assert of_view.keys() == wanted.keys()
+            assert all((of_view[name] == wanted[name]).all() for name in wanted)
+
+
 def test_an_environment_gives_views_of_height_and_width(scene, row):
     env = Env(scene, image_size=(48, 64))
     env.reset(row)
