@@ -5,6 +5,7 @@ object's outline is the simulator's.
 """
 
 import json
+import re
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -26,6 +27,8 @@ VIEWS = 5
 """Photos of an object, as a user takes them."""
 SIZE = 320
 """Pixels of a photo, square."""
+CLAUSES = re.compile(r" with | and |, ")
+"""What stands between the clauses of a description."""
 AT_ONCE = 16
 """Objects that are photographed, and then kept, at a time."""
 
@@ -69,12 +72,12 @@ def describe(models: Sequence[ObjectModel]) -> dict[str, Description]:
 
 
 def distinguishes(described: Mapping[str, Description], names: Sequence[str], length: str) -> bool:
-    """Whether the description of names[0] has a word that each other's description lacks.
+    """Whether the description of names[0] has a clause that each other's description lacks.
 
     `length` is "short" or "long".
     """
-    words = [set(getattr(described[name], length).split()) for name in names]
-    return all(words[0] - others for others in words[1:])
+    clauses = [set(CLAUSES.split(getattr(described[name], length))) for name in names]
+    return all(clauses[0] - others for others in clauses[1:])
 
 
 def _measure(rgb: Rgb, mask: Mask) -> CropAttributes:

@@ -7,6 +7,7 @@ Each is learned in the frozen model that the policy is initialised from, as a so
 import json
 import time
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ OTHERS = 6
 """Photos of objects of other categories."""
 SIZE = 224
 """Pixels of a photo, square."""
-TRAINING = TokenTraining(augmentations=4)
+TRAINING = TokenTraining()
 LEAST_ACCURACY = 0.75
 """A word that tells its object from others in fewer unseen photos is not used."""
 
@@ -65,9 +66,8 @@ def learn_words(
         for name in crew:
             if name not in kept["accuracy"]:
                 started = time.process_time()
-                token = learned_token.learn(
-                    vlm, name, _photos(name, crew, 0), _photos(name, crew, 1), TRAINING
-                )
+                taught, unseen = (_photos(name, crew, seed) for seed in (0, 1))
+                token = learned_token.learn(vlm, name, taught, unseen, TRAINING)
                 learned_token.save(folder, token)
                 kept["accuracy"][name] = token.accuracy
                 kept["cpu_s"] += time.process_time() - started
@@ -79,7 +79,7 @@ def learn_words(
 
 def _photos(name: str, crew: Sequence[str], seed: int) -> Photos:
     """Photos of an object, its look-alikes and other things, none of which is in an evaluation."""
-    rng = np.random.default_rng([80, seed, *name.encode()])
+    rng = np.random.default_rng([80, seed, *crew[0].encode()])
     category = objects.get_object(name).category
     rivals: list[Rgb] = []
     for other in crew:
@@ -90,10 +90,12 @@ def _photos(name: str, crew: Sequence[str], seed: int) -> Photos:
     for kind in rng.choice(kinds, OTHERS, replace=False):
         instance = objects.generic_instance(str(kind), int(rng.integers(TRAIN_INSTANCES)))
         others += _photograph(instance.name, 1, seed)
-    return Photos(tuple(_photograph(name, PHOTOS, seed)), tuple(rivals), tuple(others))
+    return Photos(_photograph(name, PHOTOS, seed), tuple(rivals), tuple(others))
 
 
-def _photograph(name: str, n: int, seed: int) -> list[Rgb]:
+@lru_cache(maxsize=64)
+def _photograph(name: str, n: int, seed: int) -> tuple[Rgb, ...]:
+    """Photos of an object; those of a crew are asked for by each of it."""
     model = objects.get_object(name)
     only_generic([model])
-    return photograph(model, reference_shots(model, n, seed), SIZE)
+    return tuple(photograph(model, reference_shots(model, n, seed), SIZE))
