@@ -30,7 +30,7 @@ OTHERS = 6
 """Photos of objects of other categories."""
 SIZE = 224
 """Pixels of a photo, square."""
-TRAINING = TokenTraining()
+TRAINING = TokenTraining(epochs=8)
 LEAST_ACCURACY = 0.75
 """A word that tells its object from others in fewer unseen photos is not used."""
 
