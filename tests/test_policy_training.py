@@ -1,5 +1,6 @@
 """Training from films: what is taught and how often, what is asked besides, and that a training goes on where it stopped."""
 
+import json
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -144,6 +145,30 @@ def test_a_vision_language_model_learns_and_resumes(
     begun = policy.train(replace(grown, steps=1), tmp_path / "begun", cache=stage[0].parent)
     assert about["taught"]
     assert not begun["taught"], "without a model there is nothing to learn a word in"
+
+
+def test_films_of_what_is_held_out_are_refused(stage: tuple[Path, list[Film]]) -> None:
+    _, films = stage
+    policy._require_trainable(TINY, films)
+    held_out = replace(films[0], task="put-owl-figurine")
+    with pytest.raises(BadOutput, match="the films show put-owl-figurine"):
+        policy._require_trainable(TINY, [*films, held_out])
+    personal = replace(films[0], names=("camera-personal", *films[0].names[1:]))
+    with pytest.raises(ValueError, match="camera-personal belong to evaluation"):
+        policy._require_trainable(TINY, [personal])
+
+
+def test_a_model_that_is_whole_is_not_trained_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+    monkeypatch.setattr(vlm, "train", lambda recipe, *args, **kwargs: calls.append(recipe))
+    card = {"recipe": vars(vlm.Recipe()), "trained_steps": vlm.Recipe().steps - 1}
+    for steps, trained in ((vlm.Recipe().steps - 1, 1), (vlm.Recipe().steps, 0)):
+        calls.clear()
+        (tmp_path / "training.json").write_text(json.dumps(card | {"trained_steps": steps}))
+        assert vlm.make(tmp_path) == tmp_path
+        assert len(calls) == trained
 
 
 def test_a_commands_learned_word_reaches_the_policy(stage: tuple[Path, list[Film]]) -> None:

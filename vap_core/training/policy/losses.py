@@ -20,6 +20,7 @@ from torch.nn import functional as F  # noqa: N812
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.learned_token import WORD
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
+from vap_core.policies.mini_pi0.vlm import MiniVlm
 from vap_core.training.patches import PatchScores, patch_loss
 from vap_core.training.policy.batches import Batch
 
@@ -115,6 +116,20 @@ def embeddings(policy: MiniPI0Policy) -> Tensor:
     """The policy's table of words' embeddings (w x d)."""
     decoder: Any = policy.model.paligemma_with_expert.paligemma.model.language_model
     return decoder.embed_tokens.weight
+
+
+def embedding_cosine(policy: MiniPI0Policy, vlm: MiniVlm | None) -> dict[str, float]:
+    """How alike the embeddings of words are in the policy and in the model that it grew from.
+
+    The mean and the least cosine over words; nothing without a model.
+    """
+    if vlm is None:
+        return {}
+    table: Any = vlm.towers.paligemma.model.language_model
+    cosine = F.cosine_similarity(embeddings(policy), table.embed_tokens.weight, dim=1)
+    # The word that pads has no direction.
+    cosine = cosine[1:]
+    return {"mean": float(cosine.mean()), "least": float(cosine.min())}
 
 
 def losses(

@@ -17,13 +17,12 @@ import numpy as np
 import torch
 from safetensors.torch import load_file
 from torch import Tensor
-from torch.nn import functional as F  # noqa: N812
 
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import DATA, parse_json, write_atomic
 from vap_core.base.version import code_version
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
-from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy, fused_attention
+from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
 from vap_core.policies.mini_pi0.vlm import MiniVlm, initialise_policy, load_vlm, store_in_bfloat16
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import suite
@@ -34,7 +33,7 @@ from vap_core.training.films.scenes import only_generic
 from vap_core.training.patches import model_options
 from vap_core.training.policy.batches import Frames, statistics
 from vap_core.training.policy.commands import Known
-from vap_core.training.policy.losses import Learner, embeddings, losses
+from vap_core.training.policy.losses import Learner, embedding_cosine, losses
 from vap_core.training.policy.taught import learn_words
 from vap_core.training.recipe import Recipe, filmed_tasks
 from vap_core.training.step import Figures, Schedule, average_of, train_steps
@@ -237,20 +236,6 @@ def save(
     }
     write_atomic(out / "training.json", json.dumps(card, indent=1).encode())
     return card
-
-
-def embedding_cosine(policy: MiniPI0Policy, vlm: MiniVlm | None) -> dict[str, float]:
-    """How alike the embeddings of words are in the policy and in the model that it grew from.
-
-    The mean and the least cosine over words; nothing without a model.
-    """
-    if vlm is None:
-        return {}
-    table: Any = vlm.towers.paligemma.model.language_model
-    cosine = F.cosine_similarity(embeddings(policy), table.embed_tokens.weight, dim=1)
-    # The word that pads has no direction.
-    cosine = cosine[1:]
-    return {"mean": float(cosine.mean()), "least": float(cosine.min())}
 
 
 def _prepare_words(
