@@ -14,6 +14,10 @@ PICTURE_FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "GIF", "TIFF", "AVIF")
 All are decoded inside this process. Pillow's list holds others that are not: for EPS it starts
 Ghostscript on the file, whatever the file's suffix.
 """
+PICTURE_SUFFIXES = (
+    *(".jpg", ".jpeg", ".png", ".webp", ".bmp", ".gif"),
+    *(".tif", ".tiff", ".avif"),
+)
 MAX_PIXELS = 50_000_000
 MAX_BYTES = 200_000_000
 LONG_SIDE = 1024
@@ -58,6 +62,11 @@ def load_photo(path: Path | str, long_side: int | None = LONG_SIDE) -> Rgb:
             f"load_photo: {path} cannot be read as an image ({error!s:.150}); export it as JPEG or "
             "PNG."
         ) from error
+
+
+def photos_in(folder: Path) -> list[Path]:
+    """The picture files of a folder by their suffixes, in the order of their names."""
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES)
 
 
 def _check_file(path: Path) -> None:
