@@ -8,7 +8,7 @@ import numpy as np
 from vap_core.base.errors import BadPhoto
 from vap_core.base.types import Rgb
 
-PICTURE_FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "GIF", "TIFF", "AVIF")
+PICTURE_FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "GIF", "TIFF", "AVIF", "HEIF")
 """What Pillow may open of files from outside.
 
 All are decoded inside this process. Pillow's list holds others that are not: for EPS it starts
@@ -16,7 +16,7 @@ Ghostscript on the file, whatever the file's suffix.
 """
 PICTURE_SUFFIXES = (
     *(".jpg", ".jpeg", ".png", ".webp", ".bmp", ".gif"),
-    *(".tif", ".tiff", ".avif"),
+    *(".tif", ".tiff", ".avif", ".heic", ".heif"),
 )
 MAX_PIXELS = 50_000_000
 MAX_BYTES = 200_000_000
@@ -31,9 +31,11 @@ def load_photo(path: Path | str, long_side: int | None = LONG_SIDE) -> Rgb:
         BadPhoto: missing, empty, not an image, truncated, or more than 50 megapixels.
     """
     from PIL import Image, ImageOps, UnidentifiedImageError
+    from pillow_heif import register_heif_opener
 
     path = Path(path)
     _check_file(path)
+    register_heif_opener(thumbnails=False)
     try:
         with path.open("rb") as file, Image.open(file, formats=PICTURE_FORMATS) as image:
             if image.width * image.height > MAX_PIXELS:
