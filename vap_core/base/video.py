@@ -16,6 +16,8 @@ from vap_core.base.types import Rgb
 SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 MAX_FRAMES = 3600
 """Two minutes at 30 frames a second: longer clips are read so far."""
+USUAL_HZ = 10
+"""Frames a second of a video that does not say."""
 SHARPNESS_SIDE = 512
 """Frames are compared at this size, so that sharpness does not depend on resolution."""
 
@@ -120,11 +122,12 @@ def frame_rate(path: Path) -> float:
 
     try:
         with av.open(str(path)) as container:
-            return float(container.streams.video[0].average_rate or 10)
+            hz = container.streams.video[0].average_rate
     except (av.FFmpegError, IndexError, OSError) as error:
         raise BadPhoto(
             f"video: {path} cannot be decoded ({error!s:.120}); export the clip as MP4."
         ) from error
+    return float(hz or USUAL_HZ)
 
 
 def _picture(frame: "av.VideoFrame", long_side: int | None) -> Rgb:
