@@ -35,7 +35,7 @@ def folder(tmp_path: Path) -> Path:
     (tmp_path / "set" / "objects.csv").write_text("object,category\nmug,cup\nold_mug,cup\n")
     (tmp_path / "set" / "scenes.csv").write_text(
         HEADER + "a.png,mug,4,4,16,16\na.png,old_mug,40,4,52,16\na.png,ball,4,40,16,52\n"
-        "a.png,plant,,,,\nb.png,mug,,,,\nb.png,old_mug,4,4,16,16\nb.png,plant,44,44,64,64\n"
+        "a.png,plant,,,,\nb.png,mug,,,,\nb.png,old_mug,4,4,16,16\nb.png,plant,43,43,55,55\n"
     )
     return tmp_path / "set"
 
@@ -158,7 +158,7 @@ def test_rows_count_what_they_say():
         ["plant", "cup", "0", "0", "0", "0", "0", "1", "0"],
         ["all", "", "3", "1", "2", "1", "1", "2", "1"],
     ]
-    by_name = {cells[0].strip(): cells[1:] for cells in scene_rows(table)[1:]}
+    by_name = {cells[0].strip("- "): cells[1:] for cells in scene_rows(table)[1:]}
     assert by_name["object in view"][0].startswith("67 ")
     assert by_name["object in view"][1].startswith("33 ")
     assert by_name["beside look-alikes"][3].startswith("100 ")

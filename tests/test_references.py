@@ -1,5 +1,6 @@
 """Registering from photos: which box is cropped, when it stops, and what it says of the vote."""
 
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from PIL import Image
 
 from tests.toys import MeanColour, SameColour, detector, scene, segmenter
+from vap_core.analysis import drag_box, dragged_box
 from vap_core.base import video
 from vap_core.base.errors import BadPhoto
 from vap_core.base.photos import load_photo
@@ -119,10 +121,12 @@ def test_leave_one_out_finds_what_the_references_confuse():
     assert (fine.right, fine.n, fine.others, fine.background, fine.by_name) == (3, 3, 1, 0, ())
     assert fine.margin > 0.9
     assert "3 of 3 are elected" in str(fine)
-    mixed = [*mine[:2], scene([(26, 26, GREEN)])]
-    odd = remember("mug", "cup", [crop for crop in mixed], MeanColour())
-    wrong = leave_one_out(odd, (), {"plant": other}, MeanColour())
-    assert wrong.right < 3
+    mixed = [*mine, *mine[:1], scene([(26, 26, (100, 200, 0))])]
+    odd = remember("mug", "cup", mixed, MeanColour())
+    olive = remember("plant", "plant", [scene([(6, 6, (120, 200, 0))])], MeanColour())
+    wrong = leave_one_out(odd, (), {"plant": olive}, MeanColour())
+    assert (wrong.right, wrong.n) == (4, 5)
+    assert wrong.margin < 0
     assert wrong.by_name == ("plant",)
     few = remember("mug", "cup", mine[:2], MeanColour())
     assert "give 3 or more" in str(leave_one_out(few, (), {"plant": other}, MeanColour()))
@@ -146,7 +150,7 @@ def test_a_video_gives_sharp_frames_spread_over_it(tmp_path):
     for i in (2, 7, 9):
         clip[i] = sharp
     path = tmp_path / "mug.mp4"
-    with video.Mp4(path, hz=10) as file:
+    with video.Mp4(path, hz=10.0) as file:
         for rgb in clip:
             file.add(rgb)
     chosen = video.sharp_frames(path, 3)
@@ -190,3 +194,19 @@ def test_a_folder_gives_its_pictures(tmp_path):
         registering.gather_photos([tmp_path / "empty"])
     with pytest.raises(BadPhoto, match="no photos"):
         registering.choose([], "cup", STACK, {}, whole=False)
+
+
+@pytest.mark.parametrize("size", [200, 1600])
+def test_the_box_that_is_dragged_is_the_photos(size):
+    photo = scene([(20, 20, RED)], size=size, side=40)
+    box = np.array([20, 20, 60, 60], np.float32)
+    widget = drag_box(photo, box, "mug")
+    shown = Image.open(BytesIO(widget.image_bytes))
+    assert max(shown.size) == min(size, 800)
+    assert dragged_box(widget, photo) == pytest.approx(box)
+    scale = shown.size[0] / size
+    moved = {"x": -5, "y": 10 * scale, "width": 5 + 30 * scale, "height": 20 * scale}
+    widget.bboxes = [*widget.bboxes, moved | {"label": "mug"}]
+    assert dragged_box(widget, photo) == pytest.approx([0, 10, 30, 30])
+    widget.bboxes = []
+    assert dragged_box(widget, photo) is None

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int64
 
 from vap_core.base.types import Boxes, Rgb, value
 from vap_core.perception.boxes import box_iou, crop
@@ -18,13 +18,15 @@ THRESHOLD = 0.05
 """Photos of the object show one of its kind, so a box needs a lower score than a proposal does."""
 MOST_BOXES = 12
 """Boxes of a photo that are compared."""
-SCORE_WEIGHT, CENTRE_WEIGHT, AREA_WEIGHT = 0.05, 0.3, 0.05
+SCORE_WEIGHT, CENTRE_WEIGHT, AREA_WEIGHT = 0.1, 0.3, 0.02
 """Of log score, distance from the photo's centre (in its sides) and log share of its area, beside
 the cosine to the other photos."""
-RIVAL_IOU = 0.1
-"""A box that overlaps the chosen one by less shows something else."""
-CLOSE = 0.03
-"""Something else that scores nearer to the chosen box than this makes the choice doubtful."""
+ELSEWHERE_IOU, RIVAL_IOU = 0.1, 0.5
+"""A box that overlaps the chosen one by less than the first shows something else; by less than the
+second, it would be another crop."""
+CLOSE, CLOSE_ALONE = 0.05, 0.1
+"""Another crop that scores nearer to the chosen one than this makes it doubtful; the second holds
+for a single photo."""
 LEAST_COSINE = 0.5
 """Mean cosine to the best boxes of the other photos, below which the choice is doubtful."""
 SMALL_PX = 64
@@ -118,10 +120,10 @@ def _choose(
     score = _prior(photo, boxes) + np.nan_to_num(support)
     best = 0 if is_given else int(score.argmax())
     overlap = box_iou(boxes.xyxy[best : best + 1], boxes.xyxy)[0]
-    elsewhere = np.flatnonzero(overlap < RIVAL_IOU)
+    elsewhere = np.flatnonzero(overlap < ELSEWHERE_IOU)
     doubt = ""
     if not is_given:
-        doubt = _doubt(score, support, best, elsewhere)
+        doubt = _doubt(score, float(support[best]), best, np.flatnonzero(overlap < RIVAL_IOU))
     return Reference(
         photo=photo,
         box=boxes.xyxy[best],
@@ -147,14 +149,13 @@ def _prior(photo: Rgb, boxes: Boxes) -> Float[np.ndarray, " n"]:
 
 
 def _doubt(
-    score: Float[np.ndarray, " n"],
-    support: Float[np.ndarray, " n"],
-    best: int,
-    elsewhere: np.ndarray,
+    score: Float[np.ndarray, " n"], support: float, best: int, rivals: Int64[np.ndarray, " _r"]
 ) -> str:
-    if support[best] < LEAST_COSINE:
-        return f"what was found is unlike the other photos (cosine {support[best]:.2f})"
-    if len(elsewhere) and score[elsewhere].max() > score[best] - CLOSE:
+    """Why the best box may be wrong; `support` is nan for a single photo."""
+    if support < LEAST_COSINE:
+        return f"what was found is unlike the other photos (cosine {support:.2f})"
+    close = CLOSE_ALONE if np.isnan(support) else CLOSE
+    if len(rivals) and score[rivals].max() > score[best] - close:
         return "two things in it could be meant"
     return ""
 

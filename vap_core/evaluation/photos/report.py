@@ -1,6 +1,6 @@
 """The figures of a photo set as text: grounding per object and per kind of scene, and the vote."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,31 +47,22 @@ def object_rows(table: "pd.DataFrame") -> Rows:
 def scene_rows(table: "pd.DataFrame") -> Rows:
     """One line per kind of scene: with the object and without, with look-alikes and without."""
     rows = [["scenes", "proposed", "right", "right at IoU .25", "wrong tinted", "silent"]]
-    some = table.lookalikes > 0
-    kinds = {
-        "object in view": table.present,
-        "  beside look-alikes": table.present & some,
-        "  alone of its kind": table.present & ~some,
-        "object absent": ~table.present,
-        "  look-alikes in view": ~table.present & some,
-        "  none of its kind": ~table.present & ~some,
-    }
-    for name, chosen in kinds.items():
-        part = table[chosen]
-        scenes = part.scene.to_numpy()
-        cells = [name]
-        if "absent" in name or name.startswith("  look") or name.startswith("  none"):
-            cells += ["", "", ""]
-        else:
-            for hits in (
-                part.proposed_iou >= RIGHT_IOU,
-                part.iou >= RIGHT_IOU,
-                part.iou >= LOOSE_IOU,
-            ):
-                cells.append(clustered_share(hits.to_numpy(float), scenes).text(digits=0))
-        for hits in (part.tinted & (part.iou < RIGHT_IOU), ~part.tinted):
-            cells.append(clustered_share(hits.to_numpy(float), scenes).text(digits=0))
-        rows.append(cells)
+    seen, absent = table[table.present], table[~table.present]
+    kinds = (
+        ("object in view", seen),
+        ("- beside look-alikes", seen[seen.lookalikes > 0]),
+        ("- alone of its kind", seen[seen.lookalikes == 0]),
+        ("object absent", absent),
+        ("- look-alikes in view", absent[absent.lookalikes > 0]),
+        ("- none of its kind", absent[absent.lookalikes == 0]),
+    )
+    for number, (name, part) in enumerate(kinds):
+        right = part.iou >= RIGHT_IOU
+        measures = [part.proposed_iou >= RIGHT_IOU, right, part.iou >= LOOSE_IOU]
+        cells = [_share(hits, part) for hits in measures]
+        if number >= 3:
+            cells = ["", "", ""]
+        rows.append([name, *cells, _share(part.tinted & ~right, part), _share(~part.tinted, part)])
     return rows
 
 
@@ -87,15 +78,14 @@ def vote_rows(table: "pd.DataFrame") -> Rows:
             rows.append([*cells, "-", "-", "-", "-"])
             continue
         boxes = known[f"{among}_boxes"].to_numpy(float)
-        scenes = known.scene.to_numpy()
         cells += [f"{boxes.mean():.1f}", f"{100 * (1 / boxes).mean():.0f}"]
         for column in (f"{among}_one", f"{among}_every"):
-            cells.append(clustered_share(known[column].to_numpy(float), scenes).text(digits=0))
+            cells.append(_share(known[column], known))
         rows.append(cells)
     return rows
 
 
-def clustered_share(hits: Float64[np.ndarray, " n"], clusters: Sequence[object]) -> Estimate:
+def clustered_share(hits: Float64[np.ndarray, " n"], clusters: Iterable[object]) -> Estimate:
     """The mean of hits (0 to 1) and its 95 % interval when whole clusters are independent.
 
     Wilson's interval for n / d cases, where the design effect d is the mean's cluster-robust
@@ -106,7 +96,7 @@ def clustered_share(hits: Float64[np.ndarray, " n"], clusters: Sequence[object])
     if not n:
         return NONE
     share = float(hits.mean())
-    _, number = np.unique(np.asarray(clusters, dtype=str), return_inverse=True)
+    _, number = np.unique([str(name) for name in clusters], return_inverse=True)
     count = int(number.max()) + 1
     independent = share * (1 - share) / n
     worth = float(count)
@@ -125,6 +115,11 @@ def clustered_share(hits: Float64[np.ndarray, " n"], clusters: Sequence[object])
         high=min(1.0, float(centre + half)),
         n=n,
     )
+
+
+def _share(hits: "pd.Series", part: "pd.DataFrame") -> str:
+    """The share of hits with its interval, scenes as clusters."""
+    return clustered_share(hits.to_numpy(float), part.scene).text(digits=0)
 
 
 def _counts(part: "pd.DataFrame") -> list[str]:
