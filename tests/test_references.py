@@ -196,6 +196,9 @@ def test_a_folder_gives_its_pictures(tmp_path):
         registering.choose([], "cup", STACK, {}, whole=False)
 
 
+@pytest.mark.filterwarnings(
+    "ignore:Traits should be given as instances"
+)  # the widget library's own
 @pytest.mark.parametrize("size", [200, 1600])
 def test_the_box_that_is_dragged_is_the_photos(size):
     photo = scene([(20, 20, RED)], size=size, side=40)

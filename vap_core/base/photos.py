@@ -8,12 +8,14 @@ import numpy as np
 from vap_core.base.errors import BadPhoto
 from vap_core.base.types import Rgb
 
-PICTURE_FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "GIF", "TIFF", "AVIF", "HEIF")
+PICTURE_FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "GIF", "TIFF", "AVIF")
 """What Pillow may open of files from outside.
 
 All are decoded inside this process. Pillow's list holds others that are not: for EPS it starts
 Ghostscript on the file, whatever the file's suffix.
 """
+PHOTO_FORMATS = (*PICTURE_FORMATS, "HEIF")
+"""Of a user's photos; HEIF, which phones write, needs a plugin."""
 PICTURE_SUFFIXES = (
     *(".jpg", ".jpeg", ".png", ".webp", ".bmp", ".gif"),
     *(".tif", ".tiff", ".avif", ".heic", ".heif"),
@@ -37,7 +39,7 @@ def load_photo(path: Path | str, long_side: int | None = LONG_SIDE) -> Rgb:
     _check_file(path)
     register_heif_opener(thumbnails=False)
     try:
-        with path.open("rb") as file, Image.open(file, formats=PICTURE_FORMATS) as image:
+        with path.open("rb") as file, Image.open(file, formats=PHOTO_FORMATS) as image:
             if image.width * image.height > MAX_PIXELS:
                 raise BadPhoto(
                     f"load_photo: {path} has {image.width}x{image.height} pixels, over "
@@ -57,7 +59,7 @@ def load_photo(path: Path | str, long_side: int | None = LONG_SIDE) -> Rgb:
     except UnidentifiedImageError as error:
         raise BadPhoto(
             f"load_photo: {path} cannot be read as an image, it is none of "
-            f"{', '.join(PICTURE_FORMATS)}; export it as JPEG or PNG."
+            f"{', '.join(PHOTO_FORMATS)}; export it as JPEG or PNG."
         ) from error
     except Exception as error:  # a damaged file makes the decoders raise anything
         raise BadPhoto(

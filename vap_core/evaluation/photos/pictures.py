@@ -26,12 +26,12 @@ def join_tiles(tiles: Sequence[Rgb], columns: int = COLUMNS) -> Rgb:
     return out
 
 
-def fit(rgb: Rgb, side: int) -> tuple[Rgb, float]:
-    """The picture shrunk into a square of `side` pixels, and by how much."""
-    scale = side / max(rgb.shape[:2])
+def fit(rgb: Rgb, width: int, height: int) -> tuple[Rgb, float]:
+    """The picture scaled to fit into a white tile, at its top left corner, and by how much."""
+    scale = min(width / rgb.shape[1], height / rgb.shape[0])
     size = (max(1, round(rgb.shape[1] * scale)), max(1, round(rgb.shape[0] * scale)))
     method = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    out = np.full((side, side, 3), 255, np.uint8)
+    out = np.full((height, width, 3), 255, np.uint8)
     small = cv2.resize(rgb, size, interpolation=method)
     out[: small.shape[0], : small.shape[1]] = small
     return out, scale

@@ -140,10 +140,10 @@ def write_sheet(path: Path, references: Sequence[Reference], photos: Sequence[Pa
     """A picture of every photo with its box, and of its crop beside it. Raises: BadOutput."""
     tiles = []
     for photo, reference in zip(photos, references, strict=True):
-        shown, scale = fit(reference.photo, TILE_PX)
+        shown, scale = fit(reference.photo, TILE_PX, TILE_PX)
         colour = DOUBTFUL if reference.doubt else RIGHT
         draw_box(shown, (scale * reference.box).tolist(), colour, 2)
-        crop, _ = fit(reference.crop, TILE_PX)
+        crop, _ = fit(reference.crop, TILE_PX, TILE_PX)
         verdict = reference.doubt or reference.chosen_by
         tiles.append(labelled(np.concatenate([shown, crop], axis=1), [photo.name, verdict]))
     write_picture(path, join_tiles(tiles, columns=2))

@@ -25,7 +25,7 @@ from vap_core.evaluation.photos.report import RIGHT_IOU
 if TYPE_CHECKING:
     import pandas as pd
 
-SIDE_PX, TILES = 360, 24
+WIDTH_PX, HEIGHT_PX, TILES = 360, 270, 24
 
 
 def write_sheets(photo_set: PhotoSet, table: "pd.DataFrame", folder: Path) -> list[Path]:
@@ -50,7 +50,7 @@ def write_sheets(photo_set: PhotoSet, table: "pd.DataFrame", folder: Path) -> li
 
 
 def _tile(rgb: Rgb, scene: Scene, row: Mapping[str, object]) -> Rgb:
-    tile, scale = fit(rgb, SIDE_PX)
+    tile, scale = fit(rgb, WIDTH_PX, HEIGHT_PX)
     name = str(row["object"])
     for box in scene.boxes[name]:
         draw_box(tile, (scale * box).tolist(), TRUTH, 2)

@@ -43,9 +43,9 @@ OBJECT_FROM_FILE: dict[UpAxis, np.ndarray] = {
 }
 """Rotation to the object's axes (z up, front towards -y), by the file's axis that points up."""
 Y_UP_SUFFIXES = (".glb", ".obj")
-FLAT, NOT_FLAT = 0.4, 0.1
-"""Shares of the footprint: a file stands on the other axis than its format's where the bottom is
-flat that way by more than the first, and this way by less than the second."""
+FLATTER = 0.3
+"""Share of the footprint by which the bottom is flatter along the other axis than along the
+format's own where a file stands on that one."""
 
 
 def import_scan(
@@ -103,10 +103,10 @@ def default_name(path: Path) -> str:
 
 
 def guess_up(surface: ScannedSurface, path: Path) -> UpAxis:
-    """The axis that points up: the format's own, unless the body is flat below along the other."""
+    """The axis that points up: the format's, unless the body is flatter below along the other."""
     usual: UpAxis = "y" if path.suffix.lower() in Y_UP_SUFFIXES else "z"
     other: UpAxis = "z" if usual == "y" else "y"
-    if _flat_below(surface, other) > FLAT and _flat_below(surface, usual) < NOT_FLAT:
+    if _flat_below(surface, other) - _flat_below(surface, usual) > FLATTER:
         return other
     return usual
 
@@ -115,7 +115,7 @@ def _flat_below(surface: ScannedSurface, up: UpAxis) -> float:
     """The area that the body would stand on, as a share of its bounding box's."""
     corner = (surface.vertex @ OBJECT_FROM_FILE[up].T)[surface.face]
     low, high = corner.min(axis=(0, 1)), corner.max(axis=(0, 1))
-    lowest = corner[:, :, 2].max(axis=1) < low[2] + 0.03 * (high[2] - low[2])
+    lowest = corner[:, :, 2].max(axis=1) < low[2] + 0.02 * (high[2] - low[2])
     area = np.abs(area_vectors(corner[lowest])[:, 2]).sum() / 2
     return float(area / max(np.prod((high - low)[:2]), 1e-30))
 
