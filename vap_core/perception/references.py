@@ -29,6 +29,8 @@ CLOSE, CLOSE_ALONE = 0.05, 0.1
 for a single photo."""
 LEAST_COSINE = 0.5
 """Mean cosine to the best boxes of the other photos, below which the choice is doubtful."""
+SMALL_SHARE = 0.01
+"""Of a photo's area: a smaller box is more likely a part of the object."""
 SMALL_PX = 64
 """The shorter side of a crop, below which little detail is left to compare."""
 Box = Float32[np.ndarray, "4"]
@@ -122,7 +124,9 @@ def _choose(
     overlap = box_iou(boxes.xyxy[best : best + 1], boxes.xyxy)[0]
     elsewhere = np.flatnonzero(overlap < ELSEWHERE_IOU)
     doubt = ""
-    if not is_given:
+    if not is_given and _share_of_photo(photo, boxes.xyxy[best]) < SMALL_SHARE:
+        doubt = "what was found is a small part of it"
+    elif not is_given:
         doubt = _doubt(score, float(support[best]), best, np.flatnonzero(overlap < RIVAL_IOU))
     return Reference(
         photo=photo,
@@ -158,6 +162,11 @@ def _doubt(
     if len(rivals) and score[rivals].max() > score[best] - close:
         return "two things in it could be meant"
     return ""
+
+
+def _share_of_photo(photo: Rgb, box: Box) -> float:
+    height, width = photo.shape[:2]
+    return float((box[2:] - box[:2]).prod()) / (width * height)
 
 
 def _whole(photo: Rgb, doubt: str) -> Reference:
