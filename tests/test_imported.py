@@ -42,8 +42,8 @@ def shelf(tmp_path_factory):
         assert "convex parts" in done.stderr
         assert "too wide for the gripper of wx250s" in done.stderr
         assert "too wide for the gripper of wx250s, so101, panda" not in done.stderr
-        preview = Image.open(folder / "objects" / "my-mug.preview.png")
-        assert preview.size == (1280, 320)
+        with Image.open(folder / "objects" / "my-mug.preview.png") as preview:
+            assert preview.size == (1280, 320)
         assert "my-mug: a cup, 7.0 x 7.0 x 9.0 cm" in done.stdout
         assert "next: python -m vap_core objects photograph 'my-mug'" in done.stdout
         yield folder
