@@ -5,11 +5,12 @@ the candidates.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32, Int64
 
 from vap_core.attend import Attender
 from vap_core.base.errors import BadPhotoSet
@@ -18,7 +19,6 @@ from vap_core.base.types import Boxes, Grounding, PersonalObject, Rgb
 from vap_core.evaluation.photos.folder import PhotoSet, Scene
 from vap_core.perception.boxes import box_iou
 from vap_core.perception.candidates import Candidates, describe
-from vap_core.perception.protocols import Stack
 
 CAMERA = "photo"
 Row = dict[str, Any]
@@ -26,7 +26,7 @@ Memory = Mapping[str, PersonalObject]
 
 
 def measure_scene(
-    scene: Scene, photo_set: PhotoSet, memory: Memory, stack: Stack, attender: Attender
+    scene: Scene, photo_set: PhotoSet, memory: Memory, attender: Attender
 ) -> list[Row]:
     """One row for every remembered object that the scene's lines name.
 
@@ -34,7 +34,7 @@ def measure_scene(
     """
     rgb = load_photo(scene.path, long_side=None)
     true_boxes, owners = _true_boxes(scene, rgb)
-    candidates = describe(rgb, true_boxes, stack)
+    candidates = describe(rgb, true_boxes, attender.stack)
     rows = []
     for name, boxes in scene.boxes.items():
         if name not in memory:
@@ -52,7 +52,8 @@ def measure_scene(
         }
         row |= _ground(rgb, boxes, memory[name], attender)
         if len(boxes):
-            row |= _vote("all", own, np.ones(len(own), bool), candidates, memory[name], attender)
+            every = np.ones(len(own), bool)
+            row |= _vote("all", own, every, candidates, memory[name], attender)
             row |= _vote("kind", own, same_kind, candidates, memory[name], attender)
         rows.append(row)
     return rows
@@ -120,8 +121,8 @@ def _elected(grounding: Grounding) -> Row:
 
 def _vote(
     among: str,
-    own: np.ndarray,
-    eligible: np.ndarray,
+    own: Bool[np.ndarray, " n"],
+    eligible: Bool[np.ndarray, " n"],
     candidates: Candidates,
     obj: PersonalObject,
     attender: Attender,
@@ -134,19 +135,12 @@ def _vote(
     rows = np.flatnonzero(eligible)
     if own[rows].all():
         return dict.fromkeys(names)
-    of_box = Candidates(
-        boxes=Boxes(
-            candidates.boxes.xyxy[rows], candidates.boxes.score[rows], candidates.boxes.phrase
-        ),
-        embeddings=candidates.embeddings[rows],
-        masks=candidates.masks[rows],
-        ids=tuple(range(len(rows))),
-    )
+    among_them = _take(candidates, rows)
     right_alone = []
     for k in range(len(obj.crops)):
-        elected = attender.ground(CAMERA, _one_reference(obj, k), of_box).ballot.winner
+        elected = attender.ground(CAMERA, _one_reference(obj, k), among_them).ballot.winner
         right_alone.append(bool(own[rows[elected]]))
-    elected = attender.ground(CAMERA, obj, of_box).ballot.winner
+    elected = attender.ground(CAMERA, obj, among_them).ballot.winner
     return {
         names[0]: len(rows),
         names[1]: float(np.mean(right_alone)),
@@ -154,11 +148,16 @@ def _vote(
     }
 
 
-def _one_reference(obj: PersonalObject, k: int) -> PersonalObject:
-    return PersonalObject(
-        name=obj.name,
-        category=obj.category,
-        embeddings=obj.embeddings[k : k + 1],
-        crops=obj.crops[k : k + 1],
-        encoder=obj.encoder,
+def _take(candidates: Candidates, rows: Int64[np.ndarray, " m"]) -> Candidates:
+    """These candidates, in this order."""
+    boxes = candidates.boxes
+    return Candidates(
+        boxes=replace(boxes, xyxy=boxes.xyxy[rows], score=boxes.score[rows]),
+        embeddings=candidates.embeddings[rows],
+        masks=candidates.masks[rows],
+        ids=tuple(range(len(rows))),
     )
+
+
+def _one_reference(obj: PersonalObject, k: int) -> PersonalObject:
+    return replace(obj, embeddings=obj.embeddings[k : k + 1], crops=obj.crops[k : k + 1])

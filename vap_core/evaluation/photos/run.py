@@ -63,7 +63,7 @@ def _measure(photo_set: PhotoSet, out: Path, stack_name: str, progress: bool) ->
     for scene in tqdm(photo_set.scenes, unit="scene", desc="photos", disable=not progress):
         path = out / "parts" / f"{scene.name}.json"
         if not path.exists():
-            measured = measure_scene(scene, photo_set, memory, stack, attender)
+            measured = measure_scene(scene, photo_set, memory, attender)
             _write_part(path, measured)
         rows.extend(_read_part(path))
     return pd.DataFrame(rows)
