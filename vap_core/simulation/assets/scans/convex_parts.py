@@ -1,5 +1,6 @@
 """Convex parts that cover a body, split in a process of its own that a time limit ends."""
 
+import signal
 import subprocess
 import sys
 from contextlib import suppress
@@ -14,8 +15,9 @@ from vap_core.simulation.assets.shapes import Hull
 from vap_core.simulation.assets.triangles import Faces, Vertices
 
 HULLS, HULL_CORNERS = 16, 160
-LIMIT_S = 60.0
-"""A surface that does not cross itself takes a few seconds."""
+CPU_LIMIT_S, WALL_LIMIT_S = 60, 900.0
+"""A surface that does not cross itself takes about ten seconds of CPU; a busy machine gives them
+late."""
 SLIVER_M3 = 1e-9
 """A convex part of less volume is dropped."""
 SOLIDIFY = "give it thickness in your 3-D tool (solidify)"
@@ -46,15 +48,14 @@ def _split(vertex: Vertices, face: Faces) -> list[np.ndarray]:
     with TemporaryDirectory(prefix="vap-convex-") as folder:
         source, target = Path(folder, "surface.npz"), Path(folder, "parts.npz")
         np.savez(source, vertex=vertex, face=face)
-        words = [SCRIPT, source, target, HULLS, HULL_CORNERS]
+        words = [SCRIPT, source, target, HULLS, HULL_CORNERS, CPU_LIMIT_S]
         command = [sys.executable, "-I", *map(str, words)]
         try:
-            done = subprocess.run(command, capture_output=True, timeout=LIMIT_S)
+            done = subprocess.run(command, capture_output=True, timeout=WALL_LIMIT_S)
         except subprocess.TimeoutExpired as error:
-            raise BadObject(
-                f"objects: splitting the surface into convex parts took over {LIMIT_S:.0f} s, so "
-                "it most likely crosses itself; remesh or smooth it in your 3-D tool."
-            ) from error
+            raise _too_long(WALL_LIMIT_S) from error
+        if done.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
+            raise _too_long(CPU_LIMIT_S)
         if done.returncode or not target.exists():
             raise BadObject(
                 "objects: the surface cannot be split into convex parts "
@@ -62,3 +63,10 @@ def _split(vertex: Vertices, face: Faces) -> list[np.ndarray]:
             )
         with np.load(target) as parts:
             return [parts[name] for name in sorted(parts.files)]
+
+
+def _too_long(seconds: float) -> BadObject:
+    return BadObject(
+        f"objects: splitting the surface into convex parts took over {seconds:.0f} s, so it most "
+        "likely crosses itself; remesh or smooth it in your 3-D tool."
+    )

@@ -1,15 +1,17 @@
 """Run as a script: CoACD's convex parts of a surface, from one .npz file into another.
 
-It imports nothing of the package, so that it starts fast. CoACD cannot be interrupted: whoever
-starts this script ends it.
+It imports nothing of the package, so that it starts fast. CoACD cannot be interrupted: the system
+ends this process when it has used its seconds of CPU.
 """
 
+import resource
 import sys
 
 import numpy as np
 
 
-def main(source: str, target: str, hulls: str, corners: str) -> None:
+def main(source: str, target: str, hulls: str, corners: str, seconds: str) -> None:
+    resource.setrlimit(resource.RLIMIT_CPU, (int(seconds), int(seconds)))
     import coacd
 
     surface = np.load(source)
