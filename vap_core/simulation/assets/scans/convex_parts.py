@@ -15,7 +15,7 @@ from vap_core.simulation.assets.shapes import Hull
 from vap_core.simulation.assets.triangles import Faces, Vertices
 
 HULLS, HULL_CORNERS = 16, 160
-CPU_LIMIT_S, WALL_LIMIT_S = 60, 900.0
+CPU_LIMIT_S, WALL_LIMIT_S = 60, 900
 """A surface that does not cross itself takes about ten seconds of CPU; a busy machine gives them
 late."""
 SLIVER_M3 = 1e-9
@@ -65,8 +65,8 @@ def _split(vertex: Vertices, face: Faces) -> list[np.ndarray]:
             return [parts[name] for name in sorted(parts.files)]
 
 
-def _too_long(seconds: float) -> BadObject:
+def _too_long(seconds: int) -> BadObject:
     return BadObject(
-        f"objects: splitting the surface into convex parts took over {seconds:.0f} s, so it most "
+        f"objects: splitting the surface into convex parts took over {seconds} s, so it most "
         "likely crosses itself; remesh or smooth it in your 3-D tool."
     )
