@@ -10,6 +10,7 @@ from PIL import Image
 from tests.command import refused, vap
 from tests.toys import MeanColour, SameColour, detector, scene, segmenter
 from vap_core.base.errors import BadPhotoSet
+from vap_core.base.files import DATA
 from vap_core.evaluation.metrics import rate
 from vap_core.evaluation.photos import run
 from vap_core.evaluation.photos.folder import read_photo_set
@@ -87,6 +88,13 @@ def test_what_is_wrong_with_a_folder_is_one_line(folder, file, text, message):
     with pytest.raises(BadPhotoSet, match=message) as error:
         read_photo_set(folder)
     assert len(str(error.value).replace(str(folder), "")) <= 300
+
+
+def test_the_set_that_ships_is_in_this_form():
+    photo_set = read_photo_set(DATA / "photo-set")
+    assert [subject.name for subject in photo_set.subjects] == ["cookies"]
+    assert [len(scene.boxes["cookies"]) for scene in photo_set.scenes] == [0, 1, 0]
+    assert photo_set.categories == {"cookies": "box", "rice": "box", "book": "book"}
 
 
 def test_missing_parts_are_named(tmp_path):
