@@ -12,6 +12,7 @@ from vap_core.analysis import drag_box, dragged_box
 from vap_core.base import video
 from vap_core.base.errors import BadPhoto
 from vap_core.base.photos import load_photo
+from vap_core.base.types import Boxes
 from vap_core.evaluation.photos import register as registering
 from vap_core.evaluation.photos.trust import leave_one_out, warnings
 from vap_core.memory import remember
@@ -73,6 +74,20 @@ def test_a_given_box_is_taken_and_guides_the_other_photos():
     assert first.box.tolist() == box.tolist()
     assert not first.doubt
     assert second.chosen_by == "proposed"
+
+
+def test_a_part_of_the_object_is_not_something_else():
+    """What the photo shows besides the object are rivals in the check; its parts are not."""
+
+    def parts(images, phrase, threshold=None):
+        xyxy = np.array([[20, 20, 60, 60], [25, 25, 32, 32], [2, 2, 12, 12]], np.float32)
+        return [Boxes(xyxy, np.array([0.9, 0.5, 0.5], np.float32), phrase) for _ in images]
+
+    photo = scene([(20, 20, RED)], side=40) + scene([(2, 2, GREEN)], side=10)
+    (reference,) = choose_references([photo], "cup", parts, MeanColour())
+    assert reference.box.tolist() == [20, 20, 60, 60]
+    (other,) = reference.others
+    assert other[5, 5].tolist() == list(GREEN)
 
 
 def test_boxes_and_masks_are_read_by_the_photos_name(tmp_path):

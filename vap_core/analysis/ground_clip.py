@@ -63,7 +63,7 @@ def ground_clip(
 
     Raises: BadPhoto, BadInstruction, UnknownName, BadOutput.
     """
-    from vap_core.recording import ClipRecorder, Step
+    from vap_core.recording import ClipRecorder, ClipStep
 
     frames, hz = _open(path)
     first = next(frames, None)
@@ -91,7 +91,7 @@ def ground_clip(
                 if is_first:
                     grounded, text = number, attended.text
             visible.append(track.mask is not None)
-            recorder.add(Step(number, at, rgb, prompted, track))
+            recorder.add(ClipStep(number, at, rgb, prompted, track))
             film.add(prompted)
     summary = ClipSummary(
         frames=len(visible),

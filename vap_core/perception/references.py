@@ -21,9 +21,10 @@ MOST_BOXES = 12
 SCORE_WEIGHT, CENTRE_WEIGHT, AREA_WEIGHT = 0.1, 0.3, 0.02
 """Of log score, distance from the photo's centre (in its sides) and log share of its area, beside
 the cosine to the other photos."""
-ELSEWHERE_IOU, RIVAL_IOU = 0.1, 0.5
-"""A box that overlaps the chosen one by less than the first shows something else; by less than the
-second, it would be another crop."""
+RIVAL_IOU = 0.5
+"""A box that overlaps the chosen one by less would be another crop."""
+ELSEWHERE = 0.1
+"""A box shows something else when less than this share of the smaller of both is common."""
 CLOSE, CLOSE_ALONE = 0.05, 0.1
 """Another crop that scores nearer to the chosen one than this makes it doubtful; the second holds
 for a single photo."""
@@ -122,7 +123,7 @@ def _choose(
     score = _prior(photo, boxes) + np.nan_to_num(support)
     best = 0 if is_given else int(score.argmax())
     overlap = box_iou(boxes.xyxy[best : best + 1], boxes.xyxy)[0]
-    elsewhere = np.flatnonzero(overlap < ELSEWHERE_IOU)
+    elsewhere = np.flatnonzero(_common_share(boxes.xyxy[best], boxes.xyxy) < ELSEWHERE)
     doubt = ""
     if not is_given and _share_of_photo(photo, boxes.xyxy[best]) < SMALL_SHARE:
         doubt = "what was found is a small part of it"
@@ -162,6 +163,15 @@ def _doubt(
     if len(rivals) and score[rivals].max() > score[best] - close:
         return "two things in it could be meant"
     return ""
+
+
+def _common_share(box: Box, others: Float32[np.ndarray, "n 4"]) -> Float[np.ndarray, " n"]:
+    """What each other box has in common with `box`, as a share of the smaller of the two."""
+    near = np.maximum(others[:, :2], box[:2])
+    far = np.minimum(others[:, 2:], box[2:])
+    common = np.clip(far - near, 0, None).prod(axis=1)
+    area = (others[:, 2:] - others[:, :2]).prod(axis=1)
+    return common / np.minimum(area, (box[2:] - box[:2]).prod())
 
 
 def _share_of_photo(photo: Rgb, box: Box) -> float:

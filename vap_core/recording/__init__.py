@@ -19,7 +19,7 @@ from vap_core.recording.file import recording_file_name as recording_file_name
 from vap_core.recording.file import recording_name as recording_name
 from vap_core.recording.file import recover as recover
 from vap_core.recording.grounding import ClipRecorder as ClipRecorder
-from vap_core.recording.grounding import Step as Step
+from vap_core.recording.grounding import ClipStep as ClipStep
 from vap_core.recording.grounding import record_grounding as record_grounding
 from vap_core.recording.index import ensure_index as ensure_index
 from vap_core.recording.query import format_result as format_result

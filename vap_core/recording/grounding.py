@@ -33,12 +33,12 @@ def record_grounding(
     Raises: BadOutput, when `path` exists or its folder cannot be written.
     """
     with ClipRecorder(path, grounding.camera, grounding.object) as recorder:
-        recorder.add(Step(0, 0.0, image, prompted, Track(grounding.mask, 1.0)))
+        recorder.add(ClipStep(0, 0.0, image, prompted, Track(grounding.mask, 1.0)))
         recorder.ground(0, 0.0, image, grounding, obj, instruction, rewritten)
 
 
 @value
-class Step:
+class ClipStep:
     """One frame of a clip: as it is, as the policy is shown it, and where the first target is."""
 
     frame_index: int
@@ -79,7 +79,7 @@ class ClipRecorder:
         else:
             self._rec.disconnect()
 
-    def add(self, step: Step) -> None:
+    def add(self, step: ClipStep) -> None:
         """One frame, its prompted picture, its mask and the track's score."""
         at = time_columns([(step.frame_index, step.timestamp_s)])
         jpeg = encode_jpeg(step.image, JPEG_QUALITY)

@@ -41,6 +41,8 @@ class Trust:
         )
         if self.by_name:
             text += f"; mistaken for {', '.join(self.by_name)}"
+        if self.right < self.n:
+            text += "; more photos, from all sides, or tighter crops help"
         return text
 
 
