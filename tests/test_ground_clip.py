@@ -13,7 +13,7 @@ from vap_core.analysis import ground_clip
 from vap_core.base import video
 from vap_core.base.types import Boxes
 from vap_core.memory import remember, save
-from vap_core.perception import stacks
+from vap_core.perception import stacks, tiles
 from vap_core.perception.protocols import Stack
 from vap_core.perception.tiles import GRID, TiledDetector, tile_corners
 
@@ -85,6 +85,8 @@ def test_a_clip_without_the_object_says_so(bank, tmp_path):
 
 
 def test_bad_clips_are_one_line(bank, tmp_path):
+    line = refused("ground", tmp_path, "bring my cup", "--memory", bank, "--json")
+    assert "--json are for single pictures" in line
     (tmp_path / "empty").mkdir()
     (tmp_path / "bad.mp4").write_bytes(b"x")
     for name, message in (
@@ -128,24 +130,15 @@ def test_tiles_find_what_the_whole_picture_is_too_coarse_for():
     assert len(none) == 0
 
 
-def test_large_pictures_are_tiled_and_it_is_said(bank, tmp_path):
-    rgb = scene([(1500, 900, RED), (300, 300, GREEN)], size=2000, side=40)
+def test_large_pictures_are_tiled_and_it_is_said(bank, tmp_path, monkeypatch):
+    monkeypatch.setattr(tiles, "SMALL_MEGAPIXELS", 0.03)
+    rgb = scene([(150, 90, RED), (30, 30, GREEN)], size=200, side=12)
     Image.fromarray(rgb).save(tmp_path / "desk.png")
-    words = (
-        "ground",
-        tmp_path / "desk.png",
-        "bring my cup",
-        "--stack",
-        "toy",
-        "--memory",
-        bank,
-        "--out",
-        tmp_path,
-        "--json",
-    )
-    done = vap(*words)
+    words = ("ground", tmp_path / "desk.png", "bring my cup", "--stack", "toy")
+    where = ("--memory", bank, "--out", tmp_path, "--json")
+    done = vap(*words, *where)
     assert "nine overlapping half-size tiles" in done.stderr
     answer = json.loads(done.stdout)
-    assert answer["size"] == [2000, 2000]
-    assert answer["candidates"][answer["winner"]] == [1500, 900, 1540, 940]
-    assert "tiles" not in vap(*words, "--no-tiles").stderr
+    assert answer["size"] == [200, 200]
+    assert answer["candidates"][answer["winner"]] == [150, 90, 162, 102]
+    assert "tiles" not in vap(*words, *where, "--no-tiles").stderr

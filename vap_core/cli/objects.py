@@ -167,10 +167,16 @@ def ground(
         write_evidence,
     )
     from vap_core.analysis.ground_clip import ground_clip, is_clip
+    from vap_core.base.errors import BadInstruction
     from vap_core.memory import load_photo
     from vap_core.perception.tiles import SMALL_MEGAPIXELS
 
     if is_clip(image):
+        if box or as_json or tiles:
+            raise BadInstruction(
+                "ground: --box, --tiles and --json are for single pictures; leave them out for a "
+                "clip."
+            )
         summary, rrd, mp4 = ground_clip(image, instruction, memory, stack, out, objects=object)
         print(summary)
         print(f"wrote {mp4} and {rrd}; look: python -m vap_core view {rrd}")
