@@ -47,6 +47,8 @@ def bank(photos: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = vap("register", "mug", "--category", "cup", "--memory", folder, *photos)
     assert done.returncode == 0, done.stderr
     assert "mug: a cup with 5 references" in done.stdout
+    assert f"look at the crops: {folder / 'mug.references.png'}" in done.stdout
+    assert "vote: each photo left out in turn" in done.stdout or "vote not checked" in done.stdout
     (mug,) = load_bank(folder).values()
     assert mug.description is not None
     assert set(mug.description.long.replace(",", "").split()) <= {*WORDS, "cup"}
@@ -148,6 +150,21 @@ def test_nothing_found_is_an_answer_and_not_an_error(bank: Path, tmp_path: Path)
     assert (tmp_path / "out" / "empty.png").exists()
 
 
+def test_register_stops_at_a_doubtful_photo_and_goes_on_with_its_box(tmp_path: Path) -> None:
+    Image.new("RGB", (224, 224), (120, 130, 140)).save(tmp_path / "wall.png")
+    words = ("register", "x", "--category", "cup", "--memory", tmp_path / "bank")
+    line = refused(*words, tmp_path / "wall.png")
+    assert "wall.png: no cup was found in it" in line
+    assert "--box wall.png=x0,y0,x1,y1" in line
+    assert [path.name for path in (tmp_path / "bank").iterdir()] == ["x.references.png"]
+    done = vap(*words, tmp_path / "wall.png", "--box", "wall.png=20,30,70,90")
+    assert done.returncode == 0, done.stderr
+    assert "only 53x63 pixels" in done.stderr or "only 54x64 pixels" in done.stderr
+    (obj,) = load_bank(tmp_path / "bank").values()
+    assert len(obj.crops) == 1
+    assert "vote not checked: 1 references" in done.stdout
+
+
 def test_register_refuses_bad_photos_and_loses_nothing(
     bank: Path, photos: list[Path], tmp_path: Path
 ) -> None:
@@ -161,7 +178,10 @@ def test_register_refuses_bad_photos_and_loses_nothing(
     assert "--replace" in refused(
         "register", "mug", "--category", "cup", "--memory", bank, photos[0]
     )
-    assert [path.name for path in bank.iterdir()] == ["mug.object.safetensors"]
+    assert {path.name for path in bank.iterdir()} == {
+        "mug.object.safetensors",
+        "mug.references.png",
+    }
     assert vap("register", "x", "--category", "cup", "--memory", bank).returncode == 2
     assert "cannot name an object" in refused(
         "register", "../x", "--whole", "--category", "cup", "--memory", bank, photos[0]

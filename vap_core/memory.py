@@ -64,16 +64,7 @@ def remember(name: str, category: str, crops: Sequence[Rgb], encoder: Encoder) -
     Raises:
         BadMemory: no usable name or category; BadPhoto: no crops.
     """
-    if not NAME.fullmatch(name):
-        raise BadMemory(
-            f"remember: {name!r} cannot name an object; use letters, digits, space, dot, dash or "
-            "underscore."
-        )
-    if not CATEGORY.fullmatch(category.strip()):
-        raise BadMemory(
-            f"remember: {category!r} cannot be a category; name the kind of thing in words, for "
-            "example --category cup."
-        )
+    check_names(name, category)
     if not crops:
         raise BadPhoto(f"remember: {name!r} has no photos; give at least one, five are best.")
     category = " ".join(category.lower().split())
@@ -84,6 +75,20 @@ def remember(name: str, category: str, crops: Sequence[Rgb], encoder: Encoder) -
         crops=tuple(crops),
         encoder=encoder.name,
     )
+
+
+def check_names(name: str, category: str) -> None:
+    """Raises: BadMemory: no usable name or category of an object."""
+    if not NAME.fullmatch(name):
+        raise BadMemory(
+            f"remember: {name!r} cannot name an object; use letters, digits, space, dot, dash or "
+            "underscore."
+        )
+    if not CATEGORY.fullmatch(category.strip()):
+        raise BadMemory(
+            f"remember: {category!r} cannot be a category; name the kind of thing in words, for "
+            "example --category cup."
+        )
 
 
 def recall(
@@ -129,7 +134,7 @@ def save(bank: Path, obj: PersonalObject, *, replace: bool = False) -> Path:
     """
     from safetensors.numpy import save as encode
 
-    path = bank / f"{obj.name}{SUFFIX}"
+    path = object_path(bank, obj.name)
     tensors = {"embeddings": obj.embeddings}
     for i, reference in enumerate(obj.crops):
         tensors[f"crop.{i:03d}"] = np.ascontiguousarray(reference)
@@ -147,14 +152,22 @@ def save(bank: Path, obj: PersonalObject, *, replace: bool = False) -> Path:
         write_atomic(path, encode(tensors, metadata=header), replace=replace)
     except OSError as error:
         if path.exists() and not replace:
-            raise BadOutput(
-                f"save: {path} exists; choose another name or pass --replace."
-            ) from error
+            raise taken(path) from error
         raise BadOutput(
             f"save: {bank} cannot be written ({error.strerror}); choose another folder with "
             "--memory."
         ) from error
     return path
+
+
+def object_path(bank: Path, name: str) -> Path:
+    """The file of an object in a bank."""
+    return bank / f"{name}{SUFFIX}"
+
+
+def taken(path: Path) -> BadOutput:
+    """The error for an object whose name a bank holds already."""
+    return BadOutput(f"save: {path} exists; choose another name or pass --replace.")
 
 
 def load(path: Path, encoder: str | None = None) -> PersonalObject:

@@ -4,6 +4,7 @@ The answer is the candidates, the votes, the margin and the rewritten instructio
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ from vap_core.base.errors import BadInstruction, BadOutput
 from vap_core.base.types import Attended, Boxes, Grounding, PersonalObject, Rgb, value
 
 CAMERA = "image"
+GROUND_SIDE = 2560
+"""The longer side to which a larger picture is shrunk: every candidate has a mask of its size."""
 
 
 @value
@@ -55,13 +58,20 @@ def ground_image(
     *,
     objects: Sequence[str] | None = None,
     boxes: Boxes | None = None,
+    tiles: bool = False,
 ) -> Found:
-    """Run the method's first step on one picture with the remembered objects of a bank."""
+    """Run the method's first step on one picture with the remembered objects of a bank.
+
+    With `tiles` the detector also looks at nine overlapping tiles.
+    """
     from vap_core.attend import Attender
     from vap_core.memory import load_bank
     from vap_core.perception.stacks import load_stack
+    from vap_core.perception.tiles import TiledDetector
 
     models = load_stack(stack)
+    if tiles:
+        models = replace(models, detector=TiledDetector(models.detector))
     bank = load_bank(memory, models.encoder.name)
     attender = Attender(models, bank)
     boxes_by_camera = None if boxes is None else {CAMERA: boxes}
@@ -79,7 +89,8 @@ def ground_image(
 def to_json(found: Found) -> dict[str, Any]:
     """The evidence of the first target at the top level, that of every target under "targets".
 
-    `instruction` is the rewritten one, `said` the given one.
+    `instruction` is the rewritten one, `said` the given one. Boxes are pixels of a picture of
+    `size`, width and height.
     """
     targets = []
     for grounding in found.attended.groundings[CAMERA]:
@@ -88,6 +99,7 @@ def to_json(found: Found) -> dict[str, Any]:
         **targets[0],
         "instruction": found.attended.text,
         "said": found.instruction,
+        "size": [found.rgb.shape[1], found.rgb.shape[0]],
         "targets": targets,
     }
 

@@ -161,6 +161,21 @@ def write_views(model: ObjectModel, folder: Path, n: int = 5) -> list[Path]:
     return paths
 
 
+def write_preview(model: ObjectModel, path: Path, size: int = 320) -> None:
+    """The object from its front, its side, its back and above, side by side. Raises: BadOutput."""
+    shots = []
+    for azimuth, elevation in ((0.0, 0.3), (np.pi / 2, 0.3), (np.pi, 0.3), (0.4, 1.2)):
+        shots.append(Shot(float(azimuth), elevation, fill=0.75))
+    picture = np.concatenate(photograph(model, shots, size), axis=1)
+    try:
+        Image.fromarray(picture).save(path)
+    except OSError as error:
+        raise BadOutput(
+            f"preview: {path} cannot be written ({error.strerror}); choose another folder with "
+            "--out."
+        ) from error
+
+
 def _set_up_table(spec: mujoco.MjSpec, size: int) -> None:
     """The table and the lamp, and how they are rendered, `size` x `size` pixels."""
     headlight = spec.visual.headlight
