@@ -42,10 +42,10 @@ from vap_core.base.types import (
 )
 from vap_core.instruction import Parser, parse, rewrite
 from vap_core.memory import recall
-from vap_core.perception.candidates import Candidates, describe, masks_by_id
-from vap_core.perception.protocols import Stack
+from vap_core.perception.candidates import Candidates, Proposals, embed, masks_by_id, segment
+from vap_core.perception.protocols import FamiliarityJudge, Stack
 from vap_core.prompt import ALPHA, PALETTE, choose_colours, tint
-from vap_core.vote import VoteRule, similarity, vote
+from vap_core.vote import VoteRule, compare, election_scores, shortlist, vote
 
 PerTarget = tuple[Grounding, ...]
 """One grounding per target of the instruction, in the order of its targets."""
@@ -130,13 +130,18 @@ class Attender:
         """
         parsed, wanted = self.understand(instruction, objects)
         phrases = [target.category for target in parsed.targets]
-        candidates = self._propose(views, phrases, boxes)
+        proposals = self._propose(views, phrases, boxes)
 
+        candidates: dict[str, tuple[Candidates, ...]] = {}
         groundings: dict[str, PerTarget] = {}
-        for camera in views:
+        for camera, rgb in views.items():
+            of_view: list[Candidates] = []
             per_target = []
             for phrase, obj in zip(phrases, wanted, strict=True):
-                per_target.append(self.ground(camera, obj, candidates[camera][phrase]))
+                few = shortlist(proposals[camera][phrase], obj.embeddings, self.stack.encoder)
+                of_view.append(segment(rgb, few, self.stack, known=of_view))
+                per_target.append(self.ground(camera, obj, of_view[-1]))
+            candidates[camera] = tuple(of_view)
             groundings[camera] = tuple(per_target)
 
         associations: tuple[Association | None, ...] = ()
@@ -144,7 +149,6 @@ class Attender:
             groundings, associations = associate_targets(
                 groundings=groundings,
                 candidates=candidates,
-                phrases=phrases,
                 cameras=cameras or {},
                 pairing=self.prompting.associate,
             )
@@ -173,12 +177,13 @@ class Attender:
 
     def ground(self, camera: str, obj: PersonalObject, candidates: Candidates) -> Grounding:
         """The vote of one view for one object."""
-        cosine = similarity(candidates.embeddings, obj.embeddings)
-        ballot = vote(cosine, self.prompting.rule)
+        boxes = candidates.boxes
+        cosine = compare(self.stack.encoder, candidates.embeddings, obj.embeddings, boxes.familiar)
+        ballot = vote(election_scores(cosine, boxes), self.prompting.rule)
         return Grounding(
             camera=camera,
             object=obj.name,
-            candidates=candidates.boxes,
+            candidates=boxes,
             similarity=cosine,
             ballot=ballot,
             winner=ballot.winner,
@@ -189,30 +194,28 @@ class Attender:
         self,
         parsed: Instruction,
         views: Views,
-        candidates: Mapping[str, Mapping[str, Candidates]],
+        candidates: Mapping[str, Sequence[Candidates]],
         groundings: Mapping[str, PerTarget],
         associations: tuple[Association | None, ...] = (),
         chosen_by: str = "association",
     ) -> tuple[AttendState, Attended]:
         """Start tracking and prompt the first images, given the groundings.
 
-        `candidates[camera][phrase]` are those of each view; `chosen_by` names what overruled the
-        vote, where something did.
+        `candidates[camera][j]` are those of target j; `chosen_by` names what overruled the vote,
+        where something did.
         """
-        phrases = [target.category for target in parsed.targets]
         ids: dict[str, tuple[int | None, ...]] = {}
         masks: dict[str, Bool[np.ndarray, "n h w"]] = {}
         tracks: dict[str, tuple[Track, ...]] = {}
         for camera in views:
-            ids[camera] = _winner_ids(candidates[camera], groundings[camera], phrases)
-            of_view = tuple(candidates[camera].values())
-            masks[camera] = masks_by_id(of_view)
+            ids[camera] = _winner_ids(candidates[camera], groundings[camera])
+            masks[camera] = masks_by_id(candidates[camera])
             tracks[camera] = tuple(map(_first_track, groundings[camera]))
 
         scenes = []
         for camera, rgb in views.items():
             scenes.append((rgb, list(masks[camera])))
-        colours = choose_colours(len(phrases), scenes, self.prompting.palette)
+        colours = choose_colours(len(parsed.targets), scenes, self.prompting.palette)
         text = parsed.text
         if self.prompting.rewrite:
             text = rewrite(parsed, _colours_in_view(colours, ids))
@@ -286,22 +289,31 @@ class Attender:
 
     def _propose(
         self, views: Views, phrases: Sequence[str], given: Mapping[str, Boxes] | None
-    ) -> dict[str, dict[str, Candidates]]:
-        """Candidates by camera and phrase; each phrase is detected once."""
-        candidates: dict[str, dict[str, Candidates]] = {}
+    ) -> dict[str, dict[str, Proposals]]:
+        """Proposals by camera and phrase; each phrase is detected once."""
+        proposals: dict[str, dict[str, Proposals]] = {}
         for camera in views:
-            candidates[camera] = {}
+            proposals[camera] = {}
         images = list(views.values())
         for phrase in dict.fromkeys(phrases):
-            boxes = given
-            if boxes is None:
+            if given is None:
                 detected = self.stack.detector(images, phrase)
                 boxes = dict(zip(views, detected, strict=True))
+            else:
+                boxes = self._judge(views, phrase, given)
             for camera, rgb in views.items():
-                of_view = candidates[camera]
-                known = tuple(of_view.values())
-                of_view[phrase] = describe(rgb, boxes[camera], self.stack, known)
-        return candidates
+                proposals[camera][phrase] = embed(rgb, boxes[camera], self.stack)
+        return proposals
+
+    def _judge(self, views: Views, phrase: str, given: Mapping[str, Boxes]) -> dict[str, Boxes]:
+        """Boxes given by hand, with whether their view is familiar."""
+        detector = self.stack.detector
+        boxes = dict(given)
+        if isinstance(detector, FamiliarityJudge):
+            for camera, rgb in views.items():
+                familiar = detector.is_familiar(rgb, phrase)
+                boxes[camera] = replace(given[camera], familiar=familiar)
+        return boxes
 
     def _start_trackers(
         self, views: Views, masks: Mapping[str, Bool[np.ndarray, "n h w"]]
@@ -350,14 +362,12 @@ class Attender:
         return rgb
 
 
-def _winner_ids(
-    candidates: Mapping[str, Candidates], per_target: PerTarget, phrases: Sequence[str]
-) -> tuple[int | None, ...]:
+def _winner_ids(candidates: Sequence[Candidates], per_target: PerTarget) -> tuple[int | None, ...]:
     """The tracker's identity of every target in one view."""
     ids: list[int | None] = []
-    for phrase, grounding in zip(phrases, per_target, strict=True):
+    for of_target, grounding in zip(candidates, per_target, strict=True):
         winner = grounding.winner
-        ids.append(None if winner is None else candidates[phrase].ids[winner])
+        ids.append(None if winner is None else of_target.ids[winner])
     return tuple(ids)
 
 

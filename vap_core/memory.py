@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32
 
 from vap_core.base.errors import BadMemory, BadOutput, BadPhoto, UnknownName, one_of
 from vap_core.base.files import parse_json, write_atomic
@@ -42,20 +43,40 @@ def register(
 ) -> tuple[PersonalObject, tuple[int, ...]]:
     """Remember one object from its reference photos.
 
-    Each photo is cropped by the category detector that is used at test time (P 3.3), to its best
-    box; where none scores `threshold`, the whole photo is the crop. Also returns the indices of
+    Each photo is cropped by the detector that is used at test time (P 3.3), to its
+    `reference_box`; where there is none, the whole photo is the crop. Also returns the indices of
     those photos.
     """
     crops = []
     whole = []
     for i, photo in enumerate(photos):
-        (boxes,) = detector([photo], category, threshold)
-        if len(boxes):
-            crops.append(crop(photo, boxes.xyxy[0]))
-        else:
+        box = reference_box(photo, category, detector, threshold=threshold)
+        if box is None:
             crops.append(photo)
             whole.append(i)
+        else:
+            crops.append(crop(photo, box))
     return remember(name, category, crops, encoder), tuple(whole)
+
+
+def reference_box(
+    photo: Rgb, category: str, detector: Detector, *, threshold: float = REFERENCE_THRESHOLD
+) -> Float32[np.ndarray, "4"] | None:
+    """Where a photo shows the object that it is a reference of; None where nothing is found.
+
+    It is the best box of the category. Where boxes of any object are proposed, it is the most
+    likely one that holds the photo's centre.
+    """
+    (boxes,) = detector([photo], category, threshold)
+    if boxes.prior is None:
+        return boxes.xyxy[0] if len(boxes) else None
+    h, w = photo.shape[:2]
+    centre = np.array([w / 2, h / 2])
+    inside = (boxes.xyxy[:, :2] <= centre) & (centre <= boxes.xyxy[:, 2:])
+    holding = np.flatnonzero(inside.all(axis=1))
+    if not len(holding):
+        return None
+    return boxes.xyxy[holding[boxes.prior[holding].argmax()]]
 
 
 def remember(name: str, category: str, crops: Sequence[Rgb], encoder: Encoder) -> PersonalObject:

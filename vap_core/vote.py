@@ -5,12 +5,19 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32
 
-from vap_core.base.types import Ballot
+from vap_core.base.types import Ballot, Boxes
+from vap_core.perception.boxes import box_cover
+from vap_core.perception.candidates import Proposals
+from vap_core.perception.protocols import Encoder, WeighingEncoder
 
 VoteRule = Literal["vote", "average"]
 
 SAME = 1e-6
 """Cosines closer than this are equal, so that rounding never decides an election."""
+SAME_PLACE = 0.5
+"""Of two boxes of which the smaller is covered by more than this share, one is a candidate."""
+MOST_CANDIDATES = 6
+"""Candidates of one object among proposals of any object."""
 
 
 def similarity(
@@ -18,6 +25,50 @@ def similarity(
 ) -> Float32[np.ndarray, "n k"]:
     """cos(e_i, z_k) for L2-normalised rows."""
     return np.clip(candidates @ references.T, -1.0, 1.0).astype(np.float32)
+
+
+def compare(
+    encoder: Encoder,
+    embeddings: Float32[np.ndarray, "n d"],
+    references: Float32[np.ndarray, "k d"],
+    familiar: bool,
+) -> Float32[np.ndarray, "n k"]:
+    """`similarity` in a view that is `Boxes.familiar` or not, as the encoder weighs its rows."""
+    if isinstance(encoder, WeighingEncoder):
+        embeddings = encoder.weigh(embeddings, familiar)
+        references = encoder.weigh(references, familiar)
+    return similarity(embeddings, references)
+
+
+def election_scores(cosine: Float32[np.ndarray, "n k"], boxes: Boxes) -> Float32[np.ndarray, "n k"]:
+    """What the vote compares: cosines, and where boxes have priors their sum.
+
+    Priors count from the view's greatest, so no score is above its cosine.
+    """
+    if boxes.prior is None or not len(boxes):
+        return cosine
+    return cosine + (boxes.prior - boxes.prior.max())[:, None]
+
+
+def shortlist(
+    proposals: Proposals, references: Float32[np.ndarray, "k d"], encoder: Encoder
+) -> Proposals:
+    """The proposals that are candidates for the object of these references.
+
+    Proposals of any object overlap: of those in one place the one of the best mean score is taken,
+    and at most `MOST_CANDIDATES` places. Proposals of one category are all candidates.
+    """
+    boxes = proposals.boxes
+    if boxes.prior is None:
+        return proposals
+    cosine = compare(encoder, proposals.embeddings, references, boxes.familiar)
+    mean = election_scores(cosine, boxes).astype(np.float64).mean(axis=1)
+    cover = box_cover(boxes.xyxy, boxes.xyxy)
+    kept: list[int] = []
+    for i in np.argsort(-mean, kind="stable").tolist():
+        if len(kept) < MOST_CANDIDATES and cover[i, kept].max(initial=0.0) <= SAME_PLACE:
+            kept.append(i)
+    return proposals.take(np.array(kept, np.int64))
 
 
 def vote(cosine: Float32[np.ndarray, "n k"], rule: VoteRule = "vote") -> Ballot:

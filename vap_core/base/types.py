@@ -30,11 +30,17 @@ def value[T](cls: type[T]) -> type[T]:
 
 @value
 class Boxes:
-    """Category-level proposals of one view (P 3.3); n may be 0: a result, not an error."""
+    """Category-level proposals of one view (P 3.3); n may be 0: a result, not an error.
+
+    `prior` is the evidence for each box besides the references', in units of cosine, where boxes of
+    any object are proposed; None where every box is of the phrase's category. `familiar` says
+    whether the view is of the world that the stack's own models were trained on."""
 
     xyxy: Float32[np.ndarray, "n 4"]
     score: Float32[np.ndarray, " n"]
     phrase: str
+    prior: Float32[np.ndarray, " n"] | None = None
+    familiar: bool = True
 
     def __post_init__(self) -> None:
         if len(self.xyxy) and not (self.xyxy[:, 2:] > self.xyxy[:, :2]).all():

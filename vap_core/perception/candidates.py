@@ -1,4 +1,4 @@
-"""The candidates of one phrase in one view: boxes, embeddings, masks and identities.
+"""What a view offers to the vote: proposals of one phrase, and the candidates of one target.
 
 Identities are the indices that the view's tracker gives to what it follows.
 """
@@ -6,7 +6,7 @@ Identities are the indices that the view's tracker gives to what it follows.
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int64
 
 from vap_core.base.types import Boxes, Rgb, value
 from vap_core.perception.boxes import box_iou, crop
@@ -14,6 +14,26 @@ from vap_core.perception.protocols import Stack
 
 SAME_BOX_IOU = 0.7
 """Boxes of two phrases that overlap by more than this IoU are the same object."""
+
+
+@value
+class Proposals:
+    """The boxes that a detector proposed for one phrase in one view, and their embeddings."""
+
+    boxes: Boxes
+    embeddings: Float32[np.ndarray, "n d"]
+
+    def take(self, rows: Int64[np.ndarray, " m"]) -> "Proposals":
+        """These of them, in this order."""
+        prior = self.boxes.prior
+        boxes = Boxes(
+            xyxy=self.boxes.xyxy[rows],
+            score=self.boxes.score[rows],
+            phrase=self.boxes.phrase,
+            prior=None if prior is None else prior[rows],
+            familiar=self.boxes.familiar,
+        )
+        return Proposals(boxes, self.embeddings[rows])
 
 
 @value
@@ -26,14 +46,21 @@ class Candidates:
     ids: tuple[int, ...]
 
 
-def describe(rgb: Rgb, boxes: Boxes, stack: Stack, known: Sequence[Candidates] = ()) -> Candidates:
-    """Embed and segment every box of one view.
+def embed(rgb: Rgb, boxes: Boxes, stack: Stack) -> Proposals:
+    """The embeddings of every box of one view."""
+    return Proposals(boxes, stack.encoder([crop(rgb, box) for box in boxes.xyxy]))
 
-    A box that an earlier phrase proposed too keeps its identity.
+
+def segment(
+    rgb: Rgb, proposals: Proposals, stack: Stack, known: Sequence[Candidates] = ()
+) -> Candidates:
+    """The masks of all proposals.
+
+    A box that is a candidate for an earlier target too keeps its identity.
     """
-    embeddings = stack.encoder([crop(rgb, box) for box in boxes.xyxy])
+    boxes = proposals.boxes
     masks = stack.segmenter(rgb, boxes)
-    return Candidates(boxes, embeddings, masks, _assign_ids(boxes, known))
+    return Candidates(boxes, proposals.embeddings, masks, _assign_ids(boxes, known))
 
 
 def masks_by_id(parts: Sequence[Candidates]) -> Bool[np.ndarray, "n h w"]:

@@ -12,7 +12,10 @@ from vap_core.base.types import Boxes, Rgb, Track
 
 @runtime_checkable
 class Detector(Protocol):
-    """Finds every box that matches an open-vocabulary phrase (P 3.3)."""
+    """Finds every box that matches an open-vocabulary phrase (P 3.3).
+
+    Or proposes boxes of any object, and gives each a `Boxes.prior` by the phrase.
+    """
 
     def __call__(
         self, images: Sequence[Rgb], phrase: str, threshold: float | None = None
@@ -21,6 +24,15 @@ class Detector(Protocol):
 
         A `Boxes` is empty when nothing scores `threshold` (None: the detector's own).
         """
+        ...
+
+
+@runtime_checkable
+class FamiliarityJudge(Protocol):
+    """A detector that knows whether a view is of the world that its stack was trained on."""
+
+    def is_familiar(self, image: Rgb, phrase: str) -> bool:
+        """The `Boxes.familiar` of boxes that are given by hand."""
         ...
 
 
@@ -35,6 +47,15 @@ class Encoder(Protocol):
 
     def __call__(self, crops: Sequence[Rgb]) -> Float32[np.ndarray, "n d"]:
         """One L2-normalised row per crop; n may be 0."""
+        ...
+
+
+@runtime_checkable
+class WeighingEncoder(Protocol):
+    """An encoder whose rows count differently in views that are not `Boxes.familiar`."""
+
+    def weigh(self, rows: Float32[np.ndarray, "n d"], familiar: bool) -> Float32[np.ndarray, "n d"]:
+        """The rows as the vote compares them, each of length 1."""
         ...
 
 
@@ -72,6 +93,7 @@ class Stack:
     """The four frozen models.
 
     `domain` says what images the detector was trained on; "" means photos of anything.
+    `by_category` finds boxes of the phrase's category alone; None where `detector` does.
     """
 
     name: str
@@ -80,3 +102,9 @@ class Stack:
     segmenter: Segmenter
     tracker: Tracker
     domain: str
+    by_category: Detector | None = None
+
+    @property
+    def category_detector(self) -> Detector:
+        """What says where things of one kind are, to scripted policies and surveys."""
+        return self.by_category or self.detector

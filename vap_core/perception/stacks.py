@@ -8,16 +8,23 @@ from vap_core.perception.protocols import Stack
 
 
 def load_embedded() -> Stack:
-    """Frozen EfficientNet-Lite0 features with small heads, trained on rendered generic objects."""
-    from vap_core.perception.embedded import detector, encoder, segmenter, tracker
+    """Boxes of a COCO detector; EfficientNet-Lite0 features with heads trained on renders."""
+    from vap_core.perception.embedded import (
+        detector,
+        encoder,
+        open_detector,
+        segmenter,
+        tracker,
+    )
 
     return Stack(
         name="embedded",
-        detector=detector.load(),
+        detector=open_detector.load(),
         encoder=encoder.load(),
         segmenter=segmenter.load(),
         tracker=tracker.load(),
-        domain="rendered tabletop scenes",
+        domain="",
+        by_category=detector.load(),
     )
 
 

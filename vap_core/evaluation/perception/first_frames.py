@@ -274,17 +274,17 @@ def _same_category(view: View) -> dict[str, Mask]:
 
 def _best_boxes(view: View, stack: Stack) -> dict[str, Boxes]:
     """The boxes down to FLOOR, best first, of the category and of its unseen phrase, if any."""
-    best = {"category": stack.detector([view.rgb], view.row.category, FLOOR)[0]}
+    best = {"category": stack.category_detector([view.rgb], view.row.category, FLOOR)[0]}
     phrase = _take_turn(UNSEEN.get(view.row.category, ()), view.row.episode)
     if phrase:
-        best["unseen"] = stack.detector([view.rgb], phrase, FLOOR)[0]
+        best["unseen"] = stack.category_detector([view.rgb], phrase, FLOOR)[0]
     return best
 
 
 def _false_alarm(view: View, stack: Stack) -> TableRow:
     """Whether anything is found of a category that is absent."""
     phrase = _take_turn(_absent_categories(view), view.row.episode)
-    found = stack.detector([view.rgb], phrase)[0]
+    found = stack.category_detector([view.rgb], phrase)[0]
     return {"absent_phrase": phrase, "false_alarm": len(found) > 0}
 
 

@@ -1,0 +1,95 @@
+"""The embedded stack's detector: boxes of any object, and the evidence that one is of the phrase's
+kind.
+
+Boxes come from the proposer, which takes no phrase. The phrase head (detector.py) was trained on
+rendered scenes: on renders it knows kinds of things apart, on photos it finds next to nothing. So
+its boxes raise the prior of the proposals that they agree with and remove none, and its best score
+in a view says whether the view is of the world that it was trained on.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+from jaxtyping import Float32
+
+from vap_core.base.types import Boxes, Rgb
+from vap_core.perception.boxes import box_iou
+from vap_core.perception.embedded import detector, proposer
+from vap_core.perception.embedded.detector import LiteDetector
+from vap_core.perception.embedded.proposer import LEAST_SCORE, Proposer
+
+PHRASE_FLOOR = 0.03
+"""Score from which on a box of the phrase head is looked at."""
+FAMILIAR = 0.2
+"""Best score of the phrase head from which on a view is familiar. Between the 5th and the 95th
+percentile it is .45-.93 on renders and 0-.16 on photos; any bound from .2 to .5 elects the same
+within two points."""
+AGREEMENT = 0.05
+AGREEMENT_IOU = 0.5
+"""What a proposal gains in units of cosine where a box of the phrase head agrees with it."""
+OBJECTNESS = 0.05
+"""What a proposal gains for every natural logarithm of its score."""
+
+
+class OpenDetector:
+    """Proposes boxes of any object, with the phrase as evidence."""
+
+    def __init__(self, propose: Proposer, by_category: LiteDetector) -> None:
+        self.propose = propose
+        self.by_category = by_category
+
+    def __call__(
+        self, images: Sequence[Rgb], phrase: str, threshold: float | None = None
+    ) -> list[Boxes]:
+        """The proposals of each image with their priors; `threshold` bounds the proposer's score.
+
+        A word that the phrase head does not know changes nothing but the priors.
+        """
+        if threshold is None:
+            threshold = LEAST_SCORE
+        found = []
+        for image in images:
+            xyxy, score = self.propose(image, threshold)
+            named = self._named(image, phrase)
+            boxes = Boxes(
+                xyxy=xyxy,
+                score=score,
+                phrase=phrase,
+                prior=prior(xyxy, score, named),
+                familiar=_is_familiar(named),
+            )
+            found.append(boxes)
+        return found
+
+    def is_familiar(self, image: Rgb, phrase: str) -> bool:
+        """Whether the image is of the world that the phrase head was trained on."""
+        return _is_familiar(self._named(image, phrase))
+
+    def _named(self, image: Rgb, phrase: str) -> Boxes:
+        """The boxes of the phrase head, the unsure ones too."""
+        return self.by_category([image], phrase, PHRASE_FLOOR)[0]
+
+
+def prior(
+    xyxy: Float32[np.ndarray, "n 4"], score: Float32[np.ndarray, " n"], named: Boxes
+) -> Float32[np.ndarray, " n"]:
+    """The evidence for each proposal besides the references', in units of cosine."""
+    sure = named.xyxy[named.score >= detector.THRESHOLD]
+    overlap = box_iou(xyxy, sure).max(axis=1, initial=0.0)
+    objectness = np.log(score + np.float32(1e-3))
+    evidence = OBJECTNESS * objectness + AGREEMENT * (overlap >= AGREEMENT_IOU)
+    return evidence.astype(np.float32)
+
+
+def _is_familiar(named: Boxes) -> bool:
+    return bool(named.score.max(initial=0.0) >= FAMILIAR)
+
+
+@cache
+def load() -> OpenDetector:
+    """The shipped detector.
+
+    Raises: MissingWeights: a file of data/weights is absent or damaged.
+    """
+    return OpenDetector(proposer.load(), detector.load())
