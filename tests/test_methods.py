@@ -292,6 +292,7 @@ def test_what_each_method_changes(runs: tuple[dict[str, list[Episode]], dict[str
     both, told = (True, True, False), (True, True, True)
     assert changed == {
         "generic": (False, False, False), "hard-short": (False, True, False), "hard-long": (False, True, False), "vap": both,
+        "vap-always-tint": both,
         "mask-only": (True, False, False), "rewrite-only": (False, True, False), "vap-associated": both, "oracle-box": told, "oracle-mask": told,
         "oracle-track": told, "wrong-mask": told,
     }  # fmt: skip

@@ -42,7 +42,14 @@ from vap_core.base.types import (
 )
 from vap_core.instruction import Parser, parse, rewrite
 from vap_core.memory import recall
-from vap_core.perception.candidates import Candidates, Proposals, embed, masks_by_id, segment
+from vap_core.perception.candidates import (
+    Candidates,
+    Proposals,
+    embed_views,
+    masks_by_id,
+    propose,
+    segment,
+)
 from vap_core.perception.protocols import FamiliarityJudge, Stack
 from vap_core.prompt import ALPHA, PALETTE, choose_colours, tint
 from vap_core.vote import VoteRule, compare, election_scores, shortlist, vote
@@ -56,7 +63,9 @@ class Prompting:
     """What is changed in the policy's inputs: by default the paper's method.
 
     The switches are ablations. `associate` goes beyond the paper: views agree on one candidate each
-    (associate.PAIRINGS by name); None grounds them one by one.
+    (associate.PAIRINGS by name); None grounds them one by one. `always_tint` is the paper's rule:
+    the best candidate wins, however unlike the references it is. Without it an object whose best
+    candidate is below the stack's threshold is not in view.
     """
 
     alpha: float = ALPHA
@@ -65,6 +74,7 @@ class Prompting:
     rewrite: bool = True
     rule: VoteRule = "vote"
     associate: Pairing | None = None
+    always_tint: bool = False
 
 
 @value
@@ -138,7 +148,8 @@ class Attender:
             of_view: list[Candidates] = []
             per_target = []
             for phrase, obj in zip(phrases, wanted, strict=True):
-                few = shortlist(proposals[camera][phrase], obj.embeddings, self.stack.encoder)
+                offered = proposals[camera][phrase]
+                few = shortlist(offered, compare(obj, offered, self.stack))
                 of_view.append(segment(rgb, few, self.stack, known=of_view))
                 per_target.append(self.ground(camera, obj, of_view[-1]))
             candidates[camera] = tuple(of_view)
@@ -152,6 +163,8 @@ class Attender:
                 cameras=cameras or {},
                 pairing=self.prompting.associate,
             )
+        for camera, elected in groundings.items():
+            groundings[camera] = tuple(map(self.reject, elected))
         return self.begin(parsed, views, candidates, groundings, associations)
 
     def understand(
@@ -178,7 +191,7 @@ class Attender:
     def ground(self, camera: str, obj: PersonalObject, candidates: Candidates) -> Grounding:
         """The vote of one view for one object."""
         boxes = candidates.boxes
-        cosine = compare(self.stack.encoder, candidates.embeddings, obj.embeddings, boxes.familiar)
+        cosine = compare(obj, candidates, self.stack)
         ballot = vote(election_scores(cosine, boxes), self.prompting.rule)
         return Grounding(
             camera=camera,
@@ -189,6 +202,20 @@ class Attender:
             winner=ballot.winner,
             masks=candidates.masks,
         )
+
+    def reject(self, grounding: Grounding) -> Grounding:
+        """The grounding without a winner that is too unlike the references to be the object."""
+        thresholds = self.stack.thresholds
+        if thresholds is None or self.prompting.always_tint:
+            return grounding
+        threshold = thresholds.unfamiliar
+        if grounding.candidates.familiar:
+            threshold = thresholds.familiar
+        grounding = replace(grounding, threshold=threshold)
+        winner = grounding.winner
+        if winner is None or grounding.likeness[winner] >= threshold:
+            return grounding
+        return replace(grounding, winner=None, rejected=winner)
 
     def begin(
         self,
@@ -294,15 +321,13 @@ class Attender:
         proposals: dict[str, dict[str, Proposals]] = {}
         for camera in views:
             proposals[camera] = {}
-        images = list(views.values())
         for phrase in dict.fromkeys(phrases):
             if given is None:
-                detected = self.stack.detector(images, phrase)
-                boxes = dict(zip(views, detected, strict=True))
+                offered = propose(views, phrase, self.stack)
             else:
-                boxes = self._judge(views, phrase, given)
-            for camera, rgb in views.items():
-                proposals[camera][phrase] = embed(rgb, boxes[camera], self.stack)
+                offered = embed_views(views, self._judge(views, phrase, given), self.stack)
+            for camera, of_view in offered.items():
+                proposals[camera][phrase] = of_view
         return proposals
 
     def _judge(self, views: Views, phrase: str, given: Mapping[str, Boxes]) -> dict[str, Boxes]:

@@ -8,6 +8,7 @@ import re
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -105,6 +106,14 @@ def remember(name: str, category: str, crops: Sequence[Rgb], encoder: Encoder) -
         crops=tuple(crops),
         encoder=encoder.name,
     )
+
+
+@lru_cache(maxsize=256)
+def reference_rows(obj: PersonalObject, encoder: Encoder) -> Float32[np.ndarray, "k d"]:
+    """Z_o by this encoder: the remembered rows if they are its own, else from the kept crops."""
+    if encoder.name == obj.encoder:
+        return obj.embeddings
+    return encoder(obj.crops)
 
 
 def recall(

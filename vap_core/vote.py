@@ -5,10 +5,11 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32
 
-from vap_core.base.types import Ballot, Boxes
+from vap_core.base.types import Ballot, Boxes, PersonalObject
+from vap_core.memory import reference_rows
 from vap_core.perception.boxes import box_cover
-from vap_core.perception.candidates import Proposals
-from vap_core.perception.protocols import Encoder, WeighingEncoder
+from vap_core.perception.candidates import Candidates, Proposals
+from vap_core.perception.protocols import Stack
 
 VoteRule = Literal["vote", "average"]
 
@@ -28,16 +29,11 @@ def similarity(
 
 
 def compare(
-    encoder: Encoder,
-    embeddings: Float32[np.ndarray, "n d"],
-    references: Float32[np.ndarray, "k d"],
-    familiar: bool,
+    obj: PersonalObject, proposals: Proposals | Candidates, stack: Stack
 ) -> Float32[np.ndarray, "n k"]:
-    """`similarity` in a view that is `Boxes.familiar` or not, as the encoder weighs its rows."""
-    if isinstance(encoder, WeighingEncoder):
-        embeddings = encoder.weigh(embeddings, familiar)
-        references = encoder.weigh(references, familiar)
-    return similarity(embeddings, references)
+    """cos(e_i, z_k) of every crop of a view, by the encoder of that view."""
+    rows = reference_rows(obj, stack.encoder_of(proposals.boxes))
+    return similarity(proposals.embeddings, rows)
 
 
 def election_scores(cosine: Float32[np.ndarray, "n k"], boxes: Boxes) -> Float32[np.ndarray, "n k"]:
@@ -50,10 +46,8 @@ def election_scores(cosine: Float32[np.ndarray, "n k"], boxes: Boxes) -> Float32
     return cosine + (boxes.prior - boxes.prior.max())[:, None]
 
 
-def shortlist(
-    proposals: Proposals, references: Float32[np.ndarray, "k d"], encoder: Encoder
-) -> Proposals:
-    """The proposals that are candidates for the object of these references.
+def shortlist(proposals: Proposals, cosine: Float32[np.ndarray, "n k"]) -> Proposals:
+    """The proposals that are candidates, given their cosines with an object's references.
 
     Proposals of any object overlap: of those in one place the one of the best mean score is taken,
     and at most `MOST_CANDIDATES` places. Proposals of one category are all candidates.
@@ -61,7 +55,6 @@ def shortlist(
     boxes = proposals.boxes
     if boxes.prior is None:
         return proposals
-    cosine = compare(encoder, proposals.embeddings, references, boxes.familiar)
     mean = election_scores(cosine, boxes).astype(np.float64).mean(axis=1)
     cover = box_cover(boxes.xyxy, boxes.xyxy)
     kept: list[int] = []

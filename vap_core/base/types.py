@@ -146,7 +146,9 @@ class Grounding:
 
     `similarity[i, k]` is cos(e_i, z_k). `winner` is the candidate that is tracked and tinted: the
     ballot's, unless cross-view association or the simulator chose otherwise; None where the object
-    is not visible in this view."""
+    is not visible in this view. `rejected` is the candidate that was chosen, but whose `likeness`
+    is below `threshold`: the object is not in view. Without a threshold nothing is rejected, as in
+    the paper."""
 
     camera: str
     object: str
@@ -155,11 +157,27 @@ class Grounding:
     ballot: Ballot
     winner: int | None
     masks: Bool[np.ndarray, "n h w"]
+    threshold: float | None = None
+    rejected: int | None = None
+
+    @property
+    def chosen(self) -> int | None:
+        """The winner, or the candidate that would be it if it were like enough."""
+        return self.winner if self.rejected is None else self.rejected
 
     @property
     def overruled(self) -> bool:
-        """Whether another candidate than the elected one is used, or none."""
-        return self.winner != self.ballot.winner
+        """Whether another candidate than the elected one is chosen, or none."""
+        return self.chosen != self.ballot.winner
+
+    @property
+    def likeness(self) -> Float32[np.ndarray, " n"]:
+        """Each candidate's mean cosine with the references; the greatest in unfamiliar views."""
+        if not len(self.similarity):
+            return np.zeros(0, np.float32)
+        if self.candidates.familiar:
+            return self.similarity.mean(axis=1)
+        return self.similarity.max(axis=1)
 
     @property
     def mask(self) -> Mask | None:

@@ -104,6 +104,12 @@ def ground(
             help="A candidate x0,y0,x1,y1 in pixels, instead of the detector; repeatable."
         ),
     ] = None,
+    always_tint: Annotated[
+        bool,
+        typer.Option(
+            "--always-tint", help="Highlight the best candidate, however unlike it is (the paper)."
+        ),
+    ] = False,
     out: Annotated[Path, typer.Option(help="Folder for the overlay PNG and the recording.")] = Path(
         "data/runs/ground"
     ),
@@ -121,7 +127,15 @@ def ground(
 
     rgb = load_photo(image, long_side=None)
     boxes = parse_boxes(box, rgb) if box else None
-    found = ground_image(rgb, instruction, memory, stack, objects=object, boxes=boxes)
+    found = ground_image(
+        rgb,
+        instruction,
+        memory,
+        stack,
+        objects=object,
+        boxes=boxes,
+        always_tint=always_tint,
+    )
     if found.domain and boxes is None:
         _warn_of_domain(found.domain, "on a real photo give the candidates with --box")
     written = write_evidence(out, image.stem, found)

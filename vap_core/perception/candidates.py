@@ -3,12 +3,13 @@
 Identities are the indices that the view's tracker gives to what it follows.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
-from vap_core.base.types import Boxes, Rgb, value
+from vap_core.base.types import Boxes, Rgb, Views, value
 from vap_core.perception.boxes import box_iou, crop
 from vap_core.perception.protocols import Stack
 
@@ -46,9 +47,29 @@ class Candidates:
     ids: tuple[int, ...]
 
 
+def propose(views: Views, phrase: str, stack: Stack) -> dict[str, Proposals]:
+    """What the detector proposes for a phrase in every view, embedded."""
+    detected = stack.detector(list(views.values()), phrase)
+    return embed_views(views, dict(zip(views, detected, strict=True)), stack)
+
+
+def embed_views(views: Views, boxes: Mapping[str, Boxes], stack: Stack) -> dict[str, Proposals]:
+    """The boxes of every view, embedded.
+
+    Cameras of one robot see one world: where one view is familiar all are, so that all are embedded
+    by one encoder.
+    """
+    familiar = any(of_view.familiar for of_view in boxes.values())
+    proposals = {}
+    for camera, rgb in views.items():
+        proposals[camera] = embed(rgb, replace(boxes[camera], familiar=familiar), stack)
+    return proposals
+
+
 def embed(rgb: Rgb, boxes: Boxes, stack: Stack) -> Proposals:
     """The embeddings of every box of one view."""
-    return Proposals(boxes, stack.encoder([crop(rgb, box) for box in boxes.xyxy]))
+    encoder = stack.encoder_of(boxes)
+    return Proposals(boxes, encoder([crop(rgb, box) for box in boxes.xyxy]))
 
 
 def segment(

@@ -51,15 +51,6 @@ class Encoder(Protocol):
 
 
 @runtime_checkable
-class WeighingEncoder(Protocol):
-    """An encoder whose rows count differently in views that are not `Boxes.familiar`."""
-
-    def weigh(self, rows: Float32[np.ndarray, "n d"], familiar: bool) -> Float32[np.ndarray, "n d"]:
-        """The rows as the vote compares them, each of length 1."""
-        ...
-
-
-@runtime_checkable
 class Segmenter(Protocol):
     """Masks the object inside each box (P 3.3)."""
 
@@ -89,11 +80,22 @@ class Tracker(Protocol):
 
 
 @dataclass(frozen=True)
+class Thresholds:
+    """The least `Grounding.likeness` of an object that is in view, in familiar and other views."""
+
+    familiar: float
+    unfamiliar: float
+
+
+@dataclass(frozen=True)
 class Stack:
     """The four frozen models.
 
     `domain` says what images the detector was trained on; "" means photos of anything.
     `by_category` finds boxes of the phrase's category alone; None where `detector` does.
+    `unfamiliar_encoder` embeds crops of views that are not `Boxes.familiar`, and the references for
+    them, from the crops that a memory keeps; None: `encoder` does.
+    `thresholds` is None where none were measured: then the best candidate wins, however unlike.
     """
 
     name: str
@@ -103,8 +105,16 @@ class Stack:
     tracker: Tracker
     domain: str
     by_category: Detector | None = None
+    unfamiliar_encoder: Encoder | None = None
+    thresholds: Thresholds | None = None
 
     @property
     def category_detector(self) -> Detector:
         """What says where things of one kind are, to scripted policies and surveys."""
         return self.by_category or self.detector
+
+    def encoder_of(self, boxes: Boxes) -> Encoder:
+        """The encoder of the view in which these boxes are."""
+        if boxes.familiar or self.unfamiliar_encoder is None:
+            return self.encoder
+        return self.unfamiliar_encoder

@@ -25,6 +25,7 @@ def load_embedded() -> Stack:
         tracker=tracker.load(),
         domain="",
         by_category=detector.load(),
+        unfamiliar_encoder=encoder.load_unfamiliar(),
     )
 
 

@@ -73,7 +73,7 @@ def mean_cosines(grounding: Grounding) -> np.ndarray:
 def _drawing_order(grounding: Grounding) -> list[int]:
     """Candidates from the bottom to the top; on top the winner, or else the elected one."""
     order = list(range(len(grounding.similarity)))
-    top = grounding.ballot.winner if grounding.winner is None else grounding.winner
+    top = grounding.ballot.winner if grounding.chosen is None else grounding.chosen
     if top is not None:
         order.remove(top)
         order.append(top)
@@ -169,7 +169,10 @@ def _candidate_numbers(grounding: Grounding) -> rr.AnyValues:
             "tied": ballot.tied,
             "mean_cosine": mean_cosines(grounding),
             "similarity": grounding.similarity.reshape(-1),
+            "likeness": grounding.likeness,
         }
+        if boxes.prior is not None:
+            per_candidate["prior"] = boxes.prior
     return rr.AnyValues(
         phrase=boxes.phrase,
         object=grounding.object,
@@ -178,6 +181,8 @@ def _candidate_numbers(grounding: Grounding) -> rr.AnyValues:
         margin=ballot.margin,
         elected=_number(ballot.winner),
         cosine_margin=ballot.cosine_margin,
+        rejected=_number(grounding.rejected),
+        threshold=np.nan if grounding.threshold is None else grounding.threshold,
         **per_candidate,
     )
 
