@@ -367,7 +367,7 @@ def test_truth_reaches_nobody_but_an_oracle(
     oracles = {"oracle-box": 1, "oracle-mask": 1, "oracle-track": 3, "wrong-mask": 3}
     assert {m: n for m, n in before.items() if n} == oracles
     assert {m: n for m, n in after.items() if n} == dict.fromkeys(
-        (*oracles, "vap", "mask-only", "vap-associated"), 3
+        (*oracles, "vap", "vap-always-tint", "mask-only", "vap-associated"), 3
     )
     assert not {"truth", "masks", "row"} & set(inspect.signature(Attender.start).parameters)
     assert not {"truth", "masks", "row"} & set(inspect.signature(TextPrompter.start).parameters)

@@ -20,7 +20,7 @@ from vap_core.base.files import parse_json, write_atomic
 from vap_core.base.photos import load_photo as load_photo
 from vap_core.base.types import Description, PersonalObject, Rgb, Target
 from vap_core.perception.boxes import crop
-from vap_core.perception.protocols import Detector, Encoder
+from vap_core.perception.protocols import Detector, Encoder, ReferenceCropper
 
 FORMAT = "vap-personal-object"
 VERSION = 1
@@ -65,19 +65,12 @@ def reference_box(
 ) -> Float32[np.ndarray, "4"] | None:
     """Where a photo shows the object that it is a reference of; None where nothing is found.
 
-    It is the best box of the category. Where boxes of any object are proposed, it is the most
-    likely one that holds the photo's centre.
+    It is the best box of the category, unless the detector has its own way to find it.
     """
+    if isinstance(detector, ReferenceCropper):
+        return detector.reference_box(photo, category, threshold)
     (boxes,) = detector([photo], category, threshold)
-    if boxes.prior is None:
-        return boxes.xyxy[0] if len(boxes) else None
-    h, w = photo.shape[:2]
-    centre = np.array([w / 2, h / 2])
-    inside = (boxes.xyxy[:, :2] <= centre) & (centre <= boxes.xyxy[:, 2:])
-    holding = np.flatnonzero(inside.all(axis=1))
-    if not len(holding):
-        return None
-    return boxes.xyxy[holding[boxes.prior[holding].argmax()]]
+    return boxes.xyxy[0] if len(boxes) else None
 
 
 def remember(name: str, category: str, crops: Sequence[Rgb], encoder: Encoder) -> PersonalObject:

@@ -37,6 +37,17 @@ class FamiliarityJudge(Protocol):
 
 
 @runtime_checkable
+class ReferenceCropper(Protocol):
+    """A detector that finds the object of a reference photo in another way than in a scene."""
+
+    def reference_box(
+        self, photo: Rgb, phrase: str, threshold: float
+    ) -> Float32[np.ndarray, "4"] | None:
+        """Where the object is; None when nothing scores `threshold`."""
+        ...
+
+
+@runtime_checkable
 class Encoder(Protocol):
     """Embeds crops (P 3.3, f).
 

@@ -16,15 +16,21 @@ from jaxtyping import Float32
 from vap_core.base.types import Boxes, Rgb
 from vap_core.perception.boxes import box_iou
 from vap_core.perception.embedded import detector, proposer
-from vap_core.perception.embedded.detector import LiteDetector
-from vap_core.perception.embedded.proposer import LEAST_SCORE, Proposer
+from vap_core.perception.embedded.proposer import LARGEST_SHARE, LEAST_SCORE, MOST, Propose
+from vap_core.perception.protocols import Detector
 
 PHRASE_FLOOR = 0.03
 """Score from which on a box of the phrase head is looked at."""
-FAMILIAR = 0.2
-"""Best score of the phrase head from which on a view is familiar. Between the 5th and the 95th
-percentile it is .45-.93 on renders and 0-.16 on photos; any bound from .2 to .5 elects the same
-within two points."""
+FAMILIAR = 0.4
+"""Best score of the phrase head from which on a view is familiar. In 200 of 209 rendered opening
+views a camera of the episode reaches it, and in 24 % of 95 photos of toys, pets and other things;
+with .2 it is all of them and 43 %. The vote is the same on renders, and two of 80 better on photos.
+"""
+MOST_UNFAMILIAR = 40
+"""Boxes of an unfamiliar view. Of 80 objects pasted into real photos 20 boxes elect 56, 40 elect 60
+and 60 elect 61."""
+REFERENCE_SHARE = 0.95
+"""A reference's object may fill the photo."""
 AGREEMENT = 0.05
 AGREEMENT_IOU = 0.5
 """What a proposal gains in units of cosine where a box of the phrase head agrees with it."""
@@ -35,7 +41,7 @@ OBJECTNESS = 0.05
 class OpenDetector:
     """Proposes boxes of any object, with the phrase as evidence."""
 
-    def __init__(self, propose: Proposer, by_category: LiteDetector) -> None:
+    def __init__(self, propose: Propose, by_category: Detector) -> None:
         self.propose = propose
         self.by_category = by_category
 
@@ -50,8 +56,9 @@ class OpenDetector:
             threshold = LEAST_SCORE
         found = []
         for image in images:
-            xyxy, score = self.propose(image, threshold)
             named = self._named(image, phrase)
+            most = MOST if _is_familiar(named) else MOST_UNFAMILIAR
+            xyxy, score = self.propose(image, threshold, most, LARGEST_SHARE)
             boxes = Boxes(
                 xyxy=xyxy,
                 score=score,
@@ -61,6 +68,20 @@ class OpenDetector:
             )
             found.append(boxes)
         return found
+
+    def reference_box(
+        self, photo: Rgb, phrase: str, threshold: float
+    ) -> Float32[np.ndarray, "4"] | None:
+        """The most likely box of any size that holds the photo's centre."""
+        xyxy, score = self.propose(photo, threshold, MOST_UNFAMILIAR, REFERENCE_SHARE)
+        h, w = photo.shape[:2]
+        centre = np.array([w / 2, h / 2])
+        inside = (xyxy[:, :2] <= centre) & (centre <= xyxy[:, 2:])
+        holding = np.flatnonzero(inside.all(axis=1))
+        if not len(holding):
+            return None
+        evidence = prior(xyxy[holding], score[holding], self._named(photo, phrase))
+        return xyxy[holding[evidence.argmax()]]
 
     def is_familiar(self, image: Rgb, phrase: str) -> bool:
         """Whether the image is of the world that the phrase head was trained on."""

@@ -5,6 +5,7 @@ classes are not used: the highest class score of a box says how likely it holds 
 """
 
 from functools import cache
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -19,6 +20,8 @@ from vap_core.perception.embedded.runtime import (
 )
 from vap_core.perception.embedded.weights import read_checked
 
+Found = tuple[Float32[np.ndarray, "n 4"], Float32[np.ndarray, " n"]]
+"""Boxes and their scores."""
 GRAPH = "nanodet-coco.onnx"
 SIDE = 416
 """Pixels of the square to which a picture is resized; its aspect is not kept."""
@@ -33,11 +36,20 @@ LEAST_SCORE = 0.04
 """Flat grey gives boxes of up to .028."""
 LEAST_SIDE_PX = 4
 LARGEST_SHARE = 0.6
-"""A box of more than this share of the picture is the table or the room."""
+"""In a scene a box of more than this share of the picture is the table or the room."""
 NMS_IOU = 0.7
 """Boxes of parts, of whole objects and of pairs are all kept for the vote."""
 MOST = 20
-"""Boxes of one picture. The best 10 lose six points of tabletop's objects."""
+"""Boxes of one picture. On renders the best 10 lose six points of tabletop's objects."""
+
+
+@runtime_checkable
+class Propose(Protocol):
+    """Proposes boxes of any object, best first, with scores in [0, 1]."""
+
+    def __call__(self, rgb: Rgb, least_score: float, most: int, largest_share: float) -> Found:
+        """At most `most` boxes, none larger than a share of the picture, with a least score."""
+        ...
 
 
 class Proposer:
@@ -47,8 +59,12 @@ class Proposer:
         self.network = network
 
     def __call__(
-        self, rgb: Rgb, least_score: float = LEAST_SCORE
-    ) -> tuple[Float32[np.ndarray, "n 4"], Float32[np.ndarray, " n"]]:
+        self,
+        rgb: Rgb,
+        least_score: float = LEAST_SCORE,
+        most: int = MOST,
+        largest_share: float = LARGEST_SHARE,
+    ) -> Found:
         """Boxes in the picture's pixels and their scores, best first."""
         scores, edges = self.network(prepare(rgb))
         xyxy, score = decode(scores[0], edges[0])
@@ -58,10 +74,10 @@ class Proposer:
         sides = xyxy[:, 2:] - xyxy[:, :2]
         usable = score >= least_score
         usable &= (sides >= LEAST_SIDE_PX).all(axis=1)
-        usable &= sides.prod(axis=1) <= LARGEST_SHARE * w * h
+        usable &= sides.prod(axis=1) <= largest_share * w * h
         xyxy = xyxy[usable]
         score = score[usable]
-        kept = _suppress(xyxy, score)
+        kept = _suppress(xyxy, score)[:most]
         return xyxy[kept], score[kept]
 
 
@@ -116,9 +132,9 @@ def _cells() -> tuple[Float32[np.ndarray, "c 2"], Float32[np.ndarray, " c"]]:
 
 
 def _suppress(xyxy: Float32[np.ndarray, "n 4"], score: Float32[np.ndarray, " n"]) -> np.ndarray:
-    """Indices of at most `MOST` boxes that overlap by less than `NMS_IOU`, best first."""
+    """Indices of boxes that overlap by less than `NMS_IOU`, best first."""
     xywh = np.concatenate([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]], axis=1)
     kept = cv2.dnn.NMSBoxes(
         bboxes=xywh.tolist(), scores=score.tolist(), score_threshold=0.0, nms_threshold=NMS_IOU
     )
-    return np.asarray(kept, np.int64).reshape(-1)[:MOST]
+    return np.asarray(kept, np.int64).reshape(-1)
