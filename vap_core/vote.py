@@ -17,8 +17,8 @@ SAME = 1e-6
 """Cosines closer than this are equal, so that rounding never decides an election."""
 SAME_PLACE = 0.5
 """Of two boxes of which the smaller is covered by more than this share, one is a candidate."""
-MOST_CANDIDATES = 6
-"""Candidates of one object among proposals of any object."""
+MOST_CANDIDATES = 4
+"""Candidates of one object among proposals of any object. Each of them is segmented and tracked."""
 
 
 def similarity(
