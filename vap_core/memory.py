@@ -101,12 +101,11 @@ def remember(name: str, category: str, crops: Sequence[Rgb], encoder: Encoder) -
     )
 
 
-@lru_cache(maxsize=256)
 def reference_rows(obj: PersonalObject, encoder: Encoder) -> Float32[np.ndarray, "k d"]:
     """Z_o by this encoder: the remembered rows if they are its own, else from the kept crops."""
     if encoder.name == obj.encoder:
         return obj.embeddings
-    return encoder(obj.crops)
+    return _embed_crops(obj, encoder)  # type: ignore[arg-type]  # encoders are hashable
 
 
 def recall(
@@ -234,6 +233,11 @@ def load_bank(bank: Path, encoder: str | None = None) -> dict[str, PersonalObjec
         obj = load(path, encoder)
         objects[obj.name] = obj
     return objects
+
+
+@lru_cache(maxsize=256)
+def _embed_crops(obj: PersonalObject, encoder: Encoder) -> Float32[np.ndarray, "k d"]:
+    return encoder(obj.crops)
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
