@@ -109,6 +109,17 @@ def test_what_is_unlike_the_references_is_not_tinted_and_not_named() -> None:
     assert attended.events[0].level == "WARN"
 
 
+def test_recordings_and_signals_say_not_in_view() -> None:
+    from vap_core.recording.texts import describe_vote, vote_title
+
+    _, attended = Attender(STRICT, {"mug": MUG}).start({"front": UNLIKE}, "bring my cup")
+    (grounding,) = attended.groundings["front"]
+    said = describe_vote(grounding)
+    assert said.startswith("#0 not in view, cosine ")
+    assert said.endswith(" below 0.99 · #0 wins: votes 3 of 3, the only candidate")
+    assert vote_title(grounding) == "not in view"
+
+
 def test_always_tint_is_the_papers_rule_and_so_is_a_stack_without_thresholds() -> None:
     expected = tint(UNLIKE, UNLIKE.any(axis=2), PALETTE[0])
     for stack, prompting in ((STRICT, Prompting(always_tint=True)), (TOYS, Prompting())):
@@ -206,6 +217,17 @@ def test_a_reference_is_the_most_likely_box_that_holds_the_photos_centre() -> No
     mine, whole = register("it", "ornament", [photo], detector, MeanColour())
     assert mine.crops[0].shape == (14, 14, 3)
     assert whole == ()
+
+
+def test_where_the_phrase_head_knows_a_reference_its_own_box_is_taken() -> None:
+    def named(box: tuple[int, ...], score: float) -> object:
+        detector = OpenDetector(AllSquares(), lambda *a: [boxes(box, score=score)])
+        return reference_box(DESK[:, 18:42].copy(), "cup", detector)
+
+    holding = (4, 20, 36, 32)  # of the four proposals the only one with the centre, (12, 32)
+    assert named((4, 19, 36, 32), 0.5).tolist() == [4, 19, 36, 32]  # type: ignore[attr-defined]
+    assert tuple(named((4, 19, 36, 32), 0.3)) == holding  # type: ignore[call-overload]
+    assert tuple(named((4, 20, 10, 32), 0.5)) == holding  # type: ignore[call-overload]
 
 
 def test_a_memory_keeps_its_format_and_its_rows(tmp_path: Path) -> None:

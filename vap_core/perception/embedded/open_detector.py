@@ -82,7 +82,10 @@ class OpenDetector:
     def reference_box(
         self, photo: Rgb, phrase: str, threshold: float
     ) -> Float32[np.ndarray, "4"] | None:
-        """The most likely box of any size that holds the photo's centre."""
+        """The most likely box of any size that holds the photo's centre.
+
+        Where the phrase head knows the object, and agrees, its own box is taken.
+        """
         xyxy, score = self.propose(photo, threshold, MOST_UNFAMILIAR, REFERENCE_SHARE)
         h, w = photo.shape[:2]
         centre = np.array([w / 2, h / 2])
@@ -90,8 +93,12 @@ class OpenDetector:
         holding = np.flatnonzero(inside.all(axis=1))
         if not len(holding):
             return None
-        evidence = prior(xyxy[holding], score[holding], self._named(photo, phrase))
-        return xyxy[holding[evidence.argmax()]]
+        named = self._named(photo, phrase)
+        evidence = prior(xyxy[holding], score[holding], named)
+        best = holding[[evidence.argmax()]]
+        if _is_familiar(named) and box_iou(xyxy[best], named.xyxy[:1])[0, 0] >= AGREEMENT_IOU:
+            return named.xyxy[0]
+        return xyxy[best[0]]
 
     def is_familiar(self, image: Rgb, phrase: str) -> bool:
         """Whether the image is of the world that the phrase head was trained on."""
