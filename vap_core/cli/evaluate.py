@@ -21,8 +21,8 @@ Methods = Annotated[
         "--methods",
         "--method",
         help="generic, hard-short, hard-long, soft, vap, vap-always-tint, mask-only, rewrite-only, "
-        "vap-associated; bounds, which read the simulator: oracle-box, oracle-mask, oracle-track, wrong-mask. "
-        "With commas, or repeated. Default: generic,vap.",
+        "vap-associated; bounds, which read the simulator: oracle-box, oracle-mask, "
+        "oracle-track, wrong-mask. With commas, or repeated. Default: generic,vap.",
     ),
 ]
 POLICIES = (

@@ -160,9 +160,11 @@ def _log_bars(
 def _candidate_numbers(grounding: Grounding) -> rr.AnyValues:
     """Everything that the vote compared, and its result; -1 stands for no candidate."""
     boxes, ballot = grounding.candidates, grounding.ballot
-    per_candidate: dict[str, Any] = {}
+    numbers: dict[str, Any] = {}
+    if grounding.threshold is not None:
+        numbers["threshold"] = grounding.threshold
     if len(boxes):
-        per_candidate = {
+        numbers |= {
             "score": boxes.score,
             "xyxy": boxes.xyxy.reshape(-1),
             "votes": ballot.votes,
@@ -172,7 +174,7 @@ def _candidate_numbers(grounding: Grounding) -> rr.AnyValues:
             "likeness": grounding.likeness,
         }
         if boxes.prior is not None:
-            per_candidate["prior"] = boxes.prior
+            numbers["prior"] = boxes.prior
     return rr.AnyValues(
         phrase=boxes.phrase,
         object=grounding.object,
@@ -182,8 +184,7 @@ def _candidate_numbers(grounding: Grounding) -> rr.AnyValues:
         elected=_number(ballot.winner),
         cosine_margin=ballot.cosine_margin,
         rejected=_number(grounding.rejected),
-        threshold=np.nan if grounding.threshold is None else grounding.threshold,
-        **per_candidate,
+        **numbers,
     )
 
 
