@@ -140,6 +140,15 @@ class Ballot:
             raise ValueError(f"Ballot: winner {self.winner} of {len(self.votes)} candidates")
 
 
+def likeness(similarity: Float32[np.ndarray, "n k"], familiar: bool) -> Float32[np.ndarray, " n"]:
+    """Each candidate's mean cosine with the references; the greatest in unfamiliar views."""
+    if not len(similarity):
+        return np.zeros(0, np.float32)
+    if familiar:
+        return similarity.mean(axis=1)
+    return similarity.max(axis=1)
+
+
 @value
 class Grounding:
     """Why a view's box was chosen, or none: everything that the vote saw at t = 0 (P 3.3).
@@ -172,12 +181,8 @@ class Grounding:
 
     @property
     def likeness(self) -> Float32[np.ndarray, " n"]:
-        """Each candidate's mean cosine with the references; the greatest in unfamiliar views."""
-        if not len(self.similarity):
-            return np.zeros(0, np.float32)
-        if self.candidates.familiar:
-            return self.similarity.mean(axis=1)
-        return self.similarity.max(axis=1)
+        """`likeness` of every candidate."""
+        return likeness(self.similarity, self.candidates.familiar)
 
     @property
     def mask(self) -> Mask | None:

@@ -18,7 +18,16 @@ from typing import Any, get_args
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from vap_core.base.types import Ballot, Boxes, Camera, Mask, PersonalObject, Rgb, value
+from vap_core.base.types import (
+    Ballot,
+    Boxes,
+    Camera,
+    Mask,
+    PersonalObject,
+    Rgb,
+    likeness,
+    value,
+)
 from vap_core.memory import register
 from vap_core.perception.boxes import box_iou, crop, mask_box, mask_iou
 from vap_core.perception.candidates import Proposals, propose
@@ -372,6 +381,7 @@ def _choices(
     for k, personal in memory.items():
         few = shortlist(candidates, compare(personal, candidates, stack))
         cosine = compare(personal, few, stack)
+        like = likeness(cosine, few.boxes.familiar)
         true_cosine = similarity(true_embeddings, personal.embeddings)
         for rule in RULES:
             ballot = vote(election_scores(cosine, few.boxes), rule)
@@ -394,6 +404,7 @@ def _choices(
                 "margin": ballot.margin,
                 "cosine_margin": ballot.cosine_margin,
                 "tie": _is_tie(ballot),
+                "likeness": None if ballot.winner is None else float(like[ballot.winner]),
                 "mask_iou": overlap,
             }
             rows.append(row)
