@@ -65,7 +65,7 @@ def shortlist(proposals: Proposals, cosine: Float32[np.ndarray, "n k"]) -> Propo
 
 
 def vote(cosine: Float32[np.ndarray, "n k"], rule: VoteRule = "vote") -> Ballot:
-    """Elect one of n candidates by K references.
+    """Elect one of n candidates by K references, given cosines or `election_scores`.
 
     "vote": b* = argmax_i sum_k [i = argmax_j cos(e_j, z_k)]; a tie in votes goes to the tied
     candidate with the highest mean cosine (P 3.3). "average" is the ablation

@@ -127,7 +127,7 @@ class Ballot:
     share the most votes, where more than one does. `winner` is the elected candidate, None exactly
     when there is none to elect. `margin` is (votes of the winner - most votes of any other) / K, in
     [0, 1] when votes decide; `cosine_margin` is the same difference of mean cosines, 2 when there
-    is no other candidate."""
+    is no other candidate. Where boxes have priors, they are added to the cosines first."""
 
     votes: Int64[np.ndarray, " n"]
     tied: Bool[np.ndarray, " n"]
