@@ -123,12 +123,27 @@ def test_ground_answers_in_json_with_a_picture_and_a_recording(
     assert not again.stderr
 
 
-def test_ground_without_boxes_warns_that_the_detector_knows_renders_only(
+def test_ground_says_not_in_view_unless_it_is_to_tint_always(
     photos: list[Path], bank: Path, tmp_path: Path
 ) -> None:
-    done = vap("ground", photos[0], "bring my cup", "--memory", bank, "--out", tmp_path, "--json")
-    assert "not real photos" in done.stderr
-    assert json.loads(done.stdout)["winner"] == 0
+    """The mug's own photo shows it; one in which its colours are turned round shows another thing."""
+    told = ("bring my cup", "--memory", bank, "--out", tmp_path)
+    done = vap("ground", photos[0], *told, "--json")
+    assert not done.stderr
+    answer = json.loads(done.stdout)
+    assert (answer["winner"], answer["rejected"]) == (0, None)
+    assert answer["likeness"][0] >= answer["threshold"]
+    turned = tmp_path / "turned.png"
+    Image.fromarray(255 - np.asarray(Image.open(photos[0]).convert("RGB"))).rotate(90).save(turned)
+    answer = json.loads(vap("ground", turned, *told, "--json").stdout)
+    assert (answer["winner"], answer["instruction"]) == (None, "bring my cup")
+    assert answer["likeness"][answer["rejected"]] < answer["threshold"]
+    text = vap("ground", turned, *told).stdout
+    assert "mug not in view, cosine" in text
+    assert "--always-tint" in text
+    answer = json.loads(vap("ground", turned, *told, "--always-tint", "--json").stdout)
+    assert answer["instruction"] == "bring the red cup"
+    assert (answer["threshold"], answer["rejected"]) == (None, None)
 
 
 def test_nothing_found_is_an_answer_and_not_an_error(bank: Path, tmp_path: Path) -> None:

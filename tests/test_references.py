@@ -26,7 +26,6 @@ STACK = Stack(
     encoder=MeanColour(),
     segmenter=segmenter,
     tracker=SameColour(),
-    domain="",
 )
 
 

@@ -8,17 +8,19 @@ import re
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32
 
 from vap_core.base.errors import BadMemory, BadOutput, BadPhoto, UnknownName, one_of
 from vap_core.base.files import parse_json, write_atomic
 from vap_core.base.photos import load_photo as load_photo
 from vap_core.base.types import Description, PersonalObject, Rgb, Target
 from vap_core.perception.boxes import crop
-from vap_core.perception.protocols import Detector, Encoder
+from vap_core.perception.protocols import Detector, Encoder, ReferenceCropper
 
 FORMAT = "vap-personal-object"
 VERSION = 1
@@ -42,20 +44,33 @@ def register(
 ) -> tuple[PersonalObject, tuple[int, ...]]:
     """Remember one object from its reference photos.
 
-    Each photo is cropped by the category detector that is used at test time (P 3.3), to its best
-    box; where none scores `threshold`, the whole photo is the crop. Also returns the indices of
+    Each photo is cropped by the detector that is used at test time (P 3.3), to its
+    `reference_box`; where there is none, the whole photo is the crop. Also returns the indices of
     those photos.
     """
     crops = []
     whole = []
     for i, photo in enumerate(photos):
-        (boxes,) = detector([photo], category, threshold)
-        if len(boxes):
-            crops.append(crop(photo, boxes.xyxy[0]))
-        else:
+        box = reference_box(photo, category, detector, threshold=threshold)
+        if box is None:
             crops.append(photo)
             whole.append(i)
+        else:
+            crops.append(crop(photo, box))
     return remember(name, category, crops, encoder), tuple(whole)
+
+
+def reference_box(
+    photo: Rgb, category: str, detector: Detector, *, threshold: float = REFERENCE_THRESHOLD
+) -> Float32[np.ndarray, "4"] | None:
+    """Where a photo shows the object that it is a reference of; None where nothing is found.
+
+    It is the best box of the category, unless the detector has its own way to find it.
+    """
+    if isinstance(detector, ReferenceCropper):
+        return detector.reference_box(photo, category, threshold)
+    (boxes,) = detector([photo], category, threshold)
+    return boxes.xyxy[0] if len(boxes) else None
 
 
 def remember(name: str, category: str, crops: Sequence[Rgb], encoder: Encoder) -> PersonalObject:
@@ -89,6 +104,13 @@ def check_names(name: str, category: str) -> None:
             f"remember: {category!r} cannot be a category; name the kind of thing in words, for "
             "example --category cup."
         )
+
+
+def reference_rows(obj: PersonalObject, encoder: Encoder) -> Float32[np.ndarray, "k d"]:
+    """Z_o by this encoder: the remembered rows if they are its own, else from the kept crops."""
+    if encoder.name == obj.encoder:
+        return obj.embeddings
+    return _embed_crops(obj, encoder)  # type: ignore[arg-type]  # encoders are hashable
 
 
 def recall(
@@ -224,6 +246,11 @@ def load_bank(bank: Path, encoder: str | None = None) -> dict[str, PersonalObjec
         obj = load(path, encoder)
         objects[obj.name] = obj
     return objects
+
+
+@lru_cache(maxsize=256)
+def _embed_crops(obj: PersonalObject, encoder: Encoder) -> Float32[np.ndarray, "k d"]:
+    return encoder(obj.crops)
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from vap_core.base.errors import BadInstruction, BadOutput
+from vap_core.base.events import describe_rejection
 from vap_core.base.types import Attended, Boxes, Grounding, PersonalObject, Rgb, value
 
 CAMERA = "image"
@@ -29,7 +30,6 @@ class Found:
     instruction: str
     objects: tuple[PersonalObject, ...]
     attended: Attended
-    domain: str
 
     def __str__(self) -> str:
         lines = []
@@ -59,12 +59,13 @@ def ground_image(
     objects: Sequence[str] | None = None,
     boxes: Boxes | None = None,
     tiles: bool = False,
+    always_tint: bool = False,
 ) -> Found:
     """Run the method's first step on one picture with the remembered objects of a bank.
 
     With `tiles` the detector also looks at nine overlapping tiles.
     """
-    from vap_core.attend import Attender
+    from vap_core.attend import Attender, Prompting
     from vap_core.memory import load_bank
     from vap_core.perception.stacks import load_stack
     from vap_core.perception.tiles import TiledDetector
@@ -73,7 +74,7 @@ def ground_image(
     if tiles:
         models = replace(models, detector=TiledDetector(models.detector))
     bank = load_bank(memory, models.encoder.name)
-    attender = Attender(models, bank)
+    attender = Attender(models, bank, Prompting(always_tint=always_tint))
     boxes_by_camera = None if boxes is None else {CAMERA: boxes}
     _, attended = attender.start({CAMERA: rgb}, instruction, objects=objects, boxes=boxes_by_camera)
     matched = tuple(bank[grounding.object] for grounding in attended.groundings[CAMERA])
@@ -82,7 +83,6 @@ def ground_image(
         instruction=instruction,
         objects=matched,
         attended=attended,
-        domain=models.domain,
     )
 
 
@@ -163,6 +163,9 @@ def _grounding_to_json(grounding: Grounding) -> dict[str, Any]:
         "similarity": np.round(grounding.similarity, 6).tolist(),
         "margin": ballot.margin,
         "cosine_margin": ballot.cosine_margin if len(candidates) > 1 else None,
+        "likeness": np.round(grounding.likeness, 6).tolist(),
+        "threshold": grounding.threshold,
+        "rejected": grounding.rejected,
         "tied": ballot.tied.tolist(),
         "candidates": np.round(candidates.xyxy, 2).tolist(),
         "scores": np.round(candidates.score, 4).tolist(),
@@ -185,7 +188,7 @@ def _format_grounding(grounding: Grounding) -> list[str]:
     """One line per candidate, and one for the winner and its margin."""
     candidates = grounding.candidates
     ballot = grounding.ballot
-    winner = grounding.winner
+    winner = grounding.chosen
     if winner is None:
         return [
             f"no {candidates.phrase} found for {grounding.object}; nothing is highlighted. "
@@ -194,13 +197,19 @@ def _format_grounding(grounding: Grounding) -> list[str]:
     k = grounding.similarity.shape[1]
     lines = [f"{grounding.object} against {len(candidates)} candidates, {k} references vote:"]
     for i, (box, score) in enumerate(zip(candidates.xyxy, candidates.score, strict=True)):
-        mark = "->" if i == winner else "  "
+        mark = "->" if i == grounding.winner else "  "
         x0, y0, x1, y1 = box
         cosine = grounding.similarity[i].mean()
         lines.append(
             f" {mark} #{i}  box {x0:4.0f} {y0:4.0f} {x1:4.0f} {y1:4.0f}  score {score:.2f}  "
             f"votes {ballot.votes[i]}/{k}  mean cosine {cosine:.3f}"
         )
+    if grounding.rejected is not None:
+        lines.append(
+            f"{grounding.object} {describe_rejection(grounding)} (#{winner}): nothing is "
+            "highlighted; --always-tint highlights it nevertheless"
+        )
+        return lines
     if len(candidates) == 1:
         lines.append(
             f"winner #{winner}, the only candidate: no margin, it wins however unlike it is"

@@ -20,9 +20,9 @@ Methods = Annotated[
     typer.Option(
         "--methods",
         "--method",
-        help="generic, hard-short, hard-long, soft, vap, mask-only, rewrite-only, vap-associated; "
-        "bounds, which read the simulator: oracle-box, oracle-mask, oracle-track, wrong-mask. "
-        "With commas, or repeated. Default: generic,vap.",
+        help="generic, hard-short, hard-long, soft, vap, vap-always-tint, mask-only, rewrite-only, "
+        "vap-associated; bounds, which read the simulator: oracle-box, oracle-mask, "
+        "oracle-track, wrong-mask. With commas, or repeated. Default: generic,vap.",
     ),
 ]
 POLICIES = (

@@ -145,6 +145,12 @@ def ground(
             "on."
         ),
     ] = None,
+    always_tint: Annotated[
+        bool,
+        typer.Option(
+            "--always-tint", help="Highlight the best candidate, however unlike it is (the paper)."
+        ),
+    ] = False,
     out: Annotated[Path, typer.Option(help="Folder for the overlay PNG and the recording.")] = Path(
         "data/runs/ground"
     ),
@@ -196,9 +202,16 @@ def ground(
             "small objects; --no-tiles turns it off.",
             file=sys.stderr,
         )
-    found = ground_image(rgb, instruction, memory, stack, objects=object, boxes=boxes, tiles=tiles)
-    if found.domain and boxes is None:
-        _warn_of_domain(found.domain, "on a real photo give the candidates with --box")
+    found = ground_image(
+        rgb,
+        instruction,
+        memory,
+        stack,
+        objects=object,
+        boxes=boxes,
+        always_tint=always_tint,
+        tiles=tiles,
+    )
     written = write_evidence(out, image.stem, found)
     if as_json:
         print(json.dumps(to_json(found)))
@@ -332,11 +345,3 @@ def photograph(
     print(f"wrote {views} pictures to {out}")
     photos = " ".join(f"'{path}'" for path in paths)
     print(f"next: python -m vap_core register '{name}' --category '{model.category}' {photos}")
-
-
-def _warn_of_domain(domain: str, remedy: str) -> None:
-    """Note that the embedded detector finds things in pictures of its domain only."""
-    print(
-        f"note: the embedded detector knows {domain} only, not real photos; {remedy}.",
-        file=sys.stderr,
-    )

@@ -29,6 +29,7 @@ METHODS: dict[str, Method] = {
     "hard-long": HardPrompt("long"),
     "soft": SoftPrompt(),
     "vap": Prompting(),
+    "vap-always-tint": Prompting(always_tint=True),
     "mask-only": Prompting(rewrite=False),
     "rewrite-only": Prompting(highlight=False),
     "vap-associated": Prompting(associate=PAIRINGS["geometry"]),

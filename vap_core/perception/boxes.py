@@ -43,6 +43,16 @@ def box_iou(a: Float[np.ndarray, "n 4"], b: Float[np.ndarray, "m 4"]) -> Float[n
     return both / np.maximum(area_a[:, None] + area_b[None] - both, 1e-9)
 
 
+def box_cover(a: Float[np.ndarray, "n 4"], b: Float[np.ndarray, "m 4"]) -> Float[np.ndarray, "n m"]:
+    """Intersection over the smaller box's area, of every pair of boxes."""
+    near = np.maximum(a[:, None, :2], b[None, :, :2])
+    far = np.minimum(a[:, None, 2:], b[None, :, 2:])
+    both = np.clip(far - near, 0, None).prod(-1)
+    area_a = (a[:, 2:] - a[:, :2]).prod(-1)
+    area_b = (b[:, 2:] - b[:, :2]).prod(-1)
+    return both / np.maximum(np.minimum(area_a[:, None], area_b[None]), 1e-9)
+
+
 def suppress_overlaps(
     xyxy: Float32[np.ndarray, "n 4"], score: Float32[np.ndarray, " n"]
 ) -> Int64[np.ndarray, " k"]:

@@ -1,6 +1,7 @@
 """Small objects in large pictures: a detector that looks at overlapping tiles, too."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
 
 import cv2
@@ -39,12 +40,13 @@ class TiledDetector:
             for x0, y0, x1, y1 in corners.tolist():
                 parts.append(image[y0:y1, x0:x1])
             whole, *of_tiles = self.detector(parts, phrase, threshold)
-            xyxy, score = [whole.xyxy], [whole.score]
+            kept = [whole]
             for corner, boxes in zip(corners, of_tiles, strict=True):
                 uncut = ~_cut_by_edge(boxes.xyxy, corner, image.shape[1], image.shape[0])
-                xyxy.append(boxes.xyxy[uncut] + np.tile(corner[:2], 2).astype(np.float32))
-                score.append(boxes.score[uncut])
-            found.append(_merge(np.concatenate(xyxy), np.concatenate(score), phrase))
+                shift = np.tile(corner[:2], 2).astype(np.float32)
+                moved = replace(boxes, xyxy=boxes.xyxy + shift)
+                kept.append(_rows(moved, np.flatnonzero(uncut)))
+            found.append(_merge(kept))
         return found
 
 
@@ -70,15 +72,29 @@ def _cut_by_edge(
     return near.any(axis=1) | far.any(axis=1)
 
 
-def _merge(
-    xyxy: Float32[np.ndarray, "n 4"], score: Float32[np.ndarray, " n"], phrase: str
-) -> Boxes:
-    """The best boxes, overlaps removed."""
+def _rows(boxes: Boxes, rows: Int64[np.ndarray, " m"]) -> Boxes:
+    """These boxes, in this order."""
+    prior = boxes.prior
+    return replace(
+        boxes,
+        xyxy=boxes.xyxy[rows],
+        score=boxes.score[rows],
+        prior=None if prior is None else prior[rows],
+    )
+
+
+def _merge(parts: Sequence[Boxes]) -> Boxes:
+    """The best boxes, overlaps removed; `familiar` is that of the first, the whole picture."""
+    xyxy = np.concatenate([part.xyxy for part in parts])
+    score = np.concatenate([part.score for part in parts])
+    prior = None
+    if all(part.prior is not None for part in parts):
+        prior = np.concatenate([part.prior for part in parts])
     if not len(xyxy):
-        return Boxes.empty(phrase)
+        return parts[0]
     xywh = np.concatenate([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]], axis=1)
     kept = cv2.dnn.NMSBoxes(
         bboxes=xywh.tolist(), scores=score.tolist(), score_threshold=0.0, nms_threshold=NMS_IOU
     )
     best = np.asarray(kept, np.int64).reshape(-1)[:MOST_BOXES]
-    return Boxes(xyxy[best], score[best], phrase)
+    return _rows(replace(parts[0], xyxy=xyxy, score=score, prior=prior), best)

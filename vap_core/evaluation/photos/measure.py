@@ -18,7 +18,8 @@ from vap_core.base.photos import load_photo
 from vap_core.base.types import Boxes, Grounding, PersonalObject, Rgb
 from vap_core.evaluation.photos.folder import PhotoSet, Scene
 from vap_core.perception.boxes import box_iou
-from vap_core.perception.candidates import Candidates, describe
+from vap_core.perception.candidates import Candidates, embed, segment
+from vap_core.perception.protocols import FamiliarityJudge, Stack
 
 CAMERA = "photo"
 Row = dict[str, Any]
@@ -34,7 +35,7 @@ def measure_scene(
     """
     rgb = load_photo(scene.path, long_side=None)
     true_boxes, owners = _true_boxes(scene, rgb)
-    candidates = describe(rgb, true_boxes, attender.stack)
+    candidates = _candidates(rgb, true_boxes, attender.stack)
     rows = []
     for name, boxes in scene.boxes.items():
         if name not in memory:
@@ -76,6 +77,13 @@ def _true_boxes(scene: Scene, rgb: Rgb) -> tuple[Boxes, list[str]]:
             owners.append(name)
     xyxy = np.concatenate(clipped)
     return Boxes(xyxy, np.ones(len(xyxy), np.float32), "true boxes"), owners
+
+
+def _candidates(rgb: Rgb, boxes: Boxes, stack: Stack) -> Candidates:
+    """The true boxes, embedded as boxes of such a photo are, and their masks."""
+    if isinstance(stack.detector, FamiliarityJudge):
+        boxes = replace(boxes, familiar=stack.detector.is_familiar(rgb, boxes.phrase))
+    return segment(rgb, embed(rgb, boxes, stack), stack)
 
 
 def _ground(

@@ -85,7 +85,7 @@ class OraclePrompter:
             )
         phrase = parsed.targets[0].category
         prompted = self.prompted_object(truth.row)
-        candidates: dict[str, dict[str, Candidates]] = {}
+        candidates: dict[str, tuple[Candidates, ...]] = {}
         groundings: dict[str, tuple[Grounding, ...]] = {}
         for camera, rgb in observation.images.items():
             visible = self._visible(truth.masks[camera])
@@ -93,7 +93,7 @@ class OraclePrompter:
             found = self._describe(rgb, phrase, masks)
             elected = self.attender.ground(camera, wanted[0], found)
             choice = list(visible).index(prompted) if prompted in visible else None
-            candidates[camera] = {phrase: found}
+            candidates[camera] = (found,)
             groundings[camera] = (overrule(elected, choice),)
         state, attended = self.attender.begin(
             parsed, observation.images, candidates, groundings, chosen_by="the simulator"
