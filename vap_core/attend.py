@@ -16,7 +16,7 @@ numbers, each row of length 1. Cosines are n x k.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,7 @@ from vap_core.base.types import (
     Event,
     Grounding,
     Instruction,
+    Mask,
     PersonalObject,
     Rgb,
     Track,
@@ -51,7 +52,7 @@ from vap_core.perception.candidates import (
     segment,
 )
 from vap_core.perception.protocols import FamiliarityJudge, Stack
-from vap_core.prompt import ALPHA, PALETTE, choose_colours, tint
+from vap_core.prompt import PALETTE, PromptForm, Tint, choose_colours
 from vap_core.vote import VoteRule, compare, election_scores, shortlist, vote
 
 PerTarget = tuple[Grounding, ...]
@@ -65,16 +66,18 @@ class Prompting:
     The switches are ablations. `associate` goes beyond the paper: views agree on one candidate each
     (associate.PAIRINGS by name); None grounds them one by one. `always_tint` is the paper's rule:
     the best candidate wins, however unlike the references it is. Without it an object whose best
-    candidate is below the stack's threshold is not in view.
+    candidate is below the stack's threshold is not in view. `references` is how many of an object's
+    references are used, the first ones; None uses all.
     """
 
-    alpha: float = ALPHA
+    form: PromptForm = field(default_factory=Tint)
     palette: tuple[Colour, ...] = PALETTE
     highlight: bool = True
     rewrite: bool = True
     rule: VoteRule = "vote"
     associate: Pairing | None = None
     always_tint: bool = False
+    references: int | None = None
 
 
 @value
@@ -185,7 +188,8 @@ class Attender:
         wanted = []
         for j, target in enumerate(parsed.targets):
             name = None if objects is None else objects[j]
-            wanted.append(recall(self.memory, target, name))
+            obj = recall(self.memory, target, name)
+            wanted.append(obj.first(self.prompting.references))
         return parsed, wanted
 
     def ground(self, camera: str, obj: PersonalObject, candidates: Candidates) -> Grounding:
@@ -258,7 +262,10 @@ class Attender:
             visible=_visible(tracks),
         )
         events = grounding_events(groundings, associations, ids, chosen_by)
-        return state, self._prompt(state, views, tracks, events)
+        others: dict[str, list[Mask]] = {}
+        for camera in views:
+            others[camera] = _other_masks(list(masks[camera]), ids[camera])
+        return state, self._prompt(state, views, tracks, others, events)
 
     def step(self, state: AttendState, views: Views) -> tuple[AttendState, Attended]:
         """Track every target and prompt the new images (t > 0). Consumes `state`.
@@ -296,7 +303,11 @@ class Attender:
             next_trackers = dict(zip(state.trackers, trackers[first:stop], strict=True))
             by_camera = dict(zip(state.trackers, tracks[first:stop], strict=True))
             targets = _tracks_of_targets(state, by_camera)
-            results.append(self.follow(state, images_now, targets, next_trackers))
+            others = {}
+            for camera, of_view in by_camera.items():
+                followed = [track.mask for track in of_view]
+                others[camera] = _other_masks(followed, state.ids[camera])
+            results.append(self.follow(state, images_now, targets, next_trackers, others))
             first = stop
         return results
 
@@ -306,13 +317,17 @@ class Attender:
         views: Views,
         tracks: Mapping[str, tuple[Track, ...]],
         trackers: Mapping[str, Any],
+        others: Mapping[str, Sequence[Mask]] | None = None,
     ) -> tuple[AttendState, Attended]:
-        """Advance one step and prompt, with every target where `tracks` has it."""
+        """Advance one step and prompt, with every target where `tracks` has it.
+
+        `others` are the masks of what else is followed, which some forms of a prompt need.
+        """
         frame_index = state.frame_index + 1
         visible = _visible(tracks)
         events = visibility_events(frame_index, state.visible, visible)
         state = replace(state, frame_index=frame_index, trackers=trackers, visible=visible)
-        return state, self._prompt(state, views, tracks, events)
+        return state, self._prompt(state, views, tracks, others or {}, events)
 
     def _propose(
         self, views: Views, phrases: Sequence[str], given: Mapping[str, Boxes] | None
@@ -360,13 +375,16 @@ class Attender:
         state: AttendState,
         views: Views,
         tracks: Mapping[str, tuple[Track, ...]],
+        others: Mapping[str, Sequence[Mask]],
         events: tuple[Event, ...],
     ) -> Attended:
         """The prompted images and text, and the evidence for them."""
         images = dict(views)
         if self.prompting.highlight:
             for camera, per_target in tracks.items():
-                images[camera] = self._tint(views[camera], per_target, state.colours)
+                images[camera] = self._mark(
+                    views[camera], per_target, state.colours, others.get(camera, ())
+                )
         return Attended(
             images=images,
             text=state.text,
@@ -377,12 +395,18 @@ class Attender:
             associations=state.associations,
         )
 
-    def _tint(self, rgb: Rgb, tracks: Sequence[Track], colours: Sequence[Colour]) -> Rgb:
-        """One view with every tracked target in its colour; two never tint one pixel."""
+    def _mark(
+        self,
+        rgb: Rgb,
+        tracks: Sequence[Track],
+        colours: Sequence[Colour],
+        others: Sequence[Mask],
+    ) -> Rgb:
+        """One view with every tracked target in its colour; no pixel belongs to two of them."""
         free = np.ones(rgb.shape[:2], bool)
         for track, colour in zip(tracks, colours, strict=True):
             if track.mask is not None:
-                rgb = tint(rgb, track.mask & free, colour, self.prompting.alpha)
+                rgb = self.prompting.form(rgb, track.mask & free, colour, others)
                 free &= ~track.mask
         return rgb
 
@@ -394,6 +418,15 @@ def _winner_ids(candidates: Sequence[Candidates], per_target: PerTarget) -> tupl
         winner = grounding.winner
         ids.append(None if winner is None else of_target.ids[winner])
     return tuple(ids)
+
+
+def _other_masks(followed: Sequence[Mask | None], ids: Sequence[int | None]) -> list[Mask]:
+    """The masks of what is followed and is no target, where they are visible."""
+    others = []
+    for identity, mask in enumerate(followed):
+        if identity not in ids and mask is not None and mask.any():
+            others.append(mask)
+    return others
 
 
 def _colours_in_view(

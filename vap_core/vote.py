@@ -11,7 +11,7 @@ from vap_core.perception.boxes import box_cover
 from vap_core.perception.candidates import Candidates, Proposals
 from vap_core.perception.protocols import Stack
 
-VoteRule = Literal["vote", "average"]
+VoteRule = Literal["vote", "average", "best"]
 
 SAME = 1e-6
 """Cosines closer than this are equal, so that rounding never decides an election."""
@@ -69,8 +69,9 @@ def vote(cosine: Float32[np.ndarray, "n k"], rule: VoteRule = "vote") -> Ballot:
 
     "vote": b* = argmax_i sum_k [i = argmax_j cos(e_j, z_k)]; a tie in votes goes to the tied
     candidate with the highest mean cosine (P 3.3). "average" is the ablation
-    (P tab:ablation_vote): argmax of the mean cosine; votes are still counted. Exact duplicates
-    go to the candidate listed first, the detector's more confident one.
+    (P tab:ablation_vote): argmax of the mean cosine; "best" is another: argmax of the greatest
+    cosine with any one reference. Votes are still counted. Exact duplicates go to the candidate
+    listed first, the detector's more confident one.
 
     Raises: ValueError, when there are candidates but no references.
     """
@@ -91,8 +92,9 @@ def vote(cosine: Float32[np.ndarray, "n k"], rule: VoteRule = "vote") -> Ballot:
     most_votes = votes == votes.max()
 
     eligible = most_votes if rule == "vote" else np.ones(n, bool)
-    best = mean[eligible].max()
-    winner = int(np.flatnonzero(eligible & (mean >= best - SAME))[0])
+    score = cosine.astype(np.float64).max(axis=1) if rule == "best" else mean
+    best = score[eligible].max()
+    winner = int(np.flatnonzero(eligible & (score >= best - SAME))[0])
 
     others = np.arange(n) != winner
     runner_up = int(votes[others].max(initial=0))

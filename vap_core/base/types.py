@@ -8,7 +8,7 @@ percent is for print.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, dataclass_transform
 
 import numpy as np
@@ -88,6 +88,12 @@ class PersonalObject:
                 f"PersonalObject {self.name!r}: embeddings must be L2-normalised, "
                 f"got norms {norm.tolist()}"
             )
+
+    def first(self, k: int | None) -> "PersonalObject":
+        """The object with its first k references; with all where k is None or more."""
+        if k is None or k >= len(self.crops):
+            return self
+        return replace(self, embeddings=self.embeddings[:k], crops=self.crops[:k])
 
 
 @value
