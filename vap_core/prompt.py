@@ -5,7 +5,7 @@ The paper's are in P 3.3 and tab:ablation_prompt.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -54,6 +54,7 @@ def tint(rgb: Rgb, mask: Mask, colour: Colour, alpha: float = ALPHA) -> Rgb:
     return out
 
 
+@runtime_checkable
 class PromptForm(Protocol):
     """How one target is marked in one view. Other forms are ablations (evaluation.ablations)."""
 

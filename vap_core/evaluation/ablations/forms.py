@@ -14,11 +14,11 @@ from vap_core.base.types import Colour, Mask, Rgb
 from vap_core.perception.boxes import mask_box
 from vap_core.prompt import ALPHA
 
-LINE_PX = 2
+LINE_PX = 2.0
 """Width of lines in a picture of 224 pixels; wider ones in larger pictures."""
-MARKER_PX = 224 / 28
+MARKER_PX = 8.0
 """Radius of a numbered marker, likewise."""
-POINT_PX = 4
+POINT_PX = 4.0
 SHADE = 0.35
 """What is left of the light outside the target, where the background is dimmed."""
 GROW_PX = 9
