@@ -162,7 +162,9 @@ def test_without_a_name_ablations_are_listed_and_unknown_ones_refused() -> None:
     listed = vap("ablate")
     assert listed.returncode == 0
     assert all(name in listed.stdout for name in ABLATIONS)
-    assert "ablation 'shape' is unknown; known: association, colour, form" in refused("ablate", "shape")
+    assert "ablation 'shape' is unknown; known: association, colour, form" in refused(
+        "ablate", "shape"
+    )
 
 
 @pytest.mark.slow

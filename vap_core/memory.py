@@ -65,12 +65,21 @@ def reference_box(
 ) -> Float32[np.ndarray, "4"] | None:
     """Where a photo shows the object that it is a reference of; None where nothing is found.
 
-    It is the best box of the category, unless the detector has its own way to find it.
+    It is the best box of the category. Of boxes of any object it is the likeliest that holds the
+    photo's centre.
     """
-    if isinstance(detector, ReferenceCropper):
-        return detector.reference_box(photo, category, threshold)
-    (boxes,) = detector([photo], category, threshold)
-    return boxes.xyxy[0] if len(boxes) else None
+    if not isinstance(detector, ReferenceCropper):
+        (boxes,) = detector([photo], category, threshold)
+        return boxes.xyxy[0] if len(boxes) else None
+    boxes = detector.reference_boxes(photo, category, threshold)
+    assert boxes.prior is not None
+    h, w = photo.shape[:2]
+    centre = np.array([w / 2, h / 2])
+    inside = (boxes.xyxy[:, :2] <= centre) & (centre <= boxes.xyxy[:, 2:])
+    holding = np.flatnonzero(inside.all(axis=1))
+    if not len(holding):
+        return None
+    return boxes.xyxy[holding[boxes.prior[holding].argmax()]]
 
 
 def remember(name: str, category: str, crops: Sequence[Rgb], encoder: Encoder) -> PersonalObject:

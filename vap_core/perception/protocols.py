@@ -38,12 +38,10 @@ class FamiliarityJudge(Protocol):
 
 @runtime_checkable
 class ReferenceCropper(Protocol):
-    """A detector that finds the object of a reference photo in another way than in a scene."""
+    """A detector that looks for the object of a reference photo otherwise than in a scene."""
 
-    def reference_box(
-        self, photo: Rgb, phrase: str, threshold: float
-    ) -> Float32[np.ndarray, "4"] | None:
-        """Where the object is; None when nothing scores `threshold`."""
+    def reference_boxes(self, photo: Rgb, phrase: str, threshold: float) -> Boxes:
+        """Where the object may be, with priors; empty when nothing scores `threshold`."""
         ...
 
 

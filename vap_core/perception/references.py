@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32, Int64
 
 from vap_core.base.types import Boxes, Rgb, value
 from vap_core.perception.boxes import box_iou, crop
-from vap_core.perception.protocols import Detector, Encoder
+from vap_core.perception.protocols import Detector, Encoder, ReferenceCropper
 
 THRESHOLD = 0.05
 """Photos of the object show one of its kind, so a box needs a lower score than a proposal does."""
@@ -21,6 +21,8 @@ MOST_BOXES = 12
 SCORE_WEIGHT, CENTRE_WEIGHT, AREA_WEIGHT = 0.1, 0.3, 0.02
 """Of log score, distance from the photo's centre (in its sides) and log share of its area, beside
 the cosine to the other photos."""
+PRIOR_WEIGHT = 2.0
+"""Of a box's prior, which takes the place of its score where a detector gives it."""
 RIVAL_IOU = 0.5
 """A box that overlaps the chosen one by less would be another crop."""
 ELSEWHERE = 0.1
@@ -97,12 +99,20 @@ def whole_photos(photos: Sequence[Rgb]) -> tuple[Reference, ...]:
 
 def _boxes_of(photo: Rgb, category: str, detector: Detector, given: Box | None) -> Boxes:
     """The candidates of a photo: the given box first, then what is proposed."""
-    (found,) = detector([photo], category, THRESHOLD)
-    xyxy, score = found.xyxy[:MOST_BOXES], found.score[:MOST_BOXES]
+    if isinstance(detector, ReferenceCropper):
+        found = detector.reference_boxes(photo, category, THRESHOLD)
+    else:
+        (found,) = detector([photo], category, THRESHOLD)
+    xyxy = found.xyxy[:MOST_BOXES]
+    score = found.score[:MOST_BOXES]
+    evidence = np.log(score + np.float32(1e-3)) * np.float32(SCORE_WEIGHT)
+    if found.prior is not None:
+        evidence = np.float32(PRIOR_WEIGHT) * found.prior[:MOST_BOXES]
     if given is not None:
         xyxy = np.concatenate([given[None], xyxy])
         score = np.concatenate([np.ones(1, np.float32), score])
-    return Boxes(xyxy, score, category)
+        evidence = np.concatenate([np.zeros(1, np.float32), evidence])
+    return Boxes(xyxy, score, category, prior=evidence.astype(np.float32))
 
 
 def _support(
@@ -141,16 +151,13 @@ def _choose(
 
 def _prior(photo: Rgb, boxes: Boxes) -> Float[np.ndarray, " n"]:
     """What speaks for each box of one photo before others are looked at."""
+    assert boxes.prior is not None
     height, width = photo.shape[:2]
     size = np.array([width, height])
     centre = (boxes.xyxy[:, :2] + boxes.xyxy[:, 2:]) / 2 / size
     away = np.hypot(*(centre - 0.5).T)
     area = (boxes.xyxy[:, 2:] - boxes.xyxy[:, :2]).prod(axis=1) / (width * height)
-    return (
-        SCORE_WEIGHT * np.log(boxes.score + 1e-3)
-        - CENTRE_WEIGHT * away
-        + AREA_WEIGHT * np.log(np.clip(area, 0.01, 1))
-    )
+    return boxes.prior - CENTRE_WEIGHT * away + AREA_WEIGHT * np.log(np.clip(area, 0.01, 1))
 
 
 def _doubt(

@@ -13,7 +13,7 @@ Every row carries the keys of `View.key`. Boxes that overlap by IoU 0.5 agree.
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -51,7 +51,7 @@ TOP = 10
 KS = (1, 3, 5, 7)
 """Numbers of reference photos; each set is taken anew, as a user would take so many."""
 USUAL_K = 5
-RULES: tuple[VoteRule, ...] = get_args(VoteRule)
+RULES: tuple[VoteRule, ...] = ("vote", "average")
 TableRow = dict[str, Any]
 """A row of a table of the survey."""
 Tables = dict[str, list[TableRow]]

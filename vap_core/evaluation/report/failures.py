@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 BY = ["suite", "method"]
 """The columns that name a group of episodes here."""
-DIAGNOSIS_COLUMNS = ("case", "sub_case", "deciding_frame", "case_confidence", "case_sentence")
+DIAGNOSIS_COLUMNS = ("case", "sub_case", "deciding_frame")
 
 
 def diagnosed(table: "pd.DataFrame") -> "pd.DataFrame":

@@ -79,26 +79,21 @@ class OpenDetector:
             found.append(boxes)
         return found
 
-    def reference_box(
-        self, photo: Rgb, phrase: str, threshold: float
-    ) -> Float32[np.ndarray, "4"] | None:
-        """The most likely box of any size that holds the photo's centre.
+    def reference_boxes(self, photo: Rgb, phrase: str, threshold: float) -> Boxes:
+        """Boxes of any size, with their priors.
 
-        Where the phrase head knows the object, and agrees, its own box is taken.
+        Where the phrase head knows the object, the likeliest box that it agrees with is its own.
         """
         xyxy, score = self.propose(photo, threshold, MOST_UNFAMILIAR, REFERENCE_SHARE)
-        h, w = photo.shape[:2]
-        centre = np.array([w / 2, h / 2])
-        inside = (xyxy[:, :2] <= centre) & (centre <= xyxy[:, 2:])
-        holding = np.flatnonzero(inside.all(axis=1))
-        if not len(holding):
-            return None
         named = self._named(photo, phrase)
-        evidence = prior(xyxy[holding], score[holding], named)
-        best = holding[[evidence.argmax()]]
-        if _is_familiar(named) and box_iou(xyxy[best], named.xyxy[:1])[0, 0] >= AGREEMENT_IOU:
-            return named.xyxy[0]
-        return xyxy[best[0]]
+        evidence = prior(xyxy, score, named)
+        familiar = _is_familiar(named)
+        if familiar:
+            overlap = box_iou(xyxy, named.xyxy[:1])[:, 0]
+            agreeing = np.flatnonzero(overlap >= AGREEMENT_IOU)
+            if len(agreeing):
+                xyxy[agreeing[evidence[agreeing].argmax()]] = named.xyxy[0]
+        return Boxes(xyxy=xyxy, score=score, phrase=phrase, prior=evidence, familiar=familiar)
 
     def is_familiar(self, image: Rgb, phrase: str) -> bool:
         """Whether the image is of the world that the phrase head was trained on."""
