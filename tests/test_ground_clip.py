@@ -22,7 +22,7 @@ RED, GREEN = (250, 0, 0), (0, 250, 0)
 
 @pytest.fixture
 def bank(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    stack = Stack("toy", detector, MeanColour(), segmenter, SameColour(), "")
+    stack = Stack("toy", detector, MeanColour(), segmenter, SameColour())
     monkeypatch.setitem(stacks.STACKS, "toy", lambda: stack)
     mug = remember("mug", "cup", [scene([(26, 26, RED)])], MeanColour())
     save(tmp_path / "bank", mug)

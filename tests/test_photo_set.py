@@ -43,7 +43,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def toy(monkeypatch: pytest.MonkeyPatch) -> None:
-    stack = Stack("toy", detector, MeanColour(), segmenter, SameColour(), "")
+    stack = Stack("toy", detector, MeanColour(), segmenter, SameColour())
     monkeypatch.setattr(run, "load_stack", lambda name: stack)
 
 
