@@ -153,7 +153,6 @@ def test_the_table_by_hand() -> None:
 
 
 def test_an_arm_takes_one_line() -> None:
-    """As docs/extend.md says it."""
     own = Ablation(question="Is green better?", arms={"green": Prompting(palette=PALETTE[2:3])})
     assert own.names == ("vap", "green")
 

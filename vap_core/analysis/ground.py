@@ -115,7 +115,7 @@ def write_evidence(folder: Path, stem: str, found: Found) -> tuple[Path, Path]:
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        png, rrd = _free_paths(folder, stem)
+        png, rrd = free_paths(folder, stem, (".png", ".rrd"))
         figure = grounding_figure(found.rgb, found.attended, found.objects, CAMERA)
         write_png(figure, png)
     except OSError as error:
@@ -172,15 +172,14 @@ def _grounding_to_json(grounding: Grounding) -> dict[str, Any]:
     }
 
 
-def _free_paths(folder: Path, stem: str) -> tuple[Path, Path]:
-    """A PNG and an .rrd of the same number, of which neither exists."""
+def free_paths(folder: Path, stem: str, suffixes: tuple[str, str]) -> tuple[Path, Path]:
+    """Two files of the same name and number, of which neither exists."""
     number = 1
     while True:
         name = stem if number == 1 else f"{stem}-{number}"
-        png = folder / f"{name}.png"
-        rrd = folder / f"{name}.rrd"
-        if not (png.exists() or rrd.exists()):
-            return png, rrd
+        one, other = (folder / f"{name}{suffix}" for suffix in suffixes)
+        if not (one.exists() or other.exists()):
+            return one, other
         number += 1
 
 

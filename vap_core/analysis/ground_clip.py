@@ -5,6 +5,7 @@ from contextlib import ExitStack
 from itertools import chain
 from pathlib import Path
 
+from vap_core.analysis.ground import free_paths
 from vap_core.attend import Attender, AttendState
 from vap_core.base import video
 from vap_core.base.errors import BadOutput, BadPhoto
@@ -72,7 +73,7 @@ def ground_clip(
     models = load_stack(stack)
     attender = Attender(models, load_bank(memory, models.encoder.name))
     _, (obj, *_) = attender.understand(instruction, objects)
-    mp4, rrd = _free_paths(out, path.stem)
+    mp4, rrd = _new_files(out, path.stem)
     grounded, visible, text = None, [], instruction
     with ExitStack() as files:
         recorder = files.enter_context(ClipRecorder(rrd, CAMERA, obj.name, hz))
@@ -152,8 +153,8 @@ def _spans(visible: Sequence[bool], grounded: int | None) -> tuple[tuple[int, in
     return tuple(spans)
 
 
-def _free_paths(folder: Path, stem: str) -> tuple[Path, Path]:
-    """An .mp4 and an .rrd of the same number, of which neither exists. Raises: BadOutput."""
+def _new_files(folder: Path, stem: str) -> tuple[Path, Path]:
+    """An .mp4 and an .rrd that do not exist, in a folder that does. Raises: BadOutput."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -161,10 +162,4 @@ def _free_paths(folder: Path, stem: str) -> tuple[Path, Path]:
             f"ground: {folder} cannot be written ({error.strerror}); choose another folder with "
             "--out."
         ) from error
-    number = 1
-    while True:
-        name = stem if number == 1 else f"{stem}-{number}"
-        mp4, rrd = folder / f"{name}.mp4", folder / f"{name}.rrd"
-        if not (mp4.exists() or rrd.exists()):
-            return mp4, rrd
-        number += 1
+    return free_paths(folder, stem, (".mp4", ".rrd"))

@@ -49,6 +49,11 @@ class Boxes:
     def __len__(self) -> int:
         return len(self.xyxy)
 
+    def take(self, rows: Int64[np.ndarray, " m"]) -> "Boxes":
+        """These boxes, in this order."""
+        prior = None if self.prior is None else self.prior[rows]
+        return replace(self, xyxy=self.xyxy[rows], score=self.score[rows], prior=prior)
+
     @staticmethod
     def empty(phrase: str) -> "Boxes":
         return Boxes(np.zeros((0, 4), np.float32), np.zeros(0, np.float32), phrase)
@@ -93,7 +98,12 @@ class PersonalObject:
         """The object with its first k references; with all where k is None or more."""
         if k is None or k >= len(self.crops):
             return self
-        return replace(self, embeddings=self.embeddings[:k], crops=self.crops[:k])
+        return self.take(slice(k))
+
+    def take(self, references: slice) -> "PersonalObject":
+        """The object with these references alone."""
+        crops = self.crops[references]
+        return replace(self, embeddings=self.embeddings[references], crops=crops)
 
 
 @value

@@ -45,9 +45,7 @@ def frames(path: Path, long_side: int | None = None) -> Iterator[Rgb]:
                     return
                 yield _picture(frame, long_side)
     except (av.FFmpegError, ValueError) as error:
-        raise BadPhoto(
-            f"video: {path} cannot be decoded ({error!s:.120}); export the clip as MP4."
-        ) from error
+        raise _undecodable(path, error) from error
 
 
 def sharp_frames(path: Path, count: int) -> list[Rgb]:
@@ -124,10 +122,12 @@ def frame_rate(path: Path) -> float:
         with av.open(str(path)) as container:
             hz = container.streams.video[0].average_rate
     except (av.FFmpegError, IndexError, OSError) as error:
-        raise BadPhoto(
-            f"video: {path} cannot be decoded ({error!s:.120}); export the clip as MP4."
-        ) from error
+        raise _undecodable(path, error) from error
     return float(hz or USUAL_HZ)
+
+
+def _undecodable(path: Path, error: Exception) -> BadPhoto:
+    return BadPhoto(f"video: {path} cannot be decoded ({error!s:.120}); export the clip as MP4.")
 
 
 def _picture(frame: "av.VideoFrame", long_side: int | None) -> Rgb:

@@ -22,7 +22,8 @@ Methods = Annotated[
         "--method",
         help="generic, hard-short, hard-long, soft, vap, vap-always-tint, mask-only, rewrite-only, "
         "vap-associated; bounds, which read the simulator: oracle-box, oracle-mask, "
-        "oracle-track, wrong-mask. With commas, or repeated. Default: generic,vap.",
+        "oracle-track, wrong-mask; and the arms that `ablate` lists. With commas, or repeated. "
+        "Default: generic,vap.",
     ),
 ]
 POLICIES = (

@@ -63,7 +63,8 @@ def demonstrations(
     from vap_core.base.errors import one_of
     from vap_core.simulation.suites import BENCHMARKS
     from vap_core.training.films.dataset import ABOUT, write
-    from vap_core.training.policy.train import CACHE, FILMS
+    from vap_core.training.films.scenes import CACHE
+    from vap_core.training.policy.train import FILMS
     from vap_core.training.recipe import RECIPES
 
     if suite not in BENCHMARKS:
@@ -173,7 +174,8 @@ def policy(
     from dataclasses import replace
 
     from vap_core.base.errors import one_of
-    from vap_core.training.policy.train import CACHE, train
+    from vap_core.training.films.scenes import CACHE
+    from vap_core.training.policy.train import train
     from vap_core.training.recipe import RECIPES
     from vap_core.training.vlm.train import make
 

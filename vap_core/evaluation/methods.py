@@ -45,14 +45,17 @@ FEWEST_REFERENCES = 5
 """Reference photos of an object, unless a method needs more."""
 
 
+_ALL: dict[str, Method] = {**METHODS, **ARMS}
+
+
 def known_methods() -> tuple[str, ...]:
     """The names of METHODS, and of the arms of every ablation."""
-    return (*METHODS, *ARMS)
+    return tuple(_ALL)
 
 
 def find(method: str) -> Method:
     """What a method, or an arm of an ablation, changes. Raises: KeyError."""
-    return METHODS[method] if method in METHODS else ARMS[method]
+    return _ALL[method]
 
 
 def hidden_calls(method: str) -> int:

@@ -54,11 +54,15 @@ def box_cover(a: Float[np.ndarray, "n 4"], b: Float[np.ndarray, "m 4"]) -> Float
 
 
 def suppress_overlaps(
-    xyxy: Float32[np.ndarray, "n 4"], score: Float32[np.ndarray, " n"]
+    xyxy: Float32[np.ndarray, "n 4"],
+    score: Float32[np.ndarray, " n"],
+    *,
+    iou: float = NMS_IOU,
+    most: int = MAX_BOXES,
 ) -> Int64[np.ndarray, " k"]:
-    """Non-maximum suppression: indices of at most `MAX_BOXES` boxes, best first.
+    """Non-maximum suppression: indices of at most `most` boxes, best first.
 
-    Scores are above 0.
+    A box that overlaps a better one by more than `iou` is left out. Scores are above 0.
     """
     # torchvision's finds the same, but takes 1.5 s to import.
     xywh = np.concatenate([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]], axis=1)
@@ -66,9 +70,9 @@ def suppress_overlaps(
         bboxes=xywh.tolist(),
         scores=score.tolist(),
         score_threshold=0.0,
-        nms_threshold=NMS_IOU,
+        nms_threshold=iou,
     )
-    return np.asarray(kept, np.int64).reshape(-1)[:MAX_BOXES]
+    return np.asarray(kept, np.int64).reshape(-1)[:most]
 
 
 def mask_iou(one: Mask, other: Mask) -> float:

@@ -26,15 +26,7 @@ class Proposals:
 
     def take(self, rows: Int64[np.ndarray, " m"]) -> "Proposals":
         """These of them, in this order."""
-        prior = self.boxes.prior
-        boxes = Boxes(
-            xyxy=self.boxes.xyxy[rows],
-            score=self.boxes.score[rows],
-            phrase=self.boxes.phrase,
-            prior=None if prior is None else prior[rows],
-            familiar=self.boxes.familiar,
-        )
-        return Proposals(boxes, self.embeddings[rows])
+        return Proposals(self.boxes.take(rows), self.embeddings[rows])
 
 
 @value

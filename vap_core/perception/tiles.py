@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
 from vap_core.base.types import Boxes, Rgb
+from vap_core.perception.boxes import suppress_overlaps
 from vap_core.perception.protocols import Detector
 
 SMALL_MEGAPIXELS = 3.0
@@ -45,7 +45,7 @@ class TiledDetector:
                 uncut = ~_cut_by_edge(boxes.xyxy, corner, image.shape[1], image.shape[0])
                 shift = np.tile(corner[:2], 2).astype(np.float32)
                 moved = replace(boxes, xyxy=boxes.xyxy + shift)
-                kept.append(_rows(moved, np.flatnonzero(uncut)))
+                kept.append(moved.take(np.flatnonzero(uncut)))
             found.append(_merge(kept))
         return found
 
@@ -72,17 +72,6 @@ def _cut_by_edge(
     return near.any(axis=1) | far.any(axis=1)
 
 
-def _rows(boxes: Boxes, rows: Int64[np.ndarray, " m"]) -> Boxes:
-    """These boxes, in this order."""
-    prior = boxes.prior
-    return replace(
-        boxes,
-        xyxy=boxes.xyxy[rows],
-        score=boxes.score[rows],
-        prior=None if prior is None else prior[rows],
-    )
-
-
 def _merge(parts: Sequence[Boxes]) -> Boxes:
     """The best boxes, overlaps removed; `familiar` is that of the first, the whole picture."""
     xyxy = np.concatenate([part.xyxy for part in parts])
@@ -92,9 +81,5 @@ def _merge(parts: Sequence[Boxes]) -> Boxes:
         prior = np.concatenate([part.prior for part in parts])
     if not len(xyxy):
         return parts[0]
-    xywh = np.concatenate([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]], axis=1)
-    kept = cv2.dnn.NMSBoxes(
-        bboxes=xywh.tolist(), scores=score.tolist(), score_threshold=0.0, nms_threshold=NMS_IOU
-    )
-    best = np.asarray(kept, np.int64).reshape(-1)[:MOST_BOXES]
-    return _rows(replace(parts[0], xyxy=xyxy, score=score, prior=prior), best)
+    best = suppress_overlaps(xyxy, score, iou=NMS_IOU, most=MOST_BOXES)
+    return replace(parts[0], xyxy=xyxy, score=score, prior=prior).take(best)

@@ -1,1 +1,1 @@
-"""Ablations: the method with one thing changed at a time (P appendix; notebook 07)."""
+"""Ablations: the method with one thing changed at a time (P appendix)."""

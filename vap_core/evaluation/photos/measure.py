@@ -111,9 +111,7 @@ def _ground(
 
 def _elected(grounding: Grounding) -> Row:
     """The box that the vote elected, tinted or not; none without candidates."""
-    winner = grounding.ballot.winner
-    if grounding.winner is not None:
-        winner = grounding.winner
+    winner = grounding.chosen
     if winner is None:
         return {"x0": None, "y0": None, "x1": None, "y1": None, "cosine": None, "margin": None}
     x0, y0, x1, y1 = grounding.candidates.xyxy[winner].tolist()
@@ -146,7 +144,7 @@ def _vote(
     among_them = _take(candidates, rows)
     right_alone = []
     for k in range(len(obj.crops)):
-        elected = attender.ground(CAMERA, _one_reference(obj, k), among_them).ballot.winner
+        elected = attender.ground(CAMERA, obj.take(slice(k, k + 1)), among_them).ballot.winner
         right_alone.append(bool(own[rows[elected]]))
     elected = attender.ground(CAMERA, obj, among_them).ballot.winner
     return {
@@ -158,14 +156,9 @@ def _vote(
 
 def _take(candidates: Candidates, rows: Int64[np.ndarray, " m"]) -> Candidates:
     """These candidates, in this order."""
-    boxes = candidates.boxes
     return Candidates(
-        boxes=replace(boxes, xyxy=boxes.xyxy[rows], score=boxes.score[rows]),
+        boxes=candidates.boxes.take(rows),
         embeddings=candidates.embeddings[rows],
         masks=candidates.masks[rows],
         ids=tuple(range(len(rows))),
     )
-
-
-def _one_reference(obj: PersonalObject, k: int) -> PersonalObject:
-    return replace(obj, embeddings=obj.embeddings[k : k + 1], crops=obj.crops[k : k + 1])

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 RIGHT_IOU, LOOSE_IOU = 0.5, 0.25
-Z = 1.959964
-"""The normal distribution's 97.5 % quantile."""
 NOTE = (
     "value [95 % interval] n, in %; Wilson's interval with n reduced to what the scenes, which are "
     "the independent units, are worth.\n"
@@ -92,6 +90,8 @@ def clustered_share(hits: Float64[np.ndarray, " n"], clusters: Iterable[object])
     variance over the variance that n independent cases would have. n / d is at least the number of
     clusters, which it also is where all hits are alike, and at most n.
     """
+    from statsmodels.stats.proportion import proportion_confint
+
     n = len(hits)
     if not n:
         return NONE
@@ -107,14 +107,8 @@ def clustered_share(hits: Float64[np.ndarray, " n"], clusters: Iterable[object])
             worth = float(np.clip(n * independent / clustered, count, n))
         else:
             worth = float(n)
-    centre = (share + Z**2 / (2 * worth)) / (1 + Z**2 / worth)
-    half = Z / (1 + Z**2 / worth) * np.sqrt(share * (1 - share) / worth + Z**2 / (4 * worth**2))
-    return Estimate(
-        value=share,
-        low=max(0.0, float(centre - half)),
-        high=min(1.0, float(centre + half)),
-        n=n,
-    )
+    low, high = proportion_confint(share * worth, worth, alpha=0.05, method="wilson")
+    return Estimate(value=share, low=float(low), high=float(high), n=n)
 
 
 def _share(hits: "pd.Series", part: "pd.DataFrame") -> str:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from vap_core.base.types import Rgb
+from vap_core.perception.boxes import suppress_overlaps
 from vap_core.perception.embedded.runtime import (
     Network,
     OnnxNetwork,
@@ -77,7 +78,7 @@ class Proposer:
         usable &= sides.prod(axis=1) <= largest_share * w * h
         xyxy = xyxy[usable]
         score = score[usable]
-        kept = _suppress(xyxy, score)[:most]
+        kept = suppress_overlaps(xyxy, score, iou=NMS_IOU, most=most)
         return xyxy[kept], score[kept]
 
 
@@ -129,12 +130,3 @@ def _cells() -> tuple[Float32[np.ndarray, "c 2"], Float32[np.ndarray, " c"]]:
         centres.append((cell + np.float32(0.5)) * np.float32(stride))
         strides.append(np.full(n * n, stride, np.float32))
     return np.concatenate(centres), np.concatenate(strides)
-
-
-def _suppress(xyxy: Float32[np.ndarray, "n 4"], score: Float32[np.ndarray, " n"]) -> np.ndarray:
-    """Indices of boxes that overlap by less than `NMS_IOU`, best first."""
-    xywh = np.concatenate([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]], axis=1)
-    kept = cv2.dnn.NMSBoxes(
-        bboxes=xywh.tolist(), scores=score.tolist(), score_threshold=0.0, nms_threshold=NMS_IOU
-    )
-    return np.asarray(kept, np.int64).reshape(-1)

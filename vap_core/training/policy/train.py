@@ -19,7 +19,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import DATA, parse_json, write_atomic
+from vap_core.base.files import parse_json, write_atomic
 from vap_core.base.version import code_version
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
@@ -29,7 +29,7 @@ from vap_core.simulation.suites import suite
 from vap_core.training.films.captions import captions
 from vap_core.training.films.dataset import about, data_sha256, read, shoot_stages
 from vap_core.training.films.demonstrations import SIDE, Film, cached, cost_s
-from vap_core.training.films.scenes import only_generic
+from vap_core.training.films.scenes import CACHE, only_generic
 from vap_core.training.patches import model_options
 from vap_core.training.policy.batches import Frames, statistics
 from vap_core.training.policy.commands import Known
@@ -38,8 +38,6 @@ from vap_core.training.policy.taught import learn_words
 from vap_core.training.recipe import Recipe, filmed_tasks
 from vap_core.training.step import Figures, Schedule, average_of, train_steps
 
-CACHE = DATA / "cache"
-"""Rendered films and scenes, in folders of it."""
 FILMS = "films"
 HELD_OUT = 19
 """Every so many stages one is kept from training, to see what was learned.

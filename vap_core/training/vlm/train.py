@@ -22,7 +22,7 @@ from jaxtyping import UInt8
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
-from vap_core.base.files import DATA, parse_json, write_atomic
+from vap_core.base.files import parse_json, write_atomic
 from vap_core.base.types import Description, Rgb, value
 from vap_core.evaluation.processes import results
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
@@ -31,14 +31,12 @@ from vap_core.policies.mini_pi0.vlm import ANSWER, MiniVlm, load_vlm
 from vap_core.training.films.captions import captions
 from vap_core.training.films.demonstrations import SIDE, small
 from vap_core.training.films.looks import draw_look
-from vap_core.training.films.scenes import Shots, cached, cost_s, stage_file
+from vap_core.training.films.scenes import CACHE, Shots, cached, cost_s, stage_file
 from vap_core.training.patches import PatchScores, model_options, patch_loss, patch_shares
 from vap_core.training.recipe import Sizes
 from vap_core.training.step import Figures, Schedule, average_of, train_steps
 from vap_core.training.vlm.questions import Question, ask
 
-CACHE = DATA / "cache"
-"""Rendered films and scenes, in folders of it."""
 SCENES = "vlm"
 SEEN = 0.5
 """Weight of the patches beside the words."""
