@@ -79,6 +79,14 @@ Meshes = Annotated[
 ]
 
 
+WhatFor = Annotated[
+    str,
+    typer.Option(
+        "--what-for", help="Why the list is read, in a few words, for the log: see `readings`."
+    ),
+]
+
+
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Run folder; a run found there is resumed.")] = Path(
@@ -131,6 +139,7 @@ def rollout(
     policy_timeout: PolicyTimeout = None,
     robots: Meshes = "plain",
     stack: StackName = "embedded",
+    what_for: WhatFor = "",
 ) -> None:
     """Run tasks of a suite in closed loop, record every episode, and print the table.
 
@@ -154,6 +163,7 @@ def rollout(
         record_option=record,
         retries=retries,
         policy_timeout_s=policy_timeout,
+        what_for=what_for,
         video=video,
         attention=attention,
     )
@@ -298,6 +308,7 @@ def evaluate(
     ] = 0,
     robots: Meshes = "plain",
     stack: StackName = "embedded",
+    what_for: WhatFor = "",
 ) -> None:
     """Run whole suites, and print the table with 95 % intervals. Interrupted, the same command goes
     on.
@@ -340,6 +351,7 @@ def evaluate(
         retries=retries,
         policy_timeout_s=policy_timeout,
         address=address,
+        what_for=what_for,
         video=video,
         attention=attention,
     )
@@ -406,6 +418,7 @@ def _run(
     retries: int,
     policy_timeout_s: float | None = None,
     address: str | None = None,
+    what_for: str = "",
     **recorded: Any,
 ) -> None:
     """Run a study, on the Ray cluster at `address` if there is one, and print its table."""
@@ -434,6 +447,7 @@ def _run(
         retries=retries,
         policy_timeout_s=policy_timeout_s,
         executor=ray_executor(address) if address else results,
+        what_for=what_for,
         **recorded,
     )
     print(conclude(study, table, out))

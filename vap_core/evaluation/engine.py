@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vap_core.base.errors import WorkerDied
-from vap_core.evaluation import store
+from vap_core.evaluation import readings, store
 from vap_core.evaluation.jobs import BATCH, Job, Record, Rows, run_job
 from vap_core.evaluation.processes import prepare, results
 from vap_core.evaluation.study import Study, register_personal, worker_modules
@@ -42,8 +42,11 @@ def run(
     video: bool = False,
     attention: bool = False,
     policy_timeout_s: float | None = None,
+    what_for: str = "",
 ) -> "pd.DataFrame":
     """Run the episodes of `study` that `folder` lacks, and return the table of all its episodes.
+
+    A run that begins is entered in the log of readings (`readings.LOCAL`), with `what_for`.
 
     Raises: BadOutput when the folder holds another run, is in use or cannot be written; WorkerDied
         when workers died more often than `retries` in a row.
@@ -59,7 +62,7 @@ def run(
             )
         return complete
 
-    store.open_run(folder, study.configuration())
+    _open_run(study, folder, what_for)
     with store.locked(folder):
         store.compact(folder)
         if executor is results and missing():
@@ -94,6 +97,16 @@ def run(
                 jobs = missing()
         store.compact(folder)
     return store.read(folder)
+
+
+def _open_run(study: Study, folder: Path, what_for: str) -> None:
+    """Begin the run in `folder`, and log what it will read; or go on with the one there."""
+    begins = not (folder / store.MANIFEST).exists()
+    configuration = study.configuration()
+    store.open_run(folder, configuration)
+    if begins:
+        run_digest = store.digest(configuration)
+        readings.append(readings.readings_of(configuration, run_digest, what_for), readings.LOCAL)
 
 
 def missing_jobs(
