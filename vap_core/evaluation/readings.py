@@ -1,6 +1,6 @@
 """The log of how often every shipped episode list was read, and with which weights.
 
-    2026-11-24,simpler-bridge,e160becf5906,5b1c2d3e4f5a6b7c,mini-pi0,generic vap,96,96,1,RUN,main table
+    2026-11-24,simpler-bridge,e160becf5906,00c47015fce7,mini-pi0,generic vap,96,96,1,RUN,main table
 
 A list that was read while something was tuned is no test of it any more. A run is entered once,
 when it begins, with what it will read: `data/runs/readings.csv`, which stays on its machine. To
@@ -52,7 +52,7 @@ class Reading:
 
     @property
     def whole(self) -> bool:
-        return self.rows == self.listed
+        return 0 < self.rows == self.listed
 
 
 COLUMNS = tuple(field.name for field in fields(Reading))
