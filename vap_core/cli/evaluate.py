@@ -20,8 +20,9 @@ Methods = Annotated[
     typer.Option(
         "--methods",
         "--method",
-        help="generic, hard-short, hard-long, soft, vap, mask-only, rewrite-only, vap-associated; "
-        "bounds, which read the simulator: oracle-box, oracle-mask, oracle-track, wrong-mask. "
+        help="generic, hard-short, hard-long, soft, soft-aligned, soft-own, vap, mask-only, "
+        "rewrite-only, vap-associated; bounds, which read the simulator: oracle-box, oracle-mask, "
+        "oracle-track, wrong-mask. "
         "With commas, or repeated. Default: generic,vap.",
     ),
 ]
