@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from vap_core.analysis import embedding_report
 from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadStudy, UnknownName
+from vap_core.base.types import Rgb
 from vap_core.cli import app
 from vap_core.evaluation import engine
 from vap_core.evaluation import study as experiments
@@ -22,6 +23,7 @@ from vap_core.policies.mini_pi0 import learned_token, teach_token, token_alignme
 from vap_core.policies.mini_pi0.learned_token import TokenTraining
 from vap_core.policies.mini_pi0.vlm import load_from_policy, load_vlm
 from vap_core.policies.token_groups import token_groups
+from vap_core.simulation.assets.objects import ObjectModel
 
 from . import tiny_lerobot
 from .test_soft_prompt import SUITE, TASK, grown  # noqa: F401
@@ -38,6 +40,14 @@ def tiny(
     monkeypatch.setattr(teach_token, "VIEWS", 2)
     monkeypatch.setattr(teach_token, "OTHERS", 1)
     monkeypatch.setattr(study, "shipped", lambda suite: far)
+
+    def views(model: ObjectModel, n: int = 5, seed: int = 0) -> list[Rgb]:
+        """Noise of the object's own: rendering takes longer than all that is tested."""
+        rng = np.random.default_rng([seed, n, *model.name.encode()])
+        return list(rng.integers(0, 256, (n, 32, 32, 3)).astype(np.uint8))
+
+    for module in (study, teach_token):
+        monkeypatch.setattr(module, "reference_views", views)
 
     def training(epochs: int = 2) -> TokenTraining:
         return TokenTraining(epochs=epochs, augmentations=1)
