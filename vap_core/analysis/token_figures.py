@@ -22,7 +22,7 @@ def token_curves_figure(curve: "pd.DataFrame") -> "Figure":
     A panel per number of photos; bands are 95 % intervals.
     """
     ks = sorted(curve.k.unique())
-    figure = empty_figure(2.9 * len(ks) + 0.5, 3.2)
+    figure = empty_figure(max(4.6, 2.9 * len(ks) + 0.5), 3.2)
     grid = figure.subplots(1, len(ks), squeeze=False, sharey=True)[0]
     for axes, k in zip(grid, ks, strict=True):
         of_k = curve[curve.k == k]
