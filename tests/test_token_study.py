@@ -10,6 +10,7 @@ from scipy.stats import ortho_group
 from typer.testing import CliRunner
 
 from vap_core.analysis import embedding_report
+from vap_core.analysis.token_space import nearest_words, rotation_cosines
 from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadStudy, UnknownName
 from vap_core.base.types import Rgb
 from vap_core.cli import app
@@ -24,6 +25,7 @@ from vap_core.policies.mini_pi0.learned_token import TokenTraining
 from vap_core.policies.mini_pi0.vlm import load_from_policy, load_vlm
 from vap_core.policies.token_groups import token_groups
 from vap_core.simulation.assets.objects import ObjectModel
+from vap_core.training.words import vocabulary
 
 from . import tiny_lerobot
 from .test_soft_prompt import SUITE, TASK, grown  # noqa: F401
@@ -247,3 +249,15 @@ def test_real_checkpoints_are_compared_with_their_words(tmp_path: Path) -> None:
     (one / "tokenizer" / "tokenizer.json").write_text("{}")
     with pytest.raises(BadPolicy, match="is no tokenizer"):
         token_groups([one], ["put"])
+
+
+def test_words_that_no_film_says_are_left_out_of_the_rotation(grown: tuple[Path, Path]) -> None:  # noqa: F811
+    home, far = grown
+    assert len(rotation_cosines(home, home)["copied"]) == 0
+    shipped = experiments.MODEL.parent
+    found = rotation_cosines(experiments.MODEL, shipped / f"mini-pi0-{SUITE}")
+    assert len(found["copied"]) == 56
+    assert (found["copied"] < 0.9999).all()
+    assert found["rotated, fitted"].mean() > found["copied"].mean()
+    words = nearest_words(open_table(far).block(15, 16)[0], far, 3)
+    assert words[0] == (vocabulary()[15], pytest.approx(1))

@@ -1,5 +1,4 @@
 from .embedding_report import paper_spaces as paper_spaces
-from .embedding_search import nearest_tokens as nearest_tokens
 from .gallery import GOALS as GOALS
 from .gallery import STEMS as STEMS
 from .gallery import bounds as bounds
@@ -40,3 +39,5 @@ from .plots import rates_figure as rates_figure
 from .plots import sheet as sheet
 from .token_figures import rotation_figure as rotation_figure
 from .token_figures import token_curves_figure as token_curves_figure
+from .token_space import nearest_words as nearest_words
+from .token_space import rotation_cosines as rotation_cosines

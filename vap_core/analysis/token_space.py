@@ -1,0 +1,45 @@
+"""Where a learned token lies among words, and whether a rotation carries words into a policy."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from vap_core.analysis.embedding_search import nearest_tokens, paired_cosines
+from vap_core.base.files import parse_json
+from vap_core.policies.embedding_table import open_table
+from vap_core.policies.mini_pi0.token_alignment import (
+    held_out_cosines,
+    orthogonal_map,
+    shared_tables,
+)
+
+READ = 0.9999
+"""A word whose cosine is above it has been left alone: the policy's films never say it."""
+
+
+def nearest_words(
+    embedding: Float32[np.ndarray, " d"], model: Path, k: int = 6
+) -> list[tuple[str, float]]:
+    """The words of a small model that are nearest to an embedding, and their cosines."""
+    words = parse_json((model / "config.json").read_text())["words"]
+    found = nearest_tokens(embedding, open_table(model), k)
+    return [(words[token], cosine) for token, cosine in found]
+
+
+def rotation_cosines(model: Path, policy: Path) -> dict[str, Float64[np.ndarray, " w"]]:
+    """Cosines of the words that the policy reads to themselves in it, by what is done to them.
+
+    They are copied as they are; rotated by the best orthogonal map over the shared vocabulary; or
+    rotated by the map that was fitted without the word itself.
+    """
+    source, target = shared_tables(model, policy)
+    copied = paired_cosines(source, target)
+    # A comparison with nan, of a row of zeros, is false.
+    words = np.flatnonzero(copied < READ)
+    fitted = (source @ orthogonal_map(source, target)).astype(np.float32)
+    return {
+        "copied": copied[words],
+        "rotated, fitted": paired_cosines(fitted, target)[words],
+        "rotated, left out": held_out_cosines(source, target, words),
+    }
