@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import stats
 from scipy.stats import ortho_group
 from typer.testing import CliRunner
 
 from vap_core.analysis import embedding_report
-from vap_core.analysis.token_space import nearest_words, rotation_cosines
+from vap_core.analysis.token_space import mean_cosine, nearest_words, rotation_cosines
 from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadStudy, UnknownName
 from vap_core.base.types import Rgb
 from vap_core.cli import app
@@ -206,6 +207,17 @@ def test_rates_are_counted_by_hand() -> None:
     (line,) = report.readings(answers).to_dict("records")
     assert line["right"] == pytest.approx((3 / 4 + 5 / 6) / 2)
     assert (line["own"].k, line["look-alikes"].k, line["other objects"].k) == (3, 1, 0)
+    whole = report.pooled(answers).loc["as learned"]
+    assert whole["own"].text() == "75.0 [30.1, 95.4] 4"
+    assert (whole["right"].n, whole["right"].value) == (1, line["right"])
+    assert np.isnan(whole["right"].low)
+    other = answers.assign(object="mug", shown=answers.shown.str.replace("cup", "mug"), yes=0)
+    both = report.pooled(pd.concat([answers, other])).loc["as learned"]
+    assert (both["own"].value, both["own"].n) == (3 / 8, 8)
+    rights = [line["right"], 0.5]
+    interval = stats.t.interval(0.95, 1, np.mean(rights), stats.sem(rights))
+    assert (both["right"].n, both["right"].value) == (2, pytest.approx(np.mean(rights)))
+    assert (both["right"].low, both["right"].high) == (max(0, interval[0]), min(1, interval[1]))
     (taken,) = report.confusions(answers).to_dict("records")
     assert (taken["look-alike"], taken["yes"], taken["n"]) == ("cup-lookalike-1", 0.25, 4)
     curve = report.curve(answers).set_index(["step", "kind"]).yes
@@ -258,6 +270,9 @@ def test_words_that_no_film_says_are_left_out_of_the_rotation(grown: tuple[Path,
     found = rotation_cosines(experiments.MODEL, shipped / f"mini-pi0-{SUITE}")
     assert len(found["copied"]) == 56
     assert (found["copied"] < 0.9999).all()
+    whole = mean_cosine(found["copied"])
+    assert (whole.value, whole.n) == (pytest.approx(found["copied"].mean()), 56)
+    assert whole.low < whole.value < whole.high
     assert found["rotated, fitted"].mean() > found["copied"].mean()
     words = nearest_words(open_table(far).block(15, 16)[0], far, 3)
     assert words[0] == (vocabulary()[15], pytest.approx(1))

@@ -7,6 +7,8 @@ from jaxtyping import Float32, Float64
 
 from vap_core.analysis.embedding_search import nearest_tokens, paired_cosines
 from vap_core.base.files import parse_json
+from vap_core.evaluation.perception.estimates import Estimate
+from vap_core.evaluation.statistics import bootstrap_interval
 from vap_core.policies.embedding_table import open_table
 from vap_core.policies.mini_pi0.token_alignment import (
     held_out_cosines,
@@ -43,3 +45,9 @@ def rotation_cosines(model: Path, policy: Path) -> dict[str, Float64[np.ndarray,
         "rotated, fitted": paired_cosines(fitted, target)[words],
         "rotated, left out": held_out_cosines(source, target, words),
     }
+
+
+def mean_cosine(cosines: Float64[np.ndarray, " w"]) -> Estimate:
+    """The mean over words, with its bootstrap interval over words."""
+    low, high = bootstrap_interval(cosines, np.ones(len(cosines)))
+    return Estimate(value=float(cosines.mean()), low=low, high=high, n=len(cosines))

@@ -1,6 +1,6 @@
 """What learned tokens recognize, as text: shares of photos with n and 95 % intervals."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from vap_core.base.tables import align
@@ -89,6 +89,30 @@ def readings(answers: "pd.DataFrame", k: int = USUAL_K) -> "pd.DataFrame":
     return pd.DataFrame(lines, columns=["suite", "object", "reading", "right", *KINDS])
 
 
+def pooled(answers: "pd.DataFrame", k: int = USUAL_K) -> "pd.DataFrame":
+    """By reading, over all objects: right as a mean over objects, yes to each kind of photo.
+
+    All are `Estimate`s: yes has Wilson's interval over photos, right has Student's over objects.
+    """
+    import pandas as pd
+
+    ends = final(answers)
+    ends = ends[ends.k == k]
+    lines = []
+    for name in READINGS:
+        part = reading(ends, name)
+        if part.empty:
+            continue
+        kinds = kind_of(part)
+        of_objects = [right(rows) for _, rows in part.groupby("object", sort=False)]
+        line = {"reading": name, "right": _mean_of_objects(of_objects)}
+        for kind in KINDS:
+            found = said_yes(part[kinds == kind])
+            line[kind] = Estimate(value=found.value, low=found.low, high=found.high, n=found.n)
+        lines.append(line)
+    return pd.DataFrame(lines, columns=["reading", "right", *KINDS]).set_index("reading")
+
+
 def confusions(answers: "pd.DataFrame", k: int = USUAL_K) -> "pd.DataFrame":
     """By object and look-alike: the share of its photos that are taken for the object's."""
     import pandas as pd
@@ -125,6 +149,19 @@ def report(tables: Mapping[str, "pd.DataFrame"]) -> str:
 def text(found: Rate) -> str:
     """A rate with its interval and n: "97.2 [94.0, 98.7] 180"."""
     return _text(found.value, found.low, found.high, found.n)
+
+
+def _mean_of_objects(values: Sequence[float]) -> Estimate:
+    """Their mean with Student's 95 % interval, inside 0..1; one object has none."""
+    import numpy as np
+    from scipy import stats
+
+    n = len(values)
+    middle = float(np.mean(values))
+    if n < 2:
+        return Estimate(value=middle, low=float("nan"), high=float("nan"), n=n)
+    half = float(stats.t.ppf(0.975, n - 1) * np.std(values, ddof=1) / np.sqrt(n))
+    return Estimate(value=middle, low=max(0.0, middle - half), high=min(1.0, middle + half), n=n)
 
 
 def _numbers(found: Rate) -> tuple[int, float, float, float]:
