@@ -11,7 +11,13 @@ from scipy.stats import ortho_group
 from typer.testing import CliRunner
 
 from vap_core.analysis import embedding_report
-from vap_core.analysis.token_space import mean_cosine, nearest_words, rotation_cosines
+from vap_core.analysis.token_space import (
+    longest_word,
+    mean_cosine,
+    nearest_words,
+    rotation_cosines,
+    rotation_deg,
+)
 from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadStudy, UnknownName
 from vap_core.base.types import Rgb
 from vap_core.cli import app
@@ -274,5 +280,14 @@ def test_words_that_no_film_says_are_left_out_of_the_rotation(grown: tuple[Path,
     assert (whole.value, whole.n) == (pytest.approx(found["copied"].mean()), 56)
     assert whole.low < whole.value < whole.high
     assert found["rotated, fitted"].mean() > found["copied"].mean()
+    table = open_table(far)
+    rows = table.block(0, table.shape[0])
+    assert longest_word(far) == pytest.approx(np.sqrt((rows**2).sum(1)).max())
+    assert rotation_deg(rows[15], home, home) < 0.1
+    bridge = shipped / f"mini-pi0-{SUITE}"
+    word = open_table(experiments.MODEL).block(15, 16)[0]
+    moved = token_alignment.align(word, experiments.MODEL, bridge)
+    cosine = np.cos(np.radians(rotation_deg(word, experiments.MODEL, bridge)))
+    assert cosine * np.linalg.norm(word) ** 2 == pytest.approx(float(word @ moved), rel=1e-3)
     words = nearest_words(open_table(far).block(15, 16)[0], far, 3)
     assert words[0] == (vocabulary()[15], pytest.approx(1))

@@ -41,6 +41,8 @@ from .plots import rates_figure as rates_figure
 from .plots import sheet as sheet
 from .token_figures import rotation_figure as rotation_figure
 from .token_figures import token_curves_figure as token_curves_figure
+from .token_space import longest_word as longest_word
 from .token_space import mean_cosine as mean_cosine
 from .token_space import nearest_words as nearest_words
 from .token_space import rotation_cosines as rotation_cosines
+from .token_space import rotation_deg as rotation_deg

@@ -11,6 +11,7 @@ from vap_core.evaluation.perception.estimates import Estimate
 from vap_core.evaluation.statistics import bootstrap_interval
 from vap_core.policies.embedding_table import open_table
 from vap_core.policies.mini_pi0.token_alignment import (
+    align,
     held_out_cosines,
     orthogonal_map,
     shared_tables,
@@ -27,6 +28,19 @@ def nearest_words(
     words = parse_json((model / "config.json").read_text())["words"]
     found = nearest_tokens(embedding, open_table(model), k)
     return [(words[token], cosine) for token, cosine in found]
+
+
+def longest_word(model: Path) -> float:
+    """The largest length of a row in a model's table of embeddings."""
+    table = open_table(model)
+    return float(np.linalg.norm(table.block(0, table.shape[0]), axis=1).max())
+
+
+def rotation_deg(embedding: Float32[np.ndarray, " d"], model: Path, policy: Path) -> float:
+    """By how many degrees the rotation into a policy's space turns an embedding."""
+    rotated = align(embedding, model, policy)
+    lengths = np.linalg.norm(embedding) * np.linalg.norm(rotated)
+    return float(np.degrees(np.arccos(np.clip(embedding @ rotated / lengths, -1, 1))))
 
 
 def rotation_cosines(model: Path, policy: Path) -> dict[str, Float64[np.ndarray, " w"]]:
