@@ -231,7 +231,7 @@ def test_a_worker_that_dies_once_is_forgiven_and_said(
 
     study = replace(STUDY, episodes=1)
     table = engine.run(study, tmp_path / "run", record="none", executor=spread)
-    assert fell == [4]
+    assert fell == [2]
     assert len(table) == 4
     assert table.attempt.tolist() == [1] * 4
     assert "a worker process died" in capsys.readouterr().err
