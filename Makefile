@@ -34,15 +34,14 @@ types: setup
 	$(RUN) -m mypy
 
 check: lint
-	$(PYTEST) -m "not slow and not alone and not sweep"
+	$(PYTEST) -m "not slow and not sweep"
 
-# Types are checked beside the first tests; what takes times runs last and alone.
+# Types are checked beside the first tests.
 test: style
 	@$(MAKE) --no-print-directory -j 2 types suite
-	$(RUN) -m pytest -m alone
 
 suite: setup
-	$(PYTEST) -m "not alone and not sweep" --nbval-lax notebooks tests
+	$(PYTEST) -m "not sweep" --nbval-lax notebooks tests
 
 test-all: test
 	$(RUN) -m pytest -m sweep

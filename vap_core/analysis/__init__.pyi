@@ -28,6 +28,8 @@ from .inspection import published as published
 from .inspection import recovery as recovery
 from .inspection import track_table as track_table
 from .inspection import write_photo as write_photo
+from .kept import kept_figure as kept_figure
+from .kept import kept_table as kept_table
 from .plots import Tile as Tile
 from .plots import bounds_figure as bounds_figure
 from .plots import film as film
