@@ -10,7 +10,6 @@ trained. Photos of the actual distractors are its hard negatives, in the baselin
 is then given to the policy that was initialised from the model.
 """
 
-import json
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from vap_core.base.errors import BadMemory
-from vap_core.base.files import write_atomic
+from vap_core.base.files import encode_tensors, parse_json, read_file, write_atomic
 from vap_core.base.types import Rgb, value
 
 if TYPE_CHECKING:
@@ -127,12 +126,10 @@ def augment(photo: Rgb, rng: np.random.Generator) -> Rgb:
 
 def save(folder: Path, token: Token) -> Path:
     """Write `<object>.token.safetensors`."""
-    from safetensors.numpy import save as encode
-
     header = {"object": token.object, "accuracy": repr(token.accuracy), "model": token.model}
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{token.object}{SUFFIX}"
-    write_atomic(path, encode({"embedding": token.embedding}, metadata=header))
+    write_atomic(path, encode_tensors({"embedding": token.embedding}, header))
     return path
 
 
@@ -146,7 +143,7 @@ def load(folder: Path, name: str, model: str) -> Token:
     path = folder / f"{name}{SUFFIX}"
     try:
         token = _read(path)
-    except (OSError, SafetensorError, struct.error, ValueError, KeyError) as error:
+    except (OSError, SafetensorError, struct.error, ValueError, KeyError, TypeError) as error:
         raise BadMemory(
             f"tokens.load: {path} holds no learned word ({type(error).__name__}); learn it again."
         ) from error
@@ -263,9 +260,9 @@ def _read(path: Path) -> Token:
     """The token in a file that `save` wrote."""
     from safetensors.numpy import load as decode
 
-    data = path.read_bytes()
+    data = read_file(path)
     (length,) = struct.unpack("<Q", data[:8])
-    header = json.loads(data[8 : 8 + length])["__metadata__"]
+    header = parse_json(data[8 : 8 + length])["__metadata__"]
     return Token(
         object=header["object"],
         embedding=decode(data)["embedding"],
