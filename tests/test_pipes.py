@@ -48,12 +48,16 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
 }
 
 
+class Waits(BaseException):
+    """Nothing that a reader catches."""
+
+
 @pytest.fixture(autouse=True)
 def _two_seconds() -> Iterator[None]:
-    """Ends the test when it waits. Nothing that a reader catches."""
+    """Ends the test when it waits."""
 
     def waits(*_: object) -> None:
-        raise KeyboardInterrupt("it waits for a writer")
+        raise Waits
 
     former = signal.signal(signal.SIGALRM, waits)
     signal.alarm(2)
