@@ -233,7 +233,7 @@ def runs() -> Iterator[object]:
         yield pytest.param(name, CASES, marks=[pytest.mark.sweep, pytest.mark.timeout(3600)])
 
 
-@pytest.mark.parametrize(("name", "cases"), runs())
+@pytest.mark.parametrize(("name", "cases"), list(runs()))
 def test_a_mutated_file_is_read_or_refused_in_one_line(
     tmp_path: Path, name: str, cases: int
 ) -> None:

@@ -16,7 +16,7 @@ def rows() -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in table[2:]]
 
 
-def tests_in(file: Path) -> set[str]:
+def functions_in(file: Path) -> set[str]:
     return {
         node.name
         for node in ast.parse(file.read_text()).body
@@ -30,7 +30,7 @@ def test_every_row_names_tests_that_exist() -> None:
         named = re.findall(r"`(test_\w+\.py)(?:::(\w+))?`", tests)
         assert named, tried
         for file, name in named:
-            found = tests_in(ROOT / "tests" / file)
+            found = functions_in(ROOT / "tests" / file)
             assert found if not name else name in found, (tried, file, name)
 
 
