@@ -1,6 +1,5 @@
 """The learned word of a personal object as a value, and as a small file beside the memory."""
 
-import json
 import struct
 from pathlib import Path
 
@@ -8,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from vap_core.base.errors import BadMemory
-from vap_core.base.files import write_atomic
+from vap_core.base.files import encode_tensors, parse_json, read_file, write_atomic
 from vap_core.base.types import value
 
 SUFFIX = ".token.safetensors"
@@ -33,12 +32,10 @@ class Token:
 
 def save(folder: Path, token: Token, suffix: str = SUFFIX) -> Path:
     """Write the object's name and `suffix`."""
-    from safetensors.numpy import save as encode
-
     header = {"object": token.object, "accuracy": repr(token.accuracy), "model": token.model}
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{token.object}{suffix}"
-    write_atomic(path, encode({"embedding": token.embedding}, metadata=header))
+    write_atomic(path, encode_tensors({"embedding": token.embedding}, header))
     return path
 
 
@@ -52,7 +49,7 @@ def load(folder: Path, name: str, model: str, suffix: str = SUFFIX) -> Token:
     path = folder / f"{name}{suffix}"
     try:
         token = _read(path)
-    except (OSError, SafetensorError, struct.error, ValueError, KeyError) as error:
+    except (OSError, SafetensorError, struct.error, ValueError, KeyError, TypeError) as error:
         raise BadMemory(
             f"tokens.load: {path} holds no learned word ({type(error).__name__}); learn it again."
         ) from error
@@ -68,9 +65,9 @@ def _read(path: Path) -> Token:
     """The token in a file that `save` wrote."""
     from safetensors.numpy import load as decode
 
-    data = path.read_bytes()
+    data = read_file(path)
     (length,) = struct.unpack("<Q", data[:8])
-    header = json.loads(data[8 : 8 + length])["__metadata__"]
+    header = parse_json(data[8 : 8 + length])["__metadata__"]
     return Token(
         object=header["object"],
         embedding=decode(data)["embedding"],
