@@ -29,7 +29,7 @@ from vap_core.instruction import parse
 from vap_core.memory import load as load_object
 from vap_core.memory import save as save_object
 from vap_core.policies.lerobot.checkpoints import PIPELINES, refuse_code
-from vap_core.policies.mini_pi0 import learned_token
+from vap_core.policies.mini_pi0 import token_file
 from vap_core.recording import Recorder
 from vap_core.recording.isolated import ENDED_READER, index_isolated
 from vap_core.simulation.assets.scans import mesh_file, storage
@@ -97,8 +97,8 @@ def memories(folder: Path) -> list[bytes]:
 
 
 def words(folder: Path) -> list[bytes]:
-    token = learned_token.Token("mug", np.zeros(4, np.float32), 0.5, "0" * 64)
-    return [learned_token.save(folder, token).read_bytes()]
+    token = token_file.Token("mug", np.zeros(4, np.float32), 0.5, "0" * 64)
+    return [token_file.save(folder, token).read_bytes()]
 
 
 def meshes(suffix: str) -> Callable[[Path], list[bytes]]:
@@ -183,7 +183,7 @@ PARSERS = {
     ),
     "learned word": Parser(
         words,
-        reader("mug.token.safetensors", lambda f: learned_token.load(f, "mug", "0" * 64)),
+        reader("mug.token.safetensors", lambda f: token_file.load(f, "mug", "0" * 64)),
     ),
     "GLB": Parser(meshes("glb"), mesh_reader("glb")),
     "OBJ": Parser(meshes("obj"), mesh_reader("obj")),

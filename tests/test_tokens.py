@@ -128,12 +128,12 @@ def test_a_token_comes_back_from_disk_for_its_own_model_only(tmp_path: Path) -> 
     with pytest.raises(BadMemory, match="no learned word"):
         token_file.load(tmp_path, "red-mug", "f" * 64)
     assert path.name == f"red-mug{SUFFIX}"
-    saved = {learned_token.save(tmp_path, token).read_bytes() for _ in range(6)}
+    saved = {token_file.save(tmp_path, token).read_bytes() for _ in range(6)}
     assert len(saved) == 1
     deep = b"[" * 100_000
     path.write_bytes(len(deep).to_bytes(8, "little") + deep)
     with pytest.raises(BadMemory, match="no learned word"):
-        learned_token.load(tmp_path, "red-mug", "f" * 64)
+        token_file.load(tmp_path, "red-mug", "f" * 64)
 
 
 def test_a_policy_hears_the_word_and_its_weights_stay(checkpoint: Path) -> None:  # noqa: F811
