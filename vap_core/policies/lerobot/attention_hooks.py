@@ -62,12 +62,19 @@ def reporting_attention(
 
     `positions` are those of the queries that are words, by episode.
     """
-    smolvla = hasattr(policy.model, "vlm_with_expert")
-    layout = _smolvla_layout(policy, cameras) if smolvla else _pi0_layout(policy, cameras)
-    watch = Watch(layout, positions)
-    with _watching_smolvla(policy, watch) if smolvla else _watching_pi0(policy, watch):
+    watch = Watch(layout(policy, cameras), positions)
+    with _watching_smolvla(policy, watch) if _is_smolvla(policy) else _watching_pi0(policy, watch):
         yield
     watch.report()
+
+
+def layout(policy: Any, cameras: Sequence[str]) -> Layout:
+    """Where a policy that `can_watch` holds the views of these cameras."""
+    return (_smolvla_layout if _is_smolvla(policy) else _pi0_layout)(policy, cameras)
+
+
+def _is_smolvla(policy: Any) -> bool:
+    return hasattr(policy.model, "vlm_with_expert")
 
 
 class Watch:

@@ -1,0 +1,247 @@
+"""Measures of attention maps: shares, peaks and entropy against hand counts; patterns by their definitions; areas under ROC curves."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.command import vap
+from vap_core.analysis.attention import patterns, prediction, report
+from vap_core.analysis.attention.measures import REGIONS, inside, measure, patch_areas
+from vap_core.analysis.attention.patterns import (
+    Thresholds,
+    example,
+    localisation,
+    of_pattern,
+    over_views,
+    per_episode,
+    with_localisation,
+)
+from vap_core.evaluation.study import Study
+from vap_core.simulation import suites
+from vap_core.simulation.env import Env
+from vap_core.simulation.suites.open_row import build_scene
+from vap_core.simulation.types import Truth
+
+
+def four_patches() -> dict[str, np.ndarray]:
+    """Target in one corner, look-alike in half of the next patch, the hand in the last row."""
+    areas = {name: np.zeros((2, 2), np.float32) for name in REGIONS}
+    areas["target"][0, 0] = 1
+    areas["lookalikes"][0, 1] = 0.5
+    areas["background"][0, 1] = 0.5
+    areas["hand"][1] = 1
+    return areas
+
+
+def test_shares_are_sums_and_chance_is_area() -> None:
+    heat = np.array([[0.4, 0.2], [0.1, 0.1]], np.float32)
+    found = measure(heat, four_patches())
+    assert found["mass"] == pytest.approx(0.8)
+    assert found["share_target"] == pytest.approx(0.5)
+    assert found["share_lookalikes"] == pytest.approx(0.125)
+    assert found["share_hand"] == pytest.approx(0.25)
+    assert sum(float(found[f"share_{name}"]) for name in REGIONS) == pytest.approx(1)
+    assert sum(float(found[f"chance_{name}"]) for name in REGIONS) == pytest.approx(1)
+    assert found["chance_lookalikes"] == pytest.approx(0.125)
+    assert (found["hit"], found["chance_hit"], found["peak_region"]) == (True, 0.25, "target")
+
+
+def test_even_attention_is_at_chance_and_one_patch_has_no_entropy() -> None:
+    even = measure(np.full((2, 2), 0.1, np.float32), four_patches())
+    for name in REGIONS:
+        assert even[f"share_{name}"] == pytest.approx(even[f"chance_{name}"])
+    assert even["entropy"] == pytest.approx(1)
+    one = np.zeros((2, 2), np.float32)
+    one[0, 1] = 0.3
+    found = measure(one, four_patches())
+    assert found["entropy"] == 0
+    assert (found["hit"], found["peak_region"]) == (False, "lookalikes"), "things before background"
+
+
+def test_heads_are_measured_as_maps_are() -> None:
+    rng = np.random.default_rng(0)
+    weights = rng.random((3, 2, 2, 2), dtype=np.float32)
+    areas = four_patches()
+    for layer, head in np.ndindex(3, 2):
+        found = measure(weights[layer, head], areas)
+        total, target, rivals = inside(weights, areas)[layer, head]
+        assert target / total == pytest.approx(found["share_target"], rel=1e-5)
+        assert rivals / total == pytest.approx(found["share_lookalikes"], rel=1e-5)
+
+
+def test_areas_are_those_of_the_masks_and_the_gripper_has_one() -> None:
+    row = suites.rows("simpler-bridge", "pick-shaver", 1)[0]
+    names = tuple(place.model for place in row.placements)
+    scene = build_scene("simpler-bridge", names, row.variant, "plain")
+    env = Env(scene, image_size=224, cameras=row.cameras or None)
+    env.reset(row)
+    truth = env.truth(masks=True)
+    assert env.truth().hand == {}
+    (camera,) = truth.masks
+    hand = truth.hand[camera]
+    assert 0.002 < hand.mean() < 0.3
+    for mask in truth.masks[camera].values():
+        assert not (mask & hand).any()
+    areas = patch_areas(row, truth, camera, 7)
+    assert np.allclose(sum(areas.values()), 1, atol=1e-5)
+    assert areas["target"].mean() == pytest.approx(truth.masks[camera][row.target].mean(), rel=1e-4)
+    assert areas["lookalikes"].sum() > 0
+    moved = Truth(**{**{n: getattr(truth, n) for n in Truth.__slots__}, "hand": {camera: ~hand}})
+    assert patch_areas(row, moved, camera, 7)["hand"].mean() > 0.7
+    scene.close()
+
+
+def call(
+    episode: int, step: int, region: str, camera: str = "front", **more: Any
+) -> dict[str, Any]:
+    """A row of `calls`: the peak in a region, and attention as dense as the area elsewhere."""
+    found: dict[str, Any] = {
+        "suite": "s", "task": "t", "method": "soft", "seed": 0, "episode": episode, "step": step, "camera": camera, "query": "token",
+        "mass": 0.5, "peak": 0.1, "peak_row": 0, "peak_column": 0, "peak_region": region, "hit": region == "target", "chance_hit": 0.1, "entropy": 0.9,
+    }  # fmt: skip
+    for name in REGIONS:
+        found[f"share_{name}"] = 0.6 if name == region else 0.1
+        found[f"chance_{name}"] = 0.2
+    return {**found, **more}
+
+
+def ending(episode: int, success: bool, touch: float = 100.0) -> dict[str, Any]:
+    return {
+        "suite": "s", "task": "t", "method": "soft", "seed": 0, "episode": episode, "success": success, "outcome": "success" if success else "failure",
+        "first_touch": touch, "touched": "target", "margin": 0.1, "layout": f"layout {episode}", "reproduced": True,
+    }  # fmt: skip
+
+
+def localised(calls: list[dict[str, Any]], endings: list[dict[str, Any]]) -> pd.DataFrame:
+    return with_localisation(per_episode(pd.DataFrame(calls), pd.DataFrame(endings)))
+
+
+def test_every_pattern_is_found_by_its_definition() -> None:
+    peaks = {
+        0: ("target", "target", "target"),
+        1: ("target", "target", "target"),
+        2: ("target", "background", "target", "hand"),
+        3: ("lookalikes", "target", "lookalikes"),
+        4: ("background", "background", "background", "target"),
+    }
+    calls = [call(i, 4 * j, r) for i, regions in peaks.items() for j, r in enumerate(regions)]
+    table = localised(calls, [ending(i, i == 0) for i in peaks])
+    assert list(table.localisation) == ["stable", "stable", "drifting", "confused", "drifting"]
+    assert list(of_pattern(table, "successful").episode) == [0]
+    assert list(of_pattern(table, "stable but failed").episode) == [1]
+    chosen = {name: example(table, name) for name in patterns.PATTERNS}
+    assert {name: found.episode for name, found in chosen.items() if found is not None} == {
+        "successful": 0,
+        "stable but failed": 1,
+        "drifting": 2,
+        "confused": 3,
+    }
+    row = table.iloc[4]
+    assert localisation(row, Thresholds(switches=0.5)) == "elsewhere"
+    assert localisation(table.iloc[0], Thresholds(stable=1.1, switches=0.1)) == "elsewhere"
+    counts = report.pattern_counts(table).iloc[0]
+    assert (counts["n"], counts["stable"], counts["stable, success"]) == (5, 2, 1)
+    assert example(table[table.episode == 0], "confused") is None
+
+
+def test_calls_after_the_first_touch_do_not_count() -> None:
+    calls = [call(0, 0, "target"), call(0, 4, "target"), call(0, 8, "lookalikes")]
+    (row,) = localised(calls, [ending(0, True, touch=5)]).to_dict("records")
+    assert (row["calls"], row["on_target"], row["localisation"]) == (2, 1.0, "stable")
+    (row,) = localised(calls, [ending(0, True, touch=float("nan"))]).to_dict("records")
+    assert row["calls"] == 3
+
+
+def test_views_are_joined_by_their_attention_and_the_highest_has_the_peak() -> None:
+    front = call(0, 0, "background", mass=0.3, peak=0.1)
+    side = call(0, 0, "target", camera="side", mass=0.1, peak=0.3)
+    (row,) = over_views(pd.DataFrame([front, side])).to_dict("records")
+    assert row["share_target"] == pytest.approx((0.3 * 0.1 + 0.1 * 0.6) / 0.4)
+    assert (row["camera"], row["hit"], row["mass"]) == ("side", True, pytest.approx(0.4))
+
+
+def test_the_word_that_means_the_target_is_the_token_then_the_colour() -> None:
+    calls = [call(0, 0, "target", query=query) for query in ("action", "category", "colour")]
+    calls += [call(1, 0, "target", query=query) for query in ("action", "token")]
+    calls += [call(2, 0, "target", query="action")]
+    found = patterns.main_words(pd.DataFrame(calls))
+    assert list(found["query"]) == ["colour", "token", "action"]
+
+
+def test_the_area_is_the_share_of_pairs_in_order() -> None:
+    rng = np.random.default_rng(0)
+    scores = rng.integers(0, 5, 60).astype(float)
+    labels = rng.random(60) < 0.4
+    pairs = [(a > b) + 0.5 * (a == b) for a in scores[labels] for b in scores[~labels]]
+    assert prediction.auc(scores, labels) == pytest.approx(np.mean(pairs))
+    assert np.isnan(prediction.auc(scores, np.ones(60, bool)))
+
+
+def test_the_interval_is_wider_where_episodes_are_copies() -> None:
+    rng = np.random.default_rng(1)
+    labels = rng.random(40) < 0.5
+    scores = rng.normal(size=40) + labels
+    alone = prediction.auc_interval(scores, labels, [str(i) for i in range(40)])
+    copies = prediction.auc_interval(
+        np.tile(scores, 4), np.tile(labels, 4), [str(i) for i in range(40)] * 4
+    )
+    as_if = prediction.auc_interval(
+        np.tile(scores, 4), np.tile(labels, 4), [str(i) for i in range(160)]
+    )
+    assert copies.value == pytest.approx(alone.value)
+    assert (copies.low, copies.high) == pytest.approx((alone.low, alone.high), abs=1e-9)
+    assert as_if.high - as_if.low < 0.7 * (alone.high - alone.low)
+    assert alone.clusters == copies.clusters == 40
+
+
+def test_a_measure_of_noise_predicts_nothing_that_was_left_out() -> None:
+    rng = np.random.default_rng(2)
+    labels = rng.random(200) < 0.5
+    clusters = [str(i // 2) for i in range(200)]
+    useful = labels + rng.normal(size=200)
+    scores = prediction.left_out_scores(useful[:, None], labels, clusters)
+    assert prediction.auc(scores, labels) == pytest.approx(prediction.auc(useful, labels), abs=0.04)
+    noise = prediction.left_out_scores(rng.normal(size=(200, 3)), labels, clusters)
+    assert 0.35 < prediction.auc(noise, labels) < 0.62
+
+
+@pytest.mark.slow
+def test_the_command_measures_a_run_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    done = vap("rollout", "--suite", "simpler-bridge", "--task", "pick-shaver", "--policy", "mini-pi0", "--methods", "generic", "--episodes", "2",
+               "--record", "none", "--workers", "1", "--out", run)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    words = ("attention", run, "--workers", "1", "--explain", "1")
+    done = vap(*words)
+    assert done.returncode == 0, done.stderr
+    assert "2 episodes run again, 2 of them end as in the run" in done.stdout
+    (part,) = (run / "attention" / "parts").iterdir()
+    stamp = part.stat().st_mtime_ns
+    assert vap(*words).returncode == 0
+    assert part.stat().st_mtime_ns == stamp, "what is there is not run again"
+    tables = {
+        n: pd.read_parquet(run / "attention" / f"attention_{n}.parquet")
+        for n in ("calls", "layers", "causal")
+    }
+    assert set(tables["calls"]["query"]) == {"action", "category"}
+    assert len(tables["layers"]) == 2 * 2 * 4 * 8
+    assert set(tables["causal"]["measure"]) == {"gradient", "masking", "action", "category"}
+    own = tables["causal"][tables["causal"]["measure"] == "masking"]
+    assert (own["rank_masking"] == 1).all()
+    done = vap("attention", run, "--method", "vap")
+    assert done.returncode == 2
+    assert "holds no episode of what was asked for" in done.stderr
+
+
+def test_a_policy_without_attention_is_refused_in_one_line(tmp_path: Path) -> None:
+    from vap_core.evaluation import engine
+
+    study = Study((("widowx-pick", "pick-bottle"),), ("generic",), episodes=1, policy="random")
+    engine.run(study, tmp_path / "run", workers=1, record="none", progress=False)
+    done = vap("attention", tmp_path / "run", "--workers", "1")
+    assert done.returncode == 2
+    assert "gives no attention maps" in done.stderr
+    assert "Traceback" not in done.stderr
