@@ -111,6 +111,30 @@ def _logistic(
     return weights
 
 
+def warning_table(table: "pd.DataFrame", measures: Sequence[str]) -> "pd.DataFrame":
+    """Failures foretold by the vote margin, by the attention, and by both: areas and intervals.
+
+    Logistic regressions, scored on layouts that they were not fitted on. `table` are episodes of
+    one method that votes.
+    """
+    import pandas as pd
+
+    voted = table[table["margin"].notna()]
+    failed = ~voted["success"].to_numpy(bool)
+    layouts = list(voted["layout"])
+    rows = []
+    for name, columns in (
+        ("vote margin", ["margin"]),
+        ("attention", list(measures)),
+        ("both", ["margin", *measures]),
+    ):
+        scores = left_out_scores(voted[columns].to_numpy(float), failed, layouts)
+        rows.append(
+            {"predictor": name, "AUC for failure": str(auc_interval(scores, failed, layouts))}
+        )
+    return pd.DataFrame(rows).set_index("predictor")
+
+
 def predict_success(table: "pd.DataFrame", measures: Sequence[str]) -> "dict[str, Auc]":
     """For every measure of `patterns.per_episode`, how well it tells successes from failures."""
     found = {}

@@ -25,14 +25,23 @@ def text(tables: "dict[str, pd.DataFrame]") -> str:
         align(_rows(where_queries_look(table))),
         align(_rows(pattern_counts(with_localisation(table)))),
     ]
-    lines = [["suite", "method", "measure", "AUC for success [95 %]"]]
-    for (suite, method), group in with_localisation(table).groupby(
-        ["suite", "method"], observed=True
-    ):
-        for name, area in predict_success(group, MEASURES).items():
-            lines.append([str(suite), str(method), name, str(area)])
-    parts.append(align(lines))
+    parts.append("area under the ROC curve for success [95 %, layouts resampled]:")
+    parts.append(align(_rows(auc_table(with_localisation(table)).reset_index())))
     return "\n\n".join(parts)
+
+
+def auc_table(table: "pd.DataFrame") -> "pd.DataFrame":
+    """How well each measure tells successes from failures, a row per suite and method."""
+    import pandas as pd
+
+    rows = {}
+    for (suite, method), group in table.groupby(["suite", "method"], observed=True, sort=False):
+        areas = predict_success(group, MEASURES)
+        row = {"n": str(len(group)), "successes": str(int(group["success"].sum()))}
+        for name, area in areas.items():
+            row[name] = f"{area.value:.2f} [{area.low:.2f}, {area.high:.2f}]"
+        rows[f"{suite}, {method}"] = row
+    return pd.DataFrame(rows).T.rename_axis("suite, method")
 
 
 def where_queries_look(table: "pd.DataFrame") -> "pd.DataFrame":
@@ -83,3 +92,19 @@ def layer_table(layers: "pd.DataFrame") -> "pd.DataFrame":
 
 def _rows(table: "pd.DataFrame") -> list[list[str]]:
     return [list(map(str, table.columns)), *table.astype(str).to_numpy().tolist()]
+
+
+def causal_table(causal: "pd.DataFrame") -> "pd.DataFrame":
+    """What is where by attention and by the causal measures of the same calls.
+
+    `lift` is the density on the target, `rank_gradient` and `rank_masking` the mean rank
+    correlations over patches with the two causal measures; n is calls.
+    """
+    groups = causal.groupby(["suite", "method", "measure"], observed=True, sort=False)
+    sums = groups[["share_target", "chance_target", "share_lookalikes", "chance_lookalikes"]].sum()
+    table = groups[["hit", "chance_hit", "rank_gradient", "rank_masking"]].mean()
+    table.insert(0, "n", groups.size())
+    table.insert(1, "lift", sums["share_target"] / sums["chance_target"])
+    rivals = sums["share_lookalikes"] / sums["chance_lookalikes"]
+    table.insert(2, "lift_lookalikes", rivals)
+    return table.round(2).reset_index()
