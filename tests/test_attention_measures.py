@@ -119,6 +119,13 @@ def localised(calls: list[dict[str, Any]], endings: list[dict[str, Any]]) -> pd.
     return with_localisation(per_episode(pd.DataFrame(calls), pd.DataFrame(endings)))
 
 
+def test_whole_episodes_count_every_call() -> None:
+    calls = pd.DataFrame([call(0, 0, "target"), call(0, 8, "lookalikes")])
+    endings = pd.DataFrame([ending(0, True, touch=5)])
+    assert list(per_episode(calls, endings).calls) == [1]
+    assert list(per_episode(calls, endings, whole=True).calls) == [2]
+
+
 def test_every_pattern_is_found_by_its_definition() -> None:
     peaks = {
         0: ("target", "target", "target"),

@@ -1,3 +1,4 @@
+from .effects import layer_effects as layer_effects
 from .figures import layers_figure as layers_figure
 from .figures import patterns_figure as patterns_figure
 from .figures import time_figure as time_figure
@@ -8,6 +9,7 @@ from .patterns import main_words as main_words
 from .patterns import of_pattern as of_pattern
 from .patterns import per_episode as per_episode
 from .patterns import with_localisation as with_localisation
+from .pictures import example_tiles as example_tiles
 from .pictures import examples_figure as examples_figure
 from .prediction import warning_table as warning_table
 from .replay import read as read

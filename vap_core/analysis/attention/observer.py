@@ -16,6 +16,7 @@ from scipy.stats import spearmanr
 from vap_core.analysis.attention.measures import (
     GOAL,
     LOOKALIKES,
+    REGIONS,
     TARGET,
     Areas,
     inside,
@@ -142,10 +143,10 @@ class Observer:
 def _all_views(
     maps: dict[str, np.ndarray], areas: dict[str, Areas], cameras: list[str]
 ) -> dict[str, float | bool]:
-    """Share inside target and look-alikes, their areas, and the pointing game, over all views."""
+    """Share inside every region, its area, and the pointing game, over all views."""
     heat = np.stack([maps[camera] for camera in cameras])
     measures: dict[str, float | bool] = {}
-    for region in (TARGET, LOOKALIKES):
+    for region in REGIONS:
         area = np.stack([areas[camera][region] for camera in cameras])
         measures[f"share_{region}"] = float((heat * area).sum() / max(float(heat.sum()), 1e-12))
         measures[f"chance_{region}"] = float(area.mean())

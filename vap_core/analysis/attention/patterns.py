@@ -2,7 +2,8 @@
 
 The paper shows four patterns of a learned token (P appendix, attention analysis): localisation that
 is stable while the episode fails, that drifts, that is confused by look-alikes, and that succeeds.
-Here they are defined by thresholds, over the calls up to the first touch of anything.
+Here they are defined by thresholds, over all calls of an episode. What is to tell of the outcome in
+advance is measured over the calls up to the first touch of anything.
 """
 
 from dataclasses import dataclass
@@ -37,12 +38,14 @@ class Thresholds:
     """When a localisation is called what; shares are of an episode's calls.
 
     `rival` is the share of peaks on a look-alike from which on it is confused; so is one whose
-    attention to the look-alikes is at least as dense as that to the target. `stable` is the share
-    of peaks on the target from which on it is stable. Of the rest, it drifts where the region of
-    the peak changes in a share `switches` of successive calls; else it stays elsewhere.
+    attention to the look-alikes is as dense as that to the target and `dense` times that to the
+    whole view. `stable` is the share of peaks on the target from which on it is stable. Of the
+    rest, it drifts where the region of the peak changes in a share `switches` of successive calls;
+    else it stays elsewhere.
     """
 
     rival: float = 1 / 3
+    dense: float = 1.0
     stable: float = 2 / 3
     switches: float = 1 / 3
 
@@ -85,8 +88,10 @@ def main_words(calls: "pd.DataFrame") -> "pd.DataFrame":
     return calls[rank == first]
 
 
-def per_episode(calls: "pd.DataFrame", episodes: "pd.DataFrame", side: int = 7) -> "pd.DataFrame":
-    """One row per episode and query, over the calls up to the first touch.
+def per_episode(
+    calls: "pd.DataFrame", episodes: "pd.DataFrame", *, whole: bool = False, side: int = 7
+) -> "pd.DataFrame":
+    """One row per episode and query, over the calls up to the first touch, or `whole` episodes.
 
     `lift` is the density of attention on the target, 1 where it is that of the whole view, and
     `lift_lookalikes` that on the look-alikes. `on_target` and `on_rival` are the shares of peaks
@@ -98,7 +103,7 @@ def per_episode(calls: "pd.DataFrame", episodes: "pd.DataFrame", side: int = 7) 
 
     merged = over_views(calls).merge(episodes, on=KEY)
     touch = merged["first_touch"].fillna(np.inf)
-    before = merged[merged["step"] <= touch]
+    before = merged if whole else merged[merged["step"] <= touch]
     rows = []
     for key, group in before.groupby([*KEY, "query"], observed=True, sort=False):
         ordered = group.sort_values("step")
@@ -129,7 +134,8 @@ def per_episode(calls: "pd.DataFrame", episodes: "pd.DataFrame", side: int = 7) 
 
 def localisation(row: "pd.Series", thresholds: Thresholds = THRESHOLDS) -> str:
     """The localisation of an episode; `row` is one of `per_episode`."""
-    if row["on_rival"] >= thresholds.rival or row["lift_lookalikes"] >= row["lift"]:
+    dense = row["lift_lookalikes"] >= max(row["lift"], thresholds.dense)
+    if dense or row["on_rival"] >= thresholds.rival:
         return CONFUSED
     if row["on_target"] >= thresholds.stable:
         return STABLE

@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING
 
+from vap_core.analysis.attention.measures import REGIONS
 from vap_core.analysis.attention.patterns import LOCALISATIONS, per_episode, with_localisation
 from vap_core.analysis.attention.prediction import predict_success
 from vap_core.base.tables import align
@@ -18,14 +19,18 @@ def text(tables: "dict[str, pd.DataFrame]") -> str:
     """Where every query looks, the patterns, and how well the measures tell successes."""
     episodes = tables["episodes"]
     table = per_episode(tables["calls"], episodes)
+    whole = per_episode(tables["calls"], episodes, whole=True)
     again = int(episodes["reproduced"].sum())
     parts = [
         f"{len(episodes)} episodes run again, {again} of them end as in the run; up to the first "
         "touch:",
         align(_rows(where_queries_look(table))),
-        align(_rows(pattern_counts(with_localisation(table)))),
+        "the word that means the target, over whole episodes:",
+        align(_rows(pattern_counts(with_localisation(whole)))),
     ]
-    parts.append("area under the ROC curve for success [95 %, layouts resampled]:")
+    parts.append(
+        "area under the ROC curve for success, up to the first touch [95 %, layouts resampled]:"
+    )
     parts.append(align(_rows(auc_table(with_localisation(table)).reset_index())))
     return "\n\n".join(parts)
 
@@ -97,14 +102,14 @@ def _rows(table: "pd.DataFrame") -> list[list[str]]:
 def causal_table(causal: "pd.DataFrame") -> "pd.DataFrame":
     """What is where by attention and by the causal measures of the same calls.
 
-    `lift` is the density on the target, `rank_gradient` and `rank_masking` the mean rank
-    correlations over patches with the two causal measures; n is calls.
+    Columns with a region's name are the density inside it, 1 where it is that of the whole view;
+    `rank_gradient` and `rank_masking` are the mean rank correlations over patches with the two
+    causal measures; n is calls.
     """
     groups = causal.groupby(["suite", "method", "measure"], observed=True, sort=False)
-    sums = groups[["share_target", "chance_target", "share_lookalikes", "chance_lookalikes"]].sum()
     table = groups[["hit", "chance_hit", "rank_gradient", "rank_masking"]].mean()
+    for region in reversed(REGIONS):
+        shares = groups[[f"share_{region}", f"chance_{region}"]].sum()
+        table.insert(0, region, shares[f"share_{region}"] / shares[f"chance_{region}"])
     table.insert(0, "n", groups.size())
-    table.insert(1, "lift", sums["share_target"] / sums["chance_target"])
-    rivals = sums["share_lookalikes"] / sums["chance_lookalikes"]
-    table.insert(2, "lift_lookalikes", rivals)
     return table.round(2).reset_index()
