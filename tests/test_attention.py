@@ -35,7 +35,7 @@ from vap_core.policies.protocol import PolicyInput
 from vap_core.recording import Recorder
 from vap_core.recording.entities.attention import attention_overlay
 from vap_core.rollout.loop import rollout
-from vap_core.rollout.queries import QUERIES, named_queries
+from vap_core.rollout.queries import QUERIES, named_queries, only_queries
 from vap_core.rollout.types import EpisodeHeader
 from vap_core.simulation.types import Outcome
 
@@ -246,6 +246,13 @@ def test_pictures_that_are_padded_are_not_read(toys: dict[str, LeRobot]) -> None
     assert attention_hooks.can_watch(pi0)
     with patch.object(feature, "shape", (3, 48, 64)):
         assert not attention_hooks.can_watch(pi0)
+
+
+def test_only_the_queries_asked_for_are_kept() -> None:
+    heat = np.zeros((1, 1, 2, 2), np.float32)
+    maps = {"front": {"token": heat, ACTION: heat}, "side": {ACTION: heat}}
+    assert only_queries(maps, ("token",)) == {"front": {"token": heat}}
+    assert only_queries(maps, ("colour",)) == {}, "a step without them has no attention"
 
 
 def test_queries_are_named() -> None:

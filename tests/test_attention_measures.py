@@ -211,8 +211,51 @@ def test_a_measure_of_noise_predicts_nothing_that_was_left_out() -> None:
     useful = labels + rng.normal(size=200)
     scores = prediction.left_out_scores(useful[:, None], labels, clusters)
     assert prediction.auc(scores, labels) == pytest.approx(prediction.auc(useful, labels), abs=0.04)
+    constant = prediction.left_out_scores(np.ones((200, 1)), labels, clusters)
+    assert prediction.auc(constant, labels) == 0.5, "folds are not ranked by their positives"
     noise = prediction.left_out_scores(rng.normal(size=(200, 3)), labels, clusters)
     assert 0.35 < prediction.auc(noise, labels) < 0.62
+
+
+def test_densities_by_layer_are_shares_by_areas() -> None:
+    rows = []
+    for episode in range(2):
+        for layer, head in np.ndindex(2, 2):
+            share = 0.1 * (1 + layer + head)
+            rows.append(
+                {
+                    "suite": "s", "task": "t", "method": "soft", "seed": 0, "episode": episode, "query": "token", "layer": layer, "head": head,
+                    "share_target": share, "chance_target": 0.1, "share_lookalikes": 0.1, "chance_lookalikes": 0.2,
+                }
+            )  # fmt: skip
+    table = report.layer_table(pd.DataFrame(rows))
+    assert list(table["lift"]) == pytest.approx([1.5, 2.5])
+    assert list(table["best_head"]) == pytest.approx([2, 3])
+    assert list(table["lift_lookalikes"]) == pytest.approx([0.5, 0.5])
+    assert list(table["n"]) == [2, 2]
+
+
+def test_densities_of_causal_measures_are_shares_by_areas() -> None:
+    line: dict[str, Any] = {"suite": "s", "method": "soft", "measure": "masking", "hit": True, "chance_hit": 0.1, "rank_gradient": 0.5, "rank_masking": 1.0}  # fmt: skip
+    for name in REGIONS:
+        line |= {f"share_{name}": 0.4 if name == "hand" else 0.15, f"chance_{name}": 0.2}
+    table = report.causal_table(pd.DataFrame([line, {**line, "rank_gradient": 0.1}])).iloc[0]
+    assert (table["n"], table["hand"], table["target"]) == (2, 2.0, 0.75)
+    assert table["rank_gradient"] == pytest.approx(0.3)
+
+
+def test_a_warning_is_measured_where_enough_fails() -> None:
+    rng = np.random.default_rng(3)
+    failed = np.arange(80) % 2 == 0
+    table = pd.DataFrame({
+        "margin": rng.normal(size=80), "lift": rng.normal(size=80) - 3 * failed, "success": ~failed,
+        "layout": [str(i) for i in range(80)],
+    })  # fmt: skip
+    found = prediction.warning_table(table, ["lift"])["AUC for failure"]
+    assert float(found["attention"][:4]) > 0.9
+    assert float(found["vote margin"][:4]) < 0.7
+    few = prediction.warning_table(table.assign(success=np.arange(80) > 3), ["lift"])
+    assert set(few["AUC for failure"]) == {"too few failures (4 of 80)"}
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from .pictures import example_tiles as example_tiles
 from .pictures import examples_figure as examples_figure
 from .prediction import warning_table as warning_table
 from .replay import read as read
+from .report import auc_by_layer as auc_by_layer
 from .report import auc_table as auc_table
 from .report import causal_table as causal_table
 from .report import layer_table as layer_table

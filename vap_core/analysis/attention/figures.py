@@ -20,7 +20,8 @@ QUERY_COLOURS = {
 }
 SUCCESS, FAILURE = "#3a7d44", "#c9ccd1"
 CALLS_BEFORE = 8
-"""Calls before the first touch that are shown."""
+LEAST_EPISODES = 4
+"""Calls before the first touch that are shown, and episodes behind a point."""
 
 
 def where_figure(table: "pd.DataFrame") -> "Figure":
@@ -40,7 +41,7 @@ def where_figure(table: "pd.DataFrame") -> "Figure":
         names.append(f"{line.suite} · {line.method} · {line.query} (n = {line.n})")
     axes.set_yticks(places, names, fontsize=8)
     axes.set_xlabel("attention per area, whole view = 1")
-    axes.legend(fontsize=8, loc="lower right")
+    axes.legend(fontsize=8, loc="upper right")
     axes.spines[["top", "right"]].set_visible(False)
     return figure
 
@@ -113,7 +114,7 @@ def time_figure(calls: "pd.DataFrame", episodes: "pd.DataFrame") -> "Figure":
         of_method = shown[shown["method"].astype(str) == method]
         for success, colour in ((True, SUCCESS), (False, "#c0392b")):
             group = of_method[of_method["success"] == success].groupby("left")
-            rates = 100 * group["hit"].mean()
+            rates = 100 * group["hit"].mean()[group.size() >= LEAST_EPISODES]
             name = "success" if success else "failure"
             n = len(of_method[of_method["success"] == success][KEY].drop_duplicates())
             axes.plot(

@@ -116,13 +116,15 @@ def strip(episode: Episode, frames: Sequence[Frame], query: str) -> list[Tile]:
         camera = max(frame.attention, key=lambda name: _peak(frame, name, query))
         heat = heat_map(frame.attention[camera][query], query)
         areas = patch_areas(header.row, frame.truth, camera, heat.shape[0])
-        region = str(measure(heat, areas)["peak_region"])
+        found = measure(heat, areas)
+        region = TARGET if found["hit"] else str(found["peak_region"])
+        view = f"{camera} " if len(frame.attention) > 1 else ""
         picture = attention_overlay(frame.prompted[camera], heat).copy()
         for name, mask in frame.truth.masks[camera].items():
             colour = OUTLINES.get(kind_of(name, header.row))
             if colour is not None:
                 _outline(picture, mask, colour)
-        tiles.append(Tile(picture, f"{camera} {frame.timestamp_s:.1f} s: {region}", edge))
+        tiles.append(Tile(picture, f"{view}{frame.timestamp_s:.1f} s: {region}", edge))
     return tiles
 
 

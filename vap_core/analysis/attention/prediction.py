@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 RESAMPLES = 2000
+LEAST_FAILURES = 10
 Scores = Float[np.ndarray, " n"]
 Labels = Bool[np.ndarray, " n"]
 
@@ -78,10 +79,11 @@ def auc_interval(scores: Scores, labels: Labels, clusters: Sequence[str]) -> Auc
 def left_out_scores(
     predictors: Float[np.ndarray, "n d"], labels: Labels, clusters: Sequence[str], folds: int = 10
 ) -> Scores:
-    """The log odds that a logistic regression gives to layouts that it was not fitted on.
+    """What a logistic regression says of layouts that it was not fitted on.
 
-    Clusters are dealt out to `folds` folds. A small ridge keeps the fit finite where a predictor
-    separates the episodes.
+    Clusters are dealt out to `folds` folds. The intercept is left out: that of a fold without
+    positives is higher, which would rank the folds against the truth. A small ridge keeps the fit
+    finite where a predictor separates the episodes.
     """
     names, of_cluster = np.unique(np.asarray(clusters, dtype=str), return_inverse=True)
     fold_of = np.random.default_rng(SEED).permutation(len(names)) % folds
@@ -92,8 +94,8 @@ def left_out_scores(
         mean = predictors[~held].mean(0)
         scale = predictors[~held].std(0) + 1e-9
         known = np.column_stack([np.ones((~held).sum()), (predictors[~held] - mean) / scale])
-        unknown = np.column_stack([np.ones(held.sum()), (predictors[held] - mean) / scale])
-        scores[held] = unknown @ _logistic(known, labels[~held])
+        slopes = _logistic(known, labels[~held])[1:]
+        scores[held] = (predictors[held] - mean) / scale @ slopes
     return scores
 
 
@@ -115,7 +117,7 @@ def warning_table(table: "pd.DataFrame", measures: Sequence[str]) -> "pd.DataFra
     """Failures foretold by the vote margin, by the attention, and by both: areas and intervals.
 
     Logistic regressions, scored on layouts that they were not fitted on. `table` are episodes of
-    one method that votes.
+    one method that votes. With fewer than LEAST_FAILURES nothing is fitted.
     """
     import pandas as pd
 
@@ -123,11 +125,16 @@ def warning_table(table: "pd.DataFrame", measures: Sequence[str]) -> "pd.DataFra
     failed = ~voted["success"].to_numpy(bool)
     layouts = list(voted["layout"])
     rows = []
+    n_failures = int(failed.sum())
     for name, columns in (
         ("vote margin", ["margin"]),
         ("attention", list(measures)),
         ("both", ["margin", *measures]),
     ):
+        if n_failures < LEAST_FAILURES:
+            said = f"too few failures ({n_failures} of {len(voted)})"
+            rows.append({"predictor": name, "AUC for failure": said})
+            continue
         scores = left_out_scores(voted[columns].to_numpy(float), failed, layouts)
         rows.append(
             {"predictor": name, "AUC for failure": str(auc_interval(scores, failed, layouts))}

@@ -99,6 +99,28 @@ def _rows(table: "pd.DataFrame") -> list[list[str]]:
     return [list(map(str, table.columns)), *table.astype(str).to_numpy().tolist()]
 
 
+def auc_by_layer(layers: "pd.DataFrame", episodes: "pd.DataFrame") -> "pd.DataFrame":
+    """How well the density on the target tells successes, by query and layer, in the mean of heads.
+
+    One column a layer, counted from 1.
+    """
+    import pandas as pd
+
+    seen = layers[layers["chance_target"] > 0].copy()
+    seen["lift"] = seen["share_target"] / seen["chance_target"]
+    keys = [*KEY, "query", "layer"]
+    lifts = seen.groupby(keys, observed=True, sort=False)["lift"].mean().reset_index()
+    merged = lifts.merge(episodes, on=KEY)
+    rows: dict[str, dict[int, str]] = {}
+    for (suite, method, query, layer), group in merged.groupby(
+        ["suite", "method", "query", "layer"], observed=True, sort=False
+    ):
+        area = predict_success(group, ["lift"])["lift"]
+        row = rows.setdefault(f"{suite}, {method}, {query}", {})
+        row[int(layer) + 1] = f"{area.value:.2f} [{area.low:.2f}, {area.high:.2f}]"
+    return pd.DataFrame(rows).T
+
+
 def causal_table(causal: "pd.DataFrame") -> "pd.DataFrame":
     """What is where by attention and by the causal measures of the same calls.
 
