@@ -100,7 +100,7 @@ def call(
     """A row of `calls`: the peak in a region, and attention as dense as the area elsewhere."""
     found: dict[str, Any] = {
         "suite": "s", "task": "t", "method": "soft", "seed": 0, "episode": episode, "step": step, "camera": camera, "query": "token",
-        "mass": 0.5, "peak": 0.1, "peak_row": 0, "peak_column": 0, "peak_region": region, "hit": region == "target", "chance_hit": 0.1, "entropy": 0.9,
+        "side": 7, "mass": 0.5, "peak": 0.1, "peak_row": 0, "peak_column": 0, "peak_region": region, "hit": region == "target", "chance_hit": 0.1, "entropy": 0.9,
     }  # fmt: skip
     for name in REGIONS:
         found[f"share_{name}"] = 0.6 if name == region else 0.1

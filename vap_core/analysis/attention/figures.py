@@ -103,7 +103,7 @@ def time_figure(calls: "pd.DataFrame", episodes: "pd.DataFrame") -> "Figure":
     Episodes that succeed and that fail apart; `calls` are of one query a method.
     """
     merged = over_views(calls).merge(episodes, on=KEY)
-    touched = merged[merged["first_touch"].notna() & (merged["step"] <= merged["first_touch"])]
+    touched = merged[merged["first_touch"].notna() & (merged["step"] < merged["first_touch"])]
     keys = [touched[name] for name in KEY]
     left = touched.groupby(keys, observed=True)["step"].rank(ascending=False) - 1
     shown = touched.assign(left=left)[left <= CALLS_BEFORE]

@@ -52,7 +52,7 @@ def patch_areas(row: EpisodeRow, truth: Truth, camera: str, side: int) -> Areas:
 def measure(heat: Heat, areas: Areas) -> dict[str, float | int | str | bool]:
     """The measures of one map of one view.
 
-    `mass` is the attention to the whole view. `share_<region>` is the part of it inside a region,
+    `side` is the number of patches along an edge. `mass` is the attention to the whole view. `share_<region>` is the part of it inside a region,
     `chance_<region>` the region's area. `peak` is the attention of the most attended patch, of
     which `peak_region` is what covers most, things before background. `hit` says whether the patch
     shows any of the target (pointing game), `chance_hit` is the share of patches that do.
@@ -61,7 +61,7 @@ def measure(heat: Heat, areas: Areas) -> dict[str, float | int | str | bool]:
     mass = float(heat.sum())
     spread = heat / max(mass, 1e-12)
     row, column = np.unravel_index(int(heat.argmax()), heat.shape)
-    measures: dict[str, float | int | str | bool] = {"mass": mass}
+    measures: dict[str, float | int | str | bool] = {"side": len(heat), "mass": mass}
     for region in REGIONS:
         measures[f"share_{region}"] = float((spread * areas[region]).sum())
         measures[f"chance_{region}"] = float(areas[region].mean())

@@ -5,7 +5,7 @@
     observer.tables["calls"]
 
 `calls` has a row per call of the policy, camera and query; `layers` one per query, layer and head,
-over the calls up to the first touch; `causal` one per explained call, measure and query.
+over the calls before the first touch; `causal` one per explained call, measure and query.
 """
 
 from typing import Any

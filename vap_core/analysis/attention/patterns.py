@@ -3,7 +3,7 @@
 The paper shows four patterns of a learned token (P appendix, attention analysis): localisation that
 is stable while the episode fails, that drifts, that is confused by look-alikes, and that succeeds.
 Here they are defined by thresholds, over all calls of an episode. What is to tell of the outcome in
-advance is measured over the calls up to the first touch of anything.
+advance is measured over the calls before the first touch of anything.
 """
 
 from dataclasses import dataclass
@@ -74,7 +74,7 @@ def over_views(calls: "pd.DataFrame") -> "pd.DataFrame":
     merged["entropy"] = totals["spread"] / totals["mass"]
     highest = calls.loc[calls.groupby(keys, observed=True, sort=False)["peak"].idxmax()]
     peaks = highest.set_index(keys)
-    for name in ("camera", "peak_row", "peak_column", "peak_region", "hit"):
+    for name in ("camera", "side", "peak_row", "peak_column", "peak_region", "hit"):
         merged[name] = peaks[name]
     merged["chance_hit"] = calls.groupby(keys, observed=True, sort=False)["chance_hit"].mean()
     return merged.reset_index()
@@ -89,21 +89,21 @@ def main_words(calls: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def per_episode(
-    calls: "pd.DataFrame", episodes: "pd.DataFrame", *, whole: bool = False, side: int = 7
+    calls: "pd.DataFrame", episodes: "pd.DataFrame", *, whole: bool = False
 ) -> "pd.DataFrame":
-    """One row per episode and query, over the calls up to the first touch, or `whole` episodes.
+    """One row per episode and query, over the calls before the first touch, or `whole` episodes.
 
     `lift` is the density of attention on the target, 1 where it is that of the whole view, and
     `lift_lookalikes` that on the look-alikes. `on_target` and `on_rival` are the shares of peaks
-    there. `drift` is the mean way of the peak between successive calls, in sides of a view of
-    `side` patches; `switches` is how often its region changes.
+    there. `drift` is the mean way of the peak between successive calls, in sides of a view;
+    `switches` is how often its region changes.
     """
     import numpy as np
     import pandas as pd
 
     merged = over_views(calls).merge(episodes, on=KEY)
     touch = merged["first_touch"].fillna(np.inf)
-    before = merged if whole else merged[merged["step"] <= touch]
+    before = merged if whole else merged[merged["step"] < touch]
     rows = []
     for key, group in before.groupby([*KEY, "query"], observed=True, sort=False):
         ordered = group.sort_values("step")
@@ -111,7 +111,7 @@ def per_episode(
         regions = ordered["peak_region"].astype(str).to_numpy()
         views = ordered["camera"].astype(str).to_numpy()
         same_view = views[1:] == views[:-1]
-        way = np.hypot(*(where[1:] - where[:-1]).T)[same_view] / side
+        way = np.hypot(*(where[1:] - where[:-1]).T)[same_view] / ordered["side"].iloc[0]
         rows.append(
             {
                 **dict(zip([*KEY, "query"], key, strict=True)),

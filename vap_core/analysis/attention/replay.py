@@ -176,17 +176,24 @@ def run_job(job: Job) -> dict[str, Rows]:
             f"attention: this was run with {job.policy}, and {policy.label} is here now; run eval "
             "again."
         )
-    explained = dict(zip([row.key for row in job.rows], job.explained, strict=True))
-    observers: list[Observer] = []
+    explained = {}
+    for row, explain in zip(job.rows, job.explained, strict=True):
+        explained[row.key, row.seed] = explain
+    observers: dict[tuple[str, int], Observer] = {}
 
     def observe(header: EpisodeHeader) -> Observer:
-        observers.append(Observer(header, policy, explain=explained[header.row.key]))
-        return observers[-1]
+        row = header.row
+        observer = Observer(header, policy, explain=explained[row.key, row.seed])
+        observers[row.key, row.seed] = observer
+        return observer
 
     trial = replace(trial, attention=QUERIES)
     tables: dict[str, Rows] = {name: [] for name in TABLES}
     episodes = list(rollout(trial, job.rows, observe, batch=BATCH))
-    for observer, episode, known in zip(observers, episodes, job.known, strict=True):
+    for row, episode, known in zip(job.rows, episodes, job.known, strict=True):
+        observer = observers.get((row.key, row.seed))
+        if observer is None:  # it ended in an error before its first call
+            observer = Observer(episode.header, policy)
         about = _about(episode)
         tables["episodes"].append({**about, **_ending(observer, episode, known)})
         for name, rows in observer.tables.items():

@@ -22,14 +22,14 @@ def text(tables: "dict[str, pd.DataFrame]") -> str:
     whole = per_episode(tables["calls"], episodes, whole=True)
     again = int(episodes["reproduced"].sum())
     parts = [
-        f"{len(episodes)} episodes run again, {again} of them end as in the run; up to the first "
+        f"{len(episodes)} episodes run again, {again} of them end as in the run; before the first "
         "touch:",
         align(_rows(where_queries_look(table))),
         "the word that means the target, over whole episodes:",
         align(_rows(pattern_counts(with_localisation(whole)))),
     ]
     parts.append(
-        "area under the ROC curve for success, up to the first touch [95 %, layouts resampled]:"
+        "area under the ROC curve for success, before the first touch [95 %, layouts resampled]:"
     )
     parts.append(align(_rows(auc_table(with_localisation(table)).reset_index())))
     return "\n\n".join(parts)
