@@ -52,11 +52,12 @@ def patch_areas(row: EpisodeRow, truth: Truth, camera: str, side: int) -> Areas:
 def measure(heat: Heat, areas: Areas) -> dict[str, float | int | str | bool]:
     """The measures of one map of one view.
 
-    `side` is the number of patches along an edge. `mass` is the attention to the whole view. `share_<region>` is the part of it inside a region,
-    `chance_<region>` the region's area. `peak` is the attention of the most attended patch, of
-    which `peak_region` is what covers most, things before background. `hit` says whether the patch
-    shows any of the target (pointing game), `chance_hit` is the share of patches that do.
-    `entropy` is 1 where all patches are attended to alike, and 0 where only one is.
+    `side` is the number of patches along an edge, `mass` the attention to the whole view.
+    `share_<region>` is the part of it inside a region, `chance_<region>` the region's area. `peak`
+    is the attention of the most attended patch, of which `peak_region` is what covers most, things
+    before background. `hit` says whether the patch shows any of the target (pointing game),
+    `chance_hit` is the share of patches that do. `entropy` is 1 where all patches are attended to
+    alike, and 0 where only one is.
     """
     mass = float(heat.sum())
     spread = heat / max(mass, 1e-12)
