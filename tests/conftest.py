@@ -63,7 +63,7 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> "tuple[Path, list[Film]]"
     """A folder that keeps a stage of two episodes of simpler-bridge, and its films."""
     from vap_core.training.films import demonstrations
 
-    folder = tmp_path_factory.mktemp("films")
+    folder = tmp_path_factory.mktemp("cache") / "films"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demonstrations, "EPISODES", 2)
         return folder, demonstrations.cached(folder, "simpler-bridge", 0, 1)

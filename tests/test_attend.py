@@ -13,7 +13,7 @@ from vap_core.base.errors import BadInstruction, BadViews, UnknownName
 from vap_core.base.types import Attended, Boxes, Camera, Grounding
 from vap_core.perception.stacks import load_stack
 from vap_core.policies.protocol import PolicyInput
-from vap_core.prompt import PALETTE, tint
+from vap_core.prompt import PALETTE, Tint, tint
 from vap_core.vote import vote
 
 GREY, TEAL, SAND = (90, 90, 90), (40, 120, 110), (150, 130, 90)
@@ -43,9 +43,7 @@ def test_tracking_follows_and_never_detects_again() -> None:
         calls.append(phrase)
         return TOYS.detector(images, phrase)  # type: ignore[arg-type]
 
-    attender = Attender(
-        TOYS.__class__("toys", counting, TOYS.encoder, TOYS.segmenter, TOYS.tracker, ""), MEMORY
-    )
+    attender = Attender(replace(TOYS, detector=counting), MEMORY)
     state, _ = attender.start({"front": LINE}, "bring my cup")
     moved = scene([(4, 20, GREY), (24, 40, TEAL), (44, 20, SAND)])
     state, attended = attender.step(state, {"front": moved})
@@ -137,7 +135,7 @@ def test_mirrored_views_mirror_the_answer() -> None:
     [
         (Prompting(highlight=False), False, "bring the red cup"),
         (Prompting(rewrite=False), True, "bring my cup"),
-        (Prompting(alpha=0.0), False, "bring the red cup"),
+        (Prompting(form=Tint(0.0)), False, "bring the red cup"),
     ],
 )
 def test_switches(prompting: Prompting, tinted: bool, text: str) -> None:
@@ -354,7 +352,9 @@ def test_on_a_rendered_desk_with_three_cameras_no_view_contradicts_another() -> 
         by_hand = replace(
             stack, detector=lambda images, phrase, threshold=None: [boxes[c] for c in row.cameras]
         )
-        attender = Attender(by_hand, {"mug": mine}, METHODS["vap-associated"])
+        # one reference from one side is less like the other views than the threshold for five
+        prompting = replace(METHODS["vap-associated"], always_tint=True)
+        attender = Attender(by_hand, {"mug": mine}, prompting)
         trial = Trial(
             method="vap-associated",
             scene=world,

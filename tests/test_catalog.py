@@ -17,6 +17,7 @@ from vap_core.recording import (
     Recorder,
     combine_recordings,
     ensure_index,
+    isolated,
     load_steps,
     read_corrections,
     read_summary,
@@ -71,6 +72,46 @@ def test_every_step_is_a_row_and_what_cannot_be_read_is_named(run: Path) -> None
     assert wrong["track_score"].tolist() == pytest.approx([0.9] * 12)
     assert (wrong["gap_cm"] > 0).all()
     assert set(wrong["case"]) == {"case 1"}
+
+
+POISON = """
+import os
+import vap_core.recording.isolated as isolated
+index = isolated.ensure_index
+isolated.ensure_index = lambda path, folder: os.abort() if path.stem in ("b", "c") else index(path, folder)
+isolated.main()
+"""
+
+
+def test_a_recording_that_ends_its_reader_is_named_and_the_others_are_read(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Some wrong bytes stop the process that reads them (the sweep finds such bytes)."""
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    data = (run / "recordings" / "fine.rrd").read_bytes()
+    (folder / "a.rrd").write_bytes(data)
+    for name in ("b", "c"):
+        (folder / f"{name}.rrd").write_bytes(data + b"0")
+    monkeypatch.setattr(isolated, "START", POISON)
+    held = load_steps(folder)
+    assert set(held.table["file"]) == {str(folder / "a.rrd")}
+    assert held.unreadable == {folder / f"{name}.rrd": isolated.ENDED_READER for name in ("b", "c")}
+
+
+@pytest.mark.sweep
+def test_flipped_bits_leave_a_query_its_other_recordings(run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    data = (run / "recordings" / "fine.rrd").read_bytes()
+    (folder / "whole.rrd").write_bytes((run / "recordings" / "wrong.rrd").read_bytes())
+    for at in range(1600, 2400, 8):
+        flipped = bytearray(data)
+        flipped[at] ^= 1
+        (folder / f"flip-{at}.rrd").write_bytes(flipped)
+    held = load_steps(folder)
+    assert str(folder / "whole.rrd") in set(held.table["file"])
+    assert isolated.ENDED_READER in held.unreadable.values(), "no flip ended its reader"
 
 
 def test_from_inside_the_folder_its_recordings_have_short_names(

@@ -44,9 +44,13 @@ def line(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
 @pytest.fixture(scope="module")
 def bank(photos: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bank")
-    done = vap("register", "mug", "--category", "cup", "--memory", folder, *photos)
+    words = ("register", "mug", "--category", "cup", "--memory", folder)
+    assert "mug-3.png: two things in it could be meant" in refused(*words, *photos)
+    done = vap(*words, *photos, "--box", "mug-3.png=70,60,212,244")
     assert done.returncode == 0, done.stderr
     assert "mug: a cup with 5 references" in done.stdout
+    assert f"look at the crops: {folder / 'mug.references.png'}" in done.stdout
+    assert "vote: each photo left out in turn" in done.stdout or "vote not checked" in done.stdout
     (mug,) = load_bank(folder).values()
     assert mug.description is not None
     assert set(mug.description.long.replace(",", "").split()) <= {*WORDS, "cup"}
@@ -121,12 +125,27 @@ def test_ground_answers_in_json_with_a_picture_and_a_recording(
     assert not again.stderr
 
 
-def test_ground_without_boxes_warns_that_the_detector_knows_renders_only(
+def test_ground_says_not_in_view_unless_it_is_to_tint_always(
     photos: list[Path], bank: Path, tmp_path: Path
 ) -> None:
-    done = vap("ground", photos[0], "bring my cup", "--memory", bank, "--out", tmp_path, "--json")
-    assert "not real photos" in done.stderr
-    assert json.loads(done.stdout)["winner"] == 0
+    """The mug's own photo shows it; one in which its colours are turned round shows another thing."""
+    told = ("bring my cup", "--memory", bank, "--out", tmp_path)
+    done = vap("ground", photos[0], *told, "--json")
+    assert not done.stderr
+    answer = json.loads(done.stdout)
+    assert (answer["winner"], answer["rejected"]) == (0, None)
+    assert answer["likeness"][0] >= answer["threshold"]
+    turned = tmp_path / "turned.png"
+    Image.fromarray(255 - np.asarray(Image.open(photos[0]).convert("RGB"))).rotate(90).save(turned)
+    answer = json.loads(vap("ground", turned, *told, "--json").stdout)
+    assert (answer["winner"], answer["instruction"]) == (None, "bring my cup")
+    assert answer["likeness"][answer["rejected"]] < answer["threshold"]
+    text = vap("ground", turned, *told).stdout
+    assert "mug not in view, cosine" in text
+    assert "--always-tint" in text
+    answer = json.loads(vap("ground", turned, *told, "--always-tint", "--json").stdout)
+    assert answer["instruction"] == "bring the red cup"
+    assert (answer["threshold"], answer["rejected"]) == (None, None)
 
 
 def test_nothing_found_is_an_answer_and_not_an_error(bank: Path, tmp_path: Path) -> None:
@@ -148,6 +167,21 @@ def test_nothing_found_is_an_answer_and_not_an_error(bank: Path, tmp_path: Path)
     assert (tmp_path / "out" / "empty.png").exists()
 
 
+def test_register_stops_at_a_doubtful_photo_and_goes_on_with_its_box(tmp_path: Path) -> None:
+    Image.new("RGB", (224, 224), (120, 130, 140)).save(tmp_path / "wall.png")
+    words = ("register", "x", "--category", "cup", "--memory", tmp_path / "bank")
+    line = refused(*words, tmp_path / "wall.png")
+    assert "wall.png: no cup was found in it" in line
+    assert "--box wall.png=x0,y0,x1,y1" in line
+    assert [path.name for path in (tmp_path / "bank").iterdir()] == ["x.references.png"]
+    done = vap(*words, tmp_path / "wall.png", "--box", "wall.png=20,30,70,90")
+    assert done.returncode == 0, done.stderr
+    assert "only 53x63 pixels" in done.stderr or "only 54x64 pixels" in done.stderr
+    (obj,) = load_bank(tmp_path / "bank").values()
+    assert len(obj.crops) == 1
+    assert "vote not checked: 1 references" in done.stdout
+
+
 def test_register_refuses_bad_photos_and_loses_nothing(
     bank: Path, photos: list[Path], tmp_path: Path
 ) -> None:
@@ -161,7 +195,10 @@ def test_register_refuses_bad_photos_and_loses_nothing(
     assert "--replace" in refused(
         "register", "mug", "--category", "cup", "--memory", bank, photos[0]
     )
-    assert [path.name for path in bank.iterdir()] == ["mug.object.safetensors"]
+    assert {path.name for path in bank.iterdir()} == {
+        "mug.object.safetensors",
+        "mug.references.png",
+    }
     assert vap("register", "x", "--category", "cup", "--memory", bank).returncode == 2
     assert "cannot name an object" in refused(
         "register", "../x", "--whole", "--category", "cup", "--memory", bank, photos[0]

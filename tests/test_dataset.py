@@ -19,7 +19,7 @@ import torch
 from vap_core.base.errors import BadOutput
 from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import Suite, suite
-from vap_core.training.films import dataset, demonstrations
+from vap_core.training.films import dataset
 from vap_core.training.films.dataset import (
     ABOUT,
     MOST,
@@ -32,6 +32,7 @@ from vap_core.training.films.dataset import (
 )
 from vap_core.training.films.demonstrations import PARTS, Film, after_a_miss, cached
 from vap_core.training.policy.batches import STEADY, statistics
+from vap_core.training.recipe import FILMED, filmed_tasks
 
 SUITE, SIDE, STAGES = "simpler-bridge", 64, 4
 SHIPPED = Path(__file__).parent.parent / "data" / "demonstrations"
@@ -52,7 +53,7 @@ def invented(rng: np.random.Generator) -> Film:
         x, y = rng.integers(0, SIDE - 8, 2)
         images[t, 0, y : y + 8, x : x + 8] = rng.integers(0, 256, 3, np.uint8)
         ids[t, 0, y : y + 8, x : x + 8] = rng.integers(1, things + 1)
-    task = suite(SUITE).tasks[int(rng.integers(4))]
+    task = filmed_tasks(SUITE)[int(rng.integers(4))]
     numbers = [rng.normal(size=(steps, n)).astype(np.float32) for n in (13, 7)]
     places = rng.normal(size=(steps, things, 3)).astype(np.float32)
     return Film(
@@ -76,7 +77,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
             for i, film in enumerate([invented(rng) for _ in range(n)])
             for part in PARTS
         }
-        np.savez(folder / f"{SUITE}-0-{stage:05d}.npz", n=n, **films)
+        np.savez(folder / f"{SUITE}-0-{stage:05d}.npz", n=n, cpu_s=1.5, **films)
     return folder
 
 
@@ -123,7 +124,7 @@ def test_films_come_back_bit_for_bit(written: Path, films: list[Film], cache: Pa
 def test_so_do_those_with_fewer_pictures_than_steps(
     films: list[Film], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(demonstrations, "EVERY", {SUITE: 3})
+    monkeypatch.setitem(FILMED, SUITE, replace(FILMED[SUITE], every=3))
     fewer = [replace(film, images=film.images[::3], ids=film.ids[::3]) for film in films]
     kept = {f"{part}{i}": getattr(film, part) for i, film in enumerate(fewer) for part in PARTS}
     np.savez(tmp_path / f"{SUITE}-0-00000.npz", n=len(fewer), **kept)
@@ -229,8 +230,8 @@ def through_lerobot(folder: Path, films: list[Film]) -> None:
 def test_tasks_are_said_of_anybodys_thing() -> None:
     assert generic_instruction(suite(SUITE), "pick-shaver") == "pick up the shaver"
     assert (
-        generic_instruction(suite("simpler-fractal"), "move-bottle-near-coke-can")
-        == "move the bottle near coke can"
+        generic_instruction(suite("simpler-fractal"), "move-vase-near-coke-can")
+        == "move the vase near coke can"
     )
 
 
@@ -404,7 +405,7 @@ def test_the_shipped_ones_are_small() -> None:
         "simpler-bridge",
         "simpler-fractal",
     }
-    assert sum(path.stat().st_size for path in SHIPPED.rglob("*") if path.is_file()) < 3e6
+    assert sum(path.stat().st_size for path in SHIPPED.rglob("*") if path.is_file()) < 3.5e6
 
 
 @pytest.mark.slow

@@ -11,11 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vap_core.base.types import Description
 from vap_core.perception import describe
 from vap_core.prompt import PALETTE, has_colour
 from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import BENCHMARKS, suite
 from vap_core.training.films import demonstrations
+from vap_core.training.films.captions import captions, distinguishes
 from vap_core.training.films.demonstrations import (
     PARTS,
     SIDE,
@@ -24,21 +26,27 @@ from vap_core.training.films.demonstrations import (
     cached,
     draw_objects,
     row,
+    stage_file,
 )
 from vap_core.training.policy import train as policy
 from vap_core.training.policy.batches import SPIN_Z, Frames, statistics
-from vap_core.training.policy.commands import (
-    command,
-    near,
-    painted,
-    phrase_instruction,
-    roughen_mask,
-    tinted,
-)
+from vap_core.training.policy.colouring import colour_of, painted, roughen_mask, tinted
+from vap_core.training.policy.commands import Known, command, near, phrase_instruction
+from vap_core.training.recipe import FILMED, RECIPES, filmed_tasks
 from vap_core.training.vlm.questions import MIN_ASKED_PX, ask, place
-from vap_core.training.words import PAINTS, appearance_words, phrases, similar_colours, vocabulary
+from vap_core.training.words import PAINTS, pattern_words, vocabulary
 
 SUITE = "simpler-bridge"
+RECIPE = RECIPES[SUITE]
+
+
+@pytest.fixture(scope="module")
+def known(stage: tuple[Path, list[Film]], tmp_path_factory: pytest.TempPathFactory) -> Known:
+    """The captioner's words for the objects of the stage, and for its goal any."""
+    things = {name for film in stage[1] for i, name in enumerate(film.names) if i != film.goal}
+    described, _ = captions(sorted(things), tmp_path_factory.mktemp("captions") / "captions.json")
+    goals = {film.names[film.goal]: Description("white", "a wide plate") for film in stage[1]}
+    return Known(described | goals)
 
 
 def test_a_film_shows_a_generic_target_from_first_to_last_action(
@@ -67,7 +75,7 @@ def test_films_are_kept_and_come_again_alike(
     stage: tuple[Path, list[Film]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, films = stage
-    (path,) = folder.glob("*.npz")
+    path = stage_file(folder, SUITE, 0, 1)
     before = path.stat().st_mtime_ns
     kept = cached(folder, SUITE, 0, 1)
     assert path.stat().st_mtime_ns == before
@@ -79,34 +87,31 @@ def test_films_are_kept_and_come_again_alike(
 
 
 def test_fewer_pictures_of_the_same_film_teach_the_same(
-    stage: tuple[Path, list[Film]], monkeypatch: pytest.MonkeyPatch
+    stage: tuple[Path, list[Film]], known: Known, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A suite may keep every third picture: the film is the same otherwise, and a step that has one is told and answered as before."""
     _, whole = stage
     monkeypatch.setattr(demonstrations, "EPISODES", 2)
     before = [
-        command(film, t, SUITE, np.random.default_rng(t))
+        command(film, t, RECIPE, known, np.random.default_rng(t))
         for film in whole
         for t in range(0, len(film.action), 3)
     ]
-    monkeypatch.setattr(demonstrations, "EVERY", {SUITE: 3})
+    monkeypatch.setitem(FILMED, SUITE, replace(FILMED[SUITE], every=3))
     films = demonstrations.films(SUITE, 0, 1)
     for film, all_of_it in zip(films, whole, strict=True):
         fewer = replace(all_of_it, images=all_of_it.images[::3], ids=all_of_it.ids[::3])
         assert all(np.array_equal(getattr(film, part), getattr(fewer, part)) for part in PARTS)
     after = [
-        command(film, t, SUITE, np.random.default_rng(t))
+        command(film, t, RECIPE, known, np.random.default_rng(t))
         for film in films
         for t in range(0, len(film.action), 3)
     ]
     for one, other in zip(before, after, strict=True):
-        assert (one.text, one.way) == (other.text, other.way)
+        assert (one.text, one.form) == (other.text, other.form)
         assert np.array_equal(one.images, other.images)
-    recipe = policy.Recipe(SUITE, batch=64)
-    config, stats = policy.configuration(recipe, films[0].state.shape[1], 7), statistics(films)
-    made = Frames(SUITE, films, stats, config, recipe.focus).draw(
-        recipe.batch, np.random.default_rng(0)
-    )
+    config, stats = policy.configuration(RECIPE, films[0].state.shape[1], 7), statistics(films)
+    made = Frames(RECIPE, films, stats, config, known).draw(64, np.random.default_rng(0))
     scaled = [
         (film.state - stats["observation.state"]["mean"].numpy())
         / stats["observation.state"]["std"].numpy()
@@ -127,7 +132,7 @@ def test_a_film_can_begin_where_a_grasp_has_missed(monkeypatch: pytest.MonkeyPat
     begun = {}
     for share in (0.0, 1.0):
         monkeypatch.setattr(demonstrations, "MISSES", share)
-        begun[share] = demonstrations.films(SUITE, 0, 0)
+        begun[share] = demonstrations.films(SUITE, 0, 4)
     for first, missed in itertools.product(begun[0.0], begun[1.0]):
         assert missed.state[0, 2] < first.state[0, 2] - 0.08
         assert missed.action[:3, 2].sum() > 0.04 > 0.0 > first.action[:3, 2].sum()
@@ -144,22 +149,26 @@ def test_a_film_can_begin_where_a_grasp_has_missed(monkeypatch: pytest.MonkeyPat
 
 def test_casts_are_generic_and_of_one_category() -> None:
     for known in BENCHMARKS.values():
-        for task in known.tasks:
+        for task in filmed_tasks(known.name):
             for i in range(6):
                 names = draw_objects(known, task, np.random.default_rng(i))
                 things = names[: len(names) - bool(task.goal)]
-                assert {objects.get_object(name).category for name in things} == {task.category}
+                own = [name for name in things if name.startswith(f"{task.stem}-")]
+                assert {objects.get_object(name).category for name in own} == {task.category}
+                assert len(own) > 1
+                if not FILMED[known.name].distractors:
+                    assert own == things
                 assert {objects.get_object(name).split for name in things} == {"generic"}
-                assert len(set(names)) == len(names) > 1
+                assert len(set(names)) == len(names)
 
 
 def test_every_stage_finds_room_for_its_objects() -> None:
     """Cameras beside a plate once found none in a third of the stages, and were in a sixth of the films instead of a quarter."""
     for known in BENCHMARKS.values():
-        for n, task in enumerate(known.tasks * 3):
+        for n, task in enumerate(filmed_tasks(known.name) * 3):
             rng = np.random.default_rng([5, n])
             names = draw_objects(known, task, rng)
-            placed = row(known, task, names, n, "base", rng).placements
+            placed = row(known, task, names, n, rng).placements
             assert {one.model for one in placed} == set(names)
             for one, other in itertools.combinations(placed, 2):
                 wide = sum(
@@ -172,37 +181,38 @@ def test_every_stage_finds_room_for_its_objects() -> None:
                 )
 
 
-def test_a_command_says_what_its_picture_shows(stage: tuple[Path, list[Film]]) -> None:
+def test_a_command_says_what_its_picture_shows(
+    stage: tuple[Path, list[Film]], known: Known
+) -> None:
     _, films = stage
-    words, ways = set(vocabulary()), Counter[str]()
+    words, forms = set(vocabulary()), Counter[str]()
+    colours = {colour.name: colour for colour in PAINTS}
+    given = 0
     for seed in range(160):
         film, rng = films[seed % len(films)], np.random.default_rng(seed)
         t = int(rng.integers(len(film.action)))
-        made = command(film, t, SUITE, rng)
-        ways[made.way] += 1
+        made = command(film, t, RECIPE, known, rng)
+        forms[made.form] += 1
         assert set(re.findall(r"[\w']+", made.text.lower())) <= words
         mask, rivals = film.ids[t, 0] == 1, [i for i in range(1, len(film.names)) if i != film.goal]
-        mine, *others = (appearance_words(film.names[i]) for i in (0, *rivals))
-        if made.way == "plain":
+        assert list(made.things) == [0, *rivals]
+        names = [film.names[i] for i in made.things]
+        looks = [known.captions[name] for name in names]
+        if made.form == "plain":
             assert near(film, t, SUITE, rivals)
-        elif made.way == "described":
-            said = [
-                word
-                for word in (*mine.difference(*others), *phrases(film.names[0]))
-                if f" {word}" in made.text
-            ]
-            assert said
-            assert mine.difference(*others)
+        elif made.form == "described":
+            length = "long" if looks[0].long in made.text else "short"
+            assert getattr(looks[0], length) in made.text
+            assert distinguishes(known.captions, names, length)
         else:
-            colour = max(
-                (colour for colour in PAINTS if f" {colour.name}" in made.text),
-                key=lambda colour: len(colour.name),
-            )
-            assert made.way == "painted" or colour in PALETTE
-            assert not any(similar_colours(colour.name) & other for other in others)
-            if colour in PALETTE and mask.sum() > 60:
-                assert has_colour(made.images[0][mask], colour).mean() > 0.15, made.text
-    assert min(ways[way] for way in ("tinted", "painted", "described", "plain")) > 5
+            word = colour_of(0, looks, made.colouring)
+            assert f" {word}" in made.text
+            is_given = 0 in made.colouring.painted or 0 in made.colouring.tinted
+            if is_given and word in {one.name for one in PALETTE} and mask.sum() > 60:
+                given += 1
+                assert has_colour(made.images[0][mask], colours[word]).mean() > 0.15, made.text
+    assert min(forms[form] for form in ("coloured", "described", "plain")) > 5
+    assert given > 5
 
 
 def test_my_is_said_of_a_generic_thing_too_and_once() -> None:
@@ -232,31 +242,37 @@ def test_only_what_is_masked_changes_colour(seed: int, share: float) -> None:
     assert not roughen_mask(empty, rng).any()
 
 
-def test_training_hears_every_word_that_the_captioner_says() -> None:
-    names = [
-        objects.generic_instance(kind, i).name
-        for kind in ("cup", "camera", "vase", "slipper")
-        for i in range(120)
-    ]
-    heard = {
-        word for name in names for phrase in phrases(name) for word in re.findall(r"\w+", phrase)
-    }
-    heard |= {colour.name for colour in PAINTS}
-    assert set(describe.WORDS) <= heard, set(describe.WORDS) - heard
-    assert heard <= set(vocabulary())
+def test_the_vocabulary_has_every_word_of_captions_and_colours() -> None:
+    assert {*describe.WORDS, *(colour.name for colour in PAINTS)} <= set(vocabulary())
 
 
-def test_questions_are_true_of_their_views(stage: tuple[Path, list[Film]]) -> None:
+def test_captions_are_kept_and_say_what_is_seen(tmp_path: Path) -> None:
+    file, names = tmp_path / "captions.json", ["camera-generic-0003", "camera-generic-0003-2"]
+    described, spent = captions(names, file)
+    assert spent > 0
+    assert described[names[0]].short.startswith("black with white"), "its body is black"
+    before = file.stat().st_mtime_ns
+    again, kept = captions(names[:1], file)
+    assert (again[names[0]].long, kept) == (described[names[0]].long, spent)
+    assert file.stat().st_mtime_ns == before
+    assert distinguishes(described, names, "short")
+    assert not distinguishes(described, [names[0], names[0]], "long")
+    with pytest.raises(ValueError, match="belong to evaluation"):
+        captions(["camera-personal"], file)
+
+
+def test_questions_are_true_of_their_views(stage: tuple[Path, list[Film]], known: Known) -> None:
     _, films = stage
-    known, ends = set(vocabulary()), Counter[tuple[str, ...]]()
+    words, ends = set(vocabulary()), Counter[tuple[str, ...]]()
     for seed in range(150):
         film, rng = films[seed % len(films)], np.random.default_rng(seed)
         t = int(rng.integers(len(film.action)))
-        asked = ask(film.images[t, 0], film.ids[t, 0], film.names, 3, rng)
+        looks = [known.captions[name] for name in film.names]
+        asked = ask(film.images[t, 0], film.ids[t, 0], film.names, looks, 3, rng)
         assert asked.image.shape == film.images[t, 0].shape
         for question in asked.questions:
             assert (
-                set(re.findall(r"[\w']+", question.text.lower())) | set(question.answer) <= known
+                set(re.findall(r"[\w']+", question.text.lower())) | set(question.answer) <= words
             ), question.text
             kind = (
                 objects.get_object(film.names[question.target]).category
@@ -270,7 +286,7 @@ def test_questions_are_true_of_their_views(stage: tuple[Path, list[Film]]) -> No
                     .removeprefix("can you recognize the ")
                     .removesuffix(" in this image")
                 )
-                assert not any(asked_for in (objects.get_object(name).category, *(f"{word} {objects.get_object(name).category}" for word in appearance_words(name)))
+                assert not any(asked_for in (objects.get_object(name).category, *(f"{word} {objects.get_object(name).category}" for word in {*pattern_words(name), known.captions[name].short.split()[0]}))
                                for i, name in enumerate(film.names) if (film.ids[t, 0] == i + 1).sum() >= MIN_ASKED_PX)  # fmt: skip
             ends[
                 question.answer[:1]

@@ -211,7 +211,7 @@ REFUSED = {
     ),
     "unknown method": (
         ("eval", *EXPERT, "--method", "luck"),
-        "method 'luck' is unknown; known: generic, hard-long, hard-short, mask-only",
+        "method .*'luck' is unknown; known: generic, hard-long, hard-short, mask-only",
     ),
     "unknown task": (
         ("rollout", *EXPERT, "--task", "fly"),

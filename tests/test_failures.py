@@ -121,6 +121,18 @@ def test_case_1_at_the_opening(opening, candidates, sub_case):
     assert sub_case != "distractor vote" or OTHER in found.sentence
 
 
+def test_a_target_that_is_said_not_to_be_in_view_is_its_own_sub_case():
+    before = episode("picked", still(6, [view(None, proposal=0.9)]), candidates=1)
+    (grounding,) = before.header.groundings["front"]
+    rejected = replace(grounding, winner=None, rejected=0, threshold=1.1)
+    silent = replace(before, header=replace(before.header, groundings={"front": (rejected,)}))
+    found = diagnose(silent, THRESHOLDS)
+    assert label(found) == ("case 1", "not in view", 0, "front")
+    assert "too unlike the references" in found.sentence
+    assert found.sub_case in CASES["case 1"]
+    assert diagnose(before, THRESHOLDS).sub_case == "poor mask"
+
+
 def test_drift_opens_where_the_track_leaves():
     found = told("picked", still(4) + still(5, [view(OTHER)]))
     assert label(found) == ("case 1", "drift", 4, "front")
@@ -349,6 +361,19 @@ def test_without_truth_a_failure_stays_unlabelled(candidates, margin, events, su
     )
     assert found.evidence["margin"] == margin
     assert stages(made)["stage_touched"] is None
+
+
+def test_without_truth_not_in_view_is_a_signal():
+    made = episode("picked", still(6))
+    nowhere = Truth({}, {}, (), {}, {})
+    frames = tuple(replace(each, truth=nowhere, coverage=()) for each in made.frames)
+    (grounding,) = made.header.groundings["front"]
+    rejected = replace(grounding, winner=None, rejected=0, threshold=1.1)
+    header = replace(made.header, groundings={"front": (rejected,)})
+    found = diagnose(replace(made, frames=frames, header=header))
+    assert found is not None
+    assert label(found) == ("unlabelled", "not in view", 0, "front")
+    assert "not in view, cosine 1.00 below 1.10" in found.sentence
 
 
 SQUARE = np.zeros((20, 20), bool)

@@ -490,7 +490,7 @@ def test_the_whole_attender_runs_and_repeats_its_bits(
     monkeypatch.setenv(store.VARIABLE, str(weights))
     monkeypatch.setenv(runtime.DEVICE_VARIABLE, "cpu")
     stack = load_stack("foundation")
-    assert (stack.name, stack.domain) == ("foundation", "")
+    assert stack.name == "foundation"
     assert stack.encoder.name.startswith("dinov2-base-")
     rgb = scene[0]
     mug, _ = memory.register(

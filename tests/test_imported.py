@@ -10,8 +10,7 @@ from tests.command import vap
 from tests.scanned import mug, put
 from vap_core.base.errors import BadObject, BadOutput, UnknownName
 from vap_core.simulation.assets import objects
-from vap_core.simulation.assets.scans import import_scan as importing
-from vap_core.simulation.assets.scans import storage
+from vap_core.simulation.assets.scans import convex_parts, storage
 from vap_core.simulation.assets.scans.import_scan import import_scan
 from vap_core.simulation.gl import ensure_gl
 from vap_core.simulation.scenes import build
@@ -41,6 +40,10 @@ def shelf(tmp_path_factory):
         )
         assert done.returncode == 0, done.stderr
         assert "convex parts" in done.stderr
+        assert "too wide for the gripper of wx250s" in done.stderr
+        assert "too wide for the gripper of wx250s, so101, panda" not in done.stderr
+        with Image.open(folder / "objects" / "my-mug.preview.png") as preview:
+            assert preview.size == (1280, 320)
         assert "my-mug: a cup, 7.0 x 7.0 x 9.0 cm" in done.stdout
         assert "next: python -m vap_core objects photograph 'my-mug'" in done.stdout
         yield folder
@@ -52,7 +55,7 @@ def test_an_imported_mug_is_an_object_like_any_other(shelf):
     assert objects.extent_m(model) == pytest.approx((0.07, 0.07, 0.09), abs=1e-6)
     assert objects.mesh_of(model).vertex[:, 2].min() == pytest.approx(0, abs=1e-9)
     solids = model.shape.solids()
-    assert 4 <= len(solids) <= importing.HULLS
+    assert 4 <= len(solids) <= convex_parts.HULLS
     assert model.mass_kg == pytest.approx(
         np.clip(400 * sum(hull.volume for hull in solids), 0.03, 0.5), abs=1e-4
     )

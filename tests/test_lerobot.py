@@ -303,6 +303,8 @@ def test_a_toy_without_its_sizes_is_refused_not_random(folders):
         "lerobot.processor.pipeline.importlib",
         "os.system",
         3,
+        "lerobot.processor.nonesuch.Step",
+        "lerobot.processors.Step",
         "vap_core.policies.lerobot.adapter.load_policy",
     ],
 )
@@ -333,6 +335,9 @@ def test_what_is_missing_or_damaged_is_one_line(folders, tmp_path):
         load_policy(tmp_path)
     for name, text, said in (
         ("policy_preprocessor.json", "[", "is no processor pipeline"),
+        ("policy_preprocessor.json", "[" * 100_000, "is no processor pipeline"),
+        ("policy_preprocessor.json", '{"steps": [1]}', "is no processor pipeline"),
+        ("policy_preprocessor.json", '{"steps": ["abc"]}', "is no processor pipeline"),
         ("config.json", "{}", r"cannot become a policy \(ValueError: Missing 'type'"),
         ("config.json", '{"type": "nonesuch"}', "'nonesuch'"),
         ("model.safetensors", "x", "cannot become a policy"),
@@ -353,7 +358,8 @@ def test_what_is_missing_or_damaged_is_one_line(folders, tmp_path):
 def test_a_backbone_that_was_not_downloaded_is_named(
     folders, tmp_path, monkeypatch, name, file, part
 ):
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    asked: list[object] = []
+    monkeypatch.setattr("socket.getaddrinfo", lambda *words, **options: asked.append(words) or [])
     folder, here = copy_of(folders[name], tmp_path), str(folders["pi0"].parent / part)
     told = (folder / file).read_text()
     assert here in told
@@ -366,6 +372,7 @@ def test_a_backbone_that_was_not_downloaded_is_named(
         ),
     ):
         load_policy(folder)
+    assert not asked, "a file's name of a model was looked up"
 
 
 def test_a_fingerprint_tells_checkpoints_apart(folders, tmp_path):

@@ -292,6 +292,7 @@ def test_what_each_method_changes(runs: tuple[dict[str, list[Episode]], dict[str
     both, told = (True, True, False), (True, True, True)
     assert changed == {
         "generic": (False, False, False), "hard-short": (False, True, False), "hard-long": (False, True, False), "vap": both,
+        "vap-always-tint": both,
         "mask-only": (True, False, False), "rewrite-only": (False, True, False), "vap-associated": both, "oracle-box": told, "oracle-mask": told,
         "oracle-track": told, "wrong-mask": told,
     }  # fmt: skip
@@ -366,7 +367,7 @@ def test_truth_reaches_nobody_but_an_oracle(
     oracles = {"oracle-box": 1, "oracle-mask": 1, "oracle-track": 3, "wrong-mask": 3}
     assert {m: n for m, n in before.items() if n} == oracles
     assert {m: n for m, n in after.items() if n} == dict.fromkeys(
-        (*oracles, "vap", "mask-only", "vap-associated"), 3
+        (*oracles, "vap", "vap-always-tint", "mask-only", "vap-associated"), 3
     )
     assert not {"truth", "masks", "row"} & set(inspect.signature(Attender.start).parameters)
     assert not {"truth", "masks", "row"} & set(inspect.signature(TextPrompter.start).parameters)

@@ -1,5 +1,6 @@
 """Whatever a policy does in one episode of a batch, that episode is an error and the others are kept."""
 
+import os
 import re
 import sys
 import threading
@@ -153,6 +154,14 @@ def test_a_sound_answer_passes() -> None:
     states, chunks = checked_plan(([1, 2], (chunk, chunk)), "mine", 2)
     assert states == [1, 2]
     assert chunks[1] is chunk
+
+
+def test_a_worker_has_one_thread_whatever_the_environment_says(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    ((_, threads),) = results(os.getenv, ["OMP_NUM_THREADS"], 1, "--workers")
+    assert threads == "1"
 
 
 def test_sys_exit_in_a_worker_does_not_end_this_process() -> None:

@@ -1,5 +1,6 @@
 """Training from films: what is taught and how often, what is asked besides, and that a training goes on where it stopped."""
 
+import json
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -11,9 +12,10 @@ import torch
 from safetensors.torch import load_file
 from torch.nn import functional as F  # noqa: N812
 
-from vap_core.base.errors import BadOutput, BadPolicy
+from vap_core.base.errors import BadOutput
+from vap_core.base.types import Description
 from vap_core.policies.lerobot.adapter import load_policy
-from vap_core.policies.lerobot.checkpoints import fingerprint
+from vap_core.policies.mini_pi0.learned_token import WORD, TokenTraining
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy, fused_attention
 from vap_core.policies.mini_pi0.vlm import load_vlm
 from vap_core.simulation.control import arm, rotation_vector
@@ -21,6 +23,7 @@ from vap_core.simulation.suites import suite
 from vap_core.training.films import demonstrations
 from vap_core.training.films.dataset import data_sha256
 from vap_core.training.films.demonstrations import Film, cached
+from vap_core.training.policy import losses, taught
 from vap_core.training.policy import train as policy
 from vap_core.training.policy.batches import (
     SPIN_Z,
@@ -33,9 +36,25 @@ from vap_core.training.policy.batches import (
     turn_otherwise,
     waits,
 )
+from vap_core.training.policy.commands import Known
+from vap_core.training.recipe import RECIPES
 from vap_core.training.vlm import train as vlm
 
 SUITE = "simpler-bridge"
+TINY = replace(
+    RECIPES[SUITE],
+    width=32,
+    depth=2,
+    vision_width=32,
+    vision_depth=1,
+    expert_width=32,
+)
+
+
+def known(films: list[Film]) -> Known:
+    """The objects of the films, put into invented words."""
+    names = [name for film in films for name in film.names]
+    return Known({name: Description("white", "a tall camera, mostly white") for name in names})
 
 
 def test_a_training_that_was_stopped_ends_like_one_that_was_not(
@@ -46,22 +65,12 @@ def test_a_training_that_was_stopped_ends_like_one_that_was_not(
     folder, _ = stage
     monkeypatch.setattr(demonstrations, "EPISODES", 2)
     monkeypatch.setattr(policy, "HELD_OUT", 2)
-    recipe = policy.Recipe(
-        SUITE,
-        stages=2,
-        steps=3,
-        batch=3,
-        draws=2,
-        width=32,
-        depth=2,
-        vision_width=32,
-        vision_depth=1,
-        expert_width=32,
-    )
-    whole = policy.train(recipe, tmp_path / "whole", cache=folder)
-    first = policy.train(recipe, tmp_path / "torn", cache=folder, minutes=0.0)
+    recipe = replace(TINY, stages=2, steps=3, batch=3, draws=2)
+    cache = folder.parent
+    whole = policy.train(recipe, tmp_path / "whole", cache=cache, jobs=1)
+    first = policy.train(recipe, tmp_path / "torn", cache=cache, minutes=0.0)
     assert [line["step"] for line in first["log"]] == [1]
-    policy.train(recipe, tmp_path / "torn", cache=folder)
+    policy.train(recipe, tmp_path / "torn", cache=cache)
     one, other = (load_file(tmp_path / name / "model.safetensors") for name in ("whole", "torn"))
     assert one.keys() == other.keys()
     assert all(torch.equal(one[name], other[name]) for name in one)
@@ -79,7 +88,13 @@ def test_a_training_that_was_stopped_ends_like_one_that_was_not(
         [film for n in range(2) for film in cached(folder, SUITE, 0, n)]
     )
     with pytest.raises(BadOutput, match="another recipe or other data"):
-        policy.train(replace(recipe, rate=0.1), tmp_path / "torn", cache=folder)
+        policy.train(replace(recipe, rate=0.1), tmp_path / "torn", cache=cache)
+    assert whole["recipe"]["held_out_category"] == "owl figurine"
+    assert whole["recipe"]["tint_share"] == 0.2
+    hours = whole["cpu_hours"]
+    assert set(hours) == {"films", "captions", "vlm", "steps", "total"}
+    assert hours["total"] == pytest.approx(sum(hours.values()) - hours["total"], abs=0.003)
+    assert hours["films"] > 0
     trained = load_policy(tmp_path / "whole")
     assert trained.execute == 4
     assert (trained.action_size, set(trained.wanted)) == (
@@ -97,7 +112,8 @@ def test_a_vision_language_model_learns_and_resumes(
         for film in films
         for t in range(0, len(film.action), 6)
     ]
-    monkeypatch.setattr(vlm, "views", lambda *args, **kwargs: pool)
+    monkeypatch.setattr(vlm, "views", lambda *args, **kwargs: (pool, 36.0))
+    monkeypatch.setattr(vlm, "captions", lambda names, file: (known(films).captions, 0.0))
     recipe = vlm.Recipe(
         stages=1,
         steps=3,
@@ -114,37 +130,60 @@ def test_a_vision_language_model_learns_and_resumes(
     one, other = (load_vlm(tmp_path / name).sha256() for name in ("whole", "torn"))
     assert one == other
     assert {"words", "heat", "hit", "where", "yes", "no"} <= set(whole["held_out"])
-    grown = policy.Recipe(
-        SUITE,
-        stages=1,
-        steps=1,
-        batch=2,
-        draws=1,
-        width=32,
-        depth=2,
-        vision_width=32,
-        vision_depth=1,
-        expert_width=32,
-    )
     monkeypatch.setattr(demonstrations, "EPISODES", 2)
-    about = policy.train(grown, tmp_path / "policy", vlm=tmp_path / "whole", cache=stage[0])
-    assert about["vlm"] == one == load_policy(tmp_path / "policy").policy.config.vlm
-    further = policy.train(
-        replace(grown, rate=0.0), tmp_path / "further", start=tmp_path / "policy", cache=stage[0]
-    )
-    assert further["vlm"] == one
-    assert further["start"]["sha256"] == fingerprint(tmp_path / "policy")
-    assert further["start"]["recipe"] == about["recipe"]
-    first, second = (
-        load_file(tmp_path / name / "model.safetensors") for name in ("policy", "further")
-    )
-    assert all(torch.equal(first[name], second[name]) for name in first)
-    other = policy.Learner(replace(policy.configuration(grown, 13, 7), words=("a", "b"))).policy
-    with pytest.raises(BadPolicy, match="no mini-pi0 with the same words"):
-        policy.go_on(tmp_path / "policy", other)
-    (tmp_path / "policy" / "training.json").write_text('{"recipe": ')
-    with pytest.raises(BadPolicy, match="training.json is damaged"):
-        policy.train(grown, tmp_path / "another", start=tmp_path / "policy", cache=stage[0])
+    monkeypatch.setattr(taught, "TRAINING", TokenTraining(epochs=1, augmentations=1))
+    monkeypatch.setattr(taught, "LEAST_ACCURACY", 0.0)
+    grown = replace(TINY, stages=1, steps=4, batch=4, draws=1, taught=1, learned=1.0)
+    about = policy.train(grown, tmp_path / "policy", vlm=tmp_path / "whole", cache=stage[0].parent)
+    trained = load_policy(tmp_path / "policy").policy
+    assert about["vlm"] == one == trained.config.vlm
+    assert about["taught"]["used"] == about["taught"]["objects"] > 0
+    assert about["embedding_cosine"] == pytest.approx({"mean": 1.0, "least": 1.0})
+    words = losses.embeddings(trained)
+    taught_in = load_vlm(tmp_path / "whole").towers.paligemma.model.language_model
+    assert torch.equal(words, taught_in.embed_tokens.weight), "words keep their meaning"
+    begun = policy.train(replace(grown, steps=1), tmp_path / "begun", cache=stage[0].parent)
+    assert about["taught"]
+    assert not begun["taught"], "without a model there is nothing to learn a word in"
+
+
+def test_films_of_what_is_held_out_are_refused(stage: tuple[Path, list[Film]]) -> None:
+    _, films = stage
+    policy._require_trainable(TINY, films)
+    held_out = replace(films[0], task="put-owl-figurine")
+    with pytest.raises(BadOutput, match="the films show put-owl-figurine"):
+        policy._require_trainable(TINY, [*films, held_out])
+    personal = replace(films[0], names=("camera-personal", *films[0].names[1:]))
+    with pytest.raises(ValueError, match="camera-personal belong to evaluation"):
+        policy._require_trainable(TINY, [personal])
+
+
+def test_a_model_that_is_whole_is_not_trained_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+    monkeypatch.setattr(vlm, "train", lambda recipe, *args, **kwargs: calls.append(recipe))
+    card = {"recipe": vars(vlm.Recipe()), "trained_steps": vlm.Recipe().steps - 1}
+    for steps, trained in ((vlm.Recipe().steps - 1, 1), (vlm.Recipe().steps, 0)):
+        calls.clear()
+        (tmp_path / "training.json").write_text(json.dumps(card | {"trained_steps": steps}))
+        assert vlm.make(tmp_path) == tmp_path
+        assert len(calls) == trained
+
+
+def test_a_commands_learned_word_reaches_the_policy(stage: tuple[Path, list[Film]]) -> None:
+    """The hidden states of a command with a learned word change with its embedding, and with it alone."""
+    model, _, batch = small_policy(stage[1], 4)
+    tokens = batch.tokens.clone()
+    tokens[:2, 1] = model.config.words.index(WORD)
+    found = []
+    for value in (0.0, 1.0):
+        learned = torch.full((4, TINY.width), value)
+        changed = replace(batch, tokens=tokens, learned=learned)
+        hidden, _, _ = losses._look(model, changed)
+        found.append(hidden[0].detach())
+    differs = (found[0] - found[1]).abs().amax((1, 2)) > 1e-6
+    assert differs.tolist() == [True, True, False, False]
 
 
 def test_frames_close_to_the_start_a_turn_of_the_gripper_or_the_end_come_more_often(
@@ -169,13 +208,10 @@ def test_frames_close_to_the_start_a_turn_of_the_gripper_or_the_end_come_more_of
 
 def test_every_task_is_drawn_as_often_as_another(stage: tuple[Path, list[Film]]) -> None:
     _, films = stage
-    config = policy.configuration(
-        policy.Recipe(SUITE), films[0].state.shape[1], films[0].action.shape[1]
-    )
+    config = policy.configuration(TINY, films[0].state.shape[1], films[0].action.shape[1])
     three = [films[0], replace(films[0], task="another"), replace(films[0], task="another")]
-    assert Frames(SUITE, three, statistics(three), config, 3.0).share == pytest.approx(
-        [0.5, 0.25, 0.25]
-    )
+    frames = Frames(TINY, three, statistics(three), config, known(films))
+    assert frames.share == pytest.approx([0.5, 0.25, 0.25])
 
 
 def test_a_hand_that_is_shown_turned_otherwise_turns_back_in_time_and_does_all_else_as_before(
@@ -275,29 +311,15 @@ def test_how_the_hand_will_close_is_asked_until_it_does(stage: tuple[Path, list[
 
 def small_policy(
     films: list[Film], batch: int, depth: int = 2
-) -> tuple[MiniPI0Policy, policy.Questions, Batch]:
+) -> tuple[MiniPI0Policy, losses.Questions, Batch]:
     """An untrained policy of the smallest sizes, the questions beside it, and one batch of so many frames."""
-    recipe = policy.Recipe(
-        SUITE,
-        batch=batch,
-        draws=2,
-        width=32,
-        depth=depth,
-        vision_width=32,
-        vision_depth=1,
-        expert_width=32,
-    )
+    recipe = replace(TINY, batch=batch, draws=2, depth=depth)
     config = policy.configuration(recipe, films[0].state.shape[1], films[0].action.shape[1])
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        model, asked = MiniPI0Policy(config), policy.Questions(recipe.width)
-    return (
-        model,
-        asked,
-        Frames(SUITE, films, statistics(films), config, recipe.focus).draw(
-            batch, np.random.default_rng(0)
-        ),
-    )
+        model, asked = MiniPI0Policy(config), losses.Questions(recipe.width)
+    frames = Frames(recipe, films, statistics(films), config, known(films))
+    return model, asked, frames.draw(batch, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize(("depth", "asked_of"), [(1, [0]), (2, [0]), (4, [1, 2]), (6, [2, 3, 4])])
@@ -309,7 +331,7 @@ def test_the_middle_of_the_decoder_is_asked_and_every_layer_after_it_but_the_las
     seen: list[torch.Tensor] = []
     hooks = [layer.register_forward_hook(lambda _, args, out: seen.append(out)) for layer in layers]
     with patch.object(asked, "forward", wraps=asked.forward) as question:
-        policy.losses(model, asked, batch, 1, torch.Generator().manual_seed(0))
+        losses.losses(model, asked, batch, 1, torch.Generator().manual_seed(0))
     for hook in hooks:
         hook.remove()
     patches = batch.patches.shape[2]
@@ -332,8 +354,8 @@ def test_the_goal_is_asked_for_where_there_is_one(stage: tuple[Path, list[Film]]
     _, _, without = small_policy(goalless, 6)
     assert without.place[:, 1].isnan().all()
     assert not without.patches[:, 1].any()
-    _, with_goal = policy.losses(model, asked, batch, 1, torch.Generator().manual_seed(0))
-    loss, told = policy.losses(model, asked, without, 1, torch.Generator().manual_seed(0))
+    _, with_goal = losses.losses(model, asked, batch, 1, torch.Generator().manual_seed(0))
+    loss, told = losses.losses(model, asked, without, 1, torch.Generator().manual_seed(0))
     assert loss.isfinite()
     assert np.isnan([told["goal_where"], told["goal_hit"]]).all()
     assert np.isfinite(list(with_goal.values())).all()
@@ -353,7 +375,7 @@ def test_attention_that_is_fused_gives_the_same_losses_and_gradients(
                 wraps=F.scaled_dot_product_attention,
             ) as kernel,
         ):
-            loss, told = policy.losses(model, asked, batch, 2, torch.Generator().manual_seed(0))
+            loss, told = losses.losses(model, asked, batch, 2, torch.Generator().manual_seed(0))
         found.append(
             (
                 kernel.call_count,
@@ -375,7 +397,7 @@ def test_one_batch_can_be_learned_by_heart(stage: tuple[Path, list[Film]]) -> No
     optimiser = torch.optim.AdamW([*model.parameters(), *asked.parameters()], 3e-3)
     told = []
     for step in range(60):
-        loss, parts = policy.losses(model, asked, batch, 2, torch.Generator().manual_seed(step))
+        loss, parts = losses.losses(model, asked, batch, 2, torch.Generator().manual_seed(step))
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

@@ -7,6 +7,7 @@ from PIL import Image
 
 from tests.scanned import BLUE, EPS, RED, box, fake_ghostscript, mug, put
 from vap_core.base.errors import BadObject
+from vap_core.simulation.assets.scans import convex_parts
 from vap_core.simulation.assets.scans import import_scan as importing
 from vap_core.simulation.assets.scans.bake import _pack_charts
 from vap_core.simulation.assets.scans.import_scan import import_scan
@@ -22,7 +23,7 @@ def quick(monkeypatch):
     def one(vertex, face):
         return (Hull(vertex, float(abs(trimesh.Trimesh(vertex, face).convex_hull.volume))),)
 
-    monkeypatch.setattr(importing, "_convex_parts", one)
+    monkeypatch.setattr(importing, "convex_parts", one)
     monkeypatch.setattr(importing, "TEXTURE_PX", 256)
     monkeypatch.setattr("vap_core.simulation.assets.scans.mesh_file.SAMPLES", 100_000)
 
@@ -247,3 +248,46 @@ def test_parts_of_several_colours_become_one_object(tmp_path, quick):
     assert np.ptp(scan.form.vertex, axis=0) == pytest.approx((0.06, 0.08, 0.15), abs=1e-6)
     found, count = np.unique(scan.image.reshape(-1, 3), axis=0, return_counts=True)
     assert {tuple(map(int, rgb)) for rgb in found[np.argsort(-count)[:2]]} == {RED, BLUE}
+
+
+def test_the_up_axis_is_guessed_from_where_it_stands_flat(tmp_path, quick):
+    """A mug that an OBJ holds z up, against the format's custom, and one as the custom is."""
+    usual = put(tmp_path, "usual.obj", mug())
+    lying = mug()
+    lying.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
+    turned = put(tmp_path, "turned.obj", lying)
+    lines = []
+    for file, axis in ((usual, "y"), (turned, "z")):
+        _, scan = import_scan(file, "mug", "cup", report=lines.append)
+        size = np.ptp(scan.form.vertex, axis=0)
+        assert size == pytest.approx((0.07, 0.07, 0.09), abs=1e-4)
+        assert f"the file's {axis} axis points up; --up says otherwise" in lines
+    box_file = put(tmp_path, "box.obj", box(rgb=(200, 30, 30)))
+    assert importing.guess_up(read_mesh_file(box_file), box_file) == "y"
+
+
+def test_splitting_that_does_not_end_is_ended(monkeypatch):
+    """CoACD takes minutes over a surface that crosses itself; a limit of CPU time says so."""
+    monkeypatch.setattr(convex_parts, "CPU_LIMIT_S", 1)
+    solid = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
+    order = np.random.default_rng(0).permutation(len(solid.vertices))
+    vertex = np.array(solid.vertices)[order] * [1, 0.9, 0.8]
+    with pytest.raises(BadObject, match="took over 1 s.*remesh or smooth it"):
+        convex_parts.convex_parts(vertex, np.asarray(solid.faces, np.int64))
+
+
+def test_a_splitter_that_waits_is_ended(monkeypatch, tmp_path):
+    monkeypatch.setattr(convex_parts, "WALL_LIMIT_S", 1)
+    (tmp_path / "sleeps.py").write_text("import time; time.sleep(100)")
+    monkeypatch.setattr(convex_parts, "SCRIPT", tmp_path / "sleeps.py")
+    solid = trimesh.creation.box((0.05, 0.05, 0.05))
+    with pytest.raises(BadObject, match="took over 1 s"):
+        convex_parts.convex_parts(np.asarray(solid.vertices), np.asarray(solid.faces, np.int64))
+
+
+def test_a_splitter_that_dies_is_said(monkeypatch, tmp_path):
+    (tmp_path / "dies.py").write_text("import os; os.abort()")
+    monkeypatch.setattr(convex_parts, "SCRIPT", tmp_path / "dies.py")
+    solid = trimesh.creation.box((0.05, 0.05, 0.05))
+    with pytest.raises(BadObject, match="cannot be split into convex parts .status -6."):
+        convex_parts.convex_parts(np.asarray(solid.vertices), np.asarray(solid.faces, np.int64))

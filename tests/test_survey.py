@@ -14,7 +14,6 @@ from vap_core.base.types import Boxes, PersonalObject, Rgb
 from vap_core.evaluation.perception.episodes import OFF, agreements, survey
 from vap_core.evaluation.perception.first_frames import (
     RULES,
-    EmbeddedBoxes,
     Tables,
     View,
     find_candidates,
@@ -23,6 +22,7 @@ from vap_core.evaluation.perception.first_frames import (
     registered_object,
 )
 from vap_core.evaluation.perception.first_frames import survey_view as survey_one
+from vap_core.perception.candidates import Proposals
 from vap_core.perception.protocols import Stack
 from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
@@ -58,7 +58,7 @@ def memory(*colours: tuple[int, int, int]) -> dict[int, PersonalObject]:
 
 
 def survey_view(seen: View, stack: Stack, known: dict[int, PersonalObject]) -> Tables:
-    return survey_one(seen, stack, known, find_candidates(seen, stack))
+    return survey_one(seen, stack, known, find_candidates([seen], stack)[0])
 
 
 def test_tiers_of_the_toys() -> None:
@@ -204,10 +204,10 @@ def test_agreements_tell_contradiction_and_what_geometry_makes_of_it() -> None:
     names = [name for name in episode[0].masks if objects.get_object(name).category == "shoe"]
     assert all(name in v.visible() for v in episode for name in names)
 
-    def embedded_boxes(view: View, favourite: str) -> EmbeddedBoxes:
+    def embedded_boxes(view: View, favourite: str) -> Proposals:
         side = np.array([0.45 if name == favourite else 0.40 for name in names])
         rows = np.stack([side, np.sqrt(1 - side**2)], axis=1).astype(np.float32)
-        return EmbeddedBoxes(
+        return Proposals(
             Boxes(
                 np.stack([view.boxes()[name] for name in names]),
                 np.ones(len(names), np.float32),
@@ -219,7 +219,7 @@ def test_agreements_tell_contradiction_and_what_geometry_makes_of_it() -> None:
     mine = replace(personal(target, "shoe", RED), embeddings=np.array([[1.0, 0.0]], np.float32))
     honest = {
         line["associate"]: line
-        for line in agreements(episode, [embedded_boxes(v, target) for v in episode], mine)
+        for line in agreements(episode, [embedded_boxes(v, target) for v in episode], mine, TOYS)
     }
     assert list(honest) == [OFF, *PAIRINGS]
     assert all(
@@ -232,6 +232,7 @@ def test_agreements_tell_contradiction_and_what_geometry_makes_of_it() -> None:
             episode,
             [embedded_boxes(v, other if v.camera == "side" else target) for v in episode],
             mine,
+            TOYS,
         )
     }
     assert (torn[OFF]["case"], torn[OFF]["right"]) == ("case 2", 2)

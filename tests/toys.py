@@ -77,7 +77,7 @@ def _track(mask: np.ndarray) -> Track:
     return Track(mask, 1.0) if mask.any() else Track(None, 0.0)
 
 
-TOYS = Stack("toys", detector, MeanColour(), segmenter, SameColour(), "flat squares")
+TOYS = Stack("toys", detector, MeanColour(), segmenter, SameColour())
 
 
 def personal(name: str, category: str, *colours: tuple[int, int, int]) -> PersonalObject:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from vap_core.base.photos import load_photo as load_photo
     from vap_core.evaluation.methods import METHODS as METHODS
     from vap_core.evaluation.metrics import rate as rate
+    from vap_core.evaluation.photos.run import measure_photos as measure_photos
     from vap_core.evaluation.policy_names import shipped as shipped
     from vap_core.evaluation.study import DEMO as DEMO
     from vap_core.evaluation.study import Study as Study
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from vap_core.memory import register as register
     from vap_core.memory import save as save
     from vap_core.perception.protocols import Stack as Stack
+    from vap_core.perception.references import choose_references as choose_references
     from vap_core.perception.stacks import load_stack as load_stack
     from vap_core.policies.lerobot.adapter import load_policy as load_policy
     from vap_core.policies.lerobot.checkpoints import fingerprint as fingerprint
@@ -57,11 +59,13 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "base.photos": ["load_photo"],
         "evaluation.methods": ["METHODS"],
         "evaluation.metrics": ["rate"],
+        "evaluation.photos.run": ["measure_photos"],
         "evaluation.policy_names": ["shipped"],
         "evaluation.study": ["DEMO", "Study", "make_trial", "register_personal"],
         "instruction": ["parse", "rewrite"],
         "memory": ["load", "load_bank", "register", "save"],
         "perception.protocols": ["Stack"],
+        "perception.references": ["choose_references"],
         "perception.stacks": ["load_stack"],
         "policies.lerobot.adapter": ["load_policy"],
         "policies.lerobot.checkpoints": ["fingerprint"],

@@ -21,6 +21,7 @@ from jaxtyping import Float32, Float64
 from vap_core.base.errors import BadViews
 from vap_core.base.types import Association, Camera, Grounding, value
 from vap_core.perception.candidates import Candidates
+from vap_core.vote import election_scores
 
 Term = Literal["embedding", "hungarian", "geometry"]
 Scores = Float64[np.ndarray, "_ _"]
@@ -84,27 +85,26 @@ class Sighting:
 
 def associate_targets(
     groundings: Mapping[str, tuple[Grounding, ...]],
-    candidates: Mapping[str, Mapping[str, Candidates]],
-    phrases: Sequence[str],
+    candidates: Mapping[str, Sequence[Candidates]],
     cameras: Mapping[str, Camera],
     pairing: Pairing,
 ) -> tuple[dict[str, tuple[Grounding, ...]], tuple[Association | None, ...]]:
     """Let the views agree on each target, one target at a time.
 
-    `groundings[camera][j]` and `phrases[j]` are of target j, `candidates[camera][phrase]` of a
-    view.
+    `groundings[camera][j]` and `candidates[camera][j]` are of target j.
 
     Raises: as `associate`; BadViews, when a camera is calibrated for another image size.
     """
     chosen: dict[str, tuple[Grounding, ...]] = dict.fromkeys(groundings, ())
     associations: list[Association | None] = []
-    for j, phrase in enumerate(phrases):
+    n_targets = len(next(iter(groundings.values())))
+    for j in range(n_targets):
         sightings = {}
         for camera, per_target in groundings.items():
             _check_calibration(camera, per_target[j], cameras)
-            of_view = candidates[camera][phrase]
+            of_view = candidates[camera][j]
             sightings[camera] = Sighting(
-                cosine=per_target[j].similarity,
+                cosine=election_scores(per_target[j].similarity, of_view.boxes),
                 embeddings=of_view.embeddings,
                 xyxy=of_view.boxes.xyxy,
                 camera=cameras.get(camera),

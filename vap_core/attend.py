@@ -16,7 +16,7 @@ numbers, each row of length 1. Cosines are n x k.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,7 @@ from vap_core.base.types import (
     Event,
     Grounding,
     Instruction,
+    Mask,
     PersonalObject,
     Rgb,
     Track,
@@ -42,10 +43,17 @@ from vap_core.base.types import (
 )
 from vap_core.instruction import Parser, parse, rewrite
 from vap_core.memory import recall
-from vap_core.perception.candidates import Candidates, describe, masks_by_id
-from vap_core.perception.protocols import Stack
-from vap_core.prompt import ALPHA, PALETTE, choose_colours, tint
-from vap_core.vote import VoteRule, similarity, vote
+from vap_core.perception.candidates import (
+    Candidates,
+    Proposals,
+    embed_views,
+    masks_by_id,
+    propose,
+    segment,
+)
+from vap_core.perception.protocols import FamiliarityJudge, Stack
+from vap_core.prompt import PALETTE, PromptForm, Tint, choose_colours
+from vap_core.vote import VoteRule, compare, election_scores, shortlist, vote
 
 PerTarget = tuple[Grounding, ...]
 """One grounding per target of the instruction, in the order of its targets."""
@@ -56,15 +64,20 @@ class Prompting:
     """What is changed in the policy's inputs: by default the paper's method.
 
     The switches are ablations. `associate` goes beyond the paper: views agree on one candidate each
-    (associate.PAIRINGS by name); None grounds them one by one.
+    (associate.PAIRINGS by name); None grounds them one by one. `always_tint` is the paper's rule:
+    the best candidate wins, however unlike the references it is. Without it an object whose best
+    candidate is below the stack's threshold is not in view. `references` is how many of an object's
+    references are used, the first ones; None uses all.
     """
 
-    alpha: float = ALPHA
+    form: PromptForm = field(default_factory=Tint)
     palette: tuple[Colour, ...] = PALETTE
     highlight: bool = True
     rewrite: bool = True
     rule: VoteRule = "vote"
     associate: Pairing | None = None
+    always_tint: bool = False
+    references: int | None = None
 
 
 @value
@@ -130,13 +143,19 @@ class Attender:
         """
         parsed, wanted = self.understand(instruction, objects)
         phrases = [target.category for target in parsed.targets]
-        candidates = self._propose(views, phrases, boxes)
+        proposals = self._propose(views, phrases, boxes)
 
+        candidates: dict[str, tuple[Candidates, ...]] = {}
         groundings: dict[str, PerTarget] = {}
-        for camera in views:
+        for camera, rgb in views.items():
+            of_view: list[Candidates] = []
             per_target = []
             for phrase, obj in zip(phrases, wanted, strict=True):
-                per_target.append(self.ground(camera, obj, candidates[camera][phrase]))
+                offered = proposals[camera][phrase]
+                few = shortlist(offered, compare(obj, offered, self.stack))
+                of_view.append(segment(rgb, few, self.stack, known=of_view))
+                per_target.append(self.ground(camera, obj, of_view[-1]))
+            candidates[camera] = tuple(of_view)
             groundings[camera] = tuple(per_target)
 
         associations: tuple[Association | None, ...] = ()
@@ -144,10 +163,11 @@ class Attender:
             groundings, associations = associate_targets(
                 groundings=groundings,
                 candidates=candidates,
-                phrases=phrases,
                 cameras=cameras or {},
                 pairing=self.prompting.associate,
             )
+        for camera, elected in groundings.items():
+            groundings[camera] = tuple(map(self.reject, elected))
         return self.begin(parsed, views, candidates, groundings, associations)
 
     def understand(
@@ -168,51 +188,65 @@ class Attender:
         wanted = []
         for j, target in enumerate(parsed.targets):
             name = None if objects is None else objects[j]
-            wanted.append(recall(self.memory, target, name))
+            obj = recall(self.memory, target, name)
+            wanted.append(obj.first(self.prompting.references))
         return parsed, wanted
 
     def ground(self, camera: str, obj: PersonalObject, candidates: Candidates) -> Grounding:
         """The vote of one view for one object."""
-        cosine = similarity(candidates.embeddings, obj.embeddings)
-        ballot = vote(cosine, self.prompting.rule)
+        boxes = candidates.boxes
+        cosine = compare(obj, candidates, self.stack)
+        ballot = vote(election_scores(cosine, boxes), self.prompting.rule)
         return Grounding(
             camera=camera,
             object=obj.name,
-            candidates=candidates.boxes,
+            candidates=boxes,
             similarity=cosine,
             ballot=ballot,
             winner=ballot.winner,
             masks=candidates.masks,
         )
 
+    def reject(self, grounding: Grounding) -> Grounding:
+        """The grounding without a winner that is too unlike the references to be the object."""
+        thresholds = self.stack.thresholds
+        if thresholds is None or self.prompting.always_tint:
+            return grounding
+        threshold = thresholds.unfamiliar
+        if grounding.candidates.familiar:
+            threshold = thresholds.familiar
+        grounding = replace(grounding, threshold=threshold)
+        winner = grounding.winner
+        if winner is None or grounding.likeness[winner] >= threshold:
+            return grounding
+        return replace(grounding, winner=None, rejected=winner)
+
     def begin(
         self,
         parsed: Instruction,
         views: Views,
-        candidates: Mapping[str, Mapping[str, Candidates]],
+        candidates: Mapping[str, Sequence[Candidates]],
         groundings: Mapping[str, PerTarget],
         associations: tuple[Association | None, ...] = (),
         chosen_by: str = "association",
     ) -> tuple[AttendState, Attended]:
         """Start tracking and prompt the first images, given the groundings.
 
-        `candidates[camera][phrase]` are those of each view; `chosen_by` names what overruled the
-        vote, where something did.
+        `candidates[camera][j]` are those of target j; `chosen_by` names what overruled the vote,
+        where something did.
         """
-        phrases = [target.category for target in parsed.targets]
         ids: dict[str, tuple[int | None, ...]] = {}
         masks: dict[str, Bool[np.ndarray, "n h w"]] = {}
         tracks: dict[str, tuple[Track, ...]] = {}
         for camera in views:
-            ids[camera] = _winner_ids(candidates[camera], groundings[camera], phrases)
-            of_view = tuple(candidates[camera].values())
-            masks[camera] = masks_by_id(of_view)
+            ids[camera] = _winner_ids(candidates[camera], groundings[camera])
+            masks[camera] = masks_by_id(candidates[camera])
             tracks[camera] = tuple(map(_first_track, groundings[camera]))
 
         scenes = []
         for camera, rgb in views.items():
             scenes.append((rgb, list(masks[camera])))
-        colours = choose_colours(len(phrases), scenes, self.prompting.palette)
+        colours = choose_colours(len(parsed.targets), scenes, self.prompting.palette)
         text = parsed.text
         if self.prompting.rewrite:
             text = rewrite(parsed, _colours_in_view(colours, ids))
@@ -228,7 +262,10 @@ class Attender:
             visible=_visible(tracks),
         )
         events = grounding_events(groundings, associations, ids, chosen_by)
-        return state, self._prompt(state, views, tracks, events)
+        others: dict[str, list[Mask]] = {}
+        for camera in views:
+            others[camera] = _other_masks(list(masks[camera]), ids[camera])
+        return state, self._prompt(state, views, tracks, others, events)
 
     def step(self, state: AttendState, views: Views) -> tuple[AttendState, Attended]:
         """Track every target and prompt the new images (t > 0). Consumes `state`.
@@ -266,7 +303,11 @@ class Attender:
             next_trackers = dict(zip(state.trackers, trackers[first:stop], strict=True))
             by_camera = dict(zip(state.trackers, tracks[first:stop], strict=True))
             targets = _tracks_of_targets(state, by_camera)
-            results.append(self.follow(state, images_now, targets, next_trackers))
+            others = {}
+            for camera, of_view in by_camera.items():
+                followed = [track.mask for track in of_view]
+                others[camera] = _other_masks(followed, state.ids[camera])
+            results.append(self.follow(state, images_now, targets, next_trackers, others))
             first = stop
         return results
 
@@ -276,32 +317,43 @@ class Attender:
         views: Views,
         tracks: Mapping[str, tuple[Track, ...]],
         trackers: Mapping[str, Any],
+        others: Mapping[str, Sequence[Mask]] | None = None,
     ) -> tuple[AttendState, Attended]:
-        """Advance one step and prompt, with every target where `tracks` has it."""
+        """Advance one step and prompt, with every target where `tracks` has it.
+
+        `others` are the masks of what else is followed, which some forms of a prompt need.
+        """
         frame_index = state.frame_index + 1
         visible = _visible(tracks)
         events = visibility_events(frame_index, state.visible, visible)
         state = replace(state, frame_index=frame_index, trackers=trackers, visible=visible)
-        return state, self._prompt(state, views, tracks, events)
+        return state, self._prompt(state, views, tracks, others or {}, events)
 
     def _propose(
         self, views: Views, phrases: Sequence[str], given: Mapping[str, Boxes] | None
-    ) -> dict[str, dict[str, Candidates]]:
-        """Candidates by camera and phrase; each phrase is detected once."""
-        candidates: dict[str, dict[str, Candidates]] = {}
+    ) -> dict[str, dict[str, Proposals]]:
+        """Proposals by camera and phrase; each phrase is detected once."""
+        proposals: dict[str, dict[str, Proposals]] = {}
         for camera in views:
-            candidates[camera] = {}
-        images = list(views.values())
+            proposals[camera] = {}
         for phrase in dict.fromkeys(phrases):
-            boxes = given
-            if boxes is None:
-                detected = self.stack.detector(images, phrase)
-                boxes = dict(zip(views, detected, strict=True))
+            if given is None:
+                offered = propose(views, phrase, self.stack)
+            else:
+                offered = embed_views(views, self._judge(views, phrase, given), self.stack)
+            for camera, of_view in offered.items():
+                proposals[camera][phrase] = of_view
+        return proposals
+
+    def _judge(self, views: Views, phrase: str, given: Mapping[str, Boxes]) -> dict[str, Boxes]:
+        """Boxes given by hand, with whether their view is familiar."""
+        detector = self.stack.detector
+        boxes = dict(given)
+        if isinstance(detector, FamiliarityJudge):
             for camera, rgb in views.items():
-                of_view = candidates[camera]
-                known = tuple(of_view.values())
-                of_view[phrase] = describe(rgb, boxes[camera], self.stack, known)
-        return candidates
+                familiar = detector.is_familiar(rgb, phrase)
+                boxes[camera] = replace(given[camera], familiar=familiar)
+        return boxes
 
     def _start_trackers(
         self, views: Views, masks: Mapping[str, Bool[np.ndarray, "n h w"]]
@@ -323,13 +375,16 @@ class Attender:
         state: AttendState,
         views: Views,
         tracks: Mapping[str, tuple[Track, ...]],
+        others: Mapping[str, Sequence[Mask]],
         events: tuple[Event, ...],
     ) -> Attended:
         """The prompted images and text, and the evidence for them."""
         images = dict(views)
         if self.prompting.highlight:
             for camera, per_target in tracks.items():
-                images[camera] = self._tint(views[camera], per_target, state.colours)
+                images[camera] = self._mark(
+                    views[camera], per_target, state.colours, others.get(camera, ())
+                )
         return Attended(
             images=images,
             text=state.text,
@@ -340,25 +395,38 @@ class Attender:
             associations=state.associations,
         )
 
-    def _tint(self, rgb: Rgb, tracks: Sequence[Track], colours: Sequence[Colour]) -> Rgb:
-        """One view with every tracked target in its colour; two never tint one pixel."""
+    def _mark(
+        self,
+        rgb: Rgb,
+        tracks: Sequence[Track],
+        colours: Sequence[Colour],
+        others: Sequence[Mask],
+    ) -> Rgb:
+        """One view with every tracked target in its colour; no pixel belongs to two of them."""
         free = np.ones(rgb.shape[:2], bool)
         for track, colour in zip(tracks, colours, strict=True):
             if track.mask is not None:
-                rgb = tint(rgb, track.mask & free, colour, self.prompting.alpha)
+                rgb = self.prompting.form(rgb, track.mask & free, colour, others)
                 free &= ~track.mask
         return rgb
 
 
-def _winner_ids(
-    candidates: Mapping[str, Candidates], per_target: PerTarget, phrases: Sequence[str]
-) -> tuple[int | None, ...]:
+def _winner_ids(candidates: Sequence[Candidates], per_target: PerTarget) -> tuple[int | None, ...]:
     """The tracker's identity of every target in one view."""
     ids: list[int | None] = []
-    for phrase, grounding in zip(phrases, per_target, strict=True):
+    for of_target, grounding in zip(candidates, per_target, strict=True):
         winner = grounding.winner
-        ids.append(None if winner is None else candidates[phrase].ids[winner])
+        ids.append(None if winner is None else of_target.ids[winner])
     return tuple(ids)
+
+
+def _other_masks(followed: Sequence[Mask | None], ids: Sequence[int | None]) -> list[Mask]:
+    """The masks of what is followed and is no target, where they are visible."""
+    others = []
+    for identity, mask in enumerate(followed):
+        if identity not in ids and mask is not None and mask.any():
+            others.append(mask)
+    return others
 
 
 def _colours_in_view(

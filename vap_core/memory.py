@@ -8,17 +8,19 @@ import re
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32
 
 from vap_core.base.errors import BadMemory, BadOutput, BadPhoto, UnknownName, one_of
 from vap_core.base.files import parse_json, write_atomic
 from vap_core.base.photos import load_photo as load_photo
 from vap_core.base.types import Description, PersonalObject, Rgb, Target
 from vap_core.perception.boxes import crop
-from vap_core.perception.protocols import Detector, Encoder
+from vap_core.perception.protocols import Detector, Encoder, ReferenceCropper
 
 FORMAT = "vap-personal-object"
 VERSION = 1
@@ -42,20 +44,42 @@ def register(
 ) -> tuple[PersonalObject, tuple[int, ...]]:
     """Remember one object from its reference photos.
 
-    Each photo is cropped by the category detector that is used at test time (P 3.3), to its best
-    box; where none scores `threshold`, the whole photo is the crop. Also returns the indices of
+    Each photo is cropped by the detector that is used at test time (P 3.3), to its
+    `reference_box`; where there is none, the whole photo is the crop. Also returns the indices of
     those photos.
     """
     crops = []
     whole = []
     for i, photo in enumerate(photos):
-        (boxes,) = detector([photo], category, threshold)
-        if len(boxes):
-            crops.append(crop(photo, boxes.xyxy[0]))
-        else:
+        box = reference_box(photo, category, detector, threshold=threshold)
+        if box is None:
             crops.append(photo)
             whole.append(i)
+        else:
+            crops.append(crop(photo, box))
     return remember(name, category, crops, encoder), tuple(whole)
+
+
+def reference_box(
+    photo: Rgb, category: str, detector: Detector, *, threshold: float = REFERENCE_THRESHOLD
+) -> Float32[np.ndarray, "4"] | None:
+    """Where a photo shows the object that it is a reference of; None where nothing is found.
+
+    It is the best box of the category. Of boxes of any object it is the likeliest that holds the
+    photo's centre.
+    """
+    if not isinstance(detector, ReferenceCropper):
+        (boxes,) = detector([photo], category, threshold)
+        return boxes.xyxy[0] if len(boxes) else None
+    boxes = detector.reference_boxes(photo, category, threshold)
+    assert boxes.prior is not None
+    h, w = photo.shape[:2]
+    centre = np.array([w / 2, h / 2])
+    inside = (boxes.xyxy[:, :2] <= centre) & (centre <= boxes.xyxy[:, 2:])
+    holding = np.flatnonzero(inside.all(axis=1))
+    if not len(holding):
+        return None
+    return boxes.xyxy[holding[boxes.prior[holding].argmax()]]
 
 
 def remember(name: str, category: str, crops: Sequence[Rgb], encoder: Encoder) -> PersonalObject:
@@ -64,16 +88,7 @@ def remember(name: str, category: str, crops: Sequence[Rgb], encoder: Encoder) -
     Raises:
         BadMemory: no usable name or category; BadPhoto: no crops.
     """
-    if not NAME.fullmatch(name):
-        raise BadMemory(
-            f"remember: {name!r} cannot name an object; use letters, digits, space, dot, dash or "
-            "underscore."
-        )
-    if not CATEGORY.fullmatch(category.strip()):
-        raise BadMemory(
-            f"remember: {category!r} cannot be a category; name the kind of thing in words, for "
-            "example --category cup."
-        )
+    check_names(name, category)
     if not crops:
         raise BadPhoto(f"remember: {name!r} has no photos; give at least one, five are best.")
     category = " ".join(category.lower().split())
@@ -84,6 +99,27 @@ def remember(name: str, category: str, crops: Sequence[Rgb], encoder: Encoder) -
         crops=tuple(crops),
         encoder=encoder.name,
     )
+
+
+def check_names(name: str, category: str) -> None:
+    """Raises: BadMemory: no usable name or category of an object."""
+    if not NAME.fullmatch(name):
+        raise BadMemory(
+            f"remember: {name!r} cannot name an object; use letters, digits, space, dot, dash or "
+            "underscore."
+        )
+    if not CATEGORY.fullmatch(category.strip()):
+        raise BadMemory(
+            f"remember: {category!r} cannot be a category; name the kind of thing in words, for "
+            "example --category cup."
+        )
+
+
+def reference_rows(obj: PersonalObject, encoder: Encoder) -> Float32[np.ndarray, "k d"]:
+    """Z_o by this encoder: the remembered rows if they are its own, else from the kept crops."""
+    if encoder.name == obj.encoder:
+        return obj.embeddings
+    return _embed_crops(obj, encoder)  # type: ignore[arg-type]  # encoders are hashable
 
 
 def recall(
@@ -129,7 +165,7 @@ def save(bank: Path, obj: PersonalObject, *, replace: bool = False) -> Path:
     """
     from safetensors.numpy import save as encode
 
-    path = bank / f"{obj.name}{SUFFIX}"
+    path = object_path(bank, obj.name)
     tensors = {"embeddings": obj.embeddings}
     for i, reference in enumerate(obj.crops):
         tensors[f"crop.{i:03d}"] = np.ascontiguousarray(reference)
@@ -147,14 +183,22 @@ def save(bank: Path, obj: PersonalObject, *, replace: bool = False) -> Path:
         write_atomic(path, encode(tensors, metadata=header), replace=replace)
     except OSError as error:
         if path.exists() and not replace:
-            raise BadOutput(
-                f"save: {path} exists; choose another name or pass --replace."
-            ) from error
+            raise taken(path) from error
         raise BadOutput(
             f"save: {bank} cannot be written ({error.strerror}); choose another folder with "
             "--memory."
         ) from error
     return path
+
+
+def object_path(bank: Path, name: str) -> Path:
+    """The file of an object in a bank."""
+    return bank / f"{name}{SUFFIX}"
+
+
+def taken(path: Path) -> BadOutput:
+    """The error for an object whose name a bank holds already."""
+    return BadOutput(f"save: {path} exists; choose another name or pass --replace.")
 
 
 def load(path: Path, encoder: str | None = None) -> PersonalObject:
@@ -211,6 +255,11 @@ def load_bank(bank: Path, encoder: str | None = None) -> dict[str, PersonalObjec
         obj = load(path, encoder)
         objects[obj.name] = obj
     return objects
+
+
+@lru_cache(maxsize=256)
+def _embed_crops(obj: PersonalObject, encoder: Encoder) -> Float32[np.ndarray, "k d"]:
+    return encoder(obj.crops)
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

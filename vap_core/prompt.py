@@ -4,6 +4,8 @@ The paper's are in P 3.3 and tab:ablation_prompt.
 """
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -50,6 +52,28 @@ def tint(rgb: Rgb, mask: Mask, colour: Colour, alpha: float = ALPHA) -> Rgb:
     blend = (1.0 - alpha) * rgb[mask] + alpha * np.asarray(colour.rgb)
     out[mask] = np.rint(blend).astype(np.uint8)
     return out
+
+
+@runtime_checkable
+class PromptForm(Protocol):
+    """How one target is marked in one view. Other forms are ablations (evaluation.ablations)."""
+
+    def __call__(self, rgb: Rgb, mask: Mask, colour: Colour, others: Sequence[Mask]) -> Rgb:
+        """The marked picture; `rgb` stays as it is.
+
+        `mask` is the target's; it may be empty. `others` are the masks of what else is followed.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Tint:
+    """The method's form: the target's pixels are tinted, and nothing else changes."""
+
+    alpha: float = ALPHA
+
+    def __call__(self, rgb: Rgb, mask: Mask, colour: Colour, others: Sequence[Mask]) -> Rgb:
+        return tint(rgb, mask, colour, self.alpha)
 
 
 def has_colour(rgb: Pixels, colour: Colour) -> Bool[np.ndarray, "*n"]:

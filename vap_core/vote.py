@@ -5,12 +5,20 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32
 
-from vap_core.base.types import Ballot
+from vap_core.base.types import Ballot, Boxes, PersonalObject
+from vap_core.memory import reference_rows
+from vap_core.perception.boxes import box_cover
+from vap_core.perception.candidates import Candidates, Proposals
+from vap_core.perception.protocols import Stack
 
-VoteRule = Literal["vote", "average"]
+VoteRule = Literal["vote", "average", "best"]
 
 SAME = 1e-6
 """Cosines closer than this are equal, so that rounding never decides an election."""
+SAME_PLACE = 0.5
+"""Of two boxes of which the smaller is covered by more than this share, one is a candidate."""
+MOST_CANDIDATES = 4
+"""Candidates of one object among proposals of any object. Each of them is segmented and tracked."""
 
 
 def similarity(
@@ -20,13 +28,50 @@ def similarity(
     return np.clip(candidates @ references.T, -1.0, 1.0).astype(np.float32)
 
 
+def compare(
+    obj: PersonalObject, proposals: Proposals | Candidates, stack: Stack
+) -> Float32[np.ndarray, "n k"]:
+    """cos(e_i, z_k) of every crop of a view, by the encoder of that view."""
+    rows = reference_rows(obj, stack.encoder_of(proposals.boxes))
+    return similarity(proposals.embeddings, rows)
+
+
+def election_scores(cosine: Float32[np.ndarray, "n k"], boxes: Boxes) -> Float32[np.ndarray, "n k"]:
+    """What the vote compares: cosines, and where boxes have priors their sum.
+
+    Priors count from the view's greatest, so no score is above its cosine.
+    """
+    if boxes.prior is None or not len(boxes):
+        return cosine
+    return cosine + (boxes.prior - boxes.prior.max())[:, None]
+
+
+def shortlist(proposals: Proposals, cosine: Float32[np.ndarray, "n k"]) -> Proposals:
+    """The proposals that are candidates, given their cosines with an object's references.
+
+    Proposals of any object overlap: of those in one place the one of the best mean score is taken,
+    and at most `MOST_CANDIDATES` places. Proposals of one category are all candidates.
+    """
+    boxes = proposals.boxes
+    if boxes.prior is None:
+        return proposals
+    mean = election_scores(cosine, boxes).astype(np.float64).mean(axis=1)
+    cover = box_cover(boxes.xyxy, boxes.xyxy)
+    kept: list[int] = []
+    for i in np.argsort(-mean, kind="stable").tolist():
+        if len(kept) < MOST_CANDIDATES and cover[i, kept].max(initial=0.0) <= SAME_PLACE:
+            kept.append(i)
+    return proposals.take(np.array(kept, np.int64))
+
+
 def vote(cosine: Float32[np.ndarray, "n k"], rule: VoteRule = "vote") -> Ballot:
-    """Elect one of n candidates by K references.
+    """Elect one of n candidates by K references, given cosines or `election_scores`.
 
     "vote": b* = argmax_i sum_k [i = argmax_j cos(e_j, z_k)]; a tie in votes goes to the tied
     candidate with the highest mean cosine (P 3.3). "average" is the ablation
-    (P tab:ablation_vote): argmax of the mean cosine; votes are still counted. Exact duplicates
-    go to the candidate listed first, the detector's more confident one.
+    (P tab:ablation_vote): argmax of the mean cosine; "best" is another: argmax of the greatest
+    cosine with any one reference. Votes are still counted. Exact duplicates go to the candidate
+    listed first, the detector's more confident one.
 
     Raises: ValueError, when there are candidates but no references.
     """
@@ -47,8 +92,9 @@ def vote(cosine: Float32[np.ndarray, "n k"], rule: VoteRule = "vote") -> Ballot:
     most_votes = votes == votes.max()
 
     eligible = most_votes if rule == "vote" else np.ones(n, bool)
-    best = mean[eligible].max()
-    winner = int(np.flatnonzero(eligible & (mean >= best - SAME))[0])
+    score = cosine.astype(np.float64).max(axis=1) if rule == "best" else mean
+    best = score[eligible].max()
+    winner = int(np.flatnonzero(eligible & (score >= best - SAME))[0])
 
     others = np.arange(n) != winner
     runner_up = int(votes[others].max(initial=0))

@@ -1,3 +1,5 @@
+from .box_widget import drag_box as drag_box
+from .box_widget import dragged_box as dragged_box
 from .gallery import GOALS as GOALS
 from .gallery import STEMS as STEMS
 from .gallery import bounds as bounds

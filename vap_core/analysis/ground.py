@@ -4,15 +4,19 @@ The answer is the candidates, the votes, the margin and the rewritten instructio
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vap_core.base.errors import BadInstruction, BadOutput
+from vap_core.base.events import describe_rejection
 from vap_core.base.types import Attended, Boxes, Grounding, PersonalObject, Rgb, value
 
 CAMERA = "image"
+GROUND_SIDE = 2560
+"""The longer side to which a larger picture is shrunk: every candidate has a mask of its size."""
 
 
 @value
@@ -26,7 +30,6 @@ class Found:
     instruction: str
     objects: tuple[PersonalObject, ...]
     attended: Attended
-    domain: str
 
     def __str__(self) -> str:
         lines = []
@@ -55,15 +58,23 @@ def ground_image(
     *,
     objects: Sequence[str] | None = None,
     boxes: Boxes | None = None,
+    tiles: bool = False,
+    always_tint: bool = False,
 ) -> Found:
-    """Run the method's first step on one picture with the remembered objects of a bank."""
-    from vap_core.attend import Attender
+    """Run the method's first step on one picture with the remembered objects of a bank.
+
+    With `tiles` the detector also looks at nine overlapping tiles.
+    """
+    from vap_core.attend import Attender, Prompting
     from vap_core.memory import load_bank
     from vap_core.perception.stacks import load_stack
+    from vap_core.perception.tiles import TiledDetector
 
     models = load_stack(stack)
+    if tiles:
+        models = replace(models, detector=TiledDetector(models.detector))
     bank = load_bank(memory, models.encoder.name)
-    attender = Attender(models, bank)
+    attender = Attender(models, bank, Prompting(always_tint=always_tint))
     boxes_by_camera = None if boxes is None else {CAMERA: boxes}
     _, attended = attender.start({CAMERA: rgb}, instruction, objects=objects, boxes=boxes_by_camera)
     matched = tuple(bank[grounding.object] for grounding in attended.groundings[CAMERA])
@@ -72,14 +83,14 @@ def ground_image(
         instruction=instruction,
         objects=matched,
         attended=attended,
-        domain=models.domain,
     )
 
 
 def to_json(found: Found) -> dict[str, Any]:
     """The evidence of the first target at the top level, that of every target under "targets".
 
-    `instruction` is the rewritten one, `said` the given one.
+    `instruction` is the rewritten one, `said` the given one. Boxes are pixels of a picture of
+    `size`, width and height.
     """
     targets = []
     for grounding in found.attended.groundings[CAMERA]:
@@ -88,6 +99,7 @@ def to_json(found: Found) -> dict[str, Any]:
         **targets[0],
         "instruction": found.attended.text,
         "said": found.instruction,
+        "size": [found.rgb.shape[1], found.rgb.shape[0]],
         "targets": targets,
     }
 
@@ -103,7 +115,7 @@ def write_evidence(folder: Path, stem: str, found: Found) -> tuple[Path, Path]:
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        png, rrd = _free_paths(folder, stem)
+        png, rrd = free_paths(folder, stem, (".png", ".rrd"))
         figure = grounding_figure(found.rgb, found.attended, found.objects, CAMERA)
         write_png(figure, png)
     except OSError as error:
@@ -151,21 +163,23 @@ def _grounding_to_json(grounding: Grounding) -> dict[str, Any]:
         "similarity": np.round(grounding.similarity, 6).tolist(),
         "margin": ballot.margin,
         "cosine_margin": ballot.cosine_margin if len(candidates) > 1 else None,
+        "likeness": np.round(grounding.likeness, 6).tolist(),
+        "threshold": grounding.threshold,
+        "rejected": grounding.rejected,
         "tied": ballot.tied.tolist(),
         "candidates": np.round(candidates.xyxy, 2).tolist(),
         "scores": np.round(candidates.score, 4).tolist(),
     }
 
 
-def _free_paths(folder: Path, stem: str) -> tuple[Path, Path]:
-    """A PNG and an .rrd of the same number, of which neither exists."""
+def free_paths(folder: Path, stem: str, suffixes: tuple[str, str]) -> tuple[Path, Path]:
+    """Two files of the same name and number, of which neither exists."""
     number = 1
     while True:
         name = stem if number == 1 else f"{stem}-{number}"
-        png = folder / f"{name}.png"
-        rrd = folder / f"{name}.rrd"
-        if not (png.exists() or rrd.exists()):
-            return png, rrd
+        one, other = (folder / f"{name}{suffix}" for suffix in suffixes)
+        if not (one.exists() or other.exists()):
+            return one, other
         number += 1
 
 
@@ -173,7 +187,7 @@ def _format_grounding(grounding: Grounding) -> list[str]:
     """One line per candidate, and one for the winner and its margin."""
     candidates = grounding.candidates
     ballot = grounding.ballot
-    winner = grounding.winner
+    winner = grounding.chosen
     if winner is None:
         return [
             f"no {candidates.phrase} found for {grounding.object}; nothing is highlighted. "
@@ -182,13 +196,19 @@ def _format_grounding(grounding: Grounding) -> list[str]:
     k = grounding.similarity.shape[1]
     lines = [f"{grounding.object} against {len(candidates)} candidates, {k} references vote:"]
     for i, (box, score) in enumerate(zip(candidates.xyxy, candidates.score, strict=True)):
-        mark = "->" if i == winner else "  "
+        mark = "->" if i == grounding.winner else "  "
         x0, y0, x1, y1 = box
         cosine = grounding.similarity[i].mean()
         lines.append(
             f" {mark} #{i}  box {x0:4.0f} {y0:4.0f} {x1:4.0f} {y1:4.0f}  score {score:.2f}  "
             f"votes {ballot.votes[i]}/{k}  mean cosine {cosine:.3f}"
         )
+    if grounding.rejected is not None:
+        lines.append(
+            f"{grounding.object} {describe_rejection(grounding)} (#{winner}): nothing is "
+            "highlighted; --always-tint highlights it nevertheless"
+        )
+        return lines
     if len(candidates) == 1:
         lines.append(
             f"winner #{winner}, the only candidate: no margin, it wins however unlike it is"

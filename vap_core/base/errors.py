@@ -11,6 +11,10 @@ class BadPhoto(VapError):
     """A reference photo that is absent, empty, not an image, or too large to decode safely."""
 
 
+class BadPhotoSet(VapError):
+    """References and scenes for eval-photos that are incomplete, or boxes that do not fit them."""
+
+
 class BadInstruction(VapError):
     """An instruction without a personal object, or with more of them than the palette has tints."""
 

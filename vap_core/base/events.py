@@ -54,6 +54,13 @@ def describe_ballot(grounding: Grounding) -> str:
     return f"{votes}, {describe_lead(ballot)}"
 
 
+def describe_rejection(grounding: Grounding) -> str:
+    """Why the object is not in view, such as "not in view, cosine 0.31 below 0.59"."""
+    assert grounding.rejected is not None, "the grounding is rejected"
+    likeness = grounding.likeness[grounding.rejected]
+    return f"not in view, cosine {likeness:.2f} below {grounding.threshold:.2f}"
+
+
 def describe_lead(ballot: Ballot) -> str:
     """How far the elected candidate is ahead of every other, by `Ballot.cosine_margin`."""
     if len(ballot.votes) == 1:
@@ -70,6 +77,9 @@ def _elected(grounding: Grounding, chosen_by: str) -> Event:
     if ballot.winner is None:
         phrase = grounding.candidates.phrase
         return Event(0, "WARN", f"{camera}: no {phrase} found, {UNMODIFIED}")
+    if grounding.rejected is not None:
+        text = f"{camera}: {name} {describe_rejection(grounding)}, {UNMODIFIED}"
+        return Event(0, "WARN", text)
     if grounding.winner is None:
         text = f"{camera}: {name} is none of {n} candidates by {chosen_by}, {UNMODIFIED}"
         return Event(0, "WARN", text)

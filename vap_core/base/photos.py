@@ -14,6 +14,12 @@ PICTURE_FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "GIF", "TIFF", "AVIF")
 All are decoded inside this process. Pillow's list holds others that are not: for EPS it starts
 Ghostscript on the file, whatever the file's suffix.
 """
+PHOTO_FORMATS = (*PICTURE_FORMATS, "HEIF")
+"""Of a user's photos; HEIF, which phones write, needs a plugin."""
+PICTURE_SUFFIXES = (
+    *(".jpg", ".jpeg", ".png", ".webp", ".bmp", ".gif"),
+    *(".tif", ".tiff", ".avif", ".heic", ".heif"),
+)
 MAX_PIXELS = 50_000_000
 MAX_BYTES = 200_000_000
 LONG_SIDE = 1024
@@ -27,11 +33,13 @@ def load_photo(path: Path | str, long_side: int | None = LONG_SIDE) -> Rgb:
         BadPhoto: missing, empty, not an image, truncated, or more than 50 megapixels.
     """
     from PIL import Image, ImageOps, UnidentifiedImageError
+    from pillow_heif import register_heif_opener
 
     path = Path(path)
     _check_file(path)
+    register_heif_opener(thumbnails=False)
     try:
-        with path.open("rb") as file, Image.open(file, formats=PICTURE_FORMATS) as image:
+        with path.open("rb") as file, Image.open(file, formats=PHOTO_FORMATS) as image:
             if image.width * image.height > MAX_PIXELS:
                 raise BadPhoto(
                     f"load_photo: {path} has {image.width}x{image.height} pixels, over "
@@ -51,13 +59,18 @@ def load_photo(path: Path | str, long_side: int | None = LONG_SIDE) -> Rgb:
     except UnidentifiedImageError as error:
         raise BadPhoto(
             f"load_photo: {path} cannot be read as an image, it is none of "
-            f"{', '.join(PICTURE_FORMATS)}; export it as JPEG or PNG."
+            f"{', '.join(PHOTO_FORMATS)}; export it as JPEG or PNG."
         ) from error
     except Exception as error:  # a damaged file makes the decoders raise anything
         raise BadPhoto(
             f"load_photo: {path} cannot be read as an image ({error!s:.150}); export it as JPEG or "
             "PNG."
         ) from error
+
+
+def photos_in(folder: Path) -> list[Path]:
+    """The picture files of a folder by their suffixes, in the order of their names."""
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES)
 
 
 def _check_file(path: Path) -> None:

@@ -8,7 +8,7 @@ percent is for print.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, dataclass_transform
 
 import numpy as np
@@ -30,11 +30,17 @@ def value[T](cls: type[T]) -> type[T]:
 
 @value
 class Boxes:
-    """Category-level proposals of one view (P 3.3); n may be 0: a result, not an error."""
+    """Category-level proposals of one view (P 3.3); n may be 0: a result, not an error.
+
+    `prior` is the evidence for each box besides the references', in units of cosine, where boxes of
+    any object are proposed; None where every box is of the phrase's category. `familiar` says
+    whether the view is of the world that the stack's own models were trained on."""
 
     xyxy: Float32[np.ndarray, "n 4"]
     score: Float32[np.ndarray, " n"]
     phrase: str
+    prior: Float32[np.ndarray, " n"] | None = None
+    familiar: bool = True
 
     def __post_init__(self) -> None:
         if len(self.xyxy) and not (self.xyxy[:, 2:] > self.xyxy[:, :2]).all():
@@ -42,6 +48,11 @@ class Boxes:
 
     def __len__(self) -> int:
         return len(self.xyxy)
+
+    def take(self, rows: Int64[np.ndarray, " m"]) -> "Boxes":
+        """These boxes, in this order."""
+        prior = None if self.prior is None else self.prior[rows]
+        return replace(self, xyxy=self.xyxy[rows], score=self.score[rows], prior=prior)
 
     @staticmethod
     def empty(phrase: str) -> "Boxes":
@@ -83,6 +94,17 @@ class PersonalObject:
                 f"got norms {norm.tolist()}"
             )
 
+    def first(self, k: int | None) -> "PersonalObject":
+        """The object with its first k references; with all where k is None or more."""
+        if k is None or k >= len(self.crops):
+            return self
+        return self.take(slice(k))
+
+    def take(self, references: slice) -> "PersonalObject":
+        """The object with these references alone."""
+        crops = self.crops[references]
+        return replace(self, embeddings=self.embeddings[references], crops=crops)
+
 
 @value
 class Target:
@@ -121,7 +143,7 @@ class Ballot:
     share the most votes, where more than one does. `winner` is the elected candidate, None exactly
     when there is none to elect. `margin` is (votes of the winner - most votes of any other) / K, in
     [0, 1] when votes decide; `cosine_margin` is the same difference of mean cosines, 2 when there
-    is no other candidate."""
+    is no other candidate. Where boxes have priors, they are added to the cosines first."""
 
     votes: Int64[np.ndarray, " n"]
     tied: Bool[np.ndarray, " n"]
@@ -134,13 +156,24 @@ class Ballot:
             raise ValueError(f"Ballot: winner {self.winner} of {len(self.votes)} candidates")
 
 
+def likeness(similarity: Float32[np.ndarray, "n k"], familiar: bool) -> Float32[np.ndarray, " n"]:
+    """Each candidate's mean cosine with the references; the greatest in unfamiliar views."""
+    if not len(similarity):
+        return np.zeros(0, np.float32)
+    if familiar:
+        return similarity.mean(axis=1)
+    return similarity.max(axis=1)
+
+
 @value
 class Grounding:
     """Why a view's box was chosen, or none: everything that the vote saw at t = 0 (P 3.3).
 
     `similarity[i, k]` is cos(e_i, z_k). `winner` is the candidate that is tracked and tinted: the
     ballot's, unless cross-view association or the simulator chose otherwise; None where the object
-    is not visible in this view."""
+    is not visible in this view. `rejected` is the candidate that was chosen, but whose `likeness`
+    is below `threshold`: the object is not in view. Without a threshold nothing is rejected, as in
+    the paper."""
 
     camera: str
     object: str
@@ -149,11 +182,23 @@ class Grounding:
     ballot: Ballot
     winner: int | None
     masks: Bool[np.ndarray, "n h w"]
+    threshold: float | None = None
+    rejected: int | None = None
+
+    @property
+    def chosen(self) -> int | None:
+        """The winner, or the candidate that would be it if it were like enough."""
+        return self.winner if self.rejected is None else self.rejected
 
     @property
     def overruled(self) -> bool:
-        """Whether another candidate than the elected one is used, or none."""
-        return self.winner != self.ballot.winner
+        """Whether another candidate than the elected one is chosen, or none."""
+        return self.chosen != self.ballot.winner
+
+    @property
+    def likeness(self) -> Float32[np.ndarray, " n"]:
+        """`likeness` of every candidate."""
+        return likeness(self.similarity, self.candidates.familiar)
 
     @property
     def mask(self) -> Mask | None:

@@ -20,9 +20,10 @@ Methods = Annotated[
     typer.Option(
         "--methods",
         "--method",
-        help="generic, hard-short, hard-long, soft, vap, mask-only, rewrite-only, vap-associated; "
-        "bounds, which read the simulator: oracle-box, oracle-mask, oracle-track, wrong-mask. "
-        "With commas, or repeated. Default: generic,vap.",
+        help="generic, hard-short, hard-long, soft, vap, vap-always-tint, mask-only, rewrite-only, "
+        "vap-associated; bounds, which read the simulator: oracle-box, oracle-mask, "
+        "oracle-track, wrong-mask; and the arms that `ablate` lists. With commas, or repeated. "
+        "Default: generic,vap.",
     ),
 ]
 POLICIES = (
@@ -159,6 +160,71 @@ def rollout(
         video=video,
         attention=attention,
     )
+
+
+@app.command()
+def ablate(
+    name: Annotated[
+        str | None,
+        typer.Argument(help="The ablation; without a name they are listed with their arms."),
+    ] = None,
+    suite: Annotated[
+        list[str] | None,
+        typer.Option(help="A suite; repeatable. Default simpler-bridge."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Run folder; a run found there is resumed. Default data/runs/ablate-NAME."
+        ),
+    ] = None,
+    policy: Annotated[
+        str | None,
+        typer.Option(help=f"{POLICIES} Default: mini-pi0 where one ships, else scripted."),
+    ] = None,
+    episodes: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Episodes per task, spread evenly over its list. Default the whole list."
+        ),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Run every episode with so many seeds.")] = 1,
+    workers: Workers = 2,
+    record: Recorded = "none",
+) -> None:
+    """Change one thing of the method at a time, and compare every arm with the method itself on the
+    same episodes. Interrupted, the same command goes on.
+
+    Example: python -m vap_core ablate
+    Example: python -m vap_core ablate form --suite simpler-bridge --episodes 6
+    """
+    from vap_core.base.errors import one_of
+    from vap_core.base.tables import align
+    from vap_core.evaluation.ablations.arms import ABLATIONS
+
+    if name is None:
+        rows = [["ablation", "question", "arms"]]
+        for each, about in ABLATIONS.items():
+            rows.append([each, about.question, ", ".join(about.names)])
+        print(align(rows))
+        print("next: python -m vap_core ablate form --suite simpler-bridge --episodes 6")
+        return
+    if name not in ABLATIONS:
+        raise one_of("ablate: ablation", name, ABLATIONS)
+    from vap_core.evaluation.ablations.run import ablate_text
+    from vap_core.evaluation.policy_names import default_policy
+
+    suite_names = _suite_names(suite or ["simpler-bridge"])
+    study = _study(
+        tasks=_all_tasks(suite_names),
+        methods=list(ABLATIONS[name].names),
+        policy=policy or default_policy(suite_names),
+        episodes=episodes,
+        seeds=seeds,
+        follow="call",
+    )
+    folder = out or Path(f"data/runs/ablate-{name}")
+    print(ablate_text(name, study, folder, workers=workers, record=_record(record)))
 
 
 @app.command("eval")

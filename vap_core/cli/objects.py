@@ -25,21 +25,45 @@ BANK = Path("data/memory")
 @app.command()
 def register(
     name: Annotated[str, typer.Argument(help="What to call the object, for example mug.")],
-    photos: Annotated[
-        list[Path],
-        typer.Argument(help="One to about ten photos of this very object, five are best."),
-    ],
     category: Annotated[
         str, typer.Option(help="What kind of thing it is: the word you will use after 'my'.")
     ],
-    memory: Memory = BANK,
-    stack: StackName = "embedded",
+    photos: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="One to about ten photos of this very object, or folders of them; five are best."
+        ),
+    ] = None,
+    video: Annotated[
+        Path | None,
+        typer.Option(help="A short clip around the object: sharp frames of it are the photos."),
+    ] = None,
+    frames: Annotated[int, typer.Option(min=1, help="Frames that --video gives.")] = 5,
+    box: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="PHOTO=X0,Y0,X1,Y1",
+            help="Where the object is in a photo, in pixels of the upright photo; repeatable.",
+        ),
+    ] = None,
+    mask: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="PHOTO=MASK",
+            help="A picture as large as the photo, bright on the object; its box is cropped.",
+        ),
+    ] = None,
+    accept: Annotated[
+        bool, typer.Option("--accept", help="Use doubtful crops as the contact sheet shows them.")
+    ] = False,
     whole: Annotated[
         bool,
         typer.Option(
             "--whole", help="The photos are cut out already: use them whole, without the detector."
         ),
     ] = False,
+    memory: Memory = BANK,
+    stack: StackName = "embedded",
     describe: Annotated[
         str,
         typer.Option(
@@ -51,41 +75,51 @@ def register(
         bool, typer.Option("--replace", help="Overwrite an object of this name.")
     ] = False,
 ) -> None:
-    """Remember a personal object from photos.
+    """Remember a personal object from photos; a contact sheet beside the memory shows the crops.
 
     Example: python -m vap_core register mug --category cup photos/mug-*.jpg
+    Example: python -m vap_core register mug --category cup mug.jpg --box mug.jpg=40,60,180,220
+    Example: python -m vap_core register mug --category cup --video mug.mp4
     """
-    from vap_core.memory import load_photo, remember, save
-    from vap_core.memory import register as find_and_remember
+    from vap_core.evaluation.photos import register as registering
+    from vap_core.evaluation.photos.trust import leave_one_out, warnings
+    from vap_core.memory import check_names, load_bank, object_path, save, taken
     from vap_core.perception.describe import load_captioner, with_description
     from vap_core.perception.stacks import load_stack
 
-    pictures = [load_photo(photo) for photo in photos]
+    check_names(name, category)
+    if object_path(memory, name).exists() and not replace:
+        raise taken(object_path(memory, name))
+    paths = registering.gather_photos(photos or [])
+    if video is not None:
+        paths += registering.film_photos(video, memory / f"{name}.frames", frames)
+    given = registering.parse_given(box or [], mask or [], paths)
     models = load_stack(stack)
-    if models.domain and not whole:
-        remedy = "look at what it cropped, or cut the photos out yourself and pass --whole"
-        _warn_of_domain(models.domain, remedy)
-    if whole:
-        obj = remember(name, category, pictures, models.encoder)
-    else:
-        obj, uncropped = find_and_remember(
-            name, category, pictures, models.detector, models.encoder
-        )
-        for index in uncropped:
-            print(
-                f"note: no sure {obj.category} found in {photos[index]}; the whole photo is used.",
-                file=sys.stderr,
-            )
-    captioner = load_captioner(models.segmenter, describe)
-    obj = with_description(obj, captioner)
+    references = registering.choose(paths, category, models, given, whole=whole)
+    sheet = memory / f"{name}.references.png"
+    registering.write_sheet(sheet, references, paths)
+    if not accept:
+        registering.refuse_doubtful(references, paths, sheet)
+    obj = registering.remember_references(name, category, references, models)
+    for line in warnings(obj, references, [path.name for path in paths]):
+        print(f"note: {line}", file=sys.stderr)
+    obj = with_description(obj, load_captioner(models.segmenter, describe))
     path = save(memory, obj, replace=replace)
+    trust = leave_one_out(obj, references, load_bank(memory), models.encoder)
     print(f"{obj.name}: a {obj.category} with {len(obj.crops)} references, saved to {path}")
+    print(f"look at the crops: {sheet}")
+    print(trust)
     print(f'next: python -m vap_core ground IMAGE "bring my {obj.category}" --memory {memory}')
 
 
 @app.command()
 def ground(
-    image: Annotated[Path, typer.Argument(help="Picture of the scene.")],
+    image: Annotated[
+        Path,
+        typer.Argument(
+            help="Picture of the scene; or a video or a folder of frames, which is tracked through."
+        ),
+    ],
     instruction: Annotated[
         str, typer.Argument(help='What you would tell the robot, for example "bring my cup".')
     ],
@@ -104,6 +138,19 @@ def ground(
             help="A candidate x0,y0,x1,y1 in pixels, instead of the detector; repeatable."
         ),
     ] = None,
+    tiles: Annotated[
+        bool | None,
+        typer.Option(
+            help="Look for small objects in nine overlapping tiles, too; default from 3 megapixels "
+            "on."
+        ),
+    ] = None,
+    always_tint: Annotated[
+        bool,
+        typer.Option(
+            "--always-tint", help="Highlight the best candidate, however unlike it is (the paper)."
+        ),
+    ] = False,
     out: Annotated[Path, typer.Option(help="Folder for the overlay PNG and the recording.")] = Path(
         "data/runs/ground"
     ),
@@ -111,19 +158,60 @@ def ground(
         bool, typer.Option("--json", help="Print one JSON object and nothing else.")
     ] = False,
 ) -> None:
-    """Find a remembered object in a picture, and show why that box won.
+    """Find a remembered object in a picture, and show why that box won; or track it through a clip.
 
+    Example: python -m vap_core ground desk.jpg "bring my cup"
     Example: python -m vap_core ground desk.jpg "bring my cup" --box 40,60,180,220
         --box 300,80,420,230
+    Example: python -m vap_core ground desk.mp4 "bring my cup"
     """
-    from vap_core.analysis.ground import ground_image, parse_boxes, to_json, write_evidence
+    from vap_core.analysis.ground import (
+        GROUND_SIDE,
+        ground_image,
+        parse_boxes,
+        to_json,
+        write_evidence,
+    )
+    from vap_core.analysis.ground_clip import ground_clip, is_clip
+    from vap_core.base.errors import BadInstruction
     from vap_core.memory import load_photo
+    from vap_core.perception.tiles import SMALL_MEGAPIXELS
 
-    rgb = load_photo(image, long_side=None)
+    if is_clip(image):
+        if box or as_json or tiles:
+            raise BadInstruction(
+                "ground: --box, --tiles and --json are for single pictures; leave them out for a "
+                "clip."
+            )
+        summary, rrd, mp4 = ground_clip(image, instruction, memory, stack, out, objects=object)
+        print(summary)
+        print(f"wrote {mp4} and {rrd}; look: python -m vap_core view {rrd}")
+        return
+    rgb = load_photo(image, long_side=None if box else GROUND_SIDE)
     boxes = parse_boxes(box, rgb) if box else None
-    found = ground_image(rgb, instruction, memory, stack, objects=object, boxes=boxes)
-    if found.domain and boxes is None:
-        _warn_of_domain(found.domain, "on a real photo give the candidates with --box")
+    if max(rgb.shape[:2]) == GROUND_SIDE:
+        print(
+            f"note: boxes are pixels of the picture at {rgb.shape[1]}x{rgb.shape[0]}.",
+            file=sys.stderr,
+        )
+    if tiles is None:
+        tiles = boxes is None and rgb.shape[0] * rgb.shape[1] >= SMALL_MEGAPIXELS * 1e6
+    if tiles:
+        print(
+            "note: looking at the whole picture and at nine overlapping half-size tiles of it, for "
+            "small objects; --no-tiles turns it off.",
+            file=sys.stderr,
+        )
+    found = ground_image(
+        rgb,
+        instruction,
+        memory,
+        stack,
+        objects=object,
+        boxes=boxes,
+        always_tint=always_tint,
+        tiles=tiles,
+    )
     written = write_evidence(out, image.stem, found)
     if as_json:
         print(json.dumps(to_json(found)))
@@ -149,7 +237,8 @@ def import_object(
     up: Annotated[
         Literal["y", "z"] | None,
         typer.Option(
-            help="Axis that points up in the file; default y for GLB and OBJ, z for PLY, STL."
+            help="Axis that points up in the file; default a guess: y for GLB and OBJ, z for PLY "
+            "and STL, unless it stands flat on the other."
         ),
     ] = None,
     mass_kg: Annotated[
@@ -175,12 +264,14 @@ def import_object(
         typer.Option(help="Folder of your objects; default VAP_OBJECTS or data/objects."),
     ] = None,
 ) -> None:
-    """Make an object of your own 3-D scan; it takes about half a minute.
+    """Make an object of your own 3-D scan, in some seconds, and a picture of it beside it.
 
     Example: python -m vap_core objects import mug.glb --category cup --height-cm 9
     """
     from vap_core.simulation.assets import objects
     from vap_core.simulation.assets.scans import import_scan, storage
+    from vap_core.simulation.grasps import too_wide_for
+    from vap_core.simulation.studio import write_preview
 
     folder = out or storage.scans_folder()
     name = name or import_scan.default_name(file)
@@ -205,8 +296,19 @@ def import_object(
         f"{metadata.name}: a {metadata.category}, {size} cm, {metadata.mass_kg:g} kg, "
         f"{len(scan.hulls)} convex parts, saved to {saved}"
     )
+    preview = folder / f"{metadata.name}.preview.png"
+    write_preview(model, preview)
+    print(f"look: {preview}")
     setting = ""
-    if folder != storage.scans_folder():
+    if folder == storage.scans_folder():
+        too_wide = too_wide_for(metadata.name)
+        if too_wide:
+            print(
+                f"note: too wide for the gripper of {', '.join(too_wide)}; it can stand in their "
+                "scenes, but not be picked. A smaller --height-cm makes it fit.",
+                file=sys.stderr,
+            )
+    else:
         setting = f"VAP_OBJECTS={folder} "
     print(
         f"next: {setting}python -m vap_core objects photograph '{metadata.name}', or in Python "
@@ -243,11 +345,3 @@ def photograph(
     print(f"wrote {views} pictures to {out}")
     photos = " ".join(f"'{path}'" for path in paths)
     print(f"next: python -m vap_core register '{name}' --category '{model.category}' {photos}")
-
-
-def _warn_of_domain(domain: str, remedy: str) -> None:
-    """Note that the embedded detector finds things in pictures of its domain only."""
-    print(
-        f"note: the embedded detector knows {domain} only, not real photos; {remedy}.",
-        file=sys.stderr,
-    )

@@ -1,6 +1,6 @@
 """Commands about this machine and what it measures.
 
-They are eval-perception, eval-policy, show and doctor.
+They are eval-perception, eval-photos, eval-policy, show and doctor.
 """
 
 from pathlib import Path
@@ -57,6 +57,36 @@ def eval_perception(
     if publish is not None:
         written = ", ".join(map(str, write_tables(out, publish)))
         print(f"wrote {written}")
+
+
+@app.command("eval-photos")
+def eval_photos(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            help="Holds references/OBJECT/*.jpg; scenes/*.jpg; scenes.csv with a line "
+            "scene,object,x0,y0,x1,y1 for every object of every scene, without box where the "
+            "object is absent; optional references/boxes.csv with photo,x0,y0,x1,y1 (photo as "
+            "OBJECT/FILE) and objects.csv with object,category (else an object's name is its "
+            "kind). Pixels of the upright photo, far corner exclusive.",
+        ),
+    ],
+    stack: StackName = "embedded",
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Run folder; a run found there is resumed. Default data/runs/photos-NAME."
+        ),
+    ] = None,
+) -> None:
+    """Measure registering, grounding and the vote on photos of your own, against the boxes that you
+    give. Interrupted, it goes on.
+
+    Example: python -m vap_core eval-photos my-photos
+    """
+    from vap_core.evaluation.photos.run import measure_photos
+
+    print(measure_photos(folder, out or Path(f"data/runs/photos-{folder.resolve().name}"), stack))
 
 
 @app.command("eval-policy")

@@ -38,11 +38,13 @@ def demonstrations(
         str, typer.Option(help="The benchmark whose robot, cameras and kinds of task are shown.")
     ],
     stages: Annotated[
-        int,
+        int | None,
         typer.Option(
-            min=1, help="Scenes with generic objects, of about eight demonstrations each."
+            min=1,
+            help="Scenes with generic objects, of about eight demonstrations each. Default the "
+            "recipe's.",
         ),
-    ] = 400,
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(help="Folder of the dataset. Default data/runs/demonstrations-SUITE."),
@@ -61,13 +63,16 @@ def demonstrations(
     from vap_core.base.errors import one_of
     from vap_core.simulation.suites import BENCHMARKS
     from vap_core.training.films.dataset import ABOUT, write
-    from vap_core.training.policy.train import CACHE
+    from vap_core.training.films.scenes import CACHE
+    from vap_core.training.policy.train import FILMS
+    from vap_core.training.recipe import RECIPES
 
     if suite not in BENCHMARKS:
         raise one_of("train demonstrations: suite", suite, BENCHMARKS)
     folder = out or Path(f"data/runs/demonstrations-{suite}")
     was_complete = (folder / ABOUT).exists()
-    made = write(suite, stages, folder, cache=CACHE, seed=seed, jobs=jobs)
+    stages = stages or RECIPES[suite].stages
+    made = write(suite, stages, folder, cache=CACHE / FILMS, seed=seed, jobs=jobs)
     digest = made["data_sha256"]
     text = f"{folder}: {len(made['episodes'])} episodes of {stages} stages, sha256 {digest}"
     if was_complete:
@@ -102,6 +107,7 @@ def vlm(
     recipe = Recipe(stages=stages, steps=steps, seed=seed)
     about = train(recipe, out, minutes=minutes)
     print(json.dumps(about["held_out"], indent=1))
+    print(f"CPU hours: {json.dumps(about['cpu_hours'])}")
     print(f"next: python -m vap_core train policy --suite simpler-bridge --vlm {out}")
 
 
@@ -117,22 +123,28 @@ def policy(
             "data/runs/trained/mini-pi0-SUITE."
         ),
     ] = None,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    tint_share: Annotated[
+        float | None,
+        typer.Option(min=0.0, max=1.0, help="Share of tinted scenes. Default the recipe's."),
+    ] = None,
     stages: Annotated[
-        int,
+        int | None,
         typer.Option(
             min=2,
-            help="Scenes with generic objects, of about eight demonstrations each; filmed first.",
+            help="Scenes with generic objects, of about eight demonstrations each. Default the "
+            "recipe's.",
         ),
-    ] = 400,
-    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps.")] = 12_000,
-    batch: Annotated[int, typer.Option(min=1, help="Frames of one optimiser step.")] = 64,
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="Optimiser steps. Default the recipe's.")
+    ] = None,
     vlm: Annotated[
         Path | None,
-        typer.Option(help="The mini-PaliGemma that it grows from. Default the shipped one."),
-    ] = None,
-    start: Annotated[
-        Path | None,
-        typer.Option(help="A mini-pi0 to go on from instead, of the same suite or of another."),
+        typer.Option(
+            help="The mini-PaliGemma that it grows from. Default mini-paligemma beside the "
+            "checkpoint's folder, trained first."
+        ),
     ] = None,
     demonstrations: Annotated[
         Path | None,
@@ -141,35 +153,55 @@ def policy(
             help="A dataset of train demonstrations to learn from, instead of filming.",
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    cache: Annotated[
+        Path | None,
+        typer.Option(help="Folder of rendered films and scenes. Default data/cache."),
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Processes that render. Default one a core.")
+    ] = None,
     minutes: Annotated[
-        float | None, typer.Option(help="Stop after this long; the same command goes on.")
+        float | None,
+        typer.Option(help="Stop the policy's steps after this long; the same command goes on."),
     ] = None,
 ) -> None:
-    """Train a mini-pi0, the small frozen policy, on demonstrations with generic objects.
+    """Train a mini-pi0, the small frozen policy, from nothing, by the recipe of its suite.
     Interrupted, the same command goes on.
 
     Example: python -m vap_core train policy --suite simpler-bridge --stages 40 --steps 500
         --out data/runs/small-policy
     """
-    from vap_core.base.errors import one_of
-    from vap_core.policies.mini_pi0.teach_token import MODEL
-    from vap_core.simulation.suites import BENCHMARKS
-    from vap_core.training.policy.train import Recipe, train
+    from dataclasses import replace
 
-    if suite not in BENCHMARKS:
-        raise one_of("train policy: suite", suite, BENCHMARKS)
+    from vap_core.base.errors import one_of
+    from vap_core.training.films.scenes import CACHE
+    from vap_core.training.policy.train import train
+    from vap_core.training.recipe import RECIPES
+    from vap_core.training.vlm.train import make
+
+    if suite not in RECIPES:
+        raise one_of("train policy: suite", suite, RECIPES)
     folder = out or Path(f"data/runs/trained/mini-pi0-{suite}")
-    recipe = Recipe(suite=suite, stages=stages, steps=steps, batch=batch, seed=seed)
+    standard = RECIPES[suite]
+    recipe = replace(
+        standard,
+        seed=seed,
+        tint_share=standard.tint_share if tint_share is None else tint_share,
+        stages=stages or standard.stages,
+        steps=steps or standard.steps,
+    )
+    rendered = cache or CACHE
     about = train(
         recipe,
         folder,
-        vlm=vlm or MODEL,
-        start=start,
+        vlm=vlm or make(folder.parent / "mini-paligemma", cache=rendered, jobs=jobs),
         demonstrations=demonstrations,
         minutes=minutes,
+        cache=rendered,
+        jobs=jobs,
     )
     print(json.dumps(about["held_out"], indent=1))
+    print(f"CPU hours: {json.dumps(about['cpu_hours'])}")
     print(
         f"next: python -m vap_core eval --suite {suite} --policy {folder} "
         f"--methods generic,vap --episodes 4 --out {folder}-eval"

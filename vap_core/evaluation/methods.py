@@ -4,6 +4,7 @@ from pathlib import Path
 
 from vap_core.associate import PAIRINGS
 from vap_core.attend import Attender, Prompting
+from vap_core.evaluation.ablations.arms import ARMS, Hidden
 from vap_core.memory import load_bank
 from vap_core.perception.protocols import Stack
 from vap_core.policies.mini_pi0.learned_token import WORD
@@ -21,7 +22,7 @@ from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.scenes import Scene
 from vap_core.simulation.types import EpisodeRow
 
-type Method = Prompting | HardPrompt | SoftPrompt | Oracle | None
+type Method = Prompting | HardPrompt | SoftPrompt | Oracle | Hidden | None
 
 METHODS: dict[str, Method] = {
     "generic": None,
@@ -29,6 +30,7 @@ METHODS: dict[str, Method] = {
     "hard-long": HardPrompt("long"),
     "soft": SoftPrompt(),
     "vap": Prompting(),
+    "vap-always-tint": Prompting(always_tint=True),
     "mask-only": Prompting(rewrite=False),
     "rewrite-only": Prompting(highlight=False),
     "vap-associated": Prompting(associate=PAIRINGS["geometry"]),
@@ -39,23 +41,51 @@ METHODS: dict[str, Method] = {
 }
 """What each method changes in the policy's inputs; None changes nothing. Association is not the
 paper's, nor are the last four: they read the simulator, and bound what results can be."""
+FEWEST_REFERENCES = 5
+"""Reference photos of an object, unless a method needs more."""
+
+
+_ALL: dict[str, Method] = {**METHODS, **ARMS}
+
+
+def known_methods() -> tuple[str, ...]:
+    """The names of METHODS, and of the arms of every ablation."""
+    return tuple(_ALL)
+
+
+def find(method: str) -> Method:
+    """What a method, or an arm of an ablation, changes. Raises: KeyError."""
+    return _ALL[method]
+
+
+def hidden_calls(method: str) -> int:
+    """For how many calls of the policy the target is hidden."""
+    how = find(method)
+    return how.calls if isinstance(how, Hidden) else 0
+
+
+def references_needed(method: str) -> int:
+    """How many reference photos of an object the method wants."""
+    how = find(method)
+    wanted = how.references if isinstance(how, Prompting) else None
+    return max(FEWEST_REFERENCES, wanted or 0)
 
 
 def needs_memory(method: str) -> bool:
     """Whether the method refers to remembered objects."""
-    return METHODS[method] is not None
+    return find(method) is not None
 
 
 def needs_description(method: str) -> bool:
-    return isinstance(METHODS[method], HardPrompt)
+    return isinstance(find(method), HardPrompt)
 
 
 def needs_token(method: str) -> bool:
-    return isinstance(METHODS[method], SoftPrompt)
+    return isinstance(find(method), SoftPrompt)
 
 
 def needs_stack(method: str) -> bool:
-    return isinstance(METHODS[method], Prompting | Oracle)
+    return isinstance(find(method), Prompting | Oracle | Hidden)
 
 
 def make_prompter(
@@ -65,7 +95,7 @@ def make_prompter(
 
     Raises: BadMemory.
     """
-    match METHODS[method]:
+    match find(method):
         case None:
             return generic()
         case HardPrompt() as how:
@@ -73,6 +103,8 @@ def make_prompter(
         case SoftPrompt():
             return soft_prompt(WORD)
         case Prompting() as how:
+            return TintPrompter(_attender(how, row, bank, stack))
+        case Hidden(prompting=how):
             return TintPrompter(_attender(how, row, bank, stack))
         case Oracle() as oracle:
             alike = frozenset(n for n in scene.objects if get_object(n).category == row.category)

@@ -46,7 +46,7 @@ def make_policy(
     match name:
         case "scripted":
             assert stack is not None, "the scripted policy needs a detector"
-            return scripted(stack.detector, scene, suite)
+            return scripted(stack.category_detector, scene, suite)
         case "expert":
             return Expert()
         case "random":

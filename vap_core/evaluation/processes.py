@@ -65,9 +65,12 @@ def results[J, R](
 
 
 def _limit_threads() -> None:
-    """One thread in each worker: with two, workers compete for the cores."""
+    """One thread in each worker, whatever the environment says.
+
+    With two, workers compete for the cores, and the last bits of an action differ.
+    """
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
+        os.environ[name] = "1"
 
 
 def _begin_worker(environment: dict[str, str]) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import parse_json, write_atomic
+from vap_core.evaluation.run_schema import check_run
 from vap_core.evaluation.store import KEY, read, read_manifest
 from vap_core.simulation import suites
 
@@ -31,7 +32,8 @@ def read_published(path: Path) -> "list[tuple[dict[str, Any], pd.DataFrame]]":
         for manifest in manifests:
             episodes = table[table["configuration"] == manifest["digest"]]
             runs.append((manifest, episodes.drop(columns="configuration")))
-    except (OSError, pa.ArrowInvalid, KeyError, ValueError) as error:
+            check_run(path, *runs[-1])
+    except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
         raise BadOutput(
             f"published: {path} is no table of finished runs ({type(error).__name__}); publish "
             "writes one."
@@ -46,7 +48,10 @@ def read_runs(source: Path) -> "list[tuple[dict[str, Any], pd.DataFrame]]":
     """
     if source.suffix == ".parquet":
         return read_published(source)
-    return [(read_manifest(source), read(source))]
+    manifest = read_manifest(source)
+    episodes = read(source)
+    check_run(source, manifest, episodes)
+    return [(manifest, episodes)]
 
 
 def publish(sources: Sequence[Path], target: Path, *, replace: bool = False) -> int:

@@ -194,19 +194,25 @@ def compact(folder: Path) -> None:
 def read(folder: Path) -> "pd.DataFrame":
     """Every finished episode, in the order of KEY; of several attempts the last one."""
     import pandas as pd
-    from pyarrow import concat_tables
+    from pyarrow import ArrowException, concat_tables
 
     parts = _read_parts(folder)
     if not parts:
         return pd.DataFrame(columns=KEY)
-    table = concat_tables(parts, promote_options="permissive").to_pandas()
-    if not {*KEY, "attempt"} <= set(table.columns):
+    try:
+        table = concat_tables(parts, promote_options="permissive").to_pandas()
+        if not {*KEY, "attempt"} <= set(table.columns):
+            raise BadOutput(
+                f"read: {folder} was written by an older version; run the same command again with "
+                "another --out."
+            )
+        table = table.sort_values([*KEY, "attempt"], ignore_index=True)
+        return table.drop_duplicates(KEY, keep="last", ignore_index=True)
+    except (ArrowException, ValueError, TypeError) as error:
         raise BadOutput(
-            f"read: {folder} was written by an older version; run the same command again with "
-            "another --out."
-        )
-    table = table.sort_values([*KEY, "attempt"], ignore_index=True)
-    return table.drop_duplicates(KEY, keep="last", ignore_index=True)
+            f"read: the parts in {folder} do not fit together ({type(error).__name__}); run the "
+            "same command again with another --out."
+        ) from error
 
 
 def _read_parts(folder: Path) -> "list[pa.Table]":
@@ -231,7 +237,7 @@ def _read_part(path: Path) -> "pa.Table":
 
     try:
         return read_table(path)
-    except (ArrowException, OSError) as error:
+    except (ArrowException, OSError, ValueError) as error:
         raise BadOutput(
             f"read: {path} is damaged; delete it and run the same command again, its episodes run "
             "anew."

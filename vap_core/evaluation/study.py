@@ -14,11 +14,14 @@ from vap_core import __version__
 from vap_core.base.errors import BadStudy, one_of
 from vap_core.evaluation.methods import (
     METHODS,
+    hidden_calls,
+    known_methods,
     make_prompter,
     needs_description,
     needs_memory,
     needs_stack,
     needs_token,
+    references_needed,
 )
 from vap_core.evaluation.policy_names import (
     MINI,
@@ -41,6 +44,7 @@ from vap_core.rollout.loop import Follow, Trial
 from vap_core.simulation import robots, suites
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.cameras import RIGS
+from vap_core.simulation.occluder import Occlusion
 from vap_core.simulation.scenes import Meshes, Scene
 from vap_core.simulation.studio import reference_views
 from vap_core.simulation.suites import lists
@@ -49,6 +53,10 @@ from vap_core.simulation.suites.variants import VARIANTS
 from vap_core.simulation.types import EpisodeRow
 
 MESHES = ("plain", "menagerie")
+
+
+HIDDEN_FROM = 2
+"""The call of the policy, counted from 0, from which an arm of `ablate` hides the target."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +133,7 @@ def register_personal(study: Study, bank: Path, captioner: Captioner | None = No
         category = rows[0].category
         obj = known.get(target)
         if obj is None:
-            views = reference_views(get_object(target))
+            views = reference_views(get_object(target), max(map(references_needed, study.methods)))
             obj, _ = register(target, category, views, stack.detector, stack.encoder)
         if _any_method(study, needs_description) and obj.description is None:
             obj = with_description(obj, captioner or AttributeCaptioner(stack.segmenter))
@@ -159,23 +167,33 @@ def make_trial(study: Study, rows: Sequence[EpisodeRow], method: str, bank: Path
     suite = suites.suite(first.suite)
     scene = _scene(study, rows)
     stack = _stack(study.stack) if needs_stack(method) or study.policy == "scripted" else None
+    policy = _policy(study=study, method=method, row=first, bank=bank, scene=scene, stack=stack)
     return Trial(
         method=method,
         scene=scene,
-        policy=_policy(study=study, method=method, row=first, bank=bank, scene=scene, stack=stack),
+        policy=policy,
         prompter=make_prompter(method, first, bank=bank, scene=scene, stack=stack),
         control=suite.control,
         sensor=suite.sensor,
+        occlusion=_occlusion(method, policy.execute),
         images_every=study.images_every,
         follow=study.follow,
         audit=study.audit,
     )
 
 
+def _occlusion(method: str, execute: int) -> Occlusion | None:
+    """When the method's target is hidden: from the policy's HIDDEN_FROM-th call on."""
+    calls = hidden_calls(method)
+    if not calls:
+        return None
+    return Occlusion(start=HIDDEN_FROM * execute, frames=calls * execute)
+
+
 def _check_names(study: Study) -> None:
     for method in study.methods:
-        if method not in METHODS:
-            raise one_of("Study: method", method, METHODS)
+        if method not in known_methods():
+            raise one_of("Study: method (or an arm of `ablate`)", method, METHODS)
     if study.policy not in (*POLICIES, MINI) and not checkpoints.is_checkpoint_name(study.policy):
         what = "Study: policy (or a lerobot checkpoint's folder or hub id)"
         raise one_of(what, study.policy, [*POLICIES, MINI])

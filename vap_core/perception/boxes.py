@@ -43,12 +43,26 @@ def box_iou(a: Float[np.ndarray, "n 4"], b: Float[np.ndarray, "m 4"]) -> Float[n
     return both / np.maximum(area_a[:, None] + area_b[None] - both, 1e-9)
 
 
-def suppress_overlaps(
-    xyxy: Float32[np.ndarray, "n 4"], score: Float32[np.ndarray, " n"]
-) -> Int64[np.ndarray, " k"]:
-    """Non-maximum suppression: indices of at most `MAX_BOXES` boxes, best first.
+def box_cover(a: Float[np.ndarray, "n 4"], b: Float[np.ndarray, "m 4"]) -> Float[np.ndarray, "n m"]:
+    """Intersection over the smaller box's area, of every pair of boxes."""
+    near = np.maximum(a[:, None, :2], b[None, :, :2])
+    far = np.minimum(a[:, None, 2:], b[None, :, 2:])
+    both = np.clip(far - near, 0, None).prod(-1)
+    area_a = (a[:, 2:] - a[:, :2]).prod(-1)
+    area_b = (b[:, 2:] - b[:, :2]).prod(-1)
+    return both / np.maximum(np.minimum(area_a[:, None], area_b[None]), 1e-9)
 
-    Scores are above 0.
+
+def suppress_overlaps(
+    xyxy: Float32[np.ndarray, "n 4"],
+    score: Float32[np.ndarray, " n"],
+    *,
+    iou: float = NMS_IOU,
+    most: int = MAX_BOXES,
+) -> Int64[np.ndarray, " k"]:
+    """Non-maximum suppression: indices of at most `most` boxes, best first.
+
+    A box that overlaps a better one by more than `iou` is left out. Scores are above 0.
     """
     # torchvision's finds the same, but takes 1.5 s to import.
     xywh = np.concatenate([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]], axis=1)
@@ -56,9 +70,9 @@ def suppress_overlaps(
         bboxes=xywh.tolist(),
         scores=score.tolist(),
         score_threshold=0.0,
-        nms_threshold=NMS_IOU,
+        nms_threshold=iou,
     )
-    return np.asarray(kept, np.int64).reshape(-1)[:MAX_BOXES]
+    return np.asarray(kept, np.int64).reshape(-1)[:most]
 
 
 def mask_iou(one: Mask, other: Mask) -> float:

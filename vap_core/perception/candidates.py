@@ -1,19 +1,32 @@
-"""The candidates of one phrase in one view: boxes, embeddings, masks and identities.
+"""What a view offers to the vote: proposals of one phrase, and the candidates of one target.
 
 Identities are the indices that the view's tracker gives to what it follows.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int64
 
-from vap_core.base.types import Boxes, Rgb, value
+from vap_core.base.types import Boxes, Rgb, Views, value
 from vap_core.perception.boxes import box_iou, crop
 from vap_core.perception.protocols import Stack
 
 SAME_BOX_IOU = 0.7
 """Boxes of two phrases that overlap by more than this IoU are the same object."""
+
+
+@value
+class Proposals:
+    """The boxes that a detector proposed for one phrase in one view, and their embeddings."""
+
+    boxes: Boxes
+    embeddings: Float32[np.ndarray, "n d"]
+
+    def take(self, rows: Int64[np.ndarray, " m"]) -> "Proposals":
+        """These of them, in this order."""
+        return Proposals(self.boxes.take(rows), self.embeddings[rows])
 
 
 @value
@@ -26,14 +39,41 @@ class Candidates:
     ids: tuple[int, ...]
 
 
-def describe(rgb: Rgb, boxes: Boxes, stack: Stack, known: Sequence[Candidates] = ()) -> Candidates:
-    """Embed and segment every box of one view.
+def propose(views: Views, phrase: str, stack: Stack) -> dict[str, Proposals]:
+    """What the detector proposes for a phrase in every view, embedded."""
+    detected = stack.detector(list(views.values()), phrase)
+    return embed_views(views, dict(zip(views, detected, strict=True)), stack)
 
-    A box that an earlier phrase proposed too keeps its identity.
+
+def embed_views(views: Views, boxes: Mapping[str, Boxes], stack: Stack) -> dict[str, Proposals]:
+    """The boxes of every view, embedded.
+
+    Cameras of one robot see one world: where one view is familiar all are, so that all are embedded
+    by one encoder.
     """
-    embeddings = stack.encoder([crop(rgb, box) for box in boxes.xyxy])
+    familiar = any(of_view.familiar for of_view in boxes.values())
+    proposals = {}
+    for camera, rgb in views.items():
+        proposals[camera] = embed(rgb, replace(boxes[camera], familiar=familiar), stack)
+    return proposals
+
+
+def embed(rgb: Rgb, boxes: Boxes, stack: Stack) -> Proposals:
+    """The embeddings of every box of one view."""
+    encoder = stack.encoder_of(boxes)
+    return Proposals(boxes, encoder([crop(rgb, box) for box in boxes.xyxy]))
+
+
+def segment(
+    rgb: Rgb, proposals: Proposals, stack: Stack, known: Sequence[Candidates] = ()
+) -> Candidates:
+    """The masks of all proposals.
+
+    A box that is a candidate for an earlier target too keeps its identity.
+    """
+    boxes = proposals.boxes
     masks = stack.segmenter(rgb, boxes)
-    return Candidates(boxes, embeddings, masks, _assign_ids(boxes, known))
+    return Candidates(boxes, proposals.embeddings, masks, _assign_ids(boxes, known))
 
 
 def masks_by_id(parts: Sequence[Candidates]) -> Bool[np.ndarray, "n h w"]:

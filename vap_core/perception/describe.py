@@ -85,7 +85,7 @@ class AttributeCaptioner:
         measured: list[CropAttributes] = []
         for rgb in crops:
             measured.append(measure_crop(rgb, self.segmenter))
-        return _phrase_attributes(measured, category)
+        return phrase_attributes(measured, category)
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class ChatCaptioner:
         return phrase
 
 
-def _phrase_attributes(measured: Sequence[CropAttributes], category: str) -> Description:
+def phrase_attributes(measured: Sequence[CropAttributes], category: str) -> Description:
     """Put what was measured of an object's crops into words."""
     share = _mean_shares(measured)
     main_colour, *others = sorted(COLOURS, key=share.__getitem__, reverse=True)

@@ -12,7 +12,10 @@ from vap_core.base.types import Boxes, Rgb, Track
 
 @runtime_checkable
 class Detector(Protocol):
-    """Finds every box that matches an open-vocabulary phrase (P 3.3)."""
+    """Finds every box that matches an open-vocabulary phrase (P 3.3).
+
+    Or proposes boxes of any object, and gives each a `Boxes.prior` by the phrase.
+    """
 
     def __call__(
         self, images: Sequence[Rgb], phrase: str, threshold: float | None = None
@@ -21,6 +24,24 @@ class Detector(Protocol):
 
         A `Boxes` is empty when nothing scores `threshold` (None: the detector's own).
         """
+        ...
+
+
+@runtime_checkable
+class FamiliarityJudge(Protocol):
+    """A detector that knows whether a view is of the world that its stack was trained on."""
+
+    def is_familiar(self, image: Rgb, phrase: str) -> bool:
+        """The `Boxes.familiar` of boxes that are given by hand."""
+        ...
+
+
+@runtime_checkable
+class ReferenceCropper(Protocol):
+    """A detector that looks for the object of a reference photo otherwise than in a scene."""
+
+    def reference_boxes(self, photo: Rgb, phrase: str, threshold: float) -> Boxes:
+        """Where the object may be, with priors; empty when nothing scores `threshold`."""
         ...
 
 
@@ -68,10 +89,21 @@ class Tracker(Protocol):
 
 
 @dataclass(frozen=True)
+class Thresholds:
+    """The least `Grounding.likeness` of an object that is in view, in familiar and other views."""
+
+    familiar: float
+    unfamiliar: float
+
+
+@dataclass(frozen=True)
 class Stack:
     """The four frozen models.
 
-    `domain` says what images the detector was trained on; "" means photos of anything.
+    `by_category` finds boxes of the phrase's category alone; None where `detector` does.
+    `unfamiliar_encoder` embeds crops of views that are not `Boxes.familiar`, and the references for
+    them, from the crops that a memory keeps; None: `encoder` does.
+    `thresholds` is None where none were measured: then the best candidate wins, however unlike.
     """
 
     name: str
@@ -79,4 +111,17 @@ class Stack:
     encoder: Encoder
     segmenter: Segmenter
     tracker: Tracker
-    domain: str
+    by_category: Detector | None = None
+    unfamiliar_encoder: Encoder | None = None
+    thresholds: Thresholds | None = None
+
+    @property
+    def category_detector(self) -> Detector:
+        """What says where things of one kind are, to scripted policies and surveys."""
+        return self.by_category or self.detector
+
+    def encoder_of(self, boxes: Boxes) -> Encoder:
+        """The encoder of the view in which these boxes are."""
+        if boxes.familiar or self.unfamiliar_encoder is None:
+            return self.encoder
+        return self.unfamiliar_encoder

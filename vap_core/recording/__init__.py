@@ -18,6 +18,8 @@ from vap_core.recording.deferred import is_failure_or_sampled as is_failure_or_s
 from vap_core.recording.file import recording_file_name as recording_file_name
 from vap_core.recording.file import recording_name as recording_name
 from vap_core.recording.file import recover as recover
+from vap_core.recording.grounding import ClipRecorder as ClipRecorder
+from vap_core.recording.grounding import ClipStep as ClipStep
 from vap_core.recording.grounding import record_grounding as record_grounding
 from vap_core.recording.index import ensure_index as ensure_index
 from vap_core.recording.query import format_result as format_result

@@ -53,8 +53,8 @@ def episode_blueprint(
     return full_window(rrb.Tabs(*tabs, active_tab=0), header.hz)
 
 
-def grounding_blueprint(grounding: Grounding) -> StoredBlueprint:
-    """One picture, and why that box won."""
+def grounding_blueprint(grounding: Grounding, fps: float = 1.0) -> StoredBlueprint:
+    """One picture, or the frames of a clip, and why that box won."""
     camera = grounding.camera
     pictures = rrb.Horizontal(vote_view(camera), mask_view(camera), policy_view(camera))
     evidence = rrb.Horizontal(
@@ -64,7 +64,7 @@ def grounding_blueprint(grounding: Grounding) -> StoredBlueprint:
         cosine_view(camera),
         column_shares=[1, 1.2, 1, 1],
     )
-    return full_window(rrb.Vertical(pictures, evidence, row_shares=[1.5, 1]))
+    return full_window(rrb.Vertical(pictures, evidence, row_shares=[1.5, 1]), fps)
 
 
 def full_window(root: Part, fps: float = 1.0) -> StoredBlueprint:

@@ -18,7 +18,8 @@ import rerun as rr
 
 from vap_core.base.errors import BadRecording
 from vap_core.recording.corrections import CORRECTIONS
-from vap_core.recording.index import CURVES, STEPS, ensure_index
+from vap_core.recording.index import CURVES, STEPS, index_path
+from vap_core.recording.isolated import index_isolated
 from vap_core.recording.legacy_names import former_name
 
 if TYPE_CHECKING:
@@ -95,13 +96,26 @@ def _ensure_indexes(
     """The index of every recording that has one, or can get one."""
     from tqdm import tqdm
 
-    indexes = {}
-    for path in tqdm(files, "index", unit="recording", leave=False, delay=3, mininterval=1):
-        try:
-            indexes[path] = ensure_index(path, folder)
-        except BadRecording as error:
-            unreadable[path] = str(error)
-    return indexes
+    missing = [path for path in files if not _has_index(path, folder)]
+    for path, reason in tqdm(
+        index_isolated(missing, folder),
+        "index",
+        total=len(missing),
+        unit="recording",
+        leave=False,
+        delay=3,
+        mininterval=1,
+    ):
+        if reason is not None:
+            unreadable[path] = reason
+    return {path: index_path(path, folder) for path in files if path not in unreadable}
+
+
+def _has_index(path: Path, folder: Path | None) -> bool:
+    try:
+        return index_path(path, folder).exists()
+    except OSError:
+        return False
 
 
 def _register(

@@ -1,10 +1,12 @@
-"""A one-picture recording for `vap_core ground`."""
+"""Recordings for `vap_core ground`: of one picture, and of a clip."""
 
 from pathlib import Path
+from types import TracebackType
 
+import numpy as np
 import rerun as rr
 
-from vap_core.base.types import Grounding, PersonalObject, Rgb
+from vap_core.base.types import Grounding, PersonalObject, Rgb, Track, value
 from vap_core.recording.blueprint import grounding_blueprint
 from vap_core.recording.entities.comparison import log_similarity
 from vap_core.recording.entities.images import contact_sheet, encode_jpeg, jpeg_image
@@ -30,24 +32,84 @@ def record_grounding(
 
     Raises: BadOutput, when `path` exists or its folder cannot be written.
     """
-    path = Path(path)
-    root = image_root(grounding.camera)
-    rec = open_stream(path, f"ground.{grounding.object}.{grounding.camera}.{path.stem}")
-    rec.send_recording_name(f"ground · {grounding.object}")
-    log_row(rec, "/", rr.AnnotationContext(CLASSES))
-    at = time_columns([(0, 0.0)])
-    jpeg = encode_jpeg(image, JPEG_QUALITY)
-    log_row(rec, root, jpeg_image(jpeg), at=at)
-    prompted_jpeg = encode_jpeg(prompted, JPEG_QUALITY)
-    log_row(rec, f"{root}/prompted", jpeg_image(prompted_jpeg), at=at)
-    log_vote(rec, grounding, 0, jpeg, at)
-    if grounding.mask is not None:
-        mask = rr.SegmentationImage(track_image(grounding.mask), opacity=1.0)
-        log_row(rec, f"{root}/mask/target", mask, at=at)
-    sheet = encode_jpeg(contact_sheet(obj.crops), JPEG_QUALITY)
-    log_row(rec, "/vap/references", jpeg_image(sheet), at=at)
-    log_similarity(rec, grounding, at)
-    document = grounding_document(grounding, obj, instruction, rewritten)
-    log_row(rec, "/vap/instruction", document, at=at)
-    grounding_blueprint(grounding).send(rec)
-    finish_stream(rec, path)
+    with ClipRecorder(path, grounding.camera, grounding.object) as recorder:
+        recorder.add(ClipStep(0, 0.0, image, prompted, Track(grounding.mask, 1.0)))
+        recorder.ground(0, 0.0, image, grounding, obj, instruction, rewritten)
+
+
+@value
+class ClipStep:
+    """One frame of a clip: as it is, as the policy is shown it, and where the first target is."""
+
+    frame_index: int
+    timestamp_s: float
+    image: Rgb
+    prompted: Rgb
+    track: Track
+
+
+class ClipRecorder:
+    """Streams the frames of a clip to disk; `ground` adds the vote that started the track.
+
+    Left through an exception, the unfinished file keeps its temporary name.
+
+    Raises: BadOutput, when `path` exists or its folder cannot be written.
+    """
+
+    def __init__(self, path: Path, camera: str, name: str, hz: float = 1.0) -> None:
+        self.path = Path(path)
+        self._hz = hz
+        self._root = image_root(camera)
+        self._camera = camera
+        self._rec = open_stream(self.path, f"ground.{name}.{camera}.{self.path.stem}")
+        self._rec.send_recording_name(f"ground · {name}")
+        log_row(self._rec, "/", rr.AnnotationContext(CLASSES))
+
+    def __enter__(self) -> "ClipRecorder":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if error is None:
+            finish_stream(self._rec, self.path)
+        else:
+            self._rec.disconnect()
+
+    def add(self, step: ClipStep) -> None:
+        """One frame, its prompted picture, its mask and the track's score."""
+        at = time_columns([(step.frame_index, step.timestamp_s)])
+        jpeg = encode_jpeg(step.image, JPEG_QUALITY)
+        log_row(self._rec, self._root, jpeg_image(jpeg), at=at)
+        prompted = encode_jpeg(step.prompted, JPEG_QUALITY)
+        log_row(self._rec, f"{self._root}/prompted", jpeg_image(prompted), at=at)
+        shown = np.zeros(step.image.shape[:2], bool)
+        if step.track.mask is not None:
+            shown = step.track.mask
+        mask = rr.SegmentationImage(track_image(shown), opacity=1.0)
+        log_row(self._rec, f"{self._root}/mask/target", mask, at=at)
+        score = rr.Scalars([step.track.score])
+        log_row(self._rec, f"/vap/track_score/{self._camera}", score, at=at)
+
+    def ground(
+        self,
+        frame_index: int,
+        timestamp_s: float,
+        image: Rgb,
+        grounding: Grounding,
+        obj: PersonalObject,
+        instruction: str,
+        rewritten: str,
+    ) -> None:
+        """The vote of one frame, its references and similarities, and how it is looked at."""
+        at = time_columns([(frame_index, timestamp_s)])
+        log_vote(self._rec, grounding, 0, encode_jpeg(image, JPEG_QUALITY), at)
+        sheet = encode_jpeg(contact_sheet(obj.crops), JPEG_QUALITY)
+        log_row(self._rec, "/vap/references", jpeg_image(sheet), at=at)
+        log_similarity(self._rec, grounding, at)
+        document = grounding_document(grounding, obj, instruction, rewritten)
+        log_row(self._rec, "/vap/instruction", document, at=at)
+        grounding_blueprint(grounding, self._hz).send(self._rec)

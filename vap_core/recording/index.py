@@ -48,9 +48,8 @@ def ensure_index(recording: Path, folder: Path | None = None) -> Path:
 
     Raises: BadRecording when the recording cannot be read, or is none of an episode.
     """
-    place = folder or recording.parent / FOLDER
     try:
-        path = place / f"{recording.stem}.{recording.stat().st_size}.rrd"
+        path = index_path(recording, folder)
         if not path.exists():
             temporary_path(path).unlink(missing_ok=True)
             _write_index(recording, path)
@@ -60,6 +59,12 @@ def ensure_index(recording: Path, folder: Path | None = None) -> Path:
     except (RuntimeError, ValueError, OSError, Warning) as error:
         raise BadRecording(str(error).splitlines()[0][:160]) from error
     return path
+
+
+def index_path(recording: Path, folder: Path | None = None) -> Path:
+    """Where the index of a recording is, or will be. Raises: OSError, when it is not there."""
+    place = folder or recording.parent / FOLDER
+    return place / f"{recording.stem}.{recording.stat().st_size}.rrd"
 
 
 def _write_index(recording: Path, path: Path) -> None:

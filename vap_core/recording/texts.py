@@ -2,7 +2,7 @@
 
 import rerun as rr
 
-from vap_core.base.events import describe_ballot, describe_lead
+from vap_core.base.events import describe_ballot, describe_lead, describe_rejection
 from vap_core.base.types import Grounding, PersonalObject
 from vap_core.rollout.failure import Diagnosis
 from vap_core.rollout.types import EpisodeHeader
@@ -15,6 +15,8 @@ def describe_vote(grounding: Grounding) -> str:
     if ballot.winner is None:
         return "no candidate, view unmodified"
     text = f"#{ballot.winner} wins: {describe_ballot(grounding)}"
+    if grounding.rejected is not None:
+        return f"#{grounding.rejected} {describe_rejection(grounding)} · {text}"
     if not grounding.overruled:
         return text
     if grounding.winner is None:
@@ -26,6 +28,8 @@ def vote_title(grounding: Grounding) -> str:
     """The vote in the width of a view's title; the view itself shows the votes."""
     if grounding.ballot.winner is None:
         return describe_ballot(grounding)
+    if grounding.rejected is not None:
+        return "not in view"
     if grounding.overruled:
         return "overruled"
     return describe_lead(grounding.ballot)

@@ -16,11 +16,18 @@ from vap_core.rollout.types import Episode, MaskCoverage
 type Case = Literal["case 1", "case 2", "case 3", "unprompted", "unlabelled"]
 MANIPULATION = ("wrong object", "collision", "missed grasp", "slip", "misplacement", "timeout")
 CASES: dict[Case, tuple[str, ...]] = {
-    "case 1": ("no proposal", "shifted proposal", "distractor vote", "poor mask", "drift"),
+    "case 1": (
+        "no proposal",
+        "not in view",
+        "shifted proposal",
+        "distractor vote",
+        "poor mask",
+        "drift",
+    ),
     "case 2": ("views disagree", "views drift apart"),
     "case 3": MANIPULATION,
     "unprompted": MANIPULATION,
-    "unlabelled": ("nothing found", "lost track", "narrow vote", "no signal"),
+    "unlabelled": ("nothing found", "not in view", "lost track", "narrow vote", "no signal"),
 }
 """Every sub-case of every case, from perception to manipulation."""
 
@@ -77,7 +84,8 @@ class EpisodeTrace:
     the robot touched in a step, `touches` says whether the target was one. `gap_m` is the distance
     of the tcp from the target's bounding box, `lift_m` how much higher each object is than at
     first, `moved_m` how far it has moved. `grip` is the gripper's command, 0 closed .. 1 open, nan
-    at the terminal frame, which has none. `candidates` counts proposals by camera.
+    at the terminal frame, which has none. `candidates` counts proposals by camera; `rejected` are
+    the cameras in which the method says that the target is not in view.
     """
 
     target: str
@@ -93,6 +101,7 @@ class EpisodeTrace:
     grip: Float64[np.ndarray, " t"]
     candidates: Mapping[str, int]
     prompted: bool
+    rejected: frozenset[str] = frozenset()
 
 
 @value

@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from vap_core.base.types import value
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.shapes import Hull
-from vap_core.simulation.robots import Robot
+from vap_core.simulation.robots import ROBOTS, Robot
 from vap_core.simulation.types import Pose
 
 YAWS = np.deg2rad(np.arange(0.0, 180.0, 15.0))
@@ -81,6 +81,16 @@ def grasps(robot: Robot, target: str, poses: Mapping[str, Pose]) -> list[Grasp]:
     others = [_rims(name, pose) for name, pose in poses.items() if name != target]
     candidates = _candidates(robot, target, poses[target], points=points, others=others)
     return sorted(candidates, key=_grasp_cost)
+
+
+def too_wide_for(name: str) -> list[str]:
+    """The robots that find no grasp of the object standing upright, alone on the table."""
+    upright = np.array([0.4, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    robots = []
+    for robot in ROBOTS.values():
+        if not grasps(robot, name, {name: upright}):
+            robots.append(robot.name)
+    return robots
 
 
 def _grasp_cost(grasp: Grasp) -> tuple[float, float]:

@@ -119,9 +119,11 @@ def physics(spec: mujoco.MjSpec, hz: float) -> None:
     option.noslip_iterations = 4
 
 
-def planks(side: int, light: Colour3, dark: Colour3) -> UInt8[np.ndarray, "{side} {side} 3"]:
+def planks(
+    side: int, light: Colour3, dark: Colour3, grain: int = DEFAULT_STYLE.grain
+) -> UInt8[np.ndarray, "{side} {side} 3"]:
     """A wooden table top: five boards with grain along them, the same on every machine."""
-    rng = np.random.default_rng([7, side])
+    rng = np.random.default_rng([grain, side])
     rows, columns = np.mgrid[0:side, 0:side] / side
     board = np.minimum((rows * 5).astype(int), 4)
     tone = rng.random(5)[board]
@@ -190,7 +192,7 @@ def _add_materials(spec: mujoco.MjSpec, style: SceneStyle) -> None:
         name="planks", type=mujoco.mjtTexture.mjTEXTURE_2D, width=side, height=side, nchannel=3
     )
     light, dark = style.planks
-    texture.data = planks(side, light, dark).tobytes()
+    texture.data = planks(side, light, dark, style.grain).tobytes()
     wood = spec.add_material(name="planks", specular=0.08, shininess=0.1, texrepeat=[1, 1])
     wood.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "planks"
     red, green, blue = dark

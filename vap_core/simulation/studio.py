@@ -117,7 +117,12 @@ def photograph(model: ObjectModel, shots: Sequence[Shot], size: int = 320) -> li
 
 
 def reference_views(model: ObjectModel, n: int = 5, seed: int = 0, size: int = 320) -> list[Rgb]:
-    """K reference photos (P 3.1), from around the object.
+    """K reference photos (P 3.1), from around the object."""
+    return photograph(model, reference_shots(model, n, seed), size)
+
+
+def reference_shots(model: ObjectModel, n: int, seed: int) -> list[Shot]:
+    """How an object's reference photos are taken.
 
     Azimuths are evenly spaced, elevations 18 to 50 degrees. Lamp, table and framing differ from
     view to view.
@@ -138,7 +143,7 @@ def reference_views(model: ObjectModel, n: int = 5, seed: int = 0, size: int = 3
             table=(float(red), float(green), float(blue)),
         )
         shots.append(shot)
-    return photograph(model, shots, size)
+    return shots
 
 
 def write_views(model: ObjectModel, folder: Path, n: int = 5) -> list[Path]:
@@ -154,6 +159,21 @@ def write_views(model: ObjectModel, folder: Path, n: int = 5) -> list[Path]:
             "choose another folder with --out."
         ) from error
     return paths
+
+
+def write_preview(model: ObjectModel, path: Path, size: int = 320) -> None:
+    """The object from its front, its side, its back and above, side by side. Raises: BadOutput."""
+    shots = []
+    for azimuth, elevation in ((0.0, 0.3), (np.pi / 2, 0.3), (np.pi, 0.3), (0.4, 1.2)):
+        shots.append(Shot(float(azimuth), elevation, fill=0.75))
+    picture = np.concatenate(photograph(model, shots, size), axis=1)
+    try:
+        Image.fromarray(picture).save(path)
+    except OSError as error:
+        raise BadOutput(
+            f"preview: {path} cannot be written ({error.strerror}); choose another folder with "
+            "--out."
+        ) from error
 
 
 def _set_up_table(spec: mujoco.MjSpec, size: int) -> None:

@@ -1,6 +1,5 @@
-"""What the trainings of the small models share: sizes, and scores of patches."""
+"""What the trainings of the small models share: their configuration, and scores of patches."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -8,32 +7,23 @@ import torch
 from torch import Tensor, nn
 
 from vap_core.training.films.demonstrations import SIDE
+from vap_core.training.recipe import Sizes
 from vap_core.training.words import vocabulary
 
 
-@dataclass(frozen=True, kw_only=True)
-class Sizes:
-    """Features and layers of a mini-PaliGemma and of the action expert that grows from it."""
-
-    width: int = 128
-    depth: int = 4
-    vision_width: int = 128
-    vision_depth: int = 4
-    expert_width: int = 96
-
-    def configuration(self) -> dict[str, Any]:
-        """As MiniPI0Config takes them, with words and pictures."""
-        return {
-            "words": vocabulary(),
-            "device": "cpu",
-            "width": self.width,
-            "depth": self.depth,
-            "head_dim": self.width // 8,
-            "vision_width": self.vision_width,
-            "vision_depth": self.vision_depth,
-            "expert_width": self.expert_width,
-            "image_resolution": (SIDE, SIDE),
-        }
+def model_options(sizes: Sizes) -> dict[str, Any]:
+    """As MiniPI0Config takes sizes, with words and pictures."""
+    return {
+        "words": vocabulary(),
+        "device": "cpu",
+        "width": sizes.width,
+        "depth": sizes.depth,
+        "head_dim": sizes.width // 8,
+        "vision_width": sizes.vision_width,
+        "vision_depth": sizes.vision_depth,
+        "expert_width": sizes.expert_width,
+        "image_resolution": (SIDE, SIDE),
+    }
 
 
 class PatchScores(nn.Module):

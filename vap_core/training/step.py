@@ -42,8 +42,8 @@ def train_steps[M: nn.Module](
     """Train `model`, or go on where an earlier call stopped.
 
     The rate warms up over WARM steps and then falls with a cosine; gradients are clipped. Returns
-    the moving average of the weights, and the log. `losses` gives the loss of one step, drawn from
-    streams of its number, and figures to log.
+    the moving average of the weights, and the log, whose `cpu_s` are the CPU seconds until then.
+    `losses` gives the loss of one step, drawn from streams of its number, and figures to log.
 
     Raises: BadOutput when `out` holds another training.
     """
@@ -64,6 +64,8 @@ def train_steps[M: nn.Module](
     first_step = state.get("step", 0)
     log = state.get("log", [])
     started = time.monotonic()
+    earlier_cpu_s = log[-1]["cpu_s"] if log else 0.0
+    started_cpu = time.process_time()
     recent: list[Figures] = []
     numbers = range(first_step, run.steps)
     for step in tqdm(numbers, desc=run.name, total=run.steps, initial=first_step, mininterval=10):
@@ -77,7 +79,8 @@ def train_steps[M: nn.Module](
         recent.append(figures)
         last = step + 1 == run.steps or _is_time_up(run, started)
         if last or (step + 1) % run.every == 0:
-            log.append({"step": step + 1, **average_of(recent)})
+            cpu_s = earlier_cpu_s + time.process_time() - started_cpu
+            log.append({"step": step + 1, "cpu_s": cpu_s, **average_of(recent)})
             recent = []
             saved: dict[str, Any] = {"step": step + 1, "log": log, "made_of": made_of}
             for name, part in parts.items():

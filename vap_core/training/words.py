@@ -4,16 +4,12 @@ import re
 from collections.abc import Iterable, Sequence
 from functools import cache
 
-import cv2
-import numpy as np
-
 from vap_core.base.types import Colour
 from vap_core.perception import describe
-from vap_core.perception.colours import COLOURS, add_shade, colour_indices
 from vap_core.prompt import PALETTE
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.objects import CATEGORIES, CLUTTER
-from vap_core.simulation.assets.textures import Srgb, Texture
+from vap_core.simulation.assets.textures import Texture
 from vap_core.simulation.suites import BENCHMARKS
 
 DETERMINERS = ("my", "the", "a")
@@ -46,18 +42,6 @@ PAINTS = (
     Colour("black", (15, 15, 15)),
 )
 """Colours that something may have by nature; a tint has one of the palette's."""
-SPREAD = {
-    "plain": "",
-    "diagonal": "stripes",
-    "waves": "bands",
-    "speckle": "spots",
-    "tiles": "patches",
-    "gradient": "parts",
-}
-"""How a motif lies on an object, in the captioner's words.
-
-Every other motif is spots or, in the middle or a column, patches.
-"""
 NEAR = {
     "red": {"pink", "orange", "brown"},
     "blue": {"teal", "purple", "cyan"},
@@ -90,43 +74,22 @@ def vocabulary() -> tuple[str, ...]:
 
 
 @cache
-def appearance_words(name: str) -> frozenset[str]:
-    """An object's own colour and pattern, a word each; nothing for one without a texture."""
+def pattern_words(name: str) -> frozenset[str]:
+    """The word for an object's motif; nothing for one without a texture."""
     texture = objects.get_object(name).texture
     if not isinstance(texture, Texture):
         return frozenset()
-    return frozenset({colour_word(texture.base), PATTERNS.get(texture.motif, "patterned")})
+    return frozenset({PATTERNS.get(texture.motif, "patterned")})
 
 
 @cache
-def phrases(name: str) -> tuple[str, str]:
-    """The captioner's descriptions of an object at their best, short and long.
-
-    Hard prompts are made of such phrases, so a policy hears them in training, too.
-    """
-    model = objects.get_object(name)
-    texture = model.texture
-    assert isinstance(texture, Texture)
-    main = add_shade(colour_word(texture.base), _lightness(texture.base))
-    motif = _motif_phrase(texture)
-    accent = f"a little {colour_word(texture.accent)}"
-    shape = _shape_word(objects.extent_m(model))
-    if not motif:
-        return main, f"a {shape} {model.category}, mostly {main} with {accent}, plain"
-    extent = ""
-    if texture.layout in ("grid", "scatter", "whole"):
-        extent = ", patterned all over"
-    long = f"a {shape} {model.category}, mostly {main} with {motif} and {accent}{extent}"
-    return f"{main} with {motif}", long
-
-
-def similar_colours(word: str) -> set[str]:
+def similar_colours(word: str) -> frozenset[str]:
     """The word, and colours that it may be taken for."""
     similar = {word} | NEAR.get(word, set())
     for colour, near in NEAR.items():
         if word in near:
             similar.add(colour)
-    return similar
+    return frozenset(similar)
 
 
 def distinct_colours(taken: Iterable[str], colours: Sequence[Colour] = PALETTE) -> list[Colour]:
@@ -134,34 +97,3 @@ def distinct_colours(taken: Iterable[str], colours: Sequence[Colour] = PALETTE) 
     words = set(taken)
     distinct = [colour for colour in colours if not similar_colours(colour.name) & words]
     return distinct or list(colours)
-
-
-def colour_word(rgb: Srgb) -> str:
-    """What a person calls a colour, sRGB 0..255."""
-    pixel = np.array([[rgb]], np.uint8)
-    indices = colour_indices(pixel, np.ones((1, 1), bool))
-    return COLOURS[int(indices[0, 0])]
-
-
-def _motif_phrase(texture: Texture) -> str:
-    """The colour and the shape of a motif; "" where there is none."""
-    default = "spots"
-    if texture.layout in ("middle", "column"):
-        default = "patches"
-    kind = SPREAD.get(texture.motif, default)
-    return f"{colour_word(texture.ink)} {kind}" if kind else ""
-
-
-def _shape_word(extent_m: tuple[float, float, float]) -> str:
-    x, y, z = extent_m
-    if z > 1.6 * max(x, y):
-        return "tall"
-    if z < 0.9 * max(x, y):
-        return "wide"
-    return "compact"
-
-
-def _lightness(rgb: Srgb) -> float:
-    """CIE L* of a colour, sRGB 0..255."""
-    pixel = np.array([[rgb]], np.float32) / 255
-    return float(cv2.cvtColor(pixel, cv2.COLOR_RGB2LAB)[0, 0, 0])

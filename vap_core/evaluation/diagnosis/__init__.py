@@ -7,8 +7,8 @@ goal: up to there they have guided the hand, and a track that is lost when its o
 consequence of the manipulation. They are wrong when they are wrong in half of those steps, or when
 the hand touches another object, any time later, while a prompt is on it.
 
-Case 1, all views are prompted alike, and wrong: *no proposal*, *shifted proposal*, *distractor
-vote*, *poor mask* (all at t = 0), *drift* (later).
+Case 1, all views are prompted alike, and wrong: *no proposal*, *not in view* (the method says so),
+*shifted proposal*, *distractor vote*, *poor mask* (all at t = 0), *drift* (later).
 Case 2, views are prompted with different instances: *views disagree* (at t = 0), *views drift
 apart* (later).
 Case 3, the prompts are right and the manipulation fails: *wrong object* (it takes another, or

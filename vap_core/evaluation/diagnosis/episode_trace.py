@@ -52,8 +52,11 @@ def trace_episode(episode: Episode) -> EpisodeTrace:
             moved_m[i, step] = judge.travel_m(name, truth)
 
     candidates = {}
+    rejected = []
     for camera, per_target in header.groundings.items():
         candidates[camera] = len(per_target[0].candidates) if per_target else 0
+        if per_target and per_target[0].rejected is not None:
+            rejected.append(camera)
     return EpisodeTrace(
         target=row.target,
         rule=row.rule,
@@ -68,6 +71,7 @@ def trace_episode(episode: Episode) -> EpisodeTrace:
         grip=np.array(grip),
         candidates=candidates,
         prompted=any(coverage),
+        rejected=frozenset(rejected),
     )
 
 

@@ -166,6 +166,8 @@ def _opening_sub_case(
         return "views disagree"
     if trace.candidates.get(view.camera, 0) == 0:
         return "no proposal"
+    if view.camera in trace.rejected:
+        return "not in view"
     if not view.proposal >= thresholds.proposal:
         return "shifted proposal"
     if view.object in (trace.target, "", None):
@@ -203,6 +205,8 @@ def _sentence(
     match sub_case:
         case "no proposal":
             return f"{camera}: no candidate was found, the target passes unmarked"
+        case "not in view":
+            return f"{camera}: the best candidate is too unlike the references to be highlighted"
         case "shifted proposal":
             return f"{camera}: no box fits the target (best IoU {proposal}); {name} is highlighted"
         case "distractor vote":

@@ -1,6 +1,6 @@
 """Failures without ground truth, as on a real robot: no case, but signals from votes and tracks."""
 
-from vap_core.base.events import is_lost
+from vap_core.base.events import describe_rejection, is_lost
 from vap_core.rollout.failure import Diagnosis
 from vap_core.rollout.types import Episode
 
@@ -12,11 +12,14 @@ def unlabelled(episode: Episode) -> Diagnosis:
     """The narrowest vote, lost tracks, and how differently similar the views' choices are."""
     found = []
     similarities = []
+    rejected = []
     views_without = 0
     for groundings in episode.header.groundings.values():
         if not groundings:
             continue
         grounding = groundings[0]
+        if grounding.rejected is not None:
+            rejected.append(grounding)
         if grounding.winner is None:
             views_without += 1
         else:
@@ -37,7 +40,11 @@ def unlabelled(episode: Episode) -> Diagnosis:
                 lost.append(event.frame_index)
 
     at = 0
-    if not found:
+    if rejected and not found:
+        camera = rejected[0].camera
+        sub_case = "not in view"
+        sentence = f"{camera}: {describe_rejection(rejected[0])}, and no other view has it"
+    elif not found:
         sub_case = "nothing found"
         sentence = "no view has a candidate"
     elif margin < NARROW:

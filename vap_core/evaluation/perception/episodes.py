@@ -10,7 +10,6 @@ from vap_core.base.types import PersonalObject
 from vap_core.evaluation.perception.first_frames import (
     KS,
     USUAL_K,
-    EmbeddedBoxes,
     TableRow,
     Tables,
     View,
@@ -19,8 +18,9 @@ from vap_core.evaluation.perception.first_frames import (
     registered_object,
     survey_view,
 )
+from vap_core.perception.candidates import Proposals
 from vap_core.perception.protocols import Stack
-from vap_core.vote import similarity, vote
+from vap_core.vote import compare, election_scores, shortlist, vote
 
 OFF = "off"
 """Views grounded one by one, as the paper does."""
@@ -35,26 +35,32 @@ def survey(episode: Sequence[View], stack: Stack, ks: Sequence[int] = KS) -> Tab
     memory = {}
     for k in ks:
         memory[k], _ = registered_object(stack, target, k)
-    candidates = [find_candidates(view, stack) for view in episode]
+    candidates = find_candidates(episode, stack)
     tables: Tables = {"views": [], "objects": [], "detections": [], "choices": [], "agreements": []}
     for view, of_view in zip(episode, candidates, strict=True):
         of_tables = survey_view(view=view, stack=stack, memory=memory, candidates=of_view)
         for name, rows in of_tables.items():
             tables[name] += [{**view.key, **row} for row in rows]
     if len(episode) > 1:
-        tables["agreements"] = agreements(episode, candidates, memory[USUAL_K])
+        tables["agreements"] = agreements(episode, candidates, memory[USUAL_K], stack)
     return tables
 
 
 def agreements(
-    episode: Sequence[View], candidates: Sequence[EmbeddedBoxes], personal: PersonalObject
+    episode: Sequence[View],
+    candidates: Sequence[Proposals],
+    personal: PersonalObject,
+    stack: Stack,
 ) -> list[TableRow]:
     """What the views of an episode highlight together, by every way to associate them.
 
     `case` is the comparison of the views (SPEC section 7); `right` is in how many of the `views`
     that show the target it is highlighted. A box on no object is another thing in every view.
     """
-    sightings = _sightings(episode, candidates, personal)
+    few = []
+    for of_view in candidates:
+        few.append(shortlist(of_view, compare(personal, of_view, stack)))
+    sightings = _sightings(episode, few, personal, stack)
     single = {camera: vote(sighting.cosine).winner for camera, sighting in sightings.items()}
     pairings: Mapping[str, Pairing | None] = {OFF: None, **PAIRINGS}
     row = episode[0].row
@@ -68,7 +74,7 @@ def agreements(
         if association is not None:
             chosen = association.chosen
             margin = association.margin
-        highlighted = _highlighted_objects(episode, candidates, chosen)
+        highlighted = _highlighted_objects(episode, few, chosen)
         n_right, n_views = _count_right(episode, highlighted)
         agreement: TableRow = {
             "suite": row.suite,
@@ -86,13 +92,16 @@ def agreements(
 
 
 def _sightings(
-    episode: Sequence[View], candidates: Sequence[EmbeddedBoxes], personal: PersonalObject
+    episode: Sequence[View],
+    candidates: Sequence[Proposals],
+    personal: PersonalObject,
+    stack: Stack,
 ) -> dict[str, Sighting]:
     """The candidates of each view, by camera, as `associate` takes them."""
     sightings = {}
     for view, of_view in zip(episode, candidates, strict=True):
         sightings[view.camera] = Sighting(
-            cosine=similarity(of_view.embeddings, personal.embeddings),
+            cosine=election_scores(compare(personal, of_view, stack), of_view.boxes),
             embeddings=of_view.embeddings,
             xyxy=of_view.boxes.xyxy,
             camera=view.optics,
@@ -102,7 +111,7 @@ def _sightings(
 
 def _highlighted_objects(
     episode: Sequence[View],
-    candidates: Sequence[EmbeddedBoxes],
+    candidates: Sequence[Proposals],
     chosen: Mapping[str, int | None],
 ) -> dict[str, str | None]:
     """The object under the chosen box of each camera; None where none is chosen."""

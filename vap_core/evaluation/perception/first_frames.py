@@ -3,9 +3,8 @@
 It says what was found, which candidate was elected, and which model was wrong.
 
     for episode in opening_views(suites.rows("vlabench", "select-shoe", 12)):
-        for view in episode:
-            candidates = find_candidates(view, stack)
-            tables = survey_view(view, stack, memory, candidates)
+        for view, found in zip(episode, find_candidates(episode, stack), strict=True):
+            tables = survey_view(view, stack, memory, found)
 
 Rows are flat, one list per table: "views" (a row per view), "objects" (per visible object of the
 target's category), "detections" (per box and phrase), "choices" (per view, K references and rule).
@@ -14,14 +13,24 @@ Every row carries the keys of `View.key`. Boxes that overlap by IoU 0.5 agree.
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from vap_core.base.types import Ballot, Boxes, Camera, Mask, PersonalObject, Rgb, value
+from vap_core.base.types import (
+    Ballot,
+    Boxes,
+    Camera,
+    Mask,
+    PersonalObject,
+    Rgb,
+    likeness,
+    value,
+)
 from vap_core.memory import register
 from vap_core.perception.boxes import box_iou, crop, mask_box, mask_iou
+from vap_core.perception.candidates import Proposals, propose
 from vap_core.perception.protocols import Stack
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.phrases import AMBIGUOUS, UNSEEN
@@ -29,7 +38,7 @@ from vap_core.simulation.env import Env
 from vap_core.simulation.studio import reference_views
 from vap_core.simulation.suites.open_row import build_scene, make_env
 from vap_core.simulation.types import EpisodeRow
-from vap_core.vote import VoteRule, similarity, vote
+from vap_core.vote import VoteRule, compare, election_scores, shortlist, similarity, vote
 
 VISIBLE_PX = 100
 """Visible pixels, of a view of 224 x 224, from which on an object counts."""
@@ -42,7 +51,7 @@ TOP = 10
 KS = (1, 3, 5, 7)
 """Numbers of reference photos; each set is taken anew, as a user would take so many."""
 USUAL_K = 5
-RULES: tuple[VoteRule, ...] = get_args(VoteRule)
+RULES: tuple[VoteRule, ...] = ("vote", "average")
 TableRow = dict[str, Any]
 """A row of a table of the survey."""
 Tables = dict[str, list[TableRow]]
@@ -93,14 +102,6 @@ class View:
         return {name: mask for name, mask in self.masks.items() if mask.sum() >= self.least_px}
 
 
-@value
-class EmbeddedBoxes:
-    """The boxes of the target's category that the stack found in a view, and their embeddings."""
-
-    boxes: Boxes
-    embeddings: Float32[np.ndarray, "n d"]
-
-
 def opening_views(rows: Sequence[EpisodeRow], size: int = 224) -> Iterator[list[View]]:
     """The views of each row in turn, by the cameras, look, control and sensor of its suite.
 
@@ -135,15 +136,14 @@ def registered_object(stack: Stack, target: str, k: int) -> tuple[PersonalObject
     )
 
 
-def find_candidates(view: View, stack: Stack) -> EmbeddedBoxes:
-    """The candidates that do not depend on which personal object is asked for."""
-    boxes = stack.detector([view.rgb], view.row.category)[0]
-    crops = [crop(view.rgb, box) for box in boxes.xyxy]
-    return EmbeddedBoxes(boxes, stack.encoder(crops))
+def find_candidates(views: Sequence[View], stack: Stack) -> list[Proposals]:
+    """What is proposed in the views of one episode, whichever personal object is asked for."""
+    images = {view.camera: view.rgb for view in views}
+    return list(propose(images, views[0].row.category, stack).values())
 
 
 def survey_view(
-    view: View, stack: Stack, memory: Mapping[int, PersonalObject], candidates: EmbeddedBoxes
+    view: View, stack: Stack, memory: Mapping[int, PersonalObject], candidates: Proposals
 ) -> Tables:
     """The rows of one view, without its key.
 
@@ -274,17 +274,17 @@ def _same_category(view: View) -> dict[str, Mask]:
 
 def _best_boxes(view: View, stack: Stack) -> dict[str, Boxes]:
     """The boxes down to FLOOR, best first, of the category and of its unseen phrase, if any."""
-    best = {"category": stack.detector([view.rgb], view.row.category, FLOOR)[0]}
+    best = {"category": stack.category_detector([view.rgb], view.row.category, FLOOR)[0]}
     phrase = _take_turn(UNSEEN.get(view.row.category, ()), view.row.episode)
     if phrase:
-        best["unseen"] = stack.detector([view.rgb], phrase, FLOOR)[0]
+        best["unseen"] = stack.category_detector([view.rgb], phrase, FLOOR)[0]
     return best
 
 
 def _false_alarm(view: View, stack: Stack) -> TableRow:
     """Whether anything is found of a category that is absent."""
     phrase = _take_turn(_absent_categories(view), view.row.episode)
-    found = stack.detector([view.rgb], phrase)[0]
+    found = stack.category_detector([view.rgb], phrase)[0]
     return {"absent_phrase": phrase, "false_alarm": len(found) > 0}
 
 
@@ -304,7 +304,7 @@ def _object_rows(
     view: View,
     cosine: Float32[np.ndarray, "m k"],
     best: Mapping[str, Boxes],
-    candidates: EmbeddedBoxes,
+    candidates: Proposals,
     boxes: Mapping[str, Box],
     alike: Mapping[str, Mask],
 ) -> list[TableRow]:
@@ -334,7 +334,7 @@ def _object_rows(
     return rows
 
 
-def _view_row(view: View, candidates: EmbeddedBoxes, object_rows: Sequence[TableRow]) -> TableRow:
+def _view_row(view: View, candidates: Proposals, object_rows: Sequence[TableRow]) -> TableRow:
     """What a view shows, and how many candidates were found in it."""
     target = view.row.target
     tier = "standard"
@@ -367,7 +367,7 @@ def _choices(
     view: View,
     stack: Stack,
     memory: Mapping[int, PersonalObject],
-    candidates: EmbeddedBoxes,
+    candidates: Proposals,
     true_embeddings: Float32[np.ndarray, "m d"],
     alike: Sequence[str],
 ) -> list[TableRow]:
@@ -376,22 +376,25 @@ def _choices(
     A row per number of references and rule. `alike` names the rows of `true_embeddings`.
     """
     target = view.row.target
-    target_ious: dict[int, float] = {}
+    target_ious: dict[tuple[float, ...], float] = {}
     rows = []
     for k, personal in memory.items():
-        cosine = similarity(candidates.embeddings, personal.embeddings)
+        few = shortlist(candidates, compare(personal, candidates, stack))
+        cosine = compare(personal, few, stack)
+        like = likeness(cosine, few.boxes.familiar)
         true_cosine = similarity(true_embeddings, personal.embeddings)
         for rule in RULES:
-            ballot = vote(cosine, rule)
+            ballot = vote(election_scores(cosine, few.boxes), rule)
             true_winner = vote(true_cosine, rule).winner
             assert true_winner is not None, "the target's true box is among them"
-            elected = _elected_object(view, candidates, ballot)
+            elected = _elected_object(view, few, ballot)
             overlap = None
             if elected == target and ballot.winner is not None:
-                if ballot.winner not in target_ious:
-                    candidate = _select_box(candidates.boxes, ballot.winner)
-                    target_ious[ballot.winner] = _segmented_iou(view, stack, candidate)
-                overlap = target_ious[ballot.winner]
+                candidate = _select_box(few.boxes, ballot.winner)
+                corners = tuple(candidate.xyxy[0].tolist())
+                if corners not in target_ious:
+                    target_ious[corners] = _segmented_iou(view, stack, candidate)
+                overlap = target_ious[corners]
             row: TableRow = {
                 "k": k,
                 "rule": rule,
@@ -401,13 +404,14 @@ def _choices(
                 "margin": ballot.margin,
                 "cosine_margin": ballot.cosine_margin,
                 "tie": _is_tie(ballot),
+                "likeness": None if ballot.winner is None else float(like[ballot.winner]),
                 "mask_iou": overlap,
             }
             rows.append(row)
     return rows
 
 
-def _elected_object(view: View, candidates: EmbeddedBoxes, ballot: Ballot) -> str:
+def _elected_object(view: View, candidates: Proposals, ballot: Ballot) -> str:
     """The object under the winner's box; "" when there are no candidates."""
     if ballot.winner is None:
         return ""

@@ -86,7 +86,7 @@ def _works(stack: Stack, scene: Scene) -> dict[str, Work]:
     row = suites.rows(SUITE, TASK, 1)[0]
     film = record_film(Job(row=row, every=1, hidden=(), kind="plate"), scene).frames
     env = Env(scene)
-    policy = scripted(stack.detector, scene, suites.suite(SUITE))
+    policy = scripted(stack.category_detector, scene, suites.suite(SUITE))
     env.reset(row)
     observation = env.observe()
     camera = env.camera_names[0]

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 BY = ["suite", "method"]
 """The columns that name a group of episodes here."""
+DIAGNOSIS_COLUMNS = ("case", "sub_case", "deciding_frame")
 
 
 def diagnosed(table: "pd.DataFrame") -> "pd.DataFrame":
@@ -20,7 +21,7 @@ def diagnosed(table: "pd.DataFrame") -> "pd.DataFrame":
 
     Raises: BadOutput when the table is older than the diagnosis.
     """
-    if "case" not in table:
+    if not set(DIAGNOSIS_COLUMNS) <= set(table.columns):
         raise BadOutput(
             "diagnose: this run was made before failures were diagnosed; run the same eval again "
             "in another folder."

@@ -100,9 +100,9 @@ def _named_runs(sources: Sequence[Path]) -> "Iterator[tuple[Path, dict[str, Any]
             yield name, manifest, table
 
 
-def _check_run(name: Path, study: Any, table: "pd.DataFrame") -> None:
+def _check_run(name: Path, study: dict[str, Any], table: "pd.DataFrame") -> None:
     """Refuse what is no run, what is empty or too old, and a run of other episode lists."""
-    if not isinstance(study, dict) or not study.keys() >= NEEDED_SETTINGS:
+    if not study.keys() >= NEEDED_SETTINGS:
         raise BadOutput(
             f"report: {name} holds no run of eval, rollout or demo; name the folder that one of "
             "them wrote."

@@ -4,6 +4,9 @@ A row joins three descriptors, each L2-normalised and weighted: GeM-pooled Lite0
 texture: what kind of thing it is), a centre-weighted Lab histogram, and the row of a head that was
 trained to distinguish look-alikes (which of them it is). The cosine of two rows is the mean of the
 three cosines, weighted by the squares of their weights.
+
+The head has seen renders only. The encoder for other views, real photos above all, weighs it less
+and stretches every crop's contrast first.
 """
 
 from collections.abc import Mapping, Sequence
@@ -43,6 +46,15 @@ INSTANCE_SIDE = 112
 INSTANCE_WEIGHT = 1.0
 """Weight of the instance head's row. Held-out generic look-alikes: 75.1 % right without it, 84.7 at
 0.7, 86.3 at 1; real photos, which it was not trained on: 98.8, 98.8, 98.0."""
+
+
+UNFAMILIAR_WEIGHT = 0.5
+"""The same in views of another world than the one that the head was trained on."""
+DARKEST_PERCENT, BRIGHTEST_PERCENT = 3.0, 97.0
+STRETCHED = (15.0, 235.0)
+LEAST_CONTRAST = 40.0
+"""Grey levels: what a crop's darkest and brightest pixels are stretched to, and the least contrast
+that is assumed, so that noise is not stretched."""
 
 
 class InstanceHead(nn.Module):
@@ -139,16 +151,22 @@ class LiteEncoder:
     """The embedded encoder; `network` computes an `EncodeNetwork`.
 
     Without an instance head, rows have no part that distinguishes look-alikes. `tag` ends the name
-    that is stored with every memory.
+    that is stored with every memory. `familiar` off makes it the encoder of unfamiliar views.
     """
 
-    def __init__(self, network: Network, *, has_head: bool = True, tag: str = "") -> None:
+    def __init__(
+        self, network: Network, *, has_head: bool = True, tag: str = "", familiar: bool = True
+    ) -> None:
         self.network = network
+        self.stretch = not familiar
+        self.weight = INSTANCE_WEIGHT if familiar else UNFAMILIAR_WEIGHT
         self.name = f"lite0-gem3-lab{HISTOGRAM_WEIGHT:g}"
         self.dim = CHANNELS["head"] + HISTOGRAM_LENGTH
         if has_head:
-            self.name += f"-look{INSTANCE_WEIGHT:g}{tag}"
+            self.name += f"-look{self.weight:g}{tag}"
             self.dim += InstanceHead.DIM
+        if self.stretch:
+            self.name += "-stretched"
 
     def __call__(self, crops: Sequence[Rgb]) -> Float32[np.ndarray, "n d"]:
         rows = np.zeros((len(crops), self.dim), np.float32)
@@ -157,6 +175,8 @@ class LiteEncoder:
         return rows
 
     def _embed(self, rgb: Rgb) -> Float32[np.ndarray, " d"]:
+        if self.stretch:
+            rgb = stretch_contrast(rgb)
         whole = pad_to_square(rgb)
         small = cv2.resize(whole, (INSTANCE_SIDE, INSTANCE_SIDE), interpolation=cv2.INTER_AREA)
         histogram = _unit(lab_histogram(rgb))
@@ -164,8 +184,21 @@ class LiteEncoder:
         deepest, *instance = self.network(whole[None], small[None], colour[None])
         parts = [_unit(gem(deepest[0])), HISTOGRAM_WEIGHT * histogram]
         for rows in instance:
-            parts.append(INSTANCE_WEIGHT * rows[0])
+            parts.append(self.weight * rows[0])
         return _unit(np.concatenate(parts)).astype(np.float32)
+
+
+def stretch_contrast(rgb: Rgb) -> Rgb:
+    """The picture with its darkest and brightest pixels, by the mean of R, G and B, at `STRETCHED`.
+
+    All channels are scaled alike, so hues stay.
+    """
+    grey = rgb.mean(axis=2)
+    dark, bright = np.percentile(grey, [DARKEST_PERCENT, BRIGHTEST_PERCENT])
+    low, high = STRETCHED
+    scale = (high - low) / max(bright - dark, LEAST_CONTRAST)
+    stretched = (rgb.astype(np.float32) - dark) * scale + low
+    return np.clip(stretched, 0, 255).astype(np.uint8)
 
 
 def halve_b4(taps: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -221,6 +254,16 @@ def load() -> LiteEncoder:
     head.load_state_dict(weights)
     network = load_network(GRAPH, EncodeNetwork(head), entry["sha256"])
     return LiteEncoder(network, tag=f"-{entry['sha256'][:6]}")
+
+
+@cache
+def load_unfamiliar() -> LiteEncoder:
+    """The shipped encoder of unfamiliar views; it shares the network of `load`.
+
+    Raises: MissingWeights: a file of data/weights is absent or damaged.
+    """
+    _, entry = load_weights(PERCEPTION, "look.")
+    return LiteEncoder(load().network, tag=f"-{entry['sha256'][:6]}", familiar=False)
 
 
 def _unit(row: np.ndarray) -> np.ndarray:

@@ -93,7 +93,6 @@ def assemble(kind: str, networks: Networks, runtime: Runtime) -> Stack:
         ),
         segmenter=SamSegmenter(sam),
         tracker=SamTracker(sam),
-        domain="",
     )
 
 

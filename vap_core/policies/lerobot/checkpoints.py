@@ -1,13 +1,13 @@
 """A policy's checkpoint as files: where it lies, what it builds on, and no code in it runs."""
 
 import hashlib
-import json
 import re
-from importlib import import_module
+import sys
 from pathlib import Path
 from typing import Any
 
 from vap_core.base.errors import BadPolicy
+from vap_core.base.files import parse_json
 
 WEIGHTS = "model.safetensors"
 CONFIG = "config.json"
@@ -48,7 +48,7 @@ def config_field(checkpoint: str | Path, name: str) -> str:
     """A field of a checkpoint's config.json; "" when it is not there. Raises: BadPolicy."""
     file = locate(checkpoint) / CONFIG
     try:
-        return str(json.loads(file.read_text()).get(name, ""))
+        return str(parse_json(file.read_text()).get(name, ""))
     except (ValueError, AttributeError) as error:
         raise BadPolicy(
             f"load: {file} is no configuration ({type(error).__name__}); save the checkpoint again "
@@ -62,8 +62,10 @@ def base_models(folder: Path) -> list[str]:
     These are the backbone whose sizes it takes, and the tokenizer that reads its commands.
     """
     names = [config_field(folder, "vlm_model_name")]
-    for step in json.loads((folder / PIPELINES[0]).read_text())["steps"]:
-        names.append(step.get("config", {}).get("tokenizer_name", ""))
+    for step in _steps(folder / PIPELINES[0]):
+        config = step.get("config")
+        if isinstance(config, dict):
+            names.append(str(config.get("tokenizer_name", "")))
     found: list[str] = []
     for name in names:
         if name and name not in found and not Path(name).is_dir():
@@ -131,7 +133,7 @@ def _decides(file: Path) -> bool:
 def _steps(file: Path) -> list[dict[str, Any]]:
     """The steps of a processor pipeline. Raises: BadPolicy."""
     try:
-        steps = json.loads(file.read_text())["steps"]
+        steps = parse_json(file.read_text())["steps"]
         return [dict(step) for step in steps]
     except (ValueError, KeyError, TypeError) as error:
         raise BadPolicy(
@@ -141,10 +143,11 @@ def _steps(file: Path) -> list[dict[str, Any]]:
 
 
 def _is_lerobot_step(name: str) -> bool:
+    """Whether a step is one of lerobot's. Nothing that the file names is imported for that."""
     from lerobot.processor import ProcessorStep
 
     module, _, attribute = name.rpartition(".")
     if not module.startswith("lerobot.processor"):
         return False
-    found = getattr(import_module(module), attribute, None)
+    found = getattr(sys.modules.get(module), attribute, None)
     return isinstance(found, type) and issubclass(found, ProcessorStep)

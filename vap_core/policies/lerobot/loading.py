@@ -81,7 +81,9 @@ def _build(folder: Path, device: str | None) -> tuple["PreTrainedPolicy", Any, A
 
     # some policies trust any repository
     no_code = patch("transformers.dynamic_module_utils.get_class_in_module", _no_code)
-    with _silence(), no_code:
+    # a file does not decide what is looked up on the network
+    offline = patch("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    with _silence(), no_code, offline:
         config: Any = PreTrainedConfig.from_pretrained(folder)
         config.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
         # the file's weights replace those that these options load

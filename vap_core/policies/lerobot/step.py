@@ -34,6 +34,7 @@ from vap_core.base.types import Rgb, Views
 from vap_core.memory import load_bank
 from vap_core.perception.stacks import STACKS, load_stack
 from vap_core.policies.lerobot.checkpoints import PIPELINES, STEP_CLASS, STEP_NAME, locate
+from vap_core.prompt import Tint
 from vap_core.simulation import suites
 from vap_core.simulation.gym_env import VapEnv, env_id
 from vap_core.simulation.types import EpisodeRow
@@ -193,7 +194,9 @@ class VapPrompt(ProcessorStep):
         if self._attender is None:
             stack = load_stack(self.stack)
             memory = load_bank(Path(self.memory), stack.encoder.name)
-            prompting = Prompting(self.alpha, highlight=self.highlight, rewrite=self.rewrite)
+            prompting = Prompting(
+                form=Tint(self.alpha), highlight=self.highlight, rewrite=self.rewrite
+            )
             self._attender = Attender(stack, memory, prompting)
         return self._attender
 

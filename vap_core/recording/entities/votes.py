@@ -73,7 +73,7 @@ def mean_cosines(grounding: Grounding) -> np.ndarray:
 def _drawing_order(grounding: Grounding) -> list[int]:
     """Candidates from the bottom to the top; on top the winner, or else the elected one."""
     order = list(range(len(grounding.similarity)))
-    top = grounding.ballot.winner if grounding.winner is None else grounding.winner
+    top = grounding.ballot.winner if grounding.chosen is None else grounding.chosen
     if top is not None:
         order.remove(top)
         order.append(top)
@@ -160,16 +160,21 @@ def _log_bars(
 def _candidate_numbers(grounding: Grounding) -> rr.AnyValues:
     """Everything that the vote compared, and its result; -1 stands for no candidate."""
     boxes, ballot = grounding.candidates, grounding.ballot
-    per_candidate: dict[str, Any] = {}
+    numbers: dict[str, Any] = {}
+    if grounding.threshold is not None:
+        numbers["threshold"] = grounding.threshold
     if len(boxes):
-        per_candidate = {
+        numbers |= {
             "score": boxes.score,
             "xyxy": boxes.xyxy.reshape(-1),
             "votes": ballot.votes,
             "tied": ballot.tied,
             "mean_cosine": mean_cosines(grounding),
             "similarity": grounding.similarity.reshape(-1),
+            "likeness": grounding.likeness,
         }
+        if boxes.prior is not None:
+            numbers["prior"] = boxes.prior
     return rr.AnyValues(
         phrase=boxes.phrase,
         object=grounding.object,
@@ -178,7 +183,8 @@ def _candidate_numbers(grounding: Grounding) -> rr.AnyValues:
         margin=ballot.margin,
         elected=_number(ballot.winner),
         cosine_margin=ballot.cosine_margin,
-        **per_candidate,
+        rejected=_number(grounding.rejected),
+        **numbers,
     )
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+import cv2
 import numpy as np
 
 from vap_core.associate import overrule
@@ -25,11 +26,14 @@ class Oracle:
 
     "box": the boxes and the choice among them, then segment and track. "mask": the masks at t = 0,
     then track. "track": the mask at every step. `of` is the object that is prompted: the target, or
-    the first look-alike that the episode places.
+    the first look-alike that the episode places. With "track" the mask may be wrong on purpose: of
+    `area` times its pixels, about its middle, and moved by `shift` times its width.
     """
 
     reveal: Literal["box", "mask", "track"]
     of: Literal["target", "look-alike"] = "target"
+    area: float = 1.0
+    shift: float = 0.0
     prompting: Prompting = field(default_factory=Prompting)
 
 
@@ -85,7 +89,7 @@ class OraclePrompter:
             )
         phrase = parsed.targets[0].category
         prompted = self.prompted_object(truth.row)
-        candidates: dict[str, dict[str, Candidates]] = {}
+        candidates: dict[str, tuple[Candidates, ...]] = {}
         groundings: dict[str, tuple[Grounding, ...]] = {}
         for camera, rgb in observation.images.items():
             visible = self._visible(truth.masks[camera])
@@ -93,7 +97,7 @@ class OraclePrompter:
             found = self._describe(rgb, phrase, masks)
             elected = self.attender.ground(camera, wanted[0], found)
             choice = list(visible).index(prompted) if prompted in visible else None
-            candidates[camera] = {phrase: found}
+            candidates[camera] = (found,)
             groundings[camera] = (overrule(elected, choice),)
         state, attended = self.attender.begin(
             parsed, observation.images, candidates, groundings, chosen_by="the simulator"
@@ -118,7 +122,8 @@ class OraclePrompter:
             prompted = self.prompted_object(truth.row)
             tracks = {}
             for camera in observation.images:
-                tracks[camera] = (_track(truth.masks[camera].get(prompted)),)
+                mask = truth.masks[camera].get(prompted)
+                tracks[camera] = (_track(None if mask is None else self._spoil(mask)),)
             results.append(self.attender.follow(state, observation.images, tracks, state.trackers))
         return results
 
@@ -141,10 +146,26 @@ class OraclePrompter:
         if self.oracle.reveal == "box":
             drawn = self.attender.stack.segmenter(rgb, boxes)
         else:
-            drawn = np.array(masks, bool).reshape(-1, *rgb.shape[:2])
+            spoiled = [self._spoil(mask) for mask in masks]
+            drawn = np.array(spoiled, bool).reshape(-1, *rgb.shape[:2])
         embeddings = self.attender.stack.encoder([crop(rgb, box) for box in xyxy])
         ids = tuple(range(len(xyxy)))
         return Candidates(boxes=boxes, embeddings=embeddings, masks=drawn, ids=ids)
+
+    def _spoil(self, mask: Mask) -> Mask:
+        """The mask, of the oracle's area and moved by its shift."""
+        box = mask_box(mask)
+        if box is None or (self.oracle.area == 1.0 and self.oracle.shift == 0.0):
+            return mask
+        scale = self.oracle.area**0.5
+        middle = (box[:2] + box[2:] - 1) / 2
+        moved = middle + np.array([self.oracle.shift * (box[2] - box[0]), 0])
+        warp = np.array(
+            [[scale, 0, moved[0] - scale * middle[0]], [0, scale, moved[1] - scale * middle[1]]]
+        )
+        h, w = mask.shape
+        spoiled = cv2.warpAffine(mask.astype(np.uint8), warp, (w, h), flags=cv2.INTER_NEAREST)
+        return spoiled > 0
 
 
 def _truth(context: PromptContext) -> SceneTruth:

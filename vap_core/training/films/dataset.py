@@ -35,7 +35,8 @@ from vap_core.evaluation.store import locked, open_run
 from vap_core.simulation import robots
 from vap_core.simulation.suites import Suite, suite
 from vap_core.simulation.types import EE_ACTION
-from vap_core.training.films.demonstrations import PARTS, Film, cached, every
+from vap_core.training.films.demonstrations import MOST, PARTS, Film, cached, stage_file
+from vap_core.training.recipe import every, filmed_task
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -53,8 +54,6 @@ LEROBOT = "v3.0"
 """The version of the LeRobotDataset format."""
 PART = 10
 """Stages that are written at a time: so much is written again after an interruption."""
-MOST = 6
-"""Objects of a film that have a place in `vap.places`."""
 CODEC: dict[str, Any] = {
     "vcodec": "hevc",
     "pix_fmt": "gbrp",
@@ -145,7 +144,7 @@ def shoot_stages(
 
     missing = []
     for number in range(stages):
-        if not (cache / f"{suite_name}-{seed}-{number:05d}.npz").exists():
+        if not stage_file(cache, suite_name, seed, number).exists():
             missing.append(number)
     if missing:
         work = results(
@@ -185,7 +184,7 @@ def features(
 
 def generic_instruction(known: Suite, task: str) -> str:
     """The task in generic words."""
-    return known.task(task).instruction.replace("my ", "the ", 1)
+    return filmed_task(known.name, task).instruction.replace("my ", "the ", 1)
 
 
 def about(folder: Path) -> dict[str, Any]:

@@ -1,12 +1,14 @@
 """Demonstrations of the scripted expert with generic objects (P 5.1).
 
 They are what a frozen policy has learned from before it meets a user. A stage is one compiled scene
-of one task: some generic objects of its category, seen in EPISODES episodes from new places. Stages
-are numbered; the same suite, seed and number give the same films. Personal objects and their
-look-alikes never appear (`only_generic` refuses them).
+of one task: some generic objects of its category, in a room of its own (`looks`), seen in EPISODES
+episodes from new places. Stages are numbered; the same suite, seed and number give the same films.
+Personal objects and their look-alikes never appear (`only_generic` refuses them), nor does the
+category that the suite's recipe holds out.
 """
 
 import io
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,12 +25,14 @@ from vap_core.policies.scripted.expert import Expert, ExpertState
 from vap_core.rollout.expert_loop import expert_steps
 from vap_core.simulation.assets import objects
 from vap_core.simulation.env import Env
-from vap_core.simulation.scenes import Scene
-from vap_core.simulation.suites import VARIANTS, Suite, Task, simpler, suite, tabletop, vlabench
+from vap_core.simulation.scenes import Scene, build
+from vap_core.simulation.suites import Suite, Task, suite, tabletop
 from vap_core.simulation.suites.layout import Area, Spot, place, radius_m, random_yaw, scatter
-from vap_core.simulation.suites.open_row import build_scene, make_env
+from vap_core.simulation.suites.open_row import make_env
 from vap_core.simulation.types import EpisodeRow, Placement
+from vap_core.training.films.looks import draw_look
 from vap_core.training.films.scenes import HELD_OUT, TRAIN_INSTANCES, only_generic
+from vap_core.training.recipe import FILMED, every, filmed_tasks
 
 SIDE = 112
 """Pixels of a film: a policy sees views of SEEN pixels scaled down to SIDE."""
@@ -44,29 +48,19 @@ JOLT_RAD = 0.2
 """Standard deviation of how far the hand is turned by a knock, radians."""
 LOW_M = 0.05
 """A hand that begins so far below its highest point begins after a miss."""
-EVERY = {"tabletop": 3}
-"""Control steps from one picture to the next; 1 in the other suites.
-
-At 30 Hz neighbours hardly differ, and pictures are what a film costs.
-"""
 MISSES = 0.5
 """Share of the grasping films that begin where a first grasp has missed.
 
 A policy that has not seen that presses on for ever.
 """
-AREAS = {
-    "simpler-fractal": simpler.DESK,
-    "simpler-bridge": Area(0.18, 0.35, -0.095, 0.095),
-    "vlabench": vlabench.TABLE,
-    "tabletop": tabletop.TABLE,
-}
-"""Where the objects of each suite stand in training; a put on the tabletop uses tabletop.REACH."""
 GAPS_M = (0.05, 0.035, 0.02)
 """Room between objects, tried in turn."""
 TRIES = 400
 """How many times each gap is tried."""
-MOST = {"simpler-bridge": 4}
-"""Objects of a stage where an area has no room for every number: one to a corner."""
+MOST = 6
+"""Objects of a scene, the goal among them."""
+DISTRACTORS = ("cup", "straw cup", "owl figurine", "camera", "vase")
+"""Categories of distractors. Those of films are training instances, which no evaluation shows."""
 CORNER_M = 0.01
 """Distance from an area's corners, in x and in y, of what finds no room at random.
 
@@ -96,25 +90,24 @@ class Film:
     goal: int
 
 
-def every(suite_name: str) -> int:
-    """Control steps from one picture of a suite's films to the next."""
-    return EVERY.get(suite_name, 1)
-
-
 def draw_objects(
     known: Suite, task: Task, rng: np.random.Generator, held_out: bool = False
 ) -> list[str]:
-    """The target and its rivals, then the task's goal if it has one.
+    """The target and its rivals, distractors of other categories if any, and the task's goal.
 
     Target and rivals are generic and of the task's category; half the rivals are look-alikes. Those
     `held_out` are in no film.
     """
+    filmed = FILMED[known.name]
     pool = range(TRAIN_INSTANCES)
     if held_out:
         pool = range(HELD_OUT, HELD_OUT + TRAIN_INSTANCES)
     first = pool[int(rng.integers(len(pool)))]
+    distractors = int(rng.integers(1, 3)) if rng.random() < filmed.distractors else 0
     rivals = int(rng.choice([1, 2, 3], p=[0.15, 0.7, 0.15]))
-    rivals = min(rivals, MOST.get(known.name, 5) - 1 - bool(task.goal))
+    rivals = min(
+        rivals, filmed.most - 1 - bool(task.goal), MOST - 1 - distractors - bool(task.goal)
+    )
     models = []
     if rng.random() < 0.5:
         for twin in rng.permutation(6)[: rivals + 1]:
@@ -123,6 +116,10 @@ def draw_objects(
         others = [i for i in pool if i != first]
         for i in (first, *rng.choice(others, rivals, replace=False)):
             models.append(objects.generic_instance(task.stem, int(i)))
+    kinds = [kind for kind in DISTRACTORS if kind != task.category]
+    for kind in rng.permutation(kinds)[:distractors]:
+        index = pool[int(rng.integers(len(pool)))]
+        models.append(objects.generic_instance(str(kind), index))
     only_generic(models)
     names = [model.name for model in models]
     if task.goal:
@@ -135,7 +132,6 @@ def row(
     task: Task,
     names: Sequence[str],
     number: int,
-    variant: str,
     rng: np.random.Generator,
 ) -> EpisodeRow:
     """An episode of the task with these objects in new places; any of the category is its target.
@@ -143,10 +139,15 @@ def row(
     Raises: ValueError when they do not fit.
     """
     n_things = len(names) - bool(task.goal)
-    things = [names[i] for i in rng.permutation(n_things)]
+    same: list[str] = []
+    distractors: list[str] = []
+    for i in rng.permutation(n_things):
+        is_same = objects.get_object(names[i]).category == task.category
+        (same if is_same else distractors).append(names[i])
+    things = same + distractors
     goals = [task.goal] if task.goal else []
     fixed: dict[str, Spot] = {}
-    area = AREAS[known.name]
+    area = FILMED[known.name].area
     if task.goal and known.name == "tabletop":
         fixed[task.goal] = tabletop.BOWLS[int(rng.integers(2))]
         area = tabletop.REACH
@@ -158,7 +159,7 @@ def row(
         yaw = 0.0 if name == task.goal else random_yaw(rng)
         placed.append(place(name, spots[name], yaw))
     placements: tuple[Placement, ...] = (placed[0], *placed[n_things:], *placed[1:n_things])
-    drawn = known.row(task, number, placements, seed=number, variant=variant)
+    drawn = known.row(task, number, placements, seed=number)
     return replace(drawn, instruction=task.instruction)
 
 
@@ -167,23 +168,16 @@ def films(suite_name: str, seed: int, number: int) -> list[Film]:
     known = suite(suite_name)
     rng = np.random.default_rng([71, seed, *suite_name.encode(), number])
     miss_rng = np.random.default_rng([72, seed, *suite_name.encode(), number])
-    task = known.tasks[number % len(known.tasks)]
-    variant = "base"
-    if suite_name == "simpler-fractal":
-        variant = str(rng.choice(list(VARIANTS)))
+    tasks = filmed_tasks(suite_name)
+    task = tasks[number % len(tasks)]
+    look = draw_look(rng)
     names = draw_objects(known, task, rng)
     found = []
-    with build_scene(suite_name, names, variant) as scene:
+    with build(known.robot, names, style=look) as scene:
         for i in range(EPISODES):
             try:
-                start = row(
-                    known=known,
-                    task=task,
-                    names=names,
-                    number=number * EPISODES + i,
-                    variant=variant,
-                    rng=rng,
-                )
+                episode = number * EPISODES + i
+                start = row(known=known, task=task, names=names, number=episode, rng=rng)
                 misses = start.rule != "selected" and miss_rng.random() < MISSES
                 slips = miss_rng if misses else None
                 film = shoot(known=known, scene=scene, start=start, rng=rng, slips=slips)
@@ -261,14 +255,27 @@ def small(rgb: Rgb) -> UInt8[np.ndarray, "s s 3"]:
 
 def cached(folder: Path, suite_name: str, seed: int, number: int) -> list[Film]:
     """The stage's films from `folder`, shot first if they are not there."""
-    path = folder / f"{suite_name}-{seed}-{number:05d}.npz"
+    path = stage_file(folder, suite_name, seed, number)
     if not path.exists():
-        _write_stage(path, films(suite_name, seed, number))
+        started = time.process_time()
+        made = films(suite_name, seed, number)
+        _write_stage(path, made, time.process_time() - started)
     with np.load(path) as arrays:
         found = []
         for i in range(int(arrays["n"])):
             found.append(_read_film(arrays, i))
         return found
+
+
+def stage_file(folder: Path, suite_name: str, seed: int, number: int) -> Path:
+    """The file of a stage's films."""
+    return folder / f"{suite_name}-{seed}-{number:05d}.npz"
+
+
+def cost_s(folder: Path, suite_name: str, seed: int, number: int) -> float:
+    """CPU seconds that a stage in `folder` took to film."""
+    with np.load(stage_file(folder, suite_name, seed, number)) as arrays:
+        return float(arrays["cpu_s"])
 
 
 def _spots(
@@ -374,14 +381,14 @@ def _knock(
     return knocked
 
 
-def _write_stage(path: Path, made: Sequence[Film]) -> None:
-    """Keep the films of a stage in one file: arrays `<part><number>`, and their count `n`."""
+def _write_stage(path: Path, made: Sequence[Film], cpu_s: float) -> None:
+    """Keep the films of a stage in one file: arrays `<part><number>`, their count `n`, the cost."""
     arrays = {}
     for i, film in enumerate(made):
         for part in PARTS:
             arrays[f"{part}{i}"] = getattr(film, part)
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, n=len(made), **arrays)
+    np.savez_compressed(buffer, n=len(made), cpu_s=cpu_s, **arrays)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, buffer.getvalue())
 

@@ -7,13 +7,15 @@ are numbered; the same seed and number give the same pixels. Training stages dra
 look-alikes never appear (`only_generic` refuses them).
 """
 
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int64, UInt8
 
-from vap_core.base.files import replacing
+from vap_core.base.files import DATA, replacing
 from vap_core.base.types import value
 from vap_core.simulation import robots, scenes
 from vap_core.simulation.assets import objects
@@ -23,6 +25,8 @@ from vap_core.simulation.studio import Shot, Stage
 
 import mujoco  # isort: skip  (scenes has chosen a GL back end)
 
+CACHE = DATA / "cache"
+"""Rendered films and scenes, in folders of it."""
 SIZE = 224
 """Pixels, square, of a view."""
 PORTRAIT = 256
@@ -52,6 +56,7 @@ See studio.Shot.
 PARTS = ("rgb", "ids", "portraits", "portrait_ids", "names", "categories")
 """The fields of Shots, as files keep them."""
 Generator = np.random.Generator
+Look = Callable[[Generator], SceneStyle]
 
 
 @value
@@ -126,14 +131,20 @@ def draw_style(rng: Generator) -> SceneStyle:
 
 
 def stage(
-    seed: int, number: int, *, held_out: bool = False, views: int = VIEWS, size: int = SIZE
+    seed: int,
+    number: int,
+    *,
+    held_out: bool = False,
+    views: int = VIEWS,
+    size: int = SIZE,
+    look: Look = draw_style,
 ) -> Shots:
-    """Render one stage."""
+    """Render one stage, in a room that `look` draws."""
     rng = np.random.default_rng([seed, number, int(held_out)])
     models, crew = draw_objects(rng, held_out)
     robot = sorted(robots.ROBOTS)[int(rng.integers(len(robots.ROBOTS)))]
     with (
-        scenes.build(robot, models, style=draw_style(rng)) as scene,
+        scenes.build(robot, models, style=look(rng)) as scene,
         mujoco.Renderer(scene.model, size, size) as renderer,
     ):
         data = mujoco.MjData(scene.model)
@@ -208,13 +219,15 @@ def scatter(
     return np.array(points).reshape(-1, 2)
 
 
-def cached(folder: Path, seed: int, number: int, *, held_out: bool = False) -> Shots:
+def cached(
+    folder: Path, seed: int, number: int, *, held_out: bool = False, look: Look = draw_style
+) -> Shots:
     """The stage from `folder`, rendered first if it is not there."""
-    kind = "held" if held_out else "train"
-    path = folder / f"{kind}-{seed}-{number:05d}.npz"
+    path = stage_file(folder, seed, number, held_out)
     if not path.exists():
-        shots = stage(seed, number, held_out=held_out)
-        arrays = {}
+        started = time.process_time()
+        shots = stage(seed, number, held_out=held_out, look=look)
+        arrays: dict[str, Any] = {"cpu_s": np.array(time.process_time() - started)}
         for name in PARTS:
             arrays[name] = getattr(shots, name)
         folder.mkdir(parents=True, exist_ok=True)
@@ -229,6 +242,18 @@ def cached(folder: Path, seed: int, number: int, *, held_out: bool = False) -> S
             names=tuple(map(str, file["names"])),
             categories=tuple(map(str, file["categories"])),
         )
+
+
+def stage_file(folder: Path, seed: int, number: int, held_out: bool) -> Path:
+    """The file of a stage."""
+    kind = "held" if held_out else "train"
+    return folder / f"{kind}-{seed}-{number:05d}.npz"
+
+
+def cost_s(folder: Path, seed: int, number: int, held_out: bool) -> float:
+    """CPU seconds that a stage in `folder` took to render."""
+    with np.load(stage_file(folder, seed, number, held_out)) as file:
+        return float(file["cpu_s"])
 
 
 def boxes_of(

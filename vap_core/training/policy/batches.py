@@ -15,10 +15,11 @@ from torch import Tensor
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
 from vap_core.policies.scripted.expert import TURN_RAD_S
-from vap_core.simulation.suites import suite as known
-from vap_core.training.films.demonstrations import Film, every
+from vap_core.simulation.suites import suite
+from vap_core.training.films.demonstrations import Film
 from vap_core.training.patches import patch_shares
-from vap_core.training.policy.commands import Command, command
+from vap_core.training.policy.commands import Command, Known, command
+from vap_core.training.recipe import Recipe, every
 
 AROUND = 4
 """Pictures from a change of the gripper that `focus` still calls close."""
@@ -47,7 +48,8 @@ class Batch:
 
     Pictures (b x c x 3 x s x s in 0..1), tokens and where there are any, scaled state and chunk; of
     target and goal, the share of either in every patch (b x 2 x p) and its place (b x 2 x 3,
-    metres, nan without a goal); how the hand will close on the target (b x 2, `turn`).
+    metres, nan without a goal); how the hand will close on the target (b x 2, `turn`); embeddings
+    of learned words (b x d, zeros where the command has none).
     """
 
     images: Tensor
@@ -58,6 +60,7 @@ class Batch:
     patches: Tensor
     place: Tensor
     turn: Tensor
+    learned: Tensor
 
 
 class Frames:
@@ -68,21 +71,23 @@ class Frames:
 
     def __init__(
         self,
-        suite: str,
+        recipe: Recipe,
         films: Sequence[Film],
         stats: dict[str, dict[str, Tensor]],
         config: MiniPI0Config,
-        focus: float,
+        known: Known,
     ) -> None:
-        self.suite = suite
+        self.recipe = recipe
         self.films = films
         self.stats = stats
         self.config = config
-        self.interval = every(suite)
-        self.turns = known(suite).control == "ee"
-        self.turn_rad = TURN_RAD_S / known(suite).hz
+        self.known = known
+        benchmark = suite(recipe.suite)
+        self.interval = every(recipe.suite)
+        self.turns = benchmark.control == "ee"
+        self.turn_rad = TURN_RAD_S / benchmark.hz
         self.number = {word: i for i, word in enumerate(config.words)}
-        self.chances = [emphasis(film, focus, self.interval) for film in films]
+        self.chances = [emphasis(film, recipe.focus, self.interval) for film in films]
         self.totals = np.array([chances.sum() for chances in self.chances])
         tasks, task_of = np.unique([film.task for film in films], return_inverse=True)
         self.share = self.totals / np.bincount(task_of, self.totals)[task_of] / len(tasks)
@@ -115,6 +120,7 @@ class Frames:
             patches=torch.from_numpy(np.stack(patches)).float(),
             place=torch.from_numpy(np.stack(places)),
             turn=torch.from_numpy(np.array(turns, np.float32)),
+            learned=_stack_learned(commands, self.config.width),
         )
 
     def _draw_sample(self, i: int, rng: np.random.Generator) -> "_Sample":
@@ -123,7 +129,7 @@ class Frames:
         chances = self.chances[i]
         picture = int(rng.choice(len(chances), p=chances / self.totals[i]))
         t = picture * self.interval
-        drawn = command(film, t, self.suite, rng)
+        drawn = command(film, t, self.recipe, self.known, rng)
         state = film.state[t]
         chunk = target_chunk(film, t, self.config.chunk_size)
         closing = (np.nan, np.nan)
@@ -264,6 +270,15 @@ def _stack_images(commands: Sequence[Command]) -> Float[Tensor, "b c 3 s s"]:
     """Views as a policy takes them, in 0..1."""
     views = np.stack([each.images for each in commands])
     return torch.from_numpy(views).permute(0, 1, 4, 2, 3).float() / 255
+
+
+def _stack_learned(commands: Sequence[Command], width: int) -> Float[Tensor, "b d"]:
+    """The embeddings of learned words, zeros where there is none."""
+    learned = torch.zeros(len(commands), width)
+    for row, each in zip(learned, commands, strict=True):
+        if each.embedding is not None:
+            row.copy_(torch.from_numpy(each.embedding))
+    return learned
 
 
 def _mean_and_std(parts: Sequence[Float32[np.ndarray, "_ n"]]) -> dict[str, Tensor]:

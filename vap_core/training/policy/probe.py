@@ -7,7 +7,7 @@ is right, and what counts is whether the hand commits.
 """
 
 from collections.abc import Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from operator import itemgetter
 from pathlib import Path
 from types import MappingProxyType
@@ -18,30 +18,27 @@ import numpy as np
 from vap_core.base.errors import BadOutput, BadStudy, one_of
 from vap_core.base.files import write_atomic
 from vap_core.base.tables import align
-from vap_core.base.types import Attended, Colour, Rgb
+from vap_core.base.types import Attended, Colour, Description, Rgb
 from vap_core.evaluation.metrics import rate
 from vap_core.evaluation.processes import results
 from vap_core.policies.lerobot import adapter as lerobot
 from vap_core.prompt import ALPHA
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters.protocol import PromptContext, unchanged
+from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import Suite, Task, suite
 from vap_core.simulation.suites.open_row import build_scene
 from vap_core.simulation.types import EpisodeRow, Observation
+from vap_core.training.films.captions import describe, distinguishes
 from vap_core.training.films.demonstrations import draw_objects, row
-from vap_core.training.policy.commands import (
-    Way,
-    draw_description,
-    painted,
-    phrase_instruction,
-    tinted,
-)
-from vap_core.training.words import appearance_words, distinct_colours
+from vap_core.training.policy.colouring import natural_colours, painted, tinted
+from vap_core.training.policy.commands import describe_instruction, phrase_instruction
+from vap_core.training.words import distinct_colours
 
 if TYPE_CHECKING:
     import pandas as pd
 
-WAYS: tuple[Way, ...] = ("tinted", "painted", "described", "plain")
+WAYS = ("tinted", "painted", "described", "plain")
 EACH = 4
 """Episodes of one scene, each run in every way."""
 COAT = 0.85
@@ -67,23 +64,21 @@ class ProbePrompter:
         assert context.truth is not None
         row = context.truth.row
         rng = np.random.default_rng([79, row.seed, row.episode])
-        names = _same_kind(row)
+        described = _described(tuple(_same_kind(row)))
+        target, *rivals = described.values()
         taken: set[str] = set()
-        for name in names[1:]:
-            taken |= appearance_words(name)
+        for look in rivals:
+            taken.update(natural_colours(look))
         usable = distinct_colours(taken)
         colour = usable[int(rng.integers(len(usable)))]
-        phrase = draw_description(names, rng)  # Drawn in every way, so that all ways draw alike.
+        length = _length(described, rng)  # Drawn in every way, so that all ways draw alike.
+        task = suite(row.suite).task(row.task)
         if self.way == "plain":
-            word = ""
-        elif self.way == "described":
-            word = phrase
-        else:
-            word = colour.name
-        if word:
-            text = phrase_instruction(suite(row.suite).task(row.task), word, rng)
-        else:
             text = context.instruction.replace("my ", "the ", 1)
+        elif self.way == "described":
+            text = describe_instruction(task, getattr(target, length))
+        else:
+            text = phrase_instruction(task, colour.name, rng)
         state = (colour, text)
         return state, self._prompt(state, observation, context)
 
@@ -234,10 +229,27 @@ def _scene(
     return lines
 
 
+@cache
+def _described(names: tuple[str, ...]) -> dict[str, Description]:
+    """The objects in the captioner's words."""
+    return describe([get_object(name) for name in names])
+
+
+def _length(described: Mapping[str, Description], rng: np.random.Generator) -> str:
+    """Which description to use; one that distinguishes the target, if any does."""
+    names = list(described)
+    lengths = [str(length) for length in rng.permutation(["short", "long"])]
+    for length in lengths:
+        if distinguishes(described, names, length):
+            return length
+    return lengths[0]
+
+
 def _can_describe(row: EpisodeRow) -> bool:
-    """Whether the target's look differs from its rivals'."""
-    rivals = map(appearance_words, _same_kind(row)[1:])
-    return bool(appearance_words(row.target).difference(*rivals))
+    """Whether a description of the target distinguishes it from its rivals."""
+    names = tuple(_same_kind(row))
+    described = _described(names)
+    return any(distinguishes(described, names, length) for length in ("short", "long"))
 
 
 def _same_kind(row: EpisodeRow) -> list[str]:
@@ -253,9 +265,7 @@ def _rows(
     for i in range(EACH):
         episode = number * EACH + i
         try:
-            drawn = row(
-                known=known, task=task, names=names, number=episode, variant="base", rng=rng
-            )
+            drawn = row(known=known, task=task, names=names, number=episode, rng=rng)
         except ValueError:
             # No room for these: the next draw may have it.
             continue

@@ -5,9 +5,9 @@ A mini-PaliGemma learns to answer them before any policy grows from it.
 *Where is the red cup*: top left. *Is there a red cup in this image*, *can you recognize the striped
 cup in this image*: yes or no, equally often; the hard no's name a colour that no cup has. *What
 colour is the cup*: red. *Pick up the red cup*, *pick up my cup. My cup is white with blue spots*:
-no words; only the patches that show it are asked for. Colours are a tint, paint, or an object's
-own; an object is named by its colour or pattern where that distinguishes it from others of its
-kind, and by its kind where it is the only one.
+no words; only the patches that show it are asked for. Colours are paint, or an object's own, and
+never a tint; an object is named by its colour or pattern where that distinguishes it from others of
+its kind, and by its kind where it is the only one.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -16,24 +16,21 @@ from itertools import chain
 import numpy as np
 from jaxtyping import UInt8
 
-from vap_core.base.types import value
+from vap_core.base.types import Description, value
 from vap_core.prompt import PALETTE
 from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import BENCHMARKS
-from vap_core.training.policy.commands import ALPHA, COAT, painted, tinted
+from vap_core.training.policy.colouring import COAT, natural_colours, painted
 from vap_core.training.words import (
     DETERMINERS,
     PAINTS,
-    appearance_words,
     distinct_colours,
-    phrases,
+    pattern_words,
     similar_colours,
 )
 
 COLOURED = 0.45
-"""How often a view's object is coloured."""
-TINTED = 0.5
-"""How often that is a tint rather than paint."""
+"""How often a view's object is painted."""
 MIN_ASKED_PX = 20
 """Visible pixels of an object that is asked about."""
 TASKS = tuple(chain.from_iterable(suite.tasks for suite in BENCHMARKS.values()))
@@ -63,11 +60,11 @@ class QuestionedView:
 class VisibleObject:
     """An object in view.
 
-    `words` may name it; `appearance` is all that it shows (a tint hides no pattern); `given` is
-    the colour that it was given, or "".
+    `words` may name it; `appearance` is all that it shows (a trace of its pattern is seen through
+    paint); `given` is the colour that it was given, or "".
     """
 
-    name: str
+    look: Description
     kind: str
     words: frozenset[str]
     appearance: frozenset[str]
@@ -82,27 +79,26 @@ def ask(
     image: UInt8[np.ndarray, "s s 3"],
     ids: UInt8[np.ndarray, "s s"],
     names: Sequence[str],
+    looks: Sequence[Description],
     n: int,
     rng: np.random.Generator,
 ) -> QuestionedView:
-    """Colour some objects of a view, where `ids` is i + 1 at names[i], and ask `n` questions."""
+    """Paint some objects of a view, where `ids` is i + 1 at names[i], and ask `n` questions.
+
+    `looks` are the captioner's descriptions of the objects.
+    """
     images = image[None]
-    visible = _visible_objects(ids, names)
+    visible = _visible_objects(ids, names, looks)
     unused = set(PAINTS)
     for i in visible:
-        tint = rng.random() < TINTED
-        palette = PALETTE if tint else PAINTS
-        pool = [colour for colour in palette if colour in unused]
+        pool = sorted(unused, key=PAINTS.index)
         if pool and rng.random() < COLOURED:
             colour = pool[int(rng.integers(len(pool)))]
             unused.discard(colour)
             mask = (ids == i + 1)[None]
-            if tint:
-                images = tinted(images, mask, colour, float(rng.uniform(*ALPHA)))
-            else:
-                images = painted(images, mask, colour, float(rng.uniform(*COAT)))
+            images = painted(images, mask, colour, float(rng.uniform(*COAT)))
             visible[i] = VisibleObject(
-                name=names[i],
+                look=looks[i],
                 kind=visible[i].kind,
                 words=frozenset({colour.name}),
                 appearance=visible[i].appearance | {colour.name},
@@ -125,17 +121,19 @@ def place(mask: np.ndarray) -> tuple[str, str]:
 
 
 def _visible_objects(
-    ids: UInt8[np.ndarray, "s s"], names: Sequence[str]
+    ids: UInt8[np.ndarray, "s s"], names: Sequence[str], looks: Sequence[Description]
 ) -> dict[int, VisibleObject]:
     """The objects with enough visible pixels, as they are."""
     visible = {}
     for i, name in enumerate(names):
         if (ids == i + 1).sum() >= MIN_ASKED_PX:
+            colours = natural_colours(looks[i])
+            pattern = pattern_words(name)
             visible[i] = VisibleObject(
-                name=name,
+                look=looks[i],
                 kind=objects.get_object(name).category,
-                words=appearance_words(name),
-                appearance=appearance_words(name),
+                words=frozenset({colours[0], *pattern}),
+                appearance=frozenset({*colours, *pattern}),
                 given="",
             )
     return visible
@@ -222,7 +220,7 @@ def _ask_for_patches(
     kind = meant.kind
     text = str(rng.choice(_instructions(kind)))
     if not meant.given and phrase != kind and rng.random() < 0.5:
-        description = rng.choice(phrases(meant.name))
+        description = rng.choice([meant.look.short, meant.look.long])
         return Question(f"{text}. My {kind} is {description}.", (), target)
     determiner = rng.choice(DETERMINERS[1:])
     return Question(text.replace(f"my {kind}", f"{determiner} {phrase}"), (), target)

@@ -7,7 +7,8 @@ in training only, of the patches that show the object meant, asked of the penult
 """
 
 import json
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
@@ -21,20 +22,22 @@ from jaxtyping import UInt8
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
-from vap_core.base.files import DATA, write_atomic
-from vap_core.base.types import Rgb, value
+from vap_core.base.files import parse_json, write_atomic
+from vap_core.base.types import Description, Rgb, value
 from vap_core.evaluation.processes import results
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
 from vap_core.policies.mini_pi0.vlm import ANSWER, MiniVlm, load_vlm
+from vap_core.training.films.captions import captions
 from vap_core.training.films.demonstrations import SIDE, small
-from vap_core.training.films.scenes import Shots, cached
-from vap_core.training.patches import PatchScores, Sizes, patch_loss, patch_shares
+from vap_core.training.films.looks import draw_look
+from vap_core.training.films.scenes import CACHE, Shots, cached, cost_s, stage_file
+from vap_core.training.patches import PatchScores, model_options, patch_loss, patch_shares
+from vap_core.training.recipe import Sizes
 from vap_core.training.step import Figures, Schedule, average_of, train_steps
 from vap_core.training.vlm.questions import Question, ask
 
-CACHE = DATA / "cache" / "perception"
-"""The same scenes as perception's; what is there is not rendered again."""
+SCENES = "vlm"
 SEEN = 0.5
 """Weight of the patches beside the words."""
 KINDS = ("where", "yes", "no", "colour")
@@ -90,55 +93,66 @@ class Learner(nn.Module):
 
 def configuration(recipe: Recipe) -> MiniPI0Config:
     """The configuration of the model."""
-    return MiniPI0Config(**recipe.configuration())
+    return MiniPI0Config(**model_options(recipe))
 
 
 def views(
     stages: int, seed: int, cache: Path, *, held_out: bool = False, jobs: int = 2
-) -> list[View]:
-    """Views and every other portrait of so many stages, scaled down.
+) -> tuple[list[View], float]:
+    """Views and every other portrait of so many stages, scaled down, and their CPU seconds.
 
     `jobs` processes render the stages that are missing.
     """
     from tqdm import tqdm
 
-    kind = "held" if held_out else "train"
+    folder = cache / SCENES
     missing = []
     for number in range(stages):
-        if not (cache / f"{kind}-{seed}-{number:05d}.npz").exists():
+        if not stage_file(folder, seed, number, held_out).exists():
             missing.append(number)
     if missing:
-        render = partial(_render, cache, seed, held_out)
+        render = partial(_render, folder, seed, held_out)
         finished = results(render, missing, jobs, "jobs")
         for _ in tqdm(finished, "scenes", len(missing), mininterval=10):
             pass
     found = []
+    spent_s = 0.0
     for number in range(stages):
-        shots = cached(cache, seed, number, held_out=held_out)
+        shots = cached(folder, seed, number, held_out=held_out, look=draw_look)
+        spent_s += cost_s(folder, seed, number, held_out)
         pictures = zip(shots.rgb, shots.ids, strict=True)
         portraits = zip(shots.portraits[::2], shots.portrait_ids[::2], strict=True)
         for rgb, ids in chain(pictures, portraits):
             found.append(_view(rgb, ids, shots))
-    return found
+    return found, spent_s
 
 
 def collate(
     recipe: Recipe,
     pool: Sequence[View],
+    looks: Mapping[str, Description],
     number: dict[str, int],
     rng: np.random.Generator,
     config: MiniPI0Config,
 ) -> Batch:
     """One batch: views drawn anew, coloured anew, with questions of their own.
 
-    `number` gives the token of each word.
+    `looks` describes the objects, `number` gives the token of each word.
     """
     images = []
     questions = []
     patches = []
     for i in rng.integers(len(pool), size=recipe.batch):
         view = pool[i]
-        questioned = ask(view.image, view.ids, view.names, recipe.questions, rng)
+        described = [looks[name] for name in view.names]
+        questioned = ask(
+            image=view.image,
+            ids=view.ids,
+            names=view.names,
+            looks=described,
+            n=recipe.questions,
+            rng=rng,
+        )
         images.append(questioned.image)
         for question in questioned.questions:
             questions.append(question)
@@ -176,9 +190,14 @@ def train(
 ) -> dict[str, Any]:
     """Train, or go on where an earlier call stopped.
 
-    Writes the model to `out`, and what was measured on unseen objects, which it returns.
+    Writes the model to `out`, and what was measured on unseen objects and the cost, which it
+    returns.
     """
-    pool = views(recipe.stages, recipe.seed, cache, jobs=jobs)
+    pool, scenes_s = views(recipe.stages, recipe.seed, cache, jobs=jobs)
+    n_held_out = min(HELD_OUT, recipe.stages)
+    held_out, more_s = views(n_held_out, recipe.seed, cache, held_out=True, jobs=jobs)
+    names = dict.fromkeys(chain.from_iterable(view.names for view in [*pool, *held_out]))
+    looks, captions_s = captions(names, out / "captions.json")
     config = configuration(recipe)
     # Initial weights only; every other draw comes from the step's stream.
     torch.manual_seed(recipe.seed)
@@ -188,7 +207,7 @@ def train(
     def step_losses(model: Learner, step: int) -> tuple[Tensor, Figures]:
         rng = np.random.default_rng([75, recipe.seed, step])
         with fused_attention():
-            batch = collate(recipe, pool, number, rng, config)
+            batch = collate(recipe, pool, looks, number, rng, config)
             return losses(model, batch)
 
     run = Schedule(
@@ -196,11 +215,10 @@ def train(
         steps=recipe.steps,
         rate=recipe.rate,
         minutes=minutes,
+        every=100,
         made_of={"recipe": vars(recipe), "words": config.words},
     )
     mean, log = train_steps(learner, step_losses, run, out)
-    n_held_out = min(HELD_OUT, recipe.stages)
-    held_out = views(n_held_out, recipe.seed, cache, held_out=True, jobs=jobs)
     mean.vlm.save(out)
     # What is measured is what was saved.
     mean.vlm = load_vlm(out)
@@ -208,11 +226,31 @@ def train(
     with torch.no_grad():
         for i in range(HELD_OUT_BATCHES):
             rng = np.random.default_rng([76, i])
-            batch = collate(recipe, held_out, number, rng, config)
+            batch = collate(recipe, held_out, looks, number, rng, config)
             figures.append(losses(mean, batch)[1])
-    about = {"recipe": vars(recipe), "held_out": average_of(figures), "log": log}
+    spent_s = scenes_s + more_s + captions_s + log[-1]["cpu_s"]
+    about = {
+        "recipe": vars(recipe),
+        "trained_steps": log[-1]["step"],
+        "cpu_hours": {"total": round(spent_s / 3600, 3)},
+        "held_out": average_of(figures),
+        "log": log,
+    }
     write_atomic(out / "training.json", json.dumps(about, indent=1).encode())
     return about
+
+
+def make(out: Path, *, cache: Path = CACHE, jobs: int | None = None) -> Path:
+    """`out`, once it holds the model of the standard recipe, trained to the end."""
+    recipe = Recipe()
+    file = out / "training.json"
+    if file.is_file():
+        about = parse_json(file.read_bytes())
+        same = json.dumps(about.get("recipe")) == json.dumps(vars(recipe))
+        if same and about.get("trained_steps") == recipe.steps:
+            return out
+    train(recipe, out, cache=cache, jobs=jobs or os.cpu_count() or 1)
+    return out
 
 
 def _view(rgb: Rgb, ids: UInt8[np.ndarray, "h w"], shots: Shots) -> View:
@@ -220,8 +258,8 @@ def _view(rgb: Rgb, ids: UInt8[np.ndarray, "h w"], shots: Shots) -> View:
     return View(small(rgb), small_ids, shots.names)
 
 
-def _render(cache: Path, seed: int, held_out: bool, number: int) -> None:
-    cached(cache, seed, number, held_out=held_out)
+def _render(folder: Path, seed: int, held_out: bool, number: int) -> None:
+    cached(folder, seed, number, held_out=held_out, look=draw_look)
 
 
 def _tokenize_answers(questions: Sequence[Question], number: dict[str, int]) -> Tensor:

@@ -7,14 +7,12 @@ decomposition.
 
 import re
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from vap_core import __version__
 from vap_core.base.errors import BadObject
@@ -26,18 +24,16 @@ from vap_core.simulation.assets.scans.bake import (
     creased_mesh,
     shrink_image,
 )
+from vap_core.simulation.assets.scans.convex_parts import SOLIDIFY, convex_parts
 from vap_core.simulation.assets.scans.mesh_file import ScannedSurface, read_mesh_file
 from vap_core.simulation.assets.scans.mesh_repair import close_surface, count_edge_flaws
 from vap_core.simulation.assets.scans.storage import Scan, ScanMetadata
-from vap_core.simulation.assets.shapes import Hull
-from vap_core.simulation.assets.triangles import Faces, Vertices, area_vectors, decimate
+from vap_core.simulation.assets.triangles import area_vectors, decimate
 
-VISUAL_FACES, TEXTURE_PX, HULLS, HULL_CORNERS = 3000, 1024, 16, 160
+VISUAL_FACES, TEXTURE_PX = 3000, 1024
 MOST_VISUAL_FACES = 5 * VISUAL_FACES
 """A surface of which more faces remain than this is refused: it crosses itself all over."""
 SMALLEST_M, LARGEST_M, THINNEST_M = 0.01, 0.6, 0.002
-SLIVER_M3 = 1e-9
-"""A convex part of less volume is dropped."""
 DENSITY_KG_M3, MASS_KG = 400.0, (0.03, 0.5)
 HEAVIEST_KG = 5
 UpAxis = Literal["y", "z"]
@@ -47,7 +43,9 @@ OBJECT_FROM_FILE: dict[UpAxis, np.ndarray] = {
 }
 """Rotation to the object's axes (z up, front towards -y), by the file's axis that points up."""
 Y_UP_SUFFIXES = (".glb", ".obj")
-SOLIDIFY = "give it thickness in your 3-D tool (solidify)"
+FLATTER = 0.3
+"""Share of the footprint by which the bottom is flatter along the other axis than along the
+format's own where a file stands on that one."""
 
 
 def import_scan(
@@ -66,8 +64,8 @@ def import_scan(
     """Make a registry object of a GLB, OBJ, PLY or STL file; the decomposition takes some seconds.
 
     Without `height_cm` the file's units are metres; without `up` it is y for GLB and OBJ and z for
-    PLY and STL; without `mass_kg` the mass follows from the hulls' volume. `report` is called with
-    a line for every slow step.
+    PLY and STL, unless the object stands flat on the other one; without `mass_kg` the mass follows
+    from the hulls' volume. `report` is called with a line for every slow step.
 
     Raises:
         BadObject: the names or the file will not do; the message says what is wrong and how to
@@ -80,9 +78,8 @@ def import_scan(
         surface = ScannedSurface(vertex, face, surface.samples)
     _check_closed(surface, path, repair)
     if up is None:
-        up = "z"
-        if path.suffix.lower() in Y_UP_SUFFIXES:
-            up = "y"
+        up = guess_up(surface, path)
+        report(f"the file's {up} axis points up; --up says otherwise")
     surface = _set_upright(surface, path, up, height_cm)
     scan = _build_scan(surface, report)
     if mass_kg is None:
@@ -103,6 +100,24 @@ def import_scan(
 def default_name(path: Path) -> str:
     """A name for the object in a file."""
     return re.sub(r"[^A-Za-z0-9]+", "-", path.stem).strip("-")[:64]
+
+
+def guess_up(surface: ScannedSurface, path: Path) -> UpAxis:
+    """The axis that points up: the format's, unless the body is flatter below along the other."""
+    usual: UpAxis = "y" if path.suffix.lower() in Y_UP_SUFFIXES else "z"
+    other: UpAxis = "z" if usual == "y" else "y"
+    if _flat_below(surface, other) - _flat_below(surface, usual) > FLATTER:
+        return other
+    return usual
+
+
+def _flat_below(surface: ScannedSurface, up: UpAxis) -> float:
+    """The area that the body would stand on, as a share of its bounding box's."""
+    corner = (surface.vertex @ OBJECT_FROM_FILE[up].T)[surface.face]
+    low, high = corner.min(axis=(0, 1)), corner.max(axis=(0, 1))
+    lowest = corner[:, :, 2].max(axis=1) < low[2] + 0.02 * (high[2] - low[2])
+    area = np.abs(area_vectors(corner[lowest])[:, 2]).sum() / 2
+    return float(area / max(np.prod((high - low)[:2]), 1e-30))
 
 
 def _check_arguments(name: str, category: str, mass_kg: float | None) -> None:
@@ -225,35 +240,5 @@ def _build_scan(surface: ScannedSurface, report: Callable[[str], None]) -> Scan:
     else:
         report("painting a texture ...")
         form, image = bake_texture(vertex, face, surface.samples, TEXTURE_PX)
-    report("splitting into convex parts, about 15 s ...")
-    return Scan(form=form, hulls=_convex_parts(vertex, face), image=image)
-
-
-def _convex_parts(vertex: Vertices, face: Faces) -> tuple[Hull, ...]:
-    """Convex parts that cover the body.
-
-    They stay inside its bounding box, so that it stands where its mesh stands.
-    """
-    import coacd
-
-    coacd.set_log_level("off")
-    parts = coacd.run_coacd(
-        coacd.Mesh(vertex, face),
-        threshold=0.1,
-        preprocess_resolution=30,
-        mcts_iterations=60,
-        max_convex_hull=HULLS,
-        decimate=True,
-        max_ch_vertex=HULL_CORNERS,
-        seed=0,
-    )
-    hulls = []
-    for corners, _ in parts:
-        inside = np.clip(corners, vertex.min(axis=0), vertex.max(axis=0))
-        with suppress(QhullError):  # a part as flat as paper
-            convex = ConvexHull(inside)
-            if convex.volume > SLIVER_M3:
-                hulls.append(Hull(inside[convex.vertices], float(convex.volume)))
-    if not hulls:
-        raise BadObject(f"objects: no convex part of this object has a volume; {SOLIDIFY}.")
-    return tuple(hulls)
+    report("splitting into convex parts, some seconds ...")
+    return Scan(form=form, hulls=convex_parts(vertex, face), image=image)

@@ -1,0 +1,198 @@
+"""Ablations: forms of a prompt, arms by name, the table by hand, and the command."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.command import refused, vap
+from vap_core.attend import Prompting
+from vap_core.evaluation import paper
+from vap_core.evaluation.ablations.arms import ABLATIONS, ARMS, Ablation, Hidden
+from vap_core.evaluation.ablations.picture import effects_figure
+from vap_core.evaluation.ablations.table import arm_results, arm_rows
+from vap_core.evaluation.methods import METHODS, find, known_methods, references_needed
+from vap_core.prompt import PALETTE, Tint, tint
+from vap_core.rollout.prompters.oracle import Oracle, OraclePrompter
+from vap_core.simulation import suites
+
+FORMS = {name: arm.form for name, arm in ABLATIONS["form"].arms.items()}
+RED = PALETTE[0]
+
+
+def blob(h: int, w: int, y: int, x: int, r: int) -> np.ndarray:
+    rows, cols = np.mgrid[0:h, 0:w]
+    return (rows - y) ** 2 + (cols - x) ** 2 <= r * r
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    h=st.integers(40, 90),
+    w=st.integers(40, 90),
+    y=st.integers(-5, 95),
+    x=st.integers(-5, 95),
+    seed=st.integers(0, 9),
+)
+@pytest.mark.parametrize("name", FORMS)
+def test_a_form_marks_a_copy_of_any_picture(
+    name: str, h: int, w: int, y: int, x: int, seed: int
+) -> None:
+    rgb = np.random.default_rng(seed).integers(0, 200, (h, w, 3), np.uint8)
+    kept = rgb.copy()
+    mask, other = blob(h, w, y, x, 9), blob(h, w, h // 4, w // 4, 6)
+    marked = FORMS[name](rgb, mask, RED, [other & ~mask])
+    assert (rgb == kept).all()
+    assert (marked.shape, marked.dtype) == (rgb.shape, np.uint8)
+    if mask.any() and name != "others-erased":
+        assert (marked != rgb).any()
+
+
+@pytest.mark.parametrize("name", sorted(set(FORMS) - {"marker", "others-erased"}))
+def test_without_a_target_nothing_is_marked(name: str) -> None:
+    rgb = np.full((64, 64, 3), 90, np.uint8)
+    nothing = np.zeros((64, 64), bool)
+    assert (FORMS[name](rgb, nothing, RED, []) == rgb).all()
+
+
+def test_each_form_does_what_its_name_says() -> None:
+    rgb = np.random.default_rng(0).integers(60, 120, (112, 112, 3), np.uint8)
+    mask, other = blob(112, 112, 60, 40, 14), blob(112, 112, 60, 85, 12)
+    changed = {
+        name: (form(rgb, mask, RED, [other]) != rgb).any(axis=2) for name, form in FORMS.items()
+    }
+    assert (changed["opaque"] == mask).all()
+    box = np.zeros_like(mask)
+    box[46:75, 26:55] = True
+    assert (changed["box"] == box).all()
+    assert not changed["contour"][60, 40]
+    assert changed["point"][60, 40]
+    assert changed["point"].sum() < 0.2 * mask.sum()
+    assert not changed["circle"][mask].any()
+    assert changed["arrow"][0, 56]
+    assert changed["marker"][60, 85]
+    assert not changed["dimmed"][mask].any()
+    assert changed["dimmed"][~mask].all()
+    assert not changed["others-erased"][mask].any()
+    assert changed["others-erased"][other].mean() > 0.9
+
+
+def test_the_default_form_is_the_papers_tint() -> None:
+    rgb = np.random.default_rng(1).integers(0, 255, (32, 32, 3), np.uint8)
+    mask = blob(32, 32, 16, 16, 7)
+    assert (Prompting().form(rgb, mask, RED, []) == tint(rgb, mask, RED)).all()
+    assert Prompting().form == Tint(0.5)
+
+
+def test_every_arm_is_a_method_with_a_name_of_its_own() -> None:
+    names = [name for ablation in ABLATIONS.values() for name in ablation.arms]
+    assert len(names) == len(set(names)) == len(ARMS)
+    assert not set(ARMS) & set(METHODS)
+    for ablation in ABLATIONS.values():
+        assert len(ablation.names) >= 3
+        assert set(ablation.names) <= set(known_methods())
+        assert set(ablation.rows) <= set(ablation.names)
+    assert references_needed("references-7") == 7
+    assert references_needed("vap") == references_needed("references-1") == 5
+    assert find("hidden-3") == Hidden(3)
+
+
+def test_every_number_of_the_paper_that_an_arm_names_is_in_its_table() -> None:
+    facts = paper.ledger()
+    for ablation in ABLATIONS.values():
+        for row in ablation.rows.values():
+            held = facts[facts["table"].eq(ablation.paper) & facts["row"].eq(row)]
+            assert set(held["column"]) >= {"Google Robot", "WidowX"}, row
+
+
+@pytest.mark.parametrize(("area", "shift"), [(0.25, 0.0), (2.0, 0.0), (1.0, 0.5)])
+def test_a_spoiled_mask_has_its_area_and_its_shift(area: float, shift: float) -> None:
+    mask = blob(224, 224, 100, 90, 30)
+    prompter = OraclePrompter.__new__(OraclePrompter)
+    prompter.oracle = Oracle("track", area=area, shift=shift)
+    spoiled = prompter._spoil(mask)
+    assert spoiled.sum() == pytest.approx(area * mask.sum(), rel=0.05)
+    centre = np.argwhere(spoiled).mean(axis=0)
+    assert centre == pytest.approx([100, 90 + shift * 61], abs=1.0)
+
+
+def outcomes(arm: str, won: list[bool]) -> pd.DataFrame:
+    rows = []
+    for i, success in enumerate(won):
+        rows.append({
+            "suite": "simpler-bridge", "task": "pick-shaver", "split": "", "variant": "base", "episode": i, "seed": 0, "policy": "p",
+            "method": arm, "outcome": "success" if success else "failure", "success": success, "cmr": success, "case": "" if success else "case 1",
+        })  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def test_the_table_by_hand() -> None:
+    ablation = ABLATIONS["rewrite"]
+    table = pd.concat([
+        outcomes("vap", [True] * 9 + [False]),
+        outcomes("mask-only", [True] * 2 + [False] * 8),
+        outcomes("rewrite-only", [True] * 9 + [False]),
+    ], ignore_index=True)  # fmt: skip
+    vap_arm, mask_only, rewrite_only = arm_results(ablation, table)
+    assert (vap_arm.sr.k, vap_arm.sr.n, vap_arm.against, vap_arm.case_1.k) == (9, 10, None, 1)
+    assert mask_only.against is not None
+    assert mask_only.against.difference == pytest.approx(-0.7)
+    assert mask_only.against.p == pytest.approx(2 / 2**7)
+    assert mask_only.against.p_holm == pytest.approx(4 / 2**7), "two arms"
+    assert rewrite_only.against is not None
+    assert rewrite_only.against.difference == 0
+    assert (vap_arm.paper, mask_only.paper) == pytest.approx((0.835, 0.052))
+    text = arm_rows([vap_arm, mask_only, rewrite_only])
+    assert text[2][1:4] == ["mask-only", "10", "20 % [6, 51]"]
+    assert text[2][-1] == "5.2"
+    figure = effects_figure([vap_arm, mask_only, rewrite_only], "why")
+    labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    assert labels == ["rewrite-only, n 10", "mask-only, n 10"]
+
+
+def test_an_arm_takes_one_line() -> None:
+    own = Ablation(question="Is green better?", arms={"green": Prompting(palette=PALETTE[2:3])})
+    assert own.names == ("vap", "green")
+
+
+def test_without_a_name_ablations_are_listed_and_unknown_ones_refused() -> None:
+    listed = vap("ablate")
+    assert listed.returncode == 0
+    assert all(name in listed.stdout for name in ABLATIONS)
+    assert "ablation 'shape' is unknown; known: association, colour, form" in refused(
+        "ablate", "shape"
+    )
+
+
+WORDS = ("--suite", "widowx-pick", "--policy", "scripted", "--episodes", "1", "--workers", "1")
+
+
+@pytest.mark.slow
+def test_the_command_says_what_it_found_and_runs_nothing_twice(tmp_path: Path) -> None:
+    words = ("ablate", "selection", *WORDS, "--out", tmp_path / "run")
+    done = vap(*words)
+    assert done.returncode == 0, done.stderr
+    assert ABLATIONS["selection"].question in done.stdout
+    assert "0 errors" in done.stdout
+    assert (tmp_path / "run" / "effects.png").stat().st_size > 5_000
+    assert vap(*words).stdout == done.stdout
+
+
+@pytest.mark.sweep
+@pytest.mark.parametrize("name", sorted(set(ABLATIONS) - {"selection", "association"}))
+def test_every_ablation_runs(name: str, tmp_path: Path) -> None:
+    done = vap("ablate", name, *WORDS, "--out", tmp_path / "run")
+    assert done.returncode == 0, done.stderr
+    assert "0 errors" in done.stdout
+
+
+def test_the_target_is_hidden_from_the_third_call_on() -> None:
+    from vap_core.evaluation.study import _occlusion
+
+    occlusion = _occlusion("hidden-2", execute=4)
+    assert occlusion is not None
+    assert [step for step in range(40) if occlusion.covers("front", step)] == list(range(8, 16))
+    assert _occlusion("vap", execute=4) is None
+    assert suites.rows("simpler-bridge", "pick-shaver", n=1)

@@ -1,0 +1,144 @@
+"""ground on clips and on large pictures: tracks through, what is written, and tiles."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.command import refused, vap
+from tests.toys import MeanColour, SameColour, detector, scene, segmenter
+from vap_core.analysis import ground_clip
+from vap_core.base import video
+from vap_core.base.types import Boxes
+from vap_core.memory import remember, save
+from vap_core.perception import stacks, tiles
+from vap_core.perception.protocols import Stack
+from vap_core.perception.tiles import GRID, TiledDetector, tile_corners
+
+RED, GREEN = (250, 0, 0), (0, 250, 0)
+
+
+@pytest.fixture
+def bank(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    stack = Stack("toy", detector, MeanColour(), segmenter, SameColour())
+    monkeypatch.setitem(stacks.STACKS, "toy", lambda: stack)
+    mug = remember("mug", "cup", [scene([(26, 26, RED)])], MeanColour())
+    save(tmp_path / "bank", mug)
+    return tmp_path / "bank"
+
+
+def frames(folder: Path, squares) -> Path:
+    folder.mkdir()
+    for i, of_frame in enumerate(squares):
+        Image.fromarray(scene(of_frame)).save(folder / f"{i:03}.png")
+    return folder
+
+
+def test_a_folder_of_frames_is_tracked_through(bank, tmp_path):
+    """Found in frame 5, the second try; gone in frame 7."""
+    squares = [[]] * 5 + [
+        [(4, 4, GREEN), (40, 10, RED)],
+        [(8, 4, GREEN), (42, 12, RED)],
+        [],
+        [(44, 14, RED)],
+    ]
+    clip = frames(tmp_path / "clip", squares)
+    done = vap(
+        "ground", clip, "bring my cup", "--stack", "toy", "--memory", bank, "--out", tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    assert "grounded in frame 5 of 9; tracked in 3 frames" in done.stdout
+    assert "not visible in frames 7-7" in done.stdout
+    assert "instruction: bring the " in done.stdout
+    film = list(video.frames(tmp_path / "clip.mp4"))
+    assert len(film) == 9
+    assert video.frame_rate(tmp_path / "clip.mp4") == ground_clip.FOLDER_HZ
+    changed = np.abs(film[5].astype(int) - scene(squares[5])).mean(axis=2) > 60
+    assert changed[10:22, 40:52].mean() > 0.5
+    assert changed[4:16, 4:16].mean() < 0.2
+    assert (tmp_path / "clip.rrd").stat().st_size > 5000
+    again = vap(
+        "ground",
+        tmp_path / "clip.mp4",
+        "bring my cup",
+        "--stack",
+        "toy",
+        "--memory",
+        bank,
+        "--out",
+        tmp_path,
+    )
+    assert again.returncode == 0, again.stderr
+    assert (tmp_path / "clip-2.rrd").exists()
+
+
+def test_a_clip_without_the_object_says_so(bank, tmp_path):
+    clip = frames(tmp_path / "clip", [[]] * 3)
+    done = vap(
+        "ground", clip, "bring my cup", "--stack", "toy", "--memory", bank, "--out", tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    assert "not in view in any of 3 frames" in done.stdout
+    assert len(list(video.frames(tmp_path / "clip.mp4"))) == 3
+
+
+def test_bad_clips_are_one_line(bank, tmp_path):
+    line = refused("ground", tmp_path, "bring my cup", "--memory", bank, "--json")
+    assert "--json are for single pictures" in line
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "bad.mp4").write_bytes(b"x")
+    for name, message in (
+        ("empty", "holds no picture"),
+        ("bad.mp4", "cannot be decoded"),
+        ("gone.mp4", "is not a file"),
+    ):
+        line = refused(
+            "ground", tmp_path / name, "bring my cup", "--stack", "toy", "--memory", bank
+        )
+        assert message in line
+
+
+def test_tiles_cover_the_picture_and_overlap_by_half():
+    corners = tile_corners(61, 100)
+    assert len(corners) == GRID**2
+    covered = np.zeros((61, 100), int)
+    for x0, y0, x1, y1 in corners:
+        assert (x1 - x0, y1 - y0) == (50, 31)
+        covered[y0:y1, x0:x1] += 1
+    assert covered.min() >= 1
+    assert covered[20, 40] == 4
+    assert covered[0, 0] == 1
+
+
+def test_tiles_find_what_the_whole_picture_is_too_coarse_for():
+    """A detector that sees nothing under a tenth of its picture's width finds it in a tile, once."""
+
+    def coarse(images, phrase, threshold=None):
+        found = []
+        for boxes, image in zip(detector(images, phrase), images, strict=True):
+            large = boxes.xyxy[:, 2] - boxes.xyxy[:, 0] >= image.shape[1] / 10
+            found.append(Boxes(boxes.xyxy[large], boxes.score[large], phrase))
+        return found
+
+    rgb = scene([(70, 30, RED), (4, 100, GREEN)], size=200, side=14)
+    assert len(coarse([rgb], "cup")[0]) == 0
+    (boxes,) = TiledDetector(coarse)([rgb], "cup")
+    assert sorted(boxes.xyxy.tolist()) == [[4, 100, 18, 114], [70, 30, 84, 44]]
+    (none,) = TiledDetector(coarse)([np.zeros((200, 200, 3), np.uint8)], "cup")
+    assert len(none) == 0
+
+
+def test_large_pictures_are_tiled_and_it_is_said(bank, tmp_path, monkeypatch):
+    monkeypatch.setattr(tiles, "SMALL_MEGAPIXELS", 0.03)
+    rgb = scene([(150, 90, RED), (30, 30, GREEN)], size=200, side=12)
+    Image.fromarray(rgb).save(tmp_path / "desk.png")
+    words = ("ground", tmp_path / "desk.png", "bring my cup", "--stack", "toy")
+    where = ("--memory", bank, "--out", tmp_path, "--json")
+    done = vap(*words, *where)
+    assert "nine overlapping half-size tiles" in done.stderr
+    answer = json.loads(done.stdout)
+    assert answer["size"] == [200, 200]
+    assert answer["candidates"][answer["winner"]] == [150, 90, 162, 102]
+    assert "tiles" not in vap(*words, *where, "--no-tiles").stderr

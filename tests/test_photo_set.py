@@ -1,0 +1,193 @@
+"""eval-photos: the folder form, what is wrong with bad folders, the figures, and resuming."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+from tests.command import refused, vap
+from tests.toys import MeanColour, SameColour, detector, scene, segmenter
+from vap_core.base.errors import BadPhotoSet
+from vap_core.base.files import DATA
+from vap_core.evaluation.metrics import rate
+from vap_core.evaluation.photos import run
+from vap_core.evaluation.photos.folder import read_photo_set
+from vap_core.evaluation.photos.report import clustered_share, object_rows, scene_rows, vote_rows
+from vap_core.perception.protocols import Stack
+
+RED, GREEN, BLUE, DARK = (250, 0, 0), (0, 250, 0), (0, 0, 250), (120, 10, 0)
+HEADER = "scene,object,x0,y0,x1,y1\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A red mug, a dark red one, and a green plant, in two scenes."""
+    for name, colour in (("mug", RED), ("old_mug", DARK), ("plant", GREEN)):
+        place = tmp_path / "set" / "references" / name
+        place.mkdir(parents=True)
+        for i in range(2):
+            Image.fromarray(scene([(20 + i, 20, colour)])).save(place / f"{i}.png")
+    scenes = tmp_path / "set" / "scenes"
+    scenes.mkdir()
+    Image.fromarray(scene([(4, 4, RED), (40, 4, DARK), (4, 40, BLUE)])).save(scenes / "a.png")
+    Image.fromarray(scene([(4, 4, DARK), (40, 40, GREEN)])).save(scenes / "b.png")
+    (tmp_path / "set" / "objects.csv").write_text("object,category\nmug,cup\nold_mug,cup\n")
+    (tmp_path / "set" / "scenes.csv").write_text(
+        HEADER + "a.png,mug,4,4,16,16\na.png,old_mug,40,4,52,16\na.png,ball,4,40,16,52\n"
+        "a.png,plant,,,,\nb.png,mug,,,,\nb.png,old_mug,4,4,16,16\nb.png,plant,43,43,55,55\n"
+    )
+    return tmp_path / "set"
+
+
+@pytest.fixture
+def toy(monkeypatch: pytest.MonkeyPatch) -> None:
+    stack = Stack("toy", detector, MeanColour(), segmenter, SameColour())
+    monkeypatch.setattr(run, "load_stack", lambda name: stack)
+
+
+def test_the_form_is_read(folder):
+    photo_set = read_photo_set(folder)
+    assert [subject.name for subject in photo_set.subjects] == ["mug", "old_mug", "plant"]
+    assert photo_set.categories == {
+        "mug": "cup",
+        "old_mug": "cup",
+        "plant": "plant",
+        "ball": "ball",
+    }
+    first, second = photo_set.scenes
+    assert first.boxes["mug"].tolist() == [[4, 4, 16, 16]]
+    assert len(second.boxes["mug"]) == 0
+    assert read_photo_set(folder).sha256 == photo_set.sha256
+    (folder / "objects.csv").write_text("object,category\nmug,cup\nold_mug,mug\n")
+    assert read_photo_set(folder).sha256 != photo_set.sha256
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "message"),
+    [
+        ("scenes.csv", None, "scenes.csv is not there"),
+        ("scenes.csv", "scene,object\n", "lacks the column 'x0'"),
+        ("scenes.csv", HEADER + "c.png,mug,1,2,3,4\n", "line 2 names the scene 'c.png'"),
+        ("scenes.csv", HEADER + "a.png,mug,1,2,3\n", "line 2 has the box"),
+        ("scenes.csv", HEADER + "a.png,mug,9,2,3,4\n", "without area"),
+        ("scenes.csv", HEADER + "a.png,ghost,,,,\n", "no references of 'ghost'"),
+        ("scenes.csv", HEADER + "a.png,mug,1,2,3,4\n", "no line for b.png"),
+        ("objects.csv", "object,category\nmgu,cup\n", "line 2 names 'mgu'"),
+        ("objects.csv", "object,category\nmug,3!\n", "'3!' cannot be a category"),
+        ("references/boxes.csv", "photo,x0,y0,x1,y1\nmug/7.png,1,2,3,4\n", "names 'mug/7.png'"),
+        ("scenes.csv", "\xff\xfe", "lacks the column|cannot be read"),
+    ],
+)
+def test_what_is_wrong_with_a_folder_is_one_line(folder, file, text, message):
+    if text is None:
+        (folder / file).unlink()
+    else:
+        (folder / file).write_text(text)
+    with pytest.raises(BadPhotoSet, match=message) as error:
+        read_photo_set(folder)
+    assert len(str(error.value).replace(str(folder), "")) <= 300
+
+
+def test_the_set_that_ships_is_in_this_form():
+    photo_set = read_photo_set(DATA / "photo-set")
+    assert [subject.name for subject in photo_set.subjects] == ["cookies"]
+    assert [len(scene.boxes["cookies"]) for scene in photo_set.scenes] == [0, 1, 0]
+    assert photo_set.categories == {"cookies": "box", "rice": "box", "book": "book"}
+
+
+def test_missing_parts_are_named(tmp_path):
+    assert "is no folder" in refused("eval-photos", tmp_path / "none", "--out", tmp_path / "out")
+    with pytest.raises(BadPhotoSet, match="references holds no folder"):
+        read_photo_set(tmp_path)
+    (tmp_path / "references" / "mug").mkdir(parents=True)
+    with pytest.raises(BadPhotoSet, match="mug holds no picture"):
+        read_photo_set(tmp_path)
+
+
+def test_the_command_measures_writes_and_resumes(folder, toy, tmp_path):
+    out = tmp_path / "out"
+    done = vap("eval-photos", folder, "--stack", "toy", "--out", out)
+    assert done.returncode == 0, done.stderr
+    table = pd.read_parquet(out / "questions.parquet").set_index(["scene", "object"])
+    assert len(table) == 6
+    mug = table.loc[("a.png", "mug")]
+    assert (mug.present, mug.tinted, mug.iou, mug.lookalikes) == (True, True, 1.0, 1)
+    assert (mug.all_boxes, mug.all_one, mug.all_every) == (3, 1.0, True)
+    assert (mug.kind_boxes, mug.kind_one) == (2, 1.0)
+    plant = table.loc[("b.png", "plant")]
+    assert 0.2 < plant.iou < 0.5  # its true box is shifted
+    absent = table.loc[("b.png", "mug")]
+    assert (absent.present, absent.tinted, absent.iou) == (False, True, 0.0)
+    assert "object in view" in done.stdout
+    assert "vote among" in done.stdout
+    assert (out / "sheet-01.png").stat().st_size > 1000
+    assert (out / "memory" / "mug.references.png").exists()
+    assert len(pd.read_csv(out / "questions.csv")) == 6
+    part = (out / "parts" / "a.png.json").stat().st_mtime_ns
+    (out / "parts" / "b.png.json").unlink()
+    again = vap("eval-photos", folder, "--stack", "toy", "--out", out)
+    assert again.returncode == 0
+    assert (out / "parts" / "a.png.json").stat().st_mtime_ns == part
+    assert again.stdout.split("ms a photo")[0] == done.stdout.split("ms a photo")[0]
+    (folder / "scenes.csv").write_text(HEADER + "a.png,mug,4,4,16,16\nb.png,mug,,,,\n")
+    assert "holds another run" in refused("eval-photos", folder, "--stack", "toy", "--out", out)
+
+
+def test_a_box_outside_its_photo_is_named(folder, toy, tmp_path):
+    (folder / "scenes.csv").write_text(HEADER + "a.png,mug,70,4,90,16\nb.png,mug,,,,\n")
+    line = refused("eval-photos", folder, "--stack", "toy", "--out", tmp_path / "out")
+    assert "lies outside" in line
+    assert "64x64" in line
+
+
+def row(**changed: object) -> dict[str, object]:
+    usual: dict[str, object] = {
+        "scene": "a", "object": "mug", "category": "cup", "present": True, "lookalikes": 0,
+        "proposed_iou": 0.9, "iou": 0.9, "tinted": True, "ms": 10.0,
+        "all_boxes": None, "all_one": None, "all_every": None,
+    }  # fmt: skip
+    return usual | changed
+
+
+def test_rows_count_what_they_say():
+    table = pd.DataFrame(
+        [
+            row(),
+            row(scene="b", iou=0.3, lookalikes=1),
+            row(scene="c", iou=0.0, tinted=False, proposed_iou=0.2),
+            row(scene="d", present=False, iou=0.0, lookalikes=2),
+            row(scene="e", present=False, iou=0.0, tinted=False, object="plant"),
+        ]
+    )
+    assert object_rows(table)[1:] == [
+        ["mug", "cup", "3", "1", "2", "1", "1", "1", "1"],
+        ["plant", "cup", "0", "0", "0", "0", "0", "1", "0"],
+        ["all", "", "3", "1", "2", "1", "1", "2", "1"],
+    ]
+    by_name = {cells[0].strip("- "): cells[1:] for cells in scene_rows(table)[1:]}
+    assert by_name["object in view"][0].startswith("67 ")
+    assert by_name["object in view"][1].startswith("33 ")
+    assert by_name["beside look-alikes"][3].startswith("100 ")
+    assert by_name["look-alikes in view"][3].startswith("100 ")
+    assert by_name["none of its kind"][4].startswith("100 ")
+    assert vote_rows(table)[1] == ["all true boxes", "-", "-", "-", "-"]
+    votes = table.assign(all_boxes=[4, 2, None, None, None], all_one=[0.5, 1, None, None, None])
+    votes["all_every"] = [True, False, None, None, None]
+    assert vote_rows(votes)[1][1:3] == ["3.0", "38"]
+    assert vote_rows(votes)[1][3].startswith("75 ")
+
+
+def test_the_interval_of_independent_cases_is_wilsons_and_clusters_widen_it():
+    hits = np.array([1.0, 0, 1, 1, 0, 1, 1, 0])
+    alone = clustered_share(hits, list("abcdefgh"))
+    exact = rate(5, 8)
+    assert (alone.value, alone.n) == (0.625, 8)
+    assert alone.low == pytest.approx(exact.low, abs=0.02)
+    pairs = np.array([1.0, 1, 0, 0, 1, 1, 1, 1])
+    paired = clustered_share(pairs, list("aabbccdd"))
+    assert paired.high - paired.low > alone.high - alone.low
+    same = clustered_share(np.ones(8), list("aabbccdd"))
+    assert same.low == pytest.approx(rate(4, 4).low)
+    assert clustered_share(np.zeros(0), []).n == 0

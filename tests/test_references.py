@@ -1,0 +1,229 @@
+"""Registering from photos: which box is cropped, when it stops, and what it says of the vote."""
+
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.toys import MeanColour, SameColour, detector, scene, segmenter
+from vap_core.analysis import drag_box, dragged_box
+from vap_core.base import video
+from vap_core.base.errors import BadPhoto
+from vap_core.base.photos import load_photo
+from vap_core.base.types import Boxes
+from vap_core.evaluation.photos import register as registering
+from vap_core.evaluation.photos.trust import leave_one_out, warnings
+from vap_core.memory import remember
+from vap_core.perception.protocols import Stack
+from vap_core.perception.references import choose_references, whole_photos
+
+RED, GREEN, BLUE, GREY = (250, 0, 0), (0, 250, 0), (0, 0, 250), (90, 90, 90)
+STACK = Stack(
+    name="toy",
+    detector=detector,
+    encoder=MeanColour(),
+    segmenter=segmenter,
+    tracker=SameColour(),
+)
+
+
+def choose(photos, given=None):
+    return choose_references(photos, "cup", detector, MeanColour(), given)
+
+
+def save(folder: Path, photos) -> list[Path]:
+    paths = []
+    for i, rgb in enumerate(photos):
+        paths.append(folder / f"mug-{i}.png")
+        Image.fromarray(rgb).save(paths[-1])
+    return paths
+
+
+def test_what_all_photos_share_is_cropped_though_other_things_are_nearer_the_middle():
+    photos = [
+        scene([(4, 4, RED), (26, 26, GREEN)]),
+        scene([(40, 6, RED), (26, 26, BLUE)]),
+        scene([(26, 44, RED)]),
+    ]
+    references = choose(photos)
+    assert [reference.box[:2].tolist() for reference in references] == [[4, 4], [40, 6], [26, 44]]
+    assert all(reference.agreement > 0.99 for reference in references)
+    assert not any(reference.doubt for reference in references)
+    assert [len(reference.others) for reference in references] == [1, 1, 0]
+
+
+def test_doubts_are_said():
+    nothing, alone = choose([np.zeros((64, 64, 3), np.uint8), scene([(26, 26, RED)])])
+    assert nothing.chosen_by == "whole"
+    assert "no cup was found" in nothing.doubt
+    assert not alone.doubt
+    (either,) = choose([scene([(10, 26, RED), (42, 26, GREEN)])])
+    assert "two things" in either.doubt
+    unlike = choose([scene([(26, 26, RED)]), scene([(26, 26, RED)]), scene([(26, 26, BLUE)])])
+    assert "unlike the other photos" in unlike[2].doubt
+
+
+def test_a_given_box_is_taken_and_guides_the_other_photos():
+    photos = [scene([(6, 6, RED), (26, 26, GREEN)]), scene([(6, 6, RED), (26, 26, GREEN)])]
+    box = np.array([6, 6, 18, 18], np.float32)
+    first, second = choose(photos, {0: box})
+    assert first.chosen_by == "given"
+    assert first.box.tolist() == box.tolist()
+    assert not first.doubt
+    assert second.chosen_by == "proposed"
+
+
+def test_a_part_of_the_object_is_not_something_else():
+    """What the photo shows besides the object are rivals in the check; its parts are not."""
+
+    def parts(images, phrase, threshold=None):
+        xyxy = np.array([[20, 20, 60, 60], [25, 25, 32, 32], [2, 2, 12, 12]], np.float32)
+        return [Boxes(xyxy, np.array([0.9, 0.5, 0.5], np.float32), phrase) for _ in images]
+
+    photo = scene([(20, 20, RED)], side=40) + scene([(2, 2, GREEN)], side=10)
+    (reference,) = choose_references([photo], "cup", parts, MeanColour())
+    assert reference.box.tolist() == [20, 20, 60, 60]
+    (other,) = reference.others
+    assert other[5, 5].tolist() == list(GREEN)
+
+
+def test_boxes_and_masks_are_read_by_the_photos_name(tmp_path):
+    photos = save(tmp_path, [scene([(6, 6, RED)]), scene([(9, 9, RED)])])
+    mask = np.zeros((64, 64), np.uint8)
+    mask[9:21, 9:21] = 255
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    given = registering.parse_given(
+        ["mug-0.png=6,6,18,18"], [f"{photos[1]}={tmp_path / 'mask.png'}"], photos
+    )
+    assert given[0].tolist() == [6, 6, 18, 18]
+    assert given[1].tolist() == [9, 9, 21, 21]
+    assert registering.parse_given(["1,2,3,4"], [], photos[:1])[0].tolist() == [1, 2, 3, 4]
+    for text, message in (
+        ("mug-7.png=1,2,3,4", "names no single photo"),
+        ("1,2,3,4", "names no single photo"),
+        ("mug-0.png=1,2,3", "is not PHOTO=x0,y0,x1,y1"),
+        ("mug-0.png=5,5,5,9", "has no area"),
+    ):
+        with pytest.raises(BadPhoto, match=message):
+            registering.parse_given([text], [], photos)
+    outside = {0: np.array([0, 0, 90, 20], np.float32)}
+    with pytest.raises(BadPhoto, match="not inside"):
+        registering.choose(photos, "cup", STACK, outside, whole=False)
+
+
+def test_a_doubtful_crop_stops_it_with_the_photo_the_sheet_and_the_remedy(tmp_path):
+    photos = save(tmp_path, [scene([(10, 26, RED), (42, 26, GREEN)])])
+    references = registering.choose(photos, "cup", STACK, {}, whole=False)
+    sheet = tmp_path / "sheet.png"
+    registering.write_sheet(sheet, references, photos)
+    with pytest.raises(BadPhoto, match=r"mug-0.png: two things.*sheet.png.*--box mug-0.png=") as e:
+        registering.refuse_doubtful(references, photos, sheet)
+    assert len(str(e.value)) <= 300 + len(str(sheet))
+    shown = load_photo(sheet, long_side=None)
+    assert shown.shape[1] > 2 * registering.TILE_PX - 1
+    registering.refuse_doubtful(whole_photos([scene([(6, 6, RED)])]), photos, sheet)
+
+
+def test_leave_one_out_finds_what_the_references_confuse():
+    mine = [scene([(26, 26, RED)]), scene([(20, 20, RED)]), scene([(30, 30, RED)])]
+    references = choose(mine)
+    obj = remember("mug", "cup", [reference.crop for reference in references], MeanColour())
+    other = remember("plant", "plant", [scene([(6, 6, GREEN)])], MeanColour())
+    fine = leave_one_out(obj, references, {"plant": other}, MeanColour())
+    assert (fine.right, fine.n, fine.others, fine.background, fine.by_name) == (3, 3, 1, 0, ())
+    assert fine.margin > 0.9
+    assert "3 of 3 are elected" in str(fine)
+    mixed = [*mine, *mine[:1], scene([(26, 26, (100, 200, 0))])]
+    odd = remember("mug", "cup", mixed, MeanColour())
+    olive = remember("plant", "plant", [scene([(6, 6, (120, 200, 0))])], MeanColour())
+    wrong = leave_one_out(odd, (), {"plant": olive}, MeanColour())
+    assert (wrong.right, wrong.n) == (4, 5)
+    assert wrong.margin < 0
+    assert wrong.by_name == ("plant",)
+    few = remember("mug", "cup", mine[:2], MeanColour())
+    assert "give 3 or more" in str(leave_one_out(few, (), {"plant": other}, MeanColour()))
+    assert "nothing else" in str(leave_one_out(obj, (), {}, MeanColour()))
+
+
+def test_small_and_odd_references_are_named():
+    mixed = [scene([(26, 26, RED)]), scene([(26, 26, RED)]), scene([(26, 26, BLUE)])]
+    references = choose(mixed)
+    obj = remember("mug", "cup", [reference.crop for reference in references], MeanColour())
+    lines = warnings(obj, references, ["a", "b", "c"])
+    assert [line for line in lines if line.startswith("c: unlike")]
+    assert sum("only" in line for line in lines) == 3
+    assert not warnings(obj, whole_photos([np.zeros((80, 80, 3), np.uint8)] * 2), ["a", "b"])
+
+
+def test_a_video_gives_sharp_frames_spread_over_it(tmp_path):
+    rng = np.random.default_rng(0)
+    sharp = rng.integers(0, 255, (64, 96, 3)).astype(np.uint8)
+    clip = [np.full((64, 96, 3), 128, np.uint8)] * 12
+    for i in (2, 7, 9):
+        clip[i] = sharp
+    path = tmp_path / "mug.mp4"
+    with video.Mp4(path, hz=10.0) as file:
+        for rgb in clip:
+            file.add(rgb)
+    chosen = video.sharp_frames(path, 3)
+    assert [frame.std() > 20 for frame in chosen] == [True, True, True]
+    found = registering.film_photos(path, tmp_path / "frames", 2)
+    assert [photo.name for photo in found] == ["mug-1.png", "mug-2.png"]
+    assert load_photo(found[0]).shape == (64, 96, 3)
+    with pytest.raises(BadPhoto, match="fewer than the 99"):
+        video.sharp_frames(path, 99)
+    (tmp_path / "no.mp4").write_bytes(b"no video")
+    with pytest.raises(BadPhoto, match="cannot be decoded"):
+        video.sharp_frames(tmp_path / "no.mp4", 1)
+
+
+def test_a_photo_of_a_phone_is_read(tmp_path):
+    """HEIC turned by EXIF, CMYK, and 12 megapixels."""
+    from pillow_heif import register_heif_opener
+
+    register_heif_opener()
+    rgb = np.zeros((40, 80, 3), np.uint8)
+    rgb[:, :40] = RED
+    exif = Image.Exif()
+    exif[0x0112] = 6  # turn clockwise
+    Image.fromarray(rgb).save(tmp_path / "a.heic", exif=exif.tobytes(), quality=95)
+    upright = load_photo(tmp_path / "a.heic", long_side=None)
+    assert upright.shape[:2] == (80, 40)
+    assert upright[10, 20, 0] > 150
+    assert upright[70, 20].max() < 60
+    Image.fromarray(rgb).convert("CMYK").save(tmp_path / "b.jpg")
+    assert load_photo(tmp_path / "b.jpg")[20, 10, 0] > 150
+    Image.fromarray(np.zeros((3000, 4000, 3), np.uint8)).save(tmp_path / "c.jpg")
+    assert load_photo(tmp_path / "c.jpg", long_side=None).shape == (3000, 4000, 3)
+
+
+def test_a_folder_gives_its_pictures(tmp_path):
+    photos = save(tmp_path / "..", []) + save(tmp_path, [scene([(6, 6, RED)])] * 2)
+    (tmp_path / "notes.txt").write_text("no picture")
+    assert registering.gather_photos([tmp_path]) == photos
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(BadPhoto, match="holds no picture"):
+        registering.gather_photos([tmp_path / "empty"])
+    with pytest.raises(BadPhoto, match="no photos"):
+        registering.choose([], "cup", STACK, {}, whole=False)
+
+
+@pytest.mark.filterwarnings(
+    "ignore:Traits should be given as instances"
+)  # the widget library's own
+@pytest.mark.parametrize("size", [200, 1600])
+def test_the_box_that_is_dragged_is_the_photos(size):
+    photo = scene([(20, 20, RED)], size=size, side=40)
+    box = np.array([20, 20, 60, 60], np.float32)
+    widget = drag_box(photo, box, "mug")
+    shown = Image.open(BytesIO(widget.image_bytes))
+    assert max(shown.size) == min(size, 800)
+    assert dragged_box(widget, photo) == pytest.approx(box)
+    scale = shown.size[0] / size
+    moved = {"x": -5, "y": 10 * scale, "width": 5 + 30 * scale, "height": 20 * scale}
+    widget.bboxes = [*widget.bboxes, moved | {"label": "mug"}]
+    assert dragged_box(widget, photo) == pytest.approx([0, 10, 30, 30])
+    widget.bboxes = []
+    assert dragged_box(widget, photo) is None

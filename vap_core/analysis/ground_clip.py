@@ -1,0 +1,165 @@
+"""Ground a clip, track through it, and write it as a recording and as a video."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from itertools import chain
+from pathlib import Path
+
+from vap_core.analysis.ground import free_paths
+from vap_core.attend import Attender, AttendState
+from vap_core.base import video
+from vap_core.base.errors import BadOutput, BadPhoto
+from vap_core.base.photos import load_photo, photos_in
+from vap_core.base.types import Attended, Rgb, Track, value
+from vap_core.memory import load_bank
+from vap_core.perception.stacks import load_stack
+
+CAMERA = "clip"
+SIDE = 640
+"""The longer side to which frames are shrunk."""
+FOLDER_HZ = 10.0
+"""Frames a second that a folder of pictures is taken for."""
+RETRY = 5
+"""While the object is not in view, every so many frames are grounded."""
+
+
+@value
+class ClipSummary:
+    """What was found in a clip: the frame it was grounded in, and those in which it was tracked."""
+
+    frames: int
+    grounded: int | None
+    tracked: int
+    lost: tuple[tuple[int, int], ...]
+    text: str
+
+    def __str__(self) -> str:
+        if self.grounded is None:
+            return f"not in view in any of {self.frames} frames; nothing is highlighted"
+        lines = [
+            f"grounded in frame {self.grounded} of {self.frames}; tracked in {self.tracked} frames"
+        ]
+        if self.lost:
+            spans = ", ".join(f"{first}-{last}" for first, last in self.lost[:6])
+            lines.append(f"not visible in frames {spans}")
+        lines.append(f"instruction: {self.text}")
+        return "\n".join(lines)
+
+
+def is_clip(path: Path) -> bool:
+    """Whether `ground` is asked to follow a clip: a video, or a folder of frames."""
+    return path.is_dir() or video.is_video(path)
+
+
+def ground_clip(
+    path: Path,
+    instruction: str,
+    memory: Path,
+    stack: str,
+    out: Path,
+    *,
+    objects: Sequence[str] | None = None,
+) -> tuple[ClipSummary, Path, Path]:
+    """Follow the first target of `instruction` through a clip; write an .rrd and an .mp4.
+
+    Raises: BadPhoto, BadInstruction, UnknownName, BadOutput.
+    """
+    from vap_core.recording import ClipRecorder, ClipStep
+
+    frames, hz = _open(path)
+    first = next(frames, None)
+    if first is None:
+        raise BadPhoto(f"ground: {path} has no frame; film for some seconds.")
+    models = load_stack(stack)
+    attender = Attender(models, load_bank(memory, models.encoder.name))
+    _, (obj, *_) = attender.understand(instruction, objects)
+    mp4, rrd = _new_files(out, path.stem)
+    grounded, visible, text = None, [], instruction
+    with ExitStack() as files:
+        recorder = files.enter_context(ClipRecorder(rrd, CAMERA, obj.name, hz))
+        film = files.enter_context(video.Mp4(mp4, hz))
+        state: AttendState | None = None
+        for number, rgb in enumerate(chain([first], frames)):
+            at = number / hz
+            state, attended = _attend(attender, state, rgb, instruction, number, objects)
+            track, prompted = Track(None, 0.0), rgb
+            if attended is not None:
+                track, prompted = attended.tracks[CAMERA][0], attended.images[CAMERA]
+                grounding = attended.groundings[CAMERA][0]
+                is_first = grounded is None and state is not None
+                if is_first or number == 0:
+                    recorder.ground(number, at, rgb, grounding, obj, instruction, attended.text)
+                if is_first:
+                    grounded, text = number, attended.text
+            visible.append(track.mask is not None)
+            recorder.add(ClipStep(number, at, rgb, prompted, track))
+            film.add(prompted)
+    summary = ClipSummary(
+        frames=len(visible),
+        grounded=grounded,
+        tracked=sum(visible),
+        lost=_spans(visible, grounded),
+        text=text,
+    )
+    return summary, rrd, mp4
+
+
+def _open(path: Path) -> tuple[Iterator[Rgb], float]:
+    """The frames of a video or of a folder, and how many there are a second. Raises: BadPhoto."""
+    if not path.is_dir():
+        hz = video.frame_rate(path) if path.is_file() else 1.0
+        return video.frames(path, SIDE), hz
+    photos = photos_in(path)
+    if not photos:
+        raise BadPhoto(f"ground: {path} holds no picture; name a folder of frames.")
+    return (load_photo(photo, SIDE) for photo in photos), FOLDER_HZ
+
+
+def _attend(
+    attender: Attender,
+    state: AttendState | None,
+    rgb: Rgb,
+    instruction: str,
+    number: int,
+    objects: Sequence[str] | None,
+) -> tuple[AttendState | None, Attended | None]:
+    """Track; where nothing is tracked yet, ground every RETRY-th frame.
+
+    The state stays None until the object was found.
+    """
+    views = {CAMERA: rgb}
+    if state is not None:
+        return attender.step(state, views)
+    if number % RETRY:
+        return None, None
+    started, attended = attender.start(views, instruction, objects=objects)
+    if attended.groundings[CAMERA][0].winner is None:
+        return None, attended
+    return started, attended
+
+
+def _spans(visible: Sequence[bool], grounded: int | None) -> tuple[tuple[int, int], ...]:
+    """First and last frame of every stretch without the object, once it was grounded."""
+    spans: list[tuple[int, int]] = []
+    if grounded is None:
+        return ()
+    for number in range(grounded, len(visible)):
+        if visible[number]:
+            continue
+        if spans and spans[-1][1] == number - 1:
+            spans[-1] = (spans[-1][0], number)
+        else:
+            spans.append((number, number))
+    return tuple(spans)
+
+
+def _new_files(folder: Path, stem: str) -> tuple[Path, Path]:
+    """An .mp4 and an .rrd that do not exist, in a folder that does. Raises: BadOutput."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadOutput(
+            f"ground: {folder} cannot be written ({error.strerror}); choose another folder with "
+            "--out."
+        ) from error
+    return free_paths(folder, stem, (".mp4", ".rrd"))

@@ -1,0 +1,1 @@
+"""Ablations: the method with one thing changed at a time (P appendix)."""

@@ -1,0 +1,56 @@
+"""The effect of every arm as a forest plot: points of SR against the ablation's first arm."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from vap_core.evaluation.ablations.table import ArmResult
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+CLEAR, UNCLEAR = "#0072b2", "#9aa0a6"
+"""Intervals that leave out no difference, and those that do not."""
+PAPER = "#d55e00"
+
+
+def effects_figure(results: Sequence[ArmResult], title: str) -> "Figure":
+    """One row per arm and suite: the difference in SR with its 95 % interval.
+
+    A diamond is the paper's difference, where the paper has both arms.
+    """
+    from matplotlib.figure import Figure as NewFigure
+    from matplotlib.lines import Line2D
+
+    first = {one.suite: one for one in results if one.against is None}
+    shown = [one for one in results if one.against is not None]
+    figure = NewFigure(figsize=(7.2, 1.1 + 0.3 * len(shown)), layout="constrained")
+    axes = figure.subplots()
+    for y, one in enumerate(reversed(shown)):
+        assert one.against is not None
+        low, mid, high = (
+            100 * bound for bound in (one.against.low, one.against.difference, one.against.high)
+        )
+        colour = UNCLEAR if low <= 0 <= high else CLEAR
+        axes.plot([low, high], [y, y], color=colour, linewidth=2)
+        axes.plot(mid, y, "o", color=colour)
+        theirs = 100 * (one.paper - first[one.suite].paper)
+        if theirs == theirs:
+            axes.plot(theirs, y, "D", color=PAPER, markersize=5, fillstyle="none")
+    axes.axvline(0, color="black", linewidth=0.8)
+    axes.set_yticks(range(len(shown)), [_label(one, first) for one in reversed(shown)])
+    axes.set_xlabel("success rate against the first arm, points (95 %)")
+    axes.set_title(title, loc="left", fontsize=10)
+    axes.spines[["top", "right"]].set_visible(False)
+    handles = [
+        Line2D([], [], color=CLEAR, marker="o", label="a difference"),
+        Line2D([], [], color=UNCLEAR, marker="o", label="none shown"),
+        Line2D([], [], color=PAPER, marker="D", fillstyle="none", linewidth=0, label="the paper's"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+    return figure
+
+
+def _label(one: ArmResult, first: dict[str, ArmResult]) -> str:
+    if len(first) == 1:
+        return f"{one.arm}, n {one.sr.n}"
+    return f"{one.suite} {one.arm}, n {one.sr.n}"

@@ -1,0 +1,124 @@
+"""The table of an ablation: every arm with its rate, against the default on the same episodes."""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from vap_core.base.types import value
+from vap_core.evaluation import paper
+from vap_core.evaluation.ablations.arms import Ablation
+from vap_core.evaluation.metrics import Rate, rate
+from vap_core.evaluation.statistics import ALL_TASKS, Comparison, compare, holm
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+PAPER_SUITES = {"simpler-fractal": "Google Robot", "simpler-bridge": "WidowX"}
+"""The columns of the paper's ablation tables for our suites."""
+
+
+@value
+class ArmResult:
+    """One arm over all episodes of a suite; errors count as no success.
+
+    `against` compares it with the ablation's first arm on the same episodes; None for that arm.
+    Its `p_holm` is corrected over the arms of one suite. `paper` is the paper's SR, a fraction, nan
+    where it has none.
+    """
+
+    suite: str
+    arm: str
+    sr: Rate
+    cmr: Rate
+    case_1: Rate
+    case_2: Rate
+    against: Comparison | None
+    paper: float
+
+
+def arm_results(ablation: Ablation, episodes: "pd.DataFrame") -> list[ArmResult]:
+    """The arms of every suite in `episodes` (rows of a results table)."""
+    results = []
+    for suite in dict.fromkeys(episodes["suite"]):
+        of_suite = episodes[episodes["suite"] == suite].assign(split="")
+        against = _against_default(ablation, of_suite)
+        for arm in ablation.names:
+            rows = of_suite[of_suite["method"] == arm]
+            results.append(
+                ArmResult(
+                    suite=suite,
+                    arm=arm,
+                    sr=_share(rows, "success"),
+                    cmr=_share(rows, "cmr"),
+                    case_1=rate(int(rows["case"].eq("case 1").sum()), len(rows)),
+                    case_2=rate(int(rows["case"].eq("case 2").sum()), len(rows)),
+                    against=against.get(arm),
+                    paper=_paper_sr(ablation, suite, arm),
+                )
+            )
+    return results
+
+
+def arm_rows(results: list[ArmResult]) -> list[list[str]]:
+    """The table as text cells, header first; rates and differences in percent."""
+    rows = [
+        [
+            "suite",
+            "arm",
+            "n",
+            "SR % [95 %]",
+            "CMR % [95 %]",
+            "case 1",
+            "case 2",
+            "against the first, points [95 %]",
+            "p Holm",
+            "paper's SR %",
+        ]
+    ]
+    for one in results:
+        difference = p = "-"
+        if one.against is not None:
+            of = one.against
+            difference = f"{100 * of.difference:+.1f} [{100 * of.low:+.1f}, {100 * of.high:+.1f}]"
+            p = f"{of.p_holm:.3g}"
+        published = "-" if one.paper != one.paper else f"{100 * one.paper:.1f}"
+        cells = [one.suite, one.arm, str(one.sr.n), str(one.sr), str(one.cmr)]
+        cases = [str(one.case_1.k), str(one.case_2.k)]
+        rows.append([*cells, *cases, difference, p, published])
+    return rows
+
+
+def _against_default(ablation: Ablation, of_suite: "pd.DataFrame") -> dict[str, Comparison]:
+    """Each arm against the first, over all tasks of the suite."""
+    default, *others = ablation.names
+    found = {}
+    for arm in others:
+        part = of_suite[of_suite["method"].isin([default, arm])]
+        for comparison in compare(part, [default, arm]):
+            single = part["task"].nunique() == 1
+            if comparison.task == ALL_TASKS or single:
+                found[arm] = comparison
+    p_holm = holm([comparison.p for comparison in found.values()])
+    corrected = {}
+    for (arm, comparison), p in zip(found.items(), p_holm, strict=True):
+        corrected[arm] = replace(comparison, p_holm=p)
+    return corrected
+
+
+def _share(rows: "pd.DataFrame", column: str) -> Rate:
+    """The share of episodes in which it holds, of those that can say."""
+    told = rows[rows[column].notna() | rows["outcome"].eq("error")]
+    won = told[column].eq(True) & told["outcome"].ne("error")
+    return rate(int(won.sum()), len(told))
+
+
+def _paper_sr(ablation: Ablation, suite: str, arm: str) -> float:
+    if arm not in ablation.rows or suite not in PAPER_SUITES:
+        return float("nan")
+    facts = paper.ledger()
+    facts = facts[
+        facts["table"].eq(ablation.paper)
+        & facts["row"].eq(ablation.rows[arm])
+        & facts["column"].eq(PAPER_SUITES[suite])
+        & facts["metric"].eq("SR")
+    ]
+    return float(facts["value"].iloc[0]) / 100 if len(facts) else float("nan")

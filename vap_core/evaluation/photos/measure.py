@@ -1,0 +1,164 @@
+"""What the method does with the scenes of a photo set, one row per scene and object.
+
+A row has the elected box against the true ones, and the vote when the true boxes of the scene are
+the candidates.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int64
+
+from vap_core.attend import Attender
+from vap_core.base.errors import BadPhotoSet
+from vap_core.base.photos import load_photo
+from vap_core.base.types import Boxes, Grounding, PersonalObject, Rgb
+from vap_core.evaluation.photos.folder import PhotoSet, Scene
+from vap_core.perception.boxes import box_iou
+from vap_core.perception.candidates import Candidates, embed, segment
+from vap_core.perception.protocols import FamiliarityJudge, Stack
+
+CAMERA = "photo"
+Row = dict[str, Any]
+Memory = Mapping[str, PersonalObject]
+
+
+def measure_scene(
+    scene: Scene, photo_set: PhotoSet, memory: Memory, attender: Attender
+) -> list[Row]:
+    """One row for every remembered object that the scene's lines name.
+
+    Raises: BadPhoto, BadPhotoSet: the photo cannot be read, or a box lies outside of it.
+    """
+    rgb = load_photo(scene.path, long_side=None)
+    true_boxes, owners = _true_boxes(scene, rgb)
+    candidates = _candidates(rgb, true_boxes, attender.stack)
+    rows = []
+    for name, boxes in scene.boxes.items():
+        if name not in memory:
+            continue
+        category = photo_set.categories[name]
+        kinds = [photo_set.categories[owner] for owner in owners]
+        own = np.array([owner == name for owner in owners], bool)
+        same_kind = np.array([kind == category for kind in kinds], bool)
+        row: Row = {
+            "scene": scene.name,
+            "object": name,
+            "category": category,
+            "present": len(boxes) > 0,
+            "lookalikes": int((same_kind & ~own).sum()),
+        }
+        row |= _ground(rgb, boxes, memory[name], attender)
+        if len(boxes):
+            every = np.ones(len(own), bool)
+            row |= _vote("all", own, every, candidates, memory[name], attender)
+            row |= _vote("kind", own, same_kind, candidates, memory[name], attender)
+        rows.append(row)
+    return rows
+
+
+def _true_boxes(scene: Scene, rgb: Rgb) -> tuple[Boxes, list[str]]:
+    """Every box of the scene, clipped to the photo, and whose it is."""
+    height, width = rgb.shape[:2]
+    clipped = [np.zeros((0, 4), np.float32)]
+    owners = []
+    for name, boxes in scene.boxes.items():
+        for box in boxes:
+            inside = np.clip(box, 0, (width, height, width, height)).astype(np.float32)
+            if not (inside[2:] - inside[:2] >= 1).all():
+                raise BadPhotoSet(
+                    f"eval-photos: the box {box.tolist()} of {name!r} lies outside {scene.path}, "
+                    f"which has {width}x{height} pixels when upright; mend scenes.csv."
+                )
+            clipped.append(inside[None])
+            owners.append(name)
+    xyxy = np.concatenate(clipped)
+    return Boxes(xyxy, np.ones(len(xyxy), np.float32), "true boxes"), owners
+
+
+def _candidates(rgb: Rgb, boxes: Boxes, stack: Stack) -> Candidates:
+    """The true boxes, embedded as boxes of such a photo are, and their masks."""
+    if isinstance(stack.detector, FamiliarityJudge):
+        boxes = replace(boxes, familiar=stack.detector.is_familiar(rgb, boxes.phrase))
+    return segment(rgb, embed(rgb, boxes, stack), stack)
+
+
+def _ground(
+    rgb: Rgb, boxes: Float32[np.ndarray, "_ 4"], obj: PersonalObject, attender: Attender
+) -> Row:
+    """The method's first step on the photo, and how its choice overlaps the true boxes."""
+    started = perf_counter()
+    instruction = f"bring my {obj.category}"
+    _, attended = attender.start({CAMERA: rgb}, instruction, objects=[obj.name])
+    seconds = perf_counter() - started
+    (grounding,) = attended.groundings[CAMERA]
+    overlap = box_iou(grounding.candidates.xyxy, boxes).max(axis=1, initial=0.0)
+    row: Row = {
+        "candidates": len(overlap),
+        "proposed_iou": float(overlap.max(initial=0.0)),
+        "tinted": grounding.winner is not None,
+        "iou": 0.0,
+        "ms": round(1000 * seconds, 1),
+        **_elected(grounding),
+    }
+    if grounding.winner is not None:
+        row["iou"] = float(overlap[grounding.winner])
+    return row
+
+
+def _elected(grounding: Grounding) -> Row:
+    """The box that the vote elected, tinted or not; none without candidates."""
+    winner = grounding.chosen
+    if winner is None:
+        return {"x0": None, "y0": None, "x1": None, "y1": None, "cosine": None, "margin": None}
+    x0, y0, x1, y1 = grounding.candidates.xyxy[winner].tolist()
+    return {
+        "x0": x0,
+        "y0": y0,
+        "x1": x1,
+        "y1": y1,
+        "cosine": float(grounding.similarity[winner].mean()),
+        "margin": grounding.ballot.margin,
+    }
+
+
+def _vote(
+    among: str,
+    own: Bool[np.ndarray, " n"],
+    eligible: Bool[np.ndarray, " n"],
+    candidates: Candidates,
+    obj: PersonalObject,
+    attender: Attender,
+) -> Row:
+    """How the vote does among true boxes: with all references, and with each of them alone.
+
+    The values are None where the object has no rival among them.
+    """
+    names = (f"{among}_boxes", f"{among}_one", f"{among}_every")
+    rows = np.flatnonzero(eligible)
+    if own[rows].all():
+        return dict.fromkeys(names)
+    among_them = _take(candidates, rows)
+    right_alone = []
+    for k in range(len(obj.crops)):
+        elected = attender.ground(CAMERA, obj.take(slice(k, k + 1)), among_them).ballot.winner
+        right_alone.append(bool(own[rows[elected]]))
+    elected = attender.ground(CAMERA, obj, among_them).ballot.winner
+    return {
+        names[0]: len(rows),
+        names[1]: float(np.mean(right_alone)),
+        names[2]: bool(own[rows[elected]]),
+    }
+
+
+def _take(candidates: Candidates, rows: Int64[np.ndarray, " m"]) -> Candidates:
+    """These candidates, in this order."""
+    return Candidates(
+        boxes=candidates.boxes.take(rows),
+        embeddings=candidates.embeddings[rows],
+        masks=candidates.masks[rows],
+        ids=tuple(range(len(rows))),
+    )

@@ -1,0 +1,132 @@
+"""The figures of a photo set as text: grounding per object and per kind of scene, and the vote."""
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float64
+
+from vap_core.base.tables import Rows, align
+from vap_core.evaluation.perception.estimates import NONE, Estimate
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+RIGHT_IOU, LOOSE_IOU = 0.5, 0.25
+NOTE = (
+    "value [95 % interval] n, in %; Wilson's interval with n reduced to what the scenes, which are "
+    "the independent units, are worth.\n"
+    "right: the tinted box overlaps the object by IoU .5; proposed: some candidate does. wrong: "
+    "another box is tinted. silent: nothing is. look-alikes: other objects of its kind in the "
+    "scene.\n"
+    "vote: the true boxes of a scene are the candidates; with one reference (the mean over them) "
+    "and with all."
+)
+
+
+def text_report(table: "pd.DataFrame") -> str:
+    """What the command prints."""
+    seconds = f"ms a photo: median {table.ms.median():.0f}, slowest {table.ms.max():.0f}"
+    parts = [align(object_rows(table)), align(scene_rows(table)), align(vote_rows(table))]
+    return "\n\n".join([*parts, f"{seconds}\n{NOTE}"])
+
+
+def object_rows(table: "pd.DataFrame") -> Rows:
+    """One line per object, and one for all: counts."""
+    rows = [
+        ["object", "kind", "in view", "right", "IoU .25", "wrong", "silent", "absent", "tinted"]
+    ]
+    for (name, kind), part in table.groupby(["object", "category"], sort=True):
+        rows.append([str(name), str(kind), *_counts(part)])
+    rows.append(["all", "", *_counts(table)])
+    return rows
+
+
+def scene_rows(table: "pd.DataFrame") -> Rows:
+    """One line per kind of scene: with the object and without, with look-alikes and without."""
+    rows = [["scenes", "proposed", "right", "right at IoU .25", "wrong tinted", "silent"]]
+    seen, absent = table[table.present], table[~table.present]
+    kinds = (
+        ("object in view", seen),
+        ("- beside look-alikes", seen[seen.lookalikes > 0]),
+        ("- alone of its kind", seen[seen.lookalikes == 0]),
+        ("object absent", absent),
+        ("- look-alikes in view", absent[absent.lookalikes > 0]),
+        ("- none of its kind", absent[absent.lookalikes == 0]),
+    )
+    for number, (name, part) in enumerate(kinds):
+        right = part.iou >= RIGHT_IOU
+        measures = [part.proposed_iou >= RIGHT_IOU, right, part.iou >= LOOSE_IOU]
+        cells = [_share(hits, part) for hits in measures]
+        if number >= 3:
+            cells = ["", "", ""]
+        rows.append([name, *cells, _share(part.tinted & ~right, part), _share(~part.tinted, part)])
+    return rows
+
+
+def vote_rows(table: "pd.DataFrame") -> Rows:
+    """How the vote does among the true boxes of a scene."""
+    rows = [["vote among", "boxes", "chance", "one reference", "all references"]]
+    for among, name in (("all", "all true boxes"), ("kind", "those of its kind")):
+        cells = [name]
+        known = table
+        if f"{among}_boxes" in table:
+            known = table.dropna(subset=[f"{among}_boxes"])
+        if f"{among}_boxes" not in table or not len(known):
+            rows.append([*cells, "-", "-", "-", "-"])
+            continue
+        boxes = known[f"{among}_boxes"].to_numpy(float)
+        cells += [f"{boxes.mean():.1f}", f"{100 * (1 / boxes).mean():.0f}"]
+        for column in (f"{among}_one", f"{among}_every"):
+            cells.append(_share(known[column], known))
+        rows.append(cells)
+    return rows
+
+
+def clustered_share(hits: Float64[np.ndarray, " n"], clusters: Iterable[object]) -> Estimate:
+    """The mean of hits (0 to 1) and its 95 % interval when whole clusters are independent.
+
+    Wilson's interval for n / d cases, where the design effect d is the mean's cluster-robust
+    variance over the variance that n independent cases would have. n / d is at least the number of
+    clusters, which it also is where all hits are alike, and at most n.
+    """
+    from statsmodels.stats.proportion import proportion_confint
+
+    n = len(hits)
+    if not n:
+        return NONE
+    share = float(hits.mean())
+    _, number = np.unique([str(name) for name in clusters], return_inverse=True)
+    count = int(number.max()) + 1
+    independent = share * (1 - share) / n
+    worth = float(count)
+    if count > 1 and independent > 0:
+        sums = np.bincount(number, hits - share)
+        clustered = float((sums**2).sum()) / n**2 * count / (count - 1)
+        if clustered > 0:
+            worth = float(np.clip(n * independent / clustered, count, n))
+        else:
+            worth = float(n)
+    low, high = proportion_confint(share * worth, worth, alpha=0.05, method="wilson")
+    return Estimate(value=share, low=float(low), high=float(high), n=n)
+
+
+def _share(hits: "pd.Series", part: "pd.DataFrame") -> str:
+    """The share of hits with its interval, scenes as clusters."""
+    return clustered_share(hits.to_numpy(float), part.scene).text(digits=0)
+
+
+def _counts(part: "pd.DataFrame") -> list[str]:
+    """In view, right, right at IoU .25, wrong, silent; absent, tinted all the same."""
+    seen, absent = part[part.present], part[~part.present]
+    wrong = seen.tinted & (seen.iou < RIGHT_IOU)
+    counts = (
+        len(seen),
+        (seen.iou >= RIGHT_IOU).sum(),
+        (seen.iou >= LOOSE_IOU).sum(),
+        wrong.sum(),
+        (~seen.tinted).sum(),
+        len(absent),
+        absent.tinted.sum(),
+    )
+    return [str(int(count)) for count in counts]

@@ -1,0 +1,98 @@
+"""Measures a photo set scene by scene; what an interrupted run had finished is kept."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vap_core import __version__
+from vap_core.attend import Attender
+from vap_core.base.errors import BadOutput
+from vap_core.base.files import parse_json, write_atomic
+from vap_core.evaluation import store
+from vap_core.evaluation.photos.folder import PhotoSet, read_photo_set
+from vap_core.evaluation.photos.measure import Row, measure_scene
+from vap_core.evaluation.photos.register import remember_subjects
+from vap_core.evaluation.photos.report import text_report
+from vap_core.evaluation.photos.sheet import write_sheets
+from vap_core.perception.embedded.weights import weights_sha256
+from vap_core.perception.stacks import load_stack
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+TABLE = "questions"
+
+
+def measure_photos(folder: Path, out: Path, stack_name: str, *, progress: bool = True) -> str:
+    """Do what `out` lacks of the measurement, write tables and sheets, and return the report.
+
+    Raises: BadPhotoSet, BadPhoto; BadOutput when `out` holds another run.
+    """
+    photo_set = read_photo_set(folder)
+    store.open_run(out, _configuration(photo_set, stack_name))
+    with store.locked(out):
+        table = _measure(photo_set, out, stack_name, progress)
+        written = _write(table, out)
+        sheets = write_sheets(photo_set, table, out)
+        report = text_report(table)
+        write_atomic(out / "report.txt", f"{report}\n".encode())
+    names = ", ".join(str(path) for path in [*written, *sheets])
+    return f"{report}\n\nwrote {names}"
+
+
+def _configuration(photo_set: PhotoSet, stack_name: str) -> dict[str, object]:
+    """What the results depend on."""
+    return {
+        "measurement": "photos",
+        "photos": photo_set.sha256,
+        "stack": stack_name,
+        "version": __version__,
+        "weights": weights_sha256(),
+    }
+
+
+def _measure(photo_set: PhotoSet, out: Path, stack_name: str, progress: bool) -> "pd.DataFrame":
+    """One row per scene and object."""
+    import pandas as pd
+    from tqdm import tqdm
+
+    stack = load_stack(stack_name)
+    memory = remember_subjects(photo_set.subjects, stack, out / "memory")
+    attender = Attender(stack, memory)
+    rows: list[Row] = []
+    for scene in tqdm(photo_set.scenes, unit="scene", desc="photos", disable=not progress):
+        path = out / "parts" / f"{scene.name}.json"
+        if not path.exists():
+            measured = measure_scene(scene, photo_set, memory, attender)
+            _write_part(path, measured)
+        rows.extend(_read_part(path))
+    return pd.DataFrame(rows)
+
+
+def _write_part(path: Path, rows: list[Row]) -> None:
+    try:
+        path.parent.mkdir(exist_ok=True)
+        write_atomic(path, json.dumps(rows).encode())
+    except OSError as error:
+        raise BadOutput(
+            f"eval-photos: {path.parent} cannot be written ({error.strerror}); make room and run "
+            "the same command again."
+        ) from error
+
+
+def _read_part(path: Path) -> list[Row]:
+    try:
+        rows: list[Row] = parse_json(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise BadOutput(
+            f"eval-photos: {path} is damaged; delete it and run the same command again."
+        ) from error
+    return rows
+
+
+def _write(table: "pd.DataFrame", out: Path) -> list[Path]:
+    """The table as Parquet, for programs, and as CSV, for people."""
+    paths = [out / f"{TABLE}.parquet", out / f"{TABLE}.csv"]
+    write_atomic(paths[0], table.to_parquet(index=False, compression="zstd"))
+    write_atomic(paths[1], table.round(4).to_csv(index=False).encode())
+    return paths

@@ -1,0 +1,198 @@
+"""Which box of each reference photo shows the object: what all photos of it have in common.
+
+Every box that the detector proposes is a candidate. One that resembles some box of every other
+photo, lies near the middle and is not small is chosen; a doubtful choice says why.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Float32, Int64
+
+from vap_core.base.types import Boxes, Rgb, value
+from vap_core.perception.boxes import box_iou, crop
+from vap_core.perception.protocols import Detector, Encoder, ReferenceCropper
+
+THRESHOLD = 0.05
+"""Photos of the object show one of its kind, so a box needs a lower score than a proposal does."""
+MOST_BOXES = 12
+"""Boxes of a photo that are compared."""
+SCORE_WEIGHT, CENTRE_WEIGHT, AREA_WEIGHT = 0.1, 0.3, 0.02
+"""Of log score, distance from the photo's centre (in its sides) and log share of its area, beside
+the cosine to the other photos."""
+PRIOR_WEIGHT = 2.0
+"""Of a box's prior, which takes the place of its score where a detector gives it."""
+RIVAL_IOU = 0.5
+"""A box that overlaps the chosen one by less would be another crop."""
+ELSEWHERE = 0.1
+"""A box shows something else when less than this share of the smaller of both is common."""
+CLOSE, CLOSE_ALONE = 0.05, 0.1
+"""Another crop that scores nearer to the chosen one than this makes it doubtful; the second holds
+for a single photo."""
+LEAST_COSINE = 0.5
+"""Mean cosine to the best boxes of the other photos, below which the choice is doubtful."""
+SMALL_SHARE = 0.01
+"""Of a photo's area: a smaller box is more likely a part of the object."""
+SMALL_PX = 64
+"""The shorter side of a crop, below which little detail is left to compare."""
+Box = Float32[np.ndarray, "4"]
+ChosenBy = Literal["given", "whole", "proposed"]
+
+
+@value
+class Reference:
+    """One reference photo with the box that is cropped.
+
+    `agreement` is the mean cosine of the crop to the best crop of every other photo, nan for a
+    single photo. `doubt` says why the box may be wrong, "" where nothing speaks against it.
+    `others` are crops of the photo that show something else.
+    """
+
+    photo: Rgb
+    box: Float32[np.ndarray, "4"]
+    chosen_by: ChosenBy
+    agreement: float
+    doubt: str
+    others: tuple[Rgb, ...]
+
+    @property
+    def crop(self) -> Rgb:
+        if self.chosen_by == "whole":
+            return self.photo
+        return crop(self.photo, self.box)
+
+
+def choose_references(
+    photos: Sequence[Rgb],
+    category: str,
+    detector: Detector,
+    encoder: Encoder,
+    given: Mapping[int, Box] | None = None,
+) -> tuple[Reference, ...]:
+    """The box of every photo: the given one (by the photo's number), else the one that is chosen.
+
+    A photo in which nothing is proposed is used whole, and its doubt says so.
+    """
+    given = given or {}
+    proposals = []
+    rows = []
+    for i, photo in enumerate(photos):
+        boxes = _boxes_of(photo, category, detector, given.get(i))
+        proposals.append(boxes)
+        rows.append(encoder([crop(photo, box) for box in boxes.xyxy]))
+    references = []
+    for i, photo in enumerate(photos):
+        others = rows[:i] + rows[i + 1 :]
+        support = _support(rows[i], [part for part in others if len(part)])
+        references.append(_choose(photo, proposals[i], support, i in given))
+    return tuple(references)
+
+
+def whole_photos(photos: Sequence[Rgb]) -> tuple[Reference, ...]:
+    """References that are cut out already."""
+    references = []
+    for photo in photos:
+        references.append(_whole(photo, ""))
+    return tuple(references)
+
+
+def _boxes_of(photo: Rgb, category: str, detector: Detector, given: Box | None) -> Boxes:
+    """The candidates of a photo: the given box first, then what is proposed."""
+    if isinstance(detector, ReferenceCropper):
+        found = detector.reference_boxes(photo, category, THRESHOLD)
+    else:
+        (found,) = detector([photo], category, THRESHOLD)
+    xyxy = found.xyxy[:MOST_BOXES]
+    score = found.score[:MOST_BOXES]
+    evidence = np.log(score + np.float32(1e-3)) * np.float32(SCORE_WEIGHT)
+    if found.prior is not None:
+        evidence = np.float32(PRIOR_WEIGHT) * found.prior[:MOST_BOXES]
+    if given is not None:
+        xyxy = np.concatenate([given[None], xyxy])
+        score = np.concatenate([np.ones(1, np.float32), score])
+        evidence = np.concatenate([np.zeros(1, np.float32), evidence])
+    return Boxes(xyxy, score, category, prior=evidence.astype(np.float32))
+
+
+def _support(
+    rows: Float32[np.ndarray, "n d"], others: Sequence[Float32[np.ndarray, "_m d"]]
+) -> Float[np.ndarray, " n"]:
+    """Of every box, the mean cosine to the most similar box of each other photo."""
+    if not others:
+        return np.full(len(rows), np.nan)
+    best = [(rows @ other.T).max(axis=1) for other in others]
+    return np.mean(best, axis=0)
+
+
+def _choose(
+    photo: Rgb, boxes: Boxes, support: Float[np.ndarray, " n"], is_given: bool
+) -> Reference:
+    if not len(boxes):
+        return _whole(photo, f"no {boxes.phrase} was found in it")
+    score = _prior(photo, boxes) + np.nan_to_num(support)
+    best = 0 if is_given else int(score.argmax())
+    overlap = box_iou(boxes.xyxy[best : best + 1], boxes.xyxy)[0]
+    elsewhere = np.flatnonzero(_common_share(boxes.xyxy[best], boxes.xyxy) < ELSEWHERE)
+    doubt = ""
+    if not is_given and _share_of_photo(photo, boxes.xyxy[best]) < SMALL_SHARE:
+        doubt = "what was found is a small part of it"
+    elif not is_given:
+        doubt = _doubt(score, float(support[best]), best, np.flatnonzero(overlap < RIVAL_IOU))
+    return Reference(
+        photo=photo,
+        box=boxes.xyxy[best],
+        chosen_by="given" if is_given else "proposed",
+        agreement=float(support[best]),
+        doubt=doubt,
+        others=tuple(crop(photo, boxes.xyxy[i]) for i in elsewhere),
+    )
+
+
+def _prior(photo: Rgb, boxes: Boxes) -> Float[np.ndarray, " n"]:
+    """What speaks for each box of one photo before others are looked at."""
+    assert boxes.prior is not None
+    height, width = photo.shape[:2]
+    size = np.array([width, height])
+    centre = (boxes.xyxy[:, :2] + boxes.xyxy[:, 2:]) / 2 / size
+    away = np.hypot(*(centre - 0.5).T)
+    area = (boxes.xyxy[:, 2:] - boxes.xyxy[:, :2]).prod(axis=1) / (width * height)
+    return boxes.prior - CENTRE_WEIGHT * away + AREA_WEIGHT * np.log(np.clip(area, 0.01, 1))
+
+
+def _doubt(
+    score: Float[np.ndarray, " n"], support: float, best: int, rivals: Int64[np.ndarray, " _r"]
+) -> str:
+    """Why the best box may be wrong; `support` is nan for a single photo."""
+    if support < LEAST_COSINE:
+        return f"what was found is unlike the other photos (cosine {support:.2f})"
+    close = CLOSE_ALONE if np.isnan(support) else CLOSE
+    if len(rivals) and score[rivals].max() > score[best] - close:
+        return "two things in it could be meant"
+    return ""
+
+
+def _common_share(box: Box, others: Float32[np.ndarray, "n 4"]) -> Float[np.ndarray, " n"]:
+    """What each other box has in common with `box`, as a share of the smaller of the two."""
+    near = np.maximum(others[:, :2], box[:2])
+    far = np.minimum(others[:, 2:], box[2:])
+    common = np.clip(far - near, 0, None).prod(axis=1)
+    area = (others[:, 2:] - others[:, :2]).prod(axis=1)
+    return common / np.minimum(area, (box[2:] - box[:2]).prod())
+
+
+def _share_of_photo(photo: Rgb, box: Box) -> float:
+    height, width = photo.shape[:2]
+    return float((box[2:] - box[:2]).prod()) / (width * height)
+
+
+def _whole(photo: Rgb, doubt: str) -> Reference:
+    height, width = photo.shape[:2]
+    return Reference(
+        photo=photo,
+        box=np.array([0, 0, width, height], np.float32),
+        chosen_by="whole",
+        agreement=float("nan"),
+        doubt=doubt,
+        others=(),
+    )

@@ -1,0 +1,101 @@
+"""Learned words for some training objects, so that a policy reads such words before its user's.
+
+Each is learned in the frozen model that the policy is initialised from, as a soft prompt is
+(`learned_token`), from photos of the object, of its look-alikes in the films and of other kinds.
+"""
+
+import json
+import time
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vap_core.base.files import parse_json, write_atomic
+from vap_core.base.types import Rgb
+from vap_core.policies.mini_pi0 import learned_token
+from vap_core.policies.mini_pi0.learned_token import Photos, TokenTraining
+from vap_core.policies.mini_pi0.vlm import MiniVlm
+from vap_core.simulation.assets import objects
+from vap_core.simulation.studio import photograph, reference_shots
+from vap_core.training.films.demonstrations import Film
+from vap_core.training.films.scenes import TRAIN_INSTANCES, only_generic
+from vap_core.training.policy.commands import Embedding
+
+PHOTOS = 5
+"""Photos of an object, and of each of its look-alikes."""
+OTHERS = 6
+"""Photos of objects of other categories."""
+SIZE = 224
+"""Pixels of a photo, square."""
+TRAINING = TokenTraining(epochs=8)
+LEAST_ACCURACY = 0.75
+"""A word that tells its object from others in fewer unseen photos is not used."""
+
+
+def crews(films: Sequence[Film], count: int) -> list[tuple[str, ...]]:
+    """The look-alikes of the first films, a tuple a stage, `count` objects in all or a few more."""
+    found: dict[tuple[str, ...], None] = {}
+    for film in films:
+        category = objects.get_object(film.names[0]).category
+        crew = []
+        for i, name in enumerate(film.names):
+            if i != film.goal and objects.get_object(name).category == category:
+                crew.append(name)
+        if sum(map(len, found)) < count:
+            found[tuple(sorted(crew))] = None
+    return list(found)
+
+
+def learn_words(
+    vlm: MiniVlm, films: Sequence[Film], count: int, folder: Path
+) -> tuple[dict[str, Embedding], dict[str, Any]]:
+    """The usable words of about `count` objects of the films, and what learning them took.
+
+    `folder` keeps them; an earlier call goes on.
+    """
+    file = folder / "words.json"
+    kept: dict[str, Any] = {"cpu_s": 0.0, "accuracy": {}}
+    if file.exists():
+        kept = parse_json(file.read_bytes())
+    model = vlm.sha256()
+    words = {}
+    for crew in crews(films, count):
+        for name in crew:
+            if name not in kept["accuracy"]:
+                started = time.process_time()
+                taught, unseen = (_photos(name, crew, seed) for seed in (0, 1))
+                token = learned_token.learn(vlm, name, taught, unseen, TRAINING)
+                learned_token.save(folder, token)
+                kept["accuracy"][name] = token.accuracy
+                kept["cpu_s"] += time.process_time() - started
+                write_atomic(file, json.dumps(kept, indent=1).encode())
+            if kept["accuracy"][name] >= LEAST_ACCURACY:
+                words[name] = learned_token.load(folder, name, model).embedding
+    return words, kept
+
+
+def _photos(name: str, crew: Sequence[str], seed: int) -> Photos:
+    """Photos of an object, its look-alikes and other things, none of which is in an evaluation."""
+    rng = np.random.default_rng([80, seed, *crew[0].encode()])
+    category = objects.get_object(name).category
+    rivals: list[Rgb] = []
+    for other in crew:
+        if other != name:
+            rivals += _photograph(other, PHOTOS, seed)
+    kinds = [kind for kind in objects.CATEGORIES if kind != category]
+    others: list[Rgb] = []
+    for kind in rng.choice(kinds, OTHERS, replace=False):
+        instance = objects.generic_instance(str(kind), int(rng.integers(TRAIN_INSTANCES)))
+        others += _photograph(instance.name, 1, seed)
+    return Photos(_photograph(name, PHOTOS, seed), tuple(rivals), tuple(others))
+
+
+@lru_cache(maxsize=64)
+def _photograph(name: str, n: int, seed: int) -> tuple[Rgb, ...]:
+    """Photos of an object; those of a crew are asked for by each of it."""
+    model = objects.get_object(name)
+    only_generic([model])
+    return tuple(photograph(model, reference_shots(model, n, seed), SIZE))
