@@ -1,5 +1,6 @@
 """Measures of attention maps: shares, peaks and entropy against hand counts; patterns by their definitions; areas under ROC curves."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import pandas as pd
 import pytest
 
 from tests.command import vap
-from vap_core.analysis.attention import patterns, prediction, report
+from vap_core.analysis.attention import patterns, prediction, replay, report
 from vap_core.analysis.attention.measures import REGIONS, inside, measure, patch_areas
 from vap_core.analysis.attention.patterns import (
     Thresholds,
@@ -19,7 +20,8 @@ from vap_core.analysis.attention.patterns import (
     per_episode,
     with_localisation,
 )
-from vap_core.evaluation.study import Study
+from vap_core.base.errors import BadStudy
+from vap_core.evaluation.study import Study, make_trial
 from vap_core.simulation import suites
 from vap_core.simulation.env import Env
 from vap_core.simulation.suites.open_row import build_scene
@@ -258,7 +260,7 @@ def test_a_warning_is_measured_where_enough_fails() -> None:
     assert set(few["AUC for failure"]) == {"too few failures (4 of 80)"}
 
 
-@pytest.mark.slow
+@pytest.mark.sweep
 def test_the_command_measures_a_run_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
     run = tmp_path / "run"
     done = vap("rollout", "--suite", "simpler-bridge", "--task", "pick-shaver", "--policy", "mini-pi0", "--methods", "generic", "--episodes", "2",
@@ -286,12 +288,41 @@ def test_the_command_measures_a_run_and_goes_on_where_it_stopped(tmp_path: Path)
     assert "holds no episode of what was asked for" in done.stderr
 
 
-def test_a_policy_without_attention_is_refused_in_one_line(tmp_path: Path) -> None:
-    from vap_core.evaluation import engine
+def replayed(study: Study, task: str, memory: Path, policy: str) -> dict[str, Any]:
+    """The tables of the first episode of a task, of two calls at most."""
+    suite = study.tasks[0][0]
+    row = replace(study.rows(suite, task)[0], max_steps=5)
+    job = replay.Job(
+        name="one",
+        study=study,
+        method="generic",
+        rows=(row,),
+        known=(("failure", 5),),
+        policy=policy,
+        memory=memory,
+        explained=(True,),
+    )
+    return replay.run_job(job)
 
+
+def test_an_episode_is_run_again_and_measured(tmp_path: Path) -> None:
+    study = Study((("simpler-bridge", "pick-shaver"),), ("generic",), episodes=1, policy="mini-pi0")
+    label = make_trial(
+        study, study.rows("simpler-bridge", "pick-shaver"), "generic", tmp_path
+    ).policy.label
+    tables = replayed(study, "pick-shaver", tmp_path, label)
+    (ending,) = tables["episodes"]
+    assert ending["steps"] == 5
+    calls = pd.DataFrame(tables["calls"])
+    assert set(calls["query"]) == {"action", "category"}
+    assert sorted(set(calls["step"])) == [0, 4]
+    assert {line["measure"] for line in tables["causal"]} == {"gradient", "masking", "action", "category"}  # fmt: skip
+    assert len(tables["layers"]) == 2 * 4 * 8
+    with pytest.raises(BadStudy, match="was run with another"):
+        replayed(study, "pick-shaver", tmp_path, "another")
+
+
+def test_a_policy_without_attention_is_refused(tmp_path: Path) -> None:
     study = Study((("widowx-pick", "pick-bottle"),), ("generic",), episodes=1, policy="random")
-    engine.run(study, tmp_path / "run", workers=1, record="none", progress=False)
-    done = vap("attention", tmp_path / "run", "--workers", "1")
-    assert done.returncode == 2
-    assert "gives no attention maps" in done.stderr
-    assert "Traceback" not in done.stderr
+    with pytest.raises(BadStudy, match="gives no attention maps.*choose another run"):
+        replayed(study, "pick-bottle", tmp_path, "random")

@@ -55,8 +55,8 @@ Attention = Annotated[
     typer.Option(
         "--attention",
         metavar="all|token,colour,category,action",
-        help="Record where a pi0, mini-pi0 or smolvla looks when it decides, over every view: the "
-        "learned token, the colour word, the category word, the action expert.",
+        help="Record where a pi0, pi0.5, mini-pi0 or smolvla looks when it decides, over every "
+        "view: the learned token, the colour word, the category word, the action expert.",
     ),
 ]
 Retries = Annotated[
