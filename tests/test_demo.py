@@ -108,7 +108,7 @@ def same(one: Episode, other: Episode) -> None:
 
 def test_neither_batch_nor_order_nor_global_seeds_change_an_episode(bank: Path) -> None:
     trial = make_trial(STUDY, STUDY.rows(SUITE, TASK), "vap", bank)
-    rows = [replace(row, max_steps=20) for row in STUDY.rows(SUITE, TASK)]
+    rows = [replace(row, max_steps=8) for row in STUDY.rows(SUITE, TASK)]
     together = list(rollout(trial, rows, batch=3))
     np.random.seed(123)  # noqa: NPY002
     torch.manual_seed(123)

@@ -20,10 +20,10 @@ Methods = Annotated[
     typer.Option(
         "--methods",
         "--method",
-        help="generic, hard-short, hard-long, soft, vap, vap-always-tint, mask-only, rewrite-only, "
-        "vap-associated; bounds, which read the simulator: oracle-box, oracle-mask, "
-        "oracle-track, wrong-mask; and the arms that `ablate` lists. With commas, or repeated. "
-        "Default: generic,vap.",
+        help="generic, hard-short, hard-long, soft, soft-aligned, soft-own, vap, vap-always-tint, "
+        "mask-only, rewrite-only, vap-associated; bounds, which read the simulator: oracle-box, "
+        "oracle-mask, oracle-track, wrong-mask; and the arms that `ablate` lists. With commas, or "
+        "repeated. Default: generic,vap.",
     ),
 ]
 POLICIES = (

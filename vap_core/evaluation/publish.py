@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import parse_json, write_atomic
+from vap_core.base.files import check_regular, parse_json, write_atomic
 from vap_core.evaluation.run_schema import check_run
 from vap_core.evaluation.store import KEY, read, read_manifest
 from vap_core.simulation import suites
@@ -25,6 +25,7 @@ def read_published(path: Path) -> "list[tuple[dict[str, Any], pd.DataFrame]]":
     import pyarrow.parquet as pq
 
     try:
+        check_regular(path)
         arrow = pq.read_table(path)
         manifests = parse_json((arrow.schema.metadata or {})[b"runs"])
         table = arrow.to_pandas()

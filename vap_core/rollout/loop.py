@@ -15,7 +15,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 
 from vap_core.base.errors import BadAction, OutOfReach, VapError
-from vap_core.base.types import Attended
+from vap_core.base.types import Attended, Views
 from vap_core.policies.hooks import AttentionMap, AttentionMaps, observe_attention
 from vap_core.policies.protocol import Chunk, Policy, PolicyInput, PrivilegedPolicy
 from vap_core.rollout import audit
@@ -24,6 +24,7 @@ from vap_core.rollout.policy_call import checked_plan, policy_call
 from vap_core.rollout.prompters.protocol import PromptContext, Prompter, SceneTruth, unchanged
 from vap_core.rollout.queries import only_queries, query_phrases
 from vap_core.rollout.types import ConsumedInput, Episode, EpisodeHeader, Frame, MaskCoverage
+from vap_core.simulation.control import BEYOND
 from vap_core.simulation.env import Control, Env
 from vap_core.simulation.occluder import Occlusion
 from vap_core.simulation.scenes import Scene
@@ -96,6 +97,8 @@ class RunningEpisode:
     consumed: list[ConsumedInput] = field(default_factory=list)
     attention: Mapping[str, Mapping[str, AttentionMap]] = field(default_factory=dict)
     """Where the policy looked in this step's call."""
+    beyond: int = 0
+    """Actions far beyond the robot's speed."""
     seconds: dict[str, float] = field(
         default_factory=lambda: {"attend": 0.0, "policy": 0.0, "record": 0.0}
     )
@@ -364,8 +367,8 @@ def _call_policy(
     for episode in calling:
         observation, attended = steps[id(episode)]
         state = observation.state
-        raw.append(PolicyInput(observation.images, episode.row.instruction, state))
-        prompted.append(PolicyInput(attended.images, attended.text, state))
+        raw.append(_policy_input(observation.images, episode.row.instruction, state))
+        prompted.append(_policy_input(attended.images, attended.text, state))
 
     observer: AbstractContextManager[AttentionMaps] = nullcontext({})
     if trial.attention:
@@ -382,6 +385,18 @@ def _call_policy(
     for i, episode in enumerate(calling):
         episode.attention = only_queries(maps.get(i, {}), trial.attention)
     return after, chunks
+
+
+def _policy_input(images: Views, text: str, state: np.ndarray) -> PolicyInput:
+    """What the policy reads. It cannot write: the recording shows what the prompter made."""
+    views = {name: _read_only(rgb) for name, rgb in images.items()}
+    return PolicyInput(views, text, _read_only(state))
+
+
+def _read_only(array: np.ndarray) -> np.ndarray:
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def _act(
@@ -415,7 +430,7 @@ def _act(
         attention=episode.attention,
     )
     if episode.over:
-        episode.outcome = episode.judge.outcome()
+        episode.outcome = episode.judge.outcome(detail=_note_on_actions(episode))
     episode.attention = {}
     with _timed(episode.seconds, "record"):
         if episode.sink is not None:
@@ -423,7 +438,18 @@ def _act(
     episode.frames.append(frame if keep_images else frame.without_images())
     if action is not None:
         episode.env.step(action)
+        episode.beyond += episode.env.is_beyond_limits(action)
         episode.judge = episode.judge.step(episode.env.truth())
+
+
+def _note_on_actions(episode: RunningEpisode) -> str:
+    """A line for the results table where the policy asked for what the robot cannot do."""
+    if not episode.beyond:
+        return ""
+    return (
+        f"{episode.beyond} of {episode.judge.steps} actions asked for over {BEYOND} times the "
+        "robot's speed and were cut to it; check the policy's units."
+    )
 
 
 def _end(trial: Trial, episode: RunningEpisode) -> Episode:

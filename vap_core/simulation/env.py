@@ -23,7 +23,14 @@ from vap_core.simulation.contacts import (
     geom_roles,
     gripper_geoms,
 )
-from vap_core.simulation.control import Setpoint, arm, follow, follow_joints, rotation_vector
+from vap_core.simulation.control import (
+    Setpoint,
+    arm,
+    follow,
+    follow_joints,
+    is_beyond,
+    rotation_vector,
+)
 from vap_core.simulation.occluder import Occlusion, Screen, occluder_screens
 from vap_core.simulation.scenes import Scene, parked
 from vap_core.simulation.sensor import (
@@ -215,6 +222,12 @@ class Env:
         with self._timed("physics"):
             ramp = np.linspace(0.0, 1.0, self._substeps + 1)[1:, None]
             self._advance(self._substeps, before + ramp * (after - before))
+
+    def is_beyond_limits(self, action: Action) -> bool:
+        """Whether an action is far beyond the robot's speed; `step` cuts it to that."""
+        return is_beyond(
+            action=action, robot=self.robot, control=self.control, seconds=1.0 / self.hz
+        )
 
     def commanded(self, command: Setpoint, action: Action) -> Setpoint:
         """The command after `action`, given `command` and the present state; changes nothing."""

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadOutput, one_of
-from vap_core.base.files import write_atomic
+from vap_core.base.files import parse_json, read_file, write_atomic
 from vap_core.evaluation import store
 from vap_core.evaluation.perception import tracking
 from vap_core.evaluation.perception.episodes import survey
@@ -338,8 +338,8 @@ def _write_tables(folder: Path, parts: Sequence[Path]) -> "dict[str, pd.DataFram
 
 def _read_part(path: Path) -> Tables:
     try:
-        return json.loads(path.read_bytes())
-    except ValueError as error:
+        return parse_json(read_file(path))
+    except (OSError, ValueError) as error:
         raise BadOutput(
             f"survey: {path} is damaged; delete it and run the same command again."
         ) from error

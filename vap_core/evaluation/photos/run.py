@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from vap_core import __version__
 from vap_core.attend import Attender
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import parse_json, write_atomic
+from vap_core.base.files import parse_json, read_file, write_atomic
 from vap_core.evaluation import store
 from vap_core.evaluation.photos.folder import PhotoSet, read_photo_set
 from vap_core.evaluation.photos.measure import Row, measure_scene
@@ -82,7 +82,7 @@ def _write_part(path: Path, rows: list[Row]) -> None:
 
 def _read_part(path: Path) -> list[Row]:
     try:
-        rows: list[Row] = parse_json(path.read_bytes())
+        rows: list[Row] = parse_json(read_file(path))
     except (OSError, ValueError) as error:
         raise BadOutput(
             f"eval-photos: {path} is damaged; delete it and run the same command again."
