@@ -40,7 +40,7 @@ def run(
     progress: bool = True,
     executor: Executor = results,
     video: bool = False,
-    attention: bool = False,
+    attention: tuple[str, ...] = (),
     policy_timeout_s: float | None = None,
 ) -> "pd.DataFrame":
     """Run the episodes of `study` that `folder` lacks, and return the table of all its episodes.

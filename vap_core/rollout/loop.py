@@ -7,7 +7,7 @@ that it yields.
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -22,6 +22,7 @@ from vap_core.rollout import audit
 from vap_core.rollout.coverage import mask_coverage
 from vap_core.rollout.policy_call import checked_plan, policy_call
 from vap_core.rollout.prompters.protocol import PromptContext, Prompter, SceneTruth, unchanged
+from vap_core.rollout.queries import only_queries, query_phrases
 from vap_core.rollout.types import ConsumedInput, Episode, EpisodeHeader, Frame, MaskCoverage
 from vap_core.simulation.control import BEYOND
 from vap_core.simulation.env import Control, Env
@@ -52,7 +53,8 @@ class Trial:
     A privileged policy needs no images; it gets them every `images_every` control steps (0: never),
     for their cost or for show. `follow` is when images are taken and targets tracked: when the
     policy is called, which is all that it ever sees, or at every control step. `audit` keeps what
-    the policy consumed in every call (rollout.audit), `attention` where it looked (policies.hooks).
+    the policy consumed in every call (rollout.audit), `attention` where these queries looked
+    (rollout.queries).
     `image_size` is simulation.Env's.
     A call of the policy that takes longer than `policy_timeout_s` fails (rollout.policy_call).
     """
@@ -67,7 +69,7 @@ class Trial:
     occlusion: Occlusion | None = None
     follow: Follow = "step"
     audit: bool = False
-    attention: bool = False
+    attention: tuple[str, ...] = ()
     image_size: int | tuple[int, int] = 224
     policy_timeout_s: float | None = None
 
@@ -93,7 +95,7 @@ class RunningEpisode:
     """Actions of the last chunk that are still to be executed."""
     frames: list[Frame] = field(default_factory=list)
     consumed: list[ConsumedInput] = field(default_factory=list)
-    attention: dict[str, AttentionMap] = field(default_factory=dict)
+    attention: Mapping[str, Mapping[str, AttentionMap]] = field(default_factory=dict)
     """Where the policy looked in this step's call."""
     beyond: int = 0
     """Actions far beyond the robot's speed."""
@@ -370,7 +372,7 @@ def _call_policy(
 
     observer: AbstractContextManager[AttentionMaps] = nullcontext({})
     if trial.attention:
-        observer = observe_attention()
+        observer = observe_attention([query_phrases(episode.row) for episode in calling])
     with observer as maps:
         if trial.audit:
             after, chunks, consumed = audit.plan(policy, states, prompted, raw)
@@ -381,7 +383,7 @@ def _call_policy(
             returned = policy.plan(states, prompted)
             after, chunks = checked_plan(returned, policy.label, len(calling))
     for i, episode in enumerate(calling):
-        episode.attention = maps.get(i, {})
+        episode.attention = only_queries(maps.get(i, {}), trial.attention)
     return after, chunks
 
 

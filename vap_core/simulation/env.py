@@ -254,11 +254,12 @@ class Env:
             poses = self._poses(self._placed)
             links = self._poses(self.robot.links)
             masks_by_camera: dict[str, Mapping[str, Mask]] = {}
+            hand: dict[str, Mask] = {}
             if masks:
                 hidden = self._hidden()
                 for name in self.camera_names:
                     screens = self._screens(name)
-                    masks_by_camera[name] = self.scene.renderer.masks(
+                    masks_by_camera[name], hand[name] = self.scene.renderer.masks_and_hand(
                         self._data, name, self.image_hw, hidden=hidden, before=screens
                     )
             return Truth(
@@ -268,6 +269,7 @@ class Env:
                 pressed_s=self._touch.pressed_s,
                 contacts=self._touch.contacts,
                 masks=masks_by_camera,
+                hand=hand,
             )
 
     def cameras(self) -> tuple[Camera, ...]:
