@@ -1,6 +1,6 @@
 """Commands about this machine and what it measures.
 
-They are eval-perception, eval-photos, eval-policy, eval-tokens, show and doctor.
+They are eval-perception, eval-photos, calibrate, eval-policy, eval-tokens, show and doctor.
 """
 
 from pathlib import Path
@@ -87,6 +87,57 @@ def eval_photos(
     from vap_core.evaluation.photos.run import measure_photos
 
     print(measure_photos(folder, out or Path(f"data/runs/photos-{folder.resolve().name}"), stack))
+
+
+@app.command()
+def calibrate(
+    stack: StackName = "embedded",
+    photos: Annotated[
+        list[Path] | None,
+        typer.Option(help="A photo set in the form of eval-photos; repeatable."),
+    ] = None,
+    scenes: Annotated[int, typer.Option(min=1, help="Rendered development scenes.")] = 24,
+    price: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            max=50.0,
+            help="Per cent of the rightly elected objects that may be refused.",
+        ),
+    ] = 3.0,
+    keep: Annotated[
+        bool,
+        typer.Option(
+            "--keep",
+            help="Write the chosen thresholds beside the weights of a foundation stack, which then "
+            "uses them.",
+        ),
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Run folder; what it holds is kept. Default data/runs/calibrate-STACK."),
+    ] = None,
+) -> None:
+    """Measure from which cosine on an object is in view: what each threshold costs and brings, on
+    development scenes with and without the object. Interrupted, it goes on.
+
+    Example: python -m vap_core calibrate --scenes 8
+    Example: python -m vap_core calibrate --photos my-photos
+    """
+    from vap_core.analysis.calibration.run import calibrate, keep_choice, refuse_keep
+
+    if keep:
+        refuse_keep(stack)
+    report, chosen = calibrate(
+        stack,
+        out or Path(f"data/runs/calibrate-{stack}"),
+        scenes=scenes,
+        photos=photos or (),
+        price=price / 100,
+    )
+    print(report)
+    if keep:
+        print(f"wrote {keep_choice(stack, chosen)}")
 
 
 @app.command("eval-policy")
