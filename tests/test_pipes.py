@@ -17,7 +17,7 @@ from vap_core.evaluation.publish import read_published
 from vap_core.memory import load as load_object
 from vap_core.perception.foundation.store import read_lock
 from vap_core.policies.lerobot.checkpoints import locate
-from vap_core.policies.mini_pi0.learned_token import load as load_token
+from vap_core.policies.mini_pi0.token_file import load as load_token
 from vap_core.recording import ensure_index, read_summary
 from vap_core.recording.corrections import read_corrections
 from vap_core.simulation.assets.scans.mesh_file import read_mesh_file

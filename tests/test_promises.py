@@ -107,7 +107,7 @@ LOOPBACK = {"0100007F", "0000000000000000FFFF00000100007F", "0000000000000000000
 
 
 @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="needs Linux")
-def test_sockets_are_seen_and_a_query_opens_them_on_loopback_alone(tmp_path: Path) -> None:
+def test_sockets_are_seen_and_reruns_server_opens_them_on_loopback_alone(tmp_path: Path) -> None:
     before = listening()
     with socket.create_server(("127.0.0.1", 0)) as server:
         ((address, port),) = listening() - before

@@ -20,18 +20,19 @@ KEY = "vap_core.made_from"
 """The text chunk of a PNG and the metadata of a table that hold the digest."""
 
 
+SOURCES = ("simulation/assets", "simulation/studio.py", "perception/embedded", "memory.py")
+"""The code that decides how an object looks, and how its photos are cropped and embedded."""
+
+
 @cache
 def source_digest() -> str:
-    """A digest of what pictures of objects and their embeddings are made from.
-
-    That is the code of `simulation` and `perception`, and the shipped weights.
-    """
+    """A digest of `SOURCES` and of the shipped weights."""
     import vap_core
     from vap_core.perception.embedded.weights import FOLDER
 
     package = Path(vap_core.__file__).parent
     found = hashlib.sha256((FOLDER / "manifest.json").read_bytes())
-    for part in ("simulation", "perception"):
+    for part in SOURCES:
         found.update(code_digest(package / part).encode())
     return found.hexdigest()[:16]
 

@@ -27,12 +27,13 @@ def code_version(folder: Path | None = None) -> str:
 
 
 def code_digest(folder: Path, without: Collection[str] = ()) -> str:
-    """A digest of the Python code below a folder, but for the modules named in `without`.
+    """A digest of a module, or of those below a folder but for the ones named in `without`.
 
     Comments, docstrings and line breaks do not count.
     """
     found = hashlib.sha256()
-    for path in sorted(folder.rglob("*.py")):
+    paths = [folder] if folder.is_file() else sorted(folder.rglob("*.py"))
+    for path in paths:
         if path.stem in without:
             continue
         found.update(path.relative_to(folder).as_posix().encode())
