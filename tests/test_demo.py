@@ -137,6 +137,7 @@ def test_the_prompt_reaches_the_policy_and_only_the_prompt(bank: Path) -> None:
     frame = episode.frames[0]
     assert seen[0].text == episode.header.rewritten == f"pick up the red {row.category}"
     assert np.array_equal(seen[0].images["front"], frame.prompted["front"])
+    assert np.shares_memory(seen[0].images["front"], frame.prompted["front"])
     changed = (frame.images["front"] != frame.prompted["front"]).any(axis=2)
     assert changed.any()
     assert (changed <= frame.tracks["front"][0].mask).all()

@@ -4,6 +4,7 @@ from io import BytesIO
 from pathlib import Path
 
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 from matplotlib.figure import Figure
 from PIL import Image
@@ -38,6 +39,17 @@ def test_a_table_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert kept.kept_table(path, lambda: pd.DataFrame({"n": [3]})).equals(made)
     monkeypatch.setattr(kept, "source_digest", lambda: "other code")
     assert kept.kept_table(path, lambda: pd.DataFrame({"n": [3]})).n.tolist() == [3]
+
+
+def test_what_is_committed_was_made_from_what_ships() -> None:
+    """Else notebook 01 makes it again wherever it runs, which takes a minute more."""
+    root = Path(__file__).parents[1]
+    for name in ("objects", "generics", "references"):
+        with Image.open(root / f"figures/01_benchmark_building_{name}.png") as picture:
+            assert picture.info[kept.KEY] == kept.source_digest(), "execute notebook 01 again"
+    for name in ("lookalike_hardness", "reference_crops"):
+        about = pq.read_schema(root / f"data/results/{name}.parquet").metadata
+        assert about[kept.KEY.encode()].decode() == kept.source_digest(), "execute notebook 01"
 
 
 def test_a_comment_does_not_change_the_digest_of_code(tmp_path: Path) -> None:

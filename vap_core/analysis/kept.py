@@ -9,8 +9,10 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vap_core.analysis.plots import keep_png, small_jpeg
+from vap_core.analysis.plots import keep, small_jpeg
+from vap_core.base.files import write_atomic
 from vap_core.base.version import code_digest
+from vap_core.evaluation.measurements import encode_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -39,17 +41,13 @@ def source_digest() -> str:
 
 def kept_figure(path: Path, draw: Callable[[], "Figure"], *, again: bool = False) -> bytes:
     """The figure of a PNG as a JPEG for a notebook; drawn where it is stale, or `again`."""
-    from io import BytesIO
-
     from PIL import Image
 
     if not again and path.exists():
         with Image.open(path) as picture:
             if picture.info.get(KEY) == source_digest():
                 return small_jpeg(picture.convert("RGB"))
-    drawn = BytesIO()
-    draw().savefig(drawn, dpi=110, metadata={"Software": None, KEY: source_digest()})
-    return keep_png(drawn.getvalue(), path)
+    return keep(draw(), path, about={KEY: source_digest()})
 
 
 def kept_table(
@@ -66,5 +64,5 @@ def kept_table(
             return table.to_pandas()
     made = pa.Table.from_pandas(make(), preserve_index=False)
     about = {**(made.schema.metadata or {}), key: source_digest().encode()}
-    pq.write_table(made.replace_schema_metadata(about), path)
+    write_atomic(path, encode_table(made.replace_schema_metadata(about)))
     return made.to_pandas()

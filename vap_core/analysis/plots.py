@@ -360,14 +360,19 @@ def rates_figure(panels: Mapping[str, Mapping[str, Mapping[str, "Rate"]]], label
 
 
 def keep(
-    figure: "Figure", path: Path, dpi: int = 110, limit: int = 480_000, small: int = 115_000
+    figure: "Figure",
+    path: Path,
+    dpi: int = 110,
+    limit: int = 480_000,
+    small: int = 115_000,
+    about: Mapping[str, str] | None = None,
 ) -> bytes:
     """Save a figure as a PNG of at most `limit` bytes; return a JPEG of at most `small` bytes.
 
-    The JPEG is for a notebook.
+    The JPEG is for a notebook; `about` becomes the PNG's text chunks.
     """
     drawn = BytesIO()
-    figure.savefig(drawn, dpi=dpi, metadata={"Software": None})
+    figure.savefig(drawn, dpi=dpi, metadata={"Software": None, **(about or {})})
     return keep_png(drawn.getvalue(), path, limit=limit, small=small)
 
 

@@ -14,6 +14,7 @@ from vap_core.analysis.attention.observer import NOTHING, Observer, Rows
 from vap_core.base.errors import BadOutput, BadStudy
 from vap_core.base.files import write_atomic
 from vap_core.base.version import code_version
+from vap_core.evaluation import measurements
 from vap_core.evaluation.diagnosis.recordings import listed_row, study_of
 from vap_core.evaluation.engine import spread_evenly
 from vap_core.evaluation.jobs import BATCH
@@ -98,7 +99,8 @@ def run_replay(
             disable=not progress,
         ) as bar:
             for job, tables in results(run_job, missing, workers=workers, remedy="--workers"):
-                write_atomic(parts / f"{job.name}.json", json.dumps(tables).encode())
+                path = parts / f"{job.name}.json"
+                measurements.write_json_part(path, tables, caller="attention")
                 bar.update(len(job.rows))
         return _write_tables(source, folder, [parts / f"{job.name}.json" for job in jobs])
 
@@ -219,13 +221,11 @@ def read(folder: Path) -> "dict[str, pd.DataFrame]":
 
 def publish(folder: Path, to: Path) -> list[Path]:
     """Keep the tables of a finished replay in another folder. Raises: BadOutput."""
-    published = []
-    to.mkdir(parents=True, exist_ok=True)
+    tables = {}
     for name in TABLES:
         path = folder / f"{PREFIX}{name}.parquet"
-        write_atomic(to / path.name, path.read_bytes())
-        published.append(to / path.name)
-    return published
+        tables[path.name] = path.read_bytes()
+    return measurements.publish_tables(tables, to, caller="attention")
 
 
 def _about(episode: Episode) -> dict[str, Any]:
@@ -262,20 +262,17 @@ def _write_tables(source: Path, folder: Path, parts: Sequence[Path]) -> "dict[st
     """All parts as one table of each kind, with the runs and the code in the metadata."""
     import pandas as pd
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     rows: dict[str, Rows] = {name: [] for name in TABLES}
     for path in parts:
-        for name, part in json.loads(path.read_bytes()).items():
+        for name, part in measurements.read_json_part(path, caller="attention").items():
             rows[name] += part
     runs = [manifest for manifest, _ in read_runs(source)]
     about = json.dumps({"runs": runs, "code": code_version()}, sort_keys=True).encode()
     for name in TABLES:
         table = pa.Table.from_pandas(_compact(pd.DataFrame(rows[name])), preserve_index=False)
-        sink = pa.BufferOutputStream()
-        with_about = table.replace_schema_metadata({b"attention": about})
-        pq.write_table(with_about, sink, compression="zstd")
-        write_atomic(folder / f"{PREFIX}{name}.parquet", sink.getvalue().to_pybytes())
+        data = measurements.encode_table(table.replace_schema_metadata({b"attention": about}))
+        write_atomic(folder / f"{PREFIX}{name}.parquet", data)
     return read(folder)
 
 

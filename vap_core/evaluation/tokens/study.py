@@ -15,9 +15,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from vap_core.base.errors import BadOutput, BadStudy, one_of
-from vap_core.base.files import write_atomic
 from vap_core.base.types import Rgb
-from vap_core.evaluation import store
+from vap_core.evaluation import measurements, store
 from vap_core.evaluation.policy_names import shipped
 from vap_core.evaluation.processes import results
 from vap_core.policies.lerobot.checkpoints import fingerprint
@@ -188,26 +187,14 @@ def publish(folder: Path, to: Path) -> list[Path]:
     import json
 
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     manifest = json.dumps(store.read_manifest(folder), sort_keys=True)
-    written = []
+    tables = {}
     for name, table in read(folder).items():
         arrow = pa.Table.from_pandas(table, preserve_index=False)
         arrow = arrow.replace_schema_metadata({**arrow.schema.metadata, b"run": manifest.encode()})
-        sink = pa.BufferOutputStream()
-        pq.write_table(arrow, sink, compression="zstd")
-        path = to / f"token_{name}.parquet"
-        try:
-            to.mkdir(parents=True, exist_ok=True)
-            write_atomic(path, sink.getvalue().to_pybytes())
-        except OSError as error:
-            raise BadOutput(
-                f"eval-tokens: {to} cannot be written ({error.strerror}); choose another folder "
-                "with --publish."
-            ) from error
-        written.append(path)
-    return written
+        tables[f"token_{name}.parquet"] = measurements.encode_table(arrow)
+    return measurements.publish_tables(tables, to, caller="eval-tokens")
 
 
 def _measured_epochs(epochs: int) -> set[int]:
