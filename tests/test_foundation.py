@@ -33,7 +33,8 @@ from vap_core.perception.foundation import detector as grounding
 from vap_core.perception.foundation import encoder as dino
 from vap_core.perception.foundation import segmenter as sam
 from vap_core.perception.foundation import tracker as video
-from vap_core.perception.protocols import Stack
+from vap_core.perception.kept_thresholds import keep_thresholds
+from vap_core.perception.protocols import Stack, Thresholds
 from vap_core.perception.stacks import load_stack
 
 MEAN, STD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
@@ -482,6 +483,17 @@ def test_the_device_is_chosen_or_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 # --- The whole stack -----------------------------------------------------------------------------------------------------
+
+
+def test_the_stack_has_the_thresholds_that_calibrate_kept(weights: Path) -> None:
+    calls = foundation.load.__wrapped__
+    stack = calls("foundation", "cpu", weights)
+    assert stack.thresholds is None
+    path = keep_thresholds(weights, "foundation", stack.encoder.name, Thresholds(0.6, 0.6))
+    try:
+        assert calls("foundation", "cpu", weights).thresholds == Thresholds(0.6, 0.6)
+    finally:
+        path.unlink()
 
 
 def test_the_whole_attender_runs_and_repeats_its_bits(

@@ -1,4 +1,5 @@
-"""The log of readings: a run enters once, to publish copies its lines, and a user's own runs leave the repository as it is."""
+"""The log of readings: a run enters once, to publish copies its lines, and a run of one's own
+leaves the repository as it is."""
 
 from pathlib import Path
 

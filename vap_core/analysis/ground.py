@@ -86,6 +86,18 @@ def ground_image(
     )
 
 
+def missing_threshold(stack: str) -> str:
+    """One line where a stack cannot say "not in view", with the remedy; else ""."""
+    from vap_core.perception.stacks import load_stack
+
+    if load_stack(stack).thresholds is not None:
+        return ""
+    return (
+        f'the stack {stack} has no threshold of "not in view": the best candidate is highlighted, '
+        f"however unlike it is; measure one: python -m vap_core calibrate --stack {stack} --keep"
+    )
+
+
 def to_json(found: Found) -> dict[str, Any]:
     """The evidence of the first target at the top level, that of every target under "targets".
 

@@ -36,6 +36,7 @@ def examine() -> list[Finding]:
         findings.append(_run_check(check, needed=False))
     findings.append(_viewer())
     findings += _foundation()
+    findings.append(_not_in_view())
     return findings
 
 
@@ -148,3 +149,21 @@ def _foundation() -> list[Finding]:
             detail = f"{n_missing} of {len(models)} models missing; {remedy(kind)}"
         findings.append(Finding(f"stack {kind}", n_missing == 0, detail, needed=False))
     return findings
+
+
+def _not_in_view() -> Finding:
+    """Whether every foundation stack can say that an object is not in view."""
+    from vap_core.perception.foundation.sources import KINDS
+    from vap_core.perception.foundation.store import store_folder
+    from vap_core.perception.kept_thresholds import thresholds_file
+    from vap_core.perception.stacks import EMBEDDED_THRESHOLDS
+
+    lacking = [kind for kind in KINDS if not thresholds_file(store_folder(), kind).is_file()]
+    cosines = f"{EMBEDDED_THRESHOLDS.familiar:g}, {EMBEDDED_THRESHOLDS.unfamiliar:g}"
+    detail = f"embedded: cosine below {cosines}"
+    if lacking:
+        detail += (
+            f"; {', '.join(lacking)}: no threshold, so the best candidate is always highlighted; "
+            f"python -m vap_core calibrate --stack {lacking[0]} --keep measures one"
+        )
+    return Finding('"not in view"', not lacking, detail, needed=False)

@@ -168,6 +168,7 @@ def ground(
     from vap_core.analysis.ground import (
         GROUND_SIDE,
         ground_image,
+        missing_threshold,
         parse_boxes,
         to_json,
         write_evidence,
@@ -184,6 +185,9 @@ def ground(
                 "clip."
             )
         summary, rrd, mp4 = ground_clip(image, instruction, memory, stack, out, objects=object)
+        note = missing_threshold(stack)
+        if note:
+            print(f"note: {note}", file=sys.stderr)
         print(summary)
         print(f"wrote {mp4} and {rrd}; look: python -m vap_core view {rrd}")
         return
@@ -212,6 +216,9 @@ def ground(
         always_tint=always_tint,
         tiles=tiles,
     )
+    note = missing_threshold(stack)
+    if note and not always_tint:
+        print(f"note: {note}", file=sys.stderr)
     written = write_evidence(out, image.stem, found)
     if as_json:
         print(json.dumps(to_json(found)))

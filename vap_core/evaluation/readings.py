@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import DATA, write_atomic
+from vap_core.base.files import DATA, read_file, write_atomic
 from vap_core.simulation import suites
 
 FILE = "readings.csv"
@@ -94,13 +94,12 @@ def readings_of(
 def read_log(path: Path) -> list[Reading]:
     """The lines of a log, none where it does not exist. Raises: BadOutput."""
     try:
-        text = path.read_text()
-    except FileNotFoundError:
-        return []
-    try:
+        text = read_file(path).decode()
         lines = list(csv.DictReader(io.StringIO(text), strict=True))
         return [_parse(line) for line in lines]
-    except (KeyError, TypeError, ValueError, csv.Error) as error:
+    except FileNotFoundError:
+        return []
+    except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
         raise BadOutput(
             f"readings: {path} is damaged ({type(error).__name__}); restore it, or delete it to "
             "begin anew."

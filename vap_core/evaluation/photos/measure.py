@@ -10,7 +10,7 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Int64
 
 from vap_core.attend import Attender
 from vap_core.base.errors import BadPhotoSet
@@ -100,20 +100,22 @@ def _ground(
         "candidates": len(overlap),
         "proposed_iou": float(overlap.max(initial=0.0)),
         "tinted": grounding.winner is not None,
+        "familiar": grounding.candidates.familiar,
         "iou": 0.0,
         "ms": round(1000 * seconds, 1),
-        **_elected(grounding),
+        **_elected(grounding, overlap),
     }
     if grounding.winner is not None:
         row["iou"] = float(overlap[grounding.winner])
     return row
 
 
-def _elected(grounding: Grounding) -> Row:
-    """The box that the vote elected, tinted or not; none without candidates."""
+def _elected(grounding: Grounding, overlap: Float[np.ndarray, " n"]) -> Row:
+    """The box that the vote elected, tinted or not; None without candidates."""
     winner = grounding.chosen
     if winner is None:
-        return {"x0": None, "y0": None, "x1": None, "y1": None, "cosine": None, "margin": None}
+        names = ("x0", "y0", "x1", "y1", "cosine", "likeness", "chosen_iou", "margin")
+        return dict.fromkeys(names)
     x0, y0, x1, y1 = grounding.candidates.xyxy[winner].tolist()
     return {
         "x0": x0,
@@ -121,6 +123,8 @@ def _elected(grounding: Grounding) -> Row:
         "x1": x1,
         "y1": y1,
         "cosine": float(grounding.similarity[winner].mean()),
+        "likeness": float(grounding.likeness[winner]),
+        "chosen_iou": float(overlap[winner]),
         "margin": grounding.ballot.margin,
     }
 

@@ -3,9 +3,11 @@
 Within perception, only this package imports transformers.
 """
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+from vap_core.perception.kept_thresholds import read_thresholds
 from vap_core.perception.protocols import Stack
 
 
@@ -13,17 +15,22 @@ from vap_core.perception.protocols import Stack
 def load(kind: str, device: str | None = None, store: Path | None = None) -> Stack:
     """A stack of `sources.KINDS`, from verified local weights.
 
+    It has thresholds where `calibrate --keep` has written them beside the weights.
+
     Raises:
         MissingWeights: what is not on this machine, and both ways to get it.
         UnknownName: no such device.
+        BadOutput: the file of thresholds is damaged.
     """
     from vap_core.perception.foundation import architectures
     from vap_core.perception.foundation.runtime import select_runtime
-    from vap_core.perception.foundation.store import verify_stack
+    from vap_core.perception.foundation.store import store_folder, verify_stack
 
     runtime = select_runtime(device)
     networks = architectures.read_networks(*verify_stack(kind, store))
-    return architectures.assemble(kind, networks, runtime)
+    stack = architectures.assemble(kind, networks, runtime)
+    thresholds = read_thresholds(store or store_folder(), kind, stack.encoder.name)
+    return replace(stack, thresholds=thresholds)
 
 
 def load_random(kind: str, device: str | None = None) -> Stack:

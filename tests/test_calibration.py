@@ -1,0 +1,191 @@
+"""calibrate: development scenes, the choice of a threshold, its price, and the file that keeps it."""
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.toys import MeanColour, SameColour, segmenter
+from vap_core.analysis import ground
+from vap_core.analysis.calibration import report, run, scenes
+from vap_core.base.errors import BadOutput
+from vap_core.base.types import Boxes
+from vap_core.cli import doctor
+from vap_core.perception import kept_thresholds, stacks
+from vap_core.perception.foundation import store
+from vap_core.perception.protocols import Stack, Thresholds
+from vap_core.simulation.assets import objects
+
+
+def quarters(images, phrase, threshold=None):
+    """Four boxes of every picture."""
+    h, w = images[0].shape[:2]
+    x, y = w / 2, h / 2
+    xyxy = np.array([[0, 0, x, y], [x, 0, w, y], [0, y, x, h], [x, y, w, h]], np.float32)
+    return [Boxes(xyxy, np.ones(4, np.float32), phrase) for _ in images]
+
+
+TOY = Stack("toy", quarters, MeanColour(), segmenter, SameColour())
+
+
+def answers(right: list[float], absent: list[float], familiar: bool = True) -> pd.DataFrame:
+    """One scene per answer."""
+    rows = []
+    for case, likeness in [("present", right), ("absent", absent)]:
+        for i, cosine in enumerate(likeness):
+            row = {"scene": i, "case": case, "likeness": cosine, "right": case == "present"}
+            rows.append({**row, "familiar": familiar, "source": "rendered scenes"})
+    return pd.DataFrame(rows)
+
+
+def test_the_highest_threshold_within_the_price_is_chosen():
+    table = answers([0.415, 0.513] + [0.9] * 48, [0.3, 0.6])
+    assert report.choose(table, price=0.0).familiar == 0.41
+    assert report.choose(table, price=0.02).familiar == 0.51
+    assert report.choose(table, price=0.04).familiar == 0.9
+    assert report.choose(table).unfamiliar is None
+
+
+def test_too_few_objects_choose_nothing_and_the_report_says_so():
+    table = answers([0.8] * (report.LEAST_RIGHT - 1), [0.3])
+    chosen = report.choose(table)
+    assert chosen.familiar is None
+    text = report.text_report(table, chosen, TOY)
+    assert "29 rightly elected objects, fewer than 30" in text
+    assert "--photos" in text
+
+
+def test_the_table_has_the_price_and_the_gain():
+    table = answers([0.5] + [0.9] * 49, [0.3, 0.3, 0.3, 0.95])
+    rows = report.threshold_rows(table, 0.52, 0.3)
+    by_threshold = {row[0]: row for row in rows[1:]}
+    assert by_threshold["0.52"][1] == "chosen"
+    assert by_threshold["0.30"][1] == "now"
+    assert by_threshold["0.52"][2].startswith("2 [")
+    assert by_threshold["0.52"][2].endswith("50")
+    assert by_threshold["0.52"][5].startswith("25 [")
+    assert by_threshold["0.30"][2].startswith("0 [")
+    assert by_threshold["0.30"][5].startswith("100 [")
+
+
+def test_views_without_candidates_are_not_tinted():
+    table = answers([0.9] * 40, [np.nan, np.nan])
+    assert report.threshold_rows(table, 0.5, None)[1][5].startswith("0 [")
+
+
+def test_a_stack_without_a_judge_needs_the_threshold_of_familiar_views_alone():
+    assert report.Choice(0.6, None).thresholds(TOY) == Thresholds(0.6, 0.6)
+    judged = replace(TOY, detector=Judge())
+    assert report.Choice(0.6, None).thresholds(judged) is None
+    assert report.Choice(0.6, 0.5).thresholds(judged) == Thresholds(0.6, 0.5)
+
+
+class Judge:
+    def __call__(self, images, phrase, threshold=None):
+        return quarters(images, phrase)
+
+    def is_familiar(self, image, phrase):
+        return False
+
+
+@pytest.mark.parametrize("number", [0, 5, 10, 15])
+def test_scenes_ask_for_what_is_absent(number):
+    start = scenes.scene(number)
+    assert asdict(start) == asdict(scenes.scene(number))
+    placed = {place.model for place in start.placements}
+    lookalike = scenes.absent_lookalike(start)
+    assert lookalike not in placed
+    assert objects.get_object(lookalike).category == start.category
+    other = objects.get_object(scenes.absent_other(start, number))
+    assert other.category not in {objects.get_object(name).category for name in placed}
+    assert other.split == "generic"
+
+
+def test_a_scene_is_measured():
+    rows = pd.DataFrame(scenes.measure_scene(1, TOY))
+    assert set(rows.case) == {"present", "look-alikes", "absent"}
+    assert not rows[rows.case != "present"].right.any()
+    assert rows.likeness.between(-1, 1).all()
+
+
+def test_a_finished_scene_is_not_measured_again(tmp_path, monkeypatch):
+    asked = []
+
+    def measure(number, stack):
+        asked.append(number)
+        row = {"scene": number, "camera": "front", "familiar": True}
+        return [{**row, "case": "present", "likeness": 0.7, "right": True}] * 20
+
+    monkeypatch.setattr(run, "load_stack", lambda name: TOY)
+    monkeypatch.setattr(run, "measure_scene", measure)
+    run.calibrate("toy", tmp_path / "out", scenes=1, progress=False)
+    text, chosen = run.calibrate("toy", tmp_path / "out", scenes=2, progress=False)
+    assert asked == [0, 1]
+    assert chosen.familiar == 0.7
+    assert "chosen: Thresholds(familiar=0.7, unfamiliar=0.7); the stack has None" in text
+    (tmp_path / "out" / "scenes" / "00000.json").write_text("[")
+    with pytest.raises(BadOutput, match="delete it"):
+        run.calibrate("toy", tmp_path / "out", scenes=2, progress=False)
+
+
+def test_answers_of_a_photo_set_count_by_what_is_in_the_photo():
+    answers = pd.DataFrame(
+        {
+            "scene": list("abcd"),
+            "familiar": False,
+            "likeness": [0.7, 0.6, 0.5, None],
+            "present": [True, True, False, False],
+            "lookalikes": [1, 0, 2, 0],
+            "chosen_iou": [0.8, 0.4, 0.0, None],
+        }
+    )
+    rows = run._photo_rows(answers)
+    assert rows.case.tolist() == ["present", "present", "look-alikes", "absent"]
+    assert rows.right.tolist() == [True, False, False, False]
+
+
+def test_kept_thresholds_hold_for_their_encoder(tmp_path):
+    thresholds = Thresholds(0.61, 0.55)
+    path = kept_thresholds.keep_thresholds(tmp_path, "foundation", "dino", thresholds)
+    assert kept_thresholds.read_thresholds(tmp_path, "foundation", "dino") == thresholds
+    assert kept_thresholds.read_thresholds(tmp_path, "foundation", "other") is None
+    assert kept_thresholds.read_thresholds(tmp_path, "foundation-small", "dino") is None
+    path.write_text(json.dumps({"encoder": "dino"}))
+    with pytest.raises(BadOutput, match="calibrate --stack foundation --keep"):
+        kept_thresholds.read_thresholds(tmp_path, "foundation", "dino")
+
+
+def test_keep_is_for_stacks_that_ship_none(tmp_path, monkeypatch):
+    with pytest.raises(BadOutput, match="leave --keep out"):
+        run.refuse_keep("embedded")
+    run.refuse_keep("foundation")
+    monkeypatch.setattr(run, "load_stack", lambda name: TOY)
+    monkeypatch.setenv(store.VARIABLE, str(tmp_path))
+    path = run.keep_choice("foundation", report.Choice(0.6, None))
+    kept = kept_thresholds.read_thresholds(tmp_path, "foundation", TOY.encoder.name)
+    assert path.parent == tmp_path
+    assert kept == Thresholds(0.6, 0.6)
+    with pytest.raises(BadOutput, match="more --scenes"):
+        run.keep_choice("foundation", report.Choice(None, None))
+
+
+def test_ground_says_that_a_stack_cannot_say_not_in_view(monkeypatch):
+    monkeypatch.setitem(stacks.STACKS, "toy", lambda: TOY)
+    assert "calibrate --stack toy --keep" in ground.missing_threshold("toy")
+    monkeypatch.setitem(stacks.STACKS, "toy", lambda: replace(TOY, thresholds=Thresholds(0.5, 0.5)))
+    assert ground.missing_threshold("toy") == ""
+
+
+def test_doctor_says_which_stacks_cannot_say_not_in_view(tmp_path: Path, monkeypatch):
+    monkeypatch.setenv(store.VARIABLE, str(tmp_path))
+    finding = doctor._not_in_view()
+    assert not finding.works
+    assert not finding.needed
+    assert "foundation, foundation-small: no threshold" in finding.detail
+    assert "calibrate --stack foundation --keep" in finding.detail
+    for kind in ("foundation", "foundation-small"):
+        kept_thresholds.keep_thresholds(tmp_path, kind, "dino", Thresholds(0.5, 0.5))
+    assert doctor._not_in_view().works
