@@ -1,4 +1,4 @@
-.PHONY: setup demo lint style types check test suite test-all lab lock clean
+.PHONY: setup demo lint style types check test suite test-all audit lab lock clean
 .DEFAULT_GOAL := help
 
 # An empty PYTHONDONTWRITEBYTECODE lets Python keep what it compiled; uv compiles nothing.
@@ -11,6 +11,7 @@ help:
 	@echo "make check     for every day: lint, types and unit tests; two and a half minutes"
 	@echo "make test      lint, types, all tests but the sweeps, and notebooks; about thirteen minutes on two cores"
 	@echo "make test-all  make test, and the long sweeps"
+	@echo "make audit     known vulnerabilities of the pinned packages; needs the internet"
 	@echo "make lab       open the notebooks in JupyterLab"
 	@echo "make setup     only set up .venv"
 	@echo "make lock      renew environment.txt from pyproject.toml"
@@ -34,18 +35,20 @@ types: setup
 	$(RUN) -m mypy
 
 check: lint
-	$(PYTEST) -m "not slow and not alone and not sweep"
+	$(PYTEST) -m "not slow and not sweep"
 
-# Types are checked beside the first tests; what takes times runs last and alone.
+# Types are checked beside the first tests.
 test: style
 	@$(MAKE) --no-print-directory -j 2 types suite
-	$(RUN) -m pytest -m alone
 
 suite: setup
-	$(PYTEST) -m "not alone and not sweep" --nbval-lax notebooks tests
+	$(PYTEST) -m "not sweep" --nbval-lax notebooks tests
 
 test-all: test
 	$(RUN) -m pytest -m sweep
+
+audit: setup
+	@bash .ci/audit
 
 lab: setup
 	.venv/bin/jupyter lab --ip 127.0.0.1 $(QUIET_LAB) notebooks

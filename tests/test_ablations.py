@@ -169,7 +169,7 @@ def test_without_a_name_ablations_are_listed_and_unknown_ones_refused() -> None:
 WORDS = ("--suite", "widowx-pick", "--policy", "scripted", "--episodes", "1", "--workers", "1")
 
 
-@pytest.mark.slow
+@pytest.mark.sweep
 def test_the_command_says_what_it_found_and_runs_nothing_twice(tmp_path: Path) -> None:
     words = ("ablate", "selection", *WORDS, "--out", tmp_path / "run")
     done = vap(*words)

@@ -85,6 +85,15 @@ def test_a_cluster_gives_what_local_processes_give(address: str, tmp_path: Path)
         list(cluster.ray_executor(address)(dies, strange, 1, ""))
 
 
+@pytest.mark.parametrize("name", ["/tmp/x", "../x", "parts/../../x", ""])
+def test_a_worker_writes_into_the_run_alone(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    with pytest.raises(BadCluster, match="outside the run's folder; join clusters that you trust"):
+        cluster._write_files(folder, {"parts/a.parquet": b"a", name: b"x"})
+    assert not list(folder.iterdir())
+
+
 def test_no_cluster_is_said_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(
         BadCluster,

@@ -165,7 +165,7 @@ def test_casts_are_generic_and_of_one_category() -> None:
 def test_every_stage_finds_room_for_its_objects() -> None:
     """Cameras beside a plate once found none in a third of the stages, and were in a sixth of the films instead of a quarter."""
     for known in BENCHMARKS.values():
-        for n, task in enumerate(filmed_tasks(known.name) * 3):
+        for n, task in enumerate(filmed_tasks(known.name)):
             rng = np.random.default_rng([5, n])
             names = draw_objects(known, task, rng)
             placed = row(known, task, names, n, rng).placements

@@ -1,8 +1,10 @@
 """Objects put into words: exact ones for pictures whose every pixel is known, and a model's behind a real server on this machine."""
 
 import json
+import threading
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
 from typing import Any
@@ -301,6 +303,52 @@ def test_no_server_and_a_silent_one_are_said() -> None:
             ChatEndpoint(f"http://127.0.0.1:{mute.getsockname()[1]}/v1", "seer-1", timeout_s=0.2),
             "what?",
         )
+
+
+@contextmanager
+def endless(head: bytes, drip: bytes, pause_s: float) -> Iterator[str]:
+    """A server whose answer begins with `head` and goes on with `drip` for ever; its address."""
+    import socket
+
+    def answer(server: socket.socket) -> None:
+        with suppress(OSError):
+            connection, _ = server.accept()
+            with connection:
+                connection.settimeout(2)
+                connection.sendall(head)
+                while not stop.wait(pause_s):
+                    connection.sendall(drip)
+
+    stop = threading.Event()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        thread = threading.Thread(target=answer, args=(server,))
+        thread.start()
+        yield f"http://127.0.0.1:{server.getsockname()[1]}/v1"
+        stop.set()
+        thread.join()
+
+
+@pytest.mark.parametrize(
+    ("head", "drip", "pause_s", "said"),
+    [
+        (b"HTTP/1.1 200 OK\r\n\r\n", b"x" * 65536, 0.0, "answers with over 4 MB"),
+        (b"HTTP/1.1 200 OK\r\n\r\n", b"x", 0.02, "no whole answer within 0.3 s"),
+        (b"HTTP/1.1 200 OK\r\n", b"x", 0.02, "no whole answer within 0.3 s"),
+        (b"HTTP/1.1 200 OK\r\n", b"a: b\r\n", 0.0, r"gives no answer \("),
+        (b"HTTP/1.1 200 OK\r\nContent-Length: 9\r\n\r\n", b"", 0.02, "no whole answer|no answer"),
+        (b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\n{}", b"", 0.0, "does not answer as"),
+    ],
+)
+def test_an_answer_without_end_is_given_up(
+    head: bytes, drip: bytes, pause_s: float, said: str
+) -> None:
+    start = time.monotonic()
+    with endless(head, drip, pause_s) as url:
+        endpoint = ChatEndpoint(url, "seer-1", "secret", total_s=0.3 if pause_s else 20.0)
+        with pytest.raises(BadEndpoint, match=said) as caught:
+            request_answer(endpoint, "what?")
+    assert time.monotonic() - start < 10
+    assert "secret" not in str(caught.value)
 
 
 def test_where_to_ask_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:

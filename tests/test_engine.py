@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vap_core.evaluation import engine
+from vap_core.evaluation import engine, store
 from vap_core.evaluation import study as experiments
 from vap_core.evaluation.engine import missing_jobs, result_key
 from vap_core.evaluation.state_log import read as read_traces
@@ -201,6 +201,38 @@ def test_only_what_is_missing_runs_and_errors_run_again_recorded(tmp_path: Path)
     assert table.outcome[names[3:5]].tolist() == ["failure", "error"]
 
 
+def test_a_run_that_goes_on_begins_with_short_jobs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed again and again before a job of five ends, it would never get on."""
+    sizes: list[list[int]] = []
+
+    def killed(work, jobs, workers, mend):  # type: ignore[no-untyped-def]
+        sizes.append([len(job.rows) for job in jobs])
+        raise KeyboardInterrupt
+        yield
+
+    study = replace(STUDY, tasks=STUDY.tasks[:1], episodes=13, seeds=1)
+    monkeypatch.setattr(engine, "register_personal", lambda *_: None)
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            engine.run(study, tmp_path / "run", executor=killed, progress=False)
+    assert sizes == [[5, 5, 3], [1, 1, 5, 5, 1]]
+
+
+def test_leftovers_of_killed_writes_are_removed_but_no_recording(tmp_path: Path) -> None:
+    out = open_run(tmp_path / "run", STUDY.configuration())
+    kept = out / "recordings" / ".a.rrd.tmp"
+    gone = [out / "parts" / ".b.1.tmp", out / "recordings" / ".index-1" / ".c.9.rrd.tmp"]
+    for path in (kept, *gone):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"half")
+        os.utime(path, (0, 0))
+    store.sweep(out)
+    assert kept.exists()
+    assert not [path for path in gone if path.exists()]
+
+
 def test_how_numbers_are_printed_changes_no_configuration() -> None:
     before = STUDY.configuration()
     with np.printoptions(precision=2, threshold=3):
@@ -229,10 +261,11 @@ def test_a_worker_that_dies_once_is_forgiven_and_said(
                 raise engine.WorkerDied("a worker process died")
             yield job, work(job)
 
-    table = engine.run(STUDY, tmp_path / "run", record="none", executor=spread)
-    assert fell == [4]
-    assert len(table) == 12
-    assert table.attempt.tolist() == [1] * 12
+    study = replace(STUDY, episodes=1)
+    table = engine.run(study, tmp_path / "run", record="none", executor=spread)
+    assert fell == [2]
+    assert len(table) == 4
+    assert table.attempt.tolist() == [1] * 4
     assert "a worker process died" in capsys.readouterr().err
 
 

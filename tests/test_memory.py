@@ -1,6 +1,7 @@
 """Photos in, objects out and back; every damaged input is one clear line and loses nothing."""
 
 import json
+import os
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -93,6 +94,33 @@ def test_of_two_that_register_one_name_at_once_one_is_refused(
         save(tmp_path, personal("mug", "cup", (9, 9, 9)))
     assert (load_bank(tmp_path)["mug"].crops[0] == TEAL).all()
     assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_equal_objects_are_equal_bytes(tmp_path: Path) -> None:
+    mug = remember("mug", "cup", [np.full((4, 4, 3), TEAL, np.uint8)], TOYS.encoder)
+    files = {save(tmp_path / str(i), mug).read_bytes() for i in range(6)}
+    assert len(files) == 1
+
+
+@pytest.mark.parametrize("name", ["../../x", "\x1b[31mred", ".hidden", "a/b"])
+def test_an_object_of_a_bad_name_is_not_saved(tmp_path: Path, name: str) -> None:
+    mug = remember("mug", "cup", [np.full((4, 4, 3), TEAL, np.uint8)], TOYS.encoder)
+    with pytest.raises(BadMemory, match="cannot name an object"):
+        save(tmp_path / "bank", replace(mug, name=name))
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_a_killed_save_left_is_removed_when_it_is_old(
+    tmp_path: Path,
+) -> None:
+    mug = remember("mug", "cup", [np.full((4, 4, 3), TEAL, np.uint8)], TOYS.encoder)
+    old, young = tmp_path / ".a.1.tmp", tmp_path / ".b.2.tmp"
+    for scratch in (old, young):
+        scratch.write_bytes(b"half")
+    os.utime(old, (0, 0))
+    save(tmp_path, mug)
+    assert not old.exists()
+    assert young.exists()
 
 
 def test_a_bank_in_a_file_is_no_bank(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from vap_core.evaluation import engine
 from vap_core.evaluation import study as experiments
 from vap_core.evaluation.processes import results
 from vap_core.evaluation.study import Study, make_trial
+from vap_core.policies.protocol import PolicyInput
 from vap_core.policies.scripted.random import Random
 from vap_core.rollout import policy_call as calls
 from vap_core.rollout.loop import Trial, rollout
@@ -147,6 +149,44 @@ def test_without_a_limit_a_note_says_which_episode_waits(
     (line,) = capfd.readouterr().err.splitlines()
     name = f"simpler-bridge pick-shaver episode {BAD.episode} seed 0 (generic)"
     assert f"waiting: {name}; --policy-timeout" in line
+
+
+def test_a_policy_cannot_write_into_what_it_is_shown(trial: Trial) -> None:
+    """The recording shows the images that the prompter made, whatever the policy does."""
+    shown = []
+
+    class Paints:
+        label, execute = "paints", 1
+
+        def start(self, rng: np.random.Generator) -> None: ...
+
+        def plan(self, states: Sequence[Any], inputs: Sequence[PolicyInput]) -> object:
+            for given in inputs:
+                for image in (*given.images.values(), given.state):
+                    shown.append(image)
+                    with pytest.raises(ValueError, match="read-only"):
+                        image[:] = 0
+                mine = {name: rgb.copy() for name, rgb in given.images.items()}
+                assert all(rgb.flags.writeable for rgb in mine.values())
+            return states, [np.zeros((1, 7), np.float32)] * len(inputs)
+
+    row = replace(ROWS[0], max_steps=1)
+    (episode,) = rollout(replace(trial, policy=Paints()), [row], keep_images=True)
+    assert episode.outcome.status == "failure", episode.outcome.detail
+    assert shown
+    assert max(int(rgb.max()) for rgb in episode.frames[0].images.values()) > 0
+
+
+@pytest.mark.parametrize(("size", "noted"), [(1e30, True), (100.0, True), (0.01, False)])
+def test_actions_far_beyond_the_robot_are_noted_in_the_row(
+    trial: Trial, size: float, noted: bool
+) -> None:
+    far = Faulty(with_chunk(np.full((1, 7), size, np.float32)))
+    _, bad, _ = rollout(replace(trial, policy=far), ROWS, batch=3)
+    detail = bad.summary()["detail"]
+    assert bad.outcome.status == "failure"
+    assert detail.startswith("3 of 3 actions asked for over 10 times") is noted
+    assert bool(detail) is noted
 
 
 def test_a_sound_answer_passes() -> None:

@@ -82,7 +82,6 @@ def test_a_process_that_records_much_keeps_neither_threads_nor_memory(tmp_path: 
     assert after[-1][1] < after[11][1] + 12, "megabytes"
 
 
-@pytest.mark.alone
 def test_sixty_steps_of_three_cameras_stay_small_and_quick(tmp_path: Path) -> None:
     """The CPU of recording against that of encoding the same pictures once, in the same run: what `bench loop` measures against a whole rollout."""
     start = opening(3)

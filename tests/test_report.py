@@ -391,7 +391,7 @@ def test_methods_are_told_apart_by_colour_and_by_marker() -> None:
     assert marks["mask-only"][0] == OKABE_ITO[0]
 
 
-@pytest.mark.alone
+@pytest.mark.sweep
 def test_a_hundred_thousand_rows_take_seconds(tmp_path: Path) -> None:
     """Processor time of the whole report, shapes checked as in every test; 23 seeds of all four lists under two methods."""
     tasks = tuple(

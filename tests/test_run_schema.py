@@ -51,7 +51,7 @@ def read_back(source: Path, out: Path) -> None:
         shutil.rmtree(out, ignore_errors=True)
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
 @given(name=st.sampled_from(NOTES), value=st.sampled_from(JUNK))
 def test_any_note_of_a_run_is_read_or_refused(
     whole: Path, tmp_path: Path, name: str, value: Any
@@ -64,7 +64,7 @@ def test_any_note_of_a_run_is_read_or_refused(
     read_back(folder, tmp_path / "out")
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
 @given(name=st.sampled_from(COLUMNS), value=st.sampled_from(CELLS))
 def test_any_column_of_a_run_is_read_or_refused(
     whole: Path, tmp_path: Path, name: str, value: Any

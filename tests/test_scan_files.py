@@ -206,7 +206,7 @@ def test_a_sheet_encloses_nothing(tmp_path, quick):
 
 
 def test_too_many_faces_ask_to_decimate(tmp_path, monkeypatch):
-    monkeypatch.setattr("vap_core.simulation.assets.scans.mesh_file.MAX_FACES", 10)
+    monkeypatch.setattr("vap_core.simulation.assets.scans.mesh_parts.MAX_FACES", 10)
     with pytest.raises(BadObject, match="has 12 faces, over 10; decimate it first"):
         read_mesh_file(put(tmp_path, "box.ply", box(rgb=RED)))
 

@@ -63,7 +63,7 @@ def test_the_cost_of_a_call_is_told_for_every_policy_that_ships() -> None:
         assert gain > 1, "a batch costs less than its episodes one by one"
 
 
-@pytest.mark.slow
+@pytest.mark.sweep
 def test_a_tint_steers_it_to_objects_that_it_never_saw() -> None:
     """Not how well: that it goes for what is tinted. Twelve episodes; a guess among three moves the wrong one in half of those that it moves."""
     played = probe(str(BRIDGE), "simpler-bridge", scenes=4, ways=("tinted",), workers=2)

@@ -58,16 +58,6 @@ def test_a_smaller_copy_keeps_what_it_shows(still: Path) -> None:
     assert Image.open(BytesIO(jpeg)).format == "JPEG"
 
 
-def test_docstrings_are_not_part_of_the_recorder() -> None:
-    import ast
-
-    one, other = (
-        ast.dump(stills._without_docstrings(ast.parse(text)))
-        for text in ('def f():\n    "a"\n    return 1', 'def f():\n    "b"\n    return 1  # c')
-    )
-    assert one == other
-
-
 def test_a_picture_that_says_nothing_is_named(tmp_path: Path) -> None:
     path = tmp_path / "plain.png"
     Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(path)

@@ -9,16 +9,15 @@ import torch
 from vap_core.base.errors import BadMemory, BadPolicy
 from vap_core.base.types import Rgb
 from vap_core.policies.lerobot.adapter import load_policy
-from vap_core.policies.mini_pi0 import learned_token
+from vap_core.policies.mini_pi0 import token_file
 from vap_core.policies.mini_pi0.learned_token import (
-    SUFFIX,
     WORD,
     Photos,
-    Token,
     TokenTraining,
     augment,
     learn,
 )
+from vap_core.policies.mini_pi0.token_file import SUFFIX, Token
 from vap_core.policies.mini_pi0.vlm import MiniVlm, initialise_policy, load_vlm
 from vap_core.policies.protocol import PolicyInput
 from vap_core.training.words import vocabulary
@@ -117,18 +116,24 @@ def test_framing_keeps_size_and_type() -> None:
 
 def test_a_token_comes_back_from_disk_for_its_own_model_only(tmp_path: Path) -> None:
     token = Token("red-mug", np.arange(4, dtype=np.float32), 0.96875, "f" * 64)
-    path = learned_token.save(tmp_path, token)
-    back = learned_token.load(tmp_path, "red-mug", "f" * 64)
+    path = token_file.save(tmp_path, token)
+    back = token_file.load(tmp_path, "red-mug", "f" * 64)
     assert (back.object, back.accuracy, back.model) == (token.object, token.accuracy, token.model)
     assert np.array_equal(back.embedding, token.embedding)
     with pytest.raises(BadMemory, match="learned in model ffffffff"):
-        learned_token.load(tmp_path, "red-mug", "e" * 64)
+        token_file.load(tmp_path, "red-mug", "e" * 64)
     with pytest.raises(BadMemory, match="no learned word"):
-        learned_token.load(tmp_path, "blue-mug", "f" * 64)
+        token_file.load(tmp_path, "blue-mug", "f" * 64)
     path.write_bytes(path.read_bytes()[:20])
     with pytest.raises(BadMemory, match="no learned word"):
-        learned_token.load(tmp_path, "red-mug", "f" * 64)
+        token_file.load(tmp_path, "red-mug", "f" * 64)
     assert path.name == f"red-mug{SUFFIX}"
+    saved = {token_file.save(tmp_path, token).read_bytes() for _ in range(6)}
+    assert len(saved) == 1
+    deep = b"[" * 100_000
+    path.write_bytes(len(deep).to_bytes(8, "little") + deep)
+    with pytest.raises(BadMemory, match="no learned word"):
+        token_file.load(tmp_path, "red-mug", "f" * 64)
 
 
 def test_a_policy_hears_the_word_and_its_weights_stay(checkpoint: Path) -> None:  # noqa: F811

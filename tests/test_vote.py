@@ -92,6 +92,14 @@ def test_no_candidate_is_a_result() -> None:
     assert ballot.margin == 0.0
 
 
+def test_ten_thousand_candidates_are_no_trouble() -> None:
+    cosine = np.random.default_rng(0).uniform(-1, 0.9, (10_000, 5)).astype(np.float32)
+    cosine[7321] = 0.95
+    ballot = vote(cosine)
+    assert ballot.winner == 7321
+    assert ballot.votes.sum() == ballot.votes[7321] == 5
+
+
 def test_no_reference_is_a_mistake() -> None:
     with pytest.raises(ValueError, match="no references"):
         vote(np.zeros((2, 0), np.float32))

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from vap_core.base.errors import BadMemory, BadOutput, BadPhoto, UnknownName, one_of
-from vap_core.base.files import parse_json, write_atomic
+from vap_core.base.files import encode_tensors, parse_json, remove_scratch, write_atomic
 from vap_core.base.photos import load_photo as load_photo
 from vap_core.base.types import Description, PersonalObject, Rgb, Target
 from vap_core.perception.boxes import crop
@@ -161,10 +161,10 @@ def save(bank: Path, obj: PersonalObject, *, replace: bool = False) -> Path:
     """Write one object into the bank (a folder), atomically.
 
     Raises:
-        BadOutput: the folder cannot be written, or holds that name and `replace` is off.
+        BadMemory: no usable name or category; BadOutput: the folder cannot be written, or holds
+            that name and `replace` is off.
     """
-    from safetensors.numpy import save as encode
-
+    check_names(obj.name, obj.category)
     path = object_path(bank, obj.name)
     tensors = {"embeddings": obj.embeddings}
     for i, reference in enumerate(obj.crops):
@@ -180,7 +180,8 @@ def save(bank: Path, obj: PersonalObject, *, replace: bool = False) -> Path:
         header["description"] = json.dumps(asdict(obj.description))
     try:
         bank.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, encode(tensors, metadata=header), replace=replace)
+        remove_scratch(bank)
+        write_atomic(path, encode_tensors(tensors, header), replace=replace)
     except OSError as error:
         if path.exists() and not replace:
             raise taken(path) from error

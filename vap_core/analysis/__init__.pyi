@@ -1,5 +1,6 @@
 from .box_widget import drag_box as drag_box
 from .box_widget import dragged_box as dragged_box
+from .embedding_report import paper_spaces as paper_spaces
 from .gallery import GOALS as GOALS
 from .gallery import STEMS as STEMS
 from .gallery import bounds as bounds
@@ -27,6 +28,8 @@ from .inspection import published as published
 from .inspection import recovery as recovery
 from .inspection import track_table as track_table
 from .inspection import write_photo as write_photo
+from .kept import kept_figure as kept_figure
+from .kept import kept_table as kept_table
 from .plots import Tile as Tile
 from .plots import bounds_figure as bounds_figure
 from .plots import film as film
@@ -38,3 +41,10 @@ from .plots import layouts_figure as layouts_figure
 from .plots import learning_figure as learning_figure
 from .plots import rates_figure as rates_figure
 from .plots import sheet as sheet
+from .token_figures import rotation_figure as rotation_figure
+from .token_figures import token_curves_figure as token_curves_figure
+from .token_space import longest_word as longest_word
+from .token_space import mean_cosine as mean_cosine
+from .token_space import nearest_words as nearest_words
+from .token_space import rotation_cosines as rotation_cosines
+from .token_space import rotation_deg as rotation_deg

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.container import BarContainer
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
+    from PIL import Image
 
 
 ROLES = {"other objects": "#c9ccd1", "look-alike": OTHER, "target": WINNER, "goal": "#59a14f"}
@@ -359,14 +360,19 @@ def rates_figure(panels: Mapping[str, Mapping[str, Mapping[str, "Rate"]]], label
 
 
 def keep(
-    figure: "Figure", path: Path, dpi: int = 110, limit: int = 480_000, small: int = 115_000
+    figure: "Figure",
+    path: Path,
+    dpi: int = 110,
+    limit: int = 480_000,
+    small: int = 115_000,
+    about: Mapping[str, str] | None = None,
 ) -> bytes:
     """Save a figure as a PNG of at most `limit` bytes; return a JPEG of at most `small` bytes.
 
-    The JPEG is for a notebook.
+    The JPEG is for a notebook; `about` becomes the PNG's text chunks.
     """
     drawn = BytesIO()
-    figure.savefig(drawn, dpi=dpi, metadata={"Software": None})
+    figure.savefig(drawn, dpi=dpi, metadata={"Software": None, **(about or {})})
     return keep_png(drawn.getvalue(), path, limit=limit, small=small)
 
 
@@ -392,11 +398,18 @@ def keep_png(drawn: bytes, path: Path, limit: int = 480_000, small: int = 115_00
         if png.tell() <= limit:
             break
     path.write_bytes(png.getvalue())
+    return small_jpeg(full, small)
+
+
+def small_jpeg(picture: "Image.Image", limit: int = 115_000) -> bytes:
+    """An RGB picture as a JPEG of at most `limit` bytes, for a notebook; shrinks `picture`."""
+    from PIL import Image
+
     for width in (1100, 1000, 880, 760, 640, 520, 400):
-        full.thumbnail((width, 4 * width), Image.Resampling.LANCZOS)
+        picture.thumbnail((width, 4 * width), Image.Resampling.LANCZOS)
         jpeg = BytesIO()
-        full.save(jpeg, "JPEG", quality=84)
-        if jpeg.tell() <= small:
+        picture.save(jpeg, "JPEG", quality=84)
+        if jpeg.tell() <= limit:
             break
     return jpeg.getvalue()
 

@@ -1,15 +1,25 @@
 """Files that are complete or absent, and where the files that ship with the package are."""
 
+import errno
 import json
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+import shutil
+import stat
+import struct
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from uuid import uuid4
+
+if TYPE_CHECKING:
+    import numpy as np
 
 DATA = Path(__file__).resolve().parents[2] / "data"
 """Weights, policies, episode lists and results that ship beside the package."""
+ABANDONED_S = 3600.0
+"""A scratch file that was last written so long ago belongs to no process that runs."""
 
 
 @contextmanager
@@ -36,6 +46,46 @@ def write_atomic(path: Path, data: bytes, *, replace: bool = True) -> None:
     """Write the whole file, or nothing. Raises: OSError; without `replace` FileExistsError."""
     with replacing(path, replace=replace) as scratch:
         scratch.write_bytes(data)
+
+
+def remove_scratch(folder: Path, pattern: str = ".*.tmp") -> None:
+    """Remove what killed processes left in a folder: scratch as old as ABANDONED_S, if it can be.
+
+    What another process is writing is younger.
+    """
+    for scratch in folder.glob(pattern):
+        with suppress(OSError):
+            if time.time() - scratch.stat().st_mtime < ABANDONED_S:
+                continue
+            if scratch.is_dir():
+                shutil.rmtree(scratch)
+            else:
+                scratch.unlink()
+
+
+def check_regular(path: Path) -> None:
+    """Raises: OSError when there is no regular file. To open a pipe waits for its writer."""
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError(errno.EINVAL, "it is no regular file", str(path))
+
+
+def read_file(path: Path) -> bytes:
+    """A regular file's contents. Raises: OSError."""
+    check_regular(path)
+    return path.read_bytes()
+
+
+def encode_tensors(tensors: "Mapping[str, np.ndarray]", metadata: Mapping[str, str]) -> bytes:
+    """A safetensors file with its header sorted: equal contents are equal bytes."""
+    from safetensors.numpy import save
+
+    data = save(dict(tensors), metadata=dict(metadata))
+    (size,) = struct.unpack("<Q", data[:8])
+    header = json.dumps(
+        json.loads(data[8 : 8 + size]), sort_keys=True, separators=(",", ":"), ensure_ascii=False
+    ).encode()
+    header += b" " * (-len(header) % 8)
+    return struct.pack("<Q", len(header)) + header + data[8 + size :]
 
 
 def parse_json(text: str | bytes) -> Any:

@@ -1,6 +1,9 @@
 """Which code is running: results and recordings carry it beside their numbers."""
 
+import ast
+import hashlib
 import subprocess
+from collections.abc import Collection
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -21,3 +24,35 @@ def code_version(folder: Path | None = None) -> str:
     except (OSError, subprocess.SubprocessError):
         return f"vap-core {version('vap-core')}"
     return done.stdout.strip()
+
+
+def code_digest(folder: Path, without: Collection[str] = ()) -> str:
+    """A digest of a module, or of those below a folder but for the ones named in `without`.
+
+    Comments, docstrings and line breaks do not count.
+    """
+    found = hashlib.sha256()
+    paths = [folder] if folder.is_file() else sorted(folder.rglob("*.py"))
+    for path in paths:
+        if path.stem in without:
+            continue
+        found.update(path.relative_to(folder).as_posix().encode())
+        found.update(ast.dump(_without_docstrings(ast.parse(path.read_text()))).encode())
+    return found.hexdigest()[:16]
+
+
+def _without_docstrings(tree: ast.Module) -> ast.Module:
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if not isinstance(body, list):
+            continue
+        node.body = [part for part in body if not _is_string(part)]  # type: ignore[attr-defined]
+    return tree
+
+
+def _is_string(node: ast.AST) -> bool:
+    return (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )

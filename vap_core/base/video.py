@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from vap_core.base.errors import BadOutput, BadPhoto
+from vap_core.base.files import check_regular
 from vap_core.base.types import Rgb
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
@@ -119,6 +120,7 @@ def frame_rate(path: Path) -> float:
     import av
 
     try:
+        check_regular(path)
         with av.open(str(path)) as container:
             hz = container.streams.video[0].average_rate
     except (av.FFmpegError, IndexError, OSError) as error:

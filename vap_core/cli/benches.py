@@ -26,7 +26,8 @@ def bench(
             "profile: a control step of eval by part; "
             "scale: cost against cameras, image size, candidates, batch and workers, and memory; "
             "engine: a Ray cluster on this machine against local processes; "
-            "query: a question to a thousand recordings; style: how the source reads; "
+            "query: a question to a thousand recordings; "
+            "embeddings: tables of PaliGemma's size, compared; style: how the source reads; "
             "measured: write docs/measured.md from what ships."
         ),
     ] = "loop",
@@ -47,8 +48,8 @@ def bench(
         bool,
         typer.Option(
             "--quick",
-            help="policy, eval, profile, scale, engine, query: a few steps, to see that it runs; "
-            "its numbers mean nothing.",
+            help="policy, eval, profile, scale, engine, query, embeddings: a few steps, to see "
+            "that it runs; its numbers mean nothing.",
         ),
     ] = False,
     repeats: Annotated[
@@ -75,6 +76,7 @@ def bench(
     Example: python -m vap_core bench profile --json data/results/bench_profile.json
     """
     from vap_core.base.errors import one_of
+    from vap_core.cli.bench import embeddings as bench_embeddings
     from vap_core.cli.bench import engine as bench_engine
     from vap_core.cli.bench import eval as bench_eval
     from vap_core.cli.bench import eval_report, measured, scale_report
@@ -111,6 +113,7 @@ def bench(
         "profile": partial(kept, by_part, bench_profile.tables),
         "scale": partial(kept, scale, scale_report.tables),
         "engine": partial(bench_engine.run, workers, quick),
+        "embeddings": partial(bench_embeddings.run, quick),
         "query": partial(bench_query.run, quick=quick),
         "style": bench_style.run,
         "measured": measured.run,

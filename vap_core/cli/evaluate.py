@@ -20,10 +20,10 @@ Methods = Annotated[
     typer.Option(
         "--methods",
         "--method",
-        help="generic, hard-short, hard-long, soft, vap, vap-always-tint, mask-only, rewrite-only, "
-        "vap-associated; bounds, which read the simulator: oracle-box, oracle-mask, "
-        "oracle-track, wrong-mask; and the arms that `ablate` lists. With commas, or repeated. "
-        "Default: generic,vap.",
+        help="generic, hard-short, hard-long, soft, soft-aligned, soft-own, vap, vap-always-tint, "
+        "mask-only, rewrite-only, vap-associated; bounds, which read the simulator: oracle-box, "
+        "oracle-mask, oracle-track, wrong-mask; and the arms that `ablate` lists. With commas, or "
+        "repeated. Default: generic,vap.",
     ),
 ]
 POLICIES = (
@@ -51,9 +51,12 @@ Video = Annotated[
     ),
 ]
 Attention = Annotated[
-    bool,
+    str,
     typer.Option(
-        "--attention", help="Record where a pi0 or mini-pi0 looks when it decides, over every view."
+        "--attention",
+        metavar="all|token,colour,category,action",
+        help="Record where a pi0, pi0.5, mini-pi0 or smolvla looks when it decides, over every "
+        "view: the learned token, the colour word, the category word, the action expert.",
     ),
 ]
 Retries = Annotated[
@@ -126,7 +129,7 @@ def rollout(
     workers: Workers = 2,
     record: Recorded = "all",
     video: Video = False,
-    attention: Attention = False,
+    attention: Attention = "",
     retries: Retries = 1,
     policy_timeout: PolicyTimeout = None,
     robots: Meshes = "plain",
@@ -272,7 +275,7 @@ def evaluate(
         ),
     ] = None,
     video: Video = False,
-    attention: Attention = False,
+    attention: Attention = "",
     retries: Retries = 1,
     policy_timeout: PolicyTimeout = None,
     follow: Annotated[
@@ -406,7 +409,8 @@ def _run(
     retries: int,
     policy_timeout_s: float | None = None,
     address: str | None = None,
-    **recorded: Any,
+    video: bool = False,
+    attention: str = "",
 ) -> None:
     """Run a study, on the Ray cluster at `address` if there is one, and print its table."""
     from vap_core.base.errors import BadStudy
@@ -415,9 +419,11 @@ def _run(
     from vap_core.evaluation.power import detectable_effect_text
     from vap_core.evaluation.processes import results
     from vap_core.evaluation.report import conclude
+    from vap_core.rollout.queries import named_queries
 
     record = _record(record_option)
-    if record == "none" and any(recorded.values()):
+    queries = named_queries(names(attention))
+    if record == "none" and (video or queries):
         raise BadStudy(
             "--video and --attention say how to record; with --record none leave them out."
         )
@@ -434,7 +440,8 @@ def _run(
         retries=retries,
         policy_timeout_s=policy_timeout_s,
         executor=ray_executor(address) if address else results,
-        **recorded,
+        video=video,
+        attention=queries,
     )
     print(conclude(study, table, out))
     if study.audit:

@@ -1,5 +1,6 @@
-"""Commands that read the results of runs: diagnose, query, rescore, report, publish."""
+"""Commands that read results: diagnose, embeddings, query, rescore, report, publish."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -106,6 +107,55 @@ def diagnose(
     frame = deciding_frame(failures, number)
     print(f"{path}, frame {frame}: {failures.table['case_sentence'].iloc[number]}")
     _show_frame(path, frame, png)
+
+
+@app.command()
+def embeddings(
+    vlm: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Folder of a vision-language model, such as PaliGemma's. Default the shipped one."
+        ),
+    ] = None,
+    policies: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="Folders of policies that were initialised from it: pi0, pi0.5, mini-pi0. Default "
+            "the shipped ones."
+        ),
+    ] = None,
+    suite: Annotated[
+        str,
+        typer.Option(
+            help="Whose words to compare, too. Default the one in the policy's name, or all."
+        ),
+    ] = "",
+    out: Annotated[
+        Path | None, typer.Option(help="Keep the rows in this .parquet or .csv file, too.")
+    ] = None,
+) -> None:
+    """Compare the word embeddings of a vision-language model with those of policies: cosine, CKA,
+    kNN@1, with the paper's numbers below.
+
+    Example: python -m vap_core embeddings
+    Example: python -m vap_core embeddings models/paligemma-3b-pt-224 models/pi0 models/pi05
+    """
+    from vap_core.analysis.embedding_report import keep, report, spaces
+    from vap_core.base.errors import BadPolicy
+    from vap_core.evaluation.policy_names import shipped
+    from vap_core.policies.mini_pi0.teach_token import MODEL
+    from vap_core.simulation.suites import BENCHMARKS
+
+    folders = list(policies or ())
+    if vlm is None:
+        folders = [shipped(name) for name in BENCHMARKS if shipped(name).is_dir()]
+    if not folders:
+        raise BadPolicy("embeddings: name the folder of a policy after the model's.")
+    table = spaces(vlm or MODEL, folders, suite, _with_bar)
+    print(report(table))
+    if out is not None:
+        keep(table, out)
+        print(f"wrote {out}")
 
 
 @app.command()
@@ -247,3 +297,10 @@ def _show_frame(recording: Path, frame: int, png: Path | None) -> None:
     else:
         screenshot(recording, png, frame_index=frame, size=(1920, 1080))
         print(f"wrote {png}")
+
+
+def _with_bar(starts: Iterable[int], label: str) -> Iterable[int]:
+    """The starts of blocks, with a bar on a terminal."""
+    from tqdm import tqdm
+
+    return tqdm(starts, desc=label, unit="block", disable=None, leave=False)

@@ -1,6 +1,6 @@
 """Commands about this machine and what it measures.
 
-They are eval-perception, eval-photos, calibrate, eval-policy, show and doctor.
+They are eval-perception, eval-photos, calibrate, eval-policy, eval-tokens, show and doctor.
 """
 
 from pathlib import Path
@@ -205,6 +205,50 @@ def eval_policy(
     if out is not None:
         keep(table, out)
         print(f"wrote {out}")
+
+
+@app.command("eval-tokens")
+def eval_tokens(
+    suite: Annotated[
+        list[str] | None, typer.Option(help="A benchmark; repeatable. Default all four.")
+    ] = None,
+    k: Annotated[
+        str, typer.Option("--k", help="Numbers of photos to learn from, with commas.")
+    ] = "1,3,5,7",
+    epochs: Annotated[
+        int,
+        typer.Option(min=1, help="Passes over the augmented photos; the soft prompt's own is 20."),
+    ] = 20,
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    out: Annotated[Path, typer.Option(help="Run folder; a run found there is resumed.")] = Path(
+        "data/runs/tokens"
+    ),
+    publish: Annotated[
+        Path | None,
+        typer.Option(help="Keep the tables in this folder too, as token_NAME.parquet."),
+    ] = None,
+) -> None:
+    """Learn the token of every personal object from few and from many photos, in the
+    vision-language model and in the policies, and measure what it recognizes. Interrupted, it goes
+    on; about a minute and a half a token and core.
+
+    Example: python -m vap_core eval-tokens --suite simpler-bridge --k 5 --epochs 2
+        --out data/runs/few-tokens
+    """
+    from vap_core.base.errors import BadStudy
+    from vap_core.evaluation.tokens.report import report
+    from vap_core.evaluation.tokens.study import Tokens, run
+    from vap_core.evaluation.tokens.study import publish as write_tables
+    from vap_core.simulation.suites import BENCHMARKS
+
+    ks = tuple(int(number) for number in names(k) if number.isdigit() and int(number))
+    if len(ks) != len(names(k)) or not ks:
+        raise BadStudy(f"eval-tokens: --k {k}: give numbers of photos, such as 1,3,5,7.")
+    asked = Tokens(tuple(dict.fromkeys(suite or BENCHMARKS)), ks, epochs)
+    print(report(run(asked, out, workers=workers)))
+    if publish is not None:
+        written = ", ".join(map(str, write_tables(out, publish)))
+        print(f"wrote {written}")
 
 
 @app.command()

@@ -3,6 +3,7 @@ from . import paper as paper
 from .diagnosis import explain as explain
 from .diagnosis.failures import list_failures as list_failures
 from .diagnosis.recordings import save_screenshot as save_screenshot
+from .perception.estimates import share as share
 from .report.cells import percent_interval as percent_interval
 from .report.failures import breakdown as breakdown
 from .report.failures import funnel_table as funnel_table

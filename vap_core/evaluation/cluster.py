@@ -11,7 +11,7 @@ import os
 import platform
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
@@ -153,6 +153,14 @@ def _read_files(folder: Path) -> Files:
 
 
 def _write_files(folder: Path, files: Files) -> None:
+    """Raises: BadOutput; BadCluster when the other machine names a file outside the folder."""
+    for name in files:
+        parts = PurePosixPath(name).parts
+        if not parts or PurePosixPath(name).is_absolute() or ".." in parts:
+            raise BadCluster(
+                f"cluster: a worker sent a file named {name[:80]!r}, outside the run's folder; "
+                "join clusters that you trust only."
+            )
     try:
         for name, data in files.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)

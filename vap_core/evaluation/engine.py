@@ -40,7 +40,7 @@ def run(
     progress: bool = True,
     executor: Executor = results,
     video: bool = False,
-    attention: bool = False,
+    attention: tuple[str, ...] = (),
     policy_timeout_s: float | None = None,
 ) -> "pd.DataFrame":
     """Run the episodes of `study` that `folder` lacks, and return the table of all its episodes.
@@ -50,8 +50,12 @@ def run(
     """
     from tqdm import tqdm
 
+    resumed = (folder / store.MANIFEST).exists()
+
     def missing() -> list[Job]:
-        jobs = missing_jobs(study, folder, record, retries)
+        # A run that was interrupted may be again: its first jobs end soon, and are kept.
+        short = max(workers, 1) if resumed else 0
+        jobs = missing_jobs(study, folder, record, retries, short)
         complete = []
         for job in jobs:
             complete.append(
@@ -61,6 +65,7 @@ def run(
 
     store.open_run(folder, study.configuration())
     with store.locked(folder):
+        store.sweep(folder)
         store.compact(folder)
         if executor is results and missing():
             prepare(worker_modules(study))
@@ -97,15 +102,17 @@ def run(
 
 
 def missing_jobs(
-    study: Study, folder: Path, record: Record = "none", retries: int = 0
+    study: Study, folder: Path, record: Record = "none", retries: int = 0, short: int = 0
 ) -> Iterator[Job]:
     """Jobs for the episodes that the run in `folder` lacks.
 
     Also for episodes in error that were tried at most `retries` times; these are recorded. The
-    slower, prompted method comes first, so that workers finish together.
+    slower, prompted method comes first, so that workers finish together. The first `short` jobs
+    have one episode each.
     """
     run_digest = store.read_manifest(folder)["digest"]
     attempts = _attempts(store.read(folder))
+    given = 0
     for method in reversed(study.methods):
         for suite, task in study.tasks:
             rows = [(row, result_key(row, method, run_digest)) for row in study.rows(suite, task)]
@@ -114,8 +121,12 @@ def missing_jobs(
                 record_now = record
                 if attempt > 1 and record != "all":
                     record_now = "failures"
-                for first in range(0, len(group), BATCH):
-                    batch, keys = zip(*group[first : first + BATCH], strict=True)
+                first = 0
+                while first < len(group):
+                    size = 1 if given < short else BATCH
+                    batch, keys = zip(*group[first : first + size], strict=True)
+                    first += size
+                    given += 1
                     yield Job(
                         study=study,
                         method=method,

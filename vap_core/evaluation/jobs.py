@@ -34,8 +34,8 @@ class Job:
     """Some rows of one task and variant under one method, for one worker.
 
     `keys` name the results (engine.result_key); `attempt` 1 is the first. `chosen` are the keys to
-    record when `record` is a number. `video` records AV1 instead of JPEGs, `attention` the policy's
-    attention. `policy_timeout_s` is rollout.Trial's.
+    record when `record` is a number. `video` records AV1 instead of JPEGs, `attention` where these
+    queries look (rollout.queries). `policy_timeout_s` is rollout.Trial's.
     """
 
     study: Study
@@ -47,7 +47,7 @@ class Job:
     record: Record
     chosen: frozenset[str] = frozenset()
     video: bool = False
-    attention: bool = False
+    attention: tuple[str, ...] = ()
     policy_timeout_s: float | None = None
 
 
@@ -68,12 +68,12 @@ def run_job(job: Job) -> Rows:
         begin = _recorders(job)
     if job.attention and not getattr(trial.policy, "attends", False):
         raise BadStudy(
-            f"engine: {trial.policy.label} gives no attention maps, as pi0, pi0.5 and mini-pi0 do; "
-            "leave --attention out."
+            f"engine: {trial.policy.label} gives no attention maps, as pi0, pi0.5, mini-pi0 and "
+            "smolvla do on square pictures; leave --attention out."
         )
     trial = replace(
         trial,
-        attention=job.attention and begin is not None,
+        attention=() if begin is None else job.attention,
         policy_timeout_s=job.policy_timeout_s,
     )
     with unchanged_weights(trial.policy) as checksum:

@@ -29,6 +29,8 @@ METHODS: dict[str, Method] = {
     "hard-short": HardPrompt("short"),
     "hard-long": HardPrompt("long"),
     "soft": SoftPrompt(),
+    "soft-aligned": SoftPrompt("aligned"),
+    "soft-own": SoftPrompt("own"),
     "vap": Prompting(),
     "vap-always-tint": Prompting(always_tint=True),
     "mask-only": Prompting(rewrite=False),
@@ -40,7 +42,8 @@ METHODS: dict[str, Method] = {
     "wrong-mask": Oracle("track", of="look-alike"),
 }
 """What each method changes in the policy's inputs; None changes nothing. Association is not the
-paper's, nor are the last four: they read the simulator, and bound what results can be."""
+paper's, nor are soft-aligned and soft-own, nor the last four: they read the simulator, and bound
+what results can be."""
 FEWEST_REFERENCES = 5
 """Reference photos of an object, unless a method needs more."""
 
@@ -82,6 +85,12 @@ def needs_description(method: str) -> bool:
 
 def needs_token(method: str) -> bool:
     return isinstance(find(method), SoftPrompt)
+
+
+def token_space(method: str) -> str:
+    """Where the method's token is learned: copied, aligned or own; "" where there is none."""
+    how = find(method)
+    return how.space if isinstance(how, SoftPrompt) else ""
 
 
 def needs_stack(method: str) -> bool:

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import parse_json, write_atomic
+from vap_core.base.files import check_regular, parse_json, write_atomic
+from vap_core.evaluation.measurements import encode_table
 from vap_core.evaluation.run_schema import check_run
 from vap_core.evaluation.store import KEY, read, read_manifest
 from vap_core.simulation import suites
@@ -25,6 +26,7 @@ def read_published(path: Path) -> "list[tuple[dict[str, Any], pd.DataFrame]]":
     import pyarrow.parquet as pq
 
     try:
+        check_regular(path)
         arrow = pq.read_table(path)
         manifests = parse_json((arrow.schema.metadata or {})[b"runs"])
         table = arrow.to_pandas()
@@ -127,14 +129,9 @@ def _exists(target: Path) -> BadOutput:
 
 
 def _write(table: "pa.Table", target: Path, replace: bool) -> None:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    sink = pa.BufferOutputStream()
-    pq.write_table(table, sink, compression="zstd")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(target, sink.getvalue().to_pybytes(), replace=replace)
+        write_atomic(target, encode_table(table), replace=replace)
     except OSError as error:
         if target.exists() and not replace:
             raise _exists(target) from error

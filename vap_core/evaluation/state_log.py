@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from vap_core.base.errors import BadOutput
+from vap_core.base.files import check_regular
 from vap_core.evaluation.store import KEY, key_of, write_part
 from vap_core.rollout.types import Episode
 from vap_core.simulation.types import Truth
@@ -39,6 +40,7 @@ def read(folder: Path) -> Iterator[tuple[tuple[Any, ...], list[Truth]]]:
     keys: set[tuple[Any, ...]] = set()
     for part in sorted((folder / "traces").glob("*.parquet")):
         try:
+            check_regular(part)
             table = pd.read_parquet(part)
         except (OSError, ValueError) as error:
             raise BadOutput(

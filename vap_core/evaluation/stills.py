@@ -4,8 +4,6 @@ A picture that is committed would otherwise go on showing weights, objects or vi
 longer so: `stale` says how it differs from what is here now.
 """
 
-import ast
-import hashlib
 import json
 from dataclasses import fields
 from functools import cache
@@ -13,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.version import code_version
+from vap_core.base.version import code_digest, code_version
 from vap_core.evaluation import store
 from vap_core.evaluation.study import Study
 
@@ -87,28 +85,4 @@ def recorder_digest() -> str:
     """
     from vap_core import recording
 
-    folder = Path(recording.__file__).parent
-    found = hashlib.sha256()
-    for path in sorted(folder.rglob("*.py")):
-        if path.stem in NOT_DRAWN:
-            continue
-        found.update(path.relative_to(folder).as_posix().encode())
-        found.update(ast.dump(_without_docstrings(ast.parse(path.read_text()))).encode())
-    return found.hexdigest()[:16]
-
-
-def _without_docstrings(tree: ast.Module) -> ast.Module:
-    for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if not isinstance(body, list):
-            continue
-        node.body = [part for part in body if not _is_string(part)]  # type: ignore[attr-defined]
-    return tree
-
-
-def _is_string(node: ast.AST) -> bool:
-    return (
-        isinstance(node, ast.Expr)
-        and isinstance(node.value, ast.Constant)
-        and isinstance(node.value.value, str)
-    )
+    return code_digest(Path(recording.__file__).parent, without=NOT_DRAWN)

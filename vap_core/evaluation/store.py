@@ -15,7 +15,13 @@ from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import parse_json, write_atomic
+from vap_core.base.files import (
+    check_regular,
+    parse_json,
+    read_file,
+    remove_scratch,
+    write_atomic,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -118,12 +124,19 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     path = folder / MANIFEST
     damaged = f"run: {path} is absent or damaged; choose another folder, or run again with --out."
     try:
-        manifest = parse_json(path.read_bytes())
+        manifest = parse_json(read_file(path))
     except (OSError, ValueError) as error:
         raise BadOutput(damaged) from error
     if not isinstance(manifest, dict) or not {"digest", "configuration"} <= manifest.keys():
         raise BadOutput(damaged)
     return manifest
+
+
+def sweep(folder: Path) -> None:
+    """Remove the scratch of killed processes; unfinished recordings stay, for `recover`."""
+    for kind in ("parts", "traces", "audit", "recordings/.index-*"):
+        for place in folder.glob(kind):
+            remove_scratch(place)
 
 
 @contextmanager
@@ -236,6 +249,7 @@ def _read_part(path: Path) -> "pa.Table":
     from pyarrow.parquet import read_table
 
     try:
+        check_regular(path)
         return read_table(path)
     except (ArrowException, OSError, ValueError) as error:
         raise BadOutput(

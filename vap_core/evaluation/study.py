@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32
 
 from vap_core import __version__
 from vap_core.base.errors import BadStudy, one_of
@@ -22,6 +23,7 @@ from vap_core.evaluation.methods import (
     needs_stack,
     needs_token,
     references_needed,
+    token_space,
 )
 from vap_core.evaluation.policy_names import (
     MINI,
@@ -37,8 +39,9 @@ from vap_core.perception.embedded.weights import weights_sha256
 from vap_core.perception.protocols import Stack
 from vap_core.perception.stacks import STACKS, load_stack
 from vap_core.policies.lerobot import adapter, checkpoints
-from vap_core.policies.mini_pi0 import learned_token
-from vap_core.policies.mini_pi0.teach_token import MODEL, teach
+from vap_core.policies.mini_pi0 import token_file
+from vap_core.policies.mini_pi0.learned_token import WORD
+from vap_core.policies.mini_pi0.teach_token import MODEL, teach, teach_own
 from vap_core.policies.protocol import Policy, PrivilegedPolicy
 from vap_core.rollout.loop import Follow, Trial
 from vap_core.simulation import robots, suites
@@ -137,9 +140,12 @@ def register_personal(study: Study, bank: Path, captioner: Captioner | None = No
             obj, _ = register(target, category, views, stack.detector, stack.encoder)
         if _any_method(study, needs_description) and obj.description is None:
             obj = with_description(obj, captioner or AttributeCaptioner(stack.segmenter))
-        if _any_method(study, needs_token):
+        spaces = {token_space(method) for method in study.methods}
+        if spaces & {"copied", "aligned"}:
             initialised_from = checkpoints.config_field(study.checkpoint(suite), "vlm")
             teach(rows, bank, initialised_from, MODEL)
+        if "own" in spaces:
+            teach_own(rows, bank, checkpoints.locate(study.checkpoint(suite)))
         if obj is not known.get(target):
             save(bank, obj, replace=True)
             known[target] = obj
@@ -283,9 +289,26 @@ def _policy(
     policy = adapter.load_for_suite(study.checkpoint(row.suite), scene, suite)
     if not needs_token(method):
         return policy
-    model = getattr(policy.policy.config, "vlm", "")
-    token = learned_token.load(bank, row.target, model)
-    return policy.with_tokens({learned_token.WORD: token.embedding})
+    embedding = _token_embedding(study.checkpoint(row.suite), method, row.target, bank)
+    return policy.with_tokens({WORD: embedding})
+
+
+def _token_embedding(
+    checkpoint: str, method: str, target: str, bank: Path
+) -> Float32[np.ndarray, " d"]:
+    """The embedding that the target's word has under a method with a soft prompt."""
+    from vap_core.policies.mini_pi0.token_alignment import align
+    from vap_core.policies.mini_pi0.vlm import load_from_policy
+
+    folder = checkpoints.locate(checkpoint)
+    space = token_space(method)
+    if space == "own":
+        own = load_from_policy(folder).sha256()
+        return token_file.load(bank, target, own, token_file.OWN_SUFFIX).embedding
+    token = token_file.load(bank, target, checkpoints.config_field(folder, "vlm"))
+    if space == "aligned":
+        return align(token.embedding, MODEL, folder)
+    return token.embedding
 
 
 def _scene(study: Study, rows: Sequence[EpisodeRow]) -> Scene:

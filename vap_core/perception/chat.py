@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from http.client import HTTPException
+from queue import Empty, SimpleQueue
+from threading import Thread
 from typing import Any
 from urllib import request
 from urllib.error import HTTPError, URLError
@@ -39,6 +41,9 @@ class ChatEndpoint:
     model: str
     key: str = field(default="", repr=False)
     timeout_s: float = 60.0
+    """A server that is silent for so long is given up."""
+    total_s: float = 600.0
+    """An answer that is not complete by then is given up."""
 
     def __post_init__(self) -> None:
         if not _is_web_address(self.url):
@@ -112,7 +117,34 @@ def _question_body(model: str, question: str, images: Sequence[Rgb]) -> dict[str
 
 
 def _post(endpoint: ChatEndpoint, body: dict[str, Any]) -> bytes:
-    """The server's response. Raises: BadEndpoint."""
+    """The server's response, within `total_s`. Raises: BadEndpoint.
+
+    A server that sends a byte now and then passes every limit on silence, so that another thread
+    reads and this one waits.
+    """
+    answers: SimpleQueue[bytes | BadEndpoint] = SimpleQueue()
+
+    def fetch() -> None:
+        try:
+            answers.put(_fetch(endpoint, body))
+        except BadEndpoint as error:
+            answers.put(error)
+
+    Thread(target=fetch, daemon=True).start()
+    try:
+        answer = answers.get(timeout=endpoint.total_s)
+    except Empty:
+        raise BadEndpoint(
+            f"chat: {endpoint.url} gives no whole answer within {endpoint.total_s:g} s; "
+            "take a smaller model, or another server."
+        ) from None
+    if isinstance(answer, BadEndpoint):
+        raise answer
+    return answer
+
+
+def _fetch(endpoint: ChatEndpoint, body: dict[str, Any]) -> bytes:
+    """The server's response, of MAX_ANSWER_BYTES at most. Raises: BadEndpoint."""
     headers = {"Content-Type": "application/json"}
     if endpoint.key:
         headers["Authorization"] = f"Bearer {endpoint.key}"
@@ -125,7 +157,13 @@ def _post(endpoint: ChatEndpoint, body: dict[str, Any]) -> bytes:
     try:
         opener = request.build_opener(_NoRedirects)
         with opener.open(post, timeout=endpoint.timeout_s) as response:
-            return response.read(MAX_ANSWER_BYTES)
+            data = response.read(MAX_ANSWER_BYTES + 1)
+        if len(data) <= MAX_ANSWER_BYTES:
+            return data
+        raise BadEndpoint(
+            f"chat: {endpoint.url} answers with over {MAX_ANSWER_BYTES / 1e6:.0f} MB; "
+            f"is it a chat endpoint, and {URL} right?"
+        )
     except HTTPError as error:
         with error:
             raise BadEndpoint(

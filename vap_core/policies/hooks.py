@@ -6,15 +6,15 @@ Without an observer a policy does no extra work.
         policy.plan(states, inputs)
     digests[0]["front"]       # first episode of the batch: SHA-256 of the tensor of camera "front"
 
-    with observe_attention() as maps:
+    with observe_attention([{"colour": ("red", "blue")}]) as maps:
         policy.plan(states, inputs)
-    maps[0]["front"]          # first episode: the share of attention of every patch, h x w
+    maps[0]["front"]["colour"]    # first episode: layers x heads x rows x columns of patches
 
 A policy that reports nothing leaves `digests` or `maps` empty.
 """
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 
@@ -28,9 +28,21 @@ Images are reported under their camera's name.
 """
 InputDigests = dict[int, dict[str, str]]
 """By episode of the batch, then by TEXT or camera: hexadecimal SHA-256."""
-AttentionMap = Float32[np.ndarray, "h w"]
-AttentionMaps = dict[int, dict[str, AttentionMap]]
-"""By episode of the batch, then by camera."""
+ACTION = "action"
+"""The query of the action expert's tokens; the other queries are words of the instruction."""
+Phrases = Mapping[str, tuple[str, ...]]
+"""The phrases of every query that is words."""
+AttentionMap = Float32[np.ndarray, "layers heads rows columns"]
+"""The share of a query's attention that every image patch gets.
+
+It is the mean over the query's tokens; that of ACTION over the chunk's actions and the denoising
+steps, too.
+"""
+AttentionMaps = dict[int, dict[str, Mapping[str, AttentionMap]]]
+"""By episode of the batch, then by camera, then by query.
+
+A query whose words are not in the text is left out.
+"""
 
 
 class Hook[T]:
@@ -64,10 +76,46 @@ _inputs: Hook[str] = Hook("inputs")
 observe_inputs = _inputs.observe
 inputs_observed = _inputs.observed
 
-_attention: Hook[AttentionMap] = Hook("attention")
-observe_attention = _attention.observe
+_attention: Hook[Mapping[str, AttentionMap]] = Hook("attention")
+_phrases: ContextVar[Sequence[Phrases]] = ContextVar("phrases", default=())
 attention_observed = _attention.observed
 report_attention = _attention.report
+
+
+@contextmanager
+def observe_attention(phrases: Sequence[Phrases] = ()) -> Iterator[AttentionMaps]:
+    """Collect where policies look inside the block.
+
+    `phrases` has an entry per episode of the batch; without it only ACTION is a query.
+    """
+    token = _phrases.set(phrases)
+    try:
+        with _attention.observe() as maps:
+            yield maps
+    finally:
+        _phrases.reset(token)
+
+
+def layer_shown(query: str, n_layers: int) -> int:
+    """The last layer in which what a query attends to has an effect on the actions.
+
+    The action expert reads keys and values of the vision-language model's layers, which a layer
+    computes before it attends: what the words of the last layer attend to reaches no action. So it
+    is the last layer but one for words, and the expert's last for its own tokens. A model of one
+    layer has none for words; its only layer is returned.
+    """
+    return n_layers - 1 if query == ACTION else max(n_layers - 2, 0)
+
+
+def heat_map(weights: AttentionMap, query: str) -> Float32[np.ndarray, "rows columns"]:
+    """The mean over heads of the layer shown."""
+    return weights[layer_shown(query, len(weights))].mean(0)
+
+
+def phrases_of(episode: int) -> Phrases:
+    """The phrases that are observed in one episode of the batch."""
+    phrases = _phrases.get()
+    return phrases[episode] if phrases else {}
 
 
 def report_input(episode: int, name: str, consumed: np.ndarray | str) -> None:

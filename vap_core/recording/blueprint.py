@@ -3,6 +3,8 @@
 Layouts are values that rerun stores inside the recording; `views` makes their single views.
 """
 
+from collections.abc import Sequence
+
 import rerun.blueprint as rrb
 
 from vap_core.base.types import Grounding
@@ -35,12 +37,15 @@ EVIDENCE_SHARES = [0.72, 0.28]
 
 
 def episode_blueprint(
-    header: EpisodeHeader, diagnosis: Diagnosis | None = None, *, has_attention: bool = False
+    header: EpisodeHeader, diagnosis: Diagnosis | None = None, *, queries: Sequence[str] = ()
 ) -> StoredBlueprint:
-    """Everything; before it the evidence of a diagnosed failure; last the policy's attention."""
+    """Everything; before it the evidence of a diagnosed failure; last the policy's attention.
+
+    `queries` are those whose attention is recorded; each has a tab of its own.
+    """
     tabs: list[Part] = [_overview(header)]
-    if has_attention:
-        tabs.append(_attention_tab(header))
+    if queries:
+        tabs.append(_attention_tab(header, queries))
     if diagnosis is not None and header.cameras:
         tabs.insert(0, _evidence_tab(header, diagnosis))
     if len(tabs) == 1:
@@ -91,11 +96,14 @@ def _overview(header: EpisodeHeader) -> rrb.Container:
     )
 
 
-def _attention_tab(header: EpisodeHeader) -> rrb.Container:
-    """Where the policy's attention was, in every view."""
-    views = rrb.Horizontal(*[attention_view(camera.name) for camera in header.cameras])
+def _attention_tab(header: EpisodeHeader, queries: Sequence[str]) -> rrb.Container:
+    """Where the attention was, in every view; the query is switched by a tab."""
+    per_query: list[Part] = []
+    for query in queries:
+        views = [attention_view(camera.name, query) for camera in header.cameras]
+        per_query.append(rrb.Horizontal(*views, name=query))
     return rrb.Vertical(
-        views,
+        rrb.Tabs(*per_query, active_tab=0),
         _time_course(header, with_gripper=True),
         row_shares=EVIDENCE_SHARES,
         name="attention",

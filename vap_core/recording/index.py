@@ -12,6 +12,7 @@ import rerun as rr
 from rerun.chunk import Chunk, RrdReader
 
 from vap_core.base.errors import BadOutput, BadRecording
+from vap_core.base.files import check_regular
 from vap_core.recording.file import temporary_path
 from vap_core.recording.reading import PROPERTIES, property_group
 from vap_core.recording.stream import finish_stream, open_stream
@@ -68,6 +69,7 @@ def index_path(recording: Path, folder: Path | None = None) -> Path:
 
 
 def _write_index(recording: Path, path: Path) -> None:
+    check_regular(recording)
     with warnings.catch_warnings():
         # Without a footer rerun warns, and can read no single entity.
         warnings.simplefilter("error")

@@ -7,6 +7,7 @@ from typing import Any
 from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 
 from vap_core.base.errors import BadRecording
+from vap_core.base.files import check_regular
 from vap_core.recording.legacy_names import with_current_names
 
 PROPERTIES = "/__properties"
@@ -15,6 +16,7 @@ PROPERTIES = "/__properties"
 
 def read_chunks(path: Path) -> LazyChunkStream:
     """The chunks of a recording, in the order of the file."""
+    check_regular(path)
     return RrdReader(path).stream()
 
 

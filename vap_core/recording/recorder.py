@@ -4,7 +4,8 @@ Timelines are `frame_index` and `timestamp`. Entities have the names of LeRobot'
 
 - `/observation.images.<camera>`: the raw picture. Below it `/prompted` is what the policy saw,
   `/candidates` the boxes over the picture that the vote was held on, `/mask/{target,gt}` track and
-  truth, `/identity` the prompt in the colour of the object it covers, `/attention` an overlay.
+  truth, `/identity` the prompt in the colour of the object it covers, `/attention/<query>`
+  overlays.
 - `/observation.state`, `/action`, `/next.reward`, `/next.success`.
 - `/vap/votes/<camera>`: `counts`, with `/winner` and `/others` as bars.
 - `/vap/{candidates,similarity,crops}/<camera>`: what the vote compared.
@@ -117,7 +118,7 @@ class Recorder:
         """All frames, without images."""
         self._unsent: list[Frame] = []
         self._grasp_state: str | None = None
-        self._has_attention = False
+        self._queries: tuple[str, ...] = ()
         recording_id = f"{row.key}.s{row.seed}.{header.method}.{header.policy}"
         self._rec: rr.RecordingStream | None = open_stream(self.path, recording_id)
         self._log_header(self._rec)
@@ -206,8 +207,9 @@ class Recorder:
         for j, association in enumerate(self._header.associations):
             if association is not None:
                 log_association(rec, association, j, frame_times([frame]))
-        self._has_attention = bool(frame.attention)
-        episode_blueprint(self._header, has_attention=self._has_attention).send(rec)
+        for of_queries in frame.attention.values():
+            self._queries = tuple(of_queries)
+        episode_blueprint(self._header, queries=self._queries).send(rec)
 
     def _log_votes(self, frame: Frame, camera: str) -> None:
         """The votes of one view, over the first one's picture."""
@@ -279,7 +281,7 @@ class Recorder:
             send_gripper(rec, explanation.trace, index)
         if explanation.diagnosis is not None:
             blueprint = episode_blueprint(
-                self._header, explanation.diagnosis, has_attention=self._has_attention
+                self._header, explanation.diagnosis, queries=self._queries
             )
             blueprint.send(rec)
 

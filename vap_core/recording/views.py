@@ -15,6 +15,12 @@ from vap_core.recording.texts import vote_title
 from vap_core.rollout.types import EpisodeHeader
 
 type Part = rrb.Container | rrb.View
+QUERY_NAMES = {
+    "token": "the learned token",
+    "colour": "the colour word",
+    "category": "the category word",
+    "action": "the action expert",
+}
 UNIT_RANGE = (-0.05, 1.05)
 """The axis of numbers between 0 and 1."""
 
@@ -42,9 +48,10 @@ def coverage_view(camera: str) -> Part:
     return _image_view(camera, "prompt, coloured by object", ["", "/identity"])
 
 
-def attention_view(camera: str) -> Part:
-    """The policy's attention over its input."""
-    return _image_view(camera, "where the policy looks", ["/attention"])
+def attention_view(camera: str, query: str) -> Part:
+    """The attention of one query over the policy's input."""
+    title = f"where {QUERY_NAMES[query]} looks"
+    return _image_view(camera, title, [f"/attention/{query}"])
 
 
 def votes_view(camera: str, groundings: Sequence[Grounding]) -> Part:

@@ -7,7 +7,7 @@ that it yields.
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -15,14 +15,16 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 
 from vap_core.base.errors import BadAction, OutOfReach, VapError
-from vap_core.base.types import Attended
+from vap_core.base.types import Attended, Views
 from vap_core.policies.hooks import AttentionMap, AttentionMaps, observe_attention
 from vap_core.policies.protocol import Chunk, Policy, PolicyInput, PrivilegedPolicy
 from vap_core.rollout import audit
 from vap_core.rollout.coverage import mask_coverage
 from vap_core.rollout.policy_call import checked_plan, policy_call
 from vap_core.rollout.prompters.protocol import PromptContext, Prompter, SceneTruth, unchanged
+from vap_core.rollout.queries import only_queries, query_phrases
 from vap_core.rollout.types import ConsumedInput, Episode, EpisodeHeader, Frame, MaskCoverage
+from vap_core.simulation.control import BEYOND
 from vap_core.simulation.env import Control, Env
 from vap_core.simulation.occluder import Occlusion
 from vap_core.simulation.scenes import Scene
@@ -51,7 +53,8 @@ class Trial:
     A privileged policy needs no images; it gets them every `images_every` control steps (0: never),
     for their cost or for show. `follow` is when images are taken and targets tracked: when the
     policy is called, which is all that it ever sees, or at every control step. `audit` keeps what
-    the policy consumed in every call (rollout.audit), `attention` where it looked (policies.hooks).
+    the policy consumed in every call (rollout.audit), `attention` where these queries looked
+    (rollout.queries).
     `image_size` is simulation.Env's.
     A call of the policy that takes longer than `policy_timeout_s` fails (rollout.policy_call).
     """
@@ -66,7 +69,7 @@ class Trial:
     occlusion: Occlusion | None = None
     follow: Follow = "step"
     audit: bool = False
-    attention: bool = False
+    attention: tuple[str, ...] = ()
     image_size: int | tuple[int, int] = 224
     policy_timeout_s: float | None = None
 
@@ -92,8 +95,10 @@ class RunningEpisode:
     """Actions of the last chunk that are still to be executed."""
     frames: list[Frame] = field(default_factory=list)
     consumed: list[ConsumedInput] = field(default_factory=list)
-    attention: dict[str, AttentionMap] = field(default_factory=dict)
+    attention: Mapping[str, Mapping[str, AttentionMap]] = field(default_factory=dict)
     """Where the policy looked in this step's call."""
+    beyond: int = 0
+    """Actions far beyond the robot's speed."""
     seconds: dict[str, float] = field(
         default_factory=lambda: {"attend": 0.0, "policy": 0.0, "record": 0.0}
     )
@@ -362,12 +367,12 @@ def _call_policy(
     for episode in calling:
         observation, attended = steps[id(episode)]
         state = observation.state
-        raw.append(PolicyInput(observation.images, episode.row.instruction, state))
-        prompted.append(PolicyInput(attended.images, attended.text, state))
+        raw.append(_policy_input(observation.images, episode.row.instruction, state))
+        prompted.append(_policy_input(attended.images, attended.text, state))
 
     observer: AbstractContextManager[AttentionMaps] = nullcontext({})
     if trial.attention:
-        observer = observe_attention()
+        observer = observe_attention([query_phrases(episode.row) for episode in calling])
     with observer as maps:
         if trial.audit:
             after, chunks, consumed = audit.plan(policy, states, prompted, raw)
@@ -378,8 +383,20 @@ def _call_policy(
             returned = policy.plan(states, prompted)
             after, chunks = checked_plan(returned, policy.label, len(calling))
     for i, episode in enumerate(calling):
-        episode.attention = maps.get(i, {})
+        episode.attention = only_queries(maps.get(i, {}), trial.attention)
     return after, chunks
+
+
+def _policy_input(images: Views, text: str, state: np.ndarray) -> PolicyInput:
+    """What the policy reads. It cannot write: the recording shows what the prompter made."""
+    views = {name: _read_only(rgb) for name, rgb in images.items()}
+    return PolicyInput(views, text, _read_only(state))
+
+
+def _read_only(array: np.ndarray) -> np.ndarray:
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def _act(
@@ -413,7 +430,7 @@ def _act(
         attention=episode.attention,
     )
     if episode.over:
-        episode.outcome = episode.judge.outcome()
+        episode.outcome = episode.judge.outcome(detail=_note_on_actions(episode))
     episode.attention = {}
     with _timed(episode.seconds, "record"):
         if episode.sink is not None:
@@ -421,7 +438,18 @@ def _act(
     episode.frames.append(frame if keep_images else frame.without_images())
     if action is not None:
         episode.env.step(action)
+        episode.beyond += episode.env.is_beyond_limits(action)
         episode.judge = episode.judge.step(episode.env.truth())
+
+
+def _note_on_actions(episode: RunningEpisode) -> str:
+    """A line for the results table where the policy asked for what the robot cannot do."""
+    if not episode.beyond:
+        return ""
+    return (
+        f"{episode.beyond} of {episode.judge.steps} actions asked for over {BEYOND} times the "
+        "robot's speed and were cut to it; check the policy's units."
+    )
 
 
 def _end(trial: Trial, episode: RunningEpisode) -> Episode:

@@ -55,8 +55,8 @@ class Frame:
 
     `action` was decided from `images`; the terminal frame has none (None), because nothing is
     executed after it. `coverage` has an entry per view at steps whose images were prompted.
-    `attention`, at steps in which the policy was observed while it planned, is the share of its
-    attention on every image patch.
+    `attention`, at steps in which the policy was observed while it planned, has by camera and query
+    the share of attention on every image patch (policies.hooks.AttentionMap).
     """
 
     frame_index: int
@@ -70,11 +70,13 @@ class Frame:
     truth: Truth
     events: tuple[Event, ...]
     coverage: tuple[MaskCoverage, ...] = ()
-    attention: Mapping[str, Float32[np.ndarray, "_ _"]] = field(default_factory=dict)
+    attention: Mapping[str, Mapping[str, Float32[np.ndarray, "_ _ _ _"]]] = field(
+        default_factory=dict
+    )
 
     def without_images(self) -> "Frame":
         """The same step without pictures, masks and attention, to keep in memory."""
-        truth = replace(self.truth, masks={})
+        truth = replace(self.truth, masks={}, hand={})
         return replace(self, images={}, prompted={}, tracks={}, truth=truth, attention={})
 
 

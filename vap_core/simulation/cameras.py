@@ -161,6 +161,7 @@ class Renderer:
         self._renderers: dict[tuple[int, int, bool], mujoco.Renderer] = {}
         self._groups = model.geom_group.copy()
         self._owner = _object_of_geoms(model, self.objects)
+        self._hand = _hand_geoms(model)
 
     def __enter__(self) -> "Renderer":
         return self
@@ -203,6 +204,17 @@ class Renderer:
         before: Sequence[Screen] = (),
     ) -> Mapping[str, Mask]:
         """Visible pixels of every object that is not hidden; `before` is in front of the camera."""
+        return self.masks_and_hand(data, name, size, hidden=hidden, before=before)[0]
+
+    def masks_and_hand(
+        self,
+        data: mujoco.MjData,
+        name: str,
+        size: int | tuple[int, int],
+        hidden: frozenset[str] = frozenset(),
+        before: Sequence[Screen] = (),
+    ) -> tuple[Mapping[str, Mask], Mask]:
+        """`masks`, and the visible pixels of the gripper."""
         renderer = self._renderer(size, masks=True)
         self._update(renderer, data, name, hidden=hidden, before=before)
         drawn = renderer.render()
@@ -212,7 +224,8 @@ class Renderer:
         for i, each in enumerate(self.objects):
             if each not in hidden:
                 masks[each] = owner == i
-        return masks
+        hand = (geom >= 0) & self._hand[geom]
+        return masks, hand
 
     def _renderer(self, size: int | tuple[int, int], *, masks: bool) -> mujoco.Renderer:
         """The renderer of pictures, or of masks, of this size."""
@@ -261,3 +274,14 @@ def _object_of_geoms(model: mujoco.MjModel, objects: Sequence[str]) -> np.ndarra
     for i, name in enumerate(objects):
         owners[model.body(name).id] = i
     return owners[model.body_rootid[model.geom_bodyid]]
+
+
+def _hand_geoms(model: mujoco.MjModel) -> np.ndarray:
+    """Whether a geom is of the gripper: of the body that bears the tcp, or of one below it."""
+    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, "tcp")
+    of_hand = np.zeros(model.nbody, bool)
+    if site >= 0:
+        of_hand[model.site_bodyid[site]] = True
+    for body in range(1, model.nbody):  # a parent comes before its children
+        of_hand[body] |= of_hand[model.body_parentid[body]]
+    return of_hand[model.geom_bodyid]

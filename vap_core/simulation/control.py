@@ -27,6 +27,8 @@ LEAD_RAD = 0.5
 """Largest lead of the commanded pose over the measured one."""
 LEAD_JOINT_RAD = 0.25
 """Largest lead of a commanded joint over the measured one under joint control."""
+BEYOND = 10
+"""An action of more than so many times the largest speed is noted: its units must be wrong."""
 
 
 @value
@@ -204,6 +206,24 @@ def follow_joints(
     allowed = np.clip(near, low, high)
     joints = command.joints + np.clip(allowed - command.joints, -fastest, fastest)
     return Setpoint(arm.forward(joints), joints, float(np.clip(delta[-1], 0.0, 1.0)))
+
+
+def is_beyond(
+    action: Float32[np.ndarray, " m"],
+    robot: Robot,
+    control: str,
+    seconds: float,
+    limits: MotionLimits = MOTION_LIMITS,
+) -> bool:
+    """Whether a pose delta ("ee") or joint deltas ask for over BEYOND times the largest speed."""
+    delta = action.astype(np.float64)
+    if control == "ee":
+        shift, turn = np.linalg.norm(delta[:3]), np.linalg.norm(delta[3:6])
+        return bool(
+            shift > BEYOND * limits.speed_m_s * seconds
+            or turn > BEYOND * limits.turn_rad_s * seconds
+        )
+    return bool((np.abs(delta[:-1]) > BEYOND * robot.speed_rad_s * seconds).any())
 
 
 def rotation(vector: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:

@@ -23,7 +23,14 @@ from vap_core.simulation.contacts import (
     geom_roles,
     gripper_geoms,
 )
-from vap_core.simulation.control import Setpoint, arm, follow, follow_joints, rotation_vector
+from vap_core.simulation.control import (
+    Setpoint,
+    arm,
+    follow,
+    follow_joints,
+    is_beyond,
+    rotation_vector,
+)
 from vap_core.simulation.occluder import Occlusion, Screen, occluder_screens
 from vap_core.simulation.scenes import Scene, parked
 from vap_core.simulation.sensor import (
@@ -216,6 +223,12 @@ class Env:
             ramp = np.linspace(0.0, 1.0, self._substeps + 1)[1:, None]
             self._advance(self._substeps, before + ramp * (after - before))
 
+    def is_beyond_limits(self, action: Action) -> bool:
+        """Whether an action is far beyond the robot's speed; `step` cuts it to that."""
+        return is_beyond(
+            action=action, robot=self.robot, control=self.control, seconds=1.0 / self.hz
+        )
+
     def commanded(self, command: Setpoint, action: Action) -> Setpoint:
         """The command after `action`, given `command` and the present state; changes nothing."""
         seconds = 1.0 / self.hz
@@ -241,11 +254,12 @@ class Env:
             poses = self._poses(self._placed)
             links = self._poses(self.robot.links)
             masks_by_camera: dict[str, Mapping[str, Mask]] = {}
+            hand: dict[str, Mask] = {}
             if masks:
                 hidden = self._hidden()
                 for name in self.camera_names:
                     screens = self._screens(name)
-                    masks_by_camera[name] = self.scene.renderer.masks(
+                    masks_by_camera[name], hand[name] = self.scene.renderer.masks_and_hand(
                         self._data, name, self.image_hw, hidden=hidden, before=screens
                     )
             return Truth(
@@ -255,6 +269,7 @@ class Env:
                 pressed_s=self._touch.pressed_s,
                 contacts=self._touch.contacts,
                 masks=masks_by_camera,
+                hand=hand,
             )
 
     def cameras(self) -> tuple[Camera, ...]:

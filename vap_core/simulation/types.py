@@ -58,6 +58,8 @@ class Truth:
     """At the end of the step: the partners of every touching object (objects, ROBOT, REST)."""
     masks: Mapping[str, Mapping[str, Mask]] = field(default_factory=dict)
     """`masks[camera][object]`: visible pixels; empty when masks were not asked for."""
+    hand: Mapping[str, Mask] = field(default_factory=dict)
+    """Visible pixels of the gripper by camera; empty when masks were not asked for."""
 
     @property
     def held(self) -> frozenset[str]:

@@ -1,6 +1,5 @@
 """Measures development scenes one by one, and photo sets; what a run had finished is kept."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,8 +8,9 @@ from vap_core import __version__
 from vap_core.analysis.calibration.report import PRICE, Choice, choose, text_report
 from vap_core.analysis.calibration.scenes import SEED, Row, measure_scene
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import parse_json, write_atomic
+from vap_core.base.files import write_atomic
 from vap_core.evaluation import store
+from vap_core.evaluation.measurements import read_json_part, write_json_part
 from vap_core.evaluation.photos.run import TABLE, measure_photos
 from vap_core.perception.embedded.weights import weights_sha256
 from vap_core.perception.foundation.sources import KINDS
@@ -96,9 +96,8 @@ def _measure(
     for number in tqdm(range(scenes), unit="scene", desc=RENDERED, disable=not progress):
         path = out / "scenes" / f"{number:05d}.json"
         if not path.exists():
-            path.parent.mkdir(exist_ok=True)
-            write_atomic(path, json.dumps(measure_scene(number, stack)).encode())
-        rows.extend(_read(path))
+            write_json_part(path, measure_scene(number, stack), caller="calibrate")
+        rows.extend(read_json_part(path, caller="calibrate"))
     tables.append(pd.DataFrame(rows).assign(source=RENDERED))
     for folder in photos:
         name = folder.resolve().name
@@ -123,13 +122,3 @@ def _photo_rows(answers: "pd.DataFrame") -> "pd.DataFrame":
     rows = answers[["scene", "familiar", "likeness"]]
     right = answers.present & (answers.chosen_iou >= RIGHT_IOU)
     return rows.assign(camera="photo", case=cases, right=right)
-
-
-def _read(path: Path) -> list[Row]:
-    try:
-        rows: list[Row] = parse_json(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise BadOutput(
-            f"calibrate: {path} is damaged; delete it and run the same command again."
-        ) from error
-    return rows

@@ -15,6 +15,7 @@ from vap_core.cli.bench.timing import seconds_of
 from vap_core.evaluation.policy_names import MINI, shipped
 from vap_core.evaluation.statistics import ratio
 from vap_core.perception.embedded.backbone import features
+from vap_core.policies.hooks import observe_attention, observe_inputs
 from vap_core.policies.lerobot.adapter import IMAGE, STATE, LeRobot, load_policy
 from vap_core.policies.lerobot.traced import CALLS_BEFORE_TRACE
 from vap_core.policies.protocol import PolicyInput
@@ -48,13 +49,17 @@ def run(quick: bool = False) -> str:
     header = ["policy", "views", "one call, ms", "units"]
     for batch in BATCHES[1:]:
         header.append(f"throughput at batch {batch} [95 %]")
+    header += ["eager call, ms", "with attention, ms"]
     rows = [header]
     for name, folder in folders.items():
-        seconds = _call_seconds(load_policy(folder), rng, repeat)
+        policy = load_policy(folder)
+        seconds = _call_seconds(policy, rng, repeat)
         call = float(np.median(seconds[1]))
         n_views = len(BENCHMARKS[name].cameras)
         gains = [_gain_text(seconds, batch) for batch in BATCHES[1:]]
-        rows.append([name, str(n_views), f"{1e3 * call:.1f}", f"{call / unit:.1f}", *gains])
+        eager, observed = _observed_seconds(policy, rng, repeat)
+        costs = [f"{1e3 * eager:.1f}", f"{1e3 * observed:.1f}"]
+        rows.append([name, str(n_views), f"{1e3 * call:.1f}", f"{call / unit:.1f}", *gains, *costs])
     about = (
         f"one thread, CPU time, {repeat} repeats; unit: one EfficientNet-Lite0 pass of a "
         f"{SIDE} px view in the same run, {1e3 * unit:.1f} ms"
@@ -110,6 +115,38 @@ def _call_seconds(policy: LeRobot, rng: np.random.Generator, repeat: int) -> dic
             if i >= warm:
                 seconds[batch].append(call_seconds)
     return seconds
+
+
+def _observed_seconds(
+    policy: LeRobot, rng: np.random.Generator, repeat: int
+) -> tuple[float, float]:
+    """The medians of an eager call for one episode, and of one whose attention is observed.
+
+    An observed call is never a traced one; the queries are two words and the expert's tokens.
+    """
+    one = _draw_input(policy, rng)
+    states = [policy.start(rng)]
+    call = partial(policy.plan, states, [one])
+
+    def eager_call() -> None:
+        with observe_inputs():  # hashes the inputs, a fraction of a millisecond, and is eager
+            call()
+
+    def observed_call() -> None:
+        with observe_attention([{"colour": ("red",), "category": ("cup",)}]):
+            call()
+
+    eager = []
+    observed = []
+    for i in range(WARM + repeat):
+        times = (
+            seconds_of(eager_call, time.process_time),
+            seconds_of(observed_call, time.process_time),
+        )
+        if i >= WARM:
+            eager.append(times[0])
+            observed.append(times[1])
+    return float(np.median(eager)), float(np.median(observed))
 
 
 def _draw_input(policy: LeRobot, rng: np.random.Generator) -> PolicyInput:

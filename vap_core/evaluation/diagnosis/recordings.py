@@ -74,7 +74,7 @@ def save_screenshot(failures: Failures, number: int, png: Path, against: str | N
         path = side_by_side_recording(failures, number, against)
     screenshot(path, png, frame_index=deciding_frame(failures, number), size=(1920, 1080))
     row = failure_row(failures, number)
-    write_provenance(png, _study_of(failures.manifests[row["configuration"]], row))
+    write_provenance(png, study_of(failures.manifests[row["configuration"]], row))
     return str(row["case_sentence"])
 
 
@@ -101,8 +101,8 @@ def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
     from vap_core.recording import Recorder, read_summary, recording_name
     from vap_core.rollout.loop import rollout
 
-    study = _study_of(failures.manifests[row["configuration"]], row)
-    episode_row = _listed_row(study, row)
+    study = study_of(failures.manifests[row["configuration"]], row)
+    episode_row = listed_row(study, row)
     folder = artifacts_folder(Path(row["source"]))
     path = folder / "recordings" / recording_name(episode_row, row["method"])
     if path.exists() and read_summary(path)["policy"] == row["policy"]:
@@ -132,7 +132,7 @@ def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
     return path
 
 
-def _study_of(manifest: Mapping[str, Any], row: Mapping[str, Any]) -> Study:
+def study_of(manifest: Mapping[str, Any], row: Mapping[str, Any]) -> Study:
     """The study of a run, of one task and method alone."""
     configuration = manifest["configuration"]
     settings = {}
@@ -144,7 +144,7 @@ def _study_of(manifest: Mapping[str, Any], row: Mapping[str, Any]) -> Study:
     return replace(Study(**settings), audit=False)
 
 
-def _listed_row(study: Study, row: Mapping[str, Any]) -> EpisodeRow:
+def listed_row(study: Study, row: Mapping[str, Any]) -> EpisodeRow:
     """The row of a failure in the episode list of today. Raises: BadStudy."""
     for listed in study.rows(row["suite"], row["task"]):
         if (listed.episode, listed.seed) == (row["episode"], row["seed"]):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadOutput, one_of
 from vap_core.base.files import write_atomic
-from vap_core.evaluation import store
+from vap_core.evaluation import measurements, store
 from vap_core.evaluation.perception import tracking
 from vap_core.evaluation.perception.episodes import survey
 from vap_core.evaluation.perception.first_frames import (
@@ -182,7 +182,8 @@ def run_survey(
         speed_path = _part_path(parts, "speed")
         paths.append(speed_path)
         if not speed_path.exists():
-            _write_part(speed_path, {"speed": _measure_speed(asked)})
+            speed = {"speed": _measure_speed(asked)}
+            measurements.write_json_part(speed_path, speed, caller="survey", default=_to_number)
         return _write_tables(folder, paths)
 
 
@@ -208,19 +209,10 @@ def publish(folder: Path, to: Path) -> list[Path]:
     prefix = "perception"
     if stack != "embedded":
         prefix = f"perception_{stack}"
-    published = []
-    try:
-        to.mkdir(parents=True, exist_ok=True)
-        for name in TABLES:
-            path = to / f"{prefix}_{name}.parquet"
-            write_atomic(path, _table_path(folder, name).read_bytes())
-            published.append(path)
-    except OSError as error:
-        raise BadOutput(
-            f"survey: {to} cannot be written ({error.strerror}); choose another folder with "
-            "--publish."
-        ) from error
-    return published
+    tables = {}
+    for name in TABLES:
+        tables[f"{prefix}_{name}.parquet"] = _table_path(folder, name).read_bytes()
+    return measurements.publish_tables(tables, to, caller="survey")
 
 
 _load_stack = cache(load_stack)
@@ -280,7 +272,8 @@ def _run_missing(
         disable=not progress,
     ) as bar:
         for job, tables in results(run_job, missing, workers=jobs, remedy="--jobs"):
-            _write_part(_part_path(parts, job.name), tables)
+            path = _part_path(parts, job.name)
+            measurements.write_json_part(path, tables, caller="survey", default=_to_number)
             bar.update()
 
 
@@ -298,17 +291,6 @@ def _table_path(folder: Path, name: str) -> Path:
     return folder / f"{name}.parquet"
 
 
-def _write_part(path: Path, tables: Tables) -> None:
-    content = json.dumps(tables, default=_to_number)
-    try:
-        write_atomic(path, content.encode())
-    except OSError as error:
-        raise BadOutput(
-            f"survey: {path.parent} cannot be written ({error.strerror}); make room and run the "
-            "same command again."
-        ) from error
-
-
 def _to_number(scalar: Any) -> Any:
     """A NumPy scalar as a Python number."""
     return scalar.item()
@@ -319,30 +301,16 @@ def _write_tables(folder: Path, parts: Sequence[Path]) -> "dict[str, pd.DataFram
 
     Raises: BadOutput for a damaged part.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     tables: Tables = {name: [] for name in TABLES}
     for path in parts:
-        for name, rows in _read_part(path).items():
+        for name, rows in measurements.read_json_part(path, caller="survey").items():
             tables[name] += rows
     tables["references"] = _unique_rows(tables["references"])
     manifest = json.dumps(store.read_manifest(folder), sort_keys=True)
     for name, rows in tables.items():
         table = _arrow_table(rows).replace_schema_metadata({b"run": manifest.encode()})
-        sink = pa.BufferOutputStream()
-        pq.write_table(table, sink, compression="zstd")
-        write_atomic(_table_path(folder, name), sink.getvalue().to_pybytes())
+        write_atomic(_table_path(folder, name), measurements.encode_table(table))
     return _read_tables(folder)
-
-
-def _read_part(path: Path) -> Tables:
-    try:
-        return json.loads(path.read_bytes())
-    except ValueError as error:
-        raise BadOutput(
-            f"survey: {path} is damaged; delete it and run the same command again."
-        ) from error
 
 
 def _unique_rows(rows: Sequence[TableRow]) -> list[TableRow]:

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from vap_core.base.errors import BadPhotoSet
+from vap_core.base.files import check_regular
 from vap_core.base.photos import photos_in
 from vap_core.base.types import value
 from vap_core.memory import CATEGORY
@@ -197,6 +198,7 @@ def _read_categories(folder: Path, named: Iterable[str]) -> dict[str, str]:
 def _read_csv(path: Path, columns: tuple[str, ...]) -> list[tuple[int, dict[str, str]]]:
     """Every row with the number of its line. Raises: BadPhotoSet."""
     try:
+        check_regular(path)
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
             missing = [name for name in columns if name not in (reader.fieldnames or ())]

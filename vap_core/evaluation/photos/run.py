@@ -1,14 +1,13 @@
 """Measures a photo set scene by scene; what an interrupted run had finished is kept."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vap_core import __version__
 from vap_core.attend import Attender
-from vap_core.base.errors import BadOutput
-from vap_core.base.files import parse_json, write_atomic
+from vap_core.base.files import write_atomic
 from vap_core.evaluation import store
+from vap_core.evaluation.measurements import read_json_part, write_json_part
 from vap_core.evaluation.photos.folder import PhotoSet, read_photo_set
 from vap_core.evaluation.photos.measure import Row, measure_scene
 from vap_core.evaluation.photos.register import remember_subjects
@@ -64,30 +63,9 @@ def _measure(photo_set: PhotoSet, out: Path, stack_name: str, progress: bool) ->
         path = out / "parts" / f"{scene.name}.json"
         if not path.exists():
             measured = measure_scene(scene, photo_set, memory, attender)
-            _write_part(path, measured)
-        rows.extend(_read_part(path))
+            write_json_part(path, measured, caller="eval-photos")
+        rows.extend(read_json_part(path, caller="eval-photos"))
     return pd.DataFrame(rows)
-
-
-def _write_part(path: Path, rows: list[Row]) -> None:
-    try:
-        path.parent.mkdir(exist_ok=True)
-        write_atomic(path, json.dumps(rows).encode())
-    except OSError as error:
-        raise BadOutput(
-            f"eval-photos: {path.parent} cannot be written ({error.strerror}); make room and run "
-            "the same command again."
-        ) from error
-
-
-def _read_part(path: Path) -> list[Row]:
-    try:
-        rows: list[Row] = parse_json(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise BadOutput(
-            f"eval-photos: {path} is damaged; delete it and run the same command again."
-        ) from error
-    return rows
 
 
 def _write(table: "pd.DataFrame", out: Path) -> list[Path]:

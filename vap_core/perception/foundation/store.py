@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vap_core.base.errors import MissingWeights
-from vap_core.base.files import DATA, write_atomic
+from vap_core.base.files import DATA, parse_json, read_file, write_atomic
 from vap_core.perception.foundation.sources import KINDS, MODELS, TENSORS, Source, models_of
 
 STORE = DATA / "weights-hub"
@@ -110,7 +110,7 @@ def weights_table(store: Path | None = None) -> str:
 def read_lock(folder: Path) -> dict[str, str]:
     """SHA-256 by file of a model's folder; empty when its lock.json is absent or damaged."""
     try:
-        return dict(json.loads((folder / LOCK).read_text())["sha256"])
+        return dict(parse_json(read_file(folder / LOCK))["sha256"])
     except (OSError, ValueError, KeyError, TypeError):
         return {}
 

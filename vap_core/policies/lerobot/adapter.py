@@ -24,10 +24,18 @@ from jaxtyping import Float32
 
 from vap_core.base.errors import BadPolicy
 from vap_core.base.types import value
-from vap_core.policies.hooks import TEXT, attention_observed, inputs_observed, report_input
+from vap_core.policies.hooks import (
+    TEXT,
+    attention_observed,
+    inputs_observed,
+    phrases_of,
+    report_input,
+)
+from vap_core.policies.lerobot.attention_hooks import can_watch, reporting_attention
 from vap_core.policies.lerobot.checkpoints import PIPELINES, fingerprint, locate
 from vap_core.policies.lerobot.loading import build
-from vap_core.policies.lerobot.module_hooks import overriding_tokens, reporting_attention
+from vap_core.policies.lerobot.module_hooks import overriding_tokens
+from vap_core.policies.lerobot.token_positions import positions
 from vap_core.policies.lerobot.traced import ChunkPredictor
 from vap_core.policies.protocol import Chunk, PolicyInput
 from vap_core.simulation.env import Env
@@ -102,9 +110,8 @@ class LeRobot:
                 self.wanted[self.renamed.get(key, key)] = tuple(feature.shape)
         self.learned: dict[int, torch.Tensor] = {}
         """The learned embedding of a word, by its token."""
-        model = getattr(policy, "model", None)
-        self.attends = self.batched and hasattr(model, "paligemma_with_expert")
-        """Whether it reports its attention (module hooks)."""
+        self.attends = self.batched and can_watch(policy)
+        """Whether it reports its attention (attention_hooks)."""
         self.predict = ChunkPredictor(policy, label)
 
     def with_tokens(self, words: Mapping[str, Float32[np.ndarray, " d"]]) -> "LeRobot":
@@ -186,6 +193,19 @@ class LeRobot:
                 f"takes {action_size}; take a policy trained for it."
             )
 
+    def cameras(self) -> list[str]:
+        """The names of our cameras, in the order in which the policy reads them."""
+        config: Any = self.policy.config
+        keys = [key for key in config.image_features if not key.startswith(EMPTY)]
+        return [self._camera(key) for key in keys]
+
+    def prepare(
+        self, states: Sequence[LeRobotState], inputs: Sequence[PolicyInput]
+    ) -> tuple[dict[str, Any], torch.Tensor | None]:
+        """The preprocessed batch of some episodes, and their sampling noise if it takes any."""
+        batch = self.preprocessor(self._observation(inputs))
+        return batch, self._noise(states) if self.noisy else None
+
     def sha256(self) -> str:
         """Checksum of all parameters and buffers as they stand."""
         digest = hashlib.sha256()
@@ -198,19 +218,21 @@ class LeRobot:
     def _plan_batch(
         self, states: Sequence[LeRobotState], inputs: Sequence[PolicyInput]
     ) -> list[Chunk]:
-        config: Any = self.policy.config
-        batch = self.preprocessor(self._observation(inputs))
-        episodes = range(len(inputs))
-        self._report_inputs(batch, episodes)
-        noise = self._noise(states) if self.noisy else None
-        watching: AbstractContextManager[None] = nullcontext()
-        if self.attends and attention_observed():
-            keys = [key for key in config.image_features if not key.startswith(EMPTY)]
-            watching = reporting_attention(self.policy, [self._camera(key) for key in keys])
-        with overriding_tokens(self.policy, self.learned), watching:
+        batch, noise = self.prepare(states, inputs)
+        self._report_inputs(batch, range(len(inputs)))
+        with overriding_tokens(self.policy, self.learned), self._watching(batch):
             planned = self.predict(batch, noise)
         actions = self.postprocessor(planned[:, : self.execute])
         return list(actions.float().cpu().numpy())
+
+    def _watching(self, batch: dict[str, Any]) -> AbstractContextManager[None]:
+        """Reports the attention of a call where somebody observes it."""
+        if not self.attends or not attention_observed():
+            return nullcontext()
+        places = []
+        for episode, tokens in enumerate(batch[TOKENS]):
+            places.append(positions(self.preprocessor, tokens, phrases_of(episode)))
+        return reporting_attention(self.policy, self.cameras(), places)
 
     def _plan_step(self, episode: int, state: LeRobotState, policy_input: PolicyInput) -> Chunk:
         batch = self.preprocessor(self._observation([policy_input]))

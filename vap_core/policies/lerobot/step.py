@@ -29,7 +29,8 @@ from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 
 from vap_core.attend import Attender, AttendState, Prompting
-from vap_core.base.errors import BadMemory, BadOutput, BadViews, one_of
+from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadViews, one_of
+from vap_core.base.files import parse_json
 from vap_core.base.types import Rgb, Views
 from vap_core.memory import load_bank
 from vap_core.perception.stacks import STACKS, load_stack
@@ -215,9 +216,17 @@ def attach(checkpoint: str | Path, out: Path, memory: Path, **options: Any) -> P
     step = VapPrompt(str(memory), **options)
     if out.exists():
         raise BadOutput(f"attach: {out} exists; choose another folder.")
-    pipeline = json.loads((source / PIPELINES[0]).read_text())
+    file = source / PIPELINES[0]
+    try:
+        pipeline = parse_json(file.read_text())
+        place = _place_of_step(pipeline["steps"])
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise BadPolicy(
+            f"attach: {file} is no processor pipeline ({type(error).__name__}); save it again with "
+            "lerobot 0.6."
+        ) from error
     entry = {"class": STEP_CLASS, "config": step.get_config()}
-    pipeline["steps"].insert(_place_of_step(pipeline["steps"]), entry)
+    pipeline["steps"].insert(place, entry)
     out.mkdir(parents=True)
     for file in source.iterdir():
         if file.name != PIPELINES[0]:

@@ -10,19 +10,16 @@ trained. Photos of the actual distractors are its hard negatives, in the baselin
 is then given to the policy that was initialised from the model.
 """
 
-import json
-import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 
 from vap_core.base.errors import BadMemory
-from vap_core.base.files import write_atomic
 from vap_core.base.types import Rgb, value
+from vap_core.policies.mini_pi0.token_file import Token
 
 if TYPE_CHECKING:
     import torch
@@ -31,24 +28,9 @@ if TYPE_CHECKING:
 
 WORD = "<my_0>"
 QUESTION = "can you recognize <my_0> in this image"
-SUFFIX = ".token.safetensors"
 SHARES = (0.5, 0.35, 0.15)
 """Shares of own photos, look-alikes and other objects in a batch."""
 EMBEDDED_AT_ONCE = 64
-
-
-@value
-class Token:
-    """A learned word: its embedding in the model's space, and its accuracy on held-out photos.
-
-    In `accuracy` positives and negatives have equal weight. `model` is the SHA-256 of the model in
-    which it was learned: it means nothing in another.
-    """
-
-    object: str
-    embedding: Float32[np.ndarray, " d"]
-    accuracy: float
-    model: str
 
 
 @value
@@ -84,28 +66,53 @@ def learn(
 
     Raises: BadMemory when a kind of photo is missing.
     """
+    _check_kinds(name, unseen)
+    *_, (_, embedding) = lessons(vlm, name, taught, training)
+    return Token(
+        object=name,
+        embedding=embedding,
+        accuracy=accuracy(vlm, embedding, unseen),
+        model=vlm.sha256(),
+    )
+
+
+def lessons(
+    vlm: "MiniVlm", name: str, taught: Photos, training: TokenTraining | None = None
+) -> Iterator[tuple[int, Float32[np.ndarray, " d"]]]:
+    """The embedding as it is learned: before the first step, then after each epoch, and its step.
+
+    Raises: BadMemory when a kind of photo is missing.
+    """
     options = training or TokenTraining()
     rng = np.random.default_rng([77, options.seed, *name.encode()])
-    for photos in (taught, unseen):
-        if not photos.own or not (photos.rivals or photos.others):
-            raise BadMemory(
-                f"tokens.learn: {name}: photos of the object and of others are both needed, to "
-                "learn from and to measure by."
-            )
+    _check_kinds(name, taught)
     question = _Question(vlm)
     patches = []
     for kind in (taught.own, taught.rivals, taught.others):
         if kind:
             augmented = _augmentations(kind, options.augmentations, rng)
             patches.append(question.embed(augmented))
-    _train(question, patches, options, rng)
-    embedding = question.embedding.detach().numpy().astype(np.float32)
-    return Token(
-        object=name,
-        embedding=embedding,
-        accuracy=_accuracy(question, unseen),
-        model=vlm.sha256(),
-    )
+    yield 0, question.learned()
+    for step in _train(question, patches, options, rng):
+        yield step, question.learned()
+
+
+def recognized(
+    vlm: "MiniVlm", embedding: Float32[np.ndarray, " d"], photos: Sequence[Rgb]
+) -> Bool[np.ndarray, " n"]:
+    """In which photos the model says yes to the word that has this embedding."""
+    import torch
+
+    question = _Question(vlm, embedding)
+    with torch.no_grad():
+        return (question.ask(question.embed(photos)) > 0).numpy()
+
+
+def accuracy(vlm: "MiniVlm", embedding: Float32[np.ndarray, " d"], photos: Photos) -> float:
+    """The share of right answers, positives and negatives with equal weight."""
+    said_yes = recognized(vlm, embedding, photos.own).mean()
+    said_no = 1 - recognized(vlm, embedding, [*photos.rivals, *photos.others]).mean()
+    return float((said_yes + said_no) / 2)
 
 
 def augment(photo: Rgb, rng: np.random.Generator) -> Rgb:
@@ -125,51 +132,25 @@ def augment(photo: Rgb, rng: np.random.Generator) -> Rgb:
     return np.clip(lit, 0, 255).astype(np.uint8)
 
 
-def save(folder: Path, token: Token) -> Path:
-    """Write `<object>.token.safetensors`."""
-    from safetensors.numpy import save as encode
-
-    header = {"object": token.object, "accuracy": repr(token.accuracy), "model": token.model}
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{token.object}{SUFFIX}"
-    write_atomic(path, encode({"embedding": token.embedding}, metadata=header))
-    return path
-
-
-def load(folder: Path, name: str, model: str) -> Token:
-    """The word of that object.
-
-    Raises: BadMemory when it is absent, damaged, or was learned in another model.
-    """
-    from safetensors import SafetensorError
-
-    path = folder / f"{name}{SUFFIX}"
-    try:
-        token = _read(path)
-    except (OSError, SafetensorError, struct.error, ValueError, KeyError) as error:
-        raise BadMemory(
-            f"tokens.load: {path} holds no learned word ({type(error).__name__}); learn it again."
-        ) from error
-    if token.model != model:
-        raise BadMemory(
-            f"tokens.load: {path} was learned in model {token.model[:8]}, this is {model[:8]}; "
-            "learn it again."
-        )
-    return token
-
-
 class _Question:
     """The yes/no question about one object, with a trainable embedding for its word."""
 
-    def __init__(self, vlm: "MiniVlm") -> None:
+    def __init__(self, vlm: "MiniVlm", embedding: Float32[np.ndarray, " d"] | None = None) -> None:
         import torch
 
         self.vlm = vlm
         tokens, self.mask = vlm.tokenize([QUESTION])
         self.words = vlm.towers.embed_language_tokens(tokens).detach()[0]
         self.is_word = tokens[0] == vlm.vocabulary[WORD]
-        self.embedding = self.words[self.is_word][0].clone().requires_grad_(True)
+        start = self.words[self.is_word][0].clone()
+        if embedding is not None:
+            start = torch.from_numpy(embedding)
+        self.embedding = start.requires_grad_(True)
         self.answer = torch.zeros((1, 1), dtype=torch.long)
+
+    def learned(self) -> Float32[np.ndarray, " d"]:
+        """A copy of the embedding as it stands."""
+        return self.embedding.detach().numpy().astype(np.float32)
 
     def embed(self, photos: Sequence[Rgb]) -> "torch.Tensor":
         """The patch features of photos."""
@@ -199,6 +180,15 @@ class _Question:
         return scores[:, 0, vocabulary["yes"]] - scores[:, 0, vocabulary["no"]]
 
 
+def _check_kinds(name: str, photos: Photos) -> None:
+    """Raises: BadMemory when a kind of photo is missing."""
+    if not photos.own or not (photos.rivals or photos.others):
+        raise BadMemory(
+            f"tokens.learn: {name}: photos of the object and of others are both needed, to "
+            "learn from and to measure by."
+        )
+
+
 def _augmentations(photos: Sequence[Rgb], n: int, rng: np.random.Generator) -> list[Rgb]:
     """`n` augmentations of every photo."""
     augmented = []
@@ -213,8 +203,11 @@ def _train(
     patches: Sequence["torch.Tensor"],
     options: TokenTraining,
     rng: np.random.Generator,
-) -> None:
-    """Train the question's embedding; the photos of the object come first in `patches`."""
+) -> Iterator[int]:
+    """Train the question's embedding, and pass on the number of steps after each epoch.
+
+    The photos of the object come first in `patches`.
+    """
     import torch
     from torch.nn import functional as F  # noqa: N812
 
@@ -237,18 +230,7 @@ def _train(
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
-
-
-def _accuracy(question: _Question, photos: Photos) -> float:
-    """The share of right answers, positives and negatives with equal weight."""
-    import torch
-
-    with torch.no_grad():
-        positives = question.embed(photos.own)
-        negatives = question.embed([*photos.rivals, *photos.others])
-        said_yes = (question.ask(positives) > 0).float().mean()
-        said_no = (question.ask(negatives) <= 0).float().mean()
-    return float(np.mean([said_yes.item(), said_no.item()]))
+        yield (epoch + 1) * n_steps
 
 
 def _tensor(images: Sequence[Rgb], side: int) -> "torch.Tensor":
@@ -257,18 +239,3 @@ def _tensor(images: Sequence[Rgb], side: int) -> "torch.Tensor":
 
     tensor = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).float() / 255
     return torch.nn.functional.interpolate(tensor, (side, side), mode="bilinear", antialias=True)
-
-
-def _read(path: Path) -> Token:
-    """The token in a file that `save` wrote."""
-    from safetensors.numpy import load as decode
-
-    data = path.read_bytes()
-    (length,) = struct.unpack("<Q", data[:8])
-    header = json.loads(data[8 : 8 + length])["__metadata__"]
-    return Token(
-        object=header["object"],
-        embedding=decode(data)["embedding"],
-        accuracy=float(header["accuracy"]),
-        model=header["model"],
-    )

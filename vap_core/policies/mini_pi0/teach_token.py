@@ -6,15 +6,20 @@ It says which photos the token is learned from, and where it is kept.
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vap_core.base.errors import BadStudy
 from vap_core.base.files import DATA
 from vap_core.base.types import Rgb
-from vap_core.policies.mini_pi0 import learned_token
-from vap_core.policies.mini_pi0.learned_token import Photos, Token
+from vap_core.policies.mini_pi0 import learned_token, token_file
+from vap_core.policies.mini_pi0.learned_token import Photos
+from vap_core.policies.mini_pi0.token_file import Token
 from vap_core.simulation.assets import objects
 from vap_core.simulation.studio import reference_views
 from vap_core.simulation.types import EpisodeRow
+
+if TYPE_CHECKING:
+    from vap_core.policies.mini_pi0.vlm import MiniVlm
 
 MODEL = DATA / "policies" / "mini-paligemma"
 """The shipped vision-language model that the shipped policies were initialised from."""
@@ -34,20 +39,34 @@ def photographs(rows: Iterable[EpisodeRow], seed: int, k: int) -> Photos:
     There are `k` of the target, as its owner takes them.
     """
     rows = list(rows)
-    target = objects.get_object(rows[0].target)
+    own = reference_views(objects.get_object(rows[0].target), k, seed)
     rivals: list[Rgb] = []
+    for name in lookalikes(rows):
+        rivals += reference_views(objects.get_object(name), VIEWS, seed)
+    return Photos(tuple(own), tuple(rivals), other_objects(rows, seed))
+
+
+def lookalikes(rows: Iterable[EpisodeRow]) -> list[str]:
+    """The objects of the target's category that the rows place beside it, sorted."""
+    rows = list(rows)
+    target = objects.get_object(rows[0].target)
+    names = []
     for name in sorted(_placed(rows) - {target.name}):
-        model = objects.get_object(name)
-        if model.category == target.category:
-            rivals += reference_views(model, VIEWS, seed)
-    kinds = [kind for kind in objects.CATEGORIES if kind != target.category]
-    first = objects.CATEGORIES.index(target.category)
-    others: list[Rgb] = []
+        if objects.get_object(name).category == target.category:
+            names.append(name)
+    return names
+
+
+def other_objects(rows: Sequence[EpisodeRow], seed: int) -> tuple[Rgb, ...]:
+    """Photos of personal objects of other categories than the rows' target."""
+    category = objects.get_object(rows[0].target).category
+    kinds = [kind for kind in objects.CATEGORIES if kind != category]
+    first = objects.CATEGORIES.index(category)
+    photos: list[Rgb] = []
     for i in range(OTHERS):
         other = objects.personal_instance(kinds[(first + 5 * i) % len(kinds)])
-        others += reference_views(other, seed=seed)
-    own = reference_views(target, k, seed)
-    return Photos(tuple(own), tuple(rivals), tuple(others))
+        photos += reference_views(other, seed=seed)
+    return tuple(photos)
 
 
 def teach(
@@ -63,7 +82,6 @@ def teach(
     """
     from vap_core.policies.mini_pi0 import vlm
 
-    rows = list(rows)
     teacher = vlm.load_vlm(model)
     if teacher.sha256() != initialised_from:
         known = f"mini-PaliGemma {initialised_from[:8]}" if initialised_from else "none"
@@ -71,9 +89,24 @@ def teach(
             f"soft prompt: the policy was initialised from {known}, but the model in {model} is "
             f"{teacher.sha256()[:8]}; leave soft out, or put the right one there."
         )
+    return _teach(teacher, list(rows), folder, token_file.SUFFIX)
+
+
+def teach_own(rows: Iterable[EpisodeRow], folder: Path, policy: Path) -> Token:
+    """The same in the weights of the policy whose checkpoint is given, not in those it came from.
+
+    Raises: BadPolicy when the checkpoint is no mini-pi0.
+    """
+    from vap_core.policies.mini_pi0 import vlm
+
+    return _teach(vlm.load_from_policy(policy), list(rows), folder, token_file.OWN_SUFFIX)
+
+
+def _teach(teacher: "MiniVlm", rows: Sequence[EpisodeRow], folder: Path, suffix: str) -> Token:
+    """Learn the target's token in `teacher` unless the folder has it."""
     name = rows[0].target
-    if (folder / f"{name}{learned_token.SUFFIX}").exists():
-        return learned_token.load(folder, name, teacher.sha256())
+    if (folder / f"{name}{suffix}").exists():
+        return token_file.load(folder, name, teacher.sha256(), suffix)
     taught = photographs(rows, 0, K)
     unseen = photographs(rows, 1, VIEWS)
     token = learned_token.learn(teacher, name, taught, unseen)
@@ -83,7 +116,7 @@ def teach(
             f"photos, less than {100 * LEAST_ACCURACY:.0f} %.",
             file=sys.stderr,
         )
-    learned_token.save(folder, token)
+    token_file.save(folder, token, suffix)
     return token
 
 

@@ -23,6 +23,8 @@ from vap_core.policies.mini_pi0.processor_mini_pi0 import END, encode, vocabular
 ANSWER = 3
 """Words of the longest answer, END included."""
 WEIGHTS = "vlm.safetensors"
+IN_POLICY = "model.paligemma_with_expert.paligemma."
+"""What precedes the names of its weights in a policy's file."""
 SIZES = ("image_resolution", "patch", "width", "depth", "head_dim", "vision_width", "vision_depth")
 
 
@@ -152,6 +154,31 @@ def load_vlm(folder: Path) -> MiniVlm:
         raise BadPolicy(
             f"load_vlm: {folder} is damaged ({type(error).__name__}: {reason:.150}); run: "
             "python -m vap_core train vlm"
+        ) from error
+    return vlm.eval().requires_grad_(False)
+
+
+def load_from_policy(folder: Path) -> MiniVlm:
+    """The frozen model inside a mini-pi0's checkpoint, with the policy's own weights.
+
+    Its language head is as it was in the model that the policy was initialised from: acting gives
+    it no gradient.
+
+    Raises: BadPolicy.
+    """
+    try:
+        config = PreTrainedConfig.from_pretrained(folder)
+        vlm = MiniVlm(cast(MiniPI0Config, config))
+        weights = {}
+        for name, tensor in load_file(folder / "model.safetensors").items():
+            if name.startswith(IN_POLICY):
+                weights[name.removeprefix(IN_POLICY)] = tensor
+        vlm.towers.paligemma.load_state_dict(weights)
+    except Exception as error:
+        reason = (str(error).strip().splitlines() or [""])[0]
+        raise BadPolicy(
+            f"load_from_policy: {folder} is no mini-pi0 ({type(error).__name__}: {reason:.120}); "
+            "leave soft-own out, or give one: python -m vap_core train policy"
         ) from error
     return vlm.eval().requires_grad_(False)
 

@@ -1,4 +1,8 @@
-"""Where the policy's attention was: numbers per image patch, and an overlay on its input."""
+"""Where the policy's attention was: numbers per image patch, and overlays on its input.
+
+Every query has its own entity below `/vap/attention/<camera>`, a tensor of all layers and heads,
+and its own overlay below `<image>/attention`, of the layer shown, in the mean over heads.
+"""
 
 from collections.abc import Sequence
 
@@ -7,6 +11,7 @@ import numpy as np
 import rerun as rr
 
 from vap_core.base.types import Rgb
+from vap_core.policies.hooks import heat_map
 from vap_core.recording.entities.images import encode_jpeg, send_jpegs
 from vap_core.recording.entities.paths import image_root
 from vap_core.recording.stream import frame_times, log_row
@@ -14,16 +19,18 @@ from vap_core.rollout.types import Frame
 
 
 def send_attention(rec: rr.RecordingStream, frames: Sequence[Frame], jpeg_quality: int) -> None:
-    """The share of attention on every image patch, and the overlay; `frames` have attention."""
-    for camera in frames[0].attention:
-        overlays = []
-        for frame in frames:  # rerun has no columns of tensors
-            heat = frame.attention[camera]
-            tensor = rr.Tensor(heat, dim_names=("row", "column"))
-            log_row(rec, f"/vap/attention/{camera}", tensor, at=frame_times([frame]))
-            overlay = attention_overlay(frame.prompted[camera], heat)
-            overlays.append(encode_jpeg(overlay, jpeg_quality))
-        send_jpegs(rec, f"{image_root(camera)}/attention", frame_times(frames), overlays)
+    """The share of attention on every image patch, and the overlays; `frames` have attention."""
+    for camera, of_queries in frames[0].attention.items():
+        for query in of_queries:
+            overlays = []
+            for frame in frames:  # rerun has no columns of tensors
+                weights = frame.attention[camera][query]
+                tensor = rr.Tensor(weights, dim_names=("layer", "head", "row", "column"))
+                log_row(rec, f"/vap/attention/{camera}/{query}", tensor, at=frame_times([frame]))
+                overlay = attention_overlay(frame.prompted[camera], heat_map(weights, query))
+                overlays.append(encode_jpeg(overlay, jpeg_quality))
+            entity = f"{image_root(camera)}/attention/{query}"
+            send_jpegs(rec, entity, frame_times(frames), overlays)
 
 
 def attention_overlay(rgb: Rgb, heat: np.ndarray) -> Rgb:

@@ -21,7 +21,13 @@ class HardPrompt:
 
 @dataclass(frozen=True)
 class SoftPrompt:
-    """The personal span is replaced by a reserved, learned word (SPEC section 4)."""
+    """The personal span is replaced by a reserved, learned word (SPEC section 4).
+
+    It is learned in the model that the policy was initialised from and copied, as the paper does;
+    learned there and rotated into the policy's space; or learned in the policy's own weights.
+    """
+
+    space: Literal["copied", "aligned", "own"] = "copied"
 
 
 class TextPrompter:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from vap_core.base.errors import BadSuite
-from vap_core.base.files import DATA, parse_json, write_atomic
+from vap_core.base.files import DATA, parse_json, read_file, write_atomic
 from vap_core.simulation.suites.variants import VARIANTS
 from vap_core.simulation.types import EpisodeRow, Placement, SuccessRule
 
@@ -51,7 +51,7 @@ def read(name: str, folder: Path = FOLDER) -> tuple[EpisodeRow, ...]:
     """
     path = folder / f"{name}.jsonl"
     try:
-        data = path.read_bytes()
+        data = read_file(path)
     except OSError as error:
         raise BadSuite(
             f"suites: {path} cannot be read ({error.strerror}); "
@@ -105,7 +105,7 @@ def _manifest(folder: Path, missing_is_empty: bool = False) -> dict[str, Any]:
     if missing_is_empty and not path.exists():
         return {}
     try:
-        manifest = parse_json(path.read_bytes())
+        manifest = parse_json(read_file(path))
     except (OSError, ValueError) as error:
         raise BadSuite(
             f"suites: {path} cannot be read; "

@@ -28,7 +28,7 @@ from jaxtyping import Float32, UInt8
 from PIL import Image
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import write_atomic
+from vap_core.base.files import parse_json, read_file, write_atomic
 from vap_core.base.version import code_version
 from vap_core.evaluation.processes import results
 from vap_core.evaluation.store import locked, open_run
@@ -203,8 +203,8 @@ def about(folder: Path) -> dict[str, Any]:
             "python -m vap_core train demonstrations --suite NAME --out FOLDER."
         )
     try:
-        card = json.loads((folder / ABOUT).read_bytes())
-        info = json.loads((folder / "meta" / "info.json").read_bytes())
+        card = parse_json(read_file(folder / ABOUT))
+        info = parse_json(read_file(folder / "meta" / "info.json"))
         lerobot = info["codebase_version"]
         version = card["version"]
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -15,7 +15,7 @@ import numpy as np
 
 from vap_core.base.files import parse_json, write_atomic
 from vap_core.base.types import Rgb
-from vap_core.policies.mini_pi0 import learned_token
+from vap_core.policies.mini_pi0 import learned_token, token_file
 from vap_core.policies.mini_pi0.learned_token import Photos, TokenTraining
 from vap_core.policies.mini_pi0.vlm import MiniVlm
 from vap_core.simulation.assets import objects
@@ -68,12 +68,12 @@ def learn_words(
                 started = time.process_time()
                 taught, unseen = (_photos(name, crew, seed) for seed in (0, 1))
                 token = learned_token.learn(vlm, name, taught, unseen, TRAINING)
-                learned_token.save(folder, token)
+                token_file.save(folder, token)
                 kept["accuracy"][name] = token.accuracy
                 kept["cpu_s"] += time.process_time() - started
                 write_atomic(file, json.dumps(kept, indent=1).encode())
             if kept["accuracy"][name] >= LEAST_ACCURACY:
-                words[name] = learned_token.load(folder, name, model).embedding
+                words[name] = token_file.load(folder, name, model).embedding
     return words, kept
 
 

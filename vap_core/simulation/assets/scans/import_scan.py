@@ -16,6 +16,7 @@ import numpy as np
 
 from vap_core import __version__
 from vap_core.base.errors import BadObject
+from vap_core.base.limits import bounded
 from vap_core.memory import CATEGORY, NAME
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.scans.bake import (
@@ -31,6 +32,8 @@ from vap_core.simulation.assets.scans.storage import Scan, ScanMetadata
 from vap_core.simulation.assets.triangles import area_vectors, decimate
 
 VISUAL_FACES, TEXTURE_PX = 3000, 1024
+MEMORY_BYTES, CPU_LIMIT_S = 6_000_000_000, 300.0
+"""What an import may take; the convex decomposition has its own limits."""
 MOST_VISUAL_FACES = 5 * VISUAL_FACES
 """A surface of which more faces remain than this is refused: it crosses itself all over."""
 SMALLEST_M, LARGEST_M, THINNEST_M = 0.01, 0.6, 0.002
@@ -72,16 +75,23 @@ def import_scan(
             repair it.
     """
     _check_arguments(name, category, mass_kg)
-    surface = read_mesh_file(path, colour)
-    if repair:
-        vertex, face = close_surface(surface.vertex, surface.face)
-        surface = ScannedSurface(vertex, face, surface.samples)
-    _check_closed(surface, path, repair)
-    if up is None:
-        up = guess_up(surface, path)
-        report(f"the file's {up} axis points up; --up says otherwise")
-    surface = _set_upright(surface, path, up, height_cm)
-    scan = _build_scan(surface, report)
+    try:
+        with bounded(MEMORY_BYTES, CPU_LIMIT_S):
+            surface = read_mesh_file(path, colour)
+            if repair:
+                vertex, face = close_surface(surface.vertex, surface.face)
+                surface = ScannedSurface(vertex, face, surface.samples)
+            _check_closed(surface, path, repair)
+            if up is None:
+                up = guess_up(surface, path)
+                report(f"the file's {up} axis points up; --up says otherwise")
+            surface = _set_upright(surface, path, up, height_cm)
+            scan = _build_scan(surface, report)
+    except (MemoryError, TimeoutError) as error:
+        raise BadObject(
+            f"objects: {path} takes over {MEMORY_BYTES / 1e9:.0f} GB or {CPU_LIMIT_S:g} s of CPU; "
+            "decimate the mesh and shrink its texture."
+        ) from error
     if mass_kg is None:
         volume_m3 = sum(hull.volume for hull in scan.hulls)
         mass_kg = float(np.clip(DENSITY_KG_M3 * volume_m3, *MASS_KG))

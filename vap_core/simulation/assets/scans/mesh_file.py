@@ -1,25 +1,24 @@
 """What a GLB, OBJ, PLY or STL file holds: one welded surface, and the colours on it."""
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from PIL import Image, ImageColor, UnidentifiedImageError
+from PIL import ImageColor
 
 from vap_core.base.errors import BadObject
-from vap_core.base.photos import MAX_PIXELS, PICTURE_FORMATS
 from vap_core.base.types import Rgb, value
 from vap_core.simulation.assets.scans.bake import ColouredPoints, CornerPoints
+from vap_core.simulation.assets.scans.mesh_parts import check_file, load_parts
 from vap_core.simulation.assets.triangles import Faces, Vertices, area_vectors
 
 if TYPE_CHECKING:
     import trimesh
 
-SUFFIXES = (".glb", ".obj", ".ply", ".stl")
-MAX_MB, MAX_FACES = 200, 500_000
+SMALLEST_AREA = 1e-24
+"""A surface of less, in square units of its file, is a point to the arithmetic."""
 SAMPLES = 600_000
 """Coloured points that are taken from a surface."""
 ColourLookup = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -50,12 +49,32 @@ def read_mesh_file(path: Path, colour: str | None = None) -> ScannedSurface:
     Raises:
         BadObject: the file is missing, damaged, too large or colourless.
     """
-    _check_file(path)
-    parts = _load_parts(path)
+    check_file(path)
+    try:
+        return _read_surface(path, colour)
+    except BadObject:
+        raise
+    except Exception as error:  # a damaged file makes the readers raise anything
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise BadObject(
+            f"objects: {path} cannot be read ({reason:.120}); export it again, without compression."
+        ) from error
+
+
+def _read_surface(path: Path, colour: str | None) -> ScannedSurface:
+    parts = load_parts(path)
     corner = np.concatenate([np.asarray(part.triangles, np.float64) for part in parts])
     if not np.isfinite(corner).all():
         raise BadObject(f"objects: {path} has vertices that are not numbers; export it again.")
+    area = float(np.linalg.norm(area_vectors(corner), axis=1).sum())
+    if not SMALLEST_AREA < area < np.inf:
+        raise BadObject(
+            f"objects: {path} has triangles of {area / 2:.3g} square units in all, so it is no "
+            "surface; export it again, in metres."
+        )
     vertex, face, alive = _weld(corner)
+    if not len(face):
+        raise BadObject(f"objects: {path} has only triangles that vanish; export it again.")
     samples = _sample_colours(corner, parts, _colour_lookups(path, parts, colour))
     visual: Any = parts[0].visual
     picture = _texture_picture(visual)
@@ -63,85 +82,6 @@ def read_mesh_file(path: Path, colour: str | None = None) -> ScannedSurface:
         return ScannedSurface(vertex, face, samples)
     uv = (np.asarray(visual.uv, np.float64) * (1, -1) + (0, 1))[parts[0].faces][alive]
     return ScannedSurface(vertex, face, samples, uv=uv, picture=picture)
-
-
-def _check_file(path: Path) -> None:
-    if path.suffix.lower() not in SUFFIXES:
-        raise BadObject(
-            f"objects: {path} is no GLB, OBJ, PLY or STL file; export it as one of them."
-        )
-    if not path.exists():
-        raise BadObject(f"objects: {path} is not there; check the path, or export it again.")
-    if not path.is_file() or not path.stat().st_size:
-        raise BadObject(f"objects: {path} is empty; check the path, or export it again.")
-    if path.stat().st_size > MAX_MB * 1e6:
-        raise BadObject(
-            f"objects: {path} has {path.stat().st_size / 1e6:.0f} MB, over {MAX_MB}; decimate it "
-            "or shrink its texture."
-        )
-
-
-def _load_parts(path: Path) -> "list[trimesh.Trimesh]":
-    """The file's meshes that have triangles."""
-    import trimesh
-
-    try:
-        with _checked_pictures() as refused:
-            geometries = trimesh.load_scene(path).dump()
-    except Exception as error:  # a damaged file makes the readers raise anything
-        raise BadObject(
-            f"objects: {path} cannot be read ({type(error).__name__}: {error}); export it again, "
-            "without compression."
-        ) from error
-    if refused:
-        raise BadObject(f"objects: {path} has a texture that {refused[0]}.")
-    parts, count = [], 0
-    for geometry in geometries:
-        if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
-            parts.append(geometry)
-            count += len(geometry.faces)
-    if not count:
-        raise BadObject(f"objects: {path} holds no triangles; export the object as a mesh.")
-    if count > MAX_FACES:
-        raise BadObject(
-            f"objects: {path} has {count:,} faces, over {MAX_FACES:,}; decimate it first, a "
-            "hundred thousand are plenty."
-        )
-    return parts
-
-
-@contextmanager
-def _checked_pictures() -> Iterator[list[str]]:
-    """Inside the block Pillow opens PICTURE_FORMATS up to MAX_PIXELS alone, whoever calls it.
-
-    The readers of meshes open textures themselves, and go on without those that fail. The list
-    says what was wrong with each.
-    """
-    unchecked = Image.open
-    refused = []
-
-    def checked(file: Any, *_: Any, **__: Any) -> Image.Image:
-        try:
-            image = unchecked(file, formats=PICTURE_FORMATS)
-        except UnidentifiedImageError:
-            refused.append(f"is none of {', '.join(PICTURE_FORMATS)}; save it as JPEG or PNG")
-            raise
-        except (Image.DecompressionBombError, Image.DecompressionBombWarning):
-            refused.append(f"has over {MAX_PIXELS / 1e6:.0f} million pixels; shrink it")
-            raise
-        if image.width * image.height > MAX_PIXELS:
-            refused.append(
-                f"has {image.width}x{image.height} pixels, over {MAX_PIXELS / 1e6:.0f} million; "
-                "shrink it"
-            )
-            raise Image.DecompressionBombError(refused[-1])
-        return image
-
-    Image.open = checked  # type: ignore[assignment]
-    try:
-        yield refused
-    finally:
-        Image.open = unchecked
 
 
 def _weld(
@@ -169,11 +109,12 @@ def _texture_picture(visual: Any) -> Rgb | None:
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is None or getattr(visual, "uv", None) is None or max(image.size) <= 2:
         return None
-    tint: np.ndarray = np.ones(3)
     factor = getattr(material, "baseColorFactor", None)
+    rgb = image.convert("RGB")
     if factor is not None:
-        tint = np.asarray(factor, np.float64)[:3] / 255
-    return np.asarray(np.asarray(image.convert("RGB")) * tint, np.uint8)
+        table = np.outer(np.asarray(factor, np.float64)[:3] / 255, np.arange(256))
+        rgb = rgb.point(table.astype(np.uint8).ravel().tolist())
+    return np.array(rgb)
 
 
 def _colour_lookups(

@@ -20,14 +20,14 @@ import numpy as np
 from PIL import Image
 
 from vap_core.base.errors import BadObject, BadOutput
-from vap_core.base.files import parse_json
+from vap_core.base.files import parse_json, remove_scratch
 from vap_core.base.types import Rgb, value
 from vap_core.simulation.assets.shapes import Hull, Mesh
 
 FORMAT, VERSION = "vap-object", 1
 MESH_FILE, HULLS_FILE, TEXTURE_FILE = FILES = ("mesh.npz", "hulls.npz", "texture.png")
 METADATA_FILE = "object.json"
-FORMER = ".old"
+FORMER, STAGE = ".old", ".stage-"
 REMEDY = "import the object again with --replace, or delete its folder"
 
 
@@ -156,7 +156,8 @@ def _write_folder(target: Path, files: Mapping[str, bytes], replace: bool) -> No
     former scan is at `_former`, where readers find it; it goes when the new one is in place.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
-    stage = Path(mkdtemp(prefix=".", dir=target.parent))
+    remove_scratch(target.parent, f"{STAGE}*")
+    stage = Path(mkdtemp(prefix=STAGE, dir=target.parent))
     try:
         for name, data in files.items():
             (stage / name).write_bytes(data)

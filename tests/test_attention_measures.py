@@ -1,0 +1,328 @@
+"""Measures of attention maps: shares, peaks and entropy against hand counts; patterns by their definitions; areas under ROC curves."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.command import vap
+from vap_core.analysis.attention import patterns, prediction, replay, report
+from vap_core.analysis.attention.measures import REGIONS, inside, measure, patch_areas
+from vap_core.analysis.attention.patterns import (
+    Thresholds,
+    example,
+    localisation,
+    of_pattern,
+    over_views,
+    per_episode,
+    with_localisation,
+)
+from vap_core.base.errors import BadStudy
+from vap_core.evaluation.study import Study, make_trial
+from vap_core.simulation import suites
+from vap_core.simulation.env import Env
+from vap_core.simulation.suites.open_row import build_scene
+from vap_core.simulation.types import Truth
+
+
+def four_patches() -> dict[str, np.ndarray]:
+    """Target in one corner, look-alike in half of the next patch, the hand in the last row."""
+    areas = {name: np.zeros((2, 2), np.float32) for name in REGIONS}
+    areas["target"][0, 0] = 1
+    areas["lookalikes"][0, 1] = 0.5
+    areas["background"][0, 1] = 0.5
+    areas["hand"][1] = 1
+    return areas
+
+
+def test_shares_are_sums_and_chance_is_area() -> None:
+    heat = np.array([[0.4, 0.2], [0.1, 0.1]], np.float32)
+    found = measure(heat, four_patches())
+    assert found["mass"] == pytest.approx(0.8)
+    assert found["share_target"] == pytest.approx(0.5)
+    assert found["share_lookalikes"] == pytest.approx(0.125)
+    assert found["share_hand"] == pytest.approx(0.25)
+    assert sum(float(found[f"share_{name}"]) for name in REGIONS) == pytest.approx(1)
+    assert sum(float(found[f"chance_{name}"]) for name in REGIONS) == pytest.approx(1)
+    assert found["chance_lookalikes"] == pytest.approx(0.125)
+    assert (found["hit"], found["chance_hit"], found["peak_region"]) == (True, 0.25, "target")
+
+
+def test_even_attention_is_at_chance_and_one_patch_has_no_entropy() -> None:
+    even = measure(np.full((2, 2), 0.1, np.float32), four_patches())
+    for name in REGIONS:
+        assert even[f"share_{name}"] == pytest.approx(even[f"chance_{name}"])
+    assert even["entropy"] == pytest.approx(1)
+    one = np.zeros((2, 2), np.float32)
+    one[0, 1] = 0.3
+    found = measure(one, four_patches())
+    assert found["entropy"] == 0
+    assert (found["hit"], found["peak_region"]) == (False, "lookalikes"), "things before background"
+
+
+def test_heads_are_measured_as_maps_are() -> None:
+    rng = np.random.default_rng(0)
+    weights = rng.random((3, 2, 2, 2), dtype=np.float32)
+    areas = four_patches()
+    for layer, head in np.ndindex(3, 2):
+        found = measure(weights[layer, head], areas)
+        total, target, rivals = inside(weights, areas)[layer, head]
+        assert target / total == pytest.approx(found["share_target"], rel=1e-5)
+        assert rivals / total == pytest.approx(found["share_lookalikes"], rel=1e-5)
+
+
+def test_areas_are_those_of_the_masks_and_the_gripper_has_one() -> None:
+    row = suites.rows("simpler-bridge", "pick-shaver", 1)[0]
+    names = tuple(place.model for place in row.placements)
+    scene = build_scene("simpler-bridge", names, row.variant, "plain")
+    env = Env(scene, image_size=224, cameras=row.cameras or None)
+    env.reset(row)
+    truth = env.truth(masks=True)
+    assert env.truth().hand == {}
+    (camera,) = truth.masks
+    hand = truth.hand[camera]
+    assert 0.002 < hand.mean() < 0.3
+    for mask in truth.masks[camera].values():
+        assert not (mask & hand).any()
+    areas = patch_areas(row, truth, camera, 7)
+    assert np.allclose(sum(areas.values()), 1, atol=1e-5)
+    assert areas["target"].mean() == pytest.approx(truth.masks[camera][row.target].mean(), rel=1e-4)
+    assert areas["lookalikes"].sum() > 0
+    moved = Truth(**{**{n: getattr(truth, n) for n in Truth.__slots__}, "hand": {camera: ~hand}})
+    assert patch_areas(row, moved, camera, 7)["hand"].mean() > 0.7
+    scene.close()
+
+
+def call(
+    episode: int, step: int, region: str, camera: str = "front", **more: Any
+) -> dict[str, Any]:
+    """A row of `calls`: the peak in a region, and attention as dense as the area elsewhere."""
+    found: dict[str, Any] = {
+        "suite": "s", "task": "t", "method": "soft", "seed": 0, "episode": episode, "step": step, "camera": camera, "query": "token",
+        "side": 7, "mass": 0.5, "peak": 0.1, "peak_row": 0, "peak_column": 0, "peak_region": region, "hit": region == "target", "chance_hit": 0.1, "entropy": 0.9,
+    }  # fmt: skip
+    for name in REGIONS:
+        found[f"share_{name}"] = 0.6 if name == region else 0.1
+        found[f"chance_{name}"] = 0.2
+    return {**found, **more}
+
+
+def ending(episode: int, success: bool, touch: float = 100.0) -> dict[str, Any]:
+    return {
+        "suite": "s", "task": "t", "method": "soft", "seed": 0, "episode": episode, "success": success, "outcome": "success" if success else "failure",
+        "first_touch": touch, "touched": "target", "margin": 0.1, "layout": f"layout {episode}", "reproduced": True,
+    }  # fmt: skip
+
+
+def localised(calls: list[dict[str, Any]], endings: list[dict[str, Any]]) -> pd.DataFrame:
+    return with_localisation(per_episode(pd.DataFrame(calls), pd.DataFrame(endings)))
+
+
+def test_whole_episodes_count_every_call() -> None:
+    calls = pd.DataFrame([call(0, 0, "target"), call(0, 8, "lookalikes")])
+    endings = pd.DataFrame([ending(0, True, touch=5)])
+    assert list(per_episode(calls, endings).calls) == [1]
+    assert list(per_episode(calls, endings, whole=True).calls) == [2]
+
+
+def test_every_pattern_is_found_by_its_definition() -> None:
+    peaks = {
+        0: ("target", "target", "target"),
+        1: ("target", "target", "target"),
+        2: ("target", "background", "target", "hand"),
+        3: ("lookalikes", "target", "lookalikes"),
+        4: ("background", "background", "background", "target"),
+    }
+    calls = [call(i, 4 * j, r) for i, regions in peaks.items() for j, r in enumerate(regions)]
+    table = localised(calls, [ending(i, i == 0) for i in peaks])
+    assert list(table.localisation) == ["stable", "stable", "drifting", "confused", "drifting"]
+    assert list(of_pattern(table, "successful").episode) == [0]
+    assert list(of_pattern(table, "stable but failed").episode) == [1]
+    chosen = {name: example(table, name) for name in patterns.PATTERNS}
+    assert {name: found.episode for name, found in chosen.items() if found is not None} == {
+        "successful": 0,
+        "stable but failed": 1,
+        "drifting": 2,
+        "confused": 3,
+    }
+    row = table.iloc[4]
+    assert localisation(row, Thresholds(switches=0.5)) == "elsewhere"
+    assert localisation(table.iloc[0], Thresholds(stable=1.1, switches=0.1)) == "elsewhere"
+    counts = report.pattern_counts(table).iloc[0]
+    assert (counts["n"], counts["stable"], counts["stable, success"]) == (5, 2, 1)
+    assert example(table[table.episode == 0], "confused") is None
+
+
+def test_calls_after_the_first_touch_do_not_count() -> None:
+    calls = [call(0, 0, "target"), call(0, 4, "target"), call(0, 8, "lookalikes")]
+    (row,) = localised(calls, [ending(0, True, touch=5)]).to_dict("records")
+    assert (row["calls"], row["on_target"], row["localisation"]) == (2, 1.0, "stable")
+    (row,) = localised(calls, [ending(0, True, touch=float("nan"))]).to_dict("records")
+    assert row["calls"] == 3
+
+
+def test_views_are_joined_by_their_attention_and_the_highest_has_the_peak() -> None:
+    front = call(0, 0, "background", mass=0.3, peak=0.1)
+    side = call(0, 0, "target", camera="side", mass=0.1, peak=0.3)
+    (row,) = over_views(pd.DataFrame([front, side])).to_dict("records")
+    assert row["share_target"] == pytest.approx((0.3 * 0.1 + 0.1 * 0.6) / 0.4)
+    assert (row["camera"], row["hit"], row["mass"]) == ("side", True, pytest.approx(0.4))
+
+
+def test_the_word_that_means_the_target_is_the_token_then_the_colour() -> None:
+    calls = [call(0, 0, "target", query=query) for query in ("action", "category", "colour")]
+    calls += [call(1, 0, "target", query=query) for query in ("action", "token")]
+    calls += [call(2, 0, "target", query="action")]
+    found = patterns.main_words(pd.DataFrame(calls))
+    assert list(found["query"]) == ["colour", "token", "action"]
+
+
+def test_the_area_is_the_share_of_pairs_in_order() -> None:
+    rng = np.random.default_rng(0)
+    scores = rng.integers(0, 5, 60).astype(float)
+    labels = rng.random(60) < 0.4
+    pairs = [(a > b) + 0.5 * (a == b) for a in scores[labels] for b in scores[~labels]]
+    assert prediction.auc(scores, labels) == pytest.approx(np.mean(pairs))
+    assert np.isnan(prediction.auc(scores, np.ones(60, bool)))
+
+
+def test_the_interval_is_wider_where_episodes_are_copies() -> None:
+    rng = np.random.default_rng(1)
+    labels = rng.random(40) < 0.5
+    scores = rng.normal(size=40) + labels
+    alone = prediction.auc_interval(scores, labels, [str(i) for i in range(40)])
+    copies = prediction.auc_interval(
+        np.tile(scores, 4), np.tile(labels, 4), [str(i) for i in range(40)] * 4
+    )
+    as_if = prediction.auc_interval(
+        np.tile(scores, 4), np.tile(labels, 4), [str(i) for i in range(160)]
+    )
+    assert copies.value == pytest.approx(alone.value)
+    assert (copies.low, copies.high) == pytest.approx((alone.low, alone.high), abs=1e-9)
+    assert as_if.high - as_if.low < 0.7 * (alone.high - alone.low)
+    assert alone.clusters == copies.clusters == 40
+
+
+def test_a_measure_of_noise_predicts_nothing_that_was_left_out() -> None:
+    rng = np.random.default_rng(2)
+    labels = rng.random(200) < 0.5
+    clusters = [str(i // 2) for i in range(200)]
+    useful = labels + rng.normal(size=200)
+    scores = prediction.left_out_scores(useful[:, None], labels, clusters)
+    assert prediction.auc(scores, labels) == pytest.approx(prediction.auc(useful, labels), abs=0.04)
+    constant = prediction.left_out_scores(np.ones((200, 1)), labels, clusters)
+    assert prediction.auc(constant, labels) == 0.5, "folds are not ranked by their positives"
+    noise = prediction.left_out_scores(rng.normal(size=(200, 3)), labels, clusters)
+    assert 0.35 < prediction.auc(noise, labels) < 0.62
+
+
+def test_densities_by_layer_are_shares_by_areas() -> None:
+    rows = []
+    for episode in range(2):
+        for layer, head in np.ndindex(2, 2):
+            share = 0.1 * (1 + layer + head)
+            rows.append(
+                {
+                    "suite": "s", "task": "t", "method": "soft", "seed": 0, "episode": episode, "query": "token", "layer": layer, "head": head,
+                    "share_target": share, "chance_target": 0.1, "share_lookalikes": 0.1, "chance_lookalikes": 0.2,
+                }
+            )  # fmt: skip
+    table = report.layer_table(pd.DataFrame(rows))
+    assert list(table["lift"]) == pytest.approx([1.5, 2.5])
+    assert list(table["best_head"]) == pytest.approx([2, 3])
+    assert list(table["lift_lookalikes"]) == pytest.approx([0.5, 0.5])
+    assert list(table["n"]) == [2, 2]
+
+
+def test_densities_of_causal_measures_are_shares_by_areas() -> None:
+    line: dict[str, Any] = {"suite": "s", "method": "soft", "measure": "masking", "hit": True, "chance_hit": 0.1, "rank_gradient": 0.5, "rank_masking": 1.0}  # fmt: skip
+    for name in REGIONS:
+        line |= {f"share_{name}": 0.4 if name == "hand" else 0.15, f"chance_{name}": 0.2}
+    table = report.causal_table(pd.DataFrame([line, {**line, "rank_gradient": 0.1}])).iloc[0]
+    assert (table["n"], table["hand"], table["target"]) == (2, 2.0, 0.75)
+    assert table["rank_gradient"] == pytest.approx(0.3)
+
+
+def test_a_warning_is_measured_where_enough_fails() -> None:
+    rng = np.random.default_rng(3)
+    failed = np.arange(80) % 2 == 0
+    table = pd.DataFrame({
+        "margin": rng.normal(size=80), "lift": rng.normal(size=80) - 3 * failed, "success": ~failed,
+        "layout": [str(i) for i in range(80)],
+    })  # fmt: skip
+    found = prediction.warning_table(table, ["lift"])["AUC for failure"]
+    assert float(found["attention"][:4]) > 0.9
+    assert float(found["vote margin"][:4]) < 0.7
+    few = prediction.warning_table(table.assign(success=np.arange(80) > 3), ["lift"])
+    assert set(few["AUC for failure"]) == {"too few failures (4 of 80)"}
+
+
+@pytest.mark.sweep
+def test_the_command_measures_a_run_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    done = vap("rollout", "--suite", "simpler-bridge", "--task", "pick-shaver", "--policy", "mini-pi0", "--methods", "generic", "--episodes", "2",
+               "--record", "none", "--workers", "1", "--out", run)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    words = ("attention", run, "--workers", "1", "--explain", "1")
+    done = vap(*words)
+    assert done.returncode == 0, done.stderr
+    assert "2 episodes run again, 2 of them end as in the run" in done.stdout
+    (part,) = (run / "attention" / "parts").iterdir()
+    stamp = part.stat().st_mtime_ns
+    assert vap(*words).returncode == 0
+    assert part.stat().st_mtime_ns == stamp, "what is there is not run again"
+    tables = {
+        n: pd.read_parquet(run / "attention" / f"attention_{n}.parquet")
+        for n in ("calls", "layers", "causal")
+    }
+    assert set(tables["calls"]["query"]) == {"action", "category"}
+    assert len(tables["layers"]) == 2 * 2 * 4 * 8
+    assert set(tables["causal"]["measure"]) == {"gradient", "masking", "action", "category"}
+    own = tables["causal"][tables["causal"]["measure"] == "masking"]
+    assert (own["rank_masking"] == 1).all()
+    done = vap("attention", run, "--method", "vap")
+    assert done.returncode == 2
+    assert "holds no episode of what was asked for" in done.stderr
+
+
+def replayed(study: Study, task: str, memory: Path, policy: str) -> dict[str, Any]:
+    """The tables of the first episode of a task, of two calls at most."""
+    suite = study.tasks[0][0]
+    row = replace(study.rows(suite, task)[0], max_steps=5)
+    job = replay.Job(
+        name="one",
+        study=study,
+        method="generic",
+        rows=(row,),
+        known=(("failure", 5),),
+        policy=policy,
+        memory=memory,
+        explained=(True,),
+    )
+    return replay.run_job(job)
+
+
+def test_an_episode_is_run_again_and_measured(tmp_path: Path) -> None:
+    study = Study((("simpler-bridge", "pick-shaver"),), ("generic",), episodes=1, policy="mini-pi0")
+    label = make_trial(
+        study, study.rows("simpler-bridge", "pick-shaver"), "generic", tmp_path
+    ).policy.label
+    tables = replayed(study, "pick-shaver", tmp_path, label)
+    (ending,) = tables["episodes"]
+    assert ending["steps"] == 5
+    calls = pd.DataFrame(tables["calls"])
+    assert set(calls["query"]) == {"action", "category"}
+    assert sorted(set(calls["step"])) == [0, 4]
+    assert {line["measure"] for line in tables["causal"]} == {"gradient", "masking", "action", "category"}  # fmt: skip
+    assert len(tables["layers"]) == 2 * 4 * 8
+    with pytest.raises(BadStudy, match="was run with another"):
+        replayed(study, "pick-shaver", tmp_path, "another")
+
+
+def test_a_policy_without_attention_is_refused(tmp_path: Path) -> None:
+    study = Study((("widowx-pick", "pick-bottle"),), ("generic",), episodes=1, policy="random")
+    with pytest.raises(BadStudy, match="gives no attention maps.*choose another run"):
+        replayed(study, "pick-bottle", tmp_path, "random")

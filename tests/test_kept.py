@@ -1,0 +1,62 @@
+"""Figures and tables that are kept are made again when what they were made from has changed, and only then."""
+
+from io import BytesIO
+from pathlib import Path
+
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+
+from vap_core.analysis import kept
+from vap_core.base.version import code_digest
+
+
+def draw() -> Figure:
+    return Figure(figsize=(2, 1))
+
+
+def refuse() -> Figure:
+    raise AssertionError("drawn again")
+
+
+def test_a_figure_is_drawn_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "figure.png"
+    first = kept.kept_figure(path, draw)
+    assert Image.open(BytesIO(first)).size == (220, 110)
+    assert kept.kept_figure(path, refuse) == first
+    with pytest.raises(AssertionError, match="drawn again"):
+        kept.kept_figure(path, refuse, again=True)
+    monkeypatch.setattr(kept, "source_digest", lambda: "other code")
+    with pytest.raises(AssertionError, match="drawn again"):
+        kept.kept_figure(path, refuse)
+
+
+def test_a_table_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "table.parquet"
+    made = kept.kept_table(path, lambda: pd.DataFrame({"n": [1, 2]}))
+    assert kept.kept_table(path, lambda: pd.DataFrame({"n": [3]})).equals(made)
+    monkeypatch.setattr(kept, "source_digest", lambda: "other code")
+    assert kept.kept_table(path, lambda: pd.DataFrame({"n": [3]})).n.tolist() == [3]
+
+
+def test_what_is_committed_was_made_from_what_ships() -> None:
+    """Else notebook 01 makes it again wherever it runs, which takes a minute more."""
+    root = Path(__file__).parents[1]
+    for name in ("objects", "generics", "references"):
+        with Image.open(root / f"figures/01_benchmark_building_{name}.png") as picture:
+            assert picture.info[kept.KEY] == kept.source_digest(), "execute notebook 01 again"
+    for name in ("lookalike_hardness", "reference_crops"):
+        about = pq.read_schema(root / f"data/results/{name}.parquet").metadata
+        assert about[kept.KEY.encode()].decode() == kept.source_digest(), "execute notebook 01"
+
+
+def test_a_comment_does_not_change_the_digest_of_code(tmp_path: Path) -> None:
+    (tmp_path / "module.py").write_text("A = 1\n")
+    before = code_digest(tmp_path)
+    (tmp_path / "module.py").write_text('"""What it is."""\n\nA = 1  # one\n')
+    assert code_digest(tmp_path) == before
+    (tmp_path / "module.py").write_text("A = 2\n")
+    assert code_digest(tmp_path) != before
+    assert code_digest(tmp_path, without={"module"}) == code_digest(tmp_path / "nothing")

@@ -1,0 +1,141 @@
+"""Files are parsed and never executed, servers are on loopback, and keys stay where they are."""
+
+import ast
+import re
+import socket
+from pathlib import Path
+
+import pytest
+
+import vap_core
+from vap_core.recording import viewer
+
+ROOT = Path(vap_core.__file__).resolve().parent
+SOURCES = sorted(ROOT.rglob("*.py"))
+RUNS_CODE = {
+    *("pickle", "cPickle", "_pickle", "dill", "cloudpickle", "joblib", "marshal", "shelve", "yaml"),
+}
+"""Modules whose readers execute what a file says, or build any object that it names."""
+
+
+def calls(tree: ast.AST) -> list[tuple[str, ast.Call]]:
+    """Every call with the dotted name of what is called."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            found.append((ast.unparse(node.func), node))
+    return found
+
+
+def keyword(call: ast.Call, name: str) -> str:
+    return next((ast.unparse(each.value) for each in call.keywords if each.arg == name), "")
+
+
+def test_no_module_reads_what_can_execute() -> None:
+    wrong = []
+    for path in SOURCES:
+        tree = ast.parse(path.read_text())
+        for node in ast.walk(tree):
+            names = []
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                names = [node.module or ""]
+            wrong += [f"{path.name}: {name}" for name in names if name.split(".")[0] in RUNS_CODE]
+        for name, call in calls(tree):
+            if name in ("eval", "exec", "compile", "__import__"):
+                wrong.append(f"{path.name}: {name}()")
+            if name == "torch.load" and keyword(call, "weights_only") != "True":
+                wrong.append(f"{path.name}: torch.load without weights_only")
+            if name in ("np.load", "numpy.load") and keyword(call, "allow_pickle") == "True":
+                wrong.append(f"{path.name}: np.load with pickle")
+            if name.endswith(("read_pickle", "to_pickle")):
+                wrong.append(f"{path.name}: {name}")
+            if keyword(call, "shell") == "True" or keyword(call, "trust_remote_code") == "True":
+                wrong.append(f"{path.name}: {name} with shell or remote code")
+    assert not wrong
+
+
+def test_arrays_of_objects_are_refused_wherever_arrays_are_read(tmp_path: Path) -> None:
+    """numpy's default, which nothing of ours changes."""
+    import numpy as np
+
+    ran = tmp_path / "ran"
+
+    class Runs:
+        def __reduce__(self) -> tuple:
+            return ran.touch, ()
+
+    array = np.empty(1, object)
+    array[0] = Runs()
+    np.savez(tmp_path / "a.npz", vertex=array)
+    with np.load(tmp_path / "a.npz") as file, pytest.raises(ValueError, match="allow_pickle"):
+        file["vertex"]
+    assert not ran.exists()
+
+
+def test_no_address_but_loopback_is_listened_to() -> None:
+    wrong = []
+    for path in (*SOURCES, ROOT.parent / "Makefile"):
+        for number, line in enumerate(path.read_text().splitlines(), 1):
+            if re.search(r"0\.0\.0\.0|\[::\]|--ip[= ](?!127)|INADDR_ANY", line):
+                wrong.append(f"{path.name}:{number}: {line.strip()}")
+    assert not wrong
+
+
+def listening() -> set[tuple[str, int]]:
+    """Addresses and ports that this process listens on, as the kernel says."""
+    own = set()
+    for descriptor in Path("/proc/self/fd").iterdir():
+        try:
+            target = str(descriptor.readlink())
+        except OSError:
+            continue
+        if target.startswith("socket:["):
+            own.add(target[8:-1])
+    found = set()
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+            cells = line.split()
+            if cells[3] == "0A" and cells[9] in own:
+                address, port = cells[1].split(":")
+                found.add((address, int(port, 16)))
+    return found
+
+
+LOOPBACK = {"0100007F", "0000000000000000FFFF00000100007F", "00000000000000000000000001000000"}
+
+
+@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="needs Linux")
+def test_sockets_are_seen_and_reruns_server_opens_them_on_loopback_alone(tmp_path: Path) -> None:
+    before = listening()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        ((address, port),) = listening() - before
+        assert (address in LOOPBACK, port) == (True, server.getsockname()[1])
+    with socket.create_server(("0.0.0.0", 0)):
+        ((address, _),) = listening() - before
+        assert address not in LOOPBACK
+    import rerun as rr
+
+    with rr.server.Server(host="127.0.0.1"):
+        opened = listening() - before
+    assert opened
+    assert {address for address, _ in opened} <= LOOPBACK
+
+
+def test_the_viewer_has_a_port_on_loopback() -> None:
+    command = list(map(str, viewer._viewer_command(viewer.free_port())))
+    assert "0.0.0.0" not in " ".join(command)
+
+
+def test_keys_are_read_in_one_place_and_shown_in_none() -> None:
+    readers = set()
+    for path in SOURCES:
+        if re.search(r"[\"'][A-Z_]*(API_KEY|TOKEN|SECRET)[\"']", path.read_text()):
+            readers.add(path.relative_to(ROOT).as_posix())
+    assert readers <= {"perception/chat.py"}
+    text = (ROOT / "perception" / "chat.py").read_text()
+    shown = [line for line in text.splitlines() if re.search(r"\{[^}]*\bkey\b[^}]*\}", line)]
+    assert [line.strip() for line in shown] == [
+        'headers["Authorization"] = f"Bearer {endpoint.key}"'
+    ]

@@ -1,0 +1,293 @@
+"""Tokens learned and measured: the rotation into a policy's space, methods that use it, and the study with its tables."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+from scipy.stats import ortho_group
+from typer.testing import CliRunner
+
+from vap_core.analysis import embedding_report
+from vap_core.analysis.token_space import (
+    longest_word,
+    mean_cosine,
+    nearest_words,
+    rotation_cosines,
+    rotation_deg,
+)
+from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadStudy, UnknownName
+from vap_core.base.types import Rgb
+from vap_core.cli import app
+from vap_core.evaluation import engine
+from vap_core.evaluation import study as experiments
+from vap_core.evaluation.study import Study
+from vap_core.evaluation.tokens import report, study
+from vap_core.evaluation.tokens.study import OTHER, Job, Tokens, plan
+from vap_core.policies.embedding_table import open_table
+from vap_core.policies.mini_pi0 import learned_token, teach_token, token_alignment, token_file
+from vap_core.policies.mini_pi0.learned_token import TokenTraining
+from vap_core.policies.mini_pi0.vlm import load_from_policy, load_vlm
+from vap_core.policies.token_groups import token_groups
+from vap_core.simulation.assets.objects import ObjectModel
+from vap_core.training.words import vocabulary
+
+from . import tiny_lerobot
+from .test_soft_prompt import SUITE, TASK, grown  # noqa: F401
+
+
+@pytest.fixture
+def tiny(
+    grown: tuple[Path, Path],  # noqa: F811
+    monkeypatch: pytest.MonkeyPatch,
+) -> tuple[Path, Path]:
+    """A tiny model and policy in place of those that ship, and few photos."""
+    home, far = grown
+    monkeypatch.setattr(teach_token, "MODEL", home)
+    monkeypatch.setattr(teach_token, "VIEWS", 2)
+    monkeypatch.setattr(teach_token, "OTHERS", 1)
+    monkeypatch.setattr(study, "shipped", lambda suite: far)
+
+    def views(model: ObjectModel, n: int = 5, seed: int = 0) -> list[Rgb]:
+        """Noise of the object's own: rendering takes longer than all that is tested."""
+        rng = np.random.default_rng([seed, n, *model.name.encode()])
+        return list(rng.integers(0, 256, (n, 32, 32, 3)).astype(np.uint8))
+
+    for module in (study, teach_token):
+        monkeypatch.setattr(module, "reference_views", views)
+
+    def training(epochs: int = 2) -> TokenTraining:
+        return TokenTraining(epochs=epochs, augmentations=1)
+
+    def in_this_process(work: object, jobs: list[Job], workers: int, remedy: str) -> Iterator:
+        for job in jobs:
+            yield job, work(job)
+
+    monkeypatch.setattr(study, "TokenTraining", training)
+    monkeypatch.setattr(study, "results", in_this_process)
+    for cached in (study._model, study._policy_model, study._negatives):
+        cached.cache_clear()
+    yield grown
+    for cached in (study._model, study._policy_model, study._negatives):
+        cached.cache_clear()
+
+
+def test_a_rotation_is_found_again() -> None:
+    rng = np.random.default_rng(0)
+    turn = ortho_group.rvs(16, random_state=1)
+    source = rng.normal(size=(60, 16)).astype(np.float32)
+    target = (source @ turn).astype(np.float32)
+    found = token_alignment.orthogonal_map(source, target)
+    assert np.allclose(found, turn, atol=1e-2)
+    assert np.allclose(found @ found.T, np.eye(16), atol=1e-6)
+    cosines = token_alignment.held_out_cosines(source, target, np.arange(5))
+    assert cosines.min() > 0.999
+
+
+def test_what_no_word_says_stays_as_it_is() -> None:
+    """Eight words in sixteen dimensions: a direction without words is not turned."""
+    rng = np.random.default_rng(0)
+    source = np.zeros((8, 16), np.float32)
+    source[:, :8] = rng.normal(size=(8, 8))
+    target = np.zeros_like(source)
+    target[:, :8] = source[:, :8] @ ortho_group.rvs(8, random_state=1)
+    found = token_alignment.orthogonal_map(source, target)
+    assert np.allclose(found[8:, 8:], np.eye(8), atol=1e-4)
+    assert np.allclose(source @ found, target, atol=0.05)
+
+
+def test_a_held_out_word_is_not_fitted() -> None:
+    """Unrelated tables: the map fits the words it has seen, and says nothing of another."""
+    rng = np.random.default_rng(2)
+    source, target = rng.normal(size=(2, 12, 32)).astype(np.float32)
+    fitted = source @ token_alignment.orthogonal_map(source, target)
+    lengths = np.linalg.norm(fitted, axis=1) * np.linalg.norm(target, axis=1)
+    held_out = token_alignment.held_out_cosines(source, target, np.arange(12))
+    assert ((fitted * target).sum(1) / lengths).mean() > 0.8
+    assert abs(held_out.mean()) < 0.3
+
+
+def test_the_model_inside_a_policy_has_the_policys_weights(grown: tuple[Path, Path]) -> None:  # noqa: F811
+    home, far = grown
+    inside = load_from_policy(far)
+    table = open_table(far)
+    words = inside.towers.paligemma.model.language_model.embed_tokens.weight.numpy()
+    assert np.array_equal(table.block(0, table.shape[0]), words)
+    assert open_table(home).shape == table.shape
+    assert inside.sha256() == load_from_policy(far).sha256()
+    with pytest.raises(BadPolicy, match="is no mini-pi0"):
+        load_from_policy(home)
+
+
+@pytest.mark.parametrize("method", ["soft-aligned", "soft-own"])
+def test_tokens_of_other_spaces_are_methods(
+    method: str,
+    tiny: tuple[Path, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    home, far = tiny
+    monkeypatch.setattr(experiments, "MODEL", home)
+    monkeypatch.setattr(
+        learned_token, "TokenTraining", lambda: TokenTraining(epochs=1, augmentations=1)
+    )
+    asked = Study(((SUITE, TASK),), (method,), episodes=1, policy=str(far))
+    engine.store.open_run(tmp_path, asked.configuration())
+    bank = tmp_path / "memory"
+    experiments.register_personal(asked, bank)
+    row = asked.rows(SUITE, TASK)[0]
+    trial = experiments.make_trial(asked, [row], method, bank)
+    assert trial.prompter.rewrite(row.instruction) == "put <my_0> on the plate"
+    (used,) = trial.policy.learned.values()
+    suffix = token_file.OWN_SUFFIX if method == "soft-own" else token_file.SUFFIX
+    model = load_from_policy(far) if method == "soft-own" else load_vlm(home)
+    token = token_file.load(bank, row.target, model.sha256(), suffix)
+    expected = token.embedding
+    if method == "soft-aligned":
+        expected = token_alignment.align(token.embedding, home, far)
+    assert np.allclose(used.numpy(), expected)
+    (bank / f"{row.target}{suffix}").unlink()
+    with pytest.raises(BadMemory, match="no learned word"):
+        experiments.make_trial(asked, [row], method, bank)
+
+
+def test_the_study_measures_every_token_and_goes_on(
+    tiny: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(study, "plan", lambda asked: plan(asked)[:2])
+    asked = Tokens((SUITE,), (5,), epochs=2)
+    tables = study.run(asked, tmp_path / "run", progress=False)
+    answers = tables["answers"]
+    assert set(answers.groupby(["learned_in", "token", "read_by"]).groups) == set(
+        report.READINGS.values()
+    )
+    assert set(answers[answers.learned_in == "policy"].step) == {0, 1, 2}
+    own = answers[answers.shown == answers.object]
+    assert (own.n == 2).all()
+    assert OTHER in set(answers.shown)
+    (kinds, counts) = np.unique(report.kind_of(answers), return_counts=True)
+    assert list(kinds) == ["look-alikes", "other objects", "own"]
+    assert counts[0] == 6 * counts[1]
+    widths = {len(embedding) for embedding in tables["embeddings"].embedding}
+    assert widths == {16}
+    learned = tables["embeddings"].set_index("learned_in").embedding
+    rows = experiments.suites.rows(SUITE, tables["embeddings"].task[0])
+    taught = teach_token.photographs(rows, 0, 5)
+    training = TokenTraining(epochs=2, augmentations=1)
+    *_, (_, method) = learned_token.lessons(load_vlm(tiny[0]), rows[0].target, taught, training)
+    assert np.allclose(learned["vlm"], method, atol=1e-5)
+
+    def must_not_run(job: Job) -> None:
+        raise AssertionError(job)
+
+    monkeypatch.setattr(study, "run_job", must_not_run)
+    again = study.run(asked, tmp_path / "run", progress=False)
+    assert again["answers"].equals(answers)
+    for path in study.publish(tmp_path / "run", tmp_path / "kept"):
+        assert len(pd.read_parquet(path)) == len(tables[path.stem.removeprefix("token_")])
+    with pytest.raises(BadOutput):
+        study.run(Tokens((SUITE,), (5,), epochs=1), tmp_path / "run", progress=False)
+    assert "learned in the policy" in report.report(tables)
+
+
+def test_the_usual_number_of_photos_comes_first_and_once_in_the_policy() -> None:
+    jobs = plan(Tokens((SUITE,), (1, 5), epochs=1))
+    assert [(job.k, job.where) for job in jobs[:2]] == [(5, "vlm"), (5, "policy")]
+    assert len(jobs) == 4 * 3
+    with pytest.raises(UnknownName, match="eval-tokens: suite"):
+        Tokens(("nowhere",))
+    found = CliRunner().invoke(app, ["eval-tokens", "--k", "1,none"])
+    assert isinstance(found.exception, BadStudy)
+
+
+def test_rates_are_counted_by_hand() -> None:
+    """Own 3 of 4, a look-alike 1 of 4, others 0 of 2, after two steps of one token."""
+    lines = []
+    for step, own in ((0, 0), (9, 3)):
+        for shown, yes, n in (("cup", own, 4), ("cup-lookalike-1", 1, 4), (OTHER, 0, 2)):
+            lines.append(("s", "t", "cup", 5, "vlm", step, "as learned", "vlm", shown, yes, n))
+    columns = ["suite", "task", "object", "k", "learned_in", "step", "token", "read_by"]
+    answers = pd.DataFrame(lines, columns=[*columns, "shown", "yes", "n"])
+    (line,) = report.readings(answers).to_dict("records")
+    assert line["right"] == pytest.approx((3 / 4 + 5 / 6) / 2)
+    assert (line["own"].k, line["look-alikes"].k, line["other objects"].k) == (3, 1, 0)
+    whole = report.pooled(answers).loc["as learned"]
+    assert whole["own"].text() == "75.0 [30.1, 95.4] 4"
+    assert (whole["right"].n, whole["right"].value) == (1, line["right"])
+    assert np.isnan(whole["right"].low)
+    other = answers.assign(object="mug", shown=answers.shown.str.replace("cup", "mug"), yes=0)
+    both = report.pooled(pd.concat([answers, other])).loc["as learned"]
+    assert (both["own"].value, both["own"].n) == (3 / 8, 8)
+    rights = [line["right"], 0.5]
+    interval = stats.t.interval(0.95, 1, np.mean(rights), stats.sem(rights))
+    assert (both["right"].n, both["right"].value) == (2, pytest.approx(np.mean(rights)))
+    assert (both["right"].low, both["right"].high) == (max(0, interval[0]), min(1, interval[1]))
+    (taken,) = report.confusions(answers).to_dict("records")
+    assert (taken["look-alike"], taken["yes"], taken["n"]) == ("cup-lookalike-1", 0.25, 4)
+    curve = report.curve(answers).set_index(["step", "kind"]).yes
+    assert (curve[0, "own"], curve[9, "own"]) == (0, 0.75)
+
+
+def test_the_report_compares_the_shipped_policies_beside_the_paper() -> None:
+    found = CliRunner().invoke(app, ["embeddings"])
+    assert found.exit_code == 0, found.output
+    assert "words of simpler-bridge" in found.output
+    assert found.output.count("paper: pi0") == 4
+    assert "0.945626 ± 0.066187" in found.output
+    kept = pd.read_parquet(experiments.MODEL.parents[1] / "results" / "token_spaces.parquet")
+    whole = kept[kept.group == embedding_report.WHOLE]
+    assert (whole.tokens == 113).all()
+    for row in whole.itertuples():
+        assert f"{row.cosine_mean:.6f} ± {row.cosine_std:.6f}" in found.output
+
+
+def test_real_checkpoints_are_compared_with_their_words(tmp_path: Path) -> None:
+    """A tiny pi0 and pi0.5 of lerobot's classes, whose tokenizer lies beside the weights."""
+    one, other = tiny_lerobot.pi0(tmp_path / "pi0"), tiny_lerobot.pi05(tmp_path / "pi05")
+    table = embedding_report.spaces(one, [one, other], SUITE)
+    assert list(table.policy) == ["pi0", "pi0", "pi05", "pi05"]
+    assert list(table.group) == [embedding_report.WHOLE, f"words of {SUITE}"] * 2
+    assert (table.cosine_mean[:2] > 0.999999).all()
+    words = token_groups([one], ["put my camera on the plate", "put my camera"])["words"]
+    vocabulary = tiny_lerobot.tokenizer(tmp_path / "again").get_vocab()
+    expected = sorted(
+        vocabulary[word]
+        for word in ("put", "my", "camera", "on", "the", "plate")
+        if word in vocabulary
+    )
+    assert words.tolist() == sorted({*expected})
+    embedding_report.keep(table, tmp_path / "new" / "rows.csv")
+    assert len(pd.read_csv(tmp_path / "new" / "rows.csv")) == 4
+    with pytest.raises(BadOutput, match="neither"):
+        embedding_report.keep(table, tmp_path / "rows.txt")
+    with pytest.raises(BadPolicy, match="no suite 'nowhere'"):
+        embedding_report.spaces(one, [other], "nowhere")
+    (one / "tokenizer" / "tokenizer.json").write_text("{}")
+    with pytest.raises(BadPolicy, match="is no tokenizer"):
+        token_groups([one], ["put"])
+
+
+def test_words_that_no_film_says_are_left_out_of_the_rotation(grown: tuple[Path, Path]) -> None:  # noqa: F811
+    home, far = grown
+    assert len(rotation_cosines(home, home)["copied"]) == 0
+    shipped = experiments.MODEL.parent
+    found = rotation_cosines(experiments.MODEL, shipped / f"mini-pi0-{SUITE}")
+    assert len(found["copied"]) == 56
+    assert (found["copied"] < 0.9999).all()
+    whole = mean_cosine(found["copied"])
+    assert (whole.value, whole.n) == (pytest.approx(found["copied"].mean()), 56)
+    assert whole.low < whole.value < whole.high
+    assert found["rotated, fitted"].mean() > found["copied"].mean()
+    table = open_table(far)
+    rows = table.block(0, table.shape[0])
+    assert longest_word(far) == pytest.approx(np.sqrt((rows**2).sum(1)).max())
+    assert rotation_deg(rows[15], home, home) < 0.1
+    bridge = shipped / f"mini-pi0-{SUITE}"
+    word = open_table(experiments.MODEL).block(15, 16)[0]
+    moved = token_alignment.align(word, experiments.MODEL, bridge)
+    cosine = np.cos(np.radians(rotation_deg(word, experiments.MODEL, bridge)))
+    assert cosine * np.linalg.norm(word) ** 2 == pytest.approx(float(word @ moved), rel=1e-3)
+    words = nearest_words(open_table(far).block(15, 16)[0], far, 3)
+    assert words[0] == (vocabulary()[15], pytest.approx(1))

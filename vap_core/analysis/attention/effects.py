@@ -1,0 +1,71 @@
+"""Which layers' attention reaches the actions: each layer's queries are set to zero in turn."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vap_core.evaluation.policy_names import shipped
+from vap_core.policies.hooks import observe_attention
+from vap_core.policies.lerobot.adapter import IMAGE, STATE, LeRobot, load_policy
+from vap_core.policies.protocol import Chunk, PolicyInput
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SIDE = 112
+
+
+def layer_effects(suite: str) -> "pd.DataFrame":
+    """Largest change of an action of the shipped pi0 when a layer attends evenly.
+
+    Two rows: the vision-language model, whose queries are patches and words, and the action expert.
+    The input is noise under a real instruction.
+    """
+    import pandas as pd
+
+    policy = load_policy(shipped(suite))
+    towers = policy.policy.model.paligemma_with_expert
+    look = _noise(policy)
+    plain = _chunk(policy, look)
+    rows: dict[str, dict[int, float]] = {}
+    for name, decoder in (
+        ("vision-language model", towers.paligemma.model.language_model),
+        ("action expert", towers.gemma_expert.model),
+    ):
+        rows[name] = {}
+        for i, layer in enumerate(decoder.layers):
+            with _without_queries(layer):
+                change = _chunk(policy, look) - plain
+            rows[name][i + 1] = float(np.abs(change).max())
+    assert np.array_equal(_chunk(policy, look), plain), "the weights are as they were"
+    return pd.DataFrame(rows).T.rename_axis("layer", axis=1)
+
+
+@contextmanager
+def _without_queries(layer: Any) -> Iterator[None]:
+    """Inside, a layer attends to everything alike."""
+    weight = layer.self_attn.q_proj.weight
+    kept = weight.clone()
+    weight.zero_()
+    try:
+        yield
+    finally:
+        weight.copy_(kept)
+
+
+def _chunk(policy: LeRobot, look: PolicyInput) -> Chunk:
+    with observe_attention():  # eager
+        return policy.plan([policy.start(np.random.default_rng(0))], [look])[1][0]
+
+
+def _noise(policy: LeRobot) -> PolicyInput:
+    rng = np.random.default_rng(0)
+    images = {}
+    for key in policy.wanted:
+        if key != STATE:
+            rgb = rng.integers(0, 256, (SIDE, SIDE, 3), dtype=np.uint8)
+            images[key.removeprefix(IMAGE)] = rgb
+    state = rng.normal(size=policy.wanted[STATE]).astype(np.float32)
+    return PolicyInput(images, "pick up the red cup", state)

@@ -1,0 +1,288 @@
+"""Runs the episodes of a run again with the attention observed, and keeps the measures as tables.
+
+The same row, weights and seed give the same episode; observing changes no action. What a killed
+command had finished is found again in its folder.
+"""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vap_core.analysis.attention.observer import NOTHING, Observer, Rows
+from vap_core.base.errors import BadOutput, BadStudy
+from vap_core.base.files import write_atomic
+from vap_core.base.version import code_version
+from vap_core.evaluation import measurements
+from vap_core.evaluation.diagnosis.recordings import listed_row, study_of
+from vap_core.evaluation.engine import spread_evenly
+from vap_core.evaluation.jobs import BATCH
+from vap_core.evaluation.layouts import layout_name
+from vap_core.evaluation.processes import prepare, results
+from vap_core.evaluation.publish import read_runs
+from vap_core.evaluation.store import digest, locked
+from vap_core.evaluation.study import Study, make_trial, register_personal
+from vap_core.rollout.loop import rollout
+from vap_core.rollout.queries import QUERIES
+from vap_core.rollout.types import Episode, EpisodeHeader
+from vap_core.simulation.types import EpisodeRow
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+TABLES = ("episodes", "calls", "layers", "causal")
+PREFIX = "attention_"
+Known = tuple[str, int]
+"""Outcome and number of steps that an episode has in the run."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """Some episodes of one task, variant and method; its name is its file's.
+
+    `known` is how they ended in the run. `explained` of them get the causal measures.
+    """
+
+    name: str
+    study: Study
+    method: str
+    rows: tuple[EpisodeRow, ...]
+    known: tuple[Known, ...]
+    policy: str
+    memory: Path
+    explained: tuple[bool, ...]
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Which episodes of a run: of these suites and methods ("" all), so many a task and method.
+
+    `explain` of them get the causal measures, which take as long as many calls.
+    """
+
+    suites: tuple[str, ...] = ()
+    methods: tuple[str, ...] = ()
+    episodes: int | None = None
+    explain: int = 2
+
+
+def run_replay(
+    source: Path, folder: Path, wanted: Wanted, *, workers: int = 2, progress: bool = True
+) -> "dict[str, pd.DataFrame]":
+    """Do what `folder` lacks, write a parquet table each and return them.
+
+    `source` is a run's folder or a published table.
+
+    Raises: BadOutput, BadStudy when nothing is left of what is asked for, or it was run with
+        weights that are not here.
+    """
+    from tqdm import tqdm
+
+    folder.mkdir(parents=True, exist_ok=True)
+    with locked(folder):
+        jobs = plan(source, folder / "memory", wanted)
+        parts = folder / "parts"
+        parts.mkdir(exist_ok=True)
+        missing = []
+        for job in jobs:
+            if not (parts / f"{job.name}.json").exists():
+                missing.append(job)
+        for study in dict.fromkeys(job.study for job in missing):
+            register_personal(study, folder / "memory")
+        prepare(("vap_core.analysis.attention.replay", "lerobot.policies"))
+        with tqdm(
+            total=sum(len(job.rows) for job in jobs),
+            initial=sum(len(job.rows) for job in jobs) - sum(len(job.rows) for job in missing),
+            unit="episode",
+            desc="attention",
+            disable=not progress,
+        ) as bar:
+            for job, tables in results(run_job, missing, workers=workers, remedy="--workers"):
+                path = parts / f"{job.name}.json"
+                measurements.write_json_part(path, tables, caller="attention")
+                bar.update(len(job.rows))
+        return _write_tables(source, folder, [parts / f"{job.name}.json" for job in jobs])
+
+
+def plan(source: Path, memory: Path, wanted: Wanted) -> list[Job]:
+    """The jobs of the wanted episodes of a run. Raises: BadOutput, BadStudy."""
+    jobs: list[Job] = []
+    for manifest, episodes in read_runs(source):
+        if wanted.suites:
+            episodes = episodes[episodes["suite"].isin(wanted.suites)]
+        if wanted.methods:
+            episodes = episodes[episodes["method"].isin(wanted.methods)]
+        ended = episodes[episodes["outcome"] != "error"]
+        for _, group in ended.groupby(["suite", "task", "method"], sort=False):
+            lines = group.sort_values(["seed", "episode"]).to_dict("records")
+            if wanted.episodes is not None:
+                lines = spread_evenly(lines, wanted.episodes)
+            jobs += _jobs_of(manifest, lines, memory, wanted.explain)
+    if not jobs:
+        raise BadStudy(
+            f"attention: {source} holds no episode of what was asked for; leave --suite or "
+            "--method out."
+        )
+    return jobs
+
+
+def _jobs_of(
+    manifest: dict[str, Any], lines: Sequence[dict[str, Any]], memory: Path, explain: int
+) -> Iterator[Job]:
+    """The jobs of some episodes of one task and method."""
+    study = study_of(manifest, lines[0])
+    chosen = [id(line) for line in spread_evenly(lines, explain)] if explain else []
+    by_variant: dict[str, list[dict[str, Any]]] = {}
+    for line in lines:
+        by_variant.setdefault(str(line["variant"]), []).append(line)
+    for same in by_variant.values():
+        for first in range(0, len(same), BATCH):
+            batch = same[first : first + BATCH]
+            rows = tuple(listed_row(study, line) for line in batch)
+            method = str(batch[0]["method"])
+            known = tuple((str(line["outcome"]), int(line["steps"])) for line in batch)
+            explained = tuple(id(line) in chosen for line in batch)
+            what = {
+                "run": manifest["digest"],
+                "rows": [(row.task, row.seed, row.episode) for row in rows],
+                "explained": explained,
+                "method": method,
+            }
+            yield Job(
+                name=f"{rows[0].suite}.{rows[0].task}.{method}.{digest(what)}",
+                study=study,
+                method=method,
+                rows=rows,
+                known=known,
+                policy=str(batch[0]["policy"]),
+                memory=memory,
+                explained=explained,
+            )
+
+
+def run_job(job: Job) -> dict[str, Rows]:
+    """Run the episodes of one job in this process, and return its part of the tables.
+
+    Raises: BadStudy for a policy without attention maps, or one that has changed since.
+    """
+    trial = make_trial(job.study, job.rows, job.method, job.memory)
+    policy: Any = trial.policy
+    if not getattr(policy, "attends", False):
+        raise BadStudy(
+            f"attention: {policy.label} gives no attention maps, as pi0, pi0.5, mini-pi0 and "
+            "smolvla do on square pictures; choose another run."
+        )
+    if policy.label != job.policy:
+        raise BadStudy(
+            f"attention: this was run with {job.policy}, and {policy.label} is here now; run eval "
+            "again."
+        )
+    explained = {}
+    for row, explain in zip(job.rows, job.explained, strict=True):
+        explained[row.key, row.seed] = explain
+    observers: dict[tuple[str, int], Observer] = {}
+
+    def observe(header: EpisodeHeader) -> Observer:
+        row = header.row
+        observer = Observer(header, policy, explain=explained[row.key, row.seed])
+        observers[row.key, row.seed] = observer
+        return observer
+
+    trial = replace(trial, attention=QUERIES)
+    tables: dict[str, Rows] = {name: [] for name in TABLES}
+    episodes = list(rollout(trial, job.rows, observe, batch=BATCH))
+    for row, episode, known in zip(job.rows, episodes, job.known, strict=True):
+        observer = observers.get((row.key, row.seed))
+        if observer is None:  # it ended in an error before its first call
+            observer = Observer(episode.header, policy)
+        about = _about(episode)
+        tables["episodes"].append({**about, **_ending(observer, episode, known)})
+        for name, rows in observer.tables.items():
+            tables[name] += [{**about, **row} for row in rows]
+    return tables
+
+
+def read(folder: Path) -> "dict[str, pd.DataFrame]":
+    """The tables that were published in a folder. Raises: BadOutput."""
+    import pandas as pd
+
+    tables = {}
+    for name in TABLES:
+        path = folder / f"{PREFIX}{name}.parquet"
+        if not path.exists():
+            raise BadOutput(
+                f"attention: {path} is missing; make it: python -m vap_core attention RUN "
+                f"--publish {folder}"
+            )
+        tables[name] = pd.read_parquet(path)
+    return tables
+
+
+def publish(folder: Path, to: Path) -> list[Path]:
+    """Keep the tables of a finished replay in another folder. Raises: BadOutput."""
+    tables = {}
+    for name in TABLES:
+        path = folder / f"{PREFIX}{name}.parquet"
+        tables[path.name] = path.read_bytes()
+    return measurements.publish_tables(tables, to, caller="attention")
+
+
+def _about(episode: Episode) -> dict[str, Any]:
+    row = episode.header.row
+    return {
+        "suite": row.suite,
+        "task": row.task,
+        "method": episode.header.method,
+        "seed": row.seed,
+        "episode": row.episode,
+    }
+
+
+def _ending(observer: Observer, episode: Episode, known: Known) -> dict[str, Any]:
+    """How an episode ended, and whether it ended so in the run, too."""
+    outcome = episode.outcome
+    step, touched = observer.first_touch or (None, NOTHING)
+    summary = episode.summary()
+    return {
+        "policy": episode.header.policy,
+        "layout": f"{episode.header.row.task} {layout_name(episode.header.row)}",
+        "text": episode.header.rewritten,
+        "outcome": outcome.status,
+        "success": outcome.success,
+        "steps": outcome.steps,
+        "first_touch": step,
+        "touched": touched,
+        "margin": summary["margin"],
+        "reproduced": (outcome.status, outcome.steps) == known,
+    }
+
+
+def _write_tables(source: Path, folder: Path, parts: Sequence[Path]) -> "dict[str, pd.DataFrame]":
+    """All parts as one table of each kind, with the runs and the code in the metadata."""
+    import pandas as pd
+    import pyarrow as pa
+
+    rows: dict[str, Rows] = {name: [] for name in TABLES}
+    for path in parts:
+        for name, part in measurements.read_json_part(path, caller="attention").items():
+            rows[name] += part
+    runs = [manifest for manifest, _ in read_runs(source)]
+    about = json.dumps({"runs": runs, "code": code_version()}, sort_keys=True).encode()
+    for name in TABLES:
+        table = pa.Table.from_pandas(_compact(pd.DataFrame(rows[name])), preserve_index=False)
+        data = measurements.encode_table(table.replace_schema_metadata({b"attention": about}))
+        write_atomic(folder / f"{PREFIX}{name}.parquet", data)
+    return read(folder)
+
+
+def _compact(table: "pd.DataFrame") -> "pd.DataFrame":
+    """Four digits of every number, names as categories."""
+    for name in table.columns:
+        if table[name].dtype == "float64":
+            table[name] = table[name].round(4).astype("float32")
+        elif table[name].dtype == "int64":
+            table[name] = table[name].astype("int32")
+        elif table[name].dtype == object and name not in ("layout", "text"):
+            table[name] = table[name].astype("category")
+    return table

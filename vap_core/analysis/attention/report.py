@@ -1,0 +1,137 @@
+"""The measures of a replay as tables of text and numbers."""
+
+from typing import TYPE_CHECKING
+
+from vap_core.analysis.attention.measures import REGIONS
+from vap_core.analysis.attention.patterns import LOCALISATIONS, per_episode, with_localisation
+from vap_core.analysis.attention.prediction import predict_success
+from vap_core.base.tables import align
+from vap_core.evaluation.store import KEY
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MEASURES = ("lift", "on_target", "on_rival", "drift", "switches", "entropy")
+"""The measures of an episode whose relation to success is reported."""
+
+
+def text(tables: "dict[str, pd.DataFrame]") -> str:
+    """Where every query looks, the patterns, and how well the measures tell successes."""
+    episodes = tables["episodes"]
+    table = per_episode(tables["calls"], episodes)
+    whole = per_episode(tables["calls"], episodes, whole=True)
+    again = int(episodes["reproduced"].sum())
+    parts = [
+        f"{len(episodes)} episodes run again, {again} of them end as in the run; before the first "
+        "touch:",
+        align(_rows(where_queries_look(table))),
+        "the word that means the target, over whole episodes:",
+        align(_rows(pattern_counts(with_localisation(whole)))),
+    ]
+    parts.append(
+        "area under the ROC curve for success, before the first touch [95 %, layouts resampled]:"
+    )
+    parts.append(align(_rows(auc_table(with_localisation(table)).reset_index())))
+    return "\n\n".join(parts)
+
+
+def auc_table(table: "pd.DataFrame") -> "pd.DataFrame":
+    """How well each measure tells successes from failures, a row per suite and method."""
+    import pandas as pd
+
+    rows = {}
+    for (suite, method), group in table.groupby(["suite", "method"], observed=True, sort=False):
+        areas = predict_success(group, MEASURES)
+        row = {"n": str(len(group)), "successes": str(int(group["success"].sum()))}
+        for name, area in areas.items():
+            row[name] = f"{area.value:.2f} [{area.low:.2f}, {area.high:.2f}]"
+        rows[f"{suite}, {method}"] = row
+    return pd.DataFrame(rows).T.rename_axis("suite, method")
+
+
+def where_queries_look(table: "pd.DataFrame") -> "pd.DataFrame":
+    """Means over episodes, by suite, method and query; `table` is `per_episode`'s."""
+    names = ["share", "chance", "lift", "lift_lookalikes", "on_target", "chance_hit", "on_rival"]
+    names += ["drift", "entropy"]
+    groups = table.groupby(["suite", "method", "query"], observed=True, sort=False)
+    means = groups[names].mean().round(2)
+    means.insert(0, "n", groups.size())
+    return means.reset_index()
+
+
+def pattern_counts(table: "pd.DataFrame") -> "pd.DataFrame":
+    """Episodes of every localisation and their successes; `table` is `with_localisation`'s."""
+    import pandas as pd
+
+    rows = []
+    for (suite, method), group in table.groupby(["suite", "method"], observed=True, sort=False):
+        row = {"suite": str(suite), "method": str(method), "n": len(group)}
+        for name in LOCALISATIONS:
+            found = group[group["localisation"] == name]
+            row[name] = len(found)
+            row[f"{name}, success"] = int(found["success"].sum())
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def layer_table(layers: "pd.DataFrame") -> "pd.DataFrame":
+    """Density on the target and on the look-alikes by layer, mean over heads and episodes.
+
+    `best_head` is the mean over episodes of the densest head on the target.
+    """
+    import pandas as pd
+
+    rows = []
+    keys = ["suite", "method", "query", "layer"]
+    for key, group in layers.groupby(keys, observed=True, sort=False):
+        seen = group[group["chance_target"] > 0]
+        row = dict(zip(keys, key, strict=True))
+        row["n"] = len(seen[KEY].drop_duplicates())
+        row["lift"] = seen["share_target"].sum() / seen["chance_target"].sum()
+        row["lift_lookalikes"] = seen["share_lookalikes"].sum() / seen["chance_lookalikes"].sum()
+        by_head = seen.groupby("head", observed=True)[["share_target", "chance_target"]].sum()
+        row["best_head"] = (by_head["share_target"] / by_head["chance_target"]).max()
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _rows(table: "pd.DataFrame") -> list[list[str]]:
+    return [list(map(str, table.columns)), *table.astype(str).to_numpy().tolist()]
+
+
+def auc_by_layer(layers: "pd.DataFrame", episodes: "pd.DataFrame") -> "pd.DataFrame":
+    """How well the density on the target tells successes, by query and layer, in the mean of heads.
+
+    One column a layer, counted from 1.
+    """
+    import pandas as pd
+
+    seen = layers[layers["chance_target"] > 0].copy()
+    seen["lift"] = seen["share_target"] / seen["chance_target"]
+    keys = [*KEY, "query", "layer"]
+    lifts = seen.groupby(keys, observed=True, sort=False)["lift"].mean().reset_index()
+    merged = lifts.merge(episodes, on=KEY)
+    rows: dict[str, dict[int, str]] = {}
+    for (suite, method, query, layer), group in merged.groupby(
+        ["suite", "method", "query", "layer"], observed=True, sort=False
+    ):
+        area = predict_success(group, ["lift"])["lift"]
+        row = rows.setdefault(f"{suite}, {method}, {query}", {})
+        row[int(layer) + 1] = f"{area.value:.2f} [{area.low:.2f}, {area.high:.2f}]"
+    return pd.DataFrame(rows).T
+
+
+def causal_table(causal: "pd.DataFrame") -> "pd.DataFrame":
+    """What is where by attention and by the causal measures of the same calls.
+
+    Columns with a region's name are the density inside it, 1 where it is that of the whole view;
+    `rank_gradient` and `rank_masking` are the mean rank correlations over patches with the two
+    causal measures; n is calls.
+    """
+    groups = causal.groupby(["suite", "method", "measure"], observed=True, sort=False)
+    table = groups[["hit", "chance_hit", "rank_gradient", "rank_masking"]].mean()
+    for region in reversed(REGIONS):
+        shares = groups[[f"share_{region}", f"chance_{region}"]].sum()
+        table.insert(0, region, shares[f"share_{region}"] / shares[f"chance_{region}"])
+    table.insert(0, "n", groups.size())
+    return table.round(2).reset_index()

@@ -1,0 +1,79 @@
+"""Figures of learned tokens: what they recognize as they are learned, and how far words moved."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float64
+
+from vap_core.base.figures import OTHER, WINNER, empty_figure
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+COLOURS = {"own": WINNER, "look-alikes": OTHER, "other objects": "#9aa0a6"}
+"""The colour of each kind of photo."""
+
+
+def token_curves_figure(curve: "pd.DataFrame") -> "Figure":
+    """Yes to each kind of photo over the steps of a training, of `report.curve`.
+
+    A panel per number of photos; bands are 95 % intervals.
+    """
+    ks = sorted(curve.k.unique())
+    figure = empty_figure(max(4.6, 2.9 * len(ks) + 0.5), 3.2)
+    grid = figure.subplots(1, len(ks), squeeze=False, sharey=True)[0]
+    for axes, k in zip(grid, ks, strict=True):
+        of_k = curve[curve.k == k]
+        for kind, colour in COLOURS.items():
+            part = of_k[of_k.kind == kind].sort_values("step")
+            axes.plot(part.step, 100 * part.yes, "o-", color=colour, markersize=3, label=kind)
+            axes.fill_between(
+                part.step, 100 * part.low, 100 * part.high, color=colour, alpha=0.2, linewidth=0
+            )
+        photos = "photo" if k == 1 else "photos"
+        axes.set(
+            title=f"{k} {photos}, {int(of_k.objects.max())} objects",
+            xlabel="optimiser steps",
+            ylim=(-2, 102),
+        )
+        axes.grid(color="#eeeeee")
+        axes.spines[["top", "right"]].set_visible(False)
+    grid[0].set_ylabel("yes, % of unseen photos")
+    handles, labels = grid[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+    return figure
+
+
+def rotation_figure(
+    cosines: Mapping[str, Mapping[str, Float64[np.ndarray, " t"]]],
+) -> "Figure":
+    """Cosines of words to themselves in a policy: a group per policy, a box per key inside."""
+    names = list(next(iter(cosines.values())))
+    figure = empty_figure(1.7 * len(cosines) + 1.5, 3.2)
+    axes = figure.subplots()
+    for i, name in enumerate(names):
+        values = [of_policy[name] for of_policy in cosines.values()]
+        offset = (i - (len(names) - 1) / 2) * 0.26
+        boxes = axes.boxplot(
+            values,
+            positions=np.arange(len(cosines)) + offset,
+            widths=0.2,
+            patch_artist=True,
+            medianprops={"color": "black"},
+            flierprops={"markersize": 3},
+        )
+        for box in boxes["boxes"]:
+            box.set_facecolor(f"C{i}")
+            box.set_label(name)
+    axes.set_xticks(range(len(cosines)), list(cosines), fontsize=8)
+    axes.set(ylabel="cosine to the word in the policy", ylim=(-0.25, 1.03))
+    axes.grid(axis="y", color="#eeeeee")
+    axes.spines[["top", "right"]].set_visible(False)
+    handles, labels = axes.get_legend_handles_labels()
+    unique = dict(zip(labels, handles, strict=True))
+    figure.legend(
+        unique.values(), unique.keys(), loc="outside lower center", ncols=3, frameon=False
+    )
+    return figure

@@ -1,0 +1,72 @@
+"""The command that measures where a policy looks."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vap_core.cli.options import Workers, names
+
+app = typer.Typer()
+
+
+@app.command()
+def attention(
+    run: Annotated[
+        Path, typer.Argument(help="Run folder of eval or rollout, or a table that publish wrote.")
+    ],
+    suite: Annotated[
+        str, typer.Option(help="Only these suites, with commas. Default: all of the run.")
+    ] = "",
+    method: Annotated[
+        str,
+        typer.Option(
+            "--methods", "--method", help="Only these methods, with commas. Default: all."
+        ),
+    ] = "",
+    episodes: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Episodes per task and method, spread evenly. Default: all of the run."
+        ),
+    ] = None,
+    explain: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="Episodes per task and method that also get the causal measures: gradient times "
+            "activation, and masked patches.",
+        ),
+    ] = 2,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the tables; what is found there goes on. Default: RUN/attention, or "
+            "data/runs/attention-TABLE."
+        ),
+    ] = None,
+    publish: Annotated[
+        Path | None, typer.Option(help="Keep the tables in this folder, too: data/results.")
+    ] = None,
+    workers: Workers = 2,
+) -> None:
+    """Run the episodes of a run again, measure where every query looks, and print the patterns.
+
+    Example: python -m vap_core attention data/results/mini_pi0.parquet --method soft,vap
+        --suite simpler-bridge
+    """
+    from vap_core.analysis.attention import replay, report
+
+    if out is None:
+        table = run.suffix == ".parquet"
+        out = Path("data/runs") / f"attention-{run.stem}" if table else run / "attention"
+    wanted = replay.Wanted(
+        suites=tuple(names(suite)),
+        methods=tuple(names(method)),
+        episodes=episodes,
+        explain=explain,
+    )
+    tables = replay.run_replay(run, out, wanted, workers=workers)
+    if publish is not None:
+        replay.publish(out, publish)
+    print(report.text(tables))

@@ -1,0 +1,63 @@
+"""Files of a measurement that goes on where it stopped: JSON parts, and the tables they become.
+
+`caller` is the command that an error names.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vap_core.base.errors import BadOutput
+from vap_core.base.files import parse_json, read_file, write_atomic
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+def write_json_part(
+    path: Path, content: Any, caller: str, default: Callable[[Any], Any] | None = None
+) -> None:
+    """Keep one finished part; its folder is made. `default` is json's. Raises: BadOutput."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, json.dumps(content, default=default).encode())
+    except OSError as error:
+        raise BadOutput(
+            f"{caller}: {path.parent} cannot be written ({error.strerror}); make room and run the "
+            "same command again."
+        ) from error
+
+
+def read_json_part(path: Path, caller: str) -> Any:
+    """What `write_json_part` kept. Raises: BadOutput for a damaged part."""
+    try:
+        return parse_json(read_file(path))
+    except (OSError, ValueError) as error:
+        raise BadOutput(
+            f"{caller}: {path} is damaged; delete it and run the same command again."
+        ) from error
+
+
+def encode_table(table: "pa.Table") -> bytes:
+    """The table as a Parquet file, with its metadata."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, compression="zstd")
+    return sink.getvalue().to_pybytes()
+
+
+def publish_tables(tables: Mapping[str, bytes], to: Path, caller: str) -> list[Path]:
+    """Write files by name into a folder, which is made; returns their paths. Raises: BadOutput."""
+    try:
+        to.mkdir(parents=True, exist_ok=True)
+        for name, data in tables.items():
+            write_atomic(to / name, data)
+    except OSError as error:
+        raise BadOutput(
+            f"{caller}: {to} cannot be written ({error.strerror}); choose another folder with "
+            "--publish."
+        ) from error
+    return [to / name for name in tables]

@@ -1,0 +1,1 @@
+"""What the learned tokens of personal objects recognize, in the model and in the policies."""

@@ -1,0 +1,258 @@
+"""Learns the token of every personal object from few or many photos, and measures it as it grows.
+
+A job is one training: of one task's target, from so many photos, in the vision-language model or in
+the policy's own weights. Afterwards a token that was learned in the model is read by the policy,
+copied as it is and rotated into the policy's space. What a killed run had finished is found again.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from jaxtyping import Float32
+
+from vap_core.base.errors import BadOutput, BadStudy, one_of
+from vap_core.base.types import Rgb
+from vap_core.evaluation import measurements, store
+from vap_core.evaluation.policy_names import shipped
+from vap_core.evaluation.processes import results
+from vap_core.policies.lerobot.checkpoints import fingerprint
+from vap_core.policies.mini_pi0 import teach_token
+from vap_core.policies.mini_pi0.learned_token import Photos, TokenTraining, lessons, recognized
+from vap_core.policies.mini_pi0.token_alignment import align
+from vap_core.simulation import suites
+from vap_core.simulation.assets.objects import get_object
+from vap_core.simulation.studio import reference_views
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from vap_core.policies.mini_pi0.vlm import MiniVlm
+
+KS = (1, 3, 5, 7)
+"""Numbers of photos to learn from."""
+USUAL_K = teach_token.K
+SHARES = (0.05, 0.15, 0.3, 0.5, 1.0)
+"""Shares of a training after which the token is measured, besides before its first step."""
+OTHER = "other objects"
+TABLES = ("answers", "embeddings")
+"""Kinds of parts: photos to which the answer was yes; and what was learned."""
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Tokens:
+    """What is asked for: the suites, numbers of photos, and epochs of a training."""
+
+    suites: tuple[str, ...] = tuple(suites.BENCHMARKS)
+    ks: tuple[int, ...] = KS
+    epochs: int = TokenTraining().epochs
+
+    def __post_init__(self) -> None:
+        for name in self.suites:
+            if name not in suites.BENCHMARKS:
+                raise one_of("eval-tokens: suite", name, suites.BENCHMARKS)
+            if not shipped(name).is_dir():
+                raise BadStudy(
+                    f"eval-tokens: no mini-pi0 for {name} ships; run: python -m vap_core train "
+                    f"policy --suite {name}"
+                )
+
+    def configuration(self) -> dict[str, Any]:
+        """What the results depend on, as JSON; suites and numbers of photos may be added to."""
+        policies = {name: fingerprint(shipped(name)) for name in suites.BENCHMARKS}
+        return {
+            "survey": "tokens",
+            "epochs": self.epochs,
+            "views": teach_token.VIEWS,
+            "vlm": _model().sha256(),
+            "policies": policies,
+        }
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training: `where` the token is learned, from `k` photos."""
+
+    suite: str
+    task: str
+    k: int
+    where: Literal["vlm", "policy"]
+    epochs: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.suite}.{self.task}.{self.where}.{self.k}"
+
+
+def plan(asked: Tokens) -> list[Job]:
+    """Every job: the usual number of photos of every object first."""
+    jobs = []
+    usual = [k for k in asked.ks if k == USUAL_K]
+    for ks in (usual, [k for k in asked.ks if k != USUAL_K]):
+        for suite in asked.suites:
+            for task in suites.suite(suite).tasks:
+                for k in ks:
+                    jobs.append(Job(suite, task.name, k, "vlm", asked.epochs))
+                    if k == USUAL_K:
+                        jobs.append(Job(suite, task.name, k, "policy", asked.epochs))
+    return jobs
+
+
+def run_job(job: Job) -> dict[str, list[Row]]:
+    """Learn one token, and return the rows of both tables."""
+    from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
+
+    target = suites.rows(job.suite, job.task, 1)[0].target
+    taught = _photos(job.suite, job.task, 0, job.k)
+    shown = _shown(job.suite, job.task)
+    policy_folder = shipped(job.suite)
+    teacher = _model() if job.where == "vlm" else _policy_model(job.suite)
+    training = TokenTraining(epochs=job.epochs)
+    about = {"suite": job.suite, "task": job.task, "object": target, "k": job.k}
+    about["learned_in"] = job.where
+    answers: list[Row] = []
+    with fused_attention():
+        measured = _measured_epochs(job.epochs)
+        for epoch, (step, embedding) in enumerate(lessons(teacher, target, taught, training)):
+            if epoch in measured:
+                where = {**about, "step": step, "token": "as learned", "read_by": job.where}
+                answers += _answers(where, teacher, embedding, shown)
+        if job.where == "vlm":
+            reader = _policy_model(job.suite)
+            aligned = align(embedding, teach_token.MODEL, policy_folder)
+            for token, read in (("copied", embedding), ("aligned", aligned)):
+                where = {**about, "step": step, "token": token, "read_by": "policy"}
+                answers += _answers(where, reader, read, shown)
+    learned = {**about, "step": step, "embedding": embedding.tolist()}
+    return {"answers": answers, "embeddings": [learned]}
+
+
+def run(
+    asked: Tokens, folder: Path, *, workers: int = 1, progress: bool = True
+) -> "dict[str, pd.DataFrame]":
+    """Do what `folder` lacks, and return the tables.
+
+    Raises: BadOutput when the folder holds another run, or is in use; WorkerDied.
+    """
+    from tqdm import tqdm
+
+    store.open_run(folder, asked.configuration())
+    with store.locked(folder):
+        done = folder / "done"
+        done.mkdir(exist_ok=True)
+        jobs = plan(asked)
+        missing = [job for job in jobs if not (done / job.name).exists()]
+        with tqdm(
+            total=len(jobs),
+            initial=len(jobs) - len(missing),
+            unit="token",
+            disable=not progress,
+        ) as bar:
+            for job, tables in results(run_job, missing, workers=workers, remedy="--workers"):
+                for name, rows in tables.items():
+                    store.write_part(folder, name, rows, caller="eval-tokens")
+                (done / job.name).touch()
+                bar.update()
+    return read(folder)
+
+
+def read(folder: Path) -> "dict[str, pd.DataFrame]":
+    """The tables of a run, as far as it is. Raises: BadOutput."""
+    import pandas as pd
+
+    tables = {}
+    for name in TABLES:
+        parts = [pd.read_parquet(path) for path in sorted((folder / name).glob("*.parquet"))]
+        if not parts:
+            raise BadOutput(
+                f"eval-tokens: {folder} holds no {name}; run the same command again to finish it."
+            )
+        whole = pd.concat(parts, ignore_index=True)
+        key = [column for column in whole.columns if column not in ("yes", "n", "embedding")]
+        # A run that was killed between two files has written one of them twice.
+        whole = whole.drop_duplicates(key, ignore_index=True)
+        tables[name] = whole.sort_values(key, ignore_index=True)
+    return tables
+
+
+def publish(folder: Path, to: Path) -> list[Path]:
+    """Keep the tables in `to` as token_NAME.parquet, with their configuration.
+
+    Raises: BadOutput.
+    """
+    import json
+
+    import pyarrow as pa
+
+    manifest = json.dumps(store.read_manifest(folder), sort_keys=True)
+    tables = {}
+    for name, table in read(folder).items():
+        arrow = pa.Table.from_pandas(table, preserve_index=False)
+        arrow = arrow.replace_schema_metadata({**arrow.schema.metadata, b"run": manifest.encode()})
+        tables[f"token_{name}.parquet"] = measurements.encode_table(arrow)
+    return measurements.publish_tables(tables, to, caller="eval-tokens")
+
+
+def _measured_epochs(epochs: int) -> set[int]:
+    """After how many epochs a token is measured."""
+    return {0, *(max(1, round(share * epochs)) for share in SHARES)}
+
+
+def _answers(
+    about: Row,
+    reader: "MiniVlm",
+    embedding: Float32[np.ndarray, " d"],
+    shown: Mapping[str, Sequence[Rgb]],
+) -> Iterator[Row]:
+    """A row per object of the photos: to how many of them the reader says yes."""
+    for name, photos in shown.items():
+        yes = recognized(reader, embedding, photos)
+        yield {**about, "shown": name, "yes": int(yes.sum()), "n": len(yes)}
+
+
+@lru_cache(maxsize=4)
+def _negatives(
+    suite: str, task: str, seed: int
+) -> tuple[dict[str, tuple[Rgb, ...]], tuple[Rgb, ...]]:
+    """Photos of every look-alike of a task's target, and of other objects."""
+    rows = suites.rows(suite, task)
+    rivals = {}
+    for name in teach_token.lookalikes(rows):
+        rivals[name] = tuple(reference_views(get_object(name), teach_token.VIEWS, seed))
+    return rivals, teach_token.other_objects(rows, seed)
+
+
+def _photos(suite: str, task: str, seed: int, k: int) -> Photos:
+    """What teach_token.photographs takes, with the negatives rendered once."""
+    target = get_object(suites.rows(suite, task, 1)[0].target)
+    rivals, others = _negatives(suite, task, seed)
+    photos: list[Rgb] = []
+    for views in rivals.values():
+        photos += views
+    return Photos(tuple(reference_views(target, k, seed)), tuple(photos), others)
+
+
+def _shown(suite: str, task: str) -> dict[str, Sequence[Rgb]]:
+    """Photos that no training saw, by the object that they show; the target's first."""
+    photos = _photos(suite, task, 1, teach_token.VIEWS)
+    target = suites.rows(suite, task, 1)[0].target
+    rivals, others = _negatives(suite, task, 1)
+    return {target: photos.own, **rivals, OTHER: others}
+
+
+@lru_cache(maxsize=1)
+def _model() -> "MiniVlm":
+    from vap_core.policies.mini_pi0.vlm import load_vlm
+
+    return load_vlm(teach_token.MODEL)
+
+
+@lru_cache(maxsize=1)
+def _policy_model(suite: str) -> "MiniVlm":
+    from vap_core.policies.mini_pi0.vlm import load_from_policy
+
+    return load_from_policy(shipped(suite))

@@ -1,0 +1,231 @@
+"""Where a pi0, pi0.5, mini-pi0 or SmolVLA looks, read while it is called.
+
+Words of the instruction are queries in the layers of the vision-language model, the action expert's
+tokens in its own layers; keys are the image patches of every view. What is set on the policy is
+removed when the call ends.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from jaxtyping import Bool, Float
+
+from vap_core.base.types import value
+from vap_core.policies.hooks import ACTION, AttentionMap, report_attention
+from vap_core.policies.lerobot.token_positions import Positions
+
+Weights = Float[torch.Tensor, "b heads queries keys"]
+MARKS = 3
+"""Tokens that SmolVLA sets around the patches of a view, two before and one behind, if it does."""
+
+
+@value
+class Layout:
+    """Where a policy's prefix holds its views and its text.
+
+    `starts` is the first patch of every camera, `side` the number of patches along both edges,
+    `text` the first token of the text, `chunk` the number of the expert's action tokens.
+    """
+
+    cameras: tuple[str, ...]
+    starts: tuple[int, ...]
+    side: int
+    text: int
+    chunk: int
+
+
+def can_watch(policy: Any) -> bool:
+    """Whether the attention can be read: a pi0 or SmolVLA whose pictures are not padded."""
+    model = getattr(policy, "model", None)
+    if hasattr(model, "paligemma_with_expert"):
+        target = policy.config.image_resolution
+    elif hasattr(model, "vlm_with_expert"):
+        target = policy.config.resize_imgs_with_padding
+    else:
+        return False
+    shapes = []
+    if target is not None:
+        shapes.append(target)
+    for feature in policy.config.image_features.values():
+        shapes.append(feature.shape[-2:])
+    return all(height == width for height, width in shapes)
+
+
+@contextmanager
+def reporting_attention(
+    policy: Any, cameras: Sequence[str], positions: Sequence[Positions]
+) -> Iterator[None]:
+    """Inside, a policy that `can_watch` reports its attention to the image patches of its cameras.
+
+    `positions` are those of the queries that are words, by episode.
+    """
+    watch = Watch(layout(policy, cameras), positions)
+    with _watching_smolvla(policy, watch) if _is_smolvla(policy) else _watching_pi0(policy, watch):
+        yield
+    watch.report()
+
+
+def layout(policy: Any, cameras: Sequence[str]) -> Layout:
+    """Where a policy that `can_watch` holds the views of these cameras."""
+    return (_smolvla_layout if _is_smolvla(policy) else _pi0_layout)(policy, cameras)
+
+
+def _is_smolvla(policy: Any) -> bool:
+    return hasattr(policy.model, "vlm_with_expert")
+
+
+class Watch:
+    """Collects attention to the patches, layer by layer, during one call."""
+
+    def __init__(self, layout: Layout, positions: Sequence[Positions]) -> None:
+        self.layout = layout
+        self.positions = positions
+        patches = []
+        for start in layout.starts:
+            patches.append(start + torch.arange(layout.side**2))
+        self._patches = torch.cat(patches)
+        self._words: dict[tuple[int, str], dict[int, torch.Tensor]] = {}
+        self._actions: dict[int, list[torch.Tensor]] = {}
+
+    def words(self, layer: int, weights: Weights) -> None:
+        """Take what the prefix attends to in a layer of the vision-language model."""
+        for episode, positions in enumerate(self.positions):
+            for query, places in positions.items():
+                rows = self.layout.text + torch.tensor(places)
+                attended = weights[episode][:, rows].mean(1)[:, self._patches]
+                self._words.setdefault((episode, query), {})[layer] = attended
+
+    def actions(self, layer: int, weights: Weights) -> None:
+        """Take what the action tokens attend to in a layer of the expert."""
+        attended = weights[:, :, -self.layout.chunk :].mean(2)[..., self._patches]
+        self._actions.setdefault(layer, []).append(attended)
+
+    def report(self) -> None:
+        """Report the maps of every episode and camera."""
+        of_actions = []
+        for layer in sorted(self._actions):
+            of_actions.append(torch.stack(self._actions[layer]).mean(0))
+        for episode, positions in enumerate(self.positions):
+            queries = {}
+            for query in positions:
+                layers = self._words[episode, query]
+                queries[query] = torch.stack([layers[layer] for layer in sorted(layers)])
+            queries[ACTION] = torch.stack(of_actions)[:, episode]
+            by_camera: dict[str, dict[str, AttentionMap]] = {}
+            for query, attended in queries.items():
+                for camera, heat in zip(self.layout.cameras, self._maps(attended), strict=True):
+                    by_camera.setdefault(camera, {})[query] = heat
+            for camera, maps in by_camera.items():
+                report_attention(episode, camera, maps)
+
+    def _maps(self, attended: Float[torch.Tensor, "layers heads _"]) -> list[AttentionMap]:
+        """One map per camera."""
+        side = self.layout.side
+        maps = attended.unflatten(2, (len(self.layout.cameras), side, side))
+        return list(maps.permute(2, 0, 1, 3, 4).float().cpu().numpy())
+
+
+@contextmanager
+def _watching_pi0(policy: Any, watch: Watch) -> Iterator[None]:
+    """Inside, every layer's self-attention, which PI0 computes eagerly, is taken."""
+
+    def taking(take: Callable[[int, torch.Tensor], None], layer: int) -> Callable[..., None]:
+        def hook(module: Any, args: Any, output: Any) -> None:
+            take(layer, output[1])
+
+        return hook
+
+    towers = policy.model.paligemma_with_expert
+    with ExitStack() as hooks:
+        for take, decoder in (
+            (watch.words, towers.paligemma.model.language_model),
+            (watch.actions, towers.gemma_expert.model),
+        ):
+            for i, layer in enumerate(decoder.layers):
+                handle = layer.self_attn.register_forward_hook(taking(take, i))
+                hooks.callback(handle.remove)
+        yield
+
+
+@contextmanager
+def _watching_smolvla(policy: Any, watch: Watch) -> Iterator[None]:
+    """Inside, every attention is taken.
+
+    SmolVLA calls no attention module: the projection of the queries tells which layer is running,
+    and the weights are computed a second time beside its own function.
+    """
+    towers = policy.model.vlm_with_expert
+    running: list[tuple[Callable[[int, torch.Tensor], None], int]] = []
+
+    def entering(take: Callable[[int, torch.Tensor], None], layer: int) -> Callable[..., None]:
+        def hook(module: Any, args: Any, output: Any) -> None:
+            running[:] = [(take, layer)]
+
+        return hook
+
+    attend = towers.eager_attention_forward
+
+    def observed(mask: Any, batch: int, head_dim: int, query: Any, key: Any, values: Any) -> Any:
+        take, layer = running[0]
+        take(layer, _weights(mask, query, key))
+        return attend(mask, batch, head_dim, query, key, values)
+
+    with ExitStack() as hooks:
+        for take, decoder in (
+            (watch.words, towers.get_vlm_model().text_model),
+            (watch.actions, towers.lm_expert),
+        ):
+            for i, layer in enumerate(decoder.layers):
+                handle = layer.self_attn.q_proj.register_forward_hook(entering(take, i))
+                hooks.callback(handle.remove)
+        hooks.enter_context(patch.object(towers, "eager_attention_forward", observed))
+        yield
+
+
+def _weights(
+    mask: Bool[torch.Tensor, "b queries keys"],
+    query: Float[torch.Tensor, "b queries heads d"],
+    key: Float[torch.Tensor, "b keys groups d"],
+) -> Weights:
+    """The weights that SmolVLA's attention gives its values."""
+    n_heads = query.shape[2] // key.shape[2]
+    keys = key.float().repeat_interleave(n_heads, dim=2).transpose(1, 2)
+    scores = query.float().transpose(1, 2) @ keys.transpose(2, 3) * query.shape[-1] ** -0.5
+    masked = torch.where(mask[:, None], scores, torch.finfo(scores.dtype).min)
+    return masked.softmax(-1)
+
+
+def _pi0_layout(policy: Any, cameras: Sequence[str]) -> Layout:
+    """PI0's: the views, behind them its empty cameras, then the text."""
+    config = policy.config
+    vision = policy.model.paligemma_with_expert.paligemma.config.vision_config
+    side = config.image_resolution[0] // vision.patch_size
+    return Layout(
+        cameras=tuple(cameras),
+        starts=tuple(i * side**2 for i in range(len(cameras))),
+        side=side,
+        text=len(config.image_features) * side**2,
+        chunk=config.chunk_size,
+    )
+
+
+def _smolvla_layout(policy: Any, cameras: Sequence[str]) -> Layout:
+    """SmolVLA's: as PI0's, with marks around every view where its configuration asks for them."""
+    config = policy.config
+    vlm = policy.model.vlm_with_expert.config
+    pixels = config.resize_imgs_with_padding
+    if pixels is None:
+        pixels = next(iter(config.image_features.values())).shape[-2:]
+    side = pixels[0] // vlm.vision_config.patch_size // vlm.scale_factor
+    marks = MARKS if config.add_image_special_tokens else 0
+    width = side**2 + marks
+    return Layout(
+        cameras=tuple(cameras),
+        starts=tuple(i * width + max(marks - 1, 0) for i in range(len(cameras))),
+        side=side,
+        text=len(config.image_features) * width,
+        chunk=config.chunk_size,
+    )

@@ -1,0 +1,111 @@
+"""What the image patches contribute to the actions of a policy, by two causal measures.
+
+Attention says what is mixed, not what it is mixed for. `gradient_maps` is the gradient of the
+actions times the activation of every patch, `masking_maps` the change of the actions when a patch
+is painted over. Both take the same sampling noise as the episode.
+"""
+
+import inspect
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from vap_core.policies.lerobot.adapter import LeRobot, LeRobotState
+from vap_core.policies.lerobot.attention_hooks import layout
+from vap_core.policies.lerobot.module_hooks import overriding_tokens
+from vap_core.policies.protocol import PolicyInput
+
+Map = Float32[np.ndarray, "rows columns"]
+
+
+def gradient_maps(
+    policy: LeRobot, state: LeRobotState, policy_input: PolicyInput
+) -> dict[str, Map]:
+    """Size of the gradient times activation of every patch, by camera.
+
+    The scalar is half the squared length of the normalised actions that are executed. Activations
+    are the patches' embeddings, as the vision-language model reads them.
+    """
+    batch, noise = policy.prepare([state], [policy_input])
+    activations: list[torch.Tensor] = []
+
+    def keep(module: Any, args: Any, output: torch.Tensor) -> torch.Tensor:
+        activations.append(output.detach().requires_grad_(True))
+        return activations[-1]
+
+    hook = _projector(policy.policy.model).register_forward_hook(keep)
+    try:
+        with _gradients(policy.policy.model), overriding_tokens(policy.policy, policy.learned):
+            predict = inspect.unwrap(type(policy.policy).predict_action_chunk)
+            planned = predict(policy.policy, batch, noise=noise)[:, : policy.execute]
+            (0.5 * planned.square().sum()).backward()
+    finally:
+        hook.remove()
+    side = layout(policy.policy, policy.cameras()).side
+    maps = {}
+    for camera, activation in zip(policy.cameras(), activations, strict=False):
+        assert activation.grad is not None
+        relevance = (activation.grad * activation).sum(-1).abs().detach()
+        maps[camera] = relevance.reshape(side, side).numpy()
+    return maps
+
+
+@torch.inference_mode()
+def masking_maps(policy: LeRobot, state: LeRobotState, policy_input: PolicyInput) -> dict[str, Map]:
+    """Change of the normalised actions that are executed when a patch is masked, by camera.
+
+    A patch is painted with the mean colour of its view.
+    """
+    side = layout(policy.policy, policy.cameras()).side
+    plain = _planned(policy, state, [policy_input])
+    maps = {}
+    for camera in policy.cameras():
+        rgb = policy_input.images[camera]
+        mean = rgb.mean((0, 1)).round().astype(np.uint8)
+        rows = np.linspace(0, rgb.shape[0], side + 1).round().astype(int)
+        columns = np.linspace(0, rgb.shape[1], side + 1).round().astype(int)
+        masked = []
+        for i in range(side):
+            for j in range(side):
+                painted = rgb.copy()
+                painted[rows[i] : rows[i + 1], columns[j] : columns[j + 1]] = mean
+                images = {**policy_input.images, camera: painted}
+                masked.append(replace(policy_input, images=images))
+        change = _planned(policy, state, masked) - plain
+        maps[camera] = change.flatten(1).norm(dim=1).reshape(side, side).numpy()
+    return maps
+
+
+def _planned(
+    policy: LeRobot, state: LeRobotState, inputs: list[PolicyInput]
+) -> Float32[torch.Tensor, "b execute action"]:
+    """The normalised actions that are executed."""
+    batch, noise = policy.prepare([state] * len(inputs), inputs)
+    with overriding_tokens(policy.policy, policy.learned):
+        planned = policy.policy.predict_action_chunk(batch, noise=noise)
+    return planned[:, : policy.execute]
+
+
+def _projector(model: Any) -> torch.nn.Module:
+    """The module that gives the patches' embeddings."""
+    if hasattr(model, "vlm_with_expert"):
+        return model.vlm_with_expert.get_vlm_model().connector
+    return model.paligemma_with_expert.paligemma.model.multi_modal_projector
+
+
+@contextmanager
+def _gradients(model: Any) -> Iterator[None]:
+    """Inside, sampling keeps gradients, which lerobot switches off by a decorator."""
+    with ExitStack() as patches:
+        for kind in type(model).__mro__:
+            sample = vars(kind).get("sample_actions")
+            if sample is not None and hasattr(sample, "__wrapped__"):
+                patches.enter_context(patch.object(kind, "sample_actions", sample.__wrapped__))
+        patches.enter_context(torch.enable_grad())
+        yield
