@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -253,11 +254,24 @@ def test_crop_is_the_box_with_margin_and_clipped() -> None:
     assert np.array_equal(crop(image, np.array([90.0, 90, 100, 100]), margin=0.2), image[88:, 88:])
 
 
-def test_gem_lies_between_mean_and_maximum() -> None:
+def test_gem_is_the_cubic_mean() -> None:
     x = np.random.default_rng(0).random((5, 4, 4)).astype(np.float32)
-    assert np.allclose(embed.gem(x, 1.0), x.mean((1, 2)))
-    assert (embed.gem(x, 3.0) > x.mean((1, 2))).all()
-    assert (embed.gem(x, 3.0) < x.max((1, 2))).all()
+    x[0] = 0
+    wanted = (np.maximum(x.astype(np.float64), 1e-6) ** 3).mean((1, 2)) ** (1 / 3)
+    assert np.allclose(embed.gem(x), wanted, rtol=1e-6, atol=0)
+
+
+def test_the_lab_histogram_counts_each_pixel_in_its_bin_by_its_weight() -> None:
+    rgb = noise(3, embed.HISTOGRAM_SIDE, embed.HISTOGRAM_SIDE)
+    lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB).astype(np.float32)
+    half_sides = np.linspace(-1, 1, embed.HISTOGRAM_SIDE)
+    wanted = np.zeros(embed.HISTOGRAM_BINS)
+    for (row, column), lightness in np.ndenumerate(lab[..., 0]):
+        unit = (lightness / 255, *(lab[row, column, 1:] - 64) / 128)
+        where = [int(np.clip(u * n, 0, n - 1)) for u, n in zip(unit, wanted.shape, strict=True)]
+        squared = half_sides[row] ** 2 + half_sides[column] ** 2
+        wanted[tuple(where)] += np.exp(-squared / (2 * embed.HISTOGRAM_SIGMA**2))
+    assert np.allclose(embed.lab_histogram(rgb), np.sqrt(wanted.ravel()), atol=1e-6)
 
 
 def test_decode_reads_peaks_exactly_and_drops_overlaps() -> None:

@@ -15,7 +15,7 @@ from functools import cache
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Int64, UInt8
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
@@ -206,12 +206,10 @@ def halve_b4(taps: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {"b4": F.avg_pool2d(taps["b4"], 2), "b10": taps["b10"], "b14": taps["b14"]}
 
 
-def gem(features_chw: Float32[np.ndarray, "c h w"], p: float = 3.0) -> Float32[np.ndarray, " c"]:
-    """Generalised-mean pooling: (mean of x^p)^(1/p) per channel.
-
-    p = 1 is the average, large p the maximum.
-    """
-    return (np.maximum(features_chw, 1e-6) ** p).mean((1, 2)) ** (1 / p)
+def gem(features_chw: Float32[np.ndarray, "c h w"]) -> Float32[np.ndarray, " c"]:
+    """Generalised-mean pooling with p = 3: (mean of x^3)^(1/3) per channel."""
+    x = np.maximum(features_chw, np.float32(1e-6))
+    return np.cbrt((x * x * x).mean((1, 2)))  # a fifth of the time of general powers
 
 
 def lab_histogram(rgb: Rgb) -> Float[np.ndarray, " b"]:
@@ -221,15 +219,37 @@ def lab_histogram(rgb: Rgb) -> Float[np.ndarray, " b"]:
     """
     size = (HISTOGRAM_SIDE, HISTOGRAM_SIDE)
     small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
-    lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB).astype(np.float32)
+    lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB)
+    lightness, chroma = _histogram_bins()
+    _, greens, blues = HISTOGRAM_BINS
+    flat = lightness[lab[..., 0]] * greens * blues
+    flat += chroma[0][lab[..., 1]] * blues
+    flat += chroma[1][lab[..., 2]]
+    counts = np.bincount(flat.ravel(), _histogram_weight(), minlength=HISTOGRAM_LENGTH)
+    return np.sqrt(counts)
+
+
+@cache
+def _histogram_weight() -> Float[np.ndarray, " q"]:
+    """The weight of every pixel of the square, row by row."""
     r = np.linspace(-1, 1, HISTOGRAM_SIDE)
-    weight = np.exp(-(r[:, None] ** 2 + r[None] ** 2) / (2 * HISTOGRAM_SIGMA**2))
-    lightness = lab[..., :1] / 255.0
-    chroma = (lab[..., 1:] - 64.0) / 128.0  # chroma beyond +-64 shares the outer bins
-    unit = np.concatenate([lightness, chroma], axis=-1)
-    index = np.clip((unit * HISTOGRAM_BINS).astype(int), 0, np.array(HISTOGRAM_BINS) - 1)
-    flat = np.ravel_multi_index((index[..., 0], index[..., 1], index[..., 2]), HISTOGRAM_BINS)
-    return np.sqrt(np.bincount(flat.ravel(), weight.ravel(), minlength=HISTOGRAM_LENGTH))
+    squared = r[:, None] ** 2 + r[None] ** 2
+    return np.exp(-squared / (2 * HISTOGRAM_SIGMA**2)).ravel()
+
+
+@cache
+def _histogram_bins() -> tuple[Int64[np.ndarray, "256"], tuple[Int64[np.ndarray, "256"], ...]]:
+    """The bin of every value of 8-bit lightness, and of both chromas."""
+    value = np.arange(256, dtype=np.float32)
+    lights, *colours = HISTOGRAM_BINS
+    lightness = _bin(value / 255.0, lights)
+    # Chroma beyond +-64 shares the outer bins.
+    chroma = tuple(_bin((value - 64.0) / 128.0, n) for n in colours)
+    return lightness, chroma
+
+
+def _bin(unit: Float32[np.ndarray, " v"], n: int) -> Int64[np.ndarray, " v"]:
+    return np.clip((unit * n).astype(np.int64), 0, n - 1)
 
 
 def pad_to_square(rgb: Rgb) -> Rgb:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from vap_core.base.types import Boxes, Rgb
-from vap_core.perception.boxes import box_iou
+from vap_core.perception.boxes import box_iou, suppress_overlaps
 from vap_core.perception.embedded import detector, proposer
 from vap_core.perception.embedded.proposer import LARGEST_SHARE, LEAST_SCORE, MOST, Propose
 from vap_core.perception.protocols import Detector
@@ -33,6 +33,9 @@ a pass of the encoder."""
 MOST_UNFAMILIAR = 40
 """Boxes of an unfamiliar view. Of 80 objects pasted into real photos 20 boxes elect 56, 40 elect 60
 and 60 elect 61."""
+SAME_OBJECT_IOU = 0.6
+"""Of proposals that overlap by more, the best stays. In 198 views it changes no winner, and leaves
+29 crops of 40 in an unfamiliar view and 8 of 9 in a familiar one."""
 REFERENCE_SHARE = 0.95
 """A reference's object may fill the photo."""
 AGREEMENT = 0.05
@@ -64,6 +67,9 @@ class OpenDetector:
             familiar = _is_familiar(named)
             most = MOST if familiar else MOST_UNFAMILIAR
             xyxy, score = self.propose(image, threshold, most, LARGEST_SHARE)
+            alone = suppress_overlaps(xyxy, score, iou=SAME_OBJECT_IOU, most=len(xyxy))
+            xyxy = xyxy[alone]
+            score = score[alone]
             if familiar:
                 kept = agreed(xyxy, named)
                 kept[:MOST_FAMILIAR] = True
