@@ -34,7 +34,10 @@ PolicyName = Annotated[str, typer.Option("--policy", help=POLICIES)]
 Seed = Annotated[
     int,
     typer.Option(
-        min=0, help="Seed of the policy and the sensors; of a warm-up suite's episode list, too."
+        min=0,
+        help="Seed of the policy, the sensors and the starts: 0 starts every episode as it is "
+        "listed, another moves arm, objects and light a little. Of a warm-up suite the seed of its "
+        "list.",
     ),
 ]
 RECORDED = (

@@ -18,7 +18,7 @@ from vap_core.evaluation import readings, store
 from vap_core.evaluation.jobs import BATCH, Job, Record, Rows, run_job
 from vap_core.evaluation.processes import prepare, results
 from vap_core.evaluation.study import Study, register_personal, worker_modules
-from vap_core.simulation.types import EpisodeRow
+from vap_core.simulation.types import AS_LISTED, EpisodeRow
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -154,7 +154,10 @@ def missing_jobs(
 
 def result_key(row: EpisodeRow, method: str, run_digest: str) -> str:
     """Names a result: a hash of the episode's row, the method and the digest of the run."""
-    return store.digest({"row": asdict(row), "method": method, "run": run_digest})
+    about = asdict(row)
+    if about["start"] == asdict(AS_LISTED):  # keys are those of versions without starts
+        del about["start"]
+    return store.digest({"row": about, "method": method, "run": run_digest})
 
 
 def spread_evenly[T](items: Sequence[T], n: int) -> list[T]:

@@ -50,7 +50,7 @@ from vap_core.simulation.cameras import RIGS
 from vap_core.simulation.occluder import Occlusion
 from vap_core.simulation.scenes import Meshes, Scene
 from vap_core.simulation.studio import reference_views
-from vap_core.simulation.suites import lists
+from vap_core.simulation.suites import lists, starts
 from vap_core.simulation.suites.open_row import build_scene
 from vap_core.simulation.suites.variants import VARIANTS
 from vap_core.simulation.types import EpisodeRow
@@ -116,6 +116,8 @@ class Study:
         elif names:
             about["checkpoints"] = fingerprints
         about |= {"version": __version__, "weights": weights_sha256(), "lists": digests}
+        if digests and self.seed + self.seeds > 1:
+            about["starts"] = starts.settings()
         return {**about, "world": _world_digest(self)}
 
 

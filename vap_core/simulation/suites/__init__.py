@@ -3,14 +3,14 @@
 The episode lists of the benchmarks are hashed files; those of the warm-up suites are generated.
 """
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 
 from vap_core.base.errors import BadSuite, UnknownName, one_of
+from vap_core.simulation import robots
 from vap_core.simulation.assets import objects
-from vap_core.simulation.suites import lists, pick
+from vap_core.simulation.suites import lists, pick, starts
 from vap_core.simulation.suites.rules import Judge as Judge
 from vap_core.simulation.suites.simpler import BRIDGE, FRACTAL
 from vap_core.simulation.suites.suite import Suite as Suite
@@ -67,7 +67,8 @@ def rows(
     """Episodes of a task: the whole list, or `n` of it spread evenly.
 
     Of a warm-up suite the first `n` (20) of `seed`. A benchmark's list is the same for every seed;
-    the seed reaches the policy and the sensor noise.
+    a seed but 0 changes how its episodes start (starts.seeded), and every seed the policy's and
+    the sensors' noise.
     Raises: UnknownName for a suite or a task that no registry holds; BadSuite for a damaged list.
     """
     known = suite(suite_name)
@@ -78,7 +79,8 @@ def rows(
     if n is not None and n < len(episodes):
         spread = np.linspace(0, len(episodes) - 1, n).astype(int)
         episodes = [episodes[i] for i in np.unique(spread)]
-    return tuple(replace(row, seed=seed) for row in episodes)
+    joints = len(robots.get(known.robot).joints)
+    return tuple(starts.seeded(row, seed, joints) for row in episodes)
 
 
 def listed(
