@@ -2,7 +2,8 @@
 
     2026-11-24,simpler-bridge,e160becf5906,00c47015fce7,mini-pi0,generic vap,96,96,1,RUN,main table
 
-A list that was read while something was tuned is no test of it any more. A run is entered once,
+A list that was read while something was tuned is no test of it any more; development lists are read
+for that, and not logged. A run is entered once,
 when it begins, with what it will read: `data/runs/readings.csv`, which stays on its machine. To
 publish a run copies its lines to `readings.csv` beside the published table.
 """
@@ -61,14 +62,14 @@ COLUMNS = tuple(field.name for field in fields(Reading))
 def readings_of(
     configuration: Mapping[str, Any], run: str, what_for: str = "", date: str = ""
 ) -> list[Reading]:
-    """What a run reads: one line for each of its suites that has a shipped list."""
+    """What a run reads: one line for each of its suites that has a shipped list to report."""
     found = []
     weights = _weights_by_suite(configuration)
     tasks_by_suite: dict[str, list[str]] = {}
     for suite, task in configuration["tasks"]:
         tasks_by_suite.setdefault(suite, []).append(task)
     for suite, tasks in tasks_by_suite.items():
-        if suite not in suites.BENCHMARKS:
+        if not suites.is_listed(suite) or suites.is_development(suite):
             continue
         n_rows = 0
         for task in tasks:
@@ -179,13 +180,15 @@ def readings_of_lists(digests: Iterable[str]) -> list[Reading]:
 
 def _weights_by_suite(configuration: Mapping[str, Any]) -> dict[str, str]:
     """The beginning of the weights' digest of every suite of a run's configuration."""
-    names = sorted({suite for suite, _ in configuration["tasks"]})
+    names = {suite for suite, _ in configuration["tasks"]}
     if "checkpoint" in configuration:
         return dict.fromkeys(names, str(configuration["checkpoint"])[:SHORT])
     digests = configuration.get("checkpoints", [])
-    if len(digests) != len(names):
+    benchmarks = sorted(set(map(suites.benchmark_name, names)))
+    if len(digests) != len(benchmarks):
         return {}
-    return {name: str(digest)[:SHORT] for name, digest in zip(names, digests, strict=True)}
+    by_benchmark = dict(zip(benchmarks, digests, strict=True))
+    return {name: str(by_benchmark[suites.benchmark_name(name)])[:SHORT] for name in names}
 
 
 def _parse(line: Mapping[str, str]) -> Reading:

@@ -123,6 +123,7 @@ class Env:
         self._base_from_world = np.linalg.inv(base)
         self._row: EpisodeRow | None = None
         self._placed: tuple[str, ...] = ()
+        self._parked = set(scene.objects)
         self._disturbances: Mapping[str, Disturbance] = {}
         self._touch = Touch()
         self._cameras: tuple[Camera, ...] | None = None
@@ -160,7 +161,7 @@ class Env:
         """Start the episode of `row`: objects in place, robot at home, gripper open.
 
         Everything settles for 0.3 s. Objects of the scene that the row does not name are parked,
-        weightless and invisible.
+        weightless and invisible; so is an absent target.
         Raises: UnknownName when the row places an object that the scene lacks, or one twice.
         """
         self._check_placed(row)
@@ -336,6 +337,9 @@ class Env:
         """Take `row` as the episode, and draw the errors of its cameras."""
         self._row = row
         self._placed = tuple(place.model for place in row.placements)
+        self._parked = set(self.scene.objects) - set(self._placed)
+        if row.start.absent:
+            self._parked.add(row.target)
         disturbances = {}
         if self.sensor != PERFECT:
             for name in self.camera_names:
@@ -354,7 +358,7 @@ class Env:
             data.joint(f"{place.model}/free").qpos[:] = (*position, *quat)
         n_parked = 0
         for name in self.scene.objects:
-            if name in self._placed:
+            if name not in self._parked:
                 continue
             body = model.body(name)
             position = parked(self.robot, n_parked)
@@ -468,8 +472,8 @@ class Env:
         return dict(zip(bodies, poses, strict=True))
 
     def _hidden(self) -> frozenset[str]:
-        """The objects that are not part of the episode."""
-        return frozenset(self.scene.objects) - frozenset(self._placed)
+        """The objects that are not on the table."""
+        return frozenset(self._parked)
 
     @contextmanager
     def _timed(self, part: str) -> Iterator[None]:

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from vap_core.simulation.types import EpisodeRow, Start
+from vap_core.simulation.types import EpisodeRow
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ def seeded(row: EpisodeRow, seed: int, joints: int) -> EpisodeRow:
     if not seed:
         return replace(row, seed=seed)
     target = row.placements[0]
-    layout = f"{row.suite} {row.task} {target.x:g} {target.y:g} {target.yaw:g}"
+    layout = f"{row.task} {target.x:g} {target.y:g} {target.yaw:g}"
     rng = np.random.default_rng([seed, zlib.crc32(layout.encode())])
     lamp, ambient = _rounded(rng.uniform(1 - SPREAD.light, 1 + SPREAD.light, 2))
     arm = _rounded(rng.uniform(-SPREAD.joints_rad, SPREAD.joints_rad, joints))
@@ -44,7 +44,7 @@ def seeded(row: EpisodeRow, seed: int, joints: int) -> EpisodeRow:
     for _ in row.placements:
         dx, dy, turn = _rounded(rng.uniform(-1, 1, 3) * most)
         offsets.append((dx, dy, turn))
-    start = Start(joints_rad=arm, offsets=tuple(offsets), lamp=lamp, ambient=ambient)
+    start = replace(row.start, joints_rad=arm, offsets=tuple(offsets), lamp=lamp, ambient=ambient)
     return replace(row, seed=seed, start=start)
 
 
