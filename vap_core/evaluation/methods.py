@@ -4,6 +4,7 @@ from pathlib import Path
 
 from vap_core.associate import PAIRINGS
 from vap_core.attend import Attender, Prompting
+from vap_core.base.errors import BadStudy
 from vap_core.evaluation.ablations.arms import ARMS, Hidden
 from vap_core.memory import load_bank
 from vap_core.perception.protocols import Stack
@@ -12,17 +13,20 @@ from vap_core.rollout.prompters.oracle import Oracle, OraclePrompter
 from vap_core.rollout.prompters.protocol import Prompter
 from vap_core.rollout.prompters.text import (
     HardPrompt,
+    OtherCommand,
     SoftPrompt,
     generic,
     hard_prompt,
+    say,
     soft_prompt,
 )
 from vap_core.rollout.prompters.tint import TintPrompter
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.scenes import Scene
+from vap_core.simulation.suites import suite
 from vap_core.simulation.types import EpisodeRow
 
-type Method = Prompting | HardPrompt | SoftPrompt | Oracle | Hidden | None
+type Method = Prompting | HardPrompt | SoftPrompt | Oracle | Hidden | OtherCommand | None
 
 METHODS: dict[str, Method] = {
     "generic": None,
@@ -76,7 +80,8 @@ def references_needed(method: str) -> int:
 
 def needs_memory(method: str) -> bool:
     """Whether the method refers to remembered objects."""
-    return find(method) is not None
+    how = find(method)
+    return how is not None and not isinstance(how, OtherCommand)
 
 
 def needs_description(method: str) -> bool:
@@ -85,6 +90,11 @@ def needs_description(method: str) -> bool:
 
 def needs_token(method: str) -> bool:
     return isinstance(find(method), SoftPrompt)
+
+
+def has_no_command(method: str) -> bool:
+    """Whether the policy reads nothing, so that one that parses its commands cannot run."""
+    return find(method) == OtherCommand("blank")
 
 
 def token_space(method: str) -> str:
@@ -111,6 +121,10 @@ def make_prompter(
             return hard_prompt(load_bank(bank)[row.target], how)
         case SoftPrompt():
             return soft_prompt(WORD)
+        case OtherCommand(command="blank"):
+            return say("")
+        case OtherCommand():
+            return say(_next_command(row))
         case Prompting() as how:
             return TintPrompter(_attender(how, row, bank, stack))
         case Hidden(prompting=how):
@@ -118,6 +132,17 @@ def make_prompter(
         case Oracle() as oracle:
             alike = frozenset(n for n in scene.objects if get_object(n).category == row.category)
             return OraclePrompter(_attender(oracle.prompting, row, bank, stack), oracle, alike)
+
+
+def _next_command(row: EpisodeRow) -> str:
+    """The command of the suite's next task with another one. Raises: BadStudy."""
+    tasks = suite(row.suite).tasks
+    names = [task.name for task in tasks]
+    start = names.index(row.task) + 1
+    for task in (*tasks[start:], *tasks[:start]):
+        if task.instruction != row.instruction:
+            return task.instruction
+    raise BadStudy(f"other-text: {row.suite} has one command only; leave other-text out.")
 
 
 def _attender(how: Prompting, row: EpisodeRow, bank: Path, stack: Stack | None) -> Attender:

@@ -15,6 +15,7 @@ from vap_core import __version__
 from vap_core.base.errors import BadStudy, one_of
 from vap_core.evaluation.methods import (
     METHODS,
+    has_no_command,
     hidden_calls,
     known_methods,
     make_prompter,
@@ -238,6 +239,11 @@ def _check_policy(study: Study) -> None:
         raise BadStudy(
             f"Study: {absent[0]} leaves the target out, which the expert would go for; leave that "
             "suite or the expert out."
+        )
+    if policy == "scripted" and _any_method(study, has_no_command):
+        raise BadStudy(
+            f"Study: policy {policy!r} parses its command, and blank-text gives it none; leave "
+            f"blank-text out, or take --policy {MINI}."
         )
     if policy in POLICIES and _any_method(study, needs_token):
         raise BadStudy(

@@ -20,6 +20,7 @@ from vap_core.evaluation.ablations.forms import (
 )
 from vap_core.prompt import PALETTE, Tint
 from vap_core.rollout.prompters.oracle import Oracle
+from vap_core.rollout.prompters.text import OtherCommand
 
 DEFAULT = "vap"
 """The arm that every other is compared with."""
@@ -33,7 +34,7 @@ class Hidden:
     prompting: Prompting = field(default_factory=Prompting)
 
 
-type Arm = Prompting | Oracle | Hidden
+type Arm = Prompting | Oracle | Hidden | OtherCommand
 
 
 @dataclass(frozen=True)
@@ -138,6 +139,14 @@ ABLATIONS: dict[str, Ablation] = {
         arms={f"hidden-{n}": Hidden(n) for n in range(1, 7)},
         paper="occlusion_sweep",
         rows={DEFAULT: "0 frames", **{f"hidden-{n}": f"{n} frames" for n in range(1, 7)}},
+    ),
+    "language": Ablation(
+        question="Does the policy listen to its command at all?",
+        arms={
+            "blank-text": OtherCommand("blank"),
+            "other-text": OtherCommand("next task"),
+        },
+        methods=("generic",),
     ),
     "mask": Ablation(
         question="How exact must the mask be?",
