@@ -11,6 +11,7 @@ from vap_core.perception.protocols import Stack
 from vap_core.policies.mini_pi0.learned_token import WORD
 from vap_core.rollout.prompters.oracle import Oracle, OraclePrompter
 from vap_core.rollout.prompters.protocol import Prompter
+from vap_core.rollout.prompters.switch import Switch, SwitchPrompter
 from vap_core.rollout.prompters.text import (
     HardPrompt,
     OtherCommand,
@@ -26,7 +27,7 @@ from vap_core.simulation.scenes import Scene
 from vap_core.simulation.suites import suite
 from vap_core.simulation.types import EpisodeRow
 
-type Method = Prompting | HardPrompt | SoftPrompt | Oracle | Hidden | OtherCommand | None
+type Method = Prompting | HardPrompt | SoftPrompt | Oracle | Hidden | Switch | OtherCommand | None
 
 METHODS: dict[str, Method] = {
     "generic": None,
@@ -104,7 +105,7 @@ def token_space(method: str) -> str:
 
 
 def needs_stack(method: str) -> bool:
-    return isinstance(find(method), Prompting | Oracle | Hidden)
+    return isinstance(find(method), Prompting | Oracle | Hidden | Switch)
 
 
 def make_prompter(
@@ -130,8 +131,17 @@ def make_prompter(
         case Hidden(prompting=how):
             return TintPrompter(_attender(how, row, bank, stack))
         case Oracle() as oracle:
-            alike = frozenset(n for n in scene.objects if get_object(n).category == row.category)
-            return OraclePrompter(_attender(oracle.prompting, row, bank, stack), oracle, alike)
+            attender = _attender(oracle.prompting, row, bank, stack)
+            return OraclePrompter(attender, oracle, _alike(scene, row))
+        case Switch() as switch:
+            return SwitchPrompter(
+                _attender(Prompting(), row, bank, stack), switch, _alike(scene, row)
+            )
+
+
+def _alike(scene: Scene, row: EpisodeRow) -> frozenset[str]:
+    """The scene's objects of the target's category."""
+    return frozenset(name for name in scene.objects if get_object(name).category == row.category)
 
 
 def _next_command(row: EpisodeRow) -> str:

@@ -20,6 +20,7 @@ from vap_core.evaluation.ablations.forms import (
 )
 from vap_core.prompt import PALETTE, Tint
 from vap_core.rollout.prompters.oracle import Oracle
+from vap_core.rollout.prompters.switch import Switch
 from vap_core.rollout.prompters.text import OtherCommand
 
 DEFAULT = "vap"
@@ -34,7 +35,7 @@ class Hidden:
     prompting: Prompting = field(default_factory=Prompting)
 
 
-type Arm = Prompting | Oracle | Hidden | OtherCommand
+type Arm = Prompting | Oracle | Hidden | Switch | OtherCommand
 
 
 @dataclass(frozen=True)
@@ -163,6 +164,11 @@ ABLATIONS: dict[str, Ablation] = {
             for name in ("embedding", "hungarian", "all")
         },
         methods=(DEFAULT, "vap-associated"),
+    ),
+    "switch": Ablation(
+        question="Does the policy follow the tint to a look-alike in mid-episode?",
+        arms={"switched-early": Switch("early"), "switched-moved": Switch("moved")},
+        methods=("oracle-track",),
     ),
     "truth": Ablation(
         question="What would a perfect stage bring?",
