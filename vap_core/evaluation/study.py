@@ -38,7 +38,7 @@ from vap_core.perception.describe import AttributeCaptioner, Captioner, with_des
 from vap_core.perception.embedded.weights import weights_sha256
 from vap_core.perception.protocols import Stack
 from vap_core.perception.stacks import STACKS, load_stack
-from vap_core.policies.lerobot import adapter, checkpoints
+from vap_core.policies.lerobot import checkpoints
 from vap_core.policies.mini_pi0 import token_file
 from vap_core.policies.mini_pi0.learned_token import WORD
 from vap_core.policies.mini_pi0.teach_token import MODEL, teach, teach_own
@@ -161,7 +161,7 @@ def worker_modules(study: Study) -> tuple[str, ...]:
     )
     if study.policy in POLICIES:
         return modules
-    return (*modules, "lerobot.policies")
+    return (*modules, "vap_core.policies.lerobot.adapter", "lerobot.policies")
 
 
 def make_trial(study: Study, rows: Sequence[EpisodeRow], method: str, bank: Path) -> Trial:
@@ -286,6 +286,8 @@ def _policy(
     suite = suites.suite(row.suite)
     if study.policy in POLICIES:
         return make_policy(study.policy, scene, suite, stack)
+    from vap_core.policies.lerobot import adapter  # and torch
+
     policy = adapter.load_for_suite(study.checkpoint(row.suite), scene, suite)
     if not needs_token(method):
         return policy
