@@ -50,7 +50,7 @@ from vap_core.simulation.cameras import RIGS
 from vap_core.simulation.occluder import Occlusion
 from vap_core.simulation.scenes import Meshes, Scene
 from vap_core.simulation.studio import reference_views
-from vap_core.simulation.suites import lists
+from vap_core.simulation.suites import starts
 from vap_core.simulation.suites.open_row import build_scene
 from vap_core.simulation.suites.variants import VARIANTS
 from vap_core.simulation.types import EpisodeRow
@@ -103,8 +103,8 @@ class Study:
         """
         digests = {}
         for suite, _ in self.tasks:
-            if suite in suites.BENCHMARKS:
-                digests[suite] = lists.digest(suite)
+            if suites.is_listed(suite):
+                digests[suite] = suites.digest(suite)
         checkpoints_used = set()
         for suite, _ in self.tasks:
             checkpoints_used.add(self.checkpoint(suite))
@@ -116,6 +116,8 @@ class Study:
         elif names:
             about["checkpoints"] = fingerprints
         about |= {"version": __version__, "weights": weights_sha256(), "lists": digests}
+        if digests and self.seed + self.seeds > 1:
+            about["starts"] = starts.settings()
         return {**about, "world": _world_digest(self)}
 
 
@@ -219,7 +221,7 @@ def _check_policy(study: Study) -> None:
             there = ", ".join(names) or "none"
             raise BadStudy(
                 f"Study: no {MINI} for {suite} ships (there is {there}); run: python -m vap_core "
-                f"train policy --suite {suite}"
+                f"train policy --suite {suites.benchmark_name(suite)}"
             )
     if policy in PRIVILEGED and study.audit:
         raise BadStudy(
@@ -230,6 +232,12 @@ def _check_policy(study: Study) -> None:
         raise BadStudy(
             f"Study: policy {policy!r} reads the simulator, not pictures; no method can prompt "
             "it. Use --method generic."
+        )
+    absent = [suite for suite, _ in study.tasks if suite.endswith(suites.ABSENT)]
+    if policy == "expert" and absent:
+        raise BadStudy(
+            f"Study: {absent[0]} leaves the target out, which the expert would go for; leave that "
+            "suite or the expert out."
         )
     if policy in POLICIES and _any_method(study, needs_token):
         raise BadStudy(

@@ -19,7 +19,7 @@ def ablate_text(
     Raises: what `engine.run` raises.
     """
     ablation = ABLATIONS[name]
-    episodes = run(study, folder, workers=workers, record=record)
+    episodes = run(study, folder, workers=workers, record=record, what_for=f"ablate {name}")
     results = arm_results(ablation, episodes)
     picture = folder / "effects.png"
     effects_figure(results, ablation.question).savefig(picture, dpi=200)

@@ -1,10 +1,12 @@
 """The sections of a report as Markdown."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from vap_core.base.tables import markdown
 from vap_core.evaluation import paper
 from vap_core.evaluation.metrics import TRACK
+from vap_core.evaluation.readings import Reading, readings_rows
 from vap_core.evaluation.report.cells import (
     comparison_rows,
     outcome_rows,
@@ -51,6 +53,12 @@ FAILURES_NOTE = (
     "neighbouring thresholds under which a label stays the same.\n"
     "`python -m vap_core diagnose` lists the failures and opens one at the frame that decided it; "
     "runs older than the diagnosis are left out."
+)
+
+READINGS_NOTE = (
+    "Every reading of these lists, with any weights: a list that was read while something was "
+    "tuned is no test of it any more.\n"
+    "`python -m vap_core readings` has the lists that are not in this report."
 )
 
 
@@ -131,3 +139,10 @@ def provenance_section(origins: "pd.DataFrame") -> str:
                 parts.append(f"{name} {line[name]}")
         lines.append(f"- {line['run']}: {', '.join(parts)}\n  `{line['command']}`")
     return "## Provenance\n\n" + "\n".join(lines)
+
+
+def readings_section(readings: Sequence[Reading]) -> str:
+    """How often the lists of the report were read; "" where none of them ships."""
+    if not readings:
+        return ""
+    return f"## Readings of the lists\n\n{READINGS_NOTE}\n\n{markdown(readings_rows(readings))}"
