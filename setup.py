@@ -1,7 +1,7 @@
 """What pyproject.toml cannot say: a wheel holds the files of data/ that the package reads.
 
-They go to vap_core/data (vap_core.base.files.DATA); a checkout reads them where they are. MANIFEST.in
-names the same files for a source distribution.
+They go to vap_core/data (vap_core.base.files.DATA); a checkout reads them where they are.
+MANIFEST.in names the same files for a source distribution.
 """
 
 import shutil

@@ -475,11 +475,22 @@ def test_the_device_is_chosen_or_named(monkeypatch: pytest.MonkeyPatch) -> None:
     assert runtime.select_runtime("cpu") == runtime.Runtime(
         torch.device("cpu"), None, batched=False
     )
-    monkeypatch.setenv(runtime.DEVICE_VARIABLE, "cpu")
+    monkeypatch.setenv("VAP_DEVICE", "cpu")
     assert runtime.select_runtime().device == torch.device("cpu")
-    monkeypatch.setenv(runtime.DEVICE_VARIABLE, "abacus")
+    monkeypatch.setenv("VAP_DEVICE", "abacus")
     with pytest.raises(UnknownName, match="device 'abacus' is not on this machine"):
         runtime.select_runtime()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+@pytest.mark.parametrize("stack", ["embedded", "foundation"])
+def test_a_gpu_that_is_asked_for_and_not_there_is_an_error(
+    monkeypatch: pytest.MonkeyPatch, stack: str
+) -> None:
+    """Also for the embedded stack, which computes on the CPU whatever is asked for."""
+    monkeypatch.setenv("VAP_DEVICE", "cuda")
+    with pytest.raises(UnknownName, match=r"device 'cuda' is not on this machine .* VAP_DEVICE"):
+        load_stack(stack)
 
 
 # --- The whole stack -----------------------------------------------------------------------------------------------------

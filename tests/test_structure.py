@@ -74,7 +74,7 @@ def layer(module: str) -> int:
 
 
 def test_the_package_shows_at_most_18_entries() -> None:
-    entries = {path.name for path in ROOT.iterdir()} - {"__pycache__"}
+    entries = {path.name for path in ROOT.iterdir()} - {"__pycache__", "py.typed"}
     assert len(entries) <= 18, sorted(entries)
     folders = {path.name for path in ROOT.iterdir() if path.is_dir()} - {"__pycache__"}
     assert folders == {name for names in LAYERS if names != METHOD for name in names}

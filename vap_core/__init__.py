@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from vap_core.attend import Prompting as Prompting
     from vap_core.base.errors import VapError as VapError
     from vap_core.base.photos import load_photo as load_photo
+    from vap_core.evaluation.diagnosis import diagnose as diagnose
     from vap_core.evaluation.methods import METHODS as METHODS
     from vap_core.evaluation.metrics import rate as rate
     from vap_core.evaluation.photos.run import measure_photos as measure_photos
@@ -57,6 +58,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "attend": ["Attender", "Prompting"],
         "base.errors": ["VapError"],
         "base.photos": ["load_photo"],
+        "evaluation.diagnosis": ["diagnose"],
         "evaluation.methods": ["METHODS"],
         "evaluation.metrics": ["rate"],
         "evaluation.photos.run": ["measure_photos"],

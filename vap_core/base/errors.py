@@ -68,7 +68,8 @@ class BadStudy(VapError):
 
 
 class BadPolicy(VapError):
-    """A checkpoint that is absent, would execute code, is damaged, or does not fit the suite."""
+    """A policy that does not follow its protocol, or a checkpoint that is absent or damaged, would
+    execute code, or does not fit the suite."""
 
 
 class BadEndpoint(VapError):
