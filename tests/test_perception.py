@@ -19,8 +19,8 @@ from vap_core.perception.embedded import backbone as features
 from vap_core.perception.embedded import detector as detect
 from vap_core.perception.embedded import encoder as embed
 from vap_core.perception.embedded import segmenter as segment
+from vap_core.perception.embedded import taps, weights
 from vap_core.perception.embedded import tracker as track
-from vap_core.perception.embedded import weights
 from vap_core.perception.embedded.tracker import cells
 from vap_core.perception.embedded.tracker.components import argmax_planes
 from vap_core.perception.embedded.tracker.state import RECENT
@@ -215,10 +215,10 @@ def test_folded_backbone_is_the_published_one() -> None:
     image = noise(0, 224, 224)
     with torch.inference_mode():
         published = net.eval().extract_features(features.normalise(torch.from_numpy(image)[None]))
-    found = features.features([image], list(features.CHANNELS))
+    found = features.features([image], list(taps.CHANNELS))
     assert torch.allclose(found["head"], published, atol=1e-3)
-    assert {tap: value.shape[1] for tap, value in found.items()} == features.CHANNELS
-    assert {tap: 224 // value.shape[2] for tap, value in found.items()} == features.STRIDE
+    assert {tap: value.shape[1] for tap, value in found.items()} == taps.CHANNELS
+    assert {tap: 224 // value.shape[2] for tap, value in found.items()} == taps.STRIDE
 
 
 def test_text_is_minilm() -> None:

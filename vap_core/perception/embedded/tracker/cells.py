@@ -8,20 +8,11 @@ from functools import cache
 
 import cv2
 import numpy as np
-import torch
-from jaxtyping import Bool, Float, Float32, Int64, UInt8
-from torch import Tensor, nn
-from torch.nn import functional as F  # noqa: N812
+from jaxtyping import Bool, Float32, Int64
 
 from vap_core.base.types import Rgb, value
-from vap_core.perception.embedded.backbone import (
-    CHANNELS,
-    STRIDE,
-    Trunk,
-    normalise,
-    resize_and_pad,
-)
 from vap_core.perception.embedded.runtime import Network
+from vap_core.perception.embedded.taps import STRIDE, resize_and_pad
 
 GRAPH = "tracker.onnx"
 TAP = "b4"
@@ -49,23 +40,10 @@ class FrameMemory:
     labels: Labels
 
 
-class CellNetwork(nn.Module):
-    """The shallow backbone: an image in, unit-length features of every cell out, row by row."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.trunk = Trunk([TAP])
-
-    def forward(self, rgb: UInt8[Tensor, "1 h w 3"]) -> tuple[Float[Tensor, "p c"]]:
-        maps = self.trunk(normalise(rgb))[TAP][0]
-        keys = maps.reshape(CHANNELS[TAP], -1).T
-        return (F.normalize(keys, dim=1).contiguous(),)
-
-
 def embed_cells(image: Rgb, network: Network) -> tuple[Float32[np.ndarray, "p c"], Grid]:
     """Unit-length features of every cell, row by row, and the grid.
 
-    `network` computes a `CellNetwork`.
+    `network` computes a `cell_network.CellNetwork`.
     """
     resized, _ = resize_and_pad(image, SIDE)
     (keys,) = network(resized[None])
@@ -87,19 +65,22 @@ def propagate(
     if selected is None:
         selected = np.ones(len(keys), bool)
     cells = np.flatnonzero(selected)
-    query = torch.from_numpy(keys[cells])
+    query = keys[cells]
     cosines = []
     for frame in memory:
-        cosine = query @ torch.from_numpy(frame.keys).T
+        cosine = query @ frame.keys.T
         if local:
-            cosine = cosine + _distance_bias(grid)[cells]
+            cosine += _distance_bias(grid)[cells]
         cosines.append(cosine)
-    best, neighbours = torch.cat(cosines, dim=1).topk(NEIGHBOURS, dim=1)
-    weight = torch.softmax(best / TEMPERATURE, dim=1)
-    known = torch.from_numpy(np.concatenate([frame.labels for frame in memory], axis=1))
+    joined = np.concatenate(cosines, axis=1)
+    neighbours = np.argpartition(joined, -NEIGHBOURS, axis=1)[:, -NEIGHBOURS:]
+    best = np.take_along_axis(joined, neighbours, axis=1)
+    weight = np.exp((best - best.max(axis=1, keepdims=True)) / np.float32(TEMPERATURE))
+    weight /= weight.sum(axis=1, keepdims=True)
+    known = np.concatenate([frame.labels for frame in memory], axis=1)
     labels = np.zeros((len(known), len(keys)), np.float32)
     labels[0] = 1
-    labels[:, cells] = (known[:, neighbours] * weight).sum(-1).numpy()
+    labels[:, cells] = (known[:, neighbours] * weight).sum(axis=-1)
     return labels
 
 
@@ -167,8 +148,8 @@ def cosine_lead(
 
 
 @cache
-def _distance_bias(grid: Grid) -> torch.Tensor:
+def _distance_bias(grid: Grid) -> Float32[np.ndarray, "p p"]:
     """0 between cells at most `RADIUS` apart, `TOO_FAR` between others."""
     rows, cols = np.mgrid[0 : grid[0], 0 : grid[1]].reshape(2, -1)
     distance = np.maximum(abs(rows[:, None] - rows), abs(cols[:, None] - cols))
-    return torch.from_numpy(np.where(distance > RADIUS, np.float32(TOO_FAR), np.float32(0)))
+    return np.where(distance > RADIUS, np.float32(TOO_FAR), np.float32(0))
