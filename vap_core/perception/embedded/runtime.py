@@ -69,7 +69,7 @@ def load_network(
     values: list[OrtValue] = []
     for key, weight in weights.items():
         names.append(key)
-        values.append(OrtValue.ortvalue_from_numpy(np.ascontiguousarray(weight)))
+        values.append(OrtValue.ortvalue_from_numpy(np.asarray(weight, order="C")))
     options.add_external_initializers(names, values)
     session = start_session(graph, options)
     made_with = session.get_modelmeta().custom_metadata_map.get(WEIGHTS_KEY, "unknown weights")

@@ -65,23 +65,34 @@ def propagate(
     if selected is None:
         selected = np.ones(len(keys), bool)
     cells = np.flatnonzero(selected)
-    query = keys[cells]
-    cosines = []
-    for frame in memory:
-        cosine = query @ frame.keys.T
-        if local:
-            cosine += _distance_bias(grid)[cells]
-        cosines.append(cosine)
-    joined = np.concatenate(cosines, axis=1)
-    neighbours = np.argpartition(joined, -NEIGHBOURS, axis=1)[:, -NEIGHBOURS:]
-    best = np.take_along_axis(joined, neighbours, axis=1)
-    weight = np.exp((best - best.max(axis=1, keepdims=True)) / np.float32(TEMPERATURE))
+    bias = _distance_bias(grid)[cells] if local else np.float32(0)
+    cosines = [keys[cells] @ frame.keys.T + bias for frame in memory]
+    neighbours, best = largest(np.concatenate(cosines, axis=1), NEIGHBOURS)
+    weight = np.exp((best - best[:, :1]) / np.float32(TEMPERATURE))
     weight /= weight.sum(axis=1, keepdims=True)
     known = np.concatenate([frame.labels for frame in memory], axis=1)
     labels = np.zeros((len(known), len(keys)), np.float32)
     labels[0] = 1
     labels[:, cells] = (known[:, neighbours] * weight).sum(axis=-1)
     return labels
+
+
+def largest(
+    rows: Float32[np.ndarray, "q p"], k: int
+) -> tuple[Int64[np.ndarray, "q k"], Float32[np.ndarray, "q k"]]:
+    """Columns and values of the k largest numbers of every row, in falling order; consumes `rows`.
+
+    For a handful of numbers this takes a fifth of the time of a partition.
+    """
+    columns = np.zeros((len(rows), k), np.int64)
+    values = np.zeros((len(rows), k), np.float32)
+    row = np.arange(len(rows))
+    for i in range(k):
+        column = rows.argmax(axis=1)
+        columns[:, i] = column
+        values[:, i] = rows[row, column]
+        rows[row, column] = -np.inf
+    return columns, values
 
 
 def cells_near(
