@@ -5,7 +5,7 @@ The public names below load when they are first used: importing this package loa
 or rerun. Start reading at attend.py.
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import lazy_loader
 
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
+_load, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "attend": ["Attender", "Prompting"],
@@ -83,3 +83,16 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "vote": ["similarity"],
     },
 )
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name. Raises: MissingPart: its extra is not installed."""
+    try:
+        return _load(name)
+    except ModuleNotFoundError as error:
+        from vap_core.base.extras import missing_part
+
+        part = missing_part(error)
+        if part is None:
+            raise
+        raise part from error

@@ -3,6 +3,7 @@
 import os
 
 from vap_core.base.errors import UnknownName
+from vap_core.base.extras import require
 
 VARIABLE = "VAP_DEVICE"
 """Environment variable that names the device of foundation models and policies: cpu, cuda:1, ..."""
@@ -13,6 +14,7 @@ def device_name(device: str | None = None) -> str:
 
     Raises: UnknownName: no such device on this machine.
     """
+    require("policy", "a choice of device")
     import torch
 
     name = device or os.environ.get(VARIABLE)

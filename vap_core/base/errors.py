@@ -47,6 +47,10 @@ class MissingWeights(VapError):
     """Weights that are not on this machine, or whose checksum differs from the manifest."""
 
 
+class MissingPart(VapError):
+    """An optional part of the package that is not installed (base.extras)."""
+
+
 class MissingMeshes(VapError):
     """MuJoCo Menagerie's meshes of a robot, neither on this machine nor to be downloaded."""
 

