@@ -25,7 +25,8 @@ WIDTH = 384
 HEADS = 12
 LAYERS = 6
 MAX_TOKENS = 256
-Tokens = Float32[np.ndarray, "t c"]
+Tokens = Float32[np.ndarray, "_ _"]
+"""A row for every token."""
 Weights = dict[str, np.ndarray]
 
 

@@ -187,7 +187,7 @@ def read_tensors(path: Path) -> Weights:
         flat = storages[tensor.storage[2]][tensor.offset :]
         steps = [step * flat.itemsize for step in tensor.strides]
         view = np.lib.stride_tricks.as_strided(flat, tensor.shape, steps, writeable=False)
-        arrays[name] = np.ascontiguousarray(view)
+        arrays[name] = np.array(view, order="C")
     return arrays
 
 
