@@ -303,8 +303,8 @@ def test_pins_are_commits_and_hashes_of_safe_files() -> None:
     used = {name for models in sources.KINDS.values() for name in models} | {sources.TEXT}
     assert used == set(sources.MODELS)
     assert sources.models_of("embedded") == (sources.TEXT,)
-    with pytest.raises(UnknownName, match="known: foundation, foundation-small"):
-        sources.models_of("embedded")
+    with pytest.raises(UnknownName, match="known: embedded, foundation, foundation-small"):
+        sources.models_of("huge")
 
 
 def test_commands_pull_and_list(tmp_path: Path) -> None:

@@ -80,11 +80,11 @@ def _blocks() -> Iterator[Block]:
                 groups=wide,
             )
             project = Convolution(f"{within}_project_conv", f"{within}_bn2", wide, outputs)
-            convolutions = (depthwise, project)
+            convolutions = [depthwise, project]
             if expansion > 1:
                 expand = Convolution(f"{within}_expand_conv", f"{within}_bn0", given, wide)
-                convolutions = (expand, *convolutions)
-            yield Block(convolutions, residual=stride == 1 and given == outputs)
+                convolutions.insert(0, expand)
+            yield Block(tuple(convolutions), residual=stride == 1 and given == outputs)
             index += 1
 
 
