@@ -1,6 +1,7 @@
 """The parts that ship keep the contracts, and the contracts find what an implementation does wrong."""
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -130,6 +131,30 @@ def test_randomness_of_its_own_is_found() -> None:
         test_policy.test_an_episode_repeats_its_actions(Wild(), WHERE)
 
 
+# --- The page ------------------------------------------------------------------------------------
+
+PAGE = (ROOT / "docs" / "contracts.md").read_text()
+
+
+def test_the_page_names_every_test_of_every_contract() -> None:
+    named = {}
+    for section in PAGE.split("\n## ")[1:]:
+        named[section.split()[0].lower()] = set(re.findall(r"`(test_\w+)`", section))
+    held = {}
+    for path in sorted(Path(given.__file__).parent.glob("test_*.py")):
+        held[path.stem.removeprefix("test_")] = set(
+            re.findall(r"^def (test_\w+)", path.read_text(), re.M)
+        )
+    assert named == held
+
+
+def test_the_documented_encoder_keeps_the_contract(scene: RenderedScene) -> None:
+    (block,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    names: dict[str, Any] = {}
+    exec(compile(block, "documented", "exec"), names)
+    kept(test_encoder, sanity=False, encoder=names["MeanColour"](), scene=scene)
+
+
 # --- The command ---------------------------------------------------------------------------------
 
 MINE = """
@@ -172,6 +197,7 @@ def test_the_command_tests_what_it_is_given(tmp_path: Path) -> None:
         "test_sanity_most_objects_of_a_rendered_table_have_a_box",
         "test_rows_are_float32_of_length_1",
         "test_no_crop_gives_no_row",
+        "test_sanity_an_object_is_most_like_itself",
     }
     assert "test_tracker" not in done.stdout
 

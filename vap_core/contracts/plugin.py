@@ -19,3 +19,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         default="widowx-pick/pick-straw-cup",
         help="where a policy or prompter is run; default widowx-pick/pick-straw-cup",
     )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Refuse a run of the contracts in which nothing is given to test."""
+    asked = any(config.getoption(name) for name in PROTOCOLS)
+    if not asked and "vap_core.contracts" in config.args:
+        options = ", ".join(f"--{name}" for name in PROTOCOLS)
+        raise pytest.UsageError(f"give what is to be tested, as MODULE:NAME: {options}")
