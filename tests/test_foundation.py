@@ -508,7 +508,7 @@ def test_the_whole_attender_runs_and_repeats_its_bits(
     weights: Path, scene: Pair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(store.VARIABLE, str(weights))
-    monkeypatch.setenv(runtime.DEVICE_VARIABLE, "cpu")
+    monkeypatch.setenv("VAP_DEVICE", "cpu")
     stack = load_stack("foundation")
     assert stack.name == "foundation"
     assert stack.encoder.name.startswith("dinov2-base-")
