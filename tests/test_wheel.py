@@ -65,9 +65,8 @@ def environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("environment") / "venv"
     uv = [sys.executable, "-m", "uv"]
     subprocess.run([*uv, "venv", "--quiet", "--python", sys.executable, folder], check=True)
-    subprocess.run(
-        [*uv, "pip", "install", "--quiet", "--python", folder / "bin" / "python", wheel], check=True
-    )
+    install = [*uv, "pip", "install", "--quiet", "--python", folder / "bin" / "python"]
+    subprocess.run([*install, wheel, "pytest"], check=True)
     return folder
 
 
@@ -134,6 +133,11 @@ def test_an_installed_wheel_registers_grounds_rolls_out_and_diagnoses(
         "error: the policy mini-pi0 needs torch, which is not installed; "
         "run: pip install 'vap-core[policy]'"
     )
+    (here / "mine.py").write_text(
+        "from vap_core.perception.embedded import encoder\nmake = encoder.load\n"
+    )
+    contracts = ("--pyargs", "vap_core.contracts", "--encoder", "mine:make", "-p", "no:cacheprovider")
+    assert "5 passed" in run("-m", "pytest", *contracts).stdout
     written = {path.relative_to(here).parts[0] for path in here.rglob("*")}
-    assert written == {"photos", "data", "runs"}
+    assert written == {"photos", "data", "runs", "mine.py", "__pycache__"}
     assert (tmp_path / ".cache" / "vap-core" / "weights-hub").is_dir()

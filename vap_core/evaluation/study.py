@@ -162,7 +162,7 @@ def worker_modules(study: Study) -> tuple[str, ...]:
     )
     if study.policy in POLICIES:
         return modules
-    return (*modules, "lerobot.policies")
+    return (*modules, "vap_core.policies.lerobot.adapter", "lerobot.policies")
 
 
 def make_trial(study: Study, rows: Sequence[EpisodeRow], method: str, bank: Path) -> Trial:
@@ -289,7 +289,7 @@ def _policy(
     suite = suites.suite(row.suite)
     if study.policy in POLICIES:
         return make_policy(study.policy, scene, suite, stack)
-    from vap_core.policies.lerobot import adapter
+    from vap_core.policies.lerobot import adapter  # and torch
 
     policy = adapter.load_for_suite(study.checkpoint(row.suite), scene, suite)
     if not needs_token(method):
