@@ -136,7 +136,14 @@ def test_an_installed_wheel_registers_grounds_rolls_out_and_diagnoses(
     (here / "mine.py").write_text(
         "from vap_core.perception.embedded import encoder\nmake = encoder.load\n"
     )
-    contracts = ("--pyargs", "vap_core.contracts", "--encoder", "mine:make", "-p", "no:cacheprovider")
+    contracts = (
+        "--pyargs",
+        "vap_core.contracts",
+        "--encoder",
+        "mine:make",
+        "-p",
+        "no:cacheprovider",
+    )
     assert "5 passed" in run("-m", "pytest", *contracts).stdout
     written = {path.relative_to(here).parts[0] for path in here.rglob("*")}
     assert written == {"photos", "data", "runs", "mine.py", "__pycache__"}
