@@ -13,6 +13,7 @@ from jaxtyping import Float32
 
 from vap_core import __version__
 from vap_core.base.errors import BadStudy, one_of
+from vap_core.base.extras import require
 from vap_core.evaluation.methods import (
     METHODS,
     hidden_calls,
@@ -68,7 +69,7 @@ class Study:
 
     `episodes` None takes whole lists. `images_every`, `follow` and `audit` are rollout.Trial's.
 
-    Raises: UnknownName, BadStudy, when it is built from what does not fit together.
+    Raises: UnknownName, BadStudy, when it is built from what does not fit together; MissingPart.
     """
 
     tasks: tuple[tuple[str, str], ...]
@@ -215,6 +216,8 @@ def _check_names(study: Study) -> None:
 
 def _check_policy(study: Study) -> None:
     policy = study.policy
+    if policy not in POLICIES:
+        require("policy", f"the policy {policy}")
     for suite, _ in study.tasks:
         if policy == MINI and not shipped(suite).is_dir():
             names = sorted(path.name for path in SHIPPED.glob(f"{MINI}-*"))
