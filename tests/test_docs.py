@@ -4,7 +4,7 @@ import ast
 import importlib
 import re
 import shlex
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import pytest
@@ -13,6 +13,7 @@ import typer
 from tests.pages import FENCE, PAGES, ROOT, blocks, commands, spans
 from tests.test_stills import COMMITTED
 from vap_core.cli import app
+from vap_core.contracts import plugin
 from vap_core.evaluation.ablations import arms
 from vap_core.evaluation.methods import known_methods
 from vap_core.perception.stacks import STACKS
@@ -24,6 +25,7 @@ MADE_LATER = ("data/runs", "data/memory", "data/objects", "data/cache", "data/ph
 """Folders that commands make, and that do not ship."""
 RECORD = "data/policies/README.md"
 """The card of the shipped policies names the commands of their day, which are no more."""
+CONTRACT_OPTIONS = set(re.findall(r'"(--[a-z-]+)"', Path(plugin.__file__).read_text()))
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 
 
@@ -104,7 +106,7 @@ def options(command: Any) -> set[str]:
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page != RECORD])
 def test_options_are_there(page: str) -> None:
-    known = options(typer.main.get_command(app))
+    known = options(typer.main.get_command(app)) | CONTRACT_OPTIONS
     for span in spans(page):
         for option in re.findall(r"(?<!\S)--[a-z][\w-]*", span):
             assert option in known, span
