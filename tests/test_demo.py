@@ -27,30 +27,19 @@ ENV = {**os.environ, "OMP_NUM_THREADS": "1"}
 
 
 def command(out: Path, episodes: int) -> list[str]:
-    return [
-        sys.executable,
-        "-m",
-        "vap_core",
-        "demo",
-        "--out",
-        str(out),
-        "--episodes",
-        str(episodes),
-        "--workers",
-        "2",
-    ]
+    return ["demo", "--out", str(out), "--episodes", str(episodes), "--workers", "2"]
 
 
 @pytest.mark.slow
 def test_it_ends_with_the_whole_table_and_goes_on_from_it(tmp_path: Path) -> None:
     """That a killed run goes on is proven in test_engine."""
     out = tmp_path / "demo"
-    done = subprocess.run(command(out, 1), env=ENV, capture_output=True, text=True, timeout=400)
+    done = vap(*command(out, 1))
     assert done.returncode == 0, done.stderr
     _complete(out, done.stdout)
-    again = vap(*command(out, 1)[3:])
+    again = vap(*command(out, 1))
     assert again.stdout == done.stdout
-    other = vap(*command(out, 2)[3:])
+    other = vap(*command(out, 2))
     assert other.returncode == 2
     assert "holds another run" in other.stderr
 
@@ -69,7 +58,7 @@ def _complete(out: Path, printed: str) -> None:
     assert (out / "figure.png").stat().st_size > 10_000
     recordings = sorted((out / "recordings").glob("*.rrd"))
     assert len(recordings) == 4
-    for recording in recordings[::2]:
+    for recording in recordings[:1]:
         done = subprocess.run(
             [sys.executable, "-m", "rerun", "rrd", "verify", str(recording)],
             capture_output=True,
@@ -108,7 +97,7 @@ def same(one: Episode, other: Episode) -> None:
 
 def test_neither_batch_nor_order_nor_global_seeds_change_an_episode(bank: Path) -> None:
     trial = make_trial(STUDY, STUDY.rows(SUITE, TASK), "vap", bank)
-    rows = [replace(row, max_steps=8) for row in STUDY.rows(SUITE, TASK)]
+    rows = [replace(row, max_steps=5) for row in STUDY.rows(SUITE, TASK)]
     together = list(rollout(trial, rows, batch=3))
     np.random.seed(123)  # noqa: NPY002
     torch.manual_seed(123)
@@ -227,6 +216,7 @@ def test_a_run_in_use_is_left_alone(tmp_path: Path) -> None:
         pass
 
 
+@pytest.mark.sweep
 def test_a_dead_worker_is_said_and_what_was_done_stays(tmp_path: Path) -> None:
     out = tmp_path / "demo"
     code = (

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.command import vap
 from vap_core.evaluation import engine, store
 from vap_core.evaluation import study as experiments
 from vap_core.evaluation.engine import missing_jobs, result_key
@@ -35,6 +36,8 @@ def command(out: Path, episodes: int, several: bool = False) -> list[str]:
         "--suite",
         "simpler-bridge",
         *(("--suite", "tabletop") if several else ()),
+        "--methods",
+        "generic",
         "--policy",
         "random",
         "--episodes",
@@ -114,15 +117,8 @@ def hear_interrupts() -> None:
 def check(torn: Path, whole: Path, episodes: int, several: bool = False) -> None:
     """A run that was killed and goes on ends with the rows of an undisturbed one."""
     for out in (torn, whole):
-        subprocess.run(
-            command(out, episodes, several),
-            env=ENV,
-            cwd=out.parent,
-            check=True,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            timeout=1800,
-        )
+        done = vap(*command(out, episodes, several)[3:])
+        assert done.returncode == 0, done.stderr
     pd.testing.assert_frame_equal(told(torn), told(whole))
     assert told(whole).key.is_unique
     assert {k for k, _ in read_traces(torn)} == {k for k, _ in read_traces(whole)}

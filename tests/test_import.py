@@ -47,7 +47,8 @@ def test_type_checkers_see_the_names_that_load() -> None:
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and str(node.module).startswith("vap_core."):
             for alias in node.names:
-                seen.add(alias.name)
+                if alias.asname is not None:
+                    seen.add(alias.name)
     assert seen == set(vap_core.__all__)
 
 
@@ -59,3 +60,23 @@ def test_every_name_of_a_package_exists(package: str) -> None:
     module = import_module(f"vap_core.{package}")
     for name in module.__all__:
         assert getattr(module, name) is not None
+
+
+def test_the_engine_imports_no_policy() -> None:
+    """The parent of a run starts its workers at once; only they load torch and lerobot."""
+    code = (
+        "import sys, vap_core.evaluation.engine; "
+        "print([m for m in ('torch', 'lerobot', 'transformers', 'rerun') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_the_adapter_imports_no_lerobot() -> None:
+    """A policy in another process needs none."""
+    code = (
+        "import sys, vap_core.policies.lerobot.adapter; "
+        "print([m for m in ('lerobot', 'transformers') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

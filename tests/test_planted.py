@@ -1,4 +1,4 @@
-"""Failures planted in the real simulator, ten of each kind, are told apart: wrong prompts by hand-made masks, failed hands by hand-made policies."""
+"""Failures planted in the real simulator, ten of each kind in the sweeps and two every day, are told apart: wrong prompts by hand-made masks, failed hands by hand-made policies."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
@@ -228,7 +228,7 @@ def failures(
     plant: Plant,
     policy: Still,
     steps: int,
-    n: int = N,
+    n: int,
 ) -> list[Diagnosis]:
     """Diagnoses of the first n rows in which the plant took: in which the hand could do what it was to do, and failed."""
     suite, found = suites.suite(rows[0].suite), []
@@ -262,10 +262,12 @@ def failures(
 
 BRIDGE = ("simpler-bridge", "put-owl-figurine")
 FIRST = "no proposal", "shifted proposal", "distractor vote", "drift"
+often = pytest.mark.parametrize("n", [2, pytest.param(N, marks=pytest.mark.sweep)])
 
 
+@often
 @pytest.mark.parametrize("kind", FIRST)
-def test_case_1(world, kind):  # type: ignore[no-untyped-def]
+def test_case_1(world, kind, n):  # type: ignore[no-untyped-def]
     scene, rows = world(*BRIDGE)
     plants: dict[str, Plant] = {
         "no proposal": lambda step, row, masks: {camera: {} for camera in masks},
@@ -273,15 +275,16 @@ def test_case_1(world, kind):  # type: ignore[no-untyped-def]
         "distractor vote": lambda step, row, masks: swapped(masks, row, list(masks)),
         "drift": lambda step, row, masks: swapped(masks, row, list(masks) if step >= 2 else ()),
     }
-    found = failures(scene, rows, plants[kind], Still(), 8)
-    assert [(each.case, each.sub_case) for each in found] == [("case 1", kind)] * N
+    found = failures(scene, rows, plants[kind], Still(), 8, n)
+    assert [(each.case, each.sub_case) for each in found] == [("case 1", kind)] * n
     assert {each.frame_index for each in found} == {4 if kind == "drift" else 0}, (
         "images are taken every other step"
     )
 
 
+@often
 @pytest.mark.parametrize(("since", "kind"), [(0, "views disagree"), (2, "views drift apart")])
-def test_case_2(world, since, kind):  # type: ignore[no-untyped-def]
+def test_case_2(world, since, kind, n):  # type: ignore[no-untyped-def]
     scene, rows = world("vlabench", "select-shoe")
     astray = rows[0].cameras[1]
     found = failures(
@@ -290,10 +293,11 @@ def test_case_2(world, since, kind):  # type: ignore[no-untyped-def]
         lambda step, row, masks: swapped(masks, row, [astray] if step >= since else ()),
         Still(),
         8,
+        n,
     )
     assert [(each.case, each.sub_case, each.camera, each.frame_index) for each in found] == [
         ("case 2", kind, astray, 2 * since)
-    ] * N
+    ] * n
 
 
 HANDS = {
@@ -306,8 +310,8 @@ HANDS = {
 """Policies that fail at the object, and the steps that they are given."""
 
 
+@often
 @pytest.mark.parametrize("kind", HANDS)
-@pytest.mark.parametrize("n", [3, pytest.param(N, marks=pytest.mark.sweep)])
 def test_case_3(world, kind, n):  # type: ignore[no-untyped-def]
     scene, rows = world(*BRIDGE)
     policy, steps = HANDS[kind]

@@ -47,6 +47,10 @@ class MissingWeights(VapError):
     """Weights that are not on this machine, or whose checksum differs from the manifest."""
 
 
+class MissingPart(VapError):
+    """An optional part of the package that is not installed (base.extras)."""
+
+
 class MissingMeshes(VapError):
     """MuJoCo Menagerie's meshes of a robot, neither on this machine nor to be downloaded."""
 
@@ -68,7 +72,8 @@ class BadStudy(VapError):
 
 
 class BadPolicy(VapError):
-    """A checkpoint that is absent, would execute code, is damaged, or does not fit the suite."""
+    """A policy that does not follow its protocol, or a checkpoint that is absent or damaged, would
+    execute code, or does not fit the suite."""
 
 
 class BadEndpoint(VapError):

@@ -13,6 +13,7 @@ from jaxtyping import Float32
 
 from vap_core import __version__
 from vap_core.base.errors import BadStudy, one_of
+from vap_core.base.extras import require
 from vap_core.evaluation.methods import (
     METHODS,
     has_no_command,
@@ -39,7 +40,7 @@ from vap_core.perception.describe import AttributeCaptioner, Captioner, with_des
 from vap_core.perception.embedded.weights import weights_sha256
 from vap_core.perception.protocols import Stack
 from vap_core.perception.stacks import STACKS, load_stack
-from vap_core.policies.lerobot import adapter, checkpoints
+from vap_core.policies.lerobot import checkpoints
 from vap_core.policies.mini_pi0 import token_file
 from vap_core.policies.mini_pi0.learned_token import WORD
 from vap_core.policies.mini_pi0.teach_token import MODEL, teach, teach_own
@@ -72,7 +73,7 @@ class Study:
     `episodes` None takes whole lists. `images_every`, `follow` and `audit` are rollout.Trial's.
     `temperature` scales the sampling noise of a mini-pi0; None leaves it as its checkpoint says.
 
-    Raises: UnknownName, BadStudy, when it is built from what does not fit together.
+    Raises: UnknownName, BadStudy, when it is built from what does not fit together; MissingPart.
     """
 
     tasks: tuple[tuple[str, str], ...]
@@ -170,7 +171,7 @@ def worker_modules(study: Study) -> tuple[str, ...]:
     )
     if study.policy in POLICIES:
         return modules
-    return (*modules, "lerobot.policies")
+    return (*modules, "vap_core.policies.lerobot.adapter", "lerobot.policies")
 
 
 def make_trial(study: Study, rows: Sequence[EpisodeRow], method: str, bank: Path) -> Trial:
@@ -222,6 +223,8 @@ def _check_names(study: Study) -> None:
 
 def _check_policy(study: Study) -> None:
     policy = study.policy
+    if policy not in POLICIES:
+        require("policy", f"the policy {policy}")
     for suite, _ in study.tasks:
         if policy == MINI and not shipped(suite).is_dir():
             names = sorted(path.name for path in SHIPPED.glob(f"{MINI}-*"))
@@ -317,6 +320,8 @@ def _policy(
     suite = suites.suite(row.suite)
     if study.policy in POLICIES:
         return make_policy(study.policy, scene, suite, stack)
+    from vap_core.policies.lerobot import adapter  # and torch
+
     policy = adapter.load_for_suite(
         study.checkpoint(row.suite), scene, suite, temperature=study.temperature
     )

@@ -6,7 +6,6 @@ from typing import Any
 import torch
 
 from vap_core.policies.hooks import Phrases
-from vap_core.policies.mini_pi0.processor_mini_pi0 import SPLIT, UNKNOWN, Words
 
 Positions = dict[str, list[int]]
 """The places of every query's tokens, by query."""
@@ -44,6 +43,8 @@ def _spellings(preprocessor: Any, phrase: str) -> list[list[int]]:
 
     A phrase that the vocabulary lacks has none.
     """
+    from vap_core.policies.mini_pi0.processor_mini_pi0 import SPLIT, UNKNOWN, Words  # lerobot's
+
     for step in preprocessor.steps:
         if isinstance(step, Words):
             known = step._vocabulary
