@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from tests.test_lists import gap_m
+from vap_core.base.errors import BadStudy
 from vap_core.base.files import DATA
+from vap_core.evaluation.diagnosis.recordings import study_of
 from vap_core.evaluation.engine import result_key
 from vap_core.evaluation.publish import read_published
 from vap_core.evaluation.study import Study
@@ -43,6 +45,23 @@ def test_only_seeds_that_change_the_starts_say_so_in_the_configuration() -> None
         assert ("starts" in study.configuration()) == said
     warm_up = Study((("widowx-pick", "pick-cup"),), ("generic",), policy="random", seed=3)
     assert "starts" not in warm_up.configuration()
+
+
+def test_a_temperature_is_a_setting_where_it_is_given() -> None:
+    plain = Study((TASK,), ("generic",), policy="mini-pi0")
+    assert "temperature" not in plain.configuration()
+    warm = replace(plain, temperature=0.5)
+    assert warm.configuration()["temperature"] == 0.5
+    row = {"suite": TASK[0], "task": TASK[1], "method": "generic"}
+    for study in (plain, warm):
+        assert study_of({"configuration": study.configuration()}, row).temperature == (
+            study.temperature
+        )
+    with pytest.raises(BadStudy, match="samples nothing; leave --temperature out"):
+        replace(warm, policy="scripted")
+    for wrong in (-0.1, 11.0, float("nan")):
+        with pytest.raises(BadStudy, match="say a number from 0, no noise, to 10"):
+            replace(plain, temperature=wrong)
 
 
 def test_a_start_depends_on_seed_and_layout_alone() -> None:

@@ -268,6 +268,14 @@ def evaluate(
     seeds: Annotated[
         int, typer.Option(min=1, help="Run every episode with so many seeds, from --seed on.")
     ] = 1,
+    temperature: Annotated[
+        float | None,
+        typer.Option(
+            metavar="FACTOR",
+            help="mini-pi0: factor of the sampling noise, with which seeds differ in the policy, "
+            "too. Default as its checkpoint says; the shipped ones have 0, no noise.",
+        ),
+    ] = None,
     workers: Annotated[
         int | None,
         typer.Option(min=1, help="Jobs at once. Default 2 processes; on a cluster, its CPUs."),
@@ -341,6 +349,7 @@ def evaluate(
         images_every=images_every,
         follow=follow,
         audit=audit,
+        temperature=temperature,
     )
     if address and engine != "ray":
         raise BadStudy("eval: --address needs --engine ray.")

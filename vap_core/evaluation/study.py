@@ -16,6 +16,7 @@ from vap_core.base.errors import BadStudy, one_of
 from vap_core.base.extras import require
 from vap_core.evaluation.methods import (
     METHODS,
+    has_no_command,
     hidden_calls,
     known_methods,
     make_prompter,
@@ -59,6 +60,8 @@ from vap_core.simulation.types import EpisodeRow
 MESHES = ("plain", "menagerie")
 
 
+HOTTEST = 10.0
+"""The largest factor of a policy's sampling noise."""
 HIDDEN_FROM = 2
 """The call of the policy, counted from 0, from which an arm of `ablate` hides the target."""
 
@@ -68,6 +71,7 @@ class Study:
     """The same episodes of every task, once per method and seed.
 
     `episodes` None takes whole lists. `images_every`, `follow` and `audit` are rollout.Trial's.
+    `temperature` scales the sampling noise of a mini-pi0; None leaves it as its checkpoint says.
 
     Raises: UnknownName, BadStudy, when it is built from what does not fit together; MissingPart.
     """
@@ -83,6 +87,7 @@ class Study:
     images_every: int = 0
     follow: Follow = "step"
     audit: bool = False
+    temperature: float | None = None
 
     def __post_init__(self) -> None:
         _check_names(self)
@@ -112,6 +117,8 @@ class Study:
         names = sorted(checkpoints_used - {""})
         fingerprints = [checkpoints.fingerprint(name) for name in names]
         about = asdict(self)
+        if self.temperature is None:  # digests are those of versions without it
+            del about["temperature"]
         if names == [self.policy]:
             about["checkpoint"] = fingerprints[0]
         elif names:
@@ -226,6 +233,17 @@ def _check_policy(study: Study) -> None:
                 f"Study: no {MINI} for {suite} ships (there is {there}); run: python -m vap_core "
                 f"train policy --suite {suites.benchmark_name(suite)}"
             )
+    if study.temperature is not None:
+        if policy in POLICIES:
+            raise BadStudy(
+                f"Study: policy {policy!r} samples nothing; leave --temperature out, or take "
+                f"--policy {MINI}."
+            )
+        if not 0 <= study.temperature <= HOTTEST:
+            raise BadStudy(
+                f"Study: temperature {study.temperature:g}; say a number from 0, no noise, to "
+                f"{HOTTEST:g}."
+            )
     if policy in PRIVILEGED and study.audit:
         raise BadStudy(
             f"Study: policy {policy!r} consumes no prompt; there is nothing to audit. Leave "
@@ -241,6 +259,11 @@ def _check_policy(study: Study) -> None:
         raise BadStudy(
             f"Study: {absent[0]} leaves the target out, which the expert would go for; leave that "
             "suite or the expert out."
+        )
+    if policy == "scripted" and _any_method(study, has_no_command):
+        raise BadStudy(
+            f"Study: policy {policy!r} parses its command, and blank-text gives it none; leave "
+            f"blank-text out, or take --policy {MINI}."
         )
     if policy in POLICIES and _any_method(study, needs_token):
         raise BadStudy(
@@ -299,7 +322,9 @@ def _policy(
         return make_policy(study.policy, scene, suite, stack)
     from vap_core.policies.lerobot import adapter  # and torch
 
-    policy = adapter.load_for_suite(study.checkpoint(row.suite), scene, suite)
+    policy = adapter.load_for_suite(
+        study.checkpoint(row.suite), scene, suite, temperature=study.temperature
+    )
     if not needs_token(method):
         return policy
     embedding = _token_embedding(study.checkpoint(row.suite), method, row.target, bank)

@@ -296,7 +296,9 @@ def _context(trial: Trial, episode: RunningEpisode) -> PromptContext:
     needs = trial.prompter.needs_truth
     truth = None
     if needs == "always" or (needs == "start" and not started):
-        truth = SceneTruth(episode.row, episode.env.truth(masks=True).masks)
+        masks = episode.env.truth(masks=True).masks
+        judge = episode.judge
+        truth = SceneTruth(episode.row, masks, step=judge.steps, moved=judge.moved)
     cameras = {camera.name: camera for camera in episode.env.cameras()}
     return PromptContext(episode.row.instruction, cameras, truth)
 

@@ -48,6 +48,7 @@ def report(sources: Sequence[Path], out: Path) -> str:
         sections.outcomes_section(runs, ends),
         sections.failures_section(runs),
         sections.comparisons_section(differences),
+        sections.abstention_section(runs),
         sections.pictures_section(with_differences=bool(compared)),
         sections.readings_section(readings_of_lists(_lists(runs))),
         sections.provenance_section(origins),

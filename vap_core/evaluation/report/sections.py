@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from vap_core.base.tables import markdown
 from vap_core.evaluation import paper
+from vap_core.evaluation.abstention import abstention_rows, abstentions
 from vap_core.evaluation.metrics import TRACK
 from vap_core.evaluation.readings import Reading, readings_rows
 from vap_core.evaluation.report.cells import (
@@ -53,6 +54,11 @@ FAILURES_NOTE = (
     "neighbouring thresholds under which a label stays the same.\n"
     "`python -m vap_core diagnose` lists the failures and opens one at the frame that decided it; "
     "runs older than the diagnosis are left out."
+)
+
+ABSTENTION_NOTE = (
+    "If the robot did not act where the vote's margin at t = 0, the least of all views, is below a "
+    "threshold. The episodes without a target are those of NAME-absent."
 )
 
 READINGS_NOTE = (
@@ -139,6 +145,14 @@ def provenance_section(origins: "pd.DataFrame") -> str:
                 parts.append(f"{name} {line[name]}")
         lines.append(f"- {line['run']}: {', '.join(parts)}\n  `{line['command']}`")
     return "## Provenance\n\n" + "\n".join(lines)
+
+
+def abstention_section(runs: Runs) -> str:
+    """Success against coverage; empty where no suite was run with and without its targets."""
+    found = abstentions(runs.table)
+    if not found:
+        return ""
+    return f"## Abstention\n\n{ABSTENTION_NOTE}\n\n{markdown(abstention_rows(found))}"
 
 
 def readings_section(readings: Sequence[Reading]) -> str:
