@@ -10,7 +10,7 @@ from pathlib import Path
 from setuptools import setup
 from setuptools.command.build_py import build_py
 
-SHIPPED = ("paper_tables.csv", "policies", "suites", "weights")
+SHIPPED = ("paper_tables.csv", "policies", "results/readings.csv", "suites", "weights")
 
 
 class BuildWithData(build_py):
@@ -25,8 +25,9 @@ class BuildWithData(build_py):
             if source.is_dir():
                 shutil.copytree(source, target / name)
             else:
-                target.mkdir(parents=True, exist_ok=True)
-                shutil.copy2(source, target)
+                copy = target / name
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(source, copy)
 
 
 setup(cmdclass={"build_py": BuildWithData})

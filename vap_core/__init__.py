@@ -84,15 +84,16 @@ _load, __dir__, __all__ = lazy_loader.attach(
     },
 )
 
+if not TYPE_CHECKING:  # else every name would exist for type checkers
 
-def __getattr__(name: str) -> Any:
-    """Load a public name. Raises: MissingPart: its extra is not installed."""
-    try:
-        return _load(name)
-    except ModuleNotFoundError as error:
-        from vap_core.base.extras import missing_part
+    def __getattr__(name: str) -> Any:
+        """Load a public name. Raises: MissingPart: its extra is not installed."""
+        try:
+            return _load(name)
+        except ModuleNotFoundError as error:
+            from vap_core.base.extras import missing_part
 
-        part = missing_part(error)
-        if part is None:
-            raise
-        raise part from error
+            part = missing_part(error)
+            if part is None:
+                raise
+            raise part from error

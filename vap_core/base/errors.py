@@ -67,6 +67,10 @@ class BadViews(VapError):
     """Views that cannot be associated: too many of them, or cameras without calibration."""
 
 
+class BadEncoder(VapError):
+    """An encoder whose numbers are not finite."""
+
+
 class BadStudy(VapError):
     """Tasks, methods and a policy that do not fit together."""
 
