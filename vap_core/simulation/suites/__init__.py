@@ -111,12 +111,22 @@ def rows(
     task = known.task(task_name)
     if suite_name in WARM_UPS:
         return pick.rows(known, task, 20 if n is None else n, seed)
-    episodes = [row for row in benchmark(suite_name) if row.task == task_name]
+    episodes = _seeded(suite_name, task_name, seed)
     if n is not None and n < len(episodes):
         spread = np.linspace(0, len(episodes) - 1, n).astype(int)
-        episodes = [episodes[i] for i in np.unique(spread)]
-    joints = len(robots.get(known.robot).joints)
-    return tuple(starts.seeded(row, seed, joints) for row in episodes)
+        return tuple(episodes[i] for i in np.unique(spread))
+    return episodes
+
+
+@cache
+def _seeded(suite_name: str, task_name: str, seed: int) -> tuple[EpisodeRow, ...]:
+    """The list of a task under a seed."""
+    joints = len(robots.get(suite(suite_name).robot).joints)
+    episodes = []
+    for row in benchmark(suite_name):
+        if row.task == task_name:
+            episodes.append(starts.seeded(row, seed, joints))
+    return tuple(episodes)
 
 
 def listed(
