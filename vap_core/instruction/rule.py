@@ -1,8 +1,4 @@
-"""Personalised instructions: find "my cup", and rewrite it to "the red cup".
-
-The logic is that of P 3.3 and its appendix "Instruction Rewriting Logic". A parser is any function
-`(text, categories) -> Instruction`; `parse` is the deterministic rule of the paper's main results.
-"""
+"""Parsing by rule, and the rewrite (P 3.3, appendix "Instruction Rewriting Logic")."""
 
 import re
 from collections.abc import Collection, Sequence
@@ -13,6 +9,13 @@ from vap_core.base.types import Colour, Instruction, Target
 
 OWNER = re.compile(r"\bmy\s+(?:(?:[\w-]+\s+){0,2}?[\w-]+(?:['’]s|s['’])\s+)?", re.IGNORECASE)
 """A possessive trigger: "my cup", or with an owner beside the speaker, "my brother's cup"."""
+
+ANY_OWNER = re.compile(
+    r"\b(?:my|his|her|their|our|(?!(?:it|that|what|who|where|here|there|let|how)['’])[\w-]+['’]s)\s+"
+    r"(?:(?:[\w-]+\s+){0,2}?[\w-]+(?:['’]s|s['’])\s+)?",
+    re.IGNORECASE,
+)
+"""As OWNER, and "his cup", "Anna's cup", "Anna's brother's cup"."""
 
 STOP_WORDS = frozenset(
     """and or to into onto in on near next beside behind under over from with at by off up down left
@@ -29,24 +32,27 @@ class Parser(Protocol):
     def __call__(self, text: str, categories: Collection[str] = ()) -> Instruction: ...
 
 
-def parse(text: str, categories: Collection[str] = ()) -> Instruction:
+def parse(
+    text: str, categories: Collection[str] = (), owners: Collection[str] = ()
+) -> Instruction:
     """Parse by rule, left to right.
 
     Every "my <category>" or "my <person>'s <category>" becomes a target. The longest of
     `categories` (a plural s allowed) that follows the trigger wins; otherwise the words up to
-    punctuation or the first stop word are the category, so unseen nouns work too.
+    punctuation or the first stop word are the category, so unseen nouns work too. Where objects
+    have `owners`, "Anna's <category>" and "his <category>" of a known category are targets as well.
 
     Raises:
         BadInstruction: the text holds no possessive span.
     """
     targets: list[Target] = []
-    for trigger in OWNER.finditer(text):
+    for trigger in (ANY_OWNER if owners else OWNER).finditer(text):
         if targets and trigger.start() < targets[-1].stop:
             continue
         category, length = leading_category(text[trigger.end() :], categories)
-        if category:
+        owner = trigger.group().strip()
+        if category and (category in categories or owner.lower().startswith("my")):
             start, stop = trigger.span()
-            owner = trigger.group().strip()
             target = Target(start=start, stop=stop + length, owner=owner, category=category)
             targets.append(target)
     if not targets:
