@@ -29,11 +29,11 @@ from vap_core.instruction.looks import fit
 from vap_core.instruction.owners import MINE, OTHERS, belonging, find_owner, fold
 
 EmbedText = Callable[[Sequence[str]], Float32[np.ndarray, "n d"]]
-PURPOSE = 0.36
+PURPOSE = 0.33
 """Least cosine of words without a category with the object that they mean."""
 NOUN = 0.55
 """The same where the words are a noun of the speaker's, as in "my mug"."""
-MARGIN = 0.02
+MARGIN = 0.01
 """Least lead over the second object."""
 LOOKS = 0.25
 """Weight of the description's words beside the cosine."""
@@ -44,6 +44,12 @@ EARLIER = re.compile(
     re.IGNORECASE,
 )
 """Words of time that make a reference one to an earlier use."""
+LOOSE = re.compile(
+    r"^(?:what|whatever|whichever|something|(?:the|that|this)\s+(?:[\w-]+\s+){0,2}?(?:ones?|things?|"
+    r"items?|objects?|tools?|stuff))\b|\b(?:I|my|me|we|our)\b",
+    re.IGNORECASE,
+)
+"""Expressions that do not say what kind of thing they mean; "the window" does."""
 TIME = frozenset(
     """earlier last yesterday ago again previous previously recent recently latest same already once
     more just now today tonight before moment time most day""".split()
@@ -276,10 +282,9 @@ class _Reading:
         self, words: str, candidates: list[PersonalObject], owner: str | None
     ) -> PersonalObject | None:
         """The object that words without a category mean."""
-        if self.expression.destination and owner is None:
+        if owner is None and not LOOSE.search(self.expression.said):
             return None
-        borrowed = not words
-        if borrowed and (self.expression.argument or owner is not None):
+        if not words and (self.expression.argument or owner is not None):
             words = content(self._rest(), self._known_words(None))
         if not words or not candidates:
             return None
