@@ -29,7 +29,7 @@ from vap_core.instruction.looks import fit
 from vap_core.instruction.owners import MINE, OTHERS, belonging, find_owner, fold
 
 EmbedText = Callable[[Sequence[str]], Float32[np.ndarray, "n d"]]
-PURPOSE = 0.33
+PURPOSE = 0.3
 """Least cosine of words without a category with the object that they mean."""
 NOUN = 0.55
 """The same where the words are a noun of the speaker's, as in "my mug"."""
@@ -69,10 +69,10 @@ class EmbeddingParser:
         Raises: BadInstruction: no personal object, or several fit; UnknownName: none is remembered.
         """
         exclusions = find_exclusions(text)
-        targets: list[Target] = []
-        argument: list[bool] = []
+        found: list[tuple[Expression, PersonalObject]] = []
         problem: VapError | None = None
-        expressions = list(find_expressions(text, exclusions))
+        people = person_pattern(self.context)
+        expressions = list(find_expressions(text, exclusions, people))
         for expression in expressions:
             try:
                 obj = _Reading(self, text, expression, expressions, exclusions).object()
@@ -80,26 +80,34 @@ class EmbeddingParser:
                 if problem is None or expression.argument:
                     problem = error
                 continue
-            if obj is None or any(target.object == obj.name for target in targets):
-                continue
-            targets.append(
-                Target(
-                    start=expression.start,
-                    stop=expression.stop,
-                    owner=obj.owner,
-                    category=obj.category,
-                    object=obj.name,
-                )
-            )
-            argument.append(expression.argument or expression.destination)
-        if any(argument):
-            targets = [one for one, kept in zip(targets, argument, strict=True) if kept]
+            if obj is not None:
+                found.append((expression, obj))
+        targets = _targets(found)
         if targets:
-            return Instruction(text, tuple(targets))
+            return Instruction(text, targets)
         raise problem or BadInstruction(
             f"parse: no personal object in {text[:80]!r}; name one as \"my <category>\", or say what "
             "it is for."
         )
+
+
+def _targets(found: Sequence[tuple[Expression, PersonalObject]]) -> tuple[Target, ...]:
+    """One target per object: where a verb of action or a place is, only those that stand there."""
+    governed = [pair for pair in found if pair[0].argument or pair[0].destination]
+    targets: list[Target] = []
+    for expression, obj in governed or found:
+        if obj.name in {target.object for target in targets}:
+            continue
+        targets.append(
+            Target(
+                start=expression.start,
+                stop=expression.stop,
+                owner=obj.owner,
+                category=obj.category,
+                object=obj.name,
+            )
+        )
+    return tuple(targets)
 
 
 @dataclass(frozen=True)
@@ -125,8 +133,6 @@ class _Reading:
         context = self.parser.context
         said = _without(expression.said, self.exclusions, expression.start)
         owner = self._owner(said)
-        if owner is not None and self._is_person(said):
-            return None
         earlier = self._is_earlier(said)
         if expression.destination and owner is None and not earlier:
             return None
@@ -197,11 +203,6 @@ class _Reading:
             if fold(match.group()) not in MINE:
                 named.append(match.group())
         return named[-1] if named else owner
-
-    def _is_person(self, said: str) -> bool:
-        """Whether "my brother" names a person, not an object."""
-        person = person_pattern(self.parser.context)
-        return re.match(rf"(?:{person})\b(?!['’])", said, re.IGNORECASE) is not None
 
     def _is_earlier(self, said: str) -> bool:
         rest = _without(self.expression.clause, self.exclusions, self.expression.start)
@@ -330,27 +331,33 @@ class _Reading:
         self, words: str, candidates: Sequence[PersonalObject]
     ) -> Float32[np.ndarray, " n"]:
         """How well words fit every object: cosine with what is known of it, and its description."""
-        return object_scores(words, candidates, self.parser.embed)
+        one = len({obj.category for obj in candidates}) == 1
+        return object_scores(words, candidates, self.parser.embed, looks=one)
 
 
 def object_scores(
-    words: str, objects: Sequence[PersonalObject], embed: EmbedText
+    words: str, objects: Sequence[PersonalObject], embed: EmbedText, *, looks: bool
 ) -> Float32[np.ndarray, " n"]:
-    """The greatest cosine of the words with an object's texts, and the fit of its description."""
+    """How well words fit every object.
+
+    It is the mean of the two greatest cosines with the object's texts, and the fit of its
+    description; among objects of one category, whose `looks` differ, the greatest cosine.
+    """
     (query,) = embed([words])
     scores = np.zeros(len(objects), np.float32)
     for i, obj in enumerate(objects):
-        rows = embed(_texts(obj))
-        scores[i] = float((rows @ query).max()) + LOOKS * fit(words, obj)
+        cosines = np.sort(embed(_texts(obj, looks)) @ query)
+        cosine = cosines[-1] if looks else cosines[-2:].mean()
+        scores[i] = float(cosine) + LOOKS * fit(words, obj)
     return scores
 
 
-def _texts(obj: PersonalObject) -> list[str]:
+def _texts(obj: PersonalObject, looks: bool) -> list[str]:
     """What is known of an object, in phrases."""
     texts = [obj.category]
     if obj.note:
-        texts += [obj.note, f"{obj.category} {obj.note}"]
-    if obj.description is not None:
+        texts += [obj.note, f"{obj.category} {obj.note}", f"something {obj.note}"]
+    if looks and obj.description is not None:
         texts.append(f"{obj.category}, {obj.description.short}")
     return texts
 

@@ -20,6 +20,12 @@ DESTINATION = (
     "into|onto|in|on|near|next to|beside|to|towards|toward|under|behind|from|at|over|inside|by|"
     "against|between|above|below|around"
 )
+TIMES = re.compile(
+    r"(?:(?:the|this|last|that|next)\s+)?(?:time|morning|afternoon|evening|night|noon|weekend|"
+    r"week|yesterday|today|breakfast|lunch|dinner|\w+day|before|earlier)s?\b",
+    re.IGNORECASE,
+)
+"""What a preposition of time stands before: "in the morning", "from last time"."""
 PUNCTUATION = ",;:.!?—–"
 GENERIC = frozenset(
     """one ones thing things item items object objects tool tools pick choice stuff what whatever
@@ -99,12 +105,19 @@ def find_exclusions(text: str) -> tuple[Exclusion, ...]:
     return tuple(found)
 
 
-def find_expressions(text: str, exclusions: Collection[Exclusion]) -> Iterator[Expression]:
-    """Every expression outside the exclusions, left to right and disjoint."""
+def find_expressions(
+    text: str, exclusions: Collection[Exclusion], people: str = "me"
+) -> Iterator[Expression]:
+    """Every expression outside the exclusions, left to right and disjoint.
+
+    `people` is a `person_pattern`: "my brother" is a person, "my brother's cup" is not.
+    """
     last = 0
     for match in START.finditer(text):
         start = match.start()
         if start < last or _inside(start, exclusions):
+            continue
+        if re.match(rf"(?:{people})\b(?!['’])", text[start:], re.IGNORECASE):
             continue
         clause_end = _clause_end(text, match.end())
         stop = _before_destination(text, start, match.end(), clause_end)
@@ -192,6 +205,8 @@ def _before_destination(text: str, begin: int, start: int, stop: int) -> int:
         if re.match(rf"(?:{DESTINATION})\b", follows, re.IGNORECASE):
             continue  # a stranded preposition: "the thing I put flowers in on the plate"
         if re.search(r"\b(?:belong\w*|lent|owned)$", rest[: match.start()], re.IGNORECASE):
+            continue
+        if TIMES.match(follows):
             continue
         places.append(start + match.start())
     if not places:
