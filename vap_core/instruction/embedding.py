@@ -141,6 +141,8 @@ class _Reading:
         candidates = every
         if category is not None:
             candidates = [obj for obj in every if obj.category == category]
+        if earlier and category is None and owner is not None and fold(owner) not in MINE:
+            return self._used(said, every, owner)
         if owner is not None:
             candidates = belonging(candidates, owner, context.speaker, context.owners)
         excluded = False
@@ -153,7 +155,7 @@ class _Reading:
             return self._used(said, kept)
         if category is None:
             return self._by_meaning(words, kept, owner)
-        if owner is None and not excluded and not words:
+        if owner is None and not excluded and (not words or expression.kind == "pronoun"):
             return None
         return self._only(kept, words, owner, category)
 
@@ -214,12 +216,12 @@ class _Reading:
         return sorted({obj.category for obj in self.parser.context.objects.values()})
 
     def _category(self, said: str, owned: bool) -> str | None:
-        """The category that is named; after "mine" or "my other one" the one named elsewhere."""
+        """The category that is named; after "mine" or "the striped one" the one named elsewhere."""
         here = find_category(said, self._categories())
         if here is not None:
             return here
         bare = not content(said, self._known_words(None))
-        if bare and (owned or re.search(r"\bother\b", said)):
+        if (bare and owned) or re.search(r"\b(?:other|ones?)\b", said):
             return find_category(self.text, self._categories())
         return None
 
@@ -252,10 +254,14 @@ class _Reading:
             kept = [obj for obj in kept if obj is not kept[best]]
         return kept
 
-    def _used(self, said: str, candidates: list[PersonalObject]) -> PersonalObject:
+    def _used(
+        self, said: str, candidates: list[PersonalObject], user: str = ""
+    ) -> PersonalObject:
         """The one of `candidates` that was used last, by the person and on the day that are said."""
         context = self.parser.context
         by: str | None = fold(context.speaker) or None
+        if user:
+            by = find_owner(user, context.speaker, context.owners)
         person = person_pattern(context)
         match = re.search(rf"\b({person}|he|she|they)\s+(?!own)[\w-]+", said, re.IGNORECASE)
         if match and fold(match.group(1)) not in MINE:
@@ -325,7 +331,29 @@ class _Reading:
             order = np.argsort(-scores)
             if scores[order[0]] - scores[order[1]] >= MARGIN:
                 return candidates[order[0]]
+        kept = self._contrasted(candidates, category)
+        if len(kept) == 1:
+            return kept[0]
         raise _ambiguous(self.expression, candidates)
+
+    def _contrasted(
+        self, candidates: list[PersonalObject], category: str
+    ) -> list[PersonalObject]:
+        """Those of `candidates` that no other expression of the instruction describes.
+
+        "put my cup on the plate; the striped one stays" names the other cup.
+        """
+        kept = candidates
+        for other in self.expressions:
+            if other is self.expression or other.destination or len(kept) < 2:
+                continue
+            if find_category(other.said, self._categories()) not in (None, category):
+                continue
+            words = content(other.said, self._known_words(category))
+            if words:
+                best = int(self._scores(words, kept).argmax())
+                kept = [obj for obj in kept if obj is not kept[best]]
+        return kept
 
     def _scores(
         self, words: str, candidates: Sequence[PersonalObject]

@@ -30,7 +30,7 @@ PUNCTUATION = ",;:.!?—–"
 GENERIC = frozenset(
     """one ones thing things item items object objects tool tools pick choice stuff what whatever
     whichever something anything which that this those these the my mine his her hers their theirs
-    our ours own personal favourite favorite dear old good other same very of is are was were be
+    our ours own personal favourite favorite dear old good right proper best other same very of is are was were be
     been being for with to from at when while i me you we us he she they it need needs want wants
     use used uses using normally usually always often like likes love loves can could would will
     meant reserved made helps help do does did just really know thanks please so and or then
@@ -117,7 +117,8 @@ def find_expressions(
         start = match.start()
         if start < last or _inside(start, exclusions):
             continue
-        if re.match(rf"(?:{people})\b(?!['’])", text[start:], re.IGNORECASE):
+        person = re.match(rf"(?:{people})\b(?!['’])", text[start:], re.IGNORECASE)
+        if person and match.end() <= start + person.end():
             continue
         clause_end = _clause_end(text, match.end())
         stop = _before_destination(text, start, match.end(), clause_end)
@@ -181,12 +182,14 @@ def _inside(place: int, exclusions: Collection[Exclusion]) -> bool:
 
 
 def _clause_end(text: str, start: int) -> int:
-    """The next punctuation mark, ", so" or " and <action>" after `start`."""
+    """The next punctuation mark, "but", or " and <action>" after `start`."""
     stop = len(text)
     mark = re.search(rf"[{PUNCTUATION}](?=\s|$)", text[start:])
     if mark:
         stop = start + mark.start()
-    further = re.search(rf"\s+(?:and|so|then)\s+(?:{ACTION}|leave)\b", text[start:stop], re.I)
+    further = re.search(
+        rf"\s+(?:but\b|(?:and|so|then)\s+(?:{ACTION}|leave)\b)", text[start:stop], re.IGNORECASE
+    )
     if further:
         stop = start + further.start()
     return stop
