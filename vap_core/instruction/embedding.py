@@ -40,7 +40,9 @@ LOOKS = 0.25
 EARLIER = re.compile(
     r"\b(?:earlier|last|yesterday|ago|again|previous(?:ly)?|recent(?:ly)?|latest|same|already|"
     r"once more|just now|this (?:morning|afternoon|evening)|today|tonight|"
-    r"before(?!\s+(?!(?:" "in|on|into|onto|near|next|to" r")\b)\w)|(?:was|were|been) \w+ing)\b",
+    r"before(?!\s+(?!(?:"
+    "in|on|into|onto|near|next|to"
+    r")\b)\w)|(?:was|were|been) \w+ing)\b",
     re.IGNORECASE,
 )
 """Words of time that make a reference one to an earlier use."""
@@ -86,7 +88,7 @@ class EmbeddingParser:
         if targets:
             return Instruction(text, targets)
         raise problem or BadInstruction(
-            f"parse: no personal object in {text[:80]!r}; name one as \"my <category>\", or say what "
+            f'parse: no personal object in {text[:80]!r}; name one as "my <category>", or say what '
             "it is for."
         )
 
@@ -183,8 +185,12 @@ class _Reading:
         if expression.kind == "several":
             return said.split()[2]
         if expression.kind in ("owner", "alone"):
-            match = re.match(r"(?:my|his|her|their|our)(?:\s+(?:[\w-]+\s+)?[\w-]+['’]s)?(?=\W|$)|mine"
-                             r"|hers|theirs|ours|[\w-]+['’]s(?:\s+[\w-]+['’]s)?", said, re.I)
+            match = re.match(
+                r"(?:my|his|her|their|our)(?:\s+(?:[\w-]+\s+)?[\w-]+['’]s)?(?=\W|$)|mine"
+                r"|hers|theirs|ours|[\w-]+['’]s(?:\s+[\w-]+['’]s)?",
+                said,
+                re.I,
+            )
             return None if match is None else self._antecedent(match.group())
         if find_category(said, self._categories()) is not None:
             for other in self.expressions:
@@ -254,9 +260,7 @@ class _Reading:
             kept = [obj for obj in kept if obj is not kept[best]]
         return kept
 
-    def _used(
-        self, said: str, candidates: list[PersonalObject], user: str = ""
-    ) -> PersonalObject:
+    def _used(self, said: str, candidates: list[PersonalObject], user: str = "") -> PersonalObject:
         """The one of `candidates` that was used last, by the person and on the day that are said."""
         context = self.parser.context
         by: str | None = fold(context.speaker) or None
@@ -336,9 +340,7 @@ class _Reading:
             return kept[0]
         raise _ambiguous(self.expression, candidates)
 
-    def _contrasted(
-        self, candidates: list[PersonalObject], category: str
-    ) -> list[PersonalObject]:
+    def _contrasted(self, candidates: list[PersonalObject], category: str) -> list[PersonalObject]:
         """Those of `candidates` that no other expression of the instruction describes.
 
         "put my cup on the plate; the striped one stays" names the other cup.

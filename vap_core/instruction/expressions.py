@@ -215,7 +215,9 @@ def _before_destination(text: str, begin: int, start: int, stop: int) -> int:
     if not places:
         return stop
     verbs = re.findall(rf"\b(?:{ACTION})\b", text[:begin], re.IGNORECASE)
-    placing = bool(verbs) and re.fullmatch(rf"(?:{PLACING}|putting|placing|moving)", verbs[-1], re.I)
+    placing = bool(verbs) and re.fullmatch(
+        rf"(?:{PLACING}|putting|placing|moving)", verbs[-1], re.I
+    )
     relative = re.search(
         rf"^(?:what|whatever|something)\b|\b(?:I|you|we|he|she|they|that|which|for|when|[\w-]+ing|"
         rf"is|are|was|meant|reserved)\b",

@@ -50,6 +50,8 @@ def read_uses(bank: Path) -> tuple[Use, ...]:
 
 def add_uses(bank: Path, objects: Sequence[str], by: str, at: datetime) -> None:
     """Append one use per object. Raises: BadOutput."""
+    if not objects:
+        return
     lines = ""
     for name in objects:
         row = {"object": name, "by": by, "at": at.isoformat(timespec="seconds")}

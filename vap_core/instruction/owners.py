@@ -87,7 +87,7 @@ def find_owner(person: str, speaker: str, owners: dict[str, tuple[str, ...]]) ->
         if found:
             raise BadInstruction(
                 f"owners: {person!r} could be {' or '.join(found)}; say the name, for example "
-                f"\"{found[0]}'s\"."
+                f'"{found[0]}\'s".'
             )
     raise UnknownName(
         f"owners: nobody is {person!r}; the memory knows {describe(owners)}. Register an object "
@@ -122,6 +122,6 @@ def _only_other(objects: Sequence[PersonalObject], word: str, speaker: str) -> s
     if len(people) > 1:
         raise BadInstruction(
             f"owners: {word!r} could be {' or '.join(people)}; say the name, for example "
-            f"\"{people[0]}'s\"."
+            f'"{people[0]}\'s".'
         )
     return people[0] if people else "-"

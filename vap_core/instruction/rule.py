@@ -32,9 +32,7 @@ class Parser(Protocol):
     def __call__(self, text: str, categories: Collection[str] = ()) -> Instruction: ...
 
 
-def parse(
-    text: str, categories: Collection[str] = (), owners: Collection[str] = ()
-) -> Instruction:
+def parse(text: str, categories: Collection[str] = (), owners: Collection[str] = ()) -> Instruction:
     """Parse by rule, left to right.
 
     Every "my <category>" or "my <person>'s <category>" becomes a target. The longest of

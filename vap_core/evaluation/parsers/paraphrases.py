@@ -1,8 +1,9 @@
 """Paraphrased instructions, by template families (data/paraphrases).
 
-A family is one sentence with places to fill in. Its part is "tune" or "test": parsers were made by
-the former, and what a test family's sentences name (what things are for, what is not there) differs
-too.
+A family is one sentence with places to fill in. Its part says what it was used for: the parser
+`embedding` was made with "tune"; "check-1" and "check-2" were held out, scored once, and then looked
+at; "test" is held out. What the sentences of a part name (what things are for, what is not there) is
+the part's own, too.
 """
 
 import csv
@@ -52,6 +53,11 @@ def read_vocabulary() -> dict[str, Any]:
     """The suites' objects, what they are for and look like, and other things."""
     vocabulary: dict[str, Any] = json.loads((FOLDER / "objects.json").read_text("utf-8"))
     return vocabulary
+
+
+def suite_names() -> tuple[str, ...]:
+    """The suites that have paraphrases."""
+    return tuple(read_vocabulary()["suites"])
 
 
 def read_families() -> list[dict[str, str]]:
@@ -120,7 +126,12 @@ def _words(key: str, family: Mapping[str, str], second: bool, turn: int) -> dict
         "other_with": about[other]["with"],
         **about["purpose"][part],
     }
-    for one, many in (("prop", "props"), ("absent", "absent"), ("room", "rooms"), ("unknown", "unknown")):
+    for one, many in (
+        ("prop", "props"),
+        ("absent", "absent"),
+        ("room", "rooms"),
+        ("unknown", "unknown"),
+    ):
         words[one] = vocabulary[many][part][turn % len(vocabulary[many][part])]
     words["question"] = vocabulary["questions"][part][turn % len(vocabulary["questions"][part])]
     return words
