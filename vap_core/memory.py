@@ -19,7 +19,7 @@ from vap_core.base.errors import BadMemory, BadOutput, BadPhoto, UnknownName, on
 from vap_core.base.files import encode_tensors, parse_json, remove_scratch, write_atomic
 from vap_core.base.photos import load_photo as load_photo
 from vap_core.base.types import Description, PersonalObject, Rgb, Target
-from vap_core.instruction.owners import belonging, owners_of
+from vap_core.instruction.owners import belonging, check_owner, owners_of
 from vap_core.perception.boxes import crop
 from vap_core.perception.protocols import Detector, Encoder, ReferenceCropper
 
@@ -30,9 +30,6 @@ REFERENCE_THRESHOLD = 0.05
 """A photo of the object shows one of its category, so a reference's box needs a lower score than a
 proposal does."""
 CATEGORY = re.compile(r"[^\W\d_][\w -]*")
-OWNER = re.compile(r"[^\W\d_][^\W\d_ .'’-]*(?:[ .'’-]+[^\W\d_]+){0,4}\.?")
-MAX_NOTE = 200
-"""Characters of a note."""
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,63}")
 AGAIN = "register the object again with --replace, or delete the file"
 
@@ -103,22 +100,6 @@ def remember(name: str, category: str, crops: Sequence[Rgb], encoder: Encoder) -
         crops=tuple(crops),
         encoder=encoder.name,
     )
-
-
-def check_owner(owner: str, known_as: Sequence[str], note: str) -> None:
-    """Raises: BadMemory: no usable owner, other word for one, or note."""
-    for word in (owner, *known_as):
-        if word and not OWNER.fullmatch(word):
-            raise BadMemory(
-                f"remember: {word[:64]!r} cannot be a person; use letters, spaces and 's, for "
-                'example --owner anna, or --known-as "anna\'s brother".'
-            )
-    if known_as and not owner:
-        raise BadMemory("remember: --known-as is another word for the owner; name one by --owner.")
-    if len(note) > MAX_NOTE or not note.isprintable():
-        raise BadMemory(
-            f"remember: a note is one line of at most {MAX_NOTE} characters; shorten it."
-        )
 
 
 def check_names(name: str, category: str) -> None:

@@ -100,7 +100,8 @@ def register(
 
     from vap_core.evaluation.photos import register as registering
     from vap_core.evaluation.photos.trust import leave_one_out, warnings
-    from vap_core.memory import check_names, check_owner, load_bank, object_path, save, taken
+    from vap_core.instruction.owners import check_owner
+    from vap_core.memory import check_names, load_bank, object_path, save, taken
     from vap_core.perception.describe import load_captioner, with_description
     from vap_core.perception.stacks import load_stack
 

@@ -8,6 +8,7 @@ executed.
 import json
 from collections.abc import Collection
 from dataclasses import dataclass
+from itertools import pairwise
 from queue import Empty, SimpleQueue
 from threading import Thread
 from typing import Any
@@ -17,14 +18,17 @@ from vap_core.base.types import Instruction, Target
 from vap_core.instruction.context import Context
 from vap_core.perception.chat import KEY, MAX_ANSWER_BYTES, MODEL, URL, ChatEndpoint
 
-TASK = """A user tells a robot what to do. Find every expression of the instruction that refers to \
-one of the user's or another person's remembered objects, and say which object it means. Expressions \
-can be explicit ("my cup"), about an owner ("Anna's cup"), implicit ("the thing for shaving"), about \
-earlier uses ("the one I used last"), or exclude others ("not the striped one"). "my" means objects \
-of the speaker. Any cup, a cup, and things that are not remembered are no remembered object: leave \
-them out; if there is none, answer with an empty list. Leave out pronouns for an object that is named \
-already. Copy each expression letter by letter from the instruction, with its article or possessive \
-and everything that describes it, without the verb and the place where it goes."""
+TASK = (
+    "A user tells a robot what to do. Find every expression of the instruction that refers to one "
+    "of the user's or another person's remembered objects, and say which object it means. "
+    'Expressions can be explicit ("my cup"), about an owner ("Anna\'s cup"), implicit ("the thing '
+    'for shaving"), about earlier uses ("the one I used last"), or exclude others ("not the striped '
+    'one"). "my" means objects of the speaker. A cup, any cup, and things that are not remembered '
+    "are no remembered object: leave them out; if there is none, answer with an empty list. Leave "
+    "out pronouns for an object that is named already. Copy each expression letter by letter from "
+    "the instruction, with its article or possessive and everything that describes it, without the "
+    "verb and the place where it goes. Answer in JSON."
+)
 NO_KEY = "none"
 """Sent where the endpoint has no key: without one the client would send Hugging Face's."""
 MAX_TOKENS = 400
@@ -111,14 +115,14 @@ class ChatParser:
                     )
                 )
             targets.sort(key=lambda target: target.start)
-            for one, other in zip(targets, targets[1:], strict=False):
+            for one, other in pairwise(targets):
                 if other.start < one.stop:
                     raise ValueError("overlapping expressions")
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise BadEndpoint(
                 f"parse: {self.endpoint.model} at {self.endpoint.url} answers outside the form that "
-                f"was asked for ({type(error).__name__}: {str(error)[:60]!r}); try another model in "
-                f"{MODEL}, or --parser rule."
+                f"was asked for ({type(error).__name__}: {_line(str(error))[:60]!r}); try another "
+                f"model in {MODEL}, or --parser rule."
             ) from error
         return tuple(targets)
 
@@ -182,18 +186,21 @@ def _ask(endpoint: ChatEndpoint, messages: list[dict[str, str]], schema: dict[st
         OfflineModeIsEnabled,
     )
 
-    form = {"name": "targets", "strict": True, "schema": schema}
+    form = {
+        "type": _Verbatim("json_schema"),
+        "json_schema": {"name": "targets", "strict": True, "schema": schema},
+    }
     client = InferenceClient(
         base_url=endpoint.url, api_key=endpoint.key or NO_KEY, timeout=endpoint.timeout_s
     )
     try:
         with client:
             answer = client.chat_completion(
-                messages=messages,  # type: ignore[arg-type]
+                messages=list[Any](messages),
                 model=endpoint.model,
                 max_tokens=MAX_TOKENS,
                 temperature=0.0,
-                response_format={"type": _Verbatim("json_schema"), "json_schema": form},  # type: ignore[arg-type]
+                extra_body={"response_format": form},
             )
         message = answer.choices[0].message
         refusal = getattr(message, "refusal", None)

@@ -219,8 +219,8 @@ def _before_destination(text: str, begin: int, start: int, stop: int) -> int:
         rf"(?:{PLACING}|putting|placing|moving)", verbs[-1], re.I
     )
     relative = re.search(
-        rf"^(?:what|whatever|something)\b|\b(?:I|you|we|he|she|they|that|which|for|when|[\w-]+ing|"
-        rf"is|are|was|meant|reserved)\b",
+        r"^(?:what|whatever|something)\b|\b(?:I|you|we|he|she|they|that|which|for|when|[\w-]+ing|"
+        r"is|are|was|meant|reserved)\b",
         text[begin : places[-1]],
         re.IGNORECASE,
     )

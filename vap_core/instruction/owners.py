@@ -18,12 +18,31 @@ An owner that nobody has, and words that fit several people, are errors.
 import re
 from collections.abc import Iterable, Sequence
 
-from vap_core.base.errors import BadInstruction, UnknownName
+from vap_core.base.errors import BadInstruction, BadMemory, UnknownName
 from vap_core.base.types import PersonalObject
 
+PERSON = re.compile(r"[^\W\d_][^\W\d_ .'’-]*(?:[ .'’-]+[^\W\d_]+){0,4}\.?")
+MAX_NOTE = 200
+"""Characters of a note."""
 MINE = ("my", "mine", "my own", "i", "me")
 OURS = ("our", "ours", "us", "we")
 OTHERS = ("his", "her", "hers", "their", "theirs", "he", "she", "they", "him", "them")
+
+
+def check_owner(owner: str, known_as: Sequence[str], note: str) -> None:
+    """Raises: BadMemory: no usable owner, other word for one, or note."""
+    for word in (owner, *known_as):
+        if word and not PERSON.fullmatch(word):
+            raise BadMemory(
+                f"remember: {word[:64]!r} cannot be a person; use letters, spaces and 's, for "
+                'example --owner anna, or --known-as "anna\'s brother".'
+            )
+    if known_as and not owner:
+        raise BadMemory("remember: --known-as is another word for the owner; name one by --owner.")
+    if len(note) > MAX_NOTE or not note.isprintable():
+        raise BadMemory(
+            f"remember: a note is one line of at most {MAX_NOTE} characters; shorten it."
+        )
 
 
 def owners_of(objects: Iterable[PersonalObject]) -> dict[str, tuple[str, ...]]:

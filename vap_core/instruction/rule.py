@@ -77,10 +77,19 @@ def rewrite(instruction: Instruction, colours: Sequence[Colour | None]) -> str:
     for target, colour in reversed(list(pairs)):
         if colour is None:
             continue
-        article = "The" if text[target.start].isupper() else "the"
+        article = "The" if _has_capital(instruction.text, target) else "the"
         phrase = f"{article} {colour.name} {target.category}"
         text = text[: target.start] + phrase + text[target.stop :]
     return text
+
+
+def _has_capital(text: str, target: Target) -> bool:
+    """Whether a span begins with a capital letter that is not a name's ("Anna's cup")."""
+    before = text[: target.start].rstrip()
+    named = re.match(r"(?!my\b)[\w-]+['’]s?\b", text[target.start : target.stop], re.IGNORECASE)
+    if named and before and before[-1] not in ".!?":
+        return False
+    return text[target.start].isupper()
 
 
 def leading_category(rest: str, categories: Collection[str] = ()) -> tuple[str, int]:
