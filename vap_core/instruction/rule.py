@@ -44,15 +44,19 @@ def parse(text: str, categories: Collection[str] = (), owners: Collection[str] =
         BadInstruction: the text holds no possessive span.
     """
     targets: list[Target] = []
-    for trigger in (ANY_OWNER if owners else OWNER).finditer(text):
-        if targets and trigger.start() < targets[-1].stop:
-            continue
-        category, length = leading_category(text[trigger.end() :], categories)
-        owner = trigger.group().strip()
+    pattern = ANY_OWNER if owners else OWNER
+    trigger = pattern.search(text)
+    while trigger is not None:
+        start, stop = trigger.span()
+        first = re.match(r"[\w'’-]+\s+", text[start:])
+        if first and leading_category(text[start + first.end() :], categories)[0] in categories:
+            stop = start + first.end()  # "my cup near Anna's" is about my cup
+        category, length = leading_category(text[stop:], categories)
+        owner = text[start:stop].strip()
         if category and (category in categories or owner.lower().startswith("my")):
-            start, stop = trigger.span()
-            target = Target(start=start, stop=stop + length, owner=owner, category=category)
-            targets.append(target)
+            stop += length
+            targets.append(Target(start=start, stop=stop, owner=owner, category=category))
+        trigger = pattern.search(text, stop)
     if not targets:
         raise BadInstruction(
             f'parse: no personal object in {text!r}; name one as "my <category>", '
