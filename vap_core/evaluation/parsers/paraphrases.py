@@ -23,7 +23,7 @@ from vap_core.instruction.history import Use
 
 FOLDER = DATA / "paraphrases"
 KINDS = ("explicit", "implicit", "negated", "owner", "history", "none")
-PARTS = ("tune", "check-1", "check-2", "test")
+PARTS = ("tune", "check-1", "check-2", "check-3", "test")
 SENTENCES_EACH = 4
 """So many sentences of a family are made in a suite, or one for every object if these are more."""
 NOW = datetime(2026, 6, 12, 15, 0)
