@@ -25,7 +25,7 @@ from vap_core.instruction.expressions import (
     find_expressions,
     person_pattern,
 )
-from vap_core.instruction.looks import fit
+from vap_core.instruction.looks import fit, wanted
 from vap_core.instruction.owners import MINE, OTHERS, belonging, find_owner, fold
 
 EmbedText = Callable[[Sequence[str]], Float32[np.ndarray, "n d"]]
@@ -46,6 +46,9 @@ EARLIER = re.compile(
     re.IGNORECASE,
 )
 """Words of time that make a reference one to an earlier use."""
+GENERIC_HEAD = re.compile(
+    r"\b(?:ones?|things?|items?|objects?|tools?|stuff|pick|choice)\b", re.IGNORECASE
+)
 LOOSE = re.compile(
     r"^(?:what|whatever|whichever|something|(?:the|that|this)\s+(?:[\w-]+\s+){0,2}?(?:ones?|things?|"
     r"items?|objects?|tools?|stuff))\b|\b(?:I|my|me|we|our)\b",
@@ -75,7 +78,10 @@ class EmbeddingParser:
         problem: VapError | None = None
         people = person_pattern(self.context)
         expressions = list(find_expressions(text, exclusions, people))
+        last = 0
         for expression in expressions:
+            if expression.start < last:
+                continue
             try:
                 obj = _Reading(self, text, expression, expressions, exclusions).object()
             except VapError as error:
@@ -84,6 +90,7 @@ class EmbeddingParser:
                 continue
             if obj is not None:
                 found.append((expression, obj))
+                last = max(last, expression.stop)
         targets = _targets(found)
         if targets:
             return Instruction(text, targets)
@@ -128,18 +135,20 @@ class _Reading:
         Raises: BadInstruction, UnknownName.
         """
         expression = self.expression
-        if expression.kind == "indefinite":
-            return None
         if expression.kind == "it":
             return self._it()
         context = self.parser.context
         said = _without(expression.said, self.exclusions, expression.start)
         owner = self._owner(said)
+        if expression.kind == "indefinite" and owner is None:
+            return None
         earlier = self._is_earlier(said)
         if expression.destination and owner is None and not earlier:
             return None
         every = list(context.objects.values())
         category = self._category(said, owner is not None)
+        if owner is None and category is not None and find_category(said, [category]) is None:
+            owner = self._owner_elsewhere()
         candidates = every
         if category is not None:
             candidates = [obj for obj in every if obj.category == category]
@@ -147,11 +156,11 @@ class _Reading:
             return self._used(said, every, owner)
         if owner is not None:
             candidates = belonging(candidates, owner, context.speaker, context.owners)
-        excluded = False
+        excluded = re.search(r"\bother\b", said) is not None
         kept = candidates
         if category is not None or owner is not None:
             kept = self._exclude(candidates)
-            excluded = len(kept) < len(candidates)
+            excluded |= len(kept) < len(candidates)
         words = content(said, self._known_words(category))
         if earlier:
             return self._used(said, kept)
@@ -161,13 +170,31 @@ class _Reading:
             return None
         return self._only(kept, words, owner, category)
 
-    def _it(self) -> None:
-        """ "it" refers to what another expression names; alone it is ambiguous."""
-        if self.expression.argument and not self.text[: self.expression.start].count(" ") > 3:
-            names = ", ".join(sorted(self.parser.context.objects))
-            raise BadInstruction(
-                f"parse: 'it' in {self.text[:60]!r} could be any of {names[:150]}; name the object."
-            )
+    def _it(self) -> PersonalObject | None:
+        """ "it" is what another expression names, or what was used earlier; alone it is ambiguous.
+
+        Raises: BadInstruction, UnknownName.
+        """
+        if not self.expression.argument:
+            return None
+        if EARLIER.search(self.text):
+            return self._used(self.text, list(self.parser.context.objects.values()))
+        if self.text[: self.expression.start].count(" ") > 3:
+            return None
+        names = ", ".join(sorted(self.parser.context.objects))
+        raise BadInstruction(
+            f"parse: 'it' in {self.text[:60]!r} could be any of {names[:150]}; name the object."
+        )
+
+    def _owner_elsewhere(self) -> str | None:
+        """The only owner that another expression names: "Ben's own: put that one there"."""
+        owners = set()
+        for other in self.expressions:
+            if other.kind in ("owner", "alone") and other is not self.expression:
+                owner = self._named_owner(other.said)
+                if owner is not None:
+                    owners.add(fold(owner))
+        return owners.pop() if len(owners) == 1 else None
 
     def _owner(self, said: str) -> str | None:
         """Whose the object is said to be; None where nothing is said."""
@@ -185,18 +212,23 @@ class _Reading:
         if expression.kind == "several":
             return said.split()[2]
         if expression.kind in ("owner", "alone"):
-            match = re.match(
-                r"(?:my|his|her|their|our)(?:\s+(?:[\w-]+\s+)?[\w-]+['’]s)?(?=\W|$)|mine"
-                r"|hers|theirs|ours|[\w-]+['’]s(?:\s+[\w-]+['’]s)?",
-                said,
-                re.I,
-            )
-            return None if match is None else self._antecedent(match.group())
+            owner = self._named_owner(said)
+            return None if owner is None else self._antecedent(owner)
         if find_category(said, self._categories()) is not None:
             for other in self.expressions:
                 if other.kind == "alone" and other is not expression:
                     return fold(other.said)
         return None
+
+    def _named_owner(self, said: str) -> str | None:
+        """The owner that an expression begins with."""
+        match = re.match(
+            r"(?:my|his|her|their|our)(?:\s+(?:[\w-]+\s+)?[\w-]+['’]s)?(?=\W|$)|mine|hers|theirs|"
+            r"ours|[\w-]+['’]s(?:\s+[\w-]+['’]s)?",
+            said,
+            re.IGNORECASE,
+        )
+        return None if match is None else match.group()
 
     def _antecedent(self, owner: str) -> str:
         """The person that "his" refers to, where one is named before."""
@@ -301,7 +333,9 @@ class _Reading:
             return None
         scores = self._scores(words, candidates)
         order = np.argsort(-scores)
-        least = NOUN if owner is not None and len(words.split()) < 2 else PURPOSE
+        least = PURPOSE
+        if owner is not None and not GENERIC_HEAD.search(self.expression.said):
+            least = NOUN
         if scores[order[0]] < least:
             if owner is None:
                 return None
@@ -345,17 +379,22 @@ class _Reading:
 
         "put my cup on the plate; the striped one stays" names the other cup.
         """
-        kept = candidates
+        best: tuple[float, int] | None = None
         for other in self.expressions:
-            if other is self.expression or other.destination or len(kept) < 2:
+            if other is self.expression or other.destination:
                 continue
             if find_category(other.said, self._categories()) not in (None, category):
                 continue
             words = content(other.said, self._known_words(category))
             if words:
-                best = int(self._scores(words, kept).argmax())
-                kept = [obj for obj in kept if obj is not kept[best]]
-        return kept
+                scores = self._scores(words, candidates)
+                order = np.argsort(-scores)
+                lead = float(scores[order[0]] - scores[order[1]])
+                if best is None or lead > best[0]:
+                    best = lead, int(order[0])
+        if best is None or best[0] < MARGIN:
+            return candidates
+        return [obj for obj in candidates if obj is not candidates[best[1]]]
 
     def _scores(
         self, words: str, candidates: Sequence[PersonalObject]
@@ -373,11 +412,14 @@ def object_scores(
     It is the mean of the two greatest cosines with the object's texts, and the fit of its
     description; among objects of one category, whose `looks` differ, the greatest cosine.
     """
-    (query,) = embed([words])
+    there = wanted(words) if looks else words
+    (query,) = embed([there or words])
     scores = np.zeros(len(objects), np.float32)
     for i, obj in enumerate(objects):
         cosines = np.sort(embed(_texts(obj, looks)) @ query)
         cosine = cosines[-1] if looks else cosines[-2:].mean()
+        if not there:
+            cosine = 0.0
         scores[i] = float(cosine) + LOOKS * fit(words, obj)
     return scores
 

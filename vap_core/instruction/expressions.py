@@ -30,10 +30,10 @@ PUNCTUATION = ",;:.!?—–"
 GENERIC = frozenset(
     """one ones thing things item items object objects tool tools pick choice stuff what whatever
     whichever something anything which that this those these the my mine his her hers their theirs
-    our ours own personal favourite favorite dear old good right proper best other same very of is are was were be
+    our ours own personal favourite favorite dear old good right wrong proper best other same very of is are was were be
     been being for with to from at when while i me you we us he she they it need needs want wants
     use used uses using normally usually always often like likes love loves can could would will
-    meant reserved made helps help do does did just really know thanks please so and or then
+    meant reserved made helps help lets let takes take needed required cannot goes back do does did just really know thanks please so and or then
     belongs belong belonging owned owns owns by not n't isn't don't has have had who whose""".split()
 )
 """Words that say nothing about which object is meant."""
@@ -108,20 +108,22 @@ def find_exclusions(text: str) -> tuple[Exclusion, ...]:
 def find_expressions(
     text: str, exclusions: Collection[Exclusion], people: str = "me"
 ) -> Iterator[Expression]:
-    """Every expression outside the exclusions, left to right and disjoint.
+    """Every expression outside the exclusions, left to right; one can be inside another.
 
     `people` is a `person_pattern`: "my brother" is a person, "my brother's cup" is not.
     """
-    last = 0
     for match in START.finditer(text):
         start = match.start()
-        if start < last or _inside(start, exclusions):
+        if _inside(start, exclusions):
             continue
         person = re.match(rf"(?:{people})\b(?!['’])", text[start:], re.IGNORECASE)
         if person and match.end() <= start + person.end():
             continue
         clause_end = _clause_end(text, match.end())
-        stop = _before_destination(text, start, match.end(), clause_end)
+        stop = _before_verb(text, start, match.end(), clause_end)
+        stop = _before_destination(text, start, match.end(), stop)
+        if match.lastgroup == "it":
+            stop = match.end()
         for exclusion in exclusions:
             if start < exclusion.start < stop:
                 stop = exclusion.start
@@ -142,7 +144,6 @@ def find_expressions(
             destination=re.search(rf"\b(?:{DESTINATION})$", before, re.IGNORECASE) is not None,
             clause=text[start:clause_end],
         )
-        last = stop
 
 
 def content(said: str, without: Collection[str] = ()) -> str:
@@ -193,6 +194,23 @@ def _clause_end(text: str, start: int) -> int:
     if further:
         stop = start + further.start()
     return stop
+
+
+def _before_verb(text: str, start: int, begin: int, stop: int) -> int:
+    """Where a noun phrase from `start` ends: before its verb, unless that is in a relative clause."""
+    verb = re.search(
+        r"\s(?:is|are|was|were|goes|go|stays|stay|has|can|cannot|will|would|should|must|comes)\b",
+        text[begin:stop],
+        re.IGNORECASE,
+    )
+    if verb is None:
+        return stop
+    said = text[start : begin + verb.start()]
+    if re.search(r"\b(?:that|which|who|what|whatever|whichever|I|you|we|he|she|they)\b", said, re.I):
+        return stop
+    if re.search(r"\s(?:my|[A-Z])[\w-]*\s+[\w-]+$", said):
+        return stop  # a relative clause without its pronoun: "the cup my brother has"
+    return begin + verb.start()
 
 
 def _before_destination(text: str, begin: int, start: int, stop: int) -> int:

@@ -27,7 +27,7 @@ PROMINENT = 0.6
 MINOR = 0.2
 PAIR = 1.0
 """Weight of two neighbouring words that are neighbours in the description: "black bands"."""
-NONE = re.compile(r"\b(?:without|no|nothing)\b")
+NONE = re.compile(r"\b(?:without|no|nothing|non)\b")
 
 
 def fit(words: str, obj: PersonalObject) -> float:
@@ -37,11 +37,16 @@ def fit(words: str, obj: PersonalObject) -> float:
     """
     if obj.description is None:
         return 0.0
-    wanted, _, unwanted = _split_none(words.lower())
+    there, _, absent = _split_none(words.lower())
     total = 0.0
-    for part, sign in ((wanted, 1.0), (unwanted, -1.0)):
+    for part, sign in ((there, 1.0), (absent, -1.0)):
         total += sign * _fit(part, obj.description.short.lower(), obj.description.long.lower())
     return total
+
+
+def wanted(words: str) -> str:
+    """The words before "without", "no" or "non-": what follows is not there."""
+    return _split_none(words.lower())[0].strip()
 
 
 def _split_none(words: str) -> tuple[str, str, str]:
@@ -56,7 +61,7 @@ def _fit(words: str, short: str, long: str) -> float:
     prominent = short.split()
     minor = re.findall(r"[\w-]+", long)
     total = 0.0
-    said = re.findall(r"[\w-]+", words)
+    said = re.findall(r"\w[\w-]*", words)
     for i, word in enumerate(said):
         weights = [0.0]
         for same in (word, *SYNONYMS.get(word, ()), word.rstrip("s")):

@@ -179,7 +179,7 @@ def _uses(
     assert meant is not None
     user = objects[meant].owner if family["memory"] == "shared" else family["speaker"]
     yesterday = NOW - timedelta(days=1)
-    said_day = yesterday if "yesterday" in family["text"] else NOW
+    said_day = yesterday if "yesterday" in family["text"].lower() else NOW
     uses = []
     others = [name for name in objects if name != meant]
     for i, name in enumerate(others):
