@@ -1,64 +1,23 @@
-"""The offline parser of implicit references: grammar, MiniLM, owners and history.
+"""The offline parser of implicit references: grammar, MiniLM, owners and history (SPEC section 3).
 
-`expressions` finds what may refer to an object. What it says is evidence in this order: the owner,
-earlier uses ("the one I used earlier"), the category, what is excluded ("not the striped one"), and
-what the rest of the words mean: their sentence embedding against each object's category, note and
-description (SPEC section 3).
+`expressions` finds what may refer to an object, `reading` decides which object one of them means,
+and `meaning` compares words by their sentence embeddings.
 """
 
-import re
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from jaxtyping import Float32
-
-from vap_core.base.errors import BadInstruction, UnknownName, VapError
+from vap_core.base.errors import BadInstruction, VapError
 from vap_core.base.types import Instruction, PersonalObject, Target
 from vap_core.instruction.context import Context
 from vap_core.instruction.expressions import (
-    Exclusion,
     Expression,
-    content,
-    find_category,
     find_exclusions,
     find_expressions,
     person_pattern,
 )
-from vap_core.instruction.looks import fit, wanted
-from vap_core.instruction.owners import MINE, OTHERS, belonging, find_owner, fold
-
-EmbedText = Callable[[Sequence[str]], Float32[np.ndarray, "n d"]]
-PURPOSE = 0.3
-"""Least cosine of words without a category with the object that they mean."""
-NOUN = 0.55
-"""The same where the words are a noun of the speaker's, as in "my mug"."""
-MARGIN = 0.01
-"""Least lead over the second object."""
-LOOKS = 0.25
-"""Weight of the description's words beside the cosine."""
-EARLIER = re.compile(
-    r"\b(?:earlier|last|yesterday|ago|again|previous(?:ly)?|recent(?:ly)?|latest|same|already|"
-    r"once more|just now|this (?:morning|afternoon|evening)|today|tonight|"
-    r"before(?!\s+(?!(?:"
-    "in|on|into|onto|near|next|to"
-    r")\b)\w)|(?:was|were|been) \w+ing)\b",
-    re.IGNORECASE,
-)
-"""Words of time that make a reference one to an earlier use."""
-GENERIC_HEAD = re.compile(
-    r"\b(?:ones?|things?|items?|objects?|tools?|stuff|pick|choice)\b", re.IGNORECASE
-)
-LOOSE = re.compile(
-    r"^(?:what|whatever|whichever|something|(?:the|that|this)\s+(?:[\w-]+\s+){0,2}?(?:ones?|things?|"
-    r"items?|objects?|tools?|stuff))\b|\b(?:I|my|me|we|our)\b",
-    re.IGNORECASE,
-)
-"""Expressions that do not say what kind of thing they mean; "the window" does."""
-TIME = frozenset(
-    """earlier last yesterday ago again previous previously recent recently latest same already once
-    more just now today tonight before moment time most day""".split()
-)
+from vap_core.instruction.meaning import EmbedText
+from vap_core.instruction.reading import Reading
 
 
 @dataclass(frozen=True)
@@ -83,9 +42,16 @@ class EmbeddingParser:
             if expression.start < last:
                 continue
             try:
-                obj = _Reading(self, text, expression, expressions, exclusions).object()
+                obj = Reading(
+                    context=self.context,
+                    embed=self.embed,
+                    text=text,
+                    expression=expression,
+                    expressions=expressions,
+                    exclusions=exclusions,
+                ).object()
             except VapError as error:
-                if problem is None or expression.argument:
+                if problem is None or expression.governed:
                     problem = error
                 continue
             if obj is not None:
@@ -102,7 +68,7 @@ class EmbeddingParser:
 
 def _targets(found: Sequence[tuple[Expression, PersonalObject]]) -> tuple[Target, ...]:
     """One target per object: where a verb of action or a place is, only those that stand there."""
-    governed = [pair for pair in found if pair[0].argument or pair[0].destination]
+    governed = [pair for pair in found if pair[0].governed]
     targets: list[Target] = []
     for expression, obj in governed or found:
         if obj.name in {target.object for target in targets}:
@@ -117,335 +83,3 @@ def _targets(found: Sequence[tuple[Expression, PersonalObject]]) -> tuple[Target
             )
         )
     return tuple(targets)
-
-
-@dataclass(frozen=True)
-class _Reading:
-    """One expression of an instruction, and all that it says."""
-
-    parser: EmbeddingParser
-    text: str
-    expression: Expression
-    expressions: Sequence[Expression]
-    exclusions: Sequence[Exclusion]
-
-    def object(self) -> PersonalObject | None:
-        """The object that is meant; None where the expression refers to no personal object.
-
-        Raises: BadInstruction, UnknownName.
-        """
-        expression = self.expression
-        if expression.kind == "it":
-            return self._it()
-        context = self.parser.context
-        said = _without(expression.said, self.exclusions, expression.start)
-        owner = self._owner(said)
-        if expression.kind == "indefinite" and owner is None:
-            return None
-        earlier = self._is_earlier(said)
-        if expression.destination and owner is None and not earlier:
-            return None
-        every = list(context.objects.values())
-        category = self._category(said, owner is not None)
-        if owner is None and category is not None and find_category(said, [category]) is None:
-            owner = self._owner_elsewhere()
-        candidates = every
-        if category is not None:
-            candidates = [obj for obj in every if obj.category == category]
-        if earlier and category is None and owner is not None and fold(owner) not in MINE:
-            return self._used(said, every, owner)
-        if owner is not None:
-            candidates = belonging(candidates, owner, context.speaker, context.owners)
-        excluded = re.search(r"\bother\b", said) is not None
-        kept = candidates
-        if category is not None or owner is not None:
-            kept = self._exclude(candidates)
-            excluded |= len(kept) < len(candidates)
-        words = content(said, self._known_words(category))
-        if earlier:
-            return self._used(said, kept)
-        if category is None:
-            return self._by_meaning(words, kept, owner)
-        if owner is None and not excluded and (not words or expression.kind == "pronoun"):
-            return None
-        return self._only(kept, words, owner, category)
-
-    def _it(self) -> PersonalObject | None:
-        """ "it" is what another expression names, or what was used earlier; alone it is ambiguous.
-
-        Raises: BadInstruction, UnknownName.
-        """
-        if not self.expression.argument:
-            return None
-        if EARLIER.search(self.text):
-            return self._used(self.text, list(self.parser.context.objects.values()))
-        if self.text[: self.expression.start].count(" ") > 3:
-            return None
-        names = ", ".join(sorted(self.parser.context.objects))
-        raise BadInstruction(
-            f"parse: 'it' in {self.text[:60]!r} could be any of {names[:150]}; name the object."
-        )
-
-    def _owner_elsewhere(self) -> str | None:
-        """The only owner that another expression names: "Ben's own: put that one there"."""
-        owners = set()
-        for other in self.expressions:
-            if other.kind in ("owner", "alone") and other is not self.expression:
-                owner = self._named_owner(other.said)
-                if owner is not None:
-                    owners.add(fold(owner))
-        return owners.pop() if len(owners) == 1 else None
-
-    def _owner(self, said: str) -> str | None:
-        """Whose the object is said to be; None where nothing is said."""
-        expression = self.expression
-        person = person_pattern(self.parser.context)
-        for pattern in (
-            rf"\bof (mine|his|hers|theirs|ours|(?:{person})|[\w-]+['’]s)(?:['’]s)?(?:\W|$)",
-            rf"\b(?:belong\w*|owned) (?:to|by) (my [\w-]+|{person}|us|him|her|them|[\w-]+)\b",
-            rf"\b({person}|my [\w-]+|he|she|they|we|[A-Z][\w-]+) owns?\b",
-            r"\b(?:is|are) (mine|his|hers|theirs|ours|(?:my )?[\w-]+['’]s)(?:\W|$)",
-        ):
-            match = re.search(pattern, said, re.IGNORECASE)
-            if match:
-                return self._antecedent(match.group(1))
-        if expression.kind == "several":
-            return said.split()[2]
-        if expression.kind in ("owner", "alone"):
-            owner = self._named_owner(said)
-            return None if owner is None else self._antecedent(owner)
-        if find_category(said, self._categories()) is not None:
-            for other in self.expressions:
-                if other.kind == "alone" and other is not expression:
-                    return fold(other.said)
-        return None
-
-    def _named_owner(self, said: str) -> str | None:
-        """The owner that an expression begins with."""
-        match = re.match(
-            r"(?:my|his|her|their|our)(?:\s+(?:[\w-]+\s+)?[\w-]+['’]s)?(?=\W|$)|mine|hers|theirs|"
-            r"ours|[\w-]+['’]s(?:\s+[\w-]+['’]s)?",
-            said,
-            re.IGNORECASE,
-        )
-        return None if match is None else match.group()
-
-    def _antecedent(self, owner: str) -> str:
-        """The person that "his" refers to, where one is named before."""
-        if fold(owner) not in OTHERS:
-            return owner
-        named = []
-        for match in re.finditer(
-            rf"\b(?:{person_pattern(self.parser.context)})\b",
-            self.text[: self.expression.start],
-            re.IGNORECASE,
-        ):
-            if fold(match.group()) not in MINE:
-                named.append(match.group())
-        return named[-1] if named else owner
-
-    def _is_earlier(self, said: str) -> bool:
-        rest = _without(self.expression.clause, self.exclusions, self.expression.start)
-        if EARLIER.search(said):
-            return True
-        return self.expression.argument and re.search(r"\b(?:again|once more)\b", rest) is not None
-
-    def _categories(self) -> list[str]:
-        return sorted({obj.category for obj in self.parser.context.objects.values()})
-
-    def _category(self, said: str, owned: bool) -> str | None:
-        """The category that is named; after "mine" or "the striped one" the one named elsewhere."""
-        here = find_category(said, self._categories())
-        if here is not None:
-            return here
-        bare = not content(said, self._known_words(None))
-        if (bare and owned) or re.search(r"\b(?:other|ones?)\b", said):
-            return find_category(self.text, self._categories())
-        return None
-
-    def _known_words(self, category: str | None) -> set[str]:
-        """Words that name people, time or the category: they do not describe the object."""
-        words = set(TIME)
-        for name, known_as in self.parser.context.owners.items():
-            words.add(name)
-            for word in known_as:
-                words.update(word.replace("'s", "").split())
-        if category is not None:
-            for word in category.split():
-                words |= {word, f"{word}s", f"{word}es"}
-        return words
-
-    def _exclude(self, candidates: list[PersonalObject]) -> list[PersonalObject]:
-        """Those of `candidates` that no exclusion means."""
-        kept = candidates
-        for exclusion in self.exclusions:
-            if len(kept) < 2:
-                break
-            category = find_category(exclusion.said, self._categories())
-            if category is not None and category not in {obj.category for obj in kept}:
-                continue
-            words = content(exclusion.said, self._known_words(category))
-            if not words:
-                continue
-            scores = self._scores(words, kept)
-            best = int(scores.argmax())
-            kept = [obj for obj in kept if obj is not kept[best]]
-        return kept
-
-    def _used(self, said: str, candidates: list[PersonalObject], user: str = "") -> PersonalObject:
-        """The one of `candidates` that was used last, by the person and on the day that are said."""
-        context = self.parser.context
-        by: str | None = fold(context.speaker) or None
-        if user:
-            by = find_owner(user, context.speaker, context.owners)
-        person = person_pattern(context)
-        match = re.search(rf"\b({person}|he|she|they)\s+(?!own)[\w-]+", said, re.IGNORECASE)
-        if match and fold(match.group(1)) not in MINE:
-            owner = self._antecedent(match.group(1))
-            if fold(owner) in OTHERS:
-                by = None
-            else:
-                by = find_owner(owner, context.speaker, context.owners)
-        day = None
-        if re.search(r"\byesterday\b", said, re.IGNORECASE):
-            day = 1
-        elif re.search(r"\b(?:today|this (?:morning|afternoon|evening)|tonight)\b", said, re.I):
-            day = 0
-        for name in context.latest(by, day):
-            for obj in candidates:
-                if obj.name == name:
-                    return obj
-        who = f" by {by}" if by else ""
-        raise UnknownName(
-            f"parse: no earlier use{who} of what {self.expression.said[:60]!r} means is remembered; "
-            "name the object."
-        )
-
-    def _by_meaning(
-        self, words: str, candidates: list[PersonalObject], owner: str | None
-    ) -> PersonalObject | None:
-        """The object that words without a category mean."""
-        if owner is None and not LOOSE.search(self.expression.said):
-            return None
-        if not words and (self.expression.argument or owner is not None):
-            words = content(self._rest(), self._known_words(None))
-        if not words or not candidates:
-            return None
-        scores = self._scores(words, candidates)
-        order = np.argsort(-scores)
-        least = PURPOSE
-        if owner is not None and not GENERIC_HEAD.search(self.expression.said):
-            least = NOUN
-        if scores[order[0]] < least:
-            if owner is None:
-                return None
-            raise UnknownName(
-                f"parse: nothing like {self.expression.said[:60]!r} is remembered; register it, or "
-                "say what kind of thing it is."
-            )
-        if len(order) > 1 and scores[order[0]] - scores[order[1]] < MARGIN:
-            raise _ambiguous(self.expression, [candidates[i] for i in order[:2]])
-        return candidates[order[0]]
-
-    def _rest(self) -> str:
-        """The text beside the expression and its verb."""
-        before, after = self.text[: self.expression.start], self.text[self.expression.stop :]
-        return re.sub(r"[\w-]+(?: me| up)?$", "", before.rstrip()) + after
-
-    def _only(
-        self, candidates: list[PersonalObject], words: str, owner: str | None, category: str
-    ) -> PersonalObject | None:
-        """The one of several objects of a category that the words describe."""
-        if not candidates:
-            whose = "" if owner is None else f" of {fold(owner)!r}"
-            raise UnknownName(
-                f"parse: no {category!r}{whose} is remembered; register one with --owner, or name "
-                "another owner."
-            )
-        if len(candidates) == 1:
-            return candidates[0]
-        if words:
-            scores = self._scores(words, candidates)
-            order = np.argsort(-scores)
-            if scores[order[0]] - scores[order[1]] >= MARGIN:
-                return candidates[order[0]]
-        kept = self._contrasted(candidates, category)
-        if len(kept) == 1:
-            return kept[0]
-        raise _ambiguous(self.expression, candidates)
-
-    def _contrasted(self, candidates: list[PersonalObject], category: str) -> list[PersonalObject]:
-        """Those of `candidates` that no other expression of the instruction describes.
-
-        "put my cup on the plate; the striped one stays" names the other cup.
-        """
-        best: tuple[float, int] | None = None
-        for other in self.expressions:
-            if other is self.expression or other.destination:
-                continue
-            if find_category(other.said, self._categories()) not in (None, category):
-                continue
-            words = content(other.said, self._known_words(category))
-            if words:
-                scores = self._scores(words, candidates)
-                order = np.argsort(-scores)
-                lead = float(scores[order[0]] - scores[order[1]])
-                if best is None or lead > best[0]:
-                    best = lead, int(order[0])
-        if best is None or best[0] < MARGIN:
-            return candidates
-        return [obj for obj in candidates if obj is not candidates[best[1]]]
-
-    def _scores(
-        self, words: str, candidates: Sequence[PersonalObject]
-    ) -> Float32[np.ndarray, " n"]:
-        """How well words fit every object: cosine with what is known of it, and its description."""
-        one = len({obj.category for obj in candidates}) == 1
-        return object_scores(words, candidates, self.parser.embed, looks=one)
-
-
-def object_scores(
-    words: str, objects: Sequence[PersonalObject], embed: EmbedText, *, looks: bool
-) -> Float32[np.ndarray, " n"]:
-    """How well words fit every object.
-
-    It is the mean of the two greatest cosines with the object's texts, and the fit of its
-    description; among objects of one category, whose `looks` differ, the greatest cosine.
-    """
-    there = wanted(words) if looks else words
-    (query,) = embed([there or words])
-    scores = np.zeros(len(objects), np.float32)
-    for i, obj in enumerate(objects):
-        cosines = np.sort(embed(_texts(obj, looks)) @ query)
-        cosine = cosines[-1] if looks else cosines[-2:].mean()
-        if not there:
-            cosine = 0.0
-        scores[i] = float(cosine) + LOOKS * fit(words, obj)
-    return scores
-
-
-def _texts(obj: PersonalObject, looks: bool) -> list[str]:
-    """What is known of an object, in phrases."""
-    texts = [obj.category]
-    if obj.note:
-        texts += [obj.note, f"{obj.category} {obj.note}", f"something {obj.note}"]
-    if looks and obj.description is not None:
-        texts.append(f"{obj.category}, {obj.description.short}")
-    return texts
-
-
-def _without(said: str, exclusions: Sequence[Exclusion], start: int) -> str:
-    """An expression without the exclusions inside it; `start` is its place in the text."""
-    for exclusion in reversed(exclusions):
-        first, last = exclusion.start - start, exclusion.stop - start
-        if 0 <= first < len(said):
-            said = said[:first] + said[max(last, 0) :]
-    return said.strip(" ,")
-
-
-def _ambiguous(expression: Expression, objects: Sequence[PersonalObject]) -> BadInstruction:
-    names = " or ".join(obj.name for obj in objects[:4])
-    return BadInstruction(
-        f"parse: {expression.said[:60]!r} could be {names}; say whose it is, what it looks like or "
-        "what it is for."
-    )

@@ -87,6 +87,11 @@ class Expression:
     clause: str
     """The expression and the rest of its clause."""
 
+    @property
+    def governed(self) -> bool:
+        """Whether it is what something is done with, or where."""
+        return self.argument or self.destination
+
 
 def find_exclusions(text: str) -> tuple[Exclusion, ...]:
     """What an instruction says is not meant, left to right."""
@@ -206,7 +211,9 @@ def _before_verb(text: str, start: int, begin: int, stop: int) -> int:
     if verb is None:
         return stop
     said = text[start : begin + verb.start()]
-    if re.search(r"\b(?:that|which|who|what|whatever|whichever|I|you|we|he|she|they)\b", said, re.I):
+    if re.search(
+        r"\b(?:that|which|who|what|whatever|whichever|I|you|we|he|she|they)\b", said, re.I
+    ):
         return stop
     if re.search(r"\s(?:my|[A-Z])[\w-]*\s+[\w-]+$", said):
         return stop  # a relative clause without its pronoun: "the cup my brother has"
