@@ -72,8 +72,8 @@ class PersonalObject:
     """One remembered object: K reference crops and their embeddings Z_o (P 3.3).
 
     Rows of `embeddings` are L2-normalised. `owner` is the person that it belongs to, "" where that
-    does not matter; `known_as` are other words for that person, as in "my brother's". `note` is what
-    its owner says about it: "for the morning coffee".
+    does not matter; `known_as` are other words for that person, as in "my brother's". `note` is
+    what its owner says about it: "for the morning coffee".
     """
 
     name: str

@@ -22,9 +22,9 @@ TASK = (
     "A user tells a robot what to do. Find every expression of the instruction that refers to one "
     "of the user's or another person's remembered objects, and say which object it means. "
     'Expressions can be explicit ("my cup"), about an owner ("Anna\'s cup"), implicit ("the thing '
-    'for shaving"), about earlier uses ("the one I used last"), or exclude others ("not the striped '
-    'one"). "my" means objects of the speaker. A cup, any cup, and things that are not remembered '
-    "are no remembered object: leave them out; if there is none, answer with an empty list. Leave "
+    'for shaving"), about earlier uses ("the one I used last"), or exclude others ("not the '
+    'striped one"). "my" means objects of the speaker. A cup, any cup, and things that are not '
+    "remembered are no remembered object: leave them out; if there is none, answer with an empty list. Leave "
     "out pronouns for an object that is named already. Copy each expression letter by letter from "
     "the instruction, with its article or possessive and everything that describes it, without the "
     "verb and the place where it goes. Answer in JSON."
@@ -120,8 +120,8 @@ class ChatParser:
                     raise ValueError("overlapping expressions")
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise BadEndpoint(
-                f"parse: {self.endpoint.model} at {self.endpoint.url} answers outside the form that "
-                f"was asked for ({type(error).__name__}: {_line(str(error))[:60]!r}); try another "
+                f"parse: {self.endpoint.model} at {self.endpoint.url} answers outside the form "
+                f"that was asked for ({type(error).__name__}: {_line(str(error))[:60]!r}); try another "
                 f"model in {MODEL}, or --parser rule."
             ) from error
         return tuple(targets)

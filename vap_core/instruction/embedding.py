@@ -12,6 +12,7 @@ from vap_core.base.types import Instruction, PersonalObject, Target
 from vap_core.instruction.context import Context
 from vap_core.instruction.expressions import (
     Expression,
+    find_category,
     find_exclusions,
     find_expressions,
     person_pattern,
@@ -35,6 +36,7 @@ class EmbeddingParser:
         exclusions = find_exclusions(text)
         found: list[tuple[Expression, PersonalObject]] = []
         problem: VapError | None = None
+        unmet: VapError | None = None
         people = person_pattern(self.context)
         expressions = list(find_expressions(text, exclusions, people))
         last = 0
@@ -53,17 +55,29 @@ class EmbeddingParser:
             except VapError as error:
                 if problem is None or expression.governed:
                     problem = error
+                if expression.kind == "owner" and self._is_wanted(expression):
+                    unmet = unmet or error
                 continue
             if obj is not None:
                 found.append((expression, obj))
                 last = max(last, expression.stop)
         targets = _targets(found)
-        if targets:
+        if targets and unmet is None:
             return Instruction(text, targets)
-        raise problem or BadInstruction(
-            f'parse: no personal object in {text[:80]!r}; name one as "my <category>", or say what '
-            "it is for."
+        raise (
+            unmet
+            or problem
+            or BadInstruction(
+                f'parse: no personal object in {text[:80]!r}; name one as "my <category>", or say what '
+                "it is for."
+            )
         )
+
+    def _is_wanted(self, expression: Expression) -> bool:
+        """Whether the instruction cannot be followed without the object."""
+        known = {obj.category for obj in self.context.objects.values()}
+        named = find_category(expression.said, known) is not None
+        return expression.argument or (expression.destination and named)
 
 
 def _targets(found: Sequence[tuple[Expression, PersonalObject]]) -> tuple[Target, ...]:

@@ -28,13 +28,14 @@ TIMES = re.compile(
 """What a preposition of time stands before: "in the morning", "from last time"."""
 PUNCTUATION = ",;:.!?—–"
 GENERIC = frozenset(
-    """one ones thing things item items object objects tool tools pick choice stuff what whatever
-    whichever something anything which that this those these the my mine his her hers their theirs
-    our ours own personal favourite favorite dear old good right wrong proper best other same very of is are was were be
-    been being for with to from at when while i me you we us he she they it need needs want wants
-    use used uses using normally usually always often like likes love loves can could would will
-    meant reserved made helps help lets let takes take needed required cannot goes back do does did just really know thanks please so and or then
-    belongs belong belonging owned owns owns by not n't isn't don't has have had who whose""".split()
+    """one ones thing things item items object objects tool tools pick choice stuff what
+    whatever whichever something anything which that this those these the my mine his her hers
+    their theirs our ours own personal favourite favorite dear old good right wrong proper best
+    other same very of is are was were be been being for with to from at when while i me you we
+    us he she they it need needs want wants use used uses using normally usually always often
+    like likes love loves can could would will meant reserved made helps help lets let takes
+    take needed required cannot goes back do does did just really know thanks please so and or
+    then belongs belong belonging owned owns by not n't isn't don't has have had who whose""".split()
 )
 """Words that say nothing about which object is meant."""
 _OWNED = r"(?!(?:it|that|what|who|where|here|there|let|how|she|he)['’]s)[\w-]+['’]s"
@@ -74,8 +75,8 @@ class Exclusion:
 class Expression:
     """`text[start:stop]`, which may refer to an object.
 
-    `kind` is the group of START that it begins with. `argument` says whether an action's verb stands
-    before it, `destination` whether it is where something is put.
+    `kind` is the group of START that it begins with. `argument` says whether an action's verb
+    stands before it, `destination` whether it is where something is put.
     """
 
     start: int
@@ -202,7 +203,7 @@ def _clause_end(text: str, start: int) -> int:
 
 
 def _before_verb(text: str, start: int, begin: int, stop: int) -> int:
-    """Where a noun phrase from `start` ends: before its verb, unless that is in a relative clause."""
+    """Where a noun phrase from `start` ends: before its verb, unless a relative clause has it."""
     verb = re.search(
         r"\s(?:is|are|was|were|goes|go|stays|stay|has|can|cannot|will|would|should|must|comes)\b",
         text[begin:stop],
@@ -223,7 +224,8 @@ def _before_verb(text: str, start: int, begin: int, stop: int) -> int:
 def _before_destination(text: str, begin: int, start: int, stop: int) -> int:
     """Where an expression ends that begins at `begin` and whose clause ends at `stop`.
 
-    In a relative clause a preposition belongs to it, but for the last phrase after a verb of placing.
+    In a relative clause a preposition belongs to it, but for the last phrase after a verb of
+    placing.
     """
     rest = text[start:stop]
     phrase = rf"\s(?:{DESTINATION})(?=\s+\w)"

@@ -47,8 +47,8 @@ def load_parser(name: str, context: Context, *, fall_back: bool = False) -> Pars
             return FallBack(parser, rule_parser(context.objects), _print_error)
         return parser
     raise UnknownName(
-        f"parser: {name!r} is unknown; known: {', '.join(NAMES)}, or the address of a chat endpoint "
-        "such as http://127.0.0.1:8080/v1."
+        f"parser: {name!r} is unknown; known: {', '.join(NAMES)}, or the address of a chat "
+        "endpoint such as http://127.0.0.1:8080/v1."
     )
 
 

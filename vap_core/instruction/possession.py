@@ -49,7 +49,7 @@ class Possession:
         return None
 
     def elsewhere(self, expression: Expression) -> str | None:
-        """The only owner that another expression names: "a cup of Ben's is there: take that one"."""
+        """The only owner that another expression names: "Ben's cup is there: take that one"."""
         owners = set()
         for other in self.expressions:
             if other.kind in ("owner", "alone") and other is not expression:

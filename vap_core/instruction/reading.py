@@ -174,7 +174,7 @@ class Reading:
         return kept
 
     def _used(self, said: str, candidates: list[PersonalObject], user: str = "") -> PersonalObject:
-        """The one of `candidates` that was used last, by the person and on the day that are said."""
+        """The one of `candidates` that the person whom the words name used last, on their day."""
         context = self.context
         by: str | None = fold(context.speaker) or None
         if user:
@@ -198,8 +198,8 @@ class Reading:
                     return obj
         who = f" by {by}" if by else ""
         raise UnknownName(
-            f"parse: no earlier use{who} of what {self.expression.said[:60]!r} means is remembered; "
-            "name the object."
+            f"parse: no earlier use{who} of what {self.expression.said[:60]!r} means is "
+            "remembered; name the object."
         )
 
     def _by_meaning(

@@ -20,9 +20,10 @@ if TYPE_CHECKING:
 class Answer:
     """What a parser makes of one paraphrase.
 
-    `found` are the names of the objects that it finds, with commas; "" where it abstains, and `error`
-    says why. `right` says whether that is the object that is meant, or whether it abstains where none
-    is. `kept` says whether the expression begins where it should and leaves the rest of the command.
+    `found` are the names of the objects that it finds, with commas; "" where it abstains, and
+    `error` says why. `right` says whether that is the object that is meant, or whether it abstains
+    where none is. `kept` says whether the expression begins where it should and leaves the rest of
+    the command.
     """
 
     parser: str

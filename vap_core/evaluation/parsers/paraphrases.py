@@ -1,9 +1,9 @@
 """Paraphrased instructions, by template families (data/paraphrases).
 
 A family is one sentence with places to fill in. Its part says what it was used for: the parser
-`embedding` was made with "tune"; "check-1" and "check-2" were held out, scored once, and then looked
-at; "test" is held out. What the sentences of a part name (what things are for, what is not there) is
-the part's own, too.
+`embedding` was made with "tune"; "check-1" to "check-3" were held out, scored once, and then
+looked at; "test" is held out. What the sentences of a part name (what things are for, what is not
+there) is the part's own, too.
 """
 
 import csv
