@@ -24,10 +24,10 @@ TASK = (
     'Expressions can be explicit ("my cup"), about an owner ("Anna\'s cup"), implicit ("the thing '
     'for shaving"), about earlier uses ("the one I used last"), or exclude others ("not the '
     'striped one"). "my" means objects of the speaker. A cup, any cup, and things that are not '
-    "remembered are no remembered object: leave them out; if there is none, answer with an empty list. Leave "
-    "out pronouns for an object that is named already. Copy each expression letter by letter from "
-    "the instruction, with its article or possessive and everything that describes it, without the "
-    "verb and the place where it goes. Answer in JSON."
+    "remembered are no remembered object: leave them out; if there is none, answer with an empty "
+    "list. Leave out pronouns for an object that is named already. Copy each expression letter by "
+    "letter from the instruction, with its article or possessive and everything that describes "
+    "it, without the verb and the place where it goes. Answer in JSON."
 )
 NO_KEY = "none"
 """Sent where the endpoint has no key: without one the client would send Hugging Face's."""
@@ -121,8 +121,8 @@ class ChatParser:
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise BadEndpoint(
                 f"parse: {self.endpoint.model} at {self.endpoint.url} answers outside the form "
-                f"that was asked for ({type(error).__name__}: {_line(str(error))[:60]!r}); try another "
-                f"model in {MODEL}, or --parser rule."
+                f"that was asked for ({type(error).__name__}: {_line(str(error))[:60]!r}); try "
+                f"another model in {MODEL}, or --parser rule."
             ) from error
         return tuple(targets)
 

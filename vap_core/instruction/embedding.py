@@ -64,14 +64,11 @@ class EmbeddingParser:
         targets = _targets(found)
         if targets and unmet is None:
             return Instruction(text, targets)
-        raise (
-            unmet
-            or problem
-            or BadInstruction(
-                f'parse: no personal object in {text[:80]!r}; name one as "my <category>", or say what '
-                "it is for."
-            )
+        nothing = BadInstruction(
+            f'parse: no personal object in {text[:80]!r}; name one as "my <category>", or say what '
+            "it is for."
         )
+        raise unmet or problem or nothing
 
     def _is_wanted(self, expression: Expression) -> bool:
         """Whether the instruction cannot be followed without the object."""

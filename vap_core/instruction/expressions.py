@@ -35,7 +35,8 @@ GENERIC = frozenset(
     us he she they it need needs want wants use used uses using normally usually always often
     like likes love loves can could would will meant reserved made helps help lets let takes
     take needed required cannot goes back do does did just really know thanks please so and or
-    then belongs belong belonging owned owns by not n't isn't don't has have had who whose""".split()
+    then belongs belong belonging owned owns by not n't isn't don't has have had who
+    whose""".split()
 )
 """Words that say nothing about which object is meant."""
 _OWNED = r"(?!(?:it|that|what|who|where|here|there|let|how|she|he)['’]s)[\w-]+['’]s"
