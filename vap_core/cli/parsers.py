@@ -23,7 +23,7 @@ def eval_parsers(
     part: Annotated[
         str,
         typer.Option(
-            help="Only these parts, with commas: tune, check-1, check-2, and the held-out test. "
+            help="Only these parts, with commas: tune, check-1 to check-4, and the held-out test. "
             "Default: all."
         ),
     ] = "",

@@ -1,7 +1,7 @@
 """Paraphrased instructions, by template families (data/paraphrases).
 
 A family is one sentence with places to fill in. Its part says what it was used for: the parser
-`embedding` was made with "tune"; "check-1" to "check-3" were held out, scored once, and then
+`embedding` was made with "tune"; "check-1" to "check-4" were held out, scored once, and then
 looked at; "test" is held out. What the sentences of a part name (what things are for, what is not
 there) is the part's own, too.
 """
@@ -23,7 +23,7 @@ from vap_core.instruction.history import Use
 
 FOLDER = DATA / "paraphrases"
 KINDS = ("explicit", "implicit", "negated", "owner", "history", "none")
-PARTS = ("tune", "check-1", "check-2", "check-3", "test")
+PARTS = ("tune", "check-1", "check-2", "check-3", "check-4", "test")
 SENTENCES_EACH = 4
 """So many sentences of a family are made in a suite, or one for every object if these are more."""
 NOW = datetime(2026, 6, 12, 15, 0)
