@@ -44,7 +44,8 @@ START = re.compile(
     r"\b(?:(?P<several>(?:one|some|any) of (?:my|his|her|their|our))"
     rf"|(?P<owner>(?:my|his|her|their|our)\b(?:\s+(?:[\w-]+\s+)?{_OWNED})?|{_OWNED}(?:\s+[\w-]+['’]s)?)"
     r"|(?P<alone>mine|hers|theirs|ours)"
-    r"|(?P<definite>(?:the|that|this|those|these)\b(?!['’])(?!\s+(?:time|way)\b))"
+    r"|(?P<definite>(?:the|that|this|those|these)\b(?!['’])"
+    r"(?!\s+(?:time|way|you|I|we|he|she|they)\b))"
     r"|(?P<pronoun>what|whatever|whichever|something)|(?P<it>it)"
     r"|(?P<indefinite>an?|any|some|another|one))\b",
     re.IGNORECASE,
@@ -235,7 +236,9 @@ def _before_destination(text: str, begin: int, start: int, stop: int) -> int:
         follows = rest[match.end() :].lstrip()
         if re.match(rf"(?:{DESTINATION})\b", follows, re.IGNORECASE):
             continue  # a stranded preposition: "the thing I put flowers in on the plate"
-        if re.search(r"\b(?:belong\w*|lent|owned)$", rest[: match.start()], re.IGNORECASE):
+        if re.search(
+            r"\b(?:belong\w*|lent|owned|suited|used)$", rest[: match.start()], re.IGNORECASE
+        ):
             continue
         if TIMES.match(follows):
             continue

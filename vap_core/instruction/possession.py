@@ -30,7 +30,7 @@ class Possession:
         for pattern in (
             rf"\bof (mine|his|hers|theirs|ours|(?:{person})|[\w-]+['’]s)(?:['’]s)?(?:\W|$)",
             rf"\b(?:belong\w*|owned) (?:to|by) (my [\w-]+|{person}|us|him|her|them|[\w-]+)\b",
-            rf"\b({person}|my [\w-]+|he|she|they|we|[A-Z][\w-]+) owns?\b",
+            rf"\b({person}|my [\w-]+|he|she|they|we|[A-Z][\w-]+) (?:owns?\b|has\W*$)",
             r"(?:\bis|\bare|['’]s) (mine|his|hers|theirs|ours|(?:my )?[\w-]+['’]s)(?:\W|$)",
         ):
             match = re.search(pattern, said, re.IGNORECASE)

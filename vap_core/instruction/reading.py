@@ -91,7 +91,7 @@ class Reading:
             return self._used(said, every, owner)
         if owner is not None:
             candidates = belonging(candidates, owner, context.speaker, context.owners)
-        excluded = re.search(r"\bother\b", said) is not None
+        excluded = re.search(r"\b(?:other|right)\b", said) is not None
         kept = candidates
         if category is not None or owner is not None:
             kept = self._exclude(candidates)
