@@ -200,7 +200,7 @@ def test_a_damaged_history_is_one_line(tmp_path: Path, line: str) -> None:
     with pytest.raises(BadMemory, match="is damaged .*; delete it to start a new one"):
         read_uses(tmp_path)
     with pytest.raises(BadMemory, match="is damaged"):
-        Parsing("embedding").load(tmp_path, {})
+        Parsing("embedding").load(tmp_path, {"mug": cup("mug")})
     assert Parsing("rule").load(tmp_path, {})("bring my cup").targets
 
 

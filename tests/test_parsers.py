@@ -4,6 +4,7 @@ import json
 import socket
 from dataclasses import replace
 from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,9 +19,9 @@ from vap_core.instruction.chat import ChatParser
 from vap_core.instruction.context import Context
 from vap_core.instruction.embedding import EmbeddingParser
 from vap_core.instruction.expressions import find_exclusions, find_expressions
-from vap_core.instruction.history import Use
+from vap_core.instruction.history import Use, add_uses
 from vap_core.instruction.looks import fit
-from vap_core.instruction.parsers import load_parser, rule_parser
+from vap_core.instruction.parsers import Parsing, load_parser, rule_parser
 from vap_core.perception.chat import ChatEndpoint
 from vap_core.perception.text_encoder import embed_text
 from vap_core.prompt import PALETTE
@@ -283,7 +284,23 @@ def test_parsers_by_name() -> None:
     assert isinstance(load_parser("embedding", CONTEXT), EmbeddingParser)
     for one in (parse, rule_parser({}), load_parser("embedding", CONTEXT)):
         assert isinstance(one, Parser)
+    for name in ("embedding", "chat"):
+        with pytest.raises(UnknownName, match="the memory is empty; register"):
+            load_parser(name, Context({}))
     with pytest.raises(UnknownName, match="known: rule, embedding, chat, or the address"):
         load_parser("magic", CONTEXT)
     with pytest.raises(BadEndpoint, match="'' is no address"):
         load_parser("chat", CONTEXT)
+
+
+def test_a_command_asks_a_server_once_for_a_text(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OPENAI_MODEL", "reader-1")
+    add_uses(tmp_path, ["camera"], "ben", datetime(2026, 6, 12))
+    with serving(answer(("my camera", "camera"))) as server:
+        parser = Parsing(server.url, speaker="anna").load(tmp_path, CONTEXT.objects)
+        assert parser("bring my camera") is parser("bring my camera")
+    ((_, _, body),) = server.asked
+    about = json.loads(body["messages"][1]["content"])
+    assert (about["speaker"], about["earlier uses, last one last"][0]["by"]) == ("anna", "ben")

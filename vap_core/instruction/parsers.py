@@ -32,6 +32,8 @@ def load_parser(name: str, context: Context, *, fall_back: bool = False) -> Pars
     """
     if name == "rule":
         return rule_parser(context.objects)
+    if not context.objects and name in ("embedding", "chat"):
+        raise UnknownName("parser: the memory is empty; register an object first.")
     if name == "embedding":
         from vap_core.instruction.embedding import EmbeddingParser
         from vap_core.perception.text_encoder import embed_text
@@ -52,6 +54,18 @@ def load_parser(name: str, context: Context, *, fall_back: bool = False) -> Pars
     )
 
 
+def ask_once(parser: Parser) -> Parser:
+    """The parser, which is asked once for every text: a clip is grounded several times."""
+    answers: dict[str, Instruction] = {}
+
+    def ask(text: str, categories: Collection[str] = ()) -> Instruction:
+        if text not in answers:
+            answers[text] = parser(text, categories)
+        return answers[text]
+
+    return ask
+
+
 @value
 class Parsing:
     """Which parser a command takes, and who speaks ("" where nobody said)."""
@@ -64,7 +78,7 @@ class Parsing:
         """The parser for the objects of a bank, and for its history. Raises: as `load_parser`."""
         uses = () if self.parser == "rule" else read_uses(bank)
         context = Context(objects=objects, speaker=self.speaker, uses=uses)
-        return load_parser(self.parser, context, fall_back=self.fall_back)
+        return ask_once(load_parser(self.parser, context, fall_back=self.fall_back))
 
 
 @dataclass(frozen=True)
