@@ -4,7 +4,8 @@
 # An empty PYTHONDONTWRITEBYTECODE lets Python keep what it compiled; uv compiles nothing.
 RUN := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 .venv/bin/python
 QUIET_LAB := --LabApp.news_url=None --LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate --LabApp.extension_manager=readonly
-PYTEST := $(RUN) -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+# Three workers for two cores: some tests wait for processes that they have started.
+PYTEST := $(RUN) -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 help:
 	@echo "make demo      set up what is missing, then the main job: VAP against generic on two robots, with recordings"

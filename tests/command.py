@@ -1,5 +1,6 @@
 """Commands as `python -m vap_core` runs them: in this process, or in one of their own."""
 
+import os
 import subprocess
 import sys
 import warnings
@@ -56,10 +57,12 @@ def refused(*words: str | Path) -> str:
     return last
 
 
-def process(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    """Run `python -m vap_core WORDS` in a process of its own."""
+def process(*words: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run `python -m vap_core WORDS` in a process of its own, which logs its readings in `cwd`."""
     return subprocess.run(
         [sys.executable, "-m", "vap_core", *map(str, words)],
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": str(Path.cwd())},
         capture_output=True,
         text=True,
         timeout=500,

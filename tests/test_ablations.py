@@ -181,7 +181,7 @@ def test_the_command_says_what_it_found_and_runs_nothing_twice(tmp_path: Path) -
 
 
 @pytest.mark.sweep
-@pytest.mark.parametrize("name", sorted(set(ABLATIONS) - {"selection", "association"}))
+@pytest.mark.parametrize("name", sorted(set(ABLATIONS) - {"selection", "association", "language"}))
 def test_every_ablation_runs(name: str, tmp_path: Path) -> None:
     done = vap("ablate", name, *WORDS, "--out", tmp_path / "run")
     assert done.returncode == 0, done.stderr

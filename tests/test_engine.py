@@ -28,7 +28,7 @@ STUDY = Study(
     episodes=3,
     seeds=2,
 )
-ENV = {**os.environ, "OMP_NUM_THREADS": "1"}
+ENV = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path.cwd())}
 
 
 def command(out: Path, episodes: int, several: bool = False) -> list[str]:
@@ -65,7 +65,7 @@ def kill_once_rows_are_kept(words: list[str], out: Path) -> int:
     Returns: the rows that were there after the kill.
     """
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
-    with subprocess.Popen(words, env=ENV, **quiet) as run:
+    with subprocess.Popen(words, env=ENV, cwd=out.parent, **quiet) as run:
         while not rows_of(out):
             assert run.poll() is None, f"ended with status {run.returncode} and no row"
             time.sleep(0.1)
@@ -87,7 +87,9 @@ def kills(
             "stderr": subprocess.DEVNULL,
             "start_new_session": True,
         }
-        with subprocess.Popen(words, env=ENV, preexec_fn=hear_interrupts, **quiet) as run:
+        with subprocess.Popen(
+            words, env=ENV, cwd=out.parent, preexec_fn=hear_interrupts, **quiet
+        ) as run:
             try:
                 run.wait(rng.uniform(0.5, longest_s))
                 assert run.returncode == 0, f"status {run.returncode}"

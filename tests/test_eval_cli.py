@@ -28,7 +28,7 @@ def words(out: Path) -> tuple[str | Path, ...]:
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """A finished evaluation and what it printed."""
     out = tmp_path_factory.mktemp("eval") / "run"
-    done = process(*words(out))
+    done = process(*words(out), cwd=out.parent)
     assert done.returncode == 0, done.stderr
     return out, done.stdout
 

@@ -20,12 +20,14 @@ from PIL import Image
 from torch.nn import functional as F  # noqa: N812
 
 import vap_core
-from tests import test_perception as contract
 from tests import tiny_foundation
+from tests.contract import kept
 from vap_core import attend, memory
 from vap_core.base.errors import MissingWeights, UnknownName
 from vap_core.base.types import Boxes, Rgb
 from vap_core.cli.bench import stack as bench_stack
+from vap_core.contracts import test_detector, test_encoder, test_segmenter, test_tracker
+from vap_core.contracts.given import RenderedScene
 from vap_core.perception import foundation
 from vap_core.perception.boxes import MAX_BOXES, NMS_IOU, box_iou
 from vap_core.perception.foundation import architectures, runtime, sources, store
@@ -73,28 +75,23 @@ def blurred(seed: int, h: int, w: int) -> Rgb:
     return ((soft - soft.min()) / np.ptp(soft) * 255).astype(np.uint8)
 
 
-# --- The contracts of the four protocols, as the embedded stack keeps them -----------------------------------------------
+# --- The contracts of the four protocols; with random weights there is no sanity -------------------------------------------
 
 
 def test_contract_of_the_encoder(parts: Stack, scene: Pair) -> None:
-    contract.test_encoder_gives_unit_rows_in_order_and_one_by_one(parts.encoder)
-    contract.test_encoder_knows_an_object_again(parts.encoder, scene)
+    kept(test_encoder, encoder=parts.encoder, scene=RenderedScene(*scene))
 
 
 def test_contract_of_the_detector(parts: Stack, scene: Pair) -> None:
-    contract.test_detector_gives_boxes_inside_the_image_best_first(parts.detector, scene)
-    contract.test_detector_batches_as_one_by_one_and_repeats_its_bits(parts.detector, scene)
+    kept(test_detector, sanity=False, detector=parts.detector, scene=RenderedScene(*scene))
 
 
 def test_contract_of_the_segmenter(parts: Stack, scene: Pair) -> None:
-    contract.test_segmenter_takes_no_box_and_always_masks_a_box(parts.segmenter)
-    rgb, masks, boxes = scene
-    assert np.array_equal(parts.segmenter(rgb, boxes), parts.segmenter(rgb, boxes))
-    assert parts.segmenter(rgb, boxes).shape == masks.shape
+    kept(test_segmenter, sanity=False, segmenter=parts.segmenter, scene=RenderedScene(*scene))
 
 
 def test_contract_of_the_tracker(parts: Stack, scene: Pair) -> None:
-    contract.test_tracker_views_are_independent_and_repeat_their_bits(parts.tracker, scene)
+    kept(test_tracker, sanity=False, tracker=parts.tracker, scene=RenderedScene(*scene))
 
 
 # --- Pre-processing, against a few readable lines each -------------------------------------------------------------------
@@ -475,11 +472,22 @@ def test_the_device_is_chosen_or_named(monkeypatch: pytest.MonkeyPatch) -> None:
     assert runtime.select_runtime("cpu") == runtime.Runtime(
         torch.device("cpu"), None, batched=False
     )
-    monkeypatch.setenv(runtime.DEVICE_VARIABLE, "cpu")
+    monkeypatch.setenv("VAP_DEVICE", "cpu")
     assert runtime.select_runtime().device == torch.device("cpu")
-    monkeypatch.setenv(runtime.DEVICE_VARIABLE, "abacus")
+    monkeypatch.setenv("VAP_DEVICE", "abacus")
     with pytest.raises(UnknownName, match="device 'abacus' is not on this machine"):
         runtime.select_runtime()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+@pytest.mark.parametrize("stack", ["embedded", "foundation"])
+def test_a_gpu_that_is_asked_for_and_not_there_is_an_error(
+    monkeypatch: pytest.MonkeyPatch, stack: str
+) -> None:
+    """Also for the embedded stack, which computes on the CPU whatever is asked for."""
+    monkeypatch.setenv("VAP_DEVICE", "cuda")
+    with pytest.raises(UnknownName, match=r"device 'cuda' is not on this machine .* VAP_DEVICE"):
+        load_stack(stack)
 
 
 # --- The whole stack -----------------------------------------------------------------------------------------------------
@@ -500,7 +508,7 @@ def test_the_whole_attender_runs_and_repeats_its_bits(
     weights: Path, scene: Pair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(store.VARIABLE, str(weights))
-    monkeypatch.setenv(runtime.DEVICE_VARIABLE, "cpu")
+    monkeypatch.setenv("VAP_DEVICE", "cpu")
     stack = load_stack("foundation")
     assert stack.name == "foundation"
     assert stack.encoder.name.startswith("dinov2-base-")

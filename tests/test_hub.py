@@ -50,9 +50,9 @@ class Hub(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, origin: Path, cuts: int = 0) -> None:
+    def __init__(self, origin: Path, cuts: int = 0, revision: str = SOURCE.revision) -> None:
         super().__init__(("127.0.0.1", 0), Answer)
-        self.origin, self.cuts = origin, cuts
+        self.origin, self.cuts, self.revision = origin, cuts, revision
         self.requests: list[tuple[str, str | None]] = []
 
     def downloads(self, file: str) -> list[str | None]:
@@ -74,7 +74,7 @@ class Answer(BaseHTTPRequestHandler):
         repo, _, rest = self.path.strip("/").partition("/resolve/")
         revision, _, file = rest.partition("/")
         path = self.server.origin / repo / file
-        if revision != SOURCE.revision or not path.is_file():
+        if revision != self.server.revision or not path.is_file():
             self.send_error(404)
             return
         data = path.read_bytes()
@@ -90,9 +90,14 @@ class Answer(BaseHTTPRequestHandler):
 
 
 @contextmanager
-def serving(origin: Path, monkeypatch: pytest.MonkeyPatch, cuts: int = 0) -> Iterator[Hub]:
+def serving(
+    origin: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    cuts: int = 0,
+    revision: str = SOURCE.revision,
+) -> Iterator[Hub]:
     monkeypatch.setenv("no_proxy", "127.0.0.1")
-    with Hub(origin, cuts) as server:
+    with Hub(origin, cuts, revision) as server:
         url = f"http://127.0.0.1:{server.server_port}"
         monkeypatch.setenv(downloads.ENDPOINT_VARIABLE, url)
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
@@ -295,9 +300,11 @@ def test_pins_are_commits_and_hashes_of_safe_files() -> None:
         assert len(source.sha256) == 64
         assert int(source.revision + source.sha256, 16)
         assert all(Path(file).suffix in (".safetensors", ".json", ".txt") for file in source.files)
-    assert {name for models in sources.KINDS.values() for name in models} == set(sources.MODELS)
-    with pytest.raises(UnknownName, match="known: foundation, foundation-small"):
-        sources.models_of("embedded")
+    used = {name for models in sources.KINDS.values() for name in models} | {sources.TEXT}
+    assert used == set(sources.MODELS)
+    assert sources.models_of("embedded") == (sources.TEXT,)
+    with pytest.raises(UnknownName, match="known: embedded, foundation, foundation-small"):
+        sources.models_of("huge")
 
 
 def test_commands_pull_and_list(tmp_path: Path) -> None:

@@ -46,6 +46,11 @@ def policies(folders):
         return {name: load_policy(folder) for name, folder in folders.items()}
 
 
+def test_a_policy_without_a_temperature_is_given_none(folders):
+    with toy_sizes(tiny.TOY), pytest.raises(BadPolicy, match="has no temperature; leave it out"):
+        load_policy(folders["act"], temperature=0.5)
+
+
 def look(i, text="put my camera on the plate", side=64):
     rng = np.random.default_rng(i)
     return PolicyInput(

@@ -118,6 +118,22 @@ def test_cooler_noise_is_less_noise(checkpoint: Path) -> None:
     )
 
 
+def test_a_temperature_that_is_asked_for_is_the_one_that_samples(checkpoint: Path) -> None:
+    seen = look("put my camera on the plate")
+    chunks = {}
+    for temperature in (None, 0.0, 1.0):
+        policy = load_policy(checkpoint, temperature=temperature)
+        own = policy.policy.config.temperature
+        assert own == (1.0 if temperature is None else temperature)
+        assert policy.label.endswith(", temperature 0") == (temperature == 0.0)
+        for seed in (1, 2):
+            states = [policy.start(np.random.default_rng(seed))]
+            chunks[temperature, seed] = policy.plan(states, [seen])[1][0]
+    assert np.array_equal(chunks[0.0, 1], chunks[0.0, 2])
+    assert not np.array_equal(chunks[1.0, 1], chunks[1.0, 2])
+    assert np.array_equal(chunks[None, 1], chunks[1.0, 1])
+
+
 def test_words_become_the_tokens_that_they_are() -> None:
     words = vocabulary()
     assert len(set(words)) == len(words)

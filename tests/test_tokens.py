@@ -82,8 +82,10 @@ def test_one_embedding_is_learned_and_nothing_else_moves(vlm: MiniVlm) -> None:
     assert vlm.sha256() == before == token.model
     assert token.embedding.shape == (32,)
     assert token.accuracy > 0.95
-    again = learn(vlm, "disc", taught, unseen, TokenTraining(epochs=40, augmentations=3, rate=0.05))
-    assert np.array_equal(again.embedding, token.embedding)
+    one, again = (
+        learn(vlm, "disc", taught, unseen, TokenTraining(epochs=2, augmentations=3)) for _ in "ab"
+    )
+    assert np.array_equal(again.embedding, one.embedding)
 
 
 def test_what_cannot_be_told_apart_is_not_learned(vlm: MiniVlm) -> None:

@@ -221,3 +221,13 @@ def test_changes_near_an_identity_are_noticed() -> None:
         begun, state.thumbnail_of(np.clip(image.astype(int) + 5, 0, 255).astype(np.uint8))
     ).any()
     assert state.changed_nearby(begun, state.thumbnail_of(np.roll(image, 1, axis=1))).all()
+
+
+def test_the_largest_numbers_of_every_row_are_those_that_sorting_finds() -> None:
+    rows = np.random.default_rng(0).standard_normal((7, 60)).astype(np.float32)
+    rows[0] = 0.5
+    expected = np.sort(rows, axis=1)[:, :-6:-1]
+    columns, values = cells.largest(rows.copy(), 5)
+    assert np.array_equal(values, expected)
+    assert np.array_equal(np.take_along_axis(rows, columns, axis=1), expected)
+    assert columns[0].tolist() == [0, 1, 2, 3, 4]

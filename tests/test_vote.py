@@ -6,7 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from vap_core.vote import similarity, vote
+from tests.toys import TOYS, personal
+from vap_core.base.errors import BadEncoder
+from vap_core.base.types import Boxes
+from vap_core.perception.candidates import Proposals
+from vap_core.vote import compare, similarity, vote
 
 cosines = st.integers(0, 2**31).flatmap(
     lambda seed: st.tuples(st.integers(1, 6), st.integers(1, 7)).map(
@@ -108,3 +112,17 @@ def test_no_reference_is_a_mistake() -> None:
 def test_similarity_is_cosine() -> None:
     a, b = np.array([[1, 0], [0, 1]], np.float32), np.array([[0.6, 0.8]], np.float32)
     assert similarity(a, b).tolist() == [[pytest.approx(0.6)], [pytest.approx(0.8)]]
+
+
+def test_numbers_that_are_not_finite_elect_nothing() -> None:
+    """An argmax over NaN would take the first candidate, whatever it is."""
+    boxes = Boxes(
+        np.array([[0, 0, 9, 9], [9, 9, 20, 20]], np.float32), np.ones(2, np.float32), "cup"
+    )
+    mine = personal("mine", "cup", (90, 90, 90))
+    known = Proposals(boxes, np.repeat(mine.embeddings[:1], 2, axis=0))
+    assert compare(mine, known, TOYS).max() == pytest.approx(1.0)
+    broken = known.embeddings.copy()
+    broken[1, 0] = np.nan
+    with pytest.raises(BadEncoder, match="not finite; test it with pytest"):
+        compare(mine, Proposals(boxes, broken), TOYS)

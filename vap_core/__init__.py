@@ -5,7 +5,7 @@ The public names below load when they are first used: importing this package loa
 or rerun. Start reading at attend.py.
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import lazy_loader
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from vap_core.attend import Prompting as Prompting
     from vap_core.base.errors import VapError as VapError
     from vap_core.base.photos import load_photo as load_photo
+    from vap_core.evaluation.diagnosis import diagnose as diagnose
     from vap_core.evaluation.methods import METHODS as METHODS
     from vap_core.evaluation.metrics import rate as rate
     from vap_core.evaluation.photos.run import measure_photos as measure_photos
@@ -51,12 +52,13 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
+_load, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "attend": ["Attender", "Prompting"],
         "base.errors": ["VapError"],
         "base.photos": ["load_photo"],
+        "evaluation.diagnosis": ["diagnose"],
         "evaluation.methods": ["METHODS"],
         "evaluation.metrics": ["rate"],
         "evaluation.photos.run": ["measure_photos"],
@@ -81,3 +83,17 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "vote": ["similarity"],
     },
 )
+
+if not TYPE_CHECKING:  # else every name would exist for type checkers
+
+    def __getattr__(name: str) -> Any:
+        """Load a public name. Raises: MissingPart: its extra is not installed."""
+        try:
+            return _load(name)
+        except ModuleNotFoundError as error:
+            from vap_core.base.extras import missing_part
+
+            part = missing_part(error)
+            if part is None:
+                raise
+            raise part from error

@@ -5,6 +5,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32
 
+from vap_core.base.errors import BadEncoder
 from vap_core.base.types import Ballot, Boxes, PersonalObject
 from vap_core.memory import reference_rows
 from vap_core.perception.boxes import box_cover
@@ -31,9 +32,18 @@ def similarity(
 def compare(
     obj: PersonalObject, proposals: Proposals | Candidates, stack: Stack
 ) -> Float32[np.ndarray, "n k"]:
-    """cos(e_i, z_k) of every crop of a view, by the encoder of that view."""
-    rows = reference_rows(obj, stack.encoder_of(proposals.boxes))
-    return similarity(proposals.embeddings, rows)
+    """cos(e_i, z_k) of every crop of a view, by the encoder of that view.
+
+    Raises: BadEncoder when it gives numbers that are not finite: no vote would mean anything.
+    """
+    encoder = stack.encoder_of(proposals.boxes)
+    cosine = similarity(proposals.embeddings, reference_rows(obj, encoder))
+    if not np.isfinite(cosine).all():
+        raise BadEncoder(
+            f"vote: encoder {encoder.name!r} gave numbers that are not finite; test it with "
+            "pytest --pyargs vap_core.contracts --encoder MODULE:NAME."
+        )
+    return cosine
 
 
 def election_scores(cosine: Float32[np.ndarray, "n k"], boxes: Boxes) -> Float32[np.ndarray, "n k"]:

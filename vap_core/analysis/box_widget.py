@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
+from vap_core.base.extras import require
 from vap_core.base.types import Rgb
 from vap_core.perception.references import Box
 
@@ -18,6 +19,7 @@ SIDE_PX = 800
 
 def drag_box(photo: Rgb, box: Box, label: str) -> "BBoxWidget":
     """The photo with `box` on it; drag its corners or draw another one, then ask `dragged_box`."""
+    require("notebooks", "a box to drag")
     from jupyter_bbox_widget import BBoxWidget
 
     image = Image.fromarray(photo)

@@ -47,6 +47,10 @@ class MissingWeights(VapError):
     """Weights that are not on this machine, or whose checksum differs from the manifest."""
 
 
+class MissingPart(VapError):
+    """An optional part of the package that is not installed (base.extras)."""
+
+
 class MissingMeshes(VapError):
     """MuJoCo Menagerie's meshes of a robot, neither on this machine nor to be downloaded."""
 
@@ -63,12 +67,17 @@ class BadViews(VapError):
     """Views that cannot be associated: too many of them, or cameras without calibration."""
 
 
+class BadEncoder(VapError):
+    """An encoder whose numbers are not finite."""
+
+
 class BadStudy(VapError):
     """Tasks, methods and a policy that do not fit together."""
 
 
 class BadPolicy(VapError):
-    """A checkpoint that is absent, would execute code, is damaged, or does not fit the suite."""
+    """A policy that does not follow its protocol, or a checkpoint that is absent or damaged, would
+    execute code, or does not fit the suite."""
 
 
 class BadEndpoint(VapError):

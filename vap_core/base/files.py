@@ -16,10 +16,24 @@ from uuid import uuid4
 if TYPE_CHECKING:
     import numpy as np
 
-DATA = Path(__file__).resolve().parents[2] / "data"
-"""Weights, policies, episode lists and results that ship beside the package."""
+_PACKAGE = Path(__file__).resolve().parents[1]
+_INSTALLED = _PACKAGE / "data"
+DATA = _INSTALLED if _INSTALLED.is_dir() else _PACKAGE.parent / "data"
+"""Weights, policies and episode lists that ship: inside an installed package (setup.py copies them
+there), beside the package in a checkout."""
 ABANDONED_S = 3600.0
 """A scratch file that was last written so long ago belongs to no process that runs."""
+
+
+def kept_folder(name: str) -> Path:
+    """Where what is downloaded or computed once is kept for later: beside `DATA` in a checkout.
+
+    An installed package keeps it in the user's cache, `XDG_CACHE_HOME` or ~/.cache.
+    """
+    if DATA != _INSTALLED:
+        return DATA / name
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(cache) / "vap-core" / name
 
 
 @contextmanager

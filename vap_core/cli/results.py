@@ -1,4 +1,4 @@
-"""Commands that read results: diagnose, embeddings, query, rescore, report, publish."""
+"""Commands that read results: diagnose, embeddings, query, rescore, report, publish, readings."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -279,6 +279,19 @@ def publish(
 
     n_episodes = write_table(runs, to, replace=replace)
     print(f"wrote {to}: {n_episodes} episodes")
+
+
+@app.command()
+def readings() -> None:
+    """Say how often every shipped episode list was read, with which weights and what for: the log
+    beside the published results, and that of this machine's runs (data/runs/readings.csv).
+
+    Example: python -m vap_core readings
+    """
+    from vap_core.base.tables import align
+    from vap_core.evaluation.readings import all_readings, readings_rows
+
+    print(align(readings_rows(all_readings())))
 
 
 def _report_folder(first_run: Path) -> Path:

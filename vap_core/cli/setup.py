@@ -153,7 +153,8 @@ def eval_policy(
     ways: Annotated[
         str,
         typer.Option(
-            help="How the target is named, with commas: tinted, painted, described, plain."
+            help="How the target is named, with commas: tinted, painted, described, plain; "
+            "tinted-magenta, tinted-0.3 or tinted-yellow-0.7 force the colour and the opacity."
         ),
     ] = "tinted,painted,described,plain",
     execute: Annotated[
@@ -178,6 +179,7 @@ def eval_policy(
 
     Example: python -m vap_core eval-policy --suite simpler-bridge --scenes 4
     Example: python -m vap_core eval-policy --suite tabletop --ways tinted --execute 10
+    Example: python -m vap_core eval-policy --suite simpler-bridge --ways tinted,tinted-magenta
     """
     from vap_core.base.errors import BadStudy
     from vap_core.evaluation.study import Study

@@ -26,7 +26,10 @@ def list_weights() -> None:
 @app.command("pull")
 def pull_weights(
     stack: Annotated[
-        str, typer.Option("--stack", help="foundation, or foundation-small.")
+        str,
+        typer.Option(
+            "--stack", help="foundation, foundation-small; or embedded: the text encoder."
+        ),
     ] = "foundation",
     origin: Annotated[
         Path | None,

@@ -38,7 +38,9 @@ def ray_executor(address: str) -> "Executor":
     try:
         import ray  # noqa: F401
     except ImportError as error:
-        raise BadCluster("cluster: ray is not installed; run: pip install 'ray>=2.50'") from error
+        raise BadCluster(
+            "cluster: ray is not installed; run: pip install 'vap-core[ray]'"
+        ) from error
 
     def results(
         work: "Callable[[Job], Rows]", jobs: "Sequence[Job]", workers: int, remedy: str

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vap_core.base.errors import WorkerDied
-from vap_core.evaluation import store
+from vap_core.evaluation import readings, store
 from vap_core.evaluation.jobs import BATCH, Job, Record, Rows, run_job
 from vap_core.evaluation.processes import prepare, results
 from vap_core.evaluation.study import Study, register_personal, worker_modules
-from vap_core.simulation.types import EpisodeRow
+from vap_core.simulation.types import AS_LISTED, EpisodeRow
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,8 +42,11 @@ def run(
     video: bool = False,
     attention: tuple[str, ...] = (),
     policy_timeout_s: float | None = None,
+    what_for: str = "",
 ) -> "pd.DataFrame":
     """Run the episodes of `study` that `folder` lacks, and return the table of all its episodes.
+
+    A run that begins is entered in the log of readings (`readings.LOCAL`), with `what_for`.
 
     Raises: BadOutput when the folder holds another run, is in use or cannot be written; WorkerDied
         when workers died more often than `retries` in a row.
@@ -63,7 +66,7 @@ def run(
             )
         return complete
 
-    store.open_run(folder, study.configuration())
+    _open_run(study, folder, what_for)
     with store.locked(folder):
         store.sweep(folder)
         store.compact(folder)
@@ -99,6 +102,16 @@ def run(
                 jobs = missing()
         store.compact(folder)
     return store.read(folder)
+
+
+def _open_run(study: Study, folder: Path, what_for: str) -> None:
+    """Begin the run in `folder`, and log what it will read; or go on with the one there."""
+    begins = not (folder / store.MANIFEST).exists()
+    configuration = study.configuration()
+    store.open_run(folder, configuration)
+    if begins:
+        run_digest = store.digest(configuration)
+        readings.append(readings.readings_of(configuration, run_digest, what_for), readings.LOCAL)
 
 
 def missing_jobs(
@@ -141,7 +154,10 @@ def missing_jobs(
 
 def result_key(row: EpisodeRow, method: str, run_digest: str) -> str:
     """Names a result: a hash of the episode's row, the method and the digest of the run."""
-    return store.digest({"row": asdict(row), "method": method, "run": run_digest})
+    about = asdict(row)
+    if about["start"] == asdict(AS_LISTED):  # keys are those of versions without starts
+        del about["start"]
+    return store.digest({"row": about, "method": method, "run": run_digest})
 
 
 def spread_evenly[T](items: Sequence[T], n: int) -> list[T]:

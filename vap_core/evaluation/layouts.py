@@ -24,7 +24,7 @@ def layout_names(episodes: "pd.DataFrame") -> "pd.Series":
 
     lines: list[tuple[str, str, int, str]] = []
     for suite in dict.fromkeys(episodes["suite"]):
-        if suite in suites.BENCHMARKS:
+        if suites.is_listed(suite):
             lines += _listed_layouts(suite)
     keys = ["suite", "task", "episode"]
     listed = pd.DataFrame(lines, columns=[*keys, "layout"])
@@ -40,7 +40,8 @@ def layout_name(row: EpisodeRow) -> str:
     """Where the target, its look-alikes and its goal start; other objects do not count."""
     parts = []
     for place in row.placements:
-        if place.model in (row.target, row.goal) or "-lookalike-" in place.model:
+        lookalike = "-lookalike-" in place.model or place.model.startswith(f"{row.target}-")
+        if lookalike or place.model in (row.target, row.goal):
             parts.append(f"{place.model} {place.x:g} {place.y:g} {place.yaw:g}")
     return "; ".join(parts)
 
@@ -48,5 +49,5 @@ def layout_name(row: EpisodeRow) -> str:
 @cache
 def _listed_layouts(suite: str) -> tuple[tuple[str, str, int, str], ...]:
     """Suite, task, episode and layout of every row of a benchmark's list."""
-    rows = suites.lists.read(suite)
+    rows = suites.benchmark(suite)
     return tuple((row.suite, row.task, row.episode, layout_name(row)) for row in rows)

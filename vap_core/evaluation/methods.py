@@ -4,25 +4,30 @@ from pathlib import Path
 
 from vap_core.associate import PAIRINGS
 from vap_core.attend import Attender, Prompting
+from vap_core.base.errors import BadStudy
 from vap_core.evaluation.ablations.arms import ARMS, Hidden
 from vap_core.memory import load_bank
 from vap_core.perception.protocols import Stack
 from vap_core.policies.mini_pi0.learned_token import WORD
 from vap_core.rollout.prompters.oracle import Oracle, OraclePrompter
 from vap_core.rollout.prompters.protocol import Prompter
+from vap_core.rollout.prompters.switch import Switch, SwitchPrompter
 from vap_core.rollout.prompters.text import (
     HardPrompt,
+    OtherCommand,
     SoftPrompt,
     generic,
     hard_prompt,
+    say,
     soft_prompt,
 )
 from vap_core.rollout.prompters.tint import TintPrompter
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.scenes import Scene
+from vap_core.simulation.suites import suite
 from vap_core.simulation.types import EpisodeRow
 
-type Method = Prompting | HardPrompt | SoftPrompt | Oracle | Hidden | None
+type Method = Prompting | HardPrompt | SoftPrompt | Oracle | Hidden | Switch | OtherCommand | None
 
 METHODS: dict[str, Method] = {
     "generic": None,
@@ -76,7 +81,8 @@ def references_needed(method: str) -> int:
 
 def needs_memory(method: str) -> bool:
     """Whether the method refers to remembered objects."""
-    return find(method) is not None
+    how = find(method)
+    return how is not None and not isinstance(how, OtherCommand)
 
 
 def needs_description(method: str) -> bool:
@@ -87,6 +93,11 @@ def needs_token(method: str) -> bool:
     return isinstance(find(method), SoftPrompt)
 
 
+def has_no_command(method: str) -> bool:
+    """Whether the policy reads nothing, so that one that parses its commands cannot run."""
+    return find(method) == OtherCommand("blank")
+
+
 def token_space(method: str) -> str:
     """Where the method's token is learned: copied, aligned or own; "" where there is none."""
     how = find(method)
@@ -94,7 +105,7 @@ def token_space(method: str) -> str:
 
 
 def needs_stack(method: str) -> bool:
-    return isinstance(find(method), Prompting | Oracle | Hidden)
+    return isinstance(find(method), Prompting | Oracle | Hidden | Switch)
 
 
 def make_prompter(
@@ -111,13 +122,37 @@ def make_prompter(
             return hard_prompt(load_bank(bank)[row.target], how)
         case SoftPrompt():
             return soft_prompt(WORD)
+        case OtherCommand(command="blank"):
+            return say("")
+        case OtherCommand():
+            return say(_next_command(row))
         case Prompting() as how:
             return TintPrompter(_attender(how, row, bank, stack))
         case Hidden(prompting=how):
             return TintPrompter(_attender(how, row, bank, stack))
         case Oracle() as oracle:
-            alike = frozenset(n for n in scene.objects if get_object(n).category == row.category)
-            return OraclePrompter(_attender(oracle.prompting, row, bank, stack), oracle, alike)
+            attender = _attender(oracle.prompting, row, bank, stack)
+            return OraclePrompter(attender, oracle, _alike(scene, row))
+        case Switch() as switch:
+            return SwitchPrompter(
+                _attender(Prompting(), row, bank, stack), switch, _alike(scene, row)
+            )
+
+
+def _alike(scene: Scene, row: EpisodeRow) -> frozenset[str]:
+    """The scene's objects of the target's category."""
+    return frozenset(name for name in scene.objects if get_object(name).category == row.category)
+
+
+def _next_command(row: EpisodeRow) -> str:
+    """The command of the suite's next task with another one. Raises: BadStudy."""
+    tasks = suite(row.suite).tasks
+    names = [task.name for task in tasks]
+    start = names.index(row.task) + 1
+    for task in (*tasks[start:], *tasks[:start]):
+        if task.instruction != row.instruction:
+            return task.instruction
+    raise BadStudy(f"other-text: {row.suite} has one command only; leave other-text out.")
 
 
 def _attender(how: Prompting, row: EpisodeRow, bank: Path, stack: Stack | None) -> Attender:

@@ -13,7 +13,7 @@ from vap_core.policies.scripted.random import Random
 from vap_core.policies.scripted.scripted import Scripted
 from vap_core.simulation.env import Env
 from vap_core.simulation.scenes import Scene
-from vap_core.simulation.suites import Suite
+from vap_core.simulation.suites import Suite, benchmark_name
 
 MINI = "mini-pi0"
 """The shipped frozen policy, one checkpoint a suite."""
@@ -56,7 +56,7 @@ def make_policy(
 
 def shipped(suite: str) -> Path:
     """Where the shipped policy of a suite is, if there is one."""
-    return SHIPPED / f"{MINI}-{suite}"
+    return SHIPPED / f"{MINI}-{benchmark_name(suite)}"
 
 
 def default_policy(suites: Iterable[str]) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import check_regular, parse_json, write_atomic
 from vap_core.evaluation.measurements import encode_table
+from vap_core.evaluation.readings import FILE, publish_readings
 from vap_core.evaluation.run_schema import check_run
 from vap_core.evaluation.store import KEY, read, read_manifest
 from vap_core.simulation import suites
@@ -60,7 +61,8 @@ def publish(sources: Sequence[Path], target: Path, *, replace: bool = False) -> 
     """Write every episode of the runs, with their manifests in the file's metadata.
 
     A source is a run's folder, or a table that `publish` wrote, whose runs are taken as they are.
-    Tracebacks, wall times and memory use are left out.
+    Tracebacks, wall times and memory use are left out. What the runs read of shipped lists is
+    entered in the log beside the table (readings.publish_readings).
 
     Returns: the number of episodes.
 
@@ -97,6 +99,7 @@ def publish(sources: Sequence[Path], target: Path, *, replace: bool = False) -> 
         b"runs": json.dumps(manifests, sort_keys=True).encode(),
     }
     _write(whole.replace_schema_metadata(metadata), target, replace)
+    publish_readings(manifests, target.with_name(FILE))
     return whole.num_rows
 
 

@@ -81,7 +81,7 @@ def _checked_configuration(folder: Path) -> dict[str, Any]:
             "episode lists; run it again."
         )
     for suite, digest in study["lists"].items():
-        if suites.lists.digest(suite) != digest:
+        if suites.digest(suite) != digest:
             raise BadOutput(
                 f"rescore: the list of {suite} has changed since {folder} was run; its states fit "
                 "no row of today. Run it again."

@@ -31,6 +31,10 @@ def _is_count_or_all(value: Any) -> bool:
     return value is None or _is_count(value)
 
 
+def _is_temperature(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < LARGEST
+
+
 def _is_text(value: Any) -> bool:
     return isinstance(value, str)
 
@@ -58,6 +62,7 @@ SETTINGS: Mapping[str, Callable[[Any], bool]] = {
     "seed": _is_whole_number,
     "seeds": _is_count,
     "policy": _is_text,
+    "temperature": _is_temperature,
     "lists": _are_digests,
 }
 """Settings of a study that are read back, and what they must be where they are there."""

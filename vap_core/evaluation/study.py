@@ -13,8 +13,10 @@ from jaxtyping import Float32
 
 from vap_core import __version__
 from vap_core.base.errors import BadStudy, one_of
+from vap_core.base.extras import require
 from vap_core.evaluation.methods import (
     METHODS,
+    has_no_command,
     hidden_calls,
     known_methods,
     make_prompter,
@@ -50,7 +52,7 @@ from vap_core.simulation.cameras import RIGS
 from vap_core.simulation.occluder import Occlusion
 from vap_core.simulation.scenes import Meshes, Scene
 from vap_core.simulation.studio import reference_views
-from vap_core.simulation.suites import lists
+from vap_core.simulation.suites import starts
 from vap_core.simulation.suites.open_row import build_scene
 from vap_core.simulation.suites.variants import VARIANTS
 from vap_core.simulation.types import EpisodeRow
@@ -58,6 +60,8 @@ from vap_core.simulation.types import EpisodeRow
 MESHES = ("plain", "menagerie")
 
 
+HOTTEST = 10.0
+"""The largest factor of a policy's sampling noise."""
 HIDDEN_FROM = 2
 """The call of the policy, counted from 0, from which an arm of `ablate` hides the target."""
 
@@ -67,8 +71,9 @@ class Study:
     """The same episodes of every task, once per method and seed.
 
     `episodes` None takes whole lists. `images_every`, `follow` and `audit` are rollout.Trial's.
+    `temperature` scales the sampling noise of a mini-pi0; None leaves it as its checkpoint says.
 
-    Raises: UnknownName, BadStudy, when it is built from what does not fit together.
+    Raises: UnknownName, BadStudy, when it is built from what does not fit together; MissingPart.
     """
 
     tasks: tuple[tuple[str, str], ...]
@@ -82,6 +87,7 @@ class Study:
     images_every: int = 0
     follow: Follow = "step"
     audit: bool = False
+    temperature: float | None = None
 
     def __post_init__(self) -> None:
         _check_names(self)
@@ -103,19 +109,23 @@ class Study:
         """
         digests = {}
         for suite, _ in self.tasks:
-            if suite in suites.BENCHMARKS:
-                digests[suite] = lists.digest(suite)
+            if suites.is_listed(suite):
+                digests[suite] = suites.digest(suite)
         checkpoints_used = set()
         for suite, _ in self.tasks:
             checkpoints_used.add(self.checkpoint(suite))
         names = sorted(checkpoints_used - {""})
         fingerprints = [checkpoints.fingerprint(name) for name in names]
         about = asdict(self)
+        if self.temperature is None:  # digests are those of versions without it
+            del about["temperature"]
         if names == [self.policy]:
             about["checkpoint"] = fingerprints[0]
         elif names:
             about["checkpoints"] = fingerprints
         about |= {"version": __version__, "weights": weights_sha256(), "lists": digests}
+        if digests and self.seed + self.seeds > 1:
+            about["starts"] = starts.settings()
         return {**about, "world": _world_digest(self)}
 
 
@@ -213,13 +223,26 @@ def _check_names(study: Study) -> None:
 
 def _check_policy(study: Study) -> None:
     policy = study.policy
+    if policy not in POLICIES:
+        require("policy", f"the policy {policy}")
     for suite, _ in study.tasks:
         if policy == MINI and not shipped(suite).is_dir():
             names = sorted(path.name for path in SHIPPED.glob(f"{MINI}-*"))
             there = ", ".join(names) or "none"
             raise BadStudy(
                 f"Study: no {MINI} for {suite} ships (there is {there}); run: python -m vap_core "
-                f"train policy --suite {suite}"
+                f"train policy --suite {suites.benchmark_name(suite)}"
+            )
+    if study.temperature is not None:
+        if policy in POLICIES:
+            raise BadStudy(
+                f"Study: policy {policy!r} samples nothing; leave --temperature out, or take "
+                f"--policy {MINI}."
+            )
+        if not 0 <= study.temperature <= HOTTEST:
+            raise BadStudy(
+                f"Study: temperature {study.temperature:g}; say a number from 0, no noise, to "
+                f"{HOTTEST:g}."
             )
     if policy in PRIVILEGED and study.audit:
         raise BadStudy(
@@ -230,6 +253,17 @@ def _check_policy(study: Study) -> None:
         raise BadStudy(
             f"Study: policy {policy!r} reads the simulator, not pictures; no method can prompt "
             "it. Use --method generic."
+        )
+    absent = [suite for suite, _ in study.tasks if suite.endswith(suites.ABSENT)]
+    if policy == "expert" and absent:
+        raise BadStudy(
+            f"Study: {absent[0]} leaves the target out, which the expert would go for; leave that "
+            "suite or the expert out."
+        )
+    if policy == "scripted" and _any_method(study, has_no_command):
+        raise BadStudy(
+            f"Study: policy {policy!r} parses its command, and blank-text gives it none; leave "
+            f"blank-text out, or take --policy {MINI}."
         )
     if policy in POLICIES and _any_method(study, needs_token):
         raise BadStudy(
@@ -288,7 +322,9 @@ def _policy(
         return make_policy(study.policy, scene, suite, stack)
     from vap_core.policies.lerobot import adapter  # and torch
 
-    policy = adapter.load_for_suite(study.checkpoint(row.suite), scene, suite)
+    policy = adapter.load_for_suite(
+        study.checkpoint(row.suite), scene, suite, temperature=study.temperature
+    )
     if not needs_token(method):
         return policy
     embedding = _token_embedding(study.checkpoint(row.suite), method, row.target, bank)

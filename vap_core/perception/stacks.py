@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from functools import partial
 
+from vap_core.base.device import check_device
 from vap_core.base.errors import one_of
 from vap_core.perception.protocols import Stack, Thresholds
 
@@ -53,8 +54,9 @@ STACKS: dict[str, Callable[[], Stack]] = {
 def load_stack(name: str) -> Stack:
     """The stack of that name; loading its weights takes about a second.
 
-    Raises: UnknownName.
+    Raises: UnknownName: no such stack, or `VAP_DEVICE` names no device of this machine.
     """
     if name not in STACKS:
         raise one_of("load_stack: stack", name, STACKS)
+    check_device()
     return STACKS[name]()

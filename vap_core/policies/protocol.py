@@ -10,7 +10,7 @@ from vap_core.base.types import Views, value
 from vap_core.simulation.env import Env
 
 Chunk = Float32[np.ndarray, "t a"]
-"""Future actions, one row per control step."""
+"""Future actions, one row per control step, with a number for each of `Env.action_names`."""
 
 
 @value
@@ -30,7 +30,8 @@ class Policy[S](Protocol):
     """A frozen policy over a batch of episodes.
 
     What one episode carries is state, an argument and a result. `label` names it wherever its
-    numbers appear. `execute` rows of every chunk are executed before it is called again.
+    numbers appear. `execute` rows of every chunk are executed before it is called again. A rollout
+    needs all four, and ends with an error at a chunk of another shape or type than `Chunk`.
     """
 
     label: str

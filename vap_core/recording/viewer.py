@@ -17,6 +17,7 @@ import rerun as rr
 from rerun.experimental import ViewerClient
 
 from vap_core.base.errors import BadOutput, BadRecording, MissingGL
+from vap_core.base.extras import require
 from vap_core.recording.file import rerun_command, rerun_environment
 from vap_core.recording.reading import read_summary
 
@@ -105,8 +106,9 @@ def view(rrd: Path, *, width: int = 1100, height: int = 680) -> "Viewer":
     Its files come from this machine, unless RERUN_NOTEBOOK_ASSET says otherwise. A saved notebook
     keeps no widget: show a `screenshot` beside it.
 
-    Raises: BadRecording, when `rrd` cannot be read.
+    Raises: BadRecording, when `rrd` cannot be read; MissingPart.
     """
+    require("notebooks", "the viewer in a notebook")
     read_summary(rrd)
     os.environ.setdefault("RERUN_NOTEBOOK_ASSET", "serve-local")  # read when it is imported
     with redirect_stdout(StringIO()):  # rerun announces the port of its asset server

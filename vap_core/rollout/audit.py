@@ -11,7 +11,7 @@ from typing import Any
 
 from vap_core.base.errors import BadPolicy
 from vap_core.policies.hooks import TEXT, observe_inputs
-from vap_core.policies.protocol import Chunk, Policy, PolicyInput
+from vap_core.policies.protocol import Policy, PolicyInput
 from vap_core.rollout.policy_call import checked_plan
 from vap_core.rollout.types import ConsumedInput
 
@@ -24,7 +24,7 @@ def plan(
     states: Sequence[Any],
     prompted: Sequence[PolicyInput],
     raw: Sequence[PolicyInput],
-) -> tuple[list[Any], list[Chunk], list[Digests]]:
+) -> tuple[list[Any], list[Any], list[Digests]]:
     """The policy's chunks for the prompted inputs, and what it consumed in each episode.
 
     Raises: BadPolicy when the policy reports nothing.

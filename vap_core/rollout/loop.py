@@ -17,10 +17,10 @@ import numpy as np
 from vap_core.base.errors import BadAction, OutOfReach, VapError
 from vap_core.base.types import Attended, Views
 from vap_core.policies.hooks import AttentionMap, AttentionMaps, observe_attention
-from vap_core.policies.protocol import Chunk, Policy, PolicyInput, PrivilegedPolicy
+from vap_core.policies.protocol import Policy, PolicyInput, PrivilegedPolicy
 from vap_core.rollout import audit
 from vap_core.rollout.coverage import mask_coverage
-from vap_core.rollout.policy_call import checked_plan, policy_call
+from vap_core.rollout.policy_call import check_chunks, check_policy, checked_plan, policy_call
 from vap_core.rollout.prompters.protocol import PromptContext, Prompter, SceneTruth, unchanged
 from vap_core.rollout.queries import only_queries, query_phrases
 from vap_core.rollout.types import ConsumedInput, Episode, EpisodeHeader, Frame, MaskCoverage
@@ -57,6 +57,8 @@ class Trial:
     (rollout.queries).
     `image_size` is simulation.Env's.
     A call of the policy that takes longer than `policy_timeout_s` fails (rollout.policy_call).
+
+    Raises: BadPolicy: the policy lacks what the loop needs.
     """
 
     method: str
@@ -72,6 +74,9 @@ class Trial:
     attention: tuple[str, ...] = ()
     image_size: int | tuple[int, int] = 224
     policy_timeout_s: float | None = None
+
+    def __post_init__(self) -> None:
+        check_policy(self.policy)
 
     @property
     def bound(self) -> bool:
@@ -129,6 +134,9 @@ def rollout(
     An exception inside an episode, or a call of sys.exit, ends that episode with status "error" and
     its traceback in `detail`; the others go on. Frames keep their images only with `keep_images`; a
     sink always gets them.
+
+    Raises: VapError: the user has to act: weights are absent, or the policy returns arrays of
+        another shape or type than its protocol's.
     """
     keeps_images = sink is not None or keep_images
     for first in range(0, len(rows), batch):
@@ -288,7 +296,9 @@ def _context(trial: Trial, episode: RunningEpisode) -> PromptContext:
     needs = trial.prompter.needs_truth
     truth = None
     if needs == "always" or (needs == "start" and not started):
-        truth = SceneTruth(episode.row, episode.env.truth(masks=True).masks)
+        masks = episode.env.truth(masks=True).masks
+        judge = episode.judge
+        truth = SceneTruth(episode.row, masks, step=judge.steps, moved=judge.moved)
     cameras = {camera.name: camera for camera in episode.env.cameras()}
     return PromptContext(episode.row.instruction, cameras, truth)
 
@@ -332,6 +342,7 @@ def _plan(trial: Trial, live: Sequence[RunningEpisode], steps: dict[int, Step]) 
     try:
         with policy_call(trial.policy_timeout_s, [_named(trial, episode) for episode in calling]):
             states, chunks = _call_policy(trial, calling, steps)
+        check_chunks(chunks, trial.policy.label, calling[0].env.action_names)
     except Exception as error:
         if _ends_the_run(error):
             raise
@@ -355,7 +366,7 @@ def _named(trial: Trial, episode: RunningEpisode) -> str:
 
 def _call_policy(
     trial: Trial, calling: Sequence[RunningEpisode], steps: dict[int, Step]
-) -> tuple[list[Any], list[Chunk]]:
+) -> tuple[list[Any], list[Any]]:
     policy = trial.policy
     states = [episode.policy_state for episode in calling]
     if isinstance(policy, PrivilegedPolicy):

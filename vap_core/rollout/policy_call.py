@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vap_core.base.errors import BadAction, BadStudy
-from vap_core.policies.protocol import Chunk
+from vap_core.base.errors import BadPolicy, BadStudy
 
 NOTE_AFTER_S = 60.0
 """A call that takes longer is noted on stderr, with the episodes that wait for it."""
@@ -50,42 +49,66 @@ def policy_call(limit_s: float | None, episodes: Sequence[str]) -> Iterator[None
         note.cancel()
 
 
-def checked_plan(returned: object, label: str, n: int) -> tuple[list[Any], list[Chunk]]:
-    """The states and chunks that the policy `label` returned for `n` episodes.
+def check_policy(policy: Any) -> None:
+    """Raises: BadPolicy when a policy lacks what a rollout needs (policies.protocol)."""
+    name = type(policy).__name__
+    lacking = []
+    for part in ("label", "execute", "start"):
+        if not hasattr(policy, part):
+            lacking.append(part)
+    if not hasattr(policy, "plan") and not hasattr(policy, "plan_from_simulation"):
+        lacking.append("plan")
+    if lacking:
+        raise BadPolicy(
+            f"rollout: the policy {name} lacks {', '.join(lacking)}; it needs label (its name in "
+            "tables), execute (actions of a chunk that are done before the next call), start(rng) "
+            "and plan(states, inputs)."
+        )
+    if not isinstance(policy.label, str):
+        raise BadPolicy(f"rollout: {name}.label is {policy.label!r}; it must be a string.")
+    if not isinstance(policy.execute, int) or policy.execute < 1:
+        raise BadPolicy(
+            f"rollout: {name}.execute is {policy.execute!r}; it must be a whole number from 1 on."
+        )
 
-    Raises: BadAction when it is something else.
+
+def checked_plan(returned: object, label: str, n: int) -> tuple[list[Any], list[Any]]:
+    """The states that the policy `label` returned for `n` episodes, and what `check_chunks` checks.
+
+    Raises: BadPolicy when it returned something else, or not one of each for every episode.
     """
     if not isinstance(returned, tuple | list) or len(returned) != 2:
-        raise BadAction(
+        raise BadPolicy(
             f"{label}: plan returned {type(returned).__name__}; return two lists, of states and of "
             "chunks."
         )
     states, chunks = returned
     for name, parts in (("states", states), ("chunks", chunks)):
         if not isinstance(parts, list | tuple | np.ndarray):
-            raise BadAction(
+            raise BadPolicy(
                 f"{label}: plan returned {type(parts).__name__} for the {name}; return a list."
             )
         if len(parts) != n:
-            raise BadAction(
+            raise BadPolicy(
                 f"{label}: plan returned {len(parts)} {name} for {n} episodes; return one for each."
             )
-    for chunk in chunks:
-        _check_chunk(chunk, label)
     return list(states), list(chunks)
 
 
-def _check_chunk(chunk: object, label: str) -> None:
-    if not isinstance(chunk, np.ndarray):
+def check_chunks(chunks: Sequence[object], label: str, action_names: Sequence[str]) -> None:
+    """Raises: BadPolicy when a chunk is no float32 array with `action_names` in every row."""
+    size = len(action_names)
+    for chunk in chunks:
         found = type(chunk).__name__
-    elif chunk.ndim != 2 or not len(chunk) or chunk.dtype.kind not in "fiu":
-        found = f"an array of shape {chunk.shape} and type {chunk.dtype}"
-    else:
-        return
-    raise BadAction(
-        f"{label}: plan returned {found} as a chunk; return a float32 array with one row of "
-        "numbers for each control step."
-    )
+        if isinstance(chunk, np.ndarray):
+            fits = chunk.ndim == 2 and len(chunk) > 0 and chunk.shape[1] == size
+            if fits and chunk.dtype == np.float32:
+                continue
+            found = f"an array of shape {chunk.shape} and type {chunk.dtype}"
+        raise BadPolicy(
+            f"{label}: plan returned {found} as a chunk; return a NumPy array of type float32 and "
+            f"shape (steps, {size}), in every row {', '.join(action_names)}."
+        )
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from .occluder import Occlusion as Occlusion
 from .studio import Stage as Stage
 from .suites import SUITES as SUITES
 from .suites import VARIANTS as VARIANTS
+from .suites import development as development
 from .suites import lists as lists
 from .suites import simpler as simpler
 from .suites import tabletop as tabletop

@@ -14,6 +14,7 @@ from vap_core.simulation.gl import ensure_gl
 ensure_gl()
 import mujoco  # noqa: E402
 
+from vap_core.simulation.light import PLAIN_LIGHT, Light, dim  # noqa: E402
 from vap_core.simulation.occluder import Screen, draw_screens  # noqa: E402
 
 HIDDEN_GROUP = 5
@@ -186,6 +187,7 @@ class Renderer:
         size: int | tuple[int, int],
         hidden: frozenset[str] = frozenset(),
         before: Sequence[Screen] = (),
+        light: Light = PLAIN_LIGHT,
     ) -> Rgb:
         """The picture of camera `name`, with `before` in front of it.
 
@@ -193,6 +195,7 @@ class Renderer:
         """
         renderer = self._renderer(size, masks=False)
         self._update(renderer, data, name, hidden=hidden, before=before)
+        dim(renderer.scene, light)
         return np.ascontiguousarray(renderer.render())
 
     def masks(

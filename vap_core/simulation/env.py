@@ -31,6 +31,7 @@ from vap_core.simulation.control import (
     is_beyond,
     rotation_vector,
 )
+from vap_core.simulation.light import PLAIN_LIGHT, Light
 from vap_core.simulation.occluder import Occlusion, Screen, occluder_screens
 from vap_core.simulation.scenes import Scene, parked
 from vap_core.simulation.sensor import (
@@ -122,11 +123,12 @@ class Env:
         self._base_from_world = np.linalg.inv(base)
         self._row: EpisodeRow | None = None
         self._placed: tuple[str, ...] = ()
+        self._parked = set(scene.objects)
         self._disturbances: Mapping[str, Disturbance] = {}
         self._touch = Touch()
         self._cameras: tuple[Camera, ...] | None = None
         """The calibrated cameras, until the poses change."""
-        self._command = self._home_command()
+        self._command = self._first_command(self.robot.home)
         mujoco.mj_forward(self._model, self._data)
 
     @property
@@ -159,19 +161,20 @@ class Env:
         """Start the episode of `row`: objects in place, robot at home, gripper open.
 
         Everything settles for 0.3 s. Objects of the scene that the row does not name are parked,
-        weightless and invisible.
+        weightless and invisible; so is an absent target.
         Raises: UnknownName when the row places an object that the scene lacks, or one twice.
         """
         self._check_placed(row)
         data = self._data
         mujoco.mj_resetData(self._model, data)
-        data.qpos[self._qpos] = self.robot.home
+        joints = self._first_joints(row)
+        data.qpos[self._qpos] = joints
         data.qpos[self._fingers] = self.robot.fingers_open
-        data.ctrl[self._ctrl] = self._targets(self.robot.home, 1.0)
+        data.ctrl[self._ctrl] = self._targets(joints, 1.0)
         self._begin(row)
         self._place_objects(row)
         self._touch = Touch()
-        self._command = self._home_command()
+        self._command = self._first_command(joints)
         self._advance(self._settle, data.ctrl[self._ctrl].copy())
         self._touch = Touch(contacts=self._touch.contacts)
 
@@ -187,7 +190,12 @@ class Env:
             for name in self.camera_names:
                 screens = self._screens(name)
                 rgb = self.scene.renderer.rgb(
-                    self._data, name, self.image_hw, hidden=hidden, before=screens
+                    self._data,
+                    name,
+                    self.image_hw,
+                    hidden=hidden,
+                    before=screens,
+                    light=self._light(),
                 )
                 images[name] = self._disturb(name, rgb)
         return Observation(images, self.state())
@@ -303,9 +311,17 @@ class Env:
         self._begin(snapshot.row)
         self._update_poses()
 
-    def _home_command(self) -> Setpoint:
-        home = self.robot.home
-        return Setpoint(self._arm.forward(home), home, 1.0)
+    def _first_joints(self, row: EpisodeRow) -> Float64[np.ndarray, " n"]:
+        """The joint angles at the start of the row's episode, within their limits."""
+        if not row.start.joints_rad:
+            return self.robot.home
+        ids = [self._model.joint(name).id for name in self.robot.joints]
+        low, high = self._model.jnt_range[ids].T
+        return np.clip(self.robot.home + np.array(row.start.joints_rad), low, high)
+
+    def _first_command(self, joints: Float64[np.ndarray, " n"]) -> Setpoint:
+        """The setpoint that holds the arm at `joints`, with an open gripper."""
+        return Setpoint(self._arm.forward(joints), joints, 1.0)
 
     def _check_placed(self, row: EpisodeRow) -> None:
         names = [place.model for place in row.placements]
@@ -321,6 +337,9 @@ class Env:
         """Take `row` as the episode, and draw the errors of its cameras."""
         self._row = row
         self._placed = tuple(place.model for place in row.placements)
+        self._parked = set(self.scene.objects) - set(self._placed)
+        if row.start.absent:
+            self._parked.add(row.target)
         disturbances = {}
         if self.sensor != PERFECT:
             for name in self.camera_names:
@@ -331,13 +350,15 @@ class Env:
         """Put the objects of `row` in their places, and park the others without weight."""
         model = self._model
         data = self._data
-        for place in row.placements:
-            half = 0.5 * place.yaw
+        offsets = row.start.offsets or [(0.0, 0.0, 0.0)] * len(row.placements)
+        for place, (dx, dy, turn) in zip(row.placements, offsets, strict=True):
+            half = 0.5 * (place.yaw + turn)
             quat = (np.cos(half), 0.0, 0.0, np.sin(half))
-            data.joint(f"{place.model}/free").qpos[:] = (place.x, place.y, DROP_M, *quat)
+            position = (place.x + dx, place.y + dy, DROP_M)
+            data.joint(f"{place.model}/free").qpos[:] = (*position, *quat)
         n_parked = 0
         for name in self.scene.objects:
-            if name in self._placed:
+            if name not in self._parked:
                 continue
             body = model.body(name)
             position = parked(self.robot, n_parked)
@@ -409,6 +430,12 @@ class Env:
             step=self._step(),
         )
 
+    def _light(self) -> Light:
+        """The light of the episode."""
+        if self._row is None:
+            return PLAIN_LIGHT
+        return Light(lamp=self._row.start.lamp, ambient=self._row.start.ambient)
+
     def _screens(self, camera: str) -> tuple[Screen, ...]:
         """The occluder in front of `camera` now; the episode decides the side of an arm."""
         if self._row is None or self.occlusion is None:
@@ -445,8 +472,8 @@ class Env:
         return dict(zip(bodies, poses, strict=True))
 
     def _hidden(self) -> frozenset[str]:
-        """The objects that are not part of the episode."""
-        return frozenset(self.scene.objects) - frozenset(self._placed)
+        """The objects that are not on the table."""
+        return frozenset(self._parked)
 
     @contextmanager
     def _timed(self, part: str) -> Iterator[None]:

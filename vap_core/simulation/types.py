@@ -84,6 +84,27 @@ class Placement:
     yaw: float
 
 
+@value
+class Start:
+    """What differs at the start of an episode from its list: by its seed (suites.starts), or for
+    want of its target.
+
+    `joints_rad` are added to the robot's home; `offsets` (x, y in metres, yaw in radians) to the
+    placements, in their order. `lamp` and `ambient` multiply the lamp's and the room's light. An
+    `absent` target is nowhere to be seen, so that the episode cannot succeed.
+    """
+
+    joints_rad: tuple[float, ...] = ()
+    offsets: tuple[tuple[float, float, float], ...] = ()
+    lamp: float = 1.0
+    ambient: float = 1.0
+    absent: bool = False
+
+
+AS_LISTED = Start()
+"""Nothing changed."""
+
+
 SuccessRule = Literal["picked", "near", "put", "selected"]
 """When an episode has succeeded (SPEC section 6); see simulation.suites.rules."""
 
@@ -94,7 +115,7 @@ class EpisodeRow:
 
     `placements[0]` is the target; `goal` names the placed object that it goes to ("" when there is
     none). `split` is the track within the suite, `variant` the scene style (suites.VARIANTS),
-    `cameras` the views that the policy gets.
+    `cameras` the views that the policy gets. `start` says what differs from the list.
     """
 
     suite: str
@@ -110,6 +131,7 @@ class EpisodeRow:
     split: str = ""
     variant: str = "base"
     cameras: tuple[str, ...] = ()
+    start: Start = AS_LISTED
 
     @property
     def target(self) -> str:

@@ -57,14 +57,11 @@ def auc(scores: Scores, labels: Labels) -> float:
 def auc_interval(scores: Scores, labels: Labels, clusters: Sequence[str]) -> Auc:
     """The area, and its interval by resampling clusters (percentiles)."""
     names, of_cluster = np.unique(np.asarray(clusters, dtype=str), return_inverse=True)
-    members = [np.flatnonzero(of_cluster == i) for i in range(len(names))]
-    rng = np.random.default_rng(SEED)
-    values = []
-    for _ in range(RESAMPLES):
-        drawn = rng.integers(len(names), size=len(names))
-        chosen = np.concatenate([members[i] for i in drawn])
-        values.append(auc(scores[chosen], labels[chosen]))
-    finite = np.array(values)[~np.isnan(values)]
+    drawn = np.random.default_rng(SEED).integers(len(names), size=(RESAMPLES, len(names)))
+    times = np.zeros((RESAMPLES, len(names)))
+    np.add.at(times, (np.arange(RESAMPLES)[:, None], drawn), 1.0)
+    values = _resampled(scores, labels, times[:, of_cluster])
+    finite = values[~np.isnan(values)]
     low, high = np.quantile(finite, [0.025, 0.975]) if len(finite) else (np.nan, np.nan)
     return Auc(
         value=auc(scores, labels),
@@ -74,6 +71,21 @@ def auc_interval(scores: Scores, labels: Labels, clusters: Sequence[str]) -> Auc
         positives=int(labels.sum()),
         clusters=len(names),
     )
+
+
+def _resampled(
+    scores: Scores, labels: Labels, times: Float[np.ndarray, "resamples n"]
+) -> Float[np.ndarray, " resamples"]:
+    """The area of every resample, in which episode i stands `times[:, i]` times; nan as `auc`'s."""
+    high = scores[labels][:, None]
+    low = scores[~labels][None]
+    wins = (high > low) + 0.5 * (high == low)
+    wins[np.isnan(high) | np.isnan(low)] = np.nan
+    positive = times[:, labels]
+    negative = times[:, ~labels]
+    won = ((positive @ wins) * negative).sum(axis=1)
+    pairs = positive.sum(axis=1) * negative.sum(axis=1)
+    return np.divide(won, pairs, out=np.full(len(times), np.nan), where=pairs > 0)
 
 
 def left_out_scores(

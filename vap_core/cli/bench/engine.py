@@ -37,7 +37,7 @@ def local_cluster(cpus: int) -> Iterator[str]:
         from ray.cluster_utils import Cluster
     except ImportError as error:
         raise BadCluster(
-            "bench engine: ray is not installed; run: pip install 'ray>=2.50'"
+            "bench engine: ray is not installed; run: pip install 'vap-core[ray]'"
         ) from error
 
     head = {

@@ -20,6 +20,8 @@ from vap_core.evaluation.ablations.forms import (
 )
 from vap_core.prompt import PALETTE, Tint
 from vap_core.rollout.prompters.oracle import Oracle
+from vap_core.rollout.prompters.switch import Switch
+from vap_core.rollout.prompters.text import OtherCommand
 
 DEFAULT = "vap"
 """The arm that every other is compared with."""
@@ -33,7 +35,7 @@ class Hidden:
     prompting: Prompting = field(default_factory=Prompting)
 
 
-type Arm = Prompting | Oracle | Hidden
+type Arm = Prompting | Oracle | Hidden | Switch | OtherCommand
 
 
 @dataclass(frozen=True)
@@ -139,6 +141,14 @@ ABLATIONS: dict[str, Ablation] = {
         paper="occlusion_sweep",
         rows={DEFAULT: "0 frames", **{f"hidden-{n}": f"{n} frames" for n in range(1, 7)}},
     ),
+    "language": Ablation(
+        question="Does the policy listen to its command at all?",
+        arms={
+            "blank-text": OtherCommand("blank"),
+            "other-text": OtherCommand("next task"),
+        },
+        methods=("generic",),
+    ),
     "mask": Ablation(
         question="How exact must the mask be?",
         arms={
@@ -154,6 +164,11 @@ ABLATIONS: dict[str, Ablation] = {
             for name in ("embedding", "hungarian", "all")
         },
         methods=(DEFAULT, "vap-associated"),
+    ),
+    "switch": Ablation(
+        question="Does the policy follow the tint to a look-alike in mid-episode?",
+        arms={"switched-early": Switch("early"), "switched-moved": Switch("moved")},
+        methods=("oracle-track",),
     ),
     "truth": Ablation(
         question="What would a perfect stage bring?",

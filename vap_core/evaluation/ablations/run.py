@@ -9,6 +9,7 @@ from vap_core.evaluation.ablations.table import arm_results, arm_rows
 from vap_core.evaluation.engine import run
 from vap_core.evaluation.jobs import Record
 from vap_core.evaluation.study import Study
+from vap_core.evaluation.switching import switching_lines
 
 
 def ablate_text(
@@ -19,7 +20,7 @@ def ablate_text(
     Raises: what `engine.run` raises.
     """
     ablation = ABLATIONS[name]
-    episodes = run(study, folder, workers=workers, record=record)
+    episodes = run(study, folder, workers=workers, record=record, what_for=f"ablate {name}")
     results = arm_results(ablation, episodes)
     picture = folder / "effects.png"
     effects_figure(results, ablation.question).savefig(picture, dpi=200)
@@ -27,6 +28,7 @@ def ablate_text(
     lines = [
         ablation.question,
         align(arm_rows(results)),
+        *switching_lines(episodes),
         f"n episodes a suite, {study.seeds} seed(s) from {study.seed}; policy {study.policy}; "
         f"{errors} errors. Intervals: Wilson's for rates, cluster bootstrap over layouts for "
         "differences; p exact, Holm's correction over the arms of a suite.",

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadOutput, one_of
+from vap_core.base.extras import require
 from vap_core.base.files import write_atomic
 from vap_core.evaluation import measurements, store
 from vap_core.evaluation.perception import tracking
@@ -164,8 +165,9 @@ def run_survey(
 
     Speed is measured last and alone, so that nothing of this run disturbs it.
 
-    Raises: BadOutput when the folder holds another run, or is in use; WorkerDied.
+    Raises: BadOutput when the folder holds another run, or is in use; WorkerDied; MissingPart.
     """
+    require("foundation", "the unit of speed, a pass of the backbone by torch,")
     store.open_run(folder, asked.configuration())
     with store.locked(folder):
         planned = plan(asked)

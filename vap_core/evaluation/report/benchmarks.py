@@ -13,7 +13,8 @@ MATCHED = (
 
 def suites_table() -> str:
     """The benchmarks as their hashed lists hold them, by track and by task; the warm-up suites."""
-    parts = [align(_track_rows()), align(_task_rows()), "\n".join([MATCHED, *_warm_ups()])]
+    notes = "\n".join([MATCHED, *_development_lists(), *_warm_ups()])
+    parts = [align(_track_rows()), align(_task_rows()), notes]
     return "\n\n".join(parts)
 
 
@@ -47,6 +48,16 @@ def _task_rows() -> list[list[str]]:
                 ]
             )
     return rows
+
+
+def _development_lists() -> list[str]:
+    counts = []
+    for name in suites.BENCHMARKS:
+        counts.append(f"{name}-dev {len(suites.benchmark(f'{name}-dev'))}")
+    return [
+        f"to tune on, other layouts and objects: {', '.join(counts)}",
+        "with -absent after its name, a suite of these is the same without the target",
+    ]
 
 
 def _warm_ups() -> list[str]:

@@ -9,13 +9,14 @@ from vap_core.base.figures import write_png
 from vap_core.base.files import write_atomic
 from vap_core.base.tables import latex
 from vap_core.evaluation.metrics import RATES
+from vap_core.evaluation.readings import readings_of_lists
 from vap_core.evaluation.report import sections
 from vap_core.evaluation.report.cells import comparison_rows, outcome_rows
 from vap_core.evaluation.report.latex import main_tables
 from vap_core.evaluation.report.pictures import differences_figure, forest_figure
 from vap_core.evaluation.report.provenance import provenance
 from vap_core.evaluation.report.results import comparisons, outcomes, results
-from vap_core.evaluation.report.runs import load_runs
+from vap_core.evaluation.report.runs import Runs, load_runs
 from vap_core.evaluation.statistics import compare
 
 if TYPE_CHECKING:
@@ -47,7 +48,9 @@ def report(sources: Sequence[Path], out: Path) -> str:
         sections.outcomes_section(runs, ends),
         sections.failures_section(runs),
         sections.comparisons_section(differences),
+        sections.abstention_section(runs),
         sections.pictures_section(with_differences=bool(compared)),
+        sections.readings_section(readings_of_lists(_lists(runs))),
         sections.provenance_section(origins),
     ]
     text = "\n\n".join(filter(None, parts))
@@ -67,6 +70,14 @@ def report(sources: Sequence[Path], out: Path) -> str:
         figures["paired.png"] = differences_figure(against_first)
     _write(out, files, figures)
     return text
+
+
+def _lists(runs: Runs) -> set[str]:
+    """The digests of the lists that some runs read."""
+    digests: set[str] = set()
+    for manifest in runs.manifests.values():
+        digests.update(manifest["configuration"].get("lists", {}).values())
+    return digests
 
 
 def _csv_text(table: "pd.DataFrame", fractions: Sequence[str] = ()) -> str:

@@ -108,7 +108,7 @@ def _check_run(name: Path, study: dict[str, Any], table: "pd.DataFrame") -> None
             "them wrote."
         )
     for suite, digest in study.get("lists", {}).items():
-        if suites.lists.digest(suite) != digest:
+        if suites.digest(suite) != digest:
             raise BadOutput(
                 f"report: the list of {suite} has changed since {name} was run; use the version "
                 "that ran it, or run it again."
@@ -155,7 +155,7 @@ def _count_asked(study: dict[str, Any], labels: Mapping[str, str]) -> "pd.DataFr
     lines = []
     for suite, task, seed, rows in _asked_rows(study):
         asked = whole = _count_by_split(rows)
-        if suite in suites.BENCHMARKS:
+        if suites.is_listed(suite):
             whole = _count_by_split(_episodes(suite, task, None, 0))
         policy = labels.get(suite, study["policy"])
         for method in study["methods"]:
@@ -178,7 +178,7 @@ def _asked_rows(
     for suite, task in study["tasks"]:
         for seed in range(study["seed"], study["seed"] + study.get("seeds", 1)):
             # The rows of a benchmark do not depend on the seed.
-            drawn_from = 0 if suite in suites.BENCHMARKS else seed
+            drawn_from = 0 if suites.is_listed(suite) else seed
             yield suite, task, seed, _episodes(suite, task, study["episodes"], drawn_from)
 
 

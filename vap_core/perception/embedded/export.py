@@ -18,8 +18,12 @@ from torch import nn
 from vap_core.base.errors import MissingWeights
 from vap_core.base.types import value
 from vap_core.perception.embedded import detector, encoder, segmenter
+from vap_core.perception.embedded.detect_network import DetectHead, DetectNetwork
+from vap_core.perception.embedded.encode_network import EncodeNetwork, InstanceHead
+from vap_core.perception.embedded.mask_network import MaskHead, MaskNetwork
 from vap_core.perception.embedded.runtime import WEIGHTS_KEY
 from vap_core.perception.embedded.tracker import cells
+from vap_core.perception.embedded.tracker.cell_network import CellNetwork
 from vap_core.perception.embedded.weights import PERCEPTION, read_checked, write_entry
 from vap_core.perception.text_encoder import WIDTH as TEXT_WIDTH
 
@@ -47,13 +51,13 @@ def graphs() -> dict[str, Graph]:
     window = segmenter.SIDE
     return {
         cells.GRAPH: Graph(
-            module=cells.CellNetwork(),
+            module=CellNetwork(),
             inputs={"rgb": _pixels(cells.SIDE)},
             outputs=("keys",),
             varying={"rgb": image, "keys": {0: "cells"}},
         ),
         segmenter.GRAPH: Graph(
-            module=segmenter.MaskNetwork(_with_distinct_weights(segmenter.MaskHead())),
+            module=MaskNetwork(_with_distinct_weights(MaskHead())),
             inputs={
                 "rgb": _pixels(window),
                 "planes": np.zeros((1, 2, window, window), np.uint8),
@@ -62,7 +66,7 @@ def graphs() -> dict[str, Graph]:
             varying={},
         ),
         encoder.GRAPH: Graph(
-            module=encoder.EncodeNetwork(_with_distinct_weights(encoder.InstanceHead())),
+            module=EncodeNetwork(_with_distinct_weights(InstanceHead())),
             inputs={
                 "rgb": _pixels(crop),
                 "small": _pixels(small),
@@ -72,7 +76,7 @@ def graphs() -> dict[str, Graph]:
             varying={},
         ),
         detector.GRAPH: Graph(
-            module=detector.DetectNetwork(_with_distinct_weights(detector.DetectHead(1))),
+            module=DetectNetwork(_with_distinct_weights(DetectHead(1))),
             inputs={
                 "rgb": _pixels(detector.SIDE),
                 "text": np.zeros((1, TEXT_WIDTH), np.float32),
@@ -105,7 +109,7 @@ def export_graphs(folder: Path) -> list[Path]:
 def require_onnx() -> None:
     """Raises: MissingWeights: graphs cannot be written here."""
     if find_spec("onnx") is None:
-        raise MissingWeights("export: onnx is not installed; run: pip install onnx")
+        raise MissingWeights("export: onnx is not installed; run: pip install 'vap-core[export]'")
 
 
 def _structure(graph: Graph, metadata: Mapping[str, str]) -> bytes:

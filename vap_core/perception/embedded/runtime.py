@@ -1,10 +1,10 @@
 """What computes the embedded networks: ONNX Runtime on a CPU; torch on a GPU and in training.
 
 The torch modules define the networks. A graph in data/weights is the structure of one of them: it
-names the weights that it needs, and gets them from the module when it is loaded.
+names the weights that it needs, as the module does, and gets them when it is loaded.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,8 +53,10 @@ class OnnxNetwork:
         return tuple(self.session.run(None, dict(zip(self.inputs, arrays, strict=True))))
 
 
-def load_network(name: str, module: "nn.Module", sha256: str, folder: Path = FOLDER) -> OnnxNetwork:
-    """The graph `folder`/`name` with the module's weights, which come from the file of `sha256`.
+def load_network(
+    name: str, weights: Mapping[str, np.ndarray], sha256: str, folder: Path = FOLDER
+) -> OnnxNetwork:
+    """The graph `folder`/`name` with its weights, which come from the file of `sha256`.
 
     Raises:
         MissingWeights: the graph is absent or damaged, or was made with other weights.
@@ -65,9 +67,9 @@ def load_network(name: str, module: "nn.Module", sha256: str, folder: Path = FOL
     options = session_options()
     names: list[str] = []
     values: list[OrtValue] = []
-    for key, weight in module.named_parameters():
+    for key, weight in weights.items():
         names.append(key)
-        values.append(OrtValue.ortvalue_from_numpy(weight.detach().contiguous().numpy()))
+        values.append(OrtValue.ortvalue_from_numpy(np.asarray(weight, order="C")))
     options.add_external_initializers(names, values)
     session = start_session(graph, options)
     made_with = session.get_modelmeta().custom_metadata_map.get(WEIGHTS_KEY, "unknown weights")

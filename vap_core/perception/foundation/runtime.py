@@ -4,17 +4,13 @@ A GPU works in half precision on batches, a CPU in single precision on one image
 nothing from batches, and without them the last bits of a result do not depend on the other images.
 """
 
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
 
-from vap_core.base.errors import UnknownName
-
-DEVICE_VARIABLE = "VAP_DEVICE"
-"""Environment variable that overrides the device, for example cpu or cuda:1."""
+from vap_core.base.device import device_name
 
 
 @dataclass(frozen=True)
@@ -49,22 +45,8 @@ def select_runtime(device: str | None = None) -> Runtime:
 
     Raises: UnknownName: no such device on this machine.
     """
-    name = device or os.environ.get(DEVICE_VARIABLE) or _default_device()
-    try:
-        chosen = torch.device(name)
-        torch.empty(0, device=chosen)
-    except (RuntimeError, AssertionError) as error:
-        raise UnknownName(
-            f"foundation: device {name!r} is not on this machine ({str(error).splitlines()[0]}); "
-            f"unset {DEVICE_VARIABLE}, or use cpu."
-        ) from error
+    chosen = torch.device(device_name(device))
     if chosen.type != "cuda":
         return Runtime(chosen, None, batched=False)
     half = torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float16
     return Runtime(chosen, half, batched=True)
-
-
-def _default_device() -> str:
-    if torch.cuda.is_available():
-        return "cuda"
-    return "cpu"

@@ -1,4 +1,4 @@
-"""Where the foundation stacks' weights come from: repositories of the Hugging Face hub, pinned."""
+"""Where weights that do not ship come from: repositories of the Hugging Face hub, pinned."""
 
 from dataclasses import dataclass
 
@@ -63,7 +63,15 @@ MODELS = {
         revision="de431c4043854a71d8101e17995dfe596bf101a5",
         sha256="48c14467e5cf9e51870511feb72c89688e82dd74523142c0538b663e193ac2a7",
     ),
+    "all-minilm-l6-v2": Source(
+        repo="sentence-transformers/all-MiniLM-L6-v2",
+        revision="1110a243fdf4706b3f48f1d95db1a4f5529b4d41",
+        sha256="53aa51172d142c89d9012cce15ae4d6cc0ca6895895114379cacb4fab128d9db",
+        small_files=("tokenizer.json",),
+    ),
 }
+TEXT = "all-minilm-l6-v2"
+"""The text encoder of the embedded stack, for an installation without the pip package of it."""
 KINDS = {
     "foundation": ("grounding-dino-base", "dinov2-base", "sam2.1-hiera-large"),
     "foundation-small": ("grounding-dino-tiny", "dinov2-small", "sam2.1-hiera-tiny"),
@@ -73,6 +81,8 @@ KINDS = {
 
 def models_of(kind: str) -> tuple[str, ...]:
     """The models of a stack. Raises: UnknownName."""
+    if kind == "embedded":
+        return (TEXT,)
     if kind not in KINDS:
-        raise one_of("weights: stack", kind, KINDS)
+        raise one_of("weights: stack", kind, ["embedded", *KINDS])
     return KINDS[kind]

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vap_core.base.errors import MissingWeights
-from vap_core.base.files import DATA, parse_json, read_file, write_atomic
+from vap_core.base.files import kept_folder, parse_json, read_file, write_atomic
 from vap_core.perception.foundation.sources import KINDS, MODELS, TENSORS, Source, models_of
 
-STORE = DATA / "weights-hub"
+STORE = kept_folder("weights-hub")
 VARIABLE = "VAP_WEIGHTS"
 """Environment variable that names another store."""
 LOCK = "lock.json"
@@ -30,7 +30,7 @@ class VerifiedWeights:
 
 
 def store_folder() -> Path:
-    """Where weights are kept: `VAP_WEIGHTS`, or data/weights-hub."""
+    """Where weights are kept: `VAP_WEIGHTS`, or data/weights-hub (`base.files.kept_folder`)."""
     return Path(os.environ.get(VARIABLE) or STORE)
 
 

@@ -295,18 +295,30 @@ class LeRobot:
         return torch.stack(noise).to(config.device)
 
 
-def load_policy(checkpoint: str | Path, device: str | None = None) -> LeRobot:
+def load_policy(
+    checkpoint: str | Path, device: str | None = None, temperature: float | None = None
+) -> LeRobot:
     """Load a checkpoint through lerobot's factory.
 
     `checkpoint` is a folder, or the `owner/name` of a model that was downloaded before.
+    `temperature` scales a mini-pi0's sampling noise, instead of the checkpoint's own.
 
-    Raises: BadPolicy when it is not there, would execute code, cannot be built, or does not end
-        with exactly the file's weights.
+    Raises: BadPolicy when it is not there, would execute code, cannot be built, does not end with
+        exactly the file's weights, or has no temperature to set.
     """
     folder = locate(checkpoint)
     policy, preprocessor, postprocessor = build(folder, device)
     name = folder.name if Path(checkpoint).is_dir() else checkpoint
     label = f"{policy.config.type}:{name}@{fingerprint(folder)[:8]}"
+    if temperature is not None:
+        config: Any = policy.config
+        if not hasattr(config, "temperature"):
+            raise BadPolicy(
+                f"load: {label} has no temperature; leave it out, or take a mini-pi0, whose "
+                "sampling noise is scaled by one."
+            )
+        config.temperature = temperature
+        label = f"{label}, temperature {temperature:g}"
     return LeRobot(
         policy=policy, preprocessor=preprocessor, postprocessor=postprocessor, label=label
     )
@@ -315,12 +327,14 @@ def load_policy(checkpoint: str | Path, device: str | None = None) -> LeRobot:
 _load_cached = cache(load_policy)
 
 
-def load_for_suite(checkpoint: str, scene: Scene, suite: Suite) -> LeRobot:
+def load_for_suite(
+    checkpoint: str, scene: Scene, suite: Suite, temperature: float | None = None
+) -> LeRobot:
     """The checkpoint, loaded once in this process, for the inputs and actions of a suite.
 
     Raises: BadPolicy when it does not fit them.
     """
-    policy = _load_cached(checkpoint)
+    policy = _load_cached(checkpoint, temperature=temperature)
     env = Env(scene, control=suite.control)
     state_size = len(env.state())
     policy.check(suite.cameras, state_size, env.action_size)

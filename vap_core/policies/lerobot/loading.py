@@ -14,6 +14,7 @@ from unittest.mock import patch
 
 import torch
 
+from vap_core.base.device import device_name
 from vap_core.base.errors import BadPolicy
 from vap_core.policies.lerobot.checkpoints import WEIGHTS, base_models, refuse_code
 
@@ -25,11 +26,12 @@ def build(folder: Path, device: str | None) -> tuple["PreTrainedPolicy", Any, An
     """The policy of a checkpoint, its preprocessor and its postprocessor.
 
     Raises: BadPolicy when it would execute code, cannot be built, or does not end with exactly the
-        file's weights.
+        file's weights. UnknownName when the device is not on this machine.
     """
     # registers our own type of policy and its step
     import_module("vap_core.policies.mini_pi0.processor_mini_pi0")
     refuse_code(folder)
+    device = device_name(device)
     try:
         policy, preprocessor, postprocessor = _build(folder, device)
     except Exception as error:
@@ -74,7 +76,7 @@ def compare(policy: "PreTrainedPolicy", file: Path) -> None:
         )
 
 
-def _build(folder: Path, device: str | None) -> tuple["PreTrainedPolicy", Any, Any]:
+def _build(folder: Path, device: str) -> tuple["PreTrainedPolicy", Any, Any]:
     """The policy of a checkpoint, its preprocessor and its postprocessor."""
     from lerobot import policies
     from lerobot.configs import PreTrainedConfig
@@ -85,7 +87,7 @@ def _build(folder: Path, device: str | None) -> tuple["PreTrainedPolicy", Any, A
     offline = patch("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     with _silence(), no_code, offline:
         config: Any = PreTrainedConfig.from_pretrained(folder)
-        config.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+        config.device = device
         # the file's weights replace those that these options load
         if getattr(config, "pretrained_backbone_weights", None):
             config.pretrained_backbone_weights = None

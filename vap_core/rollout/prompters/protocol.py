@@ -13,10 +13,16 @@ Masks = Mapping[str, Mapping[str, Mask]]
 
 @value
 class SceneTruth:
-    """Ground truth of one step, for prompters that declare `needs_truth`."""
+    """Ground truth of one step, for prompters that declare `needs_truth`.
+
+    `step` counts the control steps that were taken, `moved` names the objects that moved so far
+    (simulation.suites.rules).
+    """
 
     row: EpisodeRow
     masks: Masks
+    step: int = 0
+    moved: frozenset[str] = frozenset()
 
 
 @value

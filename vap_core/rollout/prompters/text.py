@@ -30,6 +30,16 @@ class SoftPrompt:
     space: Literal["copied", "aligned", "own"] = "copied"
 
 
+@dataclass(frozen=True)
+class OtherCommand:
+    """The policy reads another command than the episode's.
+
+    None at all, or that of the suite's next task.
+    """
+
+    command: Literal["blank", "next task"]
+
+
 class TextPrompter:
     """Passes images unchanged; the policy reads `rewrite(instruction)` in every step."""
 
@@ -60,6 +70,15 @@ class TextPrompter:
 def generic() -> TextPrompter:
     """The generic policy: raw images, raw instruction."""
     return TextPrompter(str)
+
+
+def say(text: str) -> TextPrompter:
+    """Raw images and `text`, whatever the instruction is."""
+
+    def replace_all(instruction: str) -> str:
+        return text
+
+    return TextPrompter(replace_all)
 
 
 def hard_prompt(obj: PersonalObject, how: HardPrompt) -> TextPrompter:

@@ -1,6 +1,8 @@
 """Suites: the four personalised benchmarks, and the demo's warm-up suites.
 
 The episode lists of the benchmarks are hashed files; those of the warm-up suites are generated.
+Every benchmark has a development list, the suite NAME-dev. NAME-absent and NAME-dev-absent are the
+same lists with the target left out.
 """
 
 from dataclasses import replace
@@ -9,8 +11,9 @@ from functools import cache
 import numpy as np
 
 from vap_core.base.errors import BadSuite, UnknownName, one_of
+from vap_core.simulation import robots
 from vap_core.simulation.assets import objects
-from vap_core.simulation.suites import lists, pick
+from vap_core.simulation.suites import development, lists, pick, starts
 from vap_core.simulation.suites.rules import Judge as Judge
 from vap_core.simulation.suites.simpler import BRIDGE, FRACTAL
 from vap_core.simulation.suites.suite import Suite as Suite
@@ -18,7 +21,7 @@ from vap_core.simulation.suites.suite import Task as Task
 from vap_core.simulation.suites.tabletop import TABLETOP
 from vap_core.simulation.suites.variants import VARIANTS as VARIANTS
 from vap_core.simulation.suites.vlabench import VLABENCH
-from vap_core.simulation.types import EpisodeRow
+from vap_core.simulation.types import AS_LISTED, EpisodeRow
 
 BENCHMARKS: dict[str, Suite] = {
     "simpler-fractal": FRACTAL,
@@ -28,21 +31,54 @@ BENCHMARKS: dict[str, Suite] = {
 }
 WARM_UPS: dict[str, Suite] = {"widowx-pick": pick.WIDOWX, "franka-pick": pick.FRANKA}
 SUITES: dict[str, Suite] = {**BENCHMARKS, **WARM_UPS}
+ABSENT = "-absent"
+"""Ends the name of a suite whose target is left out."""
 
 
 def suite(name: str) -> Suite:
     """The suite called `name`. Raises: UnknownName."""
-    if name not in SUITES:
-        raise one_of("suites.suite: suite", name, SUITES)
-    return SUITES[name]
+    if name in SUITES:
+        return SUITES[name]
+    if not is_listed(name):
+        raise one_of(
+            "suites.suite: suite (a benchmark also with -dev, -absent, -dev-absent)", name, SUITES
+        )
+    return replace(BENCHMARKS[benchmark_name(name)], name=name)
+
+
+def list_name(name: str) -> str:
+    """The list that a suite reads, without or with its target."""
+    return name.removesuffix(ABSENT)
+
+
+def benchmark_name(name: str) -> str:
+    """The benchmark of a suite: its own name, or that without -dev and -absent."""
+    return list_name(name).removesuffix(development.SUFFIX)
+
+
+def is_listed(name: str) -> bool:
+    """Whether a suite has a list on disk: a benchmark, its development list, or without targets."""
+    return benchmark_name(name) in BENCHMARKS
+
+
+def is_development(name: str) -> bool:
+    return is_listed(name) and list_name(name).endswith(development.SUFFIX)
+
+
+def digest(name: str) -> str:
+    """The sha256 of a suite's list. Raises: BadSuite."""
+    return lists.digest(list_name(name))
 
 
 @cache
 def benchmark(name: str) -> tuple[EpisodeRow, ...]:
-    """The whole list of a benchmark.
+    """The whole list of a benchmark, or of its development list; for both without their targets.
 
     Raises: BadSuite, naming row and field, also for a task, camera or object that does not exist.
     """
+    if name.endswith(ABSENT):
+        left_out = replace(AS_LISTED, absent=True)
+        return tuple(replace(row, suite=name, start=left_out) for row in benchmark(list_name(name)))
     episodes = lists.read(name)
     known = suite(name)
     tasks = {task.name for task in known.tasks}
@@ -67,7 +103,8 @@ def rows(
     """Episodes of a task: the whole list, or `n` of it spread evenly.
 
     Of a warm-up suite the first `n` (20) of `seed`. A benchmark's list is the same for every seed;
-    the seed reaches the policy and the sensor noise.
+    a seed but 0 changes how its episodes start (starts.seeded), and every seed the policy's and
+    the sensors' noise.
     Raises: UnknownName for a suite or a task that no registry holds; BadSuite for a damaged list.
     """
     known = suite(suite_name)
@@ -78,7 +115,8 @@ def rows(
     if n is not None and n < len(episodes):
         spread = np.linspace(0, len(episodes) - 1, n).astype(int)
         episodes = [episodes[i] for i in np.unique(spread)]
-    return tuple(replace(row, seed=seed) for row in episodes)
+    joints = len(robots.get(known.robot).joints)
+    return tuple(starts.seeded(row, seed, joints) for row in episodes)
 
 
 def listed(

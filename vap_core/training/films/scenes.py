@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int64, UInt8
 
-from vap_core.base.files import DATA, replacing
+from vap_core.base.files import kept_folder, replacing
 from vap_core.base.types import value
 from vap_core.simulation import robots, scenes
 from vap_core.simulation.assets import objects
@@ -25,7 +25,7 @@ from vap_core.simulation.studio import Shot, Stage
 
 import mujoco  # isort: skip  (scenes has chosen a GL back end)
 
-CACHE = DATA / "cache"
+CACHE = kept_folder("cache")
 """Rendered films and scenes, in folders of it."""
 SIZE = 224
 """Pixels, square, of a view."""

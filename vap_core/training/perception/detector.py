@@ -15,9 +15,11 @@ from torch.nn import functional as F  # noqa: N812
 
 from vap_core.base.files import replacing
 from vap_core.base.types import Rgb
-from vap_core.perception.embedded.backbone import CHANNELS, features
-from vap_core.perception.embedded.backbone import STRIDE as STRIDES
-from vap_core.perception.embedded.detector import SIDE, STRIDE, TAPS, DetectHead, resize_for_search
+from vap_core.perception.embedded.backbone import features
+from vap_core.perception.embedded.detect_network import DetectHead
+from vap_core.perception.embedded.detector import SIDE, STRIDE, TAPS, resize_for_search
+from vap_core.perception.embedded.taps import CHANNELS
+from vap_core.perception.embedded.taps import STRIDE as STRIDES
 from vap_core.perception.text_encoder import embed_text
 from vap_core.simulation.assets.phrases import AMBIGUOUS, NEGATIVES, training_phrases
 from vap_core.training.films.scenes import POSES, Shots, boxes_of

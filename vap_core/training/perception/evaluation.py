@@ -14,17 +14,18 @@ from vap_core.evaluation.metrics import rate
 from vap_core.evaluation.perception.estimates import average_precision
 from vap_core.evaluation.perception.first_frames import FLOOR, VISIBLE_PX
 from vap_core.perception.boxes import box_iou, crop, mask_iou
+from vap_core.perception.embedded.detect_network import DetectHead, DetectNetwork
 from vap_core.perception.embedded.detector import (
     THRESHOLD,
-    DetectHead,
-    DetectNetwork,
     LiteDetector,
     decode,
     resize_for_search,
 )
-from vap_core.perception.embedded.encoder import EncodeNetwork, InstanceHead, LiteEncoder
+from vap_core.perception.embedded.encode_network import EncodeNetwork, InstanceHead
+from vap_core.perception.embedded.encoder import LiteEncoder
+from vap_core.perception.embedded.mask_network import MaskHead, MaskNetwork
 from vap_core.perception.embedded.runtime import TorchNetwork
-from vap_core.perception.embedded.segmenter import LiteSegmenter, MaskHead, MaskNetwork
+from vap_core.perception.embedded.segmenter import LiteSegmenter
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.phrases import AMBIGUOUS, NEGATIVES, UNSEEN, UNSEEN_NEGATIVES
 from vap_core.training.films.scenes import POSES, Shots, boxes_of

@@ -15,17 +15,17 @@ from torch.nn import functional as F  # noqa: N812
 
 from vap_core.base.types import Rgb, value
 from vap_core.perception.boxes import crop
-from vap_core.perception.embedded.backbone import CHANNELS, features, normalise
+from vap_core.perception.embedded.backbone import features, normalise
+from vap_core.perception.embedded.encode_network import InstanceHead, halve_b4
 from vap_core.perception.embedded.encoder import (
     HISTOGRAM_LENGTH,
     INSTANCE_SIDE,
     INSTANCE_TAPS,
-    InstanceHead,
     gem,
-    halve_b4,
     lab_histogram,
     pad_to_square,
 )
+from vap_core.perception.embedded.taps import CHANNELS
 from vap_core.training.films.scenes import POSES, Shots, boxes_of
 from vap_core.training.perception.detector import augment, save_array
 from vap_core.training.perception.fitting import Run, fit, half_precision

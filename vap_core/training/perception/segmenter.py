@@ -14,10 +14,10 @@ from torch.nn import functional as F  # noqa: N812
 
 from vap_core.perception.boxes import mask_box
 from vap_core.perception.embedded.backbone import load_backbone, normalise
+from vap_core.perception.embedded.mask_network import MaskHead
 from vap_core.perception.embedded.segmenter import (
     SIDE,
     TAPS,
-    MaskHead,
     box_plane,
     cut,
     window_around,

@@ -19,7 +19,7 @@ import torch
 from torch import nn
 from tqdm import tqdm
 
-from vap_core.base.files import DATA
+from vap_core.base.files import kept_folder
 from vap_core.evaluation.processes import results
 from vap_core.perception.embedded.export import export_graphs, require_onnx
 from vap_core.perception.embedded.weights import PERCEPTION, save_weights
@@ -28,7 +28,7 @@ from vap_core.training.films.scenes import VIEWS, Shots, cached, only_generic
 from vap_core.training.perception import detector, instance_head, segmenter
 from vap_core.training.perception.fitting import Run, checkpoint
 
-CACHE = DATA / "cache" / "perception"
+CACHE = kept_folder("cache") / "perception"
 HELD_OUT_STAGES = 30
 EPOCHS = {"detector": 6, "segmenter": 6, "looks": 40}
 CROPS_PER_EPOCH = 8000

@@ -6,7 +6,9 @@ colour by nature), a description of its own look, or nothing. When nothing is sa
 is right, and what counts is whether the hand commits.
 """
 
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache, partial
 from operator import itemgetter
 from pathlib import Path
@@ -18,11 +20,11 @@ import numpy as np
 from vap_core.base.errors import BadOutput, BadStudy, one_of
 from vap_core.base.files import write_atomic
 from vap_core.base.tables import align
-from vap_core.base.types import Attended, Colour, Description, Rgb
+from vap_core.base.types import Attended, Colour, Description, Rgb, value
 from vap_core.evaluation.metrics import rate
 from vap_core.evaluation.processes import results
 from vap_core.policies.lerobot import adapter as lerobot
-from vap_core.prompt import ALPHA
+from vap_core.prompt import ALPHA, PALETTE
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters.protocol import PromptContext, unchanged
 from vap_core.simulation.assets.objects import get_object
@@ -47,6 +49,15 @@ ProbeState = tuple[Colour, str]
 """The colour and the instruction of one episode."""
 
 
+@value
+class Tinting:
+    """What `tinted-COLOUR`, `tinted-OPACITY` or `tinted-COLOUR-OPACITY` force, whatever fits the
+    scene; a colour of None is drawn among those that no rival has."""
+
+    colour: Colour | None = None
+    alpha: float = ALPHA
+
+
 class ProbePrompter:
     """Colours the target by ground-truth masks at every step, and says which object is meant."""
 
@@ -56,7 +67,7 @@ class ProbePrompter:
     references: Mapping[str, tuple[Rgb, ...]] = MappingProxyType({})
 
     def __init__(self, way: str) -> None:
-        self.way = way
+        self.way, self.tinting = parse_way(way)
 
     def start(
         self, observation: Observation, context: PromptContext
@@ -71,6 +82,8 @@ class ProbePrompter:
             taken.update(natural_colours(look))
         usable = distinct_colours(taken)
         colour = usable[int(rng.integers(len(usable)))]
+        if self.tinting.colour is not None:
+            colour = self.tinting.colour
         length = _length(described, rng)  # Drawn in every way, so that all ways draw alike.
         task = suite(row.suite).task(row.task)
         if self.way == "plain":
@@ -104,10 +117,28 @@ class ProbePrompter:
             if mask is None:
                 continue
             if self.way == "tinted":
-                (images[camera],) = tinted(rgb[None], mask[None], colour, alpha=ALPHA)
+                (images[camera],) = tinted(rgb[None], mask[None], colour, alpha=self.tinting.alpha)
             elif self.way == "painted":
                 (images[camera],) = painted(rgb[None], mask[None], colour, coat=COAT)
         return unchanged(images, text)
+
+
+def parse_way(way: str) -> tuple[str, Tinting]:
+    """One of WAYS, and what its further words force. Raises: UnknownName."""
+    name, *forced = way.split("-")
+    tinting = Tinting()
+    colours = {colour.name: colour for colour in PALETTE}
+    known = (*WAYS, *(f"tinted-{colour}" for colour in colours), "tinted-0.3")
+    if name not in WAYS or (forced and name != "tinted"):
+        raise one_of("probe: way", way, known)
+    for word in forced:
+        if word in colours:
+            tinting = replace(tinting, colour=colours[word])
+        elif re.fullmatch(r"0?\.\d+|1(\.0*)?", word):
+            tinting = replace(tinting, alpha=float(word))
+        else:
+            raise one_of("probe: way", way, known)
+    return name, tinting
 
 
 def probe(
@@ -131,8 +162,7 @@ def probe(
     from tqdm import tqdm
 
     for way in ways:
-        if way not in WAYS:
-            raise one_of("probe: way", way, WAYS)
+        parse_way(way)
     work = partial(_scene, checkpoint, suite_name, tuple(ways), execute, seed)
     done = tqdm(
         results(work=work, jobs=range(scenes), workers=workers, remedy="--workers"),

@@ -8,9 +8,10 @@ decides which masks are believed, `search` looks for lost identities, and `track
 from functools import cache
 
 from vap_core.perception.embedded.encoder import load as load_encoder
+from vap_core.perception.embedded.lite0 import trunk_weights
 from vap_core.perception.embedded.runtime import load_network
 from vap_core.perception.embedded.segmenter import load as load_segmenter
-from vap_core.perception.embedded.tracker.cells import GRAPH, CellNetwork
+from vap_core.perception.embedded.tracker.cells import GRAPH, TAP
 from vap_core.perception.embedded.tracker.tracker import LiteTracker
 from vap_core.perception.embedded.weights import PERCEPTION, read_manifest
 
@@ -22,5 +23,5 @@ def load() -> LiteTracker:
     Raises: MissingWeights: a file of data/weights is absent or damaged.
     """
     sha256 = read_manifest()[PERCEPTION]["sha256"]
-    network = load_network(GRAPH, CellNetwork(), sha256)
+    network = load_network(GRAPH, trunk_weights([TAP]), sha256)
     return LiteTracker(network, load_segmenter(), load_encoder())

@@ -8,20 +8,11 @@ from functools import cache
 
 import cv2
 import numpy as np
-import torch
-from jaxtyping import Bool, Float, Float32, Int64, UInt8
-from torch import Tensor, nn
-from torch.nn import functional as F  # noqa: N812
+from jaxtyping import Bool, Float32, Int64
 
 from vap_core.base.types import Rgb, value
-from vap_core.perception.embedded.backbone import (
-    CHANNELS,
-    STRIDE,
-    Trunk,
-    normalise,
-    resize_and_pad,
-)
 from vap_core.perception.embedded.runtime import Network
+from vap_core.perception.embedded.taps import STRIDE, resize_and_pad
 
 GRAPH = "tracker.onnx"
 TAP = "b4"
@@ -49,23 +40,10 @@ class FrameMemory:
     labels: Labels
 
 
-class CellNetwork(nn.Module):
-    """The shallow backbone: an image in, unit-length features of every cell out, row by row."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.trunk = Trunk([TAP])
-
-    def forward(self, rgb: UInt8[Tensor, "1 h w 3"]) -> tuple[Float[Tensor, "p c"]]:
-        maps = self.trunk(normalise(rgb))[TAP][0]
-        keys = maps.reshape(CHANNELS[TAP], -1).T
-        return (F.normalize(keys, dim=1).contiguous(),)
-
-
 def embed_cells(image: Rgb, network: Network) -> tuple[Float32[np.ndarray, "p c"], Grid]:
     """Unit-length features of every cell, row by row, and the grid.
 
-    `network` computes a `CellNetwork`.
+    `network` computes a `cell_network.CellNetwork`.
     """
     resized, _ = resize_and_pad(image, SIDE)
     (keys,) = network(resized[None])
@@ -87,20 +65,34 @@ def propagate(
     if selected is None:
         selected = np.ones(len(keys), bool)
     cells = np.flatnonzero(selected)
-    query = torch.from_numpy(keys[cells])
-    cosines = []
-    for frame in memory:
-        cosine = query @ torch.from_numpy(frame.keys).T
-        if local:
-            cosine = cosine + _distance_bias(grid)[cells]
-        cosines.append(cosine)
-    best, neighbours = torch.cat(cosines, dim=1).topk(NEIGHBOURS, dim=1)
-    weight = torch.softmax(best / TEMPERATURE, dim=1)
-    known = torch.from_numpy(np.concatenate([frame.labels for frame in memory], axis=1))
+    bias = _distance_bias(grid)[cells] if local else np.float32(0)
+    cosines = [keys[cells] @ frame.keys.T + bias for frame in memory]
+    neighbours, best = largest(np.concatenate(cosines, axis=1), NEIGHBOURS)
+    weight = np.exp((best - best[:, :1]) / np.float32(TEMPERATURE))
+    weight /= weight.sum(axis=1, keepdims=True)
+    known = np.concatenate([frame.labels for frame in memory], axis=1)
     labels = np.zeros((len(known), len(keys)), np.float32)
     labels[0] = 1
-    labels[:, cells] = (known[:, neighbours] * weight).sum(-1).numpy()
+    labels[:, cells] = (known[:, neighbours] * weight).sum(axis=-1)
     return labels
+
+
+def largest(
+    rows: Float32[np.ndarray, "q p"], k: int
+) -> tuple[Int64[np.ndarray, "q k"], Float32[np.ndarray, "q k"]]:
+    """Columns and values of the k largest numbers of every row, in falling order; consumes `rows`.
+
+    For a handful of numbers this takes a fifth of the time of a partition.
+    """
+    columns = np.zeros((len(rows), k), np.int64)
+    values = np.zeros((len(rows), k), np.float32)
+    row = np.arange(len(rows))
+    for i in range(k):
+        column = rows.argmax(axis=1)
+        columns[:, i] = column
+        values[:, i] = rows[row, column]
+        rows[row, column] = -np.inf
+    return columns, values
 
 
 def cells_near(
@@ -167,8 +159,8 @@ def cosine_lead(
 
 
 @cache
-def _distance_bias(grid: Grid) -> torch.Tensor:
+def _distance_bias(grid: Grid) -> Float32[np.ndarray, "p p"]:
     """0 between cells at most `RADIUS` apart, `TOO_FAR` between others."""
     rows, cols = np.mgrid[0 : grid[0], 0 : grid[1]].reshape(2, -1)
     distance = np.maximum(abs(rows[:, None] - rows), abs(cols[:, None] - cols))
-    return torch.from_numpy(np.where(distance > RADIUS, np.float32(TOO_FAR), np.float32(0)))
+    return np.where(distance > RADIUS, np.float32(TOO_FAR), np.float32(0))

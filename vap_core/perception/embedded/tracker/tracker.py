@@ -54,7 +54,7 @@ HINT_GROWTH_PX = 9
 class LiteTracker:
     """The embedded tracker. Views are independent; the same frames give the same bits.
 
-    `network` computes a `CellNetwork`.
+    `network` computes a `cell_network.CellNetwork`.
     """
 
     def __init__(self, network: Network, segmenter: LiteSegmenter, encoder: Encoder) -> None:

@@ -1,0 +1,37 @@
+"""Success against coverage by a threshold on the vote's margin, by hand."""
+
+import pandas as pd
+
+from vap_core.evaluation.abstention import THRESHOLDS, abstention_rows, abstentions
+
+EPISODES = [
+    ("tabletop", "vap", 1.0, True, True),
+    ("tabletop", "vap", 1.0, False, True),
+    ("tabletop", "vap", 0.6, True, True),
+    ("tabletop", "vap", 0.2, False, True),
+    ("tabletop-absent", "vap", 0.2, False, True),
+    ("tabletop-absent", "vap", 0.0, False, False),
+    ("vlabench", "vap", 1.0, True, True),
+    ("tabletop", "generic", None, True, True),
+    ("tabletop-absent", "generic", None, False, True),
+]
+
+
+def test_the_curve_by_hand() -> None:
+    table = pd.DataFrame(EPISODES, columns=["suite", "method", "margin", "success", "touched"])
+    found = abstentions(table)
+    assert [(line.suite, line.method) for line in found] == [("tabletop", "vap")] * len(THRESHOLDS)
+    by_threshold = {line.threshold: line for line in found}
+
+    def counts(threshold: float) -> list[tuple[int, int]]:
+        line = by_threshold[threshold]
+        rates = (line.acts, line.success, line.acts_absent, line.touches_absent)
+        return [(each.k, each.n) for each in rates]
+
+    assert counts(0.0) == [(4, 4), (2, 4), (2, 2), (1, 2)]
+    assert counts(0.2) == [(4, 4), (2, 4), (1, 2), (1, 2)]
+    assert counts(0.4) == [(3, 4), (2, 3), (0, 2), (0, 2)]
+    assert counts(1.0) == [(2, 4), (1, 2), (0, 2), (0, 2)]
+    header, first, *_ = abstention_rows(found)
+    assert dict(zip(header, first, strict=True))["SR when it acts [95 %]"] == "50 % [15, 85]"
+    assert abstentions(table.drop(columns="margin")) == []

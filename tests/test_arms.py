@@ -1,0 +1,160 @@
+"""Arms that ask what the policy follows: another command or none, and a tint that changes sides."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.test_methods import ALIKE, GREY, LINE, MUG, RED, ROW, TEAL, looking, where
+from tests.toys import TOYS, observation, personal
+from vap_core.attend import Attender
+from vap_core.base.errors import BadStudy
+from vap_core.evaluation.methods import find, make_prompter, needs_memory, needs_stack
+from vap_core.evaluation.study import Study
+from vap_core.evaluation.switching import columns, switching_lines
+from vap_core.policies.protocol import PolicyInput
+from vap_core.prompt import tint
+from vap_core.rollout.loop import Trial, rollout
+from vap_core.rollout.prompters.protocol import PromptContext
+from vap_core.rollout.prompters.switch import SWITCHED, Switch, SwitchPrompter
+from vap_core.rollout.prompters.text import OtherCommand
+from vap_core.rollout.types import Frame
+from vap_core.simulation import suites
+from vap_core.simulation.scenes import build
+from vap_core.simulation.suites.open_row import build_scene
+from vap_core.simulation.types import Observation
+
+TASK = ("simpler-bridge", "put-camera")
+
+
+class Waiting:
+    """A policy that does nothing."""
+
+    label = "waiting"
+    execute = 1
+
+    def start(self, rng: np.random.Generator) -> None:
+        return None
+
+    def plan(
+        self, states: Sequence[None], inputs: Sequence[PolicyInput]
+    ) -> tuple[list[None], list[np.ndarray]]:
+        still = np.array([[0, 0, 0, 0, 0, 0, 1]], np.float32)
+        return list(states), [still] * len(inputs)
+
+
+def looked(step: int, moved: set[str]) -> tuple[Observation, PromptContext]:
+    """What the prompter gets at a step of the toy world."""
+    views, context = looking({"front": LINE})
+    assert context.truth is not None
+    truth = replace(context.truth, step=step, moved=frozenset(moved))
+    return views, replace(context, truth=truth)
+
+
+@pytest.mark.parametrize(
+    ("when", "moments", "at"),
+    [
+        ("early", [(0, {"mug"}), (1, set()), (9, set())], 1),
+        ("moved", [(3, {"other"}), (4, {"mug"}), (5, set())], 1),
+    ],
+)
+def test_the_tint_goes_to_a_lookalike_once_and_stays(
+    when: Literal["early", "moved"], moments: list[tuple[int, set[str]]], at: int
+) -> None:
+    """ROW has five steps, so that early is from the first one on."""
+    prompter = SwitchPrompter(Attender(TOYS, {"mug": MUG}), Switch(when), ALIKE)
+    state, attended = prompter.start(*looked(0, set()))
+    assert (attended.images["front"] == tint(LINE, where(LINE, TEAL), RED)).all()
+    said = attended.text
+    for i, moment in enumerate(moments):
+        views, context = looked(*moment)
+        ((state, attended),) = prompter.steps([state], [views], [context])
+        prompted = GREY if i >= at else TEAL
+        assert (attended.images["front"] == tint(LINE, where(LINE, prompted), RED)).all()
+        assert attended.text == said
+        events = [event for event in attended.events if event.text == f"{SWITCHED}twin"]
+        assert [event.frame_index for event in events] == [moment[0]] * (i == at)
+    alone = replace(ROW, placements=ROW.placements[:2])
+    with pytest.raises(BadStudy, match="places no look-alike of 'mug'"):
+        prompter.start(*looking({"front": LINE}, alone))
+
+
+def test_reaction_and_obedience_are_read_from_an_episode() -> None:
+    """A switch after a tenth of the steps; then the hand is where it is told to be."""
+    (row,) = suites.rows(*TASK, 1)
+    row = replace(row, max_steps=10)
+    mine = personal(row.target, row.category, TEAL)
+    with build_scene(TASK[0], [place.model for place in row.placements]) as scene:
+        alike = frozenset(name for name in scene.objects if "camera" in name)
+        prompter = SwitchPrompter(Attender(TOYS, {row.target: mine}), Switch("early"), alike)
+        trial = Trial("switched-early", scene, Waiting(), prompter, image_size=64)
+        (episode,) = rollout(trial, [row])
+    assert trial.bound
+    rival = prompter.after.prompted_object(row)
+    found = columns(episode)
+    assert found["switched_s"] == pytest.approx(1 / 5)
+    assert not found["obeyed"]
+
+    def told(frame: Frame) -> Frame:
+        """The hand is over the rival from frame 4 on, which it touches in frame 6."""
+        name = rival if frame.frame_index >= 4 else row.target
+        touched = (rival,) if frame.frame_index == 6 else ()
+        x, y = frame.truth.objects_world[name][:2]
+        state = frame.state.copy()
+        state[:2] = x, y  # the WidowX stands at the origin
+        return replace(frame, state=state, truth=replace(frame.truth, touched=touched))
+
+    played = replace(episode, frames=tuple(map(told, episode.frames)))
+    found = columns(played)
+    assert found["obeyed"]
+    assert found["turned_s"] == pytest.approx((4 - 1) / 5)
+    assert columns(replace(played, frames=played.frames[:2])) == {}, "no action follows"
+    assert columns(replace(played, frames=played.frames[:3])) != {}
+    stays = replace(played, frames=played.frames[:4])
+    assert columns(stays) == {"switched_s": found["switched_s"], "turned_s": None, "obeyed": False}
+    table = pd.DataFrame(
+        [
+            {"suite": TASK[0], "method": "switched-early", **columns(played)},
+            {"suite": TASK[0], "method": "switched-early", **columns(stays)},
+            {"suite": TASK[0], "method": "oracle-track"},
+        ]
+    )
+    (line,) = switching_lines(table)
+    assert "switched in 2 episodes, obeyed in 50 % [9, 91]; 1 hands turned, median 0.6 s" in line
+    assert switching_lines(table[["suite", "method"]]) == []
+
+
+def test_blank_and_other_commands_leave_pictures_alone(tmp_path: Path) -> None:
+    views = {"front": np.full((8, 8, 3), 70, np.uint8)}
+    with build("wx250s", []) as scene:
+        for suite in (*suites.BENCHMARKS, "simpler-bridge-dev"):
+            commands = {task.instruction for task in suites.suite(suite).tasks}
+            for task in suites.suite(suite).tasks:
+                (row,) = suites.rows(suite, task.name, 1)
+                said = {}
+                for method in ("blank-text", "other-text"):
+                    prompter = make_prompter(method, row, tmp_path, scene, None)
+                    state, first = prompter.start(observation(views), PromptContext("x"))
+                    ((_, later),) = prompter.steps(
+                        [state], [observation(views)], [PromptContext("x")]
+                    )
+                    assert first.text == later.text
+                    assert first.images is later.images is views
+                    assert not prompter.highlights
+                    said[method] = first.text
+                assert said["blank-text"] == ""
+                assert said["other-text"] in commands - {row.instruction}
+
+
+def test_the_command_arms_need_neither_memory_nor_perception() -> None:
+    assert find("blank-text") == OtherCommand("blank")
+    for method in ("blank-text", "other-text"):
+        assert not needs_memory(method)
+        assert not needs_stack(method)
+    study = Study((TASK,), ("other-text",), policy="scripted")
+    with pytest.raises(BadStudy, match="parses its command, and blank-text gives it none"):
+        replace(study, methods=("generic", "blank-text"))

@@ -1,0 +1,224 @@
+"""The parts that ship keep the contracts, and the contracts find what an implementation does wrong."""
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.contract import kept
+from vap_core.attend import Attender
+from vap_core.base.errors import UnknownName
+from vap_core.base.types import Boxes
+from vap_core.contracts import (  # fmt: skip
+    given,
+    test_detector,
+    test_encoder,
+    test_policy,
+    test_prompter,
+    test_segmenter,
+    test_suite,
+    test_tracker,
+)
+from vap_core.contracts.given import RenderedScene
+from vap_core.memory import register
+from vap_core.perception.stacks import load_stack
+from vap_core.policies.scripted.random import Random
+from vap_core.rollout.prompters import text
+from vap_core.rollout.prompters.protocol import PromptContext, Prompter, unchanged
+from vap_core.rollout.prompters.tint import TintPrompter
+from vap_core.simulation.assets.objects import get_object
+from vap_core.simulation.studio import reference_views
+from vap_core.simulation.suites import SUITES, Suite
+from vap_core.vote import similarity
+
+ROOT = Path(__file__).resolve().parents[1]
+WHERE = "widowx-pick/pick-straw-cup"
+
+
+@pytest.fixture(scope="module")
+def scene() -> RenderedScene:
+    return given.rendered_scene()
+
+
+def test_the_embedded_stack_keeps_its_contracts(scene: RenderedScene) -> None:
+    stack = load_stack("embedded")
+    kept(test_encoder, encoder=stack.encoder, scene=scene)
+    kept(test_encoder, encoder=stack.unfamiliar_encoder, scene=scene)
+    kept(test_detector, detector=stack.detector, scene=scene)
+    kept(test_detector, sanity=False, detector=stack.by_category, scene=scene)
+    kept(test_segmenter, segmenter=stack.segmenter, scene=scene)
+    kept(test_tracker, tracker=stack.tracker, scene=scene)
+
+
+@pytest.mark.parametrize("make", [Random])
+def test_shipped_policies_keep_theirs(make: Callable[[], Any]) -> None:
+    kept(test_policy, policy=make(), where=WHERE)
+
+
+def tinting() -> TintPrompter:
+    """The method, with one object in memory."""
+    stack = load_stack("embedded")
+    views = reference_views(get_object("straw-cup-personal"), 3)
+    obj, _ = register("straw-cup-personal", "straw cup", views, stack.detector, stack.encoder)
+    return TintPrompter(Attender(stack, {obj.name: obj}))
+
+
+@pytest.mark.parametrize("make", [text.generic, tinting])
+def test_prompters_keep_theirs(make: Callable[[], Prompter[Any]]) -> None:
+    kept(test_prompter, prompter=make(), where=WHERE)
+
+
+@pytest.mark.parametrize("suite", SUITES.values(), ids=SUITES)
+def test_suites_keep_theirs(suite: Suite) -> None:
+    kept(test_suite, suite=suite)
+
+
+# --- What they find ------------------------------------------------------------------------------
+
+
+class Outside:
+    """Boxes beyond the image, worst first, and another number with every call."""
+
+    def __call__(self, images: list, phrase: str, threshold: float | None = None) -> list[Boxes]:
+        wide = [[0, 0, image.shape[1] + 5, 10] for image in images]
+        return [Boxes(np.array([box], np.float32), np.ones(1, np.float32), phrase) for box in wide]
+
+
+class Paints:
+    """Darkens what it is given in place."""
+
+    needs_truth = "never"
+    highlights = True
+    references: dict = {}  # noqa: RUF012
+
+    def start(self, observation: Any, context: PromptContext) -> Any:
+        for image in observation.images.values():
+            image[:] //= 2
+        return None, unchanged(observation.images, context.instruction)
+
+    def steps(self, *_: Any) -> Any: ...
+
+
+class Wild(Random):
+    """Other actions in every episode that it ever runs."""
+
+    count = 0
+
+    def start(self, rng: np.random.Generator) -> Any:
+        Wild.count += 1
+        return super().start(np.random.default_rng(Wild.count))
+
+
+def test_boxes_outside_the_image_are_found(scene: RenderedScene) -> None:
+    with pytest.raises(AssertionError):
+        test_detector.test_every_image_has_its_boxes_inside_it_best_first(Outside(), scene)
+
+
+def test_a_prompter_that_paints_in_place_is_found() -> None:
+    with pytest.raises(AssertionError):
+        test_prompter.test_what_it_is_given_stays_as_it_was(Paints(), WHERE)
+
+
+def test_randomness_of_its_own_is_found() -> None:
+    test_policy.test_its_actions_fit_the_robot(Wild(), WHERE)
+    with pytest.raises(AssertionError):
+        test_policy.test_an_episode_repeats_its_actions(Wild(), WHERE)
+
+
+# --- The page ------------------------------------------------------------------------------------
+
+PAGE = (ROOT / "docs" / "contracts.md").read_text()
+
+
+def test_the_page_names_every_test_of_every_contract() -> None:
+    named = {}
+    for section in PAGE.split("\n## ")[1:]:
+        named[section.split()[0].lower()] = set(re.findall(r"`(test_\w+)`", section))
+    held = {}
+    for path in sorted(Path(given.__file__).parent.glob("test_*.py")):
+        held[path.stem.removeprefix("test_")] = set(
+            re.findall(r"^def (test_\w+)", path.read_text(), re.M)
+        )
+    assert named == held
+
+
+def test_the_documented_encoder_keeps_the_contract(scene: RenderedScene) -> None:
+    (block,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    names: dict[str, Any] = {}
+    exec(compile(block, "documented", "exec"), names)
+    kept(test_encoder, sanity=False, encoder=names["MeanColour"](), scene=scene)
+
+
+# --- The command ---------------------------------------------------------------------------------
+
+MINE = """
+import numpy as np
+from vap_core.base.types import Boxes
+
+class Detector:
+    def __call__(self, images, phrase, threshold=None):
+        return [Boxes.empty(phrase) for _ in images]
+
+class Encoder:
+    name = "mean"
+
+    def __call__(self, crops):
+        return np.array([crop.reshape(-1, 3).mean(axis=0) for crop in crops])
+"""
+
+
+def contracts(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    """The command as a user runs it, from the folder of `mine.py`."""
+    (folder / "mine.py").write_text(MINE)
+    plugin = ("-p", "vap_core.contracts.plugin", "-p", "no:cacheprovider")
+    command = [sys.executable, "-m", "pytest", "-q", "--pyargs", "vap_core.contracts", *plugin]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.run(
+        [*command, *options], cwd=folder, env=environment, capture_output=True, text=True
+    )
+
+
+@pytest.mark.slow
+def test_the_command_tests_what_it_is_given(tmp_path: Path) -> None:
+    done = contracts(tmp_path, "--detector", "mine:Detector", "--encoder", "mine:Encoder")
+    assert done.returncode == 1, done.stdout + done.stderr
+    failed = {
+        line.split(" - ")[0].rpartition("::")[2]
+        for line in done.stdout.splitlines()
+        if line.startswith("FAILED")
+    }
+    assert failed == {
+        "test_sanity_most_objects_of_a_rendered_table_have_a_box",
+        "test_rows_are_float32_of_length_1",
+        "test_no_crop_gives_no_row",
+        "test_sanity_an_object_is_most_like_itself",
+    }
+    assert "test_tracker" not in done.stdout
+
+
+@pytest.mark.slow
+def test_the_command_without_a_part_says_how(tmp_path: Path) -> None:
+    done = contracts(tmp_path)
+    assert done.returncode == 4
+    assert "give what is to be tested, as MODULE:NAME: --detector, --encoder" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "name", ["nowhere:Detector", "vap_core.memory:Nothing", "vap_core.memory", ""]
+)
+def test_what_names_nothing_is_one_line(name: str) -> None:
+    with pytest.raises(UnknownName, match="names nothing .* write MODULE:NAME"):
+        given.made(name)
+
+
+def test_objects_classes_and_functions_can_be_named() -> None:
+    assert isinstance(given.made("vap_core.policies.scripted.random:Random"), Random)
+    assert given.made("vap_core.simulation.suites.pick:WIDOWX") is SUITES["widowx-pick"]
+    assert given.made("vap_core.perception.embedded.encoder:load").name.startswith("lite0")
+    assert given.made("vap_core.vote:similarity") is similarity

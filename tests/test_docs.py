@@ -1,0 +1,155 @@
+"""README, docs/ and the cards: their links lead somewhere, their commands and code are there."""
+
+import ast
+import importlib
+import re
+import shlex
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import pytest
+import typer
+
+from tests.pages import FENCE, PAGES, ROOT, blocks, commands, spans
+from tests.test_stills import COMMITTED
+from vap_core.cli import app
+from vap_core.contracts import plugin
+from vap_core.evaluation.ablations import arms
+from vap_core.evaluation.methods import known_methods
+from vap_core.perception.stacks import STACKS
+from vap_core.simulation.suites import SUITES
+
+WORDS = 1200
+"""README is read in five minutes; the rest is in docs/."""
+MADE_LATER = ("data/runs", "data/memory", "data/objects", "data/cache", "data/photos")
+"""Folders that commands make, and that do not ship."""
+RECORD = "data/policies/README.md"
+"""The card of the shipped policies names the commands of their day, which are no more."""
+CONTRACT_OPTIONS = set(re.findall(r'"(--[a-z-]+)"', Path(plugin.__file__).read_text()))
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+
+
+def slug(heading: str) -> str:
+    """The anchor that GitHub gives a heading."""
+    plain = re.sub(r"[^\w\- ]", "", heading.strip().lower())
+    return plain.replace(" ", "-")
+
+
+def anchors(text: str) -> set[str]:
+    found = re.findall(r"^#+ (.+)$", FENCE.sub("", text), re.MULTILINE)
+    return {slug(heading) for heading in found}
+
+
+def test_readme_is_short() -> None:
+    assert len(PAGES["README.md"].split()) <= WORDS
+
+
+def test_readme_names_every_page() -> None:
+    linked = set(LINK.findall(PAGES["README.md"]))
+    for page in PAGES:
+        if page.startswith("docs/") or page.endswith("/README.md") or page == "CHANGELOG.md":
+            assert page in linked
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_somewhere(page: str) -> None:
+    for link in LINK.findall(FENCE.sub("", PAGES[page])):
+        if link.startswith("https://"):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (ROOT / page).parent / path if path else ROOT / page
+        assert target.exists(), link
+        if anchor:
+            assert anchor in anchors(target.read_text()), link
+
+
+def find_command(words: list[str]) -> tuple[Any, list[str]]:
+    """The command that the words name, and its arguments."""
+    command: Any = typer.main.get_command(app)
+    while hasattr(command, "commands"):
+        name, *words = words
+        assert name in command.commands, name
+        command = command.commands[name]
+    return command, words
+
+
+def check_names(values: dict[str, object]) -> None:
+    """Suites, methods and stacks exist; words in capitals stand for any."""
+    methods = set(known_methods())
+    known = {"suite": {*SUITES, "all"}, "methods": methods, "method": methods, "stack": {*STACKS}}
+    for option, names in known.items():
+        given = values.get(option) or ()
+        for text in (given,) if isinstance(given, str) else given:
+            for name in text.split(","):
+                assert name.isupper() or name in names, (option, name)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if commands(page) and page != RECORD])
+def test_commands_are_there(page: str) -> None:
+    for line in commands(page):
+        words = [word for word in shlex.split(line) if word != "..."]
+        if not words:
+            continue
+        command, arguments = find_command(words)
+        check_names(command.make_context(command.name, arguments).params)
+
+
+def options(command: Any) -> set[str]:
+    """All options of a command and of those below it."""
+    found = {"--help"}
+    for parameter in command.params:
+        found.update(parameter.opts, parameter.secondary_opts)
+    for each in getattr(command, "commands", {}).values():
+        found |= options(each)
+    return found
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page != RECORD])
+def test_options_are_there(page: str) -> None:
+    known = options(typer.main.get_command(app)) | CONTRACT_OPTIONS
+    for span in spans(page):
+        for option in re.findall(r"(?<!\S)--[a-z][\w-]*", span):
+            assert option in known, span
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")])
+def test_imports_of_the_code_are_there(page: str) -> None:
+    for block in blocks(page, "python"):
+        if "import " not in block:
+            continue
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                module = importlib.import_module(node.module)
+                for name in node.names:
+                    assert hasattr(module, name.name), (node.module, name.name)
+            if isinstance(node, ast.Import):
+                for name in node.names:
+                    importlib.import_module(name.name)
+
+
+def test_the_ablation_of_five_lines_is_one() -> None:
+    (block,) = (block for block in blocks("docs/extend.md", "python") if "Ablation(" in block)
+    assert len(block.splitlines()) == 5
+    ((name, ablation),) = eval(f"{{{block}}}", vars(arms)).items()
+    assert isinstance(ablation, arms.Ablation)
+    assert name not in arms.ABLATIONS
+    assert not set(ablation.arms) & set(known_methods())
+    assert set(ablation.methods) <= set(known_methods())
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_files_are_there(page: str) -> None:
+    for span in spans(page):
+        path = PurePosixPath(span)
+        if " " in span or path.parts[0] not in ("data", "notebooks", "tests", "figures", "docs"):
+            continue
+        if not span.startswith(MADE_LATER):
+            assert list(ROOT.glob(span.rstrip("/"))), span
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if "figures/" in PAGES[page]])
+def test_a_page_links_the_notebook_that_draws_its_figures(page: str) -> None:
+    for figure in re.findall(r"figures/([\w.]+\.png)", PAGES[page]):
+        (notebook,) = (ROOT / "notebooks").glob(f"{figure[:2]}_*.ipynb")
+        assert f"notebooks/{notebook.name})" in PAGES[page], figure
+        assert figure in COMMITTED or figure in notebook.read_text(), figure

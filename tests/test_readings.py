@@ -1,0 +1,126 @@
+"""The log of readings: a run enters once, to publish copies its lines, and a run of one's own
+leaves the repository as it is."""
+
+from pathlib import Path
+
+import pytest
+
+from vap_core.base.errors import BadOutput
+from vap_core.base.files import DATA
+from vap_core.evaluation import readings
+from vap_core.evaluation.engine import _open_run
+from vap_core.evaluation.publish import read_published
+from vap_core.evaluation.readings import Reading, all_readings, append, publish_readings, read_log
+from vap_core.evaluation.report.sections import readings_section
+from vap_core.evaluation.store import read_manifest
+from vap_core.evaluation.study import Study
+from vap_core.simulation import suites
+
+TASKS = (("simpler-bridge", "pick-shaver"), ("simpler-bridge", "put-camera"))
+
+
+@pytest.fixture(autouse=True)
+def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+    """This machine's log and the published one, neither begun."""
+    local, published = tmp_path / "runs" / "readings.csv", tmp_path / "results" / "readings.csv"
+    monkeypatch.setattr(readings, "LOCAL", local)
+    monkeypatch.setattr(readings, "PUBLISHED", published)
+    return local, published
+
+
+def test_a_run_enters_once_with_what_it_reads(tmp_path: Path, logs: tuple[Path, Path]) -> None:
+    study = Study(TASKS, ("generic", "vap"), episodes=6, seeds=2, policy="mini-pi0")
+    for _ in range(2):
+        _open_run(study, tmp_path / "run", "a look")
+    (line,) = read_log(logs[0])
+    assert (line.rows, line.listed, line.seeds, line.whole) == (12, 96, 2, False)
+    assert (line.methods, line.policy, line.what_for) == ("generic vap", "mini-pi0", "a look")
+    assert suites.lists.digest("simpler-bridge").startswith(line.list)
+    assert len(line.weights) == len(line.list) == readings.SHORT
+    _open_run(Study((("widowx-pick", "pick-cup"),), ("generic",)), tmp_path / "warm-up", "")
+    assert len(read_log(logs[0])) == 1, "a warm-up suite has no list"
+
+
+def test_to_publish_copies_the_lines_of_a_run_once(tmp_path: Path, logs: tuple[Path, Path]) -> None:
+    local, published = logs
+    for name, seed in (("kept", 0), ("private", 1)):
+        _open_run(Study(TASKS, ("generic",), seed=seed), tmp_path / name, name)
+    assert not published.exists(), "a run changes nothing in the repository"
+    manifest = read_manifest(tmp_path / "kept")
+    for _ in range(2):
+        publish_readings([manifest], published)
+    assert [line.what_for for line in read_log(published)] == ["kept"]
+    assert sorted(line.what_for for line in all_readings()) == ["kept", "private"]
+    local.unlink()
+    publish_readings([read_manifest(tmp_path / "private")], published)
+    assert [line.what_for for line in read_log(published)] == ["kept", readings.UNLOGGED]
+
+
+def test_readings_are_counted_by_weights() -> None:
+    lines = []
+    for weights, rows, day in (
+        ("aa", 96, "01"),
+        ("aa", 4, "03"),
+        ("bb", 96, "02"),
+        ("bb", 0, "01"),
+    ):
+        lines.append(
+            Reading(
+                date=f"2026-01-{day}",
+                suite="simpler-bridge",
+                list="e160",
+                weights=weights,
+                policy="mini-pi0",
+                methods="vap",
+                rows=rows,
+                listed=96 if rows else 0,
+                seeds=1,
+                run=f"{weights}{day}",
+                what_for="x, y",
+            )
+        )
+    append(lines, readings.PUBLISHED)
+    assert read_log(readings.PUBLISHED) == lines
+    header, first, second = readings.readings_rows(lines)
+    assert first[header.index("readings") :] == ["2", "1", "2026-01-03", "x, y"]
+    assert second[header.index("weights") :] == ["bb", "2", "1", "2026-01-02", "x, y"]
+    assert "| bb " in readings_section(lines)
+    assert readings_section([]) == ""
+
+
+def test_a_damaged_log_is_named(logs: tuple[Path, Path]) -> None:
+    logs[0].parent.mkdir()
+    logs[0].write_text("date,suite\n2026-01-01,vlabench\n")
+    with pytest.raises(BadOutput, match="is damaged"):
+        all_readings()
+
+
+@pytest.mark.parametrize("name", ["mini_pi0", "oracle_track", "scripted", "bounds"])
+def test_every_published_run_is_in_the_log_that_ships(name: str) -> None:
+    logged = {}
+    for line in read_log(DATA / "results" / readings.FILE):
+        logged[line.run, line.suite] = line
+    for manifest, _ in read_published(DATA / "results" / f"{name}.parquet"):
+        for wanted in readings.readings_of(manifest["configuration"], manifest["digest"]):
+            line = logged[wanted.run, wanted.suite]
+            for field in ("list", "weights", "policy", "methods", "rows", "listed", "seeds"):
+                assert getattr(line, field) == getattr(wanted, field)
+
+
+def test_the_readme_counts_the_published_readings() -> None:
+    text = " ".join((DATA.parent / "README.md").read_text().split())
+    counts = {}
+    for suite in suites.BENCHMARKS:
+        weights = [
+            line.weights
+            for line in read_log(DATA / "results" / readings.FILE)
+            if line.suite == suite and line.policy == "mini-pi0" and line.rows
+        ]
+        counts[suite] = len(weights), len(set(weights))
+    bridge, desk = counts["simpler-bridge"], counts["tabletop"]
+    fractal, vlabench = counts["simpler-fractal"], counts["vlabench"]
+    assert (
+        f"stand {bridge[0]} readings of simpler-bridge with {bridge[1]} weights, {desk[0]} of "
+        f"tabletop with {desk[1]}, {fractal[0]} of simpler-fractal with {fractal[1]}, and "
+        f"{vlabench[0]} of vlabench with {vlabench[1]}." in text
+    )

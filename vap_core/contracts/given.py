@@ -1,0 +1,109 @@
+"""What the options name, and what it is tested with."""
+
+import inspect
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vap_core.base.errors import UnknownName
+from vap_core.base.types import Boxes, Mask, Rgb, value
+from vap_core.rollout.loop import Trial
+from vap_core.rollout.prompters.text import generic
+from vap_core.simulation import suites
+from vap_core.simulation.suites.open_row import build_scene
+from vap_core.simulation.types import EpisodeRow
+from vap_core.training.films.scenes import boxes_of, stage
+
+LEAST_PX = 150
+"""Visible pixels of an object of the scene."""
+
+
+@value
+class RenderedScene:
+    """A picture of a table, and the mask and the box of every object on it."""
+
+    rgb: Rgb
+    masks: np.ndarray
+    boxes: Boxes
+
+
+def made(name: str) -> Any:
+    """What MODULE:NAME names; a class, or a function that needs no argument, is called.
+
+    Raises: UnknownName.
+    """
+    module_name, _, attribute = name.partition(":")
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        found = getattr(import_module(module_name), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise UnknownName(
+            f"contracts: {name!r} names nothing ({error}); write MODULE:NAME, as in "
+            "my.module:Detector, from the folder in which `import my.module` works."
+        ) from error
+    finally:
+        sys.path.pop(0)
+    if inspect.isclass(found):
+        return found()
+    if inspect.isroutine(found) and not _needed(found):
+        return found()
+    return found
+
+
+def _needed(function: Any) -> list[str]:
+    """The parameters of a function that have no default."""
+    needed = []
+    for parameter in inspect.signature(function).parameters.values():
+        if parameter.default is parameter.empty and parameter.kind not in (
+            parameter.VAR_POSITIONAL,
+            parameter.VAR_KEYWORD,
+        ):
+            needed.append(parameter.name)
+    return needed
+
+
+def rendered_scene() -> RenderedScene:
+    """The fullest of eight views of a rendered table with generic objects."""
+    shots = stage(3, 2, held_out=True, views=8)
+    seen = []
+    for ids in shots.ids:
+        seen.append(list(boxes_of(ids, len(shots.names), LEAST_PX)))
+    v = int(np.argmax([len(found) for found in seen]))
+    masks = np.stack([shots.ids[v] == i + 1 for i, _ in seen[v]])
+    corners = np.array([box for _, box in seen[v]], np.float32)
+    boxes = Boxes(corners, np.ones(len(corners), np.float32), "object")
+    return RenderedScene(shots.rgb[v], masks, boxes)
+
+
+def noise(seed: int, h: int = 96, w: int = 128) -> Rgb:
+    """A picture of nothing."""
+    return np.random.default_rng(seed).integers(0, 255, (h, w, 3), dtype=np.uint8)
+
+
+def iou(a: Mask, b: Mask) -> float:
+    return float((a & b).sum() / max((a | b).sum(), 1))
+
+
+def short_rows(where: str, steps: int, n: int = 2) -> list[EpisodeRow]:
+    """The first steps of the first episodes of SUITE/TASK."""
+    suite, _, task = where.partition("/")
+    return [replace(row, max_steps=steps) for row in suites.rows(suite, task, n)]
+
+
+def trial_of(policy: Any, rows: Sequence[EpisodeRow]) -> Trial:
+    """A trial of a policy that sees raw images and reads the raw instruction."""
+    suite = suites.suite(rows[0].suite)
+    models = {place.model: None for row in rows for place in row.placements}
+    return Trial(
+        method="generic",
+        scene=build_scene(suite.name, list(models)),
+        policy=policy,
+        prompter=generic(),
+        control=suite.control,
+        sensor=suite.sensor,
+    )

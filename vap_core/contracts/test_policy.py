@@ -1,0 +1,55 @@
+"""The contract of a policy: chunks of actions that fit the robot, and no other randomness than its
+episode's."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from vap_core.contracts.given import short_rows, trial_of
+from vap_core.rollout.loop import rollout
+from vap_core.rollout.policy_call import check_policy
+from vap_core.rollout.types import Episode
+
+STEPS = 6
+
+
+def episodes(policy: Any, where: str, batch: int) -> list[Episode]:
+    """The first steps of two episodes."""
+    rows = short_rows(where, STEPS)
+    trial = trial_of(policy, rows)
+    try:
+        return list(rollout(trial, rows, batch=batch))
+    finally:
+        trial.scene.close()
+
+
+def actions(of: Sequence[Episode]) -> np.ndarray:
+    taken = []
+    for episode in of:
+        for frame in episode.frames:
+            if frame.action is not None:
+                taken.append(frame.action)
+    return np.array(taken)
+
+
+def test_it_has_label_execute_start_and_plan(policy: Any) -> None:
+    check_policy(policy)
+
+
+def test_its_actions_fit_the_robot(policy: Any, where: str) -> None:
+    """A chunk of another shape or type ends the rollout with the sentence that says so."""
+    for episode in episodes(policy, where, batch=2):
+        assert episode.outcome.status != "error", episode.outcome.detail
+        assert "cut to it" not in episode.outcome.detail, episode.outcome.detail
+
+
+def test_an_episode_repeats_its_actions(policy: Any, where: str) -> None:
+    once = actions(episodes(policy, where, batch=2))
+    np.random.seed(5)  # noqa: NPY002  (global seeding must change nothing)
+    assert np.array_equal(once, actions(episodes(policy, where, batch=2)))
+
+
+def test_a_batch_equals_one_by_one(policy: Any, where: str) -> None:
+    together = actions(episodes(policy, where, batch=2))
+    assert np.allclose(together, actions(episodes(policy, where, batch=1)), atol=1e-3)

@@ -1,0 +1,87 @@
+"""The contract of a prompter: images of the same size and a text, each episode for itself."""
+
+from typing import Any
+
+import numpy as np
+
+from vap_core.base.types import Attended
+from vap_core.contracts.given import short_rows
+from vap_core.rollout.prompters.protocol import PromptContext, Prompter, SceneTruth
+from vap_core.simulation.env import Env
+from vap_core.simulation.suites.open_row import open_row
+from vap_core.simulation.types import Observation
+
+Step = tuple[Observation, PromptContext]
+
+
+def step_of(prompter: Prompter[Any], env: Env) -> Step:
+    """What a prompter is given at this moment."""
+    cameras = {camera.name: camera for camera in env.cameras()}
+    truth = None
+    if prompter.needs_truth != "never":
+        truth = SceneTruth(env.row, env.truth(masks=True).masks)
+    return env.observe(), PromptContext(env.row.instruction, cameras, truth)
+
+
+def two_steps(prompter: Prompter[Any], where: str) -> list[tuple[Step, Step]]:
+    """The first two steps of two episodes."""
+    found = []
+    for row in short_rows(where, steps=2):
+        with open_row(row) as env:
+            first = step_of(prompter, env)
+            env.step(np.zeros(env.action_size, np.float32))
+            found.append((first, step_of(prompter, env)))
+    return found
+
+
+def check_fits(attended: Attended, observation: Observation) -> None:
+    assert isinstance(attended.text, str)
+    assert attended.text
+    assert attended.images.keys() == observation.images.keys()
+    for name, image in attended.images.items():
+        assert image.dtype == np.uint8
+        assert image.shape == observation.images[name].shape
+
+
+def check_same(one: Attended, other: Attended) -> None:
+    assert one.text == other.text
+    for name, image in one.images.items():
+        assert np.array_equal(image, other.images[name])
+
+
+def test_it_says_what_it_reads_and_whether_it_highlights(prompter: Prompter[Any]) -> None:
+    assert prompter.needs_truth in ("never", "start", "always")
+    assert isinstance(prompter.highlights, bool)
+    assert dict(prompter.references) is not None
+
+
+def test_every_step_has_a_text_and_images_that_fit(prompter: Prompter[Any], where: str) -> None:
+    for first, second in two_steps(prompter, where):
+        state, attended = prompter.start(*first)
+        check_fits(attended, first[0])
+        ((_, attended),) = prompter.steps([state], [second[0]], [second[1]])
+        check_fits(attended, second[0])
+
+
+def test_what_it_is_given_stays_as_it_was(prompter: Prompter[Any], where: str) -> None:
+    (observation, context), _ = two_steps(prompter, where)[0]
+    before = {name: image.copy() for name, image in observation.images.items()}
+    prompter.start(observation, context)
+    for name, image in observation.images.items():
+        assert np.array_equal(image, before[name])
+
+
+def test_a_batch_equals_one_by_one(prompter: Prompter[Any], where: str) -> None:
+    steps = two_steps(prompter, where)
+    alone = []
+    for first, second in steps:
+        state, _ = prompter.start(*first)
+        ((_, attended),) = prompter.steps([state], [second[0]], [second[1]])
+        alone.append(attended)
+    states = [prompter.start(*first)[0] for first, _ in steps]
+    observations = [second[0] for _, second in steps]
+    contexts = [second[1] for _, second in steps]
+    for expected, (_, found) in zip(
+        alone, prompter.steps(states, observations, contexts), strict=True
+    ):
+        check_same(found, expected)

@@ -1,0 +1,35 @@
+"""The contract of a suite: a known robot and its cameras, and tasks whose objects exist."""
+
+from vap_core.instruction import parse
+from vap_core.simulation import robots
+from vap_core.simulation.assets import objects
+from vap_core.simulation.cameras import RIGS
+from vap_core.simulation.suites import Suite
+
+
+def test_its_robot_and_cameras_exist(suite: Suite) -> None:
+    robot = robots.get(suite.robot)
+    assert suite.hz > 0
+    assert suite.cameras
+    assert set(suite.cameras) <= {rig.name for rig in RIGS[robot.name]}
+
+
+def test_its_tasks_have_names_of_their_own_and_a_limit(suite: Suite) -> None:
+    names = [task.name for task in suite.tasks]
+    assert names
+    assert len(set(names)) == len(names)
+    assert all(task.max_steps > 0 for task in suite.tasks)
+
+
+def test_every_instruction_has_one_personal_object_of_the_tasks_category(suite: Suite) -> None:
+    for task in suite.tasks:
+        (target,) = parse(task.instruction).targets
+        assert target.category == task.category, task.name
+
+
+def test_every_target_exists_with_look_alikes_to_tell_it_from(suite: Suite) -> None:
+    for task in suite.tasks:
+        objects.get_object(task.personal)
+        objects.get_object(f"{task.stem}-lookalike-1")
+        if task.goal:
+            objects.get_object(task.goal)

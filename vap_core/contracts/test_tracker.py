@@ -1,0 +1,70 @@
+"""The contract of a tracker: every identity of each view, whatever the other views are."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from vap_core.base.types import Rgb, Track
+from vap_core.contracts.given import RenderedScene, iou
+from vap_core.perception.protocols import Tracker
+
+
+def follow(
+    tracker: Tracker, images: Sequence[Rgb], masks: Sequence[np.ndarray]
+) -> list[tuple[Track, ...]]:
+    """The tracks one frame later, in which everything has moved by two pixels."""
+    states = tracker.start(images, masks)
+    return tracker.step(states, [np.roll(image, 2, axis=0) for image in images])[1]
+
+
+def test_every_identity_has_a_track_in_order(tracker: Tracker, scene: RenderedScene) -> None:
+    first, second = follow(tracker, [scene.rgb, scene.rgb], [scene.masks, scene.masks[:1]])
+    assert (len(first), len(second)) == (len(scene.masks), 1)
+    for track in (*first, *second):
+        assert isinstance(track, Track)
+        assert 0 <= track.score <= 1
+        if track.mask is not None:
+            assert track.mask.shape == scene.rgb.shape[:2]
+
+
+def test_a_view_without_identities_has_no_tracks(tracker: Tracker, scene: RenderedScene) -> None:
+    assert follow(tracker, [scene.rgb], [scene.masks[:0]]) == [()]
+
+
+def test_views_are_independent_and_repeat_their_bits(
+    tracker: Tracker, scene: RenderedScene
+) -> None:
+    shifted = np.roll(scene.rgb, 3, axis=1)
+    both = follow(tracker, [scene.rgb, shifted], [scene.masks[:2], scene.masks[1:2]])
+    alone = follow(tracker, [scene.rgb], [scene.masks[:2]])
+    for a, b in zip(both[0], alone[0], strict=True):
+        assert a.score == b.score
+        if a.mask is None or b.mask is None:
+            assert a.mask is b.mask
+        else:
+            assert np.array_equal(a.mask, b.mask)
+
+
+def test_sanity_a_still_scene_keeps_its_masks(tracker: Tracker, scene: RenderedScene) -> None:
+    states = tracker.start([scene.rgb], [scene.masks])
+    for _ in range(3):
+        states, (tracks,) = tracker.step(states, [scene.rgb])
+    kept = []
+    for track, mask in zip(tracks, scene.masks, strict=True):
+        kept.append(0.0 if track.mask is None else iou(track.mask, mask))
+    assert np.mean(kept) >= 0.7
+
+
+def test_sanity_what_is_gone_has_no_mask_and_what_is_back_has_one(
+    tracker: Tracker, scene: RenderedScene
+) -> None:
+    states = tracker.start([scene.rgb], [scene.masks])
+    for _ in range(3):
+        states, (gone,) = tracker.step(states, [np.full_like(scene.rgb, 127)])
+    assert all(track.mask is None for track in gone)
+    for _ in range(2):
+        states, (back,) = tracker.step(states, [scene.rgb])
+    right = []
+    for track, mask in zip(back, scene.masks, strict=True):
+        right.append(track.mask is not None and iou(track.mask, mask) > 0.5)
+    assert np.mean(right) >= 0.6
