@@ -168,9 +168,9 @@ class Reading:
             words = content(exclusion.said, self._known_words(category))
             if not words:
                 continue
-            scores = self._scores(words, kept)
-            best = int(scores.argmax())
-            kept = [obj for obj in kept if obj is not kept[best]]
+            order, lead = self._ranked(words, kept)
+            if lead >= MARGIN:
+                kept = [obj for obj in kept if obj is not kept[order[0]]]
         return kept
 
     def _used(self, said: str, candidates: list[PersonalObject], user: str = "") -> PersonalObject:
@@ -246,9 +246,8 @@ class Reading:
         if len(candidates) == 1:
             return candidates[0]
         if words:
-            scores = self._scores(words, candidates)
-            order = np.argsort(-scores)
-            if scores[order[0]] - scores[order[1]] >= MARGIN:
+            order, lead = self._ranked(words, candidates)
+            if lead >= MARGIN:
                 return candidates[order[0]]
         kept = self._contrasted(candidates, category)
         if len(kept) == 1:
@@ -268,14 +267,18 @@ class Reading:
                 continue
             words = content(other.said, self._known_words(category))
             if words:
-                scores = self._scores(words, candidates)
-                order = np.argsort(-scores)
-                lead = float(scores[order[0]] - scores[order[1]])
+                order, lead = self._ranked(words, candidates)
                 if best is None or lead > best[0]:
                     best = lead, int(order[0])
         if best is None or best[0] < MARGIN:
             return candidates
         return [obj for obj in candidates if obj is not candidates[best[1]]]
+
+    def _ranked(self, words: str, candidates: Sequence[PersonalObject]) -> tuple[list[int], float]:
+        """The places of at least two candidates, best first, and the lead of the first."""
+        scores = self._scores(words, candidates)
+        order = np.argsort(-scores)
+        return order.tolist(), float(scores[order[0]] - scores[order[1]])
 
     def _scores(
         self, words: str, candidates: Sequence[PersonalObject]
