@@ -133,6 +133,12 @@ def test_the_words_alone_decide_about_meaning() -> None:
         parser("bring the thing for shaving")
 
 
+def test_a_tie_among_what_is_excluded_is_ambiguous() -> None:
+    alike = {name: thing(name, looks="white with blue spots", category="cup") for name in "ab"}
+    with pytest.raises(BadInstruction, match="could be a or b"):
+        EmbeddingParser(Context(alike), embed_text)("bring my cup, not the spotted one")
+
+
 def test_expressions_end_before_the_place() -> None:
     text = "put the thing I put flowers in on the plate"
     (said, *_) = [one.said for one in find_expressions(text, ())]

@@ -230,8 +230,8 @@ class Reading:
 
     def _rest(self) -> str:
         """The text beside the expression and its verb."""
-        before, after = self.text[: self.expression.start], self.text[self.expression.stop :]
-        return re.sub(r"[\w-]+(?: me| up)?$", "", before.rstrip()) + after
+        before = self.text[: self.expression.start].rstrip()
+        return re.sub(r"[\w-]+(?: me| up)?$", "", before) + self.text[self.expression.stop :]
 
     def _only(
         self, candidates: list[PersonalObject], words: str, owner: str | None, category: str
@@ -298,7 +298,7 @@ def _without(said: str, exclusions: Sequence[Exclusion], start: int) -> str:
 
 
 def _ambiguous(expression: Expression, objects: Sequence[PersonalObject]) -> BadInstruction:
-    names = " or ".join(obj.name for obj in objects[:4])
+    names = " or ".join(obj.name for obj in objects[:4])[:150]
     return BadInstruction(
         f"parse: {expression.said[:60]!r} could be {names}; say whose it is, what it looks like or "
         "what it is for."
