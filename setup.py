@@ -10,7 +10,14 @@ from pathlib import Path
 from setuptools import setup
 from setuptools.command.build_py import build_py
 
-SHIPPED = ("paper_tables.csv", "policies", "results/readings.csv", "suites", "weights")
+SHIPPED = (
+    "paper_tables.csv",
+    "paraphrases",
+    "policies",
+    "results/readings.csv",
+    "suites",
+    "weights",
+)
 
 
 class BuildWithData(build_py):

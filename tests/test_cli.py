@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from tests.command import process, refused, vap
 from vap_core.cli import app
+from vap_core.instruction.history import read_uses
 from vap_core.memory import load_bank
 from vap_core.perception.describe import WORDS
 from vap_core.simulation.assets.objects import get_object
@@ -123,6 +124,11 @@ def test_ground_answers_in_json_with_a_picture_and_a_recording(
     assert "-> #1" in again.stdout
     assert (tmp_path / "line-2.rrd").exists()
     assert not again.stderr
+    implicit = ("bring the one I used last", "--parser", "embedding", "--memory", bank)
+    done = vap("ground", image, *implicit, "--out", tmp_path, *hand)
+    assert "instruction: bring the red cup" in done.stdout, done.stderr
+    assert len(read_uses(bank)) >= 3
+    assert {use.object for use in read_uses(bank)} == {"mug"}
 
 
 def test_ground_says_not_in_view_unless_it_is_to_tint_always(
@@ -195,7 +201,7 @@ def test_register_refuses_bad_photos_and_loses_nothing(
     assert "--replace" in refused(
         "register", "mug", "--category", "cup", "--memory", bank, photos[0]
     )
-    assert {path.name for path in bank.iterdir()} == {
+    assert {path.name for path in bank.iterdir()} - {"history.jsonl"} == {
         "mug.object.safetensors",
         "mug.references.png",
     }

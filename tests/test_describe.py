@@ -1,12 +1,9 @@
 """Objects put into words: exact ones for pictures whose every pixel is known, and a model's behind a real server on this machine."""
 
-import json
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from threading import Thread
 from typing import Any
 
 import cv2
@@ -15,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.chat_server import says, serving
 from tests.toys import personal
 from vap_core.base.errors import BadEndpoint
 from vap_core.base.types import Boxes, Description
@@ -190,44 +188,6 @@ def test_the_shipped_segmenter_and_pictures_of_real_renders() -> None:
     }
     assert told["cat-figurine-personal"].short.startswith("black")
     assert "red with green" in told["scrubber-personal"].short
-
-
-class Model(BaseHTTPRequestHandler):
-    """Speaks the protocol: answers from the server's `answers`, in turn, and keeps what it was asked."""
-
-    def do_POST(self) -> None:
-        server: Any = self.server
-        body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-        server.asked.append((self.path, self.headers.get("Authorization"), body))
-        status, said, *headers = server.answers.pop(0)
-        data = said if isinstance(said, bytes) else json.dumps(said).encode()
-        self.send_response(status)
-        for name, text in headers:
-            self.send_header(name, text)
-        self.send_header("Content-Length", str(len(data)))
-        self.end_headers()
-        self.wfile.write(data)
-
-    def log_message(self, *args: Any) -> None:
-        pass
-
-
-def says(text: Any) -> tuple[int, Any]:
-    return 200, {"choices": [{"message": {"role": "assistant", "content": text}}]}
-
-
-@contextmanager
-def serving(*answers: Any) -> Iterator[Any]:
-    with ThreadingHTTPServer(("127.0.0.1", 0), Model) as server:
-        server.answers, server.asked = list(answers), []  # type: ignore[attr-defined]
-        server.url = f"http://127.0.0.1:{server.server_address[1]}/v1"  # type: ignore[attr-defined]
-        thread = Thread(target=server.serve_forever, args=(0.02,))
-        thread.start()
-        try:
-            yield server
-        finally:
-            server.shutdown()
-            thread.join()
 
 
 @pytest.fixture(autouse=True)

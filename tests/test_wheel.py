@@ -18,7 +18,14 @@ from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.studio import reference_views
 
 ROOT = Path(__file__).resolve().parents[1]
-SHIPPED = ("paper_tables.csv", "policies", "results/readings.csv", "suites", "weights")
+SHIPPED = (
+    "paper_tables.csv",
+    "paraphrases",
+    "policies",
+    "results/readings.csv",
+    "suites",
+    "weights",
+)
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
 

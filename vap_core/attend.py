@@ -41,7 +41,8 @@ from vap_core.base.types import (
     Views,
     value,
 )
-from vap_core.instruction import Parser, parse, rewrite
+from vap_core.instruction import Parser, rewrite
+from vap_core.instruction.parsers import rule_parser
 from vap_core.memory import recall
 from vap_core.perception.candidates import (
     Candidates,
@@ -102,7 +103,8 @@ class AttendState:
 class Attender:
     """Grounds personal objects at t = 0, tracks them afterwards, and prompts every image.
 
-    It holds models and the memory, and no state of an episode.
+    It holds models and the memory, and no state of an episode. `speaker` is whom "my" means
+    (instruction.owners); without a `parser` the rule parses.
     """
 
     def __init__(
@@ -110,12 +112,14 @@ class Attender:
         stack: Stack,
         memory: Mapping[str, PersonalObject],
         prompting: Prompting | None = None,
-        parser: Parser = parse,
+        parser: Parser | None = None,
+        speaker: str = "",
     ) -> None:
         self.stack = stack
         self.memory = memory
         self.prompting = prompting or Prompting()
-        self.parser = parser
+        self.parser = parser or rule_parser(memory)
+        self.speaker = speaker
 
     @property
     def references(self) -> Mapping[str, tuple[Rgb, ...]]:
@@ -188,7 +192,7 @@ class Attender:
         wanted = []
         for j, target in enumerate(parsed.targets):
             name = None if objects is None else objects[j]
-            obj = recall(self.memory, target, name)
+            obj = recall(self.memory, target, name, self.speaker)
             wanted.append(obj.first(self.prompting.references))
         return parsed, wanted
 

@@ -19,6 +19,7 @@ from vap_core.base.errors import BadMemory, BadOutput, BadPhoto, UnknownName, on
 from vap_core.base.files import encode_tensors, parse_json, remove_scratch, write_atomic
 from vap_core.base.photos import load_photo as load_photo
 from vap_core.base.types import Description, PersonalObject, Rgb, Target
+from vap_core.instruction.owners import belonging, check_owner, owners_of
 from vap_core.perception.boxes import crop
 from vap_core.perception.protocols import Detector, Encoder, ReferenceCropper
 
@@ -123,25 +124,38 @@ def reference_rows(obj: PersonalObject, encoder: Encoder) -> Float32[np.ndarray,
 
 
 def recall(
-    memory: Mapping[str, PersonalObject], target: Target, name: str | None = None
+    memory: Mapping[str, PersonalObject],
+    target: Target,
+    name: str | None = None,
+    speaker: str = "",
 ) -> PersonalObject:
-    """The remembered object that a target means.
+    """The remembered object that a target means when `speaker` speaks ("" where nobody said).
 
-    It is found by name when given, else it is the only one of its category.
+    It is found by name when given, else it is the only one of its category and of its owner.
 
     Raises:
-        UnknownName: nothing, or more than one object, fits.
+        UnknownName: nothing, or more than one object, fits; BadInstruction: several owners do.
     """
+    name = name or target.object
     if name is not None:
         if name not in memory:
             raise one_of("recall: object", name, memory)
         return memory[name]
-    fitting = []
+    of_category = []
     known = []
     for obj in memory.values():
-        known.append(f"{obj.name} ({obj.category})")
+        whose = f", {obj.owner}'s" if obj.owner else ""
+        known.append(f"{obj.name} ({obj.category}{whose})")
         if obj.category == target.category:
-            fitting.append(obj)
+            of_category.append(obj)
+    owners = owners_of(memory.values())
+    fitting = belonging(of_category, target.owner, speaker, owners)
+    if of_category and not fitting:
+        who = f"{speaker} speaks" if speaker else "nobody is named with --speaker"
+        raise UnknownName(
+            f"recall: no {target.category!r} is {target.owner!r} where {who}; the memory holds "
+            f"{', '.join(sorted(known))[:120]}. Say whose it is, or name the --speaker."
+        )
     if len(fitting) == 1:
         return fitting[0]
     if fitting:
@@ -165,6 +179,7 @@ def save(bank: Path, obj: PersonalObject, *, replace: bool = False) -> Path:
             that name and `replace` is off.
     """
     check_names(obj.name, obj.category)
+    check_owner(obj.owner, obj.known_as, obj.note)
     path = object_path(bank, obj.name)
     tensors = {"embeddings": obj.embeddings}
     for i, reference in enumerate(obj.crops):
@@ -178,6 +193,10 @@ def save(bank: Path, obj: PersonalObject, *, replace: bool = False) -> Path:
     }
     if obj.description is not None:
         header["description"] = json.dumps(asdict(obj.description))
+    if obj.owner:
+        header |= {"owner": obj.owner, "known_as": json.dumps(obj.known_as)}
+    if obj.note:
+        header["note"] = obj.note
     try:
         bank.mkdir(parents=True, exist_ok=True)
         remove_scratch(bank)
@@ -235,6 +254,9 @@ def load(path: Path, encoder: str | None = None) -> PersonalObject:
         description = None
         if "description" in header:
             description = Description(**parse_json(header["description"]))
+        owner, note = header.get("owner", ""), header.get("note", "")
+        known_as = tuple(parse_json(header.get("known_as", "[]")))
+        check_owner(owner, known_as, note)
         return PersonalObject(
             name=name,
             category=category,
@@ -242,8 +264,11 @@ def load(path: Path, encoder: str | None = None) -> PersonalObject:
             crops=tuple(crops),
             encoder=header["encoder"],
             description=description,
+            owner=owner,
+            known_as=known_as,
+            note=note,
         )
-    except (KeyError, ValueError, TypeError) as error:
+    except (KeyError, ValueError, TypeError, BadMemory) as error:
         raise BadMemory(
             f"load: {path} lacks what an object needs ({type(error).__name__}); {AGAIN}."
         ) from error

@@ -13,6 +13,7 @@ import numpy as np
 from vap_core.base.errors import BadInstruction, BadOutput
 from vap_core.base.events import describe_rejection
 from vap_core.base.types import Attended, Boxes, Grounding, PersonalObject, Rgb, value
+from vap_core.instruction.parsers import Parsing
 
 CAMERA = "image"
 GROUND_SIDE = 2560
@@ -30,6 +31,12 @@ class Found:
     instruction: str
     objects: tuple[PersonalObject, ...]
     attended: Attended
+
+    @property
+    def used(self) -> tuple[str, ...]:
+        """Names of the objects that are highlighted."""
+        groundings = self.attended.groundings[CAMERA]
+        return tuple(one.object for one in groundings if one.winner is not None)
 
     def __str__(self) -> str:
         lines = []
@@ -60,10 +67,12 @@ def ground_image(
     boxes: Boxes | None = None,
     tiles: bool = False,
     always_tint: bool = False,
+    parsing: Parsing | None = None,
 ) -> Found:
     """Run the method's first step on one picture with the remembered objects of a bank.
 
-    With `tiles` the detector also looks at nine overlapping tiles.
+    With `tiles` the detector also looks at nine overlapping tiles. Without `parsing` the rule
+    parses.
     """
     from vap_core.attend import Attender, Prompting
     from vap_core.memory import load_bank
@@ -74,7 +83,14 @@ def ground_image(
     if tiles:
         models = replace(models, detector=TiledDetector(models.detector))
     bank = load_bank(memory, models.encoder.name)
-    attender = Attender(models, bank, Prompting(always_tint=always_tint))
+    parsing = parsing or Parsing()
+    attender = Attender(
+        models,
+        bank,
+        Prompting(always_tint=always_tint),
+        parser=parsing.load(memory, bank),
+        speaker=parsing.speaker,
+    )
     boxes_by_camera = None if boxes is None else {CAMERA: boxes}
     _, attended = attender.start({CAMERA: rgb}, instruction, objects=objects, boxes=boxes_by_camera)
     matched = tuple(bank[grounding.object] for grounding in attended.groundings[CAMERA])

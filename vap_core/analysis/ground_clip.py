@@ -11,6 +11,7 @@ from vap_core.base import video
 from vap_core.base.errors import BadOutput, BadPhoto
 from vap_core.base.photos import load_photo, photos_in
 from vap_core.base.types import Attended, Rgb, Track, value
+from vap_core.instruction.parsers import Parsing
 from vap_core.memory import load_bank
 from vap_core.perception.stacks import load_stack
 
@@ -32,6 +33,7 @@ class ClipSummary:
     tracked: int
     lost: tuple[tuple[int, int], ...]
     text: str
+    object: str
 
     def __str__(self) -> str:
         if self.grounded is None:
@@ -59,6 +61,7 @@ def ground_clip(
     out: Path,
     *,
     objects: Sequence[str] | None = None,
+    parsing: Parsing | None = None,
 ) -> tuple[ClipSummary, Path, Path]:
     """Follow the first target of `instruction` through a clip; write an .rrd and an .mp4.
 
@@ -71,7 +74,10 @@ def ground_clip(
     if first is None:
         raise BadPhoto(f"ground: {path} has no frame; film for some seconds.")
     models = load_stack(stack)
-    attender = Attender(models, load_bank(memory, models.encoder.name))
+    bank = load_bank(memory, models.encoder.name)
+    parsing = parsing or Parsing()
+    parser = parsing.load(memory, bank)
+    attender = Attender(models, bank, parser=parser, speaker=parsing.speaker)
     _, (obj, *_) = attender.understand(instruction, objects)
     mp4, rrd = _new_files(out, path.stem)
     grounded, visible, text = None, [], instruction
@@ -100,6 +106,7 @@ def ground_clip(
         tracked=sum(visible),
         lost=_spans(visible, grounded),
         text=text,
+        object=obj.name,
     )
     return summary, rrd, mp4
 

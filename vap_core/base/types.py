@@ -71,7 +71,9 @@ class Description:
 class PersonalObject:
     """One remembered object: K reference crops and their embeddings Z_o (P 3.3).
 
-    Rows of `embeddings` are L2-normalised.
+    Rows of `embeddings` are L2-normalised. `owner` is the person that it belongs to, "" where that
+    does not matter; `known_as` are other words for that person, as in "my brother's". `note` is
+    what its owner says about it: "for the morning coffee".
     """
 
     name: str
@@ -80,6 +82,9 @@ class PersonalObject:
     crops: tuple[Rgb, ...]
     encoder: str
     description: Description | None = None
+    owner: str = ""
+    known_as: tuple[str, ...] = ()
+    note: str = ""
 
     def __post_init__(self) -> None:
         if len(self.crops) != len(self.embeddings) or not self.crops:
@@ -110,13 +115,16 @@ class PersonalObject:
 class Target:
     """One personalised span of an instruction.
 
-    `text[start:stop]` is "my cup" for owner "my" and category "cup".
+    `text[start:stop]` is "my cup" for owner "my" and category "cup". `object` is the name of the
+    remembered object that a parser of implicit references found; None where category and owner
+    decide.
     """
 
     start: int
     stop: int
     owner: str
     category: str
+    object: str | None = None
 
 
 @value

@@ -12,7 +12,17 @@ import typer
 
 from vap_core.base.errors import VapError
 from vap_core.base.extras import missing_part
-from vap_core.cli import attention, benches, evaluate, objects, results, setup, train, weights
+from vap_core.cli import (
+    attention,
+    benches,
+    evaluate,
+    objects,
+    parsers,
+    results,
+    setup,
+    train,
+    weights,
+)
 
 HELP = """Visual Attentive Prompting: steer a frozen policy to your own object, and see why it
 worked or failed.
@@ -27,7 +37,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     help=HELP,
 )
-for module in (objects, evaluate, results, attention, setup, benches):
+for module in (objects, evaluate, results, attention, parsers, setup, benches):
     app.add_typer(module.app)
 app.add_typer(train.app, name="train")
 app.add_typer(weights.app, name="weights")

@@ -5,6 +5,7 @@ Remember them from photos, find them in a picture, import them as 3-D scans.
 
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -71,6 +72,18 @@ def register(
             "or a URL."
         ),
     ] = "offline",
+    owner: Annotated[
+        str, typer.Option(help="Whose it is, for example anna; default nobody in particular.")
+    ] = "",
+    known_as: Annotated[
+        list[str] | None,
+        typer.Option(
+            help='Another word for the owner, for example brother or "anna\'s brother"; repeatable.'
+        ),
+    ] = None,
+    note: Annotated[
+        str, typer.Option(help='What it is for, for example "for the morning coffee".')
+    ] = "",
     replace: Annotated[
         bool, typer.Option("--replace", help="Overwrite an object of this name.")
     ] = False,
@@ -80,14 +93,20 @@ def register(
     Example: python -m vap_core register mug --category cup photos/mug-*.jpg
     Example: python -m vap_core register mug --category cup mug.jpg --box mug.jpg=40,60,180,220
     Example: python -m vap_core register mug --category cup --video mug.mp4
+    Example: python -m vap_core register mug --category cup photos/mug-*.jpg --owner anna
+        --note "for the morning coffee"
     """
+    import dataclasses
+
     from vap_core.evaluation.photos import register as registering
     from vap_core.evaluation.photos.trust import leave_one_out, warnings
+    from vap_core.instruction.owners import check_owner
     from vap_core.memory import check_names, load_bank, object_path, save, taken
     from vap_core.perception.describe import load_captioner, with_description
     from vap_core.perception.stacks import load_stack
 
     check_names(name, category)
+    check_owner(owner, known_as or [], note)
     if object_path(memory, name).exists() and not replace:
         raise taken(object_path(memory, name))
     paths = registering.gather_photos(photos or [])
@@ -104,6 +123,7 @@ def register(
     for line in warnings(obj, references, [path.name for path in paths]):
         print(f"note: {line}", file=sys.stderr)
     obj = with_description(obj, load_captioner(models.segmenter, describe))
+    obj = dataclasses.replace(obj, owner=owner, known_as=tuple(known_as or []), note=note)
     path = save(memory, obj, replace=replace)
     trust = leave_one_out(obj, references, load_bank(memory), models.encoder)
     print(f"{obj.name}: a {obj.category} with {len(obj.crops)} references, saved to {path}")
@@ -151,6 +171,18 @@ def ground(
             "--always-tint", help="Highlight the best candidate, however unlike it is (the paper)."
         ),
     ] = False,
+    parser: Annotated[
+        str,
+        typer.Option(
+            help="Who parses: rule, embedding (implicit references, offline), chat "
+            "(OPENAI_BASE_URL, _MODEL, _API_KEY), or a URL."
+        ),
+    ] = "rule",
+    speaker: Annotated[str, typer.Option(help='Whom "my" means, for example anna.')] = "",
+    fall_back: Annotated[
+        bool,
+        typer.Option("--fall-back", help="Where the chat endpoint fails, warn and take the rule."),
+    ] = False,
     out: Annotated[Path, typer.Option(help="Folder for the overlay PNG and the recording.")] = Path(
         "data/runs/ground"
     ),
@@ -164,6 +196,8 @@ def ground(
     Example: python -m vap_core ground desk.jpg "bring my cup" --box 40,60,180,220
         --box 300,80,420,230
     Example: python -m vap_core ground desk.mp4 "bring my cup"
+    Example: python -m vap_core ground desk.jpg "bring the one I used last" --parser embedding
+        --speaker anna
     """
     from vap_core.analysis.ground import (
         GROUND_SIDE,
@@ -175,16 +209,22 @@ def ground(
     )
     from vap_core.analysis.ground_clip import ground_clip, is_clip
     from vap_core.base.errors import BadInstruction
+    from vap_core.instruction.parsers import Parsing
     from vap_core.memory import load_photo
     from vap_core.perception.tiles import SMALL_MEGAPIXELS
 
+    parsing = Parsing(parser=parser, speaker=speaker, fall_back=fall_back)
     if is_clip(image):
         if box or as_json or tiles:
             raise BadInstruction(
                 "ground: --box, --tiles and --json are for single pictures; leave them out for a "
                 "clip."
             )
-        summary, rrd, mp4 = ground_clip(image, instruction, memory, stack, out, objects=object)
+        summary, rrd, mp4 = ground_clip(
+            image, instruction, memory, stack, out, objects=object, parsing=parsing
+        )
+        if summary.grounded is not None:
+            note_uses(memory, [summary.object], speaker)
         note = missing_threshold(stack)
         if note:
             print(f"note: {note}", file=sys.stderr)
@@ -215,7 +255,9 @@ def ground(
         boxes=boxes,
         always_tint=always_tint,
         tiles=tiles,
+        parsing=parsing,
     )
+    note_uses(memory, found.used, speaker)
     note = missing_threshold(stack)
     if note and not always_tint:
         print(f"note: {note}", file=sys.stderr)
@@ -226,6 +268,19 @@ def ground(
     print(found)
     paths = " and ".join(map(str, written))
     print(f"wrote {paths}; look: python -m vap_core view {written[1]}")
+
+
+def note_uses(memory: Path, objects: Sequence[str], speaker: str) -> None:
+    """Add what was found to the memory's history; a note where that cannot be written."""
+    from datetime import datetime
+
+    from vap_core.base.errors import BadOutput
+    from vap_core.instruction.history import add_uses
+
+    try:
+        add_uses(memory, objects, speaker, datetime.now().astimezone())
+    except BadOutput as error:
+        print(f"note: {error}", file=sys.stderr)
 
 
 @objects_app.command("import")

@@ -1,8 +1,4 @@
-"""Personalised instructions: find "my cup", and rewrite it to "the red cup".
-
-The logic is that of P 3.3 and its appendix "Instruction Rewriting Logic". A parser is any function
-`(text, categories) -> Instruction`; `parse` is the deterministic rule of the paper's main results.
-"""
+"""Parsing by rule, and the rewrite (P 3.3, appendix "Instruction Rewriting Logic")."""
 
 import re
 from collections.abc import Collection, Sequence
@@ -13,6 +9,13 @@ from vap_core.base.types import Colour, Instruction, Target
 
 OWNER = re.compile(r"\bmy\s+(?:(?:[\w-]+\s+){0,2}?[\w-]+(?:['’]s|s['’])\s+)?", re.IGNORECASE)
 """A possessive trigger: "my cup", or with an owner beside the speaker, "my brother's cup"."""
+
+ANY_OWNER = re.compile(
+    r"\b(?:my|his|her|their|our|(?!(?:it|that|what|who|where|here|there|let|how)['’])[\w-]+['’]s)\s+"
+    r"(?:(?:[\w-]+\s+){0,2}?[\w-]+(?:['’]s|s['’])\s+)?",
+    re.IGNORECASE,
+)
+"""As OWNER, and "his cup", "Anna's cup", "Anna's brother's cup"."""
 
 STOP_WORDS = frozenset(
     """and or to into onto in on near next beside behind under over from with at by off up down left
@@ -29,26 +32,31 @@ class Parser(Protocol):
     def __call__(self, text: str, categories: Collection[str] = ()) -> Instruction: ...
 
 
-def parse(text: str, categories: Collection[str] = ()) -> Instruction:
+def parse(text: str, categories: Collection[str] = (), owners: Collection[str] = ()) -> Instruction:
     """Parse by rule, left to right.
 
     Every "my <category>" or "my <person>'s <category>" becomes a target. The longest of
     `categories` (a plural s allowed) that follows the trigger wins; otherwise the words up to
-    punctuation or the first stop word are the category, so unseen nouns work too.
+    punctuation or the first stop word are the category, so unseen nouns work too. Where objects
+    have `owners`, "Anna's <category>" and "his <category>" of a known category are targets as well.
 
     Raises:
         BadInstruction: the text holds no possessive span.
     """
     targets: list[Target] = []
-    for trigger in OWNER.finditer(text):
-        if targets and trigger.start() < targets[-1].stop:
-            continue
-        category, length = leading_category(text[trigger.end() :], categories)
-        if category:
-            start, stop = trigger.span()
-            owner = trigger.group().strip()
-            target = Target(start=start, stop=stop + length, owner=owner, category=category)
-            targets.append(target)
+    pattern = ANY_OWNER if owners else OWNER
+    trigger = pattern.search(text)
+    while trigger is not None:
+        start, stop = trigger.span()
+        first = re.match(r"[\w'’-]+\s+", text[start:])
+        if first and leading_category(text[start + first.end() :], categories)[0] in categories:
+            stop = start + first.end()  # "my cup near Anna's" is about my cup
+        category, length = leading_category(text[stop:], categories)
+        owner = text[start:stop].strip()
+        if category and (category in categories or owner.lower().startswith("my")):
+            stop += length
+            targets.append(Target(start=start, stop=stop, owner=owner, category=category))
+        trigger = pattern.search(text, stop)
     if not targets:
         raise BadInstruction(
             f'parse: no personal object in {text!r}; name one as "my <category>", '
@@ -73,10 +81,19 @@ def rewrite(instruction: Instruction, colours: Sequence[Colour | None]) -> str:
     for target, colour in reversed(list(pairs)):
         if colour is None:
             continue
-        article = "The" if text[target.start].isupper() else "the"
+        article = "The" if _has_capital(instruction.text, target) else "the"
         phrase = f"{article} {colour.name} {target.category}"
         text = text[: target.start] + phrase + text[target.stop :]
     return text
+
+
+def _has_capital(text: str, target: Target) -> bool:
+    """Whether a span begins with a capital letter that is not a name's ("Anna's cup")."""
+    before = text[: target.start].rstrip()
+    named = re.match(r"(?!my\b)[\w-]+['’]s?\b", text[target.start : target.stop], re.IGNORECASE)
+    if named and before and before[-1] not in ".!?":
+        return False
+    return text[target.start].isupper()
 
 
 def leading_category(rest: str, categories: Collection[str] = ()) -> tuple[str, int]:

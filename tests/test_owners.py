@@ -1,0 +1,210 @@
+"""Whose object is meant, what a memory keeps about owners, and the history of uses."""
+
+import json
+import struct
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+
+import pytest
+
+from tests.toys import TOYS, personal, scene
+from vap_core.attend import Attender
+from vap_core.base.errors import BadInstruction, BadMemory, BadOutput, UnknownName
+from vap_core.base.types import PersonalObject
+from vap_core.instruction import parse, rewrite
+from vap_core.instruction.history import FILE, add_uses, read_uses
+from vap_core.instruction.owners import owners_of
+from vap_core.instruction.parsers import Parsing, rule_parser
+from vap_core.memory import load, load_bank, recall, save
+from vap_core.prompt import PALETTE
+
+TEAL = (40, 120, 110)
+RUST = (160, 60, 20)
+
+
+def cup(name: str, owner: str = "", *known_as: str, category: str = "cup") -> PersonalObject:
+    return replace(personal(name, category, TEAL), owner=owner, known_as=known_as)
+
+
+HOUSE = {
+    obj.name: obj
+    for obj in (
+        cup("a", "Anna", "ben's sister"),
+        cup("b", "ben", "brother", "anna's brother"),
+        cup("n"),
+        cup("lamp-b", "ben", category="lamp"),
+        cup("vase-c", "carl", "zoe's brother", category="vase"),
+        cup("vase-b", "ben", category="vase"),
+        cup("pot", category="pot"),
+    )
+}
+
+
+def meant(text: str, speaker: str) -> str:
+    categories = {obj.category for obj in HOUSE.values()}
+    (target,) = rule_parser(HOUSE)(text, categories).targets
+    return recall(HOUSE, target, speaker=speaker).name
+
+
+@pytest.mark.parametrize(
+    ("text", "speaker", "name"),
+    [
+        ("bring my cup", "anna", "a"),
+        ("bring my cup", "ANNA", "a"),
+        ("bring my cup", "ben", "b"),
+        ("bring my cup", "", "n"),
+        ("bring my cup", "zoe", "n"),
+        ("bring my pot", "anna", "pot"),
+        ("bring our cup", "anna", "n"),
+        ("bring Anna's cup", "ben", "a"),
+        ("bring anna’s cup", "", "a"),
+        ("bring my brother's cup", "anna", "b"),
+        ("bring my brother's vase", "zoe", "vase-c"),
+        ("bring my brother's cup", "", "b"),
+        ("bring Anna's brother's cup", "carl", "b"),
+        ("bring my sister's cup", "ben", "a"),
+        ("bring her cup", "ben", "a"),
+        ("bring his lamp", "anna", "lamp-b"),
+    ],
+)
+def test_whom_my_means(text: str, speaker: str, name: str) -> None:
+    assert meant(text, speaker) == name
+
+
+@pytest.mark.parametrize(
+    ("text", "speaker", "error", "said"),
+    [
+        ("bring Carla's cup", "anna", UnknownName, "nobody is 'carla'; the memory knows anna"),
+        ("bring my uncle's cup", "anna", UnknownName, "nobody is 'my uncle'"),
+        ("bring my lamp", "anna", UnknownName, "no 'lamp' is 'my' where anna speaks"),
+        ("bring my lamp", "", UnknownName, "where nobody is named with --speaker"),
+        ("bring his vase", "anna", BadInstruction, "'his' could be ben or carl; say the name"),
+        ("bring Anna's lamp", "ben", UnknownName, "no 'lamp' is \"Anna's\""),
+    ],
+)
+def test_what_is_nobodys_is_one_line(
+    text: str, speaker: str, error: type[Exception], said: str
+) -> None:
+    with pytest.raises(error, match=said) as caught:
+        meant(text, speaker)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) <= 300
+
+
+def test_two_brothers_are_ambiguous() -> None:
+    objects = {obj.name: obj for obj in (cup("b", "ben", "brother"), cup("c", "carl", "brother"))}
+    (target,) = parse("bring my brother's cup").targets
+    with pytest.raises(BadInstruction, match="could be ben or carl"):
+        recall(objects, target, speaker="anna")
+
+
+def test_without_owners_nothing_changes() -> None:
+    objects = {"mug": cup("mug")}
+    for text in ("bring my cup", "bring my brother's cup"):
+        (target,) = parse(text).targets
+        assert recall(objects, target).name == "mug"
+    assert rule_parser(objects)("bring my cup near Anna's cup", ["cup"]).targets[-1].owner == "my"
+
+
+def test_names_are_targets_only_where_there_are_owners() -> None:
+    text = "put Anna's cup near what's my cup"
+    assert [target.owner for target in parse(text, ["cup"]).targets] == ["my"]
+    parsed = parse(text, ["cup"], owners_of(HOUSE.values()))
+    assert [target.owner for target in parsed.targets] == ["Anna's", "my"]
+    assert rewrite(parsed, PALETTE[:2]).startswith(f"put the {PALETTE[0].name} cup near what's")
+    with pytest.raises(BadInstruction):
+        parse("bring Anna's sandwich", ["cup"], ["anna"])
+
+
+def test_the_method_grounds_the_speakers_object() -> None:
+    objects = {
+        "a": replace(personal("a", "cup", TEAL), owner="anna"),
+        "b": replace(personal("b", "cup", RUST), owner="ben"),
+    }
+    views = {"front": scene([(4, 8, TEAL), (30, 30, RUST)])}
+    for speaker, text, name in (
+        ("anna", "bring my cup", "a"),
+        ("ben", "bring my cup", "b"),
+        ("anna", "bring Ben's cup", "b"),
+    ):
+        _, attended = Attender(TOYS, objects, speaker=speaker).start(views, text)
+        assert attended.groundings["front"][0].object == name
+
+
+def test_owner_and_note_are_kept(tmp_path: Path) -> None:
+    obj = replace(cup("mug", "Anna", "ben's sister", "Mama"), note="for the morning ☕ coffee")
+    back = load(save(tmp_path, obj))
+    assert (back.owner, back.known_as, back.note) == (obj.owner, obj.known_as, obj.note)
+
+
+def test_an_object_without_an_owner_is_the_file_that_it_was(tmp_path: Path) -> None:
+    data = save(tmp_path, cup("mug")).read_bytes()
+    (size,) = struct.unpack("<Q", data[:8])
+    about = json.loads(data[8 : 8 + size])["__metadata__"]
+    assert set(about) == {"format", "version", "name", "category", "encoder"}
+    back = load_bank(tmp_path)["mug"]
+    assert (back.owner, back.known_as, back.note) == ("", (), "")
+
+
+@pytest.mark.parametrize(
+    ("owner", "known_as", "note", "said"),
+    [
+        ("../x", (), "", "cannot be a person"),
+        ("an\x1bna", (), "", "cannot be a person"),
+        ("anna", ("3",), "", "cannot be a person"),
+        ("", ("brother",), "", "name one by --owner"),
+        ("anna", (), "two\nlines", "a note is one line"),
+        ("anna", (), "x" * 201, "of at most 200 characters"),
+    ],
+)
+def test_an_odd_owner_is_neither_saved_nor_read(
+    tmp_path: Path, owner: str, known_as: tuple[str, ...], note: str, said: str
+) -> None:
+    obj = replace(cup("mug"), owner=owner, known_as=known_as, note=note)
+    with pytest.raises(BadMemory, match=said):
+        save(tmp_path / "bank", obj)
+    path = save(tmp_path, cup("mug"))
+    data = path.read_bytes()
+    (size,) = struct.unpack("<Q", data[:8])
+    header = json.loads(data[8 : 8 + size])
+    header["__metadata__"] |= {"owner": owner, "known_as": json.dumps(known_as), "note": note}
+    text = json.dumps(header).encode()
+    path.write_bytes(struct.pack("<Q", len(text)) + text + data[8 + size :])
+    with pytest.raises(BadMemory, match="register the object again") as caught:
+        load(path)
+    assert "\x1b" not in str(caught.value)
+
+
+NOON = datetime.fromisoformat("2026-06-12T12:00:00+02:00")
+
+
+def test_uses_are_appended_and_read(tmp_path: Path) -> None:
+    bank = tmp_path / "bank"
+    assert read_uses(bank) == ()
+    add_uses(bank, ["mug", "owl"], "anna", NOON)
+    add_uses(bank, [], "ben", NOON)
+    add_uses(bank, ["mug"], "", NOON)
+    uses = [(use.object, use.by, use.at) for use in read_uses(bank)]
+    at = "2026-06-12T12:00:00+02:00"
+    assert uses == [("mug", "anna", at), ("owl", "anna", at), ("mug", "", at)]
+    assert load_bank(bank) == {}
+
+
+@pytest.mark.parametrize(
+    "line", ["{", "[]", '{"object": "mug"}', '{"object": "m", "by": "", "at": "noon"}', "[" * 100_000,
+             '{"object": 3, "by": "", "at": "2026-06-12"}', "\udcff"],
+)  # fmt: skip
+def test_a_damaged_history_is_one_line(tmp_path: Path, line: str) -> None:
+    (tmp_path / FILE).write_bytes(f"{line}\n".encode(errors="surrogateescape"))
+    with pytest.raises(BadMemory, match="is damaged .*; delete it to start a new one"):
+        read_uses(tmp_path)
+    with pytest.raises(BadMemory, match="is damaged"):
+        Parsing("embedding").load(tmp_path, {"mug": cup("mug")})
+    assert Parsing("rule").load(tmp_path, {})("bring my cup").targets
+
+
+def test_a_bank_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BadOutput, match="choose another folder with --memory"):
+        add_uses(tmp_path / "file", ["mug"], "anna", NOON)

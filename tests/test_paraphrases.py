@@ -1,0 +1,155 @@
+"""Paraphrased instructions by families, and the command that scores parsers on them."""
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+
+from tests.command import refused, vap
+from vap_core.base.errors import BadEndpoint
+from vap_core.base.types import Instruction, Target
+from vap_core.evaluation.parsers import report
+from vap_core.evaluation.parsers.measure import answer_table, measure, paraphrase_digest
+from vap_core.evaluation.parsers.paraphrases import (
+    KINDS,
+    PARTS,
+    Paraphrase,
+    paraphrases,
+    read_families,
+    read_vocabulary,
+    suite_names,
+)
+from vap_core.instruction.context import Context
+from vap_core.simulation.assets.objects import get_object
+from vap_core.simulation.suites import BENCHMARKS
+
+EVERY = {
+    suite: [one for part in PARTS for one in paraphrases(suite, part)] for suite in suite_names()
+}
+ROOT = Path(__file__).resolve().parents[1]
+PUBLISHED = ROOT / "data" / "results" / report.TABLE
+
+
+def test_every_benchmark_has_over_200_paraphrases_of_every_kind() -> None:
+    assert set(EVERY) == set(BENCHMARKS)
+    for suite, found in EVERY.items():
+        assert len(found) >= 200
+        assert len({(one.text, one.family) for one in found}) == len(found)
+        held_out = Counter(one.kind for one in found if one.part == "test")
+        assert set(held_out) == set(KINDS), suite
+
+
+def test_no_family_and_no_purpose_is_in_two_parts() -> None:
+    families = read_families()
+    assert len({row["family"] for row in families}) == len(families)
+    assert len({row["text"] for row in families}) >= len(families) - 8  # "{room}", "{question}"
+    assert {row["part"] for row in families} == set(PARTS)
+    for about in read_vocabulary()["objects"].values():
+        said = Counter(phrase for part in PARTS for phrase in set(about["purpose"][part].values()))
+        assert sum(said.values()) - len(said) <= 3, said
+
+
+def test_what_is_meant_is_in_the_memory_and_in_the_catalogue() -> None:
+    for found in EVERY.values():
+        for one in found:
+            assert (one.object is None) == (one.kind == "none")
+            assert one.object is None or one.object in one.context.objects
+            assert one.kept in one.text or one.kind == "none"
+            assert "{" not in one.text
+            assert "[" not in one.text
+    for about in read_vocabulary()["objects"].values():
+        for which in ("first", "second"):
+            assert get_object(about[which]["object"]).category == about["category"]
+
+
+def test_what_was_used_is_the_users_last_on_that_day() -> None:
+    for found in EVERY.values():
+        for one in found:
+            if one.kind != "history":
+                continue
+            used = one.context.objects[one.object or ""]
+            day = 1 if "yesterday" in one.text.lower() else None
+            names = one.context.latest(used.owner.lower(), day)
+            fitting = [
+                name for name in names
+                if used.category not in one.text or one.context.objects[name].category == used.category
+            ]  # fmt: skip
+            assert fitting[0] == one.object, one.text
+
+
+def oracle(one: Paraphrase) -> Instruction:
+    assert one.object is not None
+    obj = one.context.objects[one.object]
+    return Instruction(one.text, (Target(one.start, one.start + 2, "", obj.category, obj.name),))
+
+
+def test_rates_are_counted_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A parser that knows the answers to implicit ones, takes the first object elsewhere, and so on."""
+    by_text = {one.text: one for one in EVERY["simpler-bridge"] if one.part == "tune"}
+
+    def load(context: Context):
+        def parser(text: str, categories: object = ()) -> Instruction:
+            one = by_text[text]
+            if one.kind == "none":
+                return Instruction(text, (Target(0, 1, "", "x", next(iter(context.objects))),))
+            return oracle(one)
+
+        return parser
+
+    table = answer_table(measure("known", load, ["simpler-bridge"], ["tune"]))
+    personal = table[table["kind"] != "none"]
+    assert personal["right"].all()
+    assert personal["kept"].all()
+    assert not table[table["kind"] == "none"]["right"].any()
+    lines = {row[2]: row for row in report.rows(table)[1:]}
+    n = len(table)
+    assert lines["none"][5:8] == ["0 % [0, 14] [0, 41]", "0 %", "100 %"]
+    assert lines["all"][4] == str(n)
+    assert lines["all"][7] == f"{100 * (n - len(personal)) / n:.0f} %"
+
+
+def test_a_server_that_fails_is_no_abstention() -> None:
+    def load(context: Context):
+        def parser(text: str, categories: object = ()) -> Instruction:
+            raise BadEndpoint("down")
+
+        return parser
+
+    with pytest.raises(BadEndpoint, match="down"):
+        measure("down", load, ["tabletop"], ["tune"], 1)
+
+
+def test_the_command_prints_and_publishes(tmp_path: Path) -> None:
+    some = ("--suite", "simpler-fractal", "--part", "tune", "--limit", "9")
+    done = vap("eval-parsers", *some, "--publish", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "embedding  tune    explicit" in done.stdout
+    table = pq.read_table(tmp_path / report.TABLE)
+    assert table.num_rows == 18
+    about = json.loads((table.schema.metadata or {})[b"about"])
+    assert about["paraphrases"] == paraphrase_digest()
+    assert "suite 'lab' is unknown; known: " in refused("eval-parsers", "--suite", "lab")
+    assert "part 'all' is unknown; known: check-1" in refused("eval-parsers", "--part", "all")
+    assert "'magic' is unknown; known: rule" in refused("eval-parsers", *some, "--parser", "magic")
+
+
+def test_the_published_table_is_of_these_paraphrases() -> None:
+    arrow = pq.read_table(PUBLISHED)
+    about = json.loads((arrow.schema.metadata or {})[b"about"])
+    assert about["paraphrases"] == paraphrase_digest(), "run eval-parsers --publish data/results"
+    table: pd.DataFrame = arrow.to_pandas()
+    assert len(table) == 2 * sum(map(len, EVERY.values()))
+
+
+def test_the_page_quotes_the_published_table() -> None:
+    page = (ROOT / "docs" / "parsers.md").read_text()
+    table: pd.DataFrame = pq.read_table(PUBLISHED).to_pandas()
+    held_out = table[table["part"] == "test"]
+    for row in report.rows(held_out)[1:]:
+        assert (
+            f"| {row[0]} | {row[2]} | {row[3]} | {row[4]} | {row[5]} | {row[6]} | {row[7]} |"
+            in page
+        )

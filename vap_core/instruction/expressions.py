@@ -1,0 +1,273 @@
+"""Expressions that may refer to an object, by grammar: where they begin and end, and what they say.
+
+Nothing here knows what objects look like or are for: `embedding` decides which object is meant.
+"""
+
+import re
+from collections.abc import Collection, Iterator
+
+from vap_core.base.types import value
+from vap_core.instruction.context import Context
+from vap_core.instruction.owners import MINE
+
+PLACING = "put|place|set|lay|move|drop|push|stack|store|leave|slide|stand|stow"
+ACTION = (
+    rf"{PLACING}|pick(?: up)?|select|choose|bring|hand|give|pass|get|take|fetch|grab|lift|use|find|"
+    "show|need|want|like|ask(?:s|ed)? for|wish for|look(?:ing)? for|have|"
+    "picking up|selecting|putting|placing|moving|handing|bringing|picking"
+)
+DESTINATION = (
+    "into|onto|in|on|near|next to|beside|to|towards|toward|under|behind|from|at|over|inside|by|"
+    "against|between|above|below|around"
+)
+TIMES = re.compile(
+    r"(?:(?:the|this|last|that|next)\s+)?(?:time|morning|afternoon|evening|night|noon|weekend|"
+    r"week|yesterday|today|breakfast|lunch|dinner|\w+day|before|earlier)s?\b",
+    re.IGNORECASE,
+)
+"""What a preposition of time stands before: "in the morning", "from last time"."""
+PUNCTUATION = ",;:.!?—–"
+GENERIC = frozenset(
+    """one ones thing things item items object objects tool tools pick choice stuff what
+    whatever whichever something anything which that this those these the my mine his her hers
+    their theirs our ours own personal favourite favorite dear old good right wrong proper best
+    other same very of is are was were be been being for with to from at when while i me you we
+    us he she they it need needs want wants use used uses using normally usually always often
+    like likes love loves can could would will meant reserved made helps help lets let takes
+    take needed required cannot goes back do does did just really know thanks please so and or
+    then belongs belong belonging owned owns by not n't isn't don't has have had who
+    whose""".split()
+)
+"""Words that say nothing about which object is meant."""
+_OWNED = r"(?!(?:it|that|what|who|where|here|there|let|how|she|he)['’]s)[\w-]+['’]s"
+START = re.compile(
+    r"\b(?:(?P<several>(?:one|some|any) of (?:my|his|her|their|our))"
+    rf"|(?P<owner>(?:my|his|her|their|our)\b(?:\s+(?:[\w-]+\s+)?{_OWNED})?|{_OWNED}(?:\s+[\w-]+['’]s)?)"
+    r"|(?P<alone>mine|hers|theirs|ours)"
+    r"|(?P<definite>(?:the|that|this|those|these)\b(?!['’])"
+    r"(?!\s+(?:time|way|you|I|we|he|she|they)\b))"
+    r"|(?P<pronoun>what|whatever|whichever|something)|(?P<it>it)"
+    r"|(?P<indefinite>an?|any|some|another|one))\b",
+    re.IGNORECASE,
+)
+EXCLUSION = re.compile(
+    r"(?:\b(?:but|only|and|just)\s+)?(?:\b(?:not|never)\b|n['’]t\b(?:\s+(?:want|mean|need))?"
+    r"|\binstead of\b|\brather than\b|\bother than\b|\bexcept(?: for)?\b|\bapart from\b"
+    r"|\banything but\b|\bleave\b)",
+    re.IGNORECASE,
+)
+"""Words after which comes what is not meant."""
+IRRELEVANT = re.compile(r"(?:just\s+)?(?:any|matter|care|forget|whose)\b", re.IGNORECASE)
+TRAILING = re.compile(
+    r"(?:\s+|^)(?:please|now|again|too|then|thanks|first|right away|once more|and|so|but|only)$",
+    re.IGNORECASE,
+)
+
+
+@value
+class Exclusion:
+    """`text[start:stop]` says what is not meant; `said` is that without the words of negation."""
+
+    start: int
+    stop: int
+    said: str
+
+
+@value
+class Expression:
+    """`text[start:stop]`, which may refer to an object.
+
+    `kind` is the group of START that it begins with. `argument` says whether an action's verb
+    stands before it, `destination` whether it is where something is put.
+    """
+
+    start: int
+    stop: int
+    said: str
+    kind: str
+    argument: bool
+    destination: bool
+    clause: str
+    """The expression and the rest of its clause."""
+
+    @property
+    def governed(self) -> bool:
+        """Whether it is what something is done with, or where."""
+        return self.argument or self.destination
+
+
+def find_exclusions(text: str) -> tuple[Exclusion, ...]:
+    """What an instruction says is not meant, left to right."""
+    found: list[Exclusion] = []
+    for match in EXCLUSION.finditer(text):
+        if found and match.start() < found[-1].stop:
+            continue
+        stop = _clause_end(text, match.end())
+        further = re.search(rf"\s+(?:and|so)\s+(?:{ACTION})\b", text[match.end() : stop])
+        if further:
+            stop = match.end() + further.start()
+        stop = _before_destination(text, match.start(), match.end(), stop)
+        said = text[match.end() : stop].strip()
+        if said and not IRRELEVANT.match(said):
+            found.append(Exclusion(match.start(), stop, said))
+    return tuple(found)
+
+
+def find_expressions(
+    text: str, exclusions: Collection[Exclusion], people: str = "me"
+) -> Iterator[Expression]:
+    """Every expression outside the exclusions, left to right; one can be inside another.
+
+    `people` is a `person_pattern`: "my brother" is a person, "my brother's cup" is not.
+    """
+    for match in START.finditer(text):
+        start = match.start()
+        if _inside(start, exclusions):
+            continue
+        person = re.match(rf"(?:{people})\b(?!['’])", text[start:], re.IGNORECASE)
+        if person and match.end() <= start + person.end():
+            continue
+        clause_end = _clause_end(text, match.end())
+        stop = _before_verb(text, start, match.end(), clause_end)
+        stop = _before_destination(text, start, match.end(), stop)
+        if match.lastgroup == "it":
+            stop = match.end()
+        for exclusion in exclusions:
+            if start < exclusion.start < stop:
+                stop = exclusion.start
+        stop = _trim(text, start, stop)
+        for exclusion in exclusions:
+            if not text[stop : exclusion.start].strip(" ,") and exclusion.start >= stop:
+                stop = _trim(text, start, exclusion.stop)
+        before = text[:start].rstrip()
+        kind = str(match.lastgroup)
+        if kind in ("owner", "definite") and stop <= match.end():
+            kind = "alone" if kind == "owner" and match.group().lower() not in MINE else kind
+        yield Expression(
+            start=start,
+            stop=stop,
+            said=text[start:stop],
+            kind=kind,
+            argument=re.search(rf"\b(?:{ACTION})(?: me| us)?$", before, re.IGNORECASE) is not None,
+            destination=re.search(rf"\b(?:{DESTINATION})$", before, re.IGNORECASE) is not None,
+            clause=text[start:clause_end],
+        )
+
+
+def content(said: str, without: Collection[str] = ()) -> str:
+    """The words that say which object is meant, in their order."""
+    kept = []
+    for word in re.findall(r"[\w'’-]+", said.lower()):
+        word = re.sub(r"['’]s$", "", word)
+        if word not in GENERIC and word not in without:
+            kept.append(word)
+    return " ".join(kept)
+
+
+def find_category(said: str, categories: Collection[str]) -> str | None:
+    """The longest category that is named; a plural counts."""
+    for category in sorted(categories, key=len, reverse=True):
+        pattern = r"\s+".join(re.escape(word) for word in category.split())
+        if re.search(rf"\b{pattern}(?:s|es)?\b", said, re.IGNORECASE):
+            return category
+    return None
+
+
+def person_pattern(context: Context) -> str:
+    """A regular expression for anybody whom the memory knows, and for the speaker."""
+    words = ["I", "me"]
+    for name, known_as in context.owners.items():
+        words.append(re.escape(name))
+        for word in known_as:
+            own = re.escape(word.split("'s ")[-1])
+            words.append(f"my {own}")
+            if "'s " in word:
+                words.append(re.escape(word))
+    return "|".join(sorted(words, key=len, reverse=True))
+
+
+def _inside(place: int, exclusions: Collection[Exclusion]) -> bool:
+    return any(one.start <= place < one.stop for one in exclusions)
+
+
+def _clause_end(text: str, start: int) -> int:
+    """The next punctuation mark, "but", or " and <action>" after `start`."""
+    stop = len(text)
+    mark = re.search(rf"[{PUNCTUATION}](?=\s|$)", text[start:])
+    if mark:
+        stop = start + mark.start()
+    further = re.search(
+        rf"\s+(?:but\b|(?:and|so|then)\s+(?:{ACTION}|leave)\b)", text[start:stop], re.IGNORECASE
+    )
+    if further:
+        stop = start + further.start()
+    return stop
+
+
+def _before_verb(text: str, start: int, begin: int, stop: int) -> int:
+    """Where a noun phrase from `start` ends: before its verb, unless a relative clause has it."""
+    verb = re.search(
+        r"\s(?:is|are|was|were|goes|go|stays|stay|has|can|cannot|will|would|should|must|comes)\b",
+        text[begin:stop],
+        re.IGNORECASE,
+    )
+    if verb is None:
+        return stop
+    said = text[start : begin + verb.start()]
+    if re.search(
+        r"\b(?:that|which|who|what|whatever|whichever|I|you|we|he|she|they)\b", said, re.I
+    ):
+        return stop
+    if re.search(r"\s(?:my|[A-Z])[\w-]*\s+[\w-]+$", said):
+        return stop  # a relative clause without its pronoun: "the cup my brother has"
+    return begin + verb.start()
+
+
+def _before_destination(text: str, begin: int, start: int, stop: int) -> int:
+    """Where an expression ends that begins at `begin` and whose clause ends at `stop`.
+
+    In a relative clause a preposition belongs to it, but for the last phrase after a verb of
+    placing.
+    """
+    rest = text[start:stop]
+    phrase = rf"\s(?:{DESTINATION})(?=\s+\w)"
+    places = []
+    for match in re.finditer(phrase, rest, re.IGNORECASE):
+        follows = rest[match.end() :].lstrip()
+        if re.match(rf"(?:{DESTINATION})\b", follows, re.IGNORECASE):
+            continue  # a stranded preposition: "the thing I put flowers in on the plate"
+        if re.search(
+            r"\b(?:belong\w*|lent|owned|suited|used)$", rest[: match.start()], re.IGNORECASE
+        ):
+            continue
+        if TIMES.match(follows):
+            continue
+        places.append(start + match.start())
+    if not places:
+        return stop
+    verbs = re.findall(rf"\b(?:{ACTION})\b", text[:begin], re.IGNORECASE)
+    placing = bool(verbs) and re.fullmatch(
+        rf"(?:{PLACING}|putting|placing|moving)", verbs[-1], re.I
+    )
+    relative = re.search(
+        r"^(?:what|whatever|something)\b|\b(?:I|you|we|he|she|they|that|which|for|when|[\w-]+ing|"
+        r"is|are|was|meant|reserved)\b",
+        text[begin : places[-1]],
+        re.IGNORECASE,
+    )
+    if relative is None:
+        return places[0]
+    stranded = re.search(rf"\b(?:{DESTINATION}|with)$", rest.rstrip(), re.IGNORECASE)
+    if placing and not stranded:
+        return places[-1]
+    return stop
+
+
+def _trim(text: str, start: int, stop: int) -> int:
+    """The end of an expression without spaces, commas, and words that belong to the sentence."""
+    while True:
+        said = text[start:stop].rstrip(" ,")
+        shorter = TRAILING.sub("", said)
+        stop = start + len(shorter)
+        if shorter == text[start:stop] and shorter == said:
+            return stop

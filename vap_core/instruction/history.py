@@ -1,0 +1,67 @@
+"""What was asked for before: one line of JSON per use, beside the remembered objects."""
+
+import json
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+
+from vap_core.base.errors import BadMemory, BadOutput
+from vap_core.base.files import check_regular, parse_json
+from vap_core.base.types import value
+
+FILE = "history.jsonl"
+MAX_USES = 1000
+"""So many uses are read, the last ones."""
+
+
+@value
+class Use:
+    """One object that was asked for: by whom ("" where nobody said), and when (ISO 8601)."""
+
+    object: str
+    by: str
+    at: str
+
+    def __post_init__(self) -> None:
+        datetime.fromisoformat(self.at)
+
+
+def read_uses(bank: Path) -> tuple[Use, ...]:
+    """The uses that a memory keeps, oldest first; none where there is no history yet.
+
+    Raises: BadMemory: a damaged line.
+    """
+    path = bank / FILE
+    if not path.exists():
+        return ()
+    uses = []
+    try:
+        check_regular(path)
+        lines = path.read_text("utf-8").splitlines()
+        for line in lines[-MAX_USES:]:
+            row = parse_json(line)
+            uses.append(Use(object=row["object"], by=row["by"], at=row["at"]))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise BadMemory(
+            f"history: {path} is damaged ({type(error).__name__}); delete it to start a new one."
+        ) from error
+    return tuple(uses)
+
+
+def add_uses(bank: Path, objects: Sequence[str], by: str, at: datetime) -> None:
+    """Append one use per object. Raises: BadOutput."""
+    if not objects:
+        return
+    lines = ""
+    for name in objects:
+        row = {"object": name, "by": by, "at": at.isoformat(timespec="seconds")}
+        lines += json.dumps(row, ensure_ascii=False) + "\n"
+    try:
+        bank.mkdir(parents=True, exist_ok=True)
+        with (bank / FILE).open("a", encoding="utf-8") as file:
+            file.write(lines)
+    except OSError as error:
+        raise BadOutput(
+            f"history: {bank} cannot be written ({error.strerror}); choose another folder with "
+            "--memory."
+        ) from error

@@ -1,0 +1,146 @@
+"""Whom "my", "Anna's" and "my brother's" mean.
+
+An object belongs to the person that it was registered for (`register --owner anna`), or to nobody
+in particular. The rule, in this order:
+
+1. In a memory without any owner, the owner in an instruction is not looked at.
+2. "my cup" is a cup of the speaker's (`--speaker anna`); where she has none, a cup without an
+   owner. It is never another person's. Without a speaker it is a cup without an owner.
+3. "our cup" is a cup without an owner.
+4. "Anna's cup" is a cup of the owner called anna, upper and lower case alike.
+5. "my brother's cup" is a cup of the owner who is known as "brother" or, when Anna speaks, as
+   "Anna's brother" (`register --owner ben --known-as "anna's brother"`).
+6. "his", "her" and "their cup" are a cup of the only other person who has one.
+
+An owner that nobody has, and words that fit several people, are errors.
+"""
+
+import re
+from collections.abc import Iterable, Sequence
+
+from vap_core.base.errors import BadInstruction, BadMemory, UnknownName
+from vap_core.base.types import PersonalObject
+
+PERSON = re.compile(r"[^\W\d_][^\W\d_ .'’-]*(?:[ .'’-]+[^\W\d_]+){0,4}\.?")
+MAX_NOTE = 200
+"""Characters of a note."""
+MINE = ("my", "mine", "my own", "i", "me")
+OURS = ("our", "ours", "us", "we")
+OTHERS = ("his", "her", "hers", "their", "theirs", "he", "she", "they", "him", "them")
+
+
+def check_owner(owner: str, known_as: Sequence[str], note: str) -> None:
+    """Raises: BadMemory: no usable owner, other word for one, or note."""
+    for word in (owner, *known_as):
+        if word and not PERSON.fullmatch(word):
+            raise BadMemory(
+                f"remember: {word[:64]!r} cannot be a person; use letters, spaces and 's, for "
+                'example --owner anna, or --known-as "anna\'s brother".'
+            )
+    if known_as and not owner:
+        raise BadMemory("remember: --known-as is another word for the owner; name one by --owner.")
+    if len(note) > MAX_NOTE or not note.isprintable():
+        raise BadMemory(
+            f"remember: a note is one line of at most {MAX_NOTE} characters; shorten it."
+        )
+
+
+def owners_of(objects: Iterable[PersonalObject]) -> dict[str, tuple[str, ...]]:
+    """Every owner, and the other words for that person, lower case."""
+    owners: dict[str, tuple[str, ...]] = {}
+    for obj in objects:
+        if obj.owner:
+            known = owners.get(fold(obj.owner), ())
+            further = tuple(fold(word) for word in obj.known_as)
+            owners[fold(obj.owner)] = tuple(dict.fromkeys(known + further))
+    return owners
+
+
+def belonging(
+    objects: Sequence[PersonalObject],
+    owner: str,
+    speaker: str,
+    owners: dict[str, tuple[str, ...]],
+) -> list[PersonalObject]:
+    """Those of `objects` that `owner` ("my", "Anna's", "my brother's") means when `speaker` speaks.
+
+    `owners` are all of the memory (`owners_of`).
+
+    Raises: UnknownName: an owner whom nobody is; BadInstruction: it could be several people.
+    """
+    if not owners:
+        return list(objects)
+    person = fold(owner)
+    if person in MINE:
+        own = _owned_by(objects, fold(speaker)) if speaker else []
+        return own or _owned_by(objects, "")
+    if person in OURS:
+        return _owned_by(objects, "")
+    if person in OTHERS:
+        return _owned_by(objects, _only_other(objects, person, speaker))
+    return _owned_by(objects, find_owner(person, speaker, owners))
+
+
+def find_owner(person: str, speaker: str, owners: dict[str, tuple[str, ...]]) -> str:
+    """The owner that "anna", "my brother" or "anna's brother" means.
+
+    Raises: UnknownName, BadInstruction.
+    """
+    person = fold(person)
+    if person in owners:
+        return person
+    relation = person.removeprefix("my ")
+    speaker = fold(speaker)
+    words = [relation, relation.split()[-1]]
+    if person.startswith("my ") and speaker:
+        mine = [f"{speaker}'s {word}" for word in words]
+    else:
+        mine = []
+    for wanted in (mine, words):
+        found = []
+        for name, known_as in owners.items():
+            if name != speaker and ({name, *known_as} & set(wanted)):
+                found.append(name)
+        if len(found) == 1:
+            return found[0]
+        if found:
+            raise BadInstruction(
+                f"owners: {person!r} could be {' or '.join(found)}; say the name, for example "
+                f'"{found[0]}\'s".'
+            )
+    raise UnknownName(
+        f"owners: nobody is {person!r}; the memory knows {describe(owners)}. Register an object "
+        "with --owner, or say --known-as."
+    )
+
+
+def describe(owners: dict[str, tuple[str, ...]]) -> str:
+    """ "anna, ben (brother)", for an error."""
+    names = []
+    for name, known_as in sorted(owners.items()):
+        names.append(f"{name} ({', '.join(known_as)})" if known_as else name)
+    return ", ".join(names)
+
+
+def fold(person: str) -> str:
+    """A person's words without case, with single spaces, and without the final 's."""
+    words = " ".join(person.lower().replace("’", "'").split())
+    return re.sub(r"('s|(?<=s)')$", "", words)
+
+
+def _owned_by(objects: Sequence[PersonalObject], owner: str) -> list[PersonalObject]:
+    return [obj for obj in objects if fold(obj.owner) == owner]
+
+
+def _only_other(objects: Sequence[PersonalObject], word: str, speaker: str) -> str:
+    """The only person besides the speaker who owns one of `objects`; "-" where there is none.
+
+    Raises: BadInstruction.
+    """
+    people = sorted({fold(obj.owner) for obj in objects} - {"", fold(speaker)})
+    if len(people) > 1:
+        raise BadInstruction(
+            f"owners: {word!r} could be {' or '.join(people)}; say the name, for example "
+            f'"{people[0]}\'s".'
+        )
+    return people[0] if people else "-"

@@ -1,0 +1,70 @@
+"""Whose object an expression says that it means, in words: "Anna's", "my brother's", "his"."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from vap_core.instruction.context import Context
+from vap_core.instruction.expressions import Expression, find_category, person_pattern
+from vap_core.instruction.owners import MINE, OTHERS, fold
+
+BEGINNING = re.compile(
+    r"(?:my|his|her|their|our)(?:\s+(?:[\w-]+\s+)?[\w-]+['’]s)?(?=\W|$)|mine|hers|theirs|ours|"
+    r"[\w-]+['’]s(?:\s+[\w-]+['’]s)?",
+    re.IGNORECASE,
+)
+"""An owner that an expression begins with."""
+
+
+@dataclass(frozen=True)
+class Possession:
+    """Who owns, or did, what the expressions of one instruction say."""
+
+    context: Context
+    text: str
+    expressions: Sequence[Expression]
+
+    def owner(self, expression: Expression, said: str) -> str | None:
+        """The owner that an expression names; `said` is it without what it excludes."""
+        person = person_pattern(self.context)
+        for pattern in (
+            rf"\bof (mine|his|hers|theirs|ours|(?:{person})|[\w-]+['’]s)(?:['’]s)?(?:\W|$)",
+            rf"\b(?:belong\w*|owned) (?:to|by) (my [\w-]+|{person}|us|him|her|them|[\w-]+)\b",
+            rf"\b({person}|my [\w-]+|he|she|they|we|[A-Z][\w-]+) (?:owns?\b|has\W*$)",
+            r"(?:\bis|\bare|['’]s) (mine|his|hers|theirs|ours|(?:my )?[\w-]+['’]s)(?:\W|$)",
+        ):
+            match = re.search(pattern, said, re.IGNORECASE)
+            if match:
+                return self.antecedent(expression, match.group(1))
+        if expression.kind == "several":
+            return said.split()[2]
+        if expression.kind in ("owner", "alone"):
+            beginning = BEGINNING.match(said)
+            return beginning and self.antecedent(expression, beginning.group())
+        categories = {obj.category for obj in self.context.objects.values()}
+        if find_category(said, categories) is not None:
+            for other in self.expressions:
+                if other.kind == "alone" and other is not expression:
+                    return fold(other.said)
+        return None
+
+    def elsewhere(self, expression: Expression) -> str | None:
+        """The only owner that another expression names: "Ben's cup is there: take that one"."""
+        owners = set()
+        for other in self.expressions:
+            if other.kind in ("owner", "alone") and other is not expression:
+                beginning = BEGINNING.match(other.said)
+                if beginning:
+                    owners.add(fold(beginning.group()))
+        return owners.pop() if len(owners) == 1 else None
+
+    def antecedent(self, expression: Expression, owner: str) -> str:
+        """The person that "his" refers to, where one is named before; else the words themselves."""
+        if fold(owner) not in OTHERS:
+            return owner
+        people = re.compile(rf"\b(?:{person_pattern(self.context)})\b", re.IGNORECASE)
+        named = []
+        for match in people.finditer(self.text[: expression.start]):
+            if fold(match.group()) not in MINE:
+                named.append(match.group())
+        return named[-1] if named else owner
