@@ -127,6 +127,13 @@ def test_ground_answers_in_json_with_a_picture_and_a_recording(
     implicit = ("bring the one I used last", "--parser", "embedding", "--memory", bank)
     done = vap("ground", image, *implicit, "--out", tmp_path, *hand)
     assert "instruction: bring the red cup" in done.stdout, done.stderr
+    down = ("bring my cup", "--parser", "http://127.0.0.1:9/v1", "--memory", bank)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("OPENAI_MODEL", "reader-1")
+        assert "is the server up" in refused("ground", image, *down, "--out", tmp_path, *hand)
+        done = vap("ground", image, *down, "--fall-back", "--out", tmp_path, *hand)
+    assert "instruction: bring the red cup" in done.stdout
+    assert "The rule parses instead." in done.stderr
     assert len(read_uses(bank)) >= 3
     assert {use.object for use in read_uses(bank)} == {"mug"}
 
