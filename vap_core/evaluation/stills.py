@@ -31,7 +31,11 @@ def write_provenance(png: Path, study: Study) -> None:
 
     configuration = study.configuration()
     about = {
-        "study": {field.name: configuration[field.name] for field in fields(Study)},
+        "study": {
+            field.name: configuration[field.name]
+            for field in fields(Study)
+            if field.name in configuration
+        },
         "configuration": store.digest(configuration),
         "recorder": recorder_digest(),
         "code": code_version(),
