@@ -4,8 +4,9 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from threading import Thread
 from typing import Any
+
+from tests.local_server import running
 
 
 class Model(BaseHTTPRequestHandler):
@@ -40,10 +41,5 @@ def serving(*answers: Any) -> Iterator[Any]:
     with ThreadingHTTPServer(("127.0.0.1", 0), Model) as server:
         server.answers, server.asked = list(answers), []  # type: ignore[attr-defined]
         server.url = f"http://127.0.0.1:{server.server_address[1]}/v1"  # type: ignore[attr-defined]
-        thread = Thread(target=server.serve_forever, args=(0.02,))
-        thread.start()
-        try:
+        with running(server):
             yield server
-        finally:
-            server.shutdown()
-            thread.join()

@@ -12,6 +12,7 @@ import pytest
 
 from tests import tiny_foundation
 from tests.command import vap
+from tests.local_server import running
 from vap_core.base.errors import MissingWeights, UnknownName
 from vap_core.perception.foundation import downloads, sources, store
 from vap_core.perception.foundation.downloads import pull
@@ -100,13 +101,8 @@ def serving(
     with Hub(origin, cuts, revision) as server:
         url = f"http://127.0.0.1:{server.server_port}"
         monkeypatch.setenv(downloads.ENDPOINT_VARIABLE, url)
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        try:
+        with running(server):
             yield server
-        finally:
-            server.shutdown()
-            thread.join()
 
 
 def test_pull_takes_the_pinned_revision_from_the_hub_and_locks_every_file(

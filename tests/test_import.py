@@ -13,14 +13,15 @@ import vap_core
 HEAVY = ("torch", "mujoco", "rerun", "transformers", "matplotlib", "pandas", "cv2", "onnxruntime")
 
 
+def loaded_by(module: str, watched: tuple[str, ...]) -> str:
+    """Which of the watched modules an import loads, as a process of its own prints them."""
+    code = f"import sys, {module}; print([m for m in {watched!r} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
 def test_import_loads_nothing_heavy() -> None:
-    code = f"import sys, vap_core; print([m for m in {HEAVY!r} if m in sys.modules])"
-    assert (
-        subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, check=True
-        ).stdout.strip()
-        == "[]"
-    )
+    assert loaded_by("vap_core", HEAVY) == "[]"
 
 
 def test_import_is_fast() -> None:
@@ -62,21 +63,14 @@ def test_every_name_of_a_package_exists(package: str) -> None:
         assert getattr(module, name) is not None
 
 
-def test_the_engine_imports_no_policy() -> None:
-    """The parent of a run starts its workers at once; only they load torch and lerobot."""
-    code = (
-        "import sys, vap_core.evaluation.engine; "
-        "print([m for m in ('torch', 'lerobot', 'transformers', 'rerun') if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
-def test_the_adapter_imports_no_lerobot() -> None:
-    """A policy in another process needs none."""
-    code = (
-        "import sys, vap_core.policies.lerobot.adapter; "
-        "print([m for m in ('lerobot', 'transformers') if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+@pytest.mark.parametrize(
+    ("module", "absent"),
+    [
+        # The parent of a run starts its workers at once; only they load a policy.
+        ("vap_core.evaluation.engine", ("torch", "lerobot", "transformers", "rerun")),
+        # A policy in another process needs no lerobot here.
+        ("vap_core.policies.lerobot.adapter", ("lerobot", "transformers")),
+    ],
+)
+def test_an_import_loads_no_policy_library(module: str, absent: tuple[str, ...]) -> None:
+    assert loaded_by(module, absent) == "[]"

@@ -22,17 +22,22 @@ from .test_soft_prompt import SUITE, grown  # noqa: F401
 from .toys import observation
 
 
-def test_the_ways_differ_in_what_is_shown_and_said() -> None:
+def grey_scene(level: int) -> tuple[np.ndarray, np.ndarray, SceneTruth]:
+    """A grey picture, the mask of the target in it, and the truth of an unseen object's scene."""
     known = suites.suite(SUITE)
     task = known.task("put-camera")
     names = draw_objects(known, task, np.random.default_rng(3), held_out=True)
     start = row(known, task, names, 0, np.random.default_rng(0))
-    rgb, mask = np.full((8, 8, 3), 120, np.uint8), np.zeros((8, 8), bool)
+    rgb, mask = np.full((8, 8, 3), level, np.uint8), np.zeros((8, 8), bool)
     mask[2:5, 2:5] = True
+    return rgb, mask, SceneTruth(start, {"front": {start.target: mask}})
+
+
+def test_the_ways_differ_in_what_is_shown_and_said() -> None:
+    rgb, mask, truth = grey_scene(120)
+    start = truth.row
     seen, shown = observation({"front": rgb}), {}
-    context = PromptContext(
-        start.instruction, truth=SceneTruth(start, {"front": {start.target: mask}})
-    )
+    context = PromptContext(start.instruction, truth=truth)
     for way in WAYS:
         state, attended = ProbePrompter(way).start(seen, context)
         ((again, later),) = ProbePrompter(way).steps([state], [seen], [context])
@@ -112,15 +117,8 @@ def test_fewer_actions_of_a_chunk_are_its_first(grown: tuple[Path, Path]) -> Non
 
 
 def test_a_way_forces_the_colour_and_the_opacity() -> None:
-    known = suites.suite(SUITE)
-    task = known.task("put-camera")
-    names = draw_objects(known, task, np.random.default_rng(3), held_out=True)
-    start = row(known, task, names, 0, np.random.default_rng(0))
-    rgb, mask = np.full((8, 8, 3), 100, np.uint8), np.zeros((8, 8), bool)
-    mask[2:5, 2:5] = True
-    context = PromptContext(
-        start.instruction, truth=SceneTruth(start, {"front": {start.target: mask}})
-    )
+    rgb, _, truth = grey_scene(100)
+    context = PromptContext(truth.row.instruction, truth=truth)
     for way, pixel in (("tinted-magenta", [178, 50, 178]), ("tinted-yellow-0.2", [131, 131, 80])):
         _, attended = ProbePrompter(way).start(observation({"front": rgb}), context)
         assert attended.images["front"][3, 3].tolist() == pixel

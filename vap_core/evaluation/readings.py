@@ -3,9 +3,9 @@
     2026-11-24,simpler-bridge,e160becf5906,00c47015fce7,mini-pi0,generic vap,96,96,1,RUN,main table
 
 A list that was read while something was tuned is no test of it any more; development lists are read
-for that, and not logged. A run is entered once,
-when it begins, with what it will read: `data/runs/readings.csv`, which stays on its machine. To
-publish a run copies its lines to `readings.csv` beside the published table.
+for that, and not logged. A run is entered once, when it begins, with what it will read:
+`data/runs/readings.csv`, which stays on its machine. To publish a run copies its lines to
+`readings.csv` beside the published table.
 """
 
 import csv

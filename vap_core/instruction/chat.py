@@ -9,14 +9,19 @@ import json
 from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import pairwise
-from queue import Empty, SimpleQueue
-from threading import Thread
 from typing import Any
 
 from vap_core.base.errors import BadEndpoint, BadInstruction
 from vap_core.base.types import Instruction, Target
 from vap_core.instruction.context import Context
-from vap_core.perception.chat import KEY, MAX_ANSWER_BYTES, MODEL, URL, ChatEndpoint
+from vap_core.perception.chat import (
+    KEY,
+    MAX_ANSWER_BYTES,
+    MODEL,
+    URL,
+    ChatEndpoint,
+    answer_in_time,
+)
 
 TASK = (
     "A user tells a robot what to do. Find every expression of the instruction that refers to one "
@@ -49,7 +54,13 @@ class ChatParser:
         Raises: BadEndpoint: the server cannot be reached, takes too long, refuses, or its answer is
             malformed; BadInstruction: the model finds no personal object.
         """
-        answer = _ask_in_time(self.endpoint, self._messages(text), self._schema())
+        messages, schema = self._messages(text), self._schema()
+        answer = answer_in_time(
+            self.endpoint,
+            lambda: _ask(self.endpoint, messages, schema),
+            doing="parse",
+            instead="--parser rule",
+        )
         targets = self._targets(text, answer)
         if not targets:
             raise BadInstruction(
@@ -149,35 +160,8 @@ def _in_words(context: Context, name: str) -> dict[str, Any]:
     return about
 
 
-def _ask_in_time(
-    endpoint: ChatEndpoint, messages: list[dict[str, str]], schema: dict[str, Any]
-) -> str:
-    """The model's answer, complete within the endpoint's `total_s`. Raises: BadEndpoint.
-
-    A server that sends a byte now and then passes the limit on silence: another thread reads.
-    """
-    answers: SimpleQueue[str | BadEndpoint] = SimpleQueue()
-
-    def ask() -> None:
-        try:
-            answers.put(_ask(endpoint, messages, schema))
-        except BadEndpoint as error:
-            answers.put(error)
-
-    Thread(target=ask, daemon=True).start()
-    try:
-        answer = answers.get(timeout=endpoint.total_s)
-    except Empty:
-        raise BadEndpoint(
-            f"parse: {endpoint.url} gives no whole answer within {endpoint.total_s:g} s; take a "
-            "smaller model, or --parser rule."
-        ) from None
-    if isinstance(answer, BadEndpoint):
-        raise answer
-    return answer
-
-
 def _ask(endpoint: ChatEndpoint, messages: list[dict[str, str]], schema: dict[str, Any]) -> str:
+    """The model's answer. Raises: BadEndpoint."""
     import httpx
     from huggingface_hub import InferenceClient
     from huggingface_hub.errors import (

@@ -7,7 +7,7 @@ never executed.
 import base64
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from http.client import HTTPException
@@ -78,7 +78,10 @@ def request_answer(endpoint: ChatEndpoint, question: str, images: Sequence[Rgb] 
     Raises: BadEndpoint: the server cannot be reached, takes too long, refuses, or answers something
         other than the protocol says.
     """
-    data = _post(endpoint, _question_body(endpoint.model, question, images))
+    body = _question_body(endpoint.model, question, images)
+    data = answer_in_time(
+        endpoint, lambda: _fetch(endpoint, body), doing="chat", instead="another server"
+    )
     try:
         text = json.loads(data)["choices"][0]["message"]["content"]
         if not isinstance(text, str) or not text.strip():
@@ -90,6 +93,37 @@ def request_answer(endpoint: ChatEndpoint, question: str, images: Sequence[Rgb] 
             f"that sees pictures in {MODEL}."
         ) from error
     return text
+
+
+def answer_in_time[T](
+    endpoint: ChatEndpoint, ask: Callable[[], T], *, doing: str, instead: str
+) -> T:
+    """What `ask` returns, within the endpoint's `total_s`.
+
+    A server that sends a byte now and then passes every limit on silence, so that another thread
+    asks and this one waits. The error names what was being done, and what to take instead.
+
+    Raises: BadEndpoint: `ask`'s, or that of an answer that is not complete in time.
+    """
+    answers: SimpleQueue[T | BadEndpoint] = SimpleQueue()
+
+    def run() -> None:
+        try:
+            answers.put(ask())
+        except BadEndpoint as error:
+            answers.put(error)
+
+    Thread(target=run, daemon=True).start()
+    try:
+        answer = answers.get(timeout=endpoint.total_s)
+    except Empty:
+        raise BadEndpoint(
+            f"{doing}: {endpoint.url} gives no whole answer within {endpoint.total_s:g} s; take a "
+            f"smaller model, or {instead}."
+        ) from None
+    if isinstance(answer, BadEndpoint):
+        raise answer
+    return answer
 
 
 def data_url(rgb: Rgb) -> str:
@@ -114,33 +148,6 @@ def _question_body(model: str, question: str, images: Sequence[Rgb]) -> dict[str
     for rgb in images:
         content.append({"type": "image_url", "image_url": {"url": data_url(rgb)}})
     return {"model": model, "messages": [{"role": "user", "content": content}]}
-
-
-def _post(endpoint: ChatEndpoint, body: dict[str, Any]) -> bytes:
-    """The server's response, within `total_s`. Raises: BadEndpoint.
-
-    A server that sends a byte now and then passes every limit on silence, so that another thread
-    reads and this one waits.
-    """
-    answers: SimpleQueue[bytes | BadEndpoint] = SimpleQueue()
-
-    def fetch() -> None:
-        try:
-            answers.put(_fetch(endpoint, body))
-        except BadEndpoint as error:
-            answers.put(error)
-
-    Thread(target=fetch, daemon=True).start()
-    try:
-        answer = answers.get(timeout=endpoint.total_s)
-    except Empty:
-        raise BadEndpoint(
-            f"chat: {endpoint.url} gives no whole answer within {endpoint.total_s:g} s; "
-            "take a smaller model, or another server."
-        ) from None
-    if isinstance(answer, BadEndpoint):
-        raise answer
-    return answer
 
 
 def _fetch(endpoint: ChatEndpoint, body: dict[str, Any]) -> bytes:
