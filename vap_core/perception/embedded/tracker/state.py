@@ -90,7 +90,7 @@ def initial_state(
     All identities are followed, or the `targets` alone.
     """
     n = len(masks)
-    followed = np.ones(n, bool)
+    followed: Bool[np.ndarray, " n"] = np.ones(n, bool)
     if targets is not None:
         followed = np.isin(np.arange(n), targets)
     keys, grid = embed_cells(image, network)

@@ -76,7 +76,8 @@ class LiteTracker:
     ) -> list[TrackState]:
         """As `start`, but only `targets` are followed; the others are remembered as of t = 0.
 
-        In 50 views of 26 expert episodes the targets' masks are no worse for it.
+        In 67 views of 40 expert episodes the targets' masks have a mean IoU of .878 so, and of .881
+        with every identity followed; 97 and 93 % are on the target at the end.
         """
         states: list[TrackState] = []
         for image, of_view, wanted in zip(images, masks, targets, strict=True):
