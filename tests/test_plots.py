@@ -20,6 +20,7 @@ from vap_core.evaluation.metrics import rate, score
 from vap_core.evaluation.report.failures import breakdown, funnel_table
 from vap_core.evaluation.report.funnel import cases_figure, funnel_figure
 from vap_core.evaluation.report.pictures import scores_figure
+from vap_core.evaluation.report.result_figures import suites_figure, tasks_figure
 from vap_core.perception.boxes import mask_iou
 
 TEAL, GREY = (40, 120, 110), (90, 90, 90)
@@ -103,14 +104,58 @@ def test_the_funnel_has_a_panel_per_suite_and_a_line_per_method() -> None:
     )
 
 
-def test_every_bar_of_cases_is_a_hundred_percent() -> None:
+def test_a_bar_of_cases_is_as_long_as_the_share_of_failures_and_vap_is_on_top() -> None:
+    counts = breakdown(TABLE).set_index("method")
     axes = cases_figure(breakdown(TABLE)).axes[0]
-    ends = {
-        patch.get_y() + patch.get_height() / 2: patch.get_x() + patch.get_width()
-        for patch in axes.patches
+    ends: dict[float, float] = {}
+    for patch in axes.patches:
+        middle = patch.get_y() + patch.get_height() / 2
+        ends[middle] = max(ends.get(middle, 0.0), patch.get_x() + patch.get_width())
+    labels = [label.get_text() for label in axes.get_yticklabels()]
+    assert labels[0] == "vap"
+    for place, method in zip(axes.get_yticks(), labels, strict=True):
+        percent = 100 * counts.loc[method, "failed"] / counts.loc[method, "n"]
+        assert ends[place] == pytest.approx(percent)
+
+
+def result(method: str, sr: float, bound: bool = False) -> dict[str, object]:
+    """A line of `results.results`."""
+    return {
+        "suite": "tabletop",
+        "split": "",
+        "task": "put-plant",
+        "method": method,
+        "n": 20,
+        "sr": sr,
+        "sr_low": sr - 0.1,
+        "sr_high": sr + 0.1,
+        "sr_layout_low": float("nan"),
+        "sr_layout_high": float("nan"),
+        "bound": bound,
     }
-    assert list(ends.values()) == pytest.approx([100.0] * 2)
-    assert sorted(ends) == pytest.approx([0, 1])
+
+
+def test_results_show_every_rate_and_put_bounds_last() -> None:
+    lines = pd.DataFrame(
+        [
+            result("generic", sr=0.25),
+            result("oracle-mask", sr=0.9, bound=True),
+            result("vap", sr=0.75),
+        ]
+    )
+    panel = suites_figure(lines, title="a finding").axes[0]
+    assert [label.get_text() for label in panel.get_yticklabels()] == [
+        "generic",
+        "vap",
+        "oracle-mask (bound)",
+    ]
+    assert [text.get_text() for text in panel.texts] == ["25", "75", "90"]
+    matrix = tasks_figure(lines).axes[0]
+    areas = [dots.get_sizes()[0] for dots in matrix.collections]
+    assert areas[1] == pytest.approx(3 * areas[0]), "the area of a dot is the rate"
+    bold = [text.get_text() for text in matrix.texts if text.get_fontweight() == "bold"]
+    assert "75" in bold
+    assert "90" not in bold, "a bound is never the highest"
 
 
 def test_learning_has_a_panel_per_figure_and_a_line_per_training_that_logged_it() -> None:

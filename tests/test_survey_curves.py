@@ -185,5 +185,5 @@ def test_time_and_hidden_figures_show_the_numbers() -> None:
     ]
     assert lines[0].get_ydata()[1:].tolist() == [1.0, 0.5]
     assert np.isnan(lines[0].get_ydata()[0])
-    kept = curves.hidden_figure(tables()["tracks"]).axes[0].containers[0].lines[0]
-    assert kept.get_ydata().tolist() == [50.0, 50.0]
+    lost = curves.hidden_figure(tables()["tracks"]).axes[0].containers[0].lines[0]
+    assert lost.get_ydata().tolist() == [50.0, 50.0]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vap_core.base.figures import OTHER, TIER_COLOURS, WINNER, empty_figure
+from vap_core.base.palette import SUITES
 from vap_core.base.types import Attended, Grounding, PersonalObject, Rgb, value
 from vap_core.evaluation.metrics import Rate, Score
 from vap_core.simulation.types import EpisodeRow
@@ -22,6 +23,12 @@ if TYPE_CHECKING:
     from PIL import Image
 
 
+TIER_MARKERS = {"hard": "^", "medium": "s", "easy": "o"}
+"""The marker of a look-alike, by hardness."""
+LINE_COLOURS = ("#232f7e", "#b06ab3", "#157a6b", "#9fd0e0")
+"""The curves of what is no suite."""
+MEASURE_COLOURS = ("#232f7e", "#b06ab3", "#c9ccd1", "#157a6b")
+"""The bars of a group, in their order; told apart in grey, too."""
 ROLES = {"other objects": "#c9ccd1", "look-alike": OTHER, "target": WINNER, "goal": "#59a14f"}
 """The colours of the objects in `layouts_figure`, by role."""
 
@@ -184,9 +191,9 @@ def hardness_figure(table: "pd.DataFrame") -> "Figure":
         axes.scatter(
             part.cosine,
             part.object.map(place),
-            s=26,
+            s=30,
+            marker=TIER_MARKERS[str(tier)],
             color=TIER_COLOURS[str(tier)],
-            alpha=0.85,
             label=f"look-alike, {tier}",
         )
     own = table.groupby("object", sort=False).own.first()
@@ -299,7 +306,10 @@ def learning_figure(
                 for entry in log:
                     steps.append(entry["step"])
                     values.append(entry[name])
-                (drawn[label],) = axes.plot(steps, values, color=f"C{i}", linewidth=1.4)
+                colour = LINE_COLOURS[i % len(LINE_COLOURS)]
+                if label in SUITES:
+                    colour, _ = SUITES[label]
+                (drawn[label],) = axes.plot(steps, values, color=colour, linewidth=1.6)
         axes.set(title=title, xlabel="optimiser steps")
         axes.set_ylim(bottom=0)
         axes.grid(color="#eeeeee")
@@ -439,7 +449,8 @@ def _draw_rates(
 ) -> "BarContainer":
     """Bars of rates with their intervals, in percent."""
     percent = _percentages(rates)
-    bars = axes.bar(x, percent.value, width, color=f"C{colour}")
+    shade = MEASURE_COLOURS[colour % len(MEASURE_COLOURS)]
+    bars = axes.bar(x, percent.value, width, color=shade)
     axes.errorbar(
         x,
         percent.value,

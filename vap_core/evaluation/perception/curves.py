@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from vap_core.base.figures import OTHER, TIER_COLOURS, WINNER, empty_figure
+from vap_core.base.palette import TEXT, suite_colour
 from vap_core.evaluation.perception.estimates import Estimate, mean, share
 from vap_core.evaluation.perception.first_frames import KS, RULES, USUAL_K
 from vap_core.simulation.assets.objects import TIERS
@@ -22,8 +23,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MARGINS = {"margin": "margin of votes", "cosine_margin": "margin of mean cosines"}
-SUITE_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7")
-"""The colours of the suites, which colour-blind readers can distinguish."""
+COUNTS_BELOW = -4.0
+"""Where the axis begins that has numbers below its curve, %."""
 RULE_COLOURS = {"vote": WINNER, "average": OTHER}
 OCCLUDERS = {"plate": "a plate hides it fully", "arm": "an arm moves in front"}
 RECALLS = {
@@ -75,27 +76,31 @@ def lookalike_pairs(objects: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def abstention_figure(choices: "pd.DataFrame") -> "Figure":
-    """Right instances against coverage when views of small margin pass unmodified.
+    """Wrong instances against coverage when views of small margin pass unmodified.
 
-    Bands are 95 % Wilson intervals.
+    Bands are 95 % Wilson intervals. The axis ends at twice the largest share, so that the curve is
+    seen where the interval of a few views is wide.
     """
     figure, axes = _make_panel(6.4, 4.0)
     n_views = len(choices[(choices.k == USUAL_K) & (choices.rule == "vote")])
+    top = 0.0
     for (margin, label), colour in zip(MARGINS.items(), (WINNER, OTHER), strict=True):
         curve = abstention(choices, margin)
         coverage = 100 * curve.coverage
         axes.plot(
             coverage,
-            100 * curve.right,
+            100 * (1 - curve.right),
             color=colour,
             marker="o" if len(curve) <= 2 * USUAL_K else None,
             markersize=4,
             label=f"abstain below a {label}",
         )
-        _draw_band(axes, x=coverage, low=100 * curve.low, high=100 * curve.high, colour=colour)
-    axes.set(xlabel=f"% of {n_views} views answered", ylabel="% right instance")
-    axes.set(xlim=(0, 101), ylim=(0, 101))
-    axes.legend(frameon=False, loc="lower left", fontsize=9)
+        low, high = 100 * (1 - curve.high), 100 * (1 - curve.low)
+        _draw_band(axes, x=coverage, low=low, high=high, colour=colour)
+        top = max(top, 200 * float((1 - curve.right).max()))
+    axes.set(xlabel=f"% of {n_views} views answered", ylabel="% of them wrong")
+    axes.set(xlim=(0, 101), ylim=(0, max(top, 1.0)))
+    axes.legend(frameon=False, loc="upper left", fontsize=9)
     return figure
 
 
@@ -122,7 +127,7 @@ def hardness_figure(objects: "pd.DataFrame") -> "Figure":
 
 
 def references_figure(choices: "pd.DataFrame") -> "Figure":
-    """Right instance against the number of reference photos, by rule.
+    """Wrong instance against the number of reference photos, by rule.
 
     One panel per suite and one of all views, with 95 % Wilson intervals.
     """
@@ -134,14 +139,15 @@ def references_figure(choices: "pd.DataFrame") -> "Figure":
             rows = choices[choices.suite == suite]
         for i, rule in enumerate(RULES):
             by_rule = rows[rows.rule == rule]
-            shares = [share(by_rule[by_rule.k == k].right) for k in KS]
+            shares = [share(~by_rule[by_rule.k == k].right.astype(bool)) for k in KS]
             x = np.array(KS) + 0.25 * (i - 0.5)
             _draw_line(axes, x, shares, colour=RULE_COLOURS[rule], label=rule)
         n_views = len(rows) // (len(KS) * len(RULES))
         axes.set(title=f"{suite}\n{n_views} views", xlabel="reference photos")
-        axes.set(xticks=KS, ylim=(0, 103))
-    panels[0].set_ylabel("% right instance")
-    panels[0].legend(frameon=False, loc="lower left")
+        axes.set(xticks=KS)
+        axes.set_ylim(bottom=0)
+    panels[0].set_ylabel("% wrong instance")
+    panels[0].legend(frameon=False, loc="upper left")
     return figure
 
 
@@ -167,7 +173,7 @@ def time_figure(tracks: "pd.DataFrame") -> "Figure":
 
 
 def hidden_figure(tracks: "pd.DataFrame") -> "Figure":
-    """Identity of the target kept to the episode's end, against the frames for which it is hidden.
+    """Targets lost at the episode's end, against the frames for which they are hidden.
 
     Bars are 95 % Wilson intervals.
     """
@@ -182,16 +188,17 @@ def hidden_figure(tracks: "pd.DataFrame") -> "Figure":
         _draw_line(
             axes,
             x=np.array(hidden) + 0.12 * (n_lines - 0.5),
-            estimates=[share(part[part.hidden == n].kept) for n in hidden],
+            estimates=[share(~part[part.hidden == n].kept.astype(bool)) for n in hidden],
             colour=(WINNER, OTHER)[n_lines],
             label=label,
             counts=n_lines == 0,
         )
         n_lines += 1
     axes.set(xlabel="frames hidden (below: tracks behind the plate)")
-    axes.set(ylabel="% of targets tracked at the end", ylim=(0, 103), xticks=range(7))
+    axes.set(ylabel="% of targets lost at the end", xticks=range(7))
+    axes.set_ylim(bottom=COUNTS_BELOW)
     axes.set_xlim(-0.4, 6.4)
-    axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 0.06))
+    axes.legend(frameon=False, loc="upper left")
     return figure
 
 
@@ -219,9 +226,9 @@ def size_figure(objects: "pd.DataFrame", bins: int = 7) -> "Figure":
 def _suite_colours(table: "pd.DataFrame") -> dict[str, str]:
     """The suites of a table in their usual order, each with its colour."""
     colours = {}
-    for suite, colour in zip(BENCHMARKS, SUITE_COLOURS, strict=True):
+    for suite in BENCHMARKS:
         if (table.suite == suite).any():
-            colours[suite] = colour
+            colours[suite] = suite_colour(suite)
     return colours
 
 
@@ -306,7 +313,15 @@ def _draw_line(
     if not counts:
         return
     for place, estimate in zip(x, estimates, strict=True):
-        axes.text(place, 1.5, f"{estimate.n}", ha="center", fontsize=8, color="#666666")
+        axes.text(
+            place,
+            COUNTS_BELOW / 2,
+            f"{estimate.n}",
+            ha="center",
+            va="center",
+            fontsize=8,
+            color=TEXT,
+        )
 
 
 def _draw_bars(axes: "Axes", estimates: Mapping[str, Estimate], colours: Mapping[str, str]) -> None:

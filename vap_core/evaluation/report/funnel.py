@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vap_core.base.figures import empty_figure
+from vap_core.base.palette import CASES as CASE_COLOURS
+from vap_core.base.palette import rgb8
 from vap_core.evaluation.diagnosis import STAGES
 from vap_core.evaluation.report.failures import FunnelRow
 from vap_core.rollout.failure import CASES
@@ -13,16 +15,19 @@ from vap_core.rollout.failure import CASES
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
+    from matplotlib.container import BarContainer
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-CASE_SHADES = {
-    "case 1": "Reds",
-    "case 2": "Purples",
-    "case 3": "Blues",
-    "unprompted": "Greys",
-    "unlabelled": "Greens",
+MEANINGS = {
+    "case 1": "Case 1: every view wrong alike",
+    "case 2": "Case 2: views disagree",
+    "case 3": "Case 3: right prompt, the hand fails",
+    "unprompted": "unprompted: no mask to be wrong",
 }
+"""The cases in a legend."""
+PERCENT_A_LETTER = 0.95
+"""Width of a letter in a bar, in percent of its axis."""
 SUCCESS_MARK = "D"
 LABEL_APART = 6.0
 """Percent between two numbers at the ends of lines, so that both can be read."""
@@ -61,38 +66,43 @@ def funnel_figure(rows: Sequence[FunnelRow], colours: Mapping[str, str]) -> "Fig
     return figure
 
 
-def cases_figure(counts: "pd.DataFrame") -> "Figure":
-    """One bar per suite and method: its failures by sub-case, in percent of them (`breakdown`).
+def cases_figure(counts: "pd.DataFrame", first: str = "vap") -> "Figure":
+    """One bar per suite and method, as long as its share of failures, split by case (`breakdown`).
 
-    One hue a case; sub-cases from perception to manipulation.
+    One colour a case; within it thin lines separate the sub-cases, whose names stand where there is
+    room. Methods stand below `first` in the order of the table; suites keep theirs.
     """
-    import matplotlib
-
-    lines = counts[counts["failed"] > 0]
-    figure = empty_figure(10.5, 0.42 * len(lines) + 1.9)
+    lines = _first_on_top(counts[counts["n"] > 0], first)
+    places = _spaced(lines["suite"])
+    figure = empty_figure(10.5, 0.3 * (places[-1] + 1) + 1.5)
     axes = figure.subplots()
     start = np.zeros(len(lines))
+    drawn: dict[str, BarContainer] = {}
     for case, sub_cases in CASES.items():
-        shades = matplotlib.colormaps[CASE_SHADES[case]](np.linspace(0.85, 0.35, len(sub_cases)))
-        for sub_case, colour in zip(sub_cases, shades, strict=True):
-            name = f"{case}: {sub_case}"
-            percent = (100 * lines[name] / lines["failed"]).to_numpy()
+        for sub_case in sub_cases:
+            percent = (100 * lines[f"{case}: {sub_case}"] / lines["n"]).to_numpy()
             if percent.any():
-                _draw_bars(axes, percent, start, colour, label=name)
+                bars = _draw_bars(axes, places, percent, start, case, sub_case)
+                drawn.setdefault(case, bars)
             start += percent
-    titles = []
-    for line in lines.itertuples():
-        titles.append(f"{line.suite} · {line.method} ({line.failed} of {line.n})")
-    axes.set_yticks(range(len(lines)), titles, fontsize=8)
-    axes.invert_yaxis()
-    axes.set(xlim=(0, 100), xlabel="% of the failures")
+    for place, line in zip(places, lines.itertuples(), strict=True):
+        axes.text(
+            start[places.index(place)] + 1,
+            place,
+            f"{line.failed} of {line.n}",
+            fontsize=8,
+            va="center",
+        )
+    _name_bars(axes, lines, places, first)
+    axes.set(xlim=(0, 112), xticks=range(0, 101, 20), xlabel="% of episodes that fail")
     axes.spines[["top", "right", "left"]].set_visible(False)
     figure.legend(
-        *axes.get_legend_handles_labels(),
+        drawn.values(),
+        [MEANINGS.get(case, case) for case in drawn],
         loc="outside lower center",
         ncols=4,
         frameon=False,
-        fontsize=8,
+        fontsize=9,
     )
     return figure
 
@@ -143,26 +153,65 @@ def _draw_funnel(
     return drawn
 
 
+def _first_on_top(counts: "pd.DataFrame", first: str) -> "pd.DataFrame":
+    """The lines suite by suite, that of the method `first` before the others."""
+    suites = list(dict.fromkeys(counts["suite"]))
+    rank = counts["suite"].map(suites.index) + 0.5 * (counts["method"] != first)
+    return counts.assign(rank=rank).sort_values("rank", kind="stable").reset_index(drop=True)
+
+
+def _spaced(suites: "pd.Series") -> list[float]:
+    """The height of each bar; a new suite leaves room for its heading."""
+    places = []
+    seen: list[str] = []
+    for i, suite in enumerate(suites):
+        if suite not in seen:
+            seen.append(suite)
+        places.append(i + 1.0 * (len(seen) - 1))
+    return places
+
+
+def _name_bars(axes: "Axes", lines: "pd.DataFrame", places: Sequence[float], first: str) -> None:
+    """Methods beside their bars, the suite above its first."""
+    axes.set_yticks(places, lines["method"], fontsize=9)
+    axes.set_ylim(places[-1] + 0.6, -1.2)
+    axes.tick_params(axis="y", length=0)
+    headed: set[str] = set()
+    for place, label, line in zip(places, axes.get_yticklabels(), lines.itertuples(), strict=True):
+        label.set_fontweight("bold" if line.method == first else "normal")
+        if line.suite not in headed:
+            headed.add(line.suite)
+            axes.text(0, place - 0.85, line.suite, fontsize=9, fontweight="bold", va="center")
+
+
 def _draw_bars(
-    axes: "Axes", percent: np.ndarray, start: np.ndarray, colour: np.ndarray, label: str
-) -> None:
-    """One sub-case of every line, with the percentage in bars that have room for it."""
+    axes: "Axes",
+    places: Sequence[float],
+    percent: np.ndarray,
+    start: np.ndarray,
+    case: str,
+    sub_case: str,
+) -> "BarContainer":
+    """One sub-case of every line, with its name in bars that have room for it."""
+    colour = CASE_COLOURS[case]
     bars = axes.barh(
-        range(len(percent)),
+        places,
         percent,
         left=start,
         color=colour,
         edgecolor="white",
-        linewidth=0.6,
-        label=label,
+        linewidth=0.8,
+        height=0.82,
     )
     labels = []
     for each in percent:
-        labels.append(f"{each:.0f}" if each >= 4 else "")
+        labels.append(sub_case if each >= PERCENT_A_LETTER * len(sub_case) else "")
+    is_dark = sum(rgb8(colour)) < 400
     axes.bar_label(
         bars,
         labels,
         label_type="center",
         fontsize=7.5,
-        color="white" if sum(colour[:3]) < 1.7 else "black",
+        color="white" if is_dark else "black",
     )
+    return bars

@@ -90,7 +90,8 @@ def differences_figure(comparisons: Sequence[Comparison]) -> "Figure":
         if (c.other, c.one) not in contrasts:
             contrasts.append((c.other, c.one))
     marks = method_marks([comparisons[0].one, *(other for other, _ in contrasts)])
-    figure, axes, places = _forest_axes(lines, per_line=len(contrasts), heading_x=-100.0)
+    lowest = min(-25.0, *(100 * c.low for c in comparisons))
+    figure, axes, places = _forest_axes(lines, per_line=len(contrasts), heading_x=lowest)
     axes.axvline(0, color="#555555", linewidth=1)
     for line, c in zip(lines, comparisons, strict=True):
         colour, marker = marks[c.other]
@@ -105,7 +106,7 @@ def differences_figure(comparisons: Sequence[Comparison]) -> "Figure":
     for other, one in contrasts:
         colour, marker = marks[other]
         axes.plot([], [], marker, color=colour, label=f"{other} minus {one}")
-    axes.set_xlim(-102, 102)
+    axes.set_xlim(lowest - 2, 102)
     axes.set_xlabel(
         "difference of success rates in points, same episodes, 95 % interval over layouts\n"
         "filled: p < 0.05 after Holm's correction"
