@@ -6,7 +6,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from vap_core.cli.options import StackName, Workers, names
+from vap_core.cli.options import (
+    DetectorName,
+    EncoderName,
+    StackName,
+    TrackerName,
+    Workers,
+    names,
+    stack_of,
+)
 
 if TYPE_CHECKING:
     from vap_core.evaluation.jobs import Record
@@ -157,6 +165,9 @@ def rollout(
     policy_timeout: PolicyTimeout = None,
     robots: Meshes = "plain",
     stack: StackName = "embedded",
+    detector: DetectorName = "",
+    encoder: EncoderName = "",
+    tracker: TrackerName = "",
     object: OwnObject = "",
     what_for: WhatFor = "",
 ) -> None:
@@ -176,7 +187,7 @@ def rollout(
         episodes=episodes,
         seed=seed,
         robots=robots,
-        stack=stack,
+        stack=stack_of(stack, detector, encoder, tracker),
         object=object,
         suite_files=files,
     )
@@ -344,6 +355,9 @@ def evaluate(
     ] = 0,
     robots: Meshes = "plain",
     stack: StackName = "embedded",
+    detector: DetectorName = "",
+    encoder: EncoderName = "",
+    tracker: TrackerName = "",
     object: OwnObject = "",
     what_for: WhatFor = "",
 ) -> None:
@@ -370,7 +384,7 @@ def evaluate(
         episodes=episodes,
         seed=seed,
         robots=robots,
-        stack=stack,
+        stack=stack_of(stack, detector, encoder, tracker),
         seeds=seeds,
         images_every=images_every,
         follow=follow,

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from vap_core.cli.objects import BANK, Memory
-from vap_core.cli.options import StackName
+from vap_core.cli.options import DetectorName, EncoderName, StackName, TrackerName, stack_of
 
 app = typer.Typer()
 
@@ -26,6 +26,9 @@ def attach_command(
         ),
     ] = None,
     stack: StackName = "embedded",
+    detector: DetectorName = "",
+    encoder: EncoderName = "",
+    tracker: TrackerName = "",
     alpha: Annotated[float, typer.Option(min=0, max=1, help="Opacity of the tint.")] = 0.5,
     episodes: Annotated[
         Literal["auto", "vap_step", "reset"],
@@ -47,6 +50,7 @@ def attach_command(
     require("policy", "attach")
     from vap_core.policies.lerobot.step import attach
 
+    stack = stack_of(stack, detector, encoder, tracker)
     attach(checkpoint, out, memory, stack=stack, objects=object, alpha=alpha, episodes=episodes)
     print(f"wrote {out}: the checkpoint, and VAP before it in its preprocessor")
     print(
@@ -70,6 +74,9 @@ def inspect_dataset_command(
         ),
     ] = None,
     stack: StackName = "embedded",
+    detector: DetectorName = "",
+    encoder: EncoderName = "",
+    tracker: TrackerName = "",
     episodes: Annotated[
         int | None, typer.Option(min=1, help="The first so many episodes; default all.")
     ] = None,
@@ -109,7 +116,7 @@ def inspect_dataset_command(
         path,
         instruction,
         memory,
-        stack,
+        stack_of(stack, detector, encoder, tracker),
         out,
         objects=object,
         episodes=episodes,

@@ -39,7 +39,7 @@ from vap_core.memory import load_bank, register, save
 from vap_core.perception.describe import AttributeCaptioner, Captioner, with_description
 from vap_core.perception.embedded.weights import weights_sha256
 from vap_core.perception.protocols import Stack
-from vap_core.perception.stacks import STACKS, load_stack
+from vap_core.perception.stacks import check_stack, load_stack
 from vap_core.policies.lerobot import checkpoints
 from vap_core.policies.mini_pi0 import token_file
 from vap_core.policies.mini_pi0.learned_token import WORD
@@ -235,8 +235,7 @@ def _check_names(study: Study) -> None:
         raise one_of(what, study.policy, [*POLICIES, MINI])
     if study.robots not in MESHES:
         raise one_of("Study: robots", study.robots, MESHES)
-    if study.stack not in STACKS:
-        raise one_of("Study: stack", study.stack, STACKS)
+    check_stack(study.stack, "Study")
     for suite, task in study.tasks:
         study.rows(suite, task)
 

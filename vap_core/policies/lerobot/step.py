@@ -35,7 +35,7 @@ from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadViews, one_
 from vap_core.base.files import parse_json
 from vap_core.base.types import Rgb, Views
 from vap_core.memory import load_bank
-from vap_core.perception.stacks import STACKS, load_stack
+from vap_core.perception.stacks import check_stack, load_stack
 from vap_core.policies.lerobot.checkpoints import PIPELINES, STEP_CLASS, STEP_NAME, locate
 from vap_core.prompt import Tint
 from vap_core.simulation import suites
@@ -82,8 +82,7 @@ class VapPrompt(ProcessorStep):
     _was_reset: bool = field(default=False, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if self.stack not in STACKS:
-            raise one_of("VapPrompt: stack", self.stack, STACKS)
+        check_stack(self.stack, "VapPrompt")
         if self.episodes not in ("auto", "vap_step", "reset"):
             raise one_of("VapPrompt: episodes", self.episodes, ("auto", "vap_step", "reset"))
         if not Path(self.memory).is_dir():
