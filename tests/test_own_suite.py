@@ -65,6 +65,8 @@ def test_other_commands_find_it_by_the_environment(
         (('"wx250s"', '"wx25"'), r"no robot 'wx25'|robot.*'wx25'"),
         (('("front",)', '("back",)'), "camera 'back'"),
         (('"my-desk"', '"tabletop"'), "another suite 'tabletop'"),
+        (('"my-desk"', '"my-absent"'), "the name 'my-absent' will not do"),
+        (('"my-desk"', '"../desk"'), "the name '../desk' will not do"),
         (("bottle-lookalike-1", "bottle-lookalike-99"), "bottle-lookalike-99"),
         (("PICK, episode,", "PICK, 0,"), "is there twice"),
     ],

@@ -48,8 +48,8 @@ def suite(name: str) -> Suite:
         return own_suite.suite
     if not is_listed(name):
         raise one_of(
-            "suites.suite: suite (a benchmark also with -dev, -red, -absent, -dev-absent; your own by "
-            f"its file, or with the file in {own.VARIABLE})",
+            "suites.suite: suite (a benchmark also with -dev, -red, -absent, -dev-absent; your own "
+            f"by its file, or with the file in {own.VARIABLE})",
             name,
             SUITES,
         )
@@ -73,7 +73,7 @@ def is_listed(name: str) -> bool:
 
 def open_file(path: Path) -> Suite:
     """Make the suite known that a Python file of the user's own defines. Raises: BadSuite."""
-    return own.open_file(path, taken=SUITES)
+    return own.open_file(path, taken=SUITES, endings=(ABSENT, RED, development.SUFFIX))
 
 
 def has_list(name: str) -> bool:

@@ -6,6 +6,7 @@ paths with the system's separator between them. It is executed: open only your o
 
 import hashlib
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable
 from importlib.util import module_from_spec, spec_from_file_location
@@ -22,6 +23,7 @@ from vap_core.simulation.suites.suite import Suite
 from vap_core.simulation.types import EpisodeRow
 
 VARIABLE = "VAP_SUITES"
+NAME = re.compile(r"[\w-]+")
 
 
 @value
@@ -51,10 +53,11 @@ def find(name: str) -> OwnSuite | None:
     return OPENED.get(name)
 
 
-def open_file(path: Path, taken: Iterable[str] = ()) -> Suite:
+def open_file(path: Path, taken: Iterable[str] = (), endings: tuple[str, ...] = ()) -> Suite:
     """Execute a file, check its suite and list, and make the suite known by its name.
 
-    The same file is executed once in a process. Names in `taken` are other suites'.
+    The same file is executed once in a process. Names in `taken` are other suites', names with one
+    of the `endings` their variants'.
     Raises: BadSuite, which names the file and what is wrong in it.
     """
     file = path.resolve()
@@ -71,6 +74,11 @@ def open_file(path: Path, taken: Iterable[str] = ()) -> Suite:
         )
     if suite.name in taken or suite.name in OPENED:
         raise BadSuite(f"suites: {path}: there is another suite {suite.name!r}; rename this one.")
+    if not NAME.fullmatch(suite.name) or suite.name.endswith(endings):
+        raise BadSuite(
+            f"suites: {path}: the name {suite.name!r} will not do; take letters, digits and "
+            f"hyphens, and none of the endings {', '.join(endings)}."
+        )
     rows = _checked_rows(suite, make_rows, path)
     OPENED[suite.name] = OwnSuite(suite, rows, _digest(rows), file)
     return suite
