@@ -18,6 +18,7 @@ from vap_core.analysis.ablations import (
     rates_of_arms_figure,
     sweep_figure,
 )
+from vap_core.analysis.agreements import gate_figure, gated_cases
 from vap_core.attend import Prompting
 from vap_core.base.types import Camera
 from vap_core.evaluation import hiding, paper
@@ -309,3 +310,22 @@ def test_figures_of_published_ablations() -> None:
     assert cases_text(results["rewrite"]).splitlines()[0].split() == (
         "vap SR 90 % [60, 98], Case 1 1 of 10, Case 2 0 of 10".split()
     )
+
+
+def test_views_agree_only_where_the_margin_is_large_enough() -> None:
+    rows = []
+    for episode, (alone, joint, margin) in enumerate(
+        [("case 2", "right", 2.0), ("case 2", "case 1", 0.5), ("right", "right", 0.1),
+         ("case 1", "case 1", np.nan)]
+    ):  # fmt: skip
+        for way, case in (("off", alone), ("geometry", joint)):
+            rows.append({"suite": "s", "task": "t", "episode": episode, "associate": way,
+                         "case": case, "margin": margin if way != "off" else np.nan})  # fmt: skip
+    cases = gated_cases(pd.DataFrame(rows), "geometry", [0.0, 1.0, np.inf])
+    assert cases[["right", "case 1", "case 2"]].to_numpy().tolist() == [
+        [2, 2, 0],
+        [2, 1, 1],
+        [1, 1, 2],
+    ]
+    (part,) = gate_figure(pd.DataFrame(rows), "geometry").axes
+    assert part.get_title() == "s, n 4"
