@@ -1,11 +1,12 @@
 """Other forms of a prompt than the method's tint (P tab:ablation_prompt), each a few lines.
 
-A form is called with the picture, the target's mask, the colour, and the masks of what else is
-followed; it returns a marked copy. `prompt.PromptForm` is the protocol.
+A form is called with the picture, the target's mask, the colour, and the masks of the other
+candidates where it marks them; it returns a marked copy. `prompt.PromptForm` is the protocol.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -102,6 +103,8 @@ class Arrow:
 @dataclass(frozen=True)
 class NumberedMarker:
     """A numbered disc on every object that is followed; 1, in the colour, is the target's."""
+
+    marks_others: ClassVar[bool] = True
 
     def __call__(self, rgb: Rgb, mask: Mask, colour: Colour, others: Sequence[Mask]) -> Rgb:
         out = rgb.copy()
