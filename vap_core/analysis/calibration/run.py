@@ -53,7 +53,7 @@ def calibrate(
 
 def refuse_keep(stack_name: str) -> None:
     """Raises: BadOutput for a stack that ships thresholds."""
-    if stack_name not in KINDS:
+    if stack_name not in KINDS and ":" not in stack_name:
         raise BadOutput(
             f"calibrate: the stack {stack_name} ships its thresholds, so that results stay "
             "comparable; leave --keep out, or change them in vap_core/perception/stacks.py."
