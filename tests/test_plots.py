@@ -143,7 +143,9 @@ def test_results_show_every_rate_and_put_bounds_last() -> None:
             result("vap", sr=0.75),
         ]
     )
-    panel = suites_figure(lines, title="a finding").axes[0]
+    figure = suites_figure(lines, title="a finding")
+    assert figure.get_suptitle() == "a finding"
+    panel = figure.axes[0]
     assert [label.get_text() for label in panel.get_yticklabels()] == [
         "generic",
         "vap",

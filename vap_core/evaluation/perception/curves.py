@@ -145,7 +145,7 @@ def references_figure(choices: "pd.DataFrame") -> "Figure":
         n_views = len(rows) // (len(KS) * len(RULES))
         axes.set(title=f"{suite}\n{n_views} views", xlabel="reference photos")
         axes.set(xticks=KS)
-        axes.set_ylim(bottom=0)
+    panels[0].set_ylim(bottom=0)
     panels[0].set_ylabel("% wrong instance")
     panels[0].legend(frameon=False, loc="upper left")
     return figure

@@ -39,8 +39,8 @@ def suites_figure(results: "pd.DataFrame", title: str = "") -> "Figure":
         for i, method in enumerate(methods):
             for line in shown[shown["method"] == method].itertuples():
                 _draw_rate(axes, i, line, colour=marks[method][0], marker=marks[method][1])
-        title = f"{suite}\n{split}" if split else f"{suite}\n"
-        axes.set_title(f"{title}\nn = {shown['n'].max()} a method", fontsize=9)
+        track = f"{suite}\n{split}" if split else f"{suite}\n"
+        axes.set_title(f"{track}\nn = {shown['n'].max()} a method", fontsize=9)
         if 0 < len(bounds) < len(methods):
             axes.axhline(len(methods) - len(bounds) - 0.5, color=FRAME, linewidth=0.8)
         axes.set(xlim=(-3, 118), xticks=(0, 50, 100))
