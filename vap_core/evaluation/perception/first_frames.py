@@ -32,13 +32,14 @@ from vap_core.memory import register
 from vap_core.perception.boxes import box_iou, crop, mask_box, mask_iou
 from vap_core.perception.candidates import Proposals, propose
 from vap_core.perception.protocols import Stack
+from vap_core.proof import nominate
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.phrases import AMBIGUOUS, UNSEEN
 from vap_core.simulation.env import Env
 from vap_core.simulation.studio import reference_views
 from vap_core.simulation.suites.open_row import build_scene, make_env
 from vap_core.simulation.types import EpisodeRow
-from vap_core.vote import VoteRule, compare, election_scores, shortlist, similarity, vote
+from vap_core.vote import VoteRule, compare, election_scores, similarity, vote
 
 VISIBLE_PX = 100
 """Visible pixels, of a view of 224 x 224, from which on an object counts."""
@@ -379,9 +380,9 @@ def _choices(
     target_ious: dict[tuple[float, ...], float] = {}
     rows = []
     for k, personal in memory.items():
-        few = shortlist(candidates, compare(personal, candidates, stack))
+        few = nominate(view.rgb, personal, candidates, stack)
         cosine = compare(personal, few, stack)
-        like = likeness(cosine, few.boxes.familiar)
+        like = likeness(cosine, few.boxes)
         true_cosine = similarity(true_embeddings, personal.embeddings)
         for rule in RULES:
             ballot = vote(election_scores(cosine, few.boxes), rule)
