@@ -71,7 +71,8 @@ def refine(
     cv2.setRNGSeed(0)  # GrabCut's clusters start at random
     bgr = np.ascontiguousarray(part[..., ::-1])
     models = np.zeros((2, 1, 65))
-    cv2.grabCut(bgr, labels, None, models[0], models[1], ITERATIONS, cv2.GC_INIT_WITH_MASK)
+    nowhere = (0, 0, 1, 1)  # not read where labels are given
+    cv2.grabCut(bgr, labels, nowhere, models[0], models[1], ITERATIONS, cv2.GC_INIT_WITH_MASK)
     inside = (labels & 1).astype(np.float32)
     if inside.sum() < LEAST_SHARE * np.prod(corners[1] - corners[0]):
         return None
