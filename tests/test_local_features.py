@@ -13,8 +13,8 @@ from vap_core.base.types import Boxes
 from vap_core.memory import remember
 from vap_core.perception.embedded import local_features
 from vap_core.perception.embedded.local_features import count_verified, find_points, is_view
+from vap_core.perception.proof import CERTAIN, GAIN, is_printed, proof
 from vap_core.perception.protocols import Thresholds, Verifier
-from vap_core.proof import CERTAIN, GAIN, is_printed, proof
 
 RED, BLUE = (150, 40, 40), (40, 40, 150)
 

@@ -54,8 +54,7 @@ from vap_core.perception.candidates import (
 )
 from vap_core.perception.protocols import FamiliarityJudge, Stack, TargetTracker
 from vap_core.prompt import PALETTE, PromptForm, Tint, choose_colours
-from vap_core.proof import nominate
-from vap_core.vote import VoteRule, compare, election_scores, vote
+from vap_core.vote import VoteRule, compare, election_scores, nominate, vote
 
 PerTarget = tuple[Grounding, ...]
 """One grounding per target of the instruction, in the order of its targets."""

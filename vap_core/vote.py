@@ -6,10 +6,11 @@ import numpy as np
 from jaxtyping import Float32
 
 from vap_core.base.errors import BadEncoder
-from vap_core.base.types import Ballot, Boxes, PersonalObject
+from vap_core.base.types import Ballot, Boxes, PersonalObject, Rgb
 from vap_core.memory import reference_rows
 from vap_core.perception.boxes import box_cover
 from vap_core.perception.candidates import Candidates, Proposals
+from vap_core.perception.proof import MOST_COMPARED, prove
 from vap_core.perception.protocols import Stack
 
 VoteRule = Literal["vote", "average", "best"]
@@ -56,6 +57,18 @@ def election_scores(cosine: Float32[np.ndarray, "n k"], boxes: Boxes) -> Float32
         if of_boxes is not None:
             evidence += of_boxes
     return cosine + (evidence - evidence.max(initial=-np.inf))[:, None]
+
+
+def nominate(rgb: Rgb, obj: PersonalObject, offered: Proposals, stack: Stack) -> Proposals:
+    """The candidates for an object among the proposals of a view.
+
+    Where the stack has a verifier, crops of unfamiliar views are compared point by point first.
+    """
+    cosine = compare(obj, offered, stack)
+    if stack.verifier is None or offered.boxes.familiar:
+        return shortlist(offered, cosine)
+    few = prove(rgb, obj, shortlist(offered, cosine, most=MOST_COMPARED), stack.verifier)
+    return shortlist(few, compare(obj, few, stack))
 
 
 def shortlist(

@@ -18,14 +18,13 @@ from vap_core.evaluation.perception.first_frames import (
 )
 from vap_core.perception.candidates import Proposals, propose
 from vap_core.perception.protocols import Stack
-from vap_core.proof import nominate
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.phrases import AMBIGUOUS
 from vap_core.simulation.suites import BENCHMARKS, suite
 from vap_core.simulation.types import EpisodeRow
 from vap_core.training.films.demonstrations import draw_objects, row
 from vap_core.training.recipe import filmed_tasks
-from vap_core.vote import compare, election_scores, vote
+from vap_core.vote import compare, election_scores, nominate, vote
 
 Case = Literal["present", "look-alikes", "absent"]
 """The object is in view; it is not, but others of its kind are; nothing of its kind is."""

@@ -20,8 +20,7 @@ from vap_core.evaluation.perception.first_frames import (
 )
 from vap_core.perception.candidates import Proposals
 from vap_core.perception.protocols import Stack
-from vap_core.proof import nominate
-from vap_core.vote import compare, election_scores, vote
+from vap_core.vote import compare, election_scores, nominate, vote
 
 OFF = "off"
 """Views grounded one by one, as the paper does."""

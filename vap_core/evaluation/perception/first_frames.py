@@ -32,14 +32,13 @@ from vap_core.memory import register
 from vap_core.perception.boxes import box_iou, crop, mask_box, mask_iou
 from vap_core.perception.candidates import Proposals, propose
 from vap_core.perception.protocols import Stack
-from vap_core.proof import nominate
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.phrases import AMBIGUOUS, UNSEEN
 from vap_core.simulation.env import Env
 from vap_core.simulation.studio import reference_views
 from vap_core.simulation.suites.open_row import build_scene, make_env
 from vap_core.simulation.types import EpisodeRow
-from vap_core.vote import VoteRule, compare, election_scores, similarity, vote
+from vap_core.vote import VoteRule, compare, election_scores, nominate, similarity, vote
 
 VISIBLE_PX = 100
 """Visible pixels, of a view of 224 x 224, from which on an object counts."""

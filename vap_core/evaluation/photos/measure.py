@@ -19,8 +19,8 @@ from vap_core.base.types import Boxes, Grounding, PersonalObject, Rgb
 from vap_core.evaluation.photos.folder import PhotoSet, Scene
 from vap_core.perception.boxes import box_iou
 from vap_core.perception.candidates import Candidates, Proposals, embed, segment
+from vap_core.perception.proof import prove
 from vap_core.perception.protocols import FamiliarityJudge, Stack
-from vap_core.proof import prove
 
 CAMERA = "photo"
 Row = dict[str, Any]

@@ -15,8 +15,7 @@ from jaxtyping import Bool, Float32, Int64
 from vap_core.base.types import PersonalObject, Rgb
 from vap_core.perception.boxes import crop
 from vap_core.perception.candidates import Proposals
-from vap_core.perception.protocols import Stack, Verifier
-from vap_core.vote import compare, shortlist
+from vap_core.perception.protocols import Verifier
 
 CERTAIN = 16
 """Verified points from which on a crop and a reference show the same print: an accident
@@ -28,15 +27,6 @@ LEAST_PX = 64
 """The longer side of a box from which on its points are looked for."""
 MOST_COMPARED = 8
 """Proposals of a view that are compared, the best by cosine."""
-
-
-def nominate(rgb: Rgb, obj: PersonalObject, offered: Proposals, stack: Stack) -> Proposals:
-    """The candidates for an object among the proposals of a view, with their proofs if compared."""
-    cosine = compare(obj, offered, stack)
-    if stack.verifier is None or offered.boxes.familiar:
-        return shortlist(offered, cosine)
-    few = prove(rgb, obj, shortlist(offered, cosine, most=MOST_COMPARED), stack.verifier)
-    return shortlist(few, compare(obj, few, stack))
 
 
 def prove(rgb: Rgb, obj: PersonalObject, proposals: Proposals, verifier: Verifier) -> Proposals:
