@@ -13,7 +13,7 @@ from vap_core.base.types import Boxes
 from vap_core.memory import remember
 from vap_core.perception.embedded import local_features
 from vap_core.perception.embedded.local_features import count_verified, find_points, is_view
-from vap_core.perception.proof import CERTAIN, GAIN, is_printed, proof
+from vap_core.perception.proof import CERTAIN, GAIN, OF_USUAL, proof, usual_points
 from vap_core.perception.protocols import Thresholds, Verifier
 
 RED, BLUE = (150, 40, 40), (40, 40, 150)
@@ -87,17 +87,19 @@ def test_the_verifier_keeps_its_protocol_and_the_latest_points(monkeypatch):
 def test_what_points_say():
     verified = np.array([0, CERTAIN // 2, CERTAIN, 9 * CERTAIN, 0])
     compared = np.array([True, True, True, True, False])
-    assert proof(verified, compared, True) == pytest.approx([-GAIN, 0, GAIN, GAIN, 0])
-    assert proof(verified, compared, False) == pytest.approx([0, GAIN / 2, GAIN, GAIN, 0])
+    assert proof(verified, compared, CERTAIN) == pytest.approx([-GAIN, 0, GAIN, GAIN, 0])
+    assert proof(verified, compared, 0.0) == pytest.approx([0, GAIN / 2, GAIN, GAIN, 0])
+    many = 2 * CERTAIN / OF_USUAL
+    assert proof(verified, compared, many) == pytest.approx([-GAIN, -GAIN / 2, 0, GAIN, 0])
 
 
-def test_an_object_is_printed_where_its_references_agree():
+def test_the_usual_points_are_those_of_references_of_one_print():
     verify = local_features.PointVerifier()
     same = [print_of(0), turned(print_of(0)), turned(print_of(0), 40)]
-    assert is_printed(remember("a", "box", same, MeanColour()), verify)
+    assert usual_points(remember("a", "box", same, MeanColour()), verify) >= 2 * CERTAIN
     several = [print_of(i) for i in range(3)]
-    assert not is_printed(remember("b", "box", several, MeanColour()), verify)
-    assert not is_printed(remember("c", "box", same[:1], MeanColour()), verify)
+    assert usual_points(remember("b", "box", several, MeanColour()), verify) < CERTAIN
+    assert usual_points(remember("c", "box", same[:1], MeanColour()), verify) == 0
 
 
 def counts_red(crops, references):

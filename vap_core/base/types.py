@@ -56,12 +56,14 @@ class Boxes:
 
     def take(self, rows: Int64[np.ndarray, " m"]) -> "Boxes":
         """These boxes, in this order."""
-        changed: dict[str, np.ndarray] = {}
-        for name in ("xyxy", "score", "prior", "verified", "proof"):
-            values = getattr(self, name)
-            if values is not None:
-                changed[name] = values[rows]
-        return replace(self, **changed)
+        return replace(
+            self,
+            xyxy=self.xyxy[rows],
+            score=self.score[rows],
+            prior=None if self.prior is None else self.prior[rows],
+            verified=None if self.verified is None else self.verified[rows],
+            proof=None if self.proof is None else self.proof[rows],
+        )
 
     @staticmethod
     def empty(phrase: str) -> "Boxes":
