@@ -40,7 +40,8 @@ def prove(rgb: Rgb, obj: PersonalObject, proposals: Proposals, verifier: Verifie
     verified = np.zeros(len(boxes), np.int64)
     crops = [crop(rgb, box) for box in boxes.xyxy[large]]
     verified[large] = verifier(crops, obj.crops).max(axis=1, initial=0)
-    found = proof(verified, large, usual_points(obj, verifier))
+    usual = usual_points(obj, verifier)  # type: ignore[arg-type]  # verifiers are hashable
+    found = proof(verified, large, usual)
     return replace(proposals, boxes=replace(boxes, verified=verified, proof=found))
 
 

@@ -6,6 +6,8 @@ from functools import partial
 
 from vap_core.base.device import check_device
 from vap_core.base.errors import one_of
+from vap_core.perception.foundation.sources import EMBEDDED, parts_of
+from vap_core.perception.foundation.sources import mixed as mixed
 from vap_core.perception.protocols import Stack, Thresholds
 
 EMBEDDED_THRESHOLDS = Thresholds(familiar=0.53, unfamiliar=0.54)
@@ -73,11 +75,43 @@ def load_own(name: str) -> Stack:
 
 
 def load_stack(name: str) -> Stack:
-    """The stack of that name; loading its weights takes about a second.
+    """The stack of that name, or a mixed one (`mixed`); loading its weights takes about a second.
 
     Raises: UnknownName: no such stack, or `VAP_DEVICE` names no device of this machine.
     """
-    if name not in STACKS:
-        raise one_of("load_stack: stack", name, STACKS)
+    check_stack(name)
     check_device()
+    if ":" in name:
+        return load_mixed(name)
     return STACKS[name]()
+
+
+def check_stack(name: str, what: str = "load_stack") -> None:
+    """Raises: UnknownName: neither a stack nor a mixed one."""
+    if ":" in name:
+        parts_of(name)
+    elif name not in STACKS:
+        raise one_of(f"{what}: stack", name, STACKS)
+
+
+def load_mixed(name: str) -> Stack:
+    """A stack of parts of several; loads those alone that it has.
+
+    A threshold belongs to a detector and an encoder together: there is one where both are the
+    embedded stack's, or where `calibrate --keep` has measured this very mixture.
+
+    Raises: UnknownName, MissingPart, MissingWeights, BadOutput.
+    """
+    from vap_core.perception import foundation
+
+    parts = parts_of(name)
+    if not set(parts.values()) - {EMBEDDED}:
+        return load_embedded()
+    loaded = foundation.load_parts(name)
+    if EMBEDDED in parts.values():
+        stack = replace(load_embedded(), name=name, **loaded)
+    else:
+        stack = Stack(name=name, **loaded)
+    if parts["detector"] == parts["encoder"] == EMBEDDED:
+        return stack
+    return replace(stack, thresholds=foundation.kept_thresholds(name, stack.encoder.name))

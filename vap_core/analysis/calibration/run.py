@@ -57,9 +57,14 @@ def calibrate(
     return f"{report}\n\nwrote {out / 'report.txt'} and {out / 'answers.csv'}", chosen
 
 
+def ships_thresholds(stack_name: str) -> bool:
+    """Whether a stack has thresholds without a measurement on this machine."""
+    return stack_name not in KINDS and ":" not in stack_name
+
+
 def refuse_keep(stack_name: str, photos: Sequence[Path] = ()) -> None:
     """Raises: BadOutput for a stack that ships thresholds, unless there are own photos."""
-    if stack_name not in KINDS and not photos:
+    if ships_thresholds(stack_name) and not photos:
         raise BadOutput(
             f"calibrate: the stack {stack_name} ships its thresholds, so that results stay "
             "comparable; name photos of your own with --photos to keep a threshold for photos, or "
@@ -76,7 +81,7 @@ def keep_choice(stack_name: str, chosen: Choice) -> Path:
     """
     stack = load_stack(stack_name)
     thresholds = chosen.thresholds(stack)
-    if stack_name not in KINDS and stack.thresholds is not None:
+    if ships_thresholds(stack_name) and stack.thresholds is not None:
         thresholds = None
         if chosen.unfamiliar is not None:
             thresholds = replace(stack.thresholds, unfamiliar=chosen.unfamiliar)

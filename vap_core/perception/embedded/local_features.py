@@ -102,12 +102,11 @@ def find_points(rgb: Rgb) -> Points:
     small = cv2.resize(rgb, size, interpolation=how)
     grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
     found, sift = _detector().detectAndCompute(grey, None)
-    xy = np.zeros((0, 2), np.float32)
-    root = np.zeros((0, 128), np.float32)
-    if found:
-        xy = np.array([point.pt for point in found], np.float32)[:MOST_POINTS]
-        length = np.maximum(sift.sum(axis=1, keepdims=True), 1e-6)
-        root = np.sqrt(sift / length).astype(np.float32)[:MOST_POINTS]
+    if not found:
+        sift = np.zeros((0, 128), np.float32)
+    xy = np.array([point.pt for point in found], np.float32).reshape(-1, 2)[:MOST_POINTS]
+    length = np.maximum(sift.sum(axis=1, keepdims=True), 1e-6)
+    root = np.sqrt(sift / length).astype(np.float32)[:MOST_POINTS]
     return Points(xy, root, _chroma(small))
 
 
