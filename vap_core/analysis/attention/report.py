@@ -1,11 +1,18 @@
 """The measures of a replay as tables of text and numbers."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from vap_core.analysis.attention.measures import REGIONS
-from vap_core.analysis.attention.patterns import LOCALISATIONS, per_episode, with_localisation
+from vap_core.analysis.attention import intervals
+from vap_core.analysis.attention.measures import LOOKALIKES, REGIONS, TARGET
+from vap_core.analysis.attention.patterns import (
+    LOCALISATIONS,
+    over_views,
+    per_episode,
+    with_localisation,
+)
 from vap_core.analysis.attention.prediction import predict_success
 from vap_core.base.tables import align
+from vap_core.evaluation.perception.estimates import share
 from vap_core.evaluation.store import KEY
 
 if TYPE_CHECKING:
@@ -13,6 +20,8 @@ if TYPE_CHECKING:
 
 MEASURES = ("lift", "on_target", "on_rival", "drift", "switches", "entropy")
 """The measures of an episode whose relation to success is reported."""
+INTERVALS = ("lift", "lift_lookalikes", "on_target", "on_rival")
+"""The measures of `where_queries_look` that get an interval, over layouts."""
 
 
 def text(tables: "dict[str, pd.DataFrame]") -> str:
@@ -24,7 +33,7 @@ def text(tables: "dict[str, pd.DataFrame]") -> str:
     parts = [
         f"{len(episodes)} episodes run again, {again} of them end as in the run; before the first "
         "touch:",
-        align(_rows(where_queries_look(table))),
+        align(_rows(where_text(where_queries_look(table)))),
         "the word that means the target, over whole episodes:",
         align(_rows(pattern_counts(with_localisation(whole)))),
     ]
@@ -36,27 +45,86 @@ def text(tables: "dict[str, pd.DataFrame]") -> str:
 
 
 def auc_table(table: "pd.DataFrame") -> "pd.DataFrame":
-    """How well each measure tells successes from failures, a row per suite and method."""
+    """How well each measure tells successes from failures, a row per suite and method.
+
+    The last rows are of all suites together, where pairs of one suite are compared.
+    """
     import pandas as pd
 
-    rows = {}
+    parts = []
     for (suite, method), group in table.groupby(["suite", "method"], observed=True, sort=False):
-        areas = predict_success(group, MEASURES)
+        parts.append((f"{suite}, {method}", group))
+    if table["suite"].nunique() > 1:
+        for method, group in table.groupby("method", observed=True, sort=False):
+            parts.append((f"all suites, {method}", group))
+    rows = {}
+    for name, group in parts:
         row = {"n": str(len(group)), "successes": str(int(group["success"].sum()))}
-        for name, area in areas.items():
-            row[name] = f"{area.value:.2f} [{area.low:.2f}, {area.high:.2f}]"
-        rows[f"{suite}, {method}"] = row
+        for measure, area in predict_success(group, MEASURES).items():
+            row[measure] = f"{area.value:.2f} [{area.low:.2f}, {area.high:.2f}]"
+        rows[name] = row
     return pd.DataFrame(rows).T.rename_axis("suite, method")
 
 
 def where_queries_look(table: "pd.DataFrame") -> "pd.DataFrame":
-    """Means over episodes, by suite, method and query; `table` is `per_episode`'s."""
-    names = ["share", "chance", "lift", "lift_lookalikes", "on_target", "chance_hit", "on_rival"]
-    names += ["drift", "entropy"]
-    groups = table.groupby(["suite", "method", "query"], observed=True, sort=False)
-    means = groups[names].mean().round(2)
-    means.insert(0, "n", groups.size())
-    return means.reset_index()
+    """Means over episodes, by suite, method and query; `table` is `per_episode`'s.
+
+    Measures of INTERVALS have their 95 % interval beside them, as NAME_low and NAME_high.
+    """
+    import pandas as pd
+
+    rows = []
+    keys = ["suite", "method", "query"]
+    for key, group in table.groupby(keys, observed=True, sort=False):
+        row: dict[str, Any] = dict(zip(keys, key, strict=True))
+        row["n"] = len(group)
+        for name in ("chance", "chance_hit", "drift", "entropy"):
+            row[name] = group[name].mean()
+        for name in INTERVALS:
+            found = intervals.mean(group[name].to_numpy(float), list(group["layout"]))
+            row |= {name: found.value, f"{name}_low": found.low, f"{name}_high": found.high}
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def where_text(table: "pd.DataFrame") -> "pd.DataFrame":
+    """The rows of `where_queries_look` with two digits, and intervals in brackets."""
+    shown = table[["suite", "method", "query", "n"]].copy()
+    for name in INTERVALS:
+        cells = []
+        for row in table.to_dict("records"):
+            cells.append(f"{row[name]:.2f} [{row[f'{name}_low']:.2f}, {row[f'{name}_high']:.2f}]")
+        shown[name] = cells
+    for name in ("chance_hit", "drift", "entropy"):
+        shown[name] = table[name].map("{:.2f}".format)
+    return shown
+
+
+def first_look(calls: "pd.DataFrame", episodes: "pd.DataFrame") -> "pd.DataFrame":
+    """Whether the first call looks at the target rather than its look-alikes, and what follows.
+
+    By suite, method and query: `looks` is the share of episodes whose first call is denser on the
+    target than on its look-alikes; `then_touches` is how often the target is the first thing
+    touched after such a look, and `else_touches` how often it is after another. All `Estimate`s.
+    """
+    import pandas as pd
+
+    merged = over_views(calls)
+    merged = merged[merged[f"chance_{TARGET}"] > 0]
+    order = merged.sort_values("step").groupby([*KEY, "query"], observed=True, sort=False)
+    first = order.head(1).merge(episodes, on=KEY)
+    density = first[f"share_{TARGET}"] / first[f"chance_{TARGET}"]
+    rival = first[f"share_{LOOKALIKES}"] / first[f"chance_{LOOKALIKES}"].clip(lower=1e-9)
+    first = first.assign(looks=density > rival, touches=first["touched"].astype(str) == TARGET)
+    rows = []
+    keys = ["suite", "method", "query"]
+    for key, group in first.groupby(keys, observed=True, sort=False):
+        row: dict[str, Any] = dict(zip(keys, key, strict=True))
+        row["looks"] = share(group["looks"])
+        row["then_touches"] = share(group.loc[group["looks"], "touches"])
+        row["else_touches"] = share(group.loc[~group["looks"], "touches"])
+        rows.append(row)
+    return pd.DataFrame(rows)
 
 
 def pattern_counts(table: "pd.DataFrame") -> "pd.DataFrame":
