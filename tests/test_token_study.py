@@ -70,8 +70,9 @@ def tiny(
 
     def scenes(suite: str, task: str) -> tuple[Scene, ...]:
         """Two episodes of noise in place of rendered views."""
-        target = experiments.suites.rows(suite, task, 1)[0].target
-        names = (target, f"{target}-lookalike-1")
+        rows = experiments.suites.rows(suite, task)
+        target = rows[0].target
+        names = (target, teach_token.lookalikes(rows)[0])
         rng = np.random.default_rng(0)
         crops = {
             name: tuple(rng.integers(0, 256, (2, 32, 32, 3)).astype(np.uint8)) for name in names
@@ -187,7 +188,7 @@ def test_the_study_measures_every_token_and_goes_on(
     scored = tables["choices"]
     assert set(scored.episode) == {0, 1}
     assert set(scored.read_by) == {"vlm", "policy"}
-    assert (scored.groupby(["read_by", "episode"]).size() == 2).all()
+    assert (scored.groupby(["read_by", "seen_in", "episode"]).size() == 2).all()
     widths = {len(embedding) for embedding in tables["embeddings"].embedding}
     assert widths == {16}
     learned = tables["embeddings"].set_index("learned_in").embedding
@@ -217,6 +218,7 @@ def test_the_study_measures_every_token_and_goes_on(
     with pytest.raises(BadOutput):
         study.run(Tokens((SUITE,), (5,), epochs=1), tmp_path / "run", progress=False)
     assert "learned in the policy" in report.report(tables)
+    assert "the model chooses the target" in report.report(tables)
 
 
 def test_the_usual_number_of_photos_comes_first_and_once_in_the_policy() -> None:
@@ -273,6 +275,18 @@ def test_a_crop_shows_the_object_as_a_photo_does() -> None:
     assert choices.photo_crop(rgb, np.zeros_like(mask)) is None
 
 
+def test_photos_take_the_place_of_crops() -> None:
+    rng = np.random.default_rng(0)
+    crops = {"cup": tuple(rng.integers(0, 256, (2, 4, 4, 3)).astype(np.uint8))}
+    scenes = [Scene(episode=episode, target="cup", crops=crops) for episode in (3, 7)]
+    photos = {"cup": tuple(rng.integers(0, 256, (3, 4, 4, 3)).astype(np.uint8)), OTHER: ()}
+    found = choices.in_photos(scenes, photos)
+    assert [scene.episode for scene in found] == [3, 7]
+    for scene, taken in zip(found, ((0, 1), (2, 0)), strict=True):
+        for picture, i in zip(scene.crops["cup"], taken, strict=True):
+            assert np.array_equal(picture, photos["cup"][i])
+
+
 def test_the_highest_score_is_the_choice() -> None:
     lines = []
     for episode, scores in enumerate([(2.0, 1.0, 0.0), (-1.0, -0.5, -3.0)]):
@@ -283,15 +297,21 @@ def test_the_highest_score_is_the_choice() -> None:
     found = choices.chosen(table)
     assert list(found.right) == [True, False, False]
     assert list(found.chance) == pytest.approx([1 / 3, 1 / 3, 0])
+    even = choices.chosen(table.assign(score=1.0))
+    assert not even.right.any(), "a tie is no choice"
     rows = [("s", "t", i, m, i == 0) for i in range(3) for m in ("soft", "generic")]
     columns = ["suite", "task", "episode", "method", "first_object_correct"]
-    beside = choices.beside_policy(found, pd.DataFrame(rows, columns=columns), ["soft", "generic"])
+    both = pd.concat([table.assign(seen_in="scene"), table.assign(seen_in="photo", score=1.0)])
+    beside = choices.beside_policy(both, pd.DataFrame(rows, columns=columns), ["soft", "generic"])
     line = beside.loc["s"]
-    assert (line[choices.MODEL].value, line[choices.MODEL].n) == (pytest.approx(1 / 3), 3)
-    assert line["soft"].value == pytest.approx(1 / 3)
-    after = (line["soft, after a right choice"], line["soft, after a wrong one"])
+    assert (line[choices.IN_SCENE].value, line[choices.IN_SCENE].n) == (pytest.approx(1 / 3), 3)
+    assert (line[choices.IN_PHOTOS].value, line["soft"].value) == (0, pytest.approx(1 / 3))
+    after = (line[choices.AFTER_RIGHT], line[choices.AFTER_WRONG])
     assert [(each.value, each.n) for each in after] == [(1, 1), (0, 2)]
-    assert list(beside.index) == ["s", "all suites"]
+    assert list(beside.index) == ["s"]
+    cost = choices.cost_of_scene(both)
+    assert (cost.value, cost.n) == (pytest.approx(-1 / 3), 3)
+    assert cost.low <= cost.value <= cost.high
 
 
 def test_the_report_compares_the_shipped_policies_beside_the_paper() -> None:

@@ -1,5 +1,6 @@
 """The measures of a replay as tables of text and numbers."""
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from vap_core.analysis.attention import intervals
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 MEASURES = ("lift", "on_target", "on_rival", "drift", "switches", "entropy")
 """The measures of an episode whose relation to success is reported."""
+ALL_SUITES = "all suites"
 INTERVALS = ("lift", "lift_lookalikes", "on_target", "on_rival")
 """The measures of `where_queries_look` that get an interval, over layouts."""
 
@@ -47,41 +49,36 @@ def text(tables: "dict[str, pd.DataFrame]") -> str:
 def auc_table(table: "pd.DataFrame") -> "pd.DataFrame":
     """How well each measure tells successes from failures, a row per suite and method.
 
-    The last rows are of all suites together, where pairs of one suite are compared.
+    In the rows of ALL_SUITES pairs of one suite are compared.
     """
     import pandas as pd
 
-    parts = []
-    for (suite, method), group in table.groupby(["suite", "method"], observed=True, sort=False):
-        parts.append((f"{suite}, {method}", group))
-    if table["suite"].nunique() > 1:
-        for method, group in table.groupby("method", observed=True, sort=False):
-            parts.append((f"all suites, {method}", group))
     rows = {}
-    for name, group in parts:
+    for (suite, method), group in _groups(table, ["method"]):
         row = {"n": str(len(group)), "successes": str(int(group["success"].sum()))}
         for measure, area in predict_success(group, MEASURES).items():
             row[measure] = f"{area.value:.2f} [{area.low:.2f}, {area.high:.2f}]"
-        rows[name] = row
+        rows[f"{suite}, {method}"] = row
     return pd.DataFrame(rows).T.rename_axis("suite, method")
 
 
 def where_queries_look(table: "pd.DataFrame") -> "pd.DataFrame":
-    """Means over episodes, by suite, method and query; `table` is `per_episode`'s.
+    """Means over episodes, by suite (and ALL_SUITES), method and query of `per_episode`'s table.
 
     Measures of INTERVALS have their 95 % interval beside them, as NAME_low and NAME_high.
     """
     import pandas as pd
 
     rows = []
-    keys = ["suite", "method", "query"]
-    for key, group in table.groupby(keys, observed=True, sort=False):
-        row: dict[str, Any] = dict(zip(keys, key, strict=True))
+    for key, group in _groups(table, ["method", "query"]):
+        row: dict[str, Any] = dict(zip(["suite", "method", "query"], key, strict=True))
         row["n"] = len(group)
         for name in ("chance", "chance_hit", "drift", "entropy"):
             row[name] = group[name].mean()
         for name in INTERVALS:
-            found = intervals.mean(group[name].to_numpy(float), list(group["layout"]))
+            found = intervals.mean(
+                group[name].to_numpy(float), list(group["layout"]), list(group["suite"])
+            )
             row |= {name: found.value, f"{name}_low": found.low, f"{name}_high": found.high}
         rows.append(row)
     return pd.DataFrame(rows)
@@ -103,9 +100,10 @@ def where_text(table: "pd.DataFrame") -> "pd.DataFrame":
 def first_look(calls: "pd.DataFrame", episodes: "pd.DataFrame") -> "pd.DataFrame":
     """Whether the first call looks at the target rather than its look-alikes, and what follows.
 
-    By suite, method and query: `looks` is the share of episodes whose first call is denser on the
-    target than on its look-alikes; `then_touches` is how often the target is the first thing
-    touched after such a look, and `else_touches` how often it is after another. All `Estimate`s.
+    By suite (and ALL_SUITES), method and query: `looks` is the share of episodes whose first call
+    is denser on the target than on its look-alikes; `then_touches` is how often the target is the
+    first thing touched after such a look, and `else_touches` how often it is after another. All are
+    `Estimate`s with Wilson's interval over episodes.
     """
     import pandas as pd
 
@@ -117,9 +115,8 @@ def first_look(calls: "pd.DataFrame", episodes: "pd.DataFrame") -> "pd.DataFrame
     rival = first[f"share_{LOOKALIKES}"] / first[f"chance_{LOOKALIKES}"].clip(lower=1e-9)
     first = first.assign(looks=density > rival, touches=first["touched"].astype(str) == TARGET)
     rows = []
-    keys = ["suite", "method", "query"]
-    for key, group in first.groupby(keys, observed=True, sort=False):
-        row: dict[str, Any] = dict(zip(keys, key, strict=True))
+    for key, group in _groups(first, ["method", "query"]):
+        row: dict[str, Any] = dict(zip(["suite", "method", "query"], key, strict=True))
         row["looks"] = share(group["looks"])
         row["then_touches"] = share(group.loc[group["looks"], "touches"])
         row["else_touches"] = share(group.loc[~group["looks"], "touches"])
@@ -161,6 +158,17 @@ def layer_table(layers: "pd.DataFrame") -> "pd.DataFrame":
         row["best_head"] = (by_head["share_target"] / by_head["chance_target"]).max()
         rows.append(row)
     return pd.DataFrame(rows)
+
+
+def _groups(
+    table: "pd.DataFrame", keys: list[str]
+) -> "Iterator[tuple[tuple[str, ...], pd.DataFrame]]":
+    """The rows by suite and `keys`; where there are several suites, of all together, too."""
+    for key, group in table.groupby(["suite", *keys], observed=True, sort=False):
+        yield tuple(map(str, key)), group
+    if table["suite"].nunique() > 1:
+        for key, group in table.groupby(keys, observed=True, sort=False):
+            yield (ALL_SUITES, *map(str, key)), group
 
 
 def _rows(table: "pd.DataFrame") -> list[list[str]]:

@@ -3,7 +3,8 @@
 Every object of the target's category is cut out by its true mask, as a photo shows it, and the
 model is asked about each alone. The one with the highest answer, the mean over the views that show
 it, is the model's choice. That is its recognition at its best: a policy sees all of them at once,
-small, and has to move there as well.
+small, and has to move there as well. The same choice among unseen photos of the same objects says
+what the change from photo to scene costs.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,6 +19,7 @@ from vap_core.base.types import Mask, Rgb, value
 from vap_core.evaluation.engine import spread_evenly
 from vap_core.evaluation.perception.estimates import Estimate, share
 from vap_core.evaluation.perception.first_frames import opening_views
+from vap_core.evaluation.statistics import bootstrap_interval
 from vap_core.perception.boxes import mask_box
 from vap_core.policies.mini_pi0.learned_token import answers
 from vap_core.simulation import suites
@@ -36,8 +38,13 @@ FILL = 0.55
 """The object's share of a crop's edge, as in a reference photo."""
 KEY = ["suite", "task", "episode"]
 """What names an episode of a list."""
-MODEL = "model, by the token"
-"""The name of the model's choice beside the methods'."""
+SCENE, PHOTO = "scene", "photo"
+"""What the objects are seen in: the column `seen_in`."""
+IN_PHOTOS, IN_SCENE = "model, in photos", "model, in the scene"
+AFTER_RIGHT = "soft, where the model is right"
+AFTER_WRONG = "soft, where it is wrong"
+"""Columns of `beside_policy` beside the methods."""
+ALL_SUITES = "all suites"
 
 
 @value
@@ -83,6 +90,22 @@ def scenes(suite: str, task: str) -> tuple[Scene, ...]:
     return tuple(found)
 
 
+def in_photos(shown: Sequence[Scene], photos: Mapping[str, Sequence[Rgb]]) -> tuple[Scene, ...]:
+    """The same episodes with as many unseen photos of every object in place of its crops.
+
+    What the model chooses there and in the scene differs by what it sees, not by what it is asked.
+    """
+    found = []
+    for i, scene in enumerate(shown):
+        drawn = {}
+        for name, crops in scene.crops.items():
+            of_object = photos[name]
+            first = i * len(crops)
+            drawn[name] = tuple(of_object[(first + j) % len(of_object)] for j in range(len(crops)))
+        found.append(Scene(episode=scene.episode, target=scene.target, crops=drawn))
+    return tuple(found)
+
+
 def scores(
     about: Mapping[str, Any],
     reader: "MiniVlm",
@@ -98,7 +121,7 @@ def scores(
 
 
 def chosen(table: "pd.DataFrame") -> "pd.DataFrame":
-    """One row per episode: whether the highest score is the target's, and chance.
+    """One row per episode: whether the highest score is the target's alone, and chance.
 
     `table` has the rows of `scores` of one reading. Episodes whose target no view shows count as
     wrong.
@@ -107,37 +130,56 @@ def chosen(table: "pd.DataFrame") -> "pd.DataFrame":
 
     rows = []
     for key, group in table.groupby([*KEY, "object"], observed=True, sort=False):
-        best = group.loc[group["score"].idxmax()]
+        is_target = group["shown"] == group["object"]
+        best = group["score"] == group["score"].max()
         line = dict(zip([*KEY, "object"], key, strict=True))
-        line["right"] = best["shown"] == best["object"]
-        line["chance"] = float((group["shown"] == group["object"]).any()) / len(group)
+        line["right"] = bool(best[is_target].any() and best.sum() == 1)
+        line["chance"] = float(is_target.any()) / len(group)
         rows.append(line)
     return pd.DataFrame(rows, columns=[*KEY, "object", "right", "chance"])
 
 
 def beside_policy(
-    choice: "pd.DataFrame", episodes: "pd.DataFrame", methods: Sequence[str]
+    table: "pd.DataFrame", episodes: "pd.DataFrame", methods: Sequence[str]
 ) -> "pd.DataFrame":
-    """The model's choice and what the policy touches first in the same episodes, by suite.
+    """The model's choices, and what a policy touches first in the same episodes, by suite.
 
-    `choice` is `chosen`'s, `episodes` a published table. A row per suite and one for all; shares
-    are `Estimate`s. `after a right choice` and `after a wrong one` are soft's first touches where
-    the model's choice was right, and where it was not.
+    `table` has the rows of `scores` of one reading, of SCENE and of PHOTO; `episodes` are those of
+    a published table, whose methods are columns. A row per suite and, if there are several, one for
+    ALL_SUITES; shares are `Estimate`s. The last two columns are soft's first touches where the
+    model's choice in the scene was right, and where it was not.
     """
     import pandas as pd
 
+    photo = chosen(table[table["seen_in"] == PHOTO])[[*KEY, "right"]]
+    joined = chosen(table[table["seen_in"] == SCENE]).merge(photo, on=KEY, suffixes=("", "_photo"))
     first = episodes.pivot_table(
         index=KEY, columns="method", values="first_object_correct", aggfunc="first", observed=True
     )
-    joined = choice.merge(first.reset_index(), on=KEY)
-    lines = {}
+    joined = joined.merge(first.reset_index(), on=KEY)
     parts = [(str(name), part) for name, part in joined.groupby("suite", sort=False)]
-    for name, part in [*parts, ("all suites", joined)]:
+    if len(parts) > 1:
+        parts.append((ALL_SUITES, joined))
+    lines = {}
+    for name, part in parts:
         line: dict[str, Estimate | float] = {"chance": float(part["chance"].mean())}
-        line[MODEL] = share(part["right"])
+        line[IN_PHOTOS] = share(part["right_photo"])
+        line[IN_SCENE] = share(part["right"])
         for method in methods:
             line[method] = share(part[method])
-        line["soft, after a right choice"] = share(part.loc[part["right"], "soft"])
-        line["soft, after a wrong one"] = share(part.loc[~part["right"], "soft"])
+        line[AFTER_RIGHT] = share(part.loc[part["right"], "soft"])
+        line[AFTER_WRONG] = share(part.loc[~part["right"], "soft"])
         lines[name] = line
     return pd.DataFrame(lines).T
+
+
+def cost_of_scene(table: "pd.DataFrame") -> Estimate:
+    """The share of right choices in photos minus that in the scene, over the same episodes.
+
+    `table` is `beside_policy`'s. The interval is bootstrapped over episodes.
+    """
+    photo = chosen(table[table["seen_in"] == PHOTO])[[*KEY, "right"]]
+    both = chosen(table[table["seen_in"] == SCENE]).merge(photo, on=KEY, suffixes=("", "_photo"))
+    gain = both["right_photo"].to_numpy(float) - both["right"].to_numpy(float)
+    low, high = bootstrap_interval(gain, np.ones(len(gain)))
+    return Estimate(value=float(gain.mean()), low=low, high=high, n=len(gain))

@@ -136,7 +136,12 @@ def run_job(job: Job) -> dict[str, list[Row]]:
                 where = {**about, "step": step, "token": "as learned", "read_by": job.where}
                 answers += _answers(where, teacher, embedding, shown)
         where = {**about, "token": "as learned", "read_by": job.where}
-        chosen += choices.scores(where, teacher, embedding, choices.scenes(job.suite, job.task))
+        scenes = choices.scenes(job.suite, job.task)
+        for name, part in (
+            (choices.SCENE, scenes),
+            (choices.PHOTO, choices.in_photos(scenes, shown)),
+        ):
+            chosen += choices.scores({**where, "seen_in": name}, teacher, embedding, part)
         if job.where == "vlm":
             reader = _policy_model(job.suite)
             aligned = align(embedding, teach_token.MODEL, policy_folder)
