@@ -1,11 +1,13 @@
 """Measures of attention maps: shares, peaks and entropy against hand counts; patterns by their definitions; areas under ROC curves."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 
 from tests.command import vap

@@ -52,7 +52,7 @@ def choice_figure(table: "pd.DataFrame", columns: "Mapping[str, str]") -> "Figur
     `columns` are those that are shown, with their colours; lines are 95 % intervals, the dotted
     line is chance.
     """
-    figure = empty_figure(max(4.6, 2.3 * len(table) + 1.2), 3.2)
+    figure = empty_figure(max(6.0, 2.3 * len(table) + 1.2), 3.4)
     axes = figure.subplots()
     width = 0.8 / len(columns)
     for i, (name, colour) in enumerate(columns.items()):
@@ -62,7 +62,8 @@ def choice_figure(table: "pd.DataFrame", columns: "Mapping[str, str]") -> "Figur
         high = 100 * np.array([each.high for each in estimates]) - value
         places = np.arange(len(table)) + (i - (len(columns) - 1) / 2) * width
         axes.bar(places, value, 0.9 * width, color=colour, label=name)
-        axes.errorbar(places, value, yerr=[low, high], fmt="none", ecolor="black", elinewidth=0.8)
+        ends = np.clip([low, high], 0, None)  # rounding may leave an end inside
+        axes.errorbar(places, value, yerr=ends, fmt="none", ecolor="black", elinewidth=0.8)
     for place, chance in enumerate(table["chance"]):
         axes.hlines(100 * float(chance), place - 0.42, place + 0.42, "black", ":", linewidth=1)
     names = []
@@ -71,7 +72,7 @@ def choice_figure(table: "pd.DataFrame", columns: "Mapping[str, str]") -> "Figur
     axes.set_xticks(range(len(table)), names, fontsize=8)
     axes.set(ylabel="right object, % of episodes", ylim=(0, 104))
     axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(loc="outside lower center", ncols=len(columns), frameon=False, fontsize=8)
+    figure.legend(loc="outside lower center", ncols=5, frameon=False, fontsize=8)
     return figure
 
 

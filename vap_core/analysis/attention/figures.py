@@ -102,7 +102,9 @@ def patterns_figure(counts: "pd.DataFrame") -> "Figure":
         lost = 100 * (total - wins) / line["n"]
         axes.bar(places, lost, 0.7, 100 * wins / line["n"], color=FAILURE, label="failure")
         for place, won, of in zip(places, wins, total, strict=True):
-            axes.text(place, 100 * of / line["n"] + 1, f"{won}/{of}", ha="center", fontsize=7)
+            axes.text(
+                float(place), 100 * of / line["n"] + 1, f"{won}/{of}", ha="center", fontsize=7
+            )
         axes.set_xticks(places, LOCALISATIONS, fontsize=7)
         axes.set_ylim(0, 108)
         axes.set_title(f"{line['suite']}, {line['method']} (n = {line['n']})", fontsize=8)
