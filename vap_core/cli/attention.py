@@ -46,11 +46,7 @@ def attention(
         ),
     ] = None,
     publish: Annotated[
-        Path | None,
-        typer.Option(
-            help="Keep the tables in this folder, too: data/results. What is there of other suites "
-            "and methods stays."
-        ),
+        Path | None, typer.Option(help="Keep the tables in this folder, too: data/results.")
     ] = None,
     workers: Workers = 2,
 ) -> None:
@@ -60,7 +56,6 @@ def attention(
         --suite simpler-bridge
     """
     from vap_core.analysis.attention import replay, report
-    from vap_core.analysis.attention.tables import publish as publish_tables
 
     if out is None:
         table = run.suffix == ".parquet"
@@ -71,7 +66,7 @@ def attention(
         episodes=episodes,
         explain=explain,
     )
-    found = replay.run_replay(run, out, wanted, workers=workers)
+    tables = replay.run_replay(run, out, wanted, workers=workers)
     if publish is not None:
-        publish_tables(out, publish)
-    print(report.text(found))
+        replay.publish(out, publish)
+    print(report.text(tables))
