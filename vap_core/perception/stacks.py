@@ -24,6 +24,7 @@ def load_embedded() -> Stack:
         cut_segmenter,
         detector,
         encoder,
+        local_features,
         open_detector,
         tracker,
     )
@@ -37,6 +38,7 @@ def load_embedded() -> Stack:
         by_category=detector.load(),
         unfamiliar_encoder=encoder.load_unfamiliar(),
         thresholds=EMBEDDED_THRESHOLDS,
+        verifier=local_features.load(),
     )
 
 
@@ -52,6 +54,24 @@ STACKS: dict[str, Callable[[], Stack]] = {
     "foundation": load_foundation,
     "foundation-small": partial(load_foundation, "foundation-small"),
 }
+
+
+def load_own(name: str) -> Stack:
+    """The stack as `load_stack` gives it, for pictures of a user's own.
+
+    Where calibrate --photos --keep has measured a threshold on such pictures, it is used. Runs on
+    the benchmarks never depend on it.
+
+    Raises: as load_stack; BadOutput: the file of thresholds is damaged.
+    """
+    from vap_core.perception.foundation.store import store_folder
+    from vap_core.perception.kept_thresholds import read_thresholds
+
+    stack = load_stack(name)
+    kept = read_thresholds(store_folder(), name, stack.encoder.name)
+    if kept is None or stack.thresholds is None:
+        return stack
+    return replace(stack, thresholds=replace(stack.thresholds, unfamiliar=kept.unfamiliar))
 
 
 def load_stack(name: str) -> Stack:
