@@ -157,6 +157,9 @@ def result_key(row: EpisodeRow, method: str, run_digest: str) -> str:
     about = asdict(row)
     if about["start"] == asdict(AS_LISTED):  # keys are those of versions without starts
         del about["start"]
+    for name in ("speaker", "owned", "subgoals", "inside"):  # and without shared scenes
+        if not about[name]:
+            del about[name]
     return store.digest({"row": about, "method": method, "run": run_digest})
 
 

@@ -16,13 +16,13 @@ from vap_core.simulation.types import Truth
 def write(folder: Path, episodes: Sequence[Episode]) -> None:
     """Add the states of some finished episodes to a run, as one part.
 
-    Episodes in error are left out: they are not judged again.
+    Episodes in error, and those of several sub-goals, are left out: they are not judged again.
 
     Raises: BadOutput when the disk is full.
     """
     rows = []
     for episode in episodes:
-        if episode.frames and episode.outcome.status != "error":
+        if episode.frames and not episode.subgoals and episode.outcome.status != "error":
             rows.append(_to_row(episode))
     if rows:
         write_part(folder, "traces", rows, caller="traces")

@@ -11,13 +11,15 @@ Timelines are `frame_index` and `timestamp`. Entities have the names of LeRobot'
 - `/vap/{candidates,similarity,crops}/<camera>`: what the vote compared.
 - `/vap/association`: what the views agreed on, where they were associated.
 - `/vap/{vote_margin,track_score,attention}/<camera>`, `/vap/hand/*`: curves and tensors.
-- `/vap/{instruction,events}`, `/vap/status/{outcome,grasp}`: text and states.
+- `/vap/{instruction,events}`, `/vap/status/{outcome,grasp}`: text and states; of an instruction in
+  several steps also `/vap/status/subgoal`.
 - `/world/{table,robot/link*,objects/*}`: simulator truth.
 
 Evidence of a further target j ends in `_j`. Recording properties are in module `properties`.
 Pictures are JPEG or AV1, at the steps that have them; everything that changes travels in columns.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Literal
@@ -60,6 +62,7 @@ from vap_core.recording.entities.status import (
     send_events,
     send_grasp_changes,
     send_outcome,
+    send_subgoals,
 )
 from vap_core.recording.entities.votes import log_association, log_vote
 from vap_core.recording.file import temporary_path
@@ -77,7 +80,7 @@ from vap_core.recording.texts import (
     instruction_document,
 )
 from vap_core.rollout.failure import Diagnosis, Explain, Explanation
-from vap_core.rollout.types import Episode, EpisodeHeader, Frame
+from vap_core.rollout.types import Episode, EpisodeHeader, Frame, SubGoalSpan
 from vap_core.simulation.types import Outcome
 
 OUTCOME_LEVELS: dict[str, Literal["INFO", "WARN", "ERROR"]] = {
@@ -111,6 +114,10 @@ class Recorder:
         row = header.row
         self.path = Path(path)
         self._header = header
+        self._goal = header
+        """What is known of the present sub-goal; of the episode, where it has one goal."""
+        self._spans: list[SubGoalSpan] = []
+        self._subgoal: int | None = None
         self._flush_every = flush_every
         self._explain = explain
         self._pictures: Pictures = VideoPictures(header.hz) if video else StillPictures()
@@ -142,11 +149,23 @@ class Recorder:
         """Record one control step."""
         if not self._frames:
             self._log_first_frame(frame)
+        elif self._spans and self._spans[-1].first == frame.frame_index:
+            for camera in frame.images:
+                self._log_votes(frame, camera)
         self._pictures.add(frame)
         self._frames.append(frame.without_images())
         self._unsent.append(frame)
         if len(self._unsent) >= self._flush_every:
             self._flush()
+
+    def begin_subgoal(self, header: EpisodeHeader) -> None:
+        """From the next frame on record another sub-goal: its target, and how it was grounded."""
+        self._flush()
+        if not self._spans:
+            self._spans.append(SubGoalSpan(self._header_of_first(), 0))
+        first = self._frames[-1].frame_index + 1
+        self._spans.append(SubGoalSpan(header, first))
+        self._goal = header
 
     def close(self, outcome: Outcome) -> None:
         """Flush, write outcome, diagnosis and footer, and give the recording its name.
@@ -217,7 +236,7 @@ class Recorder:
         at = frame_times([frame])
         rgb = frame.images[camera]
         jpeg = encode_jpeg(rgb, JPEG_QUALITY)
-        groundings = self._header.groundings.get(camera, ())
+        groundings = self._goal.groundings.get(camera, ())
         if not groundings:
             log_row(rec, f"{image_root(camera)}/candidates", jpeg_image(jpeg), at=at)
             return
@@ -239,11 +258,12 @@ class Recorder:
         self._send_views(frames)
         send_camera_poses(rec, index, frames)
         send_robot(rec, index, frames)
-        send_method(rec, self._header, index, frames)
+        send_method(rec, self._goal, index, frames)
         send_truth(rec, index, frames)
         self._grasp_state = send_grasp_changes(
-            rec, frames, self._header.row.target, self._grasp_state
+            rec, frames, self._goal.row.target, self._grasp_state
         )
+        self._subgoal = send_subgoals(rec, frames, self._header.row, self._subgoal)
         self._send_events([event for frame in frames for event in frame.events])
         rec.flush()
         self._unsent = []
@@ -254,7 +274,7 @@ class Recorder:
         pictured = [frame for frame in frames if frame.images]
         if pictured:
             index = frame_times(pictured)
-            send_masks(rec, self._header, index, pictured)
+            send_masks(rec, self._goal, index, pictured)
             if any(frame.coverage for frame in pictured):
                 send_coverage(rec, self._header, index, pictured)
         attended = [frame for frame in frames if frame.attention]
@@ -268,7 +288,16 @@ class Recorder:
     def _explain_episode(self, outcome: Outcome) -> Explanation:
         if self._explain is None:
             return Explanation(None, None)
-        return self._explain(Episode(self._header, tuple(self._frames), outcome, {}))
+        spans = tuple(self._spans)
+        if not spans and outcome.subgoals:
+            spans = (SubGoalSpan(self._header_of_first(), 0),)
+        frames = tuple(self._frames)
+        return self._explain(Episode(self._header, frames, outcome, {}, subgoals=spans))
+
+    def _header_of_first(self) -> EpisodeHeader:
+        """What is known of the first sub-goal."""
+        row = self._header.row.at(0)
+        return replace(self._header, row=row, instruction=row.instruction)
 
     def _send_ending(self, outcome: Outcome, explanation: Explanation) -> None:
         """How the episode ended, at its last step, and why."""

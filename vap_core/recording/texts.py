@@ -6,7 +6,7 @@ from vap_core.base.events import describe_ballot, describe_lead, describe_reject
 from vap_core.base.types import Grounding, PersonalObject
 from vap_core.rollout.failure import Diagnosis
 from vap_core.rollout.types import EpisodeHeader
-from vap_core.simulation.types import Outcome
+from vap_core.simulation.types import EpisodeRow, Outcome
 
 
 def describe_vote(grounding: Grounding) -> str:
@@ -56,6 +56,8 @@ def instruction_document(
     """The instruction and its rewrite, how the episode ended and why, and every view's vote."""
     row = header.row
     lines = [f'**said** "{header.instruction}"']
+    if row.owned:
+        lines.append(f"**by** {row.speaker} · {_owners(row)}")
     if header.rewritten != header.instruction:
         lines.append(f'**policy read** "{header.rewritten}"')
     else:
@@ -82,6 +84,15 @@ def grounding_document(
         f"{obj.name} · {obj.category} · {len(obj.crops)} references · {obj.encoder}",
     ]
     return _markdown("\n\n".join(lines))
+
+
+def _owners(row: EpisodeRow) -> str:
+    """ "anna's camera-personal, ben's (anna's brother) camera-lookalike-5"."""
+    parts = []
+    for owned in row.owned:
+        known = f" ({', '.join(owned.known_as)})" if owned.known_as else ""
+        parts.append(f"{owned.owner}'s{known} {owned.model}")
+    return ", ".join(parts)
 
 
 def _vote_table(header: EpisodeHeader) -> str:

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 BY = ["suite", "method"]
 """The columns that name a group of episodes here."""
+SUBGOAL = "subgoal"
+"""The column of the sub-goal that was diagnosed, counted from 1, where there are several."""
 DIAGNOSIS_COLUMNS = ("case", "sub_case", "deciding_frame")
 
 
@@ -34,7 +36,8 @@ def breakdown(table: "pd.DataFrame") -> "pd.DataFrame":
 
     `n` episodes, `failed`, a column of counts for each case (`case 1`, ...) and sub-case
     (`case 1: drift`, ...), and `mean_confidence`. The cases of a row sum to `failed`; errors are in
-    `n` alone.
+    `n` alone. Where there are sub-goals, `sub-goal 1`, ... count the failures by the first that
+    failed.
     """
     episodes = diagnosed(table)
     flat = episodes[BY].assign(n=1, failed=episodes["outcome"].eq("failure").astype(int))
@@ -44,10 +47,21 @@ def breakdown(table: "pd.DataFrame") -> "pd.DataFrame":
         for sub_case in sub_cases:
             both = of_case & episodes["sub_case"].eq(sub_case)
             flat[f"{case}: {sub_case}"] = both.astype(int)
+    for number in _subgoals(episodes):
+        failed_there = episodes[SUBGOAL].eq(number) & episodes["outcome"].eq("failure")
+        flat[f"sub-goal {number}"] = failed_there.astype(int)
     counts = flat.groupby(BY, sort=False).sum().reset_index()
     with_case = episodes[episodes["case"].ne("")].groupby(BY, sort=False)
     confidence = with_case["case_confidence"].mean().rename("mean_confidence").reset_index()
     return counts.merge(confidence, on=BY, how="left")
+
+
+def _subgoals(episodes: "pd.DataFrame") -> list[int]:
+    """The numbers of the sub-goals that failed somewhere."""
+    if SUBGOAL not in episodes:
+        return []
+    failed = episodes.loc[episodes["outcome"].eq("failure"), SUBGOAL].dropna()
+    return sorted({int(number) for number in failed})
 
 
 def breakdown_rows(counts: "pd.DataFrame") -> list[list[str]]:
@@ -62,6 +76,10 @@ def breakdown_rows(counts: "pd.DataFrame") -> list[list[str]]:
         if counts[case].any():
             cases.append(case)
             titles.append(f"{case} % of failures")
+    for name in map(str, counts.columns):
+        if name.startswith("sub-goal "):
+            cases.append(name)
+            titles.append(f"{name} % of failures")
     rows = [["suite", "method", "n", "fail % [95 %]", *titles, "confidence"]]
     for line in counts.to_dict("records"):
         n = int(line["n"])

@@ -9,6 +9,7 @@ from vap_core.base.types import Event
 from vap_core.recording.colours import pack_rgba, state_style
 from vap_core.recording.stream import Moment, frame_times, log_row, time_columns
 from vap_core.rollout.types import Frame
+from vap_core.simulation.types import EpisodeRow
 
 OUTCOME_COLOURS = {
     "success": (40, 140, 85),
@@ -22,6 +23,10 @@ GRASP_COLOURS = {
     "touches other": (80, 95, 150),
     "holds other": (85, 120, 220),
 }
+SUBGOAL_COLOURS = ((120, 90, 170), (60, 130, 150))
+"""Of sub-goals in turn; the way home between them is grey."""
+HOMEWARD = "way home"
+HOMEWARD_COLOUR = (90, 90, 90)
 LEVEL_COLOURS = {
     "INFO": (150, 200, 255),
     "WARN": (255, 190, 60),
@@ -65,6 +70,41 @@ def send_grasp_changes(
         columns = rr.StateChange.columns(state=states)
         rec.send_columns("/vap/status/grasp", frame_times(changed), columns)
     return before
+
+
+def send_subgoals(
+    rec: rr.RecordingStream, frames: Sequence[Frame], row: EpisodeRow, before: int | None
+) -> int | None:
+    """The lane of sub-goals, each by its command: only changes. Returns the last number.
+
+    An episode with one goal has no such lane.
+    """
+    if not row.subgoals:
+        return before
+    if before is None:
+        colours = {HOMEWARD: HOMEWARD_COLOUR}
+        for number in range(1, row.stages + 1):
+            colour = SUBGOAL_COLOURS[number % len(SUBGOAL_COLOURS)]
+            colours[subgoal_state(row, number)] = colour
+        log_row(rec, "/vap/status/subgoal", state_style(colours))
+    changed = []
+    states = []
+    for frame in frames:
+        if frame.subgoal is not None and frame.subgoal != before:
+            changed.append(frame)
+            states.append(subgoal_state(row, frame.subgoal))
+            before = frame.subgoal
+    if changed:
+        columns = rr.StateChange.columns(state=states)
+        rec.send_columns("/vap/status/subgoal", frame_times(changed), columns)
+    return before
+
+
+def subgoal_state(row: EpisodeRow, number: int) -> str:
+    """ "2: put my camera in the basket", or the way home."""
+    if number == 0:
+        return HOMEWARD
+    return f"{number}: {row.subgoals[number - 1].instruction}"
 
 
 def send_events(
