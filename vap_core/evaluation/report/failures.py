@@ -70,16 +70,16 @@ def breakdown_rows(counts: "pd.DataFrame") -> list[list[str]]:
     Failures in percent of all episodes, cases in percent of failures, each with its 95 % Wilson
     interval.
     """
-    cases = []
+    cases: list[str] = []
     titles = []
     for case in CASES:
         if counts[case].any():
             cases.append(case)
             titles.append(f"{case} % of failures")
-    for name in map(str, counts.columns):
-        if name.startswith("sub-goal "):
-            cases.append(name)
-            titles.append(f"{name} % of failures")
+    for column in map(str, counts.columns):
+        if column.startswith("sub-goal "):
+            cases.append(column)
+            titles.append(f"{column} % of failures")
     rows = [["suite", "method", "n", "fail % [95 %]", *titles, "confidence"]]
     for line in counts.to_dict("records"):
         n = int(line["n"])

@@ -48,7 +48,6 @@ HARDEST = {
     "stuffed-toy": "stuffed-toy-lookalike-1",
     "pouch": "pouch-lookalike-1",
     "slipper": "slipper-lookalike-1",
-    "plushie": "plushie-lookalike-1",
 }
 """The look-alike of greatest mean cosine with the personal instance's photos, by stem."""
 BOWL = tabletop.BOWL
@@ -195,7 +194,6 @@ def _pair(name: str, instruction: str, stem: str, other: str, owner: str = SPEAK
 PAIR_TASKS = (
     _pair("put-pouch-near-vase", "put my pouch near her vase", "pouch", "vase", "carla"),
     _pair("move-plant-next-to-cup", "move my plant next to my cup", "plant", "cup"),
-    _pair("move-plushie-next-to-cup", "move my plushie next to my cup", "plushie", "cup"),
     _pair(
         "put-scrubber-near-slipper",
         "put my scrubber near her slipper",
