@@ -1,17 +1,18 @@
-"""Matplotlib figures: an empty one, a reproducible file, and the colours that figures share."""
+"""Matplotlib figures: an empty one, and a reproducible file. Their colours are in `palette`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vap_core.base.palette import FRAME, LOOKALIKES, METHODS, TARGET, TIERS
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-WINNER, OTHER = "#f28e2b", "#4e79a7"
+WINNER, OTHER = TARGET, LOOKALIKES[0]
 """The elected candidate or the target; every other one."""
-GENERIC, OURS = "#9aa0a6", "#c0392b"
-METHOD_COLOURS = {"generic": GENERIC, "vap": OURS}
-TIER_COLOURS = {"personal": "#f28e2b", "hard": "#c0392b", "medium": "#b8860b", "easy": "#3a7d44"}
-"""The personal object, and its look-alikes by hardness."""
+GENERIC, OURS = FRAME, METHODS["vap"][0]
+METHOD_COLOURS = {name: colour for name, (colour, _) in METHODS.items()}
+TIER_COLOURS = TIERS
 
 
 def empty_figure(width: float, height: float) -> "Figure":

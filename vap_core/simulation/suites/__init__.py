@@ -1,8 +1,9 @@
-"""Suites: the four personalised benchmarks, the shared scenes, and the demo's warm-up suites.
+"""Suites: the four personalised benchmarks, shared scenes, and the demo's warm-up suites.
 
 The episode lists of benchmarks and shared scenes are hashed files; those of the warm-up suites are
 generated. Every benchmark has a development list, the suite NAME-dev. NAME-absent and
-NAME-dev-absent are the same lists with the target left out.
+NAME-dev-absent are the same lists with the target left out; NAME-red and NAME-dev-red have a
+look-alike that is red by nature.
 """
 
 from dataclasses import replace
@@ -35,6 +36,8 @@ SHARED: dict[str, Suite] = shared.SUITES
 SUITES: dict[str, Suite] = {**BENCHMARKS, **SHARED, **WARM_UPS}
 ABSENT = "-absent"
 """Ends the name of a suite whose target is left out."""
+RED = objects.RED
+"""Ends the name of a suite whose first look-alike is red by nature; -absent may follow it."""
 
 
 def suite(name: str) -> Suite:
@@ -43,18 +46,20 @@ def suite(name: str) -> Suite:
         return SUITES[name]
     if not is_listed(name):
         raise one_of(
-            "suites.suite: suite (a benchmark also with -dev, -absent, -dev-absent)", name, SUITES
+            "suites.suite: suite (a benchmark also with -dev, -red, -absent, -dev-absent)",
+            name,
+            SUITES,
         )
     return replace(BENCHMARKS[benchmark_name(name)], name=name)
 
 
 def list_name(name: str) -> str:
-    """The list that a suite reads, without or with its target."""
-    return name.removesuffix(ABSENT)
+    """The list that a suite reads, whatever is left out of it or painted red."""
+    return name.removesuffix(ABSENT).removesuffix(RED)
 
 
 def benchmark_name(name: str) -> str:
-    """The benchmark of a suite: its own name, or that without -dev and -absent.
+    """The benchmark of a suite: its own name, or that without -dev, -red and -absent.
 
     Of a shared scene, the benchmark whose robot and frozen policy it has.
     """
@@ -80,13 +85,17 @@ def digest(name: str) -> str:
 
 @cache
 def benchmark(name: str) -> tuple[EpisodeRow, ...]:
-    """The whole list of a benchmark, or of its development list; for both without their targets.
+    """The whole list of a benchmark, or of its development list; for both without their targets, or
+    with a red look-alike.
 
     Raises: BadSuite, naming row and field, also for a task, camera or object that does not exist.
     """
     if name.endswith(ABSENT):
         left_out = replace(AS_LISTED, absent=True)
-        return tuple(replace(row, suite=name, start=left_out) for row in benchmark(list_name(name)))
+        whole = benchmark(name.removesuffix(ABSENT))
+        return tuple(replace(row, suite=name, start=left_out) for row in whole)
+    if name.endswith(RED):
+        return tuple(_with_red_lookalike(row, name) for row in benchmark(name.removesuffix(RED)))
     episodes = lists.read(name)
     known = suite(name)
     tasks = {task.name for task in known.tasks}
@@ -145,6 +154,20 @@ def listed(
     for row_seed in range(seed, seed + seeds):
         episodes.extend(rows(suite_name, task_name, n, row_seed))
     return tuple(episodes)
+
+
+def _with_red_lookalike(row: EpisodeRow, name: str) -> EpisodeRow:
+    """The row with its first look-alike red by nature, in its place."""
+    placements = list(row.placements)
+    for i, place in enumerate(placements):
+        if (
+            i
+            and place.model != row.goal
+            and objects.get_object(place.model).category == row.category
+        ):
+            placements[i] = replace(place, model=f"{place.model}{RED}")
+            break
+    return replace(row, suite=name, placements=tuple(placements))
 
 
 def _check_names(names: set[str], known: set[str], where: str) -> None:
