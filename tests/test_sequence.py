@@ -4,11 +4,16 @@ from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
+import pandas as pd
 import pytest
 
+from tests.drawn import columns
 from vap_core.base.errors import BadInstruction
+from vap_core.evaluation import diagnosis
+from vap_core.evaluation.report.failures import breakdown, breakdown_rows
 from vap_core.instruction.sequence import decompose
 from vap_core.policies.scripted.expert import Expert
+from vap_core.recording import Recorder
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters.protocol import unchanged
 from vap_core.rollout.prompters.text import generic
@@ -170,6 +175,42 @@ def test_a_step_can_be_read_as_an_episode(episode):
     assert all(frame.action is not None for frame in part.frames[:-1])
     assert len(part.frames) == part.outcome.steps + 1
     assert part.outcome.success
+
+
+def test_a_recording_has_a_lane_of_sub_goals_and_names_the_owners(episode, tmp_path):
+    done, _ = episode
+    second = done.subgoals[1]
+    path = tmp_path / "sequence.rrd"
+    with Recorder(path, done.header, explain=diagnosis.explain) as recorder:
+        for frame in done.frames:
+            if frame.frame_index == second.first:
+                recorder.begin_subgoal(second.header)
+            recorder.frame(frame)
+        recorder.close(done.outcome)
+    lane = columns(path, "/vap/status/subgoal", "StateChange:state")
+    home = next(frame.frame_index for frame in done.frames if frame.subgoal == 0)
+    assert {step: states[0] for step, states in lane.items()} == {
+        0: "1: put my brother's owl figurine on the plate",
+        home: "way home",
+        second.first: "2: put my owl figurine in the basket",
+    }
+    pane = str(columns(path, "/vap/instruction", "TextDocument:text")[None])
+    assert "**by** anna" in pane
+    assert "ben's (anna's brother) owl-figurine-lookalike-2" in pane
+
+
+def test_the_first_step_that_failed_is_diagnosed(episode):
+    done, _ = episode
+    missed = replace(done.outcome.subgoals[1], status="failure", success=False)
+    outcomes = (done.outcome.subgoals[0], missed)
+    failed = replace(done, outcome=of_subgoals(outcomes, 2, done.outcome.steps))
+    row = {**failed.summary(), **diagnosis.columns(failed)}
+    assert (row["outcome"], row["subgoal"], row["case"]) == ("failure", 2, "unprompted")
+    assert row["deciding_frame"] >= failed.subgoals[1].first
+    assert diagnosis.columns(done)["case"] == ""
+    counts = breakdown(pd.DataFrame([row, {**done.summary(), **diagnosis.columns(done)}]))
+    assert counts["sub-goal 2"].tolist() == [1]
+    assert "sub-goal 2 % of failures" in breakdown_rows(counts)[0]
 
 
 def test_a_step_out_of_time_is_followed_by_the_next():

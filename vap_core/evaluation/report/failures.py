@@ -86,9 +86,9 @@ def breakdown_rows(counts: "pd.DataFrame") -> list[list[str]]:
         failed = int(line["failed"])
         failure_rate = rate(failed, n)
         cells = [str(line["suite"]), str(line["method"]), str(line["n"]), str(failure_rate)]
-        for case in cases:
-            case_rate = rate(int(line[case]), failed)
-            cells.append(str(case_rate))
+        for column in cases:
+            share = rate(int(line[column]), failed)
+            cells.append(str(share))
         confidence = line["mean_confidence"]
         cells.append("-" if confidence != confidence else f"{confidence:.2f}")
         rows.append(cells)

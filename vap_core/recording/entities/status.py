@@ -23,10 +23,10 @@ GRASP_COLOURS = {
     "touches other": (80, 95, 150),
     "holds other": (85, 120, 220),
 }
-SUBGOAL_COLOURS = ((120, 90, 170), (60, 130, 150))
-"""Of sub-goals in turn; the way home between them is grey."""
+SUBGOAL_COLOURS = ((150, 150, 150), (110, 110, 110))
+"""Of sub-goals in turn: greys, which only frame what happens; darker on the way home between."""
 HOMEWARD = "way home"
-HOMEWARD_COLOUR = (90, 90, 90)
+HOMEWARD_COLOUR = (60, 60, 60)
 LEVEL_COLOURS = {
     "INFO": (150, 200, 255),
     "WARN": (255, 190, 60),
