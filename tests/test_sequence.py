@@ -194,7 +194,7 @@ def test_a_recording_has_a_lane_of_sub_goals_and_names_the_owners(episode, tmp_p
         home: "way home",
         second.first: "2: put my owl figurine in the basket",
     }
-    pane = str(columns(path, "/vap/instruction", "TextDocument:text")[None])
+    pane = columns(path, "/vap/instruction", "TextDocument:text")[None][0]
     assert "**by** anna" in pane
     assert "ben's (anna's brother) owl-figurine-lookalike-2" in pane
 
