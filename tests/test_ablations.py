@@ -1,5 +1,6 @@
 """Ablations: forms of a prompt, arms by name, the table by hand, and the command."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,16 +11,25 @@ from hypothesis import strategies as st
 
 from tests.command import refused, vap
 from vap_core.attend import Prompting
-from vap_core.evaluation import paper
+from vap_core.base.types import Camera
+from vap_core.evaluation import hiding, paper
 from vap_core.evaluation.ablations.arms import ABLATIONS, ARMS, Ablation, Hidden
+from vap_core.evaluation.ablations.arrow import Arrow, hand_pixel
+from vap_core.evaluation.ablations.forms import draw_arrow
 from vap_core.evaluation.ablations.picture import effects_figure
+from vap_core.evaluation.ablations.run import arm_folder
 from vap_core.evaluation.ablations.table import arm_results, arm_rows
 from vap_core.evaluation.methods import METHODS, find, known_methods, references_needed
-from vap_core.prompt import PALETTE, Tint, tint
+from vap_core.evaluation.study import Study
+from vap_core.prompt import PALETTE, Tint, has_colour, tint
 from vap_core.rollout.prompters.oracle import Oracle, OraclePrompter
+from vap_core.rollout.types import MaskCoverage
 from vap_core.simulation import suites
+from vap_core.simulation.assets.objects import get_object, texture_image
 
-FORMS = {name: arm.form for name, arm in ABLATIONS["form"].arms.items()}
+FORMS = {
+    name: arm.form for name, arm in ABLATIONS["form"].arms.items() if isinstance(arm, Prompting)
+}
 RED = PALETTE[0]
 
 
@@ -71,7 +81,6 @@ def test_each_form_does_what_its_name_says() -> None:
     assert changed["point"][60, 40]
     assert changed["point"].sum() < 0.2 * mask.sum()
     assert not changed["circle"][mask].any()
-    assert changed["arrow"][0, 56]
     assert changed["marker"][60, 85]
     assert not changed["dimmed"][mask].any()
     assert changed["dimmed"][~mask].all()
@@ -96,6 +105,7 @@ def test_every_arm_is_a_method_with_a_name_of_its_own() -> None:
         assert set(ablation.rows) <= set(ablation.names)
     assert references_needed("references-7") == 7
     assert references_needed("vap") == references_needed("references-1") == 5
+    assert find("arrow") == Arrow()
     assert find("hidden-3") == Hidden(3)
 
 
@@ -176,7 +186,7 @@ def test_the_command_says_what_it_found_and_runs_nothing_twice(tmp_path: Path) -
     assert done.returncode == 0, done.stderr
     assert ABLATIONS["selection"].question in done.stdout
     assert "0 errors" in done.stdout
-    assert (tmp_path / "run" / "effects.png").stat().st_size > 5_000
+    assert (tmp_path / "run" / "selection.png").stat().st_size > 5_000
     assert vap(*words).stdout == done.stdout
 
 
@@ -186,6 +196,69 @@ def test_every_ablation_runs(name: str, tmp_path: Path) -> None:
     done = vap("ablate", name, *WORDS, "--out", tmp_path / "run")
     assert done.returncode == 0, done.stderr
     assert "0 errors" in done.stdout
+
+
+def camera(x: float = 0.0) -> Camera:
+    """Looks straight down from one metre above the table; `x` is its place (metres)."""
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[:3, 3] = x, 0, 1
+    k = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
+    return Camera(name="top", width=100, height=100, k=k, pose_world=pose)
+
+
+def test_the_arrow_begins_at_the_hand_and_ends_on_the_target() -> None:
+    assert hand_pixel(camera(), np.array([0.1, 0.2, 0.5])) == (70, 10)
+    assert hand_pixel(camera(), np.array([0.0, 0.0, 1.5])) is None, "behind the camera"
+    assert hand_pixel(camera(), np.array([500.0, 0.0, 0.5])) == (4096, 50), "far outside"
+    rgb = np.full((100, 100, 3), 90, np.uint8)
+    drawn = draw_arrow(rgb, blob(100, 100, 70, 30, 8), RED, (70, 10))
+    changed = (drawn != rgb).any(axis=2)
+    assert changed[10, 70]
+    assert changed[70, 30]
+    assert not changed[:, 80:].any()
+
+
+def test_every_look_alike_can_be_red_by_nature() -> None:
+    for row in suites.benchmark("simpler-bridge-red"):
+        listed = suites.benchmark("simpler-bridge")
+        same = next(one for one in listed if (one.task, one.episode) == (row.task, row.episode))
+        changed = [a.model for a, b in zip(row.placements, same.placements, strict=True)
+                   if a.model != b.model]  # fmt: skip
+        assert len(changed) == 1
+        assert changed[0].endswith("-red")
+        assert get_object(changed[0]).category == row.category
+    red = get_object("shaver-lookalike-1-red")
+    assert red is get_object("shaver-lookalike-1-red"), "meshes are kept by object"
+    assert (
+        has_colour(texture_image(red), RED).mean()
+        > 3 * has_colour(texture_image(get_object("shaver-lookalike-1")), RED).mean() + 0.1
+    )
+
+
+def test_the_track_is_kept_that_is_on_the_target_soon_after_it_is_seen_again() -> None:
+    def seen(shown: str | None, pixels: int = 500) -> list[MaskCoverage]:
+        return [MaskCoverage(camera="c", object=shown, iou=0.9, pixels=pixels, proposal=np.nan)]
+
+    assert hiding.is_track_kept([[], seen("mine")], "mine") is True
+    assert hiding.is_track_kept([seen(None), [], seen("mine")], "mine") is True
+    assert hiding.is_track_kept([seen(None), seen("other"), seen("mine")], "mine") is False
+    assert hiding.is_track_kept([seen("mine", pixels=20), []], "mine") is None
+    rows = []
+    for kept in (True, True, False, None):
+        rows.append({"suite": "s", "method": "hidden-2", "hidden_s": 1.6, "track_kept": kept})
+    (line,) = hiding.hiding_lines(pd.DataFrame(rows))
+    assert line.startswith("s hidden-2: hidden for 1.6 s, track kept in 67 %")
+    assert hiding.hiding_lines(outcomes("vap", [True])) == []
+
+
+def test_an_arm_runs_once_for_all_ablations(tmp_path: Path) -> None:
+    study = Study((("widowx-pick", "pick-bottle"),), ("vap", "opaque"), episodes=1)
+    assert "opaque" in ABLATIONS["form"].arms
+    assert "opaque" in ABLATIONS["opacity"].methods
+    other = replace(study, methods=ABLATIONS["opacity"].names)
+    assert arm_folder(study, tmp_path, "opaque") == arm_folder(other, tmp_path, "opaque")
+    longer = replace(study, episodes=2)
+    assert arm_folder(study, tmp_path, "vap") != arm_folder(longer, tmp_path, "vap")
 
 
 def test_the_target_is_hidden_from_the_third_call_on() -> None:

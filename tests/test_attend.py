@@ -11,6 +11,8 @@ from vap_core.associate import PAIRINGS, compare_views
 from vap_core.attend import Attender, Prompting
 from vap_core.base.errors import BadInstruction, BadViews, UnknownName
 from vap_core.base.types import Attended, Boxes, Camera, Grounding
+from vap_core.evaluation.ablations.forms import NumberedMarker
+from vap_core.perception.protocols import Thresholds
 from vap_core.perception.stacks import load_stack
 from vap_core.policies.protocol import PolicyInput
 from vap_core.prompt import PALETTE, Tint, tint
@@ -49,6 +51,31 @@ def test_tracking_follows_and_never_detects_again() -> None:
     state, attended = attender.step(state, {"front": moved})
     assert (attended.images["front"] == tint(moved, where(moved, TEAL), RED)).all()
     assert calls == ["cup"]
+
+
+def test_only_what_is_marked_is_followed() -> None:
+    """Neither look-alikes nor a robot's hand among the candidates, nor a view without a target."""
+    started: list[list[list[int]]] = []
+
+    class OfTargets(SameColour):
+        def start_targets(self, images, masks, targets):  # type: ignore[no-untyped-def]
+            started.append([list(of_view) for of_view in targets])
+            return self.start(images, masks)
+
+    views = {"front": LINE, "side": scene([(4, 20, GREY), (44, 20, SAND)])}
+    prompting = Prompting(always_tint=False)
+    stack = replace(TOYS, tracker=OfTargets(), thresholds=Thresholds(0.999, 0.999))
+    attender = Attender(stack, MEMORY, prompting)
+    state, attended = attender.start(views, "bring my cup")
+    assert started == [[[1]]]
+    assert (list(state.trackers), state.ids) == (["front"], {"front": (1,), "side": (None,)})
+    _, attended = attender.step(state, views)
+    assert (attended.images["front"] == tint(LINE, where(LINE, TEAL), RED)).all()
+    assert attended.tracks["side"][0].mask is None
+
+    marking = replace(prompting, form=NumberedMarker())
+    Attender(stack, MEMORY, marking).start({"front": LINE}, "bring my cup")
+    assert started[-1] == [[0, 1, 2]]
 
 
 def test_a_view_without_candidates_passes_unmodified() -> None:

@@ -117,6 +117,29 @@ def test_what_is_never_seen_again_stays_not_visible_and_its_place_is_not_given_a
         assert mask_iou(tracks[1].mask, both[1][1]) > 0.9
 
 
+def test_what_is_no_target_is_evidence_and_costs_nothing() -> None:
+    """A hand that moves, or a look-alike that is lost, is neither drawn nor searched for."""
+    tracker, (image, masks) = track.load(), paint((RED, 40, 60), (BLUE, 90, 60))
+    states = tracker.start_targets([image], [masks], [[0]])
+    moved, gone = paint((RED, 40, 60), (BLUE, 100, 90)), paint((RED, 40, 60))
+    for picture, _ in (moved, gone):
+        after, (tracks,) = tracker.step(states, [picture])
+        assert after[0] is states[0]
+        assert tracks[0].mask is not None
+        assert (tracks[1].mask, tracks[1].score) == (None, 0)
+
+    only = paint((BLUE, 60, 62))[0]  # the look-alike moves to where the target was
+    for _ in range(6):
+        states, (tracks,) = tracker.step(states, [only])
+        assert tracks[0].mask is None
+        assert tracks[1].mask is None
+    back = paint((RED, 92, 66), (BLUE, 60, 62))
+    for _ in range(2):
+        states, (tracks,) = tracker.step(states, [back[0]])
+    assert tracks[0].mask is not None
+    assert mask_iou(tracks[0].mask, back[1][0]) > 0.6
+
+
 def test_order_of_identities_permutes_the_tracks_and_views_do_not_meet() -> None:
     films = [paint((RED, 40 + 5 * t, 60), (BLUE, 90, 90 - 4 * t)) for t in range(3)]
     images, masks = [image for image, _ in films], films[0][1]

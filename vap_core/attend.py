@@ -52,7 +52,7 @@ from vap_core.perception.candidates import (
     propose,
     segment,
 )
-from vap_core.perception.protocols import FamiliarityJudge, Stack
+from vap_core.perception.protocols import FamiliarityJudge, Stack, TargetTracker
 from vap_core.prompt import PALETTE, PromptForm, Tint, choose_colours
 from vap_core.vote import VoteRule, compare, election_scores, shortlist, vote
 
@@ -262,13 +262,14 @@ class Attender:
             groundings=groundings,
             associations=associations,
             ids=ids,
-            trackers=self._start_trackers(views, masks),
+            trackers=self._start_trackers(views, masks, ids),
             visible=_visible(tracks),
         )
         events = grounding_events(groundings, associations, ids, chosen_by)
         others: dict[str, list[Mask]] = {}
-        for camera in views:
-            others[camera] = _other_masks(list(masks[camera]), ids[camera])
+        if self._marks_others:
+            for camera in views:
+                others[camera] = _other_masks(list(masks[camera]), ids[camera])
         return state, self._prompt(state, views, tracks, others, events)
 
     def step(self, state: AttendState, views: Views) -> tuple[AttendState, Attended]:
@@ -308,9 +309,10 @@ class Attender:
             by_camera = dict(zip(state.trackers, tracks[first:stop], strict=True))
             targets = _tracks_of_targets(state, by_camera)
             others = {}
-            for camera, of_view in by_camera.items():
-                followed = [track.mask for track in of_view]
-                others[camera] = _other_masks(followed, state.ids[camera])
+            if self._marks_others:
+                for camera, of_view in by_camera.items():
+                    followed = [track.mask for track in of_view]
+                    others[camera] = _other_masks(followed, state.ids[camera])
             results.append(self.follow(state, images_now, targets, next_trackers, others))
             first = stop
         return results
@@ -359,19 +361,39 @@ class Attender:
                 boxes[camera] = replace(given[camera], familiar=familiar)
         return boxes
 
+    @property
+    def _marks_others(self) -> bool:
+        """Whether the prompt's form marks the other candidates, too."""
+        return bool(getattr(self.prompting.form, "marks_others", False))
+
     def _start_trackers(
-        self, views: Views, masks: Mapping[str, Bool[np.ndarray, "n h w"]]
+        self,
+        views: Views,
+        masks: Mapping[str, Bool[np.ndarray, "n h w"]],
+        ids: Mapping[str, tuple[int | None, ...]],
     ) -> dict[str, Any]:
-        """One tracker state for every view that has candidates."""
+        """One tracker state for every view with a mask that is going to be marked.
+
+        Look-alikes, and a robot's hand among the candidates, are not marked: they are not followed.
+        """
         tracked = []
         images = []
         starts = []
+        targets = []
         for camera, rgb in views.items():
-            if len(masks[camera]):
+            wanted = sorted({identity for identity in ids[camera] if identity is not None})
+            if self._marks_others:
+                wanted = list(range(len(masks[camera])))
+            if wanted:
                 tracked.append(camera)
                 images.append(rgb)
                 starts.append(masks[camera])
-        states = self.stack.tracker.start(images, starts)
+                targets.append(wanted)
+        tracker = self.stack.tracker
+        if isinstance(tracker, TargetTracker):
+            states = tracker.start_targets(images, starts, targets)
+        else:
+            states = tracker.start(images, starts)
         return dict(zip(tracked, states, strict=True))
 
     def _prompt(

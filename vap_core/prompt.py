@@ -61,7 +61,8 @@ class PromptForm(Protocol):
     def __call__(self, rgb: Rgb, mask: Mask, colour: Colour, others: Sequence[Mask]) -> Rgb:
         """The marked picture; `rgb` stays as it is.
 
-        `mask` is the target's; it may be empty. `others` are the masks of what else is followed.
+        `mask` is the target's; it may be empty. `others` are the masks of the other candidates,
+        which are followed only for a form with a true `marks_others`; for others it is empty.
         """
         ...
 

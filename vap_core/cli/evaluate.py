@@ -183,14 +183,15 @@ def ablate(
     ] = None,
     suite: Annotated[
         list[str] | None,
-        typer.Option(help="A suite; repeatable. Default simpler-bridge."),
+        typer.Option(help="A suite; repeatable. Default that of the ablation."),
     ] = None,
     out: Annotated[
-        Path | None,
+        Path,
         typer.Option(
-            help="Run folder; a run found there is resumed. Default data/runs/ablate-NAME."
+            help="Folder of the runs, one an arm; ablations share their arms, and what is there "
+            "is not run again."
         ),
-    ] = None,
+    ] = Path("data/runs/ablations"),
     policy: Annotated[
         str | None,
         typer.Option(help=f"{POLICIES} Default: mini-pi0 where one ships, else scripted."),
@@ -227,7 +228,7 @@ def ablate(
     from vap_core.evaluation.ablations.run import ablate_text
     from vap_core.evaluation.policy_names import default_policy
 
-    suite_names = _suite_names(suite or ["simpler-bridge"])
+    suite_names = _suite_names(suite or list(ABLATIONS[name].suites))
     study = _study(
         tasks=_all_tasks(suite_names),
         methods=list(ABLATIONS[name].names),
@@ -236,8 +237,7 @@ def ablate(
         seeds=seeds,
         follow="call",
     )
-    folder = out or Path(f"data/runs/ablate-{name}")
-    print(ablate_text(name, study, folder, workers=workers, record=_record(record)))
+    print(ablate_text(name, study, out, workers=workers, record=_record(record)))
 
 
 @app.command("eval")

@@ -8,7 +8,7 @@ from resource import RUSAGE_SELF, getrusage
 from typing import TYPE_CHECKING, Any, Literal
 
 from vap_core.base.errors import BadOutput, BadRecording, BadStudy
-from vap_core.evaluation import diagnosis, input_audit, state_log, switching
+from vap_core.evaluation import diagnosis, hiding, input_audit, state_log, switching
 from vap_core.evaluation.study import Study, make_trial
 from vap_core.policies.weight_guard import unchanged_weights
 from vap_core.rollout.types import EpisodeHeader
@@ -91,7 +91,8 @@ def run_job(job: Job) -> Rows:
     rows = []
     for key, episode in zip(job.keys, episodes, strict=True):
         found = {**diagnosis.columns(episode), **switching.columns(episode)}
-        rows.append({"key": key, **columns, **episode.summary(), **found})
+        hidden = hiding.columns(episode, trial.occlusion)
+        rows.append({"key": key, **columns, **episode.summary(), **found, **hidden})
     return rows
 
 

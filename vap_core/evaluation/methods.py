@@ -6,6 +6,7 @@ from vap_core.associate import PAIRINGS
 from vap_core.attend import Attender, Prompting
 from vap_core.base.errors import BadStudy
 from vap_core.evaluation.ablations.arms import ARMS, Hidden
+from vap_core.evaluation.ablations.arrow import Arrow, ArrowPrompter
 from vap_core.memory import load_bank
 from vap_core.perception.protocols import Stack
 from vap_core.policies.mini_pi0.learned_token import WORD
@@ -22,12 +23,15 @@ from vap_core.rollout.prompters.text import (
     soft_prompt,
 )
 from vap_core.rollout.prompters.tint import TintPrompter
+from vap_core.simulation import robots
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.scenes import Scene
 from vap_core.simulation.suites import suite
 from vap_core.simulation.types import EpisodeRow
 
-type Method = Prompting | HardPrompt | SoftPrompt | Oracle | Hidden | Switch | OtherCommand | None
+type Method = (
+    Prompting | HardPrompt | SoftPrompt | Oracle | Hidden | Switch | OtherCommand | Arrow | None
+)
 
 METHODS: dict[str, Method] = {
     "generic": None,
@@ -105,7 +109,7 @@ def token_space(method: str) -> str:
 
 
 def needs_stack(method: str) -> bool:
-    return isinstance(find(method), Prompting | Oracle | Hidden | Switch)
+    return isinstance(find(method), Prompting | Oracle | Hidden | Switch | Arrow)
 
 
 def make_prompter(
@@ -130,6 +134,9 @@ def make_prompter(
             return TintPrompter(_attender(how, row, bank, stack))
         case Hidden(prompting=how):
             return TintPrompter(_attender(how, row, bank, stack))
+        case Arrow():
+            attender = _attender(Prompting(highlight=False), row, bank, stack)
+            return ArrowPrompter(attender, robots.get(suite(row.suite).robot).base_world)
         case Oracle() as oracle:
             attender = _attender(oracle.prompting, row, bank, stack)
             return OraclePrompter(attender, oracle, _alike(scene, row))
@@ -158,4 +165,6 @@ def _next_command(row: EpisodeRow) -> str:
 def _attender(how: Prompting, row: EpisodeRow, bank: Path, stack: Stack | None) -> Attender:
     assert stack is not None, "a method that prompts needs a stack"
     target = load_bank(bank, stack.encoder.name)[row.target]
+    # Other methods of the run may have wanted more photos.
+    target = target.first(how.references or FEWEST_REFERENCES)
     return Attender(stack, {row.target: target}, how)

@@ -88,6 +88,23 @@ class Tracker(Protocol):
         ...
 
 
+@runtime_checkable
+class TargetTracker(Protocol):
+    """A tracker that can follow a few identities and know the others from t = 0 only."""
+
+    def start_targets(
+        self,
+        images: Sequence[Rgb],
+        masks: Sequence[Bool[np.ndarray, "_n _h _w"]],
+        targets: Sequence[Sequence[int]],
+    ) -> list[Any]:
+        """As `Tracker.start`, but only the `targets` of a view are followed.
+
+        Every other identity is evidence of what they are not; its tracks have no mask.
+        """
+        ...
+
+
 @dataclass(frozen=True)
 class Thresholds:
     """The least `Grounding.likeness` of an object that is in view, in familiar and other views."""

@@ -18,10 +18,10 @@ least that like it, 5 % of 869 where the kind is absent, and 25 % of 40 with onl
 def load_embedded() -> Stack:
     """Boxes of a COCO detector; EfficientNet-Lite0 features with heads trained on renders."""
     from vap_core.perception.embedded import (
+        cut_segmenter,
         detector,
         encoder,
         open_detector,
-        segmenter,
         tracker,
     )
 
@@ -29,7 +29,7 @@ def load_embedded() -> Stack:
         name="embedded",
         detector=open_detector.load(),
         encoder=encoder.load(),
-        segmenter=segmenter.load(),
+        segmenter=cut_segmenter.load(),
         tracker=tracker.load(),
         by_category=detector.load(),
         unfamiliar_encoder=encoder.load_unfamiliar(),

@@ -6,10 +6,11 @@ A new arm is a line in `ABLATIONS`: its name is a method that `eval --methods` t
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from vap_core.associate import PAIRINGS
+from vap_core.associate import PAIRINGS, Pairing
 from vap_core.attend import Prompting
+from vap_core.base.types import Colour
+from vap_core.evaluation.ablations.arrow import Arrow
 from vap_core.evaluation.ablations.forms import (
-    Arrow,
     Circle,
     Contour,
     DimmedBackground,
@@ -35,7 +36,7 @@ class Hidden:
     prompting: Prompting = field(default_factory=Prompting)
 
 
-type Arm = Prompting | Oracle | Hidden | Switch | OtherCommand
+type Arm = Prompting | Oracle | Hidden | Switch | OtherCommand | Arrow
 
 
 @dataclass(frozen=True)
@@ -43,12 +44,14 @@ class Ablation:
     """One ablation: a question, and its arms by method name.
 
     `paper` is the paper's table (data/paper_tables.csv), `rows` its row for each arm that it has.
-    Arms named in `methods` are methods already (evaluation.methods).
+    Arms named in `methods` are methods already (evaluation.methods), or arms of another ablation.
+    `suites` are those that it runs on where none is named.
     """
 
     question: str
     arms: Mapping[str, Arm]
     methods: tuple[str, ...] = (DEFAULT,)
+    suites: tuple[str, ...] = ("simpler-bridge",)
     paper: str = ""
     rows: Mapping[str, str] = field(default_factory=dict)
 
@@ -58,9 +61,13 @@ class Ablation:
         return (*self.methods, *self.arms)
 
 
+UNTRAINED = (Colour("orange", (255, 128, 0)), Colour("purple", (128, 0, 255)))
+"""Tints that no shipped policy was trained with; their names are words of its vocabulary."""
+
+
 def _tints() -> dict[str, Arm]:
     arms: dict[str, Arm] = {}
-    for colour in PALETTE:
+    for colour in (*PALETTE, *UNTRAINED):
         arms[f"only-{colour.name}"] = Prompting(palette=(colour,))
     return arms
 
@@ -91,12 +98,10 @@ ABLATIONS: dict[str, Ablation] = {
         arms={
             "references-1": Prompting(references=1),
             "references-3": Prompting(references=3),
-            "references-5": Prompting(references=5),
             "references-7": Prompting(references=7),
         },
-        methods=(),
         paper="ablation_k",
-        rows={f"references-{k}": f"K = {k}" for k in (1, 3, 5, 7)},
+        rows={DEFAULT: "K = 5", **{f"references-{k}": f"K = {k}" for k in (1, 3, 7)}},
     ),
     "form": Ablation(
         question="Is the tint better than other forms of a prompt?",
@@ -106,7 +111,7 @@ ABLATIONS: dict[str, Ablation] = {
             "box": Prompting(form=FilledBox()),
             "point": Prompting(form=Point()),
             "circle": Prompting(form=Circle()),
-            "arrow": Prompting(form=Arrow()),
+            "arrow": Arrow(),
             "marker": Prompting(form=NumberedMarker()),
             "dimmed": Prompting(form=DimmedBackground(), rewrite=False),
             "others-erased": Prompting(form=OthersErased(), rewrite=False),
@@ -124,16 +129,25 @@ ABLATIONS: dict[str, Ablation] = {
     ),
     "opacity": Ablation(
         question="How strong must the tint be?",
-        arms={f"opacity-{alpha}": Prompting(form=Tint(alpha)) for alpha in (0.1, 0.3, 0.7, 1.0)},
+        arms={f"opacity-{alpha}": Prompting(form=Tint(alpha)) for alpha in (0.1, 0.3, 0.7)},
+        methods=(DEFAULT, "opaque"),
         paper="ablation_prompt",
         rows={
             DEFAULT: "mask, alpha 0.5 (VAP)",
-            **{f"opacity-{alpha}": f"mask, alpha {alpha}" for alpha in (0.1, 0.3, 0.7, 1.0)},
+            "opaque": "mask, alpha 1.0",
+            **{f"opacity-{alpha}": f"mask, alpha {alpha}" for alpha in (0.1, 0.3, 0.7)},
         },
     ),
     "colour": Ablation(
         question="Does it matter which colour the tint has?",
         arms=_tints(),
+    ),
+    "red-lookalike": Ablation(
+        question="Where a look-alike is red by nature, is a tint chosen for the scene better than "
+        "always red?",
+        arms={},
+        methods=(DEFAULT, "only-red", "generic"),
+        suites=("simpler-bridge-red",),
     ),
     "occlusion": Ablation(
         question="How long may the target be hidden?",
@@ -156,14 +170,20 @@ ABLATIONS: dict[str, Ablation] = {
             "mask-shifted": Oracle("track", shift=0.5),
         },
         methods=("oracle-track",),
+        paper="mask_quality",
+        rows={
+            "oracle-track": "ratio 1.0",
+            **{f"mask-area-{r}": f"ratio {r}" for r in (0.25, 0.5, 1.5, 2.0)},
+        },
     ),
     "association": Ablation(
         question="Should views agree on one candidate?",
         arms={
-            f"associated-{name}": Prompting(associate=PAIRINGS[name])
-            for name in ("embedding", "hungarian", "all")
+            "associated-embedding": Prompting(associate=PAIRINGS["embedding"]),
+            "associated-both": Prompting(associate=Pairing(("embedding", "geometry"))),
         },
         methods=(DEFAULT, "vap-associated"),
+        suites=("vlabench",),
     ),
     "switch": Ablation(
         question="Does the policy follow the tint to a look-alike in mid-episode?",

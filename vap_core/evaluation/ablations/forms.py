@@ -1,11 +1,12 @@
 """Other forms of a prompt than the method's tint (P tab:ablation_prompt), each a few lines.
 
-A form is called with the picture, the target's mask, the colour, and the masks of what else is
-followed; it returns a marked copy. `prompt.PromptForm` is the protocol.
+A form is called with the picture, the target's mask, the colour, and the masks of the other
+candidates where it marks them; it returns a marked copy. `prompt.PromptForm` is the protocol.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -21,6 +22,8 @@ MARKER_PX = 8.0
 POINT_PX = 4.0
 SHADE = 0.35
 """What is left of the light outside the target, where the background is dimmed."""
+ARROW_TIP = 0.12
+"""The head of an arrow, as a share of its length."""
 GROW_PX = 9
 """Side, an odd number, of the square by which a mask is grown before what it covers is erased."""
 
@@ -84,24 +87,10 @@ class Circle:
 
 
 @dataclass(frozen=True)
-class Arrow:
-    """An arrow to the target from the middle of the picture's top, where hands come from.
-
-    The paper's arrow follows the hand's way, which one picture does not tell.
-    """
-
-    def __call__(self, rgb: Rgb, mask: Mask, colour: Colour, others: Sequence[Mask]) -> Rgb:
-        out = rgb.copy()
-        centre = _centre(mask)
-        if centre is not None:
-            start = (rgb.shape[1] // 2, 0)
-            cv2.arrowedLine(out, start, centre, colour.rgb, _scaled(rgb, LINE_PX), tipLength=0.12)
-        return out
-
-
-@dataclass(frozen=True)
 class NumberedMarker:
     """A numbered disc on every object that is followed; 1, in the colour, is the target's."""
+
+    marks_others: ClassVar[bool] = True
 
     def __call__(self, rgb: Rgb, mask: Mask, colour: Colour, others: Sequence[Mask]) -> Rgb:
         out = rgb.copy()
@@ -135,6 +124,16 @@ class OthersErased:
         erased = cv2.dilate(np.any(others, axis=0).astype(np.uint8), grown)
         erased[mask] = 0
         return cv2.inpaint(rgb, erased, 3, cv2.INPAINT_TELEA)
+
+
+def draw_arrow(rgb: Rgb, mask: Mask, colour: Colour, start_xy: tuple[int, int]) -> Rgb:
+    """A copy with an arrow from a pixel, which may lie outside the picture, to the target."""
+    out = rgb.copy()
+    centre = _centre(mask)
+    if centre is not None:
+        line = _scaled(rgb, LINE_PX)
+        cv2.arrowedLine(out, start_xy, centre, colour.rgb, line, tipLength=ARROW_TIP)
+    return out
 
 
 def _corners(mask: Mask) -> tuple[tuple[int, int], tuple[int, int]] | None:

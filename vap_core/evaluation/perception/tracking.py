@@ -6,7 +6,9 @@ It says whether the same object is tracked to the end, how well, and what hiding
         rows += track_episode(job, stack)
 
 Every object of the target's category that shows at t = 0 is tracked, in every camera, from the mask
-that the segmenter draws from its true box: the tracker alone is judged. A row is one object in one
+that the segmenter draws from its true box: the tracker alone is judged. A tracker that can follow a
+target alone follows each of them by itself, with the others as evidence, as the method does. A row
+is one object in one
 camera, once undisturbed through the whole episode (`hidden` 0), and once for each number of frames
 for which an occluder hides the target (vap_core.simulation.occluder), from the moment it is hidden
 to the end. A frame counts for an object when it shows at least VISIBLE_PX pixels.
@@ -23,7 +25,7 @@ from jaxtyping import Bool, Float64
 from vap_core.base.types import Boxes, Mask, Rgb, Track, value
 from vap_core.evaluation.perception.first_frames import VISIBLE_PX, TableRow
 from vap_core.perception.boxes import mask_box, mask_iou
-from vap_core.perception.protocols import Stack
+from vap_core.perception.protocols import Stack, TargetTracker
 from vap_core.policies.scripted.expert import Expert
 from vap_core.rollout.expert_loop import expert_steps
 from vap_core.simulation import suites
@@ -209,12 +211,19 @@ class _TrackerRun:
 
     def add(self, states: list[Any], frame: Frame) -> list[Any]:
         """Track the next frame of every camera, and return the tracker's states after it."""
-        images = [frame[camera][0] for camera in self.names]
+        followed = _followed(self.names, self.stack)
+        images = [frame[camera][0] for camera, _ in followed]
         start = time.perf_counter()
         states, tracks = self.stack.tracker.step(states, images)
         took_ms = 1e3 * (time.perf_counter() - start)
+        by_camera: dict[str, dict[int, Track]] = {camera: {} for camera in self.names}
+        for (camera, rows), of_state in zip(followed, tracks, strict=True):
+            for i in rows:
+                by_camera[camera][i] = of_state[i]
         self.frames.append(frame)
-        self.tracks.append(tracks)
+        self.tracks.append(
+            [tuple(by_row[i] for i in sorted(by_row)) for by_row in by_camera.values()]
+        )
         self.times_ms.append(took_ms / len(images))
         return states
 
@@ -263,14 +272,37 @@ def _shown_objects(frame: Frame, category: str) -> dict[str, tuple[str, ...]]:
 
 
 def _start_tracker(frame: Frame, names: Mapping[str, Sequence[str]], stack: Stack) -> list[Any]:
-    """The tracker's states for the objects of each camera, from their true boxes."""
-    images = []
-    first_masks = []
+    """The tracker's states of `_followed`, from true boxes."""
+    by_camera = {}
     for camera, tracked in names.items():
         rgb, masks = frame[camera]
-        images.append(rgb)
-        first_masks.append(_first_masks(rgb=rgb, masks=masks, names=tracked, stack=stack))
-    return stack.tracker.start(images, first_masks)
+        by_camera[camera] = _first_masks(rgb=rgb, masks=masks, names=tracked, stack=stack)
+    images = []
+    first_masks = []
+    targets = []
+    for camera, rows in _followed(names, stack):
+        images.append(frame[camera][0])
+        first_masks.append(by_camera[camera])
+        targets.append(rows)
+    tracker = stack.tracker
+    if isinstance(tracker, TargetTracker):
+        return tracker.start_targets(images, first_masks, targets)
+    return tracker.start(images, first_masks)
+
+
+def _followed(names: Mapping[str, Sequence[str]], stack: Stack) -> list[tuple[str, list[int]]]:
+    """The camera of every state of the tracker, and the objects that it follows, by their place.
+
+    Where the tracker can, each object is followed by itself.
+    """
+    followed = []
+    for camera, tracked in names.items():
+        rows = list(range(len(tracked)))
+        if isinstance(stack.tracker, TargetTracker):
+            followed += [(camera, [row]) for row in rows]
+        else:
+            followed.append((camera, rows))
+    return followed
 
 
 def _first_masks(

@@ -8,6 +8,7 @@ layouts from lists that evaluation instances never use.
 A "kind" is a category ("pen holder") or the stem of a family ("paper-cup").
 """
 
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal
@@ -22,6 +23,10 @@ from vap_core.simulation.assets.generics import draw_texture, draw_twin
 from vap_core.simulation.assets.scans.storage import load_scan, scan_folders
 from vap_core.simulation.assets.shapes import Mesh, Shape
 from vap_core.simulation.assets.textures import Srgb, Texture
+
+RED = "-red"
+"""Ends the name of an object that is red by nature, and else as the one before it."""
+RED_PAINT: Srgb = (196, 24, 28)
 
 Tier = Literal["hard", "medium", "easy"]
 TIERS: tuple[Tier, ...] = ("hard", "medium", "easy")
@@ -164,7 +169,7 @@ def get_object(name: str) -> ObjectModel:
     """The object of that name.
 
     It is one of `OBJECTS`, or `<stem>-generic-<index>`, or `<stem>-generic-<index>-<twin>`, or one
-    of the user's own scans.
+    of these in red, `<name>-red`, or one of the user's own scans.
 
     Raises:
         UnknownName: there is no such object.
@@ -175,6 +180,9 @@ def get_object(name: str) -> ObjectModel:
     generic = _generic_of_name(name)
     if generic is not None:
         return generic
+    red = _red_of_name(name)
+    if red is not None:
+        return red
     scanned = scan_folders()
     if name in scanned:
         return load_scanned_object(scanned[name])
@@ -194,6 +202,18 @@ def _generic_of_name(name: str) -> ObjectModel | None:
     if model.name != name:
         return None
     return model
+
+
+@lru_cache(maxsize=256)
+def _red_of_name(name: str) -> ObjectModel | None:
+    """The drawn object with this name, red where its base colour is."""
+    plain = name.removesuffix(RED)
+    if plain == name:
+        return None
+    model = OBJECTS.get(plain) or _generic_of_name(plain)
+    if model is None or not isinstance(model.texture, Texture):
+        return None
+    return replace(model, name=name, texture=replace(model.texture, base=RED_PAINT))
 
 
 def load_scanned_object(folder: Path) -> ObjectModel:

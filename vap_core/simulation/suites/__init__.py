@@ -2,7 +2,8 @@
 
 The episode lists of the benchmarks are hashed files; those of the warm-up suites are generated.
 Every benchmark has a development list, the suite NAME-dev. NAME-absent and NAME-dev-absent are the
-same lists with the target left out.
+same lists with the target left out; NAME-red and NAME-dev-red have a look-alike that is red by
+nature.
 """
 
 from dataclasses import replace
@@ -33,6 +34,8 @@ WARM_UPS: dict[str, Suite] = {"widowx-pick": pick.WIDOWX, "franka-pick": pick.FR
 SUITES: dict[str, Suite] = {**BENCHMARKS, **WARM_UPS}
 ABSENT = "-absent"
 """Ends the name of a suite whose target is left out."""
+RED = objects.RED
+"""Ends the name of a suite whose first look-alike is red by nature; -absent may follow it."""
 
 
 def suite(name: str) -> Suite:
@@ -41,18 +44,20 @@ def suite(name: str) -> Suite:
         return SUITES[name]
     if not is_listed(name):
         raise one_of(
-            "suites.suite: suite (a benchmark also with -dev, -absent, -dev-absent)", name, SUITES
+            "suites.suite: suite (a benchmark also with -dev, -red, -absent, -dev-absent)",
+            name,
+            SUITES,
         )
     return replace(BENCHMARKS[benchmark_name(name)], name=name)
 
 
 def list_name(name: str) -> str:
-    """The list that a suite reads, without or with its target."""
-    return name.removesuffix(ABSENT)
+    """The list that a suite reads, whatever is left out of it or painted red."""
+    return name.removesuffix(ABSENT).removesuffix(RED)
 
 
 def benchmark_name(name: str) -> str:
-    """The benchmark of a suite: its own name, or that without -dev and -absent."""
+    """The benchmark of a suite: its own name, or that without -dev, -red and -absent."""
     return list_name(name).removesuffix(development.SUFFIX)
 
 
@@ -72,13 +77,17 @@ def digest(name: str) -> str:
 
 @cache
 def benchmark(name: str) -> tuple[EpisodeRow, ...]:
-    """The whole list of a benchmark, or of its development list; for both without their targets.
+    """The whole list of a benchmark, or of its development list; for both without their targets, or
+    with a red look-alike.
 
     Raises: BadSuite, naming row and field, also for a task, camera or object that does not exist.
     """
     if name.endswith(ABSENT):
         left_out = replace(AS_LISTED, absent=True)
-        return tuple(replace(row, suite=name, start=left_out) for row in benchmark(list_name(name)))
+        whole = benchmark(name.removesuffix(ABSENT))
+        return tuple(replace(row, suite=name, start=left_out) for row in whole)
+    if name.endswith(RED):
+        return tuple(_with_red_lookalike(row, name) for row in benchmark(name.removesuffix(RED)))
     episodes = lists.read(name)
     known = suite(name)
     tasks = {task.name for task in known.tasks}
@@ -137,6 +146,20 @@ def listed(
     for row_seed in range(seed, seed + seeds):
         episodes.extend(rows(suite_name, task_name, n, row_seed))
     return tuple(episodes)
+
+
+def _with_red_lookalike(row: EpisodeRow, name: str) -> EpisodeRow:
+    """The row with its first look-alike red by nature, in its place."""
+    placements = list(row.placements)
+    for i, place in enumerate(placements):
+        if (
+            i
+            and place.model != row.goal
+            and objects.get_object(place.model).category == row.category
+        ):
+            placements[i] = replace(place, model=f"{place.model}{RED}")
+            break
+    return replace(row, suite=name, placements=tuple(placements))
 
 
 def _check_names(names: set[str], known: set[str], where: str) -> None:

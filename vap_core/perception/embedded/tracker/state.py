@@ -3,6 +3,8 @@
 Its size does not grow with the episode.
 """
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
@@ -52,6 +54,8 @@ class TrackState:
     """The largest mask of late, pixels."""
     lost: Int64[np.ndarray, " n"]
     """Frames since the identity was visible."""
+    followed: Bool[np.ndarray, " n"]
+    """The others have no mask after t = 0, count as lost and are not searched for."""
     colours: Float32[np.ndarray, "2 n b"]
     """Blurred shares of colours: of t = 0, and a running mean."""
     first_crops: tuple[Rgb, ...]
@@ -75,9 +79,20 @@ class FrameFeatures:
     grid: Grid
 
 
-def initial_state(image: Rgb, masks: Bool[np.ndarray, "n h w"], network: Network) -> TrackState:
-    """The state at t = 0; row i of the masks is identity i. `network` embeds cells."""
+def initial_state(
+    image: Rgb,
+    masks: Bool[np.ndarray, "n h w"],
+    network: Network,
+    targets: Sequence[int] | None = None,
+) -> TrackState:
+    """The state at t = 0; row i of the masks is identity i. `network` embeds cells.
+
+    All identities are followed, or the `targets` alone.
+    """
     n = len(masks)
+    followed: Bool[np.ndarray, " n"] = np.ones(n, bool)
+    if targets is not None:
+        followed = np.isin(np.arange(n), targets)
     keys, grid = embed_cells(image, network)
     area = masks.sum(axis=(1, 2))
     visible: Bool[np.ndarray, " n"] = area > 0
@@ -95,12 +110,13 @@ def initial_state(image: Rgb, masks: Bool[np.ndarray, "n h w"], network: Network
         first=first,
         recent=(),
         last_seen=(first,) * n,
-        masks=masks.copy(),
-        scores=visible.astype(np.float32),
+        masks=masks & followed[:, None, None],
+        scores=(visible & followed).astype(np.float32),
         thumbnails=(thumbnail_of(image),) * n,
         boxes=boxes,
         area=area.astype(np.float32),
-        lost=(~visible).astype(np.int64),
+        lost=(~(visible & followed)).astype(np.int64),
+        followed=followed,
         colours=np.stack([colours, colours]),
         first_crops=tuple(crops),
         last_crops=tuple(crops),
