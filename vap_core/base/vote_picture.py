@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vap_core.base.events import describe_ballot, describe_rejection
-from vap_core.base.palette import ELECTED, LOOKALIKES, TARGET
+from vap_core.base.palette import ELECTED, LOOKALIKES, TARGET, Rgb8, rgb8
 from vap_core.base.types import Grounding, Rgb
 
 if TYPE_CHECKING:
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 Number = float | int
 Place = tuple[Number, Number]
 """x and y, or width and height, pixels."""
+Text = tuple[str, Place, Rgb8, bool]
+"""Words, the middle of their height at their left end or, where true, their centre; colour."""
 MOST_ROWS = 6
 """Candidates that are shown, best first; a last line counts the others."""
 PAPERS = {True: ("#181c24", "#e6e6e6", "#3a404c"), False: ("#ffffff", "#222222", "#d0d0d0")}
@@ -79,7 +81,7 @@ def vote_picture(
     y += header
 
     least = float(grounding.similarity.min()) if grounding.similarity.size else 0.0
-    cosines: list[tuple[float, Place, int]] = []
+    texts: list[Text] = []
     best = grounding.similarity.argmax(axis=0) if len(grounding.similarity) else np.zeros(0, int)
     for i in rows:
         picture.paste(_fitted(_crop(rgb, grounding.candidates.xyxy[i]), cell_px - 8), (4, y + 4))
@@ -89,10 +91,13 @@ def vote_picture(
             share = (cosine - least) / max(1 - least, 1e-6)
             grey = round(DARKEST + share * (BRIGHTEST - DARKEST))
             _cell(draw, place, cell_px, grey)
-            cosines.append((cosine, place, grey))
+            middle = (place[0] + cell_px / 2, y + cell_px / 2)
+            contrast = (0, 0, 0) if grey > 120 else (255, 255, 255)
+            texts.append((f"{cosine:.2f}", middle, contrast, True))
             if best[j] == i:
                 _dot(draw, place, cell_px)
-        _row_words(draw, grounding, i, (left + n_photos * cell_px + 8, y), cell_px, font, ink)
+        beside_cells = (left + n_photos * cell_px + 8, y)
+        texts += _row_words(grounding, i, beside_cells, cell_px, rgb8(ink))
         if i == grounding.winner:
             _elected(draw, (0, y), (width - 3, cell_px), right)
         else:
@@ -104,7 +109,7 @@ def vote_picture(
         y += cell_px
     draw.text((6, y + cell_px / 4), result_line(grounding), fill=ink, font=bold, anchor="lm")
     drawn = np.array(picture)
-    _write_cosines(drawn, cosines, cell_px)
+    _write(drawn, texts, cell_px)
     return drawn
 
 
@@ -139,15 +144,7 @@ def result_line(grounding: Grounding) -> str:
     return text
 
 
-def _row_words(
-    draw: "Draw",
-    grounding: Grounding,
-    i: int,
-    place: Place,
-    cell_px: int,
-    font: "FreeTypeFont",
-    ink: str,
-) -> None:
+def _row_words(grounding: Grounding, i: int, place: Place, cell_px: int, ink: Rgb8) -> list[Text]:
     """Number, votes and mean cosine of one candidate."""
     x, y = place
     n_photos = grounding.similarity.shape[1]
@@ -156,8 +153,7 @@ def _row_words(
         f"{grounding.ballot.votes[i]} of {n_photos} votes",
         f"mean {grounding.similarity[i].mean():.2f}",
     )
-    for k, text in enumerate(words):
-        draw.text((x, y + (k + 1) * cell_px / 4), text, fill=ink, font=font, anchor="lm")
+    return [(text, (x, y + (k + 1) * cell_px / 4), ink, False) for k, text in enumerate(words)]
 
 
 def _cell(draw: "Draw", place: Place, cell_px: int, grey: int) -> None:
@@ -166,21 +162,20 @@ def _cell(draw: "Draw", place: Place, cell_px: int, grey: int) -> None:
     draw.rectangle((x + 1, y + 1, x + cell_px - 2, y + cell_px - 2), fill=(grey, grey, grey))
 
 
-def _write_cosines(picture: Rgb, cosines: list[tuple[float, Place, int]], cell_px: int) -> None:
-    """The numbers in the cells, by OpenCV: ten times as fast as a font with outlines."""
+def _write(picture: Rgb, texts: list[Text], cell_px: int) -> None:
+    """Words in and beside the cells, by OpenCV: many times as fast as a font with outlines."""
     import cv2
 
-    scale = cell_px / 150
-    for cosine, (x, y), grey in cosines:
-        text = f"{cosine:.2f}"
+    scale = cell_px / 165
+    for text, (x, y), ink, centred in texts:
         (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
         cv2.putText(
             picture,
             text,
-            org=(int(x + (cell_px - width) / 2), int(y + (cell_px + height) / 2)),
+            org=(int(x - width / 2 if centred else x), int(y + height / 2)),
             fontFace=cv2.FONT_HERSHEY_SIMPLEX,
             fontScale=scale,
-            color=(0, 0, 0) if grey > 120 else (255, 255, 255),
+            color=ink,
             thickness=1,
             lineType=cv2.LINE_AA,
         )

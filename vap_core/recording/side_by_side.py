@@ -84,7 +84,7 @@ def _method_row(name: str, image_roots: list[str]) -> rrb.Container:
     return rrb.Vertical(
         verdict_view(f"/{name}/vap/verdict", name),
         rrb.Horizontal(*views, scene),
-        row_shares=[0.24, 0.76],
+        row_shares=[0.29, 0.71],
     )
 
 
