@@ -41,6 +41,7 @@ def test_the_browser_links_every_recording_to_its_deciding_frame(run: Path) -> N
         assert "frame_index" in rows.link[0]
         assert rows.link[0].startswith("rerun+http://127.0.0.1:")
         assert client.get_table("episodes").blueprints()
+        assert client.get_dataset("recordings").default_blueprint()
     none = run / "recordings" / "none"
     with pytest.raises(BadRecording, match="there is no recording in"), serve_run(none):
         pass

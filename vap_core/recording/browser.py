@@ -17,9 +17,20 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from vap_core.base.errors import BadRecording, VapError
+from vap_core.recording.blueprint import full_window
 from vap_core.recording.catalog import register_files
 from vap_core.recording.reading import read_summary
+from vap_core.recording.stored_pictures import prompted_entities
 from vap_core.recording.viewer import free_port
+from vap_core.recording.views import (
+    coverage_view,
+    events_view,
+    gripper_view,
+    instruction_view,
+    policy_view,
+    verdict_view,
+    vote_view,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -91,10 +102,11 @@ def serve_run(run: Path, where: str | None = None, port: int | None = None) -> I
                 f"query: none of {len(files)} files in {folder} can be read; "
                 f"the first: {next(iter(unreadable.values()))}."
             )
+        _register_layout(dataset, folder / rows[0]["file"], Path(scratch))
         table = client.create_table("episodes", _schema())
         table.append(pa.RecordBatch.from_pylist(rows, schema=_schema()))
         blueprint = Path(scratch) / "episodes.rbl"
-        _blueprint(where).save("vap", blueprint)
+        _table_layout(where).save("vap", blueprint)
         table.register_blueprint(blueprint.resolve().as_uri())
         yield Browser(f"{client.url}/entry/{table.id}", rows, unreadable)
 
@@ -131,7 +143,26 @@ def _rows(
     return rows
 
 
-def _blueprint(where: str | None) -> rrb.TableBlueprint:
+def _register_layout(dataset: "DatasetEntry", recording: Path, scratch: Path) -> None:
+    """Recordings of a catalog open with one layout for all: the verdict, every view, the curves.
+
+    A recording's own layout, with the evidence of its case, opens with its file. `recording` says
+    which cameras there are.
+    """
+    columns: list[rrb.Container | rrb.View] = []
+    for camera in prompted_entities(recording):
+        pictures = rrb.Horizontal(vote_view(camera, "vote"), policy_view(camera))
+        columns.append(rrb.Vertical(coverage_view(camera), pictures, row_shares=[1.6, 1]))
+    course = rrb.Horizontal(instruction_view(), gripper_view(), events_view())
+    window = rrb.Vertical(
+        verdict_view(), rrb.Horizontal(*columns), course, row_shares=[0.11, 0.61, 0.28]
+    )
+    path = scratch / "recordings.rbl"
+    full_window(window).save("vap", path)
+    dataset.register_blueprint(path.resolve().as_uri())
+
+
+def _table_layout(where: str | None) -> rrb.TableBlueprint:
     columns = []
     for name, title in COLUMNS.items():
         columns.append(rrb.table.Column(name, name=title))
