@@ -20,7 +20,7 @@ help:
 
 setup: .venv/.ready
 
-.venv/.ready: environment.txt pyproject.toml
+.venv/.ready: environment.txt pyproject.toml plugins/lerobot_env_vap/pyproject.toml
 	@PYTHON="$(PYTHON)" bash .ci/setup
 
 demo: setup
@@ -35,14 +35,19 @@ style: setup
 types: setup
 	$(RUN) -m mypy
 
-check: lint
+check: lint .venv/.compiled
 	$(PYTEST) -m "not slow and not sweep"
 
 # Types are checked beside the first tests.
 test: style
 	@$(MAKE) --no-print-directory -j 2 types suite
 
-suite: setup
+# The first time one process compiles the modules that each of the workers would compile.
+.venv/.compiled: .venv/.ready
+	@$(RUN) -m pytest --collect-only tests >/dev/null || true
+	@touch $@
+
+suite: setup .venv/.compiled
 	$(PYTEST) -m "not sweep" --nbval-lax notebooks tests
 
 test-all: test

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import settings
-from jaxtyping import install_import_hook
+
+from tests.checked import check_signatures
 
 if TYPE_CHECKING:
     from vap_core.rollout.types import EpisodeHeader, Frame
     from vap_core.training.films.demonstrations import Film
 
-install_import_hook("vap_core", "beartype.beartype")
+check_signatures("vap_core")
 os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = (
     "0"  # read when ray is first imported: the tests' cluster stays on loopback
 )

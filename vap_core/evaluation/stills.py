@@ -22,6 +22,7 @@ NOT_DRAWN = {
     "catalog",
     "clicks",
     "corrections",
+    "dataset",
     "deferred",
     "film",
     "index",

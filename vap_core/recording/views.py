@@ -116,9 +116,14 @@ def method_curve_views(header: EpisodeHeader) -> list[Part]:
     if not cameras:
         return []
     return [
-        _curve_view("/vap/track_score", "track score", UNIT_RANGE),
+        track_score_view(),
         _curve_view("/vap/vote_margin", "vote margin", UNIT_RANGE),
     ]
+
+
+def track_score_view() -> Part:
+    """How sure the tracker is of the target, in every view."""
+    return _curve_view("/vap/track_score", "track score", UNIT_RANGE)
 
 
 def gripper_view(limits_cm: tuple[float, float] | None = None) -> Part:
