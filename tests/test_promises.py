@@ -1,13 +1,17 @@
 """Files are parsed and never executed, servers are on loopback, and keys stay where they are."""
 
 import ast
+import os
 import re
 import socket
+import time
 from pathlib import Path
 
 import pytest
 
 import vap_core
+from vap_core.base import files
+from vap_core.base.errors import BadOutput
 from vap_core.recording import viewer
 
 ROOT = Path(vap_core.__file__).resolve().parent
@@ -60,6 +64,82 @@ def test_no_module_reads_what_can_execute() -> None:
             if keyword(call, "shell") == "True" or keyword(call, "trust_remote_code") == "True":
                 wrong.append(f"{path.name}: {name} with shell or remote code")
     assert not wrong
+
+
+READERS = {
+    "json.load": set(),
+    "json.loads": {
+        *("files.py", "store.py"),  # what is read; a configuration, made JSON and back
+        *("isolated.py", "lerobot_process.py", "eval_lerobot.py"),  # lines of our own processes
+        *("chat.py",),  # answers of a chat endpoint, bounded, each in a try
+        *("measurement.py", "paraphrases.py", "weights.py", "stills.py"),  # files that ship
+        *("dataset.py",),  # in a try
+    },
+    "pd.read_parquet": set(),
+    "pq.read_table": {"publish.py", "dataset.py", "kept.py"},  # with notes, in a try; that ship
+    "read_table": {"parquet.py"},
+    "Image.open": {"photos.py", "storage.py", "dataset.py", "stills.py", "kept.py", "plots.py"},
+    "trimesh.load_scene": {"mesh_parts.py"},
+    "av.open": {"video.py"},
+    "torch.load": {"fitting.py"},
+    "safe_open": {"loading.py"},
+}
+"""Each format has one reader of files from outside; the others read what we have written."""
+
+
+def test_each_format_is_read_in_one_place() -> None:
+    found: dict[str, set[str]] = {name: set() for name in READERS}
+    for path in SOURCES:
+        for name, _ in calls(ast.parse(path.read_text())):
+            if name in found:
+                found[name].add(path.name)
+    assert found == READERS
+
+
+def test_limits_of_time_are_of_a_clock_that_nobody_sets() -> None:
+    """The clock of the day decides what a scratch file's age is, and dates; it measures nothing."""
+    of_the_day = set()
+    for path in SOURCES:
+        for name, _ in calls(ast.parse(path.read_text())):
+            if name in ("time.time", "datetime.now", "datetime.utcnow", "date.today"):
+                of_the_day.add(path.name)
+    assert of_the_day == {"files.py", "readings.py", "objects.py", "measurement.py", "context.py"}
+
+
+def test_a_clock_that_was_set_back_makes_no_scratch_file_old(tmp_path: Path) -> None:
+    young = tmp_path / ".a.tmp"
+    young.touch()
+    ahead = time.time() + 10 * files.ABANDONED_S
+    os.utime(young, (ahead, ahead))
+    files.remove_scratch(tmp_path)
+    assert young.exists()
+
+
+def damaged(path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(b"PAR1 and nothing else")
+    return path
+
+
+def test_a_damaged_table_is_one_line_wherever_it_is_read(tmp_path: Path) -> None:
+    from vap_core.analysis import attention, inspection
+    from vap_core.analysis.attention import replay
+    from vap_core.evaluation import input_audit, state_log
+    from vap_core.evaluation.tokens import study
+
+    for name in replay.TABLES:
+        damaged(tmp_path / f"{replay.PREFIX}{name}.parquet")
+    for name in inspection.TABLES:
+        damaged(tmp_path / f"perception_{name}.parquet")
+    damaged(tmp_path / "traces" / "a.parquet")
+    damaged(tmp_path / "audit" / "a.parquet")
+    damaged(tmp_path / study.TABLES[0] / "a.parquet")
+    for read in (
+        attention.read, inspection.published, input_audit.read, state_log.read, study.read,
+    ):  # fmt: skip
+        with pytest.raises(BadOutput, match=r"parquet is damaged; ") as told:
+            list(read(tmp_path))
+        assert "\n" not in str(told.value)
 
 
 def test_arrays_of_objects_are_refused_wherever_arrays_are_read(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from vap_core.analysis.attention.observer import NOTHING, Observer, Rows
 from vap_core.base.errors import BadOutput, BadStudy
 from vap_core.base.files import write_atomic
+from vap_core.base.parquet import read_parquet
 from vap_core.base.version import code_version
 from vap_core.evaluation import measurements
 from vap_core.evaluation.diagnosis.recordings import listed_row, study_of
@@ -205,8 +206,6 @@ def run_job(job: Job) -> dict[str, Rows]:
 
 def read(folder: Path) -> "dict[str, pd.DataFrame]":
     """The tables that were published in a folder. Raises: BadOutput."""
-    import pandas as pd
-
     tables = {}
     for name in TABLES:
         path = folder / f"{PREFIX}{name}.parquet"
@@ -215,7 +214,7 @@ def read(folder: Path) -> "dict[str, pd.DataFrame]":
                 f"attention: {path} is missing; make it: python -m vap_core attention RUN "
                 f"--publish {folder}"
             )
-        tables[name] = pd.read_parquet(path)
+        tables[name] = read_parquet(path, "attention", "publish it again")
     return tables
 
 
