@@ -20,7 +20,7 @@ help:
 
 setup: .venv/.ready
 
-.venv/.ready: environment.txt pyproject.toml
+.venv/.ready: environment.txt pyproject.toml plugins/lerobot_env_vap/pyproject.toml
 	@PYTHON="$(PYTHON)" bash .ci/setup
 
 demo: setup

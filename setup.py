@@ -13,6 +13,7 @@ from setuptools.command.build_py import build_py
 SHIPPED = (
     "paper_tables.csv",
     "paraphrases",
+    "photo-set",
     "policies",
     "results/readings.csv",
     "suites",

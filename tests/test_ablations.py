@@ -10,6 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.command import refused, vap
+from vap_core.analysis.ablations import (
+    ablation_results,
+    all_effects_figure,
+    cases_text,
+    effect_text,
+    rates_of_arms_figure,
+    sweep_figure,
+)
+from vap_core.analysis.agreements import gate_figure, gated_cases
 from vap_core.attend import Prompting
 from vap_core.base.types import Camera
 from vap_core.evaluation import hiding, paper
@@ -269,3 +278,54 @@ def test_the_target_is_hidden_from_the_third_call_on() -> None:
     assert [step for step in range(40) if occlusion.covers("front", step)] == list(range(8, 16))
     assert _occlusion("vap", execute=4) is None
     assert suites.rows("simpler-bridge", "pick-shaver", n=1)
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_a_form_that_marks_others_says_so(name: str) -> None:
+    rgb = np.random.default_rng(2).integers(60, 120, (112, 112, 3), np.uint8)
+    mask, other = blob(112, 112, 60, 30, 12), blob(112, 112, 60, 80, 12)
+    differs = bool((FORMS[name](rgb, mask, RED, [other]) != FORMS[name](rgb, mask, RED, [])).any())
+    assert differs == bool(getattr(FORMS[name], "marks_others", False))
+
+
+def test_figures_of_published_ablations() -> None:
+    table = pd.concat([
+        outcomes("vap", [True] * 9 + [False]),
+        outcomes("opaque", [True] * 6 + [False] * 4),
+        outcomes("opacity-0.1", [True] * 2 + [False] * 8),
+        outcomes("mask-only", [True] * 2 + [False] * 8),
+    ], ignore_index=True)  # fmt: skip
+    results = ablation_results(table)
+    assert set(results) == {"rewrite", "form", "opacity"}, "the others have no arm there"
+    assert [one.arm for one in results["opacity"]] == ["vap", "opaque", "opacity-0.1"]
+    labels = [tick.get_text() for tick in all_effects_figure(results).axes[0].get_yticklabels()]
+    assert labels[:2] == ["rewrite: against vap, 90 % of 10", "mask-only"]
+    places = {"opacity-0.1": 0.1, "vap": 0.5, "opaque": 1.0, "opacity-0.3": 0.3}
+    (line, *_) = sweep_figure(results["opacity"], places, "opacity").axes[0].containers[0]
+    assert line.get_xdata().tolist() == [0.1, 0.5, 1.0]
+    assert line.get_ydata().tolist() == pytest.approx([20, 90, 60])
+    assert len(rates_of_arms_figure(results["form"]).axes[0].get_yticklabels()) == 2
+    assert effect_text(results["opacity"], "opaque").startswith("-30 [")
+    assert effect_text(results["opacity"], "vap") == "90 % of 10"
+    assert cases_text(results["rewrite"]).splitlines()[0].split() == (
+        "vap SR 90 % [60, 98], Case 1 1 of 10, Case 2 0 of 10".split()
+    )
+
+
+def test_views_agree_only_where_the_margin_is_large_enough() -> None:
+    rows = []
+    for episode, (alone, joint, margin) in enumerate(
+        [("case 2", "right", 2.0), ("case 2", "case 1", 0.5), ("right", "right", 0.1),
+         ("case 1", "case 1", np.nan)]
+    ):  # fmt: skip
+        for way, case in (("off", alone), ("geometry", joint)):
+            rows.append({"suite": "s", "task": "t", "episode": episode, "associate": way,
+                         "case": case, "margin": margin if way != "off" else np.nan})  # fmt: skip
+    cases = gated_cases(pd.DataFrame(rows), "geometry", [0.0, 1.0, np.inf])
+    assert cases[["right", "case 1", "case 2"]].to_numpy().tolist() == [
+        [2, 2, 0],
+        [2, 1, 1],
+        [1, 1, 2],
+    ]
+    (part,) = gate_figure(pd.DataFrame(rows), "geometry").axes
+    assert part.get_title() == "s, n 4"

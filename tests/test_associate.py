@@ -367,6 +367,16 @@ def test_a_lone_view_has_nothing_to_associate() -> None:
     assert found.chosen == {"front": 1, "side": 0, "wrist": None}
 
 
+def test_views_keep_their_own_choices_where_none_is_decisive() -> None:
+    found = associate(CASE_2, PAIRINGS["geometry"])
+    assert found is not None
+    below = replace(PAIRINGS["geometry"], decisive=found.margin - 0.01)
+    again = associate(CASE_2, below)
+    assert again is not None
+    assert again.chosen == found.chosen
+    assert associate(CASE_2, replace(below, decisive=found.margin + 0.01)) is None
+
+
 def test_what_cannot_be_associated_is_said() -> None:
     five = {f"cam{i}": CASE_2["front"] for i in range(5)}
     with pytest.raises(

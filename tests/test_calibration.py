@@ -162,6 +162,7 @@ def test_keep_is_for_stacks_that_ship_none(tmp_path, monkeypatch):
     with pytest.raises(BadOutput, match="leave --keep out"):
         run.refuse_keep("embedded")
     run.refuse_keep("foundation")
+    run.refuse_keep("embedded", [tmp_path])
     monkeypatch.setattr(run, "load_stack", lambda name: TOY)
     monkeypatch.setenv(store.VARIABLE, str(tmp_path))
     path = run.keep_choice("foundation", report.Choice(0.6, None))
@@ -170,6 +171,43 @@ def test_keep_is_for_stacks_that_ship_none(tmp_path, monkeypatch):
     assert kept == Thresholds(0.6, 0.6)
     with pytest.raises(BadOutput, match="more --scenes"):
         run.keep_choice("foundation", report.Choice(None, None))
+
+
+def test_a_threshold_for_own_photos_is_kept_and_runs_do_not_depend_on_it(tmp_path, monkeypatch):
+    shipped = replace(TOY, thresholds=Thresholds(0.7, 0.5))
+    monkeypatch.setitem(stacks.STACKS, "toy", lambda: shipped)
+    monkeypatch.setenv(store.VARIABLE, str(tmp_path))
+    assert stacks.load_own("toy").thresholds == Thresholds(0.7, 0.5)
+    run.keep_choice("toy", report.Choice(0.9, 0.61))
+    assert stacks.load_own("toy").thresholds == Thresholds(0.7, 0.61)
+    assert stacks.load_stack("toy").thresholds == Thresholds(0.7, 0.5)
+    with pytest.raises(BadOutput, match="more photos in the set"):
+        run.keep_choice("toy", report.Choice(0.9, None))
+
+
+def test_photos_are_measured_without_scenes(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "load_stack", lambda name: TOY)
+    with pytest.raises(BadOutput, match="no scenes and no photos"):
+        run.calibrate("toy", tmp_path / "none", scenes=0, progress=False)
+
+    def measured(folder, out, stack, progress):
+        rows = {
+            "scene": [str(i) for i in range(40)],
+            "familiar": False,
+            "likeness": 0.64,
+            "present": True,
+            "lookalikes": 0,
+            "chosen_iou": 0.9,
+        }
+        out.mkdir(parents=True)
+        pd.DataFrame(rows).to_parquet(out / f"{run.TABLE}.parquet")
+
+    monkeypatch.setattr(run, "measure_photos", measured)
+    text, chosen = run.calibrate(
+        "toy", tmp_path / "out", scenes=0, photos=[tmp_path / "mine"], progress=False
+    )
+    assert (chosen.familiar, chosen.unfamiliar) == (None, 0.64)
+    assert "unfamiliar views" in text
 
 
 def test_ground_says_that_a_stack_cannot_say_not_in_view(monkeypatch):

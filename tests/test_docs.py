@@ -16,7 +16,7 @@ from vap_core.cli import app
 from vap_core.contracts import plugin
 from vap_core.evaluation.ablations import arms
 from vap_core.evaluation.methods import known_methods
-from vap_core.perception.stacks import STACKS
+from vap_core.perception.stacks import STACKS, check_stack
 from vap_core.simulation.suites import SUITES
 
 WORDS = 1200
@@ -74,14 +74,18 @@ def find_command(words: list[str]) -> tuple[Any, list[str]]:
 
 
 def check_names(values: dict[str, object]) -> None:
-    """Suites, methods and stacks exist; words in capitals stand for any."""
+    """Suites, methods and stacks exist; words in capitals, and Python files, stand for any."""
     methods = set(known_methods())
     known = {"suite": {*SUITES, "all"}, "methods": methods, "method": methods, "stack": {*STACKS}}
     for option, names in known.items():
         given = values.get(option) or ()
         for text in (given,) if isinstance(given, str) else given:
+            if option == "stack" and ":" in text:
+                check_stack(text)
+                continue
             for name in text.split(","):
-                assert name.isupper() or name in names, (option, name)
+                stands_for_any = name.isupper() or name.endswith(".py")
+                assert stands_for_any or name in names, (option, name)
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if commands(page) and page != RECORD])
@@ -108,8 +112,8 @@ def options(command: Any) -> set[str]:
 def test_options_are_there(page: str) -> None:
     known = options(typer.main.get_command(app)) | CONTRACT_OPTIONS
     for span in spans(page):
-        for option in re.findall(r"(?<!\S)--[a-z][\w-]*", span):
-            assert option in known, span
+        for option in re.findall(r"(?<!\S)--[a-z][\w.-]*", span):
+            assert option in known or "." in option, span  # lerobot's have a dot
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")])

@@ -354,7 +354,7 @@ def test_the_backbone_runs_once_per_opening_frame_and_once_per_step(
 
 def test_encoding_in_batches_changes_nothing_but_last_bits(parts: Stack) -> None:
     crops = [blurred(seed, 30 + seed, 50) for seed in range(dino.BATCH + 3)]
-    together = dino.DinoEncoder(parts.encoder.model, parts.encoder.processor, "batched", BATCHED)
+    together = dino.CropEncoder(parts.encoder.model, dino.DINO, "batched", BATCHED)
     with Watch(together.model) as watch:
         assert np.allclose(together(crops), parts.encoder(crops), atol=1e-5)
     assert [len(given) for given in watch.given[:2]] == [dino.BATCH, 3]
@@ -448,7 +448,7 @@ def test_half_precision_changes_little_and_ends_with_the_call(parts: Stack, scen
     rgb, masks, boxes = scene
     half = runtime.Runtime(torch.device("cpu"), torch.bfloat16, batched=True)
     exact = parts.encoder([rgb])
-    encoder = dino.DinoEncoder(parts.encoder.model, parts.encoder.processor, "half", half)
+    encoder = dino.CropEncoder(parts.encoder.model, dino.DINO, "half", half)
     assert (encoder([rgb]) @ exact.T).item() > 0.995
     assert encoder([rgb]).dtype == np.float32
     detector = grounding.GroundingDino(

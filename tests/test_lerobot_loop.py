@@ -116,6 +116,7 @@ def test_switches_and_resets(bank):
     assert (rgb(only_words) == at(4)).all()
     assert only_words["task"] != ["bring my mug"]
     step = pipeline(bank, episodes="reset", rewrite=False)
+    step.reset()
     shown = [step(batch([at(x)])) for x in (4, 6)]
     assert shown[0]["task"] == ["bring my mug"]
     assert (rgb(shown[1]) == direct(bank, [at(4), at(6)])[1].images["top"]).all()
@@ -132,9 +133,19 @@ def test_switches_and_resets(bank):
 
 def test_what_cannot_be_known_fails_loudly(bank, tmp_path):
     with pytest.raises(BadViews, match=r"observation.vap_step is missing.*episodes='reset'"):
-        pipeline(bank)(batch([at(4)]))
-    with pytest.raises(BadViews, match="2 environments but episodes='reset', which knows one"):
-        pipeline(bank, episodes="reset")(batch([at(4), at(6)]))
+        pipeline(bank, episodes="vap_step")(batch([at(4)]))
+    with pytest.raises(BadViews, match="2 environments, of which a reset .* names none"):
+        pipeline(bank)(batch([at(4), at(6)]))
+    for episodes in ("auto", "reset"):
+        with pytest.raises(
+            BadViews, match=r"lerobot-eval never does.*give the observation vap_step"
+        ):
+            pipeline(bank, episodes=episodes)(batch([at(4)]))
+    careless = pipeline(bank, episodes="reset")
+    careless.reset()
+    careless(batch([at(4)], [0]))
+    with pytest.raises(BadViews, match="at step 0 where the resets count 1; .*episodes='auto'"):
+        careless(batch([at(4)], [0]))
     step = pipeline(bank)
     with pytest.raises(BadViews, match="environment 0 is at step 3 after nothing"):
         step(batch([at(4)], [3]))

@@ -21,6 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = (
     "paper_tables.csv",
     "paraphrases",
+    "photo-set",
     "policies",
     "results/readings.csv",
     "suites",

@@ -104,26 +104,46 @@ def act(folder: Path, side: int = 64, **how: Any) -> Path:
     return _saved(folder, config, ACTPolicy)
 
 
-def _features(side: int) -> dict[str, Any]:
-    seen = {
-        "observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, side, side)),
-        "observation.state": PolicyFeature(FeatureType.STATE, (STATE,)),
-    }
+def act_of(folder: Path, cameras: tuple[str, ...], side: int, state: int, action: int) -> Path:
+    """`act` for any cameras and any sizes of state and action."""
+    config = ACTConfig(
+        **_features(side, cameras, state, action), device="cpu", pretrained_backbone_weights=None, dim_model=32, n_heads=4,
+        dim_feedforward=32, n_encoder_layers=1, n_vae_encoder_layers=1, chunk_size=3, n_action_steps=3,
+    )  # fmt: skip
+    return _saved(folder, config, ACTPolicy, cameras, state, action)
+
+
+def _features(
+    side: int, cameras: tuple[str, ...] = ("front",), state: int = STATE, action: int = ACTION
+) -> dict[str, Any]:
+    seen = {}
+    for camera in cameras:
+        seen[f"observation.images.{camera}"] = PolicyFeature(FeatureType.VISUAL, (3, side, side))
+    seen["observation.state"] = PolicyFeature(FeatureType.STATE, (state,))
     return {
         "input_features": seen,
-        "output_features": {"action": PolicyFeature(FeatureType.ACTION, (ACTION,))},
+        "output_features": {"action": PolicyFeature(FeatureType.ACTION, (action,))},
     }
 
 
-def _saved(folder: Path, config: Any, kind: Any) -> Path:
+def _saved(
+    folder: Path,
+    config: Any,
+    kind: Any,
+    cameras: tuple[str, ...] = ("front",),
+    state: int = STATE,
+    action: int = ACTION,
+) -> Path:
     with torch.random.fork_rng():
         torch.manual_seed(0)
         kind(config).save_pretrained(folder)
     stats = {
-        "observation.images.front": {"mean": torch.zeros(3, 1, 1), "std": torch.ones(3, 1, 1)},
-        "observation.state": {"mean": torch.zeros(STATE), "std": torch.ones(STATE)},
-        "action": {"mean": torch.full((ACTION,), MEAN), "std": torch.full((ACTION,), STD)},
+        "observation.state": {"mean": torch.zeros(state), "std": torch.ones(state)},
+        "action": {"mean": torch.full((action,), MEAN), "std": torch.full((action,), STD)},
     }
+    for camera in cameras:
+        key = f"observation.images.{camera}"
+        stats[key] = {"mean": torch.zeros(3, 1, 1), "std": torch.ones(3, 1, 1)}
     for pipeline in make_pre_post_processors(config, dataset_stats=stats):
         pipeline.save_pretrained(folder)
     return folder

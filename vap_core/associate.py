@@ -68,6 +68,9 @@ class Pairing:
     `spread_m` as objects stand that close on a table."""
     astray: float = 0.015
     """The share of boxes so cut or so wrong that their centres carry no evidence."""
+    decisive: float = 0.0
+    """The best choice for all views is taken where it leads every other by this; elsewhere each
+    view keeps its own."""
 
 
 @value
@@ -120,10 +123,11 @@ def associate_targets(
 
 
 def associate(views: Mapping[str, Sighting], pairing: Pairing) -> Association | None:
-    """The most probable choice for `views`, by camera; None where fewer than two have candidates.
+    """The most probable choice for `views`, by camera.
 
-    As long as `absent` is positive, the target is chosen in at least one view. Equal choices go to
-    the candidates listed first.
+    None where fewer than two have candidates, or the choice is not decisive. As long as `absent` is
+    positive, the target is chosen in at least one view. Equal choices go to the candidates listed
+    first.
 
     Raises: BadViews, for more views or candidates than can be enumerated, or for geometry without
         calibrated cameras.
@@ -152,6 +156,8 @@ def associate(views: Mapping[str, Sighting], pairing: Pairing) -> Association | 
         best_other = float(others.max(initial=-np.inf))
         rival = max(rival, best_other)
     total = float(totals[best])
+    if total - rival < pairing.decisive:
+        return None
     return Association(
         chosen=chosen,
         total=total,

@@ -54,7 +54,7 @@ from vap_core.perception.candidates import (
 )
 from vap_core.perception.protocols import FamiliarityJudge, Stack, TargetTracker
 from vap_core.prompt import PALETTE, PromptForm, Tint, choose_colours
-from vap_core.vote import VoteRule, compare, election_scores, shortlist, vote
+from vap_core.vote import VoteRule, compare, election_scores, nominate, vote
 
 PerTarget = tuple[Grounding, ...]
 """One grounding per target of the instruction, in the order of its targets."""
@@ -156,7 +156,7 @@ class Attender:
             per_target = []
             for phrase, obj in zip(phrases, wanted, strict=True):
                 offered = proposals[camera][phrase]
-                few = shortlist(offered, compare(obj, offered, self.stack))
+                few = nominate(rgb, obj, offered, self.stack)
                 of_view.append(segment(rgb, few, self.stack, known=of_view))
                 per_target.append(self.ground(camera, obj, of_view[-1]))
             candidates[camera] = tuple(of_view)

@@ -6,10 +6,11 @@ import numpy as np
 from jaxtyping import Float32
 
 from vap_core.base.errors import BadEncoder
-from vap_core.base.types import Ballot, Boxes, PersonalObject
+from vap_core.base.types import Ballot, Boxes, PersonalObject, Rgb
 from vap_core.memory import reference_rows
 from vap_core.perception.boxes import box_cover
 from vap_core.perception.candidates import Candidates, Proposals
+from vap_core.perception.proof import MOST_COMPARED, prove
 from vap_core.perception.protocols import Stack
 
 VoteRule = Literal["vote", "average", "best"]
@@ -47,20 +48,36 @@ def compare(
 
 
 def election_scores(cosine: Float32[np.ndarray, "n k"], boxes: Boxes) -> Float32[np.ndarray, "n k"]:
-    """What the vote compares: cosines, and where boxes have priors their sum.
+    """What the vote compares: cosines, and where boxes have priors or proofs their sum.
 
-    Priors count from the view's greatest, so no score is above its cosine.
+    Both count from the view's greatest sum, so no score is above its cosine.
     """
-    if boxes.prior is None or not len(boxes):
-        return cosine
-    return cosine + (boxes.prior - boxes.prior.max())[:, None]
+    evidence = np.zeros(len(boxes), np.float32)
+    for of_boxes in (boxes.prior, boxes.proof):
+        if of_boxes is not None:
+            evidence += of_boxes
+    return cosine + (evidence - evidence.max(initial=-np.inf))[:, None]
 
 
-def shortlist(proposals: Proposals, cosine: Float32[np.ndarray, "n k"]) -> Proposals:
+def nominate(rgb: Rgb, obj: PersonalObject, offered: Proposals, stack: Stack) -> Proposals:
+    """The candidates for an object among the proposals of a view.
+
+    Where the stack has a verifier, crops of unfamiliar views are compared point by point first.
+    """
+    cosine = compare(obj, offered, stack)
+    if stack.verifier is None or offered.boxes.familiar:
+        return shortlist(offered, cosine)
+    few = prove(rgb, obj, shortlist(offered, cosine, most=MOST_COMPARED), stack.verifier)
+    return shortlist(few, compare(obj, few, stack))
+
+
+def shortlist(
+    proposals: Proposals, cosine: Float32[np.ndarray, "n k"], most: int = MOST_CANDIDATES
+) -> Proposals:
     """The proposals that are candidates, given their cosines with an object's references.
 
     Proposals of any object overlap: of those in one place the one of the best mean score is taken,
-    and at most `MOST_CANDIDATES` places. Proposals of one category are all candidates.
+    and at most `most` places. Proposals of one category are all candidates.
     """
     boxes = proposals.boxes
     if boxes.prior is None:
@@ -69,7 +86,7 @@ def shortlist(proposals: Proposals, cosine: Float32[np.ndarray, "n k"]) -> Propo
     cover = box_cover(boxes.xyxy, boxes.xyxy)
     kept: list[int] = []
     for i in np.argsort(-mean, kind="stable").tolist():
-        if len(kept) < MOST_CANDIDATES and cover[i, kept].max(initial=0.0) <= SAME_PLACE:
+        if len(kept) < most and cover[i, kept].max(initial=0.0) <= SAME_PLACE:
             kept.append(i)
     return proposals.take(np.array(kept, np.int64))
 

@@ -1,3 +1,12 @@
+from .ablations import ablation_episodes as ablation_episodes
+from .ablations import ablation_results as ablation_results
+from .ablations import all_effects_figure as all_effects_figure
+from .ablations import cases_text as cases_text
+from .ablations import effect_text as effect_text
+from .ablations import rates_of_arms_figure as rates_of_arms_figure
+from .ablations import sweep_figure as sweep_figure
+from .agreements import gate_figure as gate_figure
+from .agreements import gated_cases as gated_cases
 from .box_widget import drag_box as drag_box
 from .box_widget import dragged_box as dragged_box
 from .embedding_report import paper_spaces as paper_spaces

@@ -76,10 +76,10 @@ def ground_image(
     """
     from vap_core.attend import Attender, Prompting
     from vap_core.memory import load_bank
-    from vap_core.perception.stacks import load_stack
+    from vap_core.perception.stacks import load_own
     from vap_core.perception.tiles import TiledDetector
 
-    models = load_stack(stack)
+    models = load_own(stack)
     if tiles:
         models = replace(models, detector=TiledDetector(models.detector))
     bank = load_bank(memory, models.encoder.name)
@@ -104,9 +104,9 @@ def ground_image(
 
 def missing_threshold(stack: str) -> str:
     """One line where a stack cannot say "not in view", with the remedy; else ""."""
-    from vap_core.perception.stacks import load_stack
+    from vap_core.perception.stacks import load_own
 
-    if load_stack(stack).thresholds is not None:
+    if load_own(stack).thresholds is not None:
         return ""
     return (
         f'the stack {stack} has no threshold of "not in view": the best candidate is highlighted, '
@@ -197,6 +197,7 @@ def _grounding_to_json(grounding: Grounding) -> dict[str, Any]:
         "tied": ballot.tied.tolist(),
         "candidates": np.round(candidates.xyxy, 2).tolist(),
         "scores": np.round(candidates.score, 4).tolist(),
+        "verified": None if candidates.verified is None else candidates.verified.tolist(),
     }
 
 
@@ -227,9 +228,12 @@ def _format_grounding(grounding: Grounding) -> list[str]:
         mark = "->" if i == grounding.winner else "  "
         x0, y0, x1, y1 = box
         cosine = grounding.similarity[i].mean()
+        points = ""
+        if candidates.verified is not None:
+            points = f"  points {candidates.verified[i]}"
         lines.append(
             f" {mark} #{i}  box {x0:4.0f} {y0:4.0f} {x1:4.0f} {y1:4.0f}  score {score:.2f}  "
-            f"votes {ballot.votes[i]}/{k}  mean cosine {cosine:.3f}"
+            f"votes {ballot.votes[i]}/{k}  mean cosine {cosine:.3f}{points}"
         )
     if grounding.rejected is not None:
         lines.append(

@@ -13,7 +13,7 @@ from vap_core.base.photos import load_photo, photos_in
 from vap_core.base.types import Attended, Rgb, Track, value
 from vap_core.instruction.parsers import Parsing
 from vap_core.memory import load_bank
-from vap_core.perception.stacks import load_stack
+from vap_core.perception.stacks import load_own
 
 CAMERA = "clip"
 SIDE = 640
@@ -73,7 +73,7 @@ def ground_clip(
     first = next(frames, None)
     if first is None:
         raise BadPhoto(f"ground: {path} has no frame; film for some seconds.")
-    models = load_stack(stack)
+    models = load_own(stack)
     bank = load_bank(memory, models.encoder.name)
     parsing = parsing or Parsing()
     parser = parsing.load(memory, bank)

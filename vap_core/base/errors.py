@@ -15,6 +15,10 @@ class BadPhotoSet(VapError):
     """References and scenes for eval-photos that are incomplete, or boxes that do not fit them."""
 
 
+class BadDataset(VapError):
+    """A recorded dataset that is absent, damaged, without pictures, or cannot be written."""
+
+
 class BadInstruction(VapError):
     """An instruction without a personal object, or with more of them than the palette has tints."""
 

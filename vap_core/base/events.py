@@ -55,10 +55,18 @@ def describe_ballot(grounding: Grounding) -> str:
 
 
 def describe_rejection(grounding: Grounding) -> str:
-    """Why the object is not in view, such as "not in view, cosine 0.31 below 0.59"."""
+    """Why the object is not in view, such as "not in view, cosine 0.31 below 0.59".
+
+    Where points were compared, the cosine and their proof are a likeness.
+    """
     assert grounding.rejected is not None, "the grounding is rejected"
     likeness = grounding.likeness[grounding.rejected]
-    return f"not in view, cosine {likeness:.2f} below {grounding.threshold:.2f}"
+    measure = "cosine"
+    counted = ""
+    if grounding.candidates.verified is not None:
+        measure = "likeness"
+        counted = f", {grounding.candidates.verified[grounding.rejected]} points verified"
+    return f"not in view, {measure} {likeness:.2f} below {grounding.threshold:.2f}{counted}"
 
 
 def describe_lead(ballot: Ballot) -> str:

@@ -34,13 +34,18 @@ class Boxes:
 
     `prior` is the evidence for each box besides the references', in units of cosine, where boxes of
     any object are proposed; None where every box is of the phrase's category. `familiar` says
-    whether the view is of the world that the stack's own models were trained on."""
+    whether the view is of the world that the stack's own models were trained on.
+
+    `verified` counts the points of each box that lie as they do on a reference, the most of any;
+    `proof` is what that says, in units of cosine. Both are None where no points were compared."""
 
     xyxy: Float32[np.ndarray, "n 4"]
     score: Float32[np.ndarray, " n"]
     phrase: str
     prior: Float32[np.ndarray, " n"] | None = None
     familiar: bool = True
+    verified: Int64[np.ndarray, " n"] | None = None
+    proof: Float32[np.ndarray, " n"] | None = None
 
     def __post_init__(self) -> None:
         if len(self.xyxy) and not (self.xyxy[:, 2:] > self.xyxy[:, :2]).all():
@@ -51,8 +56,14 @@ class Boxes:
 
     def take(self, rows: Int64[np.ndarray, " m"]) -> "Boxes":
         """These boxes, in this order."""
-        prior = None if self.prior is None else self.prior[rows]
-        return replace(self, xyxy=self.xyxy[rows], score=self.score[rows], prior=prior)
+        return replace(
+            self,
+            xyxy=self.xyxy[rows],
+            score=self.score[rows],
+            prior=None if self.prior is None else self.prior[rows],
+            verified=None if self.verified is None else self.verified[rows],
+            proof=None if self.proof is None else self.proof[rows],
+        )
 
     @staticmethod
     def empty(phrase: str) -> "Boxes":
@@ -164,13 +175,18 @@ class Ballot:
             raise ValueError(f"Ballot: winner {self.winner} of {len(self.votes)} candidates")
 
 
-def likeness(similarity: Float32[np.ndarray, "n k"], familiar: bool) -> Float32[np.ndarray, " n"]:
-    """Each candidate's mean cosine with the references; the greatest in unfamiliar views."""
+def likeness(similarity: Float32[np.ndarray, "n k"], boxes: Boxes) -> Float32[np.ndarray, " n"]:
+    """Each candidate's mean cosine with the references; in unfamiliar views the greatest, and its
+    proof added where points were compared.
+    """
     if not len(similarity):
         return np.zeros(0, np.float32)
-    if familiar:
+    if boxes.familiar:
         return similarity.mean(axis=1)
-    return similarity.max(axis=1)
+    greatest = similarity.max(axis=1)
+    if boxes.proof is None:
+        return greatest
+    return greatest + boxes.proof
 
 
 @value
@@ -206,7 +222,7 @@ class Grounding:
     @property
     def likeness(self) -> Float32[np.ndarray, " n"]:
         """`likeness` of every candidate."""
-        return likeness(self.similarity, self.candidates.familiar)
+        return likeness(self.similarity, self.candidates)
 
     @property
     def mask(self) -> Mask | None:

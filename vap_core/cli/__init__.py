@@ -16,6 +16,7 @@ from vap_core.cli import (
     attention,
     benches,
     evaluate,
+    lerobot,
     objects,
     parsers,
     results,
@@ -37,7 +38,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     help=HELP,
 )
-for module in (objects, evaluate, results, attention, parsers, setup, benches):
+for module in (objects, evaluate, results, attention, parsers, lerobot, setup, benches):
     app.add_typer(module.app)
 app.add_typer(train.app, name="train")
 app.add_typer(weights.app, name="weights")

@@ -6,6 +6,7 @@ import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 from vap_core.base.errors import VapError
@@ -33,7 +34,7 @@ def examine() -> list[Finding]:
     findings = []
     for check in (_python, _gl, _weights, _lists, _rerun):
         findings.append(_run_check(check, needed=True))
-    for check in (_text_encoder, _torch, _gpu, _menagerie):
+    for check in (_text_encoder, _torch, _gpu, _lerobot, _menagerie):
         findings.append(_run_check(check, needed=False))
     findings.append(_viewer())
     findings += _foundation()
@@ -136,6 +137,29 @@ def _gpu() -> tuple[str, str]:
     if not torch.cuda.is_available():
         raise VapError("none; the embedded stack needs none")
     return "gpu", torch.cuda.get_device_name()
+
+
+def _lerobot() -> tuple[str, str]:
+    """lerobot, its plugin, and the parts that drive an arm.
+
+    lerobot's extra `viz` wants rerun-sdk below 0.34, and ours is newer; only its --display_data
+    needs that extra.
+    """
+    require("policy", "lerobot")
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        version("lerobot_env_vap")
+    except PackageNotFoundError as error:
+        raise VapError(
+            "its commands do not know --env.type=vap; run: pip install --no-deps "
+            "--no-build-isolation ./plugins/lerobot_env_vap"
+        ) from error
+    arm = "with feetech"
+    if find_spec("scservo_sdk") is None:
+        arm = "an SO-101 needs: pip install 'lerobot[hardware,feetech]'"
+    rerun = f"leave its extra viz out (rerun-sdk<0.34; here {version('rerun-sdk')})"
+    return "lerobot", f"{version('lerobot')} with its plugin; {arm}; {rerun}"
 
 
 def _viewer() -> Finding:

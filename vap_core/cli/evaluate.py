@@ -6,7 +6,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from vap_core.cli.options import StackName, Workers, names
+from vap_core.cli.options import (
+    DetectorName,
+    EncoderName,
+    StackName,
+    TrackerName,
+    Workers,
+    names,
+    stack_of,
+)
 
 if TYPE_CHECKING:
     from vap_core.evaluation.jobs import Record
@@ -85,6 +93,15 @@ Meshes = Annotated[
 ]
 
 
+OwnObject = Annotated[
+    str,
+    typer.Option(
+        "--object",
+        help="An object that takes the target's place among its look-alikes, for example a scan "
+        "that `objects import` brought; of the task's category. The expert tries its episodes "
+        "first.",
+    ),
+]
 WhatFor = Annotated[
     str,
     typer.Option(
@@ -128,7 +145,10 @@ def suites() -> None:
 
 @app.command()
 def rollout(
-    suite: Annotated[str, typer.Option(help="A suite: see python -m vap_core suites.")],
+    suite: Annotated[
+        str,
+        typer.Option(help="A suite: see python -m vap_core suites; or the file of your own, .py."),
+    ],
     task: Annotated[
         list[str], typer.Option(help="Task of the suite, for example pick-cup; repeatable.")
     ],
@@ -145,14 +165,21 @@ def rollout(
     policy_timeout: PolicyTimeout = None,
     robots: Meshes = "plain",
     stack: StackName = "embedded",
+    detector: DetectorName = "",
+    encoder: EncoderName = "",
+    tracker: TrackerName = "",
+    object: OwnObject = "",
     what_for: WhatFor = "",
 ) -> None:
     """Run tasks of a suite in closed loop, record every episode, and print the table.
 
     Example: python -m vap_core rollout --suite widowx-pick --task pick-bottle --episodes 4
         --out data/runs/bottle
+    Example: python -m vap_core rollout --suite tabletop --task select-cup --object mug
+        --episodes 4 --out data/runs/mug
     """
-    tasks = tuple((suite, name) for name in dict.fromkeys(task))
+    (suite_name,), files = _suite_names([suite])
+    tasks = tuple((suite_name, name) for name in dict.fromkeys(task))
     study = _study(
         tasks=tasks,
         methods=method,
@@ -160,7 +187,9 @@ def rollout(
         episodes=episodes,
         seed=seed,
         robots=robots,
-        stack=stack,
+        stack=stack_of(stack, detector, encoder, tracker),
+        object=object,
+        suite_files=files,
     )
     _run(
         study,
@@ -228,9 +257,10 @@ def ablate(
     from vap_core.evaluation.ablations.run import ablate_text
     from vap_core.evaluation.policy_names import default_policy
 
-    suite_names = _suite_names(suite or list(ABLATIONS[name].suites))
+    suite_names, files = _suite_names(suite or list(ABLATIONS[name].suites))
     study = _study(
         tasks=_all_tasks(suite_names),
+        suite_files=files,
         methods=list(ABLATIONS[name].names),
         policy=policy or default_policy(suite_names),
         episodes=episodes,
@@ -243,7 +273,10 @@ def ablate(
 @app.command("eval")
 def evaluate(
     suite: Annotated[
-        list[str], typer.Option(help="A suite, or all four benchmarks: all; repeatable.")
+        list[str],
+        typer.Option(
+            help="A suite; all four benchmarks: all; or the file of your own, .py. Repeatable."
+        ),
     ],
     out: Annotated[
         Path | None,
@@ -322,12 +355,17 @@ def evaluate(
     ] = 0,
     robots: Meshes = "plain",
     stack: StackName = "embedded",
+    detector: DetectorName = "",
+    encoder: EncoderName = "",
+    tracker: TrackerName = "",
+    object: OwnObject = "",
     what_for: WhatFor = "",
 ) -> None:
     """Run whole suites, and print the table with 95 % intervals. Interrupted, the same command goes
-    on.
+    on. With --object, the tasks of its category.
 
     Example: python -m vap_core eval --suite simpler-bridge --policy expert
+    Example: python -m vap_core eval --suite tabletop --object mug --out data/runs/mug
     Example: python -m vap_core eval --suite all --methods generic,vap --episodes 4
         --out data/runs/all
     Example: python -m vap_core eval --suite all --engine ray --address 10.0.0.5:6379
@@ -335,16 +373,18 @@ def evaluate(
     from vap_core.base.errors import BadStudy
     from vap_core.evaluation.policy_names import PRIVILEGED, default_policy
 
-    suite_names = _suite_names(suite)
+    suite_names, files = _suite_names(suite)
     policy = policy or default_policy(suite_names)
     study = _study(
-        tasks=_all_tasks(suite_names),
+        tasks=_all_tasks(suite_names, object),
+        suite_files=files,
+        object=object,
         methods=method,
         policy=policy,
         episodes=episodes,
         seed=seed,
         robots=robots,
-        stack=stack,
+        stack=stack_of(stack, detector, encoder, tracker),
         seeds=seeds,
         images_every=images_every,
         follow=follow,
@@ -356,8 +396,10 @@ def evaluate(
     if engine == "ray":
         address = address or "127.0.0.1:6379"
     if out is None:
-        suites_part = "-".join(dict.fromkeys(suite))
-        out = Path(f"data/runs/{Path(policy).name}-{suites_part}")
+        parts = [Path(policy).name, *dict.fromkeys(Path(name).stem for name in suite)]
+        if object:
+            parts.append(object)
+        out = Path("data/runs", "-".join(parts))
     _run(
         study,
         out,
@@ -372,27 +414,49 @@ def evaluate(
     )
 
 
-def _suite_names(given: list[str]) -> list[str]:
-    """The suites that are named, each once; "all" names every benchmark."""
-    from vap_core.simulation.suites import BENCHMARKS
+def _suite_names(given: list[str]) -> tuple[list[str], tuple[str, ...]]:
+    """The suites that are named, each once, and the files of own suites among them.
 
-    names: list[str] = []
+    "all" names every benchmark; a name that ends in .py is a file, which is executed.
+    """
+    from vap_core.simulation.suites import BENCHMARKS, open_file
+
+    suite_names: list[str] = []
+    files = []
     for name in given:
         if name == "all":
-            names += BENCHMARKS
+            suite_names += BENCHMARKS
+        elif name.endswith(".py"):
+            suite_names.append(open_file(Path(name)).name)
+            files.append(str(Path(name).resolve()))
         else:
-            names.append(name)
-    return list(dict.fromkeys(names))
+            suite_names.append(name)
+    return list(dict.fromkeys(suite_names)), tuple(dict.fromkeys(files))
 
 
-def _all_tasks(suite_names: list[str]) -> tuple[tuple[str, str], ...]:
-    """Suite and task of every task of some suites."""
+def _all_tasks(suite_names: list[str], object: str = "") -> tuple[tuple[str, str], ...]:
+    """Suite and task of every task of some suites; of those for the category of `object`, if any.
+
+    Raises: BadStudy when no task has its category.
+    """
+    from vap_core.base.errors import BadStudy
     from vap_core.simulation.suites import suite
 
+    category = ""
+    if object:
+        from vap_core.simulation.assets.objects import get_object
+
+        category = get_object(object).category
     tasks = []
     for name in suite_names:
         for task in suite(name).tasks:
-            tasks.append((name, task.name))
+            if not object or task.category == category:
+                tasks.append((name, task.name))
+    if not tasks:
+        raise BadStudy(
+            f"--object: {object} is a {category}, and no task of {', '.join(suite_names)} asks for "
+            "one; python -m vap_core suites lists the tasks."
+        )
     return tuple(tasks)
 
 
@@ -444,8 +508,11 @@ def _run(
     from vap_core.evaluation.power import detectable_effect_text
     from vap_core.evaluation.processes import results
     from vap_core.evaluation.report import conclude
+    from vap_core.evaluation.store import MANIFEST
     from vap_core.rollout.queries import named_queries
 
+    if study.object and address:
+        raise BadStudy("--object: other machines do not have your objects; use --engine local.")
     record = _record(record_option)
     queries = named_queries(names(attention))
     if record == "none" and (video or queries):
@@ -455,6 +522,12 @@ def _run(
     if len(study.methods) > 1:
         for track, rows in _rows_by_track(study).items():
             print(f"{track}: {detectable_effect_text(rows)}", file=sys.stderr)
+    if study.object and study.policy != "expert" and not (out / MANIFEST).exists():
+        from vap_core.evaluation.feasibility import check_feasible
+
+        print("the expert tries the episodes first ...", file=sys.stderr)
+        for tried in check_feasible(study):
+            print(tried, file=sys.stderr)
     if workers is None:
         workers = 0 if address else 2
     table = run(

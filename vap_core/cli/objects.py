@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from vap_core.cli.options import StackName
+from vap_core.cli.options import DetectorName, EncoderName, StackName, TrackerName, stack_of
 
 app = typer.Typer()
 objects_app = typer.Typer(
@@ -65,6 +65,9 @@ def register(
     ] = False,
     memory: Memory = BANK,
     stack: StackName = "embedded",
+    detector: DetectorName = "",
+    encoder: EncoderName = "",
+    tracker: TrackerName = "",
     describe: Annotated[
         str,
         typer.Option(
@@ -93,6 +96,7 @@ def register(
     Example: python -m vap_core register mug --category cup photos/mug-*.jpg
     Example: python -m vap_core register mug --category cup mug.jpg --box mug.jpg=40,60,180,220
     Example: python -m vap_core register mug --category cup --video mug.mp4
+    Example: python -m vap_core register mug --category cup photos/mug-*.jpg --encoder dinov2-small
     Example: python -m vap_core register mug --category cup photos/mug-*.jpg --owner anna
         --note "for the morning coffee"
     """
@@ -105,6 +109,7 @@ def register(
     from vap_core.perception.describe import load_captioner, with_description
     from vap_core.perception.stacks import load_stack
 
+    stack = stack_of(stack, detector, encoder, tracker)
     check_names(name, category)
     check_owner(owner, known_as or [], note)
     if object_path(memory, name).exists() and not replace:
@@ -152,6 +157,9 @@ def ground(
     ] = None,
     memory: Memory = BANK,
     stack: StackName = "embedded",
+    detector: DetectorName = "",
+    encoder: EncoderName = "",
+    tracker: TrackerName = "",
     box: Annotated[
         list[str] | None,
         typer.Option(
@@ -213,6 +221,7 @@ def ground(
     from vap_core.memory import load_photo
     from vap_core.perception.tiles import SMALL_MEGAPIXELS
 
+    stack = stack_of(stack, detector, encoder, tracker)
     parsing = Parsing(parser=parser, speaker=speaker, fall_back=fall_back)
     if is_clip(image):
         if box or as_json or tiles:

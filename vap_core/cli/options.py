@@ -12,7 +12,26 @@ StackName = Annotated[
         "(see weights).",
     ),
 ]
+DetectorName = Annotated[
+    str,
+    typer.Option(
+        "--detector", help="Another detector in the stack; `weights list` names them, or embedded."
+    ),
+]
+EncoderName = Annotated[
+    str, typer.Option("--encoder", help="Another encoder, which sees and compares the crops.")
+]
+TrackerName = Annotated[
+    str, typer.Option("--tracker", help="Another tracker; it brings its segmenter.")
+]
 Workers = Annotated[int, typer.Option(min=1, help="Processes.")]
+
+
+def stack_of(stack: str, detector: str, encoder: str, tracker: str) -> str:
+    """The name of the stack with these parts ("" keeps the stack's). Raises: UnknownName."""
+    from vap_core.perception.stacks import mixed
+
+    return mixed(stack, detector=detector, encoder=encoder, tracker=tracker)
 
 
 def names(text: str) -> list[str]:

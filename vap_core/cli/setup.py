@@ -96,7 +96,9 @@ def calibrate(
         list[Path] | None,
         typer.Option(help="A photo set in the form of eval-photos; repeatable."),
     ] = None,
-    scenes: Annotated[int, typer.Option(min=1, help="Rendered development scenes.")] = 24,
+    scenes: Annotated[
+        int, typer.Option(min=0, help="Rendered development scenes; 0: photos alone.")
+    ] = 24,
     price: Annotated[
         float,
         typer.Option(
@@ -110,7 +112,8 @@ def calibrate(
         typer.Option(
             "--keep",
             help="Write the chosen thresholds beside the weights of a foundation stack, which then "
-            "uses them.",
+            "uses them. Of the embedded stack it is the threshold for photos, which ground then "
+            "uses; it needs --photos.",
         ),
     ] = False,
     out: Annotated[
@@ -122,12 +125,12 @@ def calibrate(
     development scenes with and without the object. Interrupted, it goes on.
 
     Example: python -m vap_core calibrate --scenes 8
-    Example: python -m vap_core calibrate --photos my-photos
+    Example: python -m vap_core calibrate --photos my-photos --scenes 0 --keep
     """
     from vap_core.analysis.calibration.run import calibrate, keep_choice, refuse_keep
 
     if keep:
-        refuse_keep(stack)
+        refuse_keep(stack, photos or ())
     report, chosen = calibrate(
         stack,
         out or Path(f"data/runs/calibrate-{stack}"),

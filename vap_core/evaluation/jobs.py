@@ -63,6 +63,7 @@ def run_job(job: Job) -> Rows:
     """
     from vap_core.rollout.loop import rollout
 
+    job.study.open_suites()
     trial = make_trial(job.study, job.rows, job.method, job.folder / "memory")
     begin = None
     if _records(job):

@@ -24,7 +24,7 @@ def layout_names(episodes: "pd.DataFrame") -> "pd.Series":
 
     lines: list[tuple[str, str, int, str]] = []
     for suite in dict.fromkeys(episodes["suite"]):
-        if suites.is_listed(suite):
+        if suites.has_list(suite):
             lines += _listed_layouts(suite)
     keys = ["suite", "task", "episode"]
     listed = pd.DataFrame(lines, columns=[*keys, "layout"])

@@ -94,7 +94,12 @@ def _rows_by_key(study: Mapping[str, Any]) -> dict[Key, EpisodeRow]:
     rows: dict[Key, EpisodeRow] = {}
     for suite, task in study["tasks"]:
         for row in suites.listed(
-            suite, task, n=study["episodes"], seed=study["seed"], seeds=study["seeds"]
+            suite,
+            task,
+            n=study["episodes"],
+            seed=study["seed"],
+            seeds=study["seeds"],
+            own_target=study.get("object", ""),
         ):
             rows[row.suite, row.task, row.seed, row.episode] = row
     return rows

@@ -39,7 +39,7 @@ from vap_core.memory import load_bank, register, save
 from vap_core.perception.describe import AttributeCaptioner, Captioner, with_description
 from vap_core.perception.embedded.weights import weights_sha256
 from vap_core.perception.protocols import Stack
-from vap_core.perception.stacks import STACKS, load_stack
+from vap_core.perception.stacks import check_stack, load_stack
 from vap_core.policies.lerobot import checkpoints
 from vap_core.policies.mini_pi0 import token_file
 from vap_core.policies.mini_pi0.learned_token import WORD
@@ -72,6 +72,8 @@ class Study:
 
     `episodes` None takes whole lists. `images_every`, `follow` and `audit` are rollout.Trial's.
     `temperature` scales the sampling noise of a mini-pi0; None leaves it as its checkpoint says.
+    `object` names an object that takes the target's place (suites.own_object). `suite_files` are
+    the files of own suites; they are executed (suites.own).
 
     Raises: UnknownName, BadStudy, when it is built from what does not fit together; MissingPart.
     """
@@ -88,13 +90,28 @@ class Study:
     follow: Follow = "step"
     audit: bool = False
     temperature: float | None = None
+    object: str = ""
+    suite_files: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        self.open_suites()
         _check_names(self)
         _check_policy(self)
 
     def rows(self, suite: str, task: str) -> tuple[EpisodeRow, ...]:
-        return suites.listed(suite, task, n=self.episodes, seed=self.seed, seeds=self.seeds)
+        return suites.listed(
+            suite,
+            task,
+            n=self.episodes,
+            seed=self.seed,
+            seeds=self.seeds,
+            own_target=self.object,
+        )
+
+    def open_suites(self) -> None:
+        """Make its own suites known in this process. Raises: BadSuite."""
+        for file in self.suite_files:
+            suites.open_file(Path(file))
 
     def checkpoint(self, suite: str) -> str:
         """The folder or hub id of the policy's weights for a suite; "" where it has none."""
@@ -109,7 +126,7 @@ class Study:
         """
         digests = {}
         for suite, _ in self.tasks:
-            if suites.is_listed(suite):
+            if suites.has_list(suite):
                 digests[suite] = suites.digest(suite)
         checkpoints_used = set()
         for suite, _ in self.tasks:
@@ -119,6 +136,9 @@ class Study:
         about = asdict(self)
         if self.temperature is None:  # digests are those of versions without it
             del about["temperature"]
+        if not self.object:
+            del about["object"]
+        del about["suite_files"]  # the lists' digests stand for them
         if names == [self.policy]:
             about["checkpoint"] = fingerprints[0]
         elif names:
@@ -215,10 +235,9 @@ def _check_names(study: Study) -> None:
         raise one_of(what, study.policy, [*POLICIES, MINI])
     if study.robots not in MESHES:
         raise one_of("Study: robots", study.robots, MESHES)
-    if study.stack not in STACKS:
-        raise one_of("Study: stack", study.stack, STACKS)
+    check_stack(study.stack, "Study")
     for suite, task in study.tasks:
-        suites.rows(suite, task, n=1)
+        study.rows(suite, task)
 
 
 def _check_policy(study: Study) -> None:

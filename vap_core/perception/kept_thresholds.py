@@ -1,6 +1,7 @@
 """Thresholds of a stack that ships none, measured on this machine: a file beside its weights."""
 
 import json
+import re
 from pathlib import Path
 
 from vap_core.base.errors import BadOutput
@@ -10,7 +11,7 @@ from vap_core.perception.protocols import Thresholds
 
 def thresholds_file(folder: Path, kind: str) -> Path:
     """Where the thresholds of a stack are kept."""
-    return folder / f"thresholds-{kind}.json"
+    return folder / f"thresholds-{re.sub(r'[^\w.=-]+', '_', kind)}.json"
 
 
 def keep_thresholds(folder: Path, kind: str, encoder: str, thresholds: Thresholds) -> Path:

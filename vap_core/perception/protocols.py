@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int64
 
 from vap_core.base.types import Boxes, Rgb, Track
 
@@ -56,6 +56,15 @@ class Encoder(Protocol):
 
     def __call__(self, crops: Sequence[Rgb]) -> Float32[np.ndarray, "n d"]:
         """One L2-normalised row per crop; n may be 0."""
+        ...
+
+
+@runtime_checkable
+class Verifier(Protocol):
+    """Compares crops with references point by point, which an embedding as a whole cannot."""
+
+    def __call__(self, crops: Sequence[Rgb], references: Sequence[Rgb]) -> Int64[np.ndarray, "n k"]:
+        """How many points of each crop lie as they do on each reference."""
         ...
 
 
@@ -120,6 +129,7 @@ class Stack:
     `by_category` finds boxes of the phrase's category alone; None where `detector` does.
     `unfamiliar_encoder` embeds crops of views that are not `Boxes.familiar`, and the references for
     them, from the crops that a memory keeps; None: `encoder` does.
+    `verifier` compares crops of such views with the references point by point.
     `thresholds` is None where none were measured: then the best candidate wins, however unlike.
     """
 
@@ -131,6 +141,7 @@ class Stack:
     by_category: Detector | None = None
     unfamiliar_encoder: Encoder | None = None
     thresholds: Thresholds | None = None
+    verifier: Verifier | None = None
 
     @property
     def category_detector(self) -> Detector:

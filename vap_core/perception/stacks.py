@@ -1,10 +1,13 @@
 """Stacks by name: the embedded one, offline on a CPU, and the foundation ones."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 from vap_core.base.device import check_device
 from vap_core.base.errors import one_of
+from vap_core.perception.foundation.sources import EMBEDDED, parts_of
+from vap_core.perception.foundation.sources import mixed as mixed
 from vap_core.perception.protocols import Stack, Thresholds
 
 EMBEDDED_THRESHOLDS = Thresholds(familiar=0.53, unfamiliar=0.54)
@@ -21,6 +24,7 @@ def load_embedded() -> Stack:
         cut_segmenter,
         detector,
         encoder,
+        local_features,
         open_detector,
         tracker,
     )
@@ -34,6 +38,7 @@ def load_embedded() -> Stack:
         by_category=detector.load(),
         unfamiliar_encoder=encoder.load_unfamiliar(),
         thresholds=EMBEDDED_THRESHOLDS,
+        verifier=local_features.load(),
     )
 
 
@@ -51,12 +56,62 @@ STACKS: dict[str, Callable[[], Stack]] = {
 }
 
 
+def load_own(name: str) -> Stack:
+    """The stack as `load_stack` gives it, for pictures of a user's own.
+
+    Where calibrate --photos --keep has measured a threshold on such pictures, it is used. Runs on
+    the benchmarks never depend on it.
+
+    Raises: as load_stack; BadOutput: the file of thresholds is damaged.
+    """
+    from vap_core.perception.foundation.store import store_folder
+    from vap_core.perception.kept_thresholds import read_thresholds
+
+    stack = load_stack(name)
+    kept = read_thresholds(store_folder(), name, stack.encoder.name)
+    if kept is None or stack.thresholds is None:
+        return stack
+    return replace(stack, thresholds=replace(stack.thresholds, unfamiliar=kept.unfamiliar))
+
+
 def load_stack(name: str) -> Stack:
-    """The stack of that name; loading its weights takes about a second.
+    """The stack of that name, or a mixed one (`mixed`); loading its weights takes about a second.
 
     Raises: UnknownName: no such stack, or `VAP_DEVICE` names no device of this machine.
     """
-    if name not in STACKS:
-        raise one_of("load_stack: stack", name, STACKS)
+    check_stack(name)
     check_device()
+    if ":" in name:
+        return load_mixed(name)
     return STACKS[name]()
+
+
+def check_stack(name: str, what: str = "load_stack") -> None:
+    """Raises: UnknownName: neither a stack nor a mixed one."""
+    if ":" in name:
+        parts_of(name)
+    elif name not in STACKS:
+        raise one_of(f"{what}: stack", name, STACKS)
+
+
+def load_mixed(name: str) -> Stack:
+    """A stack of parts of several; loads those alone that it has.
+
+    A threshold belongs to a detector and an encoder together: there is one where both are the
+    embedded stack's, or where `calibrate --keep` has measured this very mixture.
+
+    Raises: UnknownName, MissingPart, MissingWeights, BadOutput.
+    """
+    from vap_core.perception import foundation
+
+    parts = parts_of(name)
+    if not set(parts.values()) - {EMBEDDED}:
+        return load_embedded()
+    loaded = foundation.load_parts(name)
+    if EMBEDDED in parts.values():
+        stack = replace(load_embedded(), name=name, **loaded)
+    else:
+        stack = Stack(name=name, **loaded)
+    if parts["detector"] == parts["encoder"] == EMBEDDED:
+        return stack
+    return replace(stack, thresholds=foundation.kept_thresholds(name, stack.encoder.name))

@@ -13,6 +13,7 @@ from vap_core.recording.catalog import load_steps as load_steps
 from vap_core.recording.corrections import Correction as Correction
 from vap_core.recording.corrections import read_corrections as read_corrections
 from vap_core.recording.corrections import write_correction as write_correction
+from vap_core.recording.dataset import DatasetRecorder as DatasetRecorder
 from vap_core.recording.deferred import DeferredRecorder as DeferredRecorder
 from vap_core.recording.deferred import is_failure_or_sampled as is_failure_or_sampled
 from vap_core.recording.file import recording_file_name as recording_file_name

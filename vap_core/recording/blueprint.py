@@ -67,6 +67,18 @@ def grounding_blueprint(grounding: Grounding, fps: float = 1.0) -> StoredBluepri
     return full_window(rrb.Vertical(pictures, evidence, row_shares=[1.5, 1]), fps)
 
 
+def dataset_blueprint(cameras: Sequence[str], fps: float) -> StoredBlueprint:
+    """A recorded episode: per camera what a policy would see, the track and the vote."""
+    rows: list[Part] = []
+    for camera in cameras:
+        rows.append(rrb.Vertical(policy_view(camera), mask_view(camera), vote_view(camera)))
+    score, _ = method_curve_views()
+    below = rrb.Horizontal(
+        instruction_view(), score, references_view(), column_shares=[1.2, 1.4, 1]
+    )
+    return full_window(rrb.Vertical(rrb.Horizontal(*rows), below, row_shares=[2.6, 1]), fps)
+
+
 def full_window(root: Part, fps: float = 1.0) -> StoredBlueprint:
     """The whole window: `root`, and the time panel below it."""
     return StoredBlueprint(

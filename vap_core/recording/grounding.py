@@ -59,7 +59,6 @@ class ClipRecorder:
     def __init__(self, path: Path, camera: str, name: str, hz: float = 1.0) -> None:
         self.path = Path(path)
         self._hz = hz
-        self._root = image_root(camera)
         self._camera = camera
         self._rec = open_stream(self.path, f"ground.{name}.{camera}.{self.path.stem}")
         self._rec.send_recording_name(f"ground · {name}")
@@ -81,18 +80,7 @@ class ClipRecorder:
 
     def add(self, step: ClipStep) -> None:
         """One frame, its prompted picture, its mask and the track's score."""
-        at = time_columns([(step.frame_index, step.timestamp_s)])
-        jpeg = encode_jpeg(step.image, JPEG_QUALITY)
-        log_row(self._rec, self._root, jpeg_image(jpeg), at=at)
-        prompted = encode_jpeg(step.prompted, JPEG_QUALITY)
-        log_row(self._rec, f"{self._root}/prompted", jpeg_image(prompted), at=at)
-        shown = np.zeros(step.image.shape[:2], bool)
-        if step.track.mask is not None:
-            shown = step.track.mask
-        mask = rr.SegmentationImage(track_image(shown), opacity=1.0)
-        log_row(self._rec, f"{self._root}/mask/target", mask, at=at)
-        score = rr.Scalars([step.track.score])
-        log_row(self._rec, f"/vap/track_score/{self._camera}", score, at=at)
+        log_clip_step(self._rec, self._camera, step)
 
     def ground(
         self,
@@ -113,3 +101,22 @@ class ClipRecorder:
         document = grounding_document(grounding, obj, instruction, rewritten)
         log_row(self._rec, "/vap/instruction", document, at=at)
         grounding_blueprint(grounding, self._hz).send(self._rec)
+
+
+def log_clip_step(rec: rr.RecordingStream, camera: str, step: ClipStep) -> None:
+    """One frame of a camera, its prompted picture, its mask and the track's score."""
+    at = time_columns([(step.frame_index, step.timestamp_s)])
+    root = image_root(camera)
+    jpeg = encode_jpeg(step.image, JPEG_QUALITY)
+    log_row(rec, root, jpeg_image(jpeg), at=at)
+    prompted = jpeg
+    if step.prompted is not step.image:
+        prompted = encode_jpeg(step.prompted, JPEG_QUALITY)
+    log_row(rec, f"{root}/prompted", jpeg_image(prompted), at=at)
+    shown = np.zeros(step.image.shape[:2], bool)
+    if step.track.mask is not None:
+        shown = step.track.mask
+    mask = rr.SegmentationImage(track_image(shown), opacity=1.0)
+    log_row(rec, f"{root}/mask/target", mask, at=at)
+    score = rr.Scalars([step.track.score])
+    log_row(rec, f"/vap/track_score/{camera}", score, at=at)

@@ -1,6 +1,7 @@
 """Measures development scenes one by one, and photo sets; what a run had finished is kept."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,8 +40,13 @@ def calibrate(
 ) -> tuple[str, Choice]:
     """Do what `out` lacks of the measurement; the report, and the thresholds that it chooses.
 
-    Raises: BadPhotoSet, BadPhoto; BadOutput when `out` holds another run.
+    Raises: BadPhotoSet, BadPhoto; BadOutput when `out` holds another run, or nothing is measured.
     """
+    if not scenes and not photos:
+        raise BadOutput(
+            "calibrate: no scenes and no photos; take --scenes 24, or name a photo set with "
+            "--photos."
+        )
     stack = load_stack(stack_name)
     store.open_run(out, _configuration(stack))
     with store.locked(out):
@@ -52,23 +58,38 @@ def calibrate(
     return f"{report}\n\nwrote {out / 'report.txt'} and {out / 'answers.csv'}", chosen
 
 
-def refuse_keep(stack_name: str) -> None:
-    """Raises: BadOutput for a stack that ships thresholds."""
-    if stack_name not in KINDS:
+def ships_thresholds(stack_name: str) -> bool:
+    """Whether a stack has thresholds without a measurement on this machine."""
+    return stack_name not in KINDS and ":" not in stack_name
+
+
+def refuse_keep(stack_name: str, photos: Sequence[Path] = ()) -> None:
+    """Raises: BadOutput for a stack that ships thresholds, unless there are own photos."""
+    if ships_thresholds(stack_name) and not photos:
         raise BadOutput(
             f"calibrate: the stack {stack_name} ships its thresholds, so that results stay "
-            "comparable; leave --keep out, or change them in vap_core/perception/stacks.py."
+            "comparable; name photos of your own with --photos to keep a threshold for photos, or "
+            "leave --keep out."
         )
 
 
 def keep_choice(stack_name: str, chosen: Choice) -> Path:
-    """Write the chosen thresholds beside the stack's weights. Raises: BadOutput."""
+    """Write the chosen thresholds beside the stack's weights.
+
+    Of a stack that ships thresholds it is that of unfamiliar views, which `load_own` reads.
+
+    Raises: BadOutput.
+    """
     stack = load_stack(stack_name)
     thresholds = chosen.thresholds(stack)
+    if ships_thresholds(stack_name) and stack.thresholds is not None:
+        thresholds = None
+        if chosen.unfamiliar is not None:
+            thresholds = replace(stack.thresholds, unfamiliar=chosen.unfamiliar)
     if thresholds is None:
         raise BadOutput(
             f"calibrate: too few objects were elected rightly to choose a threshold of "
-            f"{stack_name}; run it again with more --scenes."
+            f"{stack_name}; run it again with more --scenes, or more photos in the set."
         )
     return keep_thresholds(store_folder(), stack_name, stack.encoder.name, thresholds)
 
@@ -99,7 +120,8 @@ def _measure(
         if not path.exists():
             write_json_part(path, measure_scene(number, stack), caller="calibrate")
         rows.extend(read_json_part(path, caller="calibrate"))
-    tables.append(pd.DataFrame(rows).assign(source=RENDERED))
+    if rows:
+        tables.append(pd.DataFrame(rows).assign(source=RENDERED))
     for folder in photos:
         name = folder.resolve().name
         run = out / f"photos-{name}"

@@ -24,7 +24,7 @@ from vap_core.simulation.suites import BENCHMARKS, suite
 from vap_core.simulation.types import EpisodeRow
 from vap_core.training.films.demonstrations import draw_objects, row
 from vap_core.training.recipe import filmed_tasks
-from vap_core.vote import compare, election_scores, shortlist, vote
+from vap_core.vote import compare, election_scores, nominate, vote
 
 Case = Literal["present", "look-alikes", "absent"]
 """The object is in view; it is not, but others of its kind are; nothing of its kind is."""
@@ -112,11 +112,11 @@ def _views_of(case: Case, views: Sequence[View]) -> list[View]:
 
 def _elect(obj: PersonalObject, offered: Proposals, view: View, stack: Stack) -> Row:
     """What the vote elects in one view."""
-    few = shortlist(offered, compare(obj, offered, stack))
+    few = nominate(view.rgb, obj, offered, stack)
     cosine = compare(obj, few, stack)
     winner = vote(election_scores(cosine, few.boxes)).winner
     answer: Row = {"familiar": few.boxes.familiar, "likeness": None, "right": False}
     if winner is not None:
-        answer["likeness"] = float(likeness(cosine, few.boxes.familiar)[winner])
+        answer["likeness"] = float(likeness(cosine, few.boxes)[winner])
         answer["right"] = object_under_box(view, few.boxes.xyxy[winner]) == obj.name
     return answer

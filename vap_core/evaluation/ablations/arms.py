@@ -181,6 +181,7 @@ ABLATIONS: dict[str, Ablation] = {
         arms={
             "associated-embedding": Prompting(associate=PAIRINGS["embedding"]),
             "associated-both": Prompting(associate=Pairing(("embedding", "geometry"))),
+            "associated-decisive": Prompting(associate=Pairing(("geometry",), decisive=1.0)),
         },
         methods=(DEFAULT, "vap-associated"),
         suites=("vlabench",),

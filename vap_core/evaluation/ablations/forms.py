@@ -117,6 +117,8 @@ class DimmedBackground:
 class OthersErased:
     """What else is followed is painted over from its surroundings; the target stays as it is."""
 
+    marks_others: ClassVar[bool] = True
+
     def __call__(self, rgb: Rgb, mask: Mask, colour: Colour, others: Sequence[Mask]) -> Rgb:
         if not others:
             return rgb.copy()

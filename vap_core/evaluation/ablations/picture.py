@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from vap_core.evaluation.ablations.table import ArmResult
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 CLEAR, UNCLEAR = "#0072b2", "#9aa0a6"
@@ -26,16 +27,7 @@ def effects_figure(results: Sequence[ArmResult], title: str) -> "Figure":
     figure = NewFigure(figsize=(7.2, 1.1 + 0.3 * len(shown)), layout="constrained")
     axes = figure.subplots()
     for y, one in enumerate(reversed(shown)):
-        assert one.against is not None
-        low, mid, high = (
-            100 * bound for bound in (one.against.low, one.against.difference, one.against.high)
-        )
-        colour = UNCLEAR if low <= 0 <= high else CLEAR
-        axes.plot([low, high], [y, y], color=colour, linewidth=2)
-        axes.plot(mid, y, "o", color=colour)
-        theirs = 100 * (one.paper - first[one.suite].paper)
-        if theirs == theirs:
-            axes.plot(theirs, y, "D", color=PAPER, markersize=5, fillstyle="none")
+        draw_effects(axes, one, results, y)
     axes.axvline(0, color="black", linewidth=0.8)
     axes.set_yticks(range(len(shown)), [_label(one, first) for one in reversed(shown)])
     axes.set_xlabel("success rate against the first arm, points (95 %)")
@@ -48,6 +40,23 @@ def effects_figure(results: Sequence[ArmResult], title: str) -> "Figure":
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=8)
     return figure
+
+
+def draw_effects(
+    axes: "Axes", one: ArmResult, results: Sequence[ArmResult], y: int | float
+) -> None:
+    """An arm's difference from the first arm of its suite among `results`, at height `y`."""
+    assert one.against is not None
+    low, mid, high = (
+        100 * bound for bound in (one.against.low, one.against.difference, one.against.high)
+    )
+    colour = UNCLEAR if low <= 0 <= high else CLEAR
+    axes.plot([low, high], [y, y], color=colour, linewidth=2)
+    axes.plot(mid, y, "o", color=colour)
+    (first,) = [each for each in results if each.suite == one.suite and each.against is None]
+    theirs = 100 * (one.paper - first.paper)
+    if theirs == theirs:
+        axes.plot(theirs, y, "D", color=PAPER, markersize=5, fillstyle="none")
 
 
 def _label(one: ArmResult, first: dict[str, ArmResult]) -> str:

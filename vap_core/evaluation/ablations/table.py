@@ -1,5 +1,6 @@
 """The table of an ablation: every arm with its rate, against the default on the same episodes."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -36,12 +37,18 @@ class ArmResult:
 
 
 def arm_results(ablation: Ablation, episodes: "pd.DataFrame") -> list[ArmResult]:
-    """The arms of every suite in `episodes` (rows of a results table)."""
+    """The arms of every suite in `episodes` (rows of a results table) that ran the first arm and
+    another.
+    """
     results = []
     for suite in dict.fromkeys(episodes["suite"]):
         of_suite = episodes[episodes["suite"] == suite].assign(split="")
-        against = _against_default(ablation, of_suite)
-        for arm in ablation.names:
+        ran = set(of_suite["method"])
+        arms = [arm for arm in ablation.names if arm in ran]
+        if ablation.names[0] not in ran or len(arms) < 2:
+            continue
+        against = _against_default(arms, of_suite)
+        for arm in arms:
             rows = of_suite[of_suite["method"] == arm]
             results.append(
                 ArmResult(
@@ -87,9 +94,9 @@ def arm_rows(results: list[ArmResult]) -> list[list[str]]:
     return rows
 
 
-def _against_default(ablation: Ablation, of_suite: "pd.DataFrame") -> dict[str, Comparison]:
+def _against_default(arms: Sequence[str], of_suite: "pd.DataFrame") -> dict[str, Comparison]:
     """Each arm against the first, over all tasks of the suite."""
-    default, *others = ablation.names
+    default, *others = arms
     found = {}
     for arm in others:
         part = of_suite[of_suite["method"].isin([default, arm])]

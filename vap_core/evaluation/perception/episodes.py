@@ -20,7 +20,7 @@ from vap_core.evaluation.perception.first_frames import (
 )
 from vap_core.perception.candidates import Proposals
 from vap_core.perception.protocols import Stack
-from vap_core.vote import compare, election_scores, shortlist, vote
+from vap_core.vote import compare, election_scores, nominate, vote
 
 OFF = "off"
 """Views grounded one by one, as the paper does."""
@@ -58,8 +58,8 @@ def agreements(
     that show the target it is highlighted. A box on no object is another thing in every view.
     """
     few = []
-    for of_view in candidates:
-        few.append(shortlist(of_view, compare(personal, of_view, stack)))
+    for view, of_view in zip(episode, candidates, strict=True):
+        few.append(nominate(view.rgb, personal, of_view, stack))
     sightings = _sightings(episode, few, personal, stack)
     single = {camera: vote(sighting.cosine).winner for camera, sighting in sightings.items()}
     pairings: Mapping[str, Pairing | None] = {OFF: None, **PAIRINGS}

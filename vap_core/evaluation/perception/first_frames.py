@@ -38,7 +38,7 @@ from vap_core.simulation.env import Env
 from vap_core.simulation.studio import reference_views
 from vap_core.simulation.suites.open_row import build_scene, make_env
 from vap_core.simulation.types import EpisodeRow
-from vap_core.vote import VoteRule, compare, election_scores, shortlist, similarity, vote
+from vap_core.vote import VoteRule, compare, election_scores, nominate, similarity, vote
 
 VISIBLE_PX = 100
 """Visible pixels, of a view of 224 x 224, from which on an object counts."""
@@ -379,9 +379,9 @@ def _choices(
     target_ious: dict[tuple[float, ...], float] = {}
     rows = []
     for k, personal in memory.items():
-        few = shortlist(candidates, compare(personal, candidates, stack))
+        few = nominate(view.rgb, personal, candidates, stack)
         cosine = compare(personal, few, stack)
-        like = likeness(cosine, few.boxes.familiar)
+        like = likeness(cosine, few.boxes)
         true_cosine = similarity(true_embeddings, personal.embeddings)
         for rule in RULES:
             ballot = vote(election_scores(cosine, few.boxes), rule)

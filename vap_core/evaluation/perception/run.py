@@ -26,7 +26,7 @@ from vap_core.evaluation.perception.first_frames import (
 )
 from vap_core.evaluation.processes import results
 from vap_core.evaluation.study import Study
-from vap_core.perception.stacks import STACKS, load_stack
+from vap_core.perception.stacks import check_stack, load_stack
 from vap_core.simulation import suites
 from vap_core.simulation.types import EpisodeRow
 
@@ -77,8 +77,7 @@ class Survey:
         for name in self.suites:
             if name not in suites.BENCHMARKS:
                 raise one_of("Survey: suite", name, suites.BENCHMARKS)
-        if self.stack not in STACKS:
-            raise one_of("Survey: stack", self.stack, STACKS)
+        check_stack(self.stack, "Survey")
 
     def n_openings(self, suite: str) -> int:
         """Opening frames a task."""

@@ -18,7 +18,8 @@ from vap_core.base.photos import load_photo
 from vap_core.base.types import Boxes, Grounding, PersonalObject, Rgb
 from vap_core.evaluation.photos.folder import PhotoSet, Scene
 from vap_core.perception.boxes import box_iou
-from vap_core.perception.candidates import Candidates, embed, segment
+from vap_core.perception.candidates import Candidates, Proposals, embed, segment
+from vap_core.perception.proof import prove
 from vap_core.perception.protocols import FamiliarityJudge, Stack
 
 CAMERA = "photo"
@@ -54,8 +55,8 @@ def measure_scene(
         row |= _ground(rgb, boxes, memory[name], attender)
         if len(boxes):
             every = np.ones(len(own), bool)
-            row |= _vote("all", own, every, candidates, memory[name], attender)
-            row |= _vote("kind", own, same_kind, candidates, memory[name], attender)
+            row |= _vote("all", own, every, candidates, memory[name], attender, rgb)
+            row |= _vote("kind", own, same_kind, candidates, memory[name], attender, rgb)
         rows.append(row)
     return rows
 
@@ -100,6 +101,7 @@ def _ground(
         "candidates": len(overlap),
         "proposed_iou": float(overlap.max(initial=0.0)),
         "tinted": grounding.winner is not None,
+        "verified": _points(grounding),
         "familiar": grounding.candidates.familiar,
         "iou": 0.0,
         "ms": round(1000 * seconds, 1),
@@ -108,6 +110,13 @@ def _ground(
     if grounding.winner is not None:
         row["iou"] = float(overlap[grounding.winner])
     return row
+
+
+def _points(grounding: Grounding) -> int | None:
+    """The verified points of the elected box; None where none were compared."""
+    if grounding.chosen is None or grounding.candidates.verified is None:
+        return None
+    return int(grounding.candidates.verified[grounding.chosen])
 
 
 def _elected(grounding: Grounding, overlap: Float[np.ndarray, " n"]) -> Row:
@@ -136,6 +145,7 @@ def _vote(
     candidates: Candidates,
     obj: PersonalObject,
     attender: Attender,
+    rgb: Rgb,
 ) -> Row:
     """How the vote does among true boxes: with all references, and with each of them alone.
 
@@ -148,14 +158,25 @@ def _vote(
     among_them = _take(candidates, rows)
     right_alone = []
     for k in range(len(obj.crops)):
-        elected = attender.ground(CAMERA, obj.take(slice(k, k + 1)), among_them).ballot.winner
+        elected = _elect(rgb, obj.take(slice(k, k + 1)), among_them, attender)
         right_alone.append(bool(own[rows[elected]]))
-    elected = attender.ground(CAMERA, obj, among_them).ballot.winner
+    elected = _elect(rgb, obj, among_them, attender)
     return {
         names[0]: len(rows),
         names[1]: float(np.mean(right_alone)),
         names[2]: bool(own[rows[elected]]),
     }
+
+
+def _elect(rgb: Rgb, obj: PersonalObject, among: Candidates, attender: Attender) -> int:
+    """The candidate that the method elects, points compared as in any such photo."""
+    verifier = attender.stack.verifier
+    if verifier is not None and not among.boxes.familiar:
+        proved = prove(rgb, obj, Proposals(among.boxes, among.embeddings), verifier)
+        among = replace(among, boxes=proved.boxes)
+    winner = attender.ground(CAMERA, obj, among).ballot.winner
+    assert winner is not None, "there are candidates"
+    return winner
 
 
 def _take(candidates: Candidates, rows: Int64[np.ndarray, " m"]) -> Candidates:

@@ -37,6 +37,8 @@ def breakdown(table: "pd.DataFrame") -> "pd.DataFrame":
     `n` alone.
     """
     episodes = diagnosed(table)
+    if "case_confidence" not in episodes:  # no episode failed
+        episodes = episodes.assign(case_confidence=float("nan"))
     flat = episodes[BY].assign(n=1, failed=episodes["outcome"].eq("failure").astype(int))
     for case, sub_cases in CASES.items():
         of_case = episodes["case"].eq(case)

@@ -155,7 +155,7 @@ def _count_asked(study: dict[str, Any], labels: Mapping[str, str]) -> "pd.DataFr
     lines = []
     for suite, task, seed, rows in _asked_rows(study):
         asked = whole = _count_by_split(rows)
-        if suites.is_listed(suite):
+        if suites.has_list(suite):
             whole = _count_by_split(_episodes(suite, task, None, 0))
         policy = labels.get(suite, study["policy"])
         for method in study["methods"]:
@@ -177,8 +177,8 @@ def _asked_rows(
     """Suite, task, seed, and the episode and split of all rows that a run was asked for."""
     for suite, task in study["tasks"]:
         for seed in range(study["seed"], study["seed"] + study.get("seeds", 1)):
-            # The rows of a benchmark do not depend on the seed.
-            drawn_from = 0 if suites.is_listed(suite) else seed
+            # The rows of a list do not depend on the seed.
+            drawn_from = 0 if suites.has_list(suite) else seed
             yield suite, task, seed, _episodes(suite, task, study["episodes"], drawn_from)
 
 

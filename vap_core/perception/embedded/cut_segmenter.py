@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from vap_core.base.types import Boxes, Mask, Rgb
 from vap_core.perception.embedded import segmenter
-from vap_core.perception.embedded.segmenter import LiteSegmenter, window_around
+from vap_core.perception.embedded.segmenter import LiteSegmenter, likely_pixels, window_around
 
 SIDE = 160
 """Pixels of the square window in which GrabCut runs."""
@@ -35,14 +35,13 @@ class CutSegmenter:
         self.lite = lite
 
     def __call__(self, image: Rgb, boxes: Boxes) -> Bool[np.ndarray, "n h w"]:
-        masks = self.lite(image, boxes)
-        sides = (boxes.xyxy[:, 2:] - boxes.xyxy[:, :2]).max(axis=1, initial=0.0)
-        large = np.flatnonzero(sides >= LEAST_PX)
+        probability = self.lite.mask_probability(image, boxes.xyxy)
+        masks = likely_pixels(probability)
         if boxes.familiar:
             return masks
-        probability = self.lite.mask_probability(image, boxes.xyxy[large])
-        for i, likely in zip(large, probability, strict=True):
-            refined = refine(image, boxes.xyxy[i], likely)
+        sides = (boxes.xyxy[:, 2:] - boxes.xyxy[:, :2]).max(axis=1, initial=0.0)
+        for i in np.flatnonzero(sides >= LEAST_PX):
+            refined = refine(image, boxes.xyxy[i], probability[i])
             if refined is not None:
                 masks[i] = refined
         return masks

@@ -38,9 +38,7 @@ class LiteSegmenter:
         self.network = network
 
     def __call__(self, image: Rgb, boxes: Boxes) -> Bool[np.ndarray, "n h w"]:
-        probability = self.mask_probability(image, boxes.xyxy)
-        best = probability.max(axis=(1, 2), initial=0.0)
-        return probability > np.minimum(0.5, 0.5 * best)[:, None, None]
+        return likely_pixels(self.mask_probability(image, boxes.xyxy))
 
     def mask_probability(
         self,
@@ -62,6 +60,12 @@ class LiteSegmenter:
             (probability,) = self.network(cut(image, window)[None], planes[None])
             paste(out[i], probability[0], window)
         return out
+
+
+def likely_pixels(probability: Float32[np.ndarray, "n h w"]) -> Bool[np.ndarray, "n h w"]:
+    """The masks of more than even probability, or of more than half of the greatest."""
+    best = probability.max(axis=(1, 2), initial=0.0)
+    return probability > np.minimum(0.5, 0.5 * best)[:, None, None]
 
 
 def window_around(box_xyxy: Float[np.ndarray, "4"]) -> Window:

@@ -6,10 +6,12 @@ Within perception, only this package imports transformers.
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from vap_core.base.extras import require
+from vap_core.perception.foundation.sources import parts_of
 from vap_core.perception.kept_thresholds import read_thresholds
-from vap_core.perception.protocols import Stack
+from vap_core.perception.protocols import Stack, Thresholds
 
 
 @cache
@@ -34,6 +36,33 @@ def load(kind: str, device: str | None = None, store: Path | None = None) -> Sta
     stack = architectures.assemble(kind, networks, runtime)
     thresholds = read_thresholds(store or store_folder(), kind, stack.encoder.name)
     return replace(stack, thresholds=thresholds)
+
+
+def load_parts(name: str, device: str | None = None, store: Path | None = None) -> dict[str, Any]:
+    """The fields of a `Stack` that a mixed stack takes from here; from verified local weights.
+
+    Raises: as `load`.
+    """
+    require("foundation", f"the stack {name}")
+    from vap_core.perception.foundation import architectures
+    from vap_core.perception.foundation.runtime import select_runtime
+    from vap_core.perception.foundation.sources import models_of
+    from vap_core.perception.foundation.store import verify_stack
+
+    runtime = select_runtime(device)
+    weights = dict(zip(models_of(name), verify_stack(name, store), strict=True))
+    loaded: dict[str, Any] = {}
+    for role, model in parts_of(name).items():
+        if model in weights:
+            loaded |= architectures.read_part(role, model, weights[model], runtime)
+    return loaded
+
+
+def kept_thresholds(name: str, encoder: str) -> Thresholds | None:
+    """The thresholds of a mixed stack that `calibrate --keep` measured. Raises: BadOutput."""
+    from vap_core.perception.foundation.store import store_folder
+
+    return read_thresholds(store_folder(), name, encoder)
 
 
 def load_random(kind: str, device: str | None = None) -> Stack:

@@ -9,9 +9,16 @@ import torch
 
 from vap_core.base.errors import MissingWeights
 from vap_core.perception.foundation.detector import GroundingDino
-from vap_core.perception.foundation.encoder import SIDE, DinoEncoder
+from vap_core.perception.foundation.encoder import (
+    DINO,
+    DINOV3,
+    SIGLIP,
+    CropEncoder,
+    CropRecipe,
+    PooledEncoder,
+)
 from vap_core.perception.foundation.runtime import Runtime
-from vap_core.perception.foundation.segmenter import MEAN, STD, Sam, SamSegmenter
+from vap_core.perception.foundation.segmenter import Sam, SamSegmenter
 from vap_core.perception.foundation.sources import KINDS
 from vap_core.perception.foundation.store import VerifiedWeights
 from vap_core.perception.foundation.tracker import SamTracker
@@ -51,6 +58,23 @@ HIERA_SIZES: dict[str, dict[str, Any]] = {
 }
 
 
+CLASSES = {
+    "grounding-dino-": "GroundingDinoForObjectDetection",
+    "llmdet-": "MMGroundingDinoForObjectDetection",
+    "mm-grounding-dino-": "MMGroundingDinoForObjectDetection",
+    "dinov2-": "Dinov2Model",
+    "dinov3-": "DINOv3ViTModel",
+    "siglip2-": "SiglipVisionModel",
+    "sam2.1-": "Sam2VideoModel",
+}
+"""transformers' class of the models whose names begin so."""
+ENCODERS: dict[str, tuple[type[CropEncoder], CropRecipe]] = {
+    "Dinov2Model": (CropEncoder, DINO),
+    "DINOv3ViTModel": (CropEncoder, DINOV3),
+    "SiglipVisionModel": (PooledEncoder, SIGLIP),
+}
+
+
 @dataclass(frozen=True)
 class Networks:
     """transformers' models of one stack, on the CPU; `encoder_name` is stored with every memory."""
@@ -64,36 +88,60 @@ class Networks:
 
 def assemble(kind: str, networks: Networks, runtime: Runtime) -> Stack:
     """Put the adapters around the networks, with the pre-processing that they were trained with."""
-    from transformers.models.bit.image_processing_pil_bit import BitImageProcessorPil
-    from transformers.models.grounding_dino.image_processing_pil_grounding_dino import (
-        GroundingDinoImageProcessorPil,
-    )
-
-    # The published 256 -> 224 centre crop would cut off the ends of padded crops.
-    crop_processor = BitImageProcessorPil(
-        size={"height": SIDE, "width": SIDE},
-        do_center_crop=False,
-        image_mean=list(MEAN),
-        image_std=list(STD),
-    )
     sam = Sam(networks.sam, runtime)
     return Stack(
         name=kind,
-        detector=GroundingDino(
-            model=networks.detector,
-            tokenizer=networks.tokenizer,
-            processor=GroundingDinoImageProcessorPil(),
-            runtime=runtime,
-        ),
-        encoder=DinoEncoder(
-            model=networks.encoder,
-            processor=crop_processor,
-            name=networks.encoder_name,
-            runtime=runtime,
+        detector=_detector(networks.detector, networks.tokenizer, runtime),
+        encoder=CropEncoder(
+            model=networks.encoder, recipe=DINO, name=networks.encoder_name, runtime=runtime
         ),
         segmenter=SamSegmenter(sam),
         tracker=SamTracker(sam),
     )
+
+
+def _detector(network: Any, tokenizer: Any, runtime: Runtime) -> GroundingDino:
+    from transformers.models.grounding_dino.image_processing_pil_grounding_dino import (
+        GroundingDinoImageProcessorPil,
+    )
+
+    return GroundingDino(
+        model=network,
+        tokenizer=tokenizer,
+        processor=GroundingDinoImageProcessorPil(),
+        runtime=runtime,
+    )
+
+
+def network_class(model: str) -> str:
+    """transformers' class of a model of `sources.PARTS`."""
+    for beginning, name in CLASSES.items():
+        if model.startswith(beginning):
+            return name
+    raise KeyError(model)
+
+
+def read_part(role: str, model: str, weights: VerifiedWeights, runtime: Runtime) -> dict[str, Any]:
+    """The fields of a `Stack` that one model fills, and those that it makes empty.
+
+    Raises: MissingWeights: a file that transformers cannot read as the network it should be.
+    """
+    import transformers
+
+    with quiet_transformers():
+        network = _read_network(getattr(transformers, network_class(model)), weights)
+        if role == "detector":
+            tokenizer = transformers.AutoTokenizer.from_pretrained(
+                weights.folder, local_files_only=True
+            )
+            detector = _detector(network, tokenizer, runtime)
+            return {"detector": detector, "by_category": None}
+    if role == "encoder":
+        encoder, recipe = ENCODERS[network_class(model)]
+        filled = encoder(model=network, recipe=recipe, name=weights.identity, runtime=runtime)
+        return {"encoder": filled, "unfamiliar_encoder": None}
+    sam = Sam(network, runtime)
+    return {"segmenter": SamSegmenter(sam), "tracker": SamTracker(sam)}
 
 
 def read_networks(

@@ -57,9 +57,13 @@ def find_folder(source: Source, origin: Path) -> Path:
 
     Raises: MissingWeights: none of them is there.
     """
+    revision = source.revision
+    ref = origin / f"models--{source.folder}" / "refs" / revision
+    if ref.is_file():  # a branch; the cache has its commit
+        revision = ref.read_text().strip()
     below = (
         source.folder,
-        f"models--{source.folder}/snapshots/{source.revision}",
+        f"models--{source.folder}/snapshots/{revision}",
         source.repo,
     )
     for path in below:
@@ -76,6 +80,12 @@ def _pull_model(name: str, store: Path, origin: Path | None, unpinned: bool) -> 
 
     source = MODELS[name]
     folder = store / source.folder
+    if not source.sha256 and not unpinned:
+        first = f"; first {source.needs}" if source.needs else ""
+        raise MissingWeights(
+            f"weights pull: no checksum of {name} ({source.repo}) is pinned here; pass --unpinned "
+            f"to take it as it is there{first}."
+        )
     if origin is None and find_problem(name, store) is None:
         return False
     try:
@@ -146,6 +156,12 @@ def _download(source: Source, file: str, path: Path) -> None:
         return
     except HfHubHTTPError as error:
         reason = f"HTTP {error.response.status_code}"
+        if source.needs:
+            raise MissingWeights(
+                f"weights pull: {url} cannot be had ({reason}): {source.needs}, run `hf download "
+                f"{source.repo}`, and pull it with --from and the cache's folder "
+                "(~/.cache/huggingface/hub)."
+            ) from error
     except (HTTPError, OSError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
     raise MissingWeights(

@@ -1,32 +1,68 @@
-"""DINOv2: an object's appearance as the final layer's [CLS] token, L2-normalised (P 3.3, 5.1)."""
+"""Encoders: an object's appearance as one L2-normalised row (P 3.3, 5.1).
+
+DINOv2, the paper's, and DINOv3 give the final layer's [CLS] token, SigLIP 2 its pooled token.
+"""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Float32
+from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
 from vap_core.base.types import Rgb
 from vap_core.perception.foundation.runtime import Runtime
+from vap_core.perception.foundation.segmenter import MEAN, STD
 
 SIDE = 224
 """Pixels of the square in which a crop is embedded."""
 BATCH = 32
-GREY = (124, 116, 104)
-"""ImageNet's mean, which normalises to zero."""
 
 
-class DinoEncoder:
-    """The foundation encoder.
+@dataclass(frozen=True)
+class CropRecipe:
+    """How a network's crops are scaled and normalised, as its published processor does it.
 
-    A crop is padded to a square, so that nothing of a long object is cut off.
+    `resample` is Pillow's number of the filter: 2 bilinear, 3 bicubic.
     """
 
-    def __init__(self, model: Any, processor: Any, name: str, runtime: Runtime) -> None:
+    mean: tuple[float, float, float] = MEAN
+    std: tuple[float, float, float] = STD
+    resample: int = 3
+
+    @property
+    def grey(self) -> tuple[int, int, int]:
+        """The colour that normalises to zero."""
+        red, green, blue = (round(255 * level) for level in self.mean)
+        return red, green, blue
+
+
+DINO = CropRecipe()
+DINOV3 = CropRecipe(resample=2)
+SIGLIP = CropRecipe(mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5), resample=3)
+
+
+class CropEncoder:
+    """A network whose [CLS] token is the embedding.
+
+    A crop is padded to a square, so that nothing of a long object is cut off: no centre crop.
+    """
+
+    def __init__(self, model: Any, recipe: CropRecipe, name: str, runtime: Runtime) -> None:
+        from transformers.models.bit.image_processing_pil_bit import BitImageProcessorPil
+
         self.model = model.requires_grad_(False).eval().to(runtime.device)
-        self.processor = processor
+        self.recipe = recipe
+        self.processor = BitImageProcessorPil(
+            size={"height": SIDE, "width": SIDE},
+            do_center_crop=False,
+            resample=recipe.resample,
+            image_mean=list(recipe.mean),
+            image_std=list(recipe.std),
+        )
         self.name = name
         self.runtime = runtime
         self.dim = int(model.config.hidden_size)
@@ -39,16 +75,27 @@ class DinoEncoder:
 
     def _embed(self, crops: Sequence[Rgb]) -> Float32[np.ndarray, "n d"]:
         pixels = self.processor(
-            images=[pad_to_square(crop) for crop in crops],
+            images=[pad_to_square(crop, self.recipe.grey) for crop in crops],
             input_data_format="channels_last",
             return_tensors="pt",
         )["pixel_values"]
         with self.runtime.inference():
-            cls = self.model(pixels.to(self.runtime.device)).last_hidden_state[:, 0].float()
-            return F.normalize(cls, dim=1).cpu().numpy()
+            row = self._row(self.model(pixels.to(self.runtime.device))).float()
+            return F.normalize(row, dim=1).cpu().numpy()
+
+    def _row(self, out: Any) -> Tensor:
+        """The embedding in the network's output."""
+        return out.last_hidden_state[:, 0]
 
 
-def pad_to_square(crop: Rgb) -> Rgb:
+class PooledEncoder(CropEncoder):
+    """A network that pools its tokens by attention."""
+
+    def _row(self, out: Any) -> Tensor:
+        return out.pooler_output
+
+
+def pad_to_square(crop: Rgb, grey: tuple[int, int, int] = DINO.grey) -> Rgb:
     """The crop in the middle of a grey square; a larger one than the model takes is reduced
     first.
     """
@@ -59,7 +106,7 @@ def pad_to_square(crop: Rgb) -> Rgb:
         w = max(1, round(w * scale))
         crop = cv2.resize(crop, (w, h), interpolation=cv2.INTER_AREA)
     side = max(h, w)
-    out = np.full((side, side, 3), GREY, np.uint8)
+    out = np.full((side, side, 3), grey, np.uint8)
     top = (side - h) // 2
     left = (side - w) // 2
     out[top : top + h, left : left + w] = crop

@@ -1,4 +1,8 @@
-"""Where weights that do not ship come from: repositories of the Hugging Face hub, pinned."""
+"""Where weights that do not ship come from: repositories of the Hugging Face hub, pinned.
+
+Those without a pin are options (`stacks.mixed`) whose files nobody has seen here: they are taken as
+the hub gives them, on purpose (`weights pull --unpinned`), and their SHA-256 is kept then.
+"""
 
 from dataclasses import dataclass
 
@@ -10,15 +14,16 @@ TOKENIZER = ("tokenizer.json", "tokenizer_config.json")
 
 @dataclass(frozen=True)
 class Source:
-    """One model: a repository at one commit, and the SHA-256 of its tensors there.
+    """One model: a repository at one commit, and the SHA-256 of its tensors there, "" for no pin.
 
-    `small_files` are what is needed besides the tensors.
+    `small_files` are what is needed besides the tensors. `needs` says what the hub asks for first.
     """
 
     repo: str
-    revision: str
-    sha256: str
+    revision: str = "main"
+    sha256: str = ""
     small_files: tuple[str, ...] = ("config.json",)
+    needs: str = ""
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -63,6 +68,25 @@ MODELS = {
         revision="de431c4043854a71d8101e17995dfe596bf101a5",
         sha256="48c14467e5cf9e51870511feb72c89688e82dd74523142c0538b663e193ac2a7",
     ),
+    "llmdet-tiny": Source(
+        repo="iSEE-Laboratory/llmdet_tiny", small_files=("config.json", *TOKENIZER)
+    ),
+    "llmdet-base": Source(
+        repo="iSEE-Laboratory/llmdet_base", small_files=("config.json", *TOKENIZER)
+    ),
+    "mm-grounding-dino-tiny": Source(
+        repo="openmmlab-community/mm_grounding_dino_tiny_o365v1_goldg_v3det",
+        small_files=("config.json", *TOKENIZER),
+    ),
+    "mm-grounding-dino-base": Source(
+        repo="openmmlab-community/mm_grounding_dino_base_all",
+        small_files=("config.json", *TOKENIZER),
+    ),
+    "dinov3-small": Source(
+        repo="facebook/dinov3-vits16-pretrain-lvd1689m",
+        needs="accept Meta's DINOv3 licence on its page and log in with `hf auth login`",
+    ),
+    "siglip2-base": Source(repo="google/siglip2-base-patch16-224"),
     "all-minilm-l6-v2": Source(
         repo="sentence-transformers/all-MiniLM-L6-v2",
         revision="1110a243fdf4706b3f48f1d95db1a4f5529b4d41",
@@ -77,12 +101,62 @@ KINDS = {
     "foundation-small": ("grounding-dino-tiny", "dinov2-small", "sam2.1-hiera-tiny"),
 }
 """Detector, encoder, and segmenter with tracker of each stack."""
+PARTS = {
+    "detector": (
+        "grounding-dino-tiny",
+        "grounding-dino-base",
+        "llmdet-tiny",
+        "llmdet-base",
+        "mm-grounding-dino-tiny",
+        "mm-grounding-dino-base",
+    ),
+    "encoder": ("dinov2-small", "dinov2-base", "dinov3-small", "siglip2-base"),
+    "tracker": ("sam2.1-hiera-tiny", "sam2.1-hiera-large"),
+}
+"""What may stand for each part of a mixed stack; the tracker brings the segmenter."""
+EMBEDDED = "embedded"
+
+
+def mixed(stack: str, **parts: str) -> str:
+    """The name of a stack with some of `PARTS` replaced: "embedded:encoder=dinov2-small".
+
+    Empty names leave a part as it is. Raises: UnknownName.
+    """
+    changed = []
+    for role, name in parts.items():
+        if name:
+            known = (EMBEDDED, *PARTS[role])
+            if name not in known:
+                raise one_of(f"load_stack: {role}", name, known)
+            changed.append(f"{role}={name}")
+    if not changed:
+        return stack
+    return f"{stack}:{','.join(changed)}"
+
+
+def parts_of(name: str) -> dict[str, str]:
+    """The model of each role of a stack, mixed or not. Raises: UnknownName."""
+    base, _, changes = name.partition(":")
+    if base not in (EMBEDDED, *KINDS):
+        raise one_of("load_stack: base of a mixed stack", base, [EMBEDDED, *KINDS])
+    models = KINDS.get(base, (EMBEDDED,) * len(PARTS))
+    parts = dict(zip(PARTS, models, strict=True))
+    for change in filter(None, changes.split(",")):
+        role, _, model = change.partition("=")
+        if role not in PARTS:
+            raise one_of("load_stack: part of a mixed stack", role, PARTS)
+        mixed(base, **{role: model or "nothing"})
+        parts[role] = model
+    return parts
 
 
 def models_of(kind: str) -> tuple[str, ...]:
-    """The models of a stack. Raises: UnknownName."""
-    if kind == "embedded":
+    """The models of a stack, of a mixed one those that do not ship. Raises: UnknownName."""
+    if kind == EMBEDDED:
         return (TEXT,)
+    if ":" in kind:
+        names = parts_of(kind).values()
+        return tuple(name for name in dict.fromkeys(names) if name != EMBEDDED)
     if kind not in KINDS:
         raise one_of("weights: stack", kind, ["embedded", *KINDS])
     return KINDS[kind]

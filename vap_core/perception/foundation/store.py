@@ -9,11 +9,12 @@ import hashlib
 import json
 import os
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from vap_core.base.errors import MissingWeights
 from vap_core.base.files import kept_folder, parse_json, read_file, write_atomic
-from vap_core.perception.foundation.sources import KINDS, MODELS, TENSORS, Source, models_of
+from vap_core.perception.foundation.sources import KINDS, MODELS, PARTS, TENSORS, Source, models_of
 
 STORE = kept_folder("weights-hub")
 VARIABLE = "VAP_WEIGHTS"
@@ -55,7 +56,7 @@ def verify_stack(kind: str, store: Path | None = None) -> tuple[VerifiedWeights,
         folder = store / MODELS[name].folder
         digest = read_lock(folder)[TENSORS]
         identity = name
-        if digest != MODELS[name].sha256:
+        if digest != MODELS[name].sha256:  # other weights, or a model without a pin
             identity = f"{name}-{digest[:12]}"
         verified.append(VerifiedWeights(folder, identity))
     return tuple(verified)
@@ -64,6 +65,8 @@ def verify_stack(kind: str, store: Path | None = None) -> tuple[VerifiedWeights,
 def remedy(kind: str) -> str:
     """How to get a stack's weights, online and offline."""
     pull = f"python -m vap_core weights pull --stack {kind}"
+    if any(not MODELS[name].sha256 for name in models_of(kind)):
+        pull += " --unpinned"
     return (
         f"run `{pull}`, without internet `{pull} --from DIR` with a copy of another machine's, "
         f"or point {VARIABLE} at a folder that has them"
@@ -104,6 +107,14 @@ def weights_table(store: Path | None = None) -> str:
             lines.append(f"{kind:<17} {name:<20} {where}: {problem or 'here'}")
         if not complete:
             remedies.append(f"{kind}: {remedy(kind)}")
+    for role, models in PARTS.items():
+        for name in models:
+            source = MODELS[name]
+            if name in chain.from_iterable(KINDS.values()):
+                continue
+            problem = find_problem(name, store, quick=True)
+            asks = f"; first {source.needs}" if problem and source.needs else ""
+            lines.append(f"--{role:<15} {name:<20} {source.repo}: {problem or 'here'}{asks}")
     return "\n".join([*lines, *remedies])
 
 

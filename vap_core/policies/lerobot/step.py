@@ -1,13 +1,15 @@
 """VAP inside lerobot: a processor step for any of its policies, and our suites as an environment.
 
-    attach("checkpoint", "personalised", memory="data/memory")
+    python -m vap_core attach CHECKPOINT personalised --memory data/memory
     lerobot-eval --policy.path=personalised --env.type=vap --env.task=simpler-bridge/put-camera \\
-        --env.discover_packages_path=vap_core.policies.lerobot --seed=0
+        --seed=0
 
 `attach` links the frozen files, and adds one step to the preprocessor. The step tints every view
 and rewrites the task before anything else reads them. It must know where an episode begins:
 lerobot-eval never resets its pipelines, so our environments number their steps in the observation
-`vap_step`; robot loops reset theirs (`episodes="reset"`).
+`vap_step`; robot loops reset theirs before the first picture. Where neither says it, the step
+refuses the picture (`episodes="auto"`). The distribution lerobot_env_vap (plugins/) lets lerobot's
+commands find all this.
 """
 
 import json
@@ -33,7 +35,7 @@ from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadViews, one_
 from vap_core.base.files import parse_json
 from vap_core.base.types import Rgb, Views
 from vap_core.memory import load_bank
-from vap_core.perception.stacks import STACKS, load_stack
+from vap_core.perception.stacks import check_stack, load_stack
 from vap_core.policies.lerobot.checkpoints import PIPELINES, STEP_CLASS, STEP_NAME, locate
 from vap_core.prompt import Tint
 from vap_core.simulation import suites
@@ -64,7 +66,8 @@ class VapPrompt(ProcessorStep):
     Views in which it is not seen pass bit for bit. `memory` is the folder of remembered objects,
     `objects` names those meant where the category alone does not decide. `episodes` says how an
     episode's beginning is known: by `observation.vap_step` being 0, or by `reset()` (then of one
-    environment only).
+    environment only). With "auto" it is the former where that observation is there, else the
+    latter in a loop that has called `reset()`.
     """
 
     memory: str
@@ -73,15 +76,15 @@ class VapPrompt(ProcessorStep):
     highlight: bool = True
     rewrite: bool = True
     alpha: float = 0.5
-    episodes: Literal["vap_step", "reset"] = "vap_step"
+    episodes: Literal["auto", "vap_step", "reset"] = "auto"
     _attender: Attender | None = field(default=None, init=False, repr=False)
     _ongoing: dict[int, OngoingEpisode] = field(default_factory=dict, init=False, repr=False)
+    _was_reset: bool = field(default=False, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if self.stack not in STACKS:
-            raise one_of("VapPrompt: stack", self.stack, STACKS)
-        if self.episodes not in ("vap_step", "reset"):
-            raise one_of("VapPrompt: episodes", self.episodes, ("vap_step", "reset"))
+        check_stack(self.stack, "VapPrompt")
+        if self.episodes not in ("auto", "vap_step", "reset"):
+            raise one_of("VapPrompt: episodes", self.episodes, ("auto", "vap_step", "reset"))
         if not Path(self.memory).is_dir():
             raise BadMemory(
                 f"VapPrompt: {self.memory} is no folder of remembered objects; register one, or "
@@ -127,6 +130,7 @@ class VapPrompt(ProcessorStep):
     def reset(self) -> None:
         """The next pictures begin an episode."""
         self._ongoing.clear()
+        self._was_reset = True
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
@@ -135,20 +139,33 @@ class VapPrompt(ProcessorStep):
 
     def _steps(self, signal: torch.Tensor | None, n: int) -> list[int]:
         """The step that every environment of the batch is at, 0 for a new episode."""
-        if self.episodes == "reset":
-            if n > 1:
+        numbered = [] if signal is None else [round(step) for step in signal.reshape(-1).tolist()]
+        if self.episodes == "vap_step" or (self.episodes == "auto" and numbered):
+            if not numbered:
                 raise BadViews(
-                    f"VapPrompt: {n} environments but episodes='reset', which knows one; give the "
-                    "observation vap_step and attach again."
+                    f"VapPrompt: {STEP} is missing, so the start of an episode is not known; "
+                    "let the environment give vap_step (0 = new), or attach with episodes='reset' "
+                    "where the caller resets the preprocessor."
                 )
-            return [self._ongoing[0].step + 1 if self._ongoing else 0]
-        if signal is None:
+            return numbered
+        if n > 1:
             raise BadViews(
-                f"VapPrompt: {STEP} is missing, so the start of an episode is not known; "
-                "let the environment give vap_step (0 = new), or attach with episodes='reset' "
-                "where the caller resets the preprocessor."
+                f"VapPrompt: {n} environments, of which a reset of the preprocessor names none; "
+                "let the environment give the observation vap_step (0 = new)."
             )
-        return [round(step) for step in signal.reshape(-1).tolist()]
+        if not self._was_reset:
+            raise BadViews(
+                "VapPrompt: this loop has not reset its preprocessor (lerobot-eval never does), so "
+                "the start of an episode is not known; let the environment give the observation "
+                "vap_step (0 = new)."
+            )
+        step = self._ongoing[0].step + 1 if self._ongoing else 0
+        if numbered and (numbered[0] == 0) != (step == 0):
+            raise BadViews(
+                f"VapPrompt: episodes='reset', but the environment is at step {numbered[0]} where "
+                f"the resets count {step}; attach with episodes='auto', which reads vap_step."
+            )
+        return [step]
 
     def _prompt(
         self, views: Mapping[str, torch.Tensor], texts: Sequence[str], steps: Sequence[int]

@@ -102,6 +102,17 @@ class MiniPI0Policy(PI0Policy):
         self.model.to(config.device)
         self.reset()
 
+    def _preprocess_images(self, batch: dict[str, Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+        """PI0's, of images that are scaled as in training: with antialiasing."""
+        size = self.config.image_resolution
+        scaled = dict(batch)
+        for key in self.config.image_features:
+            if key in batch and batch[key].shape[-2:] != size:
+                scaled[key] = torch.nn.functional.interpolate(
+                    batch[key].float(), size, mode="bilinear", antialias=True
+                )
+        return super()._preprocess_images(scaled)
+
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: Any, **kwargs: Any) -> "MiniPI0Policy":
         """The checkpoint, tensor for tensor. Raises: RuntimeError when names or shapes differ."""

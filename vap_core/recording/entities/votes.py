@@ -175,6 +175,8 @@ def _candidate_numbers(grounding: Grounding) -> rr.AnyValues:
         }
         if boxes.prior is not None:
             numbers["prior"] = boxes.prior
+        if boxes.verified is not None and boxes.proof is not None:
+            numbers |= {"verified": boxes.verified, "proof": boxes.proof}
     return rr.AnyValues(
         phrase=boxes.phrase,
         object=grounding.object,

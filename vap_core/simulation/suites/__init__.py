@@ -3,18 +3,19 @@
 The episode lists of the benchmarks are hashed files; those of the warm-up suites are generated.
 Every benchmark has a development list, the suite NAME-dev. NAME-absent and NAME-dev-absent are the
 same lists with the target left out; NAME-red and NAME-dev-red have a look-alike that is red by
-nature.
+nature. A user's own suites come from files (own.py).
 """
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 
 from vap_core.base.errors import BadSuite, UnknownName, one_of
 from vap_core.simulation import robots
 from vap_core.simulation.assets import objects
-from vap_core.simulation.suites import development, lists, pick, starts
+from vap_core.simulation.suites import development, lists, own, own_object, pick, starts
 from vap_core.simulation.suites.rules import Judge as Judge
 from vap_core.simulation.suites.simpler import BRIDGE, FRACTAL
 from vap_core.simulation.suites.suite import Suite as Suite
@@ -42,9 +43,13 @@ def suite(name: str) -> Suite:
     """The suite called `name`. Raises: UnknownName."""
     if name in SUITES:
         return SUITES[name]
+    own_suite = own.find(name)
+    if own_suite is not None:
+        return own_suite.suite
     if not is_listed(name):
         raise one_of(
-            "suites.suite: suite (a benchmark also with -dev, -red, -absent, -dev-absent)",
+            "suites.suite: suite (a benchmark also with -dev, -red, -absent, -dev-absent; your own "
+            f"by its file, or with the file in {own.VARIABLE})",
             name,
             SUITES,
         )
@@ -66,19 +71,32 @@ def is_listed(name: str) -> bool:
     return benchmark_name(name) in BENCHMARKS
 
 
+def open_file(path: Path) -> Suite:
+    """Make the suite known that a Python file of the user's own defines. Raises: BadSuite."""
+    return own.open_file(path, taken=SUITES, endings=(ABSENT, RED, development.SUFFIX))
+
+
+def has_list(name: str) -> bool:
+    """Whether a suite's rows are a list, the same for every seed: all but the warm-up suites'."""
+    return is_listed(name) or own.find(name) is not None
+
+
 def is_development(name: str) -> bool:
     return is_listed(name) and list_name(name).endswith(development.SUFFIX)
 
 
 def digest(name: str) -> str:
     """The sha256 of a suite's list. Raises: BadSuite."""
+    own_suite = own.find(name)
+    if own_suite is not None:
+        return own_suite.sha256
     return lists.digest(list_name(name))
 
 
 @cache
 def benchmark(name: str) -> tuple[EpisodeRow, ...]:
     """The whole list of a benchmark, or of its development list; for both without their targets, or
-    with a red look-alike.
+    with a red look-alike. Of an own suite its whole list.
 
     Raises: BadSuite, naming row and field, also for a task, camera or object that does not exist.
     """
@@ -88,6 +106,9 @@ def benchmark(name: str) -> tuple[EpisodeRow, ...]:
         return tuple(replace(row, suite=name, start=left_out) for row in whole)
     if name.endswith(RED):
         return tuple(_with_red_lookalike(row, name) for row in benchmark(name.removesuffix(RED)))
+    own_suite = own.find(name)
+    if own_suite is not None:
+        return own_suite.rows
     episodes = lists.read(name)
     known = suite(name)
     tasks = {task.name for task in known.tasks}
@@ -139,12 +160,27 @@ def _seeded(suite_name: str, task_name: str, seed: int) -> tuple[EpisodeRow, ...
 
 
 def listed(
-    suite_name: str, task_name: str, n: int | None = None, seed: int = 0, seeds: int = 1
+    suite_name: str,
+    task_name: str,
+    n: int | None = None,
+    seed: int = 0,
+    seeds: int = 1,
+    own_target: str = "",
 ) -> tuple[EpisodeRow, ...]:
-    """`rows` of `seeds` seeds from `seed` on, one seed after the other."""
+    """`rows` of `seeds` seeds from `seed` on, one seed after the other.
+
+    `own_target` takes the listed target's place (own_object.with_object).
+    """
+    if own_target:
+        everything = tuple(SUITES.values())
+        own_object.check_category(own_target, suite(suite_name), task_name, everything)
     episodes: list[EpisodeRow] = []
     for row_seed in range(seed, seed + seeds):
-        episodes.extend(rows(suite_name, task_name, n, row_seed))
+        drawn = rows(suite_name, task_name, n, row_seed)
+        if own_target:
+            whole = rows(suite_name, task_name, seed=row_seed)
+            drawn = own_object.with_object(drawn, own_target, whole)
+        episodes.extend(drawn)
     return tuple(episodes)
 
 

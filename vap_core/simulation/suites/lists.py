@@ -30,7 +30,7 @@ def write(name: str, rows: Sequence[EpisodeRow], folder: Path = FOLDER) -> str:
     folder.mkdir(parents=True, exist_ok=True)
     lines = []
     for row in rows:
-        lines.append(json.dumps(_to_json(row), separators=(",", ":")) + "\n")
+        lines.append(to_line(row))
     data = "".join(lines).encode()
     digest = hashlib.sha256(data).hexdigest()
     write_atomic(folder / f"{name}.jsonl", data)
@@ -98,6 +98,11 @@ def check(rows: Iterable[EpisodeRow]) -> None:
     for i, row in enumerate(rows, 1):
         text = json.dumps(_to_json(row))
         _parse_row(text, f"row {i}")
+
+
+def to_line(row: EpisodeRow) -> str:
+    """A row as a line of a list."""
+    return json.dumps(_to_json(row), separators=(",", ":")) + "\n"
 
 
 def _manifest(folder: Path, missing_is_empty: bool = False) -> dict[str, Any]:

@@ -1,0 +1,200 @@
+"""A recorded LeRobotDataset is grounded, tracked, recorded and copied; what it lacks is one line."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from tests.command import refused, vap
+from tests.toys import TOYS, personal, scene
+from vap_core import memory
+from vap_core.analysis.dataset_inspection import (
+    ViewReport,
+    _stretches,
+    inspect_dataset,
+    report_table,
+)
+from vap_core.attend import Attender
+from vap_core.base.errors import BadDataset, BadOutput
+from vap_core.perception.stacks import STACKS
+from vap_core.policies.lerobot.datasets import open_dataset
+from vap_core.recording import read_summary
+
+BLUE, GREEN = (0, 0, 255), (0, 255, 0)
+CAMERAS = ("top", "wrist")
+TOLD = "bring my mug"
+
+
+def picture(t: int, camera: str, episode: int) -> np.ndarray:
+    """My blue mug moves; in the second episode the wrist does not show it in the middle."""
+    other = [(40, 10, GREEN)]
+    if episode == 1 and camera == "wrist" and t in (2, 3):
+        return scene(other)
+    return scene([(2 + 2 * t, 30, BLUE), *other])
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two episodes of two cameras, as images, which come back bit for bit."""
+    folder = tmp_path_factory.mktemp("datasets") / "desk"
+    h, w = scene([]).shape[:2]
+    features = {
+        f"observation.images.{camera}": {"dtype": "image", "shape": (h, w, 3), "names": ["height", "width", "channels"]}
+        for camera in CAMERAS
+    }  # fmt: skip
+    features["observation.state"] = {"dtype": "float32", "shape": (2,), "names": ["a", "b"]}
+    features["action"] = {"dtype": "float32", "shape": (1,), "names": ["a"]}
+    features["next.done"] = {"dtype": "bool", "shape": (1,), "names": None}
+    dataset = LeRobotDataset.create(
+        "me/desk", fps=5, features=features, root=folder, robot_type="toy", use_videos=False
+    )
+    for episode in range(2):
+        for t in range(5):
+            frame = {
+                f"observation.images.{camera}": picture(t, camera, episode) for camera in CAMERAS
+            }
+            frame["observation.state"] = np.array([t, episode], np.float32)
+            frame["action"] = np.array([t], np.float32)
+            frame["next.done"] = np.array([t == 4])
+            dataset.add_frame({**frame, "task": "bring the mug"})
+        dataset.save_episode()
+    dataset.finalize()
+    return folder
+
+
+@pytest.fixture
+def bank(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setitem(STACKS, "toys", lambda: TOYS)
+    memory.save(tmp_path / "memory", personal("mug", "mug", BLUE))
+    return tmp_path / "memory"
+
+
+def test_frames_come_as_they_were_recorded(recorded: Path) -> None:
+    opened = open_dataset(recorded)
+    assert (opened.episodes, opened.hz, tuple(opened.keys)) == (2, 5.0, CAMERAS)
+    frames = list(opened.frames(1))
+    assert [frame.number for frame in frames] == list(range(5)) == list(range(opened.length(1)))
+    for t, frame in enumerate(frames):
+        assert frame.task == "bring the mug"
+        assert frame.at_s == t / 5
+        for camera in CAMERAS:
+            assert (frame.views[camera] == picture(t, camera, 1)).all()
+
+
+def test_losses_are_told_and_every_episode_is_a_recording(
+    recorded: Path, bank: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    reports = inspect_dataset(recorded, TOLD, bank, "toys", out)
+    found = {(r.episode, r.camera): (r.grounded, r.tracked, r.losses, r.longest) for r in reports}
+    assert found == {
+        (0, "top"): (True, 5, 0, 0),
+        (0, "wrist"): (True, 5, 0, 0),
+        (1, "top"): (True, 5, 0, 0),
+        (1, "wrist"): (True, 3, 1, 2),
+    }
+    assert all(report.agrees for report in reports)
+    table = report_table(reports)
+    assert "4 of 4 views find the object" in table
+    assert "18 of 20 frames, with 1 losses" in table
+    assert "0 of 4 views disagree" in table
+    assert [line.split()[:2] for line in table.splitlines()[2:3]] == [["1", "wrist"]]
+    assert len((out / "views.csv").read_text().splitlines()) == 5
+    for episode in range(2):
+        assert read_summary(out / f"episode_{episode:06d}.rrd")
+
+
+def test_the_same_call_goes_on_and_another_question_is_refused(
+    recorded: Path, bank: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    whole = inspect_dataset(recorded, TOLD, bank, "toys", out)
+    kept = (out / "episode_000000.rrd").stat().st_mtime_ns
+    (out / "episode_000001.json").unlink()
+    again = inspect_dataset(recorded, TOLD, bank, "toys", out)
+    assert [str(report) for report in again] == [str(report) for report in whole]
+    assert (out / "episode_000000.rrd").stat().st_mtime_ns == kept
+    with pytest.raises(BadOutput, match="holds another inspection; choose another --out"):
+        inspect_dataset(recorded, "pick my mug", bank, "toys", out)
+
+
+def test_a_copy_has_what_the_method_would_show_and_all_else_as_it_was(
+    recorded: Path, bank: Path, tmp_path: Path
+) -> None:
+    copy = tmp_path / "copy"
+    inspect_dataset(recorded, TOLD, bank, "toys", tmp_path / "out", copy=copy, masks=True)
+    before, after = open_dataset(recorded), open_dataset(copy)
+    attender = Attender(TOYS, memory.load_bank(bank))
+    for episode in range(2):
+        state = None
+        for old, new in zip(before.frames(episode), after.frames(episode), strict=True):
+            if state is None:
+                state, attended = attender.start(old.views, TOLD)
+            else:
+                state, attended = attender.step(state, old.views)
+            assert new.task == attended.text == "bring the red mug"
+            for camera in CAMERAS:
+                assert (new.views[camera] == attended.images[camera]).all()
+                mask = attended.tracks[camera][0].mask
+                stored = new.item[f"vap.mask.{camera}"].numpy().astype(bool)
+                assert (stored == (np.zeros_like(stored) if mask is None else mask)).all()
+            for key in ("observation.state", "action", "next.done", "timestamp", "episode_index"):
+                assert (old.item[key] == new.item[key]).all(), key
+    assert after.dataset.meta.robot_type == "toy"
+    with pytest.raises(BadDataset, match="copy exists; choose another folder with --copy"):
+        inspect_dataset(recorded, TOLD, bank, "toys", tmp_path / "out", copy=copy)
+
+
+def test_a_copy_that_was_interrupted_is_not_there(
+    recorded: Path, bank: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vap_core.policies.lerobot.datasets.Copy.end_episode", lambda self: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        inspect_dataset(recorded, TOLD, bank, "toys", tmp_path / "out", copy=tmp_path / "copy")
+    assert not list(tmp_path.glob("*copy*"))
+    assert not list(tmp_path.glob(".*copy*"))
+
+
+@pytest.mark.parametrize("flaw", ["absent", "no info", "damaged", "no data", "version"])
+def test_what_is_no_dataset_is_one_line(recorded: Path, tmp_path: Path, flaw: str) -> None:
+    folder = tmp_path / "broken"
+    shutil.copytree(recorded, folder)
+    info = folder / "meta" / "info.json"
+    match flaw:
+        case "absent":
+            shutil.rmtree(folder)
+        case "no info":
+            info.unlink()
+        case "damaged":
+            info.write_text("{")
+        case "no data":
+            shutil.rmtree(folder / "data")
+        case "version":
+            about = json.loads(info.read_text())
+            info.write_text(json.dumps({**about, "codebase_version": "v2.1"}))
+    with pytest.raises(BadDataset) as refusal:
+        open_dataset(folder)
+    assert "\n" not in str(refusal.value)
+    assert str(folder) in str(refusal.value)
+
+
+def test_stretches_and_views_that_disagree() -> None:
+    assert _stretches([True, False, False, True, False]) == [2, 1]
+    report = ViewReport(
+        episode=3, camera="top", frames=9, grounded=True, likeness=0.5, margin=0.2, tracked=9,
+        losses=0, longest=0, agrees=False,
+    )  # fmt: skip
+    assert "1 of 1 views disagree" in report_table([report])
+
+
+def test_the_command(recorded: Path, bank: Path, tmp_path: Path) -> None:
+    words = ("inspect-dataset", recorded, TOLD, "--memory", bank, "--stack", "toys")
+    done = vap(*words, "--episodes", 1, "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert "2 of 2 views find the object in their first frame" in done.stdout
+    assert "1 recordings" in done.stdout
+    said = refused("inspect-dataset", tmp_path / "none", TOLD, "--memory", bank, "--stack", "toys")
+    assert "is no LeRobotDataset" in said

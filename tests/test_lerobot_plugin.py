@@ -1,0 +1,128 @@
+"""The distribution that lerobot's commands discover, and their own lerobot-eval with it, on the shipped policy."""
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs.configs import EnvConfig
+from lerobot.envs.utils import _call_make_env, _import_hub_module, _normalize_hub_result
+from lerobot.processor import ProcessorStepRegistry
+
+from tests.command import vap
+from vap_core.evaluation.policy_names import shipped
+from vap_core.evaluation.study import Study, make_trial, register_personal
+from vap_core.policies.lerobot.adapter import _resize, load_policy
+from vap_core.rollout.loop import rollout
+from vap_core.simulation import suites
+
+ROOT = Path(__file__).resolve().parents[1]
+PLUGIN = ROOT / "plugins" / "lerobot_env_vap"
+SUITE, TASK = "simpler-bridge", "put-camera"
+EPISODES = 6
+
+
+def test_its_name_is_one_that_lerobot_imports_and_its_module_registers_everything() -> None:
+    project = tomllib.loads((PLUGIN / "pyproject.toml").read_text())["project"]
+    name = project["name"]
+    assert name.startswith("lerobot_env_")
+    spec = importlib.util.spec_from_file_location(name, PLUGIN / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    spec.loader.exec_module(importlib.util.module_from_spec(spec))
+    assert "vap" in EnvConfig.get_known_choices()
+    assert "mini_pi0" in PreTrainedConfig.get_known_choices()
+    assert {"vap_prompt", "mini_pi0_words"} <= set(ProcessorStepRegistry.list())
+
+
+def test_the_hubs_file_makes_the_same_environments() -> None:
+    module = _import_hub_module(str(ROOT / "plugins" / "envhub" / "env.py"), "you/vap-core")
+    made = _normalize_hub_result(_call_make_env(module, n_envs=2, use_async_envs=False, cfg=None))
+    env = made["simpler-bridge"][0]
+    seen, _ = env.reset(seed=[0, 1])
+    assert seen["pixels"]["front"].shape == (2, 224, 224, 3)
+    assert seen["vap_step"].tolist() == [[0.0], [0.0]]
+    env.close()
+
+
+def test_a_mini_pi0_scales_its_images_as_our_loop_does() -> None:
+    """Then lerobot's loop, which gives them as they come, gets the same actions."""
+    policy = load_policy(shipped(SUITE)).policy
+    rgb = torch.rand((2, 3, 224, 224), generator=torch.Generator().manual_seed(0))
+    key = "observation.images.front"
+    (whole,), _ = policy._preprocess_images({key: rgb})
+    (scaled,), _ = policy._preprocess_images({key: _resize(rgb, (3, 112, 112))})
+    assert torch.equal(whole, scaled)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the plugin installed."""
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "uv", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation",
+               "--python", sys.executable, "--target", folder, PLUGIN]  # fmt: skip
+    subprocess.run(command, check=True)
+    return folder
+
+
+def lerobot_eval(site: Path, policy: Path, out: Path, episodes: int) -> list[bool]:
+    """The successes that `lerobot-eval` writes, one per episode from the first of the list on."""
+    command = [Path(sys.executable).with_name("lerobot-eval"), f"--policy.path={policy}",
+               "--env.type=vap", f"--env.task={SUITE}/{TASK}", f"--eval.n_episodes={episodes}",
+               "--eval.batch_size=2", "--eval.use_async_envs=false", "--seed=0", f"--output_dir={out}"]  # fmt: skip
+    paths = os.pathsep.join([str(site), str(ROOT)])
+    done = subprocess.run(
+        command,
+        env={**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"},
+        cwd=out.parent,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    (task,) = json.loads((out / "eval_info.json").read_text())["per_task"]
+    return task["metrics"]["successes"]
+
+
+@pytest.mark.sweep
+@pytest.mark.timeout(1800)
+def test_lerobots_own_command_gives_the_successes_of_our_engine(site: Path, tmp_path: Path) -> None:
+    """Generic, and VAP attached by our command, with the shipped checkpoint as it is."""
+    methods = ("generic", "vap")
+    study = Study(((SUITE, TASK),), methods, policy="mini-pi0", follow="step")
+    rows = study.rows(SUITE, TASK)[:EPISODES]
+    bank = tmp_path / "memory"
+    register_personal(study, bank)
+    plain = shipped(SUITE)
+    prompted = tmp_path / "prompted"
+    done = vap("attach", plain, prompted, "--memory", bank)
+    assert done.returncode == 0, done.stderr
+
+    policies = {"generic": plain, "vap": prompted}
+    for method in methods:
+        episodes = rollout(make_trial(study, rows, method, bank), rows, batch=2)
+        ours = [episode.outcome.success for episode in episodes]
+        theirs = lerobot_eval(site, policies[method], tmp_path / method, EPISODES)
+        assert theirs == ours, method
+    assert np.mean(theirs) > 0.3, "VAP does something here"
+    assert len(suites.rows(SUITE, TASK)) == 24
+
+
+def test_attach_says_what_it_wrote_and_refuses_a_second_time(tmp_path: Path) -> None:
+    (tmp_path / "memory").mkdir()
+    words = ("attach", shipped(SUITE), tmp_path / "out", "--memory", tmp_path / "memory")
+    done = vap(*words)
+    assert done.returncode == 0, done.stderr
+    assert "next: lerobot-eval --policy.path=" in done.stdout
+    steps = json.loads((tmp_path / "out" / "policy_preprocessor.json").read_text())["steps"]
+    assert steps[1]["config"]["episodes"] == "auto"
+    again = vap(*words)
+    assert again.returncode == 2
+    assert "exists; choose another folder" in again.stderr

@@ -1,0 +1,273 @@
+"""What the method would show a policy over a dataset's recorded episodes, and where it fails there.
+
+Every episode is grounded in its first frame and tracked through the others, as in the closed loop.
+There is no ground truth: what can be told is whether views elect something, keep it, and agree.
+"""
+
+import json
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict
+from pathlib import Path
+
+from tqdm import tqdm
+
+from vap_core.associate import PAIRINGS
+from vap_core.attend import Attender, AttendState, Prompting
+from vap_core.base.errors import BadDataset, BadOutput
+from vap_core.base.files import parse_json, write_atomic
+from vap_core.base.tables import Rows, align
+from vap_core.base.types import Attended, Views, value
+from vap_core.memory import load_bank
+from vap_core.perception.stacks import load_stack
+from vap_core.policies.lerobot.datasets import Copy, Recorded, open_dataset
+
+TABLE = "views.csv"
+
+
+@value
+class ViewReport:
+    """One camera of one episode.
+
+    `grounded` says whether the first frame has the object here, `likeness` how like the references
+    the best candidate is, `margin` the vote's. Of `frames` it is tracked in `tracked`; `losses` are
+    the stretches without it after it was grounded, `longest` the frames of the longest. `agrees` is
+    whether a joint choice over all views takes the same candidate; None for a single view.
+    """
+
+    episode: int
+    camera: str
+    frames: int
+    grounded: bool
+    likeness: float
+    margin: float
+    tracked: int
+    losses: int
+    longest: int
+    agrees: bool | None
+
+
+def inspect_dataset(
+    path: Path,
+    instruction: str,
+    memory: Path,
+    stack: str,
+    out: Path,
+    *,
+    objects: Sequence[str] | None = None,
+    episodes: int | None = None,
+    copy: Path | None = None,
+    masks: bool = False,
+) -> list[ViewReport]:
+    """Ground and track the first `episodes` episodes (None: all) of a dataset.
+
+    Writes a recording of each into `out`, and the table; with `copy` the dataset with prompted
+    pictures and rewritten tasks, and with `masks` the target's masks in it. Interrupted, the same
+    call goes on with the episode that was not finished; a copy is written in one go.
+
+    Raises: BadDataset, BadInstruction, UnknownName, BadOutput, BadMemory.
+    """
+    recorded = open_dataset(path)
+    models = load_stack(stack)
+    bank = load_bank(memory, models.encoder.name)
+    attender = Attender(models, bank)
+    _check_folder(out, path, instruction, objects)
+    count = recorded.episodes if episodes is None else min(episodes, recorded.episodes)
+    reports: list[ViewReport] = []
+    with ExitStack() as files:
+        writer = None if copy is None else files.enter_context(Copy(recorded, copy, masks))
+        for episode in tqdm(range(count), unit="episode"):
+            done = out / f"episode_{episode:06d}.json"
+            found = _read_reports(done)
+            if found is None or writer is not None:
+                found = _inspect_episode(
+                    recorded, episode, attender, instruction, objects, out, writer
+                )
+                text = json.dumps([asdict(report) for report in found])
+                write_atomic(done, text.encode())
+            reports += found
+    write_atomic(out / TABLE, _csv(reports).encode())
+    return reports
+
+
+def report_table(reports: Iterable[ViewReport]) -> str:
+    """Every view that lost the object, did not find it, or disagrees; and the totals."""
+    rows: list[list[str]] = [_HEADER]
+    seen = list(reports)
+    for report in seen:
+        if not report.grounded or report.losses or report.agrees is False:
+            rows.append(_cells(report))
+    lines = []
+    if len(rows) > 1:
+        lines.append(align(rows))
+    grounded = [report for report in seen if report.grounded]
+    judged = [report for report in seen if report.agrees is not None]
+    frames = sum(report.frames for report in grounded)
+    tracked = sum(report.tracked for report in grounded)
+    lines.append(
+        f"{len(grounded)} of {len(seen)} views find the object in their first frame; these track "
+        f"it in {tracked} of {frames} frames, with {sum(r.losses for r in grounded)} losses"
+    )
+    if judged:
+        against = sum(report.agrees is False for report in judged)
+        lines.append(f"{against} of {len(judged)} views disagree with a joint choice of all views")
+    return "\n".join(lines)
+
+
+_HEADER = [
+    "episode",
+    "camera",
+    "found",
+    "likeness",
+    "margin",
+    "tracked",
+    "losses",
+    "longest",
+    "agrees",
+]
+
+
+def _cells(report: ViewReport) -> list[str]:
+    agrees = {True: "yes", False: "no", None: "-"}[report.agrees]
+    return [
+        str(report.episode),
+        report.camera,
+        "yes" if report.grounded else "no",
+        f"{report.likeness:.2f}",
+        f"{report.margin:.2f}",
+        f"{report.tracked}/{report.frames}",
+        str(report.losses),
+        str(report.longest),
+        agrees,
+    ]
+
+
+def _csv(reports: Sequence[ViewReport]) -> str:
+    rows: Rows = [_HEADER, *map(_cells, reports)]
+    return "".join(",".join(row) + "\n" for row in rows)
+
+
+def _inspect_episode(
+    recorded: Recorded,
+    episode: int,
+    attender: Attender,
+    instruction: str,
+    objects: Sequence[str] | None,
+    out: Path,
+    writer: Copy | None,
+) -> list[ViewReport]:
+    """Ground, track, record and perhaps copy one episode."""
+    from vap_core.recording import DatasetRecorder
+
+    _, (obj, *_) = attender.understand(instruction, objects)
+    rrd = out / f"episode_{episode:06d}.rrd"
+    rrd.unlink(missing_ok=True)  # of an inspection that was interrupted, or is copied anew
+    state: AttendState | None = None
+    first: Attended | None = None
+    agrees: dict[str, bool | None] = {}
+    visible: dict[str, list[bool]] = {camera: [] for camera in recorded.keys}
+    with DatasetRecorder(rrd, list(recorded.keys), obj.name, recorded.hz) as recorder:
+        for frame in recorded.frames(episode):
+            if state is None:
+                state, attended = attender.start(frame.views, instruction, objects=objects)
+                first = attended
+                agrees = _agreement(attender, frame.views, instruction, objects, attended)
+                recorder.ground(frame.views, attended, obj, instruction)
+            else:
+                state, attended = attender.step(state, frame.views)
+            recorder.add(frame.number, frame.at_s, frame.views, attended)
+            for camera, seen in visible.items():
+                seen.append(attended.tracks[camera][0].mask is not None)
+            if writer is not None:
+                tracked = {camera: attended.tracks[camera][0].mask for camera in visible}
+                writer.add(frame, attended.images, attended.text, tracked)
+    if first is None:
+        raise BadDataset(f"dataset: episode {episode} of {recorded.folder} has no frame.")
+    if writer is not None:
+        writer.end_episode()
+    reports = []
+    for camera, seen in visible.items():
+        reports.append(_report(episode, camera, first, seen, agrees[camera]))
+    return reports
+
+
+def _report(
+    episode: int, camera: str, first: Attended, seen: Sequence[bool], agrees: bool | None
+) -> ViewReport:
+    grounding = first.groundings[camera][0]
+    chosen = grounding.chosen
+    stretches = _stretches(seen) if grounding.winner is not None else []
+    return ViewReport(
+        episode=episode,
+        camera=camera,
+        frames=len(seen),
+        grounded=grounding.winner is not None,
+        likeness=0.0 if chosen is None else float(grounding.likeness[chosen]),
+        margin=float(grounding.ballot.margin),
+        tracked=sum(seen),
+        losses=len(stretches),
+        longest=max(stretches, default=0),
+        agrees=agrees,
+    )
+
+
+def _agreement(
+    attender: Attender,
+    views: Views,
+    instruction: str,
+    objects: Sequence[str] | None,
+    attended: Attended,
+) -> dict[str, bool | None]:
+    """Whether the views, asked together by their embeddings, elect what each elected by itself."""
+    if len(views) < 2:
+        return dict.fromkeys(views)
+    jointly = Attender(attender.stack, attender.memory, Prompting(associate=PAIRINGS["embedding"]))
+    _, together = jointly.start(views, instruction, objects=objects)
+    agrees: dict[str, bool | None] = {}
+    for camera in views:
+        alone = attended.groundings[camera][0].winner
+        joint = together.groundings[camera][0].winner
+        agrees[camera] = None if alone is None else alone == joint
+    return agrees
+
+
+def _stretches(seen: Sequence[bool]) -> list[int]:
+    """The lengths of the stretches without the object."""
+    lengths: list[int] = []
+    before = True
+    for here in seen:
+        if not here:
+            if before:
+                lengths.append(0)
+            lengths[-1] += 1
+        before = here
+    return lengths
+
+
+def _check_folder(out: Path, path: Path, instruction: str, objects: Sequence[str] | None) -> None:
+    """Begin in `out`, or go on there with the same question. Raises: BadOutput."""
+    about = {"dataset": str(path.resolve()), "instruction": instruction, "objects": objects}
+    file = out / "inspection.json"
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        if file.is_file():
+            if parse_json(file.read_text()) != about:
+                raise BadOutput(
+                    f"inspect-dataset: {out} holds another inspection; choose another --out."
+                )
+            return
+        write_atomic(file, json.dumps(about).encode())
+    except (OSError, ValueError) as error:
+        raise BadOutput(
+            f"inspect-dataset: {out} cannot be used ({error}); choose another --out."
+        ) from error
+
+
+def _read_reports(done: Path) -> list[ViewReport] | None:
+    """The reports of an episode that was inspected; None where it was not."""
+    if not done.is_file() or not done.with_suffix(".rrd").is_file():
+        return None
+    try:
+        return [ViewReport(**fields) for fields in parse_json(done.read_text())]
+    except (ValueError, TypeError):
+        return None

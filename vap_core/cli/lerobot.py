@@ -1,0 +1,130 @@
+"""Commands for lerobot's own: attach VAP to a checkpoint, look into a dataset."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from vap_core.cli.objects import BANK, Memory
+from vap_core.cli.options import DetectorName, EncoderName, StackName, TrackerName, stack_of
+
+app = typer.Typer()
+
+
+@app.command("attach")
+def attach_command(
+    checkpoint: Annotated[
+        str, typer.Argument(help="A lerobot checkpoint: its folder, or its hub id, downloaded.")
+    ],
+    out: Annotated[Path, typer.Argument(help="Folder for the checkpoint with VAP.")],
+    memory: Memory = BANK,
+    object: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--object",
+            help="Remembered object of each 'my ...', where the category alone does not decide.",
+        ),
+    ] = None,
+    stack: StackName = "embedded",
+    detector: DetectorName = "",
+    encoder: EncoderName = "",
+    tracker: TrackerName = "",
+    alpha: Annotated[float, typer.Option(min=0, max=1, help="Opacity of the tint.")] = 0.5,
+    episodes: Annotated[
+        Literal["auto", "vap_step", "reset"],
+        typer.Option(
+            help="How the start of an episode is known: by the observation vap_step, by a reset of "
+            "the preprocessor, or by whichever there is; without either a picture is refused."
+        ),
+    ] = "auto",
+) -> None:
+    """Put VAP into a frozen lerobot checkpoint, for lerobot-eval and lerobot-rollout.
+
+    Its files are linked, not changed; one step is added to its preprocessor.
+
+    Example: python -m vap_core attach data/policies/mini-pi0-simpler-bridge data/runs/mine
+        --memory data/runs/bridge/memory
+    """
+    from vap_core.base.extras import require
+
+    require("policy", "attach")
+    from vap_core.policies.lerobot.step import attach
+
+    stack = stack_of(stack, detector, encoder, tracker)
+    attach(checkpoint, out, memory, stack=stack, objects=object, alpha=alpha, episodes=episodes)
+    print(f"wrote {out}: the checkpoint, and VAP before it in its preprocessor")
+    print(
+        f"next: lerobot-eval --policy.path={out} --env.type=vap "
+        "--env.task=simpler-bridge/put-camera --eval.n_episodes=24 --seed=0"
+    )
+
+
+@app.command("inspect-dataset")
+def inspect_dataset_command(
+    path: Annotated[Path, typer.Argument(help="Folder of a LeRobotDataset v3.")],
+    instruction: Annotated[
+        str, typer.Argument(help='What the robot is to do, for example "pick my cup".')
+    ],
+    memory: Memory = BANK,
+    object: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--object",
+            help="Remembered object of each 'my ...', where the category alone does not decide.",
+        ),
+    ] = None,
+    stack: StackName = "embedded",
+    detector: DetectorName = "",
+    encoder: EncoderName = "",
+    tracker: TrackerName = "",
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="The first so many episodes; default all.")
+    ] = None,
+    copy: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for a copy of the dataset as the method would show it: prompted pictures "
+            "and rewritten tasks, for fine-tuning or replay."
+        ),
+    ] = None,
+    masks: Annotated[
+        bool,
+        typer.Option(
+            "--masks", help="In the copy, the target's mask of every picture, too: vap.mask.CAMERA."
+        ),
+    ] = False,
+    out: Annotated[Path, typer.Option(help="Folder for recordings and the table.")] = Path(
+        "data/runs/inspection"
+    ),
+) -> None:
+    """Ground and track a remembered object through recorded episodes: where a view does not find
+    it, loses it, or disagrees with the others. Interrupted, the same command goes on.
+
+    Example: python -m vap_core inspect-dataset ~/datasets/desk "pick my cup"
+    Example: python -m vap_core inspect-dataset ~/datasets/desk "pick my cup" --episodes 3
+        --copy ~/datasets/desk-vap
+    """
+    from vap_core.base.extras import require
+
+    require("policy", "inspect-dataset")
+    from vap_core.analysis.dataset_inspection import TABLE, inspect_dataset, report_table
+    from vap_core.base.errors import BadDataset
+
+    if masks and copy is None:
+        raise BadDataset("inspect-dataset: --masks go into a copy; name its folder with --copy.")
+    reports = inspect_dataset(
+        path,
+        instruction,
+        memory,
+        stack_of(stack, detector, encoder, tracker),
+        out,
+        objects=object,
+        episodes=episodes,
+        copy=copy,
+        masks=masks,
+    )
+    print(report_table(reports))
+    first = out / "episode_000000.rrd"
+    copied = f" and the dataset {copy}" if copy is not None else ""
+    print(f"wrote {out / TABLE}, {len({r.episode for r in reports})} recordings{copied}")
+    print(f"look: python -m vap_core view {first}")

@@ -1,0 +1,261 @@
+"""Recorded episodes of any LeRobotDataset v3 as our views, and a copy with other pictures.
+
+Datasets come from outside: they are parsed, never executed, and nothing is looked up on a network.
+"""
+
+import io
+import logging
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, redirect_stderr
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+from unittest.mock import patch
+
+import numpy as np
+
+from vap_core.base.errors import BadDataset
+from vap_core.base.types import Mask, Rgb, Views, value
+
+if TYPE_CHECKING:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+PREFIXES = ("observation.images.", "observation.")
+INFO = Path("meta", "info.json")
+MASK = "vap.mask."
+"""Begins the name of a feature that has a target's mask."""
+
+
+@value
+class RecordedFrame:
+    """One frame of an episode: its views by camera, its task, and what else the dataset has."""
+
+    number: int
+    at_s: float
+    views: Views
+    task: str
+    item: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """An opened dataset. `keys` is the feature of every camera, by the camera's name."""
+
+    folder: Path
+    dataset: "LeRobotDataset"
+    keys: Mapping[str, str]
+    hz: float
+    episodes: int
+
+    def length(self, episode: int) -> int:
+        """Frames of an episode."""
+        return int(self.dataset.meta.episodes[episode]["length"])
+
+    def frames(self, episode: int) -> Iterator[RecordedFrame]:
+        """The frames of an episode, in order. Raises: BadDataset."""
+        about = self.dataset.meta.episodes[episode]
+        first, stop = int(about["dataset_from_index"]), int(about["dataset_to_index"])
+        for number in range(stop - first):
+            try:
+                item = self.dataset[first + number]
+            except Exception as error:  # decoders of damaged files raise anything
+                raise _damaged(self.folder, error) from error
+            views = {camera: _rgb(item[key]) for camera, key in self.keys.items()}
+            yield RecordedFrame(
+                number=number,
+                at_s=number / self.hz,
+                views=views,
+                task=str(item["task"]),
+                item=item,
+            )
+
+
+def open_dataset(folder: Path) -> Recorded:
+    """Open the LeRobotDataset v3 in a folder.
+
+    Raises: BadDataset when there is none, it is damaged, of another version, or without pictures.
+    """
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    folder = Path(folder)
+    if not (folder / INFO).is_file():
+        raise BadDataset(
+            f"dataset: {folder} is no LeRobotDataset (it has no {INFO}); name its folder, for one "
+            "from the hub the folder that `hf download --repo-type dataset OWNER/NAME` prints."
+        )
+    try:
+        with offline():
+            dataset = LeRobotDataset(
+                f"local/{folder.name}", root=folder, return_uint8=True, video_backend="pyav"
+            )
+            n_episodes = len(dataset.meta.episodes)
+    except Exception as error:  # lerobot and pyarrow raise anything for a damaged folder
+        raise _damaged(folder, error) from error
+    keys = {}
+    for key, feature in dataset.meta.features.items():
+        is_picture = feature["dtype"] in ("image", "video")
+        if is_picture and key not in dataset.meta.depth_keys and 3 in feature["shape"]:
+            keys[_camera(key)] = key
+    if not keys or not n_episodes:
+        what = "episode" if keys else "colour picture"
+        raise BadDataset(f"dataset: {folder} has no {what}; record one with lerobot-record.")
+    return Recorded(
+        folder=folder,
+        dataset=dataset,
+        keys=keys,
+        hz=float(dataset.meta.fps),
+        episodes=n_episodes,
+    )
+
+
+class Copy:
+    """A copy of a dataset whose pictures and tasks are replaced; complete, or not there.
+
+    With `masks` it has a feature `vap.mask.CAMERA` more, height x width bytes, 1 on the target.
+
+    It grows beside its place under a name with a leading dot; what a killed process left there is
+    removed by the next.
+
+    Raises: BadDataset when `out` exists or cannot be written.
+    """
+
+    def __init__(self, source: Recorded, out: Path, masks: bool = False) -> None:
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+        from lerobot.utils.constants import DEFAULT_FEATURES
+
+        if out.exists():
+            raise BadDataset(f"dataset: {out} exists; choose another folder with --copy.")
+        self.out = out
+        self._stage = out.with_name(f".{out.name}.partial")
+        self._source = source
+        meta = source.dataset.meta
+        self._features = {}
+        for key, feature in meta.features.items():
+            if key not in DEFAULT_FEATURES:
+                self._features[key] = {**feature, "shape": tuple(feature["shape"])}
+        described = dict(self._features)
+        self._masks = {}
+        for camera, key in source.keys.items() if masks else ():
+            height_width = _height_width(self._features[key]["shape"])
+            feature = {"dtype": "uint8", "shape": height_width, "names": ["height", "width"]}
+            self._masks[camera] = height_width
+            described[MASK + camera] = feature
+        shutil.rmtree(self._stage, ignore_errors=True)
+        try:
+            out.parent.mkdir(parents=True, exist_ok=True)
+            self._dataset = LeRobotDataset.create(
+                f"local/{out.name}",
+                fps=round(source.hz),
+                features=described,
+                root=self._stage,
+                robot_type=meta.robot_type,
+                use_videos=bool(meta.video_keys),
+                video_backend="pyav",
+                encoder_threads=1,
+            )
+        except OSError as error:
+            raise _unwritable(out, error) from error
+
+    def __enter__(self) -> "Copy":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if error is None:
+            self._dataset.finalize()
+            self._stage.rename(self.out)
+        else:
+            shutil.rmtree(self._stage, ignore_errors=True)
+
+    def add(
+        self, frame: RecordedFrame, views: Views, task: str, masks: Mapping[str, Mask | None]
+    ) -> None:
+        """The frame with these views, this task, and perhaps the target's mask in every view."""
+        copied: dict[str, Any] = {"task": task}
+        for key, feature in self._features.items():
+            copied[key] = _as_stored(frame.item[key], feature)
+        for camera, key in self._source.keys.items():
+            copied[key] = views[camera]
+        for camera, shape in self._masks.items():
+            mask = masks[camera]
+            copied[MASK + camera] = np.zeros(shape, np.uint8) if mask is None else mask.astype("u1")
+        try:
+            self._dataset.add_frame(copied)
+        except OSError as error:
+            raise _unwritable(self.out, error) from error
+
+    def end_episode(self) -> None:
+        try:
+            with redirect_stderr(io.StringIO()):
+                self._dataset.save_episode(parallel_encoding=False)
+        except OSError as error:
+            raise _unwritable(self.out, error) from error
+
+
+@contextmanager
+def offline() -> Iterator[None]:
+    """Inside, lerobot asks no hub, and its log is silent."""
+    level = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with patch("huggingface_hub.constants.HF_HUB_OFFLINE", True):
+            yield
+    finally:
+        logging.disable(level)
+
+
+def _camera(key: str) -> str:
+    """The name of the camera that a feature's pictures are from."""
+    for prefix in PREFIXES:
+        if key.startswith(prefix):
+            return key.removeprefix(prefix)
+    return key
+
+
+def _height_width(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Of a picture's shape, whose channels come first or last."""
+    height, width = [side for i, side in enumerate(shape) if i != _channel_axis(shape)]
+    return height, width
+
+
+def _channel_axis(shape: tuple[int, ...]) -> int:
+    return 0 if shape[0] == 3 and shape[-1] != 3 else len(shape) - 1
+
+
+def _rgb(picture: Any) -> Rgb:
+    """lerobot's C x H x W tensor as H x W x 3 bytes."""
+    levels = picture.numpy()
+    if levels.dtype != np.uint8:
+        levels = np.clip(np.rint(levels * 255), 0, 255).astype(np.uint8)
+    return np.ascontiguousarray(levels.transpose(1, 2, 0))
+
+
+def _as_stored(cell: Any, feature: Mapping[str, Any]) -> Any:
+    """A cell that was read, as `add_frame` takes it."""
+    if feature["dtype"] == "string" or isinstance(cell, str):
+        return cell
+    array = np.asarray(cell)
+    if feature["dtype"] in ("image", "video"):
+        return array.transpose(1, 2, 0)
+    return array.astype(feature["dtype"]).reshape(feature["shape"])
+
+
+def _damaged(folder: Path, error: Exception) -> BadDataset:
+    words = " ".join(str(error).split())[:200]
+    return BadDataset(
+        f"dataset: {folder} cannot be read ({type(error).__name__}: {words}); it has to be a whole "
+        "LeRobotDataset of version 3.0."
+    )
+
+
+def _unwritable(out: Path, error: OSError) -> BadDataset:
+    return BadDataset(
+        f"dataset: {out} cannot be written ({error.strerror or error}); make room, or choose "
+        "another folder."
+    )

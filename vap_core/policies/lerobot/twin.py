@@ -1,0 +1,250 @@
+"""The twin of an SO-101: a lerobot robot whose arm, desk and cameras are simulated.
+
+    lerobot-rollout --robot.type=vap_so101_twin --policy.path=... --task="select my cup" --fps=30
+
+Its features are those of lerobot's `so101_follower` with three cameras: `<joint>.pos` in degrees
+from the middle of the joint's range, `gripper.pos` 0 closed to 100 open; pictures are RGB, height x
+width x 3 bytes. So the command that drives the twin drives the arm, with `--robot.type` and its
+port changed. Time passes by 1 / 30 s with every action, however long that takes.
+"""
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from lerobot.robots import Robot
+from lerobot.teleoperators import Teleoperator
+
+from vap_core.base.errors import BadStudy, UnknownName
+from vap_core.policies.lerobot.config_twin import VapExpertConfig, VapSo101TwinConfig
+from vap_core.policies.scripted.expert import Expert, ExpertState
+from vap_core.simulation import robots, suites
+from vap_core.simulation.env import Env
+from vap_core.simulation.scenes import Scene
+from vap_core.simulation.suites import Judge
+from vap_core.simulation.suites.open_row import build_scene, make_env
+from vap_core.simulation.types import EpisodeRow, Outcome
+
+ROBOT = "so101"
+GRIPPER = "gripper"
+OPEN = 100.0
+"""lerobot's number for an open gripper; 0 is closed."""
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class TwinCamera:
+    """What lerobot asks of a robot's camera, which here is no device."""
+
+    height: int
+    width: int
+    fps: int
+    is_connected: bool = True
+
+
+class VapSo101Twin(Robot):
+    """One episode of a suite, from `connect` to `disconnect`. Reads and acts in one thread."""
+
+    config_class = VapSo101TwinConfig
+    name = "vap_so101_twin"
+
+    def __init__(self, config: VapSo101TwinConfig) -> None:
+        super().__init__(config)
+        self.config = config
+        self.row = _row(config)
+        self.suite = suites.suite(self.row.suite)
+        self._scene: Scene | None = None
+        self._env: Env | None = None
+        self._judge: Judge | None = None
+        self._joints = (*robots.get(ROBOT).joints, GRIPPER)
+        side = config.image_size
+        self.cameras = {}
+        for camera in self.suite.cameras:
+            self.cameras[camera] = TwinCamera(side, side, round(self.suite.hz))
+
+    @property
+    def observation_features(self) -> dict[str, Any]:
+        pictures = {}
+        for name, camera in self.cameras.items():
+            pictures[name] = (camera.height, camera.width, 3)
+        return {**self.action_features, **pictures}
+
+    @property
+    def action_features(self) -> dict[str, Any]:
+        return {f"{joint}.pos": float for joint in self._joints}
+
+    @property
+    def env(self) -> Env:
+        """The running simulation. Raises: ConnectionError before `connect`."""
+        if self._env is None:
+            raise ConnectionError("vap_so101_twin: not connected; call connect first.")
+        return self._env
+
+    @property
+    def is_connected(self) -> bool:
+        return self._env is not None
+
+    @property
+    def is_calibrated(self) -> bool:
+        return True
+
+    def connect(self, calibrate: bool = True) -> None:
+        models = [place.model for place in self.row.placements]
+        self._scene = build_scene(self.suite.name, models, self.row.variant)
+        self._env = make_env(self._scene, self.suite.name, image_size=self.config.image_size)
+        self._env.reset(self.row)
+        self._judge = Judge.start(self.row, self._scene.sizes_m, self._env.truth())
+        CONNECTED.append(self)
+        logger.info("twin: %s, episode %d: %s", *self._title())
+
+    def calibrate(self) -> None:
+        """A simulated arm is calibrated."""
+
+    def configure(self) -> None:
+        """A simulated arm has nothing to set."""
+
+    def get_observation(self) -> dict[str, Any]:
+        seen = self.env.observe()
+        n = len(self._joints) - 1
+        degrees = np.rad2deg(seen.state[-n:])
+        positions = [*degrees.tolist(), OPEN * float(seen.state[6])]
+        observation: dict[str, Any] = {}
+        for joint, position in zip(self._joints, positions, strict=True):
+            observation[f"{joint}.pos"] = position
+        return {**observation, **seen.images}
+
+    def send_action(self, action: Mapping[str, float]) -> dict[str, float]:
+        """Go towards the positions for one control step; returns what was commanded.
+
+        A joint moves no faster than it can, and leads no farther than it can follow: then the
+        positions that come back are nearer than those asked for, as on the arm.
+        """
+        env = self.env
+        command = env.command
+        goals = [float(action.get(f"{joint}.pos", np.nan)) for joint in self._joints]
+        held = [*np.rad2deg(command.joints).tolist(), OPEN * command.gripper]
+        for i, goal in enumerate(goals):
+            if np.isnan(goal):  # a joint that is not named holds its place
+                goals[i] = held[i]
+        moves = np.deg2rad(goals[:-1]) - command.joints
+        gripper = float(np.clip(goals[-1] / OPEN, 0.0, 1.0))
+        env.step(np.array([*moves, gripper], np.float32))
+        self._follow()
+        sent = [*np.rad2deg(env.command.joints).tolist(), OPEN * env.command.gripper]
+        return {f"{joint}.pos": at for joint, at in zip(self._joints, sent, strict=True)}
+
+    def disconnect(self) -> None:
+        if self._judge is not None:
+            outcome = self._judge.outcome()
+            logger.info("twin: %s after %d steps", outcome.status, outcome.steps)
+        if self._scene is not None:
+            self._scene.close()
+        if self in CONNECTED:
+            CONNECTED.remove(self)
+        self._scene = self._env = None
+
+    def outcome(self) -> Outcome:
+        """How the episode stands, by the suite's rule. Raises: ConnectionError."""
+        if self._judge is None:
+            raise ConnectionError("vap_so101_twin: not connected; call connect first.")
+        return self._judge.outcome()
+
+    def _follow(self) -> None:
+        """Judge the step that was done, until the episode is decided."""
+        assert self._judge is not None
+        if self._judge.done or self._judge.steps >= self.row.max_steps:
+            return
+        self._judge = self._judge.step(self.env.truth())
+        if self._judge.done:
+            logger.info("twin: %s at step %d", self._judge.outcome().status, self._judge.steps)
+
+    def _title(self) -> tuple[str, int, str]:
+        return f"{self.row.suite}/{self.row.task}", self.row.episode, self.row.instruction
+
+
+CONNECTED: list[VapSo101Twin] = []
+"""The twins of this process that are connected, the last one last."""
+
+
+class VapExpert(Teleoperator):
+    """The scripted expert as a leader of the twin that is connected in this process.
+
+    It reads the simulator: what it records are demonstrations, never results of a policy.
+    """
+
+    config_class = VapExpertConfig
+    name = "vap_expert"
+
+    def __init__(self, config: VapExpertConfig) -> None:
+        super().__init__(config)
+        self.config = config
+        self._expert = Expert()
+        self._of: VapSo101Twin | None = None
+        self._state: ExpertState | None = None
+
+    @property
+    def action_features(self) -> dict[str, Any]:
+        return {f"{joint}.pos": float for joint in (*robots.get(ROBOT).joints, GRIPPER)}
+
+    @property
+    def feedback_features(self) -> dict[str, Any]:
+        return {}
+
+    @property
+    def is_connected(self) -> bool:
+        return self._state is not None
+
+    @property
+    def is_calibrated(self) -> bool:
+        return True
+
+    def connect(self, calibrate: bool = True) -> None:
+        self._state = self._expert.start(np.random.default_rng(0))
+
+    def calibrate(self) -> None:
+        """There is nothing to calibrate."""
+
+    def configure(self) -> None:
+        """There is nothing to set."""
+
+    def get_action(self) -> dict[str, float]:
+        """Where the expert goes next. Raises: ConnectionError without a connected twin."""
+        if not CONNECTED:
+            raise ConnectionError("vap_expert: no twin is connected; it leads vap_so101_twin only.")
+        twin = CONNECTED[-1]
+        if twin is not self._of or self._state is None:
+            self._of = twin
+            self._state = self._expert.start(np.random.default_rng(0))
+        env = twin.env
+        (self._state,), (chunk,) = self._expert.plan_from_simulation([self._state], [env])
+        action = chunk[0]
+        joints = np.rad2deg(env.command.joints + action[:-1]).tolist()
+        positions = [*joints, OPEN * float(np.clip(action[-1], 0.0, 1.0))]
+        return dict(zip(self.action_features, positions, strict=True))
+
+    def send_feedback(self, feedback: dict[str, float]) -> None:
+        """It feels nothing."""
+
+    def disconnect(self) -> None:
+        self._state = None
+        self._of = None
+
+
+def _row(config: VapSo101TwinConfig) -> EpisodeRow:
+    """The row of the configured episode. Raises: UnknownName, BadStudy."""
+    suite_name, _, task = config.task.partition("/")
+    suite = suites.suite(suite_name)
+    if suite.robot != ROBOT:
+        raise UnknownName(
+            f"vap_so101_twin: {suite_name} has a {suite.robot}; take a task of tabletop, or of a "
+            "suite of your own with an SO-101."
+        )
+    rows = suites.listed(suite_name, task, own_target=config.object)
+    if config.episode not in range(len(rows)):
+        raise BadStudy(
+            f"vap_so101_twin: no episode {config.episode}; {config.task} has 0 .. {len(rows) - 1}."
+        )
+    return rows[config.episode]

@@ -1,0 +1,157 @@
+"""Suites of one's own, each from a Python file that defines `SUITE` and `rows()`.
+
+A file is opened by name (`open_file`), or found in the environment variable VAP_SUITES, which holds
+paths with the system's separator between them. It is executed: open only your own.
+"""
+
+import hashlib
+import os
+import re
+import sys
+from collections.abc import Callable, Iterable
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+
+from vap_core.base.errors import BadSuite, VapError, one_of
+from vap_core.base.types import value
+from vap_core.simulation import robots
+from vap_core.simulation.assets import objects
+from vap_core.simulation.cameras import RIGS
+from vap_core.simulation.suites import lists
+from vap_core.simulation.suites.suite import Suite
+from vap_core.simulation.types import EpisodeRow
+
+VARIABLE = "VAP_SUITES"
+NAME = re.compile(r"[\w-]+")
+
+
+@value
+class OwnSuite:
+    """A suite from a file: its list, and the list's sha256."""
+
+    suite: Suite
+    rows: tuple[EpisodeRow, ...]
+    sha256: str
+    file: Path
+
+
+OPENED: dict[str, OwnSuite] = {}
+"""The suites of one's own that are open in this process."""
+
+
+def find(name: str) -> OwnSuite | None:
+    """The suite of that name that was opened, or that a file of VAP_SUITES defines.
+
+    Raises: BadSuite.
+    """
+    if name not in OPENED:
+        opened = {own.file for own in OPENED.values()}
+        for part in os.environ.get(VARIABLE, "").split(os.pathsep):
+            if part and Path(part).resolve() not in opened:
+                open_file(Path(part))
+    return OPENED.get(name)
+
+
+def open_file(path: Path, taken: Iterable[str] = (), endings: tuple[str, ...] = ()) -> Suite:
+    """Execute a file, check its suite and list, and make the suite known by its name.
+
+    The same file is executed once in a process. Names in `taken` are other suites', names with one
+    of the `endings` their variants'.
+    Raises: BadSuite, which names the file and what is wrong in it.
+    """
+    file = path.resolve()
+    for own in OPENED.values():
+        if own.file == file:
+            return own.suite
+    module = _execute(file, path)
+    suite = getattr(module, "SUITE", None)
+    make_rows = getattr(module, "rows", None)
+    if not isinstance(suite, Suite) or not callable(make_rows):
+        raise BadSuite(
+            f"suites: {path} must define SUITE, a Suite, and rows(), which returns its episodes; "
+            "docs/extend.md has one."
+        )
+    if suite.name in taken or suite.name in OPENED:
+        raise BadSuite(f"suites: {path}: there is another suite {suite.name!r}; rename this one.")
+    if not NAME.fullmatch(suite.name) or suite.name.endswith(endings):
+        raise BadSuite(
+            f"suites: {path}: the name {suite.name!r} will not do; take letters, digits and "
+            f"hyphens, and none of the endings {', '.join(endings)}."
+        )
+    rows = _checked_rows(suite, make_rows, path)
+    OPENED[suite.name] = OwnSuite(suite, rows, _digest(rows), file)
+    return suite
+
+
+def _execute(file: Path, path: Path) -> ModuleType:
+    """The module that a file makes. Raises: BadSuite."""
+    name = f"vap_own_suite_{hashlib.sha256(str(file).encode()).hexdigest()[:12]}"
+    spec = spec_from_file_location(name, file)
+    if not file.is_file() or spec is None or spec.loader is None:
+        raise BadSuite(f"suites: {path} is no Python file; name one that ends in .py.")
+    module = module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:  # the file is the user's: anything may come of it
+        del sys.modules[name]
+        raise BadSuite(f"suites: {_place(path, file, error)}: {_said(error)}") from error
+    return module
+
+
+def _place(path: Path, file: Path, error: BaseException) -> str:
+    """The file and, where the error passed through it, its line."""
+    line = None
+    traceback = error.__traceback__
+    while traceback is not None:
+        if traceback.tb_frame.f_code.co_filename == str(file):
+            line = traceback.tb_lineno
+        traceback = traceback.tb_next
+    if isinstance(error, SyntaxError):
+        line = error.lineno
+    return str(path) if line is None else f"{path}, line {line}"
+
+
+def _said(error: BaseException) -> str:
+    """An error as one line."""
+    words = " ".join(str(error).split()).removesuffix(".")
+    return f"{words}." if isinstance(error, VapError) else f"{type(error).__name__}: {words}."
+
+
+def _checked_rows(
+    suite: Suite, make_rows: Callable[[], Iterable[EpisodeRow]], path: Path
+) -> tuple[EpisodeRow, ...]:
+    """The suite's list, once it names only what exists. Raises: BadSuite."""
+    try:
+        robot = robots.get(suite.robot)
+        rigs = {rig.name for rig in RIGS[robot.name]}
+        for camera in suite.cameras:
+            if camera not in rigs:
+                raise one_of(f"suite {suite.name}: camera", camera, sorted(rigs))
+        rows = tuple(make_rows())
+        lists.check(rows)
+        keys = set()
+        for row in rows:
+            suite.task(row.task)
+            for place in row.placements:
+                objects.get_object(place.model)
+            if row.suite != suite.name or row.key in keys:
+                raise BadSuite(
+                    f"row {row.key} is there twice, or of another suite; make rows by "
+                    "SUITE.row(task, episode, placements)"
+                )
+            keys.add(row.key)
+        for task in suite.tasks:
+            if not any(row.task == task.name for row in rows):
+                raise BadSuite(f"task {task.name} has no row")
+    except Exception as error:  # rows() is the user's: anything may come of it
+        raise BadSuite(f"suites: {_place(path, path.resolve(), error)}: {_said(error)}") from error
+    return rows
+
+
+def _digest(rows: Iterable[EpisodeRow]) -> str:
+    digest = hashlib.sha256()
+    for row in rows:
+        digest.update(lists.to_line(row).encode())
+    return digest.hexdigest()
