@@ -154,7 +154,7 @@ def test_a_training_that_is_ended_again_and_again_ends_like_one_that_was_not(
     """Before each of its renames: of a checkpoint, of the weights, of what was measured."""
     folder, _ = stage
     monkeypatch.setattr(demonstrations, "EPISODES", 2)
-    monkeypatch.setattr(policy, "HELD_OUT", 0)
+    monkeypatch.setattr(policy, "HELD_OUT", 9)
     recipe = replace(TINY, stages=1, steps=3, batch=2, draws=1)
     whole, torn = tmp_path / "whole", tmp_path / "torn"
 
