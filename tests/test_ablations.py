@@ -200,8 +200,11 @@ def test_the_command_says_what_it_found_and_runs_nothing_twice(tmp_path: Path) -
 
 
 @pytest.mark.sweep
-@pytest.mark.parametrize("name", sorted(set(ABLATIONS) - {"selection", "association", "language"}))
+@pytest.mark.parametrize(
+    "name", sorted(set(ABLATIONS) - {"selection", "association", "language", "colour"})
+)
 def test_every_ablation_runs(name: str, tmp_path: Path) -> None:
+    # The scripted policy knows the palette's colour words alone, and needs a command and one view.
     done = vap("ablate", name, *WORDS, "--out", tmp_path / "run")
     assert done.returncode == 0, done.stderr
     assert "0 errors" in done.stdout

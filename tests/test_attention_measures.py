@@ -1,15 +1,17 @@
 """Measures of attention maps: shares, peaks and entropy against hand counts; patterns by their definitions; areas under ROC curves."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 
 from tests.command import vap
-from vap_core.analysis.attention import patterns, prediction, replay, report
+from vap_core.analysis.attention import intervals, patterns, prediction, replay, report, tables
 from vap_core.analysis.attention.measures import REGIONS, inside, measure, patch_areas
 from vap_core.analysis.attention.patterns import (
     Thresholds,
@@ -253,11 +255,66 @@ def test_a_warning_is_measured_where_enough_fails() -> None:
         "margin": rng.normal(size=80), "lift": rng.normal(size=80) - 3 * failed, "success": ~failed,
         "layout": [str(i) for i in range(80)],
     })  # fmt: skip
-    found = prediction.warning_table(table, ["lift"])["AUC for failure"]
-    assert float(found["attention"][:4]) > 0.9
-    assert float(found["vote margin"][:4]) < 0.7
-    few = prediction.warning_table(table.assign(success=np.arange(80) > 3), ["lift"])
-    assert set(few["AUC for failure"]) == {"too few failures (4 of 80)"}
+    table = table.assign(suite="s")
+    found = prediction.warnings(table, ["lift"])
+    assert found["attention"].value > 0.9 > 0.7 > found["vote margin"].value
+    gain = found["both, beyond the margin"]
+    assert gain.value == pytest.approx(found["both"].value - found["vote margin"].value)
+    assert 0 < gain.low < gain.value < gain.high
+    assert prediction.warnings(table.assign(success=np.arange(80) > 3), ["lift"]) == {}
+
+
+def test_only_pairs_of_one_suite_are_compared() -> None:
+    """A score that tells the suites apart, and nothing inside them."""
+    scores = np.repeat([0.0, 1.0], 40)
+    labels = np.concatenate([np.arange(40) % 5 == 0, np.arange(40) % 5 > 0])
+    suites = ["one"] * 40 + ["other"] * 40
+    clusters = [str(i) for i in range(80)]
+    assert prediction.auc(scores, labels) == pytest.approx(0.8)
+    assert prediction.auc(scores, labels, suites) == 0.5
+    inside = prediction.auc_interval(scores, labels, clusters, suites)
+    assert (inside.low, inside.value, inside.high) == (0.5, 0.5, 0.5)
+    drawn = intervals.resamples(clusters, suites)
+    assert (drawn[:, :40].sum(1) == 40).all()
+    assert (drawn[:, 40:].sum(1) == 40).all()
+
+
+def test_an_interval_of_a_mean_is_wider_where_episodes_are_copies() -> None:
+    values = np.random.default_rng(4).normal(size=40)
+    alone = intervals.mean(values, [str(i) for i in range(40)])
+    copies = intervals.mean(np.tile(values, 4), [str(i) for i in range(40)] * 4)
+    assert (copies.low, copies.high) == (pytest.approx(alone.low), pytest.approx(alone.high))
+    assert alone.low < values.mean() < alone.high
+    half = 1.96 * values.std() / np.sqrt(40)
+    assert alone.high - values.mean() == pytest.approx(half, rel=0.15)
+    assert intervals.mean(np.array([]), []).n == 0
+    names = [str(i) for i in range(40)]
+    gap = intervals.difference(values + 1, values, names, names)
+    assert (gap.low, gap.value, gap.high) == (pytest.approx(1), pytest.approx(1), pytest.approx(1))
+
+
+def test_the_first_call_is_followed_to_the_first_touch() -> None:
+    calls = [call(0, 0, "target"), call(0, 4, "lookalikes"), call(1, 0, "lookalikes")]
+    endings = [ending(0, True), {**ending(1, False), "touched": "lookalikes"}]
+    (row,) = report.first_look(pd.DataFrame(calls), pd.DataFrame(endings)).to_dict("records")
+    assert (row["looks"].value, row["looks"].n) == (0.5, 2)
+    assert (row["then_touches"].value, row["else_touches"].value) == (1, 0)
+
+
+def test_tables_are_published_beside_those_of_other_suites(tmp_path: Path) -> None:
+    def rows(suite: str, n: int) -> dict[str, list[dict[str, Any]]]:
+        line = {"suite": suite, "method": "soft", "number": 1.5}
+        return {name: [dict(line) for _ in range(n)] for name in tables.TABLES}
+
+    for folder, suite, n in (("a", "one", 2), ("b", "other", 3), ("c", "one", 4)):
+        (tmp_path / folder).mkdir()
+        tables.write(tmp_path / folder, rows(suite, n), [{"digest": folder}])
+        tables.publish(tmp_path / folder, tmp_path / "kept")
+    found = tables.read(tmp_path / "kept")["calls"]
+    assert list(found.suite) == ["other"] * 3 + ["one"] * 4
+    metadata = pq.read_schema(tmp_path / "kept" / "attention_calls.parquet").metadata
+    about = json.loads(metadata[tables.ABOUT])
+    assert [each["runs"][0]["digest"] for each in about] == ["a", "b", "c"]
 
 
 @pytest.mark.sweep

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from vap_core.analysis.attention import replay
 from vap_core.base.errors import BadOutput
 from vap_core.evaluation.measurements import publish_tables, read_json_part, write_json_part
 
@@ -22,9 +21,3 @@ def test_tables_that_cannot_be_published_are_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(BadOutput, match="survey: .* choose another folder with --publish"):
         publish_tables({"a.parquet": b"a"}, tmp_path / "file", caller="survey")
-    for name in replay.TABLES:
-        (tmp_path / f"{replay.PREFIX}{name}.parquet").write_bytes(b"table")
-    with pytest.raises(BadOutput, match="attention: .* choose another folder with --publish"):
-        replay.publish(tmp_path, tmp_path / "file")
-    kept = replay.publish(tmp_path, tmp_path / "kept")
-    assert [path.read_bytes() for path in kept] == [b"table"] * len(replay.TABLES)

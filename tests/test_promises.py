@@ -67,27 +67,15 @@ def test_no_module_reads_what_can_execute() -> None:
 
 
 READERS = {
-    "json.load": set(),
-    "json.loads": {
-        *("files.py", "store.py"),  # what is read; a configuration, made JSON and back
-        *("isolated.py", "lerobot_process.py", "eval_lerobot.py"),  # lines of our own processes
-        *("chat.py",),  # answers of a chat endpoint, bounded, each in a try
-        *("measurement.py", "paraphrases.py", "weights.py", "stills.py"),  # files that ship
-        *("dataset.py",),  # in a try
-    },
-    "pd.read_parquet": set(),
-    "pq.read_table": {"publish.py", "dataset.py", "kept.py"},  # with notes, in a try; that ship
-    "read_table": {"parquet.py"},
-    "Image.open": {"photos.py", "storage.py", "dataset.py", "stills.py", "kept.py", "plots.py"},
     "trimesh.load_scene": {"mesh_parts.py"},
     "av.open": {"video.py"},
     "torch.load": {"fitting.py"},
     "safe_open": {"loading.py"},
 }
-"""Each format has one reader of files from outside; the others read what we have written."""
+"""Meshes, videos and checkpoints have one reader each."""
 
 
-def test_each_format_is_read_in_one_place() -> None:
+def test_meshes_videos_and_checkpoints_are_read_in_one_place_each() -> None:
     found: dict[str, set[str]] = {name: set() for name in READERS}
     for path in SOURCES:
         for name, _ in calls(ast.parse(path.read_text())):
@@ -122,13 +110,13 @@ def damaged(path: Path) -> Path:
 
 
 def test_a_damaged_table_is_one_line_wherever_it_is_read(tmp_path: Path) -> None:
-    from vap_core.analysis import attention, inspection
-    from vap_core.analysis.attention import replay
+    from vap_core.analysis import inspection
+    from vap_core.analysis.attention import tables
     from vap_core.evaluation import input_audit, state_log
     from vap_core.evaluation.tokens import study
 
-    for name in replay.TABLES:
-        damaged(tmp_path / f"{replay.PREFIX}{name}.parquet")
+    for name in tables.TABLES:
+        damaged(tmp_path / f"{tables.PREFIX}{name}.parquet")
     for name in inspection.TABLES:
         damaged(tmp_path / f"perception_{name}.parquet")
     damaged(tmp_path / "traces" / "a.parquet")

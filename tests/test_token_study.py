@@ -1,10 +1,12 @@
 """Tokens learned and measured: the rotation into a policy's space, methods that use it, and the study with its tables."""
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 from scipy import stats
 from scipy.stats import ortho_group
@@ -24,7 +26,8 @@ from vap_core.cli import app
 from vap_core.evaluation import engine
 from vap_core.evaluation import study as experiments
 from vap_core.evaluation.study import Study
-from vap_core.evaluation.tokens import report, study
+from vap_core.evaluation.tokens import choices, report, study
+from vap_core.evaluation.tokens.choices import Scene
 from vap_core.evaluation.tokens.study import OTHER, Job, Tokens, plan
 from vap_core.policies.embedding_table import open_table
 from vap_core.policies.mini_pi0 import learned_token, teach_token, token_alignment, token_file
@@ -65,8 +68,20 @@ def tiny(
         for job in jobs:
             yield job, work(job)
 
+    def scenes(suite: str, task: str) -> tuple[Scene, ...]:
+        """Two episodes of noise in place of rendered views."""
+        rows = experiments.suites.rows(suite, task)
+        target = rows[0].target
+        names = (target, teach_token.lookalikes(rows)[0])
+        rng = np.random.default_rng(0)
+        crops = {
+            name: tuple(rng.integers(0, 256, (2, 32, 32, 3)).astype(np.uint8)) for name in names
+        }
+        return tuple(Scene(episode=i, target=target, crops=crops) for i in range(2))
+
     monkeypatch.setattr(study, "TokenTraining", training)
     monkeypatch.setattr(study, "results", in_this_process)
+    monkeypatch.setattr(choices, "scenes", scenes)
     for cached in (study._model, study._policy_model, study._negatives):
         cached.cache_clear()
     yield grown
@@ -170,6 +185,10 @@ def test_the_study_measures_every_token_and_goes_on(
     (kinds, counts) = np.unique(report.kind_of(answers), return_counts=True)
     assert list(kinds) == ["look-alikes", "other objects", "own"]
     assert counts[0] == 6 * counts[1]
+    scored = tables["choices"]
+    assert set(scored.episode) == {0, 1}
+    assert set(scored.read_by) == {"vlm", "policy"}
+    assert (scored.groupby(["read_by", "seen_in", "episode"]).size() == 2).all()
     widths = {len(embedding) for embedding in tables["embeddings"].embedding}
     assert widths == {16}
     learned = tables["embeddings"].set_index("learned_in").embedding
@@ -182,20 +201,33 @@ def test_the_study_measures_every_token_and_goes_on(
     def must_not_run(job: Job) -> None:
         raise AssertionError(job)
 
+    run_job = study.run_job
     monkeypatch.setattr(study, "run_job", must_not_run)
     again = study.run(asked, tmp_path / "run", progress=False)
     assert again["answers"].equals(answers)
-    for path in study.publish(tmp_path / "run", tmp_path / "kept"):
-        assert len(pd.read_parquet(path)) == len(tables[path.stem.removeprefix("token_")])
+    monkeypatch.setattr(study, "run_job", run_job)
+    other = study.run(Tokens((SUITE,), (5,), epochs=1), tmp_path / "other", progress=False)
+    for _ in range(2):
+        for path in study.publish(tmp_path / "run", tmp_path / "kept"):
+            assert len(pd.read_parquet(path)) == len(tables[path.stem.removeprefix("token_")])
+    for path in study.publish(tmp_path / "other", tmp_path / "kept"):
+        name = path.stem.removeprefix("token_")
+        assert len(pd.read_parquet(path)) == len(tables[name]) + len(other[name])
+        runs = json.loads(pq.read_schema(path).metadata[b"runs"])
+        assert [run["configuration"]["epochs"] for run in runs] == [2, 1]
     with pytest.raises(BadOutput):
         study.run(Tokens((SUITE,), (5,), epochs=1), tmp_path / "run", progress=False)
     assert "learned in the policy" in report.report(tables)
+    assert "the model chooses the target" in report.report(tables)
 
 
 def test_the_usual_number_of_photos_comes_first_and_once_in_the_policy() -> None:
     jobs = plan(Tokens((SUITE,), (1, 5), epochs=1))
     assert [(job.k, job.where) for job in jobs[:2]] == [(5, "vlm"), (5, "policy")]
     assert len(jobs) == 4 * 3
+    assert {job.where for job in plan(Tokens((SUITE,), places=("vlm",)))} == {"vlm"}
+    with pytest.raises(UnknownName, match="eval-tokens: --learn-in"):
+        Tokens((SUITE,), places=("here",))
     with pytest.raises(UnknownName, match="eval-tokens: suite"):
         Tokens(("nowhere",))
     found = CliRunner().invoke(app, ["eval-tokens", "--k", "1,none"])
@@ -228,6 +260,58 @@ def test_rates_are_counted_by_hand() -> None:
     assert (taken["look-alike"], taken["yes"], taken["n"]) == ("cup-lookalike-1", 0.25, 4)
     curve = report.curve(answers).set_index(["step", "kind"]).yes
     assert (curve[0, "own"], curve[9, "own"]) == (0, 0.75)
+
+
+def test_a_crop_shows_the_object_as_a_photo_does() -> None:
+    rgb = np.zeros((100, 100, 3), np.uint8)
+    rgb[80:100, 90:100] = 200
+    mask = rgb[..., 0] > 0
+    crop = choices.photo_crop(rgb, mask)
+    assert crop is not None
+    assert crop.shape == (36, 36, 3)
+    assert (crop[18, 18] == 200).all()
+    assert (crop[0, 0] == 0).all()
+    assert (crop[-1, -1] == 200).all(), "the edge of the view is repeated"
+    assert choices.photo_crop(rgb, np.zeros_like(mask)) is None
+
+
+def test_photos_take_the_place_of_crops() -> None:
+    rng = np.random.default_rng(0)
+    crops = {"cup": tuple(rng.integers(0, 256, (2, 4, 4, 3)).astype(np.uint8))}
+    scenes = [Scene(episode=episode, target="cup", crops=crops) for episode in (3, 7)]
+    photos = {"cup": tuple(rng.integers(0, 256, (3, 4, 4, 3)).astype(np.uint8)), OTHER: ()}
+    found = choices.in_photos(scenes, photos)
+    assert [scene.episode for scene in found] == [3, 7]
+    for scene, taken in zip(found, ((0, 1), (2, 0)), strict=True):
+        for picture, i in zip(scene.crops["cup"], taken, strict=True):
+            assert np.array_equal(picture, photos["cup"][i])
+
+
+def test_the_highest_score_is_the_choice() -> None:
+    lines = []
+    for episode, scores in enumerate([(2.0, 1.0, 0.0), (-1.0, -0.5, -3.0)]):
+        for name, score in zip(("cup", "cup-lookalike-1", "cup-lookalike-2"), scores, strict=True):
+            lines.append(("s", "t", episode, "cup", name, score))
+    lines.append(("s", "t", 2, "cup", "cup-lookalike-1", 1.0))
+    table = pd.DataFrame(lines, columns=["suite", "task", "episode", "object", "shown", "score"])
+    found = choices.chosen(table)
+    assert list(found.right) == [True, False, False]
+    assert list(found.chance) == pytest.approx([1 / 3, 1 / 3, 0])
+    even = choices.chosen(table.assign(score=1.0))
+    assert not even.right.any(), "a tie is no choice"
+    rows = [("s", "t", i, m, i == 0) for i in range(3) for m in ("soft", "generic")]
+    columns = ["suite", "task", "episode", "method", "first_object_correct"]
+    both = pd.concat([table.assign(seen_in="scene"), table.assign(seen_in="photo", score=1.0)])
+    beside = choices.beside_policy(both, pd.DataFrame(rows, columns=columns), ["soft", "generic"])
+    line = beside.loc["s"]
+    assert (line[choices.IN_SCENE].value, line[choices.IN_SCENE].n) == (pytest.approx(1 / 3), 3)
+    assert (line[choices.IN_PHOTOS].value, line["soft"].value) == (0, pytest.approx(1 / 3))
+    after = (line[choices.AFTER_RIGHT], line[choices.AFTER_WRONG])
+    assert [(each.value, each.n) for each in after] == [(1, 1), (0, 2)]
+    assert list(beside.index) == ["s"]
+    cost = choices.cost_of_scene(both)
+    assert (cost.value, cost.n) == (pytest.approx(-1 / 3), 3)
+    assert cost.low <= cost.value <= cost.high
 
 
 def test_the_report_compares_the_shipped_policies_beside_the_paper() -> None:

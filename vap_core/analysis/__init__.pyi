@@ -50,6 +50,7 @@ from .plots import layouts_figure as layouts_figure
 from .plots import learning_figure as learning_figure
 from .plots import rates_figure as rates_figure
 from .plots import sheet as sheet
+from .token_figures import choice_figure as choice_figure
 from .token_figures import rotation_figure as rotation_figure
 from .token_figures import token_curves_figure as token_curves_figure
 from .token_space import longest_word as longest_word

@@ -46,6 +46,36 @@ def token_curves_figure(curve: "pd.DataFrame") -> "Figure":
     return figure
 
 
+def choice_figure(table: "pd.DataFrame", columns: "Mapping[str, str]") -> "Figure":
+    """Shares of episodes with the right object, by suite; `table` is `choices.beside_policy`'s.
+
+    `columns` are those that are shown, with their colours; lines are 95 % intervals, the dotted
+    line is chance.
+    """
+    figure = empty_figure(max(6.0, 2.3 * len(table) + 1.2), 3.4)
+    axes = figure.subplots()
+    width = 0.8 / len(columns)
+    for i, (name, colour) in enumerate(columns.items()):
+        estimates = list(table[name])
+        value = 100 * np.array([each.value for each in estimates])
+        low = value - 100 * np.array([each.low for each in estimates])
+        high = 100 * np.array([each.high for each in estimates]) - value
+        places = np.arange(len(table)) + (i - (len(columns) - 1) / 2) * width
+        axes.bar(places, value, 0.9 * width, color=colour, label=name)
+        ends = np.clip([low, high], 0, None)  # rounding may leave an end inside
+        axes.errorbar(places, value, yerr=ends, fmt="none", ecolor="black", elinewidth=0.8)
+    for place, chance in enumerate(table["chance"]):
+        axes.hlines(100 * float(chance), place - 0.42, place + 0.42, "black", ":", linewidth=1)
+    names = []
+    for suite, line in table.iterrows():
+        names.append(f"{suite} (n = {line[next(iter(columns))].n})")
+    axes.set_xticks(range(len(table)), names, fontsize=8)
+    axes.set(ylabel="right object, % of episodes", ylim=(0, 104))
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(loc="outside lower center", ncols=5, frameon=False, fontsize=8)
+    return figure
+
+
 def rotation_figure(
     cosines: Mapping[str, Mapping[str, Float64[np.ndarray, " t"]]],
 ) -> "Figure":

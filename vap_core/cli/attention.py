@@ -46,7 +46,11 @@ def attention(
         ),
     ] = None,
     publish: Annotated[
-        Path | None, typer.Option(help="Keep the tables in this folder, too: data/results.")
+        Path | None,
+        typer.Option(
+            help="Keep the tables in this folder, too: data/results. What is there of other suites "
+            "and methods stays."
+        ),
     ] = None,
     workers: Workers = 2,
 ) -> None:
@@ -56,6 +60,7 @@ def attention(
         --suite simpler-bridge
     """
     from vap_core.analysis.attention import replay, report
+    from vap_core.analysis.attention.tables import publish as publish_tables
 
     if out is None:
         table = run.suffix == ".parquet"
@@ -66,7 +71,7 @@ def attention(
         episodes=episodes,
         explain=explain,
     )
-    tables = replay.run_replay(run, out, wanted, workers=workers)
+    found = replay.run_replay(run, out, wanted, workers=workers)
     if publish is not None:
-        replay.publish(out, publish)
-    print(report.text(tables))
+        publish_tables(out, publish)
+    print(report.text(found))

@@ -224,6 +224,10 @@ def eval_tokens(
         int,
         typer.Option(min=1, help="Passes over the augmented photos; the soft prompt's own is 20."),
     ] = 20,
+    learn_in: Annotated[
+        str,
+        typer.Option(help="vlm, policy or both: whose weights a token is learned in."),
+    ] = "vlm,policy",
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     out: Annotated[Path, typer.Option(help="Run folder; a run found there is resumed.")] = Path(
         "data/runs/tokens"
@@ -234,8 +238,9 @@ def eval_tokens(
     ] = None,
 ) -> None:
     """Learn the token of every personal object from few and from many photos, in the
-    vision-language model and in the policies, and measure what it recognizes. Interrupted, it goes
-    on; about a minute and a half a token and core.
+    vision-language model and in the policies; measure what it recognizes, and which object of
+    listed episodes the model chooses by it. Interrupted, it goes on; about a minute and a half a
+    token and core.
 
     Example: python -m vap_core eval-tokens --suite simpler-bridge --k 5 --epochs 2
         --out data/runs/few-tokens
@@ -249,7 +254,7 @@ def eval_tokens(
     ks = tuple(int(number) for number in names(k) if number.isdigit() and int(number))
     if len(ks) != len(names(k)) or not ks:
         raise BadStudy(f"eval-tokens: --k {k}: give numbers of photos, such as 1,3,5,7.")
-    asked = Tokens(tuple(dict.fromkeys(suite or BENCHMARKS)), ks, epochs)
+    asked = Tokens(tuple(dict.fromkeys(suite or BENCHMARKS)), ks, epochs, tuple(names(learn_in)))
     print(report(run(asked, out, workers=workers)))
     if publish is not None:
         written = ", ".join(map(str, write_tables(out, publish)))

@@ -12,6 +12,7 @@ from vap_core.base.errors import BadOutput
 from vap_core.base.files import parse_json, read_file, write_atomic
 
 if TYPE_CHECKING:
+    import pandas as pd
     import pyarrow as pa
 
 
@@ -47,6 +48,32 @@ def encode_table(table: "pa.Table") -> bytes:
     sink = pa.BufferOutputStream()
     pq.write_table(table, sink, compression="zstd")
     return sink.getvalue().to_pybytes()
+
+
+def add_rows(path: Path, table: "pd.DataFrame", key: list[str], about: dict[bytes, Any]) -> bytes:
+    """The rows of a kept table and of a new one as a Parquet file.
+
+    Kept rows that are equal to a new one in `key` are left out. The metadata hold, under the name
+    in `about`, a list: what they held, and its value unless that is there.
+    """
+    import pandas as pd
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    ((name, new),) = about.items()
+    held: list[Any] = []
+    whole = table
+    if path.exists():
+        kept = pq.read_table(path)
+        held = json.loads((kept.schema.metadata or {}).get(name, b"[]"))
+        old = kept.to_pandas()
+        replaced = pd.MultiIndex.from_frame(old[key]).isin(pd.MultiIndex.from_frame(table[key]))
+        whole = pd.concat([old[~replaced], table], ignore_index=True)
+    if new not in held:
+        held.append(new)
+    arrow = pa.Table.from_pandas(whole, preserve_index=False)
+    metadata = {**(arrow.schema.metadata or {}), name: json.dumps(held, sort_keys=True).encode()}
+    return encode_table(arrow.replace_schema_metadata(metadata))
 
 
 def publish_tables(tables: Mapping[str, bytes], to: Path, caller: str) -> list[Path]:

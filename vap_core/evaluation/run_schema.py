@@ -63,6 +63,7 @@ SETTINGS: Mapping[str, Callable[[Any], bool]] = {
     "seeds": _is_count,
     "policy": _is_text,
     "temperature": _is_temperature,
+    "object": _is_text,
     "lists": _are_digests,
 }
 """Settings of a study that are read back, and what they must be where they are there."""

@@ -11,11 +11,13 @@ from .patterns import per_episode as per_episode
 from .patterns import with_localisation as with_localisation
 from .pictures import example_tiles as example_tiles
 from .pictures import examples_figure as examples_figure
-from .prediction import warning_table as warning_table
-from .replay import read as read
+from .prediction import warnings as warnings
 from .report import auc_by_layer as auc_by_layer
 from .report import auc_table as auc_table
 from .report import causal_table as causal_table
+from .report import first_look as first_look
 from .report import layer_table as layer_table
 from .report import pattern_counts as pattern_counts
 from .report import where_queries_look as where_queries_look
+from .report import where_text as where_text
+from .tables import read as read

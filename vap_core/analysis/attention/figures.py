@@ -10,6 +10,7 @@ from vap_core.evaluation.store import KEY
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 QUERY_COLOURS = {
@@ -25,36 +26,47 @@ LEAST_EPISODES = 4
 
 
 def where_figure(table: "pd.DataFrame") -> "Figure":
-    """Density of attention on the target and on its look-alikes, by method and query.
+    """Density of attention on the target and on its look-alikes, by suite, method and query.
 
-    `table` is `report.where_queries_look`'s; 1 is what an even attention would have.
+    `table` is `report.where_queries_look`'s; 1 is what an even attention would have, bars of error
+    are 95 % intervals over layouts.
     """
     lines = table.iloc[::-1].reset_index(drop=True)
-    figure = empty_figure(7.2, 0.36 * len(lines) + 0.9)
+    figure = empty_figure(7.2, 0.3 * len(lines) + 1.1)
     axes = figure.subplots()
     places = np.arange(len(lines))
-    axes.barh(places + 0.19, lines["lift"], 0.36, color=WINNER, label="target")
-    axes.barh(places - 0.19, lines["lift_lookalikes"], 0.36, color=OTHER, label="look-alikes")
+    for name, label, colour, offset in (
+        ("lift", "target", WINNER, 0.19),
+        ("lift_lookalikes", "look-alikes", OTHER, -0.19),
+    ):
+        value = lines[name].to_numpy(float)
+        low = value - lines[f"{name}_low"].to_numpy(float)
+        high = lines[f"{name}_high"].to_numpy(float) - value
+        axes.barh(places + offset, value, 0.36, color=colour, label=label)
+        axes.errorbar(
+            value, places + offset, xerr=[low, high], fmt="none", ecolor="black", elinewidth=0.7
+        )
     axes.axvline(1, color="black", linewidth=0.8, linestyle=":")
     names = []
     for line in lines.itertuples():
         names.append(f"{line.suite} · {line.method} · {line.query} (n = {line.n})")
     axes.set_yticks(places, names, fontsize=8)
-    axes.set_xlabel("attention per area, whole view = 1")
-    axes.legend(fontsize=8, loc="upper right")
+    axes.set_ylim(-0.6, len(lines) - 0.4)
+    axes.set_xlabel("attention per area before the first touch, whole view = 1")
     axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(loc="outside upper right", ncols=2, frameon=False, fontsize=8)
     return figure
 
 
 def layers_figure(table: "pd.DataFrame") -> "Figure":
-    """Density on the target by layer; `table` is `report.layer_table`'s, one panel a method.
+    """Density on the target by layer; `table` is `report.layer_table`'s.
 
-    Words of the last layer have no effect on the actions: their points are hollow.
+    A column of panels a suite, a row a method. Words of the last layer have no effect on the
+    actions: their points are hollow.
     """
-    panels = list(table.groupby(["suite", "method"], observed=True, sort=False))
-    figure = empty_figure(3.3 * len(panels), 2.7)
-    row = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
-    for axes, ((suite, method), panel) in zip(row, panels, strict=True):
+    figure, grid = _grid(table, width=2.6, height=2.3)
+    for (suite, method), axes in grid.items():
+        panel = table[(table["suite"] == suite) & (table["method"] == method)]
         for query, lines in panel.groupby("query", observed=True, sort=False):
             ordered = lines.sort_values("layer")
             colour = QUERY_COLOURS[str(query)]
@@ -70,17 +82,19 @@ def layers_figure(table: "pd.DataFrame") -> "Figure":
         axes.set_title(f"{suite}, {method}", fontsize=9)
         axes.set_xlabel("layer")
         axes.set_xticks(sorted(set(panel["layer"] + 1)))
-        axes.spines[["top", "right"]].set_visible(False)
         axes.legend(fontsize=7)
-    row[0].set_ylabel("attention per area on the target")
+    figure.supylabel("attention per area on the target", fontsize=9)
     return figure
 
 
 def patterns_figure(counts: "pd.DataFrame") -> "Figure":
-    """Episodes of every localisation, successes and failures; `counts` is `pattern_counts`'."""
-    figure = empty_figure(1.6 + 2.6 * len(counts), 2.8)
-    row = figure.subplots(1, len(counts), squeeze=False, sharey=True)[0]
-    for axes, line in zip(row, counts.to_dict("records"), strict=True):
+    """Episodes of every localisation, successes and failures; `counts` is `pattern_counts`'.
+
+    A column of panels a suite, a row a method.
+    """
+    figure, grid = _grid(counts, width=2.7, height=2.2)
+    for line in counts.to_dict("records"):
+        axes = grid[line["suite"], line["method"]]
         places = np.arange(len(LOCALISATIONS))
         wins = np.array([line[f"{name}, success"] for name in LOCALISATIONS])
         total = np.array([line[name] for name in LOCALISATIONS])
@@ -88,13 +102,37 @@ def patterns_figure(counts: "pd.DataFrame") -> "Figure":
         lost = 100 * (total - wins) / line["n"]
         axes.bar(places, lost, 0.7, 100 * wins / line["n"], color=FAILURE, label="failure")
         for place, won, of in zip(places, wins, total, strict=True):
-            axes.text(place, 100 * of / line["n"] + 1, f"{won}/{of}", ha="center", fontsize=8)
-        axes.set_xticks(places, LOCALISATIONS, fontsize=8)
-        axes.set_title(f"{line['suite']}, {line['method']} (n = {line['n']})", fontsize=9)
-        axes.spines[["top", "right"]].set_visible(False)
-    row[0].set_ylabel("% of episodes")
-    row[0].legend(fontsize=8)
+            axes.text(
+                float(place), 100 * of / line["n"] + 1, f"{won}/{of}", ha="center", fontsize=7
+            )
+        axes.set_xticks(places, LOCALISATIONS, fontsize=7)
+        axes.set_ylim(0, 108)
+        axes.set_title(f"{line['suite']}, {line['method']} (n = {line['n']})", fontsize=8)
+    figure.supylabel("% of episodes", fontsize=9)
+    handles = next(iter(grid.values())).get_legend_handles_labels()
+    figure.legend(*handles, loc="outside lower center", ncols=2, frameon=False, fontsize=8)
     return figure
+
+
+def _grid(
+    table: "pd.DataFrame", *, width: float, height: float
+) -> "tuple[Figure, dict[tuple[str, str], Axes]]":
+    """A panel for every suite and method of a table, suites from left to right."""
+    suites = list(dict.fromkeys(table["suite"].astype(str)))
+    methods = list(dict.fromkeys(table["method"].astype(str)))
+    figure = empty_figure(max(4.0, width * len(suites) + 0.4), height * len(methods) + 0.5)
+    panels = figure.subplots(len(methods), len(suites), squeeze=False, sharey=True)
+    found = set(zip(table["suite"].astype(str), table["method"].astype(str), strict=True))
+    grid = {}
+    for row, method in enumerate(methods):
+        for column, suite in enumerate(suites):
+            axes = panels[row, column]
+            axes.spines[["top", "right"]].set_visible(False)
+            if (suite, method) in found:
+                grid[suite, method] = axes
+            else:
+                axes.set_axis_off()
+    return figure, grid
 
 
 def time_figure(calls: "pd.DataFrame", episodes: "pd.DataFrame") -> "Figure":

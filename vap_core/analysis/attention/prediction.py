@@ -1,6 +1,7 @@
 """How well a measure of the attention tells successes from failures: areas under the ROC curve.
 
-Intervals resample whole layouts, because the episodes of one layout are alike.
+Where episodes are of several suites, only pairs of one suite are compared: a measure that tells the
+suites apart tells nothing of an episode.
 """
 
 from collections.abc import Sequence
@@ -10,12 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float
 
+from vap_core.analysis.attention.intervals import Times, percentiles, resamples
 from vap_core.evaluation.statistics import SEED
 
 if TYPE_CHECKING:
     import pandas as pd
 
-RESAMPLES = 2000
 LEAST_FAILURES = 10
 Scores = Float[np.ndarray, " n"]
 Labels = Bool[np.ndarray, " n"]
@@ -41,40 +42,52 @@ class Auc:
         return f"{self.value:.2f} [{self.low:.2f}, {self.high:.2f}] (n = {self.n})"
 
 
-def auc(scores: Scores, labels: Labels) -> float:
-    """Mann-Whitney's U by the number of pairs, ties count half; nan without both kinds."""
-    from scipy.stats import rankdata
-
-    positives = int(labels.sum())
-    negatives = len(labels) - positives
-    if positives == 0 or negatives == 0:
-        return float("nan")
-    ranks = rankdata(scores)
-    above = ranks[labels].sum() - positives * (positives + 1) / 2
-    return float(above / (positives * negatives))
+def auc(scores: Scores, labels: Labels, strata: Sequence[str] = ()) -> float:
+    """The share of pairs in order, ties count half; nan without both kinds."""
+    once = np.ones((1, len(labels)))
+    return float(_resampled(scores, labels, strata, times=once)[0])
 
 
-def auc_interval(scores: Scores, labels: Labels, clusters: Sequence[str]) -> Auc:
+def auc_interval(
+    scores: Scores, labels: Labels, clusters: Sequence[str], strata: Sequence[str] = ()
+) -> Auc:
     """The area, and its interval by resampling clusters (percentiles)."""
-    names, of_cluster = np.unique(np.asarray(clusters, dtype=str), return_inverse=True)
-    drawn = np.random.default_rng(SEED).integers(len(names), size=(RESAMPLES, len(names)))
-    times = np.zeros((RESAMPLES, len(names)))
-    np.add.at(times, (np.arange(RESAMPLES)[:, None], drawn), 1.0)
-    values = _resampled(scores, labels, times[:, of_cluster])
-    finite = values[~np.isnan(values)]
-    low, high = np.quantile(finite, [0.025, 0.975]) if len(finite) else (np.nan, np.nan)
+    times = resamples(clusters, strata)
+    low, high = percentiles(_resampled(scores, labels, strata, times=times))
     return Auc(
-        value=auc(scores, labels),
-        low=float(low),
-        high=float(high),
+        value=auc(scores, labels, strata),
+        low=low,
+        high=high,
         n=len(labels),
         positives=int(labels.sum()),
-        clusters=len(names),
+        clusters=len(set(clusters)),
+    )
+
+
+def auc_gain(
+    scores: tuple[Scores, Scores],
+    labels: Labels,
+    clusters: Sequence[str],
+    strata: Sequence[str] = (),
+) -> Auc:
+    """By how much the second of two scores of the same episodes tells them better."""
+    first, second = scores
+    times = resamples(clusters, strata)
+    gains = _resampled(second, labels, strata, times=times)
+    gains = gains - _resampled(first, labels, strata, times=times)
+    low, high = percentiles(gains)
+    return Auc(
+        value=auc(second, labels, strata) - auc(first, labels, strata),
+        low=low,
+        high=high,
+        n=len(labels),
+        positives=int(labels.sum()),
+        clusters=len(set(clusters)),
     )
 
 
 def _resampled(
-    scores: Scores, labels: Labels, times: Float[np.ndarray, "resamples n"]
+    scores: Scores, labels: Labels, strata: Sequence[str], *, times: Times
 ) -> Float[np.ndarray, " resamples"]:
     """The area of every resample, in which episode i stands `times[:, i]` times; nan as `auc`'s."""
     high = scores[labels][:, None]
@@ -83,8 +96,14 @@ def _resampled(
     wins[np.isnan(high) | np.isnan(low)] = np.nan
     positive = times[:, labels]
     negative = times[:, ~labels]
-    won = ((positive @ wins) * negative).sum(axis=1)
-    pairs = positive.sum(axis=1) * negative.sum(axis=1)
+    if not len(strata):
+        won = ((positive @ wins) * negative).sum(axis=1)
+        pairs = positive.sum(axis=1) * negative.sum(axis=1)
+    else:
+        names = np.asarray(strata, dtype=str)
+        same = (names[labels][:, None] == names[~labels][None]).astype(float)
+        won = ((positive @ (wins * same)) * negative).sum(axis=1)
+        pairs = ((positive @ same) * negative).sum(axis=1)
     return np.divide(won, pairs, out=np.full(len(times), np.nan), where=pairs > 0)
 
 
@@ -125,40 +144,44 @@ def _logistic(
     return weights
 
 
-def warning_table(table: "pd.DataFrame", measures: Sequence[str]) -> "pd.DataFrame":
-    """Failures foretold by the vote margin, by the attention, and by both: areas and intervals.
+def warnings(table: "pd.DataFrame", measures: Sequence[str]) -> dict[str, Auc]:
+    """Failures foretold by the vote margin, by the attention, by both, and what that gains.
 
-    Logistic regressions, scored on layouts that they were not fitted on. `table` are episodes of
-    one method that votes. With fewer than LEAST_FAILURES nothing is fitted.
+    Logistic regressions, scored on layouts that they were not fitted on; predictors are ranks
+    within their suite. `table` are episodes of one method that votes. Empty with fewer than
+    LEAST_FAILURES.
     """
-    import pandas as pd
-
     voted = table[table["margin"].notna()]
     failed = ~voted["success"].to_numpy(bool)
-    layouts = list(voted["layout"])
-    rows = []
-    n_failures = int(failed.sum())
+    if failed.sum() < LEAST_FAILURES:
+        return {}
+    layouts = [f"{one} {other}" for one, other in zip(voted["suite"], voted["layout"], strict=True)]
+    suites = list(voted["suite"].astype(str))
+    ranks = voted.groupby("suite", observed=True)[["margin", *measures]].rank(pct=True)
+    scores = {}
     for name, columns in (
         ("vote margin", ["margin"]),
         ("attention", list(measures)),
         ("both", ["margin", *measures]),
     ):
-        if n_failures < LEAST_FAILURES:
-            said = f"too few failures ({n_failures} of {len(voted)})"
-            rows.append({"predictor": name, "AUC for failure": said})
-            continue
-        scores = left_out_scores(voted[columns].to_numpy(float), failed, layouts)
-        rows.append(
-            {"predictor": name, "AUC for failure": str(auc_interval(scores, failed, layouts))}
-        )
-    return pd.DataFrame(rows).set_index("predictor")
+        scores[name] = left_out_scores(ranks[columns].to_numpy(float), failed, layouts)
+    found = {}
+    for name, values in scores.items():
+        found[name] = auc_interval(values, failed, layouts, suites)
+    pair = (scores["vote margin"], scores["both"])
+    found["both, beyond the margin"] = auc_gain(pair, failed, layouts, suites)
+    return found
 
 
 def predict_success(table: "pd.DataFrame", measures: Sequence[str]) -> "dict[str, Auc]":
     """For every measure of `patterns.per_episode`, how well it tells successes from failures."""
+    suites = list(table["suite"].astype(str))
     found = {}
     for name in measures:
         found[name] = auc_interval(
-            table[name].to_numpy(float), table["success"].to_numpy(bool), list(table["layout"])
+            table[name].to_numpy(float),
+            table["success"].to_numpy(bool),
+            list(table["layout"]),
+            suites,
         )
     return found

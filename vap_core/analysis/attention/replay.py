@@ -4,17 +4,14 @@ The same row, weights and seed give the same episode; observing changes no actio
 command had finished is found again in its folder.
 """
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vap_core.analysis.attention import tables
 from vap_core.analysis.attention.observer import NOTHING, Observer, Rows
-from vap_core.base.errors import BadOutput, BadStudy
-from vap_core.base.files import write_atomic
-from vap_core.base.parquet import read_parquet
-from vap_core.base.version import code_version
+from vap_core.base.errors import BadStudy
 from vap_core.evaluation import measurements
 from vap_core.evaluation.diagnosis.recordings import listed_row, study_of
 from vap_core.evaluation.engine import spread_evenly
@@ -32,8 +29,6 @@ from vap_core.simulation.types import EpisodeRow
 if TYPE_CHECKING:
     import pandas as pd
 
-TABLES = ("episodes", "calls", "layers", "causal")
-PREFIX = "attention_"
 Known = tuple[str, int]
 """Outcome and number of steps that an episode has in the run."""
 
@@ -99,9 +94,9 @@ def run_replay(
             desc="attention",
             disable=not progress,
         ) as bar:
-            for job, tables in results(run_job, missing, workers=workers, remedy="--workers"):
+            for job, rows in results(run_job, missing, workers=workers, remedy="--workers"):
                 path = parts / f"{job.name}.json"
-                measurements.write_json_part(path, tables, caller="attention")
+                measurements.write_json_part(path, rows, caller="attention")
                 bar.update(len(job.rows))
         return _write_tables(source, folder, [parts / f"{job.name}.json" for job in jobs])
 
@@ -191,40 +186,17 @@ def run_job(job: Job) -> dict[str, Rows]:
         return observer
 
     trial = replace(trial, attention=QUERIES)
-    tables: dict[str, Rows] = {name: [] for name in TABLES}
+    found: dict[str, Rows] = {name: [] for name in tables.TABLES}
     episodes = list(rollout(trial, job.rows, observe, batch=BATCH))
     for row, episode, known in zip(job.rows, episodes, job.known, strict=True):
         observer = observers.get((row.key, row.seed))
         if observer is None:  # it ended in an error before its first call
             observer = Observer(episode.header, policy)
         about = _about(episode)
-        tables["episodes"].append({**about, **_ending(observer, episode, known)})
+        found["episodes"].append({**about, **_ending(observer, episode, known)})
         for name, rows in observer.tables.items():
-            tables[name] += [{**about, **row} for row in rows]
-    return tables
-
-
-def read(folder: Path) -> "dict[str, pd.DataFrame]":
-    """The tables that were published in a folder. Raises: BadOutput."""
-    tables = {}
-    for name in TABLES:
-        path = folder / f"{PREFIX}{name}.parquet"
-        if not path.exists():
-            raise BadOutput(
-                f"attention: {path} is missing; make it: python -m vap_core attention RUN "
-                f"--publish {folder}"
-            )
-        tables[name] = read_parquet(path, "attention", "publish it again")
-    return tables
-
-
-def publish(folder: Path, to: Path) -> list[Path]:
-    """Keep the tables of a finished replay in another folder. Raises: BadOutput."""
-    tables = {}
-    for name in TABLES:
-        path = folder / f"{PREFIX}{name}.parquet"
-        tables[path.name] = path.read_bytes()
-    return measurements.publish_tables(tables, to, caller="attention")
+            found[name] += [{**about, **row} for row in rows]
+    return found
 
 
 def _about(episode: Episode) -> dict[str, Any]:
@@ -259,29 +231,14 @@ def _ending(observer: Observer, episode: Episode, known: Known) -> dict[str, Any
 
 def _write_tables(source: Path, folder: Path, parts: Sequence[Path]) -> "dict[str, pd.DataFrame]":
     """All parts as one table of each kind, with the runs and the code in the metadata."""
-    import pandas as pd
-    import pyarrow as pa
-
-    rows: dict[str, Rows] = {name: [] for name in TABLES}
+    rows: dict[str, Rows] = {name: [] for name in tables.TABLES}
     for path in parts:
         for name, part in measurements.read_json_part(path, caller="attention").items():
             rows[name] += part
-    runs = [manifest for manifest, _ in read_runs(source)]
-    about = json.dumps({"runs": runs, "code": code_version()}, sort_keys=True).encode()
-    for name in TABLES:
-        table = pa.Table.from_pandas(_compact(pd.DataFrame(rows[name])), preserve_index=False)
-        data = measurements.encode_table(table.replace_schema_metadata({b"attention": about}))
-        write_atomic(folder / f"{PREFIX}{name}.parquet", data)
-    return read(folder)
-
-
-def _compact(table: "pd.DataFrame") -> "pd.DataFrame":
-    """Four digits of every number, names as categories."""
-    for name in table.columns:
-        if table[name].dtype == "float64":
-            table[name] = table[name].round(4).astype("float32")
-        elif table[name].dtype == "int64":
-            table[name] = table[name].astype("int32")
-        elif table[name].dtype == object and name not in ("layout", "text"):
-            table[name] = table[name].astype("category")
-    return table
+    measured = {row["suite"] for row in rows["episodes"]}
+    runs = []
+    for manifest, episodes in read_runs(source):
+        if measured & set(episodes["suite"]):
+            runs.append(manifest)
+    tables.write(folder, rows, runs)
+    return tables.read(folder)

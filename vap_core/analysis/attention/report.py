@@ -1,11 +1,19 @@
 """The measures of a replay as tables of text and numbers."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
 
-from vap_core.analysis.attention.measures import REGIONS
-from vap_core.analysis.attention.patterns import LOCALISATIONS, per_episode, with_localisation
+from vap_core.analysis.attention import intervals
+from vap_core.analysis.attention.measures import LOOKALIKES, REGIONS, TARGET
+from vap_core.analysis.attention.patterns import (
+    LOCALISATIONS,
+    over_views,
+    per_episode,
+    with_localisation,
+)
 from vap_core.analysis.attention.prediction import predict_success
 from vap_core.base.tables import align
+from vap_core.evaluation.perception.estimates import share
 from vap_core.evaluation.store import KEY
 
 if TYPE_CHECKING:
@@ -13,6 +21,9 @@ if TYPE_CHECKING:
 
 MEASURES = ("lift", "on_target", "on_rival", "drift", "switches", "entropy")
 """The measures of an episode whose relation to success is reported."""
+ALL_SUITES = "all suites"
+INTERVALS = ("lift", "lift_lookalikes", "on_target", "on_rival")
+"""The measures of `where_queries_look` that get an interval, over layouts."""
 
 
 def text(tables: "dict[str, pd.DataFrame]") -> str:
@@ -24,7 +35,7 @@ def text(tables: "dict[str, pd.DataFrame]") -> str:
     parts = [
         f"{len(episodes)} episodes run again, {again} of them end as in the run; before the first "
         "touch:",
-        align(_rows(where_queries_look(table))),
+        align(_rows(where_text(where_queries_look(table)))),
         "the word that means the target, over whole episodes:",
         align(_rows(pattern_counts(with_localisation(whole)))),
     ]
@@ -36,27 +47,81 @@ def text(tables: "dict[str, pd.DataFrame]") -> str:
 
 
 def auc_table(table: "pd.DataFrame") -> "pd.DataFrame":
-    """How well each measure tells successes from failures, a row per suite and method."""
+    """How well each measure tells successes from failures, a row per suite and method.
+
+    In the rows of ALL_SUITES pairs of one suite are compared.
+    """
     import pandas as pd
 
     rows = {}
-    for (suite, method), group in table.groupby(["suite", "method"], observed=True, sort=False):
-        areas = predict_success(group, MEASURES)
+    for (suite, method), group in _groups(table, ["method"]):
         row = {"n": str(len(group)), "successes": str(int(group["success"].sum()))}
-        for name, area in areas.items():
-            row[name] = f"{area.value:.2f} [{area.low:.2f}, {area.high:.2f}]"
+        for measure, area in predict_success(group, MEASURES).items():
+            row[measure] = f"{area.value:.2f} [{area.low:.2f}, {area.high:.2f}]"
         rows[f"{suite}, {method}"] = row
     return pd.DataFrame(rows).T.rename_axis("suite, method")
 
 
 def where_queries_look(table: "pd.DataFrame") -> "pd.DataFrame":
-    """Means over episodes, by suite, method and query; `table` is `per_episode`'s."""
-    names = ["share", "chance", "lift", "lift_lookalikes", "on_target", "chance_hit", "on_rival"]
-    names += ["drift", "entropy"]
-    groups = table.groupby(["suite", "method", "query"], observed=True, sort=False)
-    means = groups[names].mean().round(2)
-    means.insert(0, "n", groups.size())
-    return means.reset_index()
+    """Means over episodes, by suite (and ALL_SUITES), method and query of `per_episode`'s table.
+
+    Measures of INTERVALS have their 95 % interval beside them, as NAME_low and NAME_high.
+    """
+    import pandas as pd
+
+    rows = []
+    for key, group in _groups(table, ["method", "query"]):
+        row: dict[str, Any] = dict(zip(["suite", "method", "query"], key, strict=True))
+        row["n"] = len(group)
+        for name in ("chance", "chance_hit", "drift", "entropy"):
+            row[name] = group[name].mean()
+        for name in INTERVALS:
+            found = intervals.mean(
+                group[name].to_numpy(float), list(group["layout"]), list(group["suite"])
+            )
+            row |= {name: found.value, f"{name}_low": found.low, f"{name}_high": found.high}
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def where_text(table: "pd.DataFrame") -> "pd.DataFrame":
+    """The rows of `where_queries_look` with two digits, and intervals in brackets."""
+    shown = table[["suite", "method", "query", "n"]].copy()
+    for name in INTERVALS:
+        cells = []
+        for row in table.to_dict("records"):
+            cells.append(f"{row[name]:.2f} [{row[f'{name}_low']:.2f}, {row[f'{name}_high']:.2f}]")
+        shown[name] = cells
+    for name in ("chance_hit", "drift", "entropy"):
+        shown[name] = table[name].map("{:.2f}".format)
+    return shown
+
+
+def first_look(calls: "pd.DataFrame", episodes: "pd.DataFrame") -> "pd.DataFrame":
+    """Whether the first call looks at the target rather than its look-alikes, and what follows.
+
+    By suite (and ALL_SUITES), method and query: `looks` is the share of episodes whose first call
+    is denser on the target than on its look-alikes; `then_touches` is how often the target is the
+    first thing touched after such a look, and `else_touches` how often it is after another. All are
+    `Estimate`s with Wilson's interval over episodes.
+    """
+    import pandas as pd
+
+    merged = over_views(calls)
+    merged = merged[merged[f"chance_{TARGET}"] > 0]
+    order = merged.sort_values("step").groupby([*KEY, "query"], observed=True, sort=False)
+    first = order.head(1).merge(episodes, on=KEY)
+    density = first[f"share_{TARGET}"] / first[f"chance_{TARGET}"]
+    rival = first[f"share_{LOOKALIKES}"] / first[f"chance_{LOOKALIKES}"].clip(lower=1e-9)
+    first = first.assign(looks=density > rival, touches=first["touched"].astype(str) == TARGET)
+    rows = []
+    for key, group in _groups(first, ["method", "query"]):
+        row: dict[str, Any] = dict(zip(["suite", "method", "query"], key, strict=True))
+        row["looks"] = share(group["looks"])
+        row["then_touches"] = share(group.loc[group["looks"], "touches"])
+        row["else_touches"] = share(group.loc[~group["looks"], "touches"])
+        rows.append(row)
+    return pd.DataFrame(rows)
 
 
 def pattern_counts(table: "pd.DataFrame") -> "pd.DataFrame":
@@ -93,6 +158,17 @@ def layer_table(layers: "pd.DataFrame") -> "pd.DataFrame":
         row["best_head"] = (by_head["share_target"] / by_head["chance_target"]).max()
         rows.append(row)
     return pd.DataFrame(rows)
+
+
+def _groups(
+    table: "pd.DataFrame", keys: list[str]
+) -> "Iterator[tuple[tuple[str, ...], pd.DataFrame]]":
+    """The rows by suite and `keys`; where there are several suites, of all together, too."""
+    for key, group in table.groupby(["suite", *keys], observed=True, sort=False):
+        yield tuple(map(str, key)), group
+    if table["suite"].nunique() > 1:
+        for key, group in table.groupby(keys, observed=True, sort=False):
+            yield (ALL_SUITES, *map(str, key)), group
 
 
 def _rows(table: "pd.DataFrame") -> list[list[str]]:

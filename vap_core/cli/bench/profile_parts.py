@@ -36,7 +36,7 @@ PARTS = (
     Part("IK", ("vap_core.simulation.env:Env.commanded",)),
     Part("RGB", ("vap_core.simulation.cameras:Renderer.rgb",)),
     Part("sensor noise", ("vap_core.simulation.env:apply_sensor",)),
-    Part("truth masks", ("vap_core.simulation.cameras:Renderer.masks",)),
+    Part("truth masks", ("vap_core.simulation.cameras:Renderer.masks_and_hand",)),
     Part("tracker: backbone", (f"{TRACKER}:embed_cells",)),
     Part(
         "tracker: segmenter",

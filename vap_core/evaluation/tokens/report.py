@@ -143,7 +143,25 @@ def report(tables: Mapping[str, "pd.DataFrame"]) -> str:
             line = of_kind.loc[kind]
             cells.append(_text(line.yes, line.low, line.high, int(line.n)))
         by_k.append(cells)
-    return f"{align(rows)}\n\n{align(by_k)}\n\n{NOTE}"
+    parts = [align(rows), align(by_k)]
+    if "choices" in tables:
+        parts.append(align(_choice_rows(tables["choices"])))
+    return "\n\n".join([*parts, NOTE])
+
+
+def _choice_rows(table: "pd.DataFrame") -> list[list[str]]:
+    """By suite: whether the model chooses the target among the objects of listed episodes."""
+    from vap_core.evaluation.perception.estimates import share
+    from vap_core.evaluation.tokens.choices import chosen
+
+    rows = [["objects of first views", "seen in", "chance", "the model chooses the target"]]
+    usual = reading(table, "as learned")
+    usual = usual[usual.k == USUAL_K]
+    for (suite, seen_in), part in usual.groupby(["suite", "seen_in"], sort=False):
+        found = chosen(part)
+        chance = f"{100 * found.chance.mean():.1f}"
+        rows.append([str(suite), str(seen_in), chance, share(found.right).text()])
+    return rows
 
 
 def text(found: Rate) -> str:

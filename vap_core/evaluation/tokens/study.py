@@ -1,8 +1,9 @@
 """Learns the token of every personal object from few or many photos, and measures it as it grows.
 
-A job is one training: of one task's target, from so many photos, in the vision-language model or in
-the policy's own weights. Afterwards a token that was learned in the model is read by the policy,
-copied as it is and rotated into the policy's space. What a killed run had finished is found again.
+A job is one training: of one task's target, from so many photos, in the vision-language model or
+in the policy's own weights. Afterwards a token that was learned in the model is read by the policy,
+copied as it is and rotated into the policy's space, and the model chooses by it among the objects
+of listed episodes. What a killed run had finished is found again.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,6 +21,7 @@ from vap_core.base.types import Rgb
 from vap_core.evaluation import measurements, store
 from vap_core.evaluation.policy_names import shipped
 from vap_core.evaluation.processes import results
+from vap_core.evaluation.tokens import choices
 from vap_core.policies.lerobot.checkpoints import fingerprint
 from vap_core.policies.mini_pi0 import teach_token
 from vap_core.policies.mini_pi0.learned_token import Photos, TokenTraining, lessons, recognized
@@ -39,20 +41,31 @@ USUAL_K = teach_token.K
 SHARES = (0.05, 0.15, 0.3, 0.5, 1.0)
 """Shares of a training after which the token is measured, besides before its first step."""
 OTHER = "other objects"
-TABLES = ("answers", "embeddings")
-"""Kinds of parts: photos to which the answer was yes; and what was learned."""
+TABLES = ("answers", "embeddings", "choices")
+"""Kinds of parts: photos to which the answer was yes; what was learned; scores of the objects of
+episodes."""
+TRAINING = ["suite", "task", "k", "learned_in", "epochs"]
+"""The columns that name one training."""
+NOT_KEY = ("yes", "n", "embedding", "views", "score")
+Place = Literal["vlm", "policy"]
+PLACES: tuple[Place, ...] = ("vlm", "policy")
+"""Where a token is learned: in the model, or in the policy's own weights."""
 Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Tokens:
-    """What is asked for: the suites, numbers of photos, and epochs of a training."""
+    """What is asked for: the suites, numbers of photos, epochs of a training, and where."""
 
     suites: tuple[str, ...] = tuple(suites.BENCHMARKS)
     ks: tuple[int, ...] = KS
     epochs: int = TokenTraining().epochs
+    places: tuple[str, ...] = PLACES
 
     def __post_init__(self) -> None:
+        for place in self.places:
+            if place not in PLACES:
+                raise one_of("eval-tokens: --learn-in", place, PLACES)
         for name in self.suites:
             if name not in suites.BENCHMARKS:
                 raise one_of("eval-tokens: suite", name, suites.BENCHMARKS)
@@ -81,7 +94,7 @@ class Job:
     suite: str
     task: str
     k: int
-    where: Literal["vlm", "policy"]
+    where: Place
     epochs: int
 
     @property
@@ -97,14 +110,14 @@ def plan(asked: Tokens) -> list[Job]:
         for suite in asked.suites:
             for task in suites.suite(suite).tasks:
                 for k in ks:
-                    jobs.append(Job(suite, task.name, k, "vlm", asked.epochs))
-                    if k == USUAL_K:
-                        jobs.append(Job(suite, task.name, k, "policy", asked.epochs))
+                    for place in PLACES:
+                        if place in asked.places and (place == "vlm" or k == USUAL_K):
+                            jobs.append(Job(suite, task.name, k, place, asked.epochs))
     return jobs
 
 
 def run_job(job: Job) -> dict[str, list[Row]]:
-    """Learn one token, and return the rows of both tables."""
+    """Learn one token, and return the rows of every table."""
     from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
 
     target = suites.rows(job.suite, job.task, 1)[0].target
@@ -114,14 +127,22 @@ def run_job(job: Job) -> dict[str, list[Row]]:
     teacher = _model() if job.where == "vlm" else _policy_model(job.suite)
     training = TokenTraining(epochs=job.epochs)
     about = {"suite": job.suite, "task": job.task, "object": target, "k": job.k}
-    about["learned_in"] = job.where
+    about |= {"learned_in": job.where, "epochs": job.epochs}
     answers: list[Row] = []
+    chosen: list[Row] = []
     with fused_attention():
         measured = _measured_epochs(job.epochs)
         for epoch, (step, embedding) in enumerate(lessons(teacher, target, taught, training)):
             if epoch in measured:
                 where = {**about, "step": step, "token": "as learned", "read_by": job.where}
                 answers += _answers(where, teacher, embedding, shown)
+        where = {**about, "token": "as learned", "read_by": job.where}
+        scenes = choices.scenes(job.suite, job.task)
+        for name, part in (
+            (choices.SCENE, scenes),
+            (choices.PHOTO, choices.in_photos(scenes, shown)),
+        ):
+            chosen += choices.scores({**where, "seen_in": name}, teacher, embedding, part)
         if job.where == "vlm":
             reader = _policy_model(job.suite)
             aligned = align(embedding, teach_token.MODEL, policy_folder)
@@ -129,7 +150,7 @@ def run_job(job: Job) -> dict[str, list[Row]]:
                 where = {**about, "step": step, "token": token, "read_by": "policy"}
                 answers += _answers(where, reader, read, shown)
     learned = {**about, "step": step, "embedding": embedding.tolist()}
-    return {"answers": answers, "embeddings": [learned]}
+    return {"answers": answers, "embeddings": [learned], "choices": chosen}
 
 
 def run(
@@ -176,7 +197,7 @@ def read(folder: Path) -> "dict[str, pd.DataFrame]":
                 f"eval-tokens: {folder} holds no {name}; run the same command again to finish it."
             )
         whole = pd.concat(parts, ignore_index=True)
-        key = [column for column in whole.columns if column not in ("yes", "n", "embedding")]
+        key = [column for column in whole.columns if column not in NOT_KEY]
         # A run that was killed between two files has written one of them twice.
         whole = whole.drop_duplicates(key, ignore_index=True)
         tables[name] = whole.sort_values(key, ignore_index=True)
@@ -184,20 +205,15 @@ def read(folder: Path) -> "dict[str, pd.DataFrame]":
 
 
 def publish(folder: Path, to: Path) -> list[Path]:
-    """Keep the tables in `to` as token_NAME.parquet, with their configuration.
+    """Keep the tables in `to` as token_NAME.parquet, with the configurations of their runs.
 
-    Raises: BadOutput.
+    Trainings that `to` holds and the run does not stay there. Raises: BadOutput.
     """
-    import json
-
-    import pyarrow as pa
-
-    manifest = json.dumps(store.read_manifest(folder), sort_keys=True)
+    manifest = store.read_manifest(folder)
     tables = {}
     for name, table in read(folder).items():
-        arrow = pa.Table.from_pandas(table, preserve_index=False)
-        arrow = arrow.replace_schema_metadata({**arrow.schema.metadata, b"run": manifest.encode()})
-        tables[f"token_{name}.parquet"] = measurements.encode_table(arrow)
+        path = to / f"token_{name}.parquet"
+        tables[path.name] = measurements.add_rows(path, table, TRAINING, {b"runs": manifest})
     return measurements.publish_tables(tables, to, caller="eval-tokens")
 
 

@@ -101,11 +101,18 @@ def recognized(
     vlm: "MiniVlm", embedding: Float32[np.ndarray, " d"], photos: Sequence[Rgb]
 ) -> Bool[np.ndarray, " n"]:
     """In which photos the model says yes to the word that has this embedding."""
+    return answers(vlm, embedding, photos) > 0
+
+
+def answers(
+    vlm: "MiniVlm", embedding: Float32[np.ndarray, " d"], photos: Sequence[Rgb]
+) -> Float32[np.ndarray, " n"]:
+    """By how much "yes" scores above "no" in every photo, for the word that has this embedding."""
     import torch
 
     question = _Question(vlm, embedding)
     with torch.no_grad():
-        return (question.ask(question.embed(photos)) > 0).numpy()
+        return question.ask(question.embed(photos)).numpy()
 
 
 def accuracy(vlm: "MiniVlm", embedding: Float32[np.ndarray, " d"], photos: Photos) -> float:

@@ -104,7 +104,7 @@ class MiniPI0Policy(PI0Policy):
 
     def _preprocess_images(self, batch: dict[str, Tensor]) -> tuple[list[Tensor], list[Tensor]]:
         """PI0's, of images that are scaled as in training: with antialiasing."""
-        size = self.config.image_resolution
+        size = tuple(self.config.image_resolution)
         scaled = dict(batch)
         for key in self.config.image_features:
             if key in batch and batch[key].shape[-2:] != size:

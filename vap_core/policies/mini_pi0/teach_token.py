@@ -104,12 +104,15 @@ def teach_own(rows: Iterable[EpisodeRow], folder: Path, policy: Path) -> Token:
 
 def _teach(teacher: "MiniVlm", rows: Sequence[EpisodeRow], folder: Path, suffix: str) -> Token:
     """Learn the target's token in `teacher` unless the folder has it."""
+    from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
+
     name = rows[0].target
     if (folder / f"{name}{suffix}").exists():
         return token_file.load(folder, name, teacher.sha256(), suffix)
     taught = photographs(rows, 0, K)
     unseen = photographs(rows, 1, VIEWS)
-    token = learned_token.learn(teacher, name, taught, unseen)
+    with fused_attention():  # a third less time
+        token = learned_token.learn(teacher, name, taught, unseen)
     if token.accuracy < LEAST_ACCURACY:
         print(
             f"note: the learned token of {name} is right in {100 * token.accuracy:.0f} % of unseen "

@@ -113,13 +113,14 @@ def to_cells(masks: Bool[np.ndarray, "n h w"], grid: Grid) -> Labels:
     scale = SIDE / max(h, w)
     small_w = max(1, round(w * scale))
     small_h = max(1, round(h * scale))
-    labels = np.zeros((n + 1, rows * CELL_PX, cols * CELL_PX), np.float32)
-    for i, mask in enumerate(masks):
-        labels[i + 1, :small_h, :small_w] = cv2.resize(
-            mask.astype(np.float32), (small_w, small_h), interpolation=cv2.INTER_AREA
+    cells = np.zeros((n + 1, rows * cols), np.float32)
+    plane = np.zeros((rows * CELL_PX, cols * CELL_PX), np.float32)
+    blocks = plane.reshape(rows, CELL_PX, cols, CELL_PX)
+    for i in np.flatnonzero(masks.any(axis=(1, 2))):  # most are not followed
+        plane[:small_h, :small_w] = cv2.resize(
+            masks[i].astype(np.float32), (small_w, small_h), interpolation=cv2.INTER_AREA
         )
-    blocks = labels.reshape(n + 1, rows, CELL_PX, cols, CELL_PX)
-    cells = blocks.mean(axis=(2, 4)).reshape(n + 1, -1)
+        cells[i + 1] = blocks.mean(axis=(1, 3)).ravel()
     cells[0] = np.clip(1 - cells[1:].sum(axis=0), 0, 1)
     return cells
 

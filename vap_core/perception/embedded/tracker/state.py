@@ -102,7 +102,8 @@ def initial_state(
     for i, mask in enumerate(masks):
         if visible[i]:
             boxes[i] = mask_box(mask)
-        colours[i] = blur_shares(colour_shares(image, mask))
+        if followed[i]:
+            colours[i] = blur_shares(colour_shares(image, mask))
         crops.append(crop(image, boxes[i]))
     first = FrameMemory(keys, to_cells(masks, grid))
     return TrackState(

@@ -121,10 +121,13 @@ def _compete(
     judged: Int64[np.ndarray, " k"],
 ) -> np.ndarray:
     """New masks of the judged identities: likely pixels that no other identity claims more."""
-    identities = np.arange(len(state.masks))
-    winner = argmax_planes(probability) == identities[:, None, None]
-    masks = (probability > 0.5) & winner
-    return np.where(np.isin(identities, judged)[:, None, None], masks, state.masks)
+    masks = state.masks.copy()
+    claiming = np.flatnonzero(state.followed)  # the others claim nothing
+    winner = argmax_planes(probability[claiming])
+    for place, identity in enumerate(claiming):
+        if identity in judged:
+            masks[identity] = (probability[identity] > 0.5) & (winner == place)
+    return masks
 
 
 def _evidence_of_size(state: TrackState, frame: FrameFeatures, identity: int, mask: Mask) -> float:

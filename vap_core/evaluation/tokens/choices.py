@@ -1,0 +1,185 @@
+"""Which object of an episode's first views the model takes for the token's.
+
+Every object of the target's category is cut out by its true mask, as a photo shows it, and the
+model is asked about each alone. The one with the highest answer, the mean over the views that show
+it, is the model's choice. That is its recognition at its best: a policy sees all of them at once,
+small, and has to move there as well. The same choice among unseen photos of the same objects says
+what the change from photo to scene costs.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+
+from vap_core.base.types import Mask, Rgb, value
+from vap_core.evaluation.engine import spread_evenly
+from vap_core.evaluation.perception.estimates import Estimate, share
+from vap_core.evaluation.perception.first_frames import opening_views
+from vap_core.evaluation.statistics import bootstrap_interval
+from vap_core.perception.boxes import mask_box
+from vap_core.policies.mini_pi0.learned_token import answers
+from vap_core.simulation import suites
+from vap_core.simulation.assets.objects import get_object
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from vap_core.policies.mini_pi0.vlm import MiniVlm
+
+EPISODES = 48
+"""Episodes of a suite, spread evenly over its tasks."""
+SIZE = 448
+"""Pixels along the edges of a view, four times what a policy reads."""
+FILL = 0.55
+"""The object's share of a crop's edge, as in a reference photo."""
+KEY = ["suite", "task", "episode"]
+"""What names an episode of a list."""
+SCENE, PHOTO = "scene", "photo"
+"""What the objects are seen in: the column `seen_in`."""
+IN_PHOTOS, IN_SCENE = "model, in photos", "model, in the scene"
+AFTER_RIGHT = "soft, where the model is right"
+AFTER_WRONG = "soft, where it is wrong"
+"""Columns of `beside_policy` beside the methods."""
+ALL_SUITES = "all suites"
+
+
+@value
+class Scene:
+    """An episode's objects of the target's category, each as its crops from the first views."""
+
+    episode: int
+    target: str
+    crops: Mapping[str, tuple[Rgb, ...]]
+
+
+def photo_crop(rgb: Rgb, mask: Mask) -> Rgb | None:
+    """The square around an object of which it fills FILL; None where it is not in view.
+
+    Beyond the view its edge is repeated.
+    """
+    box = mask_box(mask)
+    if box is None:
+        return None
+    x0, y0, x1, y1 = box.tolist()
+    side = max(8, round(max(x1 - x0, y1 - y0) / FILL))
+    left = round((x0 + x1 - side) / 2)
+    top = round((y0 + y1 - side) / 2)
+    padded = cv2.copyMakeBorder(rgb, side, side, side, side, cv2.BORDER_REPLICATE)
+    return padded[top + side : top + 2 * side, left + side : left + 2 * side].copy()
+
+
+@lru_cache(maxsize=1)
+def scenes(suite: str, task: str) -> tuple[Scene, ...]:
+    """The first views of a task's share of EPISODES, cut into objects."""
+    n = max(1, EPISODES // len(suites.suite(suite).tasks))
+    found = []
+    for views in opening_views(spread_evenly(suites.rows(suite, task), n), SIZE):
+        row = views[0].row
+        crops: dict[str, list[Rgb]] = {}
+        for view in views:
+            for name, mask in view.visible().items():
+                crop = photo_crop(view.rgb, mask)
+                if get_object(name).category == row.category and crop is not None:
+                    crops.setdefault(name, []).append(crop)
+        kept = {name: tuple(pictures) for name, pictures in crops.items()}
+        found.append(Scene(episode=row.episode, target=row.target, crops=kept))
+    return tuple(found)
+
+
+def in_photos(shown: Sequence[Scene], photos: Mapping[str, Sequence[Rgb]]) -> tuple[Scene, ...]:
+    """The same episodes with as many unseen photos of every object in place of its crops.
+
+    What the model chooses there and in the scene differs by what it sees, not by what it is asked.
+    """
+    found = []
+    for i, scene in enumerate(shown):
+        drawn = {}
+        for name, crops in scene.crops.items():
+            of_object = photos[name]
+            first = i * len(crops)
+            drawn[name] = tuple(of_object[(first + j) % len(of_object)] for j in range(len(crops)))
+        found.append(Scene(episode=scene.episode, target=scene.target, crops=drawn))
+    return tuple(found)
+
+
+def scores(
+    about: Mapping[str, Any],
+    reader: "MiniVlm",
+    embedding: Float32[np.ndarray, " d"],
+    shown: Sequence[Scene],
+) -> Iterator[dict[str, Any]]:
+    """A row per episode and object: by how much yes scores above no, as a mean over its views."""
+    for scene in shown:
+        for name, crops in scene.crops.items():
+            score = float(answers(reader, embedding, crops).mean())
+            where = {"episode": scene.episode, "shown": name, "views": len(crops)}
+            yield {**about, **where, "score": score}
+
+
+def chosen(table: "pd.DataFrame") -> "pd.DataFrame":
+    """One row per episode: whether the highest score is the target's alone, and chance.
+
+    `table` has the rows of `scores` of one reading. Episodes whose target no view shows count as
+    wrong.
+    """
+    import pandas as pd
+
+    rows = []
+    for key, group in table.groupby([*KEY, "object"], observed=True, sort=False):
+        is_target = group["shown"] == group["object"]
+        best = group["score"] == group["score"].max()
+        line = dict(zip([*KEY, "object"], key, strict=True))
+        line["right"] = bool(best[is_target].any() and best.sum() == 1)
+        line["chance"] = float(is_target.any()) / len(group)
+        rows.append(line)
+    return pd.DataFrame(rows, columns=[*KEY, "object", "right", "chance"])
+
+
+def beside_policy(
+    table: "pd.DataFrame", episodes: "pd.DataFrame", methods: Sequence[str]
+) -> "pd.DataFrame":
+    """The model's choices, and what a policy touches first in the same episodes, by suite.
+
+    `table` has the rows of `scores` of one reading, of SCENE and of PHOTO; `episodes` are those of
+    a published table, whose methods are columns. A row per suite and, if there are several, one for
+    ALL_SUITES; shares are `Estimate`s. The last two columns are soft's first touches where the
+    model's choice in the scene was right, and where it was not.
+    """
+    import pandas as pd
+
+    photo = chosen(table[table["seen_in"] == PHOTO])[[*KEY, "right"]]
+    joined = chosen(table[table["seen_in"] == SCENE]).merge(photo, on=KEY, suffixes=("", "_photo"))
+    first = episodes.pivot_table(
+        index=KEY, columns="method", values="first_object_correct", aggfunc="first", observed=True
+    )
+    joined = joined.merge(first.reset_index(), on=KEY)
+    parts = [(str(name), part) for name, part in joined.groupby("suite", sort=False)]
+    if len(parts) > 1:
+        parts.append((ALL_SUITES, joined))
+    lines = {}
+    for name, part in parts:
+        line: dict[str, Estimate | float] = {"chance": float(part["chance"].mean())}
+        line[IN_PHOTOS] = share(part["right_photo"])
+        line[IN_SCENE] = share(part["right"])
+        for method in methods:
+            line[method] = share(part[method])
+        line[AFTER_RIGHT] = share(part.loc[part["right"], "soft"])
+        line[AFTER_WRONG] = share(part.loc[~part["right"], "soft"])
+        lines[name] = line
+    return pd.DataFrame(lines).T
+
+
+def cost_of_scene(table: "pd.DataFrame") -> Estimate:
+    """The share of right choices in photos minus that in the scene, over the same episodes.
+
+    `table` is `beside_policy`'s. The interval is bootstrapped over episodes.
+    """
+    photo = chosen(table[table["seen_in"] == PHOTO])[[*KEY, "right"]]
+    both = chosen(table[table["seen_in"] == SCENE]).merge(photo, on=KEY, suffixes=("", "_photo"))
+    gain = both["right_photo"].to_numpy(float) - both["right"].to_numpy(float)
+    low, high = bootstrap_interval(gain, np.ones(len(gain)))
+    return Estimate(value=float(gain.mean()), low=low, high=high, n=len(gain))
