@@ -82,7 +82,7 @@ def test_a_tiny_run_is_reported_to_the_letter(
     assert (out / "report.md").read_text() == text + "\n"
     assert plain(text, folder) + "\n" == GOLDEN.read_text()
     assert sorted(path.name for path in out.iterdir()) == [
-        "comparisons.csv", "comparisons.tex", "forest.png", "outcomes.csv", "outcomes.tex", "paired.png", "provenance.csv", "report.md",
+        "comparisons.csv", "comparisons.tex", "forest.png", "outcomes.csv", "outcomes.tex", "paired.png", "provenance.csv", "report.html", "report.md",
         "results.csv", "results.tex",
     ]  # fmt: skip
     before = {path.name: path.read_bytes() for path in out.iterdir()}

@@ -7,11 +7,10 @@ Timelines are `frame_index` and `timestamp`. Entities have the names of LeRobot'
   truth, `/identity` the prompt in the colour of the object it covers, `/attention/<query>`
   overlays.
 - `/observation.state`, `/action`, `/next.reward`, `/next.success`.
-- `/vap/votes/<camera>`: `counts`, with `/winner` and `/others` as bars.
-- `/vap/{candidates,similarity,crops}/<camera>`: what the vote compared.
+- `/vap/{votes,candidates}/<camera>`: the vote in numbers, `/vap/vote_picture/<camera>` its picture.
 - `/vap/association`: what the views agreed on, where they were associated.
 - `/vap/{vote_margin,track_score,attention}/<camera>`, `/vap/hand/*`: curves and tensors.
-- `/vap/{instruction,events}`, `/vap/status/{outcome,grasp}`: text and states.
+- `/vap/{verdict,instruction,events}`, `/vap/status/{outcome,grasp}`: text and states.
 - `/world/{table,robot/link*,objects/*}`: simulator truth.
 
 Evidence of a further target j ends in `_j`. Recording properties are in module `properties`.
@@ -28,7 +27,7 @@ from vap_core.base.errors import BadOutput
 from vap_core.base.types import Event
 from vap_core.recording.blueprint import episode_blueprint
 from vap_core.recording.entities.attention import send_attention
-from vap_core.recording.entities.comparison import log_crops, log_similarity
+from vap_core.recording.entities.comparison import log_vote_picture
 from vap_core.recording.entities.coverage import coverage_classes, send_coverage
 from vap_core.recording.entities.curves import (
     log_method_styles,
@@ -72,9 +71,9 @@ from vap_core.recording.stream import (
     open_stream,
 )
 from vap_core.recording.texts import (
-    describe_diagnosis,
     describe_outcome,
     instruction_document,
+    verdict_document,
 )
 from vap_core.rollout.failure import Diagnosis, Explain, Explanation
 from vap_core.rollout.types import Episode, EpisodeHeader, Frame
@@ -119,6 +118,7 @@ class Recorder:
         self._unsent: list[Frame] = []
         self._grasp_state: str | None = None
         self._queries: tuple[str, ...] = ()
+        self._has_layout = False
         recording_id = f"{row.key}.s{row.seed}.{header.method}.{header.policy}"
         self._rec: rr.RecordingStream | None = open_stream(self.path, recording_id)
         self._log_header(self._rec)
@@ -146,6 +146,10 @@ class Recorder:
         self._frames.append(frame.without_images())
         self._unsent.append(frame)
         if len(self._unsent) >= self._flush_every:
+            if not self._has_layout:
+                # An episode that is killed opens with this one; `close` sends another.
+                episode_blueprint(self._header, queries=self._queries).send(self._open_stream())
+                self._has_layout = True
             self._flush()
 
     def close(self, outcome: Outcome) -> None:
@@ -160,12 +164,9 @@ class Recorder:
         if self._frames:
             self._send_ending(outcome, explanation)
         diagnosis = explanation.diagnosis
-        document = instruction_document(
-            self._header,
-            describe_outcome(outcome),
-            "" if diagnosis is None else describe_diagnosis(diagnosis),
-        )
+        document = instruction_document(self._header, describe_outcome(outcome))
         log_row(rec, "/vap/instruction", document)
+        log_row(rec, "/vap/verdict", verdict_document(self._header, outcome, diagnosis))
         log_properties(rec, "outcome", outcome_properties(outcome, diagnosis))
         self._rec = None
         finish_stream(rec, self.path)
@@ -209,7 +210,6 @@ class Recorder:
                 log_association(rec, association, j, frame_times([frame]))
         for of_queries in frame.attention.values():
             self._queries = tuple(of_queries)
-        episode_blueprint(self._header, queries=self._queries).send(rec)
 
     def _log_votes(self, frame: Frame, camera: str) -> None:
         """The votes of one view, over the first one's picture."""
@@ -221,12 +221,21 @@ class Recorder:
         if not groundings:
             log_row(rec, f"{image_root(camera)}/candidates", jpeg_image(jpeg), at=at)
             return
-        first = groundings[0]
-        log_vote(rec, first, 0, jpeg, at)
-        log_similarity(rec, first, at)
-        log_crops(rec, first, rgb, self._header.references.get(first.object, ()), at)
+        right = _elected_target(frame, camera, self._header.row.target)
+        log_vote(rec, groundings[0], 0, jpeg, at, right)
         for j, grounding in enumerate(groundings[1:], start=1):
             log_vote(rec, grounding, j, None, at)
+        for j, grounding in enumerate(groundings):
+            references = self._header.references.get(grounding.object, ())
+            log_vote_picture(
+                rec,
+                grounding,
+                j,
+                rgb=rgb,
+                references=references,
+                right=right if j == 0 else None,
+                at=at,
+            )
 
     def _flush(self) -> None:
         """Send the buffered frames as columns and write them to the file."""
@@ -277,20 +286,36 @@ class Recorder:
         send_reward(rec, index, len(self._frames), outcome.success)
         send_outcome(rec, self._frames[0], outcome.status)
         self._send_events(self._ending_events(outcome, explanation.diagnosis))
+        gripper_cm = None
         if explanation.trace is not None:
-            send_gripper(rec, explanation.trace, index)
-        if explanation.diagnosis is not None:
-            blueprint = episode_blueprint(
-                self._header, explanation.diagnosis, queries=self._queries
+            gripper_cm = send_gripper(
+                rec,
+                self._header,
+                trace=explanation.trace,
+                frames=self._frames,
+                diagnosis=explanation.diagnosis,
             )
-            blueprint.send(rec)
+        blueprint = episode_blueprint(
+            self._header, explanation.diagnosis, queries=self._queries, gripper_cm=gripper_cm
+        )
+        blueprint.send(rec)
 
     def _ending_events(self, outcome: Outcome, diagnosis: Diagnosis | None) -> list[Event]:
         """The deciding moment of a failure, and the end."""
         events = []
         if diagnosis is not None:
-            events.append(Event(diagnosis.frame_index, "ERROR", describe_diagnosis(diagnosis)))
+            events.append(
+                Event(diagnosis.frame_index, "ERROR", f"{diagnosis.case}: {diagnosis.sub_case}")
+            )
         text = f"episode ends: {describe_outcome(outcome)}"
         last = self._frames[-1].frame_index
         events.append(Event(last, OUTCOME_LEVELS[outcome.status], text))
         return events
+
+
+def _elected_target(frame: Frame, camera: str, target: str) -> bool | None:
+    """Whether the vote of a view elected the target; None where nothing says so."""
+    for view in frame.coverage:
+        if view.camera == camera and view.object is not None:
+            return view.object == target
+    return None
