@@ -123,7 +123,7 @@ def test_a_damaged_table_is_one_line_wherever_it_is_read(tmp_path: Path) -> None
     damaged(tmp_path / "audit" / "a.parquet")
     damaged(tmp_path / study.TABLES[0] / "a.parquet")
     for read in (
-        attention.read, inspection.published, input_audit.read, state_log.read, study.read,
+        tables.read, inspection.published, input_audit.read, state_log.read, study.read,
     ):  # fmt: skip
         with pytest.raises(BadOutput, match=r"parquet is damaged; ") as told:
             list(read(tmp_path))
