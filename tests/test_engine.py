@@ -268,6 +268,43 @@ def test_a_worker_that_dies_once_is_forgiven_and_said(
     assert "a worker process died" in capsys.readouterr().err
 
 
+def test_an_episode_that_ends_its_workers_is_an_error_and_the_others_are_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    study = replace(STUDY, tasks=STUDY.tasks[:1], episodes=3, seeds=1)
+    first, bad, last = (row.episode for row in study.rows(*study.tasks[0]))
+
+    def deadly(work, jobs, workers, mend):  # type: ignore[no-untyped-def]
+        for job in jobs:
+            if bad in [row.episode for row in job.rows]:
+                raise engine.WorkerDied("a worker process died, killed")
+            yield job, work(job)
+
+    table = engine.run(study, tmp_path / "run", record="none", executor=deadly).set_index("episode")
+    assert table.outcome[bad] == "error"
+    assert table.detail[bad] == "a worker process died, killed"
+    assert table.attempt[bad] == 2, "it is not tried again"
+    assert (table.outcome[[first, last]] != "error").all()
+    assert table.policy_sha256.nunique() <= 1
+    assert "one episode at a time (2 of 2 deaths)" in capsys.readouterr().err
+    again = engine.run(study, tmp_path / "run", record="none", executor=deadly, progress=False)
+    assert len(again) == 3
+
+
+def test_where_every_worker_dies_the_run_ends_and_blames_no_episode(tmp_path: Path) -> None:
+    tried: list[int] = []
+
+    def deadly(work, jobs, workers, mend):  # type: ignore[no-untyped-def]
+        tried.append(sum(len(job.rows) for job in jobs))
+        raise engine.WorkerDied("a worker process died")
+        yield
+
+    with pytest.raises(engine.WorkerDied):
+        engine.run(STUDY, tmp_path / "run", record="none", executor=deadly, progress=False)
+    assert tried == [12, 12, 1, 1, 1]
+    assert read(tmp_path / "run").empty
+
+
 def test_an_episode_that_always_breaks_is_an_error_with_its_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,7 +16,15 @@ from vap_core.instruction import parse
 from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
 from vap_core.simulation.grasps import points_world
-from vap_core.simulation.suites import BENCHMARKS, VARIANTS, lists, simpler, tabletop, vlabench
+from vap_core.simulation.suites import (
+    BENCHMARKS,
+    SHARED,
+    VARIANTS,
+    lists,
+    simpler,
+    tabletop,
+    vlabench,
+)
 from vap_core.simulation.suites.variants import AGGREGATION, MATCHING
 from vap_core.simulation.types import AS_LISTED
 
@@ -90,7 +98,7 @@ def test_the_manifest_holds_hash_and_length_of_the_file(name, rows):
     assert hashlib.sha256(data).hexdigest() == lists.digest(name)
     manifest = json.loads((lists.FOLDER / "manifest.json").read_text())
     assert manifest[name]["episodes"] == len(rows) == len(data.splitlines())
-    assert set(manifest) == {*BENCHMARKS, *(f"{each}-dev" for each in BENCHMARKS)}
+    assert set(manifest) == {*BENCHMARKS, *(f"{each}-dev" for each in BENCHMARKS), *SHARED}
 
 
 def test_the_builder_gives_the_committed_file(name, rows, tmp_path):

@@ -87,7 +87,7 @@ def test_the_verifier_keeps_its_protocol_and_the_latest_points(monkeypatch):
 def test_what_points_say():
     verified = np.array([0, CERTAIN // 2, CERTAIN, 9 * CERTAIN, 0])
     compared = np.array([True, True, True, True, False])
-    assert proof(verified, compared, CERTAIN) == pytest.approx([-GAIN, 0, GAIN, GAIN, 0])
+    assert proof(verified, compared, float(CERTAIN)) == pytest.approx([-GAIN, 0, GAIN, GAIN, 0])
     assert proof(verified, compared, 0.0) == pytest.approx([0, GAIN / 2, GAIN, GAIN, 0])
     many = 2 * CERTAIN / OF_USUAL
     assert proof(verified, compared, many) == pytest.approx([-GAIN, -GAIN / 2, 0, GAIN, 0])

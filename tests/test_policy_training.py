@@ -12,6 +12,7 @@ import torch
 from safetensors.torch import load_file
 from torch.nn import functional as F  # noqa: N812
 
+from tests.deaths import die_before_each_rename
 from vap_core.base.errors import BadOutput
 from vap_core.base.types import Description
 from vap_core.policies.lerobot.adapter import load_policy
@@ -145,6 +146,31 @@ def test_a_vision_language_model_learns_and_resumes(
     begun = policy.train(replace(grown, steps=1), tmp_path / "begun", cache=stage[0].parent)
     assert about["taught"]
     assert not begun["taught"], "without a model there is nothing to learn a word in"
+
+
+def test_a_training_that_is_ended_again_and_again_ends_like_one_that_was_not(
+    stage: tuple[Path, list[Film]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before each of its renames: of a checkpoint, of the weights, of what was measured."""
+    folder, _ = stage
+    monkeypatch.setattr(demonstrations, "EPISODES", 2)
+    monkeypatch.setattr(policy, "HELD_OUT", 9)
+    recipe = replace(TINY, stages=1, steps=3, batch=2, draws=1)
+    whole, torn = tmp_path / "whole", tmp_path / "torn"
+
+    def weights_are_absent_or_whole() -> None:
+        if (torn / "model.safetensors").exists():
+            load_file(torn / "model.safetensors")
+
+    def train(out: Path) -> dict[str, object]:
+        return policy.train(recipe, out, cache=folder.parent, every=1)
+
+    about = train(whole)
+    assert die_before_each_rename(lambda: train(torn), weights_are_absent_or_whole) > 5
+    one, other = (load_file(path / "model.safetensors") for path in (whole, torn))
+    assert all(torch.equal(one[name], other[name]) for name in one)
+    told = json.loads((torn / "training.json").read_text())
+    assert [line["step"] for line in told["log"]] == [line["step"] for line in about["log"]]
 
 
 def test_films_of_what_is_held_out_are_refused(stage: tuple[Path, list[Film]]) -> None:

@@ -1,13 +1,17 @@
 """Files are parsed and never executed, servers are on loopback, and keys stay where they are."""
 
 import ast
+import os
 import re
 import socket
+import time
 from pathlib import Path
 
 import pytest
 
 import vap_core
+from vap_core.base import files
+from vap_core.base.errors import BadOutput
 from vap_core.recording import viewer
 
 ROOT = Path(vap_core.__file__).resolve().parent
@@ -60,6 +64,70 @@ def test_no_module_reads_what_can_execute() -> None:
             if keyword(call, "shell") == "True" or keyword(call, "trust_remote_code") == "True":
                 wrong.append(f"{path.name}: {name} with shell or remote code")
     assert not wrong
+
+
+READERS = {
+    "trimesh.load_scene": {"mesh_parts.py"},
+    "av.open": {"video.py"},
+    "torch.load": {"fitting.py"},
+    "safe_open": {"loading.py"},
+}
+"""Meshes, videos and checkpoints have one reader each."""
+
+
+def test_meshes_videos_and_checkpoints_are_read_in_one_place_each() -> None:
+    found: dict[str, set[str]] = {name: set() for name in READERS}
+    for path in SOURCES:
+        for name, _ in calls(ast.parse(path.read_text())):
+            if name in found:
+                found[name].add(path.name)
+    assert found == READERS
+
+
+def test_limits_of_time_are_of_a_clock_that_nobody_sets() -> None:
+    """The clock of the day decides what a scratch file's age is, and dates; it measures nothing."""
+    of_the_day = set()
+    for path in SOURCES:
+        for name, _ in calls(ast.parse(path.read_text())):
+            if name in ("time.time", "datetime.now", "datetime.utcnow", "date.today"):
+                of_the_day.add(path.name)
+    assert of_the_day == {"files.py", "readings.py", "objects.py", "measurement.py", "context.py"}
+
+
+def test_a_clock_that_was_set_back_makes_no_scratch_file_old(tmp_path: Path) -> None:
+    young = tmp_path / ".a.tmp"
+    young.touch()
+    ahead = time.time() + 10 * files.ABANDONED_S
+    os.utime(young, (ahead, ahead))
+    files.remove_scratch(tmp_path)
+    assert young.exists()
+
+
+def damaged(path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(b"PAR1 and nothing else")
+    return path
+
+
+def test_a_damaged_table_is_one_line_wherever_it_is_read(tmp_path: Path) -> None:
+    from vap_core.analysis import inspection
+    from vap_core.analysis.attention import tables
+    from vap_core.evaluation import input_audit, state_log
+    from vap_core.evaluation.tokens import study
+
+    for name in tables.TABLES:
+        damaged(tmp_path / f"{tables.PREFIX}{name}.parquet")
+    for name in inspection.TABLES:
+        damaged(tmp_path / f"perception_{name}.parquet")
+    damaged(tmp_path / "traces" / "a.parquet")
+    damaged(tmp_path / "audit" / "a.parquet")
+    damaged(tmp_path / study.TABLES[0] / "a.parquet")
+    for read in (
+        tables.read, inspection.published, input_audit.read, state_log.read, study.read,
+    ):  # fmt: skip
+        with pytest.raises(BadOutput, match=r"parquet is damaged; ") as told:
+            list(read(tmp_path))
+        assert "\n" not in str(told.value)
 
 
 def test_arrays_of_objects_are_refused_wherever_arrays_are_read(tmp_path: Path) -> None:

@@ -110,14 +110,15 @@ def test_what_is_unlike_the_references_is_not_tinted_and_not_named() -> None:
 
 
 def test_recordings_and_signals_say_not_in_view() -> None:
-    from vap_core.recording.texts import describe_vote, vote_title
+    from vap_core.base.vote_picture import result_line
+    from vap_core.recording.texts import describe_vote
 
     _, attended = Attender(STRICT, {"mug": MUG}).start({"front": UNLIKE}, "bring my cup")
     (grounding,) = attended.groundings["front"]
     said = describe_vote(grounding)
     assert said.startswith("#0 not in view, cosine ")
     assert said.endswith(" below 0.99 · #0 wins: votes 3 of 3, the only candidate")
-    assert vote_title(grounding) == "not in view"
+    assert result_line(grounding).startswith("#0 not in view, cosine ")
 
 
 def test_always_tint_is_the_papers_rule_and_so_is_a_stack_without_thresholds() -> None:

@@ -55,7 +55,7 @@ def test_every_entity_has_its_promised_name(three: tuple[Path, EpisodeHeader, li
     votes = [
         f"/vap/{part}/{cam}"
         for cam in ("front", "side", "wrist")
-        for part in ("votes", "candidates", "vote_margin", "track_score")
+        for part in ("votes", "candidates", "vote_picture", "vote_margin", "track_score")
     ]
     plain = [
         "/observation.state",
@@ -63,6 +63,7 @@ def test_every_entity_has_its_promised_name(three: tuple[Path, EpisodeHeader, li
         "/next.reward",
         "/next.success",
         "/vap/instruction",
+        "/vap/verdict",
         "/vap/events",
     ]
     status = [
@@ -336,8 +337,7 @@ def test_a_grounding_alone_records(tmp_path: Path) -> None:
     )
     assert rerun("rrd", "verify", tmp_path / "g.rrd").returncode == 0
     assert {
-        "/vap/references",
-        "/vap/similarity/front",
+        "/vap/vote_picture/front",
         "/observation.images.front/prompted",
         "/observation.images.front/mask/target",
     } <= entities(tmp_path / "g.rrd")

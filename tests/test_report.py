@@ -2,10 +2,7 @@
 
 import csv
 import json
-import os
 import re
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -15,6 +12,7 @@ import pandas as pd
 import pytest
 from PIL import Image
 
+from tests.command import vap
 from vap_core.base.errors import BadOutput
 from vap_core.base.tables import escape, latex, markdown
 from vap_core.evaluation.publish import publish
@@ -84,7 +82,7 @@ def test_a_tiny_run_is_reported_to_the_letter(
     assert (out / "report.md").read_text() == text + "\n"
     assert plain(text, folder) + "\n" == GOLDEN.read_text()
     assert sorted(path.name for path in out.iterdir()) == [
-        "comparisons.csv", "comparisons.tex", "forest.png", "outcomes.csv", "outcomes.tex", "paired.png", "provenance.csv", "report.md",
+        "comparisons.csv", "comparisons.tex", "forest.png", "outcomes.csv", "outcomes.tex", "paired.png", "provenance.csv", "report.html", "report.md",
         "results.csv", "results.tex",
     ]  # fmt: skip
     before = {path.name: path.read_bytes() for path in out.iterdir()}
@@ -325,13 +323,12 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
 
 
 def test_the_command_prints_what_it_writes(tmp_path: Path) -> None:
-    folder, env = run(tmp_path / "run"), {**os.environ, "OMP_NUM_THREADS": "1"}
-    words = [sys.executable, "-m", "vap_core", "report", str(folder)]
-    done = subprocess.run(words, env=env, capture_output=True, text=True, timeout=120)
+    folder = run(tmp_path / "run")
+    done = vap("report", folder)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith((folder / "report" / "report.md").read_text())
     (folder / "run.json").unlink()
-    refused = subprocess.run(words, env=env, capture_output=True, text=True, timeout=120)
+    refused = vap("report", folder)
     assert (refused.returncode, refused.stdout, refused.stderr.count("\n")) == (2, "", 1)
     assert refused.stderr.startswith("error: run: ")
 

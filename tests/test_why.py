@@ -12,6 +12,7 @@ from tests.drawn import ROW, SIDE, SIZES, SUCCESS, K, columns, entities, frame, 
 from vap_core.base.types import Track
 from vap_core.evaluation.diagnosis import explain
 from vap_core.recording import Recorder, read_summary
+from vap_core.recording.entities.status import LINE_CHARACTERS
 from vap_core.rollout.types import MaskCoverage
 
 
@@ -91,14 +92,21 @@ def test_a_recording_says_why_and_its_blueprint_opens_there(
     assert summary["case_sentence"]
     assert {
         "/observation.images.front/identity",
-        "/vap/crops/front",
-        "/vap/similarity/front",
+        "/vap/vote_picture/front",
+        "/vap/verdict",
         "/vap/hand/gripper_to_target",
+        "/vap/hand/nearest_other",
+        "/vap/hand/deciding_frame",
     } <= entities(path)
     told = [
         text for texts in columns(path, "/vap/events", "TextLog:text").values() for text in texts
     ]
-    assert any(text.startswith(f"{case.capitalize()}, {sub_case}: ") for text in told)
+    assert f"{case}: {sub_case}" in told
+    assert max(map(len, told)) <= LINE_CHARACTERS, "the list shows 60 characters of a row"
+    (verdict,) = columns(path, "/vap/verdict", "TextDocument:text").values()
+    heading, _, sentence = str(verdict[0]).partition("\n\n")  # type: ignore[index]
+    assert heading.startswith(f"## FAILURE · {case.capitalize()} · ")
+    assert sentence.startswith(summary["case_sentence"])
     assert rerun("rrd", "verify", path).returncode == 0
     assert f"{case}: {sub_case}" in tabs(path)
 

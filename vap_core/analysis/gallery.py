@@ -13,6 +13,7 @@ import numpy as np
 
 from vap_core.analysis.plots import Tile
 from vap_core.base.figures import TIER_COLOURS
+from vap_core.base.parquet import read_parquet
 from vap_core.base.types import PersonalObject, Rgb
 from vap_core.evaluation.metrics import Score, rate, score
 from vap_core.perception.boxes import crop
@@ -246,7 +247,6 @@ def same_layout(rows: Sequence[EpisodeRow], like: EpisodeRow) -> dict[str, Episo
 
 def bounds(path: Path) -> list[Score]:
     """The scores of the episodes in a parquet file, in the order of the suites and their tasks."""
-    import pandas as pd
 
     positions: dict[tuple[str, str], int] = {}
     for suite in BENCHMARKS.values():
@@ -257,7 +257,7 @@ def bounds(path: Path) -> list[Score]:
         position = positions[line.suite, line.task]
         return position, line.split == "variant aggregation", line.policy
 
-    records = pd.read_parquet(path).to_dict("records")
+    records = read_parquet(path, "bounds", "publish it again").to_dict("records")
     return sorted(score(records), key=rank)
 
 

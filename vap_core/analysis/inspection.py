@@ -15,6 +15,7 @@ from vap_core.associate import PAIRINGS, Pairing, compare_views
 from vap_core.attend import Attender, Prompting
 from vap_core.base.errors import BadOutput, UnknownName
 from vap_core.base.figures import GENERIC, OTHER, WINNER, empty_figure
+from vap_core.base.parquet import read_parquet
 from vap_core.base.types import Grounding, Mask, PersonalObject
 from vap_core.evaluation.perception.episodes import OFF
 from vap_core.evaluation.perception.first_frames import VISIBLE_PX, View, object_under_box
@@ -237,7 +238,6 @@ def recovery(track: "pd.DataFrame", occlusion: Occlusion) -> "pd.DataFrame":
 
 def published(folder: Path, stack: str = "embedded") -> "dict[str, pd.DataFrame]":
     """The survey's tables that survey.run.publish keeps in `folder`. Raises: BadOutput."""
-    import pandas as pd
 
     prefix = "perception" if stack == "embedded" else f"perception_{stack}"
     paths = {}
@@ -251,7 +251,10 @@ def published(folder: Path, stack: str = "embedded") -> "dict[str, pd.DataFrame]
             f"inspection.published: {folder} lacks {', '.join(missing)}; "
             f"make them with eval-perception --publish {folder}."
         )
-    return {name: pd.read_parquet(path) for name, path in paths.items()}
+    tables = {}
+    for name, path in paths.items():
+        tables[name] = read_parquet(path, "inspection", "publish it again")
+    return tables
 
 
 def contradicted(agreements: "pd.DataFrame") -> EpisodeRow | None:

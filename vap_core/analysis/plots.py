@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vap_core.base.figures import OTHER, TIER_COLOURS, WINNER, empty_figure
-from vap_core.base.palette import SUITES
+from vap_core.base.palette import ELECTED, ELECTED_CASING, FRAME, SUITES
 from vap_core.base.types import Attended, Grounding, PersonalObject, Rgb, value
+from vap_core.base.vote_picture import vote_picture
 from vap_core.evaluation.metrics import Rate, Score
 from vap_core.simulation.types import EpisodeRow
 
@@ -29,6 +30,8 @@ LINE_COLOURS = ("#232f7e", "#b06ab3", "#157a6b", "#9fd0e0")
 """The curves of what is no suite."""
 MEASURE_COLOURS = ("#232f7e", "#b06ab3", "#c9ccd1", "#157a6b")
 """The bars of a group, in their order; told apart in grey, too."""
+VOTE_CELL_PX = 110
+"""Side of a cell of the vote's picture in a figure."""
 ROLES = {"other objects": "#c9ccd1", "look-alike": OTHER, "target": WINNER, "goal": "#59a14f"}
 """The colours of the objects in `layouts_figure`, by role."""
 
@@ -36,89 +39,48 @@ ROLES = {"other objects": "#c9ccd1", "look-alike": OTHER, "target": WINNER, "goa
 def grounding_figure(
     rgb: Rgb, attended: Attended, objects: Sequence[PersonalObject], camera: str
 ) -> "Figure":
-    """One row per target: the candidates, the policy's image, the references, the similarities."""
-    figure = empty_figure(13.0, 3.9 * len(objects))
+    """One row per target: the candidates, the policy's image, and the picture of the vote."""
+    votes = []
+    for grounding, obj in zip(attended.groundings[camera], objects, strict=True):
+        votes.append(vote_picture(grounding, rgb, obj.crops, cell_px=VOTE_CELL_PX, dark=False))
+    aspects = [vote.shape[1] / vote.shape[0] for vote in votes]
+    figure = empty_figure(7.8 + 3.9 * max(aspects), 3.9 * len(objects))
     rows = figure.subfigures(len(objects), 1, squeeze=False)[:, 0]
-    for row, grounding, obj in zip(rows, attended.groundings[camera], objects, strict=True):
-        left, middle, refs, right = row.subplots(1, 4, width_ratios=[3, 3, 1.5, 2.6])
+    for row, grounding, vote in zip(rows, attended.groundings[camera], votes, strict=True):
+        left, middle, right = row.subplots(1, 3, width_ratios=[1, 1, max(aspects)])
         candidates(left, rgb, grounding)
-        left.set_title(f'candidates for "{obj.category}"', pad=14)
+        left.set_title(f'candidates for "{grounding.candidates.phrase}"', pad=14)
         middle.imshow(attended.images[camera])
         middle.set_title(f'shown to the policy\n"{attended.text}"')
-        refs.imshow(_strip(obj.crops))
-        refs.set_title(f"{obj.name}\n{len(obj.crops)} references")
-        for axes in (left, middle, refs):
+        right.imshow(vote)
+        for axes in (left, middle, right):
             axes.set_axis_off()
-        similarity_matrix(right, grounding)
     return figure
 
 
 def candidates(axes: "Axes", rgb: Rgb, grounding: Grounding) -> None:
-    """Draw every candidate box over the picture, the winner in orange."""
+    """Draw every candidate box over the picture, the elected one in white."""
     from matplotlib.patches import Rectangle
+    from matplotlib.patheffects import withStroke
 
     axes.imshow(rgb)
     for i, (x0, y0, x1, y1) in enumerate(grounding.candidates.xyxy):
-        colour = OTHER
-        line_width = 1.5
+        colour = FRAME
+        box = Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=colour, linewidth=1.5)
         if i == grounding.winner:
-            colour = WINNER
-            line_width = 2.5
-        box = Rectangle(
-            (x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=colour, linewidth=line_width
-        )
+            colour = ELECTED
+            box.set(edgecolor=colour, linewidth=2.5)
+            box.set_path_effects([withStroke(linewidth=5, foreground=ELECTED_CASING)])
         axes.add_patch(box)
         axes.text(
             x0,
             max(y0 - 2, 0),
             f"#{i}",
-            color="white",
+            color="black",
             fontsize=8,
             va="bottom",
             bbox={"facecolor": colour, "edgecolor": "none", "pad": 1.5},
         )
-
-
-def similarity_matrix(axes: "Axes", grounding: Grounding) -> None:
-    """Cosines, candidates x references; a dot marks each reference's vote."""
-    n, k = grounding.similarity.shape
-    if n == 0:
-        axes.text(
-            0.5,
-            0.5,
-            f"no {grounding.candidates.phrase} found",
-            ha="center",
-            va="center",
-            transform=axes.transAxes,
-        )
-        axes.set_axis_off()
-        return
-    axes.imshow(
-        grounding.similarity,
-        cmap="Greys",
-        vmin=float(grounding.similarity.min()) - 0.05,
-        vmax=1.05,
-        aspect="auto",
-    )
-    middle = (float(grounding.similarity.min()) + 1.0) / 2
-    for i in range(n):
-        for j in range(k):
-            cosine = float(grounding.similarity[i, j])
-            axes.text(
-                j,
-                i,
-                f"{cosine:.2f}",
-                ha="center",
-                va="center",
-                fontsize=8,
-                color="white" if cosine > middle else "black",
-            )
-    best = grounding.similarity.argmax(axis=0)
-    axes.scatter(np.arange(k) + 0.33, best - 0.3, s=22, color=WINNER, zorder=3)
-    axes.set_xticks(range(k), [f"ref {j}" for j in range(k)], fontsize=8)
-    votes = [f"#{i}: {v} votes" for i, v in enumerate(grounding.ballot.votes)]
-    axes.set_yticks(range(n), votes, fontsize=8)
-    axes.set_title(f"cosine, dot = vote; margin {grounding.ballot.margin:.2f}")
 
 
 def film(images: Mapping[str, Sequence[Rgb]], titles: Sequence[str]) -> "Figure":
@@ -571,22 +533,3 @@ def _coarse_levels(bits: int) -> list[int]:
         level = round(v / 255 * top)
         levels.append(round(level * 255 / top))
     return levels
-
-
-def _strip(crops: Sequence[Rgb], side: int = 96) -> Rgb:
-    """Reference crops stacked in two columns, each fitted into a grey square."""
-    from PIL import Image
-
-    tiles = []
-    for crop in crops:
-        tile = Image.new("RGB", (side, side), (235, 235, 235))
-        small = Image.fromarray(crop)
-        small.thumbnail((side - 6, side - 6))
-        tile.paste(small, ((side - small.width) // 2, (side - small.height) // 2))
-        tiles.append(np.asarray(tile))
-    if len(tiles) % 2:
-        tiles.append(np.full((side, side, 3), 255, np.uint8))
-    rows = []
-    for i in range(0, len(tiles), 2):
-        rows.append(np.concatenate(tiles[i : i + 2], axis=1))
-    return np.concatenate(rows)

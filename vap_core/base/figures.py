@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vap_core.base.files import replacing
 from vap_core.base.palette import FRAME, LOOKALIKES, METHODS, TARGET, TIERS
 
 if TYPE_CHECKING:
@@ -24,5 +25,6 @@ def empty_figure(width: float, height: float) -> "Figure":
 
 
 def write_png(figure: "Figure", path: Path, dpi: int = 110) -> None:
-    """Save a figure; the file depends on nothing but the figure."""
-    figure.savefig(path, dpi=dpi, metadata={"Software": None})
+    """Save a figure; the file is whole or absent, and depends on nothing but the figure."""
+    with replacing(path) as part:
+        figure.savefig(part, dpi=dpi, format="png", metadata={"Software": None})

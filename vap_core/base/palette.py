@@ -112,3 +112,8 @@ def rgb8(hex_colour: str) -> Rgb8:
     """The three numbers of "#rrggbb"."""
     digits = hex_colour.removeprefix("#")
     return int(digits[0:2], 16), int(digits[2:4], 16), int(digits[4:6], 16)
+
+
+def on_dark(hex_colour: str) -> str:
+    """A method's or suite's colour for a dark ground: half as far from white."""
+    return "#" + "".join(f"{(value + 255) // 2:02x}" for value in rgb8(hex_colour))

@@ -1,6 +1,7 @@
 """Video files: their frames as pictures, and pictures as an mp4."""
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from vap_core.base.errors import BadOutput, BadPhoto
-from vap_core.base.files import check_regular
+from vap_core.base.files import check_regular, replacing
 from vap_core.base.types import Rgb
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
@@ -71,6 +72,8 @@ def sharp_frames(path: Path, count: int) -> list[Rgb]:
 class Mp4:
     """Writes pictures of one size as an H.264 file, one by one.
 
+    The file takes its name when the block ends without an error.
+
     Raises: BadOutput, when the file cannot be written.
     """
 
@@ -80,13 +83,16 @@ class Mp4:
         self.path = path
         self._hz = Fraction(hz).limit_denominator(1000)
         self._stream: Any = None
+        self._files = ExitStack()
+        part = self._files.enter_context(replacing(path))
         try:
-            self._container: Any = av.open(str(path), "w", format="mp4")
+            self._container: Any = av.open(str(part), "w", format="mp4")
         except (av.FFmpegError, OSError) as error:
             raise BadOutput(
                 f"video: {path} cannot be written ({error!s:.120}); choose another folder with "
                 "--out."
             ) from error
+        self._files.callback(self._finish)
 
     def __enter__(self) -> "Mp4":
         return self
@@ -97,6 +103,9 @@ class Mp4:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        self._files.__exit__(kind, error, trace)
+
+    def _finish(self) -> None:
         if self._stream is not None:
             self._container.mux(self._stream.encode(None))
         self._container.close()

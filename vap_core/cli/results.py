@@ -1,5 +1,6 @@
 """Commands that read results: diagnose, embeddings, query, rescore, report, publish, readings."""
 
+import threading
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
@@ -50,6 +51,10 @@ def diagnose(
         Path | None,
         typer.Option(help="With --open: save a picture of it instead, without a display."),
     ] = None,
+    mp4: Annotated[
+        Path | None,
+        typer.Option(help="With --open: write it as a film of what the policy saw instead."),
+    ] = None,
     against: Annotated[
         str | None,
         typer.Option(
@@ -97,7 +102,7 @@ def diagnose(
         layer = correct_failure(failures, number, correct, note)
         print(f"wrote {layer}")
         return
-    if show is None and png is None:
+    if show is None and png is None and mp4 is None:
         print(failures_text(failures, limit))
         return
     if against:
@@ -106,7 +111,7 @@ def diagnose(
         path = recording_of(failures, number)
     frame = deciding_frame(failures, number)
     print(f"{path}, frame {frame}: {failures.table['case_sentence'].iloc[number]}")
-    _show_frame(path, frame, png)
+    _show_frame(path, frame, png, mp4)
 
 
 @app.command()
@@ -162,12 +167,12 @@ def embeddings(
 def query(
     run: Annotated[Path, typer.Argument(help="Run folder with recordings.")],
     where: Annotated[
-        str,
+        str | None,
         typer.Argument(
             help="SQL condition on steps: margin, track_score, gap_cm, lift_cm, frame_index, "
-            "method, outcome, case, steps, ..."
+            "method, outcome, case, steps, ...; with --serve on recordings."
         ),
-    ],
+    ] = None,
     limit: Annotated[int, typer.Option(min=1, help="Recordings to list.")] = 20,
     show: Annotated[
         int | None,
@@ -181,16 +186,35 @@ def query(
         Path | None,
         typer.Option(help="With --open: save a picture of it instead, without a display."),
     ] = None,
+    serve: Annotated[
+        bool,
+        typer.Option(
+            "--serve",
+            help="Browse the recordings: a table to filter in Rerun's viewer, with a link to the "
+            "deciding frame of each; served on 127.0.0.1 until Ctrl-C.",
+        ),
+    ] = False,
+    port: Annotated[
+        int | None, typer.Option(help="With --serve: the port. Default a free one.")
+    ] = None,
 ) -> None:
     """Ask all recordings of a run at once: in which of them, and at which steps, does a
-    condition hold?
+    condition hold? Or browse them.
 
     Example: python -m vap_core query data/runs/demo "margin < 0.05 and success = false"
     Example: python -m vap_core query data/runs/demo
         "gap_cm < 1 and lift_cm < 1 and frame_index > 20" --open 0 --png near.png
+    Example: python -m vap_core query data/runs/demo --serve
+    Example: python -m vap_core query data/runs/demo "outcome = 'failure'" --serve
     """
+    from vap_core.base.errors import BadStudy
     from vap_core.recording.query import first_match, format_result, run_query
 
+    if serve:
+        _serve(run, where, port)
+        return
+    if where is None:
+        raise BadStudy('query: name a condition, such as "margin < 0.05", or add --serve.')
     result = run_query(run, where)
     if show is None and png is None:
         print(format_result(result, limit))
@@ -207,12 +231,18 @@ def view(
     png: Annotated[
         Path | None, typer.Option(help="Save a picture of that step instead, without a display.")
     ] = None,
+    mp4: Annotated[
+        Path | None,
+        typer.Option(help="Write a film of what the policy saw, with the verdict, instead."),
+    ] = None,
 ) -> None:
-    """Open a recording in Rerun's viewer, with its analytics and its look for updates turned off.
+    """Open a recording in Rerun's viewer, with its analytics and its look for updates turned off;
+    or make a picture or a film of it.
 
     Example: python -m vap_core view data/runs/demo/recordings/*franka*000*vap.rrd
+    Example: python -m vap_core view data/runs/demo/recordings/*franka*000*vap.rrd --mp4 talk.mp4
     """
-    _show_frame(recording, frame, png)
+    _show_frame(recording, frame, png, mp4)
 
 
 @app.command()
@@ -254,7 +284,7 @@ def report(
 
     folder = out or _report_folder(runs[0])
     print(conclude(runs, folder))
-    print(f"\nwrote {folder}: report.md, tables as CSV and LaTeX, pictures")
+    print(f"\nwrote {folder}: report.md, report.html, tables as CSV and LaTeX, pictures")
 
 
 @app.command()
@@ -301,11 +331,35 @@ def _report_folder(first_run: Path) -> Path:
     return first_run / "report"
 
 
-def _show_frame(recording: Path, frame: int, png: Path | None) -> None:
-    """Open a recording in the viewer at one step, or picture it."""
-    from vap_core.recording import open_viewer, screenshot
+def _serve(run: Path, where: str | None, port: int | None) -> None:
+    """Serve a run's recordings until Ctrl-C, and open the viewer where there is a display."""
+    from vap_core.recording.browser import serve_run
+    from vap_core.recording.viewer import has_display, open_address
 
-    if png is None:
+    with serve_run(run, where, port) as browser:
+        n_failures = sum(row["outcome"] == "failure" for row in browser.rows)
+        print(f"{len(browser.rows)} recordings, {n_failures} of failures, at {browser.url}")
+        for path, reason in browser.unreadable.items():
+            print(f"note: {path} was left out: {reason}")
+        if has_display():
+            open_address(browser.url)
+        else:
+            print(f"open it with: python -m rerun {browser.url}")
+        print("Ctrl-C ends it.", flush=True)
+        try:
+            threading.Event().wait()
+        except KeyboardInterrupt:
+            print()
+
+
+def _show_frame(recording: Path, frame: int, png: Path | None, mp4: Path | None = None) -> None:
+    """Open a recording in the viewer at one step, or make a picture or a film of it."""
+    from vap_core.recording import open_viewer, screenshot, write_film
+
+    if mp4 is not None:
+        n_pictures = write_film(recording, mp4)
+        print(f"wrote {mp4}: {n_pictures} pictures")
+    elif png is None:
         open_viewer(recording, frame_index=frame)
     else:
         screenshot(recording, png, frame_index=frame, size=(1920, 1080))

@@ -2,20 +2,21 @@
 
 Only what is missing runs. Killed at any time, by Ctrl-C, a full disk or a lost machine, the same
 call goes on where it stopped. An episode that ends in an error is tried again, and recorded then;
-both attempts are kept. The jobs of a worker that died run again, unless workers die again and again
-and no job finishes in between.
+both attempts are kept. The jobs of a worker that died run again. Where workers die again and again
+and no job finishes in between, episodes run one by one, and one whose worker dies then is an error.
 """
 
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vap_core.base.errors import WorkerDied
 from vap_core.evaluation import readings, store
-from vap_core.evaluation.jobs import BATCH, Job, Record, Rows, run_job
+from vap_core.evaluation.jobs import BATCH, Job, Record, Rows, row_of_dead_worker, run_job
 from vap_core.evaluation.processes import prepare, results
 from vap_core.evaluation.study import Study, register_personal, worker_modules
 from vap_core.simulation.types import AS_LISTED, EpisodeRow
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 Executor = Callable[[Callable[[Job], Rows], Sequence[Job], int, str], Iterator[tuple[Job, Rows]]]
 """How jobs reach processes: `processes.results`, or `cluster.ray_executor`'s."""
+LONE_DEATHS = 3
+"""So many episodes in a row that end their worker mean that the machine is at fault, not they."""
 KeyedRow = tuple[EpisodeRow, str]
 """A row of an episode list, and the key of its result."""
 
@@ -49,7 +52,7 @@ def run(
     A run that begins is entered in the log of readings (`readings.LOCAL`), with `what_for`.
 
     Raises: BadOutput when the folder holds another run, is in use or cannot be written; WorkerDied
-        when workers died more often than `retries` in a row.
+        when LONE_DEATHS workers died in a row, each with one episode.
     """
     from tqdm import tqdm
 
@@ -85,23 +88,65 @@ def run(
             deaths = 0
             jobs = missing()
             while jobs:
+                if deaths > retries:
+                    finished = run_alone(jobs, executor, retries, bool(len(store.read(folder))))
+                else:
+                    finished = executor(run_job, jobs, workers, "--workers")
                 try:
-                    for job, rows in executor(run_job, jobs, workers, "--workers"):
+                    for job, rows in finished:
                         store.append(folder, rows)
                         deaths = 0
                         _show_progress(bar, counts, job, rows)
                 except WorkerDied:
                     deaths += 1
-                    if deaths > retries:
+                    if deaths > retries + 1:
                         raise
+                    how = "again" if deaths <= retries else "one episode at a time"
                     bar.write(
-                        "note: a worker process died; what it was doing runs again "
-                        f"({deaths} of {retries} retries).",
+                        f"note: a worker process died; what it was doing runs {how} "
+                        f"({deaths} of {retries + 1} deaths).",
                         file=sys.stderr,
                     )
                 jobs = missing()
         store.compact(folder)
     return store.read(folder)
+
+
+def run_alone(
+    jobs: Sequence[Job], executor: Executor, retries: int, others_finished: bool
+) -> Iterator[tuple[Job, Rows]]:
+    """Each episode in a worker of its own, until one that ends its worker is found.
+
+    Such an episode is an error, and is not tried again, where another one finishes: after it, or
+    before (`others_finished`).
+
+    Raises: WorkerDied.
+    """
+    dead: list[tuple[Job, Rows]] = []
+    for job in chain.from_iterable(map(_split, jobs)):
+        try:
+            found = list(executor(run_job, [job], 1, "--workers"))
+        except WorkerDied as error:
+            last = replace(job, attempt=max(job.attempt, retries + 1))
+            dead.append((last, [row_of_dead_worker(last, str(error))]))
+            if len(dead) == LONE_DEATHS:
+                raise
+            continue
+        yield from found
+        if dead:
+            yield from dead
+            return
+    if dead and not others_finished:
+        raise WorkerDied(dead[-1][1][0]["detail"])
+    yield from dead
+
+
+def _split(job: Job) -> list[Job]:
+    """A job of each of its episodes."""
+    singles = []
+    for row, key in zip(job.rows, job.keys, strict=True):
+        singles.append(replace(job, rows=(row,), keys=(key,)))
+    return singles
 
 
 def _open_run(study: Study, folder: Path, what_for: str) -> None:
@@ -157,6 +202,9 @@ def result_key(row: EpisodeRow, method: str, run_digest: str) -> str:
     about = asdict(row)
     if about["start"] == asdict(AS_LISTED):  # keys are those of versions without starts
         del about["start"]
+    for name in ("speaker", "owned", "subgoals", "inside"):  # and without shared scenes
+        if not about[name]:
+            del about[name]
     return store.digest({"row": about, "method": method, "run": run_digest})
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vap_core.base.errors import BadOutput
+from vap_core.base.parquet import read_parquet
 from vap_core.evaluation.store import KEY, write_part
 from vap_core.policies.hooks import TEXT
 from vap_core.rollout.types import Episode
@@ -34,7 +35,9 @@ def read(folder: Path) -> "pd.DataFrame":
         raise BadOutput(
             f"audit: {folder} was not audited; run it with --audit into another folder."
         )
-    whole = pd.concat([pd.read_parquet(part) for part in parts], ignore_index=True)
+    remedy = "delete it; its calls are not shown"
+    tables = [read_parquet(part, "audit", remedy) for part in parts]
+    whole = pd.concat(tables, ignore_index=True)
     # A killed run may hold calls that the resumed run made again.
     return whole.drop_duplicates([*KEY, "step", "name"], ignore_index=True)
 

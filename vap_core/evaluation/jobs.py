@@ -11,7 +11,8 @@ from vap_core.base.errors import BadOutput, BadRecording, BadStudy
 from vap_core.evaluation import diagnosis, hiding, input_audit, state_log, switching
 from vap_core.evaluation.study import Study, make_trial
 from vap_core.policies.weight_guard import unchanged_weights
-from vap_core.rollout.types import EpisodeHeader
+from vap_core.rollout.types import Episode, EpisodeHeader
+from vap_core.simulation import suites
 from vap_core.simulation.types import EpisodeRow, Outcome
 
 if TYPE_CHECKING:
@@ -95,6 +96,36 @@ def run_job(job: Job) -> Rows:
         hidden = hiding.columns(episode, trial.occlusion)
         rows.append({"key": key, **columns, **episode.summary(), **found, **hidden})
     return rows
+
+
+def row_of_dead_worker(job: Job, why: str) -> dict[str, Any]:
+    """The row of a job's only episode, whose worker died: an error before its first step."""
+    (row,), (key,) = job.rows, job.keys
+    header = EpisodeHeader(
+        row=row,
+        method=job.method,
+        policy=job.study.policy,
+        hz=suites.suite(row.suite).hz,
+        cameras=(),
+        instruction=row.instruction,
+        rewritten=row.instruction,
+        groundings={},
+        object_sizes_m={},
+    )
+    outcome = Outcome(
+        status="error",
+        success=False,
+        success_once=False,
+        held_steps=0,
+        cmr=None if row.rule == "selected" else False,
+        wrong_object=False,
+        first_object_correct=False,
+        steps=0,
+        detail=why,
+    )
+    episode = Episode(header=header, frames=(), outcome=outcome, seconds={})
+    columns = {"key": key, "attempt": job.attempt, "policy_sha256": None, "peak_mb": 0}
+    return {**columns, **episode.summary(), **diagnosis.columns(episode)}
 
 
 def _records(job: Job) -> bool:

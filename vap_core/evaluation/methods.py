@@ -1,5 +1,6 @@
 """The methods that the paper compares, by name, and the prompter of each (P 5.2)."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from vap_core.associate import PAIRINGS
@@ -147,8 +148,9 @@ def make_prompter(
 
 
 def _alike(scene: Scene, row: EpisodeRow) -> frozenset[str]:
-    """The scene's objects of the target's category."""
-    return frozenset(name for name in scene.objects if get_object(name).category == row.category)
+    """The scene's objects of the target's category, or of every sub-goal's."""
+    categories = {row.category, *(subgoal.category for subgoal in row.subgoals)}
+    return frozenset(name for name in scene.objects if get_object(name).category in categories)
 
 
 def _next_command(row: EpisodeRow) -> str:
@@ -163,8 +165,21 @@ def _next_command(row: EpisodeRow) -> str:
 
 
 def _attender(how: Prompting, row: EpisodeRow, bank: Path, stack: Stack | None) -> Attender:
+    """The method with the row's target in memory; in a shared scene with every owned object."""
     assert stack is not None, "a method that prompts needs a stack"
-    target = load_bank(bank, stack.encoder.name)[row.target]
+    known = load_bank(bank, stack.encoder.name)
     # Other methods of the run may have wanted more photos.
-    target = target.first(how.references or FEWEST_REFERENCES)
-    return Attender(stack, {row.target: target}, how)
+    n_references = how.references or FEWEST_REFERENCES
+    if not row.owned:
+        return Attender(stack, {row.target: known[row.target].first(n_references)}, how)
+    memory = {}
+    for owned in row.owned:
+        obj = known[owned.model].first(n_references)
+        memory[owned.model] = replace(obj, owner=owned.owner, known_as=owned.known_as)
+    return Attender(stack, memory, how, speaker=row.speaker)
+
+
+def suits_shared(method: str) -> bool:
+    """Whether a method can be used where several objects are remembered: text for one cannot."""
+    how = find(method)
+    return how is None or isinstance(how, Prompting)

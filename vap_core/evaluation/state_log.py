@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from vap_core.base.errors import BadOutput
-from vap_core.base.files import check_regular
+from vap_core.base.parquet import read_parquet
 from vap_core.evaluation.store import KEY, key_of, write_part
 from vap_core.rollout.types import Episode
 from vap_core.simulation.types import Truth
@@ -16,13 +15,13 @@ from vap_core.simulation.types import Truth
 def write(folder: Path, episodes: Sequence[Episode]) -> None:
     """Add the states of some finished episodes to a run, as one part.
 
-    Episodes in error are left out: they are not judged again.
+    Episodes in error, and those of several sub-goals, are left out: they are not judged again.
 
     Raises: BadOutput when the disk is full.
     """
     rows = []
     for episode in episodes:
-        if episode.frames and episode.outcome.status != "error":
+        if episode.frames and not episode.subgoals and episode.outcome.status != "error":
             rows.append(_to_row(episode))
     if rows:
         write_part(folder, "traces", rows, caller="traces")
@@ -35,17 +34,9 @@ def read(folder: Path) -> Iterator[tuple[tuple[Any, ...], list[Truth]]]:
 
     Raises: BadOutput for a part that is damaged.
     """
-    import pandas as pd
-
     keys: set[tuple[Any, ...]] = set()
     for part in sorted((folder / "traces").glob("*.parquet")):
-        try:
-            check_regular(part)
-            table = pd.read_parquet(part)
-        except (OSError, ValueError) as error:
-            raise BadOutput(
-                f"traces: {part} is damaged; delete it, its episodes cannot be judged again."
-            ) from error
+        table = read_parquet(part, "traces", "delete it, its episodes cannot be judged again")
         for row in table.to_dict("records"):
             key = key_of(row)
             if key not in keys:

@@ -17,7 +17,20 @@ from vap_core.evaluation.study import Study
 
 KEY = "vap_core"
 """The name of the text chunk in the PNG."""
-NOT_DRAWN = {"catalog", "corrections", "deferred", "index", "legacy_names", "query", "reading"}
+NOT_DRAWN = {
+    "browser",
+    "catalog",
+    "clicks",
+    "corrections",
+    "dataset",
+    "deferred",
+    "film",
+    "index",
+    "legacy_names",
+    "query",
+    "reading",
+    "stored_pictures",
+}
 """The modules of `vap_core.recording` that do not decide what a recording shows."""
 
 
@@ -83,10 +96,14 @@ def stale(png: Path) -> str:
 
 @cache
 def recorder_digest() -> str:
-    """A digest of the code that decides what a recording shows.
+    """A digest of the code that decides what a recording shows, its colours and vote included.
 
     Comments, docstrings and line breaks do not count.
     """
     from vap_core import recording
+    from vap_core.base import palette, vote_picture
 
-    return code_digest(Path(recording.__file__).parent, without=NOT_DRAWN)
+    digests = [code_digest(Path(str(recording.__file__)).parent, without=NOT_DRAWN)]
+    for module in (palette, vote_picture):
+        digests.append(code_digest(Path(str(module.__file__))))
+    return store.digest({"modules": digests})

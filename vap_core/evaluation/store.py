@@ -16,12 +16,12 @@ from uuid import uuid4
 
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import (
-    check_regular,
     parse_json,
     read_file,
     remove_scratch,
     write_atomic,
 )
+from vap_core.base.parquet import read_arrow
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -245,14 +245,6 @@ def _read_parts(folder: Path) -> "list[pa.Table]":
 
 
 def _read_part(path: Path) -> "pa.Table":
-    from pyarrow import ArrowException
-    from pyarrow.parquet import read_table
-
-    try:
-        check_regular(path)
-        return read_table(path)
-    except (ArrowException, OSError, ValueError) as error:
-        raise BadOutput(
-            f"read: {path} is damaged; delete it and run the same command again, its episodes run "
-            "anew."
-        ) from error
+    return read_arrow(
+        path, "read", "delete it and run the same command again, its episodes run anew"
+    )

@@ -25,6 +25,7 @@ from vap_core.evaluation.methods import (
     needs_stack,
     needs_token,
     references_needed,
+    suits_shared,
     token_space,
 )
 from vap_core.evaluation.policy_names import (
@@ -160,14 +161,13 @@ def register_personal(study: Study, bank: Path, captioner: Captioner | None = No
         return
     stack = load_stack(study.stack)
     known = load_bank(bank)
-    for suite, task in study.tasks:
+    for suite, task, target in _remembered(study):
         rows = study.rows(suite, task)
-        target = rows[0].target
-        category = rows[0].category
         obj = known.get(target)
         if obj is None:
-            views = reference_views(get_object(target), max(map(references_needed, study.methods)))
-            obj, _ = register(target, category, views, stack.detector, stack.encoder)
+            model = get_object(target)
+            views = reference_views(model, max(map(references_needed, study.methods)))
+            obj, _ = register(target, model.category, views, stack.detector, stack.encoder)
         if _any_method(study, needs_description) and obj.description is None:
             obj = with_description(obj, captioner or AttributeCaptioner(stack.segmenter))
         spaces = {token_space(method) for method in study.methods}
@@ -179,6 +179,16 @@ def register_personal(study: Study, bank: Path, captioner: Captioner | None = No
         if obj is not known.get(target):
             save(bank, obj, replace=True)
             known[target] = obj
+
+
+def _remembered(study: Study) -> list[tuple[str, str, str]]:
+    """Suite, task and object of all that a study remembers; in shared scenes what is owned."""
+    found = []
+    for suite, task in study.tasks:
+        row = study.rows(suite, task)[0]
+        models = [owned.model for owned in row.owned] or [row.target]
+        found += [(suite, task, model) for model in models]
+    return found
 
 
 def worker_modules(study: Study) -> tuple[str, ...]:
@@ -238,6 +248,12 @@ def _check_names(study: Study) -> None:
     check_stack(study.stack, "Study")
     for suite, task in study.tasks:
         study.rows(suite, task)
+        for method in study.methods:
+            if suite in suites.SHARED and not suits_shared(method):
+                raise BadStudy(
+                    f"Study: {method} knows one object, and {suite} has several; take generic, or "
+                    "vap and its variants."
+                )
 
 
 def _check_policy(study: Study) -> None:

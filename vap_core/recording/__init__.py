@@ -8,8 +8,11 @@ import os
 # Read when rerun is imported: its catalog warns about every name with a dot in it.
 os.environ.setdefault("RUST_LOG", "error")
 
+from vap_core.recording.browser import serve_run as serve_run
 from vap_core.recording.catalog import StepTable as StepTable
 from vap_core.recording.catalog import load_steps as load_steps
+from vap_core.recording.clicks import Votes as Votes
+from vap_core.recording.clicks import inspect_votes as inspect_votes
 from vap_core.recording.corrections import Correction as Correction
 from vap_core.recording.corrections import read_corrections as read_corrections
 from vap_core.recording.corrections import write_correction as write_correction
@@ -19,6 +22,7 @@ from vap_core.recording.deferred import is_failure_or_sampled as is_failure_or_s
 from vap_core.recording.file import recording_file_name as recording_file_name
 from vap_core.recording.file import recording_name as recording_name
 from vap_core.recording.file import recover as recover
+from vap_core.recording.film import write_film as write_film
 from vap_core.recording.grounding import ClipRecorder as ClipRecorder
 from vap_core.recording.grounding import ClipStep as ClipStep
 from vap_core.recording.grounding import record_grounding as record_grounding

@@ -12,71 +12,62 @@ from vap_core.recording.stream import StoredBlueprint
 from vap_core.recording.views import (
     Part,
     attention_view,
-    cosine_view,
     coverage_view,
-    crops_view,
     events_view,
     gripper_view,
     instruction_view,
     mask_view,
     method_curve_views,
     policy_view,
-    references_view,
     robot_curve_views,
     scene_view,
-    status_view,
     track_view,
+    verdict_view,
+    vote_picture_view,
     vote_view,
-    votes_view,
 )
 from vap_core.rollout.failure import Diagnosis
 from vap_core.rollout.types import EpisodeHeader
 
-EVIDENCE_SHARES = [0.72, 0.28]
+VERDICT_SHARES = [0.11, 0.89]
+"""Height of the verdict, and of everything below it."""
+EVIDENCE_SHARES = [0.71, 0.29]
 """Height of the evidence, and of the time course below it."""
+
+type Limits = tuple[float, float]
 
 
 def episode_blueprint(
-    header: EpisodeHeader, diagnosis: Diagnosis | None = None, *, queries: Sequence[str] = ()
+    header: EpisodeHeader,
+    diagnosis: Diagnosis | None = None,
+    *,
+    queries: Sequence[str] = (),
+    gripper_cm: Limits | None = None,
 ) -> StoredBlueprint:
-    """Everything; before it the evidence of a diagnosed failure; last the policy's attention.
+    """The verdict; below it everything, before it the evidence of a diagnosed failure, last the
+    policy's attention.
 
-    `queries` are those whose attention is recorded; each has a tab of its own.
+    `queries` are those whose attention is recorded; each has a tab of its own. `gripper_cm` is the
+    axis of the gripper's chart.
     """
-    tabs: list[Part] = [_overview(header)]
+    tabs: list[Part] = [_overview(header, gripper_cm)]
     if queries:
-        tabs.append(_attention_tab(header, queries))
+        tabs.append(_attention_tab(header, queries, gripper_cm))
     if diagnosis is not None and header.cameras:
-        tabs.insert(0, _evidence_tab(header, diagnosis))
-    if len(tabs) == 1:
-        return full_window(tabs[0], header.hz)
-    return full_window(rrb.Tabs(*tabs, active_tab=0), header.hz)
+        tabs.insert(0, _evidence_tab(header, diagnosis, gripper_cm))
+    body = tabs[0]
+    if len(tabs) > 1:
+        body = rrb.Tabs(*tabs, active_tab=0)
+    window = rrb.Vertical(verdict_view(), body, row_shares=VERDICT_SHARES)
+    return full_window(window, header.hz)
 
 
 def grounding_blueprint(grounding: Grounding, fps: float = 1.0) -> StoredBlueprint:
     """One picture, or the frames of a clip, and why that box won."""
     camera = grounding.camera
     pictures = rrb.Horizontal(vote_view(camera), mask_view(camera), policy_view(camera))
-    evidence = rrb.Horizontal(
-        instruction_view(),
-        references_view(),
-        votes_view(camera, [grounding]),
-        cosine_view(camera),
-        column_shares=[1, 1.2, 1, 1],
-    )
-    return full_window(rrb.Vertical(pictures, evidence, row_shares=[1.5, 1]), fps)
-
-
-def dataset_blueprint(cameras: Sequence[str], fps: float) -> StoredBlueprint:
-    """A recorded episode: per camera what a policy would see, the track and the vote."""
-    rows: list[Part] = []
-    for camera in cameras:
-        rows.append(rrb.Vertical(policy_view(camera), mask_view(camera), vote_view(camera)))
-    score, _ = method_curve_views()
-    below = rrb.Horizontal(
-        instruction_view(), score, references_view(), column_shares=[1.2, 1.4, 1]
-    )
-    return full_window(rrb.Vertical(rrb.Horizontal(*rows), below, row_shares=[2.6, 1]), fps)
+    evidence = rrb.Horizontal(instruction_view(), vote_picture_view(camera), column_shares=[1, 2])
+    return full_window(rrb.Vertical(pictures, evidence, row_shares=[1.2, 1]), fps)
 
 
 def full_window(root: Part, fps: float = 1.0) -> StoredBlueprint:
@@ -92,23 +83,25 @@ def full_window(root: Part, fps: float = 1.0) -> StoredBlueprint:
     )
 
 
-def _overview(header: EpisodeHeader) -> rrb.Container:
+def _overview(header: EpisodeHeader, gripper_cm: Limits | None) -> rrb.Container:
     """Pictures, scene and votes above; text, curves and events below."""
     pictures, share = _camera_grid(header)
-    votes = []
-    for camera in header.cameras:
-        votes.append(votes_view(camera.name, header.groundings.get(camera.name, ())))
-    right = rrb.Vertical(scene_view(header), rrb.Horizontal(*votes), row_shares=[2.4, 1])
+    right: Part = scene_view(header)
+    votes = [vote_picture_view(camera) for camera in _voting(header)]
+    if votes:
+        right = rrb.Vertical(right, rrb.Tabs(*votes, active_tab=0), row_shares=[1, 1.1])
     top = rrb.Horizontal(pictures, right, column_shares=[share, 1 - share])
     return rrb.Vertical(
         top,
-        _time_course(header, with_gripper=True),
-        row_shares=[0.745, 0.255],
+        _time_course(header, gripper_cm),
+        row_shares=EVIDENCE_SHARES,
         name="everything",
     )
 
 
-def _attention_tab(header: EpisodeHeader, queries: Sequence[str]) -> rrb.Container:
+def _attention_tab(
+    header: EpisodeHeader, queries: Sequence[str], gripper_cm: Limits | None
+) -> rrb.Container:
     """Where the attention was, in every view; the query is switched by a tab."""
     per_query: list[Part] = []
     for query in queries:
@@ -116,13 +109,15 @@ def _attention_tab(header: EpisodeHeader, queries: Sequence[str]) -> rrb.Contain
         per_query.append(rrb.Horizontal(*views, name=query))
     return rrb.Vertical(
         rrb.Tabs(*per_query, active_tab=0),
-        _time_course(header, with_gripper=True),
+        _time_course(header, gripper_cm),
         row_shares=EVIDENCE_SHARES,
         name="attention",
     )
 
 
-def _evidence_tab(header: EpisodeHeader, diagnosis: Diagnosis) -> rrb.Container:
+def _evidence_tab(
+    header: EpisodeHeader, diagnosis: Diagnosis, gripper_cm: Limits | None
+) -> rrb.Container:
     """The evidence that decided the case of a failure."""
     camera = diagnosis.camera or header.cameras[0].name
     with_gripper = True
@@ -132,11 +127,11 @@ def _evidence_tab(header: EpisodeHeader, diagnosis: Diagnosis) -> rrb.Container:
         case "case 2":
             evidence = _views_evidence(header)
         case _:
-            evidence = _manipulation_evidence(header)
+            evidence = _manipulation_evidence(header, gripper_cm)
             with_gripper = False  # its curves are in the evidence
     return rrb.Vertical(
         evidence,
-        _time_course(header, with_gripper),
+        _time_course(header, gripper_cm, with_gripper=with_gripper),
         row_shares=EVIDENCE_SHARES,
         name=f"{diagnosis.case}: {diagnosis.sub_case}",
     )
@@ -147,18 +142,12 @@ def _vote_evidence(header: EpisodeHeader, camera: str, drifted: bool) -> Part:
     large, small = vote_view(camera), coverage_view(camera)
     if drifted:
         large, small = small, large
-    votes = votes_view(camera, header.groundings.get(camera, ()))
-    comparison = rrb.Vertical(
-        crops_view(camera),
-        rrb.Horizontal(cosine_view(camera), votes),
-        row_shares=[1.25, 1],
-    )
-    return rrb.Horizontal(
-        large,
-        rrb.Vertical(small, policy_view(camera)),
-        comparison,
-        column_shares=[1.3, 0.68, 1.2],
-    )
+    parts = [large, rrb.Vertical(small, policy_view(camera))]
+    shares = [1.25, 0.68]
+    if camera in _voting(header):
+        parts.append(vote_picture_view(camera))
+        shares.append(1.3)
+    return rrb.Horizontal(*parts, column_shares=shares)
 
 
 def _views_evidence(header: EpisodeHeader) -> Part:
@@ -170,23 +159,32 @@ def _views_evidence(header: EpisodeHeader) -> Part:
     return rrb.Horizontal(*columns)
 
 
-def _manipulation_evidence(header: EpisodeHeader) -> Part:
-    """Case 3: the scene, what the policy saw, and the gripper's distance from the target."""
-    views = [policy_view(camera.name) for camera in header.cameras]
-    share = 0.55
-    if len(views) == 1:
-        views.append(coverage_view(header.cameras[0].name))
-        share = 0.75
+def _manipulation_evidence(header: EpisodeHeader, gripper_cm: Limits | None) -> Part:
+    """Case 3: every view's prompt is right, the scene, and the gripper's distances.
+
+    A method that prompts nothing shows the target's outline instead.
+    """
+    rows = []
+    for camera in header.cameras:
+        shown = track_view(camera.name, "target outlined")
+        if _voting(header):
+            shown = coverage_view(camera.name)
+        rows.append(rrb.Horizontal(shown, policy_view(camera.name)))
+    pictures: Part = rrb.Vertical(*rows)
+    share = 0.95
+    if len(rows) == 1:
+        pictures = rrb.Vertical(shown, policy_view(header.cameras[0].name))
+        share = 0.7
     return rrb.Horizontal(
+        pictures,
         scene_view(header),
-        rrb.Vertical(*views),
-        gripper_view(),
-        column_shares=[1.45, share, 1],
+        gripper_view(gripper_cm),
+        column_shares=[share, 1.05, 1],
     )
 
 
 def _camera_grid(header: EpisodeHeader) -> tuple[Part, float]:
-    """Three pictures of every camera, and their share of the width.
+    """The pictures of every camera, and their share of the width.
 
     The pictures are squares in a box of about 10 : 7.
     """
@@ -196,30 +194,37 @@ def _camera_grid(header: EpisodeHeader) -> tuple[Part, float]:
         track_title, vote_title = "track, truth", "vote at t = 0"
         if n_cameras == 2:
             track_title, vote_title = "track", "vote"
+        pictures = [track_view(camera.name, track_title)]
         n_targets = len(header.groundings.get(camera.name, ()))
+        if n_targets:
+            pictures.append(vote_view(camera.name, vote_title, n_targets))
         policy = policy_view(camera.name)
-        track = track_view(camera.name, track_title)
-        vote = vote_view(camera.name, vote_title, n_targets)
         if n_cameras <= 2:
-            below = rrb.Horizontal(track, vote)
-            grid.append(rrb.Vertical(policy, below, row_shares=[5, 3]))
+            grid.append(rrb.Vertical(policy, rrb.Horizontal(*pictures), row_shares=[5, 3]))
         else:
-            grid.append(rrb.Horizontal(policy, track, vote, column_shares=[1, 1, 1]))
+            grid.append(rrb.Horizontal(policy, *pictures))
     if n_cameras > 2:
         return rrb.Vertical(*grid), 0.44
     return rrb.Horizontal(*grid), 0.4 if n_cameras == 1 else 0.52
 
 
-def _time_course(header: EpisodeHeader, with_gripper: bool) -> Part:
-    """Instruction, curves, states and events."""
+def _time_course(
+    header: EpisodeHeader, gripper_cm: Limits | None, *, with_gripper: bool = True
+) -> Part:
+    """Instruction, curves and events."""
     curves = robot_curve_views(header)
     if with_gripper:
-        curves.insert(0, gripper_view())
-    return rrb.Horizontal(
-        instruction_view(),
-        rrb.Tabs(*curves, active_tab=0),
-        rrb.Tabs(*method_curve_views(), active_tab=0),
-        status_view(),
-        events_view(),
-        column_shares=[1.15, 1, 1, 0.95, 1.15],
-    )
+        curves.insert(0, gripper_view(gripper_cm))
+    parts = [instruction_view(), rrb.Tabs(*curves, active_tab=0)]
+    shares = [1.1, 1.1]
+    of_method = method_curve_views(header)
+    if of_method:
+        parts.append(rrb.Tabs(*of_method, active_tab=0))
+        shares.append(0.8)
+    parts.append(events_view())
+    return rrb.Horizontal(*parts, column_shares=[*shares, 1.35])
+
+
+def _voting(header: EpisodeHeader) -> list[str]:
+    """The cameras in whose views a vote was held."""
+    return [camera for camera, groundings in header.groundings.items() if groundings]

@@ -83,9 +83,9 @@ def load_steps(folder: Path) -> StepTable:
                 f"the first: {next(iter(unreadable.values()))}."
             )
         dataset = server.client().create_dataset("recordings")
-        _register(dataset, indexes, unreadable)
+        register_files(dataset, indexes, unreadable)
         layers = sorted((Path(folder).parent / CORRECTIONS).glob("*.rrd"))
-        _register(dataset, {path: path for path in layers}, unreadable, layer=CORRECTIONS)
+        register_files(dataset, {path: path for path in layers}, unreadable, layer=CORRECTIONS)
         recordings = {index.resolve(): file for file, index in indexes.items()}
         return StepTable(_join_steps(dataset, recordings), unreadable)
 
@@ -118,7 +118,7 @@ def _has_index(path: Path, folder: Path | None) -> bool:
         return False
 
 
-def _register(
+def register_files(
     dataset: "DatasetEntry",
     files: Mapping[Path, Path],
     unreadable: dict[Path, str],
@@ -140,7 +140,7 @@ def _register(
             return
         middle = len(paths) // 2
         for half in (paths[:middle], paths[middle:]):
-            _register(dataset, {path: files[path] for path in half}, unreadable, layer)
+            register_files(dataset, {path: files[path] for path in half}, unreadable, layer)
         return
     for path, result in zip(paths, results, strict=True):
         if result.error:

@@ -1,43 +1,39 @@
-"""The colours of a recording, and the styles of its curves and state lanes."""
+"""The palette as rerun wants it, and the styles of curves and state lanes."""
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import rerun as rr
 
-type Rgb8 = tuple[int, int, int]
-"""Red, green and blue, 0 to 255."""
+from vap_core.base import palette
+from vap_core.base.palette import Rgb8, rgb8
 
-TARGET = (255, 150, 40)
-"""The winner of the vote, the track and the target object: one orange everywhere."""
-OTHER = (126, 160, 205)
-"""Every other candidate and object."""
-TRUTH = (60, 230, 150)
-"""Simulator ground truth."""
-SERIES = [
-    (88, 166, 255),
-    (255, 150, 40),
-    (60, 210, 140),
-    (240, 100, 110),
-    (190, 140, 255),
-    (235, 205, 90),
-    (120, 215, 235),
-    (200, 200, 200),
-]
-"""Curves on a dark plot: no dark colour among them."""
+TARGET = rgb8(palette.TARGET)
+ELECTED = rgb8(palette.ELECTED)
+GOAL = rgb8(palette.GOAL)
+LOOKALIKES = tuple(rgb8(colour) for colour in palette.LOOKALIKES)
+CAMERAS = tuple(rgb8(colour) for colour in palette.CAMERAS)
+MUTED = rgb8(palette.FRAME)
+"""What has no part of its own: candidates that were not elected, the robot."""
 BACKGROUND = (24, 28, 36)
+SERIES = (*CAMERAS[:2], *LOOKALIKES)
+"""Curves of actions and states, which mean nothing by their colour."""
 
 
-def series_colour(i: int) -> Rgb8:
-    """The colour of the i-th curve; colours repeat."""
-    return SERIES[i % len(SERIES)]
+def camera_colour(i: int) -> Rgb8:
+    """The grey of the i-th camera; greys repeat."""
+    return CAMERAS[i % len(CAMERAS)]
+
+
+def object_colours(names: Sequence[str], target: str, goal: str) -> dict[str, Rgb8]:
+    """The colour of every object of a scene, by its part in the task."""
+    colours = palette.object_colours(names, target, goal)
+    return {name: rgb8(colour) for name, colour in colours.items()}
 
 
 def series_style(names: Sequence[str]) -> rr.SeriesLines:
     """Names, widths and visible colours for the curves of one entity."""
-    colours = []
-    for i in range(len(names)):
-        colours.append(series_colour(i))
+    colours = [SERIES[i % len(SERIES)] for i in range(len(names))]
     return rr.SeriesLines(names=list(names), colors=colours, widths=[1.5] * len(names))
 
 

@@ -5,16 +5,32 @@ from pathlib import Path
 from types import TracebackType
 
 import rerun as rr
+import rerun.blueprint as rrb
 
 from vap_core.base.types import Attended, PersonalObject, Views
-from vap_core.recording.blueprint import dataset_blueprint
-from vap_core.recording.entities.comparison import log_similarity
-from vap_core.recording.entities.images import contact_sheet, encode_jpeg, jpeg_image
+from vap_core.recording.blueprint import full_window
+from vap_core.recording.entities.comparison import log_vote_picture
+from vap_core.recording.entities.images import encode_jpeg
 from vap_core.recording.entities.masks import CLASSES
 from vap_core.recording.entities.votes import log_vote
 from vap_core.recording.grounding import JPEG_QUALITY, ClipStep, log_clip_step
-from vap_core.recording.stream import finish_stream, log_row, open_stream, time_columns
+from vap_core.recording.stream import (
+    StoredBlueprint,
+    finish_stream,
+    log_row,
+    open_stream,
+    time_columns,
+)
 from vap_core.recording.texts import grounding_document
+from vap_core.recording.views import (
+    Part,
+    instruction_view,
+    mask_view,
+    policy_view,
+    track_score_view,
+    vote_picture_view,
+    vote_view,
+)
 
 
 class DatasetRecorder:
@@ -61,12 +77,28 @@ class DatasetRecorder:
     def ground(self, views: Views, attended: Attended, obj: PersonalObject, told: str) -> None:
         """The votes of the first frame, and the references that voted."""
         at = time_columns([(0, 0.0)])
-        sheet = encode_jpeg(contact_sheet(obj.crops), JPEG_QUALITY)
-        log_row(self._rec, "/vap/references", jpeg_image(sheet), at=at)
         for i, (camera, rgb) in enumerate(views.items()):
             grounding = attended.groundings[camera][0]
             log_vote(self._rec, grounding, 0, encode_jpeg(rgb, JPEG_QUALITY), at)
-            log_similarity(self._rec, grounding, at)
+            log_vote_picture(
+                self._rec, grounding, 0, rgb=rgb, references=obj.crops, right=None, at=at
+            )
             if i == 0:
                 document = grounding_document(grounding, obj, told, attended.text)
                 log_row(self._rec, "/vap/instruction", document, at=at)
+
+
+def dataset_blueprint(cameras: Sequence[str], fps: float) -> StoredBlueprint:
+    """A recorded episode: per camera what a policy would see, the track and the vote."""
+    rows: list[Part] = []
+    votes: list[Part] = []
+    for camera in cameras:
+        rows.append(rrb.Vertical(policy_view(camera), mask_view(camera), vote_view(camera)))
+        votes.append(vote_picture_view(camera))
+    below = rrb.Horizontal(
+        instruction_view(),
+        track_score_view(),
+        rrb.Tabs(*votes, active_tab=0),
+        column_shares=[1.2, 1.2, 1.2],
+    )
+    return full_window(rrb.Vertical(rrb.Horizontal(*rows), below, row_shares=[2, 1]), fps)

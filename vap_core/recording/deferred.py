@@ -55,7 +55,8 @@ class DeferredRecorder:
         self._keep = keep
         self._video = video
         self._explain = explain
-        self._frames: list[Frame] = []
+        self._frames: list[Frame | EpisodeHeader] = []
+        """Frames, and the headers of further sub-goals between them."""
         self._buffer_mb = 0.0
         self._recorder: Recorder | None = None
 
@@ -68,6 +69,13 @@ class DeferredRecorder:
         self._buffer_mb += frame_megabytes(frame)
         if self._buffer_mb > MAX_BUFFER_MB:
             self._start_recorder()
+
+    def begin_subgoal(self, header: EpisodeHeader) -> None:
+        """Keep what is known of another sub-goal."""
+        if self._recorder is not None:
+            self._recorder.begin_subgoal(header)
+        else:
+            self._frames.append(header)
 
     def close(self, outcome: Outcome) -> None:
         """Write the recording, or discard it. Raises: BadOutput, when it cannot be written."""
@@ -87,8 +95,11 @@ class DeferredRecorder:
                 video=self._video,
                 explain=self._explain,
             )
-            for frame in self._frames:
-                self._recorder.frame(frame)
+            for kept in self._frames:
+                if isinstance(kept, Frame):
+                    self._recorder.frame(kept)
+                else:
+                    self._recorder.begin_subgoal(kept)
             self._frames = []
         return self._recorder
 

@@ -8,8 +8,8 @@ import rerun as rr
 
 from vap_core.base.types import Grounding, PersonalObject, Rgb, Track, value
 from vap_core.recording.blueprint import grounding_blueprint
-from vap_core.recording.entities.comparison import log_similarity
-from vap_core.recording.entities.images import contact_sheet, encode_jpeg, jpeg_image
+from vap_core.recording.entities.comparison import log_vote_picture
+from vap_core.recording.entities.images import encode_jpeg, jpeg_image
 from vap_core.recording.entities.masks import CLASSES, track_image
 from vap_core.recording.entities.paths import image_root
 from vap_core.recording.entities.votes import log_vote
@@ -95,9 +95,9 @@ class ClipRecorder:
         """The vote of one frame, its references and similarities, and how it is looked at."""
         at = time_columns([(frame_index, timestamp_s)])
         log_vote(self._rec, grounding, 0, encode_jpeg(image, JPEG_QUALITY), at)
-        sheet = encode_jpeg(contact_sheet(obj.crops), JPEG_QUALITY)
-        log_row(self._rec, "/vap/references", jpeg_image(sheet), at=at)
-        log_similarity(self._rec, grounding, at)
+        log_vote_picture(
+            self._rec, grounding, 0, rgb=image, references=obj.crops, right=None, at=at
+        )
         document = grounding_document(grounding, obj, instruction, rewritten)
         log_row(self._rec, "/vap/instruction", document, at=at)
         grounding_blueprint(grounding, self._hz).send(self._rec)

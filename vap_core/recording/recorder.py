@@ -7,17 +7,18 @@ Timelines are `frame_index` and `timestamp`. Entities have the names of LeRobot'
   truth, `/identity` the prompt in the colour of the object it covers, `/attention/<query>`
   overlays.
 - `/observation.state`, `/action`, `/next.reward`, `/next.success`.
-- `/vap/votes/<camera>`: `counts`, with `/winner` and `/others` as bars.
-- `/vap/{candidates,similarity,crops}/<camera>`: what the vote compared.
+- `/vap/{votes,candidates}/<camera>`: the vote in numbers, `/vap/vote_picture/<camera>` its picture.
 - `/vap/association`: what the views agreed on, where they were associated.
 - `/vap/{vote_margin,track_score,attention}/<camera>`, `/vap/hand/*`: curves and tensors.
-- `/vap/{instruction,events}`, `/vap/status/{outcome,grasp}`: text and states.
+- `/vap/{verdict,instruction,events}`, `/vap/status/{outcome,grasp}`: text and states; of an
+  instruction in several steps also `/vap/status/subgoal`.
 - `/world/{table,robot/link*,objects/*}`: simulator truth.
 
 Evidence of a further target j ends in `_j`. Recording properties are in module `properties`.
 Pictures are JPEG or AV1, at the steps that have them; everything that changes travels in columns.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Literal
@@ -28,7 +29,7 @@ from vap_core.base.errors import BadOutput
 from vap_core.base.types import Event
 from vap_core.recording.blueprint import episode_blueprint
 from vap_core.recording.entities.attention import send_attention
-from vap_core.recording.entities.comparison import log_crops, log_similarity
+from vap_core.recording.entities.comparison import log_vote_picture
 from vap_core.recording.entities.coverage import coverage_classes, send_coverage
 from vap_core.recording.entities.curves import (
     log_method_styles,
@@ -60,6 +61,7 @@ from vap_core.recording.entities.status import (
     send_events,
     send_grasp_changes,
     send_outcome,
+    send_subgoals,
 )
 from vap_core.recording.entities.votes import log_association, log_vote
 from vap_core.recording.file import temporary_path
@@ -72,12 +74,12 @@ from vap_core.recording.stream import (
     open_stream,
 )
 from vap_core.recording.texts import (
-    describe_diagnosis,
     describe_outcome,
     instruction_document,
+    verdict_document,
 )
 from vap_core.rollout.failure import Diagnosis, Explain, Explanation
-from vap_core.rollout.types import Episode, EpisodeHeader, Frame
+from vap_core.rollout.types import Episode, EpisodeHeader, Frame, SubGoalSpan
 from vap_core.simulation.types import Outcome
 
 OUTCOME_LEVELS: dict[str, Literal["INFO", "WARN", "ERROR"]] = {
@@ -111,6 +113,10 @@ class Recorder:
         row = header.row
         self.path = Path(path)
         self._header = header
+        self._goal = header
+        """What is known of the present sub-goal; of the episode, where it has one goal."""
+        self._spans: list[SubGoalSpan] = []
+        self._subgoal: int | None = None
         self._flush_every = flush_every
         self._explain = explain
         self._pictures: Pictures = VideoPictures(header.hz) if video else StillPictures()
@@ -119,6 +125,7 @@ class Recorder:
         self._unsent: list[Frame] = []
         self._grasp_state: str | None = None
         self._queries: tuple[str, ...] = ()
+        self._has_layout = False
         recording_id = f"{row.key}.s{row.seed}.{header.method}.{header.policy}"
         self._rec: rr.RecordingStream | None = open_stream(self.path, recording_id)
         self._log_header(self._rec)
@@ -142,11 +149,27 @@ class Recorder:
         """Record one control step."""
         if not self._frames:
             self._log_first_frame(frame)
+        elif self._spans and self._spans[-1].first == frame.frame_index:
+            for camera in frame.images:
+                self._log_votes(frame, camera)
         self._pictures.add(frame)
         self._frames.append(frame.without_images())
         self._unsent.append(frame)
         if len(self._unsent) >= self._flush_every:
+            if not self._has_layout:
+                # An episode that is killed opens with this one; `close` sends another.
+                episode_blueprint(self._header, queries=self._queries).send(self._open_stream())
+                self._has_layout = True
             self._flush()
+
+    def begin_subgoal(self, header: EpisodeHeader) -> None:
+        """From the next frame on record another sub-goal: its target, and how it was grounded."""
+        self._flush()
+        if not self._spans:
+            self._spans.append(SubGoalSpan(self._header_of_first(), 0))
+        first = self._frames[-1].frame_index + 1
+        self._spans.append(SubGoalSpan(header, first))
+        self._goal = header
 
     def close(self, outcome: Outcome) -> None:
         """Flush, write outcome, diagnosis and footer, and give the recording its name.
@@ -160,12 +183,10 @@ class Recorder:
         if self._frames:
             self._send_ending(outcome, explanation)
         diagnosis = explanation.diagnosis
-        document = instruction_document(
-            self._header,
-            describe_outcome(outcome),
-            "" if diagnosis is None else describe_diagnosis(diagnosis),
-        )
+        document = instruction_document(self._header, describe_outcome(outcome))
         log_row(rec, "/vap/instruction", document)
+        decided = self._deciding_header(outcome)
+        log_row(rec, "/vap/verdict", verdict_document(decided, outcome, diagnosis))
         log_properties(rec, "outcome", outcome_properties(outcome, diagnosis))
         self._rec = None
         finish_stream(rec, self.path)
@@ -209,7 +230,6 @@ class Recorder:
                 log_association(rec, association, j, frame_times([frame]))
         for of_queries in frame.attention.values():
             self._queries = tuple(of_queries)
-        episode_blueprint(self._header, queries=self._queries).send(rec)
 
     def _log_votes(self, frame: Frame, camera: str) -> None:
         """The votes of one view, over the first one's picture."""
@@ -217,16 +237,25 @@ class Recorder:
         at = frame_times([frame])
         rgb = frame.images[camera]
         jpeg = encode_jpeg(rgb, JPEG_QUALITY)
-        groundings = self._header.groundings.get(camera, ())
+        groundings = self._goal.groundings.get(camera, ())
         if not groundings:
             log_row(rec, f"{image_root(camera)}/candidates", jpeg_image(jpeg), at=at)
             return
-        first = groundings[0]
-        log_vote(rec, first, 0, jpeg, at)
-        log_similarity(rec, first, at)
-        log_crops(rec, first, rgb, self._header.references.get(first.object, ()), at)
+        right = _elected_target(frame, camera, self._goal.row.target)
+        log_vote(rec, groundings[0], 0, jpeg, at, right)
         for j, grounding in enumerate(groundings[1:], start=1):
             log_vote(rec, grounding, j, None, at)
+        for j, grounding in enumerate(groundings):
+            references = self._header.references.get(grounding.object, ())
+            log_vote_picture(
+                rec,
+                grounding,
+                j,
+                rgb=rgb,
+                references=references,
+                right=right if j == 0 else None,
+                at=at,
+            )
 
     def _flush(self) -> None:
         """Send the buffered frames as columns and write them to the file."""
@@ -239,11 +268,12 @@ class Recorder:
         self._send_views(frames)
         send_camera_poses(rec, index, frames)
         send_robot(rec, index, frames)
-        send_method(rec, self._header, index, frames)
+        send_method(rec, self._goal, index, frames)
         send_truth(rec, index, frames)
         self._grasp_state = send_grasp_changes(
-            rec, frames, self._header.row.target, self._grasp_state
+            rec, frames, self._goal.row.target, self._grasp_state
         )
+        self._subgoal = send_subgoals(rec, frames, self._header.row, self._subgoal)
         self._send_events([event for frame in frames for event in frame.events])
         rec.flush()
         self._unsent = []
@@ -254,7 +284,7 @@ class Recorder:
         pictured = [frame for frame in frames if frame.images]
         if pictured:
             index = frame_times(pictured)
-            send_masks(rec, self._header, index, pictured)
+            send_masks(rec, self._goal, index, pictured)
             if any(frame.coverage for frame in pictured):
                 send_coverage(rec, self._header, index, pictured)
         attended = [frame for frame in frames if frame.attention]
@@ -268,7 +298,23 @@ class Recorder:
     def _explain_episode(self, outcome: Outcome) -> Explanation:
         if self._explain is None:
             return Explanation(None, None)
-        return self._explain(Episode(self._header, tuple(self._frames), outcome, {}))
+        spans = tuple(self._spans)
+        if not spans and outcome.subgoals:
+            spans = (SubGoalSpan(self._header_of_first(), 0),)
+        frames = tuple(self._frames)
+        return self._explain(Episode(self._header, frames, outcome, {}, subgoals=spans))
+
+    def _deciding_header(self, outcome: Outcome) -> EpisodeHeader:
+        """That of the first sub-goal that failed; of the episode, where none did."""
+        for span, ended in zip(self._spans, outcome.subgoals, strict=False):
+            if not ended.success:
+                return span.header
+        return self._header
+
+    def _header_of_first(self) -> EpisodeHeader:
+        """What is known of the first sub-goal."""
+        row = self._header.row.at(0)
+        return replace(self._header, row=row, instruction=row.instruction)
 
     def _send_ending(self, outcome: Outcome, explanation: Explanation) -> None:
         """How the episode ended, at its last step, and why."""
@@ -277,20 +323,36 @@ class Recorder:
         send_reward(rec, index, len(self._frames), outcome.success)
         send_outcome(rec, self._frames[0], outcome.status)
         self._send_events(self._ending_events(outcome, explanation.diagnosis))
+        gripper_cm = None
         if explanation.trace is not None:
-            send_gripper(rec, explanation.trace, index)
-        if explanation.diagnosis is not None:
-            blueprint = episode_blueprint(
-                self._header, explanation.diagnosis, queries=self._queries
+            gripper_cm = send_gripper(
+                rec,
+                self._header,
+                trace=explanation.trace,
+                frames=self._frames,
+                diagnosis=explanation.diagnosis,
             )
-            blueprint.send(rec)
+        blueprint = episode_blueprint(
+            self._header, explanation.diagnosis, queries=self._queries, gripper_cm=gripper_cm
+        )
+        blueprint.send(rec)
 
     def _ending_events(self, outcome: Outcome, diagnosis: Diagnosis | None) -> list[Event]:
         """The deciding moment of a failure, and the end."""
         events = []
         if diagnosis is not None:
-            events.append(Event(diagnosis.frame_index, "ERROR", describe_diagnosis(diagnosis)))
+            events.append(
+                Event(diagnosis.frame_index, "ERROR", f"{diagnosis.case}: {diagnosis.sub_case}")
+            )
         text = f"episode ends: {describe_outcome(outcome)}"
         last = self._frames[-1].frame_index
         events.append(Event(last, OUTCOME_LEVELS[outcome.status], text))
         return events
+
+
+def _elected_target(frame: Frame, camera: str, target: str) -> bool | None:
+    """Whether the vote of a view elected the target; None where nothing says so."""
+    for view in frame.coverage:
+        if view.camera == camera and view.object is not None:
+            return view.object == target
+    return None

@@ -8,13 +8,17 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from vap_core.base.errors import BadStudy
+from vap_core.base.palette import method_marks, on_dark, rgb8
 from vap_core.recording.blueprint import full_window
 from vap_core.recording.colours import BACKGROUND
 from vap_core.recording.reading import read_chunks, read_summary
 from vap_core.recording.stream import finish_stream, open_stream
+from vap_core.recording.views import verdict_view
 
 EPISODE_COLUMNS = ("suite", "task", "episode", "seed")
 """What recordings of one episode share."""
+GRIPPER = "/vap/hand/gripper_to_target"
+"""The curve that is drawn for every method."""
 
 
 def combine_recordings(recordings: Mapping[str, Path], out: Path) -> None:
@@ -30,12 +34,13 @@ def combine_recordings(recordings: Mapping[str, Path], out: Path) -> None:
     recording_id = ".".join(["together", suite, task, episode, seed, *recordings])
     rec = open_stream(out, recording_id)
     rec.send_recording_name(" · ".join([suite, task, episode, " against ".join(recordings)]))
-    columns = []
+    rows: list[rrb.Container | rrb.View] = []
     for name, path in recordings.items():
-        image_roots = _copy_below(rec, name, path)
-        columns.append(_method_column(name, image_roots))
+        rows.append(_method_row(name, _copy_below(rec, name, path)))
     fps = next(iter(summaries.values())).get("hz") or 1.0
-    full_window(rrb.Horizontal(*columns), float(fps)).send(rec)
+    shares = [*[1.0] * len(rows), 0.62]
+    rows.append(_gripper_chart(list(recordings)))
+    full_window(rrb.Vertical(*rows, row_shares=shares), float(fps)).send(rec)
     finish_stream(rec, out)
 
 
@@ -66,9 +71,9 @@ def _copy_below(rec: rr.RecordingStream, name: str, path: Path) -> list[str]:
     return roots
 
 
-def _method_column(name: str, image_roots: list[str]) -> rrb.Container:
-    """One method: text, views as the policy saw them, the scene, the gripper, the states."""
-    views = [_prompted_view(name, root) for root in image_roots]
+def _method_row(name: str, image_roots: list[str]) -> rrb.Container:
+    """One method: its verdict above, its views as the policy saw them, and the scene."""
+    views: list[rrb.View] = [_prompted_view(name, root) for root in image_roots]
     scene = rrb.Spatial3DView(
         origin=f"/{name}",
         contents=[f"/{name}/world/**"],
@@ -76,18 +81,26 @@ def _method_column(name: str, image_roots: list[str]) -> rrb.Container:
         background=BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),
     )
-    text = rrb.TextDocumentView(origin=f"/{name}/vap/instruction", name=f"{name} · instruction")
-    gripper = rrb.TimeSeriesView(
-        origin=f"/{name}/vap/hand",
-        name=f"{name} · gripper and target",
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
-    )
-    status = rrb.StateTimelineView(origin=f"/{name}/vap/status", name=f"{name} · status")
     return rrb.Vertical(
-        text,
+        verdict_view(f"/{name}/vap/verdict", name),
         rrb.Horizontal(*views, scene),
-        rrb.Horizontal(gripper, status),
-        row_shares=[0.9, 2.2, 1.1],
+        row_shares=[0.29, 0.71],
+    )
+
+
+def _gripper_chart(names: list[str]) -> rrb.View:
+    """Every method's distance from the target in one chart."""
+    overrides: Any = {}
+    marks = method_marks(names)
+    for name in names:
+        colour = rgb8(on_dark(marks[name][0]))
+        overrides[f"/{name}{GRIPPER}"] = rr.SeriesLines(names=[name], colors=[colour], widths=[2.5])
+    return rrb.TimeSeriesView(
+        origin="/",
+        contents=list(overrides),
+        name="gripper to target, cm",
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
+        overrides=overrides,
     )
 
 

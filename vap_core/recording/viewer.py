@@ -76,12 +76,30 @@ def open_viewer(rrd: Path, *, frame_index: int = 0) -> None:
     """
     rrd = Path(rrd).resolve()
     read_summary(rrd)
-    has_display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    if sys.platform == "linux" and not has_display:
+    if not has_display():
         raise MissingGL(
             "open_viewer: there is no display; add --png FILE for a picture, "
             f"or copy {rrd} to a machine that has one."
         )
+    viewer = _start_viewer()
+    viewer.open(str(rrd))
+    viewer.set_time("frame_index", sequence=frame_index, play_state="paused")
+
+
+def has_display() -> bool:
+    """Whether a window can be opened here; outside Linux it always can."""
+    if sys.platform != "linux":
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def open_address(url: str) -> None:
+    """Open what a catalog server shows in Rerun's own window. Raises: MissingGL."""
+    _start_viewer().open(url)
+
+
+def _start_viewer() -> ViewerClient:
+    """Rerun's own window; it outlives this process. Raises: MissingGL."""
     port = free_port()
     process = subprocess.Popen(
         _viewer_command(port),
@@ -91,13 +109,11 @@ def open_viewer(rrd: Path, *, frame_index: int = 0) -> None:
         start_new_session=True,
     )
     try:
-        viewer = connect_viewer(process, port)
+        return connect_viewer(process, port)
     except (RuntimeError, ConnectionError) as err:
         raise MissingGL(
             f"open_viewer: the viewer did not come up ({err}); add --png FILE for a picture."
         ) from err
-    viewer.open(str(rrd))
-    viewer.set_time("frame_index", sequence=frame_index, play_state="paused")
 
 
 def view(rrd: Path, *, width: int = 1100, height: int = 680) -> "Viewer":

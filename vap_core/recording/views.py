@@ -7,11 +7,10 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from vap_core.base.types import Grounding
 from vap_core.recording.colours import BACKGROUND
+from vap_core.recording.entities.comparison import vote_picture_entity
 from vap_core.recording.entities.paths import image_root
 from vap_core.recording.entities.scene import mean_placement
-from vap_core.recording.texts import vote_title
 from vap_core.rollout.types import EpisodeHeader
 
 type Part = rrb.Container | rrb.View
@@ -31,7 +30,7 @@ def policy_view(camera: str) -> Part:
 
 
 def track_view(camera: str, title: str) -> Part:
-    """The raw picture with the tracked and the true mask."""
+    """The raw picture with the tracked mask, white, and the true one, orange."""
     return _image_view(camera, title, ["", "/mask/**"])
 
 
@@ -45,7 +44,7 @@ def vote_view(camera: str, title: str = "vote at t = 0", n_targets: int = 1) -> 
 
 def coverage_view(camera: str) -> Part:
     """The prompt in the colour of the object that it covers."""
-    return _image_view(camera, "prompt, coloured by object", ["", "/identity"])
+    return _image_view(camera, "what the prompt covers", ["", "/identity"])
 
 
 def attention_view(camera: str, query: str) -> Part:
@@ -54,36 +53,16 @@ def attention_view(camera: str, query: str) -> Part:
     return _image_view(camera, title, [f"/attention/{query}"])
 
 
-def votes_view(camera: str, groundings: Sequence[Grounding]) -> Part:
-    """The votes as bars, the first target's result in the title."""
-    title = vote_title(groundings[0]) if groundings else "no personal object"
-    return rrb.BarChartView(
-        origin=f"/vap/votes/{camera}",
-        name=f"{camera} · {title}",
-        plot_legend=rrb.PlotLegend(visible=False),
-    )
-
-
-def crops_view(camera: str) -> Part:
-    """The crops that were compared."""
+def vote_picture_view(camera: str) -> Part:
+    """The candidates, the reference photos, and the cosines that were compared."""
     return rrb.Spatial2DView(
-        origin=f"/vap/crops/{camera}",
-        name=f"{camera} · reference views, and the candidates below",
-        background=BACKGROUND,
+        origin=vote_picture_entity(camera), name=f"{camera} · vote", background=BACKGROUND
     )
 
 
-def cosine_view(camera: str) -> Part:
-    """The cosines that were compared."""
-    return rrb.TensorView(
-        origin=f"/vap/similarity/{camera}",
-        name="cosine (candidate x reference)",
-        scalar_mapping=rrb.TensorScalarMapping(
-            mag_filter=rr.components.MagnificationFilter.Nearest,
-            colormap=rr.components.Colormap.Viridis,
-        ),
-        view_fit=rrb.components.ViewFit.Fill,
-    )
+def verdict_view(origin: str = "/vap/verdict", name: str = "verdict") -> Part:
+    """How the episode ended, over the full width."""
+    return rrb.TextDocumentView(origin=origin, name=name, titlebar=False)
 
 
 def scene_view(header: EpisodeHeader) -> Part:
@@ -104,23 +83,9 @@ def instruction_view() -> Part:
     return rrb.TextDocumentView(origin="/vap/instruction", name="instruction")
 
 
-def references_view() -> Part:
-    """The reference crops of one grounded picture."""
-    return rrb.Spatial2DView(
-        origin="/vap/references",
-        name="reference views #0, #1, ...",
-        background=BACKGROUND,
-    )
-
-
 def mask_view(camera: str) -> Part:
     """The elected candidate's mask over the picture."""
     return _image_view(camera, "mask", ["", "/mask/**"])
-
-
-def status_view() -> Part:
-    """The state lanes."""
-    return rrb.StateTimelineView(origin="/vap/status", name="status")
 
 
 def events_view() -> Part:
@@ -145,17 +110,26 @@ def robot_curve_views(header: EpisodeHeader) -> list[Part]:
     ]
 
 
-def method_curve_views() -> list[Part]:
-    """Track scores and vote margins."""
+def method_curve_views(header: EpisodeHeader) -> list[Part]:
+    """Track scores and vote margins, where the method has some."""
+    cameras = [camera for camera, groundings in header.groundings.items() if groundings]
+    if not cameras:
+        return []
     return [
-        _curve_view("/vap/track_score", "track score", limits=UNIT_RANGE),
-        _curve_view("/vap/vote_margin", "vote margin", limits=UNIT_RANGE),
+        track_score_view(),
+        _curve_view("/vap/vote_margin", "vote margin", UNIT_RANGE),
     ]
 
 
-def gripper_view() -> Part:
-    """The gripper's distance from the target, and the target's lift."""
-    return _curve_view("/vap/hand", "gripper and target")
+def track_score_view() -> Part:
+    """How sure the tracker is of the target, in every view."""
+    return _curve_view("/vap/track_score", "track score", UNIT_RANGE)
+
+
+def gripper_view(limits_cm: tuple[float, float] | None = None) -> Part:
+    """The gripper's distance from the target and the nearest other object, and what it holds."""
+    title = "gripper to target (orange), to nearest other (blue), cm"
+    return _curve_view("/vap/hand", title, limits_cm, legend=False)
 
 
 def _image_view(camera: str, title: str, suffixes: Sequence[str]) -> rrb.Spatial2DView:
@@ -173,9 +147,11 @@ def _curve_view(
     name: str,
     limits: tuple[float, float] | None = None,
     visible: Sequence[bool] | None = None,
+    *,
+    legend: bool = True,
 ) -> rrb.TimeSeriesView:
     axis = None
-    corner = rrb.Corner2D.LeftTop
+    corner = rrb.Corner2D.RightTop
     if limits is not None:
         axis = rrb.ScalarAxis(range=limits)
         corner = rrb.Corner2D.RightBottom
@@ -187,7 +163,7 @@ def _curve_view(
         name=name,
         contents=["$origin/**"],
         axis_y=axis,
-        plot_legend=rrb.PlotLegend(corner),
+        plot_legend=rrb.PlotLegend(corner, visible=legend),
         overrides=overrides,
     )
 
@@ -195,7 +171,7 @@ def _curve_view(
 def _viewpoint(header: EpisodeHeader) -> rrb.EyeControls3D:
     """Towards the middle of the objects, from beside the first camera and above the table."""
     xy = mean_placement(header.row)
-    centre = np.array([*xy, 0.12])
+    centre = np.array([*xy, 0.06])
     direction = np.array([1.0, 0.0])
     if header.cameras:
         direction = header.cameras[0].pose_world[:2, 3] - xy
@@ -203,7 +179,7 @@ def _viewpoint(header: EpisodeHeader) -> rrb.EyeControls3D:
     angle = np.deg2rad(50.0)
     rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     return rrb.EyeControls3D(
-        position=centre + np.array([*(0.9 * (rotation @ direction)), 0.5]),
+        position=centre + np.array([*(0.72 * (rotation @ direction)), 0.45]),
         look_target=centre,
         eye_up=(0, 0, 1),
         kind=rrb.Eye3DKind.Orbital,

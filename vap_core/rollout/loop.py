@@ -6,41 +6,39 @@ that it yields.
 
 import time
 import traceback
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, runtime_checkable
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 
 from vap_core.base.errors import BadAction, OutOfReach, VapError
 from vap_core.base.types import Attended, Views
-from vap_core.policies.hooks import AttentionMap, AttentionMaps, observe_attention
+from vap_core.policies.hooks import AttentionMaps, observe_attention
 from vap_core.policies.protocol import Policy, PolicyInput, PrivilegedPolicy
 from vap_core.rollout import audit
 from vap_core.rollout.coverage import mask_coverage
 from vap_core.rollout.policy_call import check_chunks, check_policy, checked_plan, policy_call
 from vap_core.rollout.prompters.protocol import PromptContext, Prompter, SceneTruth, unchanged
 from vap_core.rollout.queries import only_queries, query_phrases
-from vap_core.rollout.types import ConsumedInput, Episode, EpisodeHeader, Frame, MaskCoverage
+from vap_core.rollout.running import RunningEpisode, SubGoalSink
+from vap_core.rollout.running import Sink as Sink
+from vap_core.rollout.subgoals import begins, ending, next_subgoal, subgoal_number
+from vap_core.rollout.types import (
+    Episode,
+    EpisodeHeader,
+    Frame,
+    MaskCoverage,
+    SubGoalSpan,
+)
 from vap_core.simulation.control import BEYOND
 from vap_core.simulation.env import Control, Env
 from vap_core.simulation.occluder import Occlusion
 from vap_core.simulation.scenes import Scene
 from vap_core.simulation.sensor import PERFECT, Sensor
 from vap_core.simulation.suites.rules import Judge
-from vap_core.simulation.types import EpisodeRow, Observation, Outcome
-
-
-@runtime_checkable
-class Sink(Protocol):
-    """Where the frames of one episode stream to, a recording for example."""
-
-    def frame(self, frame: Frame) -> None: ...
-
-    def close(self, outcome: Outcome) -> None: ...
-
+from vap_core.simulation.types import EpisodeRow, Observation
 
 OpenSink = Callable[[EpisodeHeader], Sink]
 Follow = Literal["call", "step"]
@@ -84,37 +82,6 @@ class Trial:
         return isinstance(self.policy, PrivilegedPolicy) or self.prompter.needs_truth != "never"
 
 
-@dataclass
-class RunningEpisode:
-    """One episode under way; the only mutable value of the loop."""
-
-    row: EpisodeRow
-    env: Env
-    judge: Judge
-    keeps_images: bool
-    policy_state: Any = None
-    prompter_state: Any = None
-    header: EpisodeHeader | None = None
-    sink: Sink | None = None
-    queue: deque[np.ndarray] = field(default_factory=deque)
-    """Actions of the last chunk that are still to be executed."""
-    frames: list[Frame] = field(default_factory=list)
-    consumed: list[ConsumedInput] = field(default_factory=list)
-    attention: Mapping[str, Mapping[str, AttentionMap]] = field(default_factory=dict)
-    """Where the policy looked in this step's call."""
-    beyond: int = 0
-    """Actions far beyond the robot's speed."""
-    seconds: dict[str, float] = field(
-        default_factory=lambda: {"attend": 0.0, "policy": 0.0, "record": 0.0}
-    )
-    outcome: Outcome | None = None
-
-    @property
-    def over(self) -> bool:
-        """Whether no action is left to take."""
-        return self.judge.done or self.judge.steps >= self.row.max_steps
-
-
 Step = tuple[Observation, Attended]
 """What one episode observed in this step, and what its prompter made of it."""
 
@@ -145,6 +112,9 @@ def rollout(
             running.append(_begin(trial, row, keeps_images))
         live = _live(running)
         while live:
+            for episode in live:
+                _guard(episode, next_subgoal, episode, trial.policy)
+            live = _live(live)
             steps = _observe_and_prompt(trial, live, sink)
             live = _live(live)
             _plan(trial, live, steps)
@@ -171,8 +141,11 @@ def _begin(trial: Trial, row: EpisodeRow, keeps_images: bool) -> RunningEpisode:
         occlusion=trial.occlusion,
     )
     env.reset(row)
-    judge = Judge.start(row, trial.scene.sizes_m, env.truth())
+    env.pursue(row.at(0))
+    judge = Judge.start(row.at(0), trial.scene.sizes_m, env.truth())
     episode = RunningEpisode(row, env, judge, keeps_images)
+    if row.subgoals:
+        episode.notes.append(begins(episode))
     rng = np.random.default_rng([row.seed, row.episode])
     episode.policy_state = _guard(episode, trial.policy.start, rng)
     return episode
@@ -210,6 +183,8 @@ def _observe_and_prompt(
             continue
         if episode.header is None:
             _guard(episode, _open_sink, trial, episode, attended, sink)
+        if episode.row.subgoals and episode.homing is None:
+            _guard(episode, _open_subgoal, trial, episode, attended)
         if episode.outcome is None:
             steps[id(episode)] = observation, attended
     return steps
@@ -226,6 +201,8 @@ def _takes_images(trial: Trial, episode: RunningEpisode) -> bool:
 
     The first always does; the others when the policy is called, or every step is wanted.
     """
+    if episode.homing is not None:
+        return episode.keeps_images
     if isinstance(trial.policy, PrivilegedPolicy):
         every = trial.images_every
         return episode.keeps_images or bool(every and episode.judge.steps % every == 0)
@@ -235,9 +212,12 @@ def _takes_images(trial: Trial, episode: RunningEpisode) -> bool:
 
 
 def _start_prompting(trial: Trial, episode: RunningEpisode, observation: Observation) -> Attended:
-    """Start the prompter at the first step with images; a step without images passes unchanged."""
-    if not observation.images:
-        return unchanged(observation.images, episode.row.instruction)
+    """Start the prompter at the first step with images.
+
+    A step without images, or on the way home between sub-goals, passes unchanged.
+    """
+    if not observation.images or episode.homing is not None:
+        return unchanged(observation.images, episode.goal.instruction)
     context = _context(trial, episode)
     with _timed(episode.seconds, "attend"):
         state, attended = trial.prompter.start(observation, context)
@@ -298,9 +278,9 @@ def _context(trial: Trial, episode: RunningEpisode) -> PromptContext:
     if needs == "always" or (needs == "start" and not started):
         masks = episode.env.truth(masks=True).masks
         judge = episode.judge
-        truth = SceneTruth(episode.row, masks, step=judge.steps, moved=judge.moved)
+        truth = SceneTruth(episode.goal, masks, step=judge.steps, moved=judge.moved)
     cameras = {camera.name: camera for camera in episode.env.cameras()}
-    return PromptContext(episode.row.instruction, cameras, truth)
+    return PromptContext(episode.goal.instruction, cameras, truth)
 
 
 def _open_sink(
@@ -309,6 +289,26 @@ def _open_sink(
     episode.header = _header(trial, episode, attended)
     with _timed(episode.seconds, "record"):
         episode.sink = sink(episode.header) if sink is not None else None
+
+
+def _open_subgoal(trial: Trial, episode: RunningEpisode, attended: Attended) -> None:
+    """Keep what is known of a sub-goal at its first step, and pass it on to the sink."""
+    if len(episode.spans) > episode.stage:
+        return
+    assert episode.header is not None
+    header = replace(
+        episode.header,
+        row=episode.goal,
+        instruction=episode.goal.instruction,
+        rewritten=attended.text,
+        groundings=attended.groundings,
+        associations=attended.associations,
+        cameras=episode.env.cameras(),
+    )
+    episode.spans.append(SubGoalSpan(header, episode.judge.steps))
+    if episode.stage and isinstance(episode.sink, SubGoalSink):
+        with _timed(episode.seconds, "record"):
+            episode.sink.begin_subgoal(header)
 
 
 def _header(trial: Trial, episode: RunningEpisode, attended: Attended) -> EpisodeHeader:
@@ -378,12 +378,12 @@ def _call_policy(
     for episode in calling:
         observation, attended = steps[id(episode)]
         state = observation.state
-        raw.append(_policy_input(observation.images, episode.row.instruction, state))
+        raw.append(_policy_input(observation.images, episode.goal.instruction, state))
         prompted.append(_policy_input(attended.images, attended.text, state))
 
     observer: AbstractContextManager[AttentionMaps] = nullcontext({})
     if trial.attention:
-        observer = observe_attention([query_phrases(episode.row) for episode in calling])
+        observer = observe_attention([query_phrases(episode.goal) for episode in calling])
     with observer as maps:
         if trial.audit:
             after, chunks, consumed = audit.plan(policy, states, prompted, raw)
@@ -424,8 +424,8 @@ def _act(
     truth = episode.env.truth(masks=needs_masks)
     coverage: tuple[MaskCoverage, ...] = ()
     if prompts:
-        opening = not episode.frames
-        coverage = mask_coverage(attended, truth, episode.row.target, opening=opening)
+        opening = episode.judge.steps == episode.judge.first
+        coverage = mask_coverage(attended, truth, episode.goal.target, opening=opening)
     frame = Frame(
         frame_index=episode.judge.steps,
         timestamp_s=episode.env.time_s,
@@ -436,13 +436,15 @@ def _act(
         state=observation.state,
         action=action,
         truth=truth,
-        events=(*attended.events, *episode.judge.events),
+        events=(*episode.notes, *attended.events, *episode.judge.events),
         coverage=coverage,
         attention=episode.attention,
+        subgoal=subgoal_number(episode),
     )
     if episode.over:
-        episode.outcome = episode.judge.outcome(detail=_note_on_actions(episode))
+        episode.outcome = ending(episode, detail=_note_on_actions(episode))
     episode.attention = {}
+    episode.notes = []
     with _timed(episode.seconds, "record"):
         if episode.sink is not None:
             episode.sink.frame(frame)
@@ -477,6 +479,7 @@ def _end(trial: Trial, episode: RunningEpisode) -> Episode:
         outcome=episode.outcome,
         seconds={**episode.env.seconds, **episode.seconds},
         consumed=tuple(episode.consumed),
+        subgoals=tuple(episode.spans),
     )
 
 
@@ -498,7 +501,7 @@ def _guard[**P, R](
 
 def _fail(episode: RunningEpisode) -> None:
     """End an episode with the exception that is being handled."""
-    episode.outcome = episode.judge.outcome("error", traceback.format_exc(limit=8))
+    episode.outcome = ending(episode, "error", traceback.format_exc(limit=8))
 
 
 def _ends_the_run(error: BaseException) -> bool:

@@ -56,7 +56,9 @@ class Frame:
     `action` was decided from `images`; the terminal frame has none (None), because nothing is
     executed after it. `coverage` has an entry per view at steps whose images were prompted.
     `attention`, at steps in which the policy was observed while it planned, has by camera and query
-    the share of attention on every image patch (policies.hooks.AttentionMap).
+    the share of attention on every image patch (policies.hooks.AttentionMap). `subgoal` is the
+    number of the present sub-goal, from 1, and 0 on the way home between two; None in an episode
+    that has one goal.
     """
 
     frame_index: int
@@ -73,6 +75,7 @@ class Frame:
     attention: Mapping[str, Mapping[str, Float32[np.ndarray, "_ _ _ _"]]] = field(
         default_factory=dict
     )
+    subgoal: int | None = None
 
     def without_images(self) -> "Frame":
         """The same step without pictures, masks and attention, to keep in memory."""
@@ -103,11 +106,22 @@ class ConsumedInput:
 
 
 @value
+class SubGoalSpan:
+    """One sub-goal of an episode that has several, from its first step on.
+
+    `header` is as if it were an episode of its own: its command, target and groundings.
+    """
+
+    header: EpisodeHeader
+    first: int
+
+
+@value
 class Episode:
     """A finished episode.
 
     `seconds` sums wall time by part: physics, render, attend, policy, record, ... `consumed` is
-    empty unless the rollout was audited.
+    empty unless the rollout was audited. `subgoals` are those that began, where there were several.
     """
 
     header: EpisodeHeader
@@ -115,6 +129,17 @@ class Episode:
     outcome: Outcome
     seconds: Mapping[str, float]
     consumed: tuple[ConsumedInput, ...] = ()
+    subgoals: tuple[SubGoalSpan, ...] = ()
+
+    def part(self, stage: int) -> "Episode":
+        """One sub-goal as an episode of its own, from its first step to its last."""
+        span = self.subgoals[stage]
+        outcome = self.outcome.subgoals[stage]
+        stop = span.first + outcome.steps
+        frames = [frame for frame in self.frames if span.first <= frame.frame_index <= stop]
+        if frames:
+            frames[-1] = replace(frames[-1], action=None)
+        return Episode(span.header, tuple(frames), outcome, {})
 
     @property
     def key(self) -> tuple[str, str, str, int, int]:
@@ -151,5 +176,18 @@ class Episode:
             "steps": outcome.steps,
             "margin": min(margins) if margins else None,
             "detail": outcome.detail,
+            **self._subgoal_columns(),
             **timings,
         }
+
+    def _subgoal_columns(self) -> dict[str, Any]:
+        """`subgoals_done` counts those that succeeded, `subgoal_1` says whether the first did."""
+        if not self.header.row.subgoals:
+            return {}
+        columns: dict[str, Any] = {}
+        done = 0
+        for i in range(self.header.row.stages):
+            ended = self.outcome.subgoals[i : i + 1]
+            columns[f"subgoal_{i + 1}"] = bool(ended) and ended[0].success
+            done += columns[f"subgoal_{i + 1}"]
+        return {"subgoals_done": done, **columns}

@@ -178,6 +178,11 @@ class Env:
         self._advance(self._settle, data.ctrl[self._ctrl].copy())
         self._touch = Touch(contacts=self._touch.contacts)
 
+    def pursue(self, row: EpisodeRow) -> None:
+        """Go on with `row`, a sub-goal of the episode under way; the scene stays as it is."""
+        assert {place.model for place in row.placements} == set(self._placed)
+        self._row = row
+
     def observe(self) -> Observation:
         """The raw views and the proprioception.
 

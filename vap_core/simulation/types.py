@@ -3,8 +3,8 @@
 Poses are `x y z qw qx qy qz` in the world frame, z up.
 """
 
-from collections.abc import Mapping
-from dataclasses import field
+from collections.abc import Mapping, Sequence
+from dataclasses import field, replace
 from typing import Literal
 
 import numpy as np
@@ -110,12 +110,41 @@ SuccessRule = Literal["picked", "near", "put", "selected"]
 
 
 @value
+class Owned:
+    """A remembered object of an episode, by its model, and its owner, who is also `known_as`."""
+
+    model: str
+    owner: str
+    known_as: tuple[str, ...] = ()
+
+
+@value
+class SubGoal:
+    """One step of an instruction that has several: a command of its own, and its rule.
+
+    `target` and `goal` name placed objects, as those of an episode do.
+    """
+
+    instruction: str
+    category: str
+    target: str
+    max_steps: int
+    rule: SuccessRule
+    goal: str = ""
+
+
+@value
 class EpisodeRow:
     """One row of an episode list: how an episode starts, and when it has succeeded.
 
     `placements[0]` is the target; `goal` names the placed object that it goes to ("" when there is
     none). `split` is the track within the suite, `variant` the scene style (suites.VARIANTS),
     `cameras` the views that the policy gets. `start` says what differs from the list.
+
+    In a shared scene objects are `owned`, and `speaker` is whom "my" means. An instruction in
+    several steps has ordered `subgoals`; target, category, rule and goal are then the first one's,
+    and `max_steps` is the sum of all. `inside` names what earlier sub-goals put into the same
+    receptacle (`at`).
     """
 
     suite: str
@@ -132,10 +161,42 @@ class EpisodeRow:
     variant: str = "base"
     cameras: tuple[str, ...] = ()
     start: Start = AS_LISTED
+    speaker: str = ""
+    owned: tuple[Owned, ...] = ()
+    subgoals: tuple[SubGoal, ...] = ()
+    inside: tuple[str, ...] = ()
 
     @property
     def target(self) -> str:
         return self.placements[0].model
+
+    @property
+    def stages(self) -> int:
+        """How many sub-goals follow one another: 1 for a plain episode."""
+        return max(1, len(self.subgoals))
+
+    def at(self, stage: int) -> "EpisodeRow":
+        """The row of one sub-goal alone, its target first; a plain episode's is the row itself."""
+        if not self.subgoals:
+            return self
+        subgoal = self.subgoals[stage]
+        rest = [place for place in self.placements if place.model != subgoal.target]
+        (first,) = [place for place in self.placements if place.model == subgoal.target]
+        inside = []
+        for earlier in self.subgoals[:stage]:
+            if earlier.rule == "put" and earlier.goal == subgoal.goal:
+                inside.append(earlier.target)
+        return replace(
+            self,
+            instruction=subgoal.instruction,
+            category=subgoal.category,
+            placements=(first, *rest),
+            max_steps=subgoal.max_steps,
+            rule=subgoal.rule,
+            goal=subgoal.goal,
+            subgoals=(),
+            inside=tuple(inside),
+        )
 
     @property
     def key(self) -> str:
@@ -161,3 +222,31 @@ class Outcome:
     detail: str = ""
     touched: bool = False
     """Whether the robot touched or moved any object but the goal."""
+    subgoals: tuple["Outcome", ...] = ()
+    """How each sub-goal ended, in order, where there were several; steps are its own."""
+
+
+def of_subgoals(outcomes: Sequence[Outcome], stages: int, steps: int) -> Outcome:
+    """How an episode of several sub-goals ended, of which these were begun.
+
+    It succeeds where every sub-goal had succeeded at its own end, in order. A wrong object in any
+    of them counts. `steps` are all, with the way home in between.
+    """
+    successes = [outcome.success for outcome in outcomes]
+    success = len(outcomes) == stages and all(successes)
+    error = outcomes[-1].status == "error"
+    moved = [outcome.cmr for outcome in outcomes if outcome.cmr is not None]
+    status: Literal["success", "failure", "error"] = "success" if success else "failure"
+    return Outcome(
+        status="error" if error else status,
+        success=success and not error,
+        success_once=len(outcomes) == stages and all(each.success_once for each in outcomes),
+        held_steps=outcomes[-1].held_steps,
+        cmr=all(moved) if moved else None,
+        wrong_object=any(outcome.wrong_object for outcome in outcomes),
+        first_object_correct=outcomes[0].first_object_correct,
+        steps=steps,
+        detail=outcomes[-1].detail,
+        touched=any(outcome.touched for outcome in outcomes),
+        subgoals=tuple(outcomes),
+    )

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import write_atomic
+from vap_core.base.parquet import read_parquet
 from vap_core.base.version import code_version
 from vap_core.evaluation import measurements
 
@@ -41,8 +42,6 @@ def write(
 
 def read(folder: Path) -> "dict[str, pd.DataFrame]":
     """The tables that were published in a folder. Raises: BadOutput."""
-    import pandas as pd
-
     tables = {}
     for name in TABLES:
         path = folder / file_name(name)
@@ -51,7 +50,7 @@ def read(folder: Path) -> "dict[str, pd.DataFrame]":
                 f"attention: {path} is missing; make it: python -m vap_core attention RUN "
                 f"--publish {folder}"
             )
-        tables[name] = pd.read_parquet(path)
+        tables[name] = read_parquet(path, "attention", "publish it again")
     return tables
 
 

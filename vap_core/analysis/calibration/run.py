@@ -10,6 +10,7 @@ from vap_core.analysis.calibration.report import PRICE, Choice, choose, text_rep
 from vap_core.analysis.calibration.scenes import SEED, Row, measure_scene
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import write_atomic
+from vap_core.base.parquet import read_parquet
 from vap_core.evaluation import store
 from vap_core.evaluation.measurements import read_json_part, write_json_part
 from vap_core.evaluation.photos.run import TABLE, measure_photos
@@ -125,7 +126,9 @@ def _measure(
         name = folder.resolve().name
         run = out / f"photos-{name}"
         measure_photos(folder, run, stack.name, progress=progress)
-        answers = pd.read_parquet(run / f"{TABLE}.parquet")
+        answers = read_parquet(
+            run / f"{TABLE}.parquet", "calibrate", "delete it and run the same command again"
+        )
         tables.append(_photo_rows(answers).assign(source=name))
     table = pd.concat(tables, ignore_index=True)
     return table.assign(likeness=table.likeness.astype(float))

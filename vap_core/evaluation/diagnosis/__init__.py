@@ -18,6 +18,9 @@ Methods that highlight nothing have no prompt to be wrong: their failures are *u
 sub-cases of Case 3. A real robot's episode has no ground truth: it stays *unlabelled*, with the
 signals that the method itself gives.
 
+Of an instruction in several steps the first sub-goal that failed is diagnosed, as an episode of its
+own; the column `subgoal` is its number.
+
 Every threshold is a field of `Thresholds`. The confidence of a diagnosis is the share of
 neighbouring thresholds (NEIGHBOURS) under which it stays the same.
 """
@@ -56,6 +59,8 @@ def diagnose(
     """
     if episode.outcome.status != "failure" or not episode.frames:
         return None
+    if episode.subgoals:
+        return diagnose(_deciding_part(episode), thresholds)
     if not has_truth(episode):
         return unlabelled(episode)
     trace = trace or trace_episode(episode)
@@ -69,18 +74,39 @@ def diagnose(
 
 def explain(episode: Episode) -> Explanation:
     """The trace and the diagnosis of an episode, for its recording."""
-    trace = trace_episode(episode) if has_truth(episode) else None
-    return Explanation(trace, diagnose(episode, trace=trace))
+    whole = trace_episode(episode) if has_truth(episode) else None
+    if episode.subgoals:
+        return Explanation(whole, diagnose(episode))
+    return Explanation(whole, diagnose(episode, trace=whole))
 
 
 def columns(episode: Episode) -> dict[str, Any]:
-    """The diagnosis and the stages (`stages`) of an episode, as columns of a results table."""
+    """The diagnosis and the stages (`stages`) of an episode, as columns of a results table.
+
+    Of several sub-goals they are of the first that failed, or of the last; `subgoal` is its number.
+    """
+    if episode.subgoals:
+        stage = deciding_subgoal(episode)
+        return {**columns(episode.part(stage)), "subgoal": stage + 1}
     trace = None
     if has_truth(episode) and episode.outcome.status != "error":
         trace = trace_episode(episode)
     found = diagnose(episode, trace=trace)
     diagnosis = NO_DIAGNOSIS if found is None else found.columns()
     return {**diagnosis, **stages(episode, trace=trace)}
+
+
+def deciding_subgoal(episode: Episode) -> int:
+    """The first sub-goal that failed, from 0; the last one where none did."""
+    began = min(len(episode.subgoals), len(episode.outcome.subgoals))
+    for stage, outcome in enumerate(episode.outcome.subgoals[:began]):
+        if not outcome.success:
+            return stage
+    return began - 1
+
+
+def _deciding_part(episode: Episode) -> Episode:
+    return episode.part(deciding_subgoal(episode))
 
 
 def _classify(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis:

@@ -16,7 +16,13 @@ from vap_core.base.condition import rows_matching
 from vap_core.base.errors import BadOutput, BadStudy
 from vap_core.base.tables import align
 from vap_core.evaluation.publish import read_runs
-from vap_core.evaluation.report.failures import breakdown, breakdown_rows, diagnosed, sub_cases_text
+from vap_core.evaluation.report.failures import (
+    SUBGOAL,
+    breakdown,
+    breakdown_rows,
+    diagnosed,
+    sub_cases_text,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,13 +33,14 @@ COLUMNS = {
     "method": "method",
     "episode": "episode",
     "seed": "seed",
+    "subgoal": "sub-goal",
     "case": "case",
     "sub_case": "sub_case",
     "deciding_frame": "frame",
     "case_confidence": "confidence",
     "case_sentence": "why",
 }
-"""The columns that `failures_text` shows, and their titles."""
+"""The columns that `failures_text` shows, and their titles; the sub-goal where there are any."""
 
 
 @dataclass(frozen=True)
@@ -180,14 +187,19 @@ def _select(table: "pd.DataFrame", column: str, wanted: Any) -> "pd.DataFrame":
 
 def _listing(shown: "pd.DataFrame") -> str:
     """A numbered line per failure; corrected ones have a star."""
-    rows: list[Sequence[str]] = [["#", *COLUMNS.values()]]
+    columns = dict(COLUMNS)
+    if SUBGOAL not in shown or shown[SUBGOAL].isna().all():
+        del columns[SUBGOAL]
+    rows: list[Sequence[str]] = [["#", *columns.values()]]
     for i, line in enumerate(shown.to_dict("records")):
         number = f"{i}*" if line["corrected"] else str(i)
-        rows.append([number, *(_cell(line[name]) for name in COLUMNS)])
+        rows.append([number, *(_cell(name, line[name]) for name in columns)])
     return align(rows)
 
 
-def _cell(cell: Any) -> str:
+def _cell(name: str, cell: Any) -> str:
+    if name == SUBGOAL:
+        return "-" if cell != cell else str(int(cell))
     if isinstance(cell, float):
         return f"{cell:.2f}"
     return str(cell)

@@ -46,7 +46,7 @@ def wrong_prompt(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | Non
         camera=view.camera,
         evidence=_evidence(view, labels, share, len(wrong)),
         confidence=1.0,
-        sentence=f"{words}; prompts wrong in {round(100 * share)} % of {len(wrong)} judged steps",
+        sentence=f"{words}; {_wrong_words(wrong)}",
     )
 
 
@@ -220,6 +220,16 @@ def _sentence(
         case "views disagree":
             return f"the views show different things from the start: {shown}"
     return f"the views agreed at first; at step {step} they show different things: {shown}"
+
+
+def _wrong_words(wrong: Sequence[bool]) -> str:
+    """In how many of the judged steps the prompts were wrong."""
+    if len(wrong) == 1:
+        return "wrong in the one frame checked"
+    n = sum(wrong)
+    if n == len(wrong):
+        return f"wrong in all {n} frames checked"
+    return f"wrong in {n} of {len(wrong)} frames checked"
 
 
 def _named(label: str | None) -> str:

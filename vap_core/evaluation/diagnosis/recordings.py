@@ -68,14 +68,26 @@ def save_screenshot(failures: Failures, number: int, png: Path, against: str | N
     """
     from vap_core.recording import screenshot
 
-    if against is None:
-        path = recording_of(failures, number)
-    else:
+    path = recording_of(failures, number)
+    frame = opening_frame(failures, number, path)
+    if against is not None:
         path = side_by_side_recording(failures, number, against)
-    screenshot(path, png, frame_index=deciding_frame(failures, number), size=(1920, 1080))
+    screenshot(path, png, frame_index=frame, size=(1920, 1080))
     row = failure_row(failures, number)
     write_provenance(png, study_of(failures.manifests[row["configuration"]], row))
     return str(row["case_sentence"])
+
+
+def opening_frame(failures: Failures, number: int, recording: Path) -> int:
+    """The frame that decided a recorded failure.
+
+    An episode that was run again may end a little otherwise than the table says: its own recording
+    goes first.
+    """
+    from vap_core.recording import read_summary
+
+    frame = int(read_summary(recording).get("deciding_frame", -1))
+    return frame if frame >= 0 else deciding_frame(failures, number)
 
 
 def correct_failure(failures: Failures, number: int, case: str, note: str = "") -> Path:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from vap_core.base.errors import BadOutput, one_of
 from vap_core.base.extras import require
 from vap_core.base.files import write_atomic
+from vap_core.base.parquet import read_parquet
 from vap_core.evaluation import measurements, store
 from vap_core.evaluation.perception import tracking
 from vap_core.evaluation.perception.episodes import survey
@@ -332,9 +333,10 @@ def _arrow_table(rows: list[TableRow]) -> "pa.Table":
 
 
 def _read_tables(folder: Path) -> "dict[str, pd.DataFrame]":
-    import pandas as pd
-
     tables = {}
     for name in TABLES:
-        tables[name] = pd.read_parquet(_table_path(folder, name))
+        path = _table_path(folder, name)
+        tables[name] = read_parquet(
+            path, "eval-perception", "delete it and run the same command again"
+        )
     return tables

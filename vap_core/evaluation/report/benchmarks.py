@@ -1,10 +1,13 @@
-"""The benchmarks as tables."""
+"""The benchmarks and shared scenes as tables."""
 
 from collections import Counter
 
 from vap_core.base.tables import align
 from vap_core.simulation import suites
+from vap_core.simulation.types import EpisodeRow
 
+LISTED = {**suites.BENCHMARKS, **suites.SHARED}
+"""The suites with a hashed list: benchmarks, and shared scenes."""
 MATCHED = (
     "protocol-matched in MuJoCo: other physics, renderings and objects than SIMPLER's and "
     "VLABench's own."
@@ -12,7 +15,7 @@ MATCHED = (
 
 
 def suites_table() -> str:
-    """The benchmarks as their hashed lists hold them, by track and by task; the warm-up suites."""
+    """Benchmarks and shared scenes as their hashed lists hold them; the warm-up suites."""
     notes = "\n".join([MATCHED, *_development_lists(), *_warm_ups()])
     parts = [align(_track_rows()), align(_task_rows()), notes]
     return "\n\n".join(parts)
@@ -22,7 +25,7 @@ def _track_rows() -> list[list[str]]:
     rows = [
         ["suite", "robot", "cameras", "Hz", "control", "track", "episodes", "sha256 of the list"]
     ]
-    for name, suite in suites.BENCHMARKS.items():
+    for name, suite in LISTED.items():
         columns = [name, suite.robot, " ".join(suite.cameras), f"{suite.hz:g}", suite.control]
         digest = suites.lists.digest(name)[:12]
         tracks = Counter(row.split for row in suites.lists.read(name))
@@ -33,7 +36,7 @@ def _track_rows() -> list[list[str]]:
 
 def _task_rows() -> list[list[str]]:
     rows = [["suite", "task", "instruction", "success when", "max steps", "episodes"]]
-    for name, suite in suites.BENCHMARKS.items():
+    for name, suite in LISTED.items():
         for task in suite.tasks:
             listed = suites.rows(name, task.name)
             counts = Counter(row.split for row in listed).values()
@@ -42,12 +45,17 @@ def _task_rows() -> list[list[str]]:
                     name,
                     task.name,
                     task.instruction,
-                    task.rule,
+                    " and ".join(_rules(listed[0])),
                     str(task.max_steps),
                     " + ".join(map(str, counts)),
                 ]
             )
     return rows
+
+
+def _rules(row: EpisodeRow) -> list[str]:
+    """The rule of every sub-goal in order."""
+    return [row.at(stage).rule for stage in range(row.stages)]
 
 
 def _development_lists() -> list[str]:

@@ -1,4 +1,4 @@
-"""The report over finished runs: Markdown to read and print, CSV and LaTeX tables, two pictures."""
+"""The report over finished runs: Markdown, a page, tables as CSV and LaTeX, pictures."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,8 +11,9 @@ from vap_core.base.tables import latex
 from vap_core.evaluation.metrics import RATES
 from vap_core.evaluation.readings import readings_of_lists
 from vap_core.evaluation.report import sections
-from vap_core.evaluation.report.cells import comparison_rows, outcome_rows
+from vap_core.evaluation.report.cells import comparison_rows, outcome_rows, result_rows
 from vap_core.evaluation.report.latex import main_tables
+from vap_core.evaluation.report.page import report_page
 from vap_core.evaluation.report.pictures import differences_figure, forest_figure
 from vap_core.evaluation.report.provenance import provenance
 from vap_core.evaluation.report.results import comparisons, outcomes, results
@@ -28,7 +29,9 @@ COMPARISON_FILES = ("paired.png", "comparisons.csv", "comparisons.tex")
 
 
 def report(sources: Sequence[Path], out: Path) -> str:
-    """Write report.md, its tables as CSV and LaTeX, forest.png and paired.png; return report.md.
+    """Write report.md and report.html, its tables as CSV and LaTeX, forest.png and paired.png.
+
+    Returns report.md.
 
     `sources` are run folders or published tables. An unfinished run is reported as it is, and
     marked. Rates in the CSV tables are fractions, as the names of their columns say.
@@ -63,6 +66,16 @@ def report(sources: Sequence[Path], out: Path) -> str:
         "provenance.csv": _csv_text(origins),
     }
     figures = {"forest.png": forest_figure(lines)}
+    files["report.html"] = report_page(
+        table=runs.table,
+        tables={
+            "Results": [result_rows(part, lines.iloc[:0]) for part in _by_track(lines)],
+            "Outcomes": [outcome_rows(ends)],
+        },
+        forest=figures["forest.png"],
+        sources=sources,
+        out=out,
+    )
     if compared:
         files["comparisons.csv"] = _csv_text(differences, fractions=["difference", "low", "high"])
         files["comparisons.tex"] = latex(comparison_rows(differences))
@@ -78,6 +91,11 @@ def _lists(runs: Runs) -> set[str]:
     for manifest in runs.manifests.values():
         digests.update(manifest["configuration"].get("lists", {}).values())
     return digests
+
+
+def _by_track(lines: "pd.DataFrame") -> "list[pd.DataFrame]":
+    """The results of each suite and track."""
+    return [part for _, part in lines.groupby(["suite", "split"], sort=False)]
 
 
 def _csv_text(table: "pd.DataFrame", fractions: Sequence[str] = ()) -> str:

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 BY = ["suite", "method"]
 """The columns that name a group of episodes here."""
+SUBGOAL = "subgoal"
+"""The column of the sub-goal that was diagnosed, counted from 1, where there are several."""
 DIAGNOSIS_COLUMNS = ("case", "sub_case", "deciding_frame")
 
 
@@ -34,7 +36,8 @@ def breakdown(table: "pd.DataFrame") -> "pd.DataFrame":
 
     `n` episodes, `failed`, a column of counts for each case (`case 1`, ...) and sub-case
     (`case 1: drift`, ...), and `mean_confidence`. The cases of a row sum to `failed`; errors are in
-    `n` alone.
+    `n` alone. Where there are sub-goals, `sub-goal 1`, ... count the failures by the first that
+    failed.
     """
     episodes = diagnosed(table)
     if "case_confidence" not in episodes:  # no episode failed
@@ -46,10 +49,21 @@ def breakdown(table: "pd.DataFrame") -> "pd.DataFrame":
         for sub_case in sub_cases:
             both = of_case & episodes["sub_case"].eq(sub_case)
             flat[f"{case}: {sub_case}"] = both.astype(int)
+    for number in _subgoals(episodes):
+        failed_there = episodes[SUBGOAL].eq(number) & episodes["outcome"].eq("failure")
+        flat[f"sub-goal {number}"] = failed_there.astype(int)
     counts = flat.groupby(BY, sort=False).sum().reset_index()
     with_case = episodes[episodes["case"].ne("")].groupby(BY, sort=False)
     confidence = with_case["case_confidence"].mean().rename("mean_confidence").reset_index()
     return counts.merge(confidence, on=BY, how="left")
+
+
+def _subgoals(episodes: "pd.DataFrame") -> list[int]:
+    """The numbers of the sub-goals that failed somewhere."""
+    if SUBGOAL not in episodes:
+        return []
+    failed = episodes.loc[episodes["outcome"].eq("failure"), SUBGOAL].dropna()
+    return sorted({int(number) for number in failed})
 
 
 def breakdown_rows(counts: "pd.DataFrame") -> list[list[str]]:
@@ -58,21 +72,25 @@ def breakdown_rows(counts: "pd.DataFrame") -> list[list[str]]:
     Failures in percent of all episodes, cases in percent of failures, each with its 95 % Wilson
     interval.
     """
-    cases = []
+    cases: list[str] = []
     titles = []
     for case in CASES:
         if counts[case].any():
             cases.append(case)
             titles.append(f"{case} % of failures")
+    for column in map(str, counts.columns):
+        if column.startswith("sub-goal "):
+            cases.append(column)
+            titles.append(f"{column} % of failures")
     rows = [["suite", "method", "n", "fail % [95 %]", *titles, "confidence"]]
     for line in counts.to_dict("records"):
         n = int(line["n"])
         failed = int(line["failed"])
         failure_rate = rate(failed, n)
         cells = [str(line["suite"]), str(line["method"]), str(line["n"]), str(failure_rate)]
-        for case in cases:
-            case_rate = rate(int(line[case]), failed)
-            cells.append(str(case_rate))
+        for column in cases:
+            share = rate(int(line[column]), failed)
+            cells.append(str(share))
         confidence = line["mean_confidence"]
         cells.append("-" if confidence != confidence else f"{confidence:.2f}")
         rows.append(cells)

@@ -97,8 +97,8 @@ def cases_figure(counts: "pd.DataFrame", first: str = "vap") -> "Figure":
     axes.set(xlim=(0, 112), xticks=range(0, 101, 20), xlabel="% of episodes that fail")
     axes.spines[["top", "right", "left"]].set_visible(False)
     figure.legend(
-        drawn.values(),
-        [MEANINGS.get(case, case) for case in drawn],
+        handles=list(drawn.values()),
+        labels=[MEANINGS.get(case, case) for case in drawn],
         loc="outside lower center",
         ncols=4,
         frameon=False,

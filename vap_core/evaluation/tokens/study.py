@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from vap_core.base.errors import BadOutput, BadStudy, one_of
+from vap_core.base.parquet import read_parquet
 from vap_core.base.types import Rgb
 from vap_core.evaluation import measurements, store
 from vap_core.evaluation.policy_names import shipped
@@ -187,7 +188,10 @@ def read(folder: Path) -> "dict[str, pd.DataFrame]":
 
     tables = {}
     for name in TABLES:
-        parts = [pd.read_parquet(path) for path in sorted((folder / name).glob("*.parquet"))]
+        parts = []
+        for path in sorted((folder / name).glob("*.parquet")):
+            remedy = "delete it and run the same command again"
+            parts.append(read_parquet(path, "eval-tokens", remedy))
         if not parts:
             raise BadOutput(
                 f"eval-tokens: {folder} holds no {name}; run the same command again to finish it."

@@ -150,7 +150,7 @@ def match(a: Points, b: Points) -> Int64[np.ndarray, "m 2"]:
         return np.zeros((0, 2), np.int64)
     cosine = a.rootsift @ b.rootsift.T
     forth = _nearest(cosine)
-    back = _nearest(cosine.T)
+    back = _nearest(np.ascontiguousarray(cosine.T))
     rows = np.flatnonzero(forth >= 0)
     mutual = rows[back[forth[rows]] == rows]
     return np.stack([mutual, forth[mutual]], axis=1)
@@ -166,10 +166,13 @@ def is_view(linear: Float64[np.ndarray, "2 2"]) -> bool:
 
 def _nearest(cosine: Float32[np.ndarray, "n m"]) -> Int64[np.ndarray, " n"]:
     """The most similar column of each row; -1 where the next one is nearly as similar."""
+    rows = np.arange(len(cosine))
     best = cosine.argmax(axis=1)
-    two = np.partition(cosine, cosine.shape[1] - 2, axis=1)[:, -2:]
-    next_best, first = np.maximum(2 - 2 * two, 0).T  # squared distances
-    return np.where(first <= RATIO**2 * next_best, best, -1)
+    others = cosine.copy()
+    others[rows, best] = -1.0
+    near = np.maximum(2 - 2 * cosine[rows, best], 0)  # squared distances
+    next_best = 2 - 2 * others.max(axis=1)
+    return np.where(near <= RATIO**2 * next_best, best, -1)
 
 
 def _chroma(rgb: Rgb) -> Float32[np.ndarray, "h w 2"]:

@@ -102,7 +102,7 @@ class MiniPI0Policy(PI0Policy):
         self.model.to(config.device)
         self.reset()
 
-    def _preprocess_images(self, batch: dict[str, Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+    def _preprocess_images(self, batch: dict[str, Any]) -> tuple[list[Tensor], list[Tensor]]:
         """PI0's, of images that are scaled as in training: with antialiasing."""
         size = tuple(self.config.image_resolution)
         scaled = dict(batch)

@@ -38,6 +38,8 @@ MISS_RAD = 1.2
 """How far beside the target a grasp goes that is to miss, and how far it is turned, either way."""
 BESIDE_M = 0.035
 """How far inside the limit of the near rule a thing is set down."""
+NEARER_M = (0.0, 0.02, 0.035, 0.05)
+"""By how much nearer to its goal a thing is set down, in this order, where that is needed."""
 LIFT_STEP_M = 0.015
 """By how much less a pose is raised in every further attempt, when the arm cannot follow."""
 PUT_DOWN_YAWS_DEG = (0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 180)
@@ -229,14 +231,15 @@ def _plan_set_down(env: Env, truth: Truth) -> tuple[Waypoint, ...]:
     points = points_world(env.row.target, truth.objects_world[env.row.target])
     centre = (points.min(axis=0) + points.max(axis=0))[:2] / 2
     foot = float(points[:, 2].min())
-    spot, floor = _put_down_spot(env, truth)
+    spots, floor = _put_down_spots(env, truth)
     base = _base_from_world(env)
-    shift = base @ np.array([*(spot - centre), floor - foot])
     about = base @ np.array([*centre, 0.0]) - base @ env.robot.base_world[:3]
     now = env.tcp_base()
     poses = []
-    for yaw in np.deg2rad(PUT_DOWN_YAWS_DEG).tolist():
-        poses.append(_turned(now, about, shift, yaw))
+    for spot in spots:
+        shift = base @ np.array([*(spot - centre), floor - foot])
+        for yaw in np.deg2rad(PUT_DOWN_YAWS_DEG).tolist():
+            poses.append(_turned(now, about, shift, yaw))
     down = _first_within_reach(env, poses, 0.006)
     if down is None:
         raise OutOfReach(
@@ -389,22 +392,33 @@ def _turned(
     return turned
 
 
-def _put_down_spot(env: Env, truth: Truth) -> tuple[Float64[np.ndarray, "2"], float]:
-    """Where the target's centre goes, and the height at which it is let go."""
+def _put_down_spots(env: Env, truth: Truth) -> tuple[list[Float64[np.ndarray, "2"]], float]:
+    """Where the target's centre goes, the best spot first, and the height at which it is let go.
+
+    Beside a goal it goes as far away as the rule lets it, for room; nearer where something else
+    would be nearer to it than the goal, or where the arm cannot reach.
+    """
     row = env.row
     goal = truth.objects_world[row.goal]
     if row.rule == "put":
-        return goal[:2].copy(), float(goal[2]) + 0.016
+        return [goal[:2].copy()], float(goal[2]) + 0.016
     target = truth.objects_world[row.target]
     goal_size = _diagonal(row.goal, goal)
     reach = 0.5 * (goal_size + _diagonal(row.target, target)) + 0.10 - BESIDE_M
     angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    spots = goal[:2] + reach * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    room = np.array([_distance_to_others(spot, env, truth) for spot in spots])
-    way = np.hypot(*(spots - target[:2]).T)
-    worth = np.minimum(room, 0.13) - 0.1 * way
-    best = int(np.argmax(worth))
-    return spots[best], float(goal[2]) + 0.004
+    fitting = []
+    farthest = None
+    for nearer in NEARER_M:
+        distance = reach - nearer
+        spots = goal[:2] + distance * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        room = np.array([_distance_to_others(spot, env, truth) for spot in spots])
+        way = np.hypot(*(spots - target[:2]).T)
+        worth = np.minimum(room, 0.13) - 0.1 * way
+        order = np.argsort(-worth, kind="stable").tolist()
+        if farthest is None:
+            farthest = spots[order[0]]
+        fitting += [spots[i] for i in order if room[i] > distance]
+    return fitting or [farthest], float(goal[2]) + 0.004
 
 
 def _diagonal(name: str, pose: Float64[np.ndarray, "7"]) -> np.floating:

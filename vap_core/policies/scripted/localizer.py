@@ -17,11 +17,16 @@ from vap_core.prompt import PALETTE, has_colour
 from vap_core.simulation.types import Pose
 
 COLOUR_NAMES = "|".join(colour.name for colour in PALETTE)
-SPAN = re.compile(rf"\b(?:the\s+(?P<colour>{COLOUR_NAMES})|my|the|a|an)\s+", re.IGNORECASE)
+OWNER = r"(?:my|his|her)(?:\s+[\w-]+['’]s)?"
+"""A possessive, with an owner beside the speaker: "my brother's"."""
+SPAN = re.compile(rf"\b(?:the\s+(?P<colour>{COLOUR_NAMES})|{OWNER}|the|a|an)\s+", re.IGNORECASE)
 """The words before a category: an article, a possessive, or "the" with a colour."""
 PLACE = re.compile(
-    r"\b(?P<how>near|on|onto|in|into|inside)\s+(?:(?:the|a|an|my)\s+)?", re.IGNORECASE
+    r"\b(?P<how>near|next to|beside|on|onto|in|into|inside)\s+"
+    rf"(?:(?:the\s+(?P<colour>{COLOUR_NAMES})|{OWNER}|the|a|an)\s+)?",
+    re.IGNORECASE,
 )
+NEAR = ("near", "next to", "beside")
 TOUCH = re.compile(r"\b(?:select|touch|point)\b", re.IGNORECASE)
 COLOURED = 0.25
 """A candidate has a colour when at least this share of its box does."""
@@ -44,13 +49,14 @@ Place = Float64[np.ndarray, "4"]
 class Command:
     """What an instruction asks for: a verb, the target's colour and category, and a goal.
 
-    `verb` is pick, put, near or touch; `colour` None and `goal` "" where the text names none.
+    `verb` is pick, put, near or touch; a colour None and `goal` "" where the text names none.
     """
 
     verb: str
     colour: Colour | None
     category: str
     goal: str = ""
+    goal_colour: Colour | None = None
 
 
 def read(text: str) -> Command:
@@ -64,8 +70,8 @@ def read(text: str) -> Command:
     if place:
         goal, _ = leading_category(text[place.end() :])
         if goal and goal != "table":
-            verb = "near" if place["how"].lower() == "near" else "put"
-            return Command(verb, colour, category, goal)
+            verb = "near" if place["how"].lower() in NEAR else "put"
+            return Command(verb, colour, category, goal, _colour_named(place["colour"]))
     verb = "touch" if TOUCH.search(text) else "pick"
     return Command(verb, colour, category)
 
@@ -108,12 +114,20 @@ class MonocularLocalizer:
         drawn = int(draw * len(confident))
         return self.place(confident[drawn], self.thick_m)
 
-    def find(self, rgb: Rgb, category: str) -> Place | None:
-        """Where the most confident box of a category stands; None when there is none."""
+    def find(self, rgb: Rgb, category: str, colour: Colour | None = None) -> Place | None:
+        """Where the most confident box of a category stands; None when there is none.
+
+        A colour that is named and seen decides.
+        """
         boxes = self.detector([rgb], category)[0]
         if not len(boxes):
             return None
-        return self.place(boxes.xyxy[0], WIDEST_M)
+        chosen = 0
+        if colour is not None:
+            shares = coloured(rgb, boxes, colour)
+            if shares.max() >= COLOURED:
+                chosen = int(shares.argmax())
+        return self.place(boxes.xyxy[chosen], WIDEST_M)
 
     def place(self, box: Float32[np.ndarray, "4"], thick_m: float) -> Place:
         """The place of an upright object by its box: that of the cylinder whose outline fills it.

@@ -32,8 +32,6 @@ LOCALIZING: tuple[Phase, ...] = ("seek", "above")
 """The phases in which the object is localized in the image."""
 RELEASING: tuple[Phase, ...] = ("carry", "lower", "open", "leave")
 """The phases in which the aim is the goal, not the target."""
-BESIDE_M = 0.075
-"""Room between a thing and what it is put near to: inside the rule's 10 cm."""
 
 Point = Float64[np.ndarray, "3"]
 
@@ -52,6 +50,9 @@ class Motion:
     """Grasp height as a share of the object's height."""
     patience_s: float = 2.0
     """Longest wait for an aim that is not quite reached."""
+    beside_m: float = 0.075
+    """Room between a thing and what it is put near to: inside the rule's 10 cm, and on a narrow
+    desk nearer than anything else."""
     empty: float = 0.08
     """A closed gripper that reads less than this holds nothing: try again."""
 
@@ -60,7 +61,7 @@ MOTIONS = {
     "wx250s": Motion(),
     "panda": Motion(),
     "google": Motion(thick_m=0.035, hover_m=0.20, close_s=1.4, arrived_m=0.02),
-    "so101": Motion(thick_m=0.028, hover_m=0.13, lift_m=0.09, close_s=0.6),
+    "so101": Motion(thick_m=0.028, hover_m=0.13, lift_m=0.09, close_s=0.6, beside_m=0.04),
 }
 
 
@@ -136,8 +137,10 @@ class Scripted:
             if found is not None:
                 state = replace(state, goal=found)
         if command.goal and state.goal is not None and state.spot is None:
-            place = self.localizer.find(rgb, command.goal)
-            state = replace(state, spot=_put_down_spot(place, state.goal, command))
+            place = self.localizer.find(rgb, command.goal, command.goal_colour)
+            state = replace(
+                state, spot=_put_down_spot(place, state.goal, command, self.motion.beside_m)
+            )
         hand = policy_input.state[:3].astype(np.float64)
         opening = float(policy_input.state[6])
         joints = policy_input.state[7:].astype(np.float64)
@@ -268,7 +271,9 @@ class Scripted:
         return low
 
 
-def _put_down_spot(place: Place | None, target: Place, command: Command) -> Point | None:
+def _put_down_spot(
+    place: Place | None, target: Place, command: Command, beside_m: float
+) -> Point | None:
     """Where the target goes: x, y and the height of what it stands on there.
 
     None when the goal is not seen.
@@ -280,5 +285,5 @@ def _put_down_spot(place: Place | None, target: Place, command: Command) -> Poin
     towards = target[:2] - place[:2]
     length = float(np.linalg.norm(towards))
     towards /= max(length, 1e-9)
-    distance = place[2] + target[2] + BESIDE_M
+    distance = place[2] + target[2] + beside_m
     return np.array([*(place[:2] + distance * towards), 0.0])

@@ -7,7 +7,7 @@ import numpy as np
 import rerun as rr
 
 from vap_core.base.types import Camera, Mask
-from vap_core.recording.colours import SERIES, TARGET, Rgb8
+from vap_core.recording.colours import object_colours
 from vap_core.recording.entities.images import send_class_images
 from vap_core.recording.entities.paths import image_root
 from vap_core.rollout.types import EpisodeHeader, Frame
@@ -16,14 +16,15 @@ NO_OBJECT_CLASS = 8
 """A prompt that covers no object."""
 FIRST_OBJECT_CLASS = 10
 """Class of the first object's inside. An inside is even; its edge is the number after it."""
-OTHER_COLOURS = [colour for colour in SERIES if colour != TARGET]
 CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 
 
 def coverage_classes(header: EpisodeHeader) -> list[rr.AnnotationInfo]:
     """One colour for each object: an inside for the prompt that covers it, an edge for itself."""
     classes = [rr.AnnotationInfo(id=NO_OBJECT_CLASS, label="no object", color=(255, 255, 255, 190))]
-    for i, (name, colour) in enumerate(_object_colours(header).items()):
+    row = header.row
+    colours = object_colours(list(header.object_sizes_m), row.target, row.goal)
+    for i, (name, colour) in enumerate(colours.items()):
         inside = FIRST_OBJECT_CLASS + 2 * i
         classes.append(rr.AnnotationInfo(id=inside, label=name, color=(*colour, 170)))
         classes.append(
@@ -56,19 +57,6 @@ def coverage_image(header: EpisodeHeader, frame: Frame, camera: Camera) -> np.nd
             image[tracks[0].mask] = FIRST_OBJECT_CLASS + 2 * names.index(covered)
     edges = _object_edges(frame.truth.masks.get(camera.name, {}), names, image)
     return np.where(edges > 0, edges, image)
-
-
-def _object_colours(header: EpisodeHeader) -> dict[str, Rgb8]:
-    """The target's orange, and a colour of its own for every other object."""
-    colours = {}
-    n_others = 0
-    for name in header.object_sizes_m:
-        if name == header.row.target:
-            colours[name] = TARGET
-        else:
-            colours[name] = OTHER_COLOURS[n_others % len(OTHER_COLOURS)]
-            n_others += 1
-    return colours
 
 
 def _covered_object(frame: Frame, camera: Camera) -> str | None:

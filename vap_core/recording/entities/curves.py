@@ -5,15 +5,29 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from vap_core.recording.colours import SERIES, TARGET, Rgb8, series_colour, series_style
+from vap_core.base.palette import Rgb8
+from vap_core.recording.colours import (
+    ELECTED,
+    LOOKALIKES,
+    MUTED,
+    TARGET,
+    camera_colour,
+    series_style,
+)
+from vap_core.recording.entities.distance import nearest_other_m
 from vap_core.recording.entities.paths import target_suffix
+from vap_core.recording.entities.status import grasp_state
 from vap_core.recording.stream import frame_times, log_row
-from vap_core.rollout.failure import EpisodeTrace
+from vap_core.rollout.failure import Diagnosis, EpisodeTrace
 from vap_core.rollout.types import EpisodeHeader, Frame
 
 STATE_NAMES = ("x", "y", "z", "rx", "ry", "rz", "gripper")
 """The first numbers of a robot state; joint angles follow."""
-MARGIN_WIDTH, SCORE_WIDTH, GRIPPER_WIDTH = 2.5, 2.0, 2.0
+MARGIN_WIDTH, SCORE_WIDTH, GRIPPER_WIDTH, LIFT_WIDTH, BAR_WIDTH = 2.5, 2.0, 2.5, 1.0, 6.0
+CLOSED = 0.5
+"""A smaller command closes the gripper."""
+BAR_SHARE = 0.05
+"""How far the bars of the grasp are below zero, as a share of the largest distance."""
 
 
 def log_robot_styles(rec: rr.RecordingStream, header: EpisodeHeader, frame: Frame) -> None:
@@ -30,7 +44,7 @@ def log_method_styles(rec: rr.RecordingStream, header: EpisodeHeader) -> None:
         for i, (camera, groundings) in enumerate(header.groundings.items()):
             for j in range(len(groundings)):
                 name = f"{camera}{target_suffix(j)}"
-                style = rr.SeriesLines(names=name, colors=series_colour(i), widths=width)
+                style = rr.SeriesLines(names=name, colors=camera_colour(i), widths=width)
                 log_row(rec, f"/vap/{curve}/{name}", style)
 
 
@@ -82,12 +96,74 @@ def send_reward(
 
 
 def send_gripper(
-    rec: rr.RecordingStream, trace: EpisodeTrace, index: Sequence[rr.TimeColumn]
+    rec: rr.RecordingStream,
+    header: EpisodeHeader,
+    trace: EpisodeTrace,
+    frames: Sequence[Frame],
+    diagnosis: Diagnosis | None,
+) -> tuple[float, float]:
+    """The gripper's distance from the target and from the nearest other object, centimetres.
+
+    Also the target's lift, bars below zero while the hand is closed and while it has an object, and
+    a cross at the deciding frame. Returns the chart's axis, from below the bars to above all
+    curves.
+    """
+    index = frame_times(frames)
+    gap_cm = 100 * trace.gap_m
+    lift_cm = 100 * trace.lift_m[trace.target]
+    curves = [
+        ("gripper to target", TARGET, GRIPPER_WIDTH, gap_cm),
+        ("target lifted", TARGET, LIFT_WIDTH, lift_cm),
+    ]
+    highest = float(max(gap_cm.max(), lift_cm.max(), 1.0))
+    other_m = nearest_other_m(header, frames)
+    if other_m is not None:
+        curves.append(("nearest other", LOOKALIKES[0], GRIPPER_WIDTH, 100 * other_m))
+        highest = max(highest, 100 * float(other_m.max()))
+    curves += _grasp_bars(trace, frames, -BAR_SHARE * highest)
+    for name, colour, width, values in curves:
+        entity = f"/vap/hand/{name.replace(' ', '_')}"
+        log_row(rec, entity, rr.SeriesLines(names=[name], colors=[colour], widths=[width]))
+        send_curve(rec, entity, index, values)
+    if diagnosis is not None:
+        _send_deciding_frame(rec, trace, frames, diagnosis)
+    return -0.2 * highest, 1.05 * highest
+
+
+def _grasp_bars(
+    trace: EpisodeTrace, frames: Sequence[Frame], level: float
+) -> list[tuple[str, Rgb8, float, np.ndarray]]:
+    """Where the hand is closed, and what it touches or holds then; nan elsewhere."""
+    states = [grasp_state(frame, trace.target) for frame in frames]
+    conditions = (
+        ("hand closed", MUTED, 2.6, trace.grip < CLOSED),
+        ("has the target", TARGET, 1.3, np.array([s.endswith("target") for s in states])),
+        ("has another", LOOKALIKES[0], 1.3, np.array([s.endswith("other") for s in states])),
+    )
+    bars = []
+    for name, colour, depth, flags in conditions:
+        if flags.any():
+            values = np.where(flags, depth * level, np.nan)
+            bars.append((name, colour, BAR_WIDTH, values))
+    return bars
+
+
+def _send_deciding_frame(
+    rec: rr.RecordingStream,
+    trace: EpisodeTrace,
+    frames: Sequence[Frame],
+    diagnosis: Diagnosis,
 ) -> None:
-    """The gripper's distance from the target's box and the target's lift, centimetres."""
-    lift_m = trace.lift_m[trace.target]
-    _send_gripper_curve(rec, "gripper to target", SERIES[0], trace.gap_m, index)
-    _send_gripper_curve(rec, "target lifted", TARGET, lift_m, index)
+    """A cross on the distance from the target."""
+    if diagnosis.frame_index not in trace.steps:
+        return
+    at = trace.steps.index(diagnosis.frame_index)
+    entity = "/vap/hand/deciding_frame"
+    style = rr.SeriesPoints(
+        names=["deciding frame"], colors=[ELECTED], markers=["cross"], marker_sizes=[7.0]
+    )
+    log_row(rec, entity, style)
+    send_curve(rec, entity, frame_times([frames[at]]), 100 * trace.gap_m[at : at + 1])
 
 
 def _send_track_scores(
@@ -103,16 +179,3 @@ def _send_track_scores(
     if tracked:
         entity = f"/vap/track_score/{camera}{target_suffix(j)}"
         send_curve(rec, entity, frame_times(tracked), np.array(scores))
-
-
-def _send_gripper_curve(
-    rec: rr.RecordingStream,
-    name: str,
-    colour: Rgb8,
-    values_m: np.ndarray,
-    index: Sequence[rr.TimeColumn],
-) -> None:
-    entity = f"/vap/hand/{name.replace(' ', '_')}"
-    style = rr.SeriesLines(names=[f"{name}, cm"], colors=[colour], widths=[GRIPPER_WIDTH])
-    log_row(rec, entity, style)
-    send_curve(rec, entity, index, 100 * values_m)

@@ -52,18 +52,3 @@ def send_class_images(
         draw_order=draw_orders,
     )
     rec.send_columns(entity, index, columns)
-
-
-def contact_sheet(crops: Sequence[np.ndarray], side: int = 128) -> Rgb:
-    """RGB crops of any sizes side by side, each fitted into a square of `side` pixels."""
-    cells = []
-    for crop in crops:
-        scale = side / max(crop.shape[:2])
-        width = max(1, round(crop.shape[1] * scale))
-        height = max(1, round(crop.shape[0] * scale))
-        top, left = (side - height) // 2, (side - width) // 2
-        cell = np.full((side, side, 3), 30, np.uint8)
-        fitted = cv2.resize(crop, (width, height), interpolation=cv2.INTER_AREA)
-        cell[top : top + height, left : left + width] = fitted
-        cells.append(cell)
-    return np.concatenate(cells, axis=1)

@@ -7,7 +7,7 @@ import numpy as np
 import rerun as rr
 
 from vap_core.base.types import Camera, Mask
-from vap_core.recording.colours import TARGET, TRUTH
+from vap_core.recording.colours import ELECTED, TARGET
 from vap_core.recording.entities.images import send_class_images
 from vap_core.recording.entities.paths import image_root, target_suffix
 from vap_core.rollout.types import EpisodeHeader, Frame
@@ -17,10 +17,10 @@ TRACK_CLASS, TRUTH_CLASS = 1, 3
 TRACK_EDGE_PX, TRUTH_EDGE_PX = 2, 1
 CLASSES = [
     rr.AnnotationInfo(id=0, label="", color=(0, 0, 0, 0)),
-    rr.AnnotationInfo(id=TRACK_CLASS, label="track", color=(*TARGET, 140)),
-    rr.AnnotationInfo(id=TRACK_CLASS + 1, label="track, edge", color=(*TARGET, 255)),
-    rr.AnnotationInfo(id=TRUTH_CLASS, label="truth", color=(*TRUTH, 1)),
-    rr.AnnotationInfo(id=TRUTH_CLASS + 1, label="truth, edge", color=(*TRUTH, 255)),
+    rr.AnnotationInfo(id=TRACK_CLASS, label="track", color=(*ELECTED, 90)),
+    rr.AnnotationInfo(id=TRACK_CLASS + 1, label="track, edge", color=(*ELECTED, 255)),
+    rr.AnnotationInfo(id=TRUTH_CLASS, label="truth", color=(*TARGET, 1)),
+    rr.AnnotationInfo(id=TRUTH_CLASS + 1, label="truth, edge", color=(*TARGET, 255)),
 ]
 """The edge has its own class so that track and truth stay apart where they agree."""
 

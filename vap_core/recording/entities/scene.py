@@ -9,7 +9,8 @@ import numpy as np
 import rerun as rr
 from scipy.spatial.transform import Rotation
 
-from vap_core.recording.colours import OTHER, TARGET, TRUTH, series_colour
+from vap_core.recording.colours import camera_colour, object_colours
+from vap_core.recording.entities.meshes import object_mesh
 from vap_core.recording.entities.paths import image_root
 from vap_core.recording.stream import log_row
 from vap_core.rollout.types import EpisodeHeader, Frame
@@ -20,7 +21,7 @@ TABLE = (92, 78, 64)
 JOINT_HALF_SIZE_M = 0.016
 MIN_BONE_M = 5e-3
 """Shorter bones are not drawn."""
-FRUSTUM_M = 0.14
+FRUSTUM_M = 0.05
 """Distance from a camera to its picture in the scene."""
 FINGERTIPS = ("finger", "jaw", "tip", "grip")
 """Links whose names contain one of these share the last link before them as their parent."""
@@ -50,23 +51,29 @@ def mean_placement(row: EpisodeRow) -> np.ndarray:
 
 
 def log_objects(rec: rr.RecordingStream, header: EpisodeHeader) -> None:
-    """Bounding boxes; an object's origin is the centre of its base."""
+    """Every object's own mesh, and its bounding box in the colour of its part in the task.
+
+    An object's origin is the centre of its base. Without a mesh in the registry its box is solid.
+    """
+    row = header.row
+    colours = object_colours(list(header.object_sizes_m), row.target, row.goal)
+    labels = {row.target: f"target: {row.target}", row.goal: f"goal: {row.goal}"}
     for name, size in header.object_sizes_m.items():
-        colour, label = OTHER, name
-        fill_mode = rr.components.FillMode.TransparentFillMajorWireframe
-        if name == header.row.target:
-            colour, label = TARGET, f"target: {name}"
+        fill_mode = rr.components.FillMode.MajorWireframe
+        mesh = object_mesh(name)
+        if mesh is None:
             fill_mode = rr.components.FillMode.Solid
-        elif name == header.row.goal:
-            colour, label = TRUTH, f"goal: {name}"
+        else:
+            log_row(rec, f"/world/objects/{name}/mesh", mesh)
         half = np.asarray(size) / 2
         box = rr.Boxes3D(
             centers=[[0, 0, half[2]]],
             half_sizes=[half],
-            colors=[colour],
+            colors=[colours[name]],
+            radii=rr.components.Radius.ui_points([1.5]),
             fill_mode=fill_mode,
-            labels=[label],
-            show_labels=label != name,
+            labels=[labels.get(name, name)],
+            show_labels=mesh is None and name in labels,
         )
         log_row(rec, f"/world/objects/{name}", box)
 
@@ -118,7 +125,7 @@ def log_cameras(rec: rr.RecordingStream, frame: Frame) -> None:
             resolution=[camera.width, camera.height],
             camera_xyz=rr.ViewCoordinates.RDF,
             image_plane_distance=FRUSTUM_M,
-            color=series_colour(i),
+            color=camera_colour(i),
         )
         log_row(rec, image_root(camera.name), pinhole)
 

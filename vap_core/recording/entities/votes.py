@@ -7,8 +7,9 @@ import numpy as np
 import rerun as rr
 
 from vap_core.base.events import describe_ballot
+from vap_core.base.palette import RIGHT_MARK, WRONG_MARK, Rgb8
 from vap_core.base.types import Association, Grounding
-from vap_core.recording.colours import OTHER, TARGET, Rgb8
+from vap_core.recording.colours import ELECTED, MUTED
 from vap_core.recording.entities.images import jpeg_image
 from vap_core.recording.entities.labels import place_labels
 from vap_core.recording.entities.paths import image_root, target_suffix
@@ -23,18 +24,21 @@ def log_vote(
     j: int,
     jpeg: np.ndarray | None,
     at: Sequence[rr.TimeColumn],
+    right: bool | None = None,
 ) -> None:
-    """The vote of target j in one view: labelled boxes over the picture, bars and numbers."""
+    """The vote of target j in one view: labelled boxes over the picture, and numbers.
+
+    `right` says whether it elected the target, where that is known.
+    """
     name = f"{grounding.camera}{target_suffix(j)}"
     order = _drawing_order(grounding)
     entity = f"{image_root(grounding.camera)}/candidates{target_suffix(j)}"
     if jpeg is not None:
         log_row(rec, entity, jpeg_image(jpeg), at=at)
     if order:
-        _log_boxes(rec, entity, grounding, order, at)
+        _log_boxes(rec, entity, grounding, order, at, right)
         counts = rr.AnyValues(counts=grounding.ballot.votes)
         log_row(rec, f"/vap/votes/{name}", counts, at=at)
-    _log_bars(rec, f"/vap/votes/{name}", grounding, order, at)
     log_row(rec, f"/vap/candidates/{name}", _candidate_numbers(grounding), at=at)
 
 
@@ -86,6 +90,7 @@ def _log_boxes(
     grounding: Grounding,
     order: list[int],
     at: Sequence[rr.TimeColumn],
+    right: bool | None,
 ) -> None:
     """Every candidate's box, and the labels that have room; `order` is that of drawing."""
     xyxy = grounding.candidates.xyxy[order]
@@ -95,11 +100,11 @@ def _log_boxes(
     labels = []
     for i in order:
         is_winner = i == grounding.winner
-        colours.append(TARGET if is_winner else OTHER)
+        colours.append(ELECTED if is_winner else MUTED)
         radii.append(WINNER_RADIUS_PT if is_winner else OTHER_RADIUS_PT)
         long_labels.append(_long_label(grounding, i))
         labels.append(f"#{i} v{grounding.ballot.votes[i]}")
-    labels[-1] = _top_label(grounding, order[-1])
+    labels[-1] = _top_label(grounding, order[-1], right)
     boxes = rr.Boxes2D(
         array=xyxy.reshape(-1, 4),
         array_format=rr.Box2DFormat.XYXY,
@@ -127,34 +132,14 @@ def _long_label(grounding: Grounding, i: int) -> str:
     return f"#{i} {score:.2f} · {votes} · cos {mean_cosines(grounding)[i]:.2f}"
 
 
-def _top_label(grounding: Grounding, i: int) -> str:
+def _top_label(grounding: Grounding, i: int, right: bool | None) -> str:
     """The label of the candidate on top: the ballot's words when it was elected."""
+    label = _long_label(grounding, i)
     if i == grounding.ballot.winner:
-        return f"#{i} {describe_ballot(grounding)}"
-    return _long_label(grounding, i)
-
-
-def _log_bars(
-    rec: rr.RecordingStream,
-    entity: str,
-    grounding: Grounding,
-    order: Sequence[int],
-    at: Sequence[rr.TimeColumn],
-) -> None:
-    """Votes as bars, the winner's in a colour of its own."""
-    others = list(order)
-    winner = []
-    if grounding.winner is not None:
-        others.remove(grounding.winner)
-        winner.append(grounding.winner)
-    for name, candidates, colour in (("others", others, OTHER), ("winner", winner, TARGET)):
-        if candidates:
-            bars = rr.BarChart(
-                grounding.ballot.votes[candidates].astype(np.float64),
-                abscissa=np.asarray(candidates, np.float64),
-                color=colour,
-            )
-            log_row(rec, f"{entity}/{name}", bars, at=at)
+        label = f"#{i} {describe_ballot(grounding)}"
+    if right is None or i != grounding.winner:
+        return label
+    return f"{RIGHT_MARK if right else WRONG_MARK} {label}"
 
 
 def _candidate_numbers(grounding: Grounding) -> rr.AnyValues:

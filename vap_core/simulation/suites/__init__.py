@@ -1,9 +1,9 @@
-"""Suites: the four personalised benchmarks, and the demo's warm-up suites.
+"""Suites: the four personalised benchmarks, shared scenes, and the demo's warm-up suites.
 
-The episode lists of the benchmarks are hashed files; those of the warm-up suites are generated.
-Every benchmark has a development list, the suite NAME-dev. NAME-absent and NAME-dev-absent are the
-same lists with the target left out; NAME-red and NAME-dev-red have a look-alike that is red by
-nature. A user's own suites come from files (own.py).
+The episode lists of benchmarks and shared scenes are hashed files; those of the warm-up suites are
+generated. Every benchmark has a development list, the suite NAME-dev. NAME-absent and
+NAME-dev-absent are the same lists with the target left out; NAME-red and NAME-dev-red have a
+look-alike that is red by nature. A user's own suites come from files (own.py).
 """
 
 from dataclasses import replace
@@ -15,7 +15,7 @@ import numpy as np
 from vap_core.base.errors import BadSuite, UnknownName, one_of
 from vap_core.simulation import robots
 from vap_core.simulation.assets import objects
-from vap_core.simulation.suites import development, lists, own, own_object, pick, starts
+from vap_core.simulation.suites import development, lists, own, own_object, pick, shared, starts
 from vap_core.simulation.suites.rules import Judge as Judge
 from vap_core.simulation.suites.simpler import BRIDGE, FRACTAL
 from vap_core.simulation.suites.suite import Suite as Suite
@@ -32,7 +32,9 @@ BENCHMARKS: dict[str, Suite] = {
     "tabletop": TABLETOP,
 }
 WARM_UPS: dict[str, Suite] = {"widowx-pick": pick.WIDOWX, "franka-pick": pick.FRANKA}
-SUITES: dict[str, Suite] = {**BENCHMARKS, **WARM_UPS}
+SHARED: dict[str, Suite] = shared.SUITES
+"""Scenes that two people share: two objects in turn, or two at once."""
+SUITES: dict[str, Suite] = {**BENCHMARKS, **SHARED, **WARM_UPS}
 ABSENT = "-absent"
 """Ends the name of a suite whose target is left out."""
 RED = objects.RED
@@ -62,13 +64,19 @@ def list_name(name: str) -> str:
 
 
 def benchmark_name(name: str) -> str:
-    """The benchmark of a suite: its own name, or that without -dev, -red and -absent."""
-    return list_name(name).removesuffix(development.SUFFIX)
+    """The benchmark of a suite: its own name, or that without -dev, -red and -absent.
+
+    Of a shared scene, the benchmark whose robot and frozen policy it has.
+    """
+    return shared.LIKE.get(name) or list_name(name).removesuffix(development.SUFFIX)
 
 
 def is_listed(name: str) -> bool:
-    """Whether a suite has a list on disk: a benchmark, its development list, or without targets."""
-    return benchmark_name(name) in BENCHMARKS
+    """Whether a suite has a list on disk: a benchmark, its development list, or without targets.
+
+    A shared scene has one, too.
+    """
+    return name in SHARED or benchmark_name(name) in BENCHMARKS
 
 
 def open_file(path: Path) -> Suite:

@@ -12,6 +12,7 @@ from typing import Any, get_args
 
 from vap_core.base.errors import BadSuite
 from vap_core.base.files import DATA, parse_json, read_file, write_atomic
+from vap_core.simulation.suites.shared_fields import BadField, from_json, to_json
 from vap_core.simulation.suites.variants import VARIANTS
 from vap_core.simulation.types import EpisodeRow, Placement, SuccessRule
 
@@ -23,6 +24,8 @@ FAR = 1e6
 _TEXT = ("suite", "task", "instruction", "category", "rule", "goal", "split", "variant")
 _COUNT = ("episode", "seed", "max_steps")
 _FIELDS = {*_TEXT, *_COUNT, "placements", "cameras"}
+_SHARED = {"speaker", "owned", "subgoals"}
+"""Fields of a shared scene's rows; the others have none of them."""
 
 
 def write(name: str, rows: Sequence[EpisodeRow], folder: Path = FOLDER) -> str:
@@ -132,7 +135,7 @@ def _to_json(row: EpisodeRow) -> dict[str, Any]:
     fields["placements"] = []
     for place in row.placements:
         fields["placements"].append([place.model, place.x, place.y, place.yaw])
-    return fields
+    return {**fields, **to_json(row)}
 
 
 def _parse_row(line: str, where: str) -> EpisodeRow:
@@ -145,74 +148,66 @@ def _parse_row(line: str, where: str) -> EpisodeRow:
         _check_fields(fields)
         _check_placements(fields["placements"])
         _check_goal(fields)
-    except _BadField as error:
+        shared = from_json(fields)
+    except BadField as error:
         raise BadSuite(f"suites: {where}, field {error.field!r}: {error.reason}.") from None
     placements = []
     for model, x, y, yaw in fields["placements"]:
         placements.append(Placement(model=model, x=float(x), y=float(y), yaw=float(yaw)))
     fields["placements"] = tuple(placements)
     fields["cameras"] = tuple(fields["cameras"])
-    return EpisodeRow(**fields)
-
-
-class _BadField(Exception):
-    """A field that a row may not have."""
-
-    def __init__(self, field: str, reason: str) -> None:
-        super().__init__(field, reason)
-        self.field = field
-        self.reason = reason
+    return EpisodeRow(**{**fields, **shared})
 
 
 def _check_fields(fields: Any) -> None:
     """The names of the fields, and the values of all but the placements and the goal."""
     expected = ", ".join(sorted(_FIELDS))
     if not isinstance(fields, Mapping):
-        raise _BadField("everything", f"missing or unknown; a row has {expected}")
-    if set(fields) != _FIELDS:
-        odd = sorted(_FIELDS ^ set(fields))
-        raise _BadField(odd[0], f"missing or unknown; a row has {expected}")
+        raise BadField("everything", f"missing or unknown; a row has {expected}")
+    if set(fields) - _SHARED != _FIELDS:
+        odd = sorted(_FIELDS ^ (set(fields) - _SHARED))
+        raise BadField(odd[0], f"missing or unknown; a row has {expected}")
     for name in _TEXT:
         if not isinstance(fields[name], str):
-            raise _BadField(name, f"{fields[name]!r} is no text")
+            raise BadField(name, f"{fields[name]!r} is no text")
     for name in _COUNT:
         least = 1 if name == "max_steps" else 0
         if type(fields[name]) is not int or fields[name] < least:
             kind = "positive whole number" if least else "whole number"
-            raise _BadField(name, f"{fields[name]!r} is no {kind}")
+            raise BadField(name, f"{fields[name]!r} is no {kind}")
     rules = get_args(SuccessRule)
     if fields["rule"] not in rules:
-        raise _BadField("rule", f"{fields['rule']!r} is unknown; known: {', '.join(rules)}")
+        raise BadField("rule", f"{fields['rule']!r} is unknown; known: {', '.join(rules)}")
     if fields["variant"] not in VARIANTS:
         known = ", ".join(VARIANTS)
-        raise _BadField("variant", f"{fields['variant']!r} is unknown; known: {known}")
+        raise BadField("variant", f"{fields['variant']!r} is unknown; known: {known}")
     cameras = fields["cameras"]
     if not isinstance(cameras, list) or not all(isinstance(name, str) for name in cameras):
-        raise _BadField("cameras", f"{cameras!r} is no list of camera names")
+        raise BadField("cameras", f"{cameras!r} is no list of camera names")
 
 
 def _check_placements(placements: Any) -> None:
     if not isinstance(placements, list) or not placements:
-        raise _BadField("placements", "empty; the first one is the target")
+        raise BadField("placements", "empty; the first one is the target")
     for i, place in enumerate(placements):
         if not (isinstance(place, list) and len(place) == 4 and isinstance(place[0], str)):
-            raise _BadField("placements", f"number {i} is {place!r}, not [model, x, y, yaw]")
+            raise BadField("placements", f"number {i} is {place!r}, not [model, x, y, yaw]")
         model, x, y, yaw = place
         if not (_is_number(x) and _is_number(y) and _is_number(yaw)):
-            raise _BadField(
+            raise BadField(
                 "placements",
                 f"{model!r} stands at {place[1:]}; x, y (m) and yaw (rad) must be finite numbers",
             )
         away_m = max(abs(x), abs(y))
         if away_m > 2.0:
-            raise _BadField(
+            raise BadField(
                 "placements",
                 f"{model!r} stands {away_m:g} m away; metres, within 2 of the robot",
             )
         for other_model, other_x, other_y, _ in placements[:i]:
             apart_m = max(abs(x - other_x), abs(y - other_y))
             if model != other_model and apart_m < CLOSE_M:
-                raise _BadField(
+                raise BadField(
                     "placements",
                     f"{model!r} and {other_model!r} stand in the same place; "
                     f"objects keep at least {CLOSE_M} m apart",
@@ -227,11 +222,11 @@ def _is_number(number: Any) -> bool:
 def _check_goal(fields: Mapping[str, Any]) -> None:
     names = [place[0] for place in fields["placements"]]
     if len(set(names)) < len(names):
-        raise _BadField("placements", f"an object is placed twice in {names}")
+        raise BadField("placements", f"an object is placed twice in {names}")
     goal = fields["goal"]
     needs_goal = fields["rule"] in ("near", "put")
     if bool(goal) != needs_goal or (goal and goal not in names[1:]):
-        raise _BadField(
+        raise BadField(
             "goal",
             f"{goal!r} for rule {fields['rule']!r}; near and put name a placed object "
             "other than the target, the others none",

@@ -9,7 +9,7 @@ least 5 steps in a row.
 dropped by 2 cm.
 *Put*: its centre within the receptacle's half-diagonal (+ 3 mm) of the receptacle's, which stands
 upright, its middle above the receptacle's foot, its underside no more than 2 cm above the rim,
-touching the receptacle and besides it at most the robot.
+touching the receptacle and besides it at most the robot, and what an earlier sub-goal put there.
 *Selected*: pressed by the gripper for more than 10 ms, no other object touched by the robot before.
 The goal of a task is no object to be confused with: touching or moving it is neither right nor
 wrong.
@@ -58,7 +58,7 @@ class Judge:
     which the rule's condition held, `held_steps` the longest; `order` names the objects in the
     order in which the robot touched or moved them (`earlier`: before the last step); it begins with
     the target, or the first object was not the right one. `step_m` is how far the target moved in
-    the last step.
+    the last step. `first` is the step at which it began: 0, or the end of an earlier sub-goal.
     """
 
     row: EpisodeRow
@@ -66,6 +66,7 @@ class Judge:
     start_world: Mapping[str, Pose]
     now: Truth
     steps: int = 0
+    first: int = 0
     step_m: float = 0.0
     run: int = 0
     held_steps: int = 0
@@ -76,12 +77,14 @@ class Judge:
     events: tuple[Event, ...] = ()
 
     @staticmethod
-    def start(row: EpisodeRow, sizes_m: Sizes, truth: Truth) -> "Judge":
-        """Before the first action, with everything settled."""
+    def start(row: EpisodeRow, sizes_m: Sizes, truth: Truth, first: int = 0) -> "Judge":
+        """Before the first action, with everything settled, `first` steps after the episode's."""
         start_world = {}
         for place in row.placements:
             start_world[place.model] = truth.objects_world[place.model].copy()
-        return Judge(row=row, sizes_m=sizes_m, start_world=start_world, now=truth)
+        return Judge(
+            row=row, sizes_m=sizes_m, start_world=start_world, now=truth, steps=first, first=first
+        )
 
     def step(self, truth: Truth) -> "Judge":
         """The state after one more control step."""
@@ -116,6 +119,11 @@ class Judge:
         """How far the middle of an object is from where it settled: toppling is moving."""
         start = _middle(self.start_world[name], self.sizes_m[name])
         return math.dist(_middle_of(self, truth or self.now, name), start)
+
+    @property
+    def over(self) -> bool:
+        """Whether no action is left to take: it is done, or out of time."""
+        return self.done or self.steps - self.first >= self.row.max_steps
 
     @property
     def success(self) -> bool:
@@ -154,7 +162,7 @@ class Judge:
             cmr=None if selecting else target in self.moved,
             wrong_object=bool(others & handled),
             first_object_correct=self.order[:1] == (target,),
-            steps=self.steps,
+            steps=self.steps - self.first,
             detail=detail,
             touched=bool(self.order),
         )
@@ -205,7 +213,7 @@ def _put(judge: Judge, truth: Truth, order: Names) -> bool:
     reach = _half_diagonal_m(judge.sizes_m[goal]) + OVER_M
     return (
         goal in partners
-        and partners <= {goal, ROBOT}
+        and partners <= {goal, ROBOT, *judge.row.inside}
         and _apart_m(judge, truth, target, goal) <= reach
         and foot <= judge.sizes_m[goal][2] + GAP_M
         and bool(middle[2] > stand[2])

@@ -19,6 +19,7 @@ import numpy as np
 
 from vap_core.base.errors import BadOutput, BadStudy, one_of
 from vap_core.base.files import write_atomic
+from vap_core.base.parquet import read_parquet
 from vap_core.base.tables import align
 from vap_core.base.types import Attended, Colour, Description, Rgb, value
 from vap_core.evaluation.metrics import rate
@@ -205,8 +206,10 @@ def keep(table: "pd.DataFrame", path: Path) -> None:
     columns = [name for name in table if name != "detail" and not name.startswith("seconds_")]
     policies = table[["suite", "policy"]].drop_duplicates()
     keys = list(policies.itertuples(index=False, name=None))
+    old = table[:0]
+    if path.exists():
+        old = read_parquet(path, "probe", "name another table with --out")
     try:
-        old = pd.read_parquet(path) if path.exists() else table[:0]
         old_keys = pd.MultiIndex.from_frame(old[["suite", "policy"]])
         parts = []
         for part in (old[~old_keys.isin(keys)], table[columns]):

@@ -8,9 +8,11 @@ on where it was interrupted, at whatever moment.
 """
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -210,12 +212,17 @@ def save(
     from lerobot.policies import make_pre_post_processors
 
     policy = learner.policy
-    policy.save_pretrained(out)
-    store_in_bfloat16(out / "model.safetensors")
+    # Killed at any moment, every file that has its name is whole.
+    with TemporaryDirectory(prefix=".saving-", dir=out) as name:
+        part = Path(name)
+        policy.save_pretrained(part)
+        store_in_bfloat16(part / "model.safetensors")
+        for pipeline in make_pre_post_processors(policy.config, dataset_stats=stats):
+            pipeline.save_pretrained(part)
+        for file in part.iterdir():
+            os.replace(file, out / file.name)
     # What is measured is what was saved.
     policy.load_state_dict(load_file(out / "model.safetensors"))
-    for pipeline in make_pre_post_processors(policy.config, dataset_stats=stats):
-        pipeline.save_pretrained(out)
     measured = []
     if held.films:
         with torch.no_grad():

@@ -1,0 +1,116 @@
+"""A run's recordings as a table, as films and as a page; a click on a candidate."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.command import vap
+from tests.drawn import K, opening, record
+from tests.test_why import fail
+from vap_core.base.errors import BadRecording
+from vap_core.base.video import frames as video_frames
+from vap_core.recording import Votes, serve_run, write_film
+from vap_core.recording.film import read_verdict
+from vap_core.recording.stored_pictures import prompted_entities, read_pictures
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A failure, a success, and a file that is no recording."""
+    folder = tmp_path_factory.mktemp("browsed") / "recordings"
+    fail(folder / "wrong.rrd", "owl_b", after=4, episode=4)
+    record(folder / "fine.rrd", opening(2))
+    (folder / "noise.rrd").write_bytes(b"noise" * 99)
+    return folder.parent
+
+
+def test_the_browser_links_every_recording_to_its_deciding_frame(run: Path) -> None:
+    import rerun as rr
+
+    with serve_run(run, "outcome = 'failure'") as browser:
+        assert browser.url.startswith("rerun+http://127.0.0.1:")
+        assert [path.name for path in browser.unreadable] == ["noise.rrd"]
+        client = rr.catalog.CatalogClient(browser.url.partition("/entry")[0])
+        rows = client.get_table("episodes").reader().to_pandas()
+        assert list(rows.file) == ["wrong.rrd", "fine.rrd"], "failures first"
+        assert rows.case[0] == "case 1"
+        assert rows.deciding_frame[0] == 4
+        assert "frame_index" in rows.link[0]
+        assert rows.link[0].startswith("rerun+http://127.0.0.1:")
+        assert client.get_table("episodes").blueprints()
+        assert client.get_dataset("recordings").default_blueprint()
+    none = run / "recordings" / "none"
+    with pytest.raises(BadRecording, match="there is no recording in"), serve_run(none):
+        pass
+
+
+def test_a_query_wants_a_condition_or_a_server(run: Path) -> None:
+    done = vap("query", run)
+    assert done.returncode == 2
+    assert "or add --serve" in done.stderr
+
+
+def test_a_film_shows_the_policys_input_and_holds_where_it_was_decided(
+    run: Path, tmp_path: Path
+) -> None:
+    path = run / "recordings" / "wrong.rrd"
+    n = write_film(path, tmp_path / "film.mp4")
+    assert n == 12 + 15 + 25, "12 steps at 10 Hz, 1.5 s at the deciding frame, 2.5 s at the end"
+    pictures = list(video_frames(tmp_path / "film.mp4"))
+    assert len(pictures) == n
+    below = slice(pictures[0].shape[0] - 50, None)
+    before, after = pictures[2][below, :600], pictures[10][below, :600]
+    assert before.std() < 10 < after.std(), "the verdict comes with the deciding frame"
+    assert read_verdict(path).startswith("✗ FAILURE · Case 1 · drift")
+    assert read_verdict(run / "recordings" / "fine.rrd") == "✓ SUCCESS · 12 steps"
+
+
+def test_pictures_come_back_from_jpeg_and_from_video(tmp_path: Path) -> None:
+    from tests.drawn import SUCCESS, frame
+    from vap_core.recording import Recorder
+
+    start = opening(1)
+    with Recorder(tmp_path / "video.rrd", start, video=True) as recorder:
+        for step in range(6):
+            recorder.frame(frame(step, start))
+        recorder.close(SUCCESS)
+    record(tmp_path / "still.rrd", start, steps=6)
+    for name in ("video", "still"):
+        path = tmp_path / f"{name}.rrd"
+        (entity,) = prompted_entities(path).values()
+        pictures = read_pictures(path, {entity})[entity]
+        assert sorted(pictures) == list(range(6))
+        true = frame(5, start).prompted["front"].astype(int)
+        assert np.abs(pictures[5].astype(int) - true).mean() < 6
+
+
+def test_a_click_on_a_candidate_says_its_cosines(run: Path) -> None:
+    votes = Votes(run / "recordings" / "fine.rrd")
+    assert votes.views == ["front", "side"]
+    entity = "/observation.images.side/candidates"
+    elected = votes.answer(entity, 2)  # the elected one is drawn last
+    assert elected is not None
+    name, words = elected
+    assert name == "side"
+    assert "candidate #0, elected: 4 of 5 votes" in words
+    assert words.count("(its vote)") == 4
+    assert words.count("photo ") == K
+    other = votes.answer(f"{entity}/labels", 0)
+    assert other is not None
+    assert "candidate #1, not elected" in other[1]
+    assert votes.answer("/world/table", 0) is None
+    beside = votes.answer(entity, None)
+    assert beside is not None
+    assert "click a box" in beside[1]
+    picture = votes.picture("side")
+    assert picture is not None
+    assert Image.open(io.BytesIO(_png(picture))).size[0] > 300
+
+
+def _png(picture: np.ndarray) -> bytes:
+    data = io.BytesIO()
+    Image.fromarray(picture).save(data, "PNG")
+    return data.getvalue()

@@ -1,0 +1,142 @@
+"""A recording in a notebook that answers clicks: a candidate's box shows its crops and cosines.
+
+    inspect_votes(Path("one.rrd"))
+
+Another box, another row; a click beside all boxes shows the whole vote again.
+"""
+
+import re
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vap_core.base.errors import BadRecording
+from vap_core.base.types import Rgb
+from vap_core.recording.entities.comparison import vote_picture_entity
+from vap_core.recording.entities.paths import image_root
+from vap_core.recording.reading import read_chunks
+from vap_core.recording.stored_pictures import read_pictures
+from vap_core.recording.viewer import view
+
+if TYPE_CHECKING:
+    from ipywidgets import VBox
+
+CANDIDATES = re.compile(
+    rf"^{re.escape(image_root(''))}(?P<camera>[^/]+)/candidates(?:_(?P<j>\d+))?"
+)
+
+
+class Votes:
+    """The votes of a recording, read once: `answer` says what a click on an entity is about."""
+
+    def __init__(self, recording: Path) -> None:
+        self._numbers: dict[str, dict[str, Any]] = {}
+        prefix = "/vap/candidates/"
+        for chunk in read_chunks(recording):
+            if chunk.entity_path.startswith(prefix):
+                batch = chunk.to_record_batch()
+                cells = {name: batch[name][0].as_py() for name in batch.schema.names}
+                self._numbers[chunk.entity_path.removeprefix(prefix)] = cells
+        if not self._numbers:
+            raise BadRecording(
+                f"inspect_votes: {recording} has no vote; take one of a vap episode."
+            )
+        entities = {vote_picture_entity(name) for name in self._numbers}
+        self._pictures = read_pictures(recording, entities)
+
+    @property
+    def views(self) -> list[str]:
+        """The views in which a vote was held; further targets end in `_j`."""
+        return list(self._numbers)
+
+    def picture(self, name: str) -> Rgb | None:
+        """The whole vote of a view."""
+        of_view = self._pictures[vote_picture_entity(name)]
+        return next(iter(of_view.values()), None)
+
+    def answer(self, entity: str, instance: int | None) -> tuple[str, str] | None:
+        """The view that a click is about, and one candidate in words; None for another entity.
+
+        Candidates are drawn with the elected one last: `instance` counts in that order.
+        """
+        match = CANDIDATES.match(entity)
+        if match is None:
+            return None
+        name = match["camera"] + (f"_{match['j']}" if match["j"] else "")
+        if name not in self._numbers:
+            return None
+        numbers = self._numbers[name]
+        n = len(numbers.get("score") or [])
+        if instance is None or not 0 <= instance < n:
+            return name, f"{name}: {n} candidates; click a box for its cosines"
+        return name, self._candidate(name, numbers, self._drawing_order(numbers, n)[instance])
+
+    @staticmethod
+    def _drawing_order(numbers: dict[str, Any], n: int) -> list[int]:
+        order = list(range(n))
+        top = numbers["winner"][0]
+        if top < 0:
+            top = numbers["elected"][0]
+        if top >= 0:
+            order.remove(top)
+            order.append(top)
+        return order
+
+    @staticmethod
+    def _candidate(name: str, numbers: dict[str, Any], i: int) -> str:
+        k = int(numbers["references"][0])
+        cosines = np.reshape(numbers["similarity"], (-1, k))
+        best = cosines.argmax(axis=0)
+        parts = []
+        for j in range(k):
+            mark = " (its vote)" if best[j] == i else ""
+            parts.append(f"photo {j}: {cosines[i, j]:.3f}{mark}")
+        role = "elected" if numbers["winner"][0] == i else "not elected"
+        return (
+            f"{name}, candidate #{i}, {role}: {numbers['votes'][i]} of {k} votes, mean cosine "
+            f"{cosines[i].mean():.3f}, detector {numbers['score'][i]:.2f}. {'; '.join(parts)}"
+        )
+
+
+def inspect_votes(recording: Path, *, width: int = 1100, height: int = 680) -> "VBox":
+    """The viewer, and below it the vote of the view that was clicked last.
+
+    Raises: BadRecording; MissingPart.
+    """
+    import ipywidgets
+
+    votes = Votes(recording)
+    shown = ipywidgets.Image(format="png", layout={"max_width": "100%"})
+    words = ipywidgets.HTML()
+
+    def show(name: str, text: str) -> None:
+        words.value = text
+        picture = votes.picture(name)
+        if picture is not None:
+            shown.value = _png(picture)
+
+    def on_event(event: Any) -> None:
+        if event.type != "selection_change":
+            return
+        for item in event.items:
+            entity = getattr(item, "entity_path", None)
+            found = None
+            if entity is not None:
+                found = votes.answer(entity, getattr(item, "instance_id", None))
+            if found is not None:
+                show(*found)
+
+    viewer = view(recording, width=width, height=height)
+    viewer.on_event(on_event)
+    show(votes.views[0], "click a candidate's box to see its cosines")
+    return ipywidgets.VBox([viewer, words, shown])
+
+
+def _png(picture: Rgb) -> bytes:
+    from PIL import Image
+
+    data = BytesIO()
+    Image.fromarray(picture).save(data, "PNG")
+    return data.getvalue()

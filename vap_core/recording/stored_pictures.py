@@ -1,0 +1,68 @@
+"""The pictures of a recording, read back: JPEG or AV1, as they were kept."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from vap_core.base.types import Rgb
+from vap_core.recording.entities.paths import image_root
+from vap_core.recording.reading import read_chunks
+
+BLOB, SAMPLE = "EncodedImage:blob", "VideoStream:sample"
+
+
+def prompted_entities(path: Path) -> dict[str, str]:
+    """The entity of what the policy saw, by camera, in the order of the file."""
+    entities: dict[str, str] = {}
+    root = image_root("")
+    for chunk in read_chunks(path):
+        name = chunk.entity_path
+        if name.startswith(root) and name.endswith("/prompted"):
+            entities[name.removeprefix(root).removesuffix("/prompted")] = name
+    return entities
+
+
+def read_pictures(path: Path, entities: set[str]) -> dict[str, dict[int, Rgb]]:
+    """The pictures of some entities, by entity and control step."""
+    jpegs: dict[str, dict[int, Any]] = {entity: {} for entity in entities}
+    packets: dict[str, dict[int, Any]] = {entity: {} for entity in entities}
+    for chunk in read_chunks(path):
+        if chunk.entity_path not in entities:
+            continue
+        batch = chunk.to_record_batch()
+        if "frame_index" not in batch.schema.names:
+            continue
+        steps = batch["frame_index"].to_pylist()
+        for name, kept in ((BLOB, jpegs), (SAMPLE, packets)):
+            if name in batch.schema.names:
+                for step, cell in zip(steps, batch[name], strict=True):
+                    blob = np.asarray(cell.values.flatten().to_numpy(), np.uint8)
+                    kept[chunk.entity_path][step] = blob
+    pictures = {}
+    for entity in entities:
+        pictures[entity] = {step: _decode_jpeg(blob) for step, blob in jpegs[entity].items()}
+        if packets[entity]:
+            in_order = dict(sorted(packets[entity].items()))
+            decoded = _decode_video(in_order.values())
+            pictures[entity] = dict(zip(in_order, decoded, strict=False))
+    return pictures
+
+
+def _decode_jpeg(blob: np.ndarray) -> Rgb:
+    bgr: Any = cv2.imdecode(blob, cv2.IMREAD_COLOR)
+    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(np.uint8)
+
+
+def _decode_video(packets: Any) -> Iterator[Rgb]:
+    """The pictures of an AV1 stream, in the order of its packets."""
+    import av
+
+    codec: Any = av.CodecContext.create("libdav1d", "r")
+    for packet in packets:
+        for frame in codec.decode(av.Packet(packet.tobytes())):
+            yield frame.to_ndarray(format="rgb24")
+    for frame in codec.decode(None):
+        yield frame.to_ndarray(format="rgb24")
