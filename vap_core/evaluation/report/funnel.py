@@ -7,7 +7,7 @@ import numpy as np
 
 from vap_core.base.figures import empty_figure
 from vap_core.base.palette import CASES as CASE_COLOURS
-from vap_core.base.palette import rgb8
+from vap_core.base.palette import METHODS, rgb8
 from vap_core.evaluation.diagnosis import STAGES
 from vap_core.evaluation.report.failures import FunnelRow
 from vap_core.rollout.failure import CASES
@@ -28,12 +28,16 @@ MEANINGS = {
 """The cases in a legend."""
 PERCENT_A_LETTER = 0.95
 """Width of a letter in a bar, in percent of its axis."""
+FUNNEL_COLOURS = {name: METHODS[name][0] for name in ("generic", "soft", "vap", "oracle-mask")}
+"""The methods of a funnel."""
 SUCCESS_MARK = "D"
 LABEL_APART = 6.0
 """Percent between two numbers at the ends of lines, so that both can be read."""
 
 
-def funnel_figure(rows: Sequence[FunnelRow], colours: Mapping[str, str]) -> "Figure":
+def funnel_figure(
+    rows: Sequence[FunnelRow], colours: Mapping[str, str] = FUNNEL_COLOURS
+) -> "Figure":
     """Per suite, the share of episodes that are left after each stage of the funnel.
 
     A line per method of `colours`, methods that read the simulator dashed. A method that highlights
