@@ -154,7 +154,7 @@ def test_ground_says_not_in_view_unless_it_is_to_tint_always(
     assert (answer["winner"], answer["instruction"]) == (None, "bring my cup")
     assert answer["likeness"][answer["rejected"]] < answer["threshold"]
     text = vap("ground", turned, *told).stdout
-    assert "mug not in view, cosine" in text
+    assert "mug not in view, likeness" in text
     assert "--always-tint" in text
     answer = json.loads(vap("ground", turned, *told, "--always-tint", "--json").stdout)
     assert answer["instruction"] == "bring the red cup"
@@ -253,7 +253,7 @@ def test_ground_refuses_a_damaged_memory(
 def test_rollout_refuses_unknown_names_and_foreign_folders(tmp_path: Path) -> None:
     out = ("--out", tmp_path / "run")
     assert (
-        "known: franka-pick, simpler-bridge, simpler-fractal, tabletop, vlabench, widowx-pick"
+        "known: franka-pick, shared-pair, shared-sequence, shared-sequence-bridge, simpler-bridge, simpler-fractal, tabletop, vlabench, widowx-pick"
         in refused("rollout", "--suite", "simpler", "--task", "pick-cup", *out)
     )
     assert "pick-bottle" in refused(

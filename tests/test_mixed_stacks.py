@@ -66,7 +66,7 @@ def network(model: str) -> Any:
                 )
             )
     for name, weight in net.named_parameters():
-        if weight.ndim > 1 and "norm" not in name:
+        if weight.ndim > 1 and weight.numel() and "norm" not in name:
             torch.nn.init.normal_(weight, std=0.9 / weight[0].numel() ** 0.5)
     return net.eval()
 
@@ -194,7 +194,10 @@ def test_names_of_mixed_stacks() -> None:
     assert models_of(name) == ("llmdet-base", "dinov2-base")
     check_stack(name)
     for wrong, words in (
-        ("embedded:encoder=resnet", "encoder 'resnet' is unknown; known: embedded, dinov2-small"),
+        (
+            "embedded:encoder=resnet",
+            "encoder 'resnet' is unknown; known: dinov2-base, dinov2-small, dinov3-small",
+        ),
         ("embedded:eye=dinov2-small", "part of a mixed stack 'eye' is unknown; known: detector"),
         ("fast:encoder=dinov2-small", "base of a mixed stack 'fast' is unknown"),
         ("embedded:encoder", "encoder 'nothing' is unknown"),

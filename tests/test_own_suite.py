@@ -49,7 +49,7 @@ def test_a_file_is_executed_once(file: Path) -> None:
 def test_other_commands_find_it_by_the_environment(
     file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(UnknownName, match="or with the file in VAP_SUITES"):
+    with pytest.raises(UnknownName, match="your own by its file or VAP_SUITES"):
         suites.suite("my-desk")
     monkeypatch.setenv("VAP_SUITES", str(file))
     assert suites.suite("my-desk").robot == "wx250s"

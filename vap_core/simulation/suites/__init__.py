@@ -51,7 +51,7 @@ def suite(name: str) -> Suite:
     if not is_listed(name):
         raise one_of(
             "suites.suite: suite (a benchmark also with -dev, -red, -absent, -dev-absent; your own "
-            f"by its file, or with the file in {own.VARIABLE})",
+            f"by its file or {own.VARIABLE})",
             name,
             SUITES,
         )
