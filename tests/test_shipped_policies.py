@@ -66,7 +66,7 @@ def test_the_cost_of_a_call_is_told_for_every_policy_that_ships() -> None:
         name for name in suites.BENCHMARKS if shipped(name) in FOLDERS
     ]
     for line in lines[5:]:
-        call, gain = float(line.split()[2]), float(line.split()[-3])
+        call, gain = float(line.split()[2]), float(line.split()[-5])
         assert 0 < call < 1000
         assert gain > 1, "a batch costs less than its episodes one by one"
 
