@@ -6,7 +6,14 @@ from typing import Annotated, Literal
 import typer
 
 from vap_core.cli.objects import BANK, Memory
-from vap_core.cli.options import DetectorName, EncoderName, StackName, TrackerName, stack_of
+from vap_core.cli.options import (
+    DetectorName,
+    EncoderName,
+    ObjectNames,
+    StackName,
+    TrackerName,
+    stack_of,
+)
 
 app = typer.Typer()
 
@@ -18,13 +25,7 @@ def attach_command(
     ],
     out: Annotated[Path, typer.Argument(help="Folder for the checkpoint with VAP.")],
     memory: Memory = BANK,
-    object: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--object",
-            help="Remembered object of each 'my ...', where the category alone does not decide.",
-        ),
-    ] = None,
+    object: ObjectNames = None,
     stack: StackName = "embedded",
     detector: DetectorName = "",
     encoder: EncoderName = "",
@@ -66,13 +67,7 @@ def inspect_dataset_command(
         str, typer.Argument(help='What the robot is to do, for example "pick my cup".')
     ],
     memory: Memory = BANK,
-    object: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--object",
-            help="Remembered object of each 'my ...', where the category alone does not decide.",
-        ),
-    ] = None,
+    object: ObjectNames = None,
     stack: StackName = "embedded",
     detector: DetectorName = "",
     encoder: EncoderName = "",

@@ -11,7 +11,14 @@ from typing import Annotated, Literal
 
 import typer
 
-from vap_core.cli.options import DetectorName, EncoderName, StackName, TrackerName, stack_of
+from vap_core.cli.options import (
+    DetectorName,
+    EncoderName,
+    ObjectNames,
+    StackName,
+    TrackerName,
+    stack_of,
+)
 
 app = typer.Typer()
 objects_app = typer.Typer(
@@ -148,13 +155,7 @@ def ground(
     instruction: Annotated[
         str, typer.Argument(help='What you would tell the robot, for example "bring my cup".')
     ],
-    object: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--object",
-            help="Remembered object of each 'my ...', where the category alone does not decide.",
-        ),
-    ] = None,
+    object: ObjectNames = None,
     memory: Memory = BANK,
     stack: StackName = "embedded",
     detector: DetectorName = "",

@@ -24,6 +24,13 @@ EncoderName = Annotated[
 TrackerName = Annotated[
     str, typer.Option("--tracker", help="Another tracker; it brings its segmenter.")
 ]
+ObjectNames = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--object",
+        help="Remembered object of each 'my ...', where the category alone does not decide.",
+    ),
+]
 Workers = Annotated[int, typer.Option(min=1, help="Processes.")]
 
 

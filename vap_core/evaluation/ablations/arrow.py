@@ -16,6 +16,7 @@ from vap_core.attend import Attender, AttendState
 from vap_core.base.types import Attended, Camera, Rgb
 from vap_core.evaluation.ablations.forms import draw_arrow
 from vap_core.rollout.prompters.protocol import PromptContext
+from vap_core.rollout.prompters.tint import TintPrompter
 from vap_core.simulation.cameras import project
 from vap_core.simulation.types import Observation, Pose
 
@@ -38,20 +39,18 @@ class ArrowPrompter:
     highlights = True
 
     def __init__(self, attender: Attender, base_world: Pose) -> None:
-        self.attender = attender
+        self.follower = TintPrompter(attender)
         rotation = SO3(base_world[3:])
         self.world_from_base = SE3.from_rotation_and_translation(rotation, base_world[:3])
 
     @property
     def references(self) -> Mapping[str, tuple[Rgb, ...]]:
-        return self.attender.references
+        return self.follower.references
 
     def start(
         self, observation: Observation, context: PromptContext
     ) -> tuple[AttendState, Attended]:
-        state, attended = self.attender.start(
-            observation.images, context.instruction, cameras=context.cameras
-        )
+        state, attended = self.follower.start(observation, context)
         return state, self._draw(attended, observation, context)
 
     def steps(
@@ -60,8 +59,7 @@ class ArrowPrompter:
         observations: Sequence[Observation],
         contexts: Sequence[PromptContext],
     ) -> list[tuple[AttendState, Attended]]:
-        views = [observation.images for observation in observations]
-        followed = self.attender.steps(states, views)
+        followed = self.follower.steps(states, observations, contexts)
         results = []
         for (state, attended), observation, context in zip(
             followed, observations, contexts, strict=True
