@@ -494,14 +494,24 @@ def test_a_gpu_that_is_asked_for_and_not_there_is_an_error(
 
 
 def test_the_stack_has_the_thresholds_that_calibrate_kept(weights: Path) -> None:
-    calls = foundation.load.__wrapped__
-    stack = calls("foundation", "cpu", weights)
+    stack = foundation.load("foundation", "cpu", weights)
     assert stack.thresholds is None
     path = keep_thresholds(weights, "foundation", stack.encoder.name, Thresholds(0.6, 0.6))
     try:
-        assert calls("foundation", "cpu", weights).thresholds == Thresholds(0.6, 0.6)
+        assert foundation.load("foundation", "cpu", weights).thresholds == Thresholds(0.6, 0.6)
     finally:
         path.unlink()
+
+
+def test_a_stack_is_kept_for_its_own_store(
+    weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(store.VARIABLE, str(weights))
+    monkeypatch.setenv("VAP_DEVICE", "cpu")
+    load_stack("foundation")
+    monkeypatch.setenv(store.VARIABLE, str(tmp_path))
+    with pytest.raises(MissingWeights, match="weights pull --stack foundation"):
+        load_stack("foundation")
 
 
 def test_the_whole_attender_runs_and_repeats_its_bits(

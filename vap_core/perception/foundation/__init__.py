@@ -8,15 +8,15 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from vap_core.base.device import device_name
 from vap_core.base.extras import require
 from vap_core.perception.foundation.sources import parts_of
 from vap_core.perception.kept_thresholds import read_thresholds
 from vap_core.perception.protocols import Stack, Thresholds
 
 
-@cache
 def load(kind: str, device: str | None = None, store: Path | None = None) -> Stack:
-    """A stack of `sources.KINDS`, from verified local weights.
+    """A stack of `sources.KINDS`, from verified local weights, which are read once.
 
     It has thresholds where `calibrate --keep` has written them beside the weights.
 
@@ -27,15 +27,22 @@ def load(kind: str, device: str | None = None, store: Path | None = None) -> Sta
         BadOutput: the file of thresholds is damaged.
     """
     require("foundation", f"the stack {kind}")
+    from vap_core.perception.foundation.store import store_folder
+
+    store = store or store_folder()
+    stack = _load_networks(kind, device_name(device), store)
+    return replace(stack, thresholds=read_thresholds(store, kind, stack.encoder.name))
+
+
+@cache
+def _load_networks(kind: str, device: str, store: Path) -> Stack:
+    """The stack without thresholds, kept for the next call with the same three."""
     from vap_core.perception.foundation import architectures
     from vap_core.perception.foundation.runtime import select_runtime
-    from vap_core.perception.foundation.store import store_folder, verify_stack
+    from vap_core.perception.foundation.store import verify_stack
 
-    runtime = select_runtime(device)
     networks = architectures.read_networks(*verify_stack(kind, store))
-    stack = architectures.assemble(kind, networks, runtime)
-    thresholds = read_thresholds(store or store_folder(), kind, stack.encoder.name)
-    return replace(stack, thresholds=thresholds)
+    return architectures.assemble(kind, networks, select_runtime(device))
 
 
 def load_parts(name: str, device: str | None = None, store: Path | None = None) -> dict[str, Any]:
