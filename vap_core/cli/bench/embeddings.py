@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -64,7 +65,7 @@ def tables(measurement: Measurement) -> list[Table]:
     return [Table("Comparing two tables of word embeddings", rows, note)]
 
 
-def _compare(plan: tuple[tuple[int, int], float]) -> dict[str, float]:
+def _compare(plan: tuple[tuple[int, int], float]) -> dict[str, Any]:
     """The comparison's figures, its CPU seconds, and the most gigabytes that the process took."""
     size, noise = plan
     with tempfile.TemporaryDirectory() as scratch:
