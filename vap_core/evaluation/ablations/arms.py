@@ -185,7 +185,7 @@ ABLATIONS: dict[str, Ablation] = {
             "associated-likest": Prompting(associate=Pairing(("geometry",), likest=True)),
         },
         methods=(DEFAULT, "vap-associated"),
-        suites=("vlabench",),
+        suites=("vlabench", "tabletop"),
     ),
     "switch": Ablation(
         question="Does the policy follow the tint to a look-alike in mid-episode?",
