@@ -8,7 +8,6 @@ read from files they show the still picture alone. Cells whose source JupyterLab
 """
 
 import html
-import json
 import os
 import re
 import shutil
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from vap_core.analysis.notebook_links import notebook_files, notebook_title
+from vap_core.analysis.notebook_links import notebook_files, notebook_title, read_notebook
 from vap_core.base.errors import BadOutput
 from vap_core.base.extras import require
 from vap_core.base.files import write_atomic
@@ -76,7 +75,7 @@ def write_pages(notebooks: Path, out: Path) -> list[Path]:
             page = out / f"{path.stem}.html"
             write_atomic(page, page_of(path, out).encode())
             pages.append(page)
-            title = notebook_title(json.loads(path.read_text()))
+            title = notebook_title(read_notebook(path))
             listed.append(f'<li><a href="{page.name}">{html.escape(title)}</a></li>')
         index = f"<!doctype html><meta charset='utf-8'><title>Notebooks</title>{STYLE}"
         index += f"<main><h1>Notebooks</h1><ul>{''.join(listed)}</ul></main>\n"
