@@ -174,7 +174,7 @@ def test_rows_count_what_they_say():
                 tinted=False,
                 elected="nothing",
                 mask_iou=None,
-            ),  # fmt: skip
+            ),
         ]
     )
     episodes = pd.DataFrame(

@@ -125,7 +125,8 @@ def _view_cells(part: "pd.DataFrame") -> list[str]:
 
 def _share(hits: "pd.Series", clusters: "pd.Series") -> str:
     """The share of hits with its interval, objects as clusters."""
-    return clustered_share(hits.fillna(False).to_numpy(float), clusters).text(digits=0)
+    known = hits.astype("boolean").fillna(False).to_numpy(float)
+    return clustered_share(known, clusters).text(digits=0)
 
 
 def _mean(values: "pd.Series") -> str:
