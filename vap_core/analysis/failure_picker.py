@@ -21,7 +21,6 @@ from vap_core.rollout.failure import CASES
 
 if TYPE_CHECKING:
     import pandas as pd
-    from rerun.notebook import Viewer
 
 KEY = ("suite", "task", "episode", "seed", "method", "policy")
 """The columns that name a labelled episode."""
@@ -123,8 +122,8 @@ class FailurePicker(Control):
         """The picked failure's line of the table."""
         return failure_row(self.failures, self.failure.value)
 
-    def viewer(self) -> "Viewer":
-        """The picked failure's recording at its deciding frame."""
+    def viewer(self) -> Any:
+        """Rerun's viewer with the picked failure's recording at its deciding frame."""
         from vap_core.recording import view
 
         path = recording_of(self.failures, self.failure.value)
