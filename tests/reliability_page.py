@@ -7,16 +7,19 @@ A test that was not run again keeps the counts of its last run in docs/reliabili
 """
 
 import argparse
+import ast
 import json
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 from tests.counts import FILE
 from tests.reliability_rows import ATTACKS, LEFT, TRIED
 
 PAGE = FILE.with_suffix(".md")
+ROOT = PAGE.parents[1]
 COLUMNS = ("outcome", "seconds", "on", "cases", "sweep")
 """What every entry has; the rest are counts that a test makes of its own."""
 HEAD = """# Reliability
@@ -45,6 +48,31 @@ def named() -> list[str]:
 def path_of(test: str) -> str:
     file, function = test.split("::")
     return f"tests/{file}.py::{function}"
+
+
+def functions_in(file: Path) -> dict[str, bool]:
+    """The tests of a file, and whether they have a short form."""
+    if not file.exists():
+        return {}
+    found = {}
+    for node in ast.parse(file.read_text()).body:
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
+            marks = [ast.unparse(decorator) for decorator in node.decorator_list]
+            found[node.name] = "pytest.mark.sweep" not in marks
+    return found
+
+
+def of_today(counts: Counts) -> dict[str, Entry]:
+    """Without the counts of tests that are gone, sorted."""
+    kept: dict[str, Entry] = {}
+    tests: dict[str, dict[str, bool]] = {}
+    for name, entry in sorted(counts.items()):
+        file, _, test = name.partition("::")
+        if file not in tests:
+            tests[file] = functions_in(ROOT / file)
+        if test.split("[")[0] in tests[file]:
+            kept[name] = entry
+    return kept
 
 
 def entries_of(tests: Iterable[str], counts: Counts) -> list[Entry]:
@@ -179,7 +207,9 @@ def main() -> int:
     parser.add_argument("--sweeps", action="store_true", help="with --run: also their long forms")
     asked = parser.parse_args()
     status = run(asked.sweeps) if asked.run else 0
-    PAGE.write_text(page(json.loads(FILE.read_text())))
+    counts = of_today(json.loads(FILE.read_text()))
+    FILE.write_text(json.dumps(counts, indent=0) + "\n")
+    PAGE.write_text(page(counts))
     print(f"wrote {PAGE}")
     return status
 

@@ -276,14 +276,19 @@ TRIED = (
         ("test_cluster::test_a_worker_writes_into_the_run_alone",),
     ),
     Row(
-        "the same episodes in another process, under another hash seed, in batches of 1 and 4",
-        "equal outcomes and steps; actions equal to the bit",
-        ("test_determinism::test_processes_hash_seeds_and_batches_change_no_bit",),
+        "24 rows of simpler-bridge under `lerobot-eval`, with the plain policy and with VAP attached",
+        "the successes of our engine, row by row",
+        ("test_lerobot_plugin::test_lerobots_own_command_gives_the_successes_of_our_engine",),
     ),
     Row(
-        "the same episodes with 1 and 2 threads",
-        "equal outcomes; actions within the stated tolerance (a run's workers have one thread)",
-        ("test_determinism::test_two_threads_change_the_last_bits_alone",),
+        "the same episodes in another process under another hash seed",
+        "actions, outcomes and steps equal to the bit",
+        ("test_determinism::test_another_process_and_hash_seed_change_no_bit",),
+    ),
+    Row(
+        "the same episodes in batches of 1 and 2, with 1 and 2 threads (a run's workers have one)",
+        "equal outcomes; actions of the first 16 steps within 2e-5 m or rad",
+        ("test_determinism::test_batches_and_threads_change_the_last_bits_alone",),
     ),
     Row(
         "pickle, eval, shell and remote code in the package",
@@ -542,7 +547,7 @@ ATTACKS = (
         "workers of a run have one thread; elsewhere the tolerance is tested",
         (
             "test_policy_faults::test_a_worker_has_one_thread_whatever_the_environment_says",
-            "test_determinism::test_two_threads_change_the_last_bits_alone",
+            "test_determinism::test_batches_and_threads_change_the_last_bits_alone",
         ),
     ),
     Attack(

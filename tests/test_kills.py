@@ -107,7 +107,7 @@ def server() -> Iterator[Server]:
         yield started
 
 
-KILLS = [2, pytest.param(40, marks=[pytest.mark.sweep, pytest.mark.timeout(1800)])]
+KILLS = [2, pytest.param(20, marks=[pytest.mark.sweep, pytest.mark.timeout(1800)])]
 
 
 @pytest.mark.parametrize("kills", KILLS)
@@ -194,7 +194,7 @@ def wait_until_it_ends(pid: int, seconds: float) -> bool:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kills", [2, pytest.param(15, marks=pytest.mark.sweep)])
+@pytest.mark.parametrize("kills", [2, pytest.param(12, marks=pytest.mark.sweep)])
 @pytest.mark.timeout(1200)
 def test_a_notebook_that_is_killed_leaves_whole_files_and_no_kernel(
     tmp_path: Path, kills: int, record_property: Callable[[str, object], None]
