@@ -1,10 +1,6 @@
 """Episodes of VAP and of generic in this process, written to a file: `python -m tests.one_rollout`.
 
-<<<<<<< HEAD
 python -m tests.one_rollout OUT.npz --batch 2 --threads 1 --episodes 2
-=======
-python -m tests.one_rollout OUT.npz --batch 4 --threads 1 --episodes 4
->>>>>>> main
 """
 
 import argparse
@@ -21,17 +17,10 @@ SUITE, TASK = "simpler-bridge", "put-camera"
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
-<<<<<<< HEAD
     parser.add_argument("--batch", type=int, default=2)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--episodes", type=int, default=2)
     parser.add_argument("--methods", nargs="+", default=["vap"])
-=======
-    parser.add_argument("--batch", type=int, default=4)
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--episodes", type=int, default=4)
-    parser.add_argument("--methods", nargs="+", default=["generic", "vap"])
->>>>>>> main
     asked = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = str(asked.threads)
 

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from tests.counts import FILE
+from tests.counts import FILE, encode
 from tests.reliability_rows import ATTACKS, LEFT, TRIED
 
 PAGE = FILE.with_suffix(".md")
@@ -208,7 +208,7 @@ def main() -> int:
     asked = parser.parse_args()
     status = run(asked.sweeps) if asked.run else 0
     counts = of_today(json.loads(FILE.read_text()))
-    FILE.write_text(json.dumps(counts, indent=0) + "\n")
+    FILE.write_text(encode(counts))
     PAGE.write_text(page(counts))
     print(f"wrote {PAGE}")
     return status
