@@ -101,66 +101,6 @@ def test_a_clip_that_is_ended_leaves_no_half_film(
     assert check_films(torn)
 
 
-@pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
-    with serving() as started:
-        yield started
-
-
-KILLS = [2, pytest.param(20, marks=[pytest.mark.sweep, pytest.mark.timeout(1800)])]
-
-
-@pytest.mark.parametrize("kills", KILLS)
-@pytest.mark.parametrize("name", random_kills.WORK)
-def test_work_that_is_killed_at_random_moments_leaves_whole_files(
-    server: Server,
-    tmp_path: Path,
-    name: str,
-    kills: int,
-    monkeypatch: pytest.MonkeyPatch,
-    record_property: Callable[[str, object], None],
-) -> None:
-    torn, whole = tmp_path / "torn", tmp_path / "whole"
-    monkeypatch.setenv("VAP_OBJECTS", str(torn))
-    torn.mkdir()
-    paths: tuple[Path, ...] = ()
-    if name == "report":
-        paths = (run(tmp_path / "one"),)
-        report([run(tmp_path / "other", episodes=4)], torn)
-    elif name == "ground":
-        paths = make_clip(tmp_path)
-    before = named(torn) if name == "report" else {}
-    server.whole(name, *paths, whole)  # the first one loads what the later ones have
-    seconds = server.whole(name, *paths, whole)
-    after = named(whole) if name == "report" else {}
-    if name == "import":
-        storage.save_scan(torn, METADATA, cube())
-
-    def is_whole() -> None:
-        for file, content in named(torn).items() if name == "report" else ():
-            assert content in (before.get(file), after.get(file)), f"{file} is torn"
-        if name == "ground":
-            check_films(torn)
-        if name == "import":
-            (place,) = storage.scan_folders().values()
-            storage.load_scan(place)
-
-    for _ in kill_in(
-        seconds,
-        lambda after_s: server.killed(after_s, name, *paths, torn),
-        kills,
-        random.Random(kills),
-    ):
-        is_whole()
-    server.whole(name, *paths, torn)
-    is_whole()
-    if name == "report":
-        assert {file: named(torn)[file] for file in after} == after
-    if name == "ground":
-        assert check_films(torn)
-    record_property("cases", kills)
-
-
 CELLS = (
     """import os
 from pathlib import Path
@@ -243,4 +183,64 @@ def test_a_notebook_that_is_killed_leaves_whole_files_and_no_kernel(
                 picture.load()
     assert not execute(None)
     assert results() == whole
+    record_property("cases", kills)
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    with serving() as started:
+        yield started
+
+
+KILLS = [2, pytest.param(20, marks=[pytest.mark.sweep, pytest.mark.timeout(1800)])]
+
+
+@pytest.mark.parametrize("kills", KILLS)
+@pytest.mark.parametrize("name", random_kills.WORK)
+def test_work_that_is_killed_at_random_moments_leaves_whole_files(
+    server: Server,
+    tmp_path: Path,
+    name: str,
+    kills: int,
+    monkeypatch: pytest.MonkeyPatch,
+    record_property: Callable[[str, object], None],
+) -> None:
+    torn, whole = tmp_path / "torn", tmp_path / "whole"
+    monkeypatch.setenv("VAP_OBJECTS", str(torn))
+    torn.mkdir()
+    paths: tuple[Path, ...] = ()
+    if name == "report":
+        paths = (run(tmp_path / "one"),)
+        report([run(tmp_path / "other", episodes=4)], torn)
+    elif name == "ground":
+        paths = make_clip(tmp_path)
+    before = named(torn) if name == "report" else {}
+    server.whole(name, *paths, whole)  # the first one loads what the later ones have
+    seconds = server.whole(name, *paths, whole)
+    after = named(whole) if name == "report" else {}
+    if name == "import":
+        storage.save_scan(torn, METADATA, cube())
+
+    def is_whole() -> None:
+        for file, content in named(torn).items() if name == "report" else ():
+            assert content in (before.get(file), after.get(file)), f"{file} is torn"
+        if name == "ground":
+            check_films(torn)
+        if name == "import":
+            (place,) = storage.scan_folders().values()
+            storage.load_scan(place)
+
+    for _ in kill_in(
+        seconds,
+        lambda after_s: server.killed(after_s, name, *paths, torn),
+        kills,
+        random.Random(kills),
+    ):
+        is_whole()
+    server.whole(name, *paths, torn)
+    is_whole()
+    if name == "report":
+        assert {file: named(torn)[file] for file in after} == after
+    if name == "ground":
+        assert check_films(torn)
     record_property("cases", kills)

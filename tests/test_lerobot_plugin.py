@@ -28,7 +28,7 @@ from vap_core.simulation import suites
 ROOT = Path(__file__).resolve().parents[1]
 PLUGIN = ROOT / "plugins" / "lerobot_env_vap"
 SUITE, TASK = "simpler-bridge", "put-camera"
-EPISODES = 8
+EPISODES = 4
 """Rows of one command."""
 
 
