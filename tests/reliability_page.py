@@ -50,22 +50,21 @@ def path_of(test: str) -> str:
     return f"tests/{file}.py::{function}"
 
 
-def functions_in(file: Path) -> dict[str, bool]:
-    """The tests of a file, and whether they have a short form."""
+def functions_in(file: Path) -> set[str]:
+    """The tests of a file."""
     if not file.exists():
-        return {}
-    found = {}
+        return set()
+    found = set()
     for node in ast.parse(file.read_text()).body:
         if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
-            marks = [ast.unparse(decorator) for decorator in node.decorator_list]
-            found[node.name] = "pytest.mark.sweep" not in marks
+            found.add(node.name)
     return found
 
 
 def of_today(counts: Counts) -> dict[str, Entry]:
     """Without the counts of tests that are gone, sorted."""
     kept: dict[str, Entry] = {}
-    tests: dict[str, dict[str, bool]] = {}
+    tests: dict[str, set[str]] = {}
     for name, entry in sorted(counts.items()):
         file, _, test = name.partition("::")
         if file not in tests:
