@@ -46,7 +46,10 @@ def test_cases_and_outcomes_are_added_up() -> None:
     entries = [entry(30, False, refused=4), entry(10_000, True, refused=9_000, largest_a=1e-7)]
     assert reliability_page.how_often(entries) == "30, 10,000 in the sweep"
     assert reliability_page.counted(entries) == "refused: 9,004; largest a: 1.0e-07"
-    assert reliability_page.last_run(entries) == "passed, 2026-01-01"
-    broken = [*entries, entry(1, False, outcome="failed", on="2026-01-02")]
-    assert reliability_page.last_run(broken) == "1 of 3 FAILED, 2026-01-02"
-    assert reliability_page.last_run([]) == "not run"
+    counted = {"tests/test_a.py::test_b[0]": entries[0], "tests/test_a.py::test_b[1]": entries[1]}
+    tests = ("test_a::test_b", "test_a::test_c")
+    assert reliability_page.last_run(tests[:1], counted) == "passed, 2026-01-01"
+    counted["tests/test_a.py::test_b[2]"] = entry(1, False, outcome="failed", on="2026-01-02")
+    broken = "1 of 3 FAILED, 1 of 2 tests not run, 2026-01-02"
+    assert reliability_page.last_run(tests, counted) == broken
+    assert reliability_page.last_run(tests[1:], counted) == "not run"
