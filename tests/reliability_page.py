@@ -28,9 +28,9 @@ What was tried against the package, how often, what happened, and what is left. 
 from outside are parsed, never executed, and bounded in size and time; what fails gives one line
 with a remedy; nothing that is finished is lost.
 
-Made by `make reliability` from `docs/reliability.json`, which the tests write when they run as
-`pytest -p tests.counts`; `python -m tests.reliability_page --run --sweeps` runs them all. The
-short forms run in `make test`, the sweeps in `make test-all`. A case is one input, one kill or one
+Made by `make reliability` from `docs/reliability.json`, which tests write when they run as
+`pytest -p tests.counts`; `tests/reliability_page.py` also runs all that are named here. The short
+forms run in `make test`, the sweeps in `make test-all`. A case is one input, one kill or one
 parameter of a test.
 """
 Entry = Mapping[str, Any]
