@@ -295,7 +295,7 @@ def _share(chosen: "pd.Series") -> Rate:
 
 def _task_order() -> dict[str, int]:
     """The place of every task in its suite."""
-    order = {}
+    order: dict[str, int] = {}
     for tasks in shared.TASKS.values():
         order |= {task.name: i for i, task in enumerate(tasks)}
     return order
