@@ -575,7 +575,7 @@ ATTACKS = (
         "26",
         "low",
         "set-up did not insist on the hashes of its packages",
-        "every install of packages says `--require-hashes`",
+        "every install of packages requires their hashes",
         ("test_promises::test_set_up_installs_nothing_without_its_hash",),
     ),
 )
