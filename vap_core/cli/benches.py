@@ -67,7 +67,10 @@ def bench(
     ] = 200,
     json: Annotated[
         Path | None,
-        typer.Option(help="eval, profile, scale: keep the measurement in this file, too."),
+        typer.Option(
+            help="eval, profile, scale: keep the measurement in this file, too. eval that was "
+            "interrupted goes on after its last whole repeat, which FILE.part.json keeps."
+        ),
     ] = None,
 ) -> None:
     """Measure what a step, a start and a query cost, as shares and ratios within one run.
@@ -97,10 +100,12 @@ def bench(
         measurement = measure()
         if json is not None:
             write(measurement, json)
+            json.with_suffix(".part.json").unlink(missing_ok=True)
         return as_text(measurement, tables(measurement))
 
+    part = None if json is None else json.with_suffix(".part.json")
     against_lerobot = partial(
-        bench_eval.measure, workers, lerobot_from, repeats=repeats, quick=quick
+        bench_eval.measure, workers, lerobot_from, repeats=repeats, quick=quick, part=part
     )
     by_part = partial(bench_profile.measure, quick=quick)
     scale = partial(bench_scale.measure, episodes, quick)
