@@ -13,12 +13,16 @@ from tests.command import refused, vap
 from vap_core.analysis.ablations import (
     ablation_results,
     all_effects_figure,
+    cases_figure,
     cases_text,
     effect_text,
+    policies_figure,
+    policy_results,
     rates_of_arms_figure,
     sweep_figure,
 )
 from vap_core.analysis.agreements import gate_figure, gated_cases
+from vap_core.analysis.prompt_forms import forms_figure, marked_frames
 from vap_core.attend import Prompting
 from vap_core.base.types import Camera
 from vap_core.evaluation import hiding, paper
@@ -313,6 +317,54 @@ def test_figures_of_published_ablations() -> None:
     assert cases_text(results["rewrite"]).splitlines()[0].split() == (
         "vap SR 90 % [60, 98], Case 1 1 of 10, Case 2 0 of 10".split()
     )
+
+
+def test_an_ablation_of_two_suites_has_a_heading_each() -> None:
+    arms = {"vap": [True] * 4 + [False] * 6, "vap-associated": [True] * 7 + [False] * 3}
+    table = pd.concat([
+        outcomes(arm, won).assign(suite=suite, case=["case 2" if suite == "tabletop" else "case 1"] * 10)
+        for suite in ("vlabench", "tabletop") for arm, won in arms.items()
+    ], ignore_index=True)  # fmt: skip
+    results = ablation_results(table)
+    (axes,) = all_effects_figure(results, columns=1).axes
+    labels = [tick.get_text() for tick in axes.get_yticklabels()]
+    assert labels == [
+        "association on vlabench: against vap, 40 % of 10",
+        "vap-associated",
+        "association on tabletop: against vap, 40 % of 10",
+        "vap-associated",
+    ]
+    assert len(all_effects_figure(results, columns=2).axes) == 2
+    assert effect_text(results["association"], "vap-associated", "tabletop").startswith("+30 [")
+    left, right = cases_figure(results["association"]).axes
+    assert [left.get_title(), right.get_title()] == ["vlabench", "tabletop"]
+    widths = [[bar.get_width() for bar in bars] for bars in right.containers]
+    assert widths == [[0, 0], [100, 100]]
+
+
+def test_policies_stand_side_by_side_and_a_method_is_taken_once() -> None:
+    newer = pd.concat([outcomes("vap", [True] * 10), outcomes("mask-only", [False] * 10)])
+    older = pd.concat(
+        [outcomes("vap", [False] * 10), outcomes("generic", [True] * 3 + [False] * 7)]
+    )
+    results = policy_results([newer, older])
+    assert [one.arm for one in results] == ["generic", "mask-only", "vap"]
+    assert [one.sr.k for one in results] == [3, 0, 10]
+    assert effect_text(results, "vap").startswith("+70 [")
+    figure = policies_figure({"one": results, "other": results[:2]})
+    assert [axes.get_title() for axes in figure.axes] == ["one", "other"]
+    assert [len(axes.get_yticklabels()) for axes in figure.axes] == [3, 2]
+
+
+def test_every_form_is_shown_on_one_frame() -> None:
+    frames = marked_frames(suites.rows("simpler-bridge", "put-camera", n=1)[0])
+    assert set(frames) == {"vap", *ABLATIONS["form"].arms, *ABLATIONS["opacity"].arms}
+    assert len({frame.shape for frame in frames.values()}) == 1
+    pictures = {frame.tobytes() for frame in frames.values()}
+    assert len(pictures) == len(frames), "no two forms look the same"
+    assert len(
+        forms_figure(suites.rows("simpler-bridge", "put-camera", n=1)[0]).axes[0].images
+    ) == len(frames)
 
 
 def test_views_agree_only_where_the_margin_is_large_enough() -> None:

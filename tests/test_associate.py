@@ -170,6 +170,21 @@ def test_references_count_ratios_of_distances_only(
         assert other == pytest.approx(one, abs=0.01)
 
 
+def test_the_likest_reference_alone_can_stand_for_all() -> None:
+    """The first candidate is near to one reference only, the second to all by half."""
+    cosine = np.array([[0.9, 0.1, 0.1], [0.5, 0.5, 0.5]], np.float32)
+    empty = np.zeros((0, 3), np.float32)
+    views = [
+        Sighting(cosine, np.zeros((2, 4), np.float32), np.zeros((2, 4), np.float32)),
+        Sighting(empty, np.zeros((0, 4), np.float32), np.zeros((0, 4), np.float32)),
+    ]
+    by_mean, nothing = references(views, Pairing(()))
+    by_likest, _ = references(views, Pairing((), likest=True))
+    assert by_mean[1] > by_mean[0]
+    assert by_likest[0] - by_likest[1] == pytest.approx(3.7 * np.log(0.5 / 0.1), abs=1e-4)
+    assert nothing.tolist() == [0.0]
+
+
 def test_geometry_recovers_true_correspondences() -> None:
     """Two overhead cameras 0.5 m apart; every distance can be reckoned by hand."""
     left, right = overhead("left", 0.0), overhead("right", 0.5)

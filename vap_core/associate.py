@@ -68,6 +68,9 @@ class Pairing:
     `spread_m` as objects stand that close on a table."""
     astray: float = 0.015
     """The share of boxes so cut or so wrong that their centres carry no evidence."""
+    likest: bool = False
+    """Whether a candidate's distance to the references is that to the likest one alone, instead of
+    the mean; the numbers above were fitted with the mean."""
     decisive: float = 0.0
     """The best choice for all views is taken where it leads every other by this; elsewhere each
     view keeps its own."""
@@ -189,13 +192,14 @@ def references(views: Sequence[Sighting], pairing: Pairing) -> list[ViewScores]:
     """The references' evidence for the candidates of every view.
 
     It is `evidence` (log(d_v / d_i) + max(log(d / d_v) + `absent`, 0)), and 0 for none. d_i is 1 -
-    the mean cosine of candidate i with the references, d_v the least in its view, d the least in
-    all views.
+    the mean cosine of candidate i with the references (the greatest where `likest`), d_v the least
+    in its view, d the least in all views.
     """
     distances = []
     for view in views:
-        mean = view.cosine.astype(np.float64).mean(axis=1)
-        distances.append(np.maximum(1.0 - mean, NEAREST))
+        cosine = view.cosine.astype(np.float64)
+        of_each = cosine.max(axis=1) if pairing.likest else cosine.mean(axis=1)
+        distances.append(np.maximum(1.0 - of_each, NEAREST))
     least = min(float(d.min()) for d in distances if len(d))
     scores = []
     for d in distances:

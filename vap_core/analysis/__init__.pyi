@@ -1,8 +1,11 @@
 from .ablations import ablation_episodes as ablation_episodes
 from .ablations import ablation_results as ablation_results
 from .ablations import all_effects_figure as all_effects_figure
+from .ablations import cases_figure as cases_figure
 from .ablations import cases_text as cases_text
 from .ablations import effect_text as effect_text
+from .ablations import policies_figure as policies_figure
+from .ablations import policy_results as policy_results
 from .ablations import rates_of_arms_figure as rates_of_arms_figure
 from .ablations import sweep_figure as sweep_figure
 from .agreements import gate_figure as gate_figure
@@ -50,6 +53,8 @@ from .plots import layouts_figure as layouts_figure
 from .plots import learning_figure as learning_figure
 from .plots import rates_figure as rates_figure
 from .plots import sheet as sheet
+from .prompt_forms import forms_figure as forms_figure
+from .prompt_forms import marked_frames as marked_frames
 from .token_figures import choice_figure as choice_figure
 from .token_figures import rotation_figure as rotation_figure
 from .token_figures import token_curves_figure as token_curves_figure

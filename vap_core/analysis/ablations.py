@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vap_core.base.figures import empty_figure
-from vap_core.evaluation.ablations.arms import ABLATIONS
+from vap_core.base.palette import CASES
+from vap_core.evaluation.ablations.arms import ABLATIONS, Ablation
 from vap_core.evaluation.ablations.picture import CLEAR, PAPER, UNCLEAR, draw_effects
 from vap_core.evaluation.ablations.table import ArmResult, arm_results
 from vap_core.evaluation.publish import read_runs
@@ -22,6 +23,14 @@ if TYPE_CHECKING:
 
 Results = dict[str, list[ArmResult]]
 """The arms of every ablation, by its name."""
+Block = list[tuple[str, ArmResult]]
+"""Arms of one ablation on one suite, each with its label; the first is what they are against."""
+POLICY = Ablation(
+    question="Was the steering taught by the tints of the policy's training?",
+    arms={},
+    methods=("generic", "rewrite-only", "mask-only", "vap", "oracle-track", "wrong-mask"),
+)
+"""Methods that two policies are compared in; its arms are policies, which no method is."""
 
 
 def ablation_episodes(path: Path) -> "pd.DataFrame":
@@ -42,37 +51,66 @@ def ablation_results(episodes: "pd.DataFrame") -> Results:
     return found
 
 
-def all_effects_figure(results: Results) -> "Figure":
-    """Every arm of every ablation: points of success against the ablation's first arm."""
-    shown = [(name, [one for one in arms if one.against]) for name, arms in results.items()]
-    n_rows = sum(len(arms) for _, arms in shown)
-    figure = empty_figure(7.4, 0.9 + 0.2 * (n_rows + len(shown)))
-    axes = figure.subplots()
-    y = 0.0
-    ticks = []
-    labels = []
-    for name, arms in shown:
-        first = results[name][0]
-        ticks.append(y)
-        labels.append(f"{name}: against {first.arm}, {100 * first.sr.value:.0f} % of {first.sr.n}")
-        y -= 1
-        for one in arms:
-            draw_effects(axes, one, results[name], y)
-            ticks.append(y)
-            labels.append(one.arm)
-            y -= 1
-    axes.set_yticks(ticks, labels, fontsize=7)
-    headings = {f"{name}: " for name, _ in shown}
-    for label in axes.get_yticklabels():
-        if any(label.get_text().startswith(heading) for heading in headings):
-            label.set_fontweight("bold")
-    axes.set_ylim(y + 0.4, 0.6)
-    axes.axvline(0, color="black", linewidth=0.8)
-    axes.set_xlabel("success rate, points against the first arm (95 %, paired)")
-    axes.spines[["top", "right", "left"]].set_visible(False)
-    axes.tick_params(axis="y", length=0)
+def all_effects_figure(results: Results, columns: int = 2) -> "Figure":
+    """Every arm of every ablation: points of success against the first arm of its suite."""
+    blocks: list[Block] = []
+    for name, arms in results.items():
+        blocks += _blocks(name, arms)
+    parts = _split_evenly(blocks, columns)
+    most = max(sum(map(len, part)) for part in parts)
+    figure = empty_figure(5.2 * len(parts), 0.9 + 0.17 * most)
+    for axes, part in zip(figure.subplots(1, len(parts), squeeze=False)[0], parts, strict=True):
+        _draw_blocks(axes, part)
+        axes.set_ylim(-most + 0.4, 0.6)
+        axes.set_xlim(-103, 45)
+    figure.supxlabel("success rate, points against the first arm (95 %, paired)", fontsize=9)
     _explain(figure)
     return figure
+
+
+def _blocks(name: str, arms: Sequence[ArmResult]) -> list[Block]:
+    """One block a suite of an ablation: its first arm, with the block's heading, and the others."""
+    several = len({one.suite for one in arms}) > 1
+    blocks: list[Block] = []
+    for one in arms:
+        if one.against is None:
+            where = f" on {one.suite}" if several else ""
+            rate = f"{100 * one.sr.value:.0f} % of {one.sr.n}"
+            blocks.append([(f"{name}{where}: against {one.arm}, {rate}", one)])
+        else:
+            blocks[-1].append((one.arm, one))
+    return blocks
+
+
+def _split_evenly(blocks: Sequence[Block], columns: int) -> list[list[Block]]:
+    """The blocks in their order, in columns of about as many lines."""
+    n_lines = sum(map(len, blocks))
+    parts: list[list[Block]] = [[]]
+    done = 0
+    for block in blocks:
+        if parts[-1] and done + len(block) / 2 > n_lines * len(parts) / columns:
+            parts.append([])
+        parts[-1].append(block)
+        done += len(block)
+    return parts
+
+
+def _draw_blocks(axes: "Axes", blocks: Sequence[Block]) -> None:
+    labels: list[str] = []
+    for block in blocks:
+        heading, first = block[0]
+        labels.append(heading)
+        for label, one in block[1:]:
+            draw_effects(axes, one, [first], -len(labels))
+            labels.append(label)
+    ticks = axes.set_yticks([-y for y in range(len(labels))], labels, fontsize=7)
+    headings = {block[0][0] for block in blocks}
+    for tick, label in zip(ticks, labels, strict=True):
+        if label in headings:
+            tick.label1.set_fontweight("bold")
+    axes.axvline(0, color="black", linewidth=0.8)
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.tick_params(axis="y", length=0)
 
 
 def sweep_figure(
@@ -105,18 +143,72 @@ def rates_of_arms_figure(results: Sequence[ArmResult]) -> "Figure":
     """The success rate of every arm, ours with 95 % intervals, the paper's as diamonds."""
     figure = empty_figure(4.6, 0.8 + 0.24 * len(results))
     axes = figure.subplots()
-    for y, one in enumerate(reversed(results)):
-        low, mid, high = (100 * x for x in (one.sr.low, one.sr.value, one.sr.high))
-        axes.plot([low, high], [y, y], color=CLEAR, linewidth=2)
-        axes.plot(mid, y, "o", color=CLEAR)
-        if one.paper == one.paper:
-            axes.plot(100 * one.paper, y, "D", color=PAPER, fillstyle="none", markersize=5)
-    names = [f"{one.arm}, n {one.sr.n}" for one in reversed(results)]
-    axes.set_yticks(range(len(results)), names, fontsize=8)
-    axes.set_xlim(-3, 103)
+    _draw_rates(axes, results)
     axes.set_xlabel("success rate, % (95 %; diamonds: the paper)", fontsize=8)
-    axes.spines[["top", "right"]].set_visible(False)
     return figure
+
+
+def policies_figure(of_policies: Mapping[str, Sequence[ArmResult]]) -> "Figure":
+    """The same arms of several policies side by side; `of_policies` has a title for each."""
+    n_arms = max(map(len, of_policies.values()))
+    figure = empty_figure(3.9 * len(of_policies), 1.0 + 0.24 * n_arms)
+    parts = figure.subplots(1, len(of_policies), squeeze=False)[0]
+    for axes, (title, results) in zip(parts, of_policies.items(), strict=True):
+        _draw_rates(axes, results)
+        axes.set_title(title, fontsize=9)
+        axes.set_xlabel("success rate, % (95 %)", fontsize=8)
+    return figure
+
+
+def cases_figure(results: Sequence[ArmResult]) -> "Figure":
+    """The share of episodes that failed by Case 1 and by Case 2, one part a suite."""
+    suites = list(dict.fromkeys(one.suite for one in results))
+    most = max(sum(one.suite == suite for one in results) for suite in suites)
+    figure = empty_figure(3.9 * len(suites), 1.0 + 0.3 * most)
+    for axes, suite in zip(figure.subplots(1, len(suites), squeeze=False)[0], suites, strict=True):
+        arms = [one for one in results if one.suite == suite]
+        ys = range(len(arms) - 1, -1, -1)
+        first = [100 * one.case_1.value for one in arms]
+        second = [100 * one.case_2.value for one in arms]
+        bars_1 = axes.barh(ys, first, color=CASES["case 1"], label="Case 1")
+        bars_2 = axes.barh(ys, second, left=first, color=CASES["case 2"], label="Case 2")
+        axes.bar_label(
+            bars_1,
+            [str(one.case_1.k or "") for one in arms],
+            label_type="center",
+            color="white",
+            fontsize=7,
+        )
+        axes.bar_label(
+            bars_2,
+            [str(one.case_2.k or "") for one in arms],
+            label_type="center",
+            color="white",
+            fontsize=7,
+        )
+        axes.set_yticks(ys, [f"{one.arm}, n {one.sr.n}" for one in arms], fontsize=8)
+        axes.set_title(suite, fontsize=9)
+        axes.set_xlabel("% of episodes", fontsize=8)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2,
+                  frameon=False, fontsize=8)  # fmt: skip
+    return figure
+
+
+def policy_results(sources: Sequence["pd.DataFrame"]) -> list[ArmResult]:
+    """`POLICY`'s methods of one policy, each against generic; of a method in several tables the
+    first is taken.
+    """
+    import pandas as pd
+
+    kept: list[pd.DataFrame] = []
+    taken: set[str] = set()
+    for table in sources:
+        wanted = set(POLICY.names) - taken
+        part = table[table["method"].isin(wanted)]
+        taken |= set(part["method"])
+        kept.append(part)
+    return arm_results(POLICY, pd.concat(kept, ignore_index=True))
 
 
 def cases_text(results: Iterable[ArmResult]) -> str:
@@ -130,13 +222,29 @@ def cases_text(results: Iterable[ArmResult]) -> str:
     return "\n".join(lines)
 
 
-def effect_text(results: Sequence[ArmResult], arm: str) -> str:
-    """Points of success of an arm against the first, with its interval and n."""
-    (one,) = [each for each in results if each.arm == arm]
+def effect_text(results: Sequence[ArmResult], arm: str, suite: str = "") -> str:
+    """Points of success of an arm against the first, with its interval; of the first its rate.
+
+    `suite` says which, where there are several.
+    """
+    (one,) = [each for each in results if each.arm == arm and suite in ("", each.suite)]
     if one.against is None:
         return f"{100 * one.sr.value:.0f} % of {one.sr.n}"
     low, mid, high = (100 * x for x in (one.against.low, one.against.difference, one.against.high))
     return f"{mid:+.0f} [{low:+.0f}, {high:+.0f}]"
+
+
+def _draw_rates(axes: "Axes", results: Sequence[ArmResult]) -> None:
+    for y, one in enumerate(reversed(results)):
+        low, mid, high = (100 * x for x in (one.sr.low, one.sr.value, one.sr.high))
+        axes.plot([low, high], [y, y], color=CLEAR, linewidth=2)
+        axes.plot(mid, y, "o", color=CLEAR)
+        if one.paper == one.paper:
+            axes.plot(100 * one.paper, y, "D", color=PAPER, fillstyle="none", markersize=5)
+    names = [f"{one.arm}, n {one.sr.n}" for one in reversed(results)]
+    axes.set_yticks(range(len(results)), names, fontsize=8)
+    axes.set_xlim(-3, 103)
+    axes.spines[["top", "right"]].set_visible(False)
 
 
 def _finish(axes: "Axes") -> None:

@@ -68,8 +68,8 @@ def bench(
     json: Annotated[
         Path | None,
         typer.Option(
-            help="eval, profile, scale: keep the measurement in this file, too. eval that was "
-            "interrupted goes on after its last whole repeat, which FILE.part.json keeps."
+            help="eval, profile, scale, embeddings: keep the measurement in this file, too. eval "
+            "that was interrupted goes on after its last whole repeat, in FILE.part.json."
         ),
     ] = None,
 ) -> None:
@@ -109,6 +109,7 @@ def bench(
     )
     by_part = partial(bench_profile.measure, quick=quick)
     scale = partial(bench_scale.measure, episodes, quick)
+    of_tables = partial(bench_embeddings.measure, quick)
     benchmarks: dict[str, Callable[[], str]] = {
         "loop": partial(bench_loop.run, steps),
         "suites": partial(bench_suites.run, workers),
@@ -118,7 +119,7 @@ def bench(
         "profile": partial(kept, by_part, bench_profile.tables),
         "scale": partial(kept, scale, scale_report.tables),
         "engine": partial(bench_engine.run, workers, quick),
-        "embeddings": partial(bench_embeddings.run, quick),
+        "embeddings": partial(kept, of_tables, bench_embeddings.tables),
         "query": partial(bench_query.run, quick=quick),
         "style": bench_style.run,
         "measured": measured.run,

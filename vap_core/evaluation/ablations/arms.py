@@ -182,9 +182,10 @@ ABLATIONS: dict[str, Ablation] = {
             "associated-embedding": Prompting(associate=PAIRINGS["embedding"]),
             "associated-both": Prompting(associate=Pairing(("embedding", "geometry"))),
             "associated-decisive": Prompting(associate=Pairing(("geometry",), decisive=1.0)),
+            "associated-likest": Prompting(associate=Pairing(("geometry",), likest=True)),
         },
         methods=(DEFAULT, "vap-associated"),
-        suites=("vlabench",),
+        suites=("vlabench", "tabletop"),
     ),
     "switch": Ablation(
         question="Does the policy follow the tint to a look-alike in mid-episode?",

@@ -40,8 +40,7 @@ class ArrowPrompter:
 
     def __init__(self, attender: Attender, base_world: Pose) -> None:
         self.follower = TintPrompter(attender)
-        rotation = SO3(base_world[3:])
-        self.world_from_base = SE3.from_rotation_and_translation(rotation, base_world[:3])
+        self.world_from_base = pose_transform(base_world)
 
     @property
     def references(self) -> Mapping[str, tuple[Rgb, ...]]:
@@ -79,6 +78,11 @@ class ArrowPrompter:
                 if track.mask is not None and start is not None:
                     images[camera] = draw_arrow(images[camera], track.mask, colour, start)
         return replace(attended, images=images)
+
+
+def pose_transform(pose: Pose) -> SE3:
+    """The transform of a position and a quaternion."""
+    return SE3.from_rotation_and_translation(SO3(pose[3:]), pose[:3])
 
 
 def hand_pixel(camera: Camera, hand_world: Float64[np.ndarray, "3"]) -> tuple[int, int] | None:
