@@ -1,6 +1,5 @@
 """The embedded tracker, on small films painted here: who stays, who vanishes, who comes back, and what is remembered meanwhile."""
 
-from collections.abc import Sequence
 from dataclasses import fields
 from functools import cache
 from typing import Any
@@ -208,41 +207,18 @@ def test_a_third_of_an_object_is_as_familiar_as_the_whole_and_a_plate_is_not() -
 
 def test_appearances_are_measured_against_bare_surroundings_and_against_each_other() -> None:
     rows = np.eye(3, dtype=np.float32)[:2]
-    bare = np.array([1 / 7, 1 / 7, np.sqrt(47) / 7], np.float32)  # the least cosine is .4
-    known = appearance.Appearances(rows, np.ones(2, bool), bare)
+    known = appearance.Appearances(rows, np.array([0.4, 0.4], np.float32))
     tilted = np.array([0.5, 0.6, np.sqrt(0.39)], np.float32)
-    plain = np.array([0.3, 0.0, np.sqrt(0.91)], np.float32)
-    assert known.is_like(tilted, rows[1], 1)
-    assert known.is_most_like(tilted, rows[1], 1)
-    assert known.is_like(tilted, rows[0], 0)
-    assert not known.is_most_like(tilted, rows[0], 0)  # more like the other
-    assert known.is_most_like(tilted, tilted, 0)  # but it has looked like this of late
-    assert not known.is_like(plain, rows[0], 0)  # like nothing in particular
+    assert known.accept(tilted, rows[1], 1)
+    assert not known.accept(tilted, rows[0], 0)  # more like the other
+    assert known.accept(tilted, tilted, 0)  # but it has looked like this of late
+    assert not known.accept(
+        np.array([0.3, 0.0, np.sqrt(0.91)], np.float32), rows[0], 0
+    )  # like nothing in particular
     boxes = np.array([[0, 0, 40, 40], [88, 0, 128, 40]], np.float32)
     assert appearance.background_crop(
         np.arange(SIZE * SIZE * 3, dtype=np.uint8).reshape(SIZE, SIZE, 3), boxes
     ).shape[:2] <= (44, 44)
-
-
-def test_a_crop_is_embedded_when_it_is_first_asked_for() -> None:
-    embedded: list[int] = []
-
-    class Encoder:
-        name = "counts"
-
-        def __call__(self, crops: Sequence[np.ndarray]) -> np.ndarray:
-            embedded.extend(int(rgb[0, 0, 0]) for rgb in crops)
-            return np.array([np.eye(4)[rgb[0, 0, 0]] for rgb in crops], np.float32)
-
-    crops = [np.full((2, 2, 3), i, np.uint8) for i in range(4)]
-    known = appearance.no_appearances(Encoder(), crops[:3], crops[3])
-    known = appearance.with_rows(known, Encoder(), crops[:3], [1])
-    assert embedded == [3, 1]
-    assert known.known.tolist() == [False, True, False]
-    assert known.is_like(np.eye(4, dtype=np.float32)[1], np.zeros(4, np.float32), 1)
-    known = appearance.with_rows(known, Encoder(), crops[:3], range(3))
-    assert embedded == [3, 1, 0, 2]
-    assert np.array_equal(known.embeddings, np.eye(4, dtype=np.float32)[:3])
 
 
 def test_cells_lead_where_they_belong() -> None:

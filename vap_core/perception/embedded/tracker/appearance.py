@@ -3,12 +3,9 @@
 Colours are compared in every frame. Embeddings decide whether what a search found is the identity.
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
-
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 
 from vap_core.base.types import Mask, Rgb, value
 from vap_core.perception.boxes import crop, mask_box
@@ -33,59 +30,33 @@ ColourShares = Float32[np.ndarray, " b"]
 
 @value
 class Appearances:
-    """Embeddings of the identities' first crops and of the bare background.
-
-    The least cosine of an accepted crop is relative to the background's: what means nothing differs
-    from one encoder to the next. An identity that no search has asked for yet has a row of zeros.
-    """
+    """Embeddings of every identity's first crop, and the least cosine of an accepted crop."""
 
     embeddings: Float32[np.ndarray, "n d"]
-    known: Bool[np.ndarray, " n"]
-    background: Float32[np.ndarray, " d"]
+    min_cosine: Float32[np.ndarray, " n"]
 
-    def is_like(
+    def accept(
         self, row: Float32[np.ndarray, " d"], last: Float32[np.ndarray, " d"], identity: int
     ) -> bool:
-        """Whether the embedding `row` is like `identity`, whose row is known.
+        """Whether the embedding `row` is like `identity`, and more so than like any other one.
 
         It may be like the identity's first crop, or like its last one, whose embedding is `last`.
         """
-        floor = self.embeddings @ self.background
-        least = floor + np.float32(MIN_LIKENESS) * (1 - floor)
-        return self._likeness(row, last, identity) >= float(least[identity])
-
-    def is_most_like(
-        self, row: Float32[np.ndarray, " d"], last: Float32[np.ndarray, " d"], identity: int
-    ) -> bool:
-        """Whether `row` is at least as like `identity` as any other one; all rows are known."""
-        others = np.delete(self.embeddings @ row, identity)
-        return self._likeness(row, last, identity) >= float(others.max(initial=-1.0))
-
-    def _likeness(
-        self, row: Float32[np.ndarray, " d"], last: Float32[np.ndarray, " d"], identity: int
-    ) -> float:
-        return max(float((self.embeddings @ row)[identity]), float(last @ row))
+        cosine = self.embeddings @ row
+        own = max(float(cosine[identity]), float(last @ row))
+        best_other = float(np.delete(cosine, identity).max(initial=-1.0))
+        return own >= float(self.min_cosine[identity]) and own >= best_other
 
 
-def no_appearances(encoder: Encoder, crops: Sequence[Rgb], background: Rgb) -> Appearances:
-    """Appearances of which only the background's is embedded."""
-    row = encoder([background])[0]
-    n = len(crops)
-    return Appearances(np.zeros((n, len(row)), np.float32), np.zeros(n, bool), row)
+def embed_appearances(encoder: Encoder, crops: tuple[Rgb, ...], background: Rgb) -> Appearances:
+    """The appearances of all identities.
 
-
-def with_rows(
-    appearances: Appearances, encoder: Encoder, crops: Sequence[Rgb], wanted: Iterable[int]
-) -> Appearances:
-    """The appearances with the rows of these identities, whose first crops are among `crops`."""
-    missing = [identity for identity in wanted if not appearances.known[identity]]
-    if not missing:
-        return appearances
-    embeddings = appearances.embeddings.copy()
-    known = appearances.known.copy()
-    embeddings[missing] = encoder([crops[identity] for identity in missing])
-    known[missing] = True
-    return replace(appearances, embeddings=embeddings, known=known)
+    The least cosine is relative to that of the bare background: what means nothing differs from one
+    encoder to the next.
+    """
+    rows = encoder(crops)
+    floor = rows @ encoder([background])[0]
+    return Appearances(rows, floor + np.float32(MIN_LIKENESS) * (1 - floor))
 
 
 def colour_shares(image: Rgb, mask: Mask) -> ColourShares:

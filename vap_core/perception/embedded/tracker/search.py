@@ -9,8 +9,8 @@ from jaxtyping import Float32
 from vap_core.base.types import Mask
 from vap_core.perception.boxes import crop, mask_box
 from vap_core.perception.embedded.segmenter import LiteSegmenter, box_plane
-from vap_core.perception.embedded.tracker.appearance import no_appearances, with_rows
-from vap_core.perception.embedded.tracker.cells import Labels, propagate, to_pixels
+from vap_core.perception.embedded.tracker.appearance import embed_appearances
+from vap_core.perception.embedded.tracker.cells import propagate, to_pixels
 from vap_core.perception.embedded.tracker.components import argmax_planes, largest_component
 from vap_core.perception.embedded.tracker.state import FrameFeatures, TrackState
 from vap_core.perception.embedded.tracker.update import FOUND_EVIDENCE, evidence_for
@@ -46,11 +46,11 @@ def search(
     """
     memory = [state.first, state.last_seen[identity]]
     labels = propagate(frame.keys, memory, frame.grid, local=False)
-    share = to_pixels(labels[[identity + 1]], frame.grid, state.hw)[0]
-    taken = np.asarray((probability > 0.5).any(axis=0))
-    if taken.any():
-        # Another identity may have grown over this one while it was hidden.
-        taken &= ~_own(state, frame, labels, identity)
+    planes = to_pixels(labels, frame.grid, state.hw)
+    share = planes[identity + 1]
+    own = argmax_planes(planes) == identity + 1
+    # Another identity may have grown over this one while it was hidden.
+    taken = (probability > 0.5).any(axis=0) & ~own
     free = np.where(taken, 0, share).astype(np.float32)
     absence = 1 - float(np.clip(free.max(), 0, 1))
     box = _seed_box(free, share)
@@ -60,45 +60,22 @@ def search(
     drawn, box = _draw(frame, segmenter, box, free, taken)
     if box is None or evidence_for(state, frame, identity, drawn > 0.5) < FOUND_EVIDENCE:
         return state, absence
+    state = _with_embeddings(state, identity, encoder)
+    last = state.last_rows[identity]
+    assert state.appearances is not None
+    assert last is not None
     row = encoder([crop(frame.image, box)])[0]
-    state, accepted = _accept(state, row, identity, encoder)
-    if accepted:
-        if probability.any():
-            own = _own(state, frame, labels, identity)
-            probability[:, own & (drawn > 0.5)] = 0
+    if state.appearances.accept(row, last, identity):
+        probability[:, own & (drawn > 0.5)] = 0
         probability[identity] = drawn
     return state, absence
 
 
-def _own(state: TrackState, frame: FrameFeatures, labels: Labels, identity: int) -> Mask:
-    """The pixels that are more an identity's than the background's or any other one's."""
-    return argmax_planes(to_pixels(labels, frame.grid, state.hw)) == identity + 1
-
-
-def _accept(
-    state: TrackState, row: Float32[np.ndarray, " d"], identity: int, encoder: Encoder
-) -> tuple[TrackState, bool]:
-    """Whether what was found, of the embedding `row`, is like the identity and like no other one.
-
-    The other ones' first crops are embedded only when it is like the identity.
-    """
-    state = _with_last_row(state, identity, encoder)
-    last = state.last_rows[identity]
-    assert last is not None
-    crops = state.first_crops
-    appearances = state.appearances
-    if appearances is None:
-        appearances = no_appearances(encoder, crops, state.background)
-    appearances = with_rows(appearances, encoder, crops, [identity])
-    accepted = appearances.is_like(row, last, identity)
-    if accepted:
-        appearances = with_rows(appearances, encoder, crops, range(len(crops)))
-        accepted = appearances.is_most_like(row, last, identity)
-    return replace(state, appearances=appearances), accepted
-
-
-def _with_last_row(state: TrackState, identity: int, encoder: Encoder) -> TrackState:
-    """The state with one identity's last crop embedded."""
+def _with_embeddings(state: TrackState, identity: int, encoder: Encoder) -> TrackState:
+    """The state with all first crops and one identity's last crop embedded."""
+    if state.appearances is None:
+        appearances = embed_appearances(encoder, state.first_crops, state.background)
+        state = replace(state, appearances=appearances)
     if state.last_rows[identity] is None:
         last_rows = list(state.last_rows)
         last_rows[identity] = encoder([state.last_crops[identity]])[0]

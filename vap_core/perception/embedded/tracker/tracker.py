@@ -138,19 +138,11 @@ class LiteTracker:
         moving: Int64[np.ndarray, " k"],
     ) -> None:
         """Draw the masks of the identities that move into `probability`, in place."""
-        labels = _propagate(state, frame, moving)
-        shown = np.asarray(labels.any(axis=1))
-        shown[0] = True
-        present = np.flatnonzero(shown)  # the other planes are empty
-        planes = to_pixels(labels[present], frame.grid, state.hw)
+        planes = to_pixels(_propagate(state, frame, moving), frame.grid, state.hw)
         owner = argmax_planes(planes)
         for i in moving:
-            if not shown[i + 1]:
-                probability[i] = 0
-                continue
-            place = int(np.searchsorted(present, i + 1))
-            share = planes[place]
-            guess = nearest_component(owner == place, share, state.boxes[i])
+            share = planes[i + 1]
+            guess = nearest_component(owner == i + 1, share, state.boxes[i])
             if guess is None:
                 guess = nearest_component(share > MIN_SHARE, share, state.boxes[i])
             if guess is None:
