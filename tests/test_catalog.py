@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -100,7 +101,9 @@ def test_a_recording_that_ends_its_reader_is_named_and_the_others_are_read(
 
 
 @pytest.mark.sweep
-def test_flipped_bits_leave_a_query_its_other_recordings(run: Path, tmp_path: Path) -> None:
+def test_flipped_bits_leave_a_query_its_other_recordings(
+    run: Path, tmp_path: Path, record_property: Callable[[str, object], None]
+) -> None:
     folder = tmp_path / "recordings"
     folder.mkdir()
     data = (run / "recordings" / "fine.rrd").read_bytes()
@@ -111,7 +114,11 @@ def test_flipped_bits_leave_a_query_its_other_recordings(run: Path, tmp_path: Pa
         (folder / f"flip-{at}.rrd").write_bytes(flipped)
     held = load_steps(folder)
     assert str(folder / "whole.rrd") in set(held.table["file"])
-    assert isolated.ENDED_READER in held.unreadable.values(), "no flip ended its reader"
+    ended = list(held.unreadable.values()).count(isolated.ENDED_READER)
+    assert ended, "no flip ended its reader"
+    record_property("cases", len(range(1600, 2400, 8)))
+    record_property("unreadable", len(held.unreadable))
+    record_property("ended_their_reader", ended)
 
 
 def test_from_inside_the_folder_its_recordings_have_short_names(

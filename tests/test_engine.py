@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -136,13 +137,17 @@ def test_killed_in_the_middle_it_ends_with_the_rows_of_an_undisturbed_run(tmp_pa
 
 @pytest.mark.sweep
 @pytest.mark.timeout(3600)
-def test_killed_twenty_times_it_ends_with_the_rows_of_an_undisturbed_run(tmp_path: Path) -> None:
+def test_killed_twenty_times_it_ends_with_the_rows_of_an_undisturbed_run(
+    tmp_path: Path, record_property: Callable[[str, object], None]
+) -> None:
     torn = tmp_path / "torn"
     words = command(torn, episodes=12, several=True)
     done, rows = kills(words, torn, times=20, longest_s=15.0, rng=random.Random(0))
     check(torn, tmp_path / "whole", episodes=12, several=True)
     assert done == 20, "the run ended before it was killed so often; give it more episodes"
     assert rows == sorted(rows), "rows were lost"
+    record_property("cases", done)
+    record_property("rows", len(read(torn)))
 
 
 def test_keys_tell_row_method_and_run_apart() -> None:

@@ -235,7 +235,7 @@ def runs() -> Iterator[object]:
 
 @pytest.mark.parametrize(("name", "cases"), list(runs()))
 def test_a_mutated_file_is_read_or_refused_in_one_line(
-    tmp_path: Path, name: str, cases: int
+    tmp_path: Path, name: str, cases: int, record_property: Callable[[str, object], None]
 ) -> None:
     quiet()
     parser = PARSERS[name]
@@ -257,17 +257,21 @@ def test_a_mutated_file_is_read_or_refused_in_one_line(
             assert "\n" not in said, (name, case)
             assert len(said) <= 600 + len(str(tmp_path)), (name, case)
     assert refused or name in ("instruction", "photo")
+    record_property("cases", cases)
+    record_property("refused", refused)
 
 
 @pytest.mark.sweep
 @pytest.mark.timeout(3600)
-def test_a_mutated_recording_ends_no_process_of_ours(tmp_path: Path) -> None:
+def test_a_mutated_recording_ends_no_process_of_ours(
+    tmp_path: Path, record_property: Callable[[str, object], None]
+) -> None:
     seed = tmp_path / "seed.rrd"
     with Recorder(seed, opening(1)) as recorder:
         recorder.frame(frame(0, opening(1)))
         recorder.close(SUCCESS)
     whole = seed.read_bytes()
-    ended = 0
+    ended = refused = 0
     for first in range(0, CASES, 500):
         paths = []
         for case in range(first, first + 500):
@@ -277,5 +281,8 @@ def test_a_mutated_recording_ends_no_process_of_ours(tmp_path: Path) -> None:
         for path, reason in index_isolated(paths, tmp_path / "index"):
             assert reason is None or "\n" not in reason
             ended += reason == ENDED_READER
+            refused += reason is not None
             path.unlink()
-    print(f"{ended} of {CASES} ended the process that read them")
+    record_property("cases", CASES)
+    record_property("refused", refused)
+    record_property("ended_their_reader", ended)

@@ -164,6 +164,30 @@ def test_what_cannot_be_known_fails_loudly(bank, tmp_path):
         VapPrompt(str(tmp_path / "none"))
 
 
+def test_a_camera_that_fails_is_named_and_nothing_reaches_the_policy(bank):
+    """A frame of NaN, a camera that is gone from one step to the next, one that is new."""
+    step = pipeline(bank)
+    step(batch([at(4)], [0]))
+    for wrong in (float("nan"), float("inf")):
+        shown = batch([at(6)], [1])
+        shown["observation.images.top"][0, 1, 5, 5] = wrong
+        with pytest.raises(
+            BadViews, match=r"observation.images.top has numbers that are not finite; mend the cam"
+        ):
+            step(shown)
+    gone = batch([at(6)], [1])
+    side = gone.pop("observation.images.top")
+    with pytest.raises(BadViews, match=r"no observation.images.\* among"):
+        step(gone)
+    with pytest.raises(
+        BadViews,
+        match=r"views of \['side'\], but the episode started with \['top'\]; give the same",
+    ):
+        step({**gone, "observation.images.side": side})
+    later = step(batch([at(6)], [1]))
+    assert (rgb(later) == direct(bank, [at(4), at(6)])[1].images["top"]).all(), "it goes on"
+
+
 def test_the_configuration_is_json_and_comes_back(bank, tmp_path):
     step = VapPrompt(str(bank), stack="toys", objects=["mug"], rewrite=False, alpha=0.3)
     assert VapPrompt(**json.loads(json.dumps(step.get_config()))).get_config() == step.get_config()

@@ -19,14 +19,15 @@ from lerobot.processor import ProcessorStepRegistry
 from tests.command import vap
 from vap_core.evaluation.policy_names import shipped
 from vap_core.evaluation.study import Study, make_trial, register_personal
-from vap_core.policies.lerobot.adapter import _resize, load_policy
+from vap_core.policies.lerobot.adapter import IMAGE, _resize, load_policy
+from vap_core.policies.protocol import PolicyInput
 from vap_core.rollout.loop import rollout
 from vap_core.simulation import suites
 
 ROOT = Path(__file__).resolve().parents[1]
 PLUGIN = ROOT / "plugins" / "lerobot_env_vap"
 SUITE, TASK = "simpler-bridge", "put-camera"
-EPISODES = 6
+EPISODES = 24
 
 
 def test_its_name_is_one_that_lerobot_imports_and_its_module_registers_everything() -> None:
@@ -60,6 +61,27 @@ def test_a_mini_pi0_scales_its_images_as_our_loop_does() -> None:
     (whole,), _ = policy._preprocess_images({key: rgb})
     (scaled,), _ = policy._preprocess_images({key: _resize(rgb, (3, 112, 112))})
     assert torch.equal(whole, scaled)
+
+
+def test_weights_that_ask_for_a_gradient_change_no_bit_of_an_action() -> None:
+    """lerobot-eval does not freeze the policy that it loads; our adapter does."""
+    policy = load_policy(shipped(SUITE))
+    sides = {name: shape for name, shape in policy.wanted.items() if name.startswith(IMAGE)}
+    rng = np.random.default_rng(0)
+    views = {
+        key.removeprefix(IMAGE): rng.integers(0, 256, (*shape[1:], 3), np.uint8)
+        for key, shape in sides.items()
+    }
+    state = np.zeros(policy.wanted["observation.state"], np.float32)
+    inputs = [PolicyInput(views, "put my camera on the plate", state)] * 2
+    batch, noise = policy.prepare([policy.start(np.random.default_rng(0)) for _ in inputs], inputs)
+    chunks = []
+    for asks in (False, True):
+        policy.policy.requires_grad_(asks)
+        with torch.inference_mode():
+            chunks.append(policy.policy.predict_action_chunk(batch, noise=noise))
+        assert all(weight.requires_grad is asks for weight in policy.policy.parameters())
+    assert torch.equal(*chunks)
 
 
 @pytest.fixture(scope="module")

@@ -1,9 +1,15 @@
 """Training from films: what is taught and how often, what is asked besides, and that a training goes on where it stopped."""
 
 import json
+import random
+import signal
+import time
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
+from shutil import rmtree
 from unittest.mock import patch
 
 import numpy as np
@@ -13,6 +19,7 @@ from safetensors.torch import load_file
 from torch.nn import functional as F  # noqa: N812
 
 from tests.deaths import die_before_each_rename
+from tests.random_kills import kill_in
 from vap_core.base.errors import BadOutput
 from vap_core.base.types import Description
 from vap_core.policies.lerobot.adapter import load_policy
@@ -104,9 +111,10 @@ def test_a_training_that_was_stopped_ends_like_one_that_was_not(
     )
 
 
-def test_a_vision_language_model_learns_and_resumes(
-    stage: tuple[Path, list[Film]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def vlm_inputs(
+    stage: tuple[Path, list[Film]], monkeypatch: pytest.MonkeyPatch
+) -> tuple[list[vlm.View], vlm.Recipe]:
+    """Views of the stage, which a tiny recipe then trains on."""
     _, films = stage
     pool = [
         vlm.View(film.images[t, 0], film.ids[t, 0], film.names)
@@ -125,6 +133,13 @@ def test_a_vision_language_model_learns_and_resumes(
         vision_depth=1,
         expert_width=32,
     )
+    return pool, recipe
+
+
+def test_a_vision_language_model_learns_and_resumes(
+    stage: tuple[Path, list[Film]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, recipe = vlm_inputs(stage, monkeypatch)
     whole = vlm.train(recipe, tmp_path / "whole")
     vlm.train(recipe, tmp_path / "torn", minutes=0.0)
     vlm.train(recipe, tmp_path / "torn")
@@ -149,7 +164,10 @@ def test_a_vision_language_model_learns_and_resumes(
 
 
 def test_a_training_that_is_ended_again_and_again_ends_like_one_that_was_not(
-    stage: tuple[Path, list[Film]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stage: tuple[Path, list[Film]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    record_property: Callable[[str, object], None],
 ) -> None:
     """Before each of its renames: of a checkpoint, of the weights, of what was measured."""
     folder, _ = stage
@@ -166,11 +184,87 @@ def test_a_training_that_is_ended_again_and_again_ends_like_one_that_was_not(
         return policy.train(recipe, out, cache=folder.parent, every=1)
 
     about = train(whole)
-    assert die_before_each_rename(lambda: train(torn), weights_are_absent_or_whole) > 5
+    ends = die_before_each_rename(lambda: train(torn), weights_are_absent_or_whole)
+    assert ends > 5
+    record_property("cases", ends)
     one, other = (load_file(path / "model.safetensors") for path in (whole, torn))
     assert all(torch.equal(one[name], other[name]) for name in one)
     told = json.loads((torn / "training.json").read_text())
     assert [line["step"] for line in told["log"]] == [line["step"] for line in about["log"]]
+
+
+def train_in_a_process(train: Callable[[], object], after_s: float) -> bool:
+    """Fork, train, and SIGKILL it after that time; returns whether it was not done."""
+
+    def alone() -> None:
+        torch.set_num_threads(1)
+        train()
+
+    process = get_context("fork").Process(target=alone)
+    process.start()
+    process.join(after_s)
+    if process.exitcode is None:
+        process.kill()
+        process.join()
+    assert process.exitcode in (0, -signal.SIGKILL)
+    return process.exitcode != 0
+
+
+def train_and_kill(train: Callable[[Path], object], folder: Path, kills: int) -> None:
+    """A training that is killed at random moments and goes on ends with the same weights."""
+    whole, torn = folder / "whole", folder / "torn"
+    start = time.monotonic()
+    assert not train_in_a_process(lambda: train(whole), 300)
+    seconds = time.monotonic() - start
+
+    def killed(after_s: float) -> bool:
+        if (torn / "training.json").exists():
+            assert_same(torn, whole)
+            rmtree(torn)
+        return train_in_a_process(lambda: train(torn), after_s)
+
+    for _ in kill_in(seconds, killed, kills, random.Random(kills)):
+        for weights in torn.glob("[!.]*.safetensors"):
+            load_file(weights)
+    assert not train_in_a_process(lambda: train(torn), 300)
+    assert_same(torn, whole)
+
+
+def assert_same(torn: Path, whole: Path) -> None:
+    one, other = (load_file(path / "model.safetensors") for path in (whole, torn))
+    assert one.keys() == other.keys()
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+@pytest.mark.parametrize("kills", [2, pytest.param(20, marks=pytest.mark.sweep)])
+def test_a_training_that_is_killed_at_random_moments_ends_the_same(
+    stage: tuple[Path, list[Film]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    kills: int,
+    record_property: Callable[[str, object], None],
+) -> None:
+    monkeypatch.setattr(demonstrations, "EPISODES", 2)
+    monkeypatch.setattr(policy, "HELD_OUT", 9)
+    recipe = replace(TINY, stages=1, steps=6, batch=2, draws=1)
+    cache = stage[0].parent
+    train_and_kill(lambda out: policy.train(recipe, out, cache=cache, every=1), tmp_path, kills)
+    record_property("cases", kills)
+
+
+@pytest.mark.sweep
+def test_a_killed_training_of_a_language_model_ends_the_same(
+    stage: tuple[Path, list[Film]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    record_property: Callable[[str, object], None],
+) -> None:
+    pool, recipe = vlm_inputs(stage, monkeypatch)
+    assert pool
+    schedule = vlm.Schedule
+    monkeypatch.setattr(vlm, "Schedule", lambda **told: schedule(**{**told, "every": 1}))
+    train_and_kill(lambda out: vlm.train(recipe, out), tmp_path, 10)
+    record_property("cases", 10)
 
 
 def test_films_of_what_is_held_out_are_refused(stage: tuple[Path, list[Film]]) -> None:

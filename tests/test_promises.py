@@ -11,8 +11,9 @@ import pytest
 
 import vap_core
 from vap_core.base import files
-from vap_core.base.errors import BadOutput
+from vap_core.base.errors import BadOutput, BadSuite
 from vap_core.recording import viewer
+from vap_core.simulation.suites import lists
 
 ROOT = Path(vap_core.__file__).resolve().parent
 SOURCES = sorted(ROOT.rglob("*.py"))
@@ -82,6 +83,50 @@ def test_meshes_videos_and_checkpoints_are_read_in_one_place_each() -> None:
             if name in found:
                 found[name].add(path.name)
     assert found == READERS
+
+
+OWN_JSON = {
+    "paraphrases.py",  # ships
+    "stills.py",  # a committed picture's provenance
+    "store.py",  # what was just written, once through JSON
+    "dataset.py",  # a part that this process has just written
+    "isolated.py",  # our own reading process
+    "eval_lerobot.py",
+    "measurement.py",
+    "lerobot_process.py",
+    "weights.py",  # ships
+    "files.py",
+}
+"""Modules that read JSON of our own; what comes from outside goes through files.parse_json."""
+
+
+def test_json_from_outside_has_one_reader() -> None:
+    """Nested too deep it is a ValueError like any other, not the end of the process."""
+    found = set()
+    for path in SOURCES:
+        for name, _ in calls(ast.parse(path.read_text())):
+            if name in ("json.loads", "json.load"):
+                found.add(path.name)
+    assert found == OWN_JSON
+    with pytest.raises(ValueError, match="nested too deep"):
+        files.parse_json("[" * 100_000)
+    with pytest.raises(BadSuite, match="row 1"):
+        lists._parse_row("[" * 100_000, "row 1")
+
+
+def test_set_up_installs_nothing_without_its_hash() -> None:
+    """Each install of packages asks for hashes, and every pinned package has one."""
+    root = Path(__file__).parents[1]
+    installs = []
+    for line in (root / ".ci" / "setup").read_text().splitlines():
+        if re.search(r"pip install|\{PIP\[@\]\}", line) and " -r " in line:
+            installs.append(line)
+    assert len(installs) == 3
+    assert all("--require-hashes" in line for line in installs)
+    pinned = re.split(r"\n(?=[a-zA-Z0-9])", (root / "environment.txt").read_text())
+    packages = [entry for entry in pinned if "==" in entry]
+    assert len(packages) > 200
+    assert all("--hash=sha256:" in entry for entry in packages)
 
 
 def test_limits_of_time_are_of_a_clock_that_nobody_sets() -> None:

@@ -176,3 +176,19 @@ def test_keys_of_other_results_are_as_before():
     assert result_key(row, "vap", "x") != result_key(
         replace(row, owned=(Owned(row.target, "anna"),)), "vap", "x"
     )
+
+
+def test_a_layout_that_was_drawn_again_is_another_and_no_other_row_changes(name, monkeypatch):
+    again = {}
+    for task in shared.TASKS[name]:
+        for episode, draw in shared.REDRAWN.get(task.name, {}).items():
+            assert draw == 1
+            again[f"{name}.{task.name}.{episode:03d}"] = lists.to_line(
+                shared.row(name, task, episode)
+            )
+    monkeypatch.setattr(shared, "REDRAWN", {})
+    first = {row.key: lists.to_line(row) for row in shared.rows(name)}
+    for row in lists.read(name):
+        line = lists.to_line(row)
+        assert line == again.get(row.key, first[row.key])
+        assert (line != first[row.key]) == (row.key in again)

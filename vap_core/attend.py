@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from vap_core.associate import Pairing, associate_targets
-from vap_core.base.errors import BadInstruction
+from vap_core.base.errors import BadInstruction, BadViews
 from vap_core.base.events import Visible, grounding_events, visibility_events
 from vap_core.base.types import (
     Association,
@@ -276,7 +276,7 @@ class Attender:
         """Track every target and prompt the new images (t > 0). Consumes `state`.
 
         Raises:
-            ValueError: `views` are not of the cameras that the episode started with.
+            BadViews: `views` are not of the cameras that the episode started with.
         """
         return self.steps([state], [views])[0]
 
@@ -291,7 +291,7 @@ class Attender:
         images = []
         for state, images_now in zip(states, views, strict=True):
             if set(images_now) != set(state.groundings):
-                raise ValueError(
+                raise BadViews(
                     f"Attender.step: views of {sorted(images_now)}, but the episode started with "
                     f"{sorted(state.groundings)}; give the same cameras."
                 )

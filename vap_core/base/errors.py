@@ -68,7 +68,7 @@ class BadSuite(VapError):
 
 
 class BadViews(VapError):
-    """Views that cannot be associated: too many of them, or cameras without calibration."""
+    """Views that cannot be used: too many, without calibration, or not those of the start."""
 
 
 class BadEncoder(VapError):

@@ -65,7 +65,7 @@ def add_rows(path: Path, table: "pd.DataFrame", key: list[str], about: dict[byte
     whole = table
     if path.exists():
         kept = pq.read_table(path)
-        held = json.loads((kept.schema.metadata or {}).get(name, b"[]"))
+        held = parse_json((kept.schema.metadata or {}).get(name, b"[]"))
         old = kept.to_pandas()
         replaced = pd.MultiIndex.from_frame(old[key]).isin(pd.MultiIndex.from_frame(table[key]))
         whole = pd.concat([old[~replaced], table], ignore_index=True)

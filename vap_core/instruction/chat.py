@@ -12,6 +12,7 @@ from itertools import pairwise
 from typing import Any
 
 from vap_core.base.errors import BadEndpoint, BadInstruction
+from vap_core.base.files import parse_json
 from vap_core.base.types import Instruction, Target
 from vap_core.instruction.context import Context
 from vap_core.perception.chat import (
@@ -110,7 +111,7 @@ class ChatParser:
         """The checked targets, left to right. Raises: BadEndpoint."""
         targets: list[Target] = []
         try:
-            for row in json.loads(answer)["targets"]:
+            for row in parse_json(answer)["targets"]:
                 obj = self.context.objects[row["object"]]
                 said = row["expression"]
                 start = text.lower().find(said.lower())
@@ -129,7 +130,7 @@ class ChatParser:
             for one, other in pairwise(targets):
                 if other.start < one.stop:
                     raise ValueError("overlapping expressions")
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise BadEndpoint(
                 f"parse: {self.endpoint.model} at {self.endpoint.url} answers outside the form "
                 f"that was asked for ({type(error).__name__}: {_line(str(error))[:60]!r}); try "

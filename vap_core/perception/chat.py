@@ -19,6 +19,7 @@ from urllib.error import HTTPError, URLError
 from urllib.parse import urlsplit
 
 from vap_core.base.errors import BadEndpoint
+from vap_core.base.files import parse_json
 from vap_core.base.types import Rgb
 
 URL = "OPENAI_BASE_URL"
@@ -83,10 +84,10 @@ def request_answer(endpoint: ChatEndpoint, question: str, images: Sequence[Rgb] 
         endpoint, lambda: _fetch(endpoint, body), doing="chat", instead="another server"
     )
     try:
-        text = json.loads(data)["choices"][0]["message"]["content"]
+        text = parse_json(data)["choices"][0]["message"]["content"]
         if not isinstance(text, str) or not text.strip():
             raise ValueError("no text")
-    except (ValueError, KeyError, IndexError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, IndexError, TypeError) as error:
         raise BadEndpoint(
             f"chat: {endpoint.url} does not answer as a chat endpoint does "
             f"({type(error).__name__}); give the address that ends in /v1, and a model "
@@ -190,9 +191,9 @@ def _fetch(endpoint: ChatEndpoint, body: dict[str, Any]) -> bytes:
 def _refusal_reason(error: HTTPError) -> str:
     """What the server says, as one line, whether it follows the protocol or sends plain text."""
     text = ""
-    with suppress(OSError, HTTPException, ValueError, KeyError, TypeError, RecursionError):
+    with suppress(OSError, HTTPException, ValueError, KeyError, TypeError):
         text = error.read(2000).decode(errors="replace")
-        text = str(json.loads(text)["error"]["message"])
+        text = str(parse_json(text)["error"]["message"])
     return " ".join(text.split())[:200] or error.reason
 
 

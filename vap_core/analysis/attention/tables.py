@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import write_atomic
+from vap_core.base.files import parse_json, write_atomic
 from vap_core.base.parquet import read_parquet
 from vap_core.base.version import code_version
 from vap_core.evaluation import measurements
@@ -64,7 +64,7 @@ def publish(folder: Path, to: Path) -> list[Path]:
     files = {}
     for name, table in read(folder).items():
         metadata = pq.read_schema(folder / file_name(name)).metadata or {}
-        (about,) = json.loads(metadata[ABOUT])
+        (about,) = parse_json(metadata[ABOUT])
         files[file_name(name)] = measurements.add_rows(
             to / file_name(name), table, REPLACED, {ABOUT: about}
         )

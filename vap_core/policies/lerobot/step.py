@@ -175,6 +175,11 @@ class VapPrompt(ProcessorStep):
         pixels = {}
         prompted = {}
         for key, tensor in views.items():
+            if not torch.isfinite(tensor).all():
+                raise BadViews(
+                    f"VapPrompt: {key} has numbers that are not finite; mend the camera, or skip "
+                    "the frame."
+                )
             pixels[key.removeprefix(IMAGES)] = _pixels(tensor[None] if single else tensor)
             prompted[key] = tensor.clone()
         new_texts = []

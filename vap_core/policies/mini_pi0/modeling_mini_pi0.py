@@ -76,15 +76,16 @@ class MiniPI0Pytorch(PI0Pytorch):
         if noise is None:
             shape = (len(state), self.config.chunk_size, self.config.max_action_dim)
             noise = self.sample_noise(shape, state.device)
-        return super().sample_actions(
-            images,
-            img_masks,
-            lang_tokens,
-            lang_masks,
-            state,
-            noise=self.config.temperature * noise,
-            **kwargs,
-        )
+        with frozen(self):
+            return super().sample_actions(
+                images,
+                img_masks,
+                lang_tokens,
+                lang_masks,
+                state,
+                noise=self.config.temperature * noise,
+                **kwargs,
+            )
 
 
 class MiniPI0Policy(PI0Policy):
@@ -119,6 +120,24 @@ class MiniPI0Policy(PI0Policy):
         from_pretrained = PreTrainedPolicy.from_pretrained.__func__
         options = {**kwargs, "strict": True}
         return cast(MiniPI0Policy, from_pretrained(cls, pretrained_name_or_path, **options))
+
+
+@contextmanager
+def frozen(module: nn.Module) -> Iterator[None]:
+    """Inside, no parameter asks for a gradient.
+
+    Where a weight asks for one, PyTorch's matmul folds a batch otherwise, also without gradients:
+    actions would differ in their last bits between a loop that freezes its policy and one, such as
+    lerobot-eval, that does not.
+    """
+    trained = [parameter for parameter in module.parameters() if parameter.requires_grad]
+    for parameter in trained:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in trained:
+            parameter.requires_grad_(True)
 
 
 @contextmanager

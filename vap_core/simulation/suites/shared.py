@@ -64,6 +64,18 @@ BESIDE_M = (0.03, 0.045)
 """Room between a pair's two targets once one is put near the other."""
 PITCH_M = 0.15
 """Of the grid on the WidowX's table: simpler-bridge's square, with one more column."""
+REDRAWN: Mapping[str, Mapping[int, int]] = {
+    "select-vases": {15: 1},
+    "put-plant-scrubber": {5: 1, 11: 1, 13: 1, 14: 1},
+    "put-pouch-near-vase": {2: 1, 14: 1, 17: 1},
+    "put-scrubber-near-slipper": {16: 1},
+    "move-stuffed-toy-next-to-plant": {6: 1},
+    "put-pouch-near-cup": {3: 1, 18: 1, 19: 1},
+}
+"""The draw of a layout, by task and episode, where the first was beyond the scripted expert.
+
+Drawn again until the expert succeeds with seed 0, before any method ran on the list.
+"""
 
 
 @value
@@ -245,7 +257,9 @@ def rows(name: str) -> tuple[EpisodeRow, ...]:
 
 def row(name: str, shared: Shared, episode: int) -> EpisodeRow:
     """One episode of a task of a shared suite; it depends on no other."""
-    rng = np.random.default_rng([91, *f"{name} {shared.name}".encode(), episode])
+    seed = [91, *f"{name} {shared.name}".encode(), episode]
+    again = REDRAWN.get(shared.name, {}).get(episode, 0)
+    rng = np.random.default_rng([*seed, again] if again else seed)
     if LIKE[name] == "simpler-bridge":
         placements = _on_grid(shared, rng, episode)
     else:
