@@ -11,7 +11,15 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests.command import vap
-from vap_core.analysis.attention import intervals, patterns, prediction, replay, report, tables
+from vap_core.analysis.attention import (
+    examples,
+    intervals,
+    patterns,
+    prediction,
+    replay,
+    report,
+    tables,
+)
 from vap_core.analysis.attention.measures import REGIONS, inside, measure, patch_areas
 from vap_core.analysis.attention.patterns import (
     Thresholds,
@@ -23,6 +31,7 @@ from vap_core.analysis.attention.patterns import (
     with_localisation,
 )
 from vap_core.base.errors import BadStudy
+from vap_core.base.files import DATA
 from vap_core.evaluation.study import Study, make_trial
 from vap_core.simulation import suites
 from vap_core.simulation.env import Env
@@ -261,7 +270,20 @@ def test_a_warning_is_measured_where_enough_fails() -> None:
     gain = found["both, beyond the margin"]
     assert gain.value == pytest.approx(found["both"].value - found["vote margin"].value)
     assert 0 < gain.low < gain.value < gain.high
+    sure = prediction.warnings(table.assign(margin=table["success"].astype(float)), ["lift"])
+    assert sure["low vote margin, unfitted"].value == 1
     assert prediction.warnings(table.assign(success=np.arange(80) > 3), ["lift"]) == {}
+
+
+def test_the_first_calls_are_those_of_each_episodes_first_step() -> None:
+    about = {"suite": "s", "task": "t", "method": "vap", "seed": 0}
+    calls = pd.DataFrame([
+        {**about, "episode": episode, "step": step, "query": query}
+        for episode, step in ((0, 0), (0, 4), (1, 4), (1, 8))
+        for query in ("colour", "action")
+    ])  # fmt: skip
+    first = patterns.first_calls(calls)
+    assert list(zip(first.episode, first.step, strict=True)) == [(0, 0)] * 2 + [(1, 4)] * 2
 
 
 def test_only_pairs_of_one_suite_are_compared() -> None:
@@ -383,3 +405,48 @@ def test_a_policy_without_attention_is_refused(tmp_path: Path) -> None:
     study = Study((("widowx-pick", "pick-bottle"),), ("generic",), episodes=1, policy="random")
     with pytest.raises(BadStudy, match="gives no attention maps.*choose another run"):
         replayed(study, "pick-bottle", tmp_path, "random")
+
+
+def test_an_episode_is_named_and_found_in_its_run(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    ran: list[tuple[str, str, str, int, Path]] = []
+
+    def run_again(
+        manifest: Any, line: Any, memory: Path, recording: Path
+    ) -> tuple[None, list[Any]]:
+        ran.append((line["suite"], line["task"], line["method"], line["episode"], recording))
+        return None, []
+
+    monkeypatch.setattr(examples, "run_again", run_again)
+    table = DATA / "results" / "mini_pi0.parquet"
+    name = "simpler-bridge/put-camera/soft/22"
+    path, step = examples.record(table, name, tmp_path / "new", tmp_path)
+    assert (path, step) == (tmp_path / "new" / "simpler-bridge.put-camera.soft.22.rrd", 0)
+    assert ran == [("simpler-bridge", "put-camera", "soft", 22, path)]
+    line = {
+        "suite": "simpler-bridge",
+        "task": "put-camera",
+        "method": "soft",
+        "episode": 22,
+        "seed": 0,
+    }
+    assert examples.name_of(line) == name
+    assert examples.name_of({**line, "seed": 3}) == f"{name}/3"
+    with pytest.raises(BadStudy, match="give SUITE/TASK/METHOD/EPISODE"):
+        examples.record(table, "put-camera/22", tmp_path, tmp_path)
+    with pytest.raises(BadStudy, match="give SUITE/TASK/METHOD/EPISODE"):
+        examples.record(table, "simpler-bridge/put-camera/soft/last", tmp_path, tmp_path)
+    with pytest.raises(BadStudy, match="holds no episode"):
+        examples.record(table, "simpler-bridge/put-camera/soft/2200", tmp_path, tmp_path)
+
+
+def test_the_clearest_call_is_that_of_a_words_highest_peak() -> None:
+    def maps(query: str, peak: float) -> dict[str, dict[str, np.ndarray]]:
+        weights = np.zeros((2, 1, 3, 3), np.float32)
+        weights[..., 1, 1] = peak
+        return {"front": {query: weights}}
+
+    calls = {0: maps("token", 0.2), 4: maps("token", 0.5), 8: maps("action", 0.9)}
+    assert examples.clearest(calls) == 4
+    assert examples.clearest({}) == 0

@@ -10,6 +10,7 @@ import pytest
 
 from vap_core.base.errors import BadOutput, BadStudy, UnknownName
 from vap_core.cli.bench import (
+    embeddings,
     engine,
     eval_report,
     lerobot_process,
@@ -312,6 +313,23 @@ def test_the_same_tables_are_printed_and_written() -> None:
     for text in (measurement.as_text(one, tables), measurement.as_markdown(one, tables)):
         for part in ("A title", "a step", "1.5", "A note.", "commit "):
             assert part in text
+
+
+def test_compared_tables_are_measured_as_the_noise_says() -> None:
+    """The cosine of a row to itself with noise of relative size s is 1 / sqrt(1 + s^2)."""
+    found = []
+    for label, noise in embeddings.NOISE.items():
+        values = embeddings._compare(((700, 64), noise))
+        assert values["cosine_mean"] == pytest.approx((1 + noise**2) ** -0.5, abs=2e-3)
+        assert values["tokens"] == 700
+        assert values["nearest"] > 0.9
+        assert 0 < values["peak_gb"] < 50
+        found.append({"label": label, "noise": noise, **values})
+    about = measurement.provenance("a command")
+    (table,) = embeddings.tables(Measurement("embeddings", about, {"size": [700, 64], "tables": found}))  # fmt: skip
+    assert [row[0] for row in table.rows[1:]] == list(embeddings.NOISE)
+    assert {row[1] for row in table.rows[1:]} == {"700 x 64"}
+    assert len({len(row) for row in table.rows}) == 1
 
 
 def test_the_page_is_what_ships() -> None:

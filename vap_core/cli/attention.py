@@ -52,19 +52,33 @@ def attention(
             "and methods stays."
         ),
     ] = None,
+    record: Annotated[
+        str,
+        typer.Option(
+            metavar="SUITE/TASK/METHOD/EPISODE",
+            help="Measure nothing: record this episode with its maps, in the folder of --out.",
+        ),
+    ] = "",
     workers: Workers = 2,
 ) -> None:
-    """Run the episodes of a run again, measure where every query looks, and print the patterns.
+    """Run the episodes of a run again, measure where every query looks, and print the patterns; or
+    record one of them with its maps.
 
     Example: python -m vap_core attention data/results/mini_pi0.parquet --method soft,vap
         --suite simpler-bridge
+    Example: python -m vap_core attention data/results/mini_pi0.parquet
+        --record simpler-bridge/put-camera/soft/22
     """
-    from vap_core.analysis.attention import replay, report
+    from vap_core.analysis.attention import examples, replay, report
     from vap_core.analysis.attention.tables import publish as publish_tables
 
     if out is None:
         table = run.suffix == ".parquet"
         out = Path("data/runs") / f"attention-{run.stem}" if table else run / "attention"
+    if record:
+        path, step = examples.record(run, record, out / "recordings", out / "memory")
+        print(f"wrote {path}\nnext: python -m vap_core show {path} {path.stem}.png --frame {step}")
+        return
     wanted = replay.Wanted(
         suites=tuple(names(suite)),
         methods=tuple(names(method)),

@@ -67,7 +67,9 @@ def bench(
     ] = 200,
     json: Annotated[
         Path | None,
-        typer.Option(help="eval, profile, scale: keep the measurement in this file, too."),
+        typer.Option(
+            help="eval, profile, scale, embeddings: keep the measurement in this file, too."
+        ),
     ] = None,
 ) -> None:
     """Measure what a step, a start and a query cost, as shares and ratios within one run.
@@ -104,6 +106,7 @@ def bench(
     )
     by_part = partial(bench_profile.measure, quick=quick)
     scale = partial(bench_scale.measure, episodes, quick)
+    of_tables = partial(bench_embeddings.measure, quick)
     benchmarks: dict[str, Callable[[], str]] = {
         "loop": partial(bench_loop.run, steps),
         "suites": partial(bench_suites.run, workers),
@@ -113,7 +116,7 @@ def bench(
         "profile": partial(kept, by_part, bench_profile.tables),
         "scale": partial(kept, scale, scale_report.tables),
         "engine": partial(bench_engine.run, workers, quick),
-        "embeddings": partial(bench_embeddings.run, quick),
+        "embeddings": partial(kept, of_tables, bench_embeddings.tables),
         "query": partial(bench_query.run, quick=quick),
         "style": bench_style.run,
         "measured": measured.run,

@@ -88,6 +88,12 @@ def main_words(calls: "pd.DataFrame") -> "pd.DataFrame":
     return calls[rank == first]
 
 
+def first_calls(calls: "pd.DataFrame") -> "pd.DataFrame":
+    """The rows of every episode's first call, before which nothing has moved."""
+    first = calls.groupby([calls[name] for name in KEY], observed=True)["step"].transform("min")
+    return calls[calls["step"] == first]
+
+
 def per_episode(
     calls: "pd.DataFrame", episodes: "pd.DataFrame", *, whole: bool = False
 ) -> "pd.DataFrame":

@@ -20,11 +20,9 @@ from vap_core.analysis.attention.measures import (
     patch_areas,
 )
 from vap_core.analysis.plots import Tile, sheet
-from vap_core.base.errors import BadStudy
 from vap_core.base.types import Mask, Rgb
 from vap_core.evaluation.diagnosis.recordings import listed_row, study_of
 from vap_core.evaluation.engine import spread_evenly
-from vap_core.evaluation.publish import read_runs
 from vap_core.evaluation.study import make_trial, register_personal
 from vap_core.policies.hooks import heat_map
 from vap_core.recording.entities.attention import attention_overlay
@@ -94,15 +92,6 @@ def run_again(
 
     (episode,) = rollout(replace(trial, attention=QUERIES), [row], observe, batch=1)
     return episode, sinks[0].frames
-
-
-def example_tiles(source: Path, line: Mapping[str, Any], memory: Path) -> list[Tile]:
-    """The tiles of an episode of `patterns.per_episode`, run again from the run of `source`."""
-    for manifest, episodes in read_runs(source):
-        if line["suite"] in set(episodes["suite"]):
-            episode, frames = run_again(manifest, line, memory)
-            return strip(episode, frames, str(line["query"]))
-    raise BadStudy(f"attention: {source} holds no run of {line['suite']}; choose another.")
 
 
 def strip(episode: Episode, frames: Sequence[Frame], query: str) -> list[Tile]:

@@ -148,8 +148,8 @@ def warnings(table: "pd.DataFrame", measures: Sequence[str]) -> dict[str, Auc]:
     """Failures foretold by the vote margin, by the attention, by both, and what that gains.
 
     Logistic regressions, scored on layouts that they were not fitted on; predictors are ranks
-    within their suite. `table` are episodes of one method that votes. Empty with fewer than
-    LEAST_FAILURES.
+    within their suite. The margin stands there unfitted, too: a low one foretells a failure.
+    `table` are episodes of one method that votes. Empty with fewer than LEAST_FAILURES.
     """
     voted = table[table["margin"].notna()]
     failed = ~voted["success"].to_numpy(bool)
@@ -166,7 +166,8 @@ def warnings(table: "pd.DataFrame", measures: Sequence[str]) -> dict[str, Auc]:
     ):
         scores[name] = left_out_scores(ranks[columns].to_numpy(float), failed, layouts)
     found = {}
-    for name, values in scores.items():
+    low_margin = -ranks["margin"].to_numpy(float)
+    for name, values in {"low vote margin, unfitted": low_margin, **scores}.items():
         found[name] = auc_interval(values, failed, layouts, suites)
     pair = (scores["vote margin"], scores["both"])
     found["both, beyond the margin"] = auc_gain(pair, failed, layouts, suites)

@@ -1,6 +1,6 @@
 """The measures of a replay as tables of text and numbers."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from vap_core.analysis.attention import intervals
@@ -46,7 +46,7 @@ def text(tables: "dict[str, pd.DataFrame]") -> str:
     return "\n\n".join(parts)
 
 
-def auc_table(table: "pd.DataFrame") -> "pd.DataFrame":
+def auc_table(table: "pd.DataFrame", measures: Sequence[str] = MEASURES) -> "pd.DataFrame":
     """How well each measure tells successes from failures, a row per suite and method.
 
     In the rows of ALL_SUITES pairs of one suite are compared.
@@ -56,7 +56,7 @@ def auc_table(table: "pd.DataFrame") -> "pd.DataFrame":
     rows = {}
     for (suite, method), group in _groups(table, ["method"]):
         row = {"n": str(len(group)), "successes": str(int(group["success"].sum()))}
-        for measure, area in predict_success(group, MEASURES).items():
+        for measure, area in predict_success(group, measures).items():
             row[measure] = f"{area.value:.2f} [{area.low:.2f}, {area.high:.2f}]"
         rows[f"{suite}, {method}"] = row
     return pd.DataFrame(rows).T.rename_axis("suite, method")

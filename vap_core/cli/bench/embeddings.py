@@ -10,13 +10,15 @@ import struct
 import tempfile
 import time
 from collections.abc import Iterable
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from vap_core.analysis.embedding_search import BLOCK
-from vap_core.analysis.embedding_space import Comparison, compare
-from vap_core.base.tables import align
+from vap_core.analysis.embedding_space import compare
+from vap_core.cli.bench.measurement import Measurement, Table, provenance
 from vap_core.evaluation import processes
 from vap_core.policies.embedding_table import open_table
 
@@ -29,33 +31,42 @@ LIMIT_GB = 4.0
 """Target of the peak memory."""
 
 
-def run(quick: bool = False) -> str:
-    """Compare random tables; a quarter of an hour and 2 GB of disk, `quick` a few seconds."""
+def measure(quick: bool = False) -> Measurement:
+    """Compare random tables; about ten minutes of one core and 2 GB of disk, `quick` seconds."""
     size = QUICK if quick else SIZE
-    rows = [["tables", "size", "CPU s", "peak GB", "cosine", "CKA", "kNN@1"]]
+    found = []
     for label, noise in NOISE.items():
         # A fresh process, so that its peak is the comparison's.
         plan = (size, noise)
-        _, (found, seconds, peak_gb) = next(
-            processes.results(_measure, [plan], workers=1, remedy="--quick")
-        )
-        cosine = f"{found.cosine_mean:.6f}"
-        rows.append(
-            [
-                label,
-                f"{size[0]} x {size[1]}",
-                f"{seconds:.0f}",
-                f"{peak_gb:.2f}",
-                cosine,
-                f"{found.cka:.6f}",
-                f"{found.nearest:.4f}",
-            ]
-        )
-    return f"one thread; target: a peak of {LIMIT_GB:g} GB at most\n\n{align(rows)}"
+        _, values = next(processes.results(_compare, [plan], workers=1, remedy="--quick"))
+        found.append({"label": label, "noise": noise, **values})
+    about = provenance(
+        "python -m vap_core bench embeddings",
+        n="one comparison a row",
+        seed=0,
+        clock="CPU time of one process, one thread",
+    )
+    return Measurement("embeddings", about, {"size": list(size), "tables": found})
 
 
-def _measure(plan: tuple[tuple[int, int], float]) -> tuple[Comparison, float, float]:
-    """The comparison, its CPU seconds, and the most gigabytes that the process took."""
+def tables(measurement: Measurement) -> list[Table]:
+    """What every comparison takes, and what it finds."""
+    rows = [["tables", "size", "CPU s", "peak GB", "cosine", "CKA", "kNN@1"]]
+    size = " x ".join(map(str, measurement.values["size"]))
+    for each in measurement.values["tables"]:
+        numbers = [f"{each['cpu_s']:.0f}", f"{each['peak_gb']:.2f}", f"{each['cosine_mean']:.6f}"]
+        numbers += [f"{each['cka']:.6f}", f"{each['nearest']:.4f}"]
+        rows.append([each["label"], size, *numbers])
+    note = (
+        "Random rows in bfloat16, the second table is the first with noise. The peak is all of the "
+        f"process's memory, the files' pages that it has read included; target: {LIMIT_GB:g} GB at "
+        "most."
+    )
+    return [Table("Comparing two tables of word embeddings", rows, note)]
+
+
+def _compare(plan: tuple[tuple[int, int], float]) -> dict[str, Any]:
+    """The comparison's figures, its CPU seconds, and the most gigabytes that the process took."""
     size, noise = plan
     with tempfile.TemporaryDirectory() as scratch:
         folders = [Path(scratch) / "vlm", Path(scratch) / "policy"]
@@ -64,7 +75,7 @@ def _measure(plan: tuple[tuple[int, int], float]) -> tuple[Comparison, float, fl
         found = compare(open_table(folders[0]), open_table(folders[1]), _with_bar)
         seconds = time.process_time() - start
     peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    return found, seconds, peak_gb
+    return {**asdict(found), "cpu_s": seconds, "peak_gb": peak_gb}
 
 
 def _write(folders: list[Path], size: tuple[int, int], noise: float) -> None:

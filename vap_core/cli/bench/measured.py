@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from vap_core.base.files import DATA, write_atomic
-from vap_core.cli.bench import eval_report, profile, scale_report
+from vap_core.cli.bench import embeddings, eval_report, profile, scale_report
 from vap_core.cli.bench.measurement import Measurement, Table, as_markdown, read
 
 ROOT = DATA.parent
@@ -14,6 +14,7 @@ SECTIONS: dict[str, tuple[str, Callable[[Measurement], list[Table]]]] = {
     "eval": ("Against lerobot's own loop", eval_report.tables),
     "profile": ("Where the time of a control step goes", profile.tables),
     "scale": ("How the cost grows", scale_report.tables),
+    "embeddings": ("Tables of PaliGemma's size", embeddings.tables),
 }
 """The benchmarks of the page, in order: a heading, and the tables of a measurement."""
 HEADER = """# What is measured
