@@ -63,7 +63,7 @@ def all_effects_figure(results: Results, columns: int = 2) -> "Figure":
         _draw_blocks(axes, part)
         axes.set_ylim(-most + 0.4, 0.6)
         axes.set_xlim(-103, 45)
-        axes.set_xlabel("success rate, points against the first arm (95 %, paired)", fontsize=8)
+        axes.set_xlabel("points of success against the first arm (95 %)", fontsize=8)
     figure.legend(
         handles=legend_handles(), loc="outside lower center", ncols=3, frameon=False, fontsize=8
     )
@@ -245,6 +245,7 @@ def _draw_rates(axes: "Axes", results: Sequence[ArmResult]) -> None:
             axes.plot(100 * one.paper, y, "D", color=PAPER, fillstyle="none", markersize=5)
     names = [f"{one.arm}, n {one.sr.n}" for one in reversed(results)]
     axes.set_yticks(range(len(results)), names, fontsize=8)
+    axes.set_ylim(-0.5, len(results) - 0.5)
     axes.set_xlim(-3, 103)
     axes.spines[["top", "right"]].set_visible(False)
 
