@@ -12,10 +12,16 @@ from .agreements import gate_figure as gate_figure
 from .agreements import gated_cases as gated_cases
 from .box_widget import drag_box as drag_box
 from .box_widget import dragged_box as dragged_box
+from .controls import Abstention as Abstention
+from .controls import EpisodeChoice as EpisodeChoice
+from .controls import OwnPhotos as OwnPhotos
 from .embedding_report import paper_spaces as paper_spaces
+from .failure_picker import FailurePicker as FailurePicker
+from .failure_picker import read_labels as read_labels
 from .gallery import GOALS as GOALS
 from .gallery import STEMS as STEMS
 from .gallery import bounds as bounds
+from .gallery import bounds_table as bounds_table
 from .gallery import camera_images as camera_images
 from .gallery import census as census
 from .gallery import frame_sheet as frame_sheet
@@ -24,7 +30,6 @@ from .gallery import hardness as hardness
 from .gallery import lookalike_sheet as lookalike_sheet
 from .gallery import lookalikes_by_tier as lookalikes_by_tier
 from .gallery import out_of_order as out_of_order
-from .gallery import pooled as pooled
 from .gallery import reference_sheet as reference_sheet
 from .gallery import same_layout as same_layout
 from .inspection import association_table as association_table
@@ -43,7 +48,6 @@ from .inspection import write_photo as write_photo
 from .kept import kept_figure as kept_figure
 from .kept import kept_table as kept_table
 from .plots import Tile as Tile
-from .plots import bounds_figure as bounds_figure
 from .plots import film as film
 from .plots import grounding_figure as grounding_figure
 from .plots import hardness_figure as hardness_figure
