@@ -69,9 +69,9 @@ def sequence_table(episodes: "pd.DataFrame") -> "pd.DataFrame":
     """Two steps in turn: a line per suite, policy, method and task, and one for all tasks.
 
     `both` is the share in which both steps succeeded, `step 1` that of the first, `step 2 after 1`
-    that of the second where the first had succeeded. `first touch right` is of the episodes in
-    which something was touched. `wrong object` counts every episode in which another object was
-    moved or selected; the failures divide into those with a wrong object and `other failures`
+    that of the second where the first had succeeded. `first touch right` says that the first thing
+    touched in step 1 was its target. `wrong object` counts every episode in which another object
+    was moved or selected; the failures divide into those with a wrong object and `other failures`
     (P tab:multiuser_seq).
     """
     import pandas as pd
@@ -285,7 +285,7 @@ def _groups(episodes: "pd.DataFrame") -> "Iterator[tuple[dict[str, str], pd.Data
 
 
 def _first_touch(group: "pd.DataFrame") -> Rate:
-    """How often the first object of the kind that the hand touches is the target."""
+    """How often the first object that the hand touches is the (first) target."""
     return _share(group["first_object_correct"].dropna())
 
 
