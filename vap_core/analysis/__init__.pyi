@@ -1,3 +1,5 @@
+from .ablation_findings import findings_table as findings_table
+from .ablation_findings import verdict as verdict
 from .ablations import ablation_episodes as ablation_episodes
 from .ablations import ablation_results as ablation_results
 from .ablations import all_effects_figure as all_effects_figure
@@ -59,6 +61,18 @@ from .plots import rates_figure as rates_figure
 from .plots import sheet as sheet
 from .prompt_forms import forms_figure as forms_figure
 from .prompt_forms import marked_frames as marked_frames
+from .shared_films import first_success as first_success
+from .shared_films import run_episode as run_episode
+from .shared_films import steps_figure as steps_figure
+from .shared_scenes import area_table as area_table
+from .shared_scenes import pair_table as pair_table
+from .shared_scenes import paper_parser as paper_parser
+from .shared_scenes import paper_sequence as paper_sequence
+from .shared_scenes import parser_figure as parser_figure
+from .shared_scenes import parser_table as parser_table
+from .shared_scenes import sequence_table as sequence_table
+from .shared_scenes import shared_episodes as shared_episodes
+from .shared_scenes import shared_figure as shared_figure
 from .token_figures import choice_figure as choice_figure
 from .token_figures import rotation_figure as rotation_figure
 from .token_figures import token_curves_figure as token_curves_figure
