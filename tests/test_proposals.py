@@ -309,6 +309,17 @@ def test_contrast_is_stretched_by_one_line_for_all_channels() -> None:
     assert stretch_contrast(flat).max() <= 15 + 4 * 220 / 40 + 1
 
 
+def test_stretched_contrast_is_to_the_bit_what_its_definition_says():
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        h, w = rng.integers(1, 40, 2)
+        middle, spread = rng.uniform(0, 255), rng.uniform(0, 60)
+        rgb = np.clip(rng.normal(middle, spread, (h, w, 3)), 0, 255).astype(np.uint8)
+        dark, bright = np.percentile(rgb.mean(axis=2), [3.0, 97.0])
+        wanted = (rgb.astype(np.float64) - dark) * (220 / max(bright - dark, 40)) + 15
+        assert (stretch_contrast(rgb) == np.clip(wanted, 0, 255).astype(np.uint8)).all()
+
+
 @pytest.mark.parametrize("familiar", [True, False])
 def test_the_shipped_encoders_share_a_network_and_differ_in_name(familiar: bool) -> None:
     from vap_core.perception.embedded import encoder

@@ -388,6 +388,26 @@ def import_object(
     )
 
 
+@objects_app.command("designs")
+def designs(
+    out: Annotated[Path, typer.Argument(help="Folder for the GLB files and objects.csv.")],
+    count: Annotated[int, typer.Option(min=1, max=200, help="How many.")] = 24,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Another seed is another set, to be held back.")
+    ] = 0,
+) -> None:
+    """Write made-up objects that nothing here was trained on, as 3-D files: with handles and
+    without, plain and loud.
+
+    Example: python -m vap_core objects designs data/designs --seed 1
+    """
+    from vap_core.simulation.assets.scans.designs import TABLE, write_designs
+
+    paths = write_designs(out, count, seed)
+    print(f"wrote {len(paths)} designs to {out}, and their kinds to {out / TABLE}")
+    print(f"next: python -m vap_core eval-objects {out}")
+
+
 @objects_app.command("list")
 def list_objects() -> None:
     """Every object there is, your own last.

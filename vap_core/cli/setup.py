@@ -1,6 +1,7 @@
 """Commands about this machine and what it measures.
 
-They are eval-perception, eval-photos, calibrate, eval-policy, eval-tokens, show and doctor.
+They are eval-perception, eval-photos, eval-objects, calibrate, eval-policy, eval-tokens, show and
+doctor.
 """
 
 from pathlib import Path
@@ -87,6 +88,55 @@ def eval_photos(
     from vap_core.evaluation.photos.run import measure_photos
 
     print(measure_photos(folder, out or Path(f"data/runs/photos-{folder.resolve().name}"), stack))
+
+
+@app.command("eval-objects")
+def eval_objects(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            help="Objects that `objects import --out` made; or 3-D files with objects.csv: a line "
+            "file,category,height_cm,groups each, the last two may be empty.",
+        ),
+    ],
+    suite: Annotated[
+        list[str] | None,
+        typer.Option(help="A suite; repeatable. Each object takes its tasks of the same category."),
+    ] = None,
+    episodes: Annotated[
+        int, typer.Option(min=1, help="Episodes per object and task, spread over its list.")
+    ] = 4,
+    policy: Annotated[
+        str, typer.Option(help="Default mini-pi0 where one ships for the suite, else scripted.")
+    ] = "",
+    views_only: Annotated[
+        bool, typer.Option("--views-only", help="Look at the opening views, and run no episodes.")
+    ] = False,
+    stack: StackName = "embedded",
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Run folder; a run found there is resumed. Default data/runs/objects-NAME."
+        ),
+    ] = None,
+) -> None:
+    """Measure objects of your own in a suite's scenes, each in the target's place among its
+    look-alikes: found in opening views, and fetched by VAP where the expert can. Interrupted, it
+    goes on.
+
+    Example: python -m vap_core objects designs data/designs --seed 1
+    Example: python -m vap_core eval-objects data/designs
+    """
+    from vap_core.evaluation.own_objects.run import ObjectSurvey, measure_objects
+
+    asked = ObjectSurvey(
+        suites=tuple(dict.fromkeys(suite or ["tabletop"])),
+        episodes=episodes,
+        stack=stack,
+        policy=policy,
+        views_only=views_only,
+    )
+    print(measure_objects(folder, out or Path(f"data/runs/objects-{folder.resolve().name}"), asked))
 
 
 @app.command()

@@ -85,7 +85,8 @@ def run_replay(
         for job in jobs:
             if not (parts / f"{job.name}.json").exists():
                 missing.append(job)
-        prepare(("vap_core.analysis.attention.replay", "lerobot.policies"))
+        modules = ("vap_core.analysis.attention.replay", "vap_core.policies.lerobot.preload")
+        prepare(modules)
         with tqdm(
             total=sum(len(job.rows) for job in jobs),
             initial=sum(len(job.rows) for job in jobs) - sum(len(job.rows) for job in missing),

@@ -97,12 +97,35 @@ def stretch_contrast(rgb: Rgb) -> Rgb:
 
     All channels are scaled alike, so hues stay.
     """
-    grey = rgb.mean(axis=2)
-    dark, bright = np.percentile(grey, [DARKEST_PERCENT, BRIGHTEST_PERCENT])
+    dark, bright = _grey_percentiles(rgb, (DARKEST_PERCENT, BRIGHTEST_PERCENT))
     low, high = STRETCHED
     scale = (high - low) / max(bright - dark, LEAST_CONTRAST)
-    stretched = (rgb.astype(np.float32) - dark) * scale + low
-    return np.clip(stretched, 0, 255).astype(np.uint8)
+    of_value = np.clip((np.arange(256) - dark) * scale + low, 0, 255)
+    return cv2.LUT(rgb, of_value.astype(np.uint8))
+
+
+def _grey_percentiles(rgb: Rgb, percents: tuple[float, ...]) -> list[float]:
+    """np.percentile of the pixels' means of R, G and B, to the bit.
+
+    Counting the 766 sums of a large crop takes a tenth of the time of partitioning its pixels.
+    """
+    sums = rgb[..., 0].astype(np.uint16)
+    sums += rgb[..., 1]
+    sums += rgb[..., 2]
+    last = sums.size - 1
+    ranked = np.bincount(sums.ravel()).cumsum()
+    found = []
+    for percent in percents:
+        place = last * (percent / 100)
+        rank = int(place)
+        share = place - rank
+        lower = int(np.searchsorted(ranked, rank, side="right")) / 3
+        upper = int(np.searchsorted(ranked, min(rank + 1, last), side="right")) / 3
+        if share < 0.5:
+            found.append(lower + (upper - lower) * share)
+        else:
+            found.append(upper - (upper - lower) * (1 - share))
+    return found
 
 
 def gem(features_chw: Float32[np.ndarray, "c h w"]) -> Float32[np.ndarray, " c"]:

@@ -1,0 +1,208 @@
+"""eval-objects: made-up designs, the folder form, what is wrong with bad folders, the figures, and resuming."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.command import refused, vap
+from tests.scanned import box, put
+from vap_core.base.errors import BadObject
+from vap_core.evaluation.own_objects.folder import VARIABLE, objects_in, read_source
+from vap_core.evaluation.own_objects.report import Tables, group_rows, object_rows, text_report
+from vap_core.simulation.assets.scans.closed_parts import blob, hollow, lathe, ring, tube
+from vap_core.simulation.assets.scans.design_paint import LOUD, QUIET, SIDE, draw_colours
+from vap_core.simulation.assets.scans.designs import FORMS, HANDLED, draw_design, write_designs
+from vap_core.simulation.assets.scans.mesh_file import _weld
+from vap_core.simulation.assets.scans.mesh_repair import count_edge_flaws
+from vap_core.simulation.assets.triangles import area_vectors
+from vap_core.simulation.suites import suite
+
+
+def volume(corner: np.ndarray) -> float:
+    return float((corner[:, 0] * area_vectors(corner)).sum() / 6)
+
+
+@pytest.mark.parametrize(
+    ("corner", "wanted"),
+    [
+        (lathe([(0, 0), (0.02, 0), (0.02, 0.05), (0, 0.05)], 4), 2 * 0.02**2 * 0.05),
+        (lathe([(0, 0), (0.02, 0), (0.02, 0.05), (0, 0.05)]), np.pi * 0.02**2 * 0.05),
+        (blob((0, 0, 0), (0.02, 0.03, 0.01)), 4 / 3 * np.pi * 0.02 * 0.03 * 0.01),
+        (tube([(0, 0, 0), (0, 0, 0.02), (0, 0, 0.05)], 0.004), np.pi * 0.004**2 * 0.05),
+    ],
+)
+def test_forms_are_closed_and_have_their_volumes(corner, wanted):
+    assert count_edge_flaws(_weld(corner)[1]) == (0, 0)
+    assert volume(corner) == pytest.approx(wanted, rel=0.1)
+
+
+def test_a_vessel_is_its_wall():
+    vessel = hollow([(0.02, 0.0), (0.02, 0.06)], 0.003)
+    solid = lathe([(0, 0), (0.02, 0), (0.02, 0.06), (0, 0.06)])
+    assert count_edge_flaws(_weld(vessel)[1]) == (0, 0)
+    assert 0 < volume(vessel) < 0.5 * volume(solid)
+
+
+def test_every_design_of_every_kind_is_closed():
+    rng = np.random.default_rng(0)
+    for forms in FORMS.values():
+        for name, form in forms:
+            for part in form(rng):
+                assert count_edge_flaws(_weld(part)[1]) == (0, 0), name
+                assert volume(part) > 0
+            size = np.ptp(np.concatenate(form(rng)), axis=(0, 1))
+            assert (size > 0.015).all(), name
+            assert (size < 0.13).all(), name
+    assert len(ring((0, 0, 0), (0.01, 0.02), 0.001, corners=3)) == 5
+
+
+def test_designs_are_of_tabletops_kinds_half_loud_and_the_same_for_the_same_seed():
+    assert set(FORMS) == {task.category for task in suite("tabletop").tasks}
+    drawn = [draw_design(i, 0) for i in range(24)]
+    assert len({design.name for design in drawn}) == 24
+    assert sum("loud" in design.groups for design in drawn) == 12
+    assert 8 <= sum("with handle" in design.groups for design in drawn) <= 16
+    assert {name for design in drawn for name in design.groups} == {
+        "with handle", "no handle", "loud", "quiet"
+    }  # fmt: skip
+    names = {name for forms in FORMS.values() for name, _ in forms}
+    assert set(HANDLED) <= names
+    assert drawn[0].glb == draw_design(0, 0).glb
+    assert drawn[0].glb != draw_design(0, 1).glb
+
+
+@pytest.mark.parametrize("paint", [*QUIET, *LOUD])
+def test_paint_wraps_twice_and_only_loud_paint_has_many_colours(paint):
+    rng = np.random.default_rng(3)
+    picture = paint(rng, draw_colours(rng))
+    assert picture.shape == (SIDE, 2 * SIDE, 3)
+    assert (picture[:, :SIDE] == picture[:, SIDE:]).all()
+    count = len(np.unique(picture.reshape(-1, 3), axis=0))
+    assert (count <= 2) == (paint in QUIET)
+
+
+def test_the_folder_of_designs_is_read_and_depends_on_all_of_it(tmp_path):
+    write_designs(tmp_path, 3, 0)
+    source = read_source(tmp_path)
+    assert len(source.groups) == 3
+    assert set(source.groups) == set(source.files)
+    assert source.sha256 == read_source(tmp_path).sha256
+    text = (tmp_path / "objects.csv").read_text()
+    (tmp_path / "objects.csv").write_text(text.replace("vase,", "cup,"))
+    assert source.sha256 != read_source(tmp_path).sha256
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "holds neither objects.csv nor imported objects"),
+        ("file\nmug.glb\n", "lacks the column 'category'"),
+        ("file,category\nmgu.glb,cup\n", "line 2 names 'mgu.glb'"),
+        ("file,category\nmug.glb,cup\nmug.glb,cup\n", "line 3 names a second 'mug'"),
+        ("file,category,height_cm\nmug.glb,cup,tall\n", "the height 'tall'"),
+        ("file,category\n", "names no file"),
+    ],
+)
+def test_what_is_wrong_with_a_folder_is_one_line(tmp_path, text, message):
+    put(tmp_path, "mug.glb", box(rgb=(90, 60, 30)))
+    if text is not None:
+        (tmp_path / "objects.csv").write_text(text)
+    with pytest.raises(BadObject, match=message):
+        read_source(tmp_path)
+
+
+def test_where_objects_are_looked_up_is_as_before_afterwards(tmp_path, monkeypatch):
+    monkeypatch.setenv(VARIABLE, "elsewhere")
+    with objects_in(tmp_path):
+        assert os.environ[VARIABLE] == str(tmp_path)
+    assert os.environ[VARIABLE] == "elsewhere"
+    monkeypatch.delenv(VARIABLE)
+    with objects_in(tmp_path):
+        pass
+    assert VARIABLE not in os.environ
+
+
+@pytest.mark.sweep
+def test_the_command_imports_looks_runs_and_resumes(tmp_path):
+    folder, out = tmp_path / "mine", tmp_path / "out"
+    folder.mkdir()
+    put(folder, "crate.glb", box(rgb=(200, 60, 30)))
+    put(folder, "lamp.glb", box(rgb=(20, 60, 30)))
+    (folder / "objects.csv").write_text(
+        "file,category,height_cm,groups\ncrate.glb,cup,6,loud\nlamp.glb,lamp,,\n"
+    )
+    words = ("eval-objects", folder, "--episodes", "1", "--policy", "scripted", "--out", out)
+    done = vap(*words)
+    assert done.returncode == 0, done.stderr
+    assert "left out: lamp: no task of tabletop asks for a lamp" in done.stdout
+    views = pd.read_parquet(out / "views.parquet")
+    assert sorted(views.camera) == ["front", "side", "wrist"]
+    assert set(views.target) == {"crate"}
+    assert views[views.counts].right.notna().all()
+    (episode,) = pd.read_parquet(out / "episodes.parquet").to_dict("records")
+    assert (episode["object"], episode["method"]) == ("crate", "vap")
+    assert episode["expert"] in (True, False)
+    assert (out / "sheet-01.png").stat().st_size > 10_000
+    parts = {path: path.stat().st_mtime_ns for path in (out / "parts").iterdir()}
+    again = vap(*words)
+    assert again.stdout == done.stdout
+    assert parts == {path: path.stat().st_mtime_ns for path in (out / "parts").iterdir()}
+    assert "holds another run" in refused(*words[:2], "--episodes", "2", "--out", out)
+
+
+def view(**changed: object) -> dict[str, object]:
+    usual: dict[str, object] = {
+        "target": "mug", "camera": "front", "counts": True, "proposed": True, "right": True,
+        "tinted": True, "elected": "mug", "mask_iou": 0.9,
+    }  # fmt: skip
+    return usual | changed
+
+
+def test_rows_count_what_they_say():
+    views = pd.DataFrame(
+        [
+            view(),
+            view(camera="side", right=False, elected="cup-lookalike-1", mask_iou=None),
+            view(camera="wrist", counts=False, proposed=None, right=None, tinted=False, elected=""),
+            view(
+                target="pot",
+                proposed=False,
+                right=False,
+                tinted=False,
+                elected="nothing",
+                mask_iou=None,
+            ),
+        ]
+    )
+    episodes = pd.DataFrame(
+        [
+            {"object": "mug", "expert": True, "success": True, "first_object_correct": True},
+            {"object": "mug", "expert": True, "success": False, "first_object_correct": None},
+            {"object": "pot", "expert": False, "success": True, "first_object_correct": True},
+        ]
+    )
+    tables = Tables(
+        views=views, episodes=episodes, groups={"mug": ("loud",), "pot": ()}, refused={"x": "no"}
+    )
+    assert object_rows(tables)[1:] == [
+        ["mug", "2", "2", "1", "1", "0.90", "2 of 2", "1 of 2"],
+        ["pot", "1", "0", "0", "0", "-", "0 of 1", "0 of 0"],
+    ]
+    by_name = {cells[0].strip("- "): cells[1:] for cells in group_rows(tables)[1:]}
+    assert list(by_name) == ["all", "front views", "side views", "wrist views", "loud"]
+    assert by_name["all"][0].startswith("67 ")
+    assert by_name["all"][1].startswith("33 ")
+    assert by_name["all"][2].startswith("25 ")
+    assert by_name["all"][5].startswith("50 ")
+    assert by_name["all"][5].endswith(" 2")
+    assert by_name["loud"][0].startswith("100 ")
+    assert "left out: x: no" in text_report(tables)
+    nothing = Tables(views=views, episodes=pd.DataFrame(), groups=tables.groups, refused={})
+    assert object_rows(nothing)[1][-2:] == ["-", "-"]
+
+
+def test_folders_that_are_none_are_one_line(tmp_path: Path):
+    assert "is no folder" in refused("eval-objects", tmp_path / "none", "--out", tmp_path / "out")
