@@ -86,7 +86,8 @@ def run_replay(
                 missing.append(job)
         for study in dict.fromkeys(job.study for job in missing):
             register_personal(study, folder / "memory")
-        prepare(("vap_core.analysis.attention.replay", "lerobot.policies"))
+        modules = ("vap_core.analysis.attention.replay", "vap_core.policies.lerobot.preload")
+        prepare(modules)
         with tqdm(
             total=sum(len(job.rows) for job in jobs),
             initial=sum(len(job.rows) for job in jobs) - sum(len(job.rows) for job in missing),
