@@ -1,9 +1,11 @@
-.PHONY: setup demo lint style types check test suite test-all audit lab lock clean
+.PHONY: setup demo lint style types check test suite test-all reliability audit lab html links lock clean
 .DEFAULT_GOAL := help
 
 # An empty PYTHONDONTWRITEBYTECODE lets Python keep what it compiled; uv compiles nothing.
 RUN := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 .venv/bin/python
 QUIET_LAB := --LabApp.news_url=None --LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate --LabApp.extension_manager=readonly
+# JupyterLab asks for this where root runs it, as in a container.
+AS_ROOT := $(if $(filter 0,$(shell id -u)),--allow-root)
 # Three workers for two cores: some tests wait for processes that they have started.
 PYTEST := $(RUN) -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
@@ -12,8 +14,11 @@ help:
 	@echo "make check     for every day: lint, types and unit tests; two and a half minutes"
 	@echo "make test      lint, types, all tests but the sweeps, and notebooks; about nine minutes on two cores"
 	@echo "make test-all  make test, and the long sweeps"
+	@echo "make reliability  write docs/reliability.md from what the tests counted"
 	@echo "make audit     known vulnerabilities of the pinned packages; needs the internet"
 	@echo "make lab       open the notebooks in JupyterLab"
+	@echo "make html      every notebook as an HTML page in build/html, with the viewer beside it"
+	@echo "make links     renew the notebooks' map and their links to each other"
 	@echo "make setup     only set up .venv"
 	@echo "make lock      renew environment.txt from pyproject.toml"
 	@echo "make clean     remove .venv and caches; data/ stays"
@@ -51,13 +56,22 @@ suite: setup .venv/.compiled
 	$(PYTEST) -m "not sweep" --nbval-lax notebooks tests
 
 test-all: test
-	$(RUN) -m pytest -m sweep
+	$(RUN) -m pytest -p tests.counts -m sweep
+
+reliability: setup
+	$(RUN) -m tests.reliability_page
 
 audit: setup
 	@bash .ci/audit
 
 lab: setup
-	.venv/bin/jupyter lab --ip 127.0.0.1 $(QUIET_LAB) notebooks
+	.venv/bin/jupyter lab --ip 127.0.0.1 $(QUIET_LAB) notebooks $(AS_ROOT)
+
+html: setup
+	@$(RUN) -m vap_core.analysis.notebook_pages
+
+links: setup
+	@$(RUN) -m vap_core.analysis.notebook_links
 
 lock: setup
 	.venv/bin/uv pip compile --quiet pyproject.toml --extra dev --universal --python-version 3.12 --generate-hashes --no-annotate --output-file environment.txt

@@ -7,6 +7,7 @@ Tests that were not run keep the entries that they have.
 
 import json
 import os
+from collections.abc import Mapping
 from datetime import date
 from pathlib import Path
 
@@ -46,5 +47,11 @@ def _save() -> None:
     kept = json.loads(FILE.read_text()) if FILE.exists() else {}
     kept.update(_found)
     scratch = FILE.with_suffix(f".{os.getpid()}")
-    scratch.write_text(json.dumps(dict(sorted(kept.items())), indent=0) + "\n")
+    scratch.write_text(encode(kept))
     os.replace(scratch, FILE)
+
+
+def encode(counts: Mapping[str, Mapping[str, object]]) -> str:
+    """As JSON with a line for every test, sorted."""
+    lines = [f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in sorted(counts.items())]
+    return "{\n" + ",\n".join(lines) + "\n}\n"

@@ -1,6 +1,6 @@
 """Episodes of VAP and of generic in this process, written to a file: `python -m tests.one_rollout`.
 
-python -m tests.one_rollout OUT.npz --batch 4 --threads 1 --episodes 4
+python -m tests.one_rollout OUT.npz --batch 2 --threads 1 --episodes 2
 """
 
 import argparse
@@ -17,10 +17,10 @@ SUITE, TASK = "simpler-bridge", "put-camera"
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--batch", type=int, default=4)
+    parser.add_argument("--batch", type=int, default=2)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--episodes", type=int, default=4)
-    parser.add_argument("--methods", nargs="+", default=["generic", "vap"])
+    parser.add_argument("--episodes", type=int, default=2)
+    parser.add_argument("--methods", nargs="+", default=["vap"])
     asked = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = str(asked.threads)
 

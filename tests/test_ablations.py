@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.command import refused, vap
+from vap_core.analysis.ablation_findings import findings_table, verdict
 from vap_core.analysis.ablations import (
     ablation_results,
     all_effects_figure,
@@ -33,6 +34,7 @@ from vap_core.evaluation.ablations.picture import effects_figure
 from vap_core.evaluation.ablations.run import arm_folder
 from vap_core.evaluation.ablations.table import arm_results, arm_rows
 from vap_core.evaluation.methods import METHODS, find, known_methods, references_needed
+from vap_core.evaluation.statistics import Comparison
 from vap_core.evaluation.study import Study
 from vap_core.prompt import PALETTE, Tint, has_colour, tint
 from vap_core.rollout.prompters.oracle import Oracle, OraclePrompter
@@ -340,6 +342,40 @@ def test_an_ablation_of_two_suites_has_a_heading_each() -> None:
     assert [left.get_title(), right.get_title()] == ["vlabench", "tabletop"]
     widths = [[bar.get_width() for bar in bars] for bars in right.containers]
     assert widths == [[0, 0], [100, 100]]
+
+
+@pytest.mark.parametrize(("low", "high", "p", "theirs", "said"), [
+    (-0.9, -0.7, 0.001, -0.78, "holds"),
+    (-0.3, -0.1, 0.001, -0.58, "holds, weaker"),
+    (-0.9, -0.7, 0.001, -0.4, "holds, stronger"),
+    (0.1, 0.3, 0.001, -0.2, "the other way round"),
+    (-0.1, 0.1, 0.7, -0.2, "not here: as much is excluded"),
+    (-0.1, 0.1, 0.7, 0.05, "cannot tell"),
+    (-0.1, -0.02, 0.06, -0.05, "cannot tell"),
+])  # fmt: skip
+def test_what_a_difference_says_about_the_papers_finding(
+    low: float, high: float, p: float, theirs: float, said: str
+) -> None:
+    found = Comparison(
+        suite="s", task="", split="", policy="p", one="vap", other="arm", pairs=96, layouts=96,
+        both=0, only_one=0, only_other=0, neither=0, difference=(low + high) / 2, low=low,
+        high=high, p_mcnemar=p, p=p, p_holm=p,
+    )  # fmt: skip
+    assert verdict(found, theirs) == said
+
+
+def test_the_table_of_findings_holds_the_papers_arms_only() -> None:
+    table = pd.concat([
+        outcomes("vap", [True] * 9 + [False]),
+        outcomes("mask-only", [False] * 10),
+        outcomes("contour", [False] * 10),
+    ], ignore_index=True)  # fmt: skip
+    (row,) = findings_table(ablation_results(table)).to_dict("records")
+    assert (row["ablation"], row["arm"], row["n"], row["paper"]) == (
+        "rewrite", "mask-only", 10, "-78",
+    )  # fmt: skip
+    assert row["here, points [95 %]"].startswith("-90 [")
+    assert row["the paper's finding"] == "holds"
 
 
 def test_policies_stand_side_by_side_and_a_method_is_taken_once() -> None:

@@ -12,12 +12,12 @@ from vap_core.analysis import gallery
 from vap_core.analysis.gallery import GOALS, STEMS
 from vap_core.analysis.plots import (
     Tile,
-    bounds_figure,
     hardness_figure,
     keep,
     layouts_figure,
     sheet,
 )
+from vap_core.base.figures import empty_figure
 from vap_core.simulation.assets.objects import TIERS, lookalikes, personal_instance
 from vap_core.simulation.studio import PORTRAIT, Shot, Stage, photograph
 from vap_core.simulation.suites import BENCHMARKS, VARIANTS, lists
@@ -162,6 +162,18 @@ def test_a_kept_figure_fits(tmp_path):
     assert len(jpeg) <= 20_000
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert Image.open(BytesIO(jpeg)).format == "JPEG"
+    assert not (tmp_path / "a.svg").exists(), "a figure with pictures"
+
+
+def test_a_plot_is_kept_as_an_svg_too_the_same_each_time(tmp_path):
+    for name in ("a", "b"):
+        figure = empty_figure(3.0, 2.0)
+        figure.subplots().plot([1, 2], [3, 4], label="one")
+        keep(figure, tmp_path / f"{name}.png")
+    assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
+    figure.axes[0].scatter(range(9000), range(9000))
+    keep(figure, tmp_path / "c.png")
+    assert not (tmp_path / "c.svg").exists(), "too large"
 
 
 def test_bounds_are_read_in_the_suites_order_and_pooled(tmp_path):
@@ -190,9 +202,11 @@ def test_bounds_are_read_in_the_suites_order_and_pooled(tmp_path):
         ("put-camera", "expert"),
     ]
     assert scores[-1].suite == "tabletop"
-    pooled = gallery.pooled(scores)
-    assert pooled.iloc[0].tolist()[:3] == ["simpler-bridge", "expert", 2]
-    assert len(bounds_figure(scores).axes[0].containers) == 2
+    table = gallery.bounds_table(scores)
+    assert list(table.columns) == ["expert, SR %", "expert, least", "random, SR %", "random, most"]
+    assert table.loc["simpler-bridge", "random, SR %"].startswith("0 % [0, ")
+    assert table.loc["simpler-bridge", "random, SR %"].endswith(" of 2")
+    assert table.loc["simpler-bridge", "expert, least"].startswith("put-camera: ")
 
 
 def test_layouts_and_hardness_draw():

@@ -101,13 +101,98 @@ def test_a_clip_that_is_ended_leaves_no_half_film(
     assert check_films(torn)
 
 
+CELLS = (
+    """import os
+from pathlib import Path
+Path("kernel").write_text(str(os.getpid()))
+import pandas as pd
+from matplotlib.figure import Figure
+from vap_core.analysis.kept import kept_figure, kept_table""",
+    """for i in range(20):
+    kept_table(Path(f"table{i}.parquet"), lambda: pd.DataFrame({"n": range(20_000 + i)}), again=True)
+    kept_figure(Path(f"figure{i}.png"), lambda: Figure(figsize=(4, 3)), again=True)""",
+    """kept_table(Path("table3.parquet"), lambda: None).n.sum()""",
+)
+"""What notebooks do with what takes them long: it is kept in files."""
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
+
+
+def wait_until_it_ends(pid: int, seconds: float) -> bool:
+    end = time.monotonic() + seconds
+    while is_alive(pid):
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.2)
+    return True
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kills", [2, pytest.param(12, marks=pytest.mark.sweep)])
+@pytest.mark.timeout(1200)
+def test_a_notebook_that_is_killed_leaves_whole_files_and_no_kernel(
+    tmp_path: Path, kills: int, record_property: Callable[[str, object], None]
+) -> None:
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(c) for c in CELLS])
+    source = tmp_path / "a.ipynb"
+    nbformat.write(notebook, source)
+    kernel = tmp_path / "kernel"
+    command = [sys.executable, "-m", "nbconvert", "--to", "notebook", "--execute", str(source)]
+    command += ["--output", "done.ipynb"]
+    environment = {**os.environ, "PYTHONPATH": str(Path.cwd()), "OMP_NUM_THREADS": "1"}
+
+    def execute(after_s: float | None) -> bool:
+        kernel.unlink(missing_ok=True)
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        with subprocess.Popen(
+            command, cwd=tmp_path, env=environment, start_new_session=True, **quiet
+        ) as process:
+            try:
+                process.wait(after_s)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+                if kernel.exists() and kernel.read_text():
+                    pid = int(kernel.read_text())
+                    assert wait_until_it_ends(pid, 30), "the kernel outlives its notebook"
+                return True
+        assert process.returncode == 0
+        return False
+
+    def results() -> dict[str, bytes]:
+        return {path.name: path.read_bytes() for path in sorted(tmp_path.glob("[ft][ia]*[0-9].*"))}
+
+    start = time.monotonic()
+    assert not execute(None)
+    seconds = time.monotonic() - start
+    whole = results()
+    assert len(whole) == 40
+    for path in tmp_path.glob("[ft][ia]*[0-9].*"):
+        path.unlink()
+    for _ in kill_in(seconds, execute, kills, random.Random(kills)):
+        for path in tmp_path.glob("table*.parquet"):
+            assert len(pd.read_parquet(path)) >= 20_000
+        for path in tmp_path.glob("figure*.png"):
+            with Image.open(path) as picture:
+                picture.load()
+    assert not execute(None)
+    assert results() == whole
+    record_property("cases", kills)
+
+
 @pytest.fixture(scope="module")
 def server() -> Iterator[Server]:
     with serving() as started:
         yield started
 
 
-KILLS = [2, pytest.param(40, marks=[pytest.mark.sweep, pytest.mark.timeout(1800)])]
+KILLS = [2, pytest.param(20, marks=[pytest.mark.sweep, pytest.mark.timeout(1800)])]
 
 
 @pytest.mark.parametrize("kills", KILLS)
@@ -158,89 +243,4 @@ def test_work_that_is_killed_at_random_moments_leaves_whole_files(
         assert {file: named(torn)[file] for file in after} == after
     if name == "ground":
         assert check_films(torn)
-    record_property("cases", kills)
-
-
-CELLS = (
-    """import os
-from pathlib import Path
-Path("kernel").write_text(str(os.getpid()))
-import pandas as pd
-from matplotlib.figure import Figure
-from vap_core.analysis.kept import kept_figure, kept_table""",
-    """for i in range(20):
-    kept_table(Path(f"table{i}.parquet"), lambda: pd.DataFrame({"n": range(20_000 + i)}), again=True)
-    kept_figure(Path(f"figure{i}.png"), lambda: Figure(figsize=(4, 3)), again=True)""",
-    """kept_table(Path("table3.parquet"), lambda: None).n.sum()""",
-)
-"""What notebooks do with what takes them long: it is kept in files."""
-
-
-def is_alive(pid: int) -> bool:
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return False
-    return state != "Z"
-
-
-def wait_until_it_ends(pid: int, seconds: float) -> bool:
-    end = time.monotonic() + seconds
-    while is_alive(pid):
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.2)
-    return True
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kills", [2, pytest.param(15, marks=pytest.mark.sweep)])
-@pytest.mark.timeout(1200)
-def test_a_notebook_that_is_killed_leaves_whole_files_and_no_kernel(
-    tmp_path: Path, kills: int, record_property: Callable[[str, object], None]
-) -> None:
-    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(c) for c in CELLS])
-    source = tmp_path / "a.ipynb"
-    nbformat.write(notebook, source)
-    kernel = tmp_path / "kernel"
-    command = [sys.executable, "-m", "nbconvert", "--to", "notebook", "--execute", str(source)]
-    command += ["--output", "done.ipynb"]
-    environment = {**os.environ, "PYTHONPATH": str(Path.cwd()), "OMP_NUM_THREADS": "1"}
-
-    def execute(after_s: float | None) -> bool:
-        kernel.unlink(missing_ok=True)
-        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        with subprocess.Popen(
-            command, cwd=tmp_path, env=environment, start_new_session=True, **quiet
-        ) as process:
-            try:
-                process.wait(after_s)
-            except subprocess.TimeoutExpired:
-                os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
-                if kernel.exists() and kernel.read_text():
-                    pid = int(kernel.read_text())
-                    assert wait_until_it_ends(pid, 30), "the kernel outlives its notebook"
-                return True
-        assert process.returncode == 0
-        return False
-
-    def results() -> dict[str, bytes]:
-        return {path.name: path.read_bytes() for path in sorted(tmp_path.glob("[ft][ia]*[0-9].*"))}
-
-    start = time.monotonic()
-    assert not execute(None)
-    seconds = time.monotonic() - start
-    whole = results()
-    assert len(whole) == 40
-    for path in tmp_path.glob("[ft][ia]*[0-9].*"):
-        path.unlink()
-    for _ in kill_in(seconds, execute, kills, random.Random(kills)):
-        for path in tmp_path.glob("table*.parquet"):
-            assert len(pd.read_parquet(path)) >= 20_000
-        for path in tmp_path.glob("figure*.png"):
-            with Image.open(path) as picture:
-                picture.load()
-    assert not execute(None)
-    assert results() == whole
     record_property("cases", kills)

@@ -5,9 +5,11 @@ import re
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
-from vap_core.analysis import notebook_links
+from vap_core.analysis import notebook_links, notebook_pages
 from vap_core.base.errors import BadOutput
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -99,3 +101,71 @@ def test_a_folder_without_notebooks_and_a_broken_one_are_named(tmp_path: Path) -
     (tmp_path / "00_tour.ipynb").write_text("{")
     with pytest.raises(BadOutput, match="00_tour.ipynb is no notebook"):
         notebook_links.write_links(tmp_path)
+
+
+def notebook(folder: Path, *cells: dict) -> Path:
+    """A notebook of these cells beside a folder with one figure."""
+    (folder / "notebooks").mkdir()
+    (folder / "figures").mkdir()
+    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(folder / "figures" / "a.png")
+    first = {"cell_type": "markdown", "id": "t", "metadata": {}}
+    first["source"] = (
+        "# 00 · A <b>\n\n[next](01_b.ipynb#Here) [page](../a.md)\n\n![a](../figures/a.png)"
+    )
+    whole = {"cells": [first, *cells], "metadata": {}, "nbformat": 4, "nbformat_minor": 5}
+    path = folder / "notebooks" / "00_a.ipynb"
+    path.write_text(json.dumps(whole))
+    return path
+
+
+def code(name: str, source: str, outputs: list, **metadata: object) -> dict:
+    return {
+        "cell_type": "code", "id": name, "metadata": metadata, "source": source,
+        "outputs": outputs, "execution_count": 1,
+    }  # fmt: skip
+
+
+def shown(**data: str) -> dict:
+    return {"output_type": "display_data", "metadata": {}, "data": data}
+
+
+def test_a_page_needs_no_network_folds_its_assertions_and_leads_on(tmp_path: Path) -> None:
+    widget = {notebook_pages.WIDGET: {"model_id": "a"}, "text/plain": "Box()"}
+    path = notebook(
+        tmp_path,
+        code("c1", "assert two", [], jupyter={"source_hidden": True}),
+        code("c2", "box", [shown(**widget)]),
+        code("c3", "words", [shown(**widget, **{"text/html": "<em>the default</em>"})]),
+    )
+    page = notebook_pages.page_of(path, tmp_path / "build" / "html")
+    assert "<title>00 · A &lt;b&gt;</title>" in page
+    assert 'href="01_b.html#Here"' in page
+    assert 'href="../../a.md"' in page
+    assert "data:image/png;base64" in page
+    assert page.count('<details class="folded">') == 1
+    assert "A control: open the notebook in JupyterLab." in page
+    assert "<em>the default</em>" in page
+    scripts = re.findall(r"""<script[^>]*src=|import[^;\n]*https?://|@import url""", page)
+    assert not scripts
+
+
+def test_a_recording_becomes_the_viewer_where_there_is_one(tmp_path: Path) -> None:
+    path = notebook(tmp_path, code("c", "view(x)", [], recording="data/runs/one.rrd"))
+    out = tmp_path / "html"
+    (out / "viewer").mkdir(parents=True)
+    assert "Run this notebook, then <code>make html</code>" in notebook_pages.page_of(path, out)
+    (tmp_path / "data" / "runs").mkdir(parents=True)
+    (tmp_path / "data" / "runs" / "one.rrd").write_bytes(b"RRF2")
+    page = notebook_pages.page_of(path, out)
+    assert 'src="viewer/index.html?url=one.rrd"' in page
+    assert (out / "viewer" / "one.rrd").read_bytes() == b"RRF2"
+
+
+def test_pages_have_an_index_and_the_viewer_beside_them(tmp_path: Path) -> None:
+    path = notebook(tmp_path)
+    out = tmp_path / "html"
+    assert notebook_pages.write_pages(path.parent, out) == [out / "00_a.html"]
+    assert 'href="00_a.html">00 · A &lt;b&gt;</a>' in (out / "index.html").read_text()
+    assert (out / "viewer" / "re_viewer_bg.wasm").stat().st_size > 1_000_000
+    with pytest.raises(BadOutput, match="choose another folder"):
+        notebook_pages.write_pages(path.parent, path)

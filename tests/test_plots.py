@@ -19,7 +19,7 @@ from vap_core.base.figures import write_png
 from vap_core.evaluation.metrics import rate, score
 from vap_core.evaluation.report.failures import breakdown, funnel_table
 from vap_core.evaluation.report.funnel import cases_figure, funnel_figure
-from vap_core.evaluation.report.pictures import scores_figure
+from vap_core.evaluation.report.pictures import forest_figure, scores_table
 from vap_core.evaluation.report.result_figures import suites_figure, tasks_figure
 from vap_core.perception.boxes import mask_iou
 
@@ -84,7 +84,9 @@ def test_scores_and_film_draw() -> None:
         {**episode, "method": m, "first_object_correct": True, "steps": 3}
         for m in ("generic", "vap")
     ]
-    assert len(scores_figure(score(rows)).axes) == 1
+    (axes,) = forest_figure(scores_table(score(rows))).axes
+    assert [tick.get_text() for tick in axes.get_yticklabels()] == ["t"]
+    assert len(axes.containers) == 2
     assert len(film({"raw": [LINE, LINE]}, ["a", "b"]).axes) == 2
 
 

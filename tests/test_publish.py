@@ -20,10 +20,18 @@ ROW = {
 }
 
 
-def run(folder: Path, seed: int, episodes: int = 2, done: int = 2) -> Path:
+def run(
+    folder: Path,
+    seed: int,
+    episodes: int = 2,
+    done: int = 2,
+    methods: tuple[str, ...] = ("generic",),
+    version: str = "1",
+) -> Path:
     study = {
         "tasks": [["widowx-pick", "pick-cup"]],
-        "methods": ["generic"],
+        "methods": list(methods),
+        "version": version,
         "episodes": episodes,
         "seed": seed,
         "seeds": 1,
@@ -32,8 +40,10 @@ def run(folder: Path, seed: int, episodes: int = 2, done: int = 2) -> Path:
     append(
         folder,
         [
-            {**ROW, "episode": i, "seed": seed, "detail": "Traceback ...", "seconds_ik": 0.1}
+            {**ROW, "method": method, "episode": i, "seed": seed, "detail": "Traceback ..."}
+            | {"seconds_ik": 0.1, "steps": int(version)}
             for i in range(done)
+            for method in methods
         ],
     )
     return folder
@@ -45,7 +55,7 @@ def test_published_results_keep_their_configurations_and_leave_tracebacks_behind
     target = tmp_path / "results" / "both.parquet"
     assert publish([run(tmp_path / "one", 0), run(tmp_path / "two", 1)], target) == 4
     table = pq.read_table(target)
-    assert set(table.column_names) == {*KEY, "policy", "attempt", "success", "configuration"}
+    assert set(table.column_names) == {*ROW, *KEY, "steps", "configuration"}
     notes = json.loads(table.schema.metadata[b"runs"])
     assert [note["configuration"]["seed"] for note in notes] == [0, 1]
     assert sorted(set(table["configuration"].to_pylist())) == sorted(
@@ -106,3 +116,29 @@ def test_a_published_table_and_a_new_run_become_one_table(tmp_path: Path) -> Non
     assert one.to_pylist() == other.to_pylist()
     with pytest.raises(BadOutput, match="hold the same episodes"):
         publish([old, tmp_path / "one"], both, replace=True)
+
+
+def test_a_method_that_was_read_again_takes_the_place_of_the_earlier_rows(tmp_path: Path) -> None:
+    old, new = tmp_path / "old.parquet", tmp_path / "new.parquet"
+    publish([run(tmp_path / "both", 0, methods=("generic", "vap"))], old)
+    again = run(tmp_path / "again", 0, methods=("vap",), version="2")
+    with pytest.raises(BadOutput, match="or pass --supersede to keep the later ones"):
+        publish([old, again], new)
+    assert publish([old, again], new, supersede=True) == 4
+    table = pq.read_table(new)
+    by_method = dict(zip(table["method"].to_pylist(), table["steps"].to_pylist(), strict=True))
+    assert by_method == {"generic": 1, "vap": 2}
+    first, second = json.loads(table.schema.metadata[b"runs"])
+    assert first["configuration"]["methods"] == ["generic"]
+    assert first["superseded"] == [{"methods": ["vap"], "by": second["digest"]}]
+    assert publish([new], new, replace=True) == 4, "the table is whole without the earlier rows"
+    everything = run(tmp_path / "all", 0, methods=("generic", "vap"), version="3")
+    assert publish([new, everything], new, replace=True, supersede=True) == 4
+    assert len(json.loads(pq.read_schema(new).metadata[b"runs"])) == 1
+
+
+def test_a_part_of_a_list_supersedes_nothing(tmp_path: Path) -> None:
+    whole = run(tmp_path / "whole", 0)
+    part = run(tmp_path / "part", 0, episodes=1, done=1, version="2")
+    with pytest.raises(BadOutput, match="only a part of the episodes of generic"):
+        publish([whole, part], tmp_path / "t.parquet", supersede=True)

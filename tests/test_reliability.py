@@ -1,41 +1,55 @@
-"""docs/reliability.md names tests that exist, and the numbers of fuzzed cases that they have."""
+"""docs/reliability.md is what its command writes, and names tests that exist and have passed."""
 
-import ast
-import re
-from pathlib import Path
+import json
 
-from tests import test_fuzz
+import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
-DOC = (ROOT / "docs" / "reliability.md").read_text()
+from tests import counts, reliability_page, test_fuzz
+from tests.reliability_rows import ATTACKS, FUZZED, LEFT, TRIED
 
-
-def rows() -> list[list[str]]:
-    """The cells of the table of what was tried."""
-    table = DOC[DOC.index("| what was tried") :].split("\n\n")[0].splitlines()
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table[2:]]
+COUNTS = json.loads(counts.FILE.read_text())
 
 
-def functions_in(file: Path) -> set[str]:
-    return {
-        node.name
-        for node in ast.parse(file.read_text()).body
-        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")
-    }
+def test_the_page_is_what_its_command_writes() -> None:
+    assert reliability_page.of_today(COUNTS) == COUNTS, "run make reliability"
+    written = reliability_page.page(COUNTS)
+    assert written == reliability_page.PAGE.read_text(), "run make reliability"
 
 
-def test_every_row_names_tests_that_exist() -> None:
-    assert len(rows()) > 20
-    for tried, _, _, tests in rows():
-        named = re.findall(r"`(test_\w+\.py)(?:::(\w+))?`", tests)
-        assert named, tried
-        for file, name in named:
-            found = functions_in(ROOT / "tests" / file)
-            assert found if not name else name in found, (tried, file, name)
+@pytest.mark.parametrize("test", reliability_page.named())
+def test_every_test_that_the_page_names_exists_and_passed(test: str) -> None:
+    """One that has not been counted yet is "not run" on the page."""
+    file, function = test.split("::")
+    assert function in reliability_page.functions_in(reliability_page.ROOT / file)
+    entries = [entry for name, entry in COUNTS.items() if name.split("[")[0] == test]
+    assert {entry["outcome"] for entry in entries} <= {"passed", "skipped"}
 
 
-def test_fuzzed_parsers_and_cases_are_those_of_the_tests() -> None:
-    (tried, often, _, _), (_, recordings, _, _), *_ = rows()
-    assert tried == f"{', '.join(test_fuzz.PARSERS)}: mutated"
-    assert often == f"{test_fuzz.CASES:,} each, {test_fuzz.DAILY} daily"
-    assert recordings == f"{test_fuzz.CASES:,}"
+def test_no_row_is_missing() -> None:
+    numbers = [str(number) for number in range(1, 27)]
+    numbers.insert(7, "7a")
+    assert [attack.number for attack in ATTACKS] == numbers
+    assert len(TRIED) > 30
+    assert all(row.tests for row in TRIED)
+    assert all(why for _, why in LEFT)
+
+
+def test_the_fuzzed_parsers_are_those_of_the_tests() -> None:
+    assert f"{', '.join(test_fuzz.PARSERS)}: mutated" == FUZZED
+
+
+def test_cases_and_outcomes_are_added_up() -> None:
+    def entry(cases: int, swept: bool, **more: object) -> dict[str, object]:
+        about = {"outcome": "passed", "seconds": 1.0, "on": "2026-01-01"}
+        return {**about, "cases": cases, "sweep": swept, **more}
+
+    entries = [entry(30, False, refused=4), entry(10_000, True, refused=9_000, largest_a=1e-7)]
+    assert reliability_page.how_often(entries) == "30, 10,000 in the sweep"
+    assert reliability_page.counted(entries) == "refused: 9,004; largest a: 1.0e-07"
+    counted = {"tests/test_a.py::test_b[0]": entries[0], "tests/test_a.py::test_b[1]": entries[1]}
+    tests = ("test_a::test_b", "test_a::test_c")
+    assert reliability_page.last_run(tests[:1], counted) == "passed, 2026-01-01"
+    counted["tests/test_a.py::test_b[2]"] = entry(1, False, outcome="failed", on="2026-01-02")
+    broken = "1 of 3 FAILED, 1 of 2 tests not run, 2026-01-02"
+    assert reliability_page.last_run(tests, counted) == broken
+    assert reliability_page.last_run(tests[1:], counted) == "not run"

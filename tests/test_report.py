@@ -13,15 +13,14 @@ import pytest
 from PIL import Image
 
 from tests.command import vap
+from vap_core.base import palette
 from vap_core.base.errors import BadOutput
 from vap_core.base.tables import escape, latex, markdown
 from vap_core.evaluation.publish import publish
 from vap_core.evaluation.report import report
 from vap_core.evaluation.report.pictures import (
-    OKABE_ITO,
     differences_figure,
     forest_figure,
-    method_marks,
 )
 from vap_core.evaluation.report.provenance import command_line
 from vap_core.evaluation.report.results import errors, results
@@ -384,13 +383,13 @@ def test_pictures_show_every_line_and_overlap_nothing(tmp_path: Path) -> None:
 
 
 def test_methods_are_told_apart_by_colour_and_by_marker() -> None:
-    marks = method_marks(["generic", "vap", "mask-only", "rewrite-only", "vap-associated"])
+    marks = palette.method_marks(["generic", "vap", "mask-only", "rewrite-only", "vap-associated"])
     assert (
         len({colour for colour, _ in marks.values()})
         == len({marker for _, marker in marks.values()})
         == 5
     )
-    assert marks["mask-only"][0] == OKABE_ITO[0]
+    assert marks["vap"] == palette.METHODS["vap"]
 
 
 @pytest.mark.sweep

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,10 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+DAMAGED_NOTES, DAMAGED_COLUMNS = 15, 12
+"""Examples that are tried of each."""
+
+
 def read_back(source: Path, out: Path) -> None:
     """What reads a run: none of them may end in anything but a VapError of one line."""
     for read in (lambda: report([source], out), lambda: list_failures(source)):
@@ -51,11 +56,16 @@ def read_back(source: Path, out: Path) -> None:
         shutil.rmtree(out, ignore_errors=True)
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=DAMAGED_NOTES, deadline=None, suppress_health_check=list(HealthCheck))
 @given(name=st.sampled_from(NOTES), value=st.sampled_from(JUNK))
 def test_any_note_of_a_run_is_read_or_refused(
-    whole: Path, tmp_path: Path, name: str, value: Any
+    whole: Path,
+    tmp_path: Path,
+    record_property: Callable[[str, object], None],
+    name: str,
+    value: Any,
 ) -> None:
+    record_property("cases", DAMAGED_NOTES)
     folder = tmp_path / "torn"
     shutil.copytree(whole, folder, dirs_exist_ok=True)
     held = json.loads((whole / "run.json").read_text())
@@ -64,11 +74,16 @@ def test_any_note_of_a_run_is_read_or_refused(
     read_back(folder, tmp_path / "out")
 
 
-@settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=DAMAGED_COLUMNS, deadline=None, suppress_health_check=list(HealthCheck))
 @given(name=st.sampled_from(COLUMNS), value=st.sampled_from(CELLS))
 def test_any_column_of_a_run_is_read_or_refused(
-    whole: Path, tmp_path: Path, name: str, value: Any
+    whole: Path,
+    tmp_path: Path,
+    record_property: Callable[[str, object], None],
+    name: str,
+    value: Any,
 ) -> None:
+    record_property("cases", DAMAGED_COLUMNS)
     folder = tmp_path / "torn"
     shutil.copytree(whole, folder, dirs_exist_ok=True)
     part = next((folder / "parts").iterdir())

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.command import vap
+from vap_core.evaluation.photos import verify
 from vap_core.evaluation.photos.verify import ELECTED, FILLED, LEAD, Check, verify_stack
 from vap_core.perception import stacks
 from vap_core.perception.protocols import Stack
@@ -41,6 +42,17 @@ def test_without_stored_figures_the_drawn_boxes_are_the_measure() -> None:
     assert not Check(ELECTED, 0.4, None, 0.5).holds
     assert str(Check(ELECTED, 0.4, None, 0.5)).startswith("FAILED")
     assert not Check(ELECTED, 0.9, 0.24, 0.5).holds, "another answer than elsewhere"
+
+
+def test_a_stack_without_stored_figures_is_said_to_have_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert set(verify.STORED) == {"embedded"}, "a foundation stack was measured: docs/stacks.md"
+    monkeypatch.setattr(verify, "STORED", {})
+    done = vap("weights", "verify", "--stack", "embedded")
+    *checks, said, _ = done.stdout.splitlines()
+    assert said.startswith("no figures of this stack are stored")
+    assert all("at least" in check for check in checks)
 
 
 def with_nonsense(stack: Stack, part: str) -> Stack:

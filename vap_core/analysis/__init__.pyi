@@ -1,3 +1,5 @@
+from .ablation_findings import findings_table as findings_table
+from .ablation_findings import verdict as verdict
 from .ablations import ablation_episodes as ablation_episodes
 from .ablations import ablation_results as ablation_results
 from .ablations import all_effects_figure as all_effects_figure
@@ -12,10 +14,16 @@ from .agreements import gate_figure as gate_figure
 from .agreements import gated_cases as gated_cases
 from .box_widget import drag_box as drag_box
 from .box_widget import dragged_box as dragged_box
+from .controls import Abstention as Abstention
+from .controls import EpisodeChoice as EpisodeChoice
+from .controls import OwnPhotos as OwnPhotos
 from .embedding_report import paper_spaces as paper_spaces
+from .failure_picker import FailurePicker as FailurePicker
+from .failure_picker import read_labels as read_labels
 from .gallery import GOALS as GOALS
 from .gallery import STEMS as STEMS
 from .gallery import bounds as bounds
+from .gallery import bounds_table as bounds_table
 from .gallery import camera_images as camera_images
 from .gallery import census as census
 from .gallery import frame_sheet as frame_sheet
@@ -24,7 +32,6 @@ from .gallery import hardness as hardness
 from .gallery import lookalike_sheet as lookalike_sheet
 from .gallery import lookalikes_by_tier as lookalikes_by_tier
 from .gallery import out_of_order as out_of_order
-from .gallery import pooled as pooled
 from .gallery import reference_sheet as reference_sheet
 from .gallery import same_layout as same_layout
 from .inspection import association_table as association_table
@@ -43,7 +50,6 @@ from .inspection import write_photo as write_photo
 from .kept import kept_figure as kept_figure
 from .kept import kept_table as kept_table
 from .plots import Tile as Tile
-from .plots import bounds_figure as bounds_figure
 from .plots import film as film
 from .plots import grounding_figure as grounding_figure
 from .plots import hardness_figure as hardness_figure
@@ -55,6 +61,18 @@ from .plots import rates_figure as rates_figure
 from .plots import sheet as sheet
 from .prompt_forms import forms_figure as forms_figure
 from .prompt_forms import marked_frames as marked_frames
+from .shared_films import first_success as first_success
+from .shared_films import run_episode as run_episode
+from .shared_films import steps_figure as steps_figure
+from .shared_scenes import area_table as area_table
+from .shared_scenes import pair_table as pair_table
+from .shared_scenes import paper_parser as paper_parser
+from .shared_scenes import paper_sequence as paper_sequence
+from .shared_scenes import parser_figure as parser_figure
+from .shared_scenes import parser_table as parser_table
+from .shared_scenes import sequence_table as sequence_table
+from .shared_scenes import shared_episodes as shared_episodes
+from .shared_scenes import shared_figure as shared_figure
 from .token_figures import choice_figure as choice_figure
 from .token_figures import rotation_figure as rotation_figure
 from .token_figures import token_curves_figure as token_curves_figure

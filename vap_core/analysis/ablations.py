@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from vap_core.base.figures import empty_figure
 from vap_core.base.palette import CASES
 from vap_core.evaluation.ablations.arms import ABLATIONS, Ablation
-from vap_core.evaluation.ablations.picture import CLEAR, PAPER, UNCLEAR, draw_effects
+from vap_core.evaluation.ablations.picture import CLEAR, PAPER, draw_effects, legend_handles
 from vap_core.evaluation.ablations.table import ArmResult, arm_results
 from vap_core.evaluation.publish import read_runs
 
@@ -63,8 +63,10 @@ def all_effects_figure(results: Results, columns: int = 2) -> "Figure":
         _draw_blocks(axes, part)
         axes.set_ylim(-most + 0.4, 0.6)
         axes.set_xlim(-103, 45)
-    figure.supxlabel("success rate, points against the first arm (95 %, paired)", fontsize=9)
-    _explain(figure)
+        axes.set_xlabel("points of success against the first arm (95 %)", fontsize=8)
+    figure.legend(
+        handles=legend_handles(), loc="outside lower center", ncols=3, frameon=False, fontsize=8
+    )
     return figure
 
 
@@ -243,6 +245,7 @@ def _draw_rates(axes: "Axes", results: Sequence[ArmResult]) -> None:
             axes.plot(100 * one.paper, y, "D", color=PAPER, fillstyle="none", markersize=5)
     names = [f"{one.arm}, n {one.sr.n}" for one in reversed(results)]
     axes.set_yticks(range(len(results)), names, fontsize=8)
+    axes.set_ylim(-0.5, len(results) - 0.5)
     axes.set_xlim(-3, 103)
     axes.spines[["top", "right"]].set_visible(False)
 
@@ -252,14 +255,3 @@ def _finish(axes: "Axes") -> None:
     axes.set_ylabel("success rate, %")
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8)
-
-
-def _explain(figure: "Figure") -> None:
-    from matplotlib.lines import Line2D
-
-    handles = [
-        Line2D([], [], color=CLEAR, marker="o", label="a difference"),
-        Line2D([], [], color=UNCLEAR, marker="o", label="none shown"),
-        Line2D([], [], color=PAPER, marker="D", fillstyle="none", linewidth=0, label="the paper's"),
-    ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=8)

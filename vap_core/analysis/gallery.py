@@ -3,7 +3,6 @@
 Contact sheets of the objects, opening frames of episodes, and how similar the look-alikes are.
 """
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
@@ -74,10 +73,10 @@ def lookalikes_by_tier(stem: str) -> tuple[ObjectModel, ...]:
     return tuple(sorted(lookalikes(stem), key=rank))
 
 
-def lookalike_sheet(stage: Stage) -> dict[str, list[Tile]]:
+def lookalike_sheet(stage: Stage, goals: Sequence[ObjectModel] = ()) -> dict[str, list[Tile]]:
     """One row per personal object: itself, then its look-alikes from hard to easy.
 
-    The title of a look-alike is its tier and the number in its name.
+    The title of a look-alike is its tier and the number in its name. `goals` are a last row.
     """
     sheet = {}
     for stem in STEMS:
@@ -86,6 +85,8 @@ def lookalike_sheet(stage: Stage) -> dict[str, list[Tile]]:
         for model in lookalikes_by_tier(stem):
             tiles.append(_lookalike_tile(stage, model))
         sheet[_label(stem)] = tiles
+    if goals:
+        sheet["goals"] = [Tile(stage.picture(goal.name), goal.category) for goal in goals]
     return sheet
 
 
@@ -261,25 +262,31 @@ def bounds(path: Path) -> list[Score]:
     return sorted(score(records), key=rank)
 
 
-def pooled(scores: Sequence[Score]) -> "pd.DataFrame":
-    """Success of every policy per suite, over all its tasks and tracks.
+def bounds_table(scores: Sequence[Score]) -> "pd.DataFrame":
+    """Success of every policy per suite over all its tasks, with Wilson's 95 % interval.
 
-    With its 95 % Wilson interval.
+    Beside it the task in which the expert succeeds least, and that in which another policy succeeds
+    most.
     """
     import pandas as pd
 
-    successes: Counter[tuple[str, str]] = Counter()
-    episodes: Counter[tuple[str, str]] = Counter()
-    for line in scores:
-        successes[line.suite, line.policy] += line.sr.k
-        episodes[line.suite, line.policy] += line.n
+    policies = list(dict.fromkeys(line.policy for line in scores))
     lines = []
-    for (suite, policy), n in episodes.items():
-        success = rate(successes[suite, policy], n)
-        lines.append(
-            {"suite": suite, "policy": policy, "episodes": success.n, "SR % [95 %]": str(success)}
-        )
-    return pd.DataFrame(lines)
+    for suite in dict.fromkeys(line.suite for line in scores):
+        cells = {"suite": suite}
+        for policy in policies:
+            own = [line for line in scores if (line.suite, line.policy) == (suite, policy)]
+            if not own:
+                continue
+            success = rate(sum(line.sr.k for line in own), sum(line.n for line in own))
+            cells[f"{policy}, SR %"] = f"{success} of {success.n}"
+            ordered = sorted(own, key=lambda line: line.sr.value)
+            word, task = ("most", ordered[-1])
+            if policy == "expert":
+                word, task = ("least", ordered[0])
+            cells[f"{policy}, {word}"] = f"{task.task}: {task.sr} of {task.n}"
+        lines.append(cells)
+    return pd.DataFrame(lines).set_index("suite")
 
 
 def _label(stem: str) -> str:

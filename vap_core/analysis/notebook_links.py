@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import write_atomic
+from vap_core.base.files import parse_json, write_atomic
 
 MAP_NOTEBOOK = "00"
 """The number of the notebook that holds the map."""
@@ -32,7 +32,7 @@ def notebook_files(folder: Path) -> list[Path]:
 def read_notebook(path: Path) -> dict[str, Any]:
     """A notebook's JSON. Raises: BadOutput for a file that is none."""
     try:
-        return dict(json.loads(path.read_text()))
+        return dict(parse_json(path.read_text()))
     except (OSError, ValueError) as error:
         raise BadOutput(
             f"notebook_links: {path} is no notebook ({error}); restore it from git."

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vap_core.base.figures import OTHER, TIER_COLOURS, WINNER, empty_figure
-from vap_core.base.palette import ELECTED, ELECTED_CASING, FRAME, SUITES
+from vap_core.base.figures import BAR_COLOURS, LINE_COLOURS, TIER_COLOURS, empty_figure
+from vap_core.base.files import write_atomic
+from vap_core.base.palette import ELECTED, ELECTED_CASING, FRAME, GRID, ROLES, SUITES, TEXT
 from vap_core.base.types import Attended, Grounding, PersonalObject, Rgb, value
 from vap_core.base.vote_picture import vote_picture
-from vap_core.evaluation.metrics import Rate, Score
+from vap_core.evaluation.metrics import Rate
 from vap_core.simulation.types import EpisodeRow
 
 if TYPE_CHECKING:
@@ -26,14 +27,12 @@ if TYPE_CHECKING:
 
 TIER_MARKERS = {"hard": "^", "medium": "s", "easy": "o"}
 """The marker of a look-alike, by hardness."""
-LINE_COLOURS = ("#232f7e", "#b06ab3", "#157a6b", "#9fd0e0")
-"""The curves of what is no suite."""
-MEASURE_COLOURS = ("#232f7e", "#b06ab3", "#c9ccd1", "#157a6b")
-"""The bars of a group, in their order; told apart in grey, too."""
+SVG_LIMIT = 300_000
+"""Bytes; a larger drawing stays a PNG."""
 VOTE_CELL_PX = 110
 """Side of a cell of the vote's picture in a figure."""
-ROLES = {"other objects": "#c9ccd1", "look-alike": OTHER, "target": WINNER, "goal": "#59a14f"}
-"""The colours of the objects in `layouts_figure`, by role."""
+LAYERS = ("other objects", "look-alike", "target", "goal")
+"""The roles of `layouts_figure`, the first one drawn below the others."""
 
 
 def grounding_figure(
@@ -171,7 +170,7 @@ def hardness_figure(table: "pd.DataFrame") -> "Figure":
     axes.set_yticks(range(len(names)), names)
     axes.invert_yaxis()
     axes.set_xlabel("mean cosine to five references of the personal object")
-    axes.grid(axis="y", color="#e6e6e6")
+    axes.grid(axis="y", color=GRID)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8, loc="upper left")
@@ -204,51 +203,6 @@ def layouts_figure(
     return figure
 
 
-def bounds_figure(scores: Sequence[Score]) -> "Figure":
-    """Success rates with 95 % Wilson intervals: a line per task and track, a colour per policy."""
-    positions: dict[tuple[str, str, str], int] = {}
-    by_policy: dict[str, list[Score]] = {}
-    for score in scores:
-        positions.setdefault((score.suite, score.task, score.split), len(positions))
-        by_policy.setdefault(score.policy, []).append(score)
-    figure = empty_figure(8.5, 0.27 * len(positions) + 1.1)
-    axes = figure.subplots()
-    for i, (policy, policy_scores) in enumerate(by_policy.items()):
-        lines = []
-        policy_rates = []
-        for score in policy_scores:
-            lines.append(positions[score.suite, score.task, score.split])
-            policy_rates.append(score.sr)
-        offset = 0.24 * (i - (len(by_policy) - 1) / 2)
-        rates = _percentages(policy_rates)
-        axes.errorbar(
-            rates.value,
-            np.array(lines) + offset,
-            xerr=np.abs([rates.value - rates.low, rates.high - rates.value]),
-            fmt="o",
-            color=f"C{i}",
-            markersize=4,
-            capsize=2.5,
-            linewidth=1,
-            label=f"{policy} policy",
-        )
-    labels = []
-    for suite, task, split in positions:
-        labels.append(f"{suite} / {task} ({split})" if split else f"{suite} / {task}")
-    axes.set_yticks(range(len(labels)), labels, fontsize=8)
-    axes.invert_yaxis()
-    axes.set(xlim=(-2, 102), xlabel="% of episodes that succeed, 95 % interval")
-    axes.grid(axis="y", color="#eeeeee")
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(
-        *axes.get_legend_handles_labels(),
-        loc="outside upper center",
-        ncols=len(by_policy),
-        frameon=False,
-    )
-    return figure
-
-
 def learning_figure(
     logs: Mapping[str, Sequence[Mapping[str, int | float]]], panels: Mapping[str, str]
 ) -> "Figure":
@@ -274,7 +228,7 @@ def learning_figure(
                 (drawn[label],) = axes.plot(steps, values, color=colour, linewidth=1.6)
         axes.set(title=title, xlabel="optimiser steps")
         axes.set_ylim(bottom=0)
-        axes.grid(color="#eeeeee")
+        axes.grid(color=GRID)
         axes.spines[["top", "right"]].set_visible(False)
     if len(logs) > 1:
         figure.legend(
@@ -341,11 +295,27 @@ def keep(
 ) -> bytes:
     """Save a figure as a PNG of at most `limit` bytes; return a JPEG of at most `small` bytes.
 
-    The JPEG is for a notebook; `about` becomes the PNG's text chunks.
+    The JPEG is for a notebook; `about` becomes the PNG's text chunks. A figure without pictures is
+    saved as an SVG, too.
     """
     drawn = BytesIO()
+    _keep_svg(figure, path.with_suffix(".svg"))
     figure.savefig(drawn, dpi=dpi, metadata={"Software": None, **(about or {})})
     return keep_png(drawn.getvalue(), path, limit=limit, small=small)
+
+
+def _keep_svg(figure: "Figure", path: Path) -> None:
+    """Save a figure as an SVG where it has no picture in it, and fits into SVG_LIMIT."""
+    from matplotlib import rc_context
+    from matplotlib.image import AxesImage
+
+    if figure.findobj(AxesImage):
+        return
+    drawn = BytesIO()
+    with rc_context({"svg.hashsalt": "vap_core", "svg.fonttype": "none"}):
+        figure.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
+    if drawn.tell() <= SVG_LIMIT:
+        write_atomic(path, drawn.getvalue())
 
 
 def keep_png(drawn: bytes, path: Path, limit: int = 480_000, small: int = 115_000) -> bytes:
@@ -411,7 +381,7 @@ def _draw_rates(
 ) -> "BarContainer":
     """Bars of rates with their intervals, in percent."""
     percent = _percentages(rates)
-    shade = MEASURE_COLOURS[colour % len(MEASURE_COLOURS)]
+    shade = BAR_COLOURS[colour % len(BAR_COLOURS)]
     bars = axes.bar(x, percent.value, width, color=shade)
     axes.errorbar(
         x,
@@ -478,7 +448,7 @@ def _draw_layouts(
     from matplotlib.patches import Rectangle
 
     spots: dict[str, set[tuple[float, float]]] = {}
-    for role in ROLES:
+    for role in LAYERS:
         spots[role] = set()
     for row in rows:
         for i, placement in enumerate(row.placements):
@@ -508,9 +478,7 @@ def _draw_layouts(
             linewidths=line_width,
             label=role,
         )
-    axes.plot(
-        0, 0, marker="s", markersize=9, color="#444444", linestyle="none", label="robot's base"
-    )
+    axes.plot(0, 0, marker="s", markersize=9, color=TEXT, linestyle="none", label="robot's base")
 
 
 def _role(row: EpisodeRow, number: int) -> str:

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vap_core.base.files import replacing
-from vap_core.base.palette import FRAME, LOOKALIKES, METHODS, TARGET, TIERS
+from vap_core.base.palette import FRAME, LOOKALIKES, METHODS, ROLES, SUITES, TARGET, TIERS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -14,6 +14,10 @@ WINNER, OTHER = TARGET, LOOKALIKES[0]
 GENERIC, OURS = FRAME, METHODS["vap"][0]
 METHOD_COLOURS = {name: colour for name, (colour, _) in METHODS.items()}
 TIER_COLOURS = TIERS
+LINE_COLOURS = tuple(SUITES[name][0] for name in ("simpler-fractal", "vlabench", "simpler-bridge"))
+"""The curves of what is no suite."""
+BAR_COLOURS = (*LINE_COLOURS[:2], ROLES["other objects"], LINE_COLOURS[2])
+"""The bars of a group, in their order; told apart in grey, too."""
 
 
 def empty_figure(width: float, height: float) -> "Figure":

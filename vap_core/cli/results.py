@@ -297,6 +297,13 @@ def publish(
         Path, typer.Option(help="The table to write, for example data/results/mine.parquet.")
     ],
     replace: Annotated[bool, typer.Option("--replace", help="Overwrite that table.")] = False,
+    supersede: Annotated[
+        bool,
+        typer.Option(
+            "--supersede",
+            help="Where a later source has read a method again, leave the earlier rows out.",
+        ),
+    ] = False,
 ) -> None:
     """Keep the results of finished runs as one small table, with their configurations.
 
@@ -304,10 +311,12 @@ def publish(
         --to data/results/bounds.parquet --replace
     Example: python -m vap_core publish data/results/mine.parquet data/runs/more
         --to data/results/mine.parquet --replace
+    Example: python -m vap_core publish data/results/mine.parquet data/runs/vap-again
+        --to data/results/mine.parquet --replace --supersede
     """
     from vap_core.evaluation.publish import publish as write_table
 
-    n_episodes = write_table(runs, to, replace=replace)
+    n_episodes = write_table(runs, to, replace=replace, supersede=supersede)
     print(f"wrote {to}: {n_episodes} episodes")
 
 

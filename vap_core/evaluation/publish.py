@@ -17,8 +17,11 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
+    type Run = tuple[dict[str, Any], pd.DataFrame]
+    """A run's manifest and its episodes."""
 
-def read_published(path: Path) -> "list[tuple[dict[str, Any], pd.DataFrame]]":
+
+def read_published(path: Path) -> "list[Run]":
     """Every run in a table that `publish` wrote: its manifest, and its episodes.
 
     Raises: BadOutput when `publish` did not write it.
@@ -44,7 +47,7 @@ def read_published(path: Path) -> "list[tuple[dict[str, Any], pd.DataFrame]]":
     return runs
 
 
-def read_runs(source: Path) -> "list[tuple[dict[str, Any], pd.DataFrame]]":
+def read_runs(source: Path) -> "list[Run]":
     """The run of a folder, or every run of a published table: its manifest, and its episodes.
 
     Raises: BadOutput.
@@ -57,12 +60,16 @@ def read_runs(source: Path) -> "list[tuple[dict[str, Any], pd.DataFrame]]":
     return [(manifest, episodes)]
 
 
-def publish(sources: Sequence[Path], target: Path, *, replace: bool = False) -> int:
+def publish(
+    sources: Sequence[Path], target: Path, *, replace: bool = False, supersede: bool = False
+) -> int:
     """Write every episode of the runs, with their manifests in the file's metadata.
 
     A source is a run's folder, or a table that `publish` wrote, whose runs are taken as they are.
     Tracebacks, wall times and memory use are left out. What the runs read of shipped lists is
-    entered in the log beside the table (readings.publish_readings).
+    entered in the log beside the table (readings.publish_readings). With `supersede`, a method that
+    a later source has read again, for the same episodes and policy, leaves the earlier source
+    (`superseded` in its manifest).
 
     Returns: the number of episodes.
 
@@ -75,24 +82,22 @@ def publish(sources: Sequence[Path], target: Path, *, replace: bool = False) -> 
         raise BadOutput(f"publish: {target} is no name of a table; end it with .parquet.")
     if target.exists() and not replace:
         raise _exists(target)
-    tables = []
-    manifests = []
+    runs: list[Run] = []
     for source in sources:
-        for manifest, episodes in read_runs(source):
-            wanted = _count_wanted(manifest["configuration"])
-            if len(episodes) < wanted:
-                raise BadOutput(
-                    f"publish: {source} holds {len(episodes)} of {wanted} episodes; run the same "
-                    "command again to finish it."
-                )
-            kept = episodes[_published_columns(episodes)].assign(configuration=manifest["digest"])
-            tables.append(pa.Table.from_pandas(kept, preserve_index=False))
-            manifests.append(manifest)
+        found = _finished_runs(source)
+        if supersede:
+            runs = _without_superseded(runs, found)
+        runs += found
+    tables = []
+    for manifest, episodes in runs:
+        kept = episodes[_published_columns(episodes)].assign(configuration=manifest["digest"])
+        tables.append(pa.Table.from_pandas(kept, preserve_index=False))
+    manifests = [manifest for manifest, _ in runs]
     whole = pa.concat_tables(tables, promote_options="permissive")
     if whole.select([*KEY, "policy"]).to_pandas().duplicated().any():
         raise BadOutput(
             f"publish: two of {', '.join(map(str, sources))} hold the same episodes; name each run "
-            "once."
+            "once, or pass --supersede to keep the later ones."
         )
     metadata = {
         **(whole.schema.metadata or {}),
@@ -101,6 +106,62 @@ def publish(sources: Sequence[Path], target: Path, *, replace: bool = False) -> 
     _write(whole.replace_schema_metadata(metadata), target, replace)
     publish_readings(manifests, target.with_name(FILE))
     return whole.num_rows
+
+
+def _finished_runs(source: Path) -> "list[Run]":
+    found = read_runs(source)
+    for manifest, episodes in found:
+        wanted = _count_wanted(manifest["configuration"])
+        if len(episodes) < wanted:
+            raise BadOutput(
+                f"publish: {source} holds {len(episodes)} of {wanted} episodes; run the same "
+                "command again to finish it."
+            )
+    return found
+
+
+def _without_superseded(earlier: "list[Run]", later: "list[Run]") -> "list[Run]":
+    """The earlier runs without the methods that the later ones have for all the same episodes."""
+    kept = []
+    for manifest, episodes in earlier:
+        for newer, again in later:
+            manifest, episodes = _supersede(manifest, episodes, newer=newer, again=again)
+        if len(episodes):
+            kept.append((manifest, episodes))
+    return kept
+
+
+def _supersede(
+    manifest: dict[str, Any],
+    episodes: "pd.DataFrame",
+    *,
+    newer: dict[str, Any],
+    again: "pd.DataFrame",
+) -> "Run":
+    """A run without the methods that a newer one has read again.
+
+    Raises: BadOutput where that one has only a part of a method's episodes.
+    """
+    names = [*KEY, "policy"]
+    repeated = episodes[names].merge(again[names], how="left", indicator=True)
+    gone = (repeated["_merge"] == "both").to_numpy()
+    methods = sorted(set(episodes["method"][gone]))
+    if not methods:
+        return manifest, episodes
+    if gone.sum() < episodes["method"].isin(methods).sum():
+        raise BadOutput(
+            f"publish: the later run has only a part of the episodes of {', '.join(methods)}; "
+            "supersede a method by a run of the whole list."
+        )
+    configuration = manifest["configuration"]
+    left = [method for method in configuration["methods"] if method not in methods]
+    note = {"methods": methods, "by": newer["digest"]}
+    changed = {
+        **manifest,
+        "configuration": {**configuration, "methods": left},
+        "superseded": [*manifest.get("superseded", []), note],
+    }
+    return changed, episodes[~gone]
 
 
 def _count_wanted(study: dict[str, Any]) -> int:

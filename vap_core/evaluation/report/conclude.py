@@ -10,7 +10,7 @@ from vap_core.base.figures import write_png
 from vap_core.base.files import write_atomic
 from vap_core.base.tables import align
 from vap_core.evaluation.metrics import Score, rate, score, step_times
-from vap_core.evaluation.report.pictures import scores_figure
+from vap_core.evaluation.report.pictures import forest_figure, scores_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,7 +31,7 @@ def conclude(study: "Study", table: "pd.DataFrame", folder: Path) -> str:
         lines.append({**each.to_json(), "seed": study.seed, "seeds": study.seeds})
     try:
         write_atomic(summary, json.dumps(lines, indent=1).encode())
-        write_png(scores_figure(scores), figure)
+        write_png(forest_figure(scores_table(scores)), figure)
     except OSError as error:
         raise BadOutput(
             f"conclude: {folder} cannot be written ({error.strerror}); make room and run the same "

@@ -1,14 +1,13 @@
 """The pictures of a report: success rates with intervals, and differences on the same episodes."""
 
 from collections.abc import Sequence
-from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vap_core.base.figures import METHOD_COLOURS, empty_figure
+from vap_core.base.figures import empty_figure
+from vap_core.base.palette import GRID, TEXT, method_marks
 from vap_core.evaluation.metrics import Score
-from vap_core.evaluation.report.cells import track_title
 from vap_core.evaluation.statistics import Comparison
 
 if TYPE_CHECKING:
@@ -16,26 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-OKABE_ITO = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#000000")
-MARKERS = "osD^vPX*"
-MEASURES = {
-    "sr": "success rate",
-    "cmr": "correct movement\nratio (CMR)",
-    "wrong_object": "wrong object\nmoved",
-}
-"""The rates of `scores_figure` and their titles."""
 Line = tuple[str, ...]
 """What a line of a forest plot is about: the words of its heading, then the task."""
-
-
-def method_marks(methods: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """A colour and a marker per method, each of them unique."""
-    others = cycle(OKABE_ITO)
-    marks = {}
-    for i, method in enumerate(methods):
-        colour = METHOD_COLOURS.get(method) or next(others)
-        marks[method] = colour, MARKERS[i % len(MARKERS)]
-    return marks
 
 
 def forest_figure(results: "pd.DataFrame") -> "Figure":
@@ -92,7 +73,7 @@ def differences_figure(comparisons: Sequence[Comparison]) -> "Figure":
     marks = method_marks([comparisons[0].one, *(other for other, _ in contrasts)])
     lowest = min(-25.0, *(100 * c.low for c in comparisons))
     figure, axes, places = _forest_axes(lines, per_line=len(contrasts), heading_x=lowest)
-    axes.axvline(0, color="#555555", linewidth=1)
+    axes.axvline(0, color=TEXT, linewidth=1)
     for line, c in zip(lines, comparisons, strict=True):
         colour, marker = marks[c.other]
         i = contrasts.index((c.other, c.one))
@@ -120,65 +101,18 @@ def differences_figure(comparisons: Sequence[Comparison]) -> "Figure":
     return figure
 
 
-def scores_figure(scores: Sequence[Score]) -> "Figure":
-    """SR, CMR and wrong-object rate of every method with 95 % Wilson intervals.
+def scores_table(scores: Sequence[Score]) -> "pd.DataFrame":
+    """The success rates of scores as `forest_figure` reads them, with Wilson's intervals."""
+    import pandas as pd
 
-    One panel per task and track, four in a row.
-    """
-    panels: dict[tuple[str, str, str], list[Score]] = {}
+    lines = []
     for score in scores:
-        panels.setdefault((score.suite, score.task, score.split), []).append(score)
-    columns = min(4, len(panels))
-    rows = -(-len(panels) // columns)
-    figure = empty_figure(4.6 * columns + 0.8, 3.4 * rows + 0.4)
-    grid = np.atleast_2d(figure.subplots(rows, columns, sharey=True, squeeze=False))
-    for axes in grid.ravel()[len(panels) :]:
-        axes.set_axis_off()
-    for axes, shown in zip(grid.ravel(), panels.values(), strict=False):
-        _draw_scores(axes, shown)
-    for axes in grid[:, 0]:
-        axes.set_ylabel("% of episodes, 95 % interval")
-    figure.legend(
-        *grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False
-    )
-    return figure
-
-
-def _draw_scores(axes: "Axes", scores: Sequence[Score]) -> None:
-    """The panel of one task and track: a group of bars per measure, a bar per method."""
-    for i, score in enumerate(scores):
-        at = []
-        heights = []
-        low = []
-        high = []
-        for j, name in enumerate(MEASURES):
-            rate = getattr(score, name)
-            if rate.n:
-                at.append(j)
-                heights.append(100 * rate.value)
-                low.append(100 * rate.low)
-                high.append(100 * rate.high)
-        x = np.array(at) + (i - (len(scores) - 1) / 2) * 0.8 / len(scores)
-        colour = METHOD_COLOURS.get(score.method, f"C{i}")
-        axes.bar(x, heights, 0.72 / len(scores), color=colour, label=score.method)
-        axes.errorbar(
-            x,
-            heights,
-            np.maximum([np.subtract(heights, low), np.subtract(high, heights)], 0),
-            fmt="none",
-            ecolor="black",
-            capsize=3,
-            linewidth=1,
-        )
-    first = scores[0]
-    axes.set_xticks(range(len(MEASURES)), list(MEASURES.values()))
-    axes.set_title(
-        f"{track_title(f'{first.suite} / {first.task}', first.split)}\n"
-        f"n = {first.n} each, {first.policy} policy",
-        fontsize=9,
-    )
-    axes.set_ylim(0, 105)
-    axes.spines[["top", "right"]].set_visible(False)
+        line: dict[str, Any] = {}
+        for name in ("suite", "split", "task", "method", "policy", "n"):
+            line[name] = getattr(score, name)
+        line |= {"sr": score.sr.value, "sr_low": score.sr.low, "sr_high": score.sr.high}
+        lines.append({**line, "sr_layout_low": np.nan, "sr_layout_high": np.nan})
+    return pd.DataFrame(lines)
 
 
 def _forest_axes(
@@ -213,7 +147,7 @@ def _forest_axes(
         )
     axes.set_yticks(list(places.values()), [line[-1] for line in places], fontsize=9)
     axes.set_ylim(bottom + 0.6, -0.2)
-    axes.grid(axis="x", color="#e6e6e6")
+    axes.grid(axis="x", color=GRID)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     return figure, axes, places

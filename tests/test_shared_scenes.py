@@ -1,0 +1,135 @@
+"""Tables and figures of shared scenes: what is counted, and that they agree with what was published."""
+
+import pandas as pd
+import pytest
+
+from vap_core.analysis import shared_films, shared_scenes
+from vap_core.base.files import DATA
+from vap_core.evaluation.paper import ledger
+from vap_core.evaluation.parsers import report
+
+SUITE = "shared-sequence-bridge"
+
+
+def sequence(ends):
+    """Episodes of one task: (step 1, step 2, wrong object) each."""
+    lines = []
+    for i, (first, second, wrong) in enumerate(ends):
+        line = {
+            "suite": SUITE,
+            "policy": "mini-pi0",
+            "method": "vap",
+            "task": "put-cameras",
+            "episode": i,
+            "success": first and second,
+            "subgoal_1": first,
+            "subgoal_2": second,
+            "wrong_object": wrong,
+            "first_object_correct": None if i == 0 else not wrong,
+        }
+        lines.append(line)
+    return pd.DataFrame(lines)
+
+
+ENDS = [
+    (True, True, False),
+    (True, True, True),
+    (True, False, True),
+    (False, False, True),
+    (False, True, False),
+]
+
+
+def test_failures_of_a_sequence_divide_and_step_two_is_of_those_that_did_step_one():
+    table = shared_scenes.sequence_table(sequence(ENDS))
+    assert list(table["task"]) == ["put-cameras", "all"]
+    line = table.iloc[-1]
+    counts = {name: (line[name].k, line[name].n) for name in table.columns[5:]}
+    assert counts == {
+        "both": (2, 5),
+        "step 1": (3, 5),
+        "step 2 after 1": (2, 3),
+        "first touch right": (1, 4),
+        "wrong object": (3, 5),
+        "failed, wrong object": (2, 5),
+        "other failures": (1, 5),
+    }
+
+
+def test_a_pair_stands_beside_the_papers():
+    lines = []
+    for task in shared_scenes.PAPER_PAIRS:
+        line = {
+            "suite": "shared-pair",
+            "policy": "scripted",
+            "method": "vap",
+            "task": task,
+            "success": task == "put-pouch-near-cup",
+            "cmr": True,
+            "first_object_correct": True,
+            "wrong_object": False,
+        }
+        lines.append(line)
+    table = shared_scenes.pair_table(pd.DataFrame(lines)).set_index("task")
+    assert dict(table["paper"]) == {
+        "put-pouch-near-vase": 75,
+        "move-plant-next-to-cup": 65,
+        "put-scrubber-near-slipper": 70,
+        "move-stuffed-toy-next-to-plant": 60,
+        "put-pouch-near-cup": 70,
+        "all": 68,
+    }
+    assert (table.loc["all", "SR"].k, table.loc["all", "n"]) == (1, 5)
+
+
+def test_the_papers_sequences_and_parser_are_its_ledgers():
+    assert shared_scenes.paper_sequence() == {
+        "both": 65,
+        "failed, wrong object": 20,
+        "other failures": 15,
+    }
+    accuracy = shared_scenes.paper_parser()["implicit, parsing accuracy"]
+    assert (accuracy.min(), accuracy.max()) == (94.7, 99.6)
+    assert len(accuracy) == (ledger()["table"] == "llm_parser").sum() / 3
+
+
+def test_parsers_are_as_the_command_prints_them():
+    answers = pd.read_parquet(DATA / "results" / "parsers.parquet")
+    answers = answers[answers["part"] == "test"]
+    ours = shared_scenes.parser_table(answers)
+    printed = report.rows(answers)[1:]
+    assert len(printed) == len(ours)
+    for line, cells in zip(ours.to_dict("records"), printed, strict=True):
+        assert [line["parser"], line["kind"], str(line["n"])] == [cells[0], cells[2], cells[4]]
+        low, high = round(100 * line["low"]), round(100 * line["high"])
+        assert f"{line['right']} [{low}, {high}]" == cells[5]
+    figure = shared_scenes.parser_figure(ours, "finding")
+    assert figure.get_suptitle() == "finding"
+
+
+def test_first_steps_divide_by_where_the_films_had_objects():
+    table = shared_scenes.area_table(sequence(ENDS)).set_index("the films' area")
+    assert set(table.index) == {"inside", "outside"}
+    assert table["n"].sum() == len(ENDS)
+    assert sum(each.k for each in table["step 1"]) == 3
+
+
+def test_the_figure_has_a_panel_a_suite():
+    pairs = sequence(ENDS).assign(suite="shared-pair", task="put-pouch-near-cup", cmr=True)
+    figure = shared_scenes.shared_figure(pd.concat([sequence(ENDS), pairs]))
+    titles = [axes.get_title().partition("\n")[0] for axes in figure.axes]
+    assert titles == [SUITE, "shared-pair"]
+
+
+def test_the_first_success_is_shown_or_else_the_first_episode():
+    episodes = sequence(ENDS)
+    assert shared_films.first_success(episodes, SUITE, "mini-pi0") == ("put-cameras", 0)
+    assert shared_films.first_success(episodes[1:], SUITE, "mini-pi0") == ("put-cameras", 1)
+    assert shared_films.first_success(episodes[2:], SUITE, "mini-pi0") == ("put-cameras", 2)
+
+
+@pytest.mark.sweep
+def test_a_film_of_a_sequence_has_a_row_a_step(tmp_path):
+    episode = shared_films.run_episode(SUITE, "put-cameras", 0, bank=tmp_path, policy="scripted")
+    figure = shared_films.steps_figure(episode, "front")
+    assert len(figure.axes) == shared_films.PICTURES * len(episode.subgoals)

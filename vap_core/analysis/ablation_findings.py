@@ -1,0 +1,60 @@
+"""Whether the paper's ablations hold here: every arm's difference beside the paper's.
+
+findings_table(ablation_results(episodes))
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from vap_core.evaluation.ablations.picture import is_shown
+from vap_core.evaluation.ablations.table import ArmResult
+from vap_core.evaluation.statistics import Comparison
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def findings_table(results: Mapping[str, Sequence[ArmResult]]) -> "pd.DataFrame":
+    """One row for every arm that the paper has, too; differences in points of success."""
+    import pandas as pd
+
+    rows = []
+    for name, arms in results.items():
+        for first, one in _pairs(arms):
+            theirs = one.paper - first.paper
+            if theirs != theirs:
+                continue
+            found = one.against
+            assert found is not None
+            low, here, high = (round(100 * x) for x in (found.low, found.difference, found.high))
+            row = {
+                "ablation": name,
+                "arm": one.arm,
+                "n": one.sr.n,
+                "here, points [95 %]": f"{here:+d} [{low:+d}, {high:+d}]",
+                "paper": f"{round(100 * theirs):+d}",
+                "the paper's finding": verdict(found, theirs),
+            }
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def verdict(found: Comparison, theirs: float) -> str:
+    """What a difference that was found says about another's difference, `theirs`.
+
+    The other's own error is not known, and not counted.
+    """
+    within = found.low <= theirs <= found.high
+    if not is_shown(found):
+        return "cannot tell" if within else "not here: as much is excluded"
+    if within:
+        return "holds"
+    if theirs * found.difference < 0:
+        return "the other way round"
+    return "holds, weaker" if abs(theirs) > abs(found.difference) else "holds, stronger"
+
+
+def _pairs(arms: Sequence[ArmResult]) -> list[tuple[ArmResult, ArmResult]]:
+    """Every arm with the first arm of its suite."""
+    first = {one.suite: one for one in arms if one.against is None}
+    return [(first[one.suite], one) for one in arms if one.against is not None]
