@@ -110,7 +110,7 @@ def _start(
 ) -> tuple[list[Any], Mask | None]:
     """The tracker of the first frame, and the object's mask there; the object is identity 0."""
     order = [name, *(other for other in scene.boxes if other != name)]
-    known: list[Float64[np.ndarray, "4"]] = []
+    known: list[np.ndarray] = []
     for other in order:
         for box in scene.boxes[other][:1].astype(np.float64):
             twin = box + np.array([pan.photo_width, 0.0, pan.photo_width, 0.0])
