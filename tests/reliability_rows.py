@@ -582,6 +582,11 @@ ATTACKS = (
 
 LEFT = (
     (
+        "a run of a trained policy that is interrupted and goes on",
+        "its policy is asked in batches of other sizes, so the last bits of an action differ, and "
+        "an episode at the edge can end otherwise; with scripted and random policies rows are equal",
+    ),
+    (
         "a clock that is set forward by over an hour while a command writes",
         "another command may take its scratch file for abandoned; the write then fails, and "
         "nothing finished is lost",

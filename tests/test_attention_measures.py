@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -405,6 +406,32 @@ def test_a_policy_without_attention_is_refused(tmp_path: Path) -> None:
     study = Study((("widowx-pick", "pick-bottle"),), ("generic",), episodes=1, policy="random")
     with pytest.raises(BadStudy, match="gives no attention maps.*choose another run"):
         replayed(study, "pick-bottle", tmp_path, "random")
+
+
+def test_methods_without_a_token_come_first_and_are_kept(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A command that is ended while tokens are learned has the other methods' episodes."""
+    soft, vap_job = (
+        SimpleNamespace(name=name, study=name, method=name, rows=(0,)) for name in ("soft", "vap")
+    )
+    learned: list[str] = []
+
+    def register(study: str, memory: Path) -> None:
+        learned.append(study)
+        if study == "soft":
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(replay, "plan", lambda *_: [soft, vap_job])
+    monkeypatch.setattr(replay, "prepare", lambda _: None)
+    monkeypatch.setattr(replay, "register_personal", register)
+    monkeypatch.setattr(
+        replay, "results", lambda work, jobs, **_: ((job, {"episodes": []}) for job in jobs)
+    )
+    with pytest.raises(KeyboardInterrupt):
+        replay.run_replay(tmp_path, tmp_path, replay.Wanted(), progress=False)
+    assert learned == ["vap", "soft"]
+    assert [path.name for path in (tmp_path / "parts").iterdir()] == ["vap.json"]
 
 
 def test_an_episode_is_named_and_found_in_its_run(

@@ -227,6 +227,24 @@ def test_parts_of_a_step_sum_to_it() -> None:
     ]
 
 
+def test_an_interrupted_measurement_goes_on_after_its_last_whole_repeat(tmp_path: Path) -> None:
+    arms = []
+    for each in VALUES["arms"]:
+        costs = [Cost(**cost) for cost in each["costs"]]
+        arms.append(Arm(each["name"], "ours", "new", lambda: Cost(1, 1, {}), costs=costs))
+    about = measurement.provenance("a command", n="8 episodes", task="a task")
+    values = {"arms": [arm.values() for arm in arms]}
+    part = tmp_path / "eval.part.json"
+    fresh = [replace(arm, costs=[]) for arm in arms]
+    assert bench_eval.resume(fresh, part, Measurement("eval", about, {})) == 0
+    measurement.write(Measurement("eval", about, values), part)
+    other = Measurement("eval", {**about, "n": "9 episodes"}, {})
+    assert bench_eval.resume(fresh, part, other) == 0
+    assert bench_eval.resume(fresh, part, Measurement("eval", about, {})) == 2
+    assert fresh == arms
+    assert bench_eval.resume(fresh[1:], part, Measurement("eval", about, {})) == 0
+
+
 def test_a_folder_that_is_no_checkout_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadStudy, match="is no checkout of this package; make one: git worktree"):
         LoopProcess(tmp_path, QUICK, tmp_path / "scratch")

@@ -68,7 +68,8 @@ def bench(
     json: Annotated[
         Path | None,
         typer.Option(
-            help="eval, profile, scale, embeddings: keep the measurement in this file, too."
+            help="eval, profile, scale, embeddings: keep the measurement in this file, too. eval "
+            "that was interrupted goes on after its last whole repeat, in FILE.part.json."
         ),
     ] = None,
 ) -> None:
@@ -99,10 +100,12 @@ def bench(
         measurement = measure()
         if json is not None:
             write(measurement, json)
+            json.with_suffix(".part.json").unlink(missing_ok=True)
         return as_text(measurement, tables(measurement))
 
+    part = None if json is None else json.with_suffix(".part.json")
     against_lerobot = partial(
-        bench_eval.measure, workers, lerobot_from, repeats=repeats, quick=quick
+        bench_eval.measure, workers, lerobot_from, repeats=repeats, quick=quick, part=part
     )
     by_part = partial(bench_profile.measure, quick=quick)
     scale = partial(bench_scale.measure, episodes, quick)

@@ -126,6 +126,9 @@ def demo(
     """
     from dataclasses import replace
 
+    from vap_core.evaluation.worker_server import start_server
+
+    start_server("scripted", out)
     from vap_core.evaluation.study import DEMO
 
     study = replace(DEMO, episodes=episodes, seed=seed)
@@ -178,6 +181,10 @@ def rollout(
     Example: python -m vap_core rollout --suite tabletop --task select-cup --object mug
         --episodes 4 --out data/runs/mug
     """
+    _check_quickly([suite], policy, record)
+    from vap_core.evaluation.worker_server import start_server
+
+    start_server(policy, out)
     (suite_name,), files = _suite_names([suite])
     tasks = tuple((suite_name, name) for name in dict.fromkeys(task))
     study = _study(
@@ -371,6 +378,13 @@ def evaluate(
     Example: python -m vap_core eval --suite all --engine ray --address 10.0.0.5:6379
     """
     from vap_core.base.errors import BadStudy
+
+    _check_quickly(suite, policy, record)
+    from vap_core.evaluation.worker_server import probable_policy, start_server
+
+    likely = policy or probable_policy(suite)
+    if likely and engine == "local":
+        start_server(likely, out or _default_folder(likely, suite, object))
     from vap_core.evaluation.policy_names import PRIVILEGED, default_policy
 
     suite_names, files = _suite_names(suite)
@@ -395,14 +409,9 @@ def evaluate(
         raise BadStudy("eval: --address needs --engine ray.")
     if engine == "ray":
         address = address or "127.0.0.1:6379"
-    if out is None:
-        parts = [Path(policy).name, *dict.fromkeys(Path(name).stem for name in suite)]
-        if object:
-            parts.append(object)
-        out = Path("data/runs", "-".join(parts))
     _run(
         study,
-        out,
+        out or _default_folder(policy, suite, object),
         workers=workers,
         record_option=record or ("none" if policy in PRIVILEGED else "failures"),
         retries=retries,
@@ -412,6 +421,34 @@ def evaluate(
         video=video,
         attention=attention,
     )
+
+
+def _check_quickly(suite_names: list[str], policy: str | None, record: str | None) -> None:
+    """Check what can be checked before anything large is imported.
+
+    Raises: BadStudy, BadSuite, UnknownName.
+    """
+    from vap_core.base.errors import BadSuite, one_of
+    from vap_core.policies.lerobot.checkpoints import is_checkpoint_name
+    from vap_core.policies.names import MINI, POLICIES
+
+    if record is not None:
+        _record(record)
+    for name in suite_names:
+        if name.endswith(".py") and not Path(name).is_file():
+            raise BadSuite(f"suites: {name} is no Python file; name one that ends in .py.")
+    known = (*POLICIES, MINI)
+    if policy is not None and policy not in known and not is_checkpoint_name(policy):
+        what = "Study: policy (or a lerobot checkpoint's folder or hub id)"
+        raise one_of(what, policy, known)
+
+
+def _default_folder(policy: str, suite_names: list[str], object: str) -> Path:
+    """The folder of a run for which none was named."""
+    parts = [Path(policy).name, *dict.fromkeys(Path(name).stem for name in suite_names)]
+    if object:
+        parts.append(object)
+    return Path("data/runs", "-".join(parts))
 
 
 def _suite_names(given: list[str]) -> tuple[list[str], tuple[str, ...]]:

@@ -6,7 +6,10 @@ from typing import Any
 
 from vap_core.base.errors import one_of
 from vap_core.perception.protocols import Detector, Stack
-from vap_core.policies.mini_pi0.teach_token import MODEL
+from vap_core.policies.names import MINI as MINI
+from vap_core.policies.names import POLICIES as POLICIES
+from vap_core.policies.names import PRIVILEGED as PRIVILEGED
+from vap_core.policies.names import SHIPPED as SHIPPED
 from vap_core.policies.protocol import Policy, PrivilegedPolicy
 from vap_core.policies.scripted.expert import Expert
 from vap_core.policies.scripted.random import Random
@@ -14,11 +17,6 @@ from vap_core.policies.scripted.scripted import Scripted
 from vap_core.simulation.env import Env
 from vap_core.simulation.scenes import Scene
 from vap_core.simulation.suites import Suite, benchmark_name
-
-MINI = "mini-pi0"
-"""The shipped frozen policy, one checkpoint a suite."""
-SHIPPED = MODEL.parent
-"""The folder of the checkpoints."""
 
 
 def scripted(detector: Detector, scene: Scene, suite: Suite) -> Scripted:
@@ -31,12 +29,6 @@ def scripted(detector: Detector, scene: Scene, suite: Suite) -> Scripted:
         hz=suite.hz,
         control=suite.control,
     )
-
-
-POLICIES = ("scripted", "expert", "random")
-"""Policies without weights; each is built for one scene."""
-PRIVILEGED = ("expert", "random")
-"""Policies that read the simulator, or nothing at all: bounds, never results."""
 
 
 def make_policy(

@@ -4,26 +4,41 @@ They are forked from a server process that has imported what they need. There is
 parent process; it starts with the first call of `prepare` or `results`.
 """
 
+import atexit
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from multiprocessing import forkserver, get_context, parent_process
+from signal import SIGTERM
 from threading import Thread
 
 from vap_core.base.errors import WorkerDied
 
-IGNORE_INTERRUPTS = "vap_core.evaluation.ignore_interrupts"
+FIRST = "vap_core.evaluation.server_begins"
+LAST = "vap_core.evaluation.server_ready"
+"""What the server imports before and after everything else."""
 
 
 def prepare(modules: Sequence[str]) -> None:
     """Start the server; it imports `modules` while this process goes on.
 
-    A server that runs already stays as it is.
+    A server that runs already stays as it is. It ends with this process, also while it imports.
     """
     _limit_threads()
-    get_context("forkserver").set_forkserver_preload([IGNORE_INTERRUPTS, *modules])
+    get_context("forkserver").set_forkserver_preload([FIRST, *modules, LAST])
     forkserver.ensure_running()
+    atexit.unregister(_end_server)
+    atexit.register(_end_server)
+
+
+def _end_server() -> None:
+    """End the server: one that still imports would only notice afterwards that nobody waits."""
+    server = forkserver._forkserver._forkserver_pid  # type: ignore[attr-defined]
+    if server is not None:
+        with suppress(ProcessLookupError):
+            os.kill(server, SIGTERM)
 
 
 def results[J, R](

@@ -191,19 +191,6 @@ def _remembered(study: Study) -> list[tuple[str, str, str]]:
     return found
 
 
-def worker_modules(study: Study) -> tuple[str, ...]:
-    """What a worker of this study imports first."""
-    modules = (
-        "vap_core.evaluation.jobs",
-        "vap_core.rollout.loop",
-        "vap_core.recording.recorder",
-        "vap_core.recording.index",
-    )
-    if study.policy in POLICIES:
-        return modules
-    return (*modules, "vap_core.policies.lerobot.adapter", "lerobot.policies")
-
-
 def make_trial(study: Study, rows: Sequence[EpisodeRow], method: str, bank: Path) -> Trial:
     """The scene, models and policy of some rows of one task and variant, built or cached.
 

@@ -38,7 +38,7 @@ def is_failure_or_sampled(outcome: Outcome, row: EpisodeRow, method: str) -> boo
 class DeferredRecorder:
     """Records an episode only if `keep` says so once its outcome is known.
 
-    Until then its frames wait in memory.
+    Until then its frames wait in memory, without true masks where these can be drawn later.
     """
 
     def __init__(
@@ -59,11 +59,16 @@ class DeferredRecorder:
         """Frames, and the headers of further sub-goals between them."""
         self._buffer_mb = 0.0
         self._recorder: Recorder | None = None
+        self._draw: Callable[[Frame], Frame] | None = None
+
+    def draw_by(self, draw: Callable[[Frame], Frame]) -> None:
+        """Draw the masks that frames lack by `draw`, when they are recorded."""
+        self._draw = draw
 
     def frame(self, frame: Frame) -> None:
         """Keep one control step."""
         if self._recorder is not None:
-            self._recorder.frame(frame)
+            self._recorder.frame(self._drawn(frame))
             return
         self._frames.append(frame)
         self._buffer_mb += frame_megabytes(frame)
@@ -85,6 +90,10 @@ class DeferredRecorder:
             self._recorder.discard()
         self._frames = []
 
+    def _drawn(self, frame: Frame) -> Frame:
+        """The frame with its true masks."""
+        return frame if self._draw is None else self._draw(frame)
+
     def _start_recorder(self) -> Recorder:
         """The recorder, with every frame so far."""
         if self._recorder is None:
@@ -97,7 +106,7 @@ class DeferredRecorder:
             )
             for kept in self._frames:
                 if isinstance(kept, Frame):
-                    self._recorder.frame(kept)
+                    self._recorder.frame(self._drawn(kept))
                 else:
                     self._recorder.begin_subgoal(kept)
             self._frames = []

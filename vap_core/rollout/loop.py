@@ -9,6 +9,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -19,10 +20,11 @@ from vap_core.policies.hooks import AttentionMaps, observe_attention
 from vap_core.policies.protocol import Policy, PolicyInput, PrivilegedPolicy
 from vap_core.rollout import audit
 from vap_core.rollout.coverage import mask_coverage
+from vap_core.rollout.late_masks import LateMasks
 from vap_core.rollout.policy_call import check_chunks, check_policy, checked_plan, policy_call
 from vap_core.rollout.prompters.protocol import PromptContext, Prompter, SceneTruth, unchanged
 from vap_core.rollout.queries import only_queries, query_phrases
-from vap_core.rollout.running import RunningEpisode, SubGoalSink
+from vap_core.rollout.running import RunningEpisode, SubGoalSink, WaitingSink
 from vap_core.rollout.running import Sink as Sink
 from vap_core.rollout.subgoals import begins, ending, next_subgoal, subgoal_number
 from vap_core.rollout.types import (
@@ -131,8 +133,9 @@ def _live(episodes: Sequence[RunningEpisode]) -> list[RunningEpisode]:
     return [episode for episode in episodes if episode.outcome is None]
 
 
-def _begin(trial: Trial, row: EpisodeRow, keeps_images: bool) -> RunningEpisode:
-    env = Env(
+def _env(trial: Trial, row: EpisodeRow) -> Env:
+    """An environment for the row's episode, in which it has not begun."""
+    return Env(
         trial.scene,
         image_size=trial.image_size,
         cameras=row.cameras or None,
@@ -140,6 +143,10 @@ def _begin(trial: Trial, row: EpisodeRow, keeps_images: bool) -> RunningEpisode:
         sensor=trial.sensor,
         occlusion=trial.occlusion,
     )
+
+
+def _begin(trial: Trial, row: EpisodeRow, keeps_images: bool) -> RunningEpisode:
+    env = _env(trial, row)
     env.reset(row)
     env.pursue(row.at(0))
     judge = Judge.start(row.at(0), trial.scene.sizes_m, env.truth())
@@ -289,6 +296,9 @@ def _open_sink(
     episode.header = _header(trial, episode, attended)
     with _timed(episode.seconds, "record"):
         episode.sink = sink(episode.header) if sink is not None else None
+    if isinstance(episode.sink, WaitingSink) and not episode.row.subgoals:
+        episode.late = LateMasks(partial(_env, trial, episode.row))
+        episode.sink.draw_by(episode.late.draw)
 
 
 def _open_subgoal(trial: Trial, episode: RunningEpisode, attended: Attended) -> None:
@@ -421,6 +431,9 @@ def _act(
     action = None if episode.over else episode.queue.popleft()
     prompts = trial.prompter.highlights and bool(attended.tracks)
     needs_masks = bool(observation.images) and (episode.sink is not None or prompts)
+    if needs_masks and episode.late is not None and not prompts and not keep_images:
+        episode.late.keep(episode.judge.steps, episode.env.snapshot())
+        needs_masks = False
     truth = episode.env.truth(masks=needs_masks)
     coverage: tuple[MaskCoverage, ...] = ()
     if prompts:

@@ -1,7 +1,7 @@
 """One episode under way, and where its frames stream to."""
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from vap_core.base.types import Event
 from vap_core.policies.hooks import AttentionMap
+from vap_core.rollout.late_masks import LateMasks
 from vap_core.rollout.types import ConsumedInput, EpisodeHeader, Frame, SubGoalSpan
 from vap_core.simulation.env import Env
 from vap_core.simulation.homing import Homing
@@ -30,6 +31,15 @@ class SubGoalSink(Protocol):
     """A sink that also takes what is known of every sub-goal after the first, when it begins."""
 
     def begin_subgoal(self, header: EpisodeHeader) -> None: ...
+
+
+@runtime_checkable
+class WaitingSink(Protocol):
+    """A sink that may drop its episode: its frames come without masks, which it can draw later."""
+
+    def draw_by(self, draw: Callable[[Frame], Frame]) -> None:
+        """Take what adds the masks to a frame, until the sink is closed."""
+        ...
 
 
 @dataclass
@@ -55,6 +65,8 @@ class RunningEpisode:
     prompter_state: Any = None
     header: EpisodeHeader | None = None
     sink: Sink | None = None
+    late: LateMasks | None = None
+    """Where the sink draws masks later."""
     queue: deque[np.ndarray] = field(default_factory=deque)
     """Actions of the last chunk that are still to be executed."""
     frames: list[Frame] = field(default_factory=list)

@@ -17,6 +17,7 @@ from vap_core.evaluation.diagnosis.recordings import listed_row, study_of
 from vap_core.evaluation.engine import spread_evenly
 from vap_core.evaluation.jobs import BATCH
 from vap_core.evaluation.layouts import layout_name
+from vap_core.evaluation.methods import needs_token
 from vap_core.evaluation.processes import prepare, results
 from vap_core.evaluation.publish import read_runs
 from vap_core.evaluation.store import digest, locked
@@ -84,9 +85,8 @@ def run_replay(
         for job in jobs:
             if not (parts / f"{job.name}.json").exists():
                 missing.append(job)
-        for study in dict.fromkeys(job.study for job in missing):
-            register_personal(study, folder / "memory")
-        prepare(("vap_core.analysis.attention.replay", "lerobot.policies"))
+        modules = ("vap_core.analysis.attention.replay", "vap_core.policies.lerobot.preload")
+        prepare(modules)
         with tqdm(
             total=sum(len(job.rows) for job in jobs),
             initial=sum(len(job.rows) for job in jobs) - sum(len(job.rows) for job in missing),
@@ -94,10 +94,15 @@ def run_replay(
             desc="attention",
             disable=not progress,
         ) as bar:
-            for job, rows in results(run_job, missing, workers=workers, remedy="--workers"):
-                path = parts / f"{job.name}.json"
-                measurements.write_json_part(path, rows, caller="attention")
-                bar.update(len(job.rows))
+            # Tokens take a minute each: what needs none comes first, and is kept.
+            for learns in (False, True):
+                group = [job for job in missing if needs_token(job.method) == learns]
+                for study in dict.fromkeys(job.study for job in group):
+                    register_personal(study, folder / "memory")
+                for job, rows in results(run_job, group, workers=workers, remedy="--workers"):
+                    path = parts / f"{job.name}.json"
+                    measurements.write_json_part(path, rows, caller="attention")
+                    bar.update(len(job.rows))
         return _write_tables(source, folder, [parts / f"{job.name}.json" for job in jobs])
 
 

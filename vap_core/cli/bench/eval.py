@@ -9,23 +9,35 @@ lerobot's loop shares `attend` with ours and so gets faster when ours does: `ear
 checkout whose loop is the fixed denominator. Start-up does not count: everything is built and warm.
 """
 
+import json
 import tempfile
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 from vap_core.cli.bench.eval_lerobot import lerobot_arms
-from vap_core.cli.bench.eval_plan import QUICK, SUITE, TASK, Arm, Plan
+from vap_core.cli.bench.eval_plan import QUICK, SUITE, TASK, Arm, Cost, Plan
 from vap_core.cli.bench.eval_rollout import rollout_arms
-from vap_core.cli.bench.measurement import Measurement, provenance
+from vap_core.cli.bench.measurement import Measurement, provenance, read, write
+
+SAME = ("commit", "machine", "libraries", "n", "task")
+"""What must be the same for a measurement to go on."""
 
 
 def measure(
-    workers: int = 2, earlier: Path | None = None, *, repeats: int = 5, quick: bool = False
+    workers: int = 2,
+    earlier: Path | None = None,
+    *,
+    repeats: int = 5,
+    quick: bool = False,
+    part: Path | None = None,
 ) -> Measurement:
-    """Measure all arms; ten minutes with an earlier checkout, `quick` a minute.
+    """Measure all arms; two minutes a repeat with an earlier checkout, `quick` a minute in all.
 
-    The arms of a repeat follow each other in turn, beginning with another one each time.
+    The arms of a repeat follow each other in turn, beginning with another one each time. Whole
+    repeats are kept in the file `part`; interrupted, the same call goes on after the last of them.
+
+    Raises: BadOutput, when `part` cannot be read or written.
     """
     from tqdm import tqdm
 
@@ -36,10 +48,34 @@ def measure(
         # The last of lerobot's processes has prepared this folder with this checkout's code.
         prepared = sorted(folder.glob("lerobot-*"))[-1]
         arms += rollout_arms(plan, prepared, stack)
-        for turn in tqdm(range(plan.repeats * len(arms)), unit="run", disable=None):
+        done = 0 if part is None else resume(arms, part, _measurement(plan, arms, earlier))
+        turns = range(done * len(arms), plan.repeats * len(arms))
+        for turn in tqdm(turns, unit="run", disable=None):
             repeat = turn // len(arms)
             arms[(turn + repeat) % len(arms)].repeat()
+            if part is not None and turn % len(arms) == len(arms) - 1:
+                write(_measurement(plan, arms, earlier), part)
     return _measurement(plan, arms, earlier)
+
+
+def resume(arms: list[Arm], part: Path, now: Measurement) -> int:
+    """Give arms the costs of the whole repeats in `part`, and return how many these are.
+
+    They are none where that measurement was of another machine, code or plan than `now`.
+
+    Raises: BadOutput.
+    """
+    if not part.exists():
+        return 0
+    kept = read(part)
+    about = json.loads(json.dumps(now.provenance))
+    if any(kept.provenance[name] != about[name] for name in SAME):
+        return 0
+    if [arm["name"] for arm in kept.values["arms"]] != [arm.name for arm in arms]:
+        return 0
+    for arm, values in zip(arms, kept.values["arms"], strict=True):
+        arm.costs = [Cost(**cost) for cost in values["costs"]]
+    return len(arms[0].costs)
 
 
 def _measurement(plan: Plan, arms: list[Arm], earlier: Path | None) -> Measurement:

@@ -1,0 +1,53 @@
+"""The server that workers are forked from."""
+
+import subprocess
+import sys
+
+import pytest
+
+COLLECTS = """
+from vap_core.evaluation.processes import prepare, results
+
+prepare(("json",))
+asked = "(lambda gc: (gc.isenabled(), gc.get_freeze_count() > 1000))(__import__('gc'))"
+(answer,) = results(eval, [asked], 1, "--workers")
+print(answer[1])
+"""
+STARTS = """
+import sys
+from vap_core.cli import main
+
+sys.argv = ["vap_core", *{arguments!r}]
+try:
+    main()
+finally:
+    heavy = ("mujoco", "pandas", "cv2", "beartype", "numpy")
+    print([name for name in heavy if name in sys.modules])
+"""
+
+
+def run(code: str) -> subprocess.CompletedProcess[str]:
+    """A process of its own."""
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+
+
+def test_a_worker_collects_garbage_but_not_among_imports() -> None:
+    done = run(COLLECTS)
+    assert done.stdout.strip() == "(True, True)", done.stderr[-500:]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--suite", "nowhere.py"), "nowhere.py is no Python file"),
+        (("--suite", "simpler-bridge", "--policy", "/no/where"), "'/no/where' is unknown"),
+        (("--suite", "simpler-bridge", "--record", "some"), "say all, failures, none"),
+    ],
+)
+def test_a_wrong_argument_is_told_before_anything_large_is_imported(
+    arguments: tuple[str, ...], says: str
+) -> None:
+    done = run(STARTS.format(arguments=("eval", *arguments)))
+    assert says in done.stderr
+    assert done.returncode == 2
+    assert done.stdout.strip() == "[]"
