@@ -73,6 +73,14 @@ def eval_photos(
         ),
     ],
     stack: StackName = "embedded",
+    clips: Annotated[
+        bool,
+        typer.Option(
+            "--clips",
+            help="Follow objects through clips, too: a window pans from each scene to a copy of "
+            "it and back, with every object twice.",
+        ),
+    ] = False,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -84,10 +92,12 @@ def eval_photos(
     give. Interrupted, it goes on.
 
     Example: python -m vap_core eval-photos my-photos
+    Example: python -m vap_core eval-photos my-photos --clips
     """
     from vap_core.evaluation.photos.run import measure_photos
 
-    print(measure_photos(folder, out or Path(f"data/runs/photos-{folder.resolve().name}"), stack))
+    folder_of_run = out or Path(f"data/runs/photos-{folder.resolve().name}")
+    print(measure_photos(folder, folder_of_run, stack, clips=clips))
 
 
 @app.command("eval-objects")

@@ -27,8 +27,29 @@ NOTE = (
 def text_report(table: "pd.DataFrame") -> str:
     """What the command prints."""
     seconds = f"ms a photo: median {table.ms.median():.0f}, slowest {table.ms.max():.0f}"
+    if "cpu_ms" in table:
+        cpu = table.cpu_ms
+        seconds += f"; of CPU: median {cpu.median():.0f}, slowest {cpu.max():.0f}"
     parts = [align(object_rows(table)), align(scene_rows(table)), align(vote_rows(table))]
     return "\n\n".join([*parts, f"{seconds}\n{NOTE}"])
+
+
+def clip_report(clips: "pd.DataFrame") -> str:
+    """What became of the objects in clips made of the scenes."""
+    if not len(clips):
+        return "clips: no object with references is in view in any scene"
+    rows = [["clips", "on the object", "on its twin", "elsewhere", "no mask"]]
+    cells = []
+    for end in ("object", "twin", "other", ""):
+        cells.append(_share(clips.end == end, clips))
+    rows.append(["at the end", *cells])
+    in_view, on_object = int(clips.in_view.sum()), int(clips.on_object.sum())
+    on_twin, frames = int(clips.on_twin.sum()), int(clips.frames.sum())
+    return (
+        f"{align(rows)}\n\nclips: the object's mask in {on_object} of {in_view} frames that show "
+        f"it, its twin's in {on_twin} of {frames} frames. The window pans from a photo to a copy "
+        "of it and back; the tracker starts from the true boxes."
+    )
 
 
 def object_rows(table: "pd.DataFrame") -> Rows:
