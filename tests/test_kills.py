@@ -172,7 +172,7 @@ def test_a_notebook_that_is_killed_leaves_whole_files_and_no_kernel(
     assert not execute(None)
     seconds = time.monotonic() - start
     whole = results()
-    assert len(whole) == 40
+    assert len(whole) == 60
     for path in tmp_path.glob("[ft][ia]*[0-9].*"):
         path.unlink()
     for _ in kill_in(seconds, execute, kills, random.Random(kills)):

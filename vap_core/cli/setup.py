@@ -134,7 +134,6 @@ def eval_objects(
     look-alikes: found in opening views, and fetched by VAP where the expert can. Interrupted, it
     goes on.
 
-    Example: python -m vap_core objects designs data/designs --seed 1
     Example: python -m vap_core eval-objects data/designs
     """
     from vap_core.evaluation.own_objects.run import ObjectSurvey, measure_objects
