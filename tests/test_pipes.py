@@ -12,6 +12,7 @@ from vap_core.base.files import read_file
 from vap_core.base.photos import load_photo
 from vap_core.base.video import frame_rate, frames
 from vap_core.evaluation import state_log, store
+from vap_core.evaluation.own_objects.folder import read_source
 from vap_core.evaluation.photos.folder import _read_csv
 from vap_core.evaluation.publish import read_published
 from vap_core.memory import load as load_object
@@ -39,6 +40,7 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "episodes": ("parts/a.parquet", store.read),
     "traces": ("traces/a.parquet", lambda folder: list(state_log.read(folder))),
     "published": ("a.parquet", lambda folder: read_published(folder / "a.parquet")),
+    "own objects": ("objects.csv", read_source),
     "boxes": ("a.csv", lambda folder: _read_csv(folder / "a.csv", ("photo",))),
     "recording": ("a.rrd", lambda folder: read_summary(folder / "a.rrd")),
     "index": ("a.rrd", lambda folder: ensure_index(folder / "a.rrd")),

@@ -8,13 +8,13 @@ semicolons, by which the report is split, or empty. A folder without objects.csv
 objects, as `objects import --out` writes them.
 """
 
-import csv
 import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
+from vap_core.base.csv_rows import read_rows
 from vap_core.base.errors import BadObject
 from vap_core.base.types import value
 from vap_core.simulation.assets.scans import import_scan, storage
@@ -44,7 +44,10 @@ def read_source(folder: Path) -> Source:
     groups: dict[str, tuple[str, ...]] = {}
     files: dict[str, Mapping[str, str]] = {}
     digest = hashlib.sha256()
-    for line, row in _read_rows(folder / TABLE):
+    rows = read_rows(
+        folder / TABLE, COLUMNS[:2], optional=COLUMNS[2:], caller="eval-objects", error=BadObject
+    )
+    for line, row in rows:
         path = folder / row["file"]
         where = f"{folder / TABLE} line {line}"
         if not path.is_file():
@@ -116,29 +119,6 @@ def _imported(folder: Path) -> Source:
             f"{','.join(COLUMNS)} for every 3-D file into {folder / TABLE}."
         )
     return Source(groups=groups, files={}, sha256=digest.hexdigest())
-
-
-def _read_rows(path: Path) -> list[tuple[int, dict[str, str]]]:
-    """Every row with the number of its line. Raises: BadObject."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            for name in COLUMNS[:2]:
-                if name not in (reader.fieldnames or ()):
-                    raise BadObject(
-                        f"eval-objects: {path} lacks the column {name!r}; its first line is "
-                        f"{','.join(COLUMNS)}."
-                    )
-            rows = []
-            for row in reader:
-                cells = {name: (row.get(name) or "").strip() for name in COLUMNS}
-                if any(cells.values()):
-                    rows.append((reader.line_num, cells))
-            return rows
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise BadObject(
-            f"eval-objects: {path} cannot be read ({error!s:.100}); save it as UTF-8 with commas."
-        ) from error
 
 
 def _check_height(text: str, where: str) -> None:

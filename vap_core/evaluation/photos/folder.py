@@ -10,7 +10,6 @@ Boxes are pixels of the upright photo, far corner exclusive. An object of scenes
 references is a rival: it is never asked for. Several rows of one scene and object are alternatives.
 """
 
-import csv
 import hashlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -19,8 +18,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
+from vap_core.base.csv_rows import read_rows
 from vap_core.base.errors import BadPhotoSet
-from vap_core.base.files import check_regular
 from vap_core.base.photos import photos_in
 from vap_core.base.types import value
 from vap_core.memory import CATEGORY
@@ -197,28 +196,7 @@ def _read_categories(folder: Path, named: Iterable[str]) -> dict[str, str]:
 
 def _read_csv(path: Path, columns: tuple[str, ...]) -> list[tuple[int, dict[str, str]]]:
     """Every row with the number of its line. Raises: BadPhotoSet."""
-    try:
-        check_regular(path)
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            missing = [name for name in columns if name not in (reader.fieldnames or ())]
-            if missing:
-                raise BadPhotoSet(
-                    f"eval-photos: {path} lacks the column {missing[0]!r}; its first line is "
-                    f"{','.join(columns)}."
-                )
-            rows = []
-            for row in reader:
-                cells = {}
-                for name in columns:
-                    cells[name] = (row[name] or "").strip()
-                if any(cells.values()):
-                    rows.append((reader.line_num, cells))
-            return rows
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise BadPhotoSet(
-            f"eval-photos: {path} cannot be read ({error!s:.100}); save it as UTF-8 with commas."
-        ) from error
+    return read_rows(path, columns, caller="eval-photos", error=BadPhotoSet)
 
 
 def _parse_box(row: Mapping[str, str], where: str) -> Box | None:
