@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.toys import Kept
 from vap_core.evaluation.study import Study, make_trial
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.types import Frame
@@ -16,19 +17,6 @@ from vap_core.simulation.types import EpisodeRow, Outcome
 
 TASK = ("tabletop", "put-plant")
 """Its cameras are displaced in every episode, and one is at the wrist."""
-
-
-class Kept:
-    """A sink that keeps every frame."""
-
-    def __init__(self) -> None:
-        self.frames: list[Frame] = []
-
-    def frame(self, frame: Frame) -> None:
-        self.frames.append(frame)
-
-    def close(self, outcome: Outcome) -> None:
-        pass
 
 
 class Waiting(Kept):

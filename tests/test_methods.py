@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from tests import tiny_lerobot as tiny
-from tests.toys import TOYS, observation, personal, scene
+from tests.toys import TOYS, Kept, observation, personal, scene
 from vap_core.attend import Attender
 from vap_core.base.errors import BadInstruction, BadMemory, BadPolicy, BadStudy
 from vap_core.base.types import Description, Views
@@ -32,8 +32,8 @@ from vap_core.rollout.prompters.oracle import Oracle, OraclePrompter
 from vap_core.rollout.prompters.protocol import PromptContext, SceneTruth
 from vap_core.rollout.prompters.text import HardPrompt, SoftPrompt, TextPrompter, hard_prompt
 from vap_core.rollout.prompters.tint import TintPrompter
-from vap_core.rollout.types import Episode, EpisodeHeader, Frame
-from vap_core.simulation.types import EpisodeRow, Observation, Outcome, Placement
+from vap_core.rollout.types import Episode, EpisodeHeader
+from vap_core.simulation.types import EpisodeRow, Observation, Placement
 
 GREY, TEAL, SAND = (90, 90, 90), (40, 120, 110), (150, 130, 90)
 RED = PALETTE[0]
@@ -307,10 +307,10 @@ def test_oracles_mark_the_true_pixels_and_the_wrong_one_a_look_alike(
     """Against masks rendered for a recording, at every step, in a batch."""
     for method, place in (("oracle-track", 0), ("wrong-mask", 2)):
         trial = make_trial(replace(STUDY, policy=str(checkpoint)), ROWS, method, bank)
-        kept: list[Keep] = []
+        kept: list[Kept] = []
 
-        def keep(opening: EpisodeHeader, into: list["Keep"] = kept) -> "Keep":
-            into.append(Keep())
+        def keep(opening: EpisodeHeader, into: list[Kept] = kept) -> Kept:
+            into.append(Kept())
             return into[-1]
 
         list(rollout(trial, ROWS, keep, batch=2))
@@ -323,19 +323,6 @@ def test_oracles_mark_the_true_pixels_and_the_wrong_one_a_look_alike(
                 mask = frame.tracks["front"][0].mask
                 assert mask is not None
                 assert (mask == frame.truth.masks["front"][row.placements[place].model]).all()
-
-
-class Keep:
-    """A sink that keeps the frames whole."""
-
-    def __init__(self) -> None:
-        self.frames: list[Frame] = []
-
-    def frame(self, frame: Frame) -> None:
-        self.frames.append(frame)
-
-    def close(self, outcome: Outcome) -> None:
-        pass
 
 
 def test_truth_reaches_nobody_but_an_oracle(

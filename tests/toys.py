@@ -6,7 +6,8 @@ import numpy as np
 
 from vap_core.base.types import Boxes, PersonalObject, Rgb, Track, Views
 from vap_core.perception.protocols import Stack
-from vap_core.simulation.types import Observation
+from vap_core.rollout.types import Frame
+from vap_core.simulation.types import Observation, Outcome
 
 BACKGROUND = 0
 
@@ -89,3 +90,16 @@ def personal(name: str, category: str, *colours: tuple[int, int, int]) -> Person
 def observation(views: Views) -> Observation:
     """These views of a robot whose state is zero."""
     return Observation(views, np.zeros(7, np.float32))
+
+
+class Kept:
+    """A sink that keeps every frame whole."""
+
+    def __init__(self) -> None:
+        self.frames: list[Frame] = []
+
+    def frame(self, frame: Frame) -> None:
+        self.frames.append(frame)
+
+    def close(self, outcome: Outcome) -> None:
+        pass

@@ -174,20 +174,10 @@ def cases_figure(results: Sequence[ArmResult]) -> "Figure":
         second = [100 * one.case_2.value for one in arms]
         bars_1 = axes.barh(ys, first, color=CASES["case 1"], label="Case 1")
         bars_2 = axes.barh(ys, second, left=first, color=CASES["case 2"], label="Case 2")
-        axes.bar_label(
-            bars_1,
-            [str(one.case_1.k or "") for one in arms],
-            label_type="center",
-            color="white",
-            fontsize=7,
-        )
-        axes.bar_label(
-            bars_2,
-            [str(one.case_2.k or "") for one in arms],
-            label_type="center",
-            color="white",
-            fontsize=7,
-        )
+        counts_1 = [str(one.case_1.k or "") for one in arms]
+        counts_2 = [str(one.case_2.k or "") for one in arms]
+        for bars, counts in ((bars_1, counts_1), (bars_2, counts_2)):
+            axes.bar_label(bars, counts, label_type="center", color="white", fontsize=7)
         axes.set_yticks(ys, [f"{one.arm}, n {one.sr.n}" for one in arms], fontsize=8)
         axes.set_title(suite, fontsize=9)
         axes.set_xlabel("% of episodes", fontsize=8)

@@ -224,15 +224,15 @@ def shared_figure(episodes: "pd.DataFrame", title: str = "") -> "Figure":
     sequences = sequences[sequences["task"] == ALL]
     pairs = pair_table(episodes)
     pairs = pairs[pairs["task"] == ALL]
-    suites = [name for name in SUITE_ORDER if name in set(episodes["suite"])]
+    names = [name for name in SUITE_ORDER if name in set(episodes["suite"])]
     tables = {}
-    for name in suites:
+    for name in names:
         table = pairs.rename(columns={"SR": "both"}) if name == PAIR else sequences
         tables[name] = table[table["suite"] == name]
     n_lines = max(len(table) for table in tables.values())
-    figure = empty_figure(3.3 * len(suites), 0.34 * n_lines + 1.5)
+    figure = empty_figure(3.3 * len(names), 0.34 * n_lines + 1.5)
     for axes, (name, table) in zip(
-        figure.subplots(1, len(suites), squeeze=False)[0], tables.items(), strict=True
+        figure.subplots(1, len(names), squeeze=False)[0], tables.items(), strict=True
     ):
         _draw_suite(axes, name, table.to_dict("records"))
     figure.supxlabel("% of episodes, 95 %; diamonds: the paper, another world", fontsize=9)

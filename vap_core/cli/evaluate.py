@@ -428,19 +428,16 @@ def _check_quickly(suite_names: list[str], policy: str | None, record: str | Non
 
     Raises: BadStudy, BadSuite, UnknownName.
     """
-    from vap_core.base.errors import BadSuite, one_of
-    from vap_core.policies.lerobot.checkpoints import is_checkpoint_name
-    from vap_core.policies.names import MINI, POLICIES
+    from vap_core.base.errors import BadSuite
+    from vap_core.policies.names import check_policy_name
 
     if record is not None:
         _record(record)
     for name in suite_names:
         if name.endswith(".py") and not Path(name).is_file():
             raise BadSuite(f"suites: {name} is no Python file; name one that ends in .py.")
-    known = (*POLICIES, MINI)
-    if policy is not None and policy not in known and not is_checkpoint_name(policy):
-        what = "Study: policy (or a lerobot checkpoint's folder or hub id)"
-        raise one_of(what, policy, known)
+    if policy is not None:
+        check_policy_name(policy)
 
 
 def _default_folder(policy: str, suite_names: list[str], object: str) -> Path:

@@ -40,6 +40,14 @@ def read_json_part(path: Path, caller: str) -> Any:
         ) from error
 
 
+def write_table(table: "pd.DataFrame", out: Path, name: str) -> list[Path]:
+    """The table as Parquet, for programs, and as CSV, for people."""
+    paths = [out / f"{name}.parquet", out / f"{name}.csv"]
+    write_atomic(paths[0], table.to_parquet(index=False, compression="zstd"))
+    write_atomic(paths[1], table.round(4).to_csv(index=False).encode())
+    return paths
+
+
 def encode_table(table: "pa.Table") -> bytes:
     """The table as a Parquet file, with its metadata."""
     import pyarrow as pa

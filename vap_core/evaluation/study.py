@@ -45,6 +45,7 @@ from vap_core.policies.lerobot import checkpoints
 from vap_core.policies.mini_pi0 import token_file
 from vap_core.policies.mini_pi0.learned_token import WORD
 from vap_core.policies.mini_pi0.teach_token import MODEL, teach, teach_own
+from vap_core.policies.names import check_policy_name
 from vap_core.policies.protocol import Policy, PrivilegedPolicy
 from vap_core.rollout.loop import Follow, Trial
 from vap_core.simulation import robots, suites
@@ -227,9 +228,7 @@ def _check_names(study: Study) -> None:
     for method in study.methods:
         if method not in known_methods():
             raise one_of("Study: method (or an arm of `ablate`)", method, METHODS)
-    if study.policy not in (*POLICIES, MINI) and not checkpoints.is_checkpoint_name(study.policy):
-        what = "Study: policy (or a lerobot checkpoint's folder or hub id)"
-        raise one_of(what, study.policy, [*POLICIES, MINI])
+    check_policy_name(study.policy)
     if study.robots not in MESHES:
         raise one_of("Study: robots", study.robots, MESHES)
     check_stack(study.stack, "Study")

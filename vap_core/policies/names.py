@@ -1,5 +1,6 @@
 """The names of policies, and where those that ship are."""
 
+from vap_core.base.errors import one_of
 from vap_core.base.files import DATA
 
 MINI = "mini-pi0"
@@ -10,3 +11,12 @@ POLICIES = ("scripted", "expert", "random")
 """Policies without weights; each is built for one scene."""
 PRIVILEGED = ("expert", "random")
 """Policies that read the simulator, or nothing at all: bounds, never results."""
+
+
+def check_policy_name(name: str) -> None:
+    """Raises: UnknownName: neither a policy nor what could name a lerobot checkpoint."""
+    from vap_core.policies.lerobot.checkpoints import is_checkpoint_name
+
+    known = (*POLICIES, MINI)
+    if name not in known and not is_checkpoint_name(name):
+        raise one_of("Study: policy (or a lerobot checkpoint's folder or hub id)", name, known)

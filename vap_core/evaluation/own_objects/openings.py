@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from vap_core.attend import Attender
-from vap_core.base.types import Grounding, Mask, Rgb
+from vap_core.base.types import Grounding, Rgb
 from vap_core.evaluation.perception.first_frames import (
     SAME_BOX,
     USUAL_K,
@@ -75,7 +75,7 @@ def _view_row(view: View, offered: Proposals, grounding: Grounding) -> Row:
     row["proposed"] = bool(overlap.max(initial=0.0) >= SAME_BOX)
     row["right"] = row["elected"] == target
     if row["right"] and chosen is not None:
-        row["mask_iou"] = _iou(grounding.masks[chosen], view.masks[target])
+        row["mask_iou"] = mask_iou(grounding.masks[chosen], view.masks[target])
     return row
 
 
@@ -84,10 +84,6 @@ def _elected(view: View, grounding: Grounding) -> str:
     if grounding.chosen is None:
         return ""
     return object_under_box(view, grounding.candidates.xyxy[grounding.chosen])
-
-
-def _iou(mask: Mask, truth: Mask) -> float:
-    return float(mask_iou(mask, truth))
 
 
 def _tile(view: View, grounding: Grounding, row: Row) -> Rgb:

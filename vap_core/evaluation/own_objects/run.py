@@ -185,11 +185,8 @@ def _slug(study: Study) -> str:
 
 
 def _write(tables: Tables, out: Path) -> list[Path]:
-    """The tables as Parquet, for programs, and as CSV, for people."""
     paths = []
     for name, table in (("views", tables.views), ("episodes", tables.episodes)):
         if len(table):
-            paths += [out / f"{name}.parquet", out / f"{name}.csv"]
-            write_atomic(paths[-2], table.to_parquet(index=False, compression="zstd"))
-            write_atomic(paths[-1], table.round(4).to_csv(index=False).encode())
+            paths += measurements.write_table(table, out, name)
     return paths

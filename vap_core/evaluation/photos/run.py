@@ -7,7 +7,7 @@ from vap_core import __version__
 from vap_core.attend import Attender
 from vap_core.base.files import write_atomic
 from vap_core.evaluation import store
-from vap_core.evaluation.measurements import read_json_part, write_json_part
+from vap_core.evaluation.measurements import read_json_part, write_json_part, write_table
 from vap_core.evaluation.photos.clips import follow_scene
 from vap_core.evaluation.photos.folder import PhotoSet, read_photo_set
 from vap_core.evaluation.photos.measure import Row, measure_scene
@@ -36,12 +36,12 @@ def measure_photos(
     store.open_run(out, _configuration(photo_set, stack_name))
     with store.locked(out):
         table = _measure(photo_set, out, stack_name, progress)
-        written = _write(table, out, TABLE)
+        written = write_table(table, out, TABLE)
         sheets = write_sheets(photo_set, table, out)
         report = text_report(table)
         if clips:
             followed = _follow(photo_set, out, stack_name, progress)
-            written += _write(followed, out, CLIPS)
+            written += write_table(followed, out, CLIPS)
             report += f"\n\n{clip_report(followed)}"
         write_atomic(out / "report.txt", f"{report}\n".encode())
     names = ", ".join(str(path) for path in [*written, *sheets])
@@ -91,11 +91,3 @@ def _follow(photo_set: PhotoSet, out: Path, stack_name: str, progress: bool) -> 
             write_json_part(path, measured, caller="eval-photos")
         rows.extend(read_json_part(path, caller="eval-photos"))
     return pd.DataFrame(rows)
-
-
-def _write(table: "pd.DataFrame", out: Path, name: str) -> list[Path]:
-    """The table as Parquet, for programs, and as CSV, for people."""
-    paths = [out / f"{name}.parquet", out / f"{name}.csv"]
-    write_atomic(paths[0], table.to_parquet(index=False, compression="zstd"))
-    write_atomic(paths[1], table.round(4).to_csv(index=False).encode())
-    return paths

@@ -48,7 +48,6 @@ def _packages(distribution: Distribution) -> list[str]:
     if declared:
         return declared
     record = distribution.read_text("RECORD")
-    files = []
     if record is None:
         files = [str(file) for file in distribution.files or ()]
     else:
