@@ -10,7 +10,8 @@ from vap_core.base.types import Description
 from vap_core.perception.colours import COLOURS
 from vap_core.prompt import PALETTE
 from vap_core.simulation import robots
-from vap_core.simulation.suites import BENCHMARKS
+from vap_core.simulation.assets.objects import get_object
+from vap_core.simulation.suites import BENCHMARKS, suite
 from vap_core.training.films.demonstrations import Film
 from vap_core.training.policy import colouring
 from vap_core.training.policy.colouring import (
@@ -219,11 +220,13 @@ def test_forms_have_their_shares_and_the_captioners_grammar(
 
 
 def test_every_suites_recipe_can_be_said_in_the_vocabulary() -> None:
-    assert set(RECIPES) == set(BENCHMARKS)
+    assert set(RECIPES) == {*BENCHMARKS, "shared-pair"}
     for name, recipe in RECIPES.items():
         assert recipe.suite == name
         assert 0 <= recipe.tint_share <= 0.2
         assert recipe.described >= 0.3
         assert 1 <= recipe.execute <= recipe.chunk
-        assert recipe.held_out_category in {task.category for task in BENCHMARKS[name].tasks}
+        evaluated = {task.category for task in suite(name).tasks}
+        evaluated |= {get_object(task.goal).category for task in suite(name).tasks if task.goal}
+        assert recipe.held_out_category in evaluated
         assert len(set(recipe.held_out_tints) & {colour.name for colour in PALETTE}) == 2

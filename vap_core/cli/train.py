@@ -191,10 +191,13 @@ def policy(
         steps=steps or standard.steps,
     )
     rendered = cache or CACHE
+    grows_from = vlm
+    if vlm is None and not recipe.start:
+        grows_from = make(folder.parent / "mini-paligemma", cache=rendered, jobs=jobs)
     about = train(
         recipe,
         folder,
-        vlm=vlm or make(folder.parent / "mini-paligemma", cache=rendered, jobs=jobs),
+        vlm=grows_from,
         demonstrations=demonstrations,
         minutes=minutes,
         cache=rendered,

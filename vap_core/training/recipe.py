@@ -11,7 +11,8 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from vap_core.base.errors import one_of
-from vap_core.simulation.suites import BENCHMARKS, Task, simpler, tabletop, vlabench
+from vap_core.simulation.assets.objects import get_object
+from vap_core.simulation.suites import Task, simpler, suite, tabletop, vlabench
 from vap_core.simulation.suites.layout import Area
 
 
@@ -36,6 +37,8 @@ class Recipe(Sizes):
     `tint_share`, whatever the command; any object that may be meant carries the tint, or none, with
     equal odds. `held_out_tints` are no tints of training, nor are opacities outside `opacities`.
 
+    The policy begins with nothing, or goes on from the shipped one called `start`.
+
     Films: none shows `held_out_category`, which the suite evaluates. `draws` flow samples share one
     look at the pictures; frames close to the start, a grasp, a release or the end come `focus`
     times as often as others. `execute` actions of each chunk of `chunk` are carried out.
@@ -59,6 +62,7 @@ class Recipe(Sizes):
     described: float = 0.4
     taught: int = 80
     learned: float = 0.5
+    start: str = ""
 
     def as_json(self) -> dict[str, Any]:
         """Every field, as training.json keeps it."""
@@ -83,6 +87,18 @@ RECIPES: dict[str, Recipe] = {
         chunk=32,
         execute=10,
     ),
+    # Two-colour commands, taught to the policy that acts in the suite without them.
+    "shared-pair": Recipe(
+        suite="shared-pair",
+        held_out_category="slipper",
+        start="mini-pi0-tabletop",
+        stages=28,
+        steps=1_500,
+        batch=32,
+        chunk=32,
+        execute=10,
+        taught=0,
+    ),
 }
 """The recipe of each suite; what is not named is as in `Recipe`."""
 
@@ -95,7 +111,8 @@ class Filmed:
     categories that the suite does not evaluate. Objects stand in `area`. There is a picture
     `every` so many control steps: at 30 Hz neighbours hardly differ, and pictures are what a film
     costs. At most `most` objects of the category and the goal are in a scene; `distractors` is the
-    share of scenes with one or two objects of other categories besides.
+    share of scenes with one or two objects of other categories besides. With `pairs`, the goal is
+    an object like the target (`films.pairs`).
     """
 
     area: Area
@@ -103,6 +120,7 @@ class Filmed:
     every: int = 1
     most: int = 5
     distractors: float = 0.0
+    pairs: bool = False
 
 
 def _instead(task: Task, category: str) -> Task:
@@ -133,6 +151,7 @@ FILMED: dict[str, Filmed] = {
     ),
     "vlabench": Filmed(area=vlabench.TABLE),
     "tabletop": Filmed(area=tabletop.TABLE, every=3),
+    "shared-pair": Filmed(area=tabletop.TABLE, every=3, pairs=True),
 }
 """What differs between the films of the suites; a put on the tabletop uses tabletop.REACH."""
 
@@ -141,8 +160,11 @@ def filmed_tasks(suite_name: str) -> tuple[Task, ...]:
     """The tasks that a suite's films show."""
     held_out = RECIPES[suite_name].held_out_category
     tasks = []
-    for task in BENCHMARKS[suite_name].tasks:
-        if task.category != held_out:
+    for task in suite(suite_name).tasks:
+        shown = {task.category}
+        if task.goal:
+            shown.add(get_object(task.goal).category)
+        if held_out not in shown:
             tasks.append(task)
     return (*tasks, *FILMED[suite_name].instead)
 

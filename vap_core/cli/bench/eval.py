@@ -85,7 +85,7 @@ def _measurement(plan: Plan, arms: list[Arm], earlier: Path | None) -> Measureme
     about = provenance(
         command,
         n=f"{plan.episodes} episodes of {plan.steps} steps",
-        repeats=plan.repeats,
+        repeats=len(arms[0].costs),
         task=f"{SUITE}/{TASK}",
     )
     values = {

@@ -315,24 +315,35 @@ def _on_desk(shared: Shared, rng: np.random.Generator) -> tuple[Placement, ...]:
     bowl = tabletop.BOWLS[int(rng.integers(2))]
     has_bowl = any(step.goal == BOWL for step in shared.steps)
     fixed = [(bowl, radius_m(BOWL) / np.sqrt(2))] if has_bowl else []
+    grasped = {step.category for step in shared.steps if step.rule != "selected"}
+    within = [name for name in models if objects.get_object(name).category in grasped]
+    gap_m = GAP_M if grasped else TOUCH_GAP_M
+    pair = None
+    if shared.owner_of_goal:
+        step = shared.steps[0]
+        pair = (step.model, step.goal, HARDEST[step.stem])
     while True:
-        spots = _try_desk(shared, models, fixed, rng)
+        spots = try_desk(models, within, fixed=fixed, gap_m=gap_m, pair=pair, rng=rng)
         if spots is not None:
             break
     placements = place_at_random_yaws(rng, models, [spots[model] for model in models])
     return tuple(_with_goals(placements, [BOWL], [bowl]) if has_bowl else placements)
 
 
-def _try_desk(
-    shared: Shared,
+def try_desk(
     models: Sequence[str],
-    fixed: Sequence[tuple[Spot, float]],
+    within: Sequence[str],
+    *,
+    fixed: Sequence[tuple[Spot, float]] = (),
+    gap_m: float = GAP_M,
+    pair: tuple[str, str, str] | None = None,
     rng: np.random.Generator,
 ) -> dict[str, Spot] | None:
-    """A spot for every model; None where they do not fit, or a pair's goal leaves no room."""
-    grasped = {step.category for step in shared.steps if step.rule != "selected"}
-    within = [name for name in models if objects.get_object(name).category in grasped]
-    gap_m = GAP_M if grasped else TOUCH_GAP_M
+    """A spot on the SO-101's desk for every model, those `within` the arm's reach.
+
+    `pair` is a target that is put near a goal, the goal, and the target's look-alike. None where
+    they do not fit, or where the goal leaves no room beside it.
+    """
     spots: dict[str, Spot] = {}
     taken = list(fixed)
     rest = [name for name in models if name not in within]
@@ -344,31 +355,31 @@ def _try_desk(
             return None
         spots |= zip(names, drawn, strict=True)
         taken += zip(drawn, radii, strict=True)
-    if shared.owner_of_goal and not _has_room(shared.steps[0], spots):
+    if pair is not None and not _has_room(*pair, spots):
         return None
     return spots
 
 
-def _has_room(step: Step, spots: Mapping[str, Spot]) -> bool:
+def _has_room(target: str, goal: str, lookalike: str, spots: Mapping[str, Spot]) -> bool:
     """Whether a target can be put beside its goal, within reach, nearer to it than to the rest.
 
     Neither it nor its look-alike is near the goal at the start.
     """
-    here = np.array(spots[step.goal])
-    limit = radius_m(step.model) + radius_m(step.goal) + NEAR_M
-    for name in (step.model, HARDEST[step.stem]):
+    here = np.array(spots[goal])
+    limit = radius_m(target) + radius_m(goal) + NEAR_M
+    for name in (target, lookalike):
         if np.hypot(*(here - spots[name])) < limit + APART_M:
             return False
-    others = [name for name in spots if name not in (step.model, step.goal)]
+    others = [name for name in spots if name not in (target, goal)]
     for beside in BESIDE_M:
-        distance = radius_m(step.model) + radius_m(step.goal) + beside
+        distance = radius_m(target) + radius_m(goal) + beside
         for angle in np.linspace(0, 2 * np.pi, 24, endpoint=False):
             x, y = here + distance * np.array([np.cos(angle), np.sin(angle)])
             reach = tabletop.REACH
             if not (reach.x0 < x < reach.x1 and reach.y0 < y < reach.y1):
                 continue
             gaps = [np.hypot(x - spots[name][0], y - spots[name][1]) for name in others]
-            widest = max(map(radius_m, others)) + radius_m(step.model) + GAP_M
+            widest = max(map(radius_m, others)) + radius_m(target) + GAP_M
             if min(gaps) > max(distance + 0.02, widest):
                 return True
     return False

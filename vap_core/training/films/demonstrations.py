@@ -30,6 +30,7 @@ from vap_core.simulation.suites import Suite, Task, suite, tabletop
 from vap_core.simulation.suites.layout import Area, Spot, place, radius_m, random_yaw, scatter
 from vap_core.simulation.suites.open_row import make_env
 from vap_core.simulation.types import EpisodeRow, Placement
+from vap_core.training.films import pairs
 from vap_core.training.films.looks import draw_look
 from vap_core.training.films.scenes import HELD_OUT, TRAIN_INSTANCES, only_generic
 from vap_core.training.recipe import FILMED, every, filmed_tasks
@@ -93,12 +94,15 @@ class Film:
 def draw_objects(
     known: Suite, task: Task, rng: np.random.Generator, held_out: bool = False
 ) -> list[str]:
-    """The target and its rivals, distractors of other categories if any, and the task's goal.
+    """The target and its rivals, distractors of other categories if any, and the task's goal; of a
+    pair those of `pairs`.
 
     Target and rivals are generic and of the task's category; half the rivals are look-alikes. Those
     `held_out` are in no film.
     """
     filmed = FILMED[known.name]
+    if filmed.pairs:
+        return pairs.draw_objects(task, rng, held_out)
     pool = range(TRAIN_INSTANCES)
     if held_out:
         pool = range(HELD_OUT, HELD_OUT + TRAIN_INSTANCES)
@@ -138,6 +142,8 @@ def row(
 
     Raises: ValueError when they do not fit.
     """
+    if FILMED[known.name].pairs:
+        return pairs.row(known, task, names, number, rng)
     n_things = len(names) - bool(task.goal)
     same: list[str] = []
     distractors: list[str] = []

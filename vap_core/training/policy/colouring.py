@@ -34,7 +34,8 @@ Images = UInt8[np.ndarray, "c s s 3"]
 class Colouring:
     """The colours that objects are given: object number to colour.
 
-    `tinted` holds one at most. `nothing` is whether the scene's tint lies on no object.
+    `tinted` holds one at most, of a pair's scene two. `nothing` is whether a tinted scene's tint
+    lies on no object.
     """
 
     tinted: Mapping[int, Colour]
@@ -54,23 +55,24 @@ def draw_colouring(
     *,
     may_paint: bool,
     distinct: bool,
+    at_once: int = 1,
 ) -> Colouring | None:
-    """Colours for objects that look like `looks` says.
+    """Colours for objects that look like `looks` says; a tinted scene has `at_once` tints.
 
     With `distinct`, every object's colour is one that no other shows; None when none is found.
     """
-    carrier = -1
+    carriers: list[int] = []
     is_tinted = bool(rng.random() < recipe.tint_share)
     if is_tinted:
-        carrier = int(rng.integers(len(looks) + 1)) - 1
+        carriers = _draw_carriers(len(looks), at_once, rng)
     bare = rng.random() < UNPAINTED or not may_paint
     for attempt in range(TRIES):
         share = 0.0
         if not bare:
             share = PAINTED[attempt] if attempt < len(PAINTED) else 1.0
-        drawn = _draw(looks, carrier, tints(recipe), share, rng)
+        drawn = _draw(looks, carriers, tints(recipe), share, rng)
         if not distinct or is_distinct(looks, drawn):
-            nothing = is_tinted and carrier < 0
+            nothing = is_tinted and not carriers
             return Colouring(tinted=drawn.tinted, painted=drawn.painted, nothing=nothing)
         bare = not may_paint
     return None
@@ -145,26 +147,37 @@ def roughen_mask(mask: Bool[np.ndarray, "s s"], rng: np.random.Generator) -> np.
     return change(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
 
+def _draw_carriers(n: int, at_once: int, rng: np.random.Generator) -> list[int]:
+    """Which of `n` objects carry the tints of a scene, each on any of them or on none."""
+    carriers: list[int] = []
+    for _ in range(at_once):
+        carrier = int(rng.integers(n + 1)) - 1
+        if carrier >= 0 and carrier not in carriers:
+            carriers.append(carrier)
+    return carriers
+
+
 def _draw(
     looks: Sequence[Description],
-    carrier: int,
+    carriers: Sequence[int],
     palette: Sequence[Colour],
     share: float,
     rng: np.random.Generator,
 ) -> Colouring:
-    """A tint on the carrier, if there is one (0 or more), and paint on a share of the others."""
+    """A tint on every carrier, and paint on a share of the others."""
     is_painted = rng.random(len(looks)) < share
     taken: set[str] = set()
     for i, look in enumerate(looks):
-        if not is_painted[i] or i == carrier:
+        if not is_painted[i] or i in carriers:
             taken.update(natural_colours(look))
-    tinted_things = {}
-    if carrier >= 0:
-        tinted_things[carrier] = _draw_colour(palette, taken, rng)
+    tinted_things: dict[int, Colour] = {}
+    for carrier in carriers:
+        left = [colour for colour in palette if colour not in tinted_things.values()]
+        tinted_things[carrier] = _draw_colour(left, taken, rng)
         taken.add(tinted_things[carrier].name)
     painted_things = {}
     for i in rng.permutation(len(looks)).tolist():
-        if is_painted[i] and i != carrier:
+        if is_painted[i] and i not in carriers:
             painted_things[i] = _draw_colour(PAINTS, taken, rng)
             taken.add(painted_things[i].name)
     return Colouring(tinted=tinted_things, painted=painted_things)

@@ -4,11 +4,13 @@
 a hard prompt does it, in the captioner's words. *Learned*: by a learned word, as a soft prompt does
 it. *Plain*: the command does not say which object is meant; only frames in which the hand is nearer
 to the target than to any rival, so that a plain command means what the hand already nears.
+A pair's command is plain, or names both its objects by their colours.
 
 The form is drawn from what the frame allows, and then the colours (`colouring`): under every form
 an object is as often tinted or painted whether it is the target or not.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -20,6 +22,7 @@ from vap_core.base.types import Description, value
 from vap_core.policies.mini_pi0.learned_token import WORD
 from vap_core.rollout.prompters.text import soft_prompt
 from vap_core.simulation import robots
+from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import Task, suite
 from vap_core.training.films.captions import distinguishes
 from vap_core.training.films.demonstrations import Film
@@ -30,7 +33,7 @@ from vap_core.training.policy.colouring import (
     colour_views,
     draw_colouring,
 )
-from vap_core.training.recipe import Recipe, every, filmed_task
+from vap_core.training.recipe import FILMED, Recipe, every, filmed_task
 from vap_core.training.words import DETERMINERS
 
 AFTERWARDS = 0.15
@@ -57,8 +60,9 @@ class Known:
 class Command:
     """One training sample: views and words, and how the two name the target.
 
-    `things` are the numbers of the film's target, which comes first, and of its rivals; the
-    colouring counts them. `embedding` is that of the learned word in `text`, if there is one.
+    `things` are the numbers of the film's target, which comes first, of its rivals, and last of a
+    pair's goal; the colouring counts them. `embedding` is that of the learned word in `text`, if
+    there is one.
     """
 
     images: Images
@@ -72,26 +76,38 @@ class Command:
 def command(film: Film, t: int, recipe: Recipe, known: Known, rng: np.random.Generator) -> Command:
     """Step t of a film, which has a picture, with a command that its action answers."""
     task = filmed_task(recipe.suite, film.task)
+    pairs = FILMED[recipe.suite].pairs
     things = [i for i in range(len(film.names)) if i != film.goal]
+    if pairs:
+        things.append(film.goal)
     names = [film.names[i] for i in things]
     looks = [known.captions[name] for name in names]
     length: Literal["short", "long"] = "long" if rng.random() < 0.5 else "short"
     fits: dict[Form, bool] = {
         "coloured": True,
-        "described": distinguishes(known.captions, names, length),
+        "described": not pairs and distinguishes(known.captions, names, length),
         "learned": names[0] in known.learned,
         "plain": near(film, t, recipe.suite, things[1:]),
     }
     form = _draw_form(recipe, fits, rng)
     colouring = draw_colouring(
-        looks, recipe, rng, may_paint=form in ("coloured", "plain"), distinct=form == "coloured"
+        looks,
+        recipe,
+        rng,
+        may_paint=form in ("coloured", "plain"),
+        distinct=form == "coloured",
+        at_once=2 if pairs else 1,
     )
     if colouring is None:
         # No colours distinguish these objects: as rare as it is, a description has to do.
         form = "described"
         colouring = Colouring(tinted={}, painted={})
     embedding = None
-    if form == "coloured":
+    if form == "coloured" and pairs:
+        text = phrase_pair(
+            task, colour_of(0, looks, colouring), colour_of(len(things) - 1, looks, colouring)
+        )
+    elif form == "coloured":
         text = phrase_instruction(task, colour_of(0, looks, colouring), rng)
     elif form == "described":
         text = describe_instruction(task, getattr(looks[0], length))
@@ -141,6 +157,13 @@ def phrase_instruction(task: Task, word: str, rng: np.random.Generator) -> str:
     else:
         determiner = f"{rng.choice(DETERMINERS)} "
     return task.instruction.replace("my ", determiner, 1)
+
+
+def phrase_pair(task: Task, word: str, goal_word: str) -> str:
+    """A pair's instruction with both its objects named by their colours, as VAP does it."""
+    text = task.instruction.replace("my ", f"the {word} ", 1)
+    goal = get_object(task.goal).category
+    return re.sub(rf"\b\w+ (?={goal}$)", f"the {goal_word} ", text)
 
 
 def describe_instruction(task: Task, phrase: str) -> str:

@@ -7,25 +7,27 @@ objects, learned words for some of them, and the policy. Each is kept, so that t
 on where it was interrupted, at whatever moment.
 """
 
+import hashlib
 import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from vap_core.base.errors import BadOutput
+from vap_core.base.errors import BadOutput, BadPolicy
 from vap_core.base.files import parse_json, write_atomic
 from vap_core.base.version import code_version
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
 from vap_core.policies.mini_pi0.vlm import MiniVlm, initialise_policy, load_vlm, store_in_bfloat16
+from vap_core.policies.names import SHIPPED
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import suite
 from vap_core.training.films.captions import captions
@@ -37,7 +39,7 @@ from vap_core.training.policy.batches import Frames, statistics
 from vap_core.training.policy.commands import Known
 from vap_core.training.policy.losses import Learner, embedding_cosine, losses
 from vap_core.training.policy.taught import learn_words
-from vap_core.training.recipe import Recipe, filmed_tasks
+from vap_core.training.recipe import FILMED, Recipe, filmed_tasks
 from vap_core.training.step import Figures, Schedule, average_of, train_steps
 
 FILMS = "films"
@@ -46,6 +48,8 @@ HELD_OUT = 19
 
 It is a prime, as tasks take turns.
 """
+SCALES = "policy_preprocessor_step_4_normalizer_processor.safetensors"
+"""The file in which lerobot keeps a policy's statistics."""
 TEMPERATURE = 0.0
 """Of the trained policy's sampling noise.
 
@@ -136,8 +140,9 @@ def train(
     """Train, or go on where an earlier call stopped, and write a checkpoint that lerobot loads.
 
     Returns training.json: the recipe, what was measured on the films held out, and the cost. The
-    policy grows from the mini-PaliGemma in `vlm`, or, None, begins with nothing and reads no
-    learned word. `demonstrations` is a dataset of train demonstrations; None: the cache.
+    policy goes on from the recipe's `start`; without one it grows from the mini-PaliGemma in `vlm`,
+    or, None, begins with nothing and reads no learned word. `demonstrations` is a dataset of train
+    demonstrations; None: the cache.
 
     Raises: BadOutput when `out` holds another training.
     """
@@ -151,20 +156,29 @@ def train(
     teacher = None if vlm is None else load_vlm(vlm)
     cost_cpu_s = {"films": films.cpu_s, "vlm": _vlm_cost_s(vlm)}
     known, taught = _prepare_words(recipe, films, teacher, out, cost_cpu_s)
-    stats = statistics(films.train)
-    first = films.train[0]
-    config = configuration(recipe, first.state.shape[1], first.action.shape[1])
+    made_of: dict[str, Any] = {
+        "recipe": recipe.as_json(),
+        "data_sha256": data_sha256(films.all),
+    }
     # Of initial weights only; every other draw comes from the step's stream.
     torch.manual_seed(recipe.seed)
-    learner = Learner(config)
+    if recipe.start:
+        start = SHIPPED / recipe.start
+        learner, stats = _go_on_from(start)
+        config = learner.policy.config
+        made_of["start"] = {
+            "name": recipe.start,
+            "sha256": hashlib.sha256((start / "model.safetensors").read_bytes()).hexdigest(),
+        }
+    else:
+        stats = statistics(films.train)
+        first = films.train[0]
+        config = configuration(recipe, first.state.shape[1], first.action.shape[1])
+        learner = Learner(config)
     if teacher is not None:
         config.vlm = teacher.sha256()
         initialise_policy(teacher, learner.policy)
-    made_of = {
-        "recipe": recipe.as_json(),
-        "data_sha256": data_sha256(films.all),
-        "vlm": config.vlm,
-    }
+    made_of["vlm"] = config.vlm
     frames = Frames(recipe=recipe, films=films.train, stats=stats, config=config, known=known)
 
     def step(model: Learner, at: int) -> tuple[Tensor, Figures]:
@@ -243,6 +257,30 @@ def save(
     return card
 
 
+def _go_on_from(folder: Path) -> tuple[Learner, dict[str, dict[str, Tensor]]]:
+    """A learner with a shipped policy's weights, and how its processors scale states and actions.
+
+    Raises: BadPolicy.
+    """
+    from lerobot.configs import PreTrainedConfig
+
+    try:
+        config = cast(MiniPI0Config, PreTrainedConfig.from_pretrained(folder))
+        learner = Learner(config)
+        learner.policy.load_state_dict(load_file(folder / "model.safetensors"))
+        kept = load_file(folder / SCALES)
+        stats: dict[str, dict[str, Tensor]] = {}
+        for name in ("observation.state", "action"):
+            stats[name] = {part: kept[f"{name}.{part}"] for part in ("mean", "std")}
+    except Exception as error:
+        reason = (str(error).strip().splitlines() or [""])[0]
+        raise BadPolicy(
+            f"train policy: {folder} is no mini-pi0 to go on from ({type(error).__name__}: "
+            f"{reason:.120}); get the repository's data/policies again: git checkout data/policies"
+        ) from error
+    return learner, stats
+
+
 def _prepare_words(
     recipe: Recipe,
     films: Films,
@@ -251,10 +289,11 @@ def _prepare_words(
     cost_cpu_s: dict[str, float],
 ) -> tuple[Known, dict[str, Any]]:
     """What can be said of the films' objects, and about the learned words; adds to the cost."""
+    pairs = FILMED[recipe.suite].pairs
     names: dict[str, None] = {}
     for film in films.all:
         for i, name in enumerate(film.names):
-            if i != film.goal:
+            if i != film.goal or pairs:
                 names[name] = None
     described, cost_cpu_s["captions"] = captions(names, out / "captions.json")
     if teacher is None or not recipe.taught:
@@ -304,6 +343,6 @@ def _require_trainable(recipe: Recipe, films: Sequence[Film]) -> None:
                 "out; film them again: python -m vap_core train demonstrations."
             )
         for i, name in enumerate(film.names):
-            if i != film.goal:
+            if i != film.goal or FILMED[recipe.suite].pairs:
                 models.append(get_object(name))
     only_generic(models)

@@ -1,0 +1,180 @@
+"""Two-colour commands: films of pairs, what is said of them, and the training that goes on from a shipped policy."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from vap_core.base.errors import BadPolicy
+from vap_core.base.types import Description
+from vap_core.instruction.rule import parse, rewrite
+from vap_core.perception.colours import COLOURS
+from vap_core.policies.lerobot.adapter import load_policy
+from vap_core.policies.names import SHIPPED
+from vap_core.prompt import PALETTE
+from vap_core.simulation import robots
+from vap_core.simulation.assets.objects import get_object
+from vap_core.simulation.suites import Task, shared, suite
+from vap_core.simulation.suites.layout import radius_m
+from vap_core.simulation.suites.rules import NEAR_M
+from vap_core.training.films import demonstrations, pairs
+from vap_core.training.films.demonstrations import Film, cached
+from vap_core.training.policy import train
+from vap_core.training.policy.commands import Command, Known, command, phrase_pair
+from vap_core.training.recipe import RECIPES, filmed_tasks
+
+SUITE = "shared-pair"
+RECIPE = RECIPES[SUITE]
+TASKS = filmed_tasks(SUITE)
+START = SHIPPED / RECIPE.start
+
+
+def film(rng: np.random.Generator) -> Film:
+    """One picture of a pair: the target, its goal, a rival of each."""
+    names = tuple(f"thing-{i}" for i in rng.permutation(20)[:4])
+    places = rng.normal(size=(1, 4, 3)).astype(np.float32)
+    state = rng.normal(size=(1, 12)).astype(np.float32)
+    if rng.random() < 0.5:  # the hand is above the target, and the plain command fits
+        state[:, :2] = places[:, 0, :2] - robots.get("so101").base_world[:2]
+    return Film(
+        images=rng.integers(0, 256, (1, 3, 8, 8, 3), np.uint8),
+        ids=rng.integers(0, 5, (1, 3, 8, 8)).astype(np.uint8),
+        state=state,
+        action=np.zeros((1, 6), np.float32),
+        places=places,
+        names=names,
+        task=TASKS[0].name,
+        goal=1,
+    )
+
+
+@pytest.fixture(scope="module")
+def commands() -> list[Command]:
+    rng = np.random.default_rng(0)
+    captions = {f"thing-{i}": Description(str(rng.choice(COLOURS)), "") for i in range(20)}
+    known = Known(captions)
+    return [command(film(rng), 0, RECIPE, known, rng) for _ in range(3_000)]
+
+
+def test_a_coloured_command_names_target_and_goal_by_colours_of_their_own(
+    commands: list[Command],
+) -> None:
+    coloured = [made for made in commands if made.form == "coloured"]
+    assert 0.5 < len(coloured) / len(commands) < 0.98
+    for made in coloured:
+        words = re.fullmatch(r"put the (\w+) pouch near the (\w+) vase", made.text)
+        assert words, made.text
+        assert words[1] != words[2]
+        for i, word in ((0, words[1]), (3, words[2])):
+            if i in made.colouring.tinted:
+                assert word == made.colouring.tinted[i].name
+            elif i in made.colouring.painted:
+                assert word == made.colouring.painted[i].name
+    assert {made.form for made in commands} <= {"coloured", "plain", "described"}
+    assert all(made.things[-1] == 1 for made in commands), "the goal comes last"
+
+
+def test_the_two_tints_of_a_scene_lie_on_any_object_with_equal_odds(
+    commands: list[Command],
+) -> None:
+    """On target and goal as often as on their rivals, whatever the command."""
+    counts = np.zeros(4)
+    both = 0
+    for made in commands:
+        assert len(made.colouring.tinted) <= 2
+        names = [colour.name for colour in made.colouring.tinted.values()]
+        assert len(set(names)) == len(names)
+        for i in made.colouring.tinted:
+            counts[i] += 1
+        both += len(names) == 2
+    # Two draws out of four objects and none, in a fifth of the scenes.
+    expected = 0.2 * (1 - (4 / 5) ** 2)
+    error = np.sqrt(expected * (1 - expected) / len(commands))
+    assert np.abs(counts / len(commands) - expected).max() < 4 * error
+    assert both / len(commands) == pytest.approx(0.2 * (4 / 5) * (3 / 5), abs=0.03)
+
+
+@pytest.mark.parametrize("task", suite(SUITE).tasks, ids=lambda task: task.name)
+def test_every_pair_is_said_as_vap_rewrites_it(task: Task) -> None:
+    known = (task.category, get_object(task.goal).category)
+    read = parse(task.instruction, known, owners=("carla",))
+    assert len(read.targets) == 2
+    red, blue = PALETTE[0], PALETTE[1]
+    assert phrase_pair(task, red.name, blue.name) == rewrite(read, (red, blue))
+
+
+def test_a_pairs_scene_is_generic_and_laid_out_as_the_suites_own() -> None:
+    known = suite(SUITE)
+    assert {task.name for task in known.tasks} - {task.name for task in TASKS} == {
+        "put-scrubber-near-slipper"
+    }
+    for number, task in enumerate(TASKS * 3):
+        rng = np.random.default_rng(number)
+        names = demonstrations.draw_objects(known, task, rng)
+        assert {get_object(name).split for name in names} == {"generic"}
+        drawn = demonstrations.row(known, task, names, number, rng)
+        target, goal, rival, other = (placed.model for placed in drawn.placements)
+        assert drawn.goal == goal
+        assert {get_object(name).category for name in (target, rival)} == {task.category}
+        category = get_object(task.goal).category
+        assert {get_object(name).category for name in (goal, other)} == {category}
+        at = {placed.model: np.array([placed.x, placed.y]) for placed in drawn.placements}
+        limit = radius_m(target) + radius_m(goal) + NEAR_M
+        assert np.hypot(*(at[target] - at[goal])) > limit + shared.APART_M - 1e-3
+
+
+def test_a_scene_without_room_is_refused() -> None:
+    names = [f"plant-generic-{i}" for i in (0, 1)] + [f"cup-generic-{i}" for i in (0, 1)]
+    task = next(task for task in TASKS if task.category == "plant")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shared, "try_desk", lambda *args, **kwargs: None)
+        with pytest.raises(ValueError, match="no room"):
+            pairs.row(suite(SUITE), task, names, 0, np.random.default_rng(0))
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Films of one stage, in a cache; of short episodes the first two."""
+    folder = tmp_path_factory.mktemp("pairs") / train.FILMS
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demonstrations, "EPISODES", 2)
+        assert cached(folder, SUITE, 0, 0)
+        assert cached(folder, SUITE, 0, 1)
+    return folder.parent
+
+
+def test_the_training_goes_on_from_the_shipped_policy(filmed: Path, tmp_path: Path) -> None:
+    """Its words and scales stay, its weights move, and the card says what it went on from."""
+    recipe = replace(RECIPE, stages=2, steps=2, batch=2, draws=1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train, "HELD_OUT", 2)
+        card = train.train(recipe, tmp_path / "pairs", cache=filmed, jobs=1)
+    assert card["start"]["name"] == RECIPE.start
+    assert len(card["start"]["sha256"]) == 64
+    before = load_file(START / "model.safetensors")
+    after = load_file(tmp_path / "pairs" / "model.safetensors")
+    assert before.keys() == after.keys()
+    words = next(name for name in before if name.endswith("embed_tokens.weight"))
+    assert torch.equal(before[words], after[words]), "words mean what they meant"
+    moved = [name for name in before if not torch.equal(before[name], after[name])]
+    assert len(moved) > len(before) / 2
+    far = max(float((before[name].float() - after[name].float()).abs().max()) for name in moved)
+    assert far < 0.05, "it goes on, and does not begin anew"
+    scales = load_file(tmp_path / "pairs" / train.SCALES)
+    for name, tensor in load_file(START / train.SCALES).items():
+        assert torch.equal(tensor, scales[name])
+    trained = load_policy(tmp_path / "pairs")
+    assert trained.execute == load_policy(START).execute
+
+
+def test_a_start_that_is_no_policy_is_named(
+    filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train, "SHIPPED", tmp_path)
+    recipe = replace(RECIPE, stages=2, steps=1)
+    with pytest.raises(BadPolicy, match=r"mini-pi0-tabletop is no mini-pi0 to go on from"):
+        train.train(recipe, tmp_path / "out", cache=filmed, jobs=1)
