@@ -32,7 +32,7 @@ def measure(
     quick: bool = False,
     part: Path | None = None,
 ) -> Measurement:
-    """Measure all arms; two minutes a repeat with an earlier checkout, `quick` a minute in all.
+    """Measure all arms; four minutes a repeat with an earlier checkout, `quick` a minute in all.
 
     The arms of a repeat follow each other in turn, beginning with another one each time. Whole
     repeats are kept in the file `part`; interrupted, the same call goes on after the last of them.
