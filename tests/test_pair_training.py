@@ -22,10 +22,10 @@ from vap_core.simulation.suites import Task, shared, suite
 from vap_core.simulation.suites.layout import radius_m
 from vap_core.simulation.suites.rules import NEAR_M
 from vap_core.training.films import demonstrations, pairs
-from vap_core.training.films.demonstrations import Film, cached
+from vap_core.training.films.demonstrations import Film
 from vap_core.training.policy import train
 from vap_core.training.policy.commands import Command, Known, command, phrase_pair
-from vap_core.training.recipe import RECIPES, filmed_tasks
+from vap_core.training.recipe import RECIPES, every, filmed_tasks
 
 SUITE = "shared-pair"
 RECIPE = RECIPES[SUITE]
@@ -33,18 +33,19 @@ TASKS = filmed_tasks(SUITE)
 START = SHIPPED / RECIPE.start
 
 
-def film(rng: np.random.Generator) -> Film:
-    """One picture of a pair: the target, its goal, a rival of each."""
-    names = tuple(f"thing-{i}" for i in rng.permutation(20)[:4])
-    places = rng.normal(size=(1, 4, 3)).astype(np.float32)
-    state = rng.normal(size=(1, 12)).astype(np.float32)
+def film(rng: np.random.Generator, names: tuple[str, ...] = (), side: int = 8, t: int = 1) -> Film:
+    """An invented film of a pair: the target, its goal, a rival of each."""
+    names = names or tuple(f"thing-{i}" for i in rng.permutation(20)[:4])
+    places = rng.normal(size=(t, 4, 3)).astype(np.float32)
+    state = rng.normal(size=(t, 12)).astype(np.float32)
     if rng.random() < 0.5:  # the hand is above the target, and the plain command fits
         state[:, :2] = places[:, 0, :2] - robots.get("so101").base_world[:2]
+    pictures = -(-t // every(SUITE))
     return Film(
-        images=rng.integers(0, 256, (1, 3, 8, 8, 3), np.uint8),
-        ids=rng.integers(0, 5, (1, 3, 8, 8)).astype(np.uint8),
+        images=rng.integers(0, 256, (pictures, 3, side, side, 3), np.uint8),
+        ids=rng.integers(0, 5, (pictures, 3, side, side)).astype(np.uint8),
         state=state,
-        action=np.zeros((1, 6), np.float32),
+        action=rng.normal(size=(t, 6)).astype(np.float32),
         places=places,
         names=names,
         task=TASKS[0].name,
@@ -136,14 +137,28 @@ def test_a_scene_without_room_is_refused() -> None:
             pairs.row(suite(SUITE), task, names, 0, np.random.default_rng(0))
 
 
+def test_the_expert_puts_a_generic_object_near_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(demonstrations, "EPISODES", 1)
+    (made,) = demonstrations.films(SUITE, 0, 0)
+    target, goal = made.names[:2]
+    assert made.goal == 1
+    assert made.task == TASKS[0].name
+    assert made.images.shape[1:] == (3, demonstrations.SIDE, demonstrations.SIDE, 3)
+    apart = np.linalg.norm(made.places[:, 0, :2] - made.places[:, 1, :2], axis=1)
+    limit = radius_m(target) + radius_m(goal) + NEAR_M
+    assert apart[0] > limit > apart[-1]
+    assert all((made.ids == i + 1).any() for i in range(4)), "every object is seen"
+
+
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Films of one stage, in a cache; of short episodes the first two."""
+    """A cache with invented films of two stages."""
     folder = tmp_path_factory.mktemp("pairs") / train.FILMS
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demonstrations, "EPISODES", 2)
-        assert cached(folder, SUITE, 0, 0)
-        assert cached(folder, SUITE, 0, 1)
+    rng = np.random.default_rng(3)
+    for stage in range(2):
+        names = demonstrations.draw_objects(suite(SUITE), TASKS[0], rng)
+        made = film(rng, tuple(names), side=demonstrations.SIDE, t=9)
+        demonstrations._write_stage(demonstrations.stage_file(folder, SUITE, 0, stage), [made], 1.0)
     return folder.parent
 
 
