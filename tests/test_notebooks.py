@@ -1,5 +1,6 @@
 """Notebooks: one map, links that lead somewhere, and what a page of one holds."""
 
+import base64
 import json
 import re
 import shutil
@@ -116,6 +117,9 @@ def notebook(folder: Path, *cells: dict) -> Path:
     return path
 
 
+PIXEL = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
+
+
 def code(name: str, source: str, outputs: list, **metadata: object) -> dict:
     return {
         "cell_type": "code", "id": name, "metadata": metadata, "source": source,
@@ -134,12 +138,17 @@ def test_a_page_needs_no_network_folds_its_assertions_and_leads_on(tmp_path: Pat
         code("c1", "assert two", [], jupyter={"source_hidden": True}),
         code("c2", "box", [shown(**widget)]),
         code("c3", "words", [shown(**widget, **{"text/html": "<em>the default</em>"})]),
+        code("c4", "figure", [shown(**{"image/png": PIXEL})]),
     )
     page = notebook_pages.page_of(path, tmp_path / "build" / "html")
     assert "<title>00 · A &lt;b&gt;</title>" in page
     assert 'href="01_b.html#Here"' in page
     assert 'href="../../a.md"' in page
-    assert "data:image/png;base64" in page
+    figure = base64.b64encode((tmp_path / "figures" / "a.png").read_bytes()).decode()
+    assert f'<img alt="a" src="data:image/png;base64,{figure}"' in page
+    assert not re.findall(r'<img[^>]+src="(?!data:)', page)
+    assert 'alt="00 · A &lt;b&gt;, picture 1"' in page
+    assert "No description" not in page
     assert page.count('<details class="folded">') == 1
     assert "A control: open the notebook in JupyterLab." in page
     assert "<em>the default</em>" in page

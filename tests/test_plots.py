@@ -8,11 +8,13 @@ from tests.test_diagnosis import TABLE, row
 from tests.toys import TOYS, personal, scene
 from vap_core.analysis.inspection import grounding_table
 from vap_core.analysis.plots import (
+    Tile,
     candidates,
     film,
     grounding_figure,
     learning_figure,
     rates_figure,
+    sheet,
 )
 from vap_core.attend import Attender
 from vap_core.base.figures import write_png
@@ -67,6 +69,39 @@ def test_the_winner_is_drawn_apart() -> None:
     axes = Figure().subplots()
     candidates(axes, LINE, attended.groundings["front"][0])
     assert len({patch.get_edgecolor() for patch in axes.patches}) == 2
+
+
+def test_the_number_of_a_box_at_the_top_stays_inside_the_picture() -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    line = scene([(4, 0, GREY), (24, 20, TEAL)])
+    _, attended = Attender(TOYS, {"mug": personal("mug", "cup", TEAL)}).start(
+        {"front": line}, "bring my cup"
+    )
+    figure = Figure(figsize=(3, 3))
+    FigureCanvasAgg(figure).draw()
+    axes = figure.subplots()
+    candidates(axes, line, attended.groundings["front"][0])
+    figure.canvas.draw()
+    assert min(axes.patches, key=lambda box: box.get_y()).get_y() == 0
+    top = axes.get_window_extent().y1
+    assert len(axes.texts) == 2
+    assert all(text.get_window_extent().y1 <= top for text in axes.texts)
+
+
+def test_what_a_sheet_says_is_dark_and_beside_its_picture() -> None:
+    from matplotlib.colors import to_rgb
+
+    tiles = [Tile(LINE, "easy, 6", "#a5cde8"), Tile(LINE, "one\ntwo\nthree\nfour")]
+    figure = sheet({"cup": tiles}, side_in=1.0, label_in=0.5)
+    (axes,) = figure.axes
+    figure.canvas.draw()
+    said = [text for text in axes.texts if text.get_text() != "cup"]
+    assert all(max(to_rgb(text.get_color())) < 0.35 for text in said)
+    boxes = [text.get_window_extent() for text in said]
+    assert boxes[0].y1 == pytest.approx(boxes[1].y1, abs=2), "captions begin at one height"
+    assert min(box.y0 for box in boxes) >= 0, "nothing is cut"
 
 
 def test_scores_and_film_draw() -> None:
@@ -173,13 +208,17 @@ def test_learning_has_a_panel_per_figure_and_a_line_per_training_that_logged_it(
     assert [axes.get_title() for axes in (flow, hit)] == ["Flow", "Hit"]
     assert [list(line.get_ydata()) for line in flow.lines] == [[2.0, 1.0], [3.0]]
     assert [list(line.get_ydata()) for line in hit.lines] == [[0.5, 0.75]]
+    flow, hit = learning_figure(logs, {"flow": "Flow", "hit": "Hit"}, shares=["hit"]).axes
+    assert 1 < hit.get_ylim()[1] < 1.1, "a share is read against the whole"
+    assert flow.get_ylim()[1] > 2
 
 
 def test_rates_are_bars_as_high_as_they_are_with_their_intervals() -> None:
     half, all_ = rate(2, 4), rate(4, 4)
-    (axes,) = rates_figure(
-        {"suite": {"tinted": {"succeeds": half, "touches": all_}, "plain": {"succeeds": all_}}}, "%"
-    ).axes
+    panels = {"suite": {"tinted": {"succeeds": half, "touches": all_}, "plain": {"succeeds": all_}}}
+    figure = rates_figure(panels, "%", "instruction")
+    (axes,) = figure.axes
+    assert figure.get_supxlabel() == "instruction"
     assert [round(patch.get_height()) for patch in axes.patches] == [50, 100, 100]
     spread = [segment[:, 1] for held in axes.collections for segment in held.get_segments()]
     assert {(round(low, 6), round(high, 6)) for low, high in spread} == {

@@ -284,7 +284,8 @@ def bounds_table(scores: Sequence[Score]) -> "pd.DataFrame":
             word, task = ("most", ordered[-1])
             if policy == "expert":
                 word, task = ("least", ordered[0])
-            cells[f"{policy}, {word}"] = f"{task.task}: {task.sr} of {task.n}"
+            cells[f"{policy}, {word} in"] = task.task
+            cells[f"there, {word}, SR %"] = f"{task.sr} of {task.n}"
         lines.append(cells)
     return pd.DataFrame(lines).set_index("suite")
 

@@ -39,15 +39,20 @@ def source_digest() -> str:
     return found.hexdigest()[:16]
 
 
-def kept_figure(path: Path, draw: Callable[[], "Figure"], *, again: bool = False) -> bytes:
-    """The figure of a PNG as a JPEG for a notebook; drawn where it is stale, or `again`."""
+def kept_figure(
+    path: Path, draw: Callable[[], "Figure"], *, again: bool = False, small: int = 115_000
+) -> bytes:
+    """The figure of a PNG as a JPEG for a notebook; drawn where it is stale, or `again`.
+
+    The JPEG has at most `small` bytes: more for a figure with small words.
+    """
     from PIL import Image
 
     if not again and path.exists():
         with Image.open(path) as picture:
             if picture.info.get(KEY) == source_digest():
-                return small_jpeg(picture.convert("RGB"))
-    return keep(draw(), path, about={KEY: source_digest()})
+                return small_jpeg(picture.convert("RGB"), small)
+    return keep(draw(), path, small=small, about={KEY: source_digest()})
 
 
 def kept_table(

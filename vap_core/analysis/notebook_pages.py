@@ -11,7 +11,9 @@ import html
 import os
 import re
 import shutil
+from base64 import b64encode
 from functools import cache
+from mimetypes import guess_type
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -24,6 +26,12 @@ from vap_core.base.files import write_atomic
 if TYPE_CHECKING:
     from nbformat import NotebookNode
 
+HEADING_OR_NAMELESS = re.compile(
+    r"<h[1-6][^>]*>(?P<heading>.*?)</h[1-6]>|"
+    r'alt="No description has been provided for this image"',
+    re.DOTALL,
+)
+"""A heading of a page, or the words that nbconvert gives a picture without any."""
 OUT = Path("build/html")
 """Where pages are written; git ignores it."""
 WIDGET = "application/vnd.jupyter.widget-view+json"
@@ -39,11 +47,13 @@ FOLDED = """\
 {%- endblock -%}
 """
 """The template of a page: JupyterLab's, with hidden sources folded and nothing from the network."""
-STYLE = """<style>
+STYLE = """<link rel="icon" href="data:,"><style>
 .folded summary{margin:4px 0 4px 80px;color:#555;cursor:pointer;font-size:13px}
 iframe.recording{width:100%;height:720px;border:1px solid #ccc}
 main{max-width:1280px;margin:0 auto}
 .jp-RenderedHTMLCommon table{font-size:13px}
+.jp-InputArea pre,.jp-RenderedText pre{white-space:pre-wrap;word-break:normal;
+overflow-wrap:anywhere}
 </style>"""
 VIEWER_PAGE = """<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Recording</title>
 <link rel="stylesheet" href="widget.css">
@@ -107,6 +117,8 @@ def page_of(path: Path, out: Path) -> str:
     title = html.escape(notebook_title(notebook))
     body = re.sub(r"<title>.*?</title>", lambda _: f"<title>{title}</title>", body, count=1)
     body = body.replace("</head>", f"{STYLE}</head>", 1)
+    body = _name_pictures(body)
+    body = re.sub(r'src="(\.\./[^":]+)"', lambda picture: _embedded(picture, path), body)
     return re.sub(r'href="([^"#:]+)(#[^"]*)?"', lambda link: _link(link, path, out), body)
 
 
@@ -133,6 +145,32 @@ def _drop_widget(output: "NotebookNode") -> None:
         del data[WIDGET]
         if "text/html" not in data and "text/markdown" not in data:
             data["text/html"] = "<p><em>A control: open the notebook in JupyterLab.</em></p>"
+
+
+def _name_pictures(body: str) -> str:
+    """Every picture without words of its own gets those of its section, for who cannot see it."""
+    section = ""
+    n_pictures = 0
+
+    def named(found: re.Match[str]) -> str:
+        nonlocal section, n_pictures
+        if found["heading"] is not None:
+            section = re.sub(r"<a class=.anchor-link.*?</a>|<[^>]+>", "", found["heading"])
+            n_pictures = 0
+            return found[0]
+        n_pictures += 1
+        return f'alt="{section.strip()}, picture {n_pictures}"'
+
+    return HEADING_OR_NAMELESS.sub(named, body)
+
+
+def _embedded(picture: re.Match[str], path: Path) -> str:
+    """A picture of another folder, inside the page; nbconvert embeds those beside a notebook."""
+    file = path.parent / picture[1]
+    if not file.is_file():
+        return picture[0]
+    kind, _ = guess_type(file.name)
+    return f'src="data:{kind};base64,{b64encode(file.read_bytes()).decode()}"'
 
 
 def _viewer_output(recording: Path, out: Path) -> "NotebookNode":

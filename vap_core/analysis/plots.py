@@ -1,6 +1,6 @@
 """Values in, matplotlib figures out; nothing here computes what it shows."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from io import BytesIO
 from itertools import chain
 from pathlib import Path
@@ -29,8 +29,14 @@ TIER_MARKERS = {"hard": "^", "medium": "s", "easy": "o"}
 """The marker of a look-alike, by hardness."""
 SVG_LIMIT = 300_000
 """Bytes; a larger drawing stays a PNG."""
+LABEL_ROOM = 0.07
+"""Share of a picture's height that the number of a candidate takes."""
 VOTE_CELL_PX = 110
 """Side of a cell of the vote's picture in a figure."""
+LEGEND_DOT = 36.0
+"""Area of a dot in a legend, points squared."""
+SHARE_TOP = 1.03
+"""The end of an axis of shares: a line at 1 is not cut."""
 LAYERS = ("other objects", "look-alike", "target", "goal")
 """The roles of `layouts_figure`, the first one drawn below the others."""
 
@@ -71,13 +77,14 @@ def candidates(axes: "Axes", rgb: Rgb, grounding: Grounding) -> None:
             box.set(edgecolor=colour, linewidth=2.5)
             box.set_path_effects([withStroke(linewidth=5, foreground=ELECTED_CASING)])
         axes.add_patch(box)
+        above = y0 > LABEL_ROOM * len(rgb)  # else the number would cover the title
         axes.text(
-            x0,
-            max(y0 - 2, 0),
+            x0 if above else x0 + 2,
+            y0 - 2 if above else y0 + 2,
             f"#{i}",
             color="black",
             fontsize=8,
-            va="bottom",
+            va="bottom" if above else "top",
             bbox={"facecolor": colour, "edgecolor": "none", "pad": 1.5},
         )
 
@@ -134,7 +141,7 @@ def sheet(
         )
         for j, tile in enumerate(tiles):
             x = left + label_in + j * side_in
-            _draw_tile(axes, tile, x=x, y=top, side_in=side_in, caption_in=caption)
+            _draw_tile(axes, tile, x=x, y=top, side_in=side_in)
     axes.set(xlim=(0, columns * width), ylim=(rows_per_column * height, 0))
     return figure
 
@@ -185,6 +192,8 @@ def layouts_figure(
 
     One panel per suite; `tables_m` are the x0 y0 x1 y1 of its table.
     """
+    from matplotlib.collections import PathCollection
+
     figure = empty_figure(3.4 * len(lists), 3.9)
     grid = figure.subplots(1, len(lists), squeeze=False)[0]
     for axes, (name, rows) in zip(grid, lists.items(), strict=True):
@@ -199,17 +208,22 @@ def layouts_figure(
         axes.spines[["top", "right"]].set_visible(False)
     grid[0].set_ylabel("away from the robot, m")
     handles, labels = grid[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
+    legend = figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
+    for handle in legend.legend_handles:
+        if isinstance(handle, PathCollection):
+            handle.set_sizes([LEGEND_DOT])  # the dots of a full panel are too small to see here
     return figure
 
 
 def learning_figure(
-    logs: Mapping[str, Sequence[Mapping[str, int | float]]], panels: Mapping[str, str]
+    logs: Mapping[str, Sequence[Mapping[str, int | float]]],
+    panels: Mapping[str, str],
+    shares: Collection[str] = (),
 ) -> "Figure":
     """What trainings logged, over their optimiser steps.
 
     A panel per quantity of the log, of which `panels` holds the name in the log and the title; a
-    line per training that logs it.
+    line per training that logs it. The axes of `shares` end at 1.
     """
     figure = empty_figure(3.1 * len(panels) + 0.4, 3.0 + 0.3 * (len(logs) > 1))
     drawn: dict[str, Line2D] = {}
@@ -227,7 +241,7 @@ def learning_figure(
                     colour, _ = SUITES[label]
                 (drawn[label],) = axes.plot(steps, values, color=colour, linewidth=1.6)
         axes.set(title=title, xlabel="optimiser steps")
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(bottom=0, top=SHARE_TOP if name in shares else None)
         axes.grid(color=GRID)
         axes.spines[["top", "right"]].set_visible(False)
     if len(logs) > 1:
@@ -237,11 +251,13 @@ def learning_figure(
     return figure
 
 
-def rates_figure(panels: Mapping[str, Mapping[str, Mapping[str, "Rate"]]], label: str) -> "Figure":
+def rates_figure(
+    panels: Mapping[str, Mapping[str, Mapping[str, "Rate"]]], label: str, groups_label: str = ""
+) -> "Figure":
     """Grouped bars: a panel per key, a group per inner key, a colour per innermost key.
 
     Rates are drawn in percent with their intervals. Groups and colours keep one order over all
-    panels, that in which they first appear.
+    panels, that in which they first appear. `groups_label` says what the groups are.
     """
     groups: dict[str, None] = {}
     names: dict[str, None] = {}
@@ -275,6 +291,8 @@ def rates_figure(panels: Mapping[str, Mapping[str, Mapping[str, "Rate"]]], label
         axes.set(title=title, ylim=(0, 105))
         axes.spines[["top", "right"]].set_visible(False)
     all_axes[0].set_ylabel(label)
+    if groups_label:
+        figure.supxlabel(groups_label, fontsize=10)
     figure.legend(
         handles=list(drawn.values()),
         labels=list(drawn),
@@ -401,13 +419,11 @@ def _caption_height_in(rows: Mapping[str, Sequence[Tile]]) -> float:
     for tile in chain.from_iterable(rows.values()):
         if tile.title:
             n_lines = len(tile.title.splitlines())
-            height = max(height, 0.05 + 0.11 * n_lines)
+            height = max(height, 0.05 + 0.12 * n_lines)
     return height
 
 
-def _draw_tile(
-    axes: "Axes", tile: Tile, *, x: float, y: float, side_in: float, caption_in: float
-) -> None:
+def _draw_tile(axes: "Axes", tile: Tile, *, x: float, y: float, side_in: float) -> None:
     """One tile of a sheet with its top left corner at (x, y)."""
     from matplotlib.patches import Rectangle
 
@@ -432,12 +448,12 @@ def _draw_tile(
         axes.add_patch(frame)
     axes.text(
         x + side_in / 2,
-        y + side_in + caption_in / 2 - 0.02,
+        y + side_in,
         tile.title,
         ha="center",
-        va="center",
+        va="top",
         fontsize=7,
-        color=tile.edge or "black",
+        color=TEXT,
     )
 
 

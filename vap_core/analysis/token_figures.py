@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float64
 
-from vap_core.base.figures import OTHER, WINNER, empty_figure
+from vap_core.base.figures import BAR_COLOURS, OTHER, WINNER, empty_figure
+from vap_core.base.palette import FRAME, GRID
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-COLOURS = {"own": WINNER, "look-alikes": OTHER, "other objects": "#9aa0a6"}
+COLOURS = {"own": WINNER, "look-alikes": OTHER, "other objects": FRAME}
 """The colour of each kind of photo."""
 
 
@@ -38,7 +39,7 @@ def token_curves_figure(curve: "pd.DataFrame") -> "Figure":
             xlabel="optimiser steps",
             ylim=(-2, 102),
         )
-        axes.grid(color="#eeeeee")
+        axes.grid(color=GRID)
         axes.spines[["top", "right"]].set_visible(False)
     grid[0].set_ylabel("yes, % of unseen photos")
     handles, labels = grid[0].get_legend_handles_labels()
@@ -65,14 +66,22 @@ def choice_figure(table: "pd.DataFrame", columns: "Mapping[str, str]") -> "Figur
         ends = np.clip([low, high], 0, None)  # rounding may leave an end inside
         axes.errorbar(places, value, yerr=ends, fmt="none", ecolor="black", elinewidth=0.8)
     for place, chance in enumerate(table["chance"]):
-        axes.hlines(100 * float(chance), place - 0.42, place + 0.42, "black", ":", linewidth=1)
+        axes.hlines(
+            100 * float(chance),
+            place - 0.42,
+            place + 0.42,
+            "black",
+            ":",
+            linewidth=1,
+            label="" if place else "chance",
+        )
     names = []
     for suite, line in table.iterrows():
         names.append(f"{suite} (n = {line[next(iter(columns))].n})")
     axes.set_xticks(range(len(table)), names, fontsize=8)
     axes.set(ylabel="right object, % of episodes", ylim=(0, 104))
     axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(loc="outside lower center", ncols=5, frameon=False, fontsize=8)
+    figure.legend(loc="outside lower center", ncols=6, frameon=False, fontsize=8)
     return figure
 
 
@@ -95,11 +104,11 @@ def rotation_figure(
             flierprops={"markersize": 3},
         )
         for box in boxes["boxes"]:
-            box.set_facecolor(f"C{i}")
+            box.set_facecolor(BAR_COLOURS[1:][i])  # light enough for the black medians
             box.set_label(name)
     axes.set_xticks(range(len(cosines)), list(cosines), fontsize=8)
     axes.set(ylabel="cosine to the word in the policy", ylim=(-0.25, 1.03))
-    axes.grid(axis="y", color="#eeeeee")
+    axes.grid(axis="y", color=GRID)
     axes.spines[["top", "right"]].set_visible(False)
     handles, labels = axes.get_legend_handles_labels()
     unique = dict(zip(labels, handles, strict=True))

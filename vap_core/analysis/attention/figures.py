@@ -6,10 +6,12 @@ import numpy as np
 
 from vap_core.analysis.attention.patterns import LOCALISATIONS, over_views
 from vap_core.base.figures import OTHER, WINNER, empty_figure
+from vap_core.base.palette import FRAME, TEXT
 from vap_core.evaluation.store import KEY
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -19,7 +21,7 @@ QUERY_COLOURS = {
     "category": "#7f5af0",
     "action": "#3b3b3b",
 }
-SUCCESS, FAILURE = "#3a7d44", "#c9ccd1"
+SUCCESS, FAILURE = TEXT, FRAME
 CALLS_BEFORE = 8
 LEAST_EPISODES = 4
 """Calls before the first touch that are shown, and episodes behind a point."""
@@ -46,7 +48,7 @@ def where_figure(table: "pd.DataFrame") -> "Figure":
         axes.errorbar(
             value, places + offset, xerr=[low, high], fmt="none", ecolor="black", elinewidth=0.7
         )
-    axes.axvline(1, color="black", linewidth=0.8, linestyle=":")
+    axes.axvline(1, color="black", linewidth=0.8, linestyle=":", label="even attention")
     names = []
     for line in lines.itertuples():
         names.append(f"{line.suite} · {line.method} · {line.query} (n = {line.n})")
@@ -54,7 +56,7 @@ def where_figure(table: "pd.DataFrame") -> "Figure":
     axes.set_ylim(-0.6, len(lines) - 0.4)
     axes.set_xlabel("attention per area before the first touch, whole view = 1")
     axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(loc="outside upper right", ncols=2, frameon=False, fontsize=8)
+    figure.legend(loc="outside upper right", ncols=3, frameon=False, fontsize=8)
     return figure
 
 
@@ -65,6 +67,7 @@ def layers_figure(table: "pd.DataFrame") -> "Figure":
     actions: their points are hollow.
     """
     figure, grid = _grid(table, width=2.6, height=2.3)
+    legend: dict[str, Artist] = {}
     for (suite, method), axes in grid.items():
         panel = table[(table["suite"] == suite) & (table["method"] == method)]
         for query, lines in panel.groupby("query", observed=True, sort=False):
@@ -78,12 +81,16 @@ def layers_figure(table: "pd.DataFrame") -> "Figure":
             axes.scatter(
                 layers[last], lift[last], facecolor="white", edgecolor=colour, s=26, zorder=3
             )
-        axes.axhline(1, color="black", linewidth=0.8, linestyle=":")
+        axes.axhline(1, color="black", linewidth=0.8, linestyle=":", label="even attention")
         axes.set_title(f"{suite}, {method}", fontsize=9)
         axes.set_xlabel("layer")
         axes.set_xticks(sorted(set(panel["layer"] + 1)))
-        axes.legend(fontsize=7)
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            legend[label] = handle
     figure.supylabel("attention per area on the target", fontsize=9)
+    figure.legend(
+        legend.values(), legend.keys(), loc="outside lower center", ncols=5, frameon=False
+    )
     return figure
 
 
@@ -150,7 +157,7 @@ def time_figure(calls: "pd.DataFrame", episodes: "pd.DataFrame") -> "Figure":
     row = figure.subplots(1, len(methods), squeeze=False, sharey=True)[0]
     for axes, method in zip(row, methods, strict=True):
         of_method = shown[shown["method"].astype(str) == method]
-        for success, colour in ((True, SUCCESS), (False, "#c0392b")):
+        for success, colour, line in ((True, SUCCESS, "o-"), (False, FAILURE, "s--")):
             group = of_method[of_method["success"] == success].groupby("left")
             rates = 100 * group["hit"].mean()[group.size() >= LEAST_EPISODES]
             name = "success" if success else "failure"
@@ -158,13 +165,17 @@ def time_figure(calls: "pd.DataFrame", episodes: "pd.DataFrame") -> "Figure":
             axes.plot(
                 -rates.index,
                 rates,
-                marker="o",
-                markersize=3,
+                line,
+                markersize=4,
                 color=colour,
                 label=f"{name} (n = {n})",
             )
         axes.axhline(
-            100 * of_method["chance_hit"].mean(), color="black", linewidth=0.8, linestyle=":"
+            100 * of_method["chance_hit"].mean(),
+            color="black",
+            linewidth=0.8,
+            linestyle=":",
+            label="chance",
         )
         axes.set_title(method, fontsize=9)
         axes.set_xlabel("calls before the first touch")

@@ -20,6 +20,7 @@ from vap_core.analysis.attention.measures import (
     patch_areas,
 )
 from vap_core.analysis.plots import Tile, sheet
+from vap_core.base.palette import RIGHT_MARK, WRONG_MARK
 from vap_core.base.types import Mask, Rgb
 from vap_core.evaluation.diagnosis.recordings import listed_row, study_of
 from vap_core.evaluation.engine import spread_evenly
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
     from vap_core.recording import Recorder
 
 OUTLINES = {TARGET: (255, 255, 255), LOOKALIKES: (0, 230, 230)}
-SUCCESS_EDGE, FAILURE_EDGE = "#3a7d44", "#c0392b"
 REFERENCES = 2
 FRAMES = 6
 
@@ -100,7 +100,6 @@ def strip(episode: Episode, frames: Sequence[Frame], query: str) -> list[Tile]:
     tiles = []
     for photo in reference_views(get_object(header.row.target))[:REFERENCES]:
         tiles.append(Tile(_square(photo), "reference"))
-    edge = SUCCESS_EDGE if episode.outcome.success else FAILURE_EDGE
     for frame in spread_evenly(list(frames), FRAMES):
         camera = max(frame.attention, key=lambda name: _peak(frame, name, query))
         heat = heat_map(frame.attention[camera][query], query)
@@ -113,12 +112,14 @@ def strip(episode: Episode, frames: Sequence[Frame], query: str) -> list[Tile]:
             colour = OUTLINES.get(kind_of(name, header.row))
             if colour is not None:
                 _outline(picture, mask, colour)
-        tiles.append(Tile(picture, f"{view}{frame.timestamp_s:.1f} s: {region}", edge))
+        tiles.append(Tile(picture, f"{view}{frame.timestamp_s:.1f} s: {region}"))
+    mark, word = (RIGHT_MARK, "success") if episode.outcome.success else (WRONG_MARK, "failure")
+    tiles[-1] = replace(tiles[-1], title=f"{tiles[-1].title}\n{mark} {word}")
     return tiles
 
 
 def examples_figure(rows: Mapping[str, Sequence[Tile]]) -> "Figure":
-    """One row of tiles per pattern; green frames are of episodes that succeed, red of others."""
+    """One row of tiles per pattern; its last one says how the episode ended."""
     return sheet(rows, side_in=1.25, label_in=1.35)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from vap_core.base.figures import OTHER, TIER_COLOURS, WINNER, empty_figure
-from vap_core.base.palette import TEXT, suite_colour
+from vap_core.base.palette import FRAME, TEXT, suite_colour
 from vap_core.evaluation.perception.estimates import Estimate, mean, share
 from vap_core.evaluation.perception.first_frames import KS, RULES, USUAL_K
 from vap_core.simulation.assets.objects import TIERS
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 MARGINS = {"margin": "margin of votes", "cosine_margin": "margin of mean cosines"}
 COUNTS_BELOW = -4.0
 """Where the axis begins that has numbers below its curve, %."""
+TIME_TARGET = 0.8
+"""The IoU that a track is to keep."""
 RULE_COLOURS = {"vote": WINNER, "average": OTHER}
 OCCLUDERS = {"plate": "a plate hides it fully", "arm": "an arm moves in front"}
 RECALLS = {
@@ -100,7 +102,7 @@ def abstention_figure(choices: "pd.DataFrame") -> "Figure":
         top = max(top, 200 * float((1 - curve.right).max()))
     axes.set(xlabel=f"% of {n_views} views answered", ylabel="% of them wrong")
     axes.set(xlim=(0, 101), ylim=(0, max(top, 1.0)))
-    axes.legend(frameon=False, loc="upper left", fontsize=9)
+    figure.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=9)
     return figure
 
 
@@ -165,7 +167,7 @@ def time_figure(tracks: "pd.DataFrame") -> "Figure":
         middle, low, high = _bounds(means)
         axes.plot(time, middle, color=colour, label=f"{suite}, {len(part)} tracks")
         _draw_band(axes, x=time, low=low, high=high, colour=colour)
-    axes.axhline(0.8, color="#999999", linewidth=0.8, linestyle=":")
+    axes.axhline(TIME_TARGET, color=FRAME, linewidth=0.8, linestyle=":", label="aimed at")
     axes.set(xlabel="% of the episode", ylabel="IoU with the visible target")
     axes.set(ylim=(0, 1.02), xlim=(0, 100))
     axes.legend(frameon=False, fontsize=9, loc="lower left")
@@ -358,7 +360,7 @@ def _draw_cosines(axes: "Axes", objects: "pd.DataFrame") -> None:
         tick_labels=labels,
         widths=0.55,
         patch_artist=True,
-        flierprops={"markersize": 2.5, "markeredgecolor": "#999999"},
+        flierprops={"markersize": 2.5, "markeredgecolor": FRAME},
         medianprops={"color": "black"},
     )
     for box, colour in zip(drawn["boxes"], colours, strict=True):
