@@ -166,6 +166,7 @@ def test_rows_count_what_they_say():
         [
             view(),
             view(camera="side", right=False, elected="cup-lookalike-1", mask_iou=None),
+            view(camera="side", tinted=False),
             view(camera="wrist", counts=False, proposed=None, right=None, tinted=False, elected=""),
             view(
                 target="pot",
@@ -188,16 +189,20 @@ def test_rows_count_what_they_say():
         views=views, episodes=episodes, groups={"mug": ("loud",), "pot": ()}, refused={"x": "no"}
     )
     assert object_rows(tables)[1:] == [
-        ["mug", "2", "2", "1", "1", "0.90", "2 of 2", "1 of 2"],
-        ["pot", "1", "0", "0", "0", "-", "0 of 1", "0 of 0"],
+        ["mug", "3", "3", "2", "1", "1", "0.90", "2 of 2", "1 of 2"],
+        ["pot", "1", "0", "0", "0", "0", "-", "0 of 1", "0 of 0"],
     ]
     by_name = {cells[0].strip("- "): cells[1:] for cells in group_rows(tables)[1:]}
     assert list(by_name) == ["all", "front views", "side views", "wrist views", "loud"]
-    assert by_name["all"][0].startswith("67 ")
-    assert by_name["all"][1].startswith("33 ")
-    assert by_name["all"][2].startswith("25 ")
-    assert by_name["all"][5].startswith("50 ")
-    assert by_name["all"][5].endswith(" 2")
+    head = group_rows(tables)[0][1:]
+    of_all = dict(zip(head, by_name["all"], strict=True))
+    assert of_all["proposed"].startswith("75 ")
+    assert of_all["right"].startswith("50 ")
+    assert of_all["not in view"].startswith("50 ")
+    assert of_all["not in view"].endswith(" 2")
+    assert of_all["wrong tint"].startswith("20 ")
+    assert of_all["VAP"].startswith("50 ")
+    assert of_all["VAP"].endswith(" 2")
     assert by_name["loud"][0].startswith("100 ")
     assert "left out: x: no" in text_report(tables)
     nothing = Tables(views=views, episodes=pd.DataFrame(), groups=tables.groups, refused={})

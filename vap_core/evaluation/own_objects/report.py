@@ -20,8 +20,9 @@ NOTE = (
     "value [95 % interval] n, in %; Wilson's interval with n reduced to what the objects, which "
     "are the independent units, are worth.\n"
     "views: those that show 100 pixels of the object or more, of 224 x 224. proposed: some box "
-    "overlaps it by IoU .5. right: the elected box does. wrong tint: another thing is tinted. mask "
-    "IoU: of the right ones, mean.\n"
+    "overlaps it by IoU .5. right: the elected box does; not in view: of the right ones, those too "
+    "unlike the references to be tinted; mask IoU: of the right ones, mean. wrong tint: another "
+    "thing is tinted.\n"
     "expert: episodes in which it succeeds. VAP: successes of these; touches first: the first "
     "object that the robot touches in these is the right one."
 )
@@ -50,11 +51,14 @@ def text_report(tables: Tables) -> str:
 
 def object_rows(tables: Tables) -> Rows:
     """One line per object: counts."""
-    rows = [["object", "views", "proposed", "right", "wrong tint", "mask IoU", "expert", "VAP"]]
+    head = ["object", "views", "proposed", "right", "not in view", "wrong tint", "mask IoU"]
+    rows = [[*head, "expert", "VAP"]]
     for name, part in tables.views.groupby("target", sort=True):
         seen = part[part.counts]
         wrong = part.tinted & (part.elected != part.target)
-        counts = [len(seen), seen.proposed.sum(), seen.right.sum(), wrong.sum()]
+        right = _right(seen)
+        refused = ~right.tinted
+        counts = [len(seen), seen.proposed.sum(), len(right), refused.sum(), wrong.sum()]
         cells = [str(name), *(str(int(count)) for count in counts), _mean(seen.mask_iou)]
         if len(tables.episodes):
             of_object = tables.episodes[tables.episodes.object == name]
@@ -68,8 +72,11 @@ def object_rows(tables: Tables) -> Rows:
 
 def group_rows(tables: Tables) -> Rows:
     """All objects, by camera, and by group: shares."""
-    head = ["", "proposed", "right", "wrong tint", "mask IoU", "expert", "VAP", "touches first"]
-    rows = [head, _shares("all", tables, tables.groups)]
+    head = ["", "proposed", "right", "not in view", "wrong tint", "mask IoU"]
+    rows = [
+        [*head, "expert", "VAP", "touches first"],
+        _shares("all", tables, tables.groups),
+    ]
     for camera, part in tables.views.groupby("camera", sort=True):
         cells = _view_cells(part)
         rows.append([f"- {camera} views", *cells, "", "", ""])
@@ -114,13 +121,20 @@ def _shares(title: str, tables: Tables, members: Iterable[str]) -> list[str]:
 
 def _view_cells(part: "pd.DataFrame") -> list[str]:
     seen = part[part.counts]
+    right = _right(seen)
     wrong = part.tinted & (part.elected != part.target)
     return [
         _share(seen.proposed, seen.target),
         _share(seen.right, seen.target),
+        _share(~right.tinted, right.target),
         _share(wrong, part.target),
         _mean(seen.mask_iou),
     ]
+
+
+def _right(seen: "pd.DataFrame") -> "pd.DataFrame":
+    """The views in which the object is elected, tinted or not."""
+    return seen[seen.right.astype("boolean").fillna(False).astype(bool)]
 
 
 def _share(hits: "pd.Series", clusters: "pd.Series") -> str:
