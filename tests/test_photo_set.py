@@ -1,5 +1,6 @@
 """eval-photos: the folder form, what is wrong with bad folders, the figures, and resuming."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -8,13 +9,22 @@ import pytest
 from PIL import Image
 
 from tests.command import refused, vap
-from tests.toys import MeanColour, SameColour, detector, scene, segmenter
+from tests.toys import MeanColour, SameColour, detector, personal, scene, segmenter
 from vap_core.base.errors import BadPhotoSet
 from vap_core.base.files import DATA
 from vap_core.evaluation.metrics import rate
 from vap_core.evaluation.photos import run
+from vap_core.evaluation.photos.apart import single_rows
 from vap_core.evaluation.photos.folder import read_photo_set
-from vap_core.evaluation.photos.report import clustered_share, object_rows, scene_rows, vote_rows
+from vap_core.evaluation.photos.pictures import fit_line, labelled
+from vap_core.evaluation.photos.report import (
+    clustered_mean,
+    clustered_share,
+    object_rows,
+    scene_rows,
+    single_report,
+    vote_rows,
+)
 from vap_core.perception.protocols import Stack
 
 RED, GREEN, BLUE, DARK = (250, 0, 0), (0, 250, 0), (0, 0, 250), (120, 10, 0)
@@ -125,6 +135,7 @@ def test_the_command_measures_writes_and_resumes(folder, toy, tmp_path):
     assert (out / "sheet-01.png").stat().st_size > 1000
     assert (out / "memory" / "mug.references.png").exists()
     assert len(pd.read_csv(out / "questions.csv")) == 6
+    assert "photos of one object" not in done.stdout  # two references each
     part = (out / "parts" / "a.png.json").stat().st_mtime_ns
     (out / "parts" / "b.png.json").unlink()
     again = vap("eval-photos", folder, "--stack", "toy", "--out", out)
@@ -145,7 +156,7 @@ def test_a_box_outside_its_photo_is_named(folder, toy, tmp_path):
 def row(**changed: object) -> dict[str, object]:
     usual: dict[str, object] = {
         "scene": "a", "object": "mug", "category": "cup", "present": True, "lookalikes": 0,
-        "proposed_iou": 0.9, "iou": 0.9, "tinted": True, "ms": 10.0,
+        "proposed_iou": 0.9, "iou": 0.9, "chosen_iou": 0.9, "tinted": True, "ms": 10.0,
         "all_boxes": None, "all_one": None, "all_every": None,
     }  # fmt: skip
     return usual | changed
@@ -155,10 +166,10 @@ def test_rows_count_what_they_say():
     table = pd.DataFrame(
         [
             row(),
-            row(scene="b", iou=0.3, lookalikes=1),
-            row(scene="c", iou=0.0, tinted=False, proposed_iou=0.2),
+            row(scene="b", iou=0.3, chosen_iou=0.3, lookalikes=1),
+            row(scene="c", iou=0.0, tinted=False, proposed_iou=0.2, chosen_iou=0.6),
             row(scene="d", present=False, iou=0.0, lookalikes=2),
-            row(scene="e", present=False, iou=0.0, tinted=False, object="plant"),
+            row(scene="e", present=False, iou=0.0, chosen_iou=None, tinted=False, object="plant"),
         ]
     )
     assert object_rows(table)[1:] == [
@@ -169,6 +180,10 @@ def test_rows_count_what_they_say():
     by_name = {cells[0].strip("- "): cells[1:] for cells in scene_rows(table)[1:]}
     assert by_name["object in view"][0].startswith("67 ")
     assert by_name["object in view"][1].startswith("33 ")
+    assert scene_rows(table)[0][6] == "not in view"
+    assert by_name["object in view"][5].startswith("50 ")
+    assert by_name["object in view"][5].endswith(" 2")
+    assert by_name["object absent"][5] == ""
     assert by_name["beside look-alikes"][3].startswith("100 ")
     assert by_name["look-alikes in view"][3].startswith("100 ")
     assert by_name["none of its kind"][4].startswith("100 ")
@@ -191,3 +206,95 @@ def test_the_interval_of_independent_cases_is_wilsons_and_clusters_widen_it():
     same = clustered_share(np.ones(8), list("aabbccdd"))
     assert same.low == pytest.approx(rate(4, 4).low)
     assert clustered_share(np.zeros(0), []).n == 0
+
+
+def masked(folder: Path) -> Path:
+    """Gives the scenes masks: the mug's exactly, the old mug's left half in scene b."""
+    for scene_name, name, box in (
+        ("a.png", "mug", (4, 4, 16, 16)),
+        ("b.png", "old_mug", (4, 4, 10, 16)),
+    ):
+        mask = np.zeros((64, 64), np.uint8)
+        x0, y0, x1, y1 = box
+        mask[y0:y1, x0:x1] = 255
+        place = folder / "masks" / scene_name
+        place.mkdir(parents=True)
+        Image.fromarray(mask).save(place / f"{name}.png")
+    return folder
+
+
+def test_masks_are_measured_from_true_boxes_with_references_and_without(folder, toy, tmp_path):
+    without_masks = read_photo_set(folder).sha256
+    masked(folder)
+    assert read_photo_set(folder).sha256 != without_masks
+    done = vap("eval-photos", folder, "--stack", "toy", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    table = pd.read_parquet(tmp_path / "out" / "masks.parquet").set_index("object")
+    assert table.mask_iou.to_dict() == {"mug": 1.0, "old_mug": 0.5}
+    assert "masks from true boxes: mean IoU 0.75 [0.50, 1.00] 2" in done.stdout
+    shutil.rmtree(folder / "references")
+    (folder / "scenes.csv").write_text(HEADER + "a.png,mug,4,4,16,16\nb.png,old_mug,4,4,16,16\n")
+    (folder / "objects.csv").unlink()
+    alone = vap("eval-photos", folder, "--stack", "toy", "--out", tmp_path / "alone")
+    assert alone.returncode == 0, alone.stderr
+    assert "mean IoU 0.75" in alone.stdout
+    assert "object in view" not in alone.stdout
+
+
+def test_masks_that_do_not_fit_are_named(folder, toy, tmp_path):
+    masked(folder)
+    Image.fromarray(np.zeros((8, 8), np.uint8)).save(folder / "masks" / "a.png" / "mug.png")
+    line = refused("eval-photos", folder, "--stack", "toy", "--out", tmp_path / "out")
+    assert "has 8x8 pixels, its scene 64x64" in line
+    (folder / "masks" / "a.png" / "mug.png").rename(folder / "masks" / "a.png" / "plant.png")
+    with pytest.raises(BadPhotoSet, match="no single box of 'plant' in a.png"):
+        read_photo_set(folder)
+    shutil.rmtree(folder / "masks" / "a.png")
+    (folder / "masks" / "c.png").mkdir()
+    with pytest.raises(BadPhotoSet, match="masks of no scene"):
+        read_photo_set(folder)
+
+
+def test_the_mean_of_clusters_has_the_interval_of_drawing_them_again():
+    spread = clustered_mean(np.array([0.0, 1.0, 0.0, 1.0]), list("abcd"))
+    alike = clustered_mean(np.array([0.0, 1.0, 0.0, 1.0]), list("aabb"))
+    assert (spread.value, spread.n) == (0.5, 4)
+    assert spread.low < 0.5 < spread.high
+    assert (alike.low, alike.high) == (0.5, 0.5)
+    assert np.isnan(clustered_mean(np.ones(3), list("aaa")).low)
+
+
+def test_left_out_photos_are_elected_against_two_others():
+    stack = Stack("toy", detector, MeanColour(), segmenter, SameColour())
+    red = [(250, 0, i) for i in range(4)]
+    memory = {
+        "mug": personal("mug", "cup", *red),
+        "plant": personal("plant", "plant", GREEN),
+        "ball": personal("ball", "ball", BLUE),
+    }
+    rows = pd.DataFrame(single_rows(memory, stack))
+    assert set(rows.object) == {"mug"}  # the others have one reference
+    assert rows.right.all()
+    twins = {**memory, "twin": personal("twin", "cup", *red), "copy": personal("copy", "cup", *red)}
+    confused = pd.DataFrame(single_rows(twins, stack))
+    assert 0 < confused[confused.object == "mug"].right.mean() < 1
+    text = single_report(confused)
+    assert "3 objects" in text
+    assert single_rows({"mug": memory["mug"]}, stack) == []
+
+
+@pytest.mark.parametrize("line", ["mug", "what was found is unlike the other photos (cosine 0.43)"])
+def test_labels_are_whole_in_a_tile_of_a_contact_sheet(line):
+    assert fit_line(line, 352)[0] == line
+
+
+def test_labels_of_any_length_and_alphabet_fit():
+    text, size = fit_line("grey_sloth_plushie (in view) in " + "a-long-name-" * 20 + "7.jpg", 352)
+    assert text.startswith("grey_sloth")
+    assert text.endswith("7.jpg")
+    assert "..." in text
+    assert size == 10
+    tile = labelled(np.zeros((20, 352, 3), np.uint8), ["Grüße", text])
+    assert tile.shape == (54, 352, 3)
+    assert (tile[20:, 349:] == 255).all()  # nothing runs out of the tile
+    assert (labelled(tile, ["ü"])[54:] != labelled(tile, ["u"])[54:]).any()

@@ -1,7 +1,7 @@
 """Commands about this machine and what it measures.
 
-They are eval-perception, eval-photos, eval-objects, calibrate, eval-policy, eval-tokens, show and
-doctor.
+They are eval-perception, eval-photos, paste-photos, eval-objects, calibrate, eval-policy,
+eval-tokens, show and doctor.
 """
 
 from pathlib import Path
@@ -69,7 +69,7 @@ def eval_photos(
             "scene,object,x0,y0,x1,y1 for every object of every scene, without box where the "
             "object is absent; optional references/boxes.csv with photo,x0,y0,x1,y1 (photo as "
             "OBJECT/FILE) and objects.csv with object,category (else an object's name is its "
-            "kind). Pixels of the upright photo, far corner exclusive.",
+            "kind), masks/SCENE/OBJECT.png. Pixels of the upright photo, far corner exclusive.",
         ),
     ],
     stack: StackName = "embedded",
@@ -98,6 +98,42 @@ def eval_photos(
 
     folder_of_run = out or Path(f"data/runs/photos-{folder.resolve().name}")
     print(measure_photos(folder, folder_of_run, stack, clips=clips))
+
+
+@app.command("paste-photos")
+def paste_photos(
+    photos: Annotated[
+        Path,
+        typer.Argument(
+            help="Holds OBJECT/*.jpg, two photos of each object or more, best with a plain "
+            "background; optional objects.csv with object,category."
+        ),
+    ],
+    out: Annotated[Path, typer.Argument(help="The set's new folder.")],
+    scenes: Annotated[Path, typer.Option(help="Folder of pictures to paste into.")],
+    size: Annotated[str, typer.Option(help="WIDTHxHEIGHT of the pictures.")] = "640x480",
+    pictures: Annotated[int, typer.Option(min=1, help="How many.")] = 16,
+    objects: Annotated[int, typer.Option(min=2, help="Objects in each, where they fit.")] = 5,
+    share: Annotated[
+        str, typer.Option(help="FROM,TO: an object's longer side in per cent of the width.")
+    ] = "15,35",
+    stack: StackName = "embedded",
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+) -> None:
+    """Make a photo set for eval-photos without drawing boxes: objects are cut out of some of their
+    photos and pasted into pictures of a place; look at cuts.png.
+
+    Example: python -m vap_core paste-photos my-things my-set --scenes my-desk
+    Example: python -m vap_core paste-photos my-things my-small-set --scenes my-desk
+        --size 1920x1080 --share 4,13 --objects 12
+    """
+    from vap_core.evaluation.photos.paste import parse_pasting
+    from vap_core.evaluation.photos.paste import paste_photos as paste
+    from vap_core.perception.stacks import load_stack
+
+    asked = parse_pasting(size, share, pictures=pictures, objects=objects, seed=seed)
+    print(paste(photos, scenes, out, asked, load_stack(stack)))
+    print(f"look: {out / 'cuts.png'}\nnext: python -m vap_core eval-photos {out}")
 
 
 @app.command("eval-objects")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from vap_core import __version__
 from vap_core.analysis.calibration.report import PRICE, Choice, choose, text_report
 from vap_core.analysis.calibration.scenes import SEED, Row, measure_scene
-from vap_core.base.errors import BadOutput
+from vap_core.base.errors import BadOutput, BadPhotoSet
 from vap_core.base.files import write_atomic
 from vap_core.base.parquet import read_parquet
 from vap_core.evaluation import store
@@ -126,6 +126,11 @@ def _measure(
         name = folder.resolve().name
         run = out / f"photos-{name}"
         measure_photos(folder, run, stack.name, progress=progress)
+        if not (run / f"{TABLE}.parquet").exists():
+            raise BadPhotoSet(
+                f"calibrate: {folder} has no references; put each object's photos into "
+                f"{folder}/references/OBJECT."
+            )
         answers = read_parquet(
             run / f"{TABLE}.parquet", "calibrate", "delete it and run the same command again"
         )

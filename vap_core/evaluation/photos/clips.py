@@ -7,7 +7,6 @@ real motion: nothing blurs, turns or is hidden by a hand. The tracker starts fro
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -17,7 +16,8 @@ from jaxtyping import Float64
 from vap_core.base.photos import load_photo
 from vap_core.base.types import Boxes, Mask, Rgb, value
 from vap_core.evaluation.photos.folder import PhotoSet, Scene
-from vap_core.perception.protocols import FamiliarityJudge, Stack, TargetTracker
+from vap_core.evaluation.photos.measure import judge
+from vap_core.perception.protocols import Stack, TargetTracker
 
 FRAMES = 48
 """Of one clip, there and back."""
@@ -120,9 +120,7 @@ def _start(
     height, width = frame.shape[:2]
     xyxy = np.clip(here[kept], 0, (width, height, width, height)).astype(np.float32)
     boxes = Boxes(xyxy, np.ones(len(xyxy), np.float32), "true boxes")
-    if isinstance(stack.detector, FamiliarityJudge):
-        boxes = replace(boxes, familiar=stack.detector.is_familiar(frame, boxes.phrase))
-    masks = stack.segmenter(frame, boxes)
+    masks = stack.segmenter(frame, judge(frame, boxes, stack))
     tracker = stack.tracker
     if isinstance(tracker, TargetTracker):
         return tracker.start_targets([frame], [masks], [[0]]), masks[0]

@@ -5,6 +5,8 @@
     scenes/*.jpg              photos of scenes
     scenes.csv                scene,object,x0,y0,x1,y1: where each object is; no box: it is absent
     objects.csv               optional: object,category; else an object's name is its category
+    masks/SCENE/OBJECT.png    optional: bright on the object, of the scene's size; with masks there
+                              need be no references, and masks alone are measured
 
 Boxes are pixels of the upright photo, far corner exclusive. An object of scenes.csv without
 references is a rival: it is never asked for. Several rows of one scene and object are alternatives.
@@ -12,6 +14,7 @@ references is a rival: it is never asked for. Several rows of one scene and obje
 
 import hashlib
 from collections.abc import Iterable, Mapping
+from dataclasses import field
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +28,7 @@ from vap_core.base.types import value
 from vap_core.memory import CATEGORY
 
 BOX = ("x0", "y0", "x1", "y1")
+MASKS = "masks"
 SCENES_CSV, BOXES_CSV, OBJECTS_CSV = "scenes.csv", "references/boxes.csv", "objects.csv"
 FORM = "see python -m vap_core eval-photos --help"
 Box = Float32[np.ndarray, "4"]
@@ -49,11 +53,14 @@ class Subject:
 
 @value
 class Scene:
-    """One photo, and the boxes of every object that scenes.csv names in it; none: it is absent."""
+    """One photo, the boxes of every object that scenes.csv names in it (none: it is absent), and
+    the files of masks.
+    """
 
     name: str
     path: Path
     boxes: Mapping[str, Float32[np.ndarray, "_n 4"]]
+    masks: Mapping[str, Path] = field(default_factory=dict)
 
 
 @value
@@ -81,7 +88,7 @@ def read_photo_set(folder: Path) -> PhotoSet:
     named = set(photos)
     for scene in scenes:
         named |= set(scene.boxes)
-    categories = _read_categories(folder, named)
+    categories = read_categories(folder, named)
     subjects = []
     for name, of_object in photos.items():
         subjects.append(Subject(name, categories[name], of_object))
@@ -99,6 +106,8 @@ def _read_references(folder: Path) -> dict[str, tuple[ReferencePhoto, ...]]:
     folders = []
     if root.is_dir():
         folders = sorted(path for path in root.iterdir() if path.is_dir())
+    if not folders and (folder / MASKS).is_dir():
+        return {}
     if not folders:
         raise BadPhotoSet(
             f"eval-photos: {root} holds no folder of photos; put each object's photos into "
@@ -167,12 +176,43 @@ def _read_scenes(folder: Path, known: Mapping[str, Any]) -> tuple[Scene, ...]:
         of_scene = {}
         for obj, boxes in rows[name].items():
             of_scene[obj] = np.array(boxes, np.float32).reshape(-1, 4)
-        scenes.append(Scene(name, path, of_scene))
+        scenes.append(Scene(name, path, of_scene, _masks_of(folder, name, of_scene)))
+    _refuse_other_masks(folder, paths)
     return tuple(scenes)
 
 
-def _read_categories(folder: Path, named: Iterable[str]) -> dict[str, str]:
-    """The kind of every object: objects.csv's, else its name."""
+def _masks_of(
+    folder: Path, scene: str, boxes: Mapping[str, Float32[np.ndarray, "_n 4"]]
+) -> dict[str, Path]:
+    """The masks of one scene by the object's name. Raises: BadPhotoSet."""
+    root = folder / MASKS / scene
+    masks = {}
+    if root.is_dir():
+        for path in photos_in(root):
+            if path.stem not in boxes or len(boxes[path.stem]) != 1:
+                raise BadPhotoSet(
+                    f"eval-photos: {path} is a mask, but {SCENES_CSV} gives no single box of "
+                    f"{path.stem!r} in {scene}; name masks as {MASKS}/SCENE/OBJECT.png."
+                )
+            masks[path.stem] = path
+    return masks
+
+
+def _refuse_other_masks(folder: Path, scenes: Mapping[str, Any]) -> None:
+    if not (folder / MASKS).is_dir():
+        return
+    for path in sorted((folder / MASKS).iterdir()):
+        if path.is_dir() and path.name not in scenes:
+            raise BadPhotoSet(
+                f"eval-photos: {path} holds masks of no scene; name the folder as the scene's "
+                "file, for example masks/desk.jpg."
+            )
+
+
+def read_categories(
+    folder: Path, named: Iterable[str], caller: str = "eval-photos"
+) -> dict[str, str]:
+    """The kind of every object: objects.csv's, else its name. Raises: BadPhotoSet."""
     categories = {}
     for name in named:
         categories[name] = name.replace("_", " ").replace("-", " ").strip()
@@ -181,14 +221,14 @@ def _read_categories(folder: Path, named: Iterable[str]) -> dict[str, str]:
         for line, row in _read_csv(table, ("object", "category")):
             if row["object"] not in categories:
                 raise BadPhotoSet(
-                    f"eval-photos: {table} line {line} names {row['object']!r}, which has no "
+                    f"{caller}: {table} line {line} names {row['object']!r}, which has no "
                     "references and is in no scene; mend the name."
                 )
             categories[row["object"]] = row["category"]
     for name, category in categories.items():
         if not CATEGORY.fullmatch(category):
             raise BadPhotoSet(
-                f"eval-photos: {category!r} cannot be a category; write {name},KIND into {table} "
+                f"{caller}: {category!r} cannot be a category; write {name},KIND into {table} "
                 "with the kind in words, for example mug-1,cup."
             )
     return categories
@@ -224,6 +264,7 @@ def _sha256(folder: Path) -> str:
     digest = hashlib.sha256()
     tables = [folder / SCENES_CSV, folder / BOXES_CSV, folder / OBJECTS_CSV]
     pictures = [*(folder / "references").rglob("*"), *(folder / "scenes").iterdir()]
+    pictures += (folder / MASKS).rglob("*")
     for path in sorted({*tables, *pictures}):
         if path.is_file():
             digest.update(str(path.relative_to(folder)).encode())

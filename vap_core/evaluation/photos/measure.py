@@ -82,9 +82,15 @@ def _true_boxes(scene: Scene, rgb: Rgb) -> tuple[Boxes, list[str]]:
 
 def _candidates(rgb: Rgb, boxes: Boxes, stack: Stack) -> Candidates:
     """The true boxes, embedded as boxes of such a photo are, and their masks."""
+    judged = judge(rgb, boxes, stack)
+    return segment(rgb, embed(rgb, judged, stack), stack)
+
+
+def judge(rgb: Rgb, boxes: Boxes, stack: Stack) -> Boxes:
+    """Boxes given by hand, with whether their picture is familiar."""
     if isinstance(stack.detector, FamiliarityJudge):
-        boxes = replace(boxes, familiar=stack.detector.is_familiar(rgb, boxes.phrase))
-    return segment(rgb, embed(rgb, boxes, stack), stack)
+        return replace(boxes, familiar=stack.detector.is_familiar(rgb, boxes.phrase))
+    return boxes
 
 
 def _ground(

@@ -1,7 +1,9 @@
 """Pictures of photos with boxes and text, and contact sheets of them."""
 
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -9,10 +11,14 @@ import numpy as np
 from vap_core.base.errors import BadOutput
 from vap_core.base.types import Rgb
 
+if TYPE_CHECKING:
+    from PIL.ImageFont import FreeTypeFont
+
 LABEL_PX, COLUMNS = 34, 4
+LARGEST_PX, SMALLEST_PX = 13, 10
+"""Sizes of a label's text, from that of a short one to that of a long one."""
 TRUTH, RIGHT, WRONG, SILENT = (255, 255, 255), (60, 200, 90), (235, 60, 50), (160, 160, 160)
 DOUBTFUL = (250, 180, 40)
-FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def join_tiles(tiles: Sequence[Rgb], columns: int = COLUMNS) -> Rgb:
@@ -46,13 +52,38 @@ def draw_box(rgb: Rgb, box: Sequence[float], colour: tuple[int, int, int], width
 
 
 def labelled(rgb: Rgb, lines: Sequence[str]) -> Rgb:
-    """The picture with two lines of text below."""
-    out = np.full((rgb.shape[0] + LABEL_PX, rgb.shape[1], 3), 255, np.uint8)
-    out[: rgb.shape[0]] = rgb
+    """The picture with two lines of text below, which are made to fit its width."""
+    from PIL import Image, ImageDraw
+
+    label = Image.new("RGB", (rgb.shape[1], LABEL_PX), "white")
+    draw = ImageDraw.Draw(label)
     for i, line in enumerate(lines):
-        at = (4, rgb.shape[0] + 13 + 15 * i)
-        cv2.putText(out, line[:52], at, FONT, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
-    return out
+        text, size = fit_line(line, rgb.shape[1] - 8)
+        draw.text((4, 9 + 16 * i), text, fill="black", font=_font(size), anchor="lm")
+    return np.concatenate([rgb, np.asarray(label)])
+
+
+def fit_line(line: str, width: int) -> tuple[str, int]:
+    """The line and the size at which it is that wide at most: smaller, then without its middle."""
+    for size in range(LARGEST_PX, SMALLEST_PX - 1, -1):
+        if _font(size).getlength(line) <= width:
+            return line, size
+    for kept in range(len(line) - 1, 1, -1):
+        head = (kept + 1) // 2
+        shorter = f"{line[:head]}...{line[len(line) - kept + head :]}"
+        if _font(SMALLEST_PX).getlength(shorter) <= width:
+            return shorter, SMALLEST_PX
+    return "", SMALLEST_PX
+
+
+@cache
+def _font(size: int) -> "FreeTypeFont":
+    """Pillow's own font."""
+    from PIL import ImageFont
+
+    font = ImageFont.load_default(size)
+    assert isinstance(font, ImageFont.FreeTypeFont), "Pillow has FreeType"
+    return font
 
 
 def write_picture(path: Path, rgb: Rgb) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from vap_core.base.tables import Rows, align
-from vap_core.evaluation.perception.estimates import NONE, Estimate
+from vap_core.evaluation.perception.estimates import NONE, RESAMPLES, Estimate
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -17,7 +17,8 @@ NOTE = (
     "value [95 % interval] n, in %; Wilson's interval with n reduced to what the scenes, which are "
     "the independent units, are worth.\n"
     "right: the tinted box overlaps the object by IoU .5; proposed: some candidate does. wrong: "
-    "another box is tinted. silent: nothing is. look-alikes: other objects of its kind in the "
+    "another box is tinted. silent: nothing is; not in view: of the rightly elected, those too "
+    "unlike the references to be tinted. look-alikes: other objects of its kind in the "
     "scene.\n"
     "vote: the true boxes of a scene are the candidates; with one reference (the mean over them) "
     "and with all."
@@ -52,6 +53,40 @@ def clip_report(clips: "pd.DataFrame") -> str:
     )
 
 
+def mask_report(masks: "pd.DataFrame") -> str:
+    """How well the true masks are met from true boxes; the interval resamples scenes."""
+    if not len(masks):
+        return ""
+    estimate = clustered_mean(masks.mask_iou.to_numpy(np.float64), masks.scene)
+    return f"masks from true boxes: mean IoU {estimate.text(scale=1.0, digits=2)}"
+
+
+def single_report(single: "pd.DataFrame") -> str:
+    """How often three references elect a left-out photo of their object among two others'."""
+    if not len(single):
+        return ""
+    found = clustered_share(single.right.to_numpy(float), single.object)
+    by_object = single.groupby("object").right.mean()
+    return (
+        f"photos of one object: three references elect a left-out one among photos of two others "
+        f"in {found.text()} elections of {len(by_object)} objects, which are the independent "
+        f"units; worst: {by_object.idxmin()}, {100 * by_object.min():.0f}"
+    )
+
+
+def clustered_mean(values: Float64[np.ndarray, " n"], clusters: Iterable[object]) -> Estimate:
+    """The mean, and percentiles of it when whole clusters are drawn again, seeded."""
+    _, number = np.unique([str(name) for name in clusters], return_inverse=True)
+    sums = np.bincount(number, values)
+    counts = np.bincount(number).astype(np.float64)
+    low = high = float("nan")
+    if len(sums) > 1:
+        share = np.full(len(sums), 1 / len(sums))
+        times = np.random.default_rng(0).multinomial(len(sums), share, RESAMPLES)
+        low, high = np.percentile(times @ sums / (times @ counts), [2.5, 97.5]).tolist()
+    return Estimate(value=float(values.mean()), low=low, high=high, n=len(values))
+
+
 def object_rows(table: "pd.DataFrame") -> Rows:
     """One line per object, and one for all: counts."""
     rows = [
@@ -65,7 +100,8 @@ def object_rows(table: "pd.DataFrame") -> Rows:
 
 def scene_rows(table: "pd.DataFrame") -> Rows:
     """One line per kind of scene: with the object and without, with look-alikes and without."""
-    rows = [["scenes", "proposed", "right", "right at IoU .25", "wrong tinted", "silent"]]
+    head = ["scenes", "proposed", "right", "right at IoU .25", "wrong tinted", "silent"]
+    rows = [[*head, "not in view"]]
     seen, absent = table[table.present], table[~table.present]
     kinds = (
         ("object in view", seen),
@@ -81,7 +117,10 @@ def scene_rows(table: "pd.DataFrame") -> Rows:
         cells = [_share(hits, part) for hits in measures]
         if number >= 3:
             cells = ["", "", ""]
-        rows.append([name, *cells, _share(part.tinted & ~right, part), _share(~part.tinted, part)])
+        cells += [_share(part.tinted & ~right, part), _share(~part.tinted, part)]
+        elected = part[part.chosen_iou.astype(float).fillna(0) >= RIGHT_IOU]
+        price = _share(~elected.tinted, elected)
+        rows.append([name, *cells, price if number < 3 else ""])
     return rows
 
 

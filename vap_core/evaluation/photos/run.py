@@ -1,5 +1,6 @@
 """Measures a photo set scene by scene; what an interrupted run had finished is kept."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,11 +9,17 @@ from vap_core.attend import Attender
 from vap_core.base.files import write_atomic
 from vap_core.evaluation import store
 from vap_core.evaluation.measurements import read_json_part, write_json_part, write_table
+from vap_core.evaluation.photos.apart import mask_rows, single_rows
 from vap_core.evaluation.photos.clips import follow_scene
-from vap_core.evaluation.photos.folder import PhotoSet, read_photo_set
+from vap_core.evaluation.photos.folder import PhotoSet, Scene, read_photo_set
 from vap_core.evaluation.photos.measure import Row, measure_scene
 from vap_core.evaluation.photos.register import remember_subjects
-from vap_core.evaluation.photos.report import clip_report, text_report
+from vap_core.evaluation.photos.report import (
+    clip_report,
+    mask_report,
+    single_report,
+    text_report,
+)
 from vap_core.evaluation.photos.sheet import write_sheets
 from vap_core.perception.embedded.weights import weights_sha256
 from vap_core.perception.stacks import load_stack
@@ -20,7 +27,7 @@ from vap_core.perception.stacks import load_stack
 if TYPE_CHECKING:
     import pandas as pd
 
-TABLE, CLIPS = "questions", "clips"
+TABLE, CLIPS, MASKS, SINGLE = "questions", "clips", "masks", "single"
 
 
 def measure_photos(
@@ -32,19 +39,40 @@ def measure_photos(
 
     Raises: BadPhotoSet, BadPhoto; BadOutput when `out` holds another run.
     """
+    import pandas as pd
+
     photo_set = read_photo_set(folder)
     store.open_run(out, _configuration(photo_set, stack_name))
+    parts: list[str] = []
+    written: list[Path] = []
     with store.locked(out):
-        table = _measure(photo_set, out, stack_name, progress)
-        written = write_table(table, out, TABLE)
-        sheets = write_sheets(photo_set, table, out)
-        report = text_report(table)
+        stack = load_stack(stack_name)
+        if photo_set.subjects:
+            memory = remember_subjects(photo_set.subjects, stack, out / "memory")
+            table = _of_scenes(
+                photo_set, out, "", progress, _questions(photo_set, Attender(stack, memory))
+            )
+            single = pd.DataFrame(single_rows(memory, stack))
+            written += write_table(table, out, TABLE)
+            if len(single):
+                written += write_table(single, out, SINGLE)
+            written += write_sheets(photo_set, table, out)
+            parts += [text_report(table), single_report(single)]
+        if any(scene.masks for scene in photo_set.scenes):
+            masks = _of_scenes(
+                photo_set, out, MASKS, progress, lambda scene: mask_rows(scene, stack)
+            )
+            written += write_table(masks, out, MASKS)
+            parts.append(mask_report(masks))
         if clips:
-            followed = _follow(photo_set, out, stack_name, progress)
+            followed = _of_scenes(
+                photo_set, out, CLIPS, progress, lambda scene: follow_scene(scene, photo_set, stack)
+            )
             written += write_table(followed, out, CLIPS)
-            report += f"\n\n{clip_report(followed)}"
+            parts.append(clip_report(followed))
+        report = "\n\n".join(part for part in parts if part)
         write_atomic(out / "report.txt", f"{report}\n".encode())
-    names = ", ".join(str(path) for path in [*written, *sheets])
+    names = ", ".join(map(str, written))
     return f"{report}\n\nwrote {names}"
 
 
@@ -59,35 +87,28 @@ def _configuration(photo_set: PhotoSet, stack_name: str) -> dict[str, object]:
     }
 
 
-def _measure(photo_set: PhotoSet, out: Path, stack_name: str, progress: bool) -> "pd.DataFrame":
-    """One row per scene and object."""
+def _questions(photo_set: PhotoSet, attender: Attender) -> Callable[[Scene], list[Row]]:
+    """What measures one scene."""
+    return lambda scene: measure_scene(scene, photo_set, attender.memory, attender)
+
+
+def _of_scenes(
+    photo_set: PhotoSet,
+    out: Path,
+    what: str,
+    progress: bool,
+    measure: Callable[[Scene], list[Row]],
+) -> "pd.DataFrame":
+    """The rows of every scene, measured or read again."""
     import pandas as pd
     from tqdm import tqdm
 
-    stack = load_stack(stack_name)
-    memory = remember_subjects(photo_set.subjects, stack, out / "memory")
-    attender = Attender(stack, memory)
     rows: list[Row] = []
-    for scene in tqdm(photo_set.scenes, unit="scene", desc="photos", disable=not progress):
-        path = out / "parts" / f"{scene.name}.json"
+    suffix = f".{what}.json" if what else ".json"
+    bar = tqdm(photo_set.scenes, unit="scene", desc=what or "photos", disable=not progress)
+    for scene in bar:
+        path = out / "parts" / f"{scene.name}{suffix}"
         if not path.exists():
-            measured = measure_scene(scene, photo_set, memory, attender)
-            write_json_part(path, measured, caller="eval-photos")
-        rows.extend(read_json_part(path, caller="eval-photos"))
-    return pd.DataFrame(rows)
-
-
-def _follow(photo_set: PhotoSet, out: Path, stack_name: str, progress: bool) -> "pd.DataFrame":
-    """One row per object and scene that shows it."""
-    import pandas as pd
-    from tqdm import tqdm
-
-    stack = load_stack(stack_name)
-    rows: list[Row] = []
-    for scene in tqdm(photo_set.scenes, unit="scene", desc="clips", disable=not progress):
-        path = out / "parts" / f"{scene.name}.clips.json"
-        if not path.exists():
-            measured = follow_scene(scene, photo_set, stack)
-            write_json_part(path, measured, caller="eval-photos")
+            write_json_part(path, measure(scene), caller="eval-photos")
         rows.extend(read_json_part(path, caller="eval-photos"))
     return pd.DataFrame(rows)

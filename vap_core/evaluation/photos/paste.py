@@ -1,0 +1,259 @@
+"""Makes a photo set in the form of eval-photos: objects cut out of photos, pasted into others.
+
+Of every object five photos or fewer stay whole, as its references. Of the others the stack chooses
+the box as `register` does, and its mask is cut out; doubtful ones are left. Where things are is
+known then, and light, sharpness and edges are not those of one photo.
+"""
+
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from vap_core.base.errors import BadOutput, BadPhoto, BadPhotoSet
+from vap_core.base.files import write_atomic
+from vap_core.base.photos import load_photo, photos_in
+from vap_core.base.types import Boxes, Rgb, value
+from vap_core.evaluation.photos.folder import OBJECTS_CSV, SCENES_CSV, read_categories
+from vap_core.evaluation.photos.measure import judge
+from vap_core.evaluation.photos.pictures import fit, join_tiles, labelled, write_picture
+from vap_core.evaluation.photos.register import choose
+from vap_core.perception.boxes import box_cover, mask_box
+from vap_core.perception.protocols import Stack
+
+MOST_REFERENCES, MOST_CUT = 5, 3
+LIGHT = 0.15
+"""By how much a pasted object is darkened or brightened at most."""
+TRIES = 60
+"""Places that are tried for one object."""
+TOUCH = 0.05
+"""Of two pasted boxes, the share of the smaller that may be common."""
+LEAST_SHARE = 0.3
+"""Of its box: a smaller mask is a bad cut."""
+Cut = UInt8[np.ndarray, "_h _w 4"]
+
+
+@value
+class Pasting:
+    """What is asked for. `share` is the range of an object's longer side in the picture's width."""
+
+    width: int
+    height: int
+    pictures: int
+    objects: int
+    share: tuple[float, float]
+    seed: int
+
+
+def parse_pasting(size: str, share: str, *, pictures: int, objects: int, seed: int) -> Pasting:
+    """What is asked for, from WIDTHxHEIGHT and FROM,TO in per cent. Raises: BadPhotoSet."""
+    try:
+        width, height = map(int, size.lower().split("x"))
+        low, high = (float(number) / 100 for number in share.split(","))
+    except ValueError as error:
+        raise BadPhotoSet(
+            f"paste-photos: --size {size} --share {share}: give for example 640x480 and 15,35."
+        ) from error
+    if not (64 <= width <= 8000 and 64 <= height <= 6000 and 0.01 <= low <= high <= 0.9):
+        raise BadPhotoSet(
+            f"paste-photos: --size {size} --share {share}: 64x64 to 8000x6000 pixels, and 1 to 90 "
+            "per cent, the lesser first."
+        )
+    return Pasting(width, height, pictures, objects, (low, high), seed)
+
+
+def paste_photos(photos: Path, scenes: Path, out: Path, asked: Pasting, stack: Stack) -> str:
+    """Write the set, a sheet of the cuts (cuts.png) beside it, and say what became of each object.
+
+    Raises: BadPhoto, BadPhotoSet, BadOutput: a folder lacks what is needed, or `out` is there.
+    """
+    if out.exists():
+        raise BadOutput(f"paste-photos: {out} is there already; choose another folder.")
+    sources = _sources(photos)
+    categories = read_categories(photos, sources, "paste-photos")
+    backgrounds = _pictures_of(scenes)
+    cuts: dict[str, list[Cut]] = {}
+    left_out = []
+    for name, paths in sources.items():
+        references, rest = split(paths)
+        found = cut_out(paths, len(references), categories[name], stack)
+        if not found:
+            left_out.append(f"left out: {name}: none of {len(rest)} photos gives a clean cut")
+            continue
+        cuts[name] = found
+        _copy(references, out / "references" / name)
+    if len(cuts) < 2:
+        raise BadPhotoSet(f"paste-photos: {photos} gives fewer than two objects to paste.")
+    _write_cuts(out / "cuts.png", cuts)
+    rows = ["scene,object,x0,y0,x1,y1"]
+    for number in range(asked.pictures):
+        rng = np.random.default_rng([asked.seed, number])
+        ground = _cover(load_photo(backgrounds[number % len(backgrounds)], None), asked)
+        picture, boxes = compose(ground, cuts, asked, rng)
+        scene = f"{number:03}.png"
+        write_picture(out / "scenes" / scene, picture)
+        for name, box in boxes.items():
+            rows.append(f"{scene},{name},{','.join(map(str, box))}")
+        for name in absent(list(boxes), list(cuts), categories, rng):
+            rows.append(f"{scene},{name},,,,")
+    kinds = [f"{name},{categories[name]}" for name in cuts]
+    write_atomic(out / SCENES_CSV, ("\n".join(rows) + "\n").encode())
+    write_atomic(out / OBJECTS_CSV, ("\n".join(["object,category", *kinds]) + "\n").encode())
+    found_text = f"{len(cuts)} objects in {asked.pictures} pictures, {len(rows) - 1} questions"
+    return "\n".join([*left_out, found_text])
+
+
+def split(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """The references, and the photos to cut out of; at least one of these."""
+    count = min(MOST_REFERENCES, len(paths) - 1)
+    return list(paths[:count]), list(paths[count : count + MOST_CUT])
+
+
+def cut_out(paths: Sequence[Path], references: int, category: str, stack: Stack) -> list[Cut]:
+    """The object of every photo after the references, with its mask as a fourth channel."""
+    used = paths[: references + MOST_CUT]
+    cuts = []
+    for chosen in choose(used, category, stack, {}, whole=False)[references:]:
+        if chosen.doubt:
+            continue
+        boxes = Boxes(chosen.box[None], np.ones(1, np.float32), category)
+        (mask,) = stack.segmenter(chosen.photo, judge(chosen.photo, boxes, stack))
+        around = mask_box(_largest_part(mask))
+        if around is None:
+            continue
+        x0, y0, x1, y1 = around.astype(int).tolist()
+        inside = _largest_part(mask)[y0:y1, x0:x1]
+        if inside.mean() < LEAST_SHARE:
+            continue
+        alpha = cv2.GaussianBlur(255 * inside.astype(np.uint8), (3, 3), 0)
+        cuts.append(np.dstack([chosen.photo[y0:y1, x0:x1], alpha]))
+    return cuts
+
+
+def compose(
+    ground: Rgb, cuts: Mapping[str, Sequence[Cut]], asked: Pasting, rng: np.random.Generator
+) -> tuple[Rgb, dict[str, tuple[int, int, int, int]]]:
+    """Objects drawn at random, pasted where they hide nothing; and the box of each."""
+    picture = ground.copy()
+    boxes: dict[str, tuple[int, int, int, int]] = {}
+    for name in rng.permutation(sorted(cuts))[: asked.objects].tolist():
+        cut = cuts[name][int(rng.integers(len(cuts[name])))]
+        side = asked.width * rng.uniform(*asked.share)
+        scale = min(side / max(cut.shape[:2]), 0.9 * asked.height / cut.shape[0])
+        size = (max(4, round(cut.shape[1] * scale)), max(4, round(cut.shape[0] * scale)))
+        small = cv2.resize(cut, size, interpolation=cv2.INTER_AREA)
+        light = 1 + rng.uniform(-LIGHT, LIGHT)
+        for _ in range(TRIES):
+            x = int(rng.integers(0, asked.width - size[0] + 1))
+            y = int(rng.integers(0, asked.height - size[1] + 1))
+            box = (x, y, x + size[0], y + size[1])
+            if _is_free(box, list(boxes.values())):
+                _paste(picture, small, box, light)
+                boxes[name] = box
+                break
+    return picture, boxes
+
+
+def absent(
+    present: Sequence[str],
+    known: Sequence[str],
+    categories: Mapping[str, str],
+    rng: np.random.Generator,
+) -> list[str]:
+    """One object that is missing beside its look-alikes, and one of whose kind nothing is there."""
+    kinds = {categories[name] for name in present}
+    beside, alone = [], []
+    for name in sorted(set(known) - set(present)):
+        (beside if categories[name] in kinds else alone).append(name)
+    drawn = []
+    for names in (beside, alone):
+        if names:
+            drawn.append(names[int(rng.integers(len(names)))])
+    return drawn
+
+
+def _sources(photos: Path) -> dict[str, list[Path]]:
+    """The photos of every object, from a folder of folders."""
+    if not photos.is_dir():
+        raise BadPhotoSet(f"paste-photos: {photos} is no folder; put photos into {photos}/OBJECT.")
+    sources = {}
+    for folder in sorted(path for path in photos.iterdir() if path.is_dir()):
+        found = photos_in(folder)
+        if len(found) == 1:
+            raise BadPhotoSet(
+                f"paste-photos: {folder} holds one photo; two are needed, one of them to cut out."
+            )
+        if found:
+            sources[folder.name] = found
+    if not sources:
+        raise BadPhotoSet(
+            f"paste-photos: {photos} holds no folder of photos; put each object's into "
+            f"{photos}/OBJECT."
+        )
+    return sources
+
+
+def _pictures_of(scenes: Path) -> list[Path]:
+    found = photos_in(scenes) if scenes.is_dir() else []
+    if not found:
+        raise BadPhoto(f"paste-photos: {scenes} holds no picture; name a folder of backgrounds.")
+    return found
+
+
+def _copy(photos: Sequence[Path], folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for photo in photos:
+            shutil.copyfile(photo, folder / photo.name)
+    except OSError as error:
+        raise BadOutput(
+            f"paste-photos: {folder} cannot be written ({error.strerror}); choose another folder."
+        ) from error
+
+
+def _largest_part(mask: np.ndarray) -> np.ndarray:
+    """The mask without what is not connected with most of it."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    if count < 2:
+        return mask
+    return labels == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
+
+
+def _cover(rgb: Rgb, asked: Pasting) -> Rgb:
+    """The middle of a photo, scaled so that it fills the picture."""
+    scale = max(asked.width / rgb.shape[1], asked.height / rgb.shape[0])
+    size = (round(rgb.shape[1] * scale), round(rgb.shape[0] * scale))
+    method = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    large = cv2.resize(rgb, size, interpolation=method)
+    x, y = (size[0] - asked.width) // 2, (size[1] - asked.height) // 2
+    return np.ascontiguousarray(large[y : y + asked.height, x : x + asked.width])
+
+
+def _is_free(box: Sequence[int], taken: Sequence[Sequence[int]]) -> bool:
+    if not taken:
+        return True
+    here = np.array([box], np.float32)
+    others = np.array(taken, np.float32)
+    return float(box_cover(here, others).max()) <= TOUCH
+
+
+def _paste(picture: Rgb, cut: Cut, box: Sequence[int], light: float) -> None:
+    x0, y0, x1, y1 = box
+    alpha = cut[..., 3:].astype(np.float32) / 255
+    lit = np.clip(cut[..., :3] * light, 0, 255)
+    below = picture[y0:y1, x0:x1]
+    picture[y0:y1, x0:x1] = np.round(alpha * lit + (1 - alpha) * below).astype(np.uint8)
+
+
+def _write_cuts(path: Path, cuts: Mapping[str, Sequence[Cut]]) -> None:
+    """Every cut on grey, to be looked at."""
+    tiles = []
+    for name, of_object in cuts.items():
+        for cut in of_object:
+            grey = np.full((*cut.shape[:2], 3), 127, np.uint8)
+            _paste(grey, cut, (0, 0, cut.shape[1], cut.shape[0]), 1.0)
+            tiles.append(labelled(fit(grey, 150, 150)[0], [name, ""]))
+    write_picture(path, join_tiles(tiles, columns=10))
