@@ -154,7 +154,7 @@ def test_ground_says_not_in_view_unless_it_is_to_tint_always(
     assert (answer["winner"], answer["instruction"]) == (None, "bring my cup")
     assert answer["likeness"][answer["rejected"]] < answer["threshold"]
     text = vap("ground", turned, *told).stdout
-    assert "mug not in view, likeness" in text
+    assert "mug: not in view, likeness" in text
     assert "--always-tint" in text
     answer = json.loads(vap("ground", turned, *told, "--always-tint", "--json").stdout)
     assert answer["instruction"] == "bring the red cup"

@@ -69,6 +69,24 @@ def test_boxes_hold_what_was_pasted_and_references_were_not_cut(things):
         assert sum(len(boxes) == 0 for boxes in one.boxes.values()) >= 1
 
 
+def test_given_boxes_and_masks_are_taken(things):
+    (things / "things" / "boxes.csv").write_text("photo,x0,y0,x1,y1\nmug/0.png,20,20,44,44\n")
+    mask = np.zeros((64, 64), np.uint8)
+    mask[20:32, 22:34] = 255
+    (things / "things" / "masks" / "mug").mkdir(parents=True)
+    Image.fromarray(mask).save(things / "things" / "masks" / "mug" / "2.png")
+    assert "4 objects" in paste(things, "set")
+    photo_set = read_photo_set(things / "set")
+    (mug,) = (subject for subject in photo_set.subjects if subject.name == "mug")
+    assert mug.photos[0].box is not None
+    assert mug.photos[0].box.tolist() == [20, 20, 44, 44]
+    assert mug.photos[1].box is None
+    Image.fromarray(mask[:30]).save(things / "things" / "masks" / "mug" / "2.png")
+    words = ("--scenes", things / "place", "--stack", "toy")
+    line = refused("paste-photos", things / "things", things / "bad", *words)
+    assert "is not as large as its photo" in line
+
+
 def test_the_same_seed_is_the_same_set_and_no_set_is_written_over(things):
     paste(things, "one")
     paste(things, "two")

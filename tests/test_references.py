@@ -113,6 +113,19 @@ def test_boxes_and_masks_are_read_by_the_photos_name(tmp_path):
         registering.choose(photos, "cup", STACK, outside, whole=False)
 
 
+def test_a_sheet_says_how_every_box_was_chosen(tmp_path):
+    photos = save(tmp_path, [scene([(26, 26, RED)]), scene([(20, 20, RED)])])
+    given = {0: np.array([26, 26, 38, 38], np.float32)}
+    by_hand, proposed = registering.choose(photos, "cup", STACK, given, whole=False)
+    assert registering.describe_choice(by_hand) == "box given by hand"
+    said = registering.describe_choice(proposed)
+    assert said == "box proposed; cosine 1.00 to the other photos"
+    (alone,) = registering.choose(photos[:1], "cup", STACK, {}, whole=False)
+    assert registering.describe_choice(alone) == "box proposed; the only photo"
+    (whole,) = whole_photos([scene([(6, 6, RED)])])
+    assert registering.describe_choice(whole) == "used whole"
+
+
 def test_a_doubtful_crop_stops_it_with_the_photo_the_sheet_and_the_remedy(tmp_path):
     photos = save(tmp_path, [scene([(10, 26, RED), (42, 26, GREEN)])])
     references = registering.choose(photos, "cup", STACK, {}, whole=False)

@@ -237,8 +237,8 @@ def _format_grounding(grounding: Grounding) -> list[str]:
         )
     if grounding.rejected is not None:
         lines.append(
-            f"{grounding.object} {describe_rejection(grounding)} (#{winner}): nothing is "
-            "highlighted; --always-tint highlights it nevertheless"
+            f"{grounding.object}: {describe_rejection(grounding)} (best candidate #{winner}); "
+            "nothing is highlighted. --always-tint highlights it nevertheless"
         )
         return lines
     if len(candidates) == 1:
@@ -247,8 +247,11 @@ def _format_grounding(grounding: Grounding) -> list[str]:
         )
         return lines
     tie = ", tie broken by mean cosine" if ballot.tied[winner] else ""
+    measure = "cosine"
+    if candidates.prior is not None or candidates.proof is not None:
+        measure = "score, which is the cosine and what phrase and points add"
     lines.append(
-        f"winner #{winner}, margin {ballot.margin:.2f} of the votes, "
-        f"{ballot.cosine_margin:.3f} in cosine{tie}"
+        f"winner #{winner}, margin {ballot.margin:.2f} of the votes{tie}, "
+        f"{ballot.cosine_margin:.3f} in {measure}"
     )
     return lines

@@ -106,7 +106,8 @@ def paste_photos(
         Path,
         typer.Argument(
             help="Holds OBJECT/*.jpg, two photos of each object or more, best with a plain "
-            "background; optional objects.csv with object,category."
+            "background; optional objects.csv with object,category, boxes.csv with "
+            "photo,x0,y0,x1,y1, and masks/OBJECT/FILE.png."
         ),
     ],
     out: Annotated[Path, typer.Argument(help="The set's new folder.")],

@@ -113,12 +113,7 @@ def _read_references(folder: Path) -> dict[str, tuple[ReferencePhoto, ...]]:
             f"eval-photos: {root} holds no folder of photos; put each object's photos into "
             "references/OBJECT."
         )
-    boxes: dict[str, Box] = {}
-    if (folder / BOXES_CSV).exists():
-        for line, row in _read_csv(folder / BOXES_CSV, ("photo", *BOX)):
-            box = _parse_box(row, f"{folder / BOXES_CSV} line {line}")
-            if box is not None:
-                boxes[row["photo"]] = box
+    boxes = read_boxes(folder / BOXES_CSV)
     objects = {}
     for path in folders:
         photos = []
@@ -136,6 +131,17 @@ def _read_references(folder: Path) -> dict[str, tuple[ReferencePhoto, ...]]:
             "name photos as OBJECT/FILE."
         )
     return objects
+
+
+def read_boxes(path: Path) -> dict[str, Box]:
+    """The boxes of photos by OBJECT/FILE, none without the table. Raises: BadPhotoSet."""
+    boxes: dict[str, Box] = {}
+    if path.exists():
+        for line, row in _read_csv(path, ("photo", *BOX)):
+            box = _parse_box(row, f"{path} line {line}")
+            if box is not None:
+                boxes[row["photo"]] = box
+    return boxes
 
 
 def _read_scenes(folder: Path, known: Mapping[str, Any]) -> tuple[Scene, ...]:

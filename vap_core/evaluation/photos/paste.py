@@ -1,8 +1,14 @@
 """Makes a photo set in the form of eval-photos: objects cut out of photos, pasted into others.
 
-Of every object five photos or fewer stay whole, as its references. Of the others the stack chooses
-the box as `register` does, and its mask is cut out; doubtful ones are left. Where things are is
-known then, and light, sharpness and edges are not those of one photo.
+    OBJECT/*.jpg           photos of each object, two or more
+    boxes.csv              optional: photo,x0,y0,x1,y1 with the photo as OBJECT/FILE
+    masks/OBJECT/FILE.png  optional: bright on the object, to be cut out along it
+    objects.csv            optional: object,category
+
+Of every object five photos or fewer stay whole, as its references. Of the others, up to three, the
+box is chosen as `register` does where none is given, and the stack's mask is cut out where none is
+given; doubtful ones are left. Where things are is known then, and light, sharpness and edges are
+not those of one photo.
 """
 
 import shutil
@@ -16,8 +22,17 @@ from jaxtyping import UInt8
 from vap_core.base.errors import BadOutput, BadPhoto, BadPhotoSet
 from vap_core.base.files import write_atomic
 from vap_core.base.photos import load_photo, photos_in
-from vap_core.base.types import Boxes, Rgb, value
-from vap_core.evaluation.photos.folder import OBJECTS_CSV, SCENES_CSV, read_categories
+from vap_core.base.types import Boxes, Mask, Rgb, value
+from vap_core.evaluation.photos.folder import (
+    BOX,
+    BOXES_CSV,
+    MASKS,
+    OBJECTS_CSV,
+    SCENES_CSV,
+    Box,
+    read_boxes,
+    read_categories,
+)
 from vap_core.evaluation.photos.measure import judge
 from vap_core.evaluation.photos.pictures import fit, join_tiles, labelled, write_picture
 from vap_core.evaluation.photos.register import choose
@@ -74,30 +89,39 @@ def paste_photos(photos: Path, scenes: Path, out: Path, asked: Pasting, stack: S
         raise BadOutput(f"paste-photos: {out} is there already; choose another folder.")
     sources = _sources(photos)
     categories = read_categories(photos, sources, "paste-photos")
+    boxes = read_boxes(photos / "boxes.csv")
     backgrounds = _pictures_of(scenes)
     cuts: dict[str, list[Cut]] = {}
     left_out = []
+    known = [",".join(("photo", *BOX))]
     for name, paths in sources.items():
         references, rest = split(paths)
-        found = cut_out(paths, len(references), categories[name], stack)
+        given = [boxes.get(f"{name}/{path.name}") for path in paths]
+        masks = [photos / MASKS / name / f"{path.stem}.png" for path in paths]
+        found = cut_out(paths, len(references), categories[name], stack, given, masks)
         if not found:
             left_out.append(f"left out: {name}: none of {len(rest)} photos gives a clean cut")
             continue
         cuts[name] = found
         _copy(references, out / "references" / name)
+        for path, box in zip(references, given, strict=False):
+            if box is not None:
+                known.append(f"{name}/{path.name},{','.join(f'{x:g}' for x in box)}")
     if len(cuts) < 2:
         raise BadPhotoSet(f"paste-photos: {photos} gives fewer than two objects to paste.")
     _write_cuts(out / "cuts.png", cuts)
+    if len(known) > 1:
+        write_atomic(out / BOXES_CSV, ("\n".join(known) + "\n").encode())
     rows = ["scene,object,x0,y0,x1,y1"]
     for number in range(asked.pictures):
         rng = np.random.default_rng([asked.seed, number])
         ground = _cover(load_photo(backgrounds[number % len(backgrounds)], None), asked)
-        picture, boxes = compose(ground, cuts, asked, rng)
+        picture, placed = compose(ground, cuts, asked, rng)
         scene = f"{number:03}.png"
         write_picture(out / "scenes" / scene, picture)
-        for name, box in boxes.items():
-            rows.append(f"{scene},{name},{','.join(map(str, box))}")
-        for name in absent(list(boxes), list(cuts), categories, rng):
+        for name, corners in placed.items():
+            rows.append(f"{scene},{name},{','.join(map(str, corners))}")
+        for name in absent(list(placed), list(cuts), categories, rng):
             rows.append(f"{scene},{name},,,,")
     kinds = [f"{name},{categories[name]}" for name in cuts]
     write_atomic(out / SCENES_CSV, ("\n".join(rows) + "\n").encode())
@@ -112,15 +136,37 @@ def split(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     return list(paths[:count]), list(paths[count : count + MOST_CUT])
 
 
-def cut_out(paths: Sequence[Path], references: int, category: str, stack: Stack) -> list[Cut]:
-    """The object of every photo after the references, with its mask as a fourth channel."""
+def cut_out(
+    paths: Sequence[Path],
+    references: int,
+    category: str,
+    stack: Stack,
+    boxes: Sequence[Box | None],
+    masks: Sequence[Path],
+) -> list[Cut]:
+    """The object of every photo after the references, with its mask as a fourth channel.
+
+    `boxes` and `masks` are those of the photos; where no mask's file exists the stack draws it.
+
+    Raises: BadPhoto.
+    """
     used = paths[: references + MOST_CUT]
+    given = {i: box for i, box in enumerate(boxes[: len(used)]) if box is not None}
+    drawn: dict[int, Mask] = {}
+    for i, path in enumerate(masks[: len(used)]):
+        if path.exists():
+            drawn[i] = load_photo(path, long_side=None).mean(axis=2) > 127
     cuts = []
-    for chosen in choose(used, category, stack, {}, whole=False)[references:]:
-        if chosen.doubt:
+    for i, chosen in enumerate(choose(used, category, stack, given, whole=False)):
+        if i < references or (chosen.doubt and i not in drawn):
             continue
-        boxes = Boxes(chosen.box[None], np.ones(1, np.float32), category)
-        (mask,) = stack.segmenter(chosen.photo, judge(chosen.photo, boxes, stack))
+        box = Boxes(chosen.box[None], np.ones(1, np.float32), category)
+        (mask,) = stack.segmenter(chosen.photo, judge(chosen.photo, box, stack))
+        mask = drawn.get(i, mask)
+        if mask.shape != chosen.photo.shape[:2]:
+            raise BadPhoto(
+                f"paste-photos: the mask {masks[i]} is not as large as its photo; save it so."
+            )
         around = mask_box(_largest_part(mask))
         if around is None:
             continue
@@ -180,7 +226,8 @@ def _sources(photos: Path) -> dict[str, list[Path]]:
     if not photos.is_dir():
         raise BadPhotoSet(f"paste-photos: {photos} is no folder; put photos into {photos}/OBJECT.")
     sources = {}
-    for folder in sorted(path for path in photos.iterdir() if path.is_dir()):
+    folders = [path for path in photos.iterdir() if path.is_dir() and path.name != MASKS]
+    for folder in sorted(folders):
         found = photos_in(folder)
         if len(found) == 1:
             raise BadPhotoSet(

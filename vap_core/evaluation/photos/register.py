@@ -144,9 +144,20 @@ def write_sheet(path: Path, references: Sequence[Reference], photos: Sequence[Pa
         colour = DOUBTFUL if reference.doubt else RIGHT
         draw_box(shown, (scale * reference.box).tolist(), colour, 2)
         crop, _ = fit(reference.crop, TILE_PX, TILE_PX)
-        verdict = reference.doubt or reference.chosen_by
+        verdict = reference.doubt or describe_choice(reference)
         tiles.append(labelled(np.concatenate([shown, crop], axis=1), [photo.name, verdict]))
     write_picture(path, join_tiles(tiles, columns=2))
+
+
+def describe_choice(reference: Reference) -> str:
+    """How a box that is not doubtful was chosen."""
+    if reference.chosen_by == "given":
+        return "box given by hand"
+    if reference.chosen_by == "whole":
+        return "used whole"
+    if np.isnan(reference.agreement):
+        return "box proposed; the only photo"
+    return f"box proposed; cosine {reference.agreement:.2f} to the other photos"
 
 
 def remember_subjects(
