@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,10 @@ FILES = notebook_links.notebook_files(NOTEBOOKS)
 READ = {path: notebook_links.read_notebook(path) for path in FILES}
 TITLES = {path: notebook_links.notebook_title(notebook) for path, notebook in READ.items()}
 LINK = re.compile(r"(?<!!)\[[^\]]+\]\(([^)\s]+)\)")
+INTERVAL = re.compile(r"(-?\d*\.?\d+)(?: %)?(?: points?)? \[(-?\d*\.?\d+), (-?\d*\.?\d+)\]")
+"""A value with its interval: 54 % [44, 64], 7 points [-6, 22], .74 [.52, .94]."""
+ANSWERED_FROM_TABLES = ("05_learned_token.ipynb", "06_attention_maps.ipynb")
+"""The notebooks whose first cell quotes what their cells print."""
 
 
 def markdown(path: Path) -> dict[str, str]:
@@ -72,6 +77,56 @@ def test_a_notebook_leads_to_its_neighbours(path: Path) -> None:
 def test_a_notebook_is_titled_by_its_number() -> None:
     for path, title in TITLES.items():
         assert title.startswith(f"{path.name[:2]} · ")
+
+
+def intervals(text: str) -> dict[str, list[tuple[float, float]]]:
+    """Every value with an interval as it is written: three numbers with half of their last digit."""
+    found = {}
+    for match in INTERVAL.finditer(text):
+        found[match[0]] = []
+        for number in match.groups():
+            digits = len(number.partition(".")[2])
+            found[match[0]].append((float(number), 0.5 * 10**-digits))
+    return found
+
+
+def printed(notebook: dict[str, Any]) -> str:
+    """The text of all outputs."""
+    parts = []
+    for cell in notebook["cells"]:
+        for output in cell.get("outputs", []):
+            parts += output.get("text", [])
+            parts += output.get("data", {}).get("text/plain", [])
+    return "".join(parts)
+
+
+def unprinted(text: str, output: str) -> list[str]:
+    """The values with intervals of a text that no output has, rounded as the text has them."""
+    shown = list(intervals(output).values())
+    missing = []
+    for written, numbers in intervals(text).items():
+        for others in shown:
+            pairs = zip(numbers, others, strict=True)
+            if all(abs(one - other) <= half + 1e-9 for (one, half), (other, _) in pairs):
+                break
+        else:
+            missing.append(written)
+    return missing
+
+
+def test_what_is_quoted_is_compared_as_it_is_rounded() -> None:
+    output = "success 48.4 [38.2, 57.8] 96, less -1.0 points [-9.4, 7.3]"
+    assert unprinted("48 % [38, 58], -1 point [-9, 7]", output) == []
+    assert unprinted("49 % [38, 58], .48 [.38, .58]", output) == ["49 % [38, 58]", ".48 [.38, .58]"]
+
+
+@pytest.mark.parametrize("name", ANSWERED_FROM_TABLES)
+def test_the_first_screen_quotes_what_the_cells_print(name: str) -> None:
+    """Its intervals are written by hand and would stay when the tables change."""
+    notebook = READ[NOTEBOOKS / name]
+    answer = "".join(notebook["cells"][0]["source"])
+    assert len(intervals(answer)) > 5
+    assert unprinted(answer, printed(notebook)) == []
 
 
 def test_links_are_written_once_and_follow_a_new_notebook(tmp_path: Path) -> None:

@@ -77,7 +77,8 @@ def attention(
         out = Path("data/runs") / f"attention-{run.stem}" if table else run / "attention"
     if record:
         path, step = examples.record(run, record, out / "recordings", out / "memory")
-        print(f"wrote {path}\nnext: python -m vap_core show {path} {path.stem}.png --frame {step}")
+        picture = f"{path} {path.stem}.png --attention --frame {step}"
+        print(f"wrote {path}\nnext: python -m vap_core show {picture}")
         return
     wanted = replay.Wanted(
         suites=tuple(names(suite)),

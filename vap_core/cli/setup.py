@@ -364,14 +364,22 @@ def show(
     frame: Annotated[
         int | None, typer.Option(help="Control step to show; default the middle one.")
     ] = None,
+    attention: Annotated[
+        bool,
+        typer.Option("--attention", help="The attention maps of every view and query instead."),
+    ] = False,
 ) -> None:
     """Take a picture of a recording as the viewer shows it, without a display.
 
     Example: python -m vap_core show data/runs/demo/recordings/NAME.rrd shot.png --frame 20
     """
     from vap_core.recording import screenshot
+    from vap_core.recording.attention_picture import attention_screenshot
 
-    screenshot(recording, png, frame_index=frame)
+    if attention:
+        attention_screenshot(recording, png, frame_index=frame)
+    else:
+        screenshot(recording, png, frame_index=frame)
     print(f"wrote {png}")
 
 

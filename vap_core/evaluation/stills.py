@@ -18,6 +18,7 @@ from vap_core.evaluation.study import Study
 KEY = "vap_core"
 """The name of the text chunk in the PNG."""
 NOT_DRAWN = {
+    "attention_picture",
     "browser",
     "catalog",
     "clicks",

@@ -19,6 +19,7 @@ from vap_core.analysis.attention.measures import (
     measure,
     patch_areas,
 )
+from vap_core.analysis.attention.replay import check_policy
 from vap_core.analysis.plots import Tile, sheet
 from vap_core.base.palette import RIGHT_MARK, WRONG_MARK
 from vap_core.base.types import Mask, Rgb
@@ -70,8 +71,10 @@ def run_again(
 ) -> tuple[Episode, list[Frame]]:
     """An episode of a run with the attention observed: the episode, and the frames of its calls.
 
-    `line` names it by suite, task, method, seed and episode. It is recorded in `recording` if one
-    is given.
+    `line` is its row there. It is recorded in `recording` if one is given. Another ending than that
+    of the run is noted.
+
+    Raises: BadStudy, as `check_policy`.
     """
     from vap_core.evaluation.diagnosis import explain
     from vap_core.recording import Recorder
@@ -80,6 +83,7 @@ def run_again(
     row = listed_row(study, line)
     register_personal(study, memory)
     trial = make_trial(study, [row], str(line["method"]), memory)
+    check_policy(trial.policy, str(line["policy"]))
     sinks = []
 
     def observe(header: EpisodeHeader) -> Calls:
@@ -91,6 +95,12 @@ def run_again(
         return sinks[-1]
 
     (episode,) = rollout(replace(trial, attention=QUERIES), [row], observe, batch=1)
+    outcome = episode.outcome
+    if (outcome.status, outcome.steps) != (line["outcome"], line["steps"]):
+        print(
+            f"note: run again, it is a {outcome.status} after {outcome.steps} steps "
+            f"(was {line['outcome']} after {line['steps']})."
+        )
     return episode, sinks[0].frames
 
 

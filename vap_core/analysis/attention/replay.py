@@ -169,16 +169,7 @@ def run_job(job: Job) -> dict[str, Rows]:
     """
     trial = make_trial(job.study, job.rows, job.method, job.memory)
     policy: Any = trial.policy
-    if not getattr(policy, "attends", False):
-        raise BadStudy(
-            f"attention: {policy.label} gives no attention maps, as pi0, pi0.5, mini-pi0 and "
-            "smolvla do on square pictures; choose another run."
-        )
-    if policy.label != job.policy:
-        raise BadStudy(
-            f"attention: this was run with {job.policy}, and {policy.label} is here now; run eval "
-            "again."
-        )
+    check_policy(policy, job.policy)
     explained = {}
     for row, explain in zip(job.rows, job.explained, strict=True):
         explained[row.key, row.seed] = explain
@@ -202,6 +193,19 @@ def run_job(job: Job) -> dict[str, Rows]:
         for name, rows in observer.tables.items():
             found[name] += [{**about, **row} for row in rows]
     return found
+
+
+def check_policy(policy: Any, label: str) -> None:
+    """Raises: BadStudy for a policy without attention maps, or another than the run's `label`."""
+    if not getattr(policy, "attends", False):
+        raise BadStudy(
+            f"attention: {policy.label} gives no attention maps, as pi0, pi0.5, mini-pi0 and "
+            "smolvla do on square pictures; choose another run."
+        )
+    if policy.label != label:
+        raise BadStudy(
+            f"attention: this was run with {label}, and {policy.label} is here now; run eval again."
+        )
 
 
 def _about(episode: Episode) -> dict[str, Any]:
