@@ -211,7 +211,8 @@ def absent(
 ) -> list[str]:
     """One object that is missing beside its look-alikes, and one of whose kind nothing is there."""
     kinds = {categories[name] for name in present}
-    beside, alone = [], []
+    beside: list[str] = []
+    alone: list[str] = []
     for name in sorted(set(known) - set(present)):
         (beside if categories[name] in kinds else alone).append(name)
     drawn = []
