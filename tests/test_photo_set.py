@@ -25,6 +25,7 @@ from vap_core.evaluation.photos.report import (
     single_report,
     vote_rows,
 )
+from vap_core.evaluation.photos.sheet import evidence
 from vap_core.perception.protocols import Stack
 
 RED, GREEN, BLUE, DARK = (250, 0, 0), (0, 250, 0), (0, 0, 250), (120, 10, 0)
@@ -281,6 +282,13 @@ def test_left_out_photos_are_elected_against_two_others():
     text = single_report(confused)
     assert "3 objects" in text
     assert single_rows({"mug": memory["mug"]}, stack) == []
+
+
+def test_a_label_says_why_a_box_is_not_tinted():
+    refused_one = row(tinted=False, iou=0.0, chosen_iou=0.76, likeness=0.44)
+    assert evidence(refused_one) == ", IoU 0.76, likeness 0.44"
+    assert evidence(row(present=False, likeness=0.3)) == ", likeness 0.30"
+    assert evidence(row(likeness=None)) == evidence(row(likeness=float("nan"))) == ""
 
 
 @pytest.mark.parametrize("line", ["mug", "what was found is unlike the other photos (cosine 0.43)"])

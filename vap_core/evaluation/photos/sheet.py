@@ -59,9 +59,20 @@ def _tile(rgb: Rgb, scene: Scene, row: Mapping[str, object]) -> Rgb:
         colour, verdict = _verdict(row)
         elected = np.array([row["x0"], row["y0"], row["x1"], row["y1"]], np.float64)
         draw_box(tile, (scale * elected).tolist(), colour, 2)
-        verdict += f", IoU {row['iou']:.2f}, cosine {row['cosine']:.2f}"
     presence = "in view" if row["present"] else "absent"
-    return labelled(tile, [f"{name} ({presence}) in {scene.name}", verdict])
+    return labelled(tile, [f"{name} ({presence}) in {scene.name}", f"{verdict}{evidence(row)}"])
+
+
+def evidence(row: Mapping[str, object]) -> str:
+    """What a label says of the elected box, tinted or not; "" where none is elected.
+
+    Its overlap with the object, where that is in view, and the likeness that the threshold of "not
+    in view" reads.
+    """
+    if row["likeness"] is None or row["likeness"] != row["likeness"]:
+        return ""
+    overlap = f", IoU {row['chosen_iou']:.2f}" if row["present"] else ""
+    return f"{overlap}, likeness {row['likeness']:.2f}"
 
 
 def _verdict(row: Mapping[str, object]) -> tuple[tuple[int, int, int], str]:
