@@ -202,7 +202,7 @@ def test_a_page_needs_no_network_folds_its_assertions_and_leads_on(tmp_path: Pat
     figure = base64.b64encode((tmp_path / "figures" / "a.png").read_bytes()).decode()
     assert f'<img alt="a" src="data:image/png;base64,{figure}"' in page
     assert not re.findall(r'<img[^>]+src="(?!data:)', page)
-    assert 'alt="00 · A &lt;b&gt;, picture 1"' in page
+    assert 'alt="00 · A, picture 1"' in page
     assert "No description" not in page
     assert page.count('<details class="folded">') == 1
     assert "A control: open the notebook in JupyterLab." in page

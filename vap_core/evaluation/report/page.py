@@ -36,7 +36,7 @@ border-bottom:1px solid #ddd;font-size:13px}th{border-bottom:2px solid #888}
 img{max-width:100%}.failures{display:grid;grid-template-columns:repeat(auto-fill,minmax(320px,1fr));
 gap:14px}.failures article{border:1px solid #ccc;border-radius:6px;padding:8px;font-size:13px}
 .failures img{width:31%;margin-right:1%}code{background:#f2f2f2;padding:1px 4px;font-size:12px}
-h3{font-size:14px;margin:6px 0 2px}
+h3{font-size:14px;margin:6px 0 2px}.wide{overflow-x:auto}
 """
 
 
@@ -178,4 +178,4 @@ def _html_table(rows: Rows) -> str:
         tag = "td" if i else "th"
         cells = "".join(f"<{tag}>{escape(str(cell))}</{tag}>" for cell in row)
         lines.append(f"<tr>{cells}</tr>")
-    return f"<table>{''.join(lines)}</table>"
+    return f"<div class='wide'><table>{''.join(lines)}</table></div>"
