@@ -291,8 +291,7 @@ def rates_figure(
         axes.set(title=title, ylim=(0, 105))
         axes.spines[["top", "right"]].set_visible(False)
     all_axes[0].set_ylabel(label)
-    if groups_label:
-        figure.supxlabel(groups_label, fontsize=10)
+    all_axes[len(all_axes) // 2].set_xlabel(groups_label)
     figure.legend(
         handles=list(drawn.values()),
         labels=list(drawn),

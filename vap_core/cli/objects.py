@@ -427,7 +427,7 @@ def photograph(
 ) -> None:
     """Take reference photos of an object, as one walks around it.
 
-    Example: python -m vap_core objects photograph cup-personal
+    Example: python -m vap_core objects photograph camera-personal --out data/photos/camera
     """
     from vap_core.simulation.assets.objects import get_object
     from vap_core.simulation.studio import write_views

@@ -48,6 +48,7 @@ def conclude(study: "Study", table: "pd.DataFrame", folder: Path) -> str:
     ]
     if table["outcome"].eq("failure").any():
         text.append(f"why they failed: python -m vap_core diagnose {folder}")
+    text.append(f"tables, paired tests, a page: python -m vap_core report {folder}")
     return "\n".join(text)
 
 
