@@ -243,7 +243,7 @@ def _format_grounding(grounding: Grounding) -> list[str]:
         return lines
     if len(candidates) == 1:
         lines.append(
-            f"winner #{winner}, the only candidate: no margin; its cosine alone says how alike it is"
+            f"winner #{winner}, the only candidate: no margin; only its cosine says how alike it is"
         )
         return lines
     tie = ", tie broken by mean cosine" if ballot.tied[winner] else ""
