@@ -23,7 +23,12 @@ from vap_core.analysis.ablations import (
     sweep_figure,
 )
 from vap_core.analysis.agreements import gate_figure, gated_cases
-from vap_core.analysis.prompt_forms import forms_figure, marked_frames
+from vap_core.analysis.prompt_forms import (
+    forms_figure,
+    marked_frames,
+    tinted_frames,
+    tints_figure,
+)
 from vap_core.attend import Prompting
 from vap_core.base.types import Camera
 from vap_core.evaluation import hiding, paper
@@ -401,6 +406,23 @@ def test_every_form_is_shown_on_one_frame() -> None:
     assert len(
         forms_figure(suites.rows("simpler-bridge", "put-camera", n=1)[0]).axes[0].images
     ) == len(frames)
+
+
+def test_the_chosen_tint_is_none_that_a_red_look_alike_has() -> None:
+    (plain, row) = (
+        suites.rows(name, "put-camera", n=1)[0] for name in ("simpler-bridge", "simpler-bridge-red")
+    )
+    frames = tinted_frames(row)
+    unmarked, chosen, always = frames
+    assert (unmarked, always) == ("no tint", f"always: {RED.name}")
+    assert chosen.startswith("chosen: ")
+    assert RED.name not in chosen
+    assert len({frame.tobytes() for frame in frames.values()}) == 3
+    red_share = {label: has_colour(frame, RED).mean() for label, frame in frames.items()}
+    assert red_share["no tint"] > 0.01, "the look-alike is red by nature"
+    assert red_share[always] > red_share["no tint"]
+    assert f"chosen: {RED.name}" in tinted_frames(plain), "nothing is red there"
+    assert len(tints_figure(row).axes[0].images) == 3
 
 
 def test_views_agree_only_where_the_margin_is_large_enough() -> None:

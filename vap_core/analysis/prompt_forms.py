@@ -1,6 +1,9 @@
-"""One opening frame with every form of a prompt, as the policy sees it with the true masks.
+"""One opening frame with every form of a prompt, or two tints, as the policy sees it.
+
+Masks are the true ones.
 
 forms_figure(episode("simpler-bridge", "put-camera", 0))
+tints_figure(episode("simpler-bridge-red", "put-camera", 0))
 """
 
 from collections.abc import Mapping
@@ -14,7 +17,7 @@ from vap_core.evaluation.ablations.arms import ABLATIONS, DEFAULT
 from vap_core.evaluation.ablations.arrow import hand_pixel, pose_transform
 from vap_core.evaluation.ablations.forms import draw_arrow
 from vap_core.perception.boxes import mask_box
-from vap_core.prompt import PALETTE, Tint
+from vap_core.prompt import PALETTE, Tint, choose_colours
 from vap_core.simulation import robots
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import suite
@@ -59,6 +62,33 @@ def forms_figure(row: EpisodeRow) -> "Figure":
     tiles = [Tile(frame, arm) for arm, frame in marked_frames(row).items()]
     half = -(-len(tiles) // 2)
     return sheet({"": tiles[:half], " ": tiles[half:]}, side_in=1.15, label_in=0.05)
+
+
+def tinted_frames(row: EpisodeRow) -> dict[str, Rgb]:
+    """The first camera's opening frame without a tint, with the one chosen for it, and with red.
+
+    Each has its tint as key; the frames are cut to the objects alike.
+    """
+    with open_row(row) as env:
+        camera = env.cameras()[0].name
+        rgb = env.observe().images[camera]
+        masks = env.truth(masks=True).masks[camera]
+    target = masks[row.target]
+    others = _alike(row, masks)
+    (chosen,) = choose_colours(1, [(rgb, [target, *others])])
+    rows, columns = _cut(target, others)
+    frames = {"no tint": rgb}
+    for label, colour in (("chosen", chosen), ("always", COLOUR)):
+        frames[f"{label}: {colour.name}"] = Tint()(rgb, target, colour, others)
+    return {label: frame[rows, columns] for label, frame in frames.items()}
+
+
+def tints_figure(row: EpisodeRow) -> "Figure":
+    """A sheet of `tinted_frames`, each with its tint."""
+    from vap_core.analysis.plots import Tile, sheet
+
+    tiles = [Tile(frame, label) for label, frame in tinted_frames(row).items()]
+    return sheet({"": tiles}, side_in=1.6, label_in=0.05)
 
 
 def _alike(row: EpisodeRow, masks: Mapping[str, Mask]) -> list[Mask]:
