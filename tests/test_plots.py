@@ -91,12 +91,13 @@ def test_the_number_of_a_box_at_the_top_stays_inside_the_picture() -> None:
 
 
 def test_what_a_sheet_says_is_dark_and_beside_its_picture() -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.colors import to_rgb
 
     tiles = [Tile(LINE, "easy, 6", "#a5cde8"), Tile(LINE, "one\ntwo\nthree\nfour")]
     figure = sheet({"cup": tiles}, side_in=1.0, label_in=0.5)
     (axes,) = figure.axes
-    figure.canvas.draw()
+    FigureCanvasAgg(figure).draw()
     said = [text for text in axes.texts if text.get_text() != "cup"]
     assert all(max(to_rgb(text.get_color())) < 0.35 for text in said)
     boxes = [text.get_window_extent() for text in said]
@@ -214,11 +215,13 @@ def test_learning_has_a_panel_per_figure_and_a_line_per_training_that_logged_it(
 
 
 def test_rates_are_bars_as_high_as_they_are_with_their_intervals() -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     half, all_ = rate(2, 4), rate(4, 4)
     panels = {"suite": {"tinted": {"succeeds": half, "touches": all_}, "plain": {"succeeds": all_}}}
     figure = rates_figure(panels, "%", "instruction")
     (axes,) = figure.axes
-    figure.canvas.draw()
+    FigureCanvasAgg(figure).draw()
     (legend,) = figure.legends
     assert axes.get_xlabel() == "instruction"
     assert axes.xaxis.label.get_window_extent().y0 >= legend.get_window_extent().y1, "no overlap"
