@@ -133,3 +133,13 @@ def test_a_film_of_a_sequence_has_a_row_a_step(tmp_path):
     episode = shared_films.run_episode(SUITE, "put-cameras", 0, bank=tmp_path, policy="scripted")
     figure = shared_films.steps_figure(episode, "front")
     assert len(figure.axes) == shared_films.PICTURES * len(episode.subgoals)
+
+
+def test_a_policy_that_was_taught_pairs_is_named_apart_from_the_benchmarks_own():
+    names = [
+        "mini_pi0:mini-pi0-tabletop@f212e7e5",
+        "mini_pi0:mini-pi0-shared-pair@e1a98faf",
+        "scripted",
+        "expert",
+    ]
+    assert [shared_scenes._policy_name(name) for name in names] == list(shared_scenes.POLICY_ORDER)

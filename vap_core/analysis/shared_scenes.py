@@ -19,6 +19,7 @@ from vap_core.evaluation.metrics import Rate, rate
 from vap_core.evaluation.parsers.paraphrases import KINDS
 from vap_core.evaluation.publish import read_runs
 from vap_core.evaluation.statistics import bootstrap_interval
+from vap_core.policies.names import MINI
 from vap_core.simulation import suites
 from vap_core.simulation.suites import shared
 from vap_core.training.recipe import FILMED
@@ -41,7 +42,9 @@ PAPER_PAIRS = {
 """The paper's instruction for each of our pairs; its plushie is our plant."""
 GROUP = ["suite", "policy", "method"]
 SUITE_ORDER = (*SEQUENCES, PAIR)
-POLICY_ORDER = ("mini-pi0", "scripted", "expert")
+TAUGHT = "mini-pi0, taught pairs"
+"""Short for tabletop's policy after `train policy --suite shared-pair`."""
+POLICY_ORDER = ("mini-pi0", TAUGHT, "scripted", "expert")
 
 
 def shared_episodes(path: Path) -> "pd.DataFrame":
@@ -302,5 +305,8 @@ def _task_order() -> dict[str, int]:
 
 
 def _policy_name(policy: str) -> str:
-    name = policy.partition(":")[0].replace("_", "-")
-    return "mini-pi0" if name.startswith("mini-pi0") else name
+    kind, _, checkpoint = policy.partition(":")
+    name = kind.replace("_", "-")
+    if checkpoint.startswith(f"{MINI}-{PAIR}"):
+        return TAUGHT
+    return MINI if name.startswith(MINI) else name
