@@ -14,6 +14,7 @@ from vap_core.policies.mini_pi0.learned_token import (
     WORD,
     Photos,
     TokenTraining,
+    answers,
     augment,
     learn,
 )
@@ -100,6 +101,17 @@ def test_what_cannot_be_told_apart_is_not_learned(vlm: MiniVlm) -> None:
         TokenTraining(epochs=4, augmentations=2),
     )
     assert token.accuracy < 0.85
+
+
+def test_crops_of_different_sizes_are_asked_about_together_as_each_alone(vlm: MiniVlm) -> None:
+    """Two cameras see an object at two sizes."""
+    rng = np.random.default_rng(4)
+    crops = [rng.integers(0, 256, (side, side, 3)).astype(np.uint8) for side in (50, 90, 64)]
+    embedding = rng.normal(size=vlm.config.width).astype(np.float32)
+    together = answers(vlm, embedding, crops)
+    alone = [answers(vlm, embedding, [crop])[0] for crop in crops]
+    assert np.allclose(together, alone, atol=1e-5)
+    assert len(set(np.round(together, 4))) > 1
 
 
 def test_photos_of_both_kinds_are_needed(vlm: MiniVlm) -> None:

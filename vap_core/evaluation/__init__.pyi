@@ -3,6 +3,7 @@ from . import paper as paper
 from .diagnosis import explain as explain
 from .diagnosis.failures import list_failures as list_failures
 from .diagnosis.recordings import save_screenshot as save_screenshot
+from .hiding import hiding_lines as hiding_lines
 from .perception.estimates import share as share
 from .report.cells import percent_interval as percent_interval
 from .report.failures import breakdown as breakdown
@@ -18,3 +19,4 @@ from .report.runs import load_runs as load_runs
 from .statistics import ALL_TASKS as ALL_TASKS
 from .statistics import compare as compare
 from .stills import write_provenance as write_provenance
+from .switching import switching_lines as switching_lines

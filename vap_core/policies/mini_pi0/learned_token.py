@@ -241,8 +241,13 @@ def _train(
 
 
 def _tensor(images: Sequence[Rgb], side: int) -> "torch.Tensor":
-    """Images with values in 0..1, B x 3 x side x side."""
+    """Images, of any sizes, with values in 0..1: B x 3 x side x side."""
     import torch
 
-    tensor = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).float() / 255
-    return torch.nn.functional.interpolate(tensor, (side, side), mode="bilinear", antialias=True)
+    resized = []
+    for image in images:
+        tensor = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
+        resized.append(
+            torch.nn.functional.interpolate(tensor, (side, side), mode="bilinear", antialias=True)
+        )
+    return torch.cat(resized)
