@@ -3,6 +3,11 @@
 from collections.abc import Iterable
 
 
+def first_line(error: BaseException) -> str:
+    """The first line of an error's text, "" where it has none."""
+    return (str(error).strip().splitlines() or [""])[0]
+
+
 class VapError(Exception):
     """Base of every error that the user can remedy; the command line prints it and exits with 2."""
 

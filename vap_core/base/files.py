@@ -1,6 +1,7 @@
 """Files that are complete or absent, and where the files that ship with the package are."""
 
 import errno
+import hashlib
 import json
 import os
 import shutil
@@ -111,3 +112,9 @@ def parse_json(text: str | bytes) -> Any:
         return json.loads(text)
     except RecursionError as error:
         raise ValueError("JSON that is nested too deep") from error
+
+
+def sha256_of(path: Path) -> str:
+    """The SHA-256 of a file, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

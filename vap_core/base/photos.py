@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from vap_core.base.errors import BadPhoto
-from vap_core.base.types import Rgb
+from vap_core.base.types import Mask, Rgb
 
 PICTURE_FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "GIF", "TIFF", "AVIF")
 """What Pillow may open of files from outside.
@@ -23,6 +23,8 @@ PICTURE_SUFFIXES = (
 MAX_PIXELS = 50_000_000
 MAX_BYTES = 200_000_000
 LONG_SIDE = 1024
+BRIGHT = 127
+"""Mean of the channels above which a pixel of a mask's picture belongs to the object."""
 
 
 def load_photo(path: Path | str, long_side: int | None = LONG_SIDE) -> Rgb:
@@ -66,6 +68,11 @@ def load_photo(path: Path | str, long_side: int | None = LONG_SIDE) -> Rgb:
             f"load_photo: {path} cannot be read as an image ({error!s:.150}); export it as JPEG or "
             "PNG."
         ) from error
+
+
+def load_mask(path: Path | str) -> Mask:
+    """A mask from a picture that is bright on the object, in its own size. Raises: BadPhoto."""
+    return load_photo(path, long_side=None).mean(axis=2) > BRIGHT
 
 
 def photos_in(folder: Path) -> list[Path]:

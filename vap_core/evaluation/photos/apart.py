@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from vap_core.base.errors import BadPhotoSet
-from vap_core.base.photos import load_photo
+from vap_core.base.photos import load_mask, load_photo
 from vap_core.base.types import Boxes, PersonalObject
 from vap_core.evaluation.photos.folder import Scene
 from vap_core.evaluation.photos.measure import judge
@@ -37,7 +37,7 @@ def mask_rows(scene: Scene, stack: Stack) -> list[Row]:
     found = stack.segmenter(rgb, judge(rgb, boxes, stack))
     rows: list[Row] = []
     for name, mask in zip(names, found, strict=True):
-        truth = load_photo(scene.masks[name], long_side=None).mean(axis=2) > 127
+        truth = load_mask(scene.masks[name])
         if truth.shape != mask.shape:
             raise BadPhotoSet(
                 f"eval-photos: the mask {scene.masks[name]} has "

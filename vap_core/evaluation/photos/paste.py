@@ -21,7 +21,7 @@ from jaxtyping import UInt8
 
 from vap_core.base.errors import BadOutput, BadPhoto, BadPhotoSet
 from vap_core.base.files import write_atomic
-from vap_core.base.photos import load_photo, photos_in
+from vap_core.base.photos import load_mask, load_photo, photos_in
 from vap_core.base.types import Boxes, Mask, Rgb, value
 from vap_core.evaluation.photos.folder import (
     BOX,
@@ -37,6 +37,7 @@ from vap_core.evaluation.photos.measure import judge
 from vap_core.evaluation.photos.pictures import fit, join_tiles, labelled, write_picture
 from vap_core.evaluation.photos.register import choose
 from vap_core.perception.boxes import box_cover, mask_box
+from vap_core.perception.embedded.tracker.components import largest_component
 from vap_core.perception.protocols import Stack
 
 MOST_REFERENCES, MOST_CUT = 5, 3
@@ -155,23 +156,26 @@ def cut_out(
     drawn: dict[int, Mask] = {}
     for i, path in enumerate(masks[: len(used)]):
         if path.exists():
-            drawn[i] = load_photo(path, long_side=None).mean(axis=2) > 127
+            drawn[i] = load_mask(path)
     cuts = []
     for i, chosen in enumerate(choose(used, category, stack, given, whole=False)):
         if i < references or (chosen.doubt and i not in drawn):
             continue
-        box = Boxes(chosen.box[None], np.ones(1, np.float32), category)
-        (mask,) = stack.segmenter(chosen.photo, judge(chosen.photo, box, stack))
-        mask = drawn.get(i, mask)
+        if i in drawn:
+            mask = drawn[i]
+        else:
+            box = Boxes(chosen.box[None], np.ones(1, np.float32), category)
+            (mask,) = stack.segmenter(chosen.photo, judge(chosen.photo, box, stack))
         if mask.shape != chosen.photo.shape[:2]:
             raise BadPhoto(
                 f"paste-photos: the mask {masks[i]} is not as large as its photo; save it so."
             )
-        around = mask_box(_largest_part(mask))
-        if around is None:
+        part = largest_component(mask, np.ones(mask.shape, np.float32))
+        around = None if part is None else mask_box(part)
+        if part is None or around is None:
             continue
         x0, y0, x1, y1 = around.astype(int).tolist()
-        inside = _largest_part(mask)[y0:y1, x0:x1]
+        inside = part[y0:y1, x0:x1]
         if inside.mean() < LEAST_SHARE:
             continue
         alpha = cv2.GaussianBlur(255 * inside.astype(np.uint8), (3, 3), 0)
@@ -260,14 +264,6 @@ def _copy(photos: Sequence[Path], folder: Path) -> None:
         raise BadOutput(
             f"paste-photos: {folder} cannot be written ({error.strerror}); choose another folder."
         ) from error
-
-
-def _largest_part(mask: np.ndarray) -> np.ndarray:
-    """The mask without what is not connected with most of it."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
-    if count < 2:
-        return mask
-    return labels == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
 
 
 def _cover(rgb: Rgb, asked: Pasting) -> Rgb:

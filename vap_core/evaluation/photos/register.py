@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from vap_core.base.errors import BadPhoto, BadPhotoSet
-from vap_core.base.photos import load_photo, photos_in
+from vap_core.base.photos import load_mask, load_photo, photos_in
 from vap_core.base.types import PersonalObject, Rgb
 from vap_core.base.video import is_video, sharp_frames
 from vap_core.evaluation.photos.folder import Subject
@@ -76,7 +76,7 @@ def parse_given(
         given[number] = _parse_box(text, words)
     for text in masks:
         number, words = _split(text, photos, "--mask", "MASK.png")
-        box = mask_box(load_photo(words, long_side=None).mean(axis=2) > 127)
+        box = mask_box(load_mask(words))
         if box is None:
             raise BadPhoto(f"register: the mask {words} is dark all over; paint the object white.")
         given[number] = box

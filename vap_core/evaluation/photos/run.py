@@ -49,8 +49,13 @@ def measure_photos(
         stack = load_stack(stack_name)
         if photo_set.subjects:
             memory = remember_subjects(photo_set.subjects, stack, out / "memory")
+            attender = Attender(stack, memory)
             table = _of_scenes(
-                photo_set, out, "", progress, _questions(photo_set, Attender(stack, memory))
+                photo_set,
+                out,
+                "",
+                progress,
+                lambda scene: measure_scene(scene, photo_set, memory, attender),
             )
             single = pd.DataFrame(single_rows(memory, stack))
             written += write_table(table, out, TABLE)
@@ -85,11 +90,6 @@ def _configuration(photo_set: PhotoSet, stack_name: str) -> dict[str, object]:
         "version": __version__,
         "weights": weights_sha256(),
     }
-
-
-def _questions(photo_set: PhotoSet, attender: Attender) -> Callable[[Scene], list[Row]]:
-    """What measures one scene."""
-    return lambda scene: measure_scene(scene, photo_set, attender.memory, attender)
 
 
 def _of_scenes(

@@ -11,12 +11,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from vap_core.base.errors import MissingWeights
+from vap_core.base.files import sha256_of
 from vap_core.perception.foundation.sources import MODELS, TENSORS, Source
 from vap_core.perception.foundation.store import (
     LOCK,
     VARIABLE,
     find_problem,
-    sha256_of,
     write_lock,
 )
 

@@ -5,7 +5,6 @@ the SHA-256 of every file. The tensors' SHA-256 is pinned in `sources`; the smal
 from the pinned revision when they are pulled.
 """
 
-import hashlib
 import json
 import os
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from itertools import chain
 from pathlib import Path
 
 from vap_core.base.errors import MissingWeights
-from vap_core.base.files import kept_folder, parse_json, read_file, write_atomic
+from vap_core.base.files import kept_folder, parse_json, read_file, sha256_of, write_atomic
 from vap_core.perception.foundation.sources import KINDS, MODELS, PARTS, TENSORS, Source, models_of
 
 STORE = kept_folder("weights-hub")
@@ -133,8 +132,3 @@ def write_lock(folder: Path, source: Source, digests: dict[str, str]) -> None:
         revision = source.revision
     about = {"repo": source.repo, "revision": revision, "sha256": digests}
     write_atomic(folder / LOCK, (json.dumps(about, indent=1) + "\n").encode())
-
-
-def sha256_of(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

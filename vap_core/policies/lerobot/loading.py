@@ -15,7 +15,7 @@ from unittest.mock import patch
 import torch
 
 from vap_core.base.device import device_name
-from vap_core.base.errors import BadPolicy
+from vap_core.base.errors import BadPolicy, first_line
 from vap_core.policies.lerobot.checkpoints import WEIGHTS, base_models, refuse_code
 
 if TYPE_CHECKING:
@@ -35,11 +35,10 @@ def build(folder: Path, device: str | None) -> tuple["PreTrainedPolicy", Any, An
     try:
         policy, preprocessor, postprocessor = _build(folder, device)
     except Exception as error:
-        reason = str(error).strip().splitlines() or [""]
         remedy = _remedy(folder, error)
         raise BadPolicy(
             f"load: {folder} cannot become a policy "
-            f"({type(error).__name__}: {reason[0]:.200}); {remedy}."
+            f"({type(error).__name__}: {first_line(error):.200}); {remedy}."
         ) from error
     with _silence():
         compare(policy, folder / WEIGHTS)

@@ -27,6 +27,7 @@ from unittest.mock import patch
 import torch
 from torch.nn.modules import module as torch_module
 
+from vap_core.base.errors import first_line
 from vap_core.policies.hooks import attention_observed, inputs_observed
 
 if TYPE_CHECKING:
@@ -118,7 +119,7 @@ class ChunkPredictor:
             graph = _trace(self.policy, inputs)
             of_others = _call(self.policy, others)
         except Exception as error:
-            self.stay_eager(f"tracing failed ({type(error).__name__}: {_first_line(error)})")
+            self.stay_eager(f"tracing failed ({type(error).__name__}: {first_line(error)})")
             return
         difference = _difference(graph, inputs, chunks) or _difference(graph, others, of_others)
         if difference:
@@ -154,7 +155,7 @@ def _difference(graph: Graph, inputs: Inputs, chunks: torch.Tensor) -> str:
         with torch.jit.optimized_execution(False):
             traced = graph(inputs)
     except RuntimeError as error:
-        return f"the graph failed ({_first_line(error)})"
+        return f"the graph failed ({first_line(error)})"
     if torch.equal(traced, chunks):
         return ""
     return "the graph gives other actions"
@@ -188,7 +189,3 @@ def _shorter_text(inputs: Inputs) -> Inputs:
         else:
             others[name] = part.flip(-1)
     return others
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [""])[0]

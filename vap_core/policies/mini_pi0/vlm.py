@@ -14,7 +14,7 @@ from lerobot.configs import PreTrainedConfig
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from vap_core.base.errors import BadPolicy
+from vap_core.base.errors import BadPolicy, first_line
 from vap_core.base.files import write_atomic
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniTowers
@@ -150,10 +150,9 @@ def load_vlm(folder: Path) -> MiniVlm:
         vlm = MiniVlm(cast(MiniPI0Config, config))
         vlm.towers.load_state_dict(load_file(folder / WEIGHTS))
     except Exception as error:
-        reason = (str(error).strip().splitlines() or [""])[0]
         raise BadPolicy(
-            f"load_vlm: {folder} is damaged ({type(error).__name__}: {reason:.150}); run: "
-            "python -m vap_core train vlm"
+            f"load_vlm: {folder} is damaged ({type(error).__name__}: {first_line(error):.150}); "
+            "run: python -m vap_core train vlm"
         ) from error
     return vlm.eval().requires_grad_(False)
 
@@ -175,10 +174,9 @@ def load_from_policy(folder: Path) -> MiniVlm:
                 weights[name.removeprefix(IN_POLICY)] = tensor
         vlm.towers.paligemma.load_state_dict(weights)
     except Exception as error:
-        reason = (str(error).strip().splitlines() or [""])[0]
         raise BadPolicy(
-            f"load_from_policy: {folder} is no mini-pi0 ({type(error).__name__}: {reason:.120}); "
-            "leave soft-own out, or give one: python -m vap_core train policy"
+            f"load_from_policy: {folder} is no mini-pi0 ({type(error).__name__}: "
+            f"{first_line(error):.120}); leave soft-own out, or give one: python -m vap_core train policy"
         ) from error
     return vlm.eval().requires_grad_(False)
 

@@ -77,9 +77,7 @@ def command(film: Film, t: int, recipe: Recipe, known: Known, rng: np.random.Gen
     """Step t of a film, which has a picture, with a command that its action answers."""
     task = filmed_task(recipe.suite, film.task)
     pairs = FILMED[recipe.suite].pairs
-    things = [i for i in range(len(film.names)) if i != film.goal]
-    if pairs:
-        things.append(film.goal)
+    things = nameable(film, recipe.suite)
     names = [film.names[i] for i in things]
     looks = [known.captions[name] for name in names]
     length: Literal["short", "long"] = "long" if rng.random() < 0.5 else "short"
@@ -135,6 +133,14 @@ def command(film: Film, t: int, recipe: Recipe, known: Known, rng: np.random.Gen
         colouring=colouring,
         embedding=embedding,
     )
+
+
+def nameable(film: Film, suite_name: str) -> list[int]:
+    """The numbers of what a command may name: the target, its rivals, and last a pair's goal."""
+    things = [i for i in range(len(film.names)) if i != film.goal]
+    if FILMED[suite_name].pairs:
+        things.append(film.goal)
+    return things
 
 
 def near(film: Film, t: int, suite_name: str, rivals: Sequence[int]) -> bool:

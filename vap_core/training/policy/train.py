@@ -7,7 +7,6 @@ objects, learned words for some of them, and the policy. Each is kept, so that t
 on where it was interrupted, at whatever moment.
 """
 
-import hashlib
 import json
 import os
 from collections.abc import Sequence
@@ -21,8 +20,8 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from vap_core.base.errors import BadOutput, BadPolicy
-from vap_core.base.files import parse_json, write_atomic
+from vap_core.base.errors import BadOutput, BadPolicy, first_line
+from vap_core.base.files import parse_json, sha256_of, write_atomic
 from vap_core.base.version import code_version
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
@@ -36,10 +35,10 @@ from vap_core.training.films.demonstrations import SIDE, Film, cached, cost_s
 from vap_core.training.films.scenes import CACHE, only_generic
 from vap_core.training.patches import model_options
 from vap_core.training.policy.batches import Frames, statistics
-from vap_core.training.policy.commands import Known
+from vap_core.training.policy.commands import Known, nameable
 from vap_core.training.policy.losses import Learner, embedding_cosine, losses
 from vap_core.training.policy.taught import learn_words
-from vap_core.training.recipe import FILMED, Recipe, filmed_tasks
+from vap_core.training.recipe import Recipe, filmed_tasks
 from vap_core.training.step import Figures, Schedule, average_of, train_steps
 
 FILMS = "films"
@@ -168,7 +167,7 @@ def train(
         config = learner.policy.config
         made_of["start"] = {
             "name": recipe.start,
-            "sha256": hashlib.sha256((start / "model.safetensors").read_bytes()).hexdigest(),
+            "sha256": sha256_of(start / "model.safetensors"),
         }
     else:
         stats = statistics(films.train)
@@ -273,10 +272,10 @@ def _go_on_from(folder: Path) -> tuple[Learner, dict[str, dict[str, Tensor]]]:
         for name in ("observation.state", "action"):
             stats[name] = {part: kept[f"{name}.{part}"] for part in ("mean", "std")}
     except Exception as error:
-        reason = (str(error).strip().splitlines() or [""])[0]
         raise BadPolicy(
             f"train policy: {folder} is no mini-pi0 to go on from ({type(error).__name__}: "
-            f"{reason:.120}); get the repository's data/policies again: git checkout data/policies"
+            f"{first_line(error):.120}); get the repository's data/policies again: "
+            "git checkout data/policies"
         ) from error
     return learner, stats
 
@@ -289,12 +288,10 @@ def _prepare_words(
     cost_cpu_s: dict[str, float],
 ) -> tuple[Known, dict[str, Any]]:
     """What can be said of the films' objects, and about the learned words; adds to the cost."""
-    pairs = FILMED[recipe.suite].pairs
     names: dict[str, None] = {}
     for film in films.all:
-        for i, name in enumerate(film.names):
-            if i != film.goal or pairs:
-                names[name] = None
+        for i in nameable(film, recipe.suite):
+            names[film.names[i]] = None
     described, cost_cpu_s["captions"] = captions(names, out / "captions.json")
     if teacher is None or not recipe.taught:
         return Known(described), {}
@@ -342,7 +339,6 @@ def _require_trainable(recipe: Recipe, films: Sequence[Film]) -> None:
                 f"train policy: the films show {film.task}, whose category {recipe.suite} holds "
                 "out; film them again: python -m vap_core train demonstrations."
             )
-        for i, name in enumerate(film.names):
-            if i != film.goal or FILMED[recipe.suite].pairs:
-                models.append(get_object(name))
+        for i in nameable(film, recipe.suite):
+            models.append(get_object(film.names[i]))
     only_generic(models)
