@@ -176,7 +176,8 @@ def load_from_policy(folder: Path) -> MiniVlm:
     except Exception as error:
         raise BadPolicy(
             f"load_from_policy: {folder} is no mini-pi0 ({type(error).__name__}: "
-            f"{first_line(error):.120}); leave soft-own out, or give one: python -m vap_core train policy"
+            f"{first_line(error):.120}); leave soft-own out, or give one: "
+            "python -m vap_core train policy"
         ) from error
     return vlm.eval().requires_grad_(False)
 
