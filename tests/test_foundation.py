@@ -6,7 +6,6 @@ the right way out is, against transformers' own image predictor, video session a
 
 import ast
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 
 import cv2
@@ -30,7 +29,7 @@ from vap_core.contracts import test_detector, test_encoder, test_segmenter, test
 from vap_core.contracts.given import RenderedScene
 from vap_core.perception import foundation
 from vap_core.perception.boxes import MAX_BOXES, NMS_IOU, box_iou
-from vap_core.perception.foundation import architectures, runtime, sources, store
+from vap_core.perception.foundation import architectures, random_weights, runtime, sources, store
 from vap_core.perception.foundation import detector as grounding
 from vap_core.perception.foundation import encoder as dino
 from vap_core.perception.foundation import segmenter as sam
@@ -361,22 +360,26 @@ def test_encoding_in_batches_changes_nothing_but_last_bits(parts: Stack) -> None
 
 
 def session(
-    model: torch.nn.Module, frames: list[Rgb], masks: np.ndarray
+    ours: sam.Sam, frames: list[Rgb], masks: np.ndarray
 ) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
     """transformers' own streaming session: every frame's mask logits and presence logits; it keeps all frames."""
-    from transformers.models.sam2_video.modeling_sam2_video import Sam2VideoInferenceSession
+    import transformers
 
-    ours = Sam2VideoInferenceSession(
+    kind = type(ours.model).__name__.replace("Model", "InferenceSession")
+    theirs = getattr(transformers, kind)(
         video_height=masks.shape[1], video_width=masks.shape[2], dtype=torch.float32
     )
     for i, mask in enumerate(masks):
         given = F.interpolate(
-            torch.from_numpy(mask)[None, None].float(), (128, 128), mode="bilinear", antialias=True
+            torch.from_numpy(mask)[None, None].float(),
+            (ours.side, ours.side),
+            mode="bilinear",
+            antialias=True,
         )
-        ours.add_mask_inputs(ours.obj_id_to_idx(i), 0, (given >= 0.5).float())
-    ours.obj_with_new_inputs = list(range(len(masks)))
+        theirs.add_mask_inputs(theirs.obj_id_to_idx(i), 0, (given >= 0.5).float())
+    theirs.obj_with_new_inputs = list(range(len(masks)))
     for frame in frames:
-        out = model(ours, frame=sam.to_model(frame, 128, torch.device("cpu")))
+        out = ours.model(theirs, frame=ours.pixels(frame))
         yield out.pred_masks.clone(), out.object_score_logits.flatten().clone()
 
 
@@ -388,7 +391,7 @@ def test_tracks_are_those_of_transformers_video_session(parts: Stack, scene: Pai
     other = blurred(8, 100, 60)
     states = parts.tracker.start([frames[0], other], [masks, np.ones((1, 100, 60), bool)])
     seen, sizes = set(), []
-    for k, (logits, presence) in enumerate(session(parts.tracker.sam.model, frames, masks)):
+    for k, (logits, presence) in enumerate(session(parts.tracker.sam, frames, masks)):
         if k == 0:
             continue
         states, (tracks, _) = parts.tracker.step(states, [frames[k], np.roll(other, k, axis=0)])
@@ -572,26 +575,21 @@ def test_without_weights_both_ways_to_get_them_are_named(
 
 
 def test_weights_of_another_architecture_are_named(weights: Path) -> None:
-    detector, encoder, _ = store.verify_stack("foundation", weights)
+    _, encoder, _ = store.verify_stack("foundation", weights)
     with pytest.raises(
         MissingWeights, match="lacks .* tensors of Sam2VideoModel|cannot be read as Sam2VideoModel"
     ):
-        architectures.read_networks(detector, encoder, encoder)
+        architectures.read_part("tracker", "sam2.1-hiera-large", encoder, BATCHED)
 
 
 @pytest.mark.parametrize(("part", "name", "published"), [
-    ("detector", "grounding-dino-tiny", 689_359_096), ("encoder", "dinov2-small", 88_249_960), ("sam", "sam2.1-hiera-tiny", 155_908_064),
+    ("detector", "grounding-dino-tiny", 689_359_096), ("encoder", "dinov2-small", 88_249_960), ("tracker", "sam2.1-hiera-tiny", 155_908_064),
 ])  # fmt: skip
 def test_random_networks_have_the_published_sizes(part: str, name: str, published: int) -> None:
     """Bytes of model.safetensors at the pinned revisions: four a parameter, and its header."""
-    assert name in sources.KINDS["foundation-small"]
-    net = getattr(small(), part)
+    with torch.device("meta"):
+        net = random_weights.random_network(part, name)
     assert 4 * sum(p.numel() for p in net.parameters()) == pytest.approx(published, rel=2e-3)
-
-
-@cache
-def small() -> architectures.Networks:
-    return architectures.random_networks("foundation-small")
 
 
 def test_bench_names_every_part_beside_the_papers_time(

@@ -4,6 +4,7 @@ What depends on trained weights is not tested here; that every option's pixels a
 of transformers' own code, is.
 """
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,9 @@ from vap_core.contracts import test_detector, test_encoder
 from vap_core.contracts.given import RenderedScene
 from vap_core.perception import foundation
 from vap_core.perception.foundation import encoder as crops
-from vap_core.perception.foundation.architectures import letter_tokenizer, quiet_transformers
+from vap_core.perception.foundation.architectures import quiet_transformers
 from vap_core.perception.foundation.downloads import pull
+from vap_core.perception.foundation.random_weights import letter_tokenizer
 from vap_core.perception.foundation.sources import KINDS, MODELS, PARTS, models_of, parts_of
 from vap_core.perception.foundation.store import weights_table
 from vap_core.perception.kept_thresholds import keep_thresholds
@@ -27,6 +29,7 @@ from vap_core.perception.protocols import Thresholds
 from vap_core.perception.stacks import EMBEDDED_THRESHOLDS, check_stack, load_stack, mixed
 
 __all__ = ["scene"]
+ROOT = Path(__file__).resolve().parents[1]
 TOYS = ("llmdet-tiny", "dinov3-small", "siglip2-base")
 
 
@@ -222,6 +225,21 @@ def test_an_option_says_what_it_needs(tmp_path: Path, monkeypatch: pytest.Monkey
     options = {name for models in PARTS.values() for name in models} - {name for kind in KINDS.values() for name in kind}  # fmt: skip
     for name in options:
         assert f" {name} " in table
+
+
+def test_the_page_says_of_every_option_what_it_needs() -> None:
+    rows: dict[tuple[str, str], str] = {}
+    role = ""
+    for line in (ROOT / "docs" / "stacks.md").read_text().splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if len(cells) == 4 and cells[1].startswith("`"):
+            role = cells[0].partition(",")[0] or role
+            rows |= {(role, name): cells[3] for name in re.findall(r"`([\w.-]+)`", cells[1])}
+    assert set(rows) == {(role, name) for role, names in PARTS.items() for name in names}
+    for (_, name), needs in rows.items():
+        assert (needs == "pinned") == bool(MODELS[name].sha256), name
+        assert ("--unpinned" in needs) == (not MODELS[name].sha256), name
+        assert ("licence" in needs) == ("licence" in MODELS[name].needs), name
 
 
 def test_a_branch_is_found_in_a_hub_cache_by_its_commit(store: Path, tmp_path: Path) -> None:

@@ -6,8 +6,9 @@ from typing import Any
 import torch
 from safetensors.torch import save_file
 
-from vap_core.perception.foundation.architectures import letter_tokenizer, quiet_transformers
+from vap_core.perception.foundation.architectures import quiet_transformers
 from vap_core.perception.foundation.downloads import pull
+from vap_core.perception.foundation.random_weights import letter_tokenizer
 from vap_core.perception.foundation.sources import KINDS, MODELS, TENSORS, Source
 
 KIND = "foundation"
@@ -73,28 +74,33 @@ def networks() -> tuple[Any, Any, Any]:
         torch.manual_seed(0)
         nets = GroundingDinoForObjectDetection(grounding), Dinov2Model(dino), Sam2VideoModel(sam)
         for net in nets:
-            for name, weight in net.named_parameters():
-                if weight.ndim > 1 and "norm" not in name:
-                    gain = (
-                        1.5
-                        if name.startswith("memory_attention")
-                        else 4.0
-                        if name.startswith("mask_decoder.pred_obj")
-                        else 0.9
-                    )
-                    torch.nn.init.normal_(weight, std=gain / weight[0].numel() ** 0.5)
-        sam_net = nets[2]
-        for word in (
-            "memory_temporal_positional_encoding",
-            "no_memory_embedding",
-            "no_object_pointer",
-            "occlusion_spatial_embedding_parameter",
-        ):
-            torch.nn.init.normal_(getattr(sam_net, word), std=1.0)
-        torch.nn.init.constant_(
-            sam_net.mask_decoder.pred_obj_score_head.proj_out.bias, 50.5
-        )  # identities come and go
+            draw(net)
     return tuple(net.eval() for net in nets)
+
+
+def draw(net: Any, presence: float = 50.5) -> None:
+    """Weights so wide that answers differ from input to input; `presence` lets identities come and go."""
+    for name, weight in net.named_parameters():
+        if weight.ndim > 1 and weight.numel() and "norm" not in name:
+            gain = (
+                1.5
+                if "memory_attention" in name
+                else 4.0
+                if "mask_decoder.pred_obj" in name
+                else 0.9
+            )
+            torch.nn.init.normal_(weight, std=gain / weight[0].numel() ** 0.5)
+    drawn = (
+        "memory_temporal_positional_encoding",
+        "no_memory_embedding",
+        "no_object_pointer",
+        "occlusion_spatial_embedding_parameter",
+    )
+    for name, weight in net.named_parameters():
+        if name.rpartition(".")[2] in drawn:
+            torch.nn.init.normal_(weight, std=1.0)
+        elif name.endswith("pred_obj_score_head.proj_out.bias"):
+            torch.nn.init.constant_(weight, presence)
 
 
 def save(origin: Path) -> Path:

@@ -6,7 +6,7 @@ from vap_core.base.errors import MissingPart
 
 EXTRAS = {
     "policy": ("torch", "torchvision", "lerobot", "transformers", "datasets"),
-    "foundation": ("torch", "torchvision", "transformers"),
+    "foundation": ("torch", "torchvision", "transformers", "timm"),
     "notebooks": ("rerun_notebook", "jupyter_bbox_widget", "ipykernel"),
     "ray": ("ray",),
     "export": ("torch", "onnx"),

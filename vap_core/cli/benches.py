@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vap_core.cli.options import StackName, Workers
+from vap_core.cli.options import (
+    DetectorName,
+    EncoderName,
+    StackName,
+    TrackerName,
+    Workers,
+    stack_of,
+)
 
 if TYPE_CHECKING:
     from vap_core.cli.bench.measurement import Measurement, Table
@@ -34,6 +41,9 @@ def bench(
     steps: Annotated[int, typer.Option(min=5, help="loop: control steps to time.")] = 60,
     workers: Workers = 2,
     stack: StackName = "foundation",
+    detector: DetectorName = "",
+    encoder: EncoderName = "",
+    tracker: TrackerName = "",
     random_weights: Annotated[
         bool,
         typer.Option(
@@ -76,6 +86,7 @@ def bench(
     """Measure what a step, a start and a query cost, as shares and ratios within one run.
 
     Example: python -m vap_core bench suites
+    Example: python -m vap_core bench stack --random-weights --detector sam3 --tracker edgetam
     Example: python -m vap_core bench profile --json data/results/bench_profile.json
     """
     from vap_core.base.errors import one_of
@@ -103,6 +114,7 @@ def bench(
             json.with_suffix(".part.json").unlink(missing_ok=True)
         return as_text(measurement, tables(measurement))
 
+    parts = stack_of(stack, detector, encoder, tracker)
     part = None if json is None else json.with_suffix(".part.json")
     against_lerobot = partial(
         bench_eval.measure, workers, lerobot_from, repeats=repeats, quick=quick, part=part
@@ -113,7 +125,7 @@ def bench(
     benchmarks: dict[str, Callable[[], str]] = {
         "loop": partial(bench_loop.run, steps),
         "suites": partial(bench_suites.run, workers),
-        "stack": partial(bench_stack.run, stack, random=random_weights, device=device),
+        "stack": partial(bench_stack.run, parts, random=random_weights, device=device),
         "policy": partial(bench_policy.run, quick),
         "eval": partial(kept, against_lerobot, eval_report.tables),
         "profile": partial(kept, by_part, bench_profile.tables),

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 from vap_core.base.device import check_device
 from vap_core.base.errors import one_of
@@ -94,7 +95,7 @@ def check_stack(name: str, what: str = "load_stack") -> None:
         raise one_of(f"{what}: stack", name, STACKS)
 
 
-def load_mixed(name: str) -> Stack:
+def load_mixed(name: str, device: str | None = None) -> Stack:
     """A stack of parts of several; loads those alone that it has.
 
     A threshold belongs to a detector and an encoder together: there is one where both are the
@@ -107,11 +108,25 @@ def load_mixed(name: str) -> Stack:
     parts = parts_of(name)
     if not set(parts.values()) - {EMBEDDED}:
         return load_embedded()
-    loaded = foundation.load_parts(name)
-    if EMBEDDED in parts.values():
-        stack = replace(load_embedded(), name=name, **loaded)
-    else:
-        stack = Stack(name=name, **loaded)
+    stack = _mixture(name, foundation.load_parts(name, device))
     if parts["detector"] == parts["encoder"] == EMBEDDED:
         return stack
     return replace(stack, thresholds=foundation.kept_thresholds(name, stack.encoder.name))
+
+
+def load_random(name: str, device: str | None = None) -> Stack:
+    """A stack, mixed or not, whose large models have random weights: as fast as trained ones.
+
+    Raises: UnknownName, MissingPart.
+    """
+    from vap_core.perception import foundation
+
+    check_stack(name)
+    return _mixture(name, foundation.random_parts(name, device))
+
+
+def _mixture(name: str, loaded: dict[str, Any]) -> Stack:
+    """The loaded fields, and the embedded stack's where its parts are in the mixture."""
+    if EMBEDDED in parts_of(name).values():
+        return replace(load_embedded(), name=name, **loaded)
+    return Stack(name=name, **loaded)

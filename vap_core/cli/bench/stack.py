@@ -15,7 +15,7 @@ from vap_core.cli.bench.timing import Clock, median_seconds
 from vap_core.perception import foundation
 from vap_core.perception.embedded.backbone import features
 from vap_core.perception.protocols import Stack
-from vap_core.perception.stacks import load_embedded
+from vap_core.perception.stacks import load_embedded, load_mixed, load_random
 
 PAPER_S = {"detection": 0.19, "segmentation and embedding": 0.07, "track step": 0.02}
 SIDE = 224
@@ -83,7 +83,9 @@ def _parts(kind: str, random: bool, device: str | None) -> Stack:
     if kind == "embedded":
         return load_embedded()
     if random:
-        return foundation.load_random(kind, device)
+        return load_random(kind, device)
+    if ":" in kind:
+        return load_mixed(kind, device)
     return foundation.load(kind, device)
 
 

@@ -1,5 +1,7 @@
 """The foundation stacks: Grounding DINO, DINOv2 and SAM 2.1 behind the protocols of every stack.
 
+Other models may stand for each of the three.
+
 Within perception, only this package imports transformers.
 """
 
@@ -10,7 +12,7 @@ from typing import Any
 
 from vap_core.base.device import device_name
 from vap_core.base.extras import require
-from vap_core.perception.foundation.sources import parts_of
+from vap_core.perception.foundation.sources import EMBEDDED, parts_of
 from vap_core.perception.kept_thresholds import read_thresholds
 from vap_core.perception.protocols import Stack, Thresholds
 
@@ -37,12 +39,7 @@ def load(kind: str, device: str | None = None, store: Path | None = None) -> Sta
 @cache
 def _load_networks(kind: str, device: str, store: Path) -> Stack:
     """The stack without thresholds, kept for the next call with the same three."""
-    from vap_core.perception.foundation import architectures
-    from vap_core.perception.foundation.runtime import select_runtime
-    from vap_core.perception.foundation.store import verify_stack
-
-    networks = architectures.read_networks(*verify_stack(kind, store))
-    return architectures.assemble(kind, networks, select_runtime(device))
+    return Stack(name=kind, **load_parts(kind, device, store))
 
 
 def load_parts(name: str, device: str | None = None, store: Path | None = None) -> dict[str, Any]:
@@ -72,10 +69,22 @@ def kept_thresholds(name: str, encoder: str) -> Thresholds | None:
     return read_thresholds(store_folder(), name, encoder)
 
 
-def load_random(kind: str, device: str | None = None) -> Stack:
-    """The real architectures of a stack with random weights: as fast, and as large, as trained."""
-    from vap_core.perception.foundation import architectures
+def random_parts(name: str, device: str | None = None) -> dict[str, Any]:
+    """As `load_parts`, with random weights in the real architectures."""
+    require("foundation", f"the stack {name}")
+    from vap_core.perception.foundation import architectures, random_weights
     from vap_core.perception.foundation.runtime import select_runtime
 
     runtime = select_runtime(device)
-    return architectures.assemble(kind, architectures.random_networks(kind), runtime)
+    filled: dict[str, Any] = {}
+    for role, model in parts_of(name).items():
+        if model == EMBEDDED:
+            continue
+        filled |= architectures.fill_part(
+            role=role,
+            network=random_weights.random_network(role, model),
+            tokenizer=random_weights.letter_tokenizer(),
+            name=f"{model}-random",
+            runtime=runtime,
+        )
+    return filled

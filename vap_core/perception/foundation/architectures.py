@@ -1,14 +1,14 @@
-"""From folders of weights, or from published sizes with random ones, to the four models."""
+"""From folders of weights, or from networks with random ones, to the parts of a stack."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 
 from vap_core.base.errors import MissingWeights
-from vap_core.perception.foundation.detector import GroundingDino
+from vap_core.perception.foundation.detector import GroundingDino, PhraseDetector
+from vap_core.perception.foundation.edgetam import EdgeTamTracker, backbone_without_hub
 from vap_core.perception.foundation.encoder import (
     DINO,
     DINOV3,
@@ -17,105 +17,47 @@ from vap_core.perception.foundation.encoder import (
     CropRecipe,
     PooledEncoder,
 )
+from vap_core.perception.foundation.pixels import CENTRED, IMAGENET, Normalisation
 from vap_core.perception.foundation.runtime import Runtime
+from vap_core.perception.foundation.sam3 import Sam3Detector
 from vap_core.perception.foundation.segmenter import Sam, SamSegmenter
-from vap_core.perception.foundation.sources import KINDS
 from vap_core.perception.foundation.store import VerifiedWeights
 from vap_core.perception.foundation.tracker import SamTracker
-from vap_core.perception.protocols import Stack
-
-SWIN_SIZES: dict[str, dict[str, Any]] = {
-    "grounding-dino-base": {
-        "embed_dim": 128,
-        "depths": [2, 2, 18, 2],
-        "num_heads": [4, 8, 16, 32],
-        "window_size": 12,
-        "image_size": 384,
-    },
-    "grounding-dino-tiny": {
-        "embed_dim": 96,
-        "depths": [2, 2, 6, 2],
-        "num_heads": [3, 6, 12, 24],
-        "window_size": 7,
-        "image_size": 224,
-    },
-}
-VIT_SIZES: dict[str, dict[str, Any]] = {
-    "dinov2-base": {"hidden_size": 768, "num_attention_heads": 12},
-    "dinov2-small": {"hidden_size": 384, "num_attention_heads": 6},
-}
-HIERA_SIZES: dict[str, dict[str, Any]] = {
-    "sam2.1-hiera-large": {
-        "hidden_size": 144,
-        "num_attention_heads": 2,
-        "blocks_per_stage": [2, 6, 36, 4],
-        "embed_dim_per_stage": [144, 288, 576, 1152],
-        "num_attention_heads_per_stage": [2, 4, 8, 16],
-        "window_size_per_stage": [8, 4, 16, 8],
-        "global_attention_blocks": [23, 33, 43],
-    },
-    "sam2.1-hiera-tiny": {},
-}
-
 
 CLASSES = {
-    "grounding-dino-": "GroundingDinoForObjectDetection",
-    "llmdet-": "MMGroundingDinoForObjectDetection",
-    "mm-grounding-dino-": "MMGroundingDinoForObjectDetection",
-    "dinov2-": "Dinov2Model",
-    "dinov3-": "DINOv3ViTModel",
-    "siglip2-": "SiglipVisionModel",
-    "sam2.1-": "Sam2VideoModel",
+    "detector": {
+        "grounding-dino-": "GroundingDinoForObjectDetection",
+        "llmdet-": "MMGroundingDinoForObjectDetection",
+        "mm-grounding-dino-": "MMGroundingDinoForObjectDetection",
+        "sam3": "Sam3Model",
+    },
+    "encoder": {
+        "dinov2-": "Dinov2Model",
+        "dinov3-": "DINOv3ViTModel",
+        "siglip2-": "SiglipVisionModel",
+    },
+    "tracker": {
+        "sam2.1-": "Sam2VideoModel",
+        "sam3": "Sam3TrackerVideoModel",
+        "edgetam": "EdgeTamVideoModel",
+    },
 }
-"""transformers' class of the models whose names begin so."""
+"""transformers' class by role, of the models whose names begin so."""
 ENCODERS: dict[str, tuple[type[CropEncoder], CropRecipe]] = {
     "Dinov2Model": (CropEncoder, DINO),
     "DINOv3ViTModel": (CropEncoder, DINOV3),
     "SiglipVisionModel": (PooledEncoder, SIGLIP),
 }
+TRACKERS: dict[str, tuple[type[SamTracker], Normalisation]] = {
+    "Sam2VideoModel": (SamTracker, IMAGENET),
+    "Sam3TrackerVideoModel": (SamTracker, CENTRED),
+    "EdgeTamVideoModel": (EdgeTamTracker, IMAGENET),
+}
 
 
-@dataclass(frozen=True)
-class Networks:
-    """transformers' models of one stack, on the CPU; `encoder_name` is stored with every memory."""
-
-    detector: Any
-    tokenizer: Any
-    encoder: Any
-    encoder_name: str
-    sam: Any
-
-
-def assemble(kind: str, networks: Networks, runtime: Runtime) -> Stack:
-    """Put the adapters around the networks, with the pre-processing that they were trained with."""
-    sam = Sam(networks.sam, runtime)
-    return Stack(
-        name=kind,
-        detector=_detector(networks.detector, networks.tokenizer, runtime),
-        encoder=CropEncoder(
-            model=networks.encoder, recipe=DINO, name=networks.encoder_name, runtime=runtime
-        ),
-        segmenter=SamSegmenter(sam),
-        tracker=SamTracker(sam),
-    )
-
-
-def _detector(network: Any, tokenizer: Any, runtime: Runtime) -> GroundingDino:
-    from transformers.models.grounding_dino.image_processing_pil_grounding_dino import (
-        GroundingDinoImageProcessorPil,
-    )
-
-    return GroundingDino(
-        model=network,
-        tokenizer=tokenizer,
-        processor=GroundingDinoImageProcessorPil(),
-        runtime=runtime,
-    )
-
-
-def network_class(model: str) -> str:
-    """transformers' class of a model of `sources.PARTS`."""
-    for beginning, name in CLASSES.items():
+def network_class(role: str, model: str) -> str:
+    """transformers' class of a model of `sources.PARTS` in a role."""
+    for beginning, name in CLASSES[role].items():
         if model.startswith(beginning):
             return name
     raise KeyError(model)
@@ -124,91 +66,54 @@ def network_class(model: str) -> str:
 def read_part(role: str, model: str, weights: VerifiedWeights, runtime: Runtime) -> dict[str, Any]:
     """The fields of a `Stack` that one model fills, and those that it makes empty.
 
+    Safetensors and JSON are read, and no code.
+
     Raises: MissingWeights: a file that transformers cannot read as the network it should be.
     """
     import transformers
 
-    with quiet_transformers():
-        network = _read_network(getattr(transformers, network_class(model)), weights)
+    tokenizer = None
+    with quiet_transformers(), backbone_without_hub():
+        network = _read_network(getattr(transformers, network_class(role, model)), weights)
         if role == "detector":
             tokenizer = transformers.AutoTokenizer.from_pretrained(
                 weights.folder, local_files_only=True
             )
-            detector = _detector(network, tokenizer, runtime)
-            return {"detector": detector, "by_category": None}
-    if role == "encoder":
-        encoder, recipe = ENCODERS[network_class(model)]
-        filled = encoder(model=network, recipe=recipe, name=weights.identity, runtime=runtime)
-        return {"encoder": filled, "unfamiliar_encoder": None}
-    sam = Sam(network, runtime)
-    return {"segmenter": SamSegmenter(sam), "tracker": SamTracker(sam)}
+    return fill_part(role, network, tokenizer, weights.identity, runtime)
 
 
-def read_networks(
-    detector: VerifiedWeights, encoder: VerifiedWeights, sam: VerifiedWeights
-) -> Networks:
-    """Networks from verified folders; safetensors and JSON only, and no code from them.
-
-    Raises: MissingWeights: a file that transformers cannot read as the network it should be.
+def fill_part(
+    role: str, network: Any, tokenizer: Any, name: str, runtime: Runtime
+) -> dict[str, Any]:
+    """As `read_part`, from a network in memory; put the adapter around it, with the pre-processing
+    that it was trained with. A detector has a tokenizer; an encoder's `name` is stored with every
+    memory.
     """
-    from transformers import (
-        AutoTokenizer,
-        Dinov2Model,
-        GroundingDinoForObjectDetection,
-        Sam2VideoModel,
+    kind = type(network).__name__
+    if role == "detector":
+        return {"detector": _detector(kind, network, tokenizer, runtime), "by_category": None}
+    if role == "encoder":
+        encoder, recipe = ENCODERS[kind]
+        filled = encoder(model=network, recipe=recipe, name=name, runtime=runtime)
+        return {"encoder": filled, "unfamiliar_encoder": None}
+    tracker, normalisation = TRACKERS[kind]
+    sam = Sam(network, runtime, normalisation)
+    return {"segmenter": SamSegmenter(sam), "tracker": tracker(sam)}
+
+
+def _detector(kind: str, network: Any, tokenizer: Any, runtime: Runtime) -> PhraseDetector:
+    from transformers.models.grounding_dino.image_processing_pil_grounding_dino import (
+        GroundingDinoImageProcessorPil,
     )
 
-    with quiet_transformers():
-        tokenizer = AutoTokenizer.from_pretrained(detector.folder, local_files_only=True)
-        return Networks(
-            detector=_read_network(GroundingDinoForObjectDetection, detector),
-            tokenizer=tokenizer,
-            encoder=_read_network(Dinov2Model, encoder),
-            encoder_name=encoder.identity,
-            sam=_read_network(Sam2VideoModel, sam),
-        )
-
-
-def random_networks(kind: str, seed: int = 0) -> Networks:
-    """Random networks of the published sizes; the tokenizer knows single letters only."""
-    import transformers
-
-    hf: Any = transformers  # its configurations take more than they declare
-    detector, encoder, sam = KINDS[kind]
-    hiera = hf.Sam2HieraDetConfig(**HIERA_SIZES[sam])
-    vision = hf.Sam2VisionConfig(
-        backbone_config=hiera, backbone_channel_list=hiera.embed_dim_per_stage[::-1]
+    if kind == "Sam3Model":
+        return Sam3Detector(network, tokenizer, runtime)
+    return GroundingDino(
+        model=network,
+        tokenizer=tokenizer,
+        processor=GroundingDinoImageProcessorPil(),
+        runtime=runtime,
     )
-    swin = hf.SwinConfig(**SWIN_SIZES[detector], out_indices=[2, 3, 4])
-    grounding = hf.GroundingDinoConfig(backbone_config=swin)
-    dino = hf.Dinov2Config(**VIT_SIZES[encoder], image_size=518)
-    with quiet_transformers(), torch.random.fork_rng():
-        torch.manual_seed(seed)
-        return Networks(
-            detector=hf.GroundingDinoForObjectDetection(grounding),
-            tokenizer=letter_tokenizer(),
-            encoder=hf.Dinov2Model(dino),
-            encoder_name=f"{encoder}-random",
-            sam=hf.Sam2VideoModel(hf.Sam2VideoConfig(vision_config=vision)),
-        )
-
-
-def letter_tokenizer() -> Any:
-    """A BERT tokenizer of letters, with the special tokens where bert-base-uncased has them."""
-    from transformers import BertTokenizer
-
-    tokens = [f"[unused{i}]" for i in range(1030)]
-    tokens[0] = "[PAD]"
-    tokens[100] = "[UNK]"
-    tokens[101] = "[CLS]"
-    tokens[102] = "[SEP]"
-    tokens[103] = "[MASK]"
-    tokens[1012] = "."
-    tokens[1029] = "?"
-    for i, letter in enumerate("abcdefghijklmnopqrstuvwxyz"):
-        tokens[200 + 2 * i] = letter
-        tokens[201 + 2 * i] = f"##{letter}"
-    return BertTokenizer(vocab={token: i for i, token in enumerate(tokens)})
 
 
 @contextmanager

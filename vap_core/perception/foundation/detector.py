@@ -1,5 +1,8 @@
-"""Grounding DINO: every box in a view that matches an open-vocabulary phrase (P 3.3, 5.1)."""
+"""Every box in a view that matches an open-vocabulary phrase (P 3.3): what all detectors of phrases
+do, and Grounding DINO, the paper's (P 5.1).
+"""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,7 +15,9 @@ from vap_core.perception.boxes import suppress_overlaps
 from vap_core.perception.foundation.runtime import Runtime
 
 THRESHOLD = 0.25
-"""The models' published default. A box's score is its best probability over the phrase's tokens."""
+"""Grounding DINO's published default. A box's score is its best probability over the phrase's
+tokens.
+"""
 BATCH = 8
 """Images per pass on a GPU; only images of one size share a pass, because padding changes the
 backbone's features."""
@@ -21,23 +26,23 @@ MAX_ASPECT = 8
 leave nothing of the shorter one."""
 
 
-class GroundingDino:
-    """The foundation detector.
+class PhraseDetector(ABC):
+    """A network that proposes boxes for a phrase; the best ones are kept.
 
-    `tokenizer` and `processor` are those that the weights were trained with.
+    `threshold` is the least score where the caller names none.
     """
 
-    def __init__(self, model: Any, tokenizer: Any, processor: Any, runtime: Runtime) -> None:
+    threshold: float
+
+    def __init__(self, model: Any, runtime: Runtime) -> None:
         self.model = model.requires_grad_(False).eval().to(runtime.device)
-        self.tokenizer = tokenizer
-        self.processor = processor
         self.runtime = runtime
 
     def __call__(
         self, images: Sequence[Rgb], phrase: str, threshold: float | None = None
     ) -> list[Boxes]:
         if threshold is None:
-            threshold = THRESHOLD
+            threshold = self.threshold
         by_size: dict[tuple[int, ...], list[int]] = {}
         for i, image in enumerate(images):
             by_size.setdefault(image.shape, []).append(i)
@@ -55,10 +60,29 @@ class GroundingDino:
                     )
         return proposals
 
+    @abstractmethod
     def _propose(
         self, images: Sequence[Rgb], phrase: str
     ) -> tuple[Float32[np.ndarray, "b q 4"], Float32[np.ndarray, "b q"]]:
         """Every query's box, in pixels, and score; the images are of one size."""
+
+
+class GroundingDino(PhraseDetector):
+    """The foundation detector.
+
+    `tokenizer` and `processor` are those that the weights were trained with.
+    """
+
+    threshold = THRESHOLD
+
+    def __init__(self, model: Any, tokenizer: Any, processor: Any, runtime: Runtime) -> None:
+        super().__init__(model, runtime)
+        self.tokenizer = tokenizer
+        self.processor = processor
+
+    def _propose(
+        self, images: Sequence[Rgb], phrase: str
+    ) -> tuple[Float32[np.ndarray, "b q 4"], Float32[np.ndarray, "b q"]]:
         padded = [pad_strip(image) for image in images]
         pixels = self.processor(
             images=padded, input_data_format="channels_last", return_tensors="pt"

@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
 from vap_core.base.types import Rgb
+from vap_core.perception.foundation.pixels import CENTRED, IMAGENET
 from vap_core.perception.foundation.runtime import Runtime
-from vap_core.perception.foundation.segmenter import MEAN, STD
 
 SIDE = 224
 """Pixels of the square in which a crop is embedded."""
@@ -29,8 +29,8 @@ class CropRecipe:
     `resample` is Pillow's number of the filter: 2 bilinear, 3 bicubic.
     """
 
-    mean: tuple[float, float, float] = MEAN
-    std: tuple[float, float, float] = STD
+    mean: tuple[float, float, float] = IMAGENET.mean
+    std: tuple[float, float, float] = IMAGENET.std
     resample: int = 3
 
     @property
@@ -42,7 +42,7 @@ class CropRecipe:
 
 DINO = CropRecipe()
 DINOV3 = CropRecipe(resample=2)
-SIGLIP = CropRecipe(mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5), resample=3)
+SIGLIP = CropRecipe(mean=CENTRED.mean, std=CENTRED.std, resample=3)
 
 
 class CropEncoder:

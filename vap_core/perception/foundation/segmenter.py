@@ -1,4 +1,5 @@
-"""SAM 2.1 on one image: masks of the objects inside boxes (P 3.3).
+"""SAM 2.1, and the later models with its interface, on one image: masks of the objects inside boxes
+(P 3.3).
 
 The video checkpoint holds everything that the image predictor needs, so segmenter and tracker share
 one model and one backbone per process.
@@ -17,11 +18,9 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
 from vap_core.base.types import Boxes, Rgb
+from vap_core.perception.foundation.pixels import IMAGENET, Normalisation, to_model
 from vap_core.perception.foundation.runtime import Runtime
 
-MEAN = (0.485, 0.456, 0.406)
-STD = (0.229, 0.224, 0.225)
-"""ImageNet's, per channel."""
 BATCH = 16
 """Images per pass of the backbone on a GPU."""
 CACHED_FRAMES = 8
@@ -53,9 +52,12 @@ class DecodedMasks:
 class Sam:
     """Model, device, and the features of the last first frames."""
 
-    def __init__(self, model: Any, runtime: Runtime) -> None:
+    def __init__(
+        self, model: Any, runtime: Runtime, normalisation: Normalisation = IMAGENET
+    ) -> None:
         self.model = model.requires_grad_(False).eval().to(runtime.device)
         self.runtime = runtime
+        self.normalisation = normalisation
         self.side = int(model.config.image_size)
         with torch.inference_mode():
             self.positions: Float[Tensor, "1 c h w"] = (
@@ -67,7 +69,7 @@ class Sam:
         """The backbone's features, on a GPU in one pass for all images."""
         encoded: list[ImageFeatures] = []
         for batch in self.runtime.batches(images, BATCH):
-            pixels = torch.cat([to_model(image, self.side, self.runtime.device) for image in batch])
+            pixels = torch.cat([self.pixels(image) for image in batch])
             with self.runtime.inference():
                 out = self.model.get_image_features(pixels)
             maps: list[Tensor] = []
@@ -79,6 +81,10 @@ class Sam:
             for i in range(len(pixels)):
                 encoded.append(ImageFeatures(fine[[i]], middle[[i]], coarse[[i]], positions[:, :1]))
         return encoded
+
+    def pixels(self, image: Rgb) -> Float[Tensor, "1 3 s s"]:
+        """The image as the backbone's input."""
+        return to_model(image, self.side, self.runtime.device, self.normalisation)
 
     def encode_first_frame(self, image: Rgb) -> ImageFeatures:
         """The features of a first frame, which are kept.
@@ -166,23 +172,6 @@ class SamSegmenter:
                 dense=dense,
                 alternatives=False,
             )
-
-
-def to_model(image: Rgb, side: int, device: torch.device) -> Float[Tensor, "1 3 s s"]:
-    """The image as the model's input.
-
-    It is stretched to a square with antialiased bilinear resampling in 8 bits, and normalised as on
-    ImageNet.
-    """
-    stretched = F.interpolate(
-        torch.from_numpy(image.copy()).permute(2, 0, 1)[None],
-        (side, side),
-        mode="bilinear",
-        antialias=True,
-    )
-    mean = torch.tensor(MEAN, device=device)[:, None, None]
-    std = torch.tensor(STD, device=device)[:, None, None]
-    return (stretched.to(device).float() / 255 - mean) / std
 
 
 def to_pixels(logits: Float[Tensor, "n k h w"], hw: tuple[int, int]) -> Float[Tensor, "n k y x"]:

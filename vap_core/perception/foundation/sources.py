@@ -87,6 +87,12 @@ MODELS = {
         needs="accept Meta's DINOv3 licence on its page and log in with `hf auth login`",
     ),
     "siglip2-base": Source(repo="google/siglip2-base-patch16-224"),
+    "sam3": Source(
+        repo="facebook/sam3",
+        small_files=("config.json", *TOKENIZER),
+        needs="accept Meta's SAM licence on its page and log in with `hf auth login`",
+    ),
+    "edgetam": Source(repo="yonigozlan/EdgeTAM-hf"),
     "all-minilm-l6-v2": Source(
         repo="sentence-transformers/all-MiniLM-L6-v2",
         revision="1110a243fdf4706b3f48f1d95db1a4f5529b4d41",
@@ -109,9 +115,10 @@ PARTS = {
         "llmdet-base",
         "mm-grounding-dino-tiny",
         "mm-grounding-dino-base",
+        "sam3",
     ),
     "encoder": ("dinov2-small", "dinov2-base", "dinov3-small", "siglip2-base"),
-    "tracker": ("sam2.1-hiera-tiny", "sam2.1-hiera-large"),
+    "tracker": ("sam2.1-hiera-tiny", "sam2.1-hiera-large", "sam3", "edgetam"),
 }
 """What may stand for each part of a mixed stack; the tracker brings the segmenter."""
 EMBEDDED = "embedded"

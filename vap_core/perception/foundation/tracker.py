@@ -1,8 +1,8 @@
-"""SAM 2.1 on a stream: identities followed by memory attention, in constant memory (P 3.3).
+"""SAM 2.1 and SAM 3 on a stream: identities followed by memory attention (P 3.3).
 
-A frame is compared with the first frame and the last few. The state of a view is a value: what one
-step returns is all that the next one needs. On a GPU all views of a step share one pass of the
-backbone; all identities of a view share one pass of the rest.
+A frame is compared with the first frame and the last few, so memory stays constant. The state of a
+view is a value: what one step returns is all that the next one needs. On a GPU all views of a step
+share one pass of the backbone; all identities of a view share one pass of the rest.
 """
 
 from collections.abc import Sequence
@@ -59,7 +59,8 @@ class SamTracker:
             positions = sam.model.memory_encoder.position_encoding(
                 torch.Size((1, m, h, w)), sam.runtime.device, torch.float32
             )
-        self.positions: Float[Tensor, "p 1 m"] = positions.flatten(2).permute(2, 0, 1)
+            self.map_positions: Float[Tensor, "1 m h w"] = positions
+            self.positions: Float[Tensor, "p 1 m"] = self._cell_positions()
 
     def start(
         self, images: Sequence[Rgb], masks: Sequence[Bool[np.ndarray, "_n _h _w"]]
@@ -201,6 +202,7 @@ class SamTracker:
         """
         model = self.sam.model
         config = model.config
+        logits = self._to_memory_size(logits)
         planes = (logits > 0).float() if certain else logits.sigmoid()
         planes = planes * config.sigmoid_scale_for_mem_enc + config.sigmoid_bias_for_mem_enc
         coarse = features.coarse.expand(len(logits), -1, -1, -1)
@@ -210,7 +212,27 @@ class SamTracker:
         if model.occlusion_spatial_embedding_parameter is not None:
             occluded = cells + model.occlusion_spatial_embedding_parameter[..., None, None]
             cells = torch.where(visible[:, None, None, None], cells, occluded)
-        return MemoryEntry(cells.to(torch.bfloat16).flatten(2).permute(2, 0, 1), pointer)
+        return MemoryEntry(self._stored(cells), pointer)
+
+    def _to_memory_size(self, logits: Float[Tensor, "n 1 s s"]) -> Float[Tensor, "n 1 y x"]:
+        """Mask logits at the resolution of the memory encoder, 16 times that of a coarse map."""
+        h, w = self.map_positions.shape[-2:]
+        size = (16 * h, 16 * w)
+        if logits.shape[-2:] == torch.Size(size):
+            return logits
+        return F.interpolate(logits, size, mode="bilinear", antialias=True)
+
+    def _stored(self, maps: Float[Tensor, "n m h w"]) -> Float[Tensor, "p n m"]:
+        """What is kept of each identity's map of a frame, in half precision."""
+        return maps.to(torch.bfloat16).flatten(2).permute(2, 0, 1)
+
+    def _cell_positions(self) -> Float[Tensor, "p 1 m"]:
+        """The positional encoding of what `_stored` keeps."""
+        return self.map_positions.flatten(2).permute(2, 0, 1)
+
+    def _attention_options(self, maps: int) -> dict[str, int]:
+        """What the memory attention asks for besides memory; `maps` are the frames in it."""
+        return {}
 
     def _attend(self, state: SamTrackState, features: ImageFeatures) -> Float[Tensor, "n c h w"]:
         """The coarse map after attention to each identity's memory."""
@@ -227,6 +249,7 @@ class SamTracker:
                 memory=torch.cat([*map_keys, pointer_keys]),
                 memory_posision_embeddings=torch.cat([*map_positions, pointer_positions]),
                 num_object_pointer_tokens=len(pointer_keys),
+                **self._attention_options(len(map_keys)),
             )
         size = features.coarse.shape[-2:]
         return out.float().reshape(n, -1, c).transpose(1, 2).reshape(n, c, *size)
@@ -246,7 +269,8 @@ class SamTracker:
     def _memory_pointers(self, state: SamTrackState) -> tuple[Tensor, Tensor]:
         """The pointers in memory, and their positional encodings.
 
-        A pointer is wider than a cell of memory, and is read as several.
+        A pointer is wider than a cell of memory, and is read as several. A model may have been
+        trained without these encodings.
         """
         assert state.first is not None
         n = state.first.cells.shape[1]
@@ -258,6 +282,8 @@ class SamTracker:
             [state.frame_index + 1, *range(1, len(state.pointers) + 1)], device=pointers.device
         )
         keys = pointers.unflatten(2, (pieces, m)).transpose(1, 2).flatten(0, 1)
+        if not self.sam.model.config.enable_temporal_pos_encoding_for_object_pointers:
+            return keys, torch.zeros_like(keys)
         times = self.sam.model.temporal_positional_encoding_projection_layer(
             sines(frames_ago / (self.max_pointers - 1), c)
         )
