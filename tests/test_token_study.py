@@ -312,6 +312,9 @@ def test_the_highest_score_is_the_choice() -> None:
     cost = choices.cost_of_scene(both)
     assert (cost.value, cost.n) == (pytest.approx(-1 / 3), 3)
     assert cost.low <= cost.value <= cost.high
+    cost = choices.cost_of_policy(both, pd.DataFrame(rows, columns=columns))
+    assert (cost.value, cost.n) == (0, 3), "one of three in the scene, and one of three touched"
+    assert cost.low <= 0 <= cost.high
 
 
 def test_the_report_compares_the_shipped_policies_beside_the_paper() -> None:

@@ -180,6 +180,21 @@ def cost_of_scene(table: "pd.DataFrame") -> Estimate:
     """
     photo = chosen(table[table["seen_in"] == PHOTO])[[*KEY, "right"]]
     both = chosen(table[table["seen_in"] == SCENE]).merge(photo, on=KEY, suffixes=("", "_photo"))
-    gain = both["right_photo"].to_numpy(float) - both["right"].to_numpy(float)
+    return _mean_gain(both["right_photo"], both["right"])
+
+
+def cost_of_policy(table: "pd.DataFrame", episodes: "pd.DataFrame") -> Estimate:
+    """The share of right choices in the scene minus that of soft's first touches, likewise.
+
+    `table` and `episodes` are `beside_policy`'s.
+    """
+    soft = episodes[episodes["method"] == "soft"][[*KEY, "first_object_correct"]]
+    both = chosen(table[table["seen_in"] == SCENE]).merge(soft, on=KEY)
+    return _mean_gain(both["right"], both["first_object_correct"])
+
+
+def _mean_gain(more: "pd.Series", less: "pd.Series") -> Estimate:
+    """The mean difference of pairs, with its bootstrap interval."""
+    gain = more.to_numpy(float) - less.to_numpy(float)
     low, high = bootstrap_interval(gain, np.ones(len(gain)))
     return Estimate(value=float(gain.mean()), low=low, high=high, n=len(gain))
