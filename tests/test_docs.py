@@ -152,8 +152,11 @@ def test_files_are_there(page: str) -> None:
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if "figures/" in PAGES[page]])
-def test_a_page_links_the_notebook_that_draws_its_figures(page: str) -> None:
+def test_a_page_names_the_notebook_or_command_that_draws_its_figures(page: str) -> None:
     for figure in re.findall(r"figures/([\w.]+\.png)", PAGES[page]):
+        if figure.startswith("bench_"):
+            assert f"bench {figure.removeprefix('bench_').removesuffix('.png')}`" in PAGES[page]
+            continue
         (notebook,) = (ROOT / "notebooks").glob(f"{figure[:2]}_*.ipynb")
         assert f"notebooks/{notebook.name})" in PAGES[page], figure
         assert figure in COMMITTED or figure in notebook.read_text(), figure

@@ -9,7 +9,7 @@ from vap_core.cli.bench.measurement import Measurement, Table, as_markdown, read
 
 ROOT = DATA.parent
 PAGE = ROOT / "docs" / "measured.md"
-PICTURE = ROOT / "figures" / "10_scale.png"
+PICTURE = ROOT / "figures" / "bench_scale.png"
 SECTIONS: dict[str, tuple[str, Callable[[Measurement], list[Table]]]] = {
     "eval": ("Against lerobot's own loop", eval_report.tables),
     "profile": ("Where the time of a control step goes", profile.tables),
