@@ -2,9 +2,11 @@
 
 import os
 import re
+import shlex
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,7 @@ from vap_core.contracts import (  # fmt: skip
     test_tracker,
 )
 from vap_core.contracts.given import RenderedScene
+from vap_core.contracts.plugin import PROTOCOLS
 from vap_core.memory import register
 from vap_core.perception.stacks import load_stack
 from vap_core.policies.scripted.random import Random
@@ -148,11 +151,43 @@ def test_the_page_names_every_test_of_every_contract() -> None:
     assert named == held
 
 
-def test_the_documented_encoder_keeps_the_contract(scene: RenderedScene) -> None:
-    (block,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
-    names: dict[str, Any] = {}
-    exec(compile(block, "documented", "exec"), names)
-    kept(test_encoder, sanity=False, encoder=names["MeanColour"](), scene=scene)
+EXAMPLES = "\n\n".join(re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL))
+COMMANDS = [shlex.split(line) for line in re.findall(r"^pytest .*$", PAGE, re.M) if "mine:" in line]
+
+
+def test_every_protocol_has_a_section_with_its_command() -> None:
+    sections = {section.split()[0].lower() for section in PAGE.split("\n## ")[1:]}
+    assert sections == set(PROTOCOLS)
+    assert sorted(command[3] for command in COMMANDS) == sorted(f"--{name}" for name in PROTOCOLS)
+
+
+@pytest.fixture
+def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The page's examples, saved as it says."""
+    (tmp_path / "mine.py").write_text(EXAMPLES)
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path
+    sys.modules.pop("mine", None)
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=[command[3] for command in COMMANDS])
+def test_the_documented_examples_keep_their_contracts(
+    command: list[str], mine: Path, scene: RenderedScene
+) -> None:
+    """What each printed command tests, in this process."""
+    assert command[:3] == ["pytest", "--pyargs", "vap_core.contracts"]
+    name = command[3].removeprefix("--")
+    found = {name: given.made(command[4]), "scene": scene, "where": WHERE}
+    kept(import_module(f"vap_core.contracts.test_{name}"), sanity="not sanity" not in command, **found)  # fmt: skip
+
+
+@pytest.mark.sweep
+@pytest.mark.parametrize("command", COMMANDS, ids=[command[3] for command in COMMANDS])
+def test_the_printed_commands_run(command: list[str], mine: Path) -> None:
+    program = str(Path(sys.executable).with_name("pytest"))
+    done = subprocess.run([program, *command[1:]], cwd=mine, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert re.search(r"[3-9] passed", done.stdout), done.stdout
 
 
 # --- The command ---------------------------------------------------------------------------------
