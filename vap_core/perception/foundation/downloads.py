@@ -74,6 +74,22 @@ def find_folder(source: Source, origin: Path) -> Path:
     )
 
 
+def endpoint() -> str:
+    """The hub's address, or its mirror's."""
+    return (os.environ.get(ENDPOINT_VARIABLE) or HUB).rstrip("/")
+
+
+def transfer(url: str, part: Path, name: str) -> None:
+    """Download into `part`, from where an earlier try stopped; `name` is shown meanwhile.
+
+    Raises: OSError, httpx.HTTPError.
+    """
+    from huggingface_hub.file_download import http_get
+
+    with part.open("ab") as out:
+        http_get(url, out, resume_size=out.tell(), headers=HEADERS, displayed_filename=name)
+
+
 def _pull_model(name: str, store: Path, origin: Path | None, unpinned: bool) -> bool:
     """Bring one model into the store; False when it is complete there already."""
     from huggingface_hub.utils import WeakFileLock
@@ -138,20 +154,11 @@ def _download(source: Source, file: str, path: Path) -> None:
     from httpx import HTTPError
     from huggingface_hub import hf_hub_url
     from huggingface_hub.errors import HfHubHTTPError
-    from huggingface_hub.file_download import http_get
 
-    endpoint = (os.environ.get(ENDPOINT_VARIABLE) or HUB).rstrip("/")
-    url = hf_hub_url(source.repo, file, revision=source.revision, endpoint=endpoint)
+    url = hf_hub_url(source.repo, file, revision=source.revision, endpoint=endpoint())
     part = path.with_name(f".{file}.{source.revision[:8]}.part")
     try:
-        with part.open("ab") as out:
-            http_get(
-                url,
-                out,
-                resume_size=out.tell(),
-                headers=HEADERS,
-                displayed_filename=f"{source.repo}/{file}",
-            )
+        transfer(url, part, f"{source.repo}/{file}")
         os.replace(part, path)
         return
     except HfHubHTTPError as error:
