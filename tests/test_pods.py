@@ -234,3 +234,22 @@ def test_the_command_takes_a_folder_or_a_benchmark(
         (("--benchmark", "pods", "--from", tmp_path), "does not tell objects from kinds"),
     ):
         assert words in refused("eval-photos", *options)
+
+
+@pytest.mark.parametrize(
+    "words", [("eval-perception", "--quick"), ("eval-photos", "--benchmark", "pods")]
+)
+def test_missing_weights_are_named_before_anything_is_fetched_or_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    monkeypatch.setenv("VAP_WEIGHTS", str(tmp_path / "none"))
+    monkeypatch.setattr(pods, "FOLDER", tmp_path / "pods")
+    for stack, remedy in (
+        ("foundation", "weights pull --stack foundation`"),
+        ("embedded:tracker=sam3", "weights pull --stack embedded:tracker=sam3 --unpinned`"),
+    ):
+        line = refused(*words, "--stack", stack, "--out", tmp_path / "out")
+        assert remedy in line
+        assert "--from DIR" in line
+    assert "stack 'fast' is unknown" in refused(*words, "--stack", "fast")
+    assert not list(tmp_path.iterdir())

@@ -49,8 +49,12 @@ def eval_perception(
     from vap_core.evaluation.perception.report import conclude
     from vap_core.evaluation.perception.run import Survey, run_survey
     from vap_core.evaluation.perception.run import publish as write_tables
+    from vap_core.perception.foundation.store import check_present
+    from vap_core.perception.stacks import check_stack
     from vap_core.simulation.suites import BENCHMARKS
 
+    check_stack(stack)
+    check_present(stack)
     suite_names = tuple(dict.fromkeys(suite or BENCHMARKS))
     survey = Survey(stack, suite_names, episodes, quick)
     tables = run_survey(survey, out, jobs=jobs)
@@ -106,6 +110,7 @@ def eval_photos(
     from vap_core.base.errors import BadPhotoSet, one_of
     from vap_core.evaluation.photos.pods import pods
     from vap_core.evaluation.photos.run import measure_photos
+    from vap_core.perception.foundation.store import check_present
     from vap_core.perception.stacks import check_stack
 
     benchmarks = {"pods": pods}
@@ -115,6 +120,7 @@ def eval_photos(
         raise BadPhotoSet("eval-photos: give a folder or --benchmark pods, one of the two.")
     if folder is None:
         check_stack(stack)
+        check_present(stack)
         folder = benchmarks[benchmark](origin=origin)
     folder_of_run = out or Path(f"data/runs/photos-{folder.resolve().name}")
     print(measure_photos(folder, folder_of_run, stack, clips=clips))

@@ -13,7 +13,15 @@ from pathlib import Path
 
 from vap_core.base.errors import MissingWeights
 from vap_core.base.files import kept_folder, parse_json, read_file, sha256_of, write_atomic
-from vap_core.perception.foundation.sources import KINDS, MODELS, PARTS, TENSORS, Source, models_of
+from vap_core.perception.foundation.sources import (
+    EMBEDDED,
+    KINDS,
+    MODELS,
+    PARTS,
+    TENSORS,
+    Source,
+    models_of,
+)
 
 STORE = kept_folder("weights-hub")
 VARIABLE = "VAP_WEIGHTS"
@@ -41,15 +49,7 @@ def verify_stack(kind: str, store: Path | None = None) -> tuple[VerifiedWeights,
     """
     store = store or store_folder()
     names = models_of(kind)
-    problems: list[str] = []
-    for name in names:
-        problem = find_problem(name, store)
-        if problem:
-            problems.append(f"{name} ({problem})")
-    if problems:
-        raise MissingWeights(
-            f"--stack {kind}: {', '.join(problems)} not usable in {store}; {remedy(kind)}."
-        )
+    _refuse_problems(kind, names, store, quick=False)
     verified: list[VerifiedWeights] = []
     for name in names:
         folder = store / MODELS[name].folder
@@ -59,6 +59,27 @@ def verify_stack(kind: str, store: Path | None = None) -> tuple[VerifiedWeights,
             identity = f"{name}-{digest[:12]}"
         verified.append(VerifiedWeights(folder, identity))
     return tuple(verified)
+
+
+def check_present(kind: str) -> None:
+    """What takes long asks this first: the files of a stack's models are there; none is hashed.
+
+    Raises: MissingWeights, as `verify_stack`.
+    """
+    if kind != EMBEDDED:  # whose text encoder may be a package's
+        _refuse_problems(kind, models_of(kind), store_folder(), quick=True)
+
+
+def _refuse_problems(kind: str, names: tuple[str, ...], store: Path, quick: bool) -> None:
+    problems: list[str] = []
+    for name in names:
+        problem = find_problem(name, store, quick)
+        if problem:
+            problems.append(f"{name} ({problem})")
+    if problems:
+        raise MissingWeights(
+            f"--stack {kind}: {', '.join(problems)} not usable in {store}; {remedy(kind)}."
+        )
 
 
 def remedy(kind: str) -> str:
