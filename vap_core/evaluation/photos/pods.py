@@ -10,7 +10,7 @@ import csv
 import io
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -100,10 +100,10 @@ def _download(folder: Path, say: Callable[[str], None]) -> None:
 def _write(origin: Path, folder: Path) -> None:
     """Convert a copy of the dataset; scenes.csv is written last. Raises: BadPhotoSet."""
     kinds = _reported_objects(origin)
-    reference_boxes = [("photo", "x0", "y0", "x1", "y1")]
+    reference_boxes: list[tuple[str, ...]] = [("photo", "x0", "y0", "x1", "y1")]
     for name, photo, mask in _photos(origin, REFERENCES, kinds, folder / "references"):
         reference_boxes.append((f"{name}/{photo.name}", *_box(mask, photo)))
-    scene_boxes = [("scene", "object", "x0", "y0", "x1", "y1")]
+    scene_boxes: list[tuple[str, ...]] = [("scene", "object", "x0", "y0", "x1", "y1")]
     for name, photo, mask in _photos(origin, SCENES, kinds, folder / "scenes"):
         scene_boxes.append((photo.name, name, *_box(mask, photo)))
         target = folder / MASKS / photo.name / f"{name}.png"
@@ -213,7 +213,7 @@ def _box(mask: Mask, photo: Path) -> tuple[str, ...]:
     return tuple(f"{value:g}" for value in box)
 
 
-def _write_csv(path: Path, rows: list[tuple[str, ...]]) -> None:
+def _write_csv(path: Path, rows: Sequence[tuple[str, ...]]) -> None:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     write_atomic(path, text.getvalue().encode())
