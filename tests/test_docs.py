@@ -25,6 +25,8 @@ MADE_LATER = ("data/runs", "data/memory", "data/objects", "data/cache", "data/ph
 """Folders that commands make, and that do not ship."""
 RECORD = "data/policies/README.md"
 """The card of the shipped policies names the commands of their day, which are no more."""
+HUB_OPTIONS = {"--repo-type", "--local-dir"}
+"""Of `hf download`."""
 CONTRACT_OPTIONS = set(re.findall(r'"(--[a-z-]+)"', Path(plugin.__file__).read_text()))
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 
@@ -110,7 +112,7 @@ def options(command: Any) -> set[str]:
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page != RECORD])
 def test_options_are_there(page: str) -> None:
-    known = options(typer.main.get_command(app)) | CONTRACT_OPTIONS
+    known = options(typer.main.get_command(app)) | CONTRACT_OPTIONS | HUB_OPTIONS
     for span in spans(page):
         for option in re.findall(r"(?<!\S)--[a-z][\w.-]*", span):
             assert option in known or "." in option, span  # lerobot's have a dot
