@@ -14,6 +14,7 @@ import pytest
 from tests.command import vap
 from vap_core.analysis.attention import (
     examples,
+    figures,
     intervals,
     patterns,
     prediction,
@@ -477,3 +478,17 @@ def test_the_clearest_call_is_that_of_a_words_highest_peak() -> None:
     calls = {0: maps("token", 0.2), 4: maps("token", 0.5), 8: maps("action", 0.9)}
     assert examples.clearest(calls) == 4
     assert examples.clearest({}) == 0
+
+
+def test_a_figure_has_the_suites_in_the_order_of_the_benchmarks() -> None:
+    """Tables hold them as they were published."""
+    published = [report.ALL_SUITES, "tabletop", *list(suites.BENCHMARKS)[:3]]
+    lines = []
+    for suite in published:
+        line: dict[str, Any] = {"suite": suite, "method": "vap", "query": "colour", "n": 3}
+        for name in ("lift", "lift_lookalikes"):
+            line |= {name: 1.0, f"{name}_low": 0.5, f"{name}_high": 2.0}
+        lines.append(line)
+    (axes,) = figures.where_figure(pd.DataFrame(lines)).axes
+    from_the_top = [label.get_text().split(" ")[0] for label in axes.get_yticklabels()][::-1]
+    assert from_the_top == [*suites.BENCHMARKS, "all"]

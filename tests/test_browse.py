@@ -1,6 +1,7 @@
 """A run's recordings as a table, as films and as a page; a click on a candidate."""
 
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from PIL import Image
 
 from tests.command import vap
-from tests.drawn import K, opening, record
+from tests.drawn import ROW, K, opening, record
 from tests.test_why import fail
 from vap_core.base.errors import BadRecording
 from vap_core.base.video import frames as video_frames
@@ -21,7 +22,7 @@ from vap_core.recording.stored_pictures import prompted_entities, read_pictures
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A failure, a success, and a file that is no recording."""
     folder = tmp_path_factory.mktemp("browsed") / "recordings"
-    fail(folder / "wrong.rrd", "owl_b", after=4, episode=4)
+    fail(folder / "wrong.rrd", "owl_b", after=4, row=replace(ROW, episode=4))
     record(folder / "fine.rrd", opening(2))
     (folder / "noise.rrd").write_bytes(b"noise" * 99)
     return folder.parent

@@ -33,7 +33,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two failures and a success, and beside them what is no recording of an episode."""
     folder = tmp_path_factory.mktemp("asked") / "recordings"
     fail(folder / "wrong.rrd", "owl_b")
-    fail(folder / "apart.rrd", "owl_a", "owl_b", after=4, episode=4)
+    fail(folder / "apart.rrd", "owl_a", "owl_b", after=4, row=replace(ROW, episode=4))
     start = replace(opening(1), row=replace(ROW, episode=5))
     with Recorder(folder / "fine.rrd", start, explain=explain) as recorder:
         for step in range(30):

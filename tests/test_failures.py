@@ -133,6 +133,15 @@ def test_a_target_that_is_said_not_to_be_in_view_is_its_own_sub_case():
     assert diagnose(before, THRESHOLDS).sub_case == "poor mask"
 
 
+def test_what_was_chosen_against_the_vote_is_not_called_elected():
+    before = episode("picked", still(6, [view(OTHER, proposal=0.9)]), candidates=2)
+    (grounding,) = before.header.groundings["front"]
+    forced = replace(before.header, groundings={"front": (replace(grounding, winner=1),)})
+    found = diagnose(replace(before, header=forced), THRESHOLDS)
+    assert f"{OTHER} was chosen against the vote" in found.sentence
+    assert f"the vote elected {OTHER}" in diagnose(before, THRESHOLDS).sentence
+
+
 def test_drift_opens_where_the_track_leaves():
     found = told("picked", still(4) + still(5, [view(OTHER)]))
     assert label(found) == ("case 1", "drift", 4, "front")

@@ -117,7 +117,7 @@ def test_recordings_and_signals_say_not_in_view() -> None:
     (grounding,) = attended.groundings["front"]
     said = describe_vote(grounding)
     assert said.startswith("#0 not in view, cosine ")
-    assert said.endswith(" below 0.99 · #0 wins: votes 3 of 3, the only candidate")
+    assert said.endswith(" below 0.99 · best of the vote: votes 3 of 3, the only candidate")
     assert result_line(grounding).startswith("#0 not in view, cosine ")
 
 

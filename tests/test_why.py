@@ -14,16 +14,21 @@ from vap_core.evaluation.diagnosis import explain
 from vap_core.recording import Recorder, read_summary
 from vap_core.recording.entities.status import LINE_CHARACTERS
 from vap_core.rollout.types import MaskCoverage
+from vap_core.simulation.types import EpisodeRow
 
 
 def fail(
-    path: Path, shown: str, second: str | None = None, after: int = 0, episode: int = 3
+    path: Path,
+    shown: str,
+    second: str | None = None,
+    after: int = 0,
+    row: EpisodeRow = ROW,
 ) -> dict[str, Any]:
     """A failed episode whose prompts cover `shown`, and in a second view `second`; from step `after` on."""
     start = opening(1 if second is None else 2)
     start = replace(
         start,
-        row=replace(ROW, episode=episode),
+        row=row,
         references={"owl_a": (np.full((20, 30, 3), 99, np.uint8),) * K},
     )
     with Recorder(path, start, explain=explain) as recorder:
@@ -109,6 +114,17 @@ def test_a_recording_says_why_and_its_blueprint_opens_there(
     assert sentence.startswith(summary["case_sentence"])
     assert rerun("rrd", "verify", path).returncode == 0
     assert f"{case}: {sub_case}" in tabs(path)
+
+
+def test_a_target_that_is_left_out_has_no_distance_from_the_gripper(tmp_path: Path) -> None:
+    left_out = replace(ROW, start=replace(ROW.start, absent=True))
+    path = tmp_path / "one.rrd"
+    fail(path, "owl_b", row=left_out)
+    drawn = entities(path)
+    assert "/vap/hand/gripper_to_target" not in drawn
+    assert {"/vap/hand/nearest_other", "/vap/hand/deciding_frame"} <= drawn
+    nearest = columns(path, "/vap/hand/nearest_other", "Scalars:scalars")
+    assert columns(path, "/vap/hand/deciding_frame", "Scalars:scalars") == {0: nearest[0]}
 
 
 def test_a_prompt_wears_the_colour_of_what_it_covers(tmp_path: Path) -> None:

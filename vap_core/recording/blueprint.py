@@ -10,6 +10,8 @@ import rerun.blueprint as rrb
 from vap_core.base.types import Grounding
 from vap_core.recording.stream import StoredBlueprint
 from vap_core.recording.views import (
+    DEFAULT_AXES,
+    Axes,
     Part,
     attention_view,
     coverage_view,
@@ -33,8 +35,8 @@ VERDICT_SHARES = [0.11, 0.89]
 """Height of the verdict, and of everything below it."""
 EVIDENCE_SHARES = [0.71, 0.29]
 """Height of the evidence, and of the time course below it."""
-
-type Limits = tuple[float, float]
+EVENTS_SHARE = 1.7
+"""Width of the events, where the instruction has 1."""
 
 
 def episode_blueprint(
@@ -42,19 +44,19 @@ def episode_blueprint(
     diagnosis: Diagnosis | None = None,
     *,
     queries: Sequence[str] = (),
-    gripper_cm: Limits | None = None,
+    axes: Axes = DEFAULT_AXES,
 ) -> StoredBlueprint:
     """The verdict; below it everything, before it the evidence of a diagnosed failure, last the
     policy's attention.
 
-    `queries` are those whose attention is recorded; each has a tab of its own. `gripper_cm` is the
-    axis of the gripper's chart.
+    `queries` are those whose attention is recorded; each has a tab of its own. `axes` are those of
+    the charts.
     """
-    tabs: list[Part] = [_overview(header, gripper_cm)]
+    tabs: list[Part] = [_overview(header, axes)]
     if queries:
-        tabs.append(_attention_tab(header, queries, gripper_cm))
+        tabs.append(_attention_tab(header, queries, axes))
     if diagnosis is not None and header.cameras:
-        tabs.insert(0, _evidence_tab(header, diagnosis, gripper_cm))
+        tabs.insert(0, _evidence_tab(header, diagnosis, axes))
     body = tabs[0]
     if len(tabs) > 1:
         body = rrb.Tabs(*tabs, active_tab=0)
@@ -83,7 +85,7 @@ def full_window(root: Part, fps: float = 1.0) -> StoredBlueprint:
     )
 
 
-def _overview(header: EpisodeHeader, gripper_cm: Limits | None) -> rrb.Container:
+def _overview(header: EpisodeHeader, axes: Axes) -> rrb.Container:
     """Pictures, scene and votes above; text, curves and events below."""
     pictures, share = _camera_grid(header)
     right: Part = scene_view(header)
@@ -93,15 +95,13 @@ def _overview(header: EpisodeHeader, gripper_cm: Limits | None) -> rrb.Container
     top = rrb.Horizontal(pictures, right, column_shares=[share, 1 - share])
     return rrb.Vertical(
         top,
-        _time_course(header, gripper_cm),
+        _time_course(header, axes),
         row_shares=EVIDENCE_SHARES,
         name="everything",
     )
 
 
-def _attention_tab(
-    header: EpisodeHeader, queries: Sequence[str], gripper_cm: Limits | None
-) -> rrb.Container:
+def _attention_tab(header: EpisodeHeader, queries: Sequence[str], axes: Axes) -> rrb.Container:
     """Where the attention was, in every view; the query is switched by a tab."""
     per_query: list[Part] = []
     for query in queries:
@@ -109,15 +109,13 @@ def _attention_tab(
         per_query.append(rrb.Horizontal(*views, name=query))
     return rrb.Vertical(
         rrb.Tabs(*per_query, active_tab=0),
-        _time_course(header, gripper_cm),
+        _time_course(header, axes),
         row_shares=EVIDENCE_SHARES,
         name="attention",
     )
 
 
-def _evidence_tab(
-    header: EpisodeHeader, diagnosis: Diagnosis, gripper_cm: Limits | None
-) -> rrb.Container:
+def _evidence_tab(header: EpisodeHeader, diagnosis: Diagnosis, axes: Axes) -> rrb.Container:
     """The evidence that decided the case of a failure."""
     camera = diagnosis.camera or header.cameras[0].name
     with_gripper = True
@@ -127,11 +125,11 @@ def _evidence_tab(
         case "case 2":
             evidence = _views_evidence(header)
         case _:
-            evidence = _manipulation_evidence(header, gripper_cm)
+            evidence = _manipulation_evidence(header, axes)
             with_gripper = False  # its curves are in the evidence
     return rrb.Vertical(
         evidence,
-        _time_course(header, gripper_cm, with_gripper=with_gripper),
+        _time_course(header, axes, with_gripper=with_gripper),
         row_shares=EVIDENCE_SHARES,
         name=f"{diagnosis.case}: {diagnosis.sub_case}",
     )
@@ -159,7 +157,7 @@ def _views_evidence(header: EpisodeHeader) -> Part:
     return rrb.Horizontal(*columns)
 
 
-def _manipulation_evidence(header: EpisodeHeader, gripper_cm: Limits | None) -> Part:
+def _manipulation_evidence(header: EpisodeHeader, axes: Axes) -> Part:
     """Case 3: every view's prompt is right, the scene, and the gripper's distances.
 
     A method that prompts nothing shows the target's outline instead.
@@ -178,7 +176,7 @@ def _manipulation_evidence(header: EpisodeHeader, gripper_cm: Limits | None) -> 
     return rrb.Horizontal(
         pictures,
         scene_view(header),
-        gripper_view(gripper_cm),
+        gripper_view(axes),
         column_shares=[share, 1.05, 1],
     )
 
@@ -208,21 +206,19 @@ def _camera_grid(header: EpisodeHeader) -> tuple[Part, float]:
     return rrb.Horizontal(*grid), 0.4 if n_cameras == 1 else 0.52
 
 
-def _time_course(
-    header: EpisodeHeader, gripper_cm: Limits | None, *, with_gripper: bool = True
-) -> Part:
+def _time_course(header: EpisodeHeader, axes: Axes, *, with_gripper: bool = True) -> Part:
     """Instruction, curves and events."""
-    curves = robot_curve_views(header)
+    curves = robot_curve_views(header, axes)
     if with_gripper:
-        curves.insert(0, gripper_view(gripper_cm))
+        curves.insert(0, gripper_view(axes))
     parts = [instruction_view(), rrb.Tabs(*curves, active_tab=0)]
-    shares = [1.1, 1.1]
-    of_method = method_curve_views(header)
+    shares = [1.0, 1.0]
+    of_method = method_curve_views(header, axes)
     if of_method:
         parts.append(rrb.Tabs(*of_method, active_tab=0))
-        shares.append(0.8)
+        shares.append(0.75)
     parts.append(events_view())
-    return rrb.Horizontal(*parts, column_shares=[*shares, 1.35])
+    return rrb.Horizontal(*parts, column_shares=[*shares, EVENTS_SHARE])
 
 
 def _voting(header: EpisodeHeader) -> list[str]:

@@ -78,6 +78,7 @@ from vap_core.recording.texts import (
     instruction_document,
     verdict_document,
 )
+from vap_core.recording.views import Axes
 from vap_core.rollout.failure import Diagnosis, Explain, Explanation
 from vap_core.rollout.types import Episode, EpisodeHeader, Frame, SubGoalSpan
 from vap_core.simulation.types import Outcome
@@ -333,7 +334,10 @@ class Recorder:
                 diagnosis=explanation.diagnosis,
             )
         blueprint = episode_blueprint(
-            self._header, explanation.diagnosis, queries=self._queries, gripper_cm=gripper_cm
+            self._header,
+            explanation.diagnosis,
+            queries=self._queries,
+            axes=Axes(gripper_cm, len(self._frames)),
         )
         blueprint.send(rec)
 

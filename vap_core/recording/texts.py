@@ -15,9 +15,10 @@ def describe_vote(grounding: Grounding) -> str:
     ballot = grounding.ballot
     if ballot.winner is None:
         return "no candidate, view unmodified"
-    text = f"#{ballot.winner} wins: {describe_ballot(grounding)}"
     if grounding.rejected is not None:
-        return f"#{grounding.rejected} {describe_rejection(grounding)} · {text}"
+        rejection = f"#{grounding.rejected} {describe_rejection(grounding)}"
+        return f"{rejection} · best of the vote: {describe_ballot(grounding)}"
+    text = f"#{ballot.winner} wins: {describe_ballot(grounding)}"
     if not grounding.overruled:
         return text
     if grounding.winner is None:

@@ -7,6 +7,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from vap_core.base.types import value
 from vap_core.recording.colours import BACKGROUND
 from vap_core.recording.entities.comparison import vote_picture_entity
 from vap_core.recording.entities.paths import image_root
@@ -22,6 +23,23 @@ QUERY_NAMES = {
 }
 UNIT_RANGE = (-0.05, 1.05)
 """The axis of numbers between 0 and 1."""
+LEGEND_SHARE = 0.45
+"""Steps after the end of a chart whose legend stands there, as a share of the episode's."""
+
+
+@value
+class Axes:
+    """The axes of an episode's charts.
+
+    `gripper_cm` is the vertical axis of the gripper's distances, `steps` the number of control
+    steps; None leaves it to the viewer.
+    """
+
+    gripper_cm: tuple[float, float] | None = None
+    steps: int | None = None
+
+
+DEFAULT_AXES = Axes()
 
 
 def policy_view(camera: str) -> Part:
@@ -100,36 +118,36 @@ def events_view() -> Part:
     return rrb.TextLogView(origin="/vap/events", name="events", columns=columns)
 
 
-def robot_curve_views(header: EpisodeHeader) -> list[Part]:
+def robot_curve_views(header: EpisodeHeader, axes: Axes) -> list[Part]:
     """Arm action, gripper action, and robot state."""
     n_arm = len(header.action_names) - 1
     return [
-        _curve_view("/action", "action", visible=[True] * n_arm + [False]),
-        _curve_view("/action", "gripper", visible=[False] * n_arm + [True]),
-        _curve_view("/observation.state", "state"),
+        _curve_view("/action", "action", axes, visible=[True] * n_arm + [False]),
+        _curve_view("/action", "gripper", axes, visible=[False] * n_arm + [True]),
+        _curve_view("/observation.state", "state", axes),
     ]
 
 
-def method_curve_views(header: EpisodeHeader) -> list[Part]:
+def method_curve_views(header: EpisodeHeader, axes: Axes) -> list[Part]:
     """Track scores and vote margins, where the method has some."""
     cameras = [camera for camera, groundings in header.groundings.items() if groundings]
     if not cameras:
         return []
     return [
-        track_score_view(),
-        _curve_view("/vap/vote_margin", "vote margin", UNIT_RANGE),
+        track_score_view(axes),
+        _curve_view("/vap/vote_margin", "vote margin", axes, UNIT_RANGE),
     ]
 
 
-def track_score_view() -> Part:
+def track_score_view(axes: Axes = DEFAULT_AXES) -> Part:
     """How sure the tracker is of the target, in every view."""
-    return _curve_view("/vap/track_score", "track score", UNIT_RANGE)
+    return _curve_view("/vap/track_score", "track score", axes, UNIT_RANGE)
 
 
-def gripper_view(limits_cm: tuple[float, float] | None = None) -> Part:
+def gripper_view(axes: Axes = DEFAULT_AXES) -> Part:
     """The gripper's distance from the target and the nearest other object, and what it holds."""
     title = "gripper to target (orange), to nearest other (blue), cm"
-    return _curve_view("/vap/hand", title, limits_cm, legend=False)
+    return _curve_view("/vap/hand", title, axes, axes.gripper_cm, legend=False)
 
 
 def _image_view(camera: str, title: str, suffixes: Sequence[str]) -> rrb.Spatial2DView:
@@ -145,12 +163,23 @@ def _image_view(camera: str, title: str, suffixes: Sequence[str]) -> rrb.Spatial
 def _curve_view(
     origin: str,
     name: str,
+    axes: Axes,
     limits: tuple[float, float] | None = None,
     visible: Sequence[bool] | None = None,
     *,
     legend: bool = True,
 ) -> rrb.TimeSeriesView:
+    """Curves over the control steps; a legend stands to the right of their end."""
     axis = None
+    time = None
+    if legend and axes.steps is not None:
+        last = round((1 + LEGEND_SHARE) * axes.steps)
+        time = rrb.TimeAxis(
+            view_range=rr.TimeRange(
+                start=rr.TimeRangeBoundary.absolute(seq=0),
+                end=rr.TimeRangeBoundary.absolute(seq=last),
+            )
+        )
     corner = rrb.Corner2D.RightTop
     if limits is not None:
         axis = rrb.ScalarAxis(range=limits)
@@ -162,6 +191,7 @@ def _curve_view(
         origin=origin,
         name=name,
         contents=["$origin/**"],
+        axis_x=time,
         axis_y=axis,
         plot_legend=rrb.PlotLegend(corner, visible=legend),
         overrides=overrides,

@@ -85,7 +85,8 @@ class EpisodeTrace:
     of the tcp from the target's bounding box, `lift_m` how much higher each object is than at
     first, `moved_m` how far it has moved. `grip` is the gripper's command, 0 closed .. 1 open, nan
     at the terminal frame, which has none. `candidates` counts proposals by camera; `rejected` are
-    the cameras in which the method says that the target is not in view.
+    the cameras in which the method says that the target is not in view, `overruled` those in which
+    something else than the vote chose the candidate.
     """
 
     target: str
@@ -102,6 +103,7 @@ class EpisodeTrace:
     candidates: Mapping[str, int]
     prompted: bool
     rejected: frozenset[str] = frozenset()
+    overruled: frozenset[str] = frozenset()
 
 
 @value

@@ -8,6 +8,7 @@ from vap_core.analysis.attention.patterns import LOCALISATIONS, over_views
 from vap_core.base.figures import OTHER, WINNER, empty_figure
 from vap_core.base.palette import FRAME, TEXT
 from vap_core.evaluation.store import KEY
+from vap_core.simulation.suites import BENCHMARKS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,7 +34,7 @@ def where_figure(table: "pd.DataFrame") -> "Figure":
     `table` is `report.where_queries_look`'s; 1 is what an even attention would have, bars of error
     are 95 % intervals over layouts.
     """
-    lines = table.iloc[::-1].reset_index(drop=True)
+    lines = _in_order(table).iloc[::-1].reset_index(drop=True)
     figure = empty_figure(7.2, 0.3 * len(lines) + 1.1)
     axes = figure.subplots()
     places = np.arange(len(lines))
@@ -121,11 +122,18 @@ def patterns_figure(counts: "pd.DataFrame") -> "Figure":
     return figure
 
 
+def _in_order(table: "pd.DataFrame") -> "pd.DataFrame":
+    """The rows in the order of the benchmarks; those of all suites are last."""
+    places = {name: i for i, name in enumerate(BENCHMARKS)}
+    order = table["suite"].astype(str).map(places).fillna(len(places))
+    return table.loc[order.sort_values(kind="stable").index]
+
+
 def _grid(
     table: "pd.DataFrame", *, width: float, height: float
 ) -> "tuple[Figure, dict[tuple[str, str], Axes]]":
     """A panel for every suite and method of a table, suites from left to right."""
-    suites = list(dict.fromkeys(table["suite"].astype(str)))
+    suites = list(dict.fromkeys(_in_order(table)["suite"].astype(str)))
     methods = list(dict.fromkeys(table["method"].astype(str)))
     figure = empty_figure(max(4.0, width * len(suites) + 0.4), height * len(methods) + 0.5)
     panels = figure.subplots(len(methods), len(suites), squeeze=False, sharey=True)

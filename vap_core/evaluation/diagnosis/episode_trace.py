@@ -53,10 +53,13 @@ def trace_episode(episode: Episode) -> EpisodeTrace:
 
     candidates = {}
     rejected = []
+    overruled = []
     for camera, per_target in header.groundings.items():
         candidates[camera] = len(per_target[0].candidates) if per_target else 0
         if per_target and per_target[0].rejected is not None:
             rejected.append(camera)
+        if per_target and per_target[0].overruled:
+            overruled.append(camera)
     return EpisodeTrace(
         target=row.target,
         rule=row.rule,
@@ -72,6 +75,7 @@ def trace_episode(episode: Episode) -> EpisodeTrace:
         candidates=candidates,
         prompted=any(coverage),
         rejected=frozenset(rejected),
+        overruled=frozenset(overruled),
     )
 
 

@@ -38,7 +38,8 @@ def wrong_prompt(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | Non
     else:
         sub_case = "drift"
     share = float(np.mean(wrong))
-    words = _sentence(sub_case, view, labels, trace.steps[at])
+    chosen_by_vote = view.camera not in trace.overruled
+    words = _sentence(sub_case, view, labels, trace.steps[at], chosen_by_vote=chosen_by_vote)
     return Diagnosis(
         case=case,
         sub_case=sub_case,
@@ -192,7 +193,12 @@ def _evidence(
 
 
 def _sentence(
-    sub_case: str, view: MaskCoverage, labels: Mapping[str, str | None], step: int
+    sub_case: str,
+    view: MaskCoverage,
+    labels: Mapping[str, str | None],
+    step: int,
+    *,
+    chosen_by_vote: bool,
 ) -> str:
     camera = view.camera
     iou = f"{view.iou:.2f}"
@@ -210,9 +216,10 @@ def _sentence(
         case "shifted proposal":
             return f"{camera}: no box fits the target (best IoU {proposal}); {name} is highlighted"
         case "distractor vote":
-            return (
-                f"{camera}: the target was proposed (IoU {proposal}), and the vote elected {name}"
-            )
+            choice = f"the vote elected {name}"
+            if not chosen_by_vote:
+                choice = f"{name} was chosen against the vote"
+            return f"{camera}: the target was proposed (IoU {proposal}), and {choice}"
         case "poor mask":
             return f"{camera}: the mask misses most of the target (IoU {iou})"
         case "drift":

@@ -105,28 +105,27 @@ def send_gripper(
     """The gripper's distance from the target and from the nearest other object, centimetres.
 
     Also the target's lift, bars below zero while the hand is closed and while it has an object, and
-    a cross at the deciding frame. Returns the chart's axis, from below the bars to above all
-    curves.
+    a cross at the deciding frame. A target that is left out of the scene has no curve. Returns the
+    chart's axis, from below the bars to above all curves.
     """
     index = frame_times(frames)
-    gap_cm = 100 * trace.gap_m
-    lift_cm = 100 * trace.lift_m[trace.target]
-    curves = [
-        ("gripper to target", TARGET, GRIPPER_WIDTH, gap_cm),
-        ("target lifted", TARGET, LIFT_WIDTH, lift_cm),
-    ]
-    highest = float(max(gap_cm.max(), lift_cm.max(), 1.0))
+    curves: list[tuple[str, Rgb8, float, np.ndarray]] = []
+    if not header.row.start.absent:
+        lift_cm = 100 * trace.lift_m[trace.target]
+        curves.append(("gripper to target", TARGET, GRIPPER_WIDTH, 100 * trace.gap_m))
+        curves.append(("target lifted", TARGET, LIFT_WIDTH, lift_cm))
     other_m = nearest_other_m(header, frames)
     if other_m is not None:
         curves.append(("nearest other", LOOKALIKES[0], GRIPPER_WIDTH, 100 * other_m))
-        highest = max(highest, 100 * float(other_m.max()))
+    highest = max([1.0, *(float(values.max()) for *_, values in curves)])
     curves += _grasp_bars(trace, frames, -BAR_SHARE * highest)
     for name, colour, width, values in curves:
         entity = f"/vap/hand/{name.replace(' ', '_')}"
         log_row(rec, entity, rr.SeriesLines(names=[name], colors=[colour], widths=[width]))
         send_curve(rec, entity, index, values)
-    if diagnosis is not None:
-        _send_deciding_frame(rec, trace, frames, diagnosis)
+    if diagnosis is not None and curves:
+        *_, distances_cm = curves[0]
+        _send_deciding_frame(rec, trace, frames, diagnosis, distances_cm)
     return -0.2 * highest, 1.05 * highest
 
 
@@ -153,8 +152,9 @@ def _send_deciding_frame(
     trace: EpisodeTrace,
     frames: Sequence[Frame],
     diagnosis: Diagnosis,
+    distances_cm: np.ndarray,
 ) -> None:
-    """A cross on the distance from the target."""
+    """A cross on a curve, one number per frame."""
     if diagnosis.frame_index not in trace.steps:
         return
     at = trace.steps.index(diagnosis.frame_index)
@@ -163,7 +163,7 @@ def _send_deciding_frame(
         names=["deciding frame"], colors=[ELECTED], markers=["cross"], marker_sizes=[7.0]
     )
     log_row(rec, entity, style)
-    send_curve(rec, entity, frame_times([frames[at]]), 100 * trace.gap_m[at : at + 1])
+    send_curve(rec, entity, frame_times([frames[at]]), distances_cm[at : at + 1])
 
 
 def _send_track_scores(
