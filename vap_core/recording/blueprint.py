@@ -193,9 +193,9 @@ def _camera_grid(header: EpisodeHeader) -> tuple[Part, float]:
         if n_cameras == 2:
             track_title, vote_title = "track", "vote"
         pictures = [track_view(camera.name, track_title)]
-        n_targets = len(header.groundings.get(camera.name, ()))
-        if n_targets:
-            pictures.append(vote_view(camera.name, vote_title, n_targets))
+        for j, grounding in enumerate(header.groundings.get(camera.name, ())):
+            title = vote_title if j == 0 else f"vote, {grounding.object}"
+            pictures.append(vote_view(camera.name, title, j))
         policy = policy_view(camera.name)
         if n_cameras <= 2:
             grid.append(rrb.Vertical(policy, rrb.Horizontal(*pictures), row_shares=[5, 3]))

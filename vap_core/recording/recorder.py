@@ -52,6 +52,7 @@ from vap_core.recording.entities.scene import (
     log_cameras,
     log_links,
     log_objects,
+    log_roles,
     log_table,
     send_camera_poses,
     send_truth,
@@ -151,6 +152,7 @@ class Recorder:
         if not self._frames:
             self._log_first_frame(frame)
         elif self._spans and self._spans[-1].first == frame.frame_index:
+            self._log_roles(frame)
             for camera in frame.images:
                 self._log_votes(frame, camera)
         self._pictures.add(frame)
@@ -210,11 +212,18 @@ class Recorder:
         header = self._header
         rec.send_recording_name(f"{header.row.key} · {header.method}")
         log_properties(rec, "rollout", rollout_properties(header))
-        classes = rr.AnnotationContext([*CLASSES, *coverage_classes(header)])
-        log_row(rec, "/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, classes)
+        log_row(rec, "/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         log_row(rec, "/vap/instruction", instruction_document(header))
         log_table(rec, header.row)
         log_objects(rec, header)
+
+    def _log_roles(self, frame: Frame) -> None:
+        """Which object is the target from this step on; static, where that never changes."""
+        rec = self._open_stream()
+        at = frame_times([frame]) if self._header.row.subgoals else ()
+        classes = rr.AnnotationContext([*CLASSES, *coverage_classes(self._goal)])
+        log_row(rec, "/", classes, at=at)
+        log_roles(rec, self._goal, at)
 
     def _log_first_frame(self, frame: Frame) -> None:
         """What only the first step shows: shapes, links, and the pictures of the vote."""
@@ -224,6 +233,7 @@ class Recorder:
         log_cameras(rec, frame)
         log_status_styles(rec)
         log_links(rec, frame.truth)
+        self._log_roles(frame)
         for camera in frame.images:
             self._log_votes(frame, camera)
         for j, association in enumerate(self._header.associations):
@@ -245,7 +255,7 @@ class Recorder:
         right = _elected_target(frame, camera, self._goal.row.target)
         log_vote(rec, groundings[0], 0, jpeg, at, right)
         for j, grounding in enumerate(groundings[1:], start=1):
-            log_vote(rec, grounding, j, None, at)
+            log_vote(rec, grounding, j, jpeg, at)
         for j, grounding in enumerate(groundings):
             references = self._header.references.get(grounding.object, ())
             log_vote_picture(

@@ -10,7 +10,7 @@ import rerun.blueprint as rrb
 from vap_core.base.types import value
 from vap_core.recording.colours import BACKGROUND
 from vap_core.recording.entities.comparison import vote_picture_entity
-from vap_core.recording.entities.paths import image_root
+from vap_core.recording.entities.paths import image_root, target_suffix
 from vap_core.recording.entities.scene import mean_placement
 from vap_core.rollout.types import EpisodeHeader
 
@@ -52,12 +52,9 @@ def track_view(camera: str, title: str) -> Part:
     return _image_view(camera, title, ["", "/mask/**"])
 
 
-def vote_view(camera: str, title: str = "vote at t = 0", n_targets: int = 1) -> Part:
-    """The candidates of every target over the picture that the vote was held on."""
-    contents = ["/candidates/**"]
-    for j in range(1, n_targets):
-        contents.append(f"/candidates_{j}/**")
-    return _image_view(camera, title, contents)
+def vote_view(camera: str, title: str = "vote at t = 0", j: int = 0) -> Part:
+    """The candidates of target j over the picture that the vote was held on."""
+    return _image_view(camera, title, [f"/candidates{target_suffix(j)}/**"])
 
 
 def coverage_view(camera: str) -> Part:

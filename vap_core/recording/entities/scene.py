@@ -51,13 +51,10 @@ def mean_placement(row: EpisodeRow) -> np.ndarray:
 
 
 def log_objects(rec: rr.RecordingStream, header: EpisodeHeader) -> None:
-    """Every object's own mesh, and its bounding box in the colour of its part in the task.
+    """Every object's own mesh and its bounding box; `log_roles` colours the boxes.
 
     An object's origin is the centre of its base. Without a mesh in the registry its box is solid.
     """
-    row = header.row
-    colours = object_colours(list(header.object_sizes_m), row.target, row.goal)
-    labels = {row.target: f"target: {row.target}", row.goal: f"goal: {row.goal}"}
     for name, size in header.object_sizes_m.items():
         fill_mode = rr.components.FillMode.MajorWireframe
         mesh = object_mesh(name)
@@ -69,13 +66,26 @@ def log_objects(rec: rr.RecordingStream, header: EpisodeHeader) -> None:
         box = rr.Boxes3D(
             centers=[[0, 0, half[2]]],
             half_sizes=[half],
-            colors=[colours[name]],
             radii=rr.components.Radius.ui_points([1.5]),
             fill_mode=fill_mode,
-            labels=[labels.get(name, name)],
-            show_labels=mesh is None and name in labels,
         )
         log_row(rec, f"/world/objects/{name}", box)
+
+
+def log_roles(
+    rec: rr.RecordingStream, header: EpisodeHeader, at: Sequence[rr.TimeColumn] = ()
+) -> None:
+    """The colour and the label of every object by its part in the task, from a moment on."""
+    row = header.row
+    colours = object_colours(list(header.object_sizes_m), row.target, row.goal)
+    labels = {row.target: f"target: {row.target}", row.goal: f"goal: {row.goal}"}
+    for name, colour in colours.items():
+        box = rr.Boxes3D.from_fields(
+            colors=[colour],
+            labels=[labels.get(name, name)],
+            show_labels=object_mesh(name) is None and name in labels,
+        )
+        log_row(rec, f"/world/objects/{name}", box, at=at)
 
 
 def log_links(rec: rr.RecordingStream, truth: Truth) -> None:
