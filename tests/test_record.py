@@ -225,10 +225,10 @@ def test_what_the_views_agreed_on_can_be_read_back(tmp_path: Path) -> None:
     }
     assert columns(tmp_path / "one.rrd", "/vap/association", "cameras")[0] == ["front", "side"]
     assert describe_vote(groundings["front"][0]).startswith(
-        "#1 by association · #0 wins: votes 4 of 5, cosine lead +0.12"
+        "#1 is chosen · #0 wins: votes 4 of 5, lead +0.12"
     )
     assert describe_vote(groundings["side"][0]).startswith(
-        "none by association · #0 wins: votes 4 of 5, cosine lead +0.12"
+        "none is chosen · #0 wins: votes 4 of 5, lead +0.12"
     )
     assert "/vap/votes/side/winner" not in entities(tmp_path / "one.rrd")
     assert rerun("rrd", "verify", tmp_path / "one.rrd").returncode == 0

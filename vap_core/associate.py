@@ -19,9 +19,8 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from vap_core.base.errors import BadViews
-from vap_core.base.types import Association, Camera, Grounding, value
+from vap_core.base.types import Association, Camera, Grounding, election_scores, value
 from vap_core.perception.candidates import Candidates
-from vap_core.vote import election_scores
 
 Term = Literal["embedding", "hungarian", "geometry"]
 Scores = Float64[np.ndarray, "_ _"]

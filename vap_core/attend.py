@@ -39,6 +39,7 @@ from vap_core.base.types import (
     Rgb,
     Track,
     Views,
+    election_scores,
     value,
 )
 from vap_core.instruction import Parser, rewrite
@@ -54,7 +55,7 @@ from vap_core.perception.candidates import (
 )
 from vap_core.perception.protocols import FamiliarityJudge, Stack, TargetTracker
 from vap_core.prompt import PALETTE, PromptForm, Tint, choose_colours
-from vap_core.vote import VoteRule, compare, election_scores, nominate, vote
+from vap_core.vote import VoteRule, compare, nominate, vote
 
 PerTarget = tuple[Grounding, ...]
 """One grounding per target of the instruction, in the order of its targets."""

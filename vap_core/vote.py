@@ -6,7 +6,14 @@ import numpy as np
 from jaxtyping import Float32
 
 from vap_core.base.errors import BadEncoder
-from vap_core.base.types import Ballot, Boxes, PersonalObject, Rgb
+from vap_core.base.types import (
+    SAME,
+    Ballot,
+    PersonalObject,
+    Rgb,
+    best_of_references,
+    election_scores,
+)
 from vap_core.memory import reference_rows
 from vap_core.perception.boxes import box_cover
 from vap_core.perception.candidates import Candidates, Proposals
@@ -15,8 +22,6 @@ from vap_core.perception.protocols import Stack
 
 VoteRule = Literal["vote", "average", "best"]
 
-SAME = 1e-6
-"""Cosines closer than this are equal, so that rounding never decides an election."""
 SAME_PLACE = 0.5
 """Of two boxes of which the smaller is covered by more than this share, one is a candidate."""
 MOST_CANDIDATES = 4
@@ -45,18 +50,6 @@ def compare(
             "pytest --pyargs vap_core.contracts --encoder MODULE:NAME."
         )
     return cosine
-
-
-def election_scores(cosine: Float32[np.ndarray, "n k"], boxes: Boxes) -> Float32[np.ndarray, "n k"]:
-    """What the vote compares: cosines, and where boxes have priors or proofs their sum.
-
-    Both count from the view's greatest sum, so no score is above its cosine.
-    """
-    evidence = np.zeros(len(boxes), np.float32)
-    for of_boxes in (boxes.prior, boxes.proof):
-        if of_boxes is not None:
-            evidence += of_boxes
-    return cosine + (evidence - evidence.max(initial=-np.inf))[:, None]
 
 
 def nominate(rgb: Rgb, obj: PersonalObject, offered: Proposals, stack: Stack) -> Proposals:
@@ -113,8 +106,7 @@ def vote(cosine: Float32[np.ndarray, "n k"], rule: VoteRule = "vote") -> Ballot:
         )
     if k == 0:
         raise ValueError("vote: no references; a personal object has at least one")
-    best_of_reference = (cosine >= cosine.max(axis=0) - SAME).argmax(axis=0)
-    votes = np.bincount(best_of_reference, minlength=n).astype(np.int64)
+    votes = np.bincount(best_of_references(cosine), minlength=n).astype(np.int64)
     mean = cosine.astype(np.float64).mean(axis=1)
     most_votes = votes == votes.max()
 

@@ -46,7 +46,7 @@ def is_lost(event: Event) -> bool:
 
 
 def describe_ballot(grounding: Grounding) -> str:
-    """The elected candidate's votes and lead, such as "votes 5 of 5, cosine lead +0.06"."""
+    """The elected candidate's votes and lead, such as "votes 5 of 5, lead +0.06"."""
     ballot = grounding.ballot
     if ballot.winner is None:
         return "no candidate"
@@ -73,7 +73,7 @@ def describe_lead(ballot: Ballot) -> str:
     """How far the elected candidate is ahead of every other, by `Ballot.cosine_margin`."""
     if len(ballot.votes) == 1:
         return "the only candidate"
-    lead = f"cosine lead {ballot.cosine_margin:+.2f}"
+    lead = f"lead {ballot.cosine_margin:+.2f}"
     if int(ballot.tied.sum()) > 1:
         return f"tie, {lead}"
     return lead

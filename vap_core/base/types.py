@@ -189,6 +189,34 @@ def likeness(similarity: Float32[np.ndarray, "n k"], boxes: Boxes) -> Float32[np
     return greatest + boxes.proof
 
 
+SAME = 1e-6
+"""Cosines closer than this are equal, so that rounding never decides an election."""
+
+
+def election_scores(
+    similarity: Float32[np.ndarray, "n k"], boxes: Boxes
+) -> Float32[np.ndarray, "n k"]:
+    """What the vote compares: cosines, and where boxes have priors or proofs their sum.
+
+    Both count from the view's greatest sum, so no score is above its cosine.
+    """
+    return similarity + _evidence(boxes)[:, None]
+
+
+def best_of_references(scores: Float32[np.ndarray, "n k"]) -> Int64[np.ndarray, " k"]:
+    """The candidate that each reference votes for, given `election_scores` of at least one."""
+    return (scores >= scores.max(axis=0) - SAME).argmax(axis=0)
+
+
+def _evidence(boxes: Boxes) -> Float32[np.ndarray, " n"]:
+    """Each box's prior and proof, less the greatest sum."""
+    evidence = np.zeros(len(boxes), np.float32)
+    for of_boxes in (boxes.prior, boxes.proof):
+        if of_boxes is not None:
+            evidence += of_boxes
+    return evidence - evidence.max(initial=-np.inf)
+
+
 @value
 class Grounding:
     """Why a view's box was chosen, or none: everything that the vote saw at t = 0 (P 3.3).
@@ -223,6 +251,18 @@ class Grounding:
     def likeness(self) -> Float32[np.ndarray, " n"]:
         """`likeness` of every candidate."""
         return likeness(self.similarity, self.candidates)
+
+    @property
+    def evidence(self) -> Float32[np.ndarray, " n"]:
+        """What the vote adds to every candidate's cosines, at most 0."""
+        return _evidence(self.candidates)
+
+    @property
+    def voted(self) -> Int64[np.ndarray, " k"]:
+        """The candidate that each reference votes for; empty without candidates."""
+        if not len(self.similarity):
+            return np.zeros(0, np.int64)
+        return best_of_references(election_scores(self.similarity, self.candidates))
 
     @property
     def mask(self) -> Mask | None:

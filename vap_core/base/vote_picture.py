@@ -2,7 +2,8 @@
 
     picture = vote_picture(grounding, rgb, obj.crops)
 
-Each photo votes for the candidate with the highest cosine in its column: a dot marks that cell.
+Each photo votes for the candidate with the highest cosine in its column, a box's prior added where
+there is one: a dot marks that cell.
 """
 
 from collections.abc import Sequence
@@ -27,6 +28,8 @@ Place = tuple[Number, Number]
 """x and y, or width and height, pixels."""
 Text = tuple[str, Place, Rgb8, bool]
 """Words, the middle of their height at their left end or, where true, their centre; colour."""
+LEAST_EVIDENCE = 0.005
+"""Smaller priors are not shown; they would read 0.00."""
 MOST_ROWS = 6
 """Candidates that are shown, best first; a last line counts the others."""
 PAPERS = {True: ("#181c24", "#e6e6e6", "#3a404c"), False: ("#ffffff", "#222222", "#d0d0d0")}
@@ -82,7 +85,7 @@ def vote_picture(
 
     least = float(grounding.similarity.min()) if grounding.similarity.size else 0.0
     texts: list[Text] = []
-    best = grounding.similarity.argmax(axis=0) if len(grounding.similarity) else np.zeros(0, int)
+    best = grounding.voted
     for i in rows:
         picture.paste(_fitted(_crop(rgb, grounding.candidates.xyxy[i]), cell_px - 8), (4, y + 4))
         for j in range(n_photos):
@@ -133,9 +136,10 @@ def result_line(grounding: Grounding) -> str:
     if grounding.rejected is not None:
         text = f"#{grounding.rejected} {describe_rejection(grounding)}"
     elif grounding.winner is None:
-        text = f"none, by association; #{elected} has {describe_ballot(grounding)}"
+        text = f"none is chosen, against the vote for #{elected}: {describe_ballot(grounding)}"
     elif grounding.overruled:
-        text = f"#{grounding.winner} by association; #{elected} has {describe_ballot(grounding)}"
+        text = f"#{grounding.winner} is chosen, against the vote for #{elected}: "
+        text += describe_ballot(grounding)
     else:
         text = f"#{elected} elected: {describe_ballot(grounding)}"
     left_out = len(grounding.candidates) - len(shown_candidates(grounding))
@@ -145,15 +149,18 @@ def result_line(grounding: Grounding) -> str:
 
 
 def _row_words(grounding: Grounding, i: int, place: Place, cell_px: int, ink: Rgb8) -> list[Text]:
-    """Number, votes and mean cosine of one candidate."""
+    """Number, votes and mean cosine of one candidate, and what the vote added to it."""
     x, y = place
     n_photos = grounding.similarity.shape[1]
-    words = (
+    words = [
         f"#{i}",
         f"{grounding.ballot.votes[i]} of {n_photos} votes",
         f"mean {grounding.similarity[i].mean():.2f}",
-    )
-    return [(text, (x, y + (k + 1) * cell_px / 4), ink, False) for k, text in enumerate(words)]
+    ]
+    if np.abs(grounding.evidence).max() >= LEAST_EVIDENCE:
+        words.append(f"prior {grounding.evidence[i]:+.2f}")
+    height = cell_px / (len(words) + 1)
+    return [(text, (x, y + (k + 1) * height), ink, False) for k, text in enumerate(words)]
 
 
 def _cell(draw: "Draw", place: Place, cell_px: int, grey: int) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vap_core.base.errors import BadRecording
-from vap_core.base.types import Rgb
+from vap_core.base.types import Rgb, best_of_references
 from vap_core.recording.entities.comparison import vote_picture_entity
 from vap_core.recording.entities.paths import image_root
 from vap_core.recording.reading import read_chunks
@@ -87,8 +87,8 @@ class Votes:
     @staticmethod
     def _candidate(name: str, numbers: dict[str, Any], i: int) -> str:
         k = int(numbers["references"][0])
-        cosines = np.reshape(numbers["similarity"], (-1, k))
-        best = cosines.argmax(axis=0)
+        cosines = np.reshape(np.asarray(numbers["similarity"], np.float32), (-1, k))
+        best = best_of_references(cosines + _added(numbers)[:, None])
         parts = []
         for j in range(k):
             mark = " (its vote)" if best[j] == i else ""
@@ -98,6 +98,15 @@ class Votes:
             f"{name}, candidate #{i}, {role}: {numbers['votes'][i]} of {k} votes, mean cosine "
             f"{cosines[i].mean():.3f}, detector {numbers['score'][i]:.2f}. {'; '.join(parts)}"
         )
+
+
+def _added(numbers: dict[str, Any]) -> np.ndarray:
+    """What the vote added to every candidate's cosines."""
+    added = np.zeros(len(numbers["score"]), np.float32)
+    for name in ("prior", "proof"):
+        if numbers.get(name) is not None:
+            added += np.asarray(numbers[name], np.float32)
+    return added
 
 
 def inspect_votes(recording: Path, *, width: int = 1100, height: int = 680) -> "VBox":

@@ -212,18 +212,16 @@ class Recorder:
         header = self._header
         rec.send_recording_name(f"{header.row.key} · {header.method}")
         log_properties(rec, "rollout", rollout_properties(header))
-        log_row(rec, "/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        classes = rr.AnnotationContext([*CLASSES, *coverage_classes(header)])
+        log_row(rec, "/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, classes)
         log_row(rec, "/vap/instruction", instruction_document(header))
         log_table(rec, header.row)
         log_objects(rec, header)
 
     def _log_roles(self, frame: Frame) -> None:
         """Which object is the target from this step on; static, where that never changes."""
-        rec = self._open_stream()
         at = frame_times([frame]) if self._header.row.subgoals else ()
-        classes = rr.AnnotationContext([*CLASSES, *coverage_classes(self._goal)])
-        log_row(rec, "/", classes, at=at)
-        log_roles(rec, self._goal, at)
+        log_roles(self._open_stream(), self._goal, at)
 
     def _log_first_frame(self, frame: Frame) -> None:
         """What only the first step shows: shapes, links, and the pictures of the vote."""
@@ -297,7 +295,8 @@ class Recorder:
             index = frame_times(pictured)
             send_masks(rec, self._goal, index, pictured)
             if any(frame.coverage for frame in pictured):
-                send_coverage(rec, self._header, index, pictured)
+                stage = max(len(self._spans) - 1, 0)
+                send_coverage(rec, self._header, index, pictured, stage)
         attended = [frame for frame in frames if frame.attention]
         if attended:
             send_attention(rec, attended, JPEG_QUALITY)

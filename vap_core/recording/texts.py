@@ -11,7 +11,7 @@ from vap_core.simulation.types import EpisodeRow, Outcome
 
 
 def describe_vote(grounding: Grounding) -> str:
-    """One view's vote in a line; before it what association chose instead."""
+    """One view's vote in a line; before it what was chosen instead."""
     ballot = grounding.ballot
     if ballot.winner is None:
         return "no candidate, view unmodified"
@@ -22,8 +22,8 @@ def describe_vote(grounding: Grounding) -> str:
     if not grounding.overruled:
         return text
     if grounding.winner is None:
-        return f"none by association · {text}"
-    return f"#{grounding.winner} by association · {text}"
+        return f"none is chosen · {text}"
+    return f"#{grounding.winner} is chosen · {text}"
 
 
 def describe_outcome(outcome: Outcome) -> str:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vap_core.base.types import PersonalObject, likeness
+from vap_core.base.types import PersonalObject, election_scores, likeness
 from vap_core.evaluation.perception.first_frames import (
     View,
     object_under_box,
@@ -24,7 +24,7 @@ from vap_core.simulation.suites import BENCHMARKS, suite
 from vap_core.simulation.types import EpisodeRow
 from vap_core.training.films.demonstrations import draw_objects, row
 from vap_core.training.recipe import filmed_tasks
-from vap_core.vote import compare, election_scores, nominate, vote
+from vap_core.vote import compare, nominate, vote
 
 Case = Literal["present", "look-alikes", "absent"]
 """The object is in view; it is not, but others of its kind are; nothing of its kind is."""

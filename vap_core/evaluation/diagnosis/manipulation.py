@@ -104,6 +104,8 @@ def _timeout(trace: EpisodeTrace) -> Diagnosis:
     closest = int(np.argmin(trace.gap_m))
     closest_cm = 100 * trace.gap_m[closest]
     sentence = f"comes no closer to {trace.target} than {closest_cm:.1f} cm"
+    if any(trace.touches):
+        sentence = f"does not complete the task after it touches {trace.target}"
     return _diagnosis(trace, "timeout", closest, sentence)
 
 

@@ -214,6 +214,8 @@ def _sentence(
         case "not in view":
             return f"{camera}: the best candidate is too unlike the references to be highlighted"
         case "shifted proposal":
+            if np.isnan(view.proposal):
+                return f"{camera}: the target cannot be seen; {name} is highlighted"
             return f"{camera}: no box fits the target (best IoU {proposal}); {name} is highlighted"
         case "distractor vote":
             choice = f"the vote elected {name}"

@@ -6,7 +6,7 @@ Views are compared with and without association.
 from collections.abc import Mapping, Sequence
 
 from vap_core.associate import PAIRINGS, Pairing, Sighting, associate, compare_views
-from vap_core.base.types import PersonalObject
+from vap_core.base.types import PersonalObject, election_scores
 from vap_core.evaluation.perception.first_frames import (
     KS,
     USUAL_K,
@@ -20,7 +20,7 @@ from vap_core.evaluation.perception.first_frames import (
 )
 from vap_core.perception.candidates import Proposals
 from vap_core.perception.protocols import Stack
-from vap_core.vote import compare, election_scores, nominate, vote
+from vap_core.vote import compare, nominate, vote
 
 OFF = "off"
 """Views grounded one by one, as the paper does."""

@@ -25,6 +25,7 @@ from vap_core.base.types import (
     Mask,
     PersonalObject,
     Rgb,
+    election_scores,
     likeness,
     value,
 )
@@ -38,7 +39,7 @@ from vap_core.simulation.env import Env
 from vap_core.simulation.studio import reference_views
 from vap_core.simulation.suites.open_row import build_scene, make_env
 from vap_core.simulation.types import EpisodeRow
-from vap_core.vote import VoteRule, compare, election_scores, nominate, similarity, vote
+from vap_core.vote import VoteRule, compare, nominate, similarity, vote
 
 VISIBLE_PX = 100
 """Visible pixels, of a view of 224 x 224, from which on an object counts."""
