@@ -5,6 +5,7 @@ import re
 import shutil
 from dataclasses import replace
 from importlib.metadata import packages_distributions
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,9 +17,14 @@ from vap_core.base.errors import BadPolicy
 from vap_core.policies.hooks import TEXT
 from vap_core.policies.lerobot import traced
 from vap_core.policies.lerobot.adapter import LeRobot, load_for_suite, load_policy
-from vap_core.policies.lerobot.checkpoints import fingerprint, is_checkpoint_name
+from vap_core.policies.lerobot.checkpoints import (
+    fingerprint,
+    is_checkpoint_name,
+    local_folder,
+)
 from vap_core.policies.lerobot.loading import compare
 from vap_core.policies.lerobot.toy_pi0 import toy_sizes
+from vap_core.policies.names import SHIPPED
 from vap_core.policies.protocol import Policy, PolicyInput
 from vap_core.rollout import audit
 from vap_core.rollout.loop import Trial, rollout
@@ -422,6 +428,22 @@ def test_a_rollout_in_a_real_suite(policies, rows, scene, name):
 def test_a_name_that_means_a_checkpoint_is_fitted_to_the_suite(folders, scene):
     assert all(map(is_checkpoint_name, (str(folders["act"]), "lerobot/pi0_base")))
     assert not any(map(is_checkpoint_name, ("scripted", "expert", "a/b/c", "/no/such/folder")))
+
+
+def test_a_shipped_policy_is_found_from_every_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Published tables name it from the repository, and notebooks run in a folder of their own."""
+    monkeypatch.chdir(tmp_path)
+    name = "data/policies/mini-pi0-simpler-bridge"
+    assert is_checkpoint_name(name)
+    assert local_folder(name) == SHIPPED / "mini-pi0-simpler-bridge"
+    assert fingerprint(name) == fingerprint(SHIPPED / "mini-pi0-simpler-bridge")
+    assert local_folder("data/policies/no-such") is None
+    assert not is_checkpoint_name("data/policies/no-such")
+    own = tmp_path / name
+    own.mkdir(parents=True)
+    assert local_folder(name) == Path(name), "a folder that is there comes first"
     name = str(folders["act"])
     policy = load_for_suite(name, scene, suites.suite(SUITE))
     assert load_for_suite(name, scene, suites.suite(SUITE)) is policy

@@ -32,7 +32,7 @@ from vap_core.policies.hooks import (
     report_input,
 )
 from vap_core.policies.lerobot.attention_hooks import can_watch, reporting_attention
-from vap_core.policies.lerobot.checkpoints import PIPELINES, fingerprint, locate
+from vap_core.policies.lerobot.checkpoints import PIPELINES, fingerprint, local_folder, locate
 from vap_core.policies.lerobot.loading import build
 from vap_core.policies.lerobot.module_hooks import overriding_tokens
 from vap_core.policies.lerobot.token_positions import positions
@@ -308,7 +308,7 @@ def load_policy(
     """
     folder = locate(checkpoint)
     policy, preprocessor, postprocessor = build(folder, device)
-    name = folder.name if Path(checkpoint).is_dir() else checkpoint
+    name = checkpoint if local_folder(checkpoint) is None else folder.name
     label = f"{policy.config.type}:{name}@{fingerprint(folder)[:8]}"
     if temperature is not None:
         config: Any = policy.config

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from vap_core.base.errors import BadPolicy
-from vap_core.base.files import parse_json
+from vap_core.base.files import DATA, parse_json
+from vap_core.policies.names import SHIPPED
 
 WEIGHTS = "model.safetensors"
 CONFIG = "config.json"
@@ -23,18 +24,28 @@ TRAINING_CARD = "training.json"
 WANTED_FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
 
 
+def local_folder(checkpoint: str | Path) -> Path | None:
+    """The checkpoint's folder, where it names one that exists.
+
+    data/policies/NAME is a policy that ships, wherever the command is run: tables that are
+    published name it so.
+    """
+    folder = Path(checkpoint).expanduser()
+    if not folder.is_dir() and folder.parts[:2] == (DATA.name, SHIPPED.name):
+        folder = DATA.joinpath(*folder.parts[1:])
+    return folder if folder.is_dir() else None
+
+
 def is_checkpoint_name(policy: str) -> bool:
     """Whether a policy's name means a checkpoint: a folder that exists, or owner/name."""
-    if Path(policy).expanduser().is_dir():
+    if local_folder(policy) is not None:
         return True
     return re.fullmatch(r"[\w.-]+/[\w.-]+", policy) is not None
 
 
 def locate(checkpoint: str | Path) -> Path:
     """The folder of a checkpoint on this machine. Raises: BadPolicy when a file is missing."""
-    folder = Path(checkpoint).expanduser()
-    if not folder.is_dir():
-        folder = _downloaded(str(checkpoint))
+    folder = local_folder(checkpoint) or _downloaded(str(checkpoint))
     missing = [name for name in (CONFIG, WEIGHTS, *PIPELINES) if not (folder / name).is_file()]
     if missing:
         raise BadPolicy(
