@@ -425,11 +425,6 @@ def test_a_rollout_in_a_real_suite(policies, rows, scene, name):
         assert a.header.policy == policy.label
 
 
-def test_a_name_that_means_a_checkpoint_is_fitted_to_the_suite(folders, scene):
-    assert all(map(is_checkpoint_name, (str(folders["act"]), "lerobot/pi0_base")))
-    assert not any(map(is_checkpoint_name, ("scripted", "expert", "a/b/c", "/no/such/folder")))
-
-
 def test_a_shipped_policy_is_found_from_every_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -444,6 +439,11 @@ def test_a_shipped_policy_is_found_from_every_folder(
     own = tmp_path / name
     own.mkdir(parents=True)
     assert local_folder(name) == Path(name), "a folder that is there comes first"
+
+
+def test_a_name_that_means_a_checkpoint_is_fitted_to_the_suite(folders, scene):
+    assert all(map(is_checkpoint_name, (str(folders["act"]), "lerobot/pi0_base")))
+    assert not any(map(is_checkpoint_name, ("scripted", "expert", "a/b/c", "/no/such/folder")))
     name = str(folders["act"])
     policy = load_for_suite(name, scene, suites.suite(SUITE))
     assert load_for_suite(name, scene, suites.suite(SUITE)) is policy
