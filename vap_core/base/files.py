@@ -22,6 +22,8 @@ _INSTALLED = _PACKAGE / "data"
 DATA = _INSTALLED if _INSTALLED.is_dir() else _PACKAGE.parent / "data"
 """Weights, policies and episode lists that ship: inside an installed package (setup.py copies them
 there), beside the package in a checkout."""
+SHIPPED = DATA / "policies"
+"""The folder of the checkpoints that ship."""
 ABANDONED_S = 3600.0
 """A scratch file that was last written so long ago belongs to no process that runs."""
 

@@ -1,12 +1,10 @@
 """The names of policies, and where those that ship are."""
 
 from vap_core.base.errors import one_of
-from vap_core.base.files import DATA
+from vap_core.base.files import SHIPPED as SHIPPED
 
 MINI = "mini-pi0"
 """The shipped frozen policy, one checkpoint a suite."""
-SHIPPED = DATA / "policies"
-"""The folder of the checkpoints."""
 POLICIES = ("scripted", "expert", "random")
 """Policies without weights; each is built for one scene."""
 PRIVILEGED = ("expert", "random")

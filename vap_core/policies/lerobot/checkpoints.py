@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from vap_core.base.errors import BadPolicy
-from vap_core.base.files import DATA, parse_json
-from vap_core.policies.names import SHIPPED
+from vap_core.base.files import DATA, SHIPPED, parse_json
 
 WEIGHTS = "model.safetensors"
 CONFIG = "config.json"
