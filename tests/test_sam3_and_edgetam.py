@@ -26,9 +26,9 @@ from vap_core.perception.foundation.architectures import quiet_transformers
 from vap_core.perception.foundation.downloads import pull
 from vap_core.perception.foundation.edgetam import backbone_without_hub
 from vap_core.perception.foundation.random_weights import random_network
-from vap_core.perception.foundation.sources import MODELS, TENSORS
+from vap_core.perception.foundation.sources import MODELS, TENSORS, models_of
 from vap_core.perception.foundation.store import weights_table
-from vap_core.perception.stacks import load_stack, mixed
+from vap_core.perception.stacks import mixed
 
 __all__ = ["scene"]
 # timm compiles a few functions as it is imported.
@@ -136,15 +136,25 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def detector(store: Path) -> Any:
-    return foundation.load_parts(mixed("embedded", detector="sam3"), "cpu", store)["detector"]
+def parts(store: Path) -> dict[str, dict[str, Any]]:
+    """What each of the two models fills of a stack; SAM 3 is detector and tracker."""
+    loaded = {}
+    for name, roles in (("sam3", ("detector", "tracker")), ("edgetam", ("tracker",))):
+        stack = mixed("embedded", **dict.fromkeys(roles, name))
+        assert models_of(stack) == (name,)
+        loaded[name] = foundation.load_parts(stack, "cpu", store)
+    return loaded
 
 
-@pytest.fixture(scope="module", params=TRACKERS)
-def tracking(store: Path, request: pytest.FixtureRequest) -> dict[str, Any]:
+@pytest.fixture
+def detector(parts: dict[str, dict[str, Any]]) -> Any:
+    return parts["sam3"]["detector"]
+
+
+@pytest.fixture(params=TRACKERS)
+def tracking(parts: dict[str, dict[str, Any]], request: pytest.FixtureRequest) -> dict[str, Any]:
     """Segmenter and tracker of one model."""
-    name = mixed("embedded", tracker=request.param)
-    return {**foundation.load_parts(name, "cpu", store), "name": request.param}
+    return {**parts[request.param], "name": request.param}
 
 
 # --- Contracts -----------------------------------------------------------------------------------
@@ -286,7 +296,7 @@ def test_tracks_are_those_of_transformers_video_session(
     """Longer than the memory of maps, with an identity that was never there, and a second view."""
     rgb, masks, _ = scene
     masks = np.concatenate([masks, np.zeros((1, 120, 160), bool)])
-    frames = [np.roll(rgb, 4 * k, axis=1) for k in range(9)]
+    frames = [np.roll(rgb, 4 * k, axis=1) for k in range(8)]
     tracker, other = tracking["tracker"], blurred(8, 100, 60)
     states = tracker.start([frames[0], other], [masks, np.ones((1, 100, 60), bool)])
     seen = []
@@ -306,14 +316,12 @@ def test_tracks_are_those_of_transformers_video_session(
 # --- How they are named and stored ---------------------------------------------------------------
 
 
-def test_one_folder_is_detector_and_tracker(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("VAP_WEIGHTS", str(store))
-    monkeypatch.setenv("VAP_DEVICE", "cpu")
-    stack = load_stack(mixed("embedded", detector="sam3", tracker="sam3"))
-    assert type(stack.detector).__name__ == "Sam3Detector"
-    assert type(stack.tracker.sam.model) is hf.Sam3TrackerVideoModel
-    assert stack.category_detector is stack.detector
-    assert stack.thresholds is None
+def test_one_folder_is_detector_and_tracker(parts: dict[str, dict[str, Any]]) -> None:
+    filled = parts["sam3"]
+    assert type(filled["detector"].model) is hf.Sam3Model
+    assert type(filled["tracker"].sam.model) is hf.Sam3TrackerVideoModel
+    assert filled["segmenter"].sam is filled["tracker"].sam
+    assert filled["by_category"] is None  # the category is a phrase, too
 
 
 def test_options_say_what_they_need(tmp_path: Path) -> None:
