@@ -287,7 +287,8 @@ TRIED = (
     ),
     Row(
         "the same episodes in batches of 1 and 2, with 1 and 2 threads (a run's workers have one)",
-        "equal outcomes; actions of the first 16 steps within 2e-5 m or rad",
+        "equal outcomes; actions of the first 8 steps within 2e-5 m or rad, then, as a pixel can be "
+        "rounded otherwise, within 0.02",
         ("test_determinism::test_batches_and_threads_change_the_last_bits_alone",),
     ),
     Row(

@@ -11,7 +11,7 @@ import pytest
 
 import vap_core
 from vap_core.base import files
-from vap_core.base.errors import BadOutput, BadSuite
+from vap_core.base.errors import LONGEST, BadObject, BadOutput, BadSuite
 from vap_core.recording import viewer
 from vap_core.simulation.suites import lists
 
@@ -261,3 +261,13 @@ def test_keys_are_read_in_one_place_and_shown_in_none() -> None:
     assert [line.strip() for line in shown] == [
         'headers["Authorization"] = f"Bearer {endpoint.key}"'
     ]
+
+
+def test_a_long_error_keeps_its_place_and_its_remedy() -> None:
+    short = "objects: mug is damaged; import it again."
+    assert str(BadObject(short)) == short
+    said = str(BadObject(f"objects: mug is damaged ({'x' * 5000}); import it again."))
+    assert len(said) <= LONGEST
+    assert said.startswith("objects: mug is damaged (x")
+    assert " ... " in said
+    assert said.endswith("x); import it again.")

@@ -8,8 +8,23 @@ def first_line(error: BaseException) -> str:
     return (str(error).strip().splitlines() or [""])[0]
 
 
+LONGEST = 600
+"""Characters of an error's text; what a library says of a damaged file may be any bytes of it."""
+
+
 class VapError(Exception):
-    """Base of every error that the user can remedy; the command line prints it and exits with 2."""
+    """Base of every error that the user can remedy; the command line prints it and exits with 2.
+
+    Of a text above LONGEST the middle is left out: it begins with the place and ends with the
+    remedy.
+    """
+
+    def __str__(self) -> str:
+        text = super().__str__()
+        if len(text) <= LONGEST:
+            return text
+        half = (LONGEST - len(" ... ")) // 2
+        return f"{text[:half]} ... {text[-half:]}"
 
 
 class BadPhoto(VapError):
