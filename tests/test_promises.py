@@ -11,7 +11,7 @@ import pytest
 
 import vap_core
 from vap_core.base import files
-from vap_core.base.errors import LONGEST, BadObject, BadOutput, BadSuite
+from vap_core.base.errors import LONGEST, BadObject, BadOutput, BadSuite, one_of
 from vap_core.recording import viewer
 from vap_core.simulation.suites import lists
 
@@ -271,3 +271,5 @@ def test_a_long_error_keeps_its_place_and_its_remedy() -> None:
     assert said.startswith("objects: mug is damaged (x")
     assert " ... " in said
     assert said.endswith("x); import it again.")
+    names = [f"cup-{i}" for i in range(500)]
+    assert all(name in str(one_of("objects: object", "mug", names)) for name in names)

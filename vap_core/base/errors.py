@@ -16,12 +16,14 @@ class VapError(Exception):
     """Base of every error that the user can remedy; the command line prints it and exits with 2.
 
     Of a text above LONGEST the middle is left out: it begins with the place and ends with the
-    remedy.
+    remedy. Where `is_whole`, nothing is left out.
     """
+
+    is_whole = False
 
     def __str__(self) -> str:
         text = super().__str__()
-        if len(text) <= LONGEST:
+        if self.is_whole or len(text) <= LONGEST:
             return text
         half = (LONGEST - len(" ... ")) // 2
         return f"{text[:half]} ... {text[-half:]}"
@@ -44,7 +46,12 @@ class BadInstruction(VapError):
 
 
 class UnknownName(VapError):
-    """A suite, task, object, category, robot, method, policy or stack that no registry holds."""
+    """A suite, task, object, category, robot, method, policy or stack that no registry holds.
+
+    It lists what there is, however much.
+    """
+
+    is_whole = True
 
 
 class BadMemory(VapError):
