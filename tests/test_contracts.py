@@ -32,6 +32,7 @@ from vap_core.contracts.plugin import PROTOCOLS
 from vap_core.memory import register
 from vap_core.perception.stacks import load_stack
 from vap_core.policies.scripted.random import Random
+from vap_core.rollout.prompters import text
 from vap_core.rollout.prompters.protocol import PromptContext, Prompter, unchanged
 from vap_core.rollout.prompters.tint import TintPrompter
 from vap_core.simulation.assets.objects import get_object
@@ -71,7 +72,7 @@ def tinting() -> TintPrompter:
     return TintPrompter(Attender(stack, {obj.name: obj}))
 
 
-@pytest.mark.parametrize("make", [tinting])
+@pytest.mark.parametrize("make", [text.generic, tinting])
 def test_prompters_keep_theirs(make: Callable[[], Prompter[Any]]) -> None:
     kept(test_prompter, prompter=make(), where=WHERE)
 

@@ -42,9 +42,9 @@ PAPER_PAIRS = {
 """The paper's instruction for each of our pairs; its plushie is our plant."""
 GROUP = ["suite", "policy", "method"]
 SUITE_ORDER = (*SEQUENCES, PAIR)
-TAUGHT = "mini-pi0, taught pairs"
+TAUGHT = f"{MINI}, taught pairs"
 """Short for tabletop's policy after `train policy --suite shared-pair`."""
-POLICY_ORDER = ("mini-pi0", TAUGHT, "scripted", "expert")
+POLICY_ORDER = (MINI, TAUGHT, "scripted", "expert")
 
 
 def shared_episodes(path: Path) -> "pd.DataFrame":

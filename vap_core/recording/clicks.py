@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vap_core.base.errors import BadRecording
-from vap_core.base.types import Rgb, best_of_references
+from vap_core.base.types import Boxes, Rgb, best_of_references, election_scores
 from vap_core.recording.entities.comparison import vote_picture_entity
 from vap_core.recording.entities.paths import image_root
 from vap_core.recording.reading import read_chunks
@@ -88,7 +88,7 @@ class Votes:
     def _candidate(name: str, numbers: dict[str, Any], i: int) -> str:
         k = int(numbers["references"][0])
         cosines = np.reshape(np.asarray(numbers["similarity"], np.float32), (-1, k))
-        best = best_of_references(cosines + _added(numbers)[:, None])
+        best = best_of_references(election_scores(cosines, _boxes(numbers)))
         parts = []
         for j in range(k):
             mark = " (its vote)" if best[j] == i else ""
@@ -100,13 +100,20 @@ class Votes:
         )
 
 
-def _added(numbers: dict[str, Any]) -> np.ndarray:
-    """What the vote added to every candidate's cosines."""
-    added = np.zeros(len(numbers["score"]), np.float32)
-    for name in ("prior", "proof"):
-        if numbers.get(name) is not None:
-            added += np.asarray(numbers[name], np.float32)
-    return added
+def _boxes(numbers: dict[str, Any]) -> Boxes:
+    """The candidates as they were voted on."""
+
+    def single(name: str) -> np.ndarray | None:
+        stored = numbers.get(name)
+        return None if stored is None else np.asarray(stored, np.float32)
+
+    return Boxes(
+        xyxy=np.asarray(numbers["xyxy"], np.float32).reshape(-1, 4),
+        score=np.asarray(numbers["score"], np.float32),
+        phrase=numbers["phrase"][0],
+        prior=single("prior"),
+        proof=single("proof"),
+    )
 
 
 def inspect_votes(recording: Path, *, width: int = 1100, height: int = 680) -> "VBox":
