@@ -335,6 +335,26 @@ def test_every_task_is_drawn_as_often_as_another(stage: tuple[Path, list[Film]])
     assert frames.share == pytest.approx([0.5, 0.25, 0.25])
 
 
+def test_angles_are_read_with_noise_and_nothing_else_is(stage: tuple[Path, list[Film]]) -> None:
+    """What a film holds still is mostly noise to the policy, and it is scaled as what varies."""
+    _, films = stage
+    config = policy.configuration(TINY, films[0].state.shape[1], films[0].action.shape[1])
+    states = []
+    for noise in (0.0, 0.05):
+        recipe = replace(TINY, angle_noise_rad=noise)
+        stats = statistics(films, noise)
+        drawn = Frames(recipe, films, stats, config, known(films)).draw(
+            200, np.random.default_rng(0)
+        )
+        states.append(drawn.state * stats["observation.state"]["std"])
+    still, noisy = states
+    assert drawn.state[:, [3, 4]].abs().max() < 5, "what is held still is not blown up"
+    added = (noisy - still).numpy()
+    angles = [3, 4, 5, *range(7, added.shape[1])]
+    assert added[:, angles].std(axis=0) == pytest.approx(0.05, rel=0.2)
+    assert np.abs(np.delete(added, angles, axis=1)).max() < 1e-6
+
+
 def test_a_hand_that_is_shown_turned_otherwise_turns_back_in_time_and_does_all_else_as_before(
     stage: tuple[Path, list[Film]],
 ) -> None:

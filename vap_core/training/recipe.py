@@ -41,7 +41,11 @@ class Recipe(Sizes):
 
     Films: none shows `held_out_category`, which the suite evaluates. `draws` flow samples share one
     look at the pictures; frames close to the start, a grasp, a release or the end come `focus`
-    times as often as others. `execute` actions of each chunk of `chunk` are carried out.
+    times as often as others. `execute` actions of each chunk of `chunk` are carried out. The arm's
+    angles are read with noise of the deviation `angle_noise_rad`: in films the arm starts alike,
+    and some angles hardly change. A policy that was trained without it reached 96 % of a task as
+    listed, 7 of 49 episodes with every joint up to 0.03 rad off at the start, and 9 of 12 with the
+    angles that hardly change held at their mean.
     """
 
     suite: str
@@ -55,6 +59,7 @@ class Recipe(Sizes):
     rate: float = 1e-3
     seed: int = 0
     focus: float = 3.0
+    angle_noise_rad: float = 0.04
     tint_share: float = 0.2
     held_out_tints: tuple[str, ...] = ("magenta", "yellow")
     opacities: tuple[tuple[float, float], ...] = ((0.25, 0.42), (0.58, 0.75))

@@ -38,6 +38,8 @@ SPUN = 0.5
 """How often a hand is shown turned otherwise."""
 IN_TIME = 0.8
 """Which part of the time that is left a hand that was turned otherwise has to turn back."""
+ANGLES = (slice(3, 6), slice(7, None))
+"""Where a state has angles in radians: the hand's turn, and the joints after the gripper."""
 STEADY = 0.01
 """Least deviation by which an action or a state is scaled: what hardly moves is not blown up."""
 
@@ -139,6 +141,9 @@ class Frames:
                 state, chunk = turn_otherwise(
                     film=film, t=t, chunk=chunk, turn_rad=self.turn_rad, rng=rng
                 )
+        state = state.copy()
+        for angles in ANGLES:
+            state[angles] += rng.normal(0.0, self.recipe.angle_noise_rad, state[angles].shape)
         patches = []
         place = np.full((2, 3), np.nan, np.float32)
         for row, index in enumerate((0, film.goal)):
@@ -161,14 +166,21 @@ class Frames:
         return (torch.from_numpy(np.stack(rows)) - stats["mean"]) / stats["std"]
 
 
-def statistics(films: Sequence[Film]) -> dict[str, dict[str, Tensor]]:
-    """Mean and deviation of states and actions, as lerobot's normalisers want them."""
+def statistics(films: Sequence[Film], angle_noise_rad: float = 0.0) -> dict[str, dict[str, Tensor]]:
+    """Mean and deviation of states and actions, as lerobot's normalisers want them.
+
+    Angles of states deviate by the noise with which they are read, too.
+    """
     states = []
     actions = []
     for film in films:
         states.append(film.state)
         actions.append(film.action)
-    return {"observation.state": _mean_and_std(states), "action": _mean_and_std(actions)}
+    scales = {"observation.state": _mean_and_std(states), "action": _mean_and_std(actions)}
+    deviation = scales["observation.state"]["std"]
+    for angles in ANGLES:
+        deviation[angles] = torch.hypot(deviation[angles], torch.tensor(angle_noise_rad))
+    return scales
 
 
 def emphasis(film: Film, focus: float, apart: int = 1) -> Float[np.ndarray, " f"]:

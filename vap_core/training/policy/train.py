@@ -170,7 +170,7 @@ def train(
             "sha256": sha256_of(start / "model.safetensors"),
         }
     else:
-        stats = statistics(films.train)
+        stats = statistics(films.train, recipe.angle_noise_rad)
         first = films.train[0]
         config = configuration(recipe, first.state.shape[1], first.action.shape[1])
         learner = Learner(config)
