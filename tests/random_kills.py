@@ -1,6 +1,6 @@
 """Work that SIGKILL ends at random moments.
 
-`python -m tests.random_kills` imports once what the work needs, then forks a process for every
+`python -m tests.random_kills MODULES` imports once what the work needs, then forks a process for every
 piece of work that it is asked for: a kill costs no second of imports.
 """
 
@@ -15,6 +15,8 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import TextIO
 
@@ -49,11 +51,38 @@ def replace_object(folder: Path) -> None:
         storage.save_scan(folder, METADATA, cube(), replace=True)
 
 
+def train_policy(cache: Path, out: Path) -> None:
+    from tests.test_policy_training import TINY
+    from vap_core.training.films import demonstrations
+    from vap_core.training.policy import train as policy
+
+    demonstrations.EPISODES = 2
+    policy.HELD_OUT = 9
+    recipe = replace(TINY, stages=1, steps=6, batch=2, draws=1)
+    policy.train(recipe, out, cache=cache, every=1)
+
+
+def train_vlm(cache: Path, out: Path) -> None:
+    import pytest
+
+    from tests.test_policy_training import SUITE, vlm_inputs
+    from vap_core.training.films.demonstrations import cached
+    from vap_core.training.vlm import train as vlm
+
+    films = cache / "films"
+    schedule = vlm.Schedule
+    with pytest.MonkeyPatch.context() as patch:
+        _, recipe = vlm_inputs((films, cached(films, SUITE, 0, 1)), patch)
+        patch.setattr(vlm, "Schedule", lambda **told: schedule(**{**told, "every": 1}))
+        vlm.train(recipe, out)
+
+
 WORK: dict[str, Callable[..., None]] = {
     "report": write_report,
     "ground": ground,
     "import": replace_object,
 }
+TRAININGS: dict[str, Callable[..., None]] = {"policy": train_policy, "vlm": train_vlm}
 
 
 class Server:
@@ -83,9 +112,19 @@ class Server:
         return status != 0
 
 
+NEEDED = (
+    "matplotlib.backends.backend_agg",
+    "vap_core.analysis.ground_clip",
+    "vap_core.evaluation.report",
+    "vap_core.recording",
+)
+"""What the work but the trainings imports."""
+
+
 @contextmanager
-def serving() -> Iterator[Server]:
-    command = [sys.executable, "-m", "tests.random_kills"]
+def serving(*modules: str) -> Iterator[Server]:
+    """A server that has imported these modules, or what is needed."""
+    command = [sys.executable, "-m", "tests.random_kills", *(modules or NEEDED)]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
     ) as process:
@@ -120,7 +159,7 @@ def serve(asked: TextIO, answers: TextIO) -> None:
             status = 1
             try:
                 os.setsid()
-                WORK[name](*map(Path, paths))
+                {**WORK, **TRAININGS}[name](*map(Path, paths))
                 status = 0
             except BaseException:
                 traceback.print_exc()
@@ -132,12 +171,8 @@ def serve(asked: TextIO, answers: TextIO) -> None:
 
 
 def main() -> None:
-    import matplotlib.backends.backend_agg  # noqa: F401
-
-    import vap_core.analysis.ground_clip
-    import vap_core.evaluation.report
-    import vap_core.recording  # noqa: F401
-
+    for name in sys.argv[1:]:
+        import_module(name)
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what the work prints is no answer
     serve(sys.stdin, answers)

@@ -2,12 +2,9 @@
 
 import json
 import random
-import signal
-import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from shutil import rmtree
 from unittest.mock import patch
@@ -19,7 +16,7 @@ from safetensors.torch import load_file
 from torch.nn import functional as F  # noqa: N812
 
 from tests.deaths import die_before_each_rename
-from tests.random_kills import kill_in
+from tests.random_kills import kill_in, serving
 from vap_core.base.errors import BadOutput
 from vap_core.base.types import Description
 from vap_core.policies.lerobot.adapter import load_policy
@@ -193,79 +190,45 @@ def test_a_training_that_is_ended_again_and_again_ends_like_one_that_was_not(
     assert [line["step"] for line in told["log"]] == [line["step"] for line in about["log"]]
 
 
-def train_in_a_process(train: Callable[[], object], after_s: float) -> bool:
-    """Fork, train, and SIGKILL it after that time; returns whether it was not done."""
-
-    def alone() -> None:
-        torch.set_num_threads(1)
-        train()
-
-    process = get_context("fork").Process(target=alone)
-    process.start()
-    process.join(after_s)
-    if process.exitcode is None:
-        process.kill()
-        process.join()
-    assert process.exitcode in (0, -signal.SIGKILL)
-    return process.exitcode != 0
-
-
-def train_and_kill(train: Callable[[Path], object], folder: Path, kills: int) -> None:
-    """A training that is killed at random moments and goes on ends with the same weights."""
-    whole, torn = folder / "whole", folder / "torn"
-    start = time.monotonic()
-    assert not train_in_a_process(lambda: train(whole), 300)
-    seconds = time.monotonic() - start
-
-    def killed(after_s: float) -> bool:
-        if (torn / "training.json").exists():
-            assert_same(torn, whole)
-            rmtree(torn)
-        return train_in_a_process(lambda: train(torn), after_s)
-
-    for _ in kill_in(seconds, killed, kills, random.Random(kills)):
-        for weights in torn.glob("[!.]*.safetensors"):
-            load_file(weights)
-    assert not train_in_a_process(lambda: train(torn), 300)
-    assert_same(torn, whole)
-
-
-def assert_same(torn: Path, whole: Path) -> None:
-    one, other = (load_file(path / "model.safetensors") for path in (whole, torn))
-    assert one.keys() == other.keys()
-    assert all(torch.equal(one[name], other[name]) for name in one)
-
-
-@pytest.mark.sweep  # a fork in a worker that has started threads may hang
-@pytest.mark.parametrize("kills", [2, 20])
+@pytest.mark.sweep
+@pytest.mark.parametrize(("name", "kills"), [("policy", 2), ("policy", 20), ("vlm", 10)])
 def test_a_training_that_is_killed_at_random_moments_ends_the_same(
     stage: tuple[Path, list[Film]],
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    name: str,
     kills: int,
     record_property: Callable[[str, object], None],
 ) -> None:
-    monkeypatch.setattr(demonstrations, "EPISODES", 2)
-    monkeypatch.setattr(policy, "HELD_OUT", 9)
-    recipe = replace(TINY, stages=1, steps=6, batch=2, draws=1)
+    """It is forked from a process that runs nothing else: the fork of one with threads may hang."""
     cache = stage[0].parent
-    train_and_kill(lambda out: policy.train(recipe, out, cache=cache, every=1), tmp_path, kills)
+    whole, torn = tmp_path / "whole", tmp_path / "torn"
+    with serving("tests.test_policy_training") as server:
+        server.whole(name, cache, tmp_path / "first")  # films, and what later ones have loaded
+        seconds = server.whole(name, cache, whole)
+
+        def killed(after_s: float) -> bool:
+            if (torn / "training.json").exists():
+                assert_same(torn, whole)
+                rmtree(torn)
+            return server.killed(after_s, name, cache, torn)
+
+        for _ in kill_in(seconds, killed, kills, random.Random(kills)):
+            for weights in torn.glob("[!.]*.safetensors"):
+                load_file(weights)
+        server.whole(name, cache, torn)
+    assert_same(torn, whole)
     record_property("cases", kills)
 
 
-@pytest.mark.sweep
-def test_a_killed_training_of_a_language_model_ends_the_same(
-    stage: tuple[Path, list[Film]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    record_property: Callable[[str, object], None],
-) -> None:
-    pool, recipe = vlm_inputs(stage, monkeypatch)
-    assert pool
-    schedule = vlm.Schedule
-    monkeypatch.setattr(vlm, "Schedule", lambda **told: schedule(**{**told, "every": 1}))
-    train_and_kill(lambda out: vlm.train(recipe, out), tmp_path, 10)
-    record_property("cases", 10)
+def assert_same(torn: Path, whole: Path) -> None:
+    files = {path.name for path in whole.glob("[!.]*.safetensors")}
+    assert files
+    assert files == {path.name for path in torn.glob("[!.]*.safetensors")}
+    for name in files:
+        one = load_file(whole / name)
+        other = load_file(torn / name)
+        assert one.keys() == other.keys()
+        assert all(torch.equal(one[part], other[part]) for part in one)
 
 
 def test_films_of_what_is_held_out_are_refused(stage: tuple[Path, list[Film]]) -> None:
