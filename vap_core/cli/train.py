@@ -128,6 +128,14 @@ def policy(
         float | None,
         typer.Option(min=0.0, max=1.0, help="Share of tinted scenes. Default the recipe's."),
     ] = None,
+    angle_noise: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="Deviation (rad) of the noise with which the arm's angles are read. Default the "
+            "recipe's; 0 made the policies that ship.",
+        ),
+    ] = None,
     stages: Annotated[
         int | None,
         typer.Option(
@@ -187,6 +195,7 @@ def policy(
         standard,
         seed=seed,
         tint_share=standard.tint_share if tint_share is None else tint_share,
+        angle_noise_rad=standard.angle_noise_rad if angle_noise is None else angle_noise,
         stages=stages or standard.stages,
         steps=steps or standard.steps,
     )

@@ -117,8 +117,8 @@ class Frames:
             images=_stack_images(commands),
             tokens=tokens,
             there=there,
-            state=self._scale("observation.state", states),
-            actions=self._scale("action", chunks),
+            state=self._scale("observation.state", self._read_angles(np.stack(states), rng)),
+            actions=self._scale("action", np.stack(chunks)),
             patches=torch.from_numpy(np.stack(patches)).float(),
             place=torch.from_numpy(np.stack(places)),
             turn=torch.from_numpy(np.array(turns, np.float32)),
@@ -141,9 +141,6 @@ class Frames:
                 state, chunk = turn_otherwise(
                     film=film, t=t, chunk=chunk, turn_rad=self.turn_rad, rng=rng
                 )
-        state = state.copy()
-        for angles in ANGLES:
-            state[angles] += rng.normal(0.0, self.recipe.angle_noise_rad, state[angles].shape)
         patches = []
         place = np.full((2, 3), np.nan, np.float32)
         for row, index in enumerate((0, film.goal)):
@@ -160,10 +157,19 @@ class Frames:
             turn=closing,
         )
 
-    def _scale(self, name: str, rows: Sequence[Float32[np.ndarray, "..."]]) -> Tensor:
+    def _read_angles(
+        self, states: Float32[np.ndarray, "b p"], rng: np.random.Generator
+    ) -> Float32[np.ndarray, "b p"]:
+        """The states, their angles with noise."""
+        for angles in ANGLES:
+            exact = states[:, angles]
+            exact += rng.normal(0.0, self.recipe.angle_noise_rad, exact.shape)
+        return states
+
+    def _scale(self, name: str, rows: Float32[np.ndarray, "..."]) -> Tensor:
         """Rows as lerobot's normalisers scale them."""
         stats = self.stats[name]
-        return (torch.from_numpy(np.stack(rows)) - stats["mean"]) / stats["std"]
+        return (torch.from_numpy(rows) - stats["mean"]) / stats["std"]
 
 
 def statistics(films: Sequence[Film], angle_noise_rad: float = 0.0) -> dict[str, dict[str, Tensor]]:
