@@ -49,7 +49,7 @@ def provenance(command: str, **about: Any) -> dict[str, Any]:
     return {
         "command": command,
         "commit": code_version(),
-        "machine": f"{_processor()}, {n_cores()} cores",
+        "machine": f"{_processor()}, {_cores()}",
         "day": datetime.now(UTC).date().isoformat(),
         "libraries": libraries,
         **about,
@@ -61,6 +61,11 @@ def n_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def _cores() -> str:
+    n = n_cores()
+    return "1 core" if n == 1 else f"{n} cores"
 
 
 def write(measurement: Measurement, path: Path) -> None:
