@@ -133,7 +133,7 @@ def policy(
         typer.Option(
             min=0.0,
             help="Deviation (rad) of the noise with which the arm's angles are read. Default the "
-            "recipe's; 0 made the policies that ship.",
+            "recipe's; 0 made what ships but any-start.",
         ),
     ] = None,
     stages: Annotated[
