@@ -1,7 +1,7 @@
 """Work that SIGKILL ends at random moments.
 
-`python -m tests.random_kills MODULES` imports once what the work needs, then forks a process for every
-piece of work that it is asked for: a kill costs no second of imports.
+`python -m tests.random_kills MODULES` imports them once, then forks a process for every piece of
+work that it is asked for: a kill costs no second of imports.
 """
 
 import json
@@ -72,7 +72,8 @@ def train_vlm(cache: Path, out: Path) -> None:
     films = cache / "films"
     schedule = vlm.Schedule
     with pytest.MonkeyPatch.context() as patch:
-        _, recipe = vlm_inputs((films, cached(films, SUITE, 0, 1)), patch)
+        pool, recipe = vlm_inputs((films, cached(films, SUITE, 0, 1)), patch)
+        assert pool
         patch.setattr(vlm, "Schedule", lambda **told: schedule(**{**told, "every": 1}))
         vlm.train(recipe, out)
 
@@ -81,8 +82,11 @@ WORK: dict[str, Callable[..., None]] = {
     "report": write_report,
     "ground": ground,
     "import": replace_object,
+    "policy": train_policy,
+    "vlm": train_vlm,
 }
-TRAININGS: dict[str, Callable[..., None]] = {"policy": train_policy, "vlm": train_vlm}
+FILES = ("report", "ground", "import")
+"""The work that leaves whole files, whenever it ends; the rest are trainings, which go on."""
 
 
 class Server:
@@ -118,7 +122,7 @@ NEEDED = (
     "vap_core.evaluation.report",
     "vap_core.recording",
 )
-"""What the work but the trainings imports."""
+"""What the work of `FILES` imports."""
 
 
 @contextmanager
@@ -159,7 +163,7 @@ def serve(asked: TextIO, answers: TextIO) -> None:
             status = 1
             try:
                 os.setsid()
-                {**WORK, **TRAININGS}[name](*map(Path, paths))
+                WORK[name](*map(Path, paths))
                 status = 0
             except BaseException:
                 traceback.print_exc()

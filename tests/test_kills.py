@@ -196,7 +196,7 @@ KILLS = [2, pytest.param(20, marks=[pytest.mark.sweep, pytest.mark.timeout(1800)
 
 
 @pytest.mark.parametrize("kills", KILLS)
-@pytest.mark.parametrize("name", random_kills.WORK)
+@pytest.mark.parametrize("name", random_kills.FILES)
 def test_work_that_is_killed_at_random_moments_leaves_whole_files(
     server: Server,
     tmp_path: Path,
