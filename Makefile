@@ -12,7 +12,7 @@ PYTEST := $(RUN) -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 help:
 	@echo "make demo      set up what is missing, then the main job: VAP against generic on two robots, with recordings"
 	@echo "make check     for every day: lint, types and unit tests; two and a half minutes"
-	@echo "make test      lint, types, all tests but the sweeps, and notebooks; nine to twenty minutes on two cores"
+	@echo "make test      lint, types, all tests but the sweeps, and notebooks; nine to 22 minutes on two cores"
 	@echo "make test-all  make test, and the long sweeps"
 	@echo "make reliability  write docs/reliability.md from what the tests counted"
 	@echo "make audit     known vulnerabilities of the pinned packages; needs the internet"
