@@ -17,8 +17,6 @@ from vap_core.analysis.ablations import (
     cases_figure,
     cases_text,
     effect_text,
-    policies_figure,
-    policy_results,
     rates_of_arms_figure,
     sweep_figure,
 )
@@ -32,12 +30,17 @@ from vap_core.analysis.prompt_forms import (
 from vap_core.attend import Prompting
 from vap_core.base.types import Camera
 from vap_core.evaluation import hiding, paper
-from vap_core.evaluation.ablations.arms import ABLATIONS, ARMS, Ablation, Hidden
+from vap_core.evaluation.ablations.arms import ABLATIONS, ARMS, TINT_SHARES, Ablation, Hidden
 from vap_core.evaluation.ablations.arrow import Arrow, hand_pixel
 from vap_core.evaluation.ablations.forms import draw_arrow
-from vap_core.evaluation.ablations.picture import effects_figure
+from vap_core.evaluation.ablations.picture import effects_figure, policies_figure
 from vap_core.evaluation.ablations.run import arm_folder
-from vap_core.evaluation.ablations.table import arm_results, arm_rows
+from vap_core.evaluation.ablations.table import (
+    across_policies,
+    arm_results,
+    arm_rows,
+    policy_results,
+)
 from vap_core.evaluation.methods import METHODS, find, known_methods, references_needed
 from vap_core.evaluation.statistics import Comparison
 from vap_core.evaluation.study import Study
@@ -212,13 +215,29 @@ def test_the_command_says_what_it_found_and_runs_nothing_twice(tmp_path: Path) -
 
 @pytest.mark.sweep
 @pytest.mark.parametrize(
-    "name", sorted(set(ABLATIONS) - {"selection", "association", "language", "colour"})
+    "name",
+    sorted(set(ABLATIONS) - {"selection", "association", "language", "colour", "tint-share"}),
 )
 def test_every_ablation_runs(name: str, tmp_path: Path) -> None:
     # The scripted policy knows the palette's colour words alone, and needs a command and one view.
     done = vap("ablate", name, *WORDS, "--out", tmp_path / "run")
     assert done.returncode == 0, done.stderr
     assert "0 errors" in done.stdout
+
+
+@pytest.mark.sweep
+def test_an_ablation_of_policies_runs_them_all(tmp_path: Path) -> None:
+    done = vap("ablate", "tint-share", "--suite", "widowx-pick", "--episodes", "1",
+               "--workers", "1", "--out", tmp_path / "run")  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "0 errors" in done.stdout
+    assert all(checkpoint in done.stdout for checkpoint in TINT_SHARES.values())
+    assert len(list((tmp_path / "run").glob("*/run.json"))) == 3 * 4
+    assert (tmp_path / "run" / "tint-share.png").stat().st_size > 5_000
+
+
+def test_an_ablation_of_policies_takes_no_other() -> None:
+    assert "leave --policy out" in refused("ablate", "tint-share", "--policy", "scripted")
 
 
 def camera(x: float = 0.0) -> Camera:
@@ -383,18 +402,30 @@ def test_the_table_of_findings_holds_the_papers_arms_only() -> None:
     assert row["the paper's finding"] == "holds"
 
 
-def test_policies_stand_side_by_side_and_a_method_is_taken_once() -> None:
-    newer = pd.concat([outcomes("vap", [True] * 10), outcomes("mask-only", [False] * 10)])
-    older = pd.concat(
-        [outcomes("vap", [False] * 10), outcomes("generic", [True] * 3 + [False] * 7)]
+def test_policies_stand_side_by_side_and_each_is_compared_with_itself() -> None:
+    shares = ABLATIONS["tint-share"]
+    older, newer = (Path(shares.policies[label]).name for label in ("0", "0.5"))
+    episodes = pd.concat(
+        [
+            outcomes("vap", [True] * 9 + [False]).assign(policy=f"mini_pi0:{older}@00aa"),
+            outcomes("generic", [True] * 3 + [False] * 7).assign(policy=f"mini_pi0:{older}@00aa"),
+            outcomes("vap", [True] * 2 + [False] * 8).assign(policy=f"mini_pi0:{newer}@00bb"),
+            outcomes("generic", [False] * 10).assign(policy=f"mini_pi0:{newer}@00bb"),
+            outcomes("vap", [True] * 10).assign(policy=f"mini_pi0:{newer}-longer@00cc"),
+        ],
+        ignore_index=True,
     )
-    results = policy_results([newer, older])
-    assert [one.arm for one in results] == ["generic", "mask-only", "vap"]
-    assert [one.sr.k for one in results] == [3, 0, 10]
-    assert effect_text(results, "vap").startswith("+70 [")
-    figure = policies_figure({"one": results, "other": results[:2]})
-    assert [axes.get_title() for axes in figure.axes] == ["one", "other"]
-    assert [len(axes.get_yticklabels()) for axes in figure.axes] == [3, 2]
+    found = policy_results(shares, episodes)
+    assert list(found) == ["0", "0.5"]
+    assert [(one.arm, one.sr.k) for one in found["0"]] == [("generic", 3), ("vap", 9)]
+    assert [(one.arm, one.sr.k) for one in found["0.5"]] == [("generic", 0), ("vap", 2)]
+    assert effect_text(found["0"], "vap").startswith("+60 [")
+    across = across_policies(shares, episodes)
+    assert [(one.arm, one.sr.k) for one in across] == [("0", 9), ("0.5", 2)]
+    assert effect_text(across, "0.5").startswith("-70 [")
+    (axes,) = policies_figure(found, "share").axes
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["0", "0.5"]
+    assert [len(bars.lines[0].get_xdata()) for bars in axes.containers] == [2, 2]
 
 
 def test_every_form_is_shown_on_one_frame() -> None:

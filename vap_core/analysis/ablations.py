@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING
 
 from vap_core.base.figures import empty_figure
 from vap_core.base.palette import CASES
-from vap_core.evaluation.ablations.arms import ABLATIONS, Ablation
+from vap_core.evaluation.ablations.arms import ABLATIONS
 from vap_core.evaluation.ablations.picture import CLEAR, PAPER, draw_effects, legend_handles
+from vap_core.evaluation.ablations.picture import policies_figure as policies_figure
 from vap_core.evaluation.ablations.table import ArmResult, arm_results
+from vap_core.evaluation.ablations.table import policy_results as policy_results
 from vap_core.evaluation.publish import read_runs
 
 if TYPE_CHECKING:
@@ -25,12 +27,6 @@ Results = dict[str, list[ArmResult]]
 """The arms of every ablation, by its name."""
 Block = list[tuple[str, ArmResult]]
 """Arms of one ablation on one suite, each with its label; the first is what they are against."""
-POLICY = Ablation(
-    question="Was the steering taught by the tints of the policy's training?",
-    arms={},
-    methods=("generic", "rewrite-only", "mask-only", "vap", "oracle-track", "wrong-mask"),
-)
-"""Methods that two policies are compared in; its arms are policies, which no method is."""
 
 
 def ablation_episodes(path: Path) -> "pd.DataFrame":
@@ -41,9 +37,14 @@ def ablation_episodes(path: Path) -> "pd.DataFrame":
 
 
 def ablation_results(episodes: "pd.DataFrame") -> Results:
-    """The arms of every ablation that has been run, each against the first of its ablation."""
+    """The arms of every ablation that has been run, each against the first of its ablation.
+
+    Those of policies are not among them (`policy_results`).
+    """
     found = {}
     for name, ablation in ABLATIONS.items():
+        if ablation.policies:
+            continue
         of_suites = episodes[episodes["suite"].isin(ablation.suites)]
         results = arm_results(ablation, of_suites)
         if results:
@@ -150,18 +151,6 @@ def rates_of_arms_figure(results: Sequence[ArmResult]) -> "Figure":
     return figure
 
 
-def policies_figure(of_policies: Mapping[str, Sequence[ArmResult]]) -> "Figure":
-    """The same arms of several policies side by side; `of_policies` has a title for each."""
-    n_arms = max(map(len, of_policies.values()))
-    figure = empty_figure(3.9 * len(of_policies), 1.0 + 0.24 * n_arms)
-    parts = figure.subplots(1, len(of_policies), squeeze=False)[0]
-    for axes, (title, results) in zip(parts, of_policies.items(), strict=True):
-        _draw_rates(axes, results)
-        axes.set_title(title, fontsize=9)
-        axes.set_xlabel("success rate, % (95 %)", fontsize=8)
-    return figure
-
-
 def cases_figure(results: Sequence[ArmResult]) -> "Figure":
     """The share of episodes that failed by Case 1 and by Case 2, one part a suite."""
     suites = list(dict.fromkeys(one.suite for one in results))
@@ -185,22 +174,6 @@ def cases_figure(results: Sequence[ArmResult]) -> "Figure":
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2,
                   frameon=False, fontsize=8)  # fmt: skip
     return figure
-
-
-def policy_results(sources: Sequence["pd.DataFrame"]) -> list[ArmResult]:
-    """`POLICY`'s methods of one policy, each against generic; of a method in several tables the
-    first is taken.
-    """
-    import pandas as pd
-
-    kept: list[pd.DataFrame] = []
-    taken: set[str] = set()
-    for table in sources:
-        wanted = set(POLICY.names) - taken
-        part = table[table["method"].isin(wanted)]
-        taken |= set(part["method"])
-        kept.append(part)
-    return arm_results(POLICY, pd.concat(kept, ignore_index=True))
 
 
 def cases_text(results: Iterable[ArmResult]) -> str:

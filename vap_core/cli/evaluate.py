@@ -248,14 +248,15 @@ def ablate(
     Example: python -m vap_core ablate
     Example: python -m vap_core ablate form --suite simpler-bridge --episodes 6
     """
-    from vap_core.base.errors import one_of
+    from vap_core.base.errors import BadStudy, one_of
     from vap_core.base.tables import align
     from vap_core.evaluation.ablations.arms import ABLATIONS
 
     if name is None:
         rows = [["ablation", "question", "arms"]]
         for each, about in ABLATIONS.items():
-            rows.append([each, about.question, ", ".join(about.names)])
+            of = f"; of the policies {', '.join(about.policies)}" if about.policies else ""
+            rows.append([each, about.question, ", ".join(about.names) + of])
         print(align(rows))
         print("next: python -m vap_core ablate form --suite simpler-bridge --episodes 6")
         return
@@ -265,6 +266,10 @@ def ablate(
     from vap_core.evaluation.policy_names import default_policy
 
     suite_names, files = _suite_names(suite or list(ABLATIONS[name].suites))
+    if ABLATIONS[name].policies:
+        if policy is not None:
+            raise BadStudy(f"ablate {name}: it compares policies of its own; leave --policy out.")
+        policy = next(iter(ABLATIONS[name].policies.values()))
     study = _study(
         tasks=_all_tasks(suite_names),
         suite_files=files,

@@ -45,7 +45,8 @@ class Ablation:
 
     `paper` is the paper's table (data/paper_tables.csv), `rows` its row for each arm that it has.
     Arms named in `methods` are methods already (evaluation.methods), or arms of another ablation.
-    `suites` are those that it runs on where none is named.
+    `suites` are those that it runs on where none is named. `policies` are checkpoints by label: the
+    methods are run with each of them, and the last method is compared over them.
     """
 
     question: str
@@ -54,6 +55,7 @@ class Ablation:
     suites: tuple[str, ...] = ("simpler-bridge",)
     paper: str = ""
     rows: Mapping[str, str] = field(default_factory=dict)
+    policies: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -61,6 +63,14 @@ class Ablation:
         return (*self.methods, *self.arms)
 
 
+_OF_BRIDGE = "data/policies/mini-pi0-simpler-bridge"
+TINT_SHARES = {
+    "0": f"{_OF_BRIDGE}-any-start",
+    "0.2": f"{_OF_BRIDGE}-tint-share-0.2",
+    "0.5": f"{_OF_BRIDGE}-tint-share-0.5",
+}
+"""Policies of one recipe, of the same films, seed and mini-PaliGemma, by the share of their
+training scenes that were tinted."""
 UNTRAINED = (Colour("orange", (255, 128, 0)), Colour("purple", (128, 0, 255)))
 """Tints that no shipped policy was trained with; their names are words of its vocabulary."""
 
@@ -196,6 +206,12 @@ ABLATIONS: dict[str, Ablation] = {
         question="What would a perfect stage bring?",
         arms={},
         methods=(DEFAULT, "oracle-box", "oracle-mask", "oracle-track", "wrong-mask"),
+    ),
+    "tint-share": Ablation(
+        question="How much of the gain was taught by tints in the policy's training?",
+        arms={},
+        methods=("generic", "rewrite-only", "mask-only", DEFAULT),
+        policies=TINT_SHARES,
     ),
 }
 """Every ablation by name; the first method of each is what the others are compared with."""

@@ -1,8 +1,9 @@
 """The effect of every arm as a forest plot: points of SR against the ablation's first arm."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from vap_core.base.palette import method_marks
 from vap_core.evaluation.ablations.table import ArmResult
 from vap_core.evaluation.statistics import Comparison
 
@@ -57,6 +58,37 @@ def draw_effects(
     theirs = 100 * (one.paper - first.paper)
     if theirs == theirs:
         axes.plot(theirs, y, "D", color=PAPER, markersize=5, fillstyle="none")
+
+
+def policies_figure(of_policies: Mapping[str, Sequence[ArmResult]], label: str) -> "Figure":
+    """The success rate of every method (95 %), with the policies side by side; `label` says what
+    tells them apart.
+    """
+    from matplotlib.figure import Figure as NewFigure
+
+    figure = NewFigure(figsize=(4.6, 3.0), layout="constrained")
+    axes = figure.subplots()
+    methods = dict.fromkeys(one.arm for results in of_policies.values() for one in results)
+    for i, (method, (colour, marker)) in enumerate(method_marks(list(methods)).items()):
+        offset = 0.08 * (i - (len(methods) - 1) / 2)
+        xs, rates = [], []
+        for x, results in enumerate(of_policies.values()):
+            for one in results:
+                if one.arm == method:
+                    xs.append(x + offset)
+                    rates.append(one.sr)
+        bounds = [
+            [100 * (one.value - one.low) for one in rates],
+            [100 * (one.high - one.value) for one in rates],
+        ]
+        ours = [100 * one.value for one in rates]
+        axes.errorbar(xs, ours, bounds, color=colour, marker=marker, capsize=2, label=method)
+    n = ", ".join(dict.fromkeys(str(one.sr.n) for part in of_policies.values() for one in part))
+    axes.set_xticks(range(len(of_policies)), list(of_policies))
+    axes.set(xlabel=label, ylabel=f"success rate, % (95 %, n {n})", ylim=(-3, 103))
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(loc="outside right center", frameon=False, fontsize=8)
+    return figure
 
 
 def is_shown(found: Comparison) -> bool:

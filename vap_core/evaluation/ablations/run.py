@@ -6,9 +6,14 @@ from typing import TYPE_CHECKING
 
 from vap_core.base.tables import align
 from vap_core.evaluation import store
-from vap_core.evaluation.ablations.arms import ABLATIONS
-from vap_core.evaluation.ablations.picture import effects_figure
-from vap_core.evaluation.ablations.table import arm_results, arm_rows
+from vap_core.evaluation.ablations.arms import ABLATIONS, Ablation
+from vap_core.evaluation.ablations.picture import effects_figure, policies_figure
+from vap_core.evaluation.ablations.table import (
+    across_policies,
+    arm_results,
+    arm_rows,
+    policy_results,
+)
 from vap_core.evaluation.engine import run
 from vap_core.evaluation.hiding import hiding_lines
 from vap_core.evaluation.jobs import Record
@@ -17,6 +22,7 @@ from vap_core.evaluation.switching import switching_lines
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
 
 
 def ablate_text(
@@ -28,17 +34,23 @@ def ablate_text(
     """
     ablation = ABLATIONS[name]
     episodes = run_arms(name, study, root, workers=workers, record=record)
-    results = arm_results(ablation, episodes)
     picture = root / f"{name}.png"
-    effects_figure(results, ablation.question).savefig(picture, dpi=200)
+    if ablation.policies:
+        tables, figure = _of_policies(ablation, episodes)
+        policy = "each by its label"
+    else:
+        results = arm_results(ablation, episodes)
+        tables, figure = [align(arm_rows(results))], effects_figure(results, ablation.question)
+        policy = study.policy
+    figure.savefig(picture, dpi=200)
     errors = int(episodes["outcome"].eq("error").sum())
     first = arm_folder(study, root, ablation.names[0])
     lines = [
         ablation.question,
-        align(arm_rows(results)),
+        *tables,
         *switching_lines(episodes),
         *hiding_lines(episodes),
-        f"n episodes a suite, {study.seeds} seed(s) from {study.seed}; policy {study.policy}; "
+        f"n episodes a suite, {study.seeds} seed(s) from {study.seed}; policy {policy}; "
         f"{errors} errors. Intervals: Wilson's for rates, cluster bootstrap over layouts for "
         "differences; p exact, Holm's correction over the arms of a suite.",
         f"picture: {picture}",
@@ -47,22 +59,35 @@ def ablate_text(
     return "\n".join(lines)
 
 
+def _of_policies(ablation: Ablation, episodes: "pd.DataFrame") -> "tuple[list[str], Figure]":
+    """A table for every policy, and one that compares the policies; and their picture."""
+    of_policies = policy_results(ablation, episodes)
+    tables = []
+    for label, results in of_policies.items():
+        tables += [f"{label}: {ablation.policies[label]}", align(arm_rows(results))]
+    across = align(arm_rows(across_policies(ablation, episodes)))
+    tables += [f"{ablation.names[-1]} with every policy, against the first", across]
+    return tables, policies_figure(of_policies, ablation.question)
+
+
 def run_arms(
     name: str, study: Study, root: Path, *, workers: int = 2, record: Record = "none"
 ) -> "pd.DataFrame":
     """The episodes of every arm of an ablation; those that `root` lacks are run.
 
     Each arm is a run in a folder of its own, so that ablations share the arms that they have in
-    common.
+    common; so is each arm with each policy, where the ablation has policies.
     """
     import pandas as pd
 
     tables = []
-    for arm in ABLATIONS[name].names:
-        of_arm = replace(study, methods=(arm,))
-        folder = arm_folder(study, root, arm)
-        what_for = f"ablate {name}"
-        tables.append(run(of_arm, folder, workers=workers, record=record, what_for=what_for))
+    for policy in ABLATIONS[name].policies.values() or (study.policy,):
+        with_policy = replace(study, policy=policy)
+        for arm in ABLATIONS[name].names:
+            of_arm = replace(with_policy, methods=(arm,))
+            folder = arm_folder(with_policy, root, arm)
+            what_for = f"ablate {name}"
+            tables.append(run(of_arm, folder, workers=workers, record=record, what_for=what_for))
     return pd.concat(tables, ignore_index=True)
 
 

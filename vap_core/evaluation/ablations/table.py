@@ -1,7 +1,9 @@
 """The table of an ablation: every arm with its rate, against the default on the same episodes."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vap_core.base.types import value
@@ -63,6 +65,39 @@ def arm_results(ablation: Ablation, episodes: "pd.DataFrame") -> list[ArmResult]
                 )
             )
     return results
+
+
+def policy_results(ablation: Ablation, episodes: "pd.DataFrame") -> dict[str, list[ArmResult]]:
+    """The methods of an ablation of policies, by the label of the policy that was run; each method
+    against the first one with the same policy.
+    """
+    found = {}
+    for label, checkpoint in ablation.policies.items():
+        results = arm_results(ablation, _of_checkpoint(episodes, checkpoint))
+        if results:
+            found[label] = results
+    return found
+
+
+def across_policies(ablation: Ablation, episodes: "pd.DataFrame") -> list[ArmResult]:
+    """The last method of an ablation of policies; its arms are the labels of the policies, each
+    against the first one on the same episodes.
+    """
+    import pandas as pd
+
+    method = ablation.names[-1]
+    parts = []
+    for label, checkpoint in ablation.policies.items():
+        part = _of_checkpoint(episodes, checkpoint)
+        parts.append(part[part["method"] == method].assign(method=label, policy=method))
+    labels = Ablation(ablation.question, arms={}, methods=tuple(ablation.policies))
+    return arm_results(labels, pd.concat(parts, ignore_index=True))
+
+
+def _of_checkpoint(episodes: "pd.DataFrame", checkpoint: str) -> "pd.DataFrame":
+    """The rows of a checkpoint of that name; a row's policy is TYPE:NAME@DIGEST."""
+    name = re.escape(Path(checkpoint).name)
+    return episodes[episodes["policy"].str.fullmatch(f".*:{name}@[0-9a-f]+")]
 
 
 def arm_rows(results: list[ArmResult]) -> list[list[str]]:
