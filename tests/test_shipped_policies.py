@@ -18,10 +18,13 @@ from vap_core.training.policy.probe import probe
 
 FOLDERS = sorted(SHIPPED.glob(f"{MINI}-*"))
 BRIDGE = shipped("simpler-bridge")
-TINT_FREE = "-tint-free"
-"""Ends the names of a policy that never saw a tint, and of the model that it grew from."""
-ANY_START = "-any-start"
-"""Ends the name of another that never saw a tint, and read the arm's angles with noise."""
+BY_TODAYS_RECIPE = {
+    "simpler-bridge-tint-free": (0.0, 0.0),
+    "simpler-bridge-any-start": (0.0, 0.04),
+    "simpler-bridge-tint-share-0.2": (0.2, 0.04),
+    "simpler-bridge-tint-share-0.5": (0.5, 0.04),
+}
+"""Policies that grew from the model that never saw a tint: the share of their scenes that were tinted, and the noise (rad) on the arm's angles."""
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
@@ -35,23 +38,23 @@ def test_it_is_whole_small_and_grown_from_the_model_that_ships(folder: Path) -> 
         )
     )
     assert len(make_pre_post_processors(policy.config, str(folder))) == 2
-    model = MODEL
-    if folder.name.endswith((TINT_FREE, ANY_START)):
-        model = MODEL.with_name(MODEL.name + TINT_FREE)
-    assert policy.config.vlm == load_vlm(model).sha256()
-    suite_name = (
-        folder.name.removeprefix(f"{MINI}-").removesuffix(TINT_FREE).removesuffix(ANY_START)
-    )
-    known = suites.suite(suite_name)
+    told = json.loads((folder / "training.json").read_text())
+    known = suites.suite(told["recipe"]["suite"])
+    name = folder.name.removeprefix(f"{MINI}-")
     assert {
         name.removeprefix("observation.images.") for name in policy.config.image_features
     } == set(known.cameras)
-    told = json.loads((folder / "training.json").read_text())
-    assert told["recipe"]["suite"] == known.name
-    if folder.name.endswith((TINT_FREE, ANY_START)):
-        assert told["recipe"]["tint_share"] == 0.0
+    if name in BY_TODAYS_RECIPE:
+        assert name.startswith(known.name)
+        model = MODEL.with_name(f"{MODEL.name}-tint-free")
+        noise = told["recipe"].get("angle_noise_rad", 0.0)
+        assert (told["recipe"]["tint_share"], noise) == BY_TODAYS_RECIPE[name]
         assert told["recipe"]["held_out_category"] == "owl figurine"
-    assert (told["recipe"].get("angle_noise_rad", 0.0) > 0) == folder.name.endswith(ANY_START)
+        assert {"magenta", "yellow"} <= set(told["recipe"]["held_out_tints"])
+    else:
+        assert name == known.name
+        model = MODEL
+    assert policy.config.vlm == load_vlm(model).sha256()
     assert len(told["data_sha256"]) == 64
     assert told["log"][-1]["step"] == told["recipe"]["steps"]
     assert sum(file.stat().st_size for file in folder.iterdir()) < 16e6
