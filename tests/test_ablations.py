@@ -404,7 +404,7 @@ def test_the_table_of_findings_holds_the_papers_arms_only() -> None:
 
 def test_policies_stand_side_by_side_and_each_is_compared_with_itself() -> None:
     shares = ABLATIONS["tint-share"]
-    older, newer = (Path(shares.policies[label]).name for label in ("0", "0.5"))
+    older, newer = (Path(shares.policies[label]).name for label in ("share-0", "share-0.5"))
     episodes = pd.concat(
         [
             outcomes("vap", [True] * 9 + [False]).assign(policy=f"mini_pi0:{older}@00aa"),
@@ -416,15 +416,15 @@ def test_policies_stand_side_by_side_and_each_is_compared_with_itself() -> None:
         ignore_index=True,
     )
     found = policy_results(shares, episodes)
-    assert list(found) == ["0", "0.5"]
-    assert [(one.arm, one.sr.k) for one in found["0"]] == [("generic", 3), ("vap", 9)]
-    assert [(one.arm, one.sr.k) for one in found["0.5"]] == [("generic", 0), ("vap", 2)]
-    assert effect_text(found["0"], "vap").startswith("+60 [")
+    assert list(found) == ["share-0", "share-0.5"]
+    assert [(one.arm, one.sr.k) for one in found["share-0"]] == [("generic", 3), ("vap", 9)]
+    assert [(one.arm, one.sr.k) for one in found["share-0.5"]] == [("generic", 0), ("vap", 2)]
+    assert effect_text(found["share-0"], "vap").startswith("+60 [")
     across = across_policies(shares, episodes)
-    assert [(one.arm, one.sr.k) for one in across] == [("0", 9), ("0.5", 2)]
-    assert effect_text(across, "0.5").startswith("-70 [")
+    assert [(one.arm, one.sr.k) for one in across] == [("share-0", 9), ("share-0.5", 2)]
+    assert effect_text(across, "share-0.5").startswith("-70 [")
     (axes,) = policies_figure(found, "share").axes
-    assert [label.get_text() for label in axes.get_xticklabels()] == ["0", "0.5"]
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["share-0", "share-0.5"]
     assert [len(bars.lines[0].get_xdata()) for bars in axes.containers] == [2, 2]
 
 

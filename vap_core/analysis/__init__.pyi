@@ -2,6 +2,7 @@ from .ablation_findings import findings_table as findings_table
 from .ablation_findings import verdict as verdict
 from .ablations import ablation_episodes as ablation_episodes
 from .ablations import ablation_results as ablation_results
+from .ablations import across_policies as across_policies
 from .ablations import all_effects_figure as all_effects_figure
 from .ablations import cases_figure as cases_figure
 from .ablations import cases_text as cases_text

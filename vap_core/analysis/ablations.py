@@ -15,6 +15,7 @@ from vap_core.evaluation.ablations.arms import ABLATIONS
 from vap_core.evaluation.ablations.picture import CLEAR, PAPER, draw_effects, legend_handles
 from vap_core.evaluation.ablations.picture import policies_figure as policies_figure
 from vap_core.evaluation.ablations.table import ArmResult, arm_results
+from vap_core.evaluation.ablations.table import across_policies as across_policies
 from vap_core.evaluation.ablations.table import policy_results as policy_results
 from vap_core.evaluation.publish import read_runs
 
@@ -39,7 +40,7 @@ def ablation_episodes(path: Path) -> "pd.DataFrame":
 def ablation_results(episodes: "pd.DataFrame") -> Results:
     """The arms of every ablation that has been run, each against the first of its ablation.
 
-    Those of policies are not among them (`policy_results`).
+    Those of policies are not among them (`policy_results`, `across_policies`).
     """
     found = {}
     for name, ablation in ABLATIONS.items():

@@ -65,9 +65,9 @@ class Ablation:
 
 _OF_BRIDGE = "data/policies/mini-pi0-simpler-bridge"
 TINT_SHARES = {
-    "0": f"{_OF_BRIDGE}-any-start",
-    "0.2": f"{_OF_BRIDGE}-tint-share-0.2",
-    "0.5": f"{_OF_BRIDGE}-tint-share-0.5",
+    "share-0": f"{_OF_BRIDGE}-any-start",
+    "share-0.2": f"{_OF_BRIDGE}-tint-share-0.2",
+    "share-0.5": f"{_OF_BRIDGE}-tint-share-0.5",
 }
 """Policies of one recipe, of the same films, seed and mini-PaliGemma, by the share of their
 training scenes that were tinted."""
