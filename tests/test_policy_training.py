@@ -134,7 +134,10 @@ def vlm_inputs(
 
 
 def test_a_vision_language_model_learns_and_resumes(
-    stage: tuple[Path, list[Film]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stage: tuple[Path, list[Film]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     _, recipe = vlm_inputs(stage, monkeypatch)
     whole = vlm.train(recipe, tmp_path / "whole")
@@ -148,6 +151,9 @@ def test_a_vision_language_model_learns_and_resumes(
     monkeypatch.setattr(taught, "LEAST_ACCURACY", 0.0)
     grown = replace(TINY, stages=1, steps=4, batch=4, draws=1, taught=1, learned=1.0)
     about = policy.train(grown, tmp_path / "policy", vlm=tmp_path / "whole", cache=stage[0].parent)
+    shown = capsys.readouterr().err
+    assert "descriptions: 100%" in shown
+    assert "learned words: 100%" in shown
     trained = load_policy(tmp_path / "policy").policy
     assert about["vlm"] == one == trained.config.vlm
     assert about["taught"]["used"] == about["taught"]["objects"] > 0

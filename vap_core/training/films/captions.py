@@ -38,11 +38,13 @@ def captions(names: Iterable[str], file: Path) -> tuple[dict[str, Description], 
 
     Those that `file` lacks are made and kept there, so that an earlier call goes on.
     """
+    from tqdm import tqdm
+
     kept: dict[str, Any] = {"cpu_s": 0.0, "captions": {}}
     if file.exists():
         kept = parse_json(file.read_bytes())
     missing = sorted(set(names) - set(kept["captions"]))
-    for first in range(0, len(missing), AT_ONCE):
+    for first in tqdm(range(0, len(missing), AT_ONCE), desc="descriptions", mininterval=10):
         started = time.process_time()
         models = [get_object(name) for name in missing[first : first + AT_ONCE]]
         only_generic(models)

@@ -56,24 +56,26 @@ def learn_words(
 
     `folder` keeps them; an earlier call goes on.
     """
+    from tqdm import tqdm
+
     file = folder / "words.json"
     kept: dict[str, Any] = {"cpu_s": 0.0, "accuracy": {}}
     if file.exists():
         kept = parse_json(file.read_bytes())
     model = vlm.sha256()
     words = {}
-    for crew in crews(films, count):
-        for name in crew:
-            if name not in kept["accuracy"]:
-                started = time.process_time()
-                taught, unseen = (_photos(name, crew, seed) for seed in (0, 1))
-                token = learned_token.learn(vlm, name, taught, unseen, TRAINING)
-                token_file.save(folder, token)
-                kept["accuracy"][name] = token.accuracy
-                kept["cpu_s"] += time.process_time() - started
-                write_atomic(file, json.dumps(kept, indent=1).encode())
-            if kept["accuracy"][name] >= LEAST_ACCURACY:
-                words[name] = token_file.load(folder, name, model).embedding
+    pairs = [(name, crew) for crew in crews(films, count) for name in crew]
+    for name, crew in tqdm(pairs, desc="learned words", mininterval=10):
+        if name not in kept["accuracy"]:
+            started = time.process_time()
+            taught, unseen = (_photos(name, crew, seed) for seed in (0, 1))
+            token = learned_token.learn(vlm, name, taught, unseen, TRAINING)
+            token_file.save(folder, token)
+            kept["accuracy"][name] = token.accuracy
+            kept["cpu_s"] += time.process_time() - started
+            write_atomic(file, json.dumps(kept, indent=1).encode())
+        if kept["accuracy"][name] >= LEAST_ACCURACY:
+            words[name] = token_file.load(folder, name, model).embedding
     return words, kept
 
 
