@@ -390,6 +390,10 @@ def test_a_backbone_that_was_not_downloaded_is_named(
 def test_a_fingerprint_tells_checkpoints_apart(folders, tmp_path):
     folder = copy_of(folders["act"], tmp_path)
     assert fingerprint(folder) == fingerprint(folders["act"]) != fingerprint(folders["ensemble"])
+    (folder / "words").mkdir()
+    for left in ("training.json", "captions.json", "words/mug.token.safetensors"):
+        (folder / left).write_text("{}")
+    assert fingerprint(folder) == fingerprint(folders["act"]), "what a training leaves beside it"
     (folder / "config.json").write_text((folder / "config.json").read_text() + " ")
     assert fingerprint(folder) != fingerprint(folders["act"])
 

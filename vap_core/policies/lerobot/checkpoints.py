@@ -18,8 +18,9 @@ STEP_CLASS = "vap_core.policies.lerobot.step.VapPrompt"
 """Its class."""
 ANY_STEP_CLASS = re.compile(r"vap_core\.(\w+\.)*VapPrompt")
 """Its class in this version or an earlier one."""
-TRAINING_CARD = "training.json"
-"""How a checkpoint was trained, which does not decide what it does."""
+OF_TRAINING = ("training.json", "captions.json", "words")
+"""How a checkpoint was trained, and what a training leaves beside it: they do not decide what it
+does."""
 WANTED_FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
 
 
@@ -88,9 +89,10 @@ def fingerprint(checkpoint: str | Path) -> str:
     folder = locate(checkpoint)
     digest = hashlib.sha256()
     for file in sorted(folder.rglob("*")):
-        if not _decides(file):
+        name = file.relative_to(folder)
+        if not file.is_file() or not _decides(name):
             continue
-        digest.update(file.relative_to(folder).as_posix().encode())
+        digest.update(name.as_posix().encode())
         with file.open("rb") as stream:
             digest.update(hashlib.file_digest(stream, "sha256").digest())
     return digest.hexdigest()
@@ -133,11 +135,11 @@ def _downloaded(name: str) -> Path:
     return Path(folder)
 
 
-def _decides(file: Path) -> bool:
-    """Whether a file of a checkpoint decides what it does."""
-    if not file.is_file() or file.name == TRAINING_CARD:
+def _decides(name: Path) -> bool:
+    """Whether a file of a checkpoint, by its name in the folder, decides what it does."""
+    if name.parts[0] in OF_TRAINING:
         return False
-    return any(file.match(pattern) for pattern in WANTED_FILES)
+    return any(name.match(pattern) for pattern in WANTED_FILES)
 
 
 def _steps(file: Path) -> list[dict[str, Any]]:
