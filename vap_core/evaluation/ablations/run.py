@@ -1,12 +1,13 @@
 """Runs an ablation with the engine, one run an arm, and says what it found."""
 
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vap_core.base.tables import align
 from vap_core.evaluation import store
-from vap_core.evaluation.ablations.arms import ABLATIONS, Ablation
+from vap_core.evaluation.ablations.arms import ABLATIONS
 from vap_core.evaluation.ablations.picture import effects_figure, policies_figure
 from vap_core.evaluation.ablations.table import (
     across_policies,
@@ -36,7 +37,7 @@ def ablate_text(
     episodes = run_arms(name, study, root, workers=workers, record=record)
     picture = root / f"{name}.png"
     if ablation.policies:
-        tables, figure = _of_policies(ablation, episodes)
+        tables, figure = _of_policies(name, episodes)
         policy = "each by its label"
     else:
         results = arm_results(ablation, episodes)
@@ -59,15 +60,16 @@ def ablate_text(
     return "\n".join(lines)
 
 
-def _of_policies(ablation: Ablation, episodes: "pd.DataFrame") -> "tuple[list[str], Figure]":
+def _of_policies(name: str, episodes: "pd.DataFrame") -> "tuple[list[str], Figure]":
     """A table for every policy, and one that compares the policies; and their picture."""
+    ablation = ABLATIONS[name]
     of_policies = policy_results(ablation, episodes)
     tables = []
     for label, results in of_policies.items():
         tables += [f"{label}: {ablation.policies[label]}", align(arm_rows(results))]
     across = align(arm_rows(across_policies(ablation, episodes)))
     tables += [f"{ablation.names[-1]} with every policy, against the first", across]
-    return tables, policies_figure(of_policies, ablation.question)
+    return tables, policies_figure(of_policies, name)
 
 
 def run_arms(
@@ -88,7 +90,9 @@ def run_arms(
             folder = arm_folder(with_policy, root, arm)
             what_for = f"ablate {name}"
             tables.append(run(of_arm, folder, workers=workers, record=record, what_for=what_for))
-    return pd.concat(tables, ignore_index=True)
+    columns = dict.fromkeys(chain.from_iterable(tables))
+    kept = [table.dropna(axis="columns", how="all") for table in tables]
+    return pd.concat(kept, ignore_index=True).reindex(columns=list(columns))
 
 
 def arm_folder(study: Study, root: Path, arm: str) -> Path:
