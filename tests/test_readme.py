@@ -1,16 +1,17 @@
 """What README and docs/ quote of the published tables is what they hold."""
 
 import re
+from pathlib import Path
 
 import pandas as pd
 import pytest
 
 from tests.pages import PAGES, PROSE, ROOT, table
 from vap_core.cli.bench import eval_report, measured, measurement
-from vap_core.evaluation.ablations.arms import ABLATIONS
+from vap_core.evaluation.ablations.arms import ABLATIONS, TINT_SHARES
 from vap_core.evaluation.ablations.table import policy_results
 from vap_core.evaluation.diagnosis.failures import list_failures
-from vap_core.evaluation.metrics import Rate
+from vap_core.evaluation.metrics import Rate, rate
 from vap_core.evaluation.publish import read_runs
 from vap_core.evaluation.report.failures import breakdown
 from vap_core.evaluation.report.results import results
@@ -18,6 +19,9 @@ from vap_core.evaluation.report.runs import load_runs
 from vap_core.evaluation.statistics import ALL_TASKS
 
 RESULTS = ROOT / "data" / "results"
+SHARES = {
+    label.removeprefix("share-"): Path(checkpoint).name for label, checkpoint in TINT_SHARES.items()
+}
 
 
 def test_success_rates() -> None:
@@ -96,6 +100,16 @@ def test_what_policies_of_other_tint_shares_reach() -> None:
     head, *body = table("| tint share | generic")
     assert [cell.strip("*").lower() for cell in head[1:]] == list(shares.names)
     assert {cells[0]: [cell.strip("*") for cell in cells[1:]] for cells in body} == held
+    (_, *ways), *body = table("| tint share | tinted")
+    told = pd.read_parquet(RESULTS / "tint_share_generic.parquet")
+    for share, *cells in body:
+        of_share = told[told.policy.str.contains(f":{SHARES[share]}@")]
+        assert cells == [_of_way(of_share, way) for way in ways]
+
+
+def _of_way(told: pd.DataFrame, way: str) -> str:
+    won = told[told.method == way].success
+    return _percent(rate(int(won.sum()), len(won))) if len(won) else ""
 
 
 def _percent(found: Rate) -> str:
