@@ -9,7 +9,6 @@ import pytest
 from tests.pages import PAGES, PROSE, ROOT, table
 from vap_core.cli.bench import eval_report, measured, measurement
 from vap_core.evaluation.ablations.arms import ABLATIONS, TINT_SHARES
-from vap_core.evaluation.ablations.table import policy_results
 from vap_core.evaluation.diagnosis.failures import list_failures
 from vap_core.evaluation.metrics import Rate, rate
 from vap_core.evaluation.publish import read_runs
@@ -92,11 +91,12 @@ def test_what_policies_of_other_tint_shares_reach() -> None:
     runs = read_runs(RESULTS / "tint_share.parquet")
     played = pd.concat([episodes for _, episodes in runs])
     assert set(played.outcome) <= {"success", "failure"}
-    listed = policy_results(shares, played[played.seed == 0])
+    listed = played[played.seed == 0]
     held = {}
-    for label, results_of in listed.items():
-        assert {one.sr.n for one in results_of} == {96}
-        held[label.removeprefix("share-")] = [_percent(one.sr) for one in results_of]
+    for share, name in SHARES.items():
+        of_share = listed[listed.policy.str.contains(f":{name}@")]
+        assert set(of_share.groupby("method").size()) == {96}
+        held[share] = [_of_way(of_share, method) for method in shares.names]
     head, *body = table("| tint share | generic")
     assert [cell.strip("*").lower() for cell in head[1:]] == list(shares.names)
     assert {cells[0]: [cell.strip("*") for cell in cells[1:]] for cells in body} == held
