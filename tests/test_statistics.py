@@ -216,6 +216,8 @@ def test_order_of_rows_and_names_of_methods_change_nothing() -> None:
         told(c) for c in compare(table.sample(frac=1, random_state=3), ["generic", "vap"])
     )
     assert shuffled == sorted(plain)
+    (whole,) = compare(table, ["generic", "vap"], by_task=False)
+    assert told(whole) == plain[-1], "all tasks together, without the comparisons of each"
     renamed = compare(table.replace({"vap": "zzz", "generic": "yyy"}), ["yyy", "zzz"])
     assert [told(c)[6:] for c in renamed] == [line[6:] for line in plain]
 

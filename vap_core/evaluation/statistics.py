@@ -57,19 +57,23 @@ class Comparison:
     p_holm: float
 
 
-def compare(episodes: "pd.DataFrame", methods: Sequence[str] = ()) -> list[Comparison]:
+def compare(
+    episodes: "pd.DataFrame", methods: Sequence[str] = (), *, by_task: bool = True
+) -> list[Comparison]:
     """Every pair of methods on the episodes that both ran.
 
-    Per task and track, and over all tasks of a track where there are several. `methods` gives their
-    order (default: of appearance); the later is compared against the earlier. Episodes are one row
-    each (`Episode.summary`); the column `layout` is added where it is absent.
+    Per task and track, unless `by_task` is false, and over all tasks of a track where there are
+    several. `methods` gives their order (default: of appearance); the later is compared against the
+    earlier. Episodes are one row each (`Episode.summary`); the column `layout` is added where it is
+    absent.
     """
     order = list(methods or dict.fromkeys(episodes["method"]))
     won = (episodes["success"].eq(True) & episodes["outcome"].ne("error")).astype(int)
     table = episodes[[*PAIR_KEY, "method"]].assign(layout=_layouts_of(episodes), won=won)
     comparisons = []
     for (suite, split, policy), track in table.groupby(["suite", "split", "policy"], sort=False):
-        for task, part in _by_task(track):
+        parts = _by_task(track)
+        for task, part in parts if by_task else parts[-1:]:
             wide = part.pivot(index=[*PAIR_KEY, "layout"], columns="method", values="won")
             present = [name for name in order if name in wide]
             for one, other in combinations(present, 2):

@@ -10,7 +10,7 @@ from vap_core.base.types import value
 from vap_core.evaluation import paper
 from vap_core.evaluation.ablations.arms import Ablation
 from vap_core.evaluation.metrics import Rate, rate
-from vap_core.evaluation.statistics import ALL_TASKS, Comparison, compare, holm
+from vap_core.evaluation.statistics import Comparison, compare, holm
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -135,10 +135,8 @@ def _against_default(arms: Sequence[str], of_suite: "pd.DataFrame") -> dict[str,
     found = {}
     for arm in others:
         part = of_suite[of_suite["method"].isin([default, arm])]
-        for comparison in compare(part, [default, arm]):
-            single = part["task"].nunique() == 1
-            if comparison.task == ALL_TASKS or single:
-                found[arm] = comparison
+        for comparison in compare(part, [default, arm], by_task=False):
+            found[arm] = comparison
     p_holm = holm([comparison.p for comparison in found.values()])
     corrected = {}
     for (arm, comparison), p in zip(found.items(), p_holm, strict=True):
