@@ -23,6 +23,7 @@ from torch import Tensor
 from vap_core.base.errors import BadOutput, BadPolicy, first_line
 from vap_core.base.files import parse_json, sha256_of, write_atomic
 from vap_core.base.version import code_version
+from vap_core.policies.lerobot.checkpoints import CAPTIONS, TRAINING_CARD, WORDS
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
 from vap_core.policies.mini_pi0.vlm import MiniVlm, initialise_policy, load_vlm, store_in_bfloat16
@@ -252,7 +253,7 @@ def save(
         "written_by": code_version(),
         "held_out": average_of(measured),
     }
-    write_atomic(out / "training.json", json.dumps(card, indent=1).encode())
+    write_atomic(out / TRAINING_CARD, json.dumps(card, indent=1).encode())
     return card
 
 
@@ -292,10 +293,10 @@ def _prepare_words(
     for film in films.all:
         for i in nameable(film, recipe.suite):
             names[film.names[i]] = None
-    described, cost_cpu_s["captions"] = captions(names, out / "captions.json")
+    described, cost_cpu_s["captions"] = captions(names, out / CAPTIONS)
     if teacher is None or not recipe.taught:
         return Known(described), {}
-    words, kept = learn_words(teacher, films.train, recipe.taught, out / "words")
+    words, kept = learn_words(teacher, films.train, recipe.taught, out / WORDS)
     cost_cpu_s["words"] = kept["cpu_s"]
     accuracy = list(kept["accuracy"].values())
     about_words = {
@@ -317,9 +318,9 @@ def _hours(cost_cpu_s: dict[str, float]) -> dict[str, float]:
 
 def _vlm_cost_s(folder: Path | None) -> float:
     """CPU seconds that the mini-PaliGemma in a folder took; 0 where its training.json says none."""
-    if folder is None or not (folder / "training.json").is_file():
+    if folder is None or not (folder / TRAINING_CARD).is_file():
         return 0.0
-    card = parse_json((folder / "training.json").read_bytes())
+    card = parse_json((folder / TRAINING_CARD).read_bytes())
     return 3600.0 * float(card.get("cpu_hours", {}).get("total", 0.0))
 
 
