@@ -154,6 +154,13 @@ def policy(
             "checkpoint's folder, trained first."
         ),
     ] = None,
+    start: Annotated[
+        Path | None,
+        typer.Option(
+            help="A trained mini-pi0 of the suite whose weights it begins with; --vlm is then the "
+            "model that learned words are taught in. Default the recipe's: nothing."
+        ),
+    ] = None,
     demonstrations: Annotated[
         Path | None,
         typer.Option(
@@ -198,6 +205,7 @@ def policy(
         angle_noise_rad=standard.angle_noise_rad if angle_noise is None else angle_noise,
         stages=stages or standard.stages,
         steps=steps or standard.steps,
+        start=standard.start if start is None else str(start),
     )
     rendered = cache or CACHE
     grows_from = vlm

@@ -37,7 +37,7 @@ class Recipe(Sizes):
     `tint_share`, whatever the command; any object that may be meant carries the tint, or none, with
     equal odds. `held_out_tints` are no tints of training, nor are opacities outside `opacities`.
 
-    The policy begins with nothing, or goes on from the shipped one called `start`.
+    The policy begins with nothing, or goes on from `start`: a shipped one's name, or a folder.
 
     Films: none shows `held_out_category`, which the suite evaluates. `draws` flow samples share one
     look at the pictures; frames close to the start, a grasp, a release or the end come `focus`

@@ -141,10 +141,11 @@ def train(
 
     Returns training.json: the recipe, what was measured on the films held out, and the cost. The
     policy goes on from the recipe's `start`; without one it grows from the mini-PaliGemma in `vlm`,
-    or, None, begins with nothing and reads no learned word. `demonstrations` is a dataset of train
-    demonstrations; None: the cache.
+    or, None, begins with nothing. Learned words are taught in `vlm`, from which the start must have
+    grown; None: none are. `demonstrations` is a dataset of train demonstrations; None: the cache.
 
-    Raises: BadOutput when `out` holds another training.
+    Raises: BadOutput when `out` holds another training; BadPolicy for a start that is no mini-pi0,
+        or one of other cameras, sizes or words.
     """
     films = load_films(recipe, cache, demonstrations, jobs)
     if not films.train:
@@ -162,9 +163,11 @@ def train(
     }
     # Of initial weights only; every other draw comes from the step's stream.
     torch.manual_seed(recipe.seed)
+    first = films.train[0]
+    config = configuration(recipe, first.state.shape[1], first.action.shape[1])
     if recipe.start:
-        start = SHIPPED / recipe.start
-        learner, stats = _go_on_from(start)
+        start = _start_folder(recipe.start)
+        learner, stats = _go_on_from(start, config, teacher)
         config = learner.policy.config
         made_of["start"] = {
             "name": recipe.start,
@@ -172,12 +175,10 @@ def train(
         }
     else:
         stats = statistics(films.train, recipe.angle_noise_rad)
-        first = films.train[0]
-        config = configuration(recipe, first.state.shape[1], first.action.shape[1])
         learner = Learner(config)
-    if teacher is not None:
-        config.vlm = teacher.sha256()
-        initialise_policy(teacher, learner.policy)
+        if teacher is not None:
+            config.vlm = teacher.sha256()
+            initialise_policy(teacher, learner.policy)
     made_of["vlm"] = config.vlm
     frames = Frames(recipe=recipe, films=films.train, stats=stats, config=config, known=known)
 
@@ -257,10 +258,19 @@ def save(
     return card
 
 
-def _go_on_from(folder: Path) -> tuple[Learner, dict[str, dict[str, Tensor]]]:
-    """A learner with a shipped policy's weights, and how its processors scale states and actions.
+def _start_folder(start: str) -> Path:
+    """The folder of the shipped policy with this name, or the folder that it names."""
+    shipped = SHIPPED / start
+    return shipped if shipped.is_dir() else Path(start)
 
-    Raises: BadPolicy.
+
+def _go_on_from(
+    folder: Path, wanted: MiniPI0Config, teacher: MiniVlm | None
+) -> tuple[Learner, dict[str, dict[str, Tensor]]]:
+    """A learner with a policy's weights, and how its processors scale states and actions.
+
+    Raises: BadPolicy when it can't be read, does not look and act as in `wanted`, or did not grow
+        from the `teacher`.
     """
     from lerobot.configs import PreTrainedConfig
 
@@ -275,9 +285,20 @@ def _go_on_from(folder: Path) -> tuple[Learner, dict[str, dict[str, Tensor]]]:
     except Exception as error:
         raise BadPolicy(
             f"train policy: {folder} is no mini-pi0 to go on from ({type(error).__name__}: "
-            f"{first_line(error):.120}); get the repository's data/policies again: "
-            "git checkout data/policies"
+            f"{first_line(error):.120}); name a checkpoint's folder, or get the repository's "
+            "data/policies again: git checkout data/policies"
         ) from error
+    for name in ("input_features", "output_features", "chunk_size", "width"):
+        if getattr(config, name) != getattr(wanted, name):
+            raise BadPolicy(
+                f"train policy: {folder} differs from the recipe in {name}; go on from a policy "
+                "of the same suite, or leave out --start."
+            )
+    if teacher is not None and config.vlm != teacher.sha256():
+        raise BadPolicy(
+            f"train policy: {folder} did not grow from this mini-PaliGemma; name the one that it "
+            "grew from with --vlm, or leave it out to teach no learned word."
+        )
     return learner, stats
 
 
