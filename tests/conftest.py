@@ -25,7 +25,7 @@ END_TO_END = {
     "test_demo", "test_demonstrations", "test_diagnosis", "test_engine", "test_eval_cli",
     "test_foundation", "test_gallery", "test_imported", "test_lerobot", "test_lerobot_loop",
     "test_methods", "test_mini_pi0", "test_perception_training", "test_planted",
-    "test_policy_training", "test_probe", "test_record", "test_record_files", "test_shipped_policies",
+    "test_policy_batches", "test_policy_training", "test_probe", "test_record", "test_record_files", "test_shipped_policies",
     "test_sim", "test_soft_prompt", "test_survey_tables", "test_tokens",
 }  # fmt: skip
 """Modules that run whole episodes, trainings or commands: slow, so `make check` leaves them out."""

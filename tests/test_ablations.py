@@ -1,4 +1,4 @@
-"""Ablations: forms of a prompt, arms by name, the table by hand, and the command."""
+"""Ablations: arms by name, the table by hand, and the command."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,8 +6,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from tests.command import refused, vap
 from vap_core.analysis.ablation_findings import findings_table, verdict
@@ -21,18 +19,10 @@ from vap_core.analysis.ablations import (
     sweep_figure,
 )
 from vap_core.analysis.agreements import gate_figure, gated_cases
-from vap_core.analysis.prompt_forms import (
-    forms_figure,
-    marked_frames,
-    tinted_frames,
-    tints_figure,
-)
 from vap_core.attend import Prompting
-from vap_core.base.types import Camera
 from vap_core.evaluation import hiding, paper
 from vap_core.evaluation.ablations.arms import ABLATIONS, ARMS, TINT_SHARES, Ablation, Hidden
-from vap_core.evaluation.ablations.arrow import Arrow, hand_pixel
-from vap_core.evaluation.ablations.forms import draw_arrow
+from vap_core.evaluation.ablations.arrow import Arrow
 from vap_core.evaluation.ablations.picture import effects_figure, policies_figure
 from vap_core.evaluation.ablations.run import arm_folder
 from vap_core.evaluation.ablations.table import (
@@ -44,78 +34,10 @@ from vap_core.evaluation.ablations.table import (
 from vap_core.evaluation.methods import METHODS, find, known_methods, references_needed
 from vap_core.evaluation.statistics import Comparison
 from vap_core.evaluation.study import Study
-from vap_core.prompt import PALETTE, Tint, has_colour, tint
-from vap_core.rollout.prompters.oracle import Oracle, OraclePrompter
+from vap_core.prompt import PALETTE
 from vap_core.rollout.types import MaskCoverage
-from vap_core.simulation import suites
-from vap_core.simulation.assets.objects import get_object, texture_image
 
-FORMS = {
-    name: arm.form for name, arm in ABLATIONS["form"].arms.items() if isinstance(arm, Prompting)
-}
-RED = PALETTE[0]
-
-
-def blob(h: int, w: int, y: int, x: int, r: int) -> np.ndarray:
-    rows, cols = np.mgrid[0:h, 0:w]
-    return (rows - y) ** 2 + (cols - x) ** 2 <= r * r
-
-
-@settings(max_examples=15, deadline=None)
-@given(
-    h=st.integers(40, 90),
-    w=st.integers(40, 90),
-    y=st.integers(-5, 95),
-    x=st.integers(-5, 95),
-    seed=st.integers(0, 9),
-)
-@pytest.mark.parametrize("name", FORMS)
-def test_a_form_marks_a_copy_of_any_picture(
-    name: str, h: int, w: int, y: int, x: int, seed: int
-) -> None:
-    rgb = np.random.default_rng(seed).integers(0, 200, (h, w, 3), np.uint8)
-    kept = rgb.copy()
-    mask, other = blob(h, w, y, x, 9), blob(h, w, h // 4, w // 4, 6)
-    marked = FORMS[name](rgb, mask, RED, [other & ~mask])
-    assert (rgb == kept).all()
-    assert (marked.shape, marked.dtype) == (rgb.shape, np.uint8)
-    if mask.any() and name != "others-erased":
-        assert (marked != rgb).any()
-
-
-@pytest.mark.parametrize("name", sorted(set(FORMS) - {"marker", "others-erased"}))
-def test_without_a_target_nothing_is_marked(name: str) -> None:
-    rgb = np.full((64, 64, 3), 90, np.uint8)
-    nothing = np.zeros((64, 64), bool)
-    assert (FORMS[name](rgb, nothing, RED, []) == rgb).all()
-
-
-def test_each_form_does_what_its_name_says() -> None:
-    rgb = np.random.default_rng(0).integers(60, 120, (112, 112, 3), np.uint8)
-    mask, other = blob(112, 112, 60, 40, 14), blob(112, 112, 60, 85, 12)
-    changed = {
-        name: (form(rgb, mask, RED, [other]) != rgb).any(axis=2) for name, form in FORMS.items()
-    }
-    assert (changed["opaque"] == mask).all()
-    box = np.zeros_like(mask)
-    box[46:75, 26:55] = True
-    assert (changed["box"] == box).all()
-    assert not changed["contour"][60, 40]
-    assert changed["point"][60, 40]
-    assert changed["point"].sum() < 0.2 * mask.sum()
-    assert not changed["circle"][mask].any()
-    assert changed["marker"][60, 85]
-    assert not changed["dimmed"][mask].any()
-    assert changed["dimmed"][~mask].all()
-    assert not changed["others-erased"][mask].any()
-    assert changed["others-erased"][other].mean() > 0.9
-
-
-def test_the_default_form_is_the_papers_tint() -> None:
-    rgb = np.random.default_rng(1).integers(0, 255, (32, 32, 3), np.uint8)
-    mask = blob(32, 32, 16, 16, 7)
-    assert (Prompting().form(rgb, mask, RED, []) == tint(rgb, mask, RED)).all()
-    assert Prompting().form == Tint(0.5)
+WORDS = ("--suite", "widowx-pick", "--policy", "scripted", "--episodes", "1", "--workers", "1")
 
 
 def test_every_arm_is_a_method_with_a_name_of_its_own() -> None:
@@ -138,17 +60,6 @@ def test_every_number_of_the_paper_that_an_arm_names_is_in_its_table() -> None:
         for row in ablation.rows.values():
             held = facts[facts["table"].eq(ablation.paper) & facts["row"].eq(row)]
             assert set(held["column"]) >= {"Google Robot", "WidowX"}, row
-
-
-@pytest.mark.parametrize(("area", "shift"), [(0.25, 0.0), (2.0, 0.0), (1.0, 0.5)])
-def test_a_spoiled_mask_has_its_area_and_its_shift(area: float, shift: float) -> None:
-    mask = blob(224, 224, 100, 90, 30)
-    prompter = OraclePrompter.__new__(OraclePrompter)
-    prompter.oracle = Oracle("track", area=area, shift=shift)
-    spoiled = prompter._spoil(mask)
-    assert spoiled.sum() == pytest.approx(area * mask.sum(), rel=0.05)
-    centre = np.argwhere(spoiled).mean(axis=0)
-    assert centre == pytest.approx([100, 90 + shift * 61], abs=1.0)
 
 
 def outcomes(arm: str, won: list[bool]) -> pd.DataFrame:
@@ -199,9 +110,6 @@ def test_without_a_name_ablations_are_listed_and_unknown_ones_refused() -> None:
     )
 
 
-WORDS = ("--suite", "widowx-pick", "--policy", "scripted", "--episodes", "1", "--workers", "1")
-
-
 @pytest.mark.sweep
 def test_the_command_says_what_it_found_and_runs_nothing_twice(tmp_path: Path) -> None:
     words = ("ablate", "selection", *WORDS, "--out", tmp_path / "run")
@@ -240,43 +148,6 @@ def test_an_ablation_of_policies_takes_no_other() -> None:
     assert "leave --policy out" in refused("ablate", "tint-share", "--policy", "scripted")
 
 
-def camera(x: float = 0.0) -> Camera:
-    """Looks straight down from one metre above the table; `x` is its place (metres)."""
-    pose = np.diag([1.0, -1.0, -1.0, 1.0])
-    pose[:3, 3] = x, 0, 1
-    k = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
-    return Camera(name="top", width=100, height=100, k=k, pose_world=pose)
-
-
-def test_the_arrow_begins_at_the_hand_and_ends_on_the_target() -> None:
-    assert hand_pixel(camera(), np.array([0.1, 0.2, 0.5])) == (70, 10)
-    assert hand_pixel(camera(), np.array([0.0, 0.0, 1.5])) is None, "behind the camera"
-    assert hand_pixel(camera(), np.array([500.0, 0.0, 0.5])) == (4096, 50), "far outside"
-    rgb = np.full((100, 100, 3), 90, np.uint8)
-    drawn = draw_arrow(rgb, blob(100, 100, 70, 30, 8), RED, (70, 10))
-    changed = (drawn != rgb).any(axis=2)
-    assert changed[10, 70]
-    assert changed[70, 30]
-    assert not changed[:, 80:].any()
-
-
-def test_every_look_alike_can_be_red_by_nature() -> None:
-    for row in suites.benchmark("simpler-bridge-red"):
-        listed = suites.benchmark("simpler-bridge")
-        same = next(one for one in listed if (one.task, one.episode) == (row.task, row.episode))
-        changed = [a.model for a, b in zip(row.placements, same.placements, strict=True)
-                   if a.model != b.model]  # fmt: skip
-        assert len(changed) == 1
-        assert changed[0].endswith("-red")
-        assert get_object(changed[0]).category == row.category
-    red = get_object("shaver-lookalike-1-red")
-    assert red is get_object("shaver-lookalike-1-red"), "meshes are kept by object"
-    assert (
-        has_colour(texture_image(red), RED).mean()
-        > 3 * has_colour(texture_image(get_object("shaver-lookalike-1")), RED).mean() + 0.1
-    )
-
-
 def test_the_track_is_kept_that_is_on_the_target_soon_after_it_is_seen_again() -> None:
     def seen(shown: str | None, pixels: int = 500) -> list[MaskCoverage]:
         return [MaskCoverage(camera="c", object=shown, iou=0.9, pixels=pixels, proposal=np.nan)]
@@ -301,24 +172,6 @@ def test_an_arm_runs_once_for_all_ablations(tmp_path: Path) -> None:
     assert arm_folder(study, tmp_path, "opaque") == arm_folder(other, tmp_path, "opaque")
     longer = replace(study, episodes=2)
     assert arm_folder(study, tmp_path, "vap") != arm_folder(longer, tmp_path, "vap")
-
-
-def test_the_target_is_hidden_from_the_third_call_on() -> None:
-    from vap_core.evaluation.study import _occlusion
-
-    occlusion = _occlusion("hidden-2", execute=4)
-    assert occlusion is not None
-    assert [step for step in range(40) if occlusion.covers("front", step)] == list(range(8, 16))
-    assert _occlusion("vap", execute=4) is None
-    assert suites.rows("simpler-bridge", "pick-shaver", n=1)
-
-
-@pytest.mark.parametrize("name", FORMS)
-def test_a_form_that_marks_others_says_so(name: str) -> None:
-    rgb = np.random.default_rng(2).integers(60, 120, (112, 112, 3), np.uint8)
-    mask, other = blob(112, 112, 60, 30, 12), blob(112, 112, 60, 80, 12)
-    differs = bool((FORMS[name](rgb, mask, RED, [other]) != FORMS[name](rgb, mask, RED, [])).any())
-    assert differs == bool(getattr(FORMS[name], "marks_others", False))
 
 
 def test_figures_of_published_ablations() -> None:
@@ -426,34 +279,6 @@ def test_policies_stand_side_by_side_and_each_is_compared_with_itself() -> None:
     (axes,) = policies_figure(found, "share").axes
     assert [label.get_text() for label in axes.get_xticklabels()] == ["share-0", "share-0.5"]
     assert [len(bars.lines[0].get_xdata()) for bars in axes.containers] == [2, 2]
-
-
-def test_every_form_is_shown_on_one_frame() -> None:
-    frames = marked_frames(suites.rows("simpler-bridge", "put-camera", n=1)[0])
-    assert set(frames) == {"vap", *ABLATIONS["form"].arms, *ABLATIONS["opacity"].arms}
-    assert len({frame.shape for frame in frames.values()}) == 1
-    pictures = {frame.tobytes() for frame in frames.values()}
-    assert len(pictures) == len(frames), "no two forms look the same"
-    assert len(
-        forms_figure(suites.rows("simpler-bridge", "put-camera", n=1)[0]).axes[0].images
-    ) == len(frames)
-
-
-def test_the_chosen_tint_is_none_that_a_red_look_alike_has() -> None:
-    (plain, row) = (
-        suites.rows(name, "put-camera", n=1)[0] for name in ("simpler-bridge", "simpler-bridge-red")
-    )
-    frames = tinted_frames(row)
-    unmarked, chosen, always = frames
-    assert (unmarked, always) == ("no tint", f"always: {RED.name}")
-    assert chosen.startswith("chosen: ")
-    assert RED.name not in chosen
-    assert len({frame.tobytes() for frame in frames.values()}) == 3
-    red_share = {label: has_colour(frame, RED).mean() for label, frame in frames.items()}
-    assert red_share["no tint"] > 0.01, "the look-alike is red by nature"
-    assert red_share[always] > red_share["no tint"]
-    assert f"chosen: {RED.name}" in tinted_frames(plain), "nothing is red there"
-    assert len(tints_figure(row).axes[0].images) == 3
 
 
 def test_views_agree_only_where_the_margin_is_large_enough() -> None:
