@@ -24,7 +24,7 @@ from vap_core.policies.lerobot.checkpoints import (
 )
 from vap_core.policies.lerobot.loading import compare
 from vap_core.policies.lerobot.toy_pi0 import toy_sizes
-from vap_core.policies.names import SHIPPED
+from vap_core.policies.names import SHIPPED, checkpoint_of
 from vap_core.policies.protocol import Policy, PolicyInput
 from vap_core.rollout import audit
 from vap_core.rollout.loop import Trial, rollout
@@ -81,6 +81,7 @@ def test_the_contract_of_a_policy(policies, name):
     policy = policies[name]
     assert isinstance(policy, Policy)
     assert re.fullmatch(rf"{name.replace('ensemble', 'act')}:{name}@[0-9a-f]{{8}}", policy.label)
+    assert checkpoint_of(policy.label) == name
     before = policy.sha256()
     states, chunks = policy.plan(begin(policy, 3), [look(i) for i in range(3)])
     assert len(states) == len(chunks) == 3

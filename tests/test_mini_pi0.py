@@ -14,6 +14,7 @@ from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
 from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
+from vap_core.policies.names import checkpoint_of
 from vap_core.policies.protocol import PolicyInput
 from vap_core.training.words import vocabulary
 
@@ -126,6 +127,7 @@ def test_a_temperature_that_is_asked_for_is_the_one_that_samples(checkpoint: Pat
         own = policy.policy.config.temperature
         assert own == (1.0 if temperature is None else temperature)
         assert policy.label.endswith(", temperature 0") == (temperature == 0.0)
+        assert checkpoint_of(policy.label) == checkpoint_of(policy.label.partition(",")[0]) != ""
         for seed in (1, 2):
             states = [policy.start(np.random.default_rng(seed))]
             chunks[temperature, seed] = policy.plan(states, [seen])[1][0]

@@ -16,6 +16,7 @@ from vap_core.evaluation.report.failures import breakdown
 from vap_core.evaluation.report.results import results
 from vap_core.evaluation.report.runs import load_runs
 from vap_core.evaluation.statistics import ALL_TASKS
+from vap_core.policies.names import checkpoint_of
 
 RESULTS = ROOT / "data" / "results"
 SHARES = {
@@ -94,7 +95,7 @@ def test_what_policies_of_other_tint_shares_reach() -> None:
     listed = played[played.seed == 0]
     held = {}
     for share, name in SHARES.items():
-        of_share = listed[listed.policy.str.contains(f":{name}@")]
+        of_share = listed[listed.policy.map(checkpoint_of) == name]
         assert set(of_share.groupby("method").size()) == {96}
         held[share] = [_of_way(of_share, method) for method in shares.names]
     head, *body = table("| tint share | generic")
@@ -103,7 +104,7 @@ def test_what_policies_of_other_tint_shares_reach() -> None:
     (_, *ways), *body = table("| tint share | tinted")
     told = pd.read_parquet(RESULTS / "tint_share_generic.parquet")
     for share, *cells in body:
-        of_share = told[told.policy.str.contains(f":{SHARES[share]}@")]
+        of_share = told[told.policy.map(checkpoint_of) == SHARES[share]]
         assert cells == [_of_way(of_share, way) for way in ways]
 
 

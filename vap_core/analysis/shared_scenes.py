@@ -19,7 +19,7 @@ from vap_core.evaluation.metrics import Rate, rate
 from vap_core.evaluation.parsers.paraphrases import KINDS
 from vap_core.evaluation.publish import read_runs
 from vap_core.evaluation.statistics import bootstrap_interval
-from vap_core.policies.names import MINI
+from vap_core.policies.names import MINI, checkpoint_of
 from vap_core.simulation import suites
 from vap_core.simulation.suites import shared
 from vap_core.training.recipe import FILMED
@@ -305,8 +305,7 @@ def _task_order() -> dict[str, int]:
 
 
 def _policy_name(policy: str) -> str:
-    kind, _, checkpoint = policy.partition(":")
-    name = kind.replace("_", "-")
-    if checkpoint.startswith(f"{MINI}-{PAIR}"):
+    name = policy.partition(":")[0].replace("_", "-")
+    if checkpoint_of(policy).startswith(f"{MINI}-{PAIR}"):
         return TAUGHT
     return MINI if name.startswith(MINI) else name

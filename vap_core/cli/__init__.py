@@ -13,6 +13,7 @@ import typer
 from vap_core.base.errors import VapError
 from vap_core.base.extras import missing_part
 from vap_core.cli import (
+    ablate,
     attention,
     benches,
     evaluate,
@@ -38,7 +39,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     help=HELP,
 )
-for module in (objects, evaluate, results, attention, parsers, lerobot, setup, benches):
+for module in (objects, evaluate, ablate, results, attention, parsers, lerobot, setup, benches):
     app.add_typer(module.app)
 app.add_typer(train.app, name="train")
 app.add_typer(weights.app, name="weights")

@@ -11,6 +11,16 @@ PRIVILEGED = ("expert", "random")
 """Policies that read the simulator, or nothing at all: bounds, never results."""
 
 
+def policy_label(kind: str, name: str, digest: str) -> str:
+    """What a run's rows call a lerobot checkpoint: its type, its folder's name, its fingerprint."""
+    return f"{kind}:{name}@{digest[:8]}"
+
+
+def checkpoint_of(label: str) -> str:
+    """The folder's name in a `policy_label`; nothing for a policy without weights."""
+    return label.partition(":")[2].rpartition("@")[0]
+
+
 def check_policy_name(name: str) -> None:
     """Raises: UnknownName: neither a policy nor what could name a lerobot checkpoint."""
     from vap_core.policies.lerobot.checkpoints import is_checkpoint_name

@@ -1,6 +1,5 @@
 """The table of an ablation: every arm with its rate, against the default on the same episodes."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from vap_core.evaluation import paper
 from vap_core.evaluation.ablations.arms import Ablation
 from vap_core.evaluation.metrics import Rate, rate
 from vap_core.evaluation.statistics import Comparison, compare, holm
+from vap_core.policies.names import checkpoint_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -95,9 +95,8 @@ def across_policies(ablation: Ablation, episodes: "pd.DataFrame") -> list[ArmRes
 
 
 def _of_checkpoint(episodes: "pd.DataFrame", checkpoint: str) -> "pd.DataFrame":
-    """The rows of a checkpoint of that name; a row's policy is TYPE:NAME@DIGEST."""
-    name = re.escape(Path(checkpoint).name)
-    return episodes[episodes["policy"].str.fullmatch(f".*:{name}@[0-9a-f]+")]
+    """The rows of a checkpoint of that name."""
+    return episodes[episodes["policy"].map(checkpoint_of) == Path(checkpoint).name]
 
 
 def arm_rows(results: list[ArmResult]) -> list[list[str]]:

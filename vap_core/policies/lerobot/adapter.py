@@ -37,6 +37,7 @@ from vap_core.policies.lerobot.loading import build
 from vap_core.policies.lerobot.module_hooks import overriding_tokens
 from vap_core.policies.lerobot.token_positions import positions
 from vap_core.policies.lerobot.traced import ChunkPredictor
+from vap_core.policies.names import policy_label
 from vap_core.policies.protocol import Chunk, PolicyInput
 from vap_core.simulation.env import Env
 from vap_core.simulation.scenes import Scene
@@ -308,8 +309,8 @@ def load_policy(
     """
     folder = locate(checkpoint)
     policy, preprocessor, postprocessor = build(folder, device)
-    name = checkpoint if local_folder(checkpoint) is None else folder.name
-    label = f"{policy.config.type}:{name}@{fingerprint(folder)[:8]}"
+    name = str(checkpoint) if local_folder(checkpoint) is None else folder.name
+    label = policy_label(policy.config.type, name, fingerprint(folder))
     if temperature is not None:
         config: Any = policy.config
         if not hasattr(config, "temperature"):
