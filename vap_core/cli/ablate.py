@@ -6,7 +6,15 @@ from typing import Annotated
 import typer
 
 from vap_core.cli.options import Workers
-from vap_core.cli.studies import POLICIES, Recorded, all_tasks, named_suites, record_of, study_of
+from vap_core.cli.studies import (
+    POLICIES,
+    Recorded,
+    SplitName,
+    all_tasks,
+    named_suites,
+    record_of,
+    study_of,
+)
 
 app = typer.Typer()
 
@@ -39,6 +47,7 @@ def ablate(
         ),
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Run every episode with so many seeds.")] = 1,
+    split: SplitName = "",
     workers: Workers = 2,
     record: Recorded = "none",
 ) -> None:
@@ -47,6 +56,7 @@ def ablate(
 
     Example: python -m vap_core ablate
     Example: python -m vap_core ablate form --suite simpler-bridge --episodes 6
+    Example: python -m vap_core ablate rewrite --suite simpler-fractal --split "visual matching"
     """
     from vap_core.base.errors import BadStudy, one_of
     from vap_core.base.tables import align
@@ -78,5 +88,6 @@ def ablate(
         episodes=episodes,
         seeds=seeds,
         follow="call",
+        split=split,
     )
     print(ablate_text(name, study, out, workers=workers, record=record_of(record)))

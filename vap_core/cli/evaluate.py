@@ -25,6 +25,7 @@ from vap_core.cli.studies import (
     Recorded,
     Retries,
     Seed,
+    SplitName,
     Video,
     WhatFor,
     all_tasks,
@@ -228,6 +229,7 @@ def evaluate(
     encoder: EncoderName = "",
     tracker: TrackerName = "",
     object: OwnObject = "",
+    split: SplitName = "",
     what_for: WhatFor = "",
 ) -> None:
     """Run whole suites, and print the table with 95 % intervals. Interrupted, the same command goes
@@ -246,7 +248,7 @@ def evaluate(
 
     likely = policy or probable_policy(suite)
     if likely and engine == "local":
-        start_server(likely, out or default_folder(likely, suite, object))
+        start_server(likely, out or default_folder(likely, suite, object, split))
     from vap_core.evaluation.policy_names import PRIVILEGED, default_policy
 
     suite_names, files = named_suites(suite)
@@ -266,6 +268,7 @@ def evaluate(
         follow=follow,
         audit=audit,
         temperature=temperature,
+        split=split,
     )
     if address and engine != "ray":
         raise BadStudy("eval: --address needs --engine ray.")
@@ -273,7 +276,7 @@ def evaluate(
         address = address or "127.0.0.1:6379"
     run_study(
         study,
-        out or default_folder(policy, suite, object),
+        out or default_folder(policy, suite, object, split),
         workers=workers,
         record_option=record or ("none" if policy in PRIVILEGED else "failures"),
         retries=retries,

@@ -92,6 +92,14 @@ OwnObject = Annotated[
         "first.",
     ),
 ]
+SplitName = Annotated[
+    str,
+    typer.Option(
+        "--split",
+        help="One split of a suite's list: simpler-fractal has 'visual matching' and 'variant "
+        "aggregation'. Default all.",
+    ),
+]
 WhatFor = Annotated[
     str,
     typer.Option(
@@ -117,11 +125,10 @@ def check_quickly(suite_names: list[str], policy: str | None, record: str | None
         check_policy_name(policy)
 
 
-def default_folder(policy: str, suite_names: list[str], object: str) -> Path:
+def default_folder(policy: str, suite_names: list[str], object: str = "", split: str = "") -> Path:
     """The folder of a run for which none was named."""
     parts = [Path(policy).name, *dict.fromkeys(Path(name).stem for name in suite_names)]
-    if object:
-        parts.append(object)
+    parts += filter(None, (object, split.replace(" ", "-")))
     return Path("data/runs", "-".join(parts))
 
 

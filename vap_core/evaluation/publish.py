@@ -175,6 +175,7 @@ def _count_wanted(study: dict[str, Any]) -> int:
                 n=study["episodes"],
                 seed=study["seed"],
                 seeds=study.get("seeds", 1),
+                split=study.get("split", ""),
             )
         )
     return len(study["methods"]) * rows

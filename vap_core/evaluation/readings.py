@@ -73,7 +73,8 @@ def readings_of(
             continue
         n_rows = 0
         for task in tasks:
-            n_rows += len(suites.rows(suite, task, configuration["episodes"]))
+            split = configuration.get("split", "")
+            n_rows += len(suites.rows(suite, task, configuration["episodes"], split=split))
         found.append(
             Reading(
                 date=date or datetime.now(UTC).date().isoformat(),

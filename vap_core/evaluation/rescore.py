@@ -100,6 +100,7 @@ def _rows_by_key(study: Mapping[str, Any]) -> dict[Key, EpisodeRow]:
             seed=study["seed"],
             seeds=study["seeds"],
             own_target=study.get("object", ""),
+            split=study.get("split", ""),
         ):
             rows[row.suite, row.task, row.seed, row.episode] = row
     return rows

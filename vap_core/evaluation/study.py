@@ -75,7 +75,8 @@ class Study:
     `episodes` None takes whole lists. `images_every`, `follow` and `audit` are rollout.Trial's.
     `temperature` scales the sampling noise of a mini-pi0; None leaves it as its checkpoint says.
     `object` names an object that takes the target's place (suites.own_object). `suite_files` are
-    the files of own suites; they are executed (suites.own).
+    the files of own suites; they are executed (suites.own). `split` takes the episodes of one split
+    of a suite's list, for example visual matching.
 
     Raises: UnknownName, BadStudy, when it is built from what does not fit together; MissingPart.
     """
@@ -94,6 +95,7 @@ class Study:
     temperature: float | None = None
     object: str = ""
     suite_files: tuple[str, ...] = ()
+    split: str = ""
 
     def __post_init__(self) -> None:
         self.open_suites()
@@ -108,6 +110,7 @@ class Study:
             seed=self.seed,
             seeds=self.seeds,
             own_target=self.object,
+            split=self.split,
         )
 
     def open_suites(self) -> None:
@@ -138,8 +141,9 @@ class Study:
         about = asdict(self)
         if self.temperature is None:  # digests are those of versions without it
             del about["temperature"]
-        if not self.object:
-            del about["object"]
+        for option in ("object", "split"):
+            if not about[option]:
+                del about[option]
         del about["suite_files"]  # the lists' digests stand for them
         if names == [self.policy]:
             about["checkpoint"] = fingerprints[0]
@@ -233,13 +237,20 @@ def _check_names(study: Study) -> None:
         raise one_of("Study: robots", study.robots, MESHES)
     check_stack(study.stack, "Study")
     for suite, task in study.tasks:
-        study.rows(suite, task)
+        if not study.rows(suite, task):
+            raise _no_such_split(study.split, suite, task)
         for method in study.methods:
             if suite in suites.SHARED and not suits_shared(method):
                 raise BadStudy(
                     f"Study: {method} knows one object, and {suite} has several; take generic, or "
                     "vap and its variants."
                 )
+
+
+def _no_such_split(split: str, suite: str, task: str) -> BadStudy:
+    there = sorted({row.split for row in suites.rows(suite, task)} - {""})
+    known = f"it has {' and '.join(there)}" if there else "its list has no splits"
+    return BadStudy(f"Study: {suite}/{task} has no split {split!r}; {known}.")
 
 
 def _check_policy(study: Study) -> None:

@@ -179,14 +179,17 @@ def _asked_rows(
         for seed in range(study["seed"], study["seed"] + study.get("seeds", 1)):
             # The rows of a list do not depend on the seed.
             drawn_from = 0 if suites.has_list(suite) else seed
-            yield suite, task, seed, _episodes(suite, task, study["episodes"], drawn_from)
+            split = study.get("split", "")
+            yield suite, task, seed, _episodes(suite, task, study["episodes"], drawn_from, split)
 
 
 @cache
-def _episodes(suite: str, task: str, n: int | None, seed: int) -> tuple[tuple[int, str], ...]:
+def _episodes(
+    suite: str, task: str, n: int | None, seed: int, split: str = ""
+) -> tuple[tuple[int, str], ...]:
     """The episode and split of the rows of a task."""
     episodes = []
-    for row in suites.rows(suite, task, n=n, seed=seed):
+    for row in suites.rows(suite, task, n=n, seed=seed, split=split):
         episodes.append((row.episode, row.split))
     return tuple(episodes)
 

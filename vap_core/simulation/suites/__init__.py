@@ -136,9 +136,9 @@ def benchmark(name: str) -> tuple[EpisodeRow, ...]:
 
 
 def rows(
-    suite_name: str, task_name: str, n: int | None = None, seed: int = 0
+    suite_name: str, task_name: str, n: int | None = None, seed: int = 0, split: str = ""
 ) -> tuple[EpisodeRow, ...]:
-    """Episodes of a task: the whole list, or `n` of it spread evenly.
+    """Episodes of a task: the whole list or a split of it, or `n` of that spread evenly.
 
     Of a warm-up suite the first `n` (20) of `seed`. A benchmark's list is the same for every seed;
     a seed but 0 changes how its episodes start (starts.seeded), and every seed the policy's and
@@ -150,6 +150,8 @@ def rows(
     if suite_name in WARM_UPS:
         return pick.rows(known, task, 20 if n is None else n, seed)
     episodes = _seeded(suite_name, task_name, seed)
+    if split:
+        episodes = tuple(row for row in episodes if row.split == split)
     if n is not None and n < len(episodes):
         spread = np.linspace(0, len(episodes) - 1, n).astype(int)
         return tuple(episodes[i] for i in np.unique(spread))
@@ -174,6 +176,7 @@ def listed(
     seed: int = 0,
     seeds: int = 1,
     own_target: str = "",
+    split: str = "",
 ) -> tuple[EpisodeRow, ...]:
     """`rows` of `seeds` seeds from `seed` on, one seed after the other.
 
@@ -184,7 +187,7 @@ def listed(
         own_object.check_category(own_target, suite(suite_name), task_name, everything)
     episodes: list[EpisodeRow] = []
     for row_seed in range(seed, seed + seeds):
-        drawn = rows(suite_name, task_name, n, row_seed)
+        drawn = rows(suite_name, task_name, n, row_seed, split)
         if own_target:
             whole = rows(suite_name, task_name, seed=row_seed)
             drawn = own_object.with_object(drawn, own_target, whole)
