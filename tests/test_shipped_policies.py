@@ -21,6 +21,7 @@ BRIDGE = shipped("simpler-bridge")
 BY_TODAYS_RECIPE = {
     "simpler-bridge-tint-free": (0.0, 0.0),
     "simpler-bridge-any-start": (0.0, 0.04),
+    "simpler-bridge-tint-share-0.1": (0.1, 0.04),
     "simpler-bridge-tint-share-0.2": (0.2, 0.04),
     "simpler-bridge-tint-share-0.5": (0.5, 0.04),
 }

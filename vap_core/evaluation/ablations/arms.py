@@ -66,6 +66,7 @@ class Ablation:
 _OF_BRIDGE = "data/policies/mini-pi0-simpler-bridge"
 TINT_SHARES = {
     "share-0": f"{_OF_BRIDGE}-any-start",
+    "share-0.1": f"{_OF_BRIDGE}-tint-share-0.1",
     "share-0.2": f"{_OF_BRIDGE}-tint-share-0.2",
     "share-0.5": f"{_OF_BRIDGE}-tint-share-0.5",
 }
