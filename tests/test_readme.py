@@ -108,6 +108,18 @@ def test_what_policies_of_other_tint_shares_reach() -> None:
         assert cells == [_of_way(of_share, way) for way in ways]
 
 
+def test_what_more_steps_on_the_same_scenes_reach() -> None:
+    played = pd.concat([episodes for _, episodes in read_runs(RESULTS / "more_steps.parquet")])
+    assert set(played.outcome) <= {"success", "failure"}
+    listed, others = played[played.seed == 0], played[played.seed > 0]
+    assert (len(listed), len(others)) == (4 * 96, 2 * 192)
+    vap, elsewhere = _of_way(listed, "vap"), _of_way(others, "vap")
+    generic, generic_elsewhere = _of_way(listed, "generic"), _of_way(others, "generic")
+    assert f"reaches {vap} % with VAP on simpler-bridge" in PROSE
+    assert f"and {elsewhere} % from other starts" in PROSE
+    assert f"generic {generic} and {generic_elsewhere} %." in PROSE
+
+
 def _of_way(told: pd.DataFrame, way: str) -> str:
     won = told[told.method == way].success
     return _percent(rate(int(won.sum()), len(won))) if len(won) else ""
