@@ -133,7 +133,7 @@ def policy(
         typer.Option(
             min=0.0,
             help="Deviation (rad) of the noise with which the arm's angles are read. Default the "
-            "recipe's; 0 made what ships but any-start.",
+            "recipe's; the default policies were made with 0.",
         ),
     ] = None,
     stages: Annotated[
@@ -158,7 +158,8 @@ def policy(
         Path | None,
         typer.Option(
             help="A trained mini-pi0 of the suite whose weights it begins with; --vlm is then the "
-            "model that learned words are taught in. Default the recipe's: nothing."
+            "model that learned words are taught in. Default the recipe's, which for the four "
+            "benchmarks is none."
         ),
     ] = None,
     demonstrations: Annotated[
