@@ -265,6 +265,7 @@ def test_policies_stand_side_by_side_and_each_is_compared_with_itself() -> None:
             outcomes("vap", [True] * 2 + [False] * 8).assign(policy=f"mini_pi0:{newer}@00bb"),
             outcomes("generic", [False] * 10).assign(policy=f"mini_pi0:{newer}@00bb"),
             outcomes("vap", [True] * 10).assign(policy=f"mini_pi0:{newer}-longer@00cc"),
+            outcomes("vap", [True] * 10).assign(policy=f"mini_pi0:{newer}@00bb, temperature 1"),
         ],
         ignore_index=True,
     )

@@ -42,6 +42,8 @@ def test_a_split_that_is_not_there_is_one_line() -> None:
         replace(WHOLE, split="visual")
     with pytest.raises(BadStudy, match="simpler-bridge/pick-shaver .* its list has no splits"):
         Study((("simpler-bridge", "pick-shaver"),), ("vap",), split="visual matching")
+    with pytest.raises(BadStudy, match="widowx-pick/pick-bottle .* its list has no splits"):
+        Study((("widowx-pick", "pick-bottle"),), ("vap",), split="visual matching")
 
 
 def test_its_run_is_whole_for_readings_report_rescoring_and_publishing(tmp_path: Path) -> None:

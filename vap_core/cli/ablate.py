@@ -8,6 +8,7 @@ import typer
 from vap_core.cli.options import Workers
 from vap_core.cli.studies import (
     POLICIES,
+    PerTask,
     Recorded,
     SplitName,
     all_tasks,
@@ -40,12 +41,7 @@ def ablate(
         str | None,
         typer.Option(help=f"{POLICIES} Default: mini-pi0 where one ships, else scripted."),
     ] = None,
-    episodes: Annotated[
-        int | None,
-        typer.Option(
-            min=1, help="Episodes per task, spread evenly over its list. Default the whole list."
-        ),
-    ] = None,
+    episodes: PerTask = None,
     seeds: Annotated[int, typer.Option(min=1, help="Run every episode with so many seeds.")] = 1,
     split: SplitName = "",
     workers: Workers = 2,

@@ -20,6 +20,7 @@ from vap_core.cli.studies import (
     Meshes,
     Methods,
     OwnObject,
+    PerTask,
     PolicyName,
     PolicyTimeout,
     Recorded,
@@ -161,12 +162,7 @@ def evaluate(
             help=f"{POLICIES} Default: mini-pi0 where one ships for every suite, else scripted."
         ),
     ] = None,
-    episodes: Annotated[
-        int | None,
-        typer.Option(
-            min=1, help="Episodes per task, spread evenly over its list. Default the whole list."
-        ),
-    ] = None,
+    episodes: PerTask = None,
     seed: Seed = 0,
     seeds: Annotated[
         int, typer.Option(min=1, help="Run every episode with so many seeds, from --seed on.")

@@ -29,6 +29,14 @@ POLICIES = (
     "the bounds: expert (reads the simulator), random."
 )
 PolicyName = Annotated[str, typer.Option("--policy", help=POLICIES)]
+PerTask = Annotated[
+    int | None,
+    typer.Option(
+        "--episodes",
+        min=1,
+        help="Episodes per task, spread evenly over its list. Default the whole list.",
+    ),
+]
 Seed = Annotated[
     int,
     typer.Option(

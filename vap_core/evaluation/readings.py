@@ -65,6 +65,7 @@ def readings_of(
     """What a run reads: one line for each of its suites that has a shipped list to report."""
     found = []
     weights = _weights_by_suite(configuration)
+    split = configuration.get("split", "")
     tasks_by_suite: dict[str, list[str]] = {}
     for suite, task in configuration["tasks"]:
         tasks_by_suite.setdefault(suite, []).append(task)
@@ -73,7 +74,6 @@ def readings_of(
             continue
         n_rows = 0
         for task in tasks:
-            split = configuration.get("split", "")
             n_rows += len(suites.rows(suite, task, configuration["episodes"], split=split))
         found.append(
             Reading(

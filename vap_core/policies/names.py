@@ -11,6 +11,10 @@ PRIVILEGED = ("expert", "random")
 """Policies that read the simulator, or nothing at all: bounds, never results."""
 
 
+TEMPERATURE = ", temperature "
+"""What follows a label where the policy's sampling noise was scaled, before the factor."""
+
+
 def policy_label(kind: str, name: str, digest: str) -> str:
     """What a run's rows call a lerobot checkpoint: its type, its folder's name, its fingerprint."""
     return f"{kind}:{name}@{digest[:8]}"

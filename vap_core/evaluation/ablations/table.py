@@ -10,7 +10,7 @@ from vap_core.evaluation import paper
 from vap_core.evaluation.ablations.arms import Ablation
 from vap_core.evaluation.metrics import Rate, rate
 from vap_core.evaluation.statistics import Comparison, compare, holm
-from vap_core.policies.names import checkpoint_of
+from vap_core.policies.names import TEMPERATURE, checkpoint_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -95,8 +95,10 @@ def across_policies(ablation: Ablation, episodes: "pd.DataFrame") -> list[ArmRes
 
 
 def _of_checkpoint(episodes: "pd.DataFrame", checkpoint: str) -> "pd.DataFrame":
-    """The rows of a checkpoint of that name."""
-    return episodes[episodes["policy"].map(checkpoint_of) == Path(checkpoint).name]
+    """The rows of a checkpoint of that name, with its own sampling noise."""
+    labels = episodes["policy"]
+    named = labels.map(checkpoint_of) == Path(checkpoint).name
+    return episodes[named & ~labels.str.contains(TEMPERATURE, regex=False)]
 
 
 def arm_rows(results: list[ArmResult]) -> list[list[str]]:

@@ -175,11 +175,11 @@ def _asked_rows(
     study: dict[str, Any],
 ) -> Iterator[tuple[str, str, int, tuple[tuple[int, str], ...]]]:
     """Suite, task, seed, and the episode and split of all rows that a run was asked for."""
+    split = study.get("split", "")
     for suite, task in study["tasks"]:
         for seed in range(study["seed"], study["seed"] + study.get("seeds", 1)):
             # The rows of a list do not depend on the seed.
             drawn_from = 0 if suites.has_list(suite) else seed
-            split = study.get("split", "")
             yield suite, task, seed, _episodes(suite, task, study["episodes"], drawn_from, split)
 
 

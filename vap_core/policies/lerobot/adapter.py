@@ -37,7 +37,7 @@ from vap_core.policies.lerobot.loading import build
 from vap_core.policies.lerobot.module_hooks import overriding_tokens
 from vap_core.policies.lerobot.token_positions import positions
 from vap_core.policies.lerobot.traced import ChunkPredictor
-from vap_core.policies.names import policy_label
+from vap_core.policies.names import TEMPERATURE, policy_label
 from vap_core.policies.protocol import Chunk, PolicyInput
 from vap_core.simulation.env import Env
 from vap_core.simulation.scenes import Scene
@@ -319,7 +319,7 @@ def load_policy(
                 "sampling noise is scaled by one."
             )
         config.temperature = temperature
-        label = f"{label}, temperature {temperature:g}"
+        label = f"{label}{TEMPERATURE}{temperature:g}"
     return LeRobot(
         policy=policy, preprocessor=preprocessor, postprocessor=postprocessor, label=label
     )

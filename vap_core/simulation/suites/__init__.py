@@ -148,14 +148,19 @@ def rows(
     known = suite(suite_name)
     task = known.task(task_name)
     if suite_name in WARM_UPS:
-        return pick.rows(known, task, 20 if n is None else n, seed)
-    episodes = _seeded(suite_name, task_name, seed)
-    if split:
-        episodes = tuple(row for row in episodes if row.split == split)
+        return _of_split(pick.rows(known, task, 20 if n is None else n, seed), split)
+    episodes = _of_split(_seeded(suite_name, task_name, seed), split)
     if n is not None and n < len(episodes):
         spread = np.linspace(0, len(episodes) - 1, n).astype(int)
         return tuple(episodes[i] for i in np.unique(spread))
     return episodes
+
+
+def _of_split(episodes: tuple[EpisodeRow, ...], split: str) -> tuple[EpisodeRow, ...]:
+    """The episodes of one split; all of them where none is named."""
+    if not split:
+        return episodes
+    return tuple(row for row in episodes if row.split == split)
 
 
 @cache

@@ -145,7 +145,7 @@ def train(
     grown; None: none are. `demonstrations` is a dataset of train demonstrations; None: the cache.
 
     Raises: BadOutput when `out` holds another training; BadPolicy for a start that is no mini-pi0,
-        or one of other cameras, sizes or words.
+        or one of other cameras or sizes, or of another mini-PaliGemma.
     """
     films = load_films(recipe, cache, demonstrations, jobs)
     if not films.train:
@@ -155,8 +155,6 @@ def train(
         )
     _require_trainable(recipe, films.all)
     teacher = None if vlm is None else load_vlm(vlm)
-    cost_cpu_s = {"films": films.cpu_s, "vlm": _vlm_cost_s(vlm)}
-    known, taught = _prepare_words(recipe, films, teacher, out, cost_cpu_s)
     made_of: dict[str, Any] = {
         "recipe": recipe.as_json(),
         "data_sha256": data_sha256(films.all),
@@ -180,6 +178,9 @@ def train(
             config.vlm = teacher.sha256()
             initialise_policy(teacher, learner.policy)
     made_of["vlm"] = config.vlm
+    cost_cpu_s = {"films": films.cpu_s, "vlm": _vlm_cost_s(vlm)}
+    # After the start was checked: words take minutes.
+    known, taught = _prepare_words(recipe, films, teacher, out, cost_cpu_s)
     frames = Frames(recipe=recipe, films=films.train, stats=stats, config=config, known=known)
 
     def step(model: Learner, at: int) -> tuple[Tensor, Figures]:
