@@ -64,7 +64,7 @@ def test_a_wheel_holds_code_and_the_tracked_files_of_data_that_it_reads(wheel: P
         held = {name for name in file.namelist() if ".dist-info/" not in name}
     assert held == expected
     assert "vap_core/py.typed" in held
-    assert wheel.stat().st_size < 45e6
+    assert wheel.stat().st_size < 40e6
 
 
 @pytest.fixture(scope="module")
