@@ -26,7 +26,8 @@ def main() -> int:
 
     import torch
 
-    from vap_core.evaluation.study import Study, make_trial, register_personal
+    from vap_core.evaluation.study import Study
+    from vap_core.evaluation.trials import make_trial, register_personal
     from vap_core.rollout.loop import rollout
 
     torch.set_num_threads(asked.threads)

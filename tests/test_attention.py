@@ -19,7 +19,8 @@ from tests.drawn import SUCCESS, columns, entities, frame, opening, rerun
 from tests.test_why import tabs
 from vap_core.base.errors import UnknownName
 from vap_core.evaluation.policy_names import shipped
-from vap_core.evaluation.study import Study, make_trial, register_personal
+from vap_core.evaluation.study import Study
+from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.policies.hooks import (
     ACTION,
     attention_observed,

@@ -34,7 +34,8 @@ from vap_core.analysis.attention.patterns import (
 )
 from vap_core.base.errors import BadStudy
 from vap_core.base.files import DATA
-from vap_core.evaluation.study import Study, make_trial
+from vap_core.evaluation.study import Study
+from vap_core.evaluation.trials import make_trial
 from vap_core.simulation import suites
 from vap_core.simulation.env import Env
 from vap_core.simulation.suites.open_row import build_scene

@@ -8,7 +8,8 @@ import pytest
 
 from vap_core.base.errors import BadOutput, BadPolicy, BadStudy
 from vap_core.evaluation import input_audit
-from vap_core.evaluation.study import DEMO, Study, make_trial, register_personal
+from vap_core.evaluation.study import DEMO, Study
+from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.policies.hooks import TEXT, inputs_observed, observe_inputs, report_input
 from vap_core.policies.protocol import PolicyInput
 from vap_core.rollout.loop import Follow, Trial, rollout

@@ -16,7 +16,8 @@ from tests.command import vap
 from vap_core.attend import Attender
 from vap_core.base.errors import BadOutput, UnknownName
 from vap_core.evaluation.store import locked, open_run, read
-from vap_core.evaluation.study import DEMO, Study, make_trial, register_personal
+from vap_core.evaluation.study import DEMO, Study
+from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.policies.protocol import PolicyInput
 from vap_core.recording import Recorder, read_summary, recording_name
 from vap_core.rollout.loop import rollout

@@ -15,8 +15,7 @@ import pandas as pd
 import pytest
 
 from tests.command import vap
-from vap_core.evaluation import engine, store
-from vap_core.evaluation import study as experiments
+from vap_core.evaluation import engine, store, trials
 from vap_core.evaluation.engine import missing_jobs, result_key
 from vap_core.evaluation.state_log import read as read_traces
 from vap_core.evaluation.store import append, open_run, read, read_manifest
@@ -321,7 +320,7 @@ def test_an_episode_that_always_breaks_is_an_error_with_its_recording(
                 raise RuntimeError("the policy fell over")
             return super().plan_from_simulation(states, envs)
 
-    monkeypatch.setattr(experiments, "make_policy", lambda name, scene, suite, stack: Breaks())
+    monkeypatch.setattr(trials, "make_policy", lambda name, scene, suite, stack: Breaks())
     study = replace(STUDY, tasks=STUDY.tasks[:1], episodes=2, seeds=1)
 
     def here(work, jobs, workers, mend):  # type: ignore[no-untyped-def]

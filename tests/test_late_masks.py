@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from tests.toys import Kept
-from vap_core.evaluation.study import Study, make_trial
+from vap_core.evaluation.study import Study
+from vap_core.evaluation.trials import make_trial
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.types import Frame
 from vap_core.simulation.cameras import Renderer

@@ -19,7 +19,8 @@ from lerobot.processor import ProcessorStepRegistry
 
 from tests.command import vap
 from vap_core.evaluation.policy_names import shipped
-from vap_core.evaluation.study import Study, make_trial, register_personal
+from vap_core.evaluation.study import Study
+from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.policies.lerobot.adapter import IMAGE, _resize, load_policy
 from vap_core.policies.protocol import PolicyInput
 from vap_core.rollout.loop import rollout

@@ -16,12 +16,12 @@ from tests.toys import TOYS, Kept, observation, personal, scene
 from vap_core.attend import Attender
 from vap_core.base.errors import BadInstruction, BadMemory, BadPolicy, BadStudy
 from vap_core.base.types import Description, Views
-from vap_core.evaluation import engine
-from vap_core.evaluation import study as experiments
+from vap_core.evaluation import engine, trials
 from vap_core.evaluation.jobs import run_job
 from vap_core.evaluation.methods import METHODS
 from vap_core.evaluation.store import open_run
-from vap_core.evaluation.study import Study, make_trial, register_personal
+from vap_core.evaluation.study import Study
+from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.memory import load_bank
 from vap_core.policies.lerobot.toy_pi0 import toy_sizes
 from vap_core.policies.protocol import PolicyInput
@@ -403,7 +403,7 @@ def test_the_checksum_is_in_every_row_and_a_policy_that_changes_is_refused(
 ) -> None:
     study = replace(STUDY, methods=("generic", "oracle-mask"), episodes=1)
     soft = Soft(learns=False)
-    monkeypatch.setattr(experiments, "make_policy", lambda name, scene, suite, stack: soft)
+    monkeypatch.setattr(trials, "make_policy", lambda name, scene, suite, stack: soft)
     out = open_run(tmp_path / "run", {})
     (tmp_path / "run" / "memory").symlink_to(bank)
 

@@ -12,7 +12,8 @@ from vap_core.evaluation.feasibility import check_feasible, feasible
 from vap_core.evaluation.report.provenance import command_line
 from vap_core.evaluation.rescore import _rows_by_key
 from vap_core.evaluation.store import read
-from vap_core.evaluation.study import Study, register_personal
+from vap_core.evaluation.study import Study
+from vap_core.evaluation.trials import register_personal
 from vap_core.memory import load_bank
 from vap_core.simulation.assets.scans import storage
 from vap_core.simulation.assets.scans.import_scan import import_scan

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 from vap_core.evaluation.diagnosis import diagnose, explain
-from vap_core.evaluation.study import Study, make_trial, register_personal
+from vap_core.evaluation.study import Study
+from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.recording import Recorder
 from vap_core.rollout.loop import rollout
 

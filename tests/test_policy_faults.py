@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from vap_core.base.errors import BadPolicy, BadStudy, WorkerDied
-from vap_core.evaluation import engine
-from vap_core.evaluation import study as experiments
+from vap_core.evaluation import engine, trials
 from vap_core.evaluation.processes import results
-from vap_core.evaluation.study import Study, make_trial
+from vap_core.evaluation.study import Study
+from vap_core.evaluation.trials import make_trial
 from vap_core.policies.protocol import PolicyInput
 from vap_core.policies.scripted.random import Random
 from vap_core.rollout import policy_call as calls
@@ -279,8 +279,8 @@ def test_sys_exit_in_a_worker_does_not_end_this_process() -> None:
 def test_the_limit_reaches_the_policy_of_a_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(experiments, "make_policy", lambda *_: Faulty(hang))
-    monkeypatch.setattr(experiments.Study, "rows", lambda *_: ROWS)
+    monkeypatch.setattr(trials, "make_policy", lambda *_: Faulty(hang))
+    monkeypatch.setattr(Study, "rows", lambda *_: ROWS)
     table = engine.run(
         STUDY,
         tmp_path / "run",

@@ -138,7 +138,7 @@ def test_every_look_alike_can_be_red_by_nature() -> None:
 
 
 def test_the_target_is_hidden_from_the_third_call_on() -> None:
-    from vap_core.evaluation.study import _occlusion
+    from vap_core.evaluation.trials import _occlusion
 
     occlusion = _occlusion("hidden-2", execute=4)
     assert occlusion is not None

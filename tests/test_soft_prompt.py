@@ -9,8 +9,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import make_pre_post_processors
 
 from vap_core.base.errors import BadMemory, BadStudy
-from vap_core.evaluation import engine
-from vap_core.evaluation import study as experiments
+from vap_core.evaluation import engine, trials
 from vap_core.evaluation.jobs import run_job
 from vap_core.evaluation.study import Study
 from vap_core.policies.mini_pi0 import learned_token, teach_token
@@ -82,22 +81,20 @@ def test_it_runs_as_a_method_and_the_policy_stays(
     grown: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     home, far = grown
-    monkeypatch.setattr(experiments, "MODEL", home)
+    monkeypatch.setattr(trials, "MODEL", home)
     monkeypatch.setattr(teach_token, "VIEWS", 2)
     monkeypatch.setattr(
         learned_token, "TokenTraining", lambda: TokenTraining(epochs=2, augmentations=1)
     )
     study = Study(((SUITE, TASK),), ("generic", "soft"), episodes=1, policy=str(far))
     engine.store.open_run(tmp_path, study.configuration())
-    experiments.register_personal(study, tmp_path / "memory")
+    trials.register_personal(study, tmp_path / "memory")
     jobs = list(engine.missing_jobs(study, tmp_path))
     rows = {job.method: run_job(job)[0] for job in jobs}
     assert {row["outcome"] for row in rows.values()} == {"failure"}
     assert rows["soft"]["policy_sha256"] == rows["generic"]["policy_sha256"] != ""
     row, bank = study.rows(SUITE, TASK)[0], tmp_path / "memory"
-    soft, plain = (
-        experiments.make_trial(study, [row], method, bank) for method in ("soft", "generic")
-    )
+    soft, plain = (trials.make_trial(study, [row], method, bank) for method in ("soft", "generic"))
     assert isinstance(soft.prompter, TextPrompter)
     assert isinstance(plain.prompter, TextPrompter)
     assert soft.prompter.rewrite(row.instruction) == "put <my_0> on the plate"
@@ -105,7 +102,7 @@ def test_it_runs_as_a_method_and_the_policy_stays(
     (token,) = bank.glob("*.token.safetensors")
     token.unlink()
     with pytest.raises(BadMemory, match="no learned word"):
-        experiments.make_trial(study, [row], "soft", bank)
+        trials.make_trial(study, [row], "soft", bank)
 
 
 def test_a_policy_of_another_model_is_refused(grown: tuple[Path, Path], tmp_path: Path) -> None:

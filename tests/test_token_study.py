@@ -23,8 +23,7 @@ from vap_core.analysis.token_space import (
 from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadStudy, UnknownName
 from vap_core.base.types import Rgb
 from vap_core.cli import app
-from vap_core.evaluation import engine
-from vap_core.evaluation import study as experiments
+from vap_core.evaluation import engine, trials
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.tokens import choices, report, study
 from vap_core.evaluation.tokens.choices import Scene
@@ -70,7 +69,7 @@ def tiny(
 
     def scenes(suite: str, task: str) -> tuple[Scene, ...]:
         """Two episodes of noise in place of rendered views."""
-        rows = experiments.suites.rows(suite, task)
+        rows = suites.rows(suite, task)
         target = rows[0].target
         names = (target, teach_token.lookalikes(rows)[0])
         rng = np.random.default_rng(0)
@@ -144,16 +143,16 @@ def test_tokens_of_other_spaces_are_methods(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     home, far = tiny
-    monkeypatch.setattr(experiments, "MODEL", home)
+    monkeypatch.setattr(trials, "MODEL", home)
     monkeypatch.setattr(
         learned_token, "TokenTraining", lambda: TokenTraining(epochs=1, augmentations=1)
     )
     asked = Study(((SUITE, TASK),), (method,), episodes=1, policy=str(far))
     engine.store.open_run(tmp_path, asked.configuration())
     bank = tmp_path / "memory"
-    experiments.register_personal(asked, bank)
+    trials.register_personal(asked, bank)
     row = asked.rows(SUITE, TASK)[0]
-    trial = experiments.make_trial(asked, [row], method, bank)
+    trial = trials.make_trial(asked, [row], method, bank)
     assert trial.prompter.rewrite(row.instruction) == "put <my_0> on the plate"
     (used,) = trial.policy.learned.values()
     suffix = token_file.OWN_SUFFIX if method == "soft-own" else token_file.SUFFIX
@@ -165,7 +164,7 @@ def test_tokens_of_other_spaces_are_methods(
     assert np.allclose(used.numpy(), expected)
     (bank / f"{row.target}{suffix}").unlink()
     with pytest.raises(BadMemory, match="no learned word"):
-        experiments.make_trial(asked, [row], method, bank)
+        trials.make_trial(asked, [row], method, bank)
 
 
 def test_the_study_measures_every_token_and_goes_on(
@@ -192,7 +191,7 @@ def test_the_study_measures_every_token_and_goes_on(
     widths = {len(embedding) for embedding in tables["embeddings"].embedding}
     assert widths == {16}
     learned = tables["embeddings"].set_index("learned_in").embedding
-    rows = experiments.suites.rows(SUITE, tables["embeddings"].task[0])
+    rows = suites.rows(SUITE, tables["embeddings"].task[0])
     taught = teach_token.photographs(rows, 0, 5)
     training = TokenTraining(epochs=2, augmentations=1)
     *_, (_, method) = learned_token.lessons(load_vlm(tiny[0]), rows[0].target, taught, training)
@@ -323,7 +322,7 @@ def test_the_report_compares_the_shipped_policies_beside_the_paper() -> None:
     assert "words of simpler-bridge" in found.output
     assert found.output.count("paper: pi0") == 4
     assert "0.945626 ± 0.066187" in found.output
-    kept = pd.read_parquet(experiments.MODEL.parents[1] / "results" / "token_spaces.parquet")
+    kept = pd.read_parquet(trials.MODEL.parents[1] / "results" / "token_spaces.parquet")
     whole = kept[kept.group == embedding_report.WHOLE]
     assert (whole.tokens == 113).all()
     for row in whole.itertuples():
@@ -359,8 +358,8 @@ def test_real_checkpoints_are_compared_with_their_words(tmp_path: Path) -> None:
 def test_words_that_no_film_says_are_left_out_of_the_rotation(grown: tuple[Path, Path]) -> None:  # noqa: F811
     home, far = grown
     assert len(rotation_cosines(home, home)["copied"]) == 0
-    shipped = experiments.MODEL.parent
-    found = rotation_cosines(experiments.MODEL, shipped / f"mini-pi0-{SUITE}")
+    shipped = trials.MODEL.parent
+    found = rotation_cosines(trials.MODEL, shipped / f"mini-pi0-{SUITE}")
     assert len(found["copied"]) == 56
     assert (found["copied"] < 0.9999).all()
     whole = mean_cosine(found["copied"])
@@ -372,9 +371,9 @@ def test_words_that_no_film_says_are_left_out_of_the_rotation(grown: tuple[Path,
     assert longest_word(far) == pytest.approx(np.sqrt((rows**2).sum(1)).max())
     assert rotation_deg(rows[15], home, home) < 0.1
     bridge = shipped / f"mini-pi0-{SUITE}"
-    word = open_table(experiments.MODEL).block(15, 16)[0]
-    moved = token_alignment.align(word, experiments.MODEL, bridge)
-    cosine = np.cos(np.radians(rotation_deg(word, experiments.MODEL, bridge)))
+    word = open_table(trials.MODEL).block(15, 16)[0]
+    moved = token_alignment.align(word, trials.MODEL, bridge)
+    cosine = np.cos(np.radians(rotation_deg(word, trials.MODEL, bridge)))
     assert cosine * np.linalg.norm(word) ** 2 == pytest.approx(float(word @ moved), rel=1e-3)
     words = nearest_words(open_table(far).block(15, 16)[0], far, 3)
     assert words[0] == (vocabulary()[15], pytest.approx(1))

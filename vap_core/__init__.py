@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from vap_core.evaluation.policy_names import shipped as shipped
     from vap_core.evaluation.study import DEMO as DEMO
     from vap_core.evaluation.study import Study as Study
-    from vap_core.evaluation.study import make_trial as make_trial
-    from vap_core.evaluation.study import register_personal as register_personal
+    from vap_core.evaluation.trials import make_trial as make_trial
+    from vap_core.evaluation.trials import register_personal as register_personal
     from vap_core.instruction import parse as parse
     from vap_core.instruction import rewrite as rewrite
     from vap_core.memory import load as load
@@ -63,7 +63,8 @@ _load, __dir__, __all__ = lazy_loader.attach(
         "evaluation.metrics": ["rate"],
         "evaluation.photos.run": ["measure_photos"],
         "evaluation.policy_names": ["shipped"],
-        "evaluation.study": ["DEMO", "Study", "make_trial", "register_personal"],
+        "evaluation.study": ["DEMO", "Study"],
+        "evaluation.trials": ["make_trial", "register_personal"],
         "instruction": ["parse", "rewrite"],
         "memory": ["load", "load_bank", "register", "save"],
         "perception.protocols": ["Stack"],

@@ -18,7 +18,8 @@ from vap_core.base.errors import WorkerDied
 from vap_core.evaluation import readings, store
 from vap_core.evaluation.jobs import BATCH, Job, Record, Rows, row_of_dead_worker, run_job
 from vap_core.evaluation.processes import prepare, results
-from vap_core.evaluation.study import Study, register_personal
+from vap_core.evaluation.study import Study
+from vap_core.evaluation.trials import register_personal
 from vap_core.evaluation.worker_server import worker_modules
 from vap_core.simulation.types import AS_LISTED, EpisodeRow
 

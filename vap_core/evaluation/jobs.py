@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from vap_core.base.errors import BadOutput, BadRecording, BadStudy
 from vap_core.evaluation import diagnosis, hiding, input_audit, state_log, switching
-from vap_core.evaluation.study import Study, make_trial
+from vap_core.evaluation.study import Study
+from vap_core.evaluation.trials import make_trial
 from vap_core.policies.weight_guard import unchanged_weights
 from vap_core.rollout.types import Episode, EpisodeHeader
 from vap_core.simulation import suites

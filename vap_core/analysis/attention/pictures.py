@@ -25,7 +25,7 @@ from vap_core.base.palette import RIGHT_MARK, WRONG_MARK
 from vap_core.base.types import Mask, Rgb
 from vap_core.evaluation.diagnosis.recordings import listed_row, study_of
 from vap_core.evaluation.engine import spread_evenly
-from vap_core.evaluation.study import make_trial, register_personal
+from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.policies.hooks import heat_map
 from vap_core.recording.entities.attention import attention_overlay
 from vap_core.rollout.loop import rollout

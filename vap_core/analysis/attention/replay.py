@@ -21,7 +21,8 @@ from vap_core.evaluation.methods import needs_token
 from vap_core.evaluation.processes import prepare, results
 from vap_core.evaluation.publish import read_runs
 from vap_core.evaluation.store import digest, locked
-from vap_core.evaluation.study import Study, make_trial, register_personal
+from vap_core.evaluation.study import Study
+from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.rollout.loop import rollout
 from vap_core.rollout.queries import QUERIES
 from vap_core.rollout.types import Episode, EpisodeHeader

@@ -15,7 +15,8 @@ import numpy as np
 
 from vap_core.base.tables import align
 from vap_core.cli.bench.timing import median_seconds, seconds_of
-from vap_core.evaluation.study import DEMO, make_trial, register_personal
+from vap_core.evaluation.study import DEMO
+from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.perception.embedded.backbone import features
 from vap_core.recording import DeferredRecorder
 from vap_core.rollout.loop import Trial, rollout

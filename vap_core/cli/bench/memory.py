@@ -11,7 +11,8 @@ from pathlib import Path
 from vap_core.evaluation import processes
 from vap_core.evaluation.jobs import BATCH, Job, run_job
 from vap_core.evaluation.policy_names import MINI
-from vap_core.evaluation.study import Study, register_personal
+from vap_core.evaluation.study import Study
+from vap_core.evaluation.trials import register_personal
 from vap_core.simulation import suites
 
 SUITE = "simpler-bridge"

@@ -18,7 +18,8 @@ from vap_core.cli.bench.profile_parts import profiled
 from vap_core.evaluation.engine import spread_evenly
 from vap_core.evaluation.jobs import BATCH, Job, run_job
 from vap_core.evaluation.policy_names import MINI
-from vap_core.evaluation.study import Study, register_personal
+from vap_core.evaluation.study import Study
+from vap_core.evaluation.trials import register_personal
 from vap_core.simulation.types import EpisodeRow
 
 METHODS = ("generic", "vap")

@@ -23,7 +23,8 @@ from vap_core.cli.bench.measurement import Measurement, provenance
 from vap_core.cli.bench.profile_parts import ROLLOUT_PARTS, profiled
 from vap_core.evaluation import cluster, processes
 from vap_core.evaluation.policy_names import MINI
-from vap_core.evaluation.study import Study, register_personal
+from vap_core.evaluation.study import Study
+from vap_core.evaluation.trials import register_personal
 from vap_core.memory import load_bank
 from vap_core.perception.stacks import load_stack
 from vap_core.policies.lerobot.adapter import LeRobot, load_policy

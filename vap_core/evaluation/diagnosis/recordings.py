@@ -18,7 +18,8 @@ from vap_core.evaluation.diagnosis.failures import (
 )
 from vap_core.evaluation.stills import write_provenance
 from vap_core.evaluation.store import ROW_KEY
-from vap_core.evaluation.study import Study, make_trial, register_personal
+from vap_core.evaluation.study import Study
+from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.simulation.types import EpisodeRow
 
 
