@@ -198,6 +198,17 @@ def test_figures_of_published_ablations() -> None:
     )
 
 
+def test_arms_of_another_suite_are_read_by_its_name() -> None:
+    arms = {"vap": [True] * 9 + [False], "mask-only": [False] * 10}
+    fractal = [outcomes(arm, won).assign(suite="simpler-fractal") for arm, won in arms.items()]
+    table = pd.concat([outcomes("vap", [True] * 10), *fractal], ignore_index=True)
+    assert ablation_results(table) == {}, "one arm on simpler-bridge, two on no default suite"
+    (arms_there,) = ablation_results(table, "simpler-fractal").values()
+    default, tint_alone = arms_there
+    assert (default.sr.k, default.sr.n, tint_alone.sr.k) == (9, 10, 0)
+    assert (default.paper, tint_alone.paper) == pytest.approx((0.627, 0.073))
+
+
 def test_an_ablation_of_two_suites_has_a_heading_each() -> None:
     arms = {"vap": [True] * 4 + [False] * 6, "vap-associated": [True] * 7 + [False] * 3}
     table = pd.concat([

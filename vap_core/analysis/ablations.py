@@ -1,6 +1,6 @@
 """What published ablations show: all effects in one figure, and one small picture each.
 
-results = ablation_results(Path("data/results/ablations.parquet"))
+results = ablation_results(ablation_episodes(Path("data/results/ablations.parquet")))
 all_effects_figure(results)
 sweep_figure(results["opacity"], {"opacity-0.1": 0.1, "vap": 0.5, "opaque": 1.0}, "opacity")
 """
@@ -37,17 +37,18 @@ def ablation_episodes(path: Path) -> "pd.DataFrame":
     return pd.concat([episodes for _, episodes in read_runs(path)], ignore_index=True)
 
 
-def ablation_results(episodes: "pd.DataFrame") -> Results:
+def ablation_results(episodes: "pd.DataFrame", suite: str = "") -> Results:
     """The arms of every ablation that has been run, each against the first of its ablation.
 
-    Those of policies are not among them (`policy_results`, `across_policies`).
+    Of the suites that an ablation runs on where none is named, or of `suite` alone. Those of
+    policies are not among them (`policy_results`, `across_policies`).
     """
     found = {}
     for name, ablation in ABLATIONS.items():
         if ablation.policies:
             continue
-        of_suites = episodes[episodes["suite"].isin(ablation.suites)]
-        results = arm_results(ablation, of_suites)
+        wanted = [suite] if suite else ablation.suites
+        results = arm_results(ablation, episodes[episodes["suite"].isin(wanted)])
         if results:
             found[name] = results
     return found
