@@ -134,6 +134,26 @@ def test_randomness_of_its_own_is_found() -> None:
         test_policy.test_an_episode_repeats_its_actions(Wild(), WHERE)
 
 
+class Counts(Random):
+    """Remembers its calls in the state that it is given."""
+
+    def start(self, rng: np.random.Generator) -> Any:
+        return [0, super().start(rng)]
+
+    def plan_from_simulation(self, states: Any, envs: Any) -> Any:
+        chunks = []
+        for state, env in zip(states, envs, strict=True):
+            chunks.append(np.full((1, env.action_size), 1e-3 * state[0], np.float32))
+            state[0] += 1
+        return states, chunks
+
+
+def test_states_that_are_changed_in_place_are_found() -> None:
+    test_policy.test_a_batch_equals_one_by_one(Counts(), WHERE)
+    with pytest.raises(AssertionError):
+        test_policy.test_the_states_it_is_given_stay_as_they_were(Counts(), WHERE)
+
+
 # --- The page ------------------------------------------------------------------------------------
 
 PAGE = (ROOT / "docs" / "contracts.md").read_text()

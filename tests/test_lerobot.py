@@ -42,7 +42,7 @@ def folders(tmp_path_factory):
     ensemble = tiny.act(root / "ensemble", n_action_steps=1, temporal_ensemble_coeff=0.01)
     made = {
         make.__name__: make(root / make.__name__)
-        for make in (tiny.pi0, tiny.pi05, tiny.smolvla, tiny.act)
+        for make in (tiny.pi0, tiny.pi05, tiny.smolvla, tiny.act, tiny.vqbet)
     }
     return {**made, "ensemble": ensemble}
 
@@ -205,18 +205,41 @@ def test_chunks_are_those_of_lerobots_own_loop(policies):
         assert np.allclose(action[0].numpy(), row, atol=1e-7)
 
 
-def test_a_policy_with_a_memory_keeps_one_per_episode(policies):
-    """Temporal ensembling averages over calls: two episodes interleaved are each as if alone."""
-    policy = policies["ensemble"]
+def remembered(policy, states, looks):
+    """The chunks of several calls, each with the states of the one before, and the states after."""
+    called = []
+    for seen in looks:
+        states, chunks = policy.plan(states, seen)
+        called.append(np.stack(chunks))
+    return states, np.stack(called)
+
+
+@pytest.mark.parametrize("name", ["ensemble", "vqbet"])
+def test_a_policy_with_a_memory_keeps_one_per_episode(policies, name):
+    """Averages over calls, and queues of observations: two interleaved are each as if alone."""
+    policy = policies[name]
     assert not policy.batched
-    mixed = begin(policy, 2)
-    interleaved = [run(policy, mixed, [look(t), look(10 + t)]) for t in range(3)]
+    interleaved = remembered(policy, begin(policy, 2), [[look(t), look(10 + t)] for t in range(3)])
     for i, first in enumerate((0, 10)):
         state = begin(policy, 2)[i : i + 1]
-        alone = [run(policy, state, [look(first + t)])[0] for t in range(3)]
-        assert np.allclose(np.stack([step[i] for step in interleaved]), np.stack(alone), atol=1e-6)
+        alone = remembered(policy, state, [[look(first + t)] for t in range(3)])
+        assert np.allclose(interleaved[1][:, i], alone[1][:, 0], atol=1e-6)
     fresh = run(policy, begin(policy, 1), [look(2)])[0]
-    assert np.abs(fresh - alone[-1]).max() > 1e-6
+    assert np.abs(fresh - alone[1][-1, 0]).max() > 1e-6
+
+
+@pytest.mark.parametrize("name", ["ensemble", "vqbet"])
+def test_a_call_that_is_made_again_or_audited_leaves_the_memory_as_it_was(policies, name):
+    policy = policies[name]
+    looks = [[look(t)] for t in range(4)]
+    _, plain = remembered(policy, begin(policy, 1), looks)
+    states = begin(policy, 1)
+    audited = []
+    for seen in looks:
+        policy.plan(states, [look(99)])  # as of a batch that another episode failed
+        states, chunks, _ = audit.plan(policy, states, seen, [look(50)])
+        audited.append(np.stack(chunks))
+    assert np.array_equal(np.stack(audited), plain)
 
 
 def test_a_smaller_picture_is_scaled_to_the_checkpoints_size(policies):

@@ -4,11 +4,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.policies import ACTConfig, make_pre_post_processors
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
+from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
+from lerobot.policies.vqbet.modeling_vqbet import VQBeTPolicy
 from transformers import (
     SmolVLMConfig,
     SmolVLMImageProcessor,
@@ -102,6 +104,24 @@ def act(folder: Path, side: int = 64, **how: Any) -> Path:
         n_vae_encoder_layers=1, **{"chunk_size": 3, "n_action_steps": 3, **how},
     )  # fmt: skip
     return _saved(folder, config, ACTPolicy)
+
+
+def vqbet(folder: Path) -> Path:
+    """It looks back: queues hold its last three observations, and what is left of a chunk."""
+    kept = dict.fromkeys(("VISUAL", "STATE", "ACTION"), NormalizationMode.MEAN_STD)
+    config = VQBeTConfig(
+        **_features(64), device="cpu", pretrained_backbone_weights=None, crop_shape=None, n_obs_steps=3, n_action_pred_token=2, action_chunk_size=2,
+        normalization_mapping=kept, vqvae_embedding_dim=16, vqvae_enc_hidden_dim=16, gpt_input_dim=32, gpt_output_dim=32, gpt_n_layer=1,
+        gpt_n_head=2, gpt_hidden_dim=32, gpt_block_size=16, spatial_softmax_num_keypoints=4,
+    )  # fmt: skip
+    return _saved(folder, config, _vqbet_past_its_first_phase)
+
+
+def _vqbet_past_its_first_phase(config: VQBeTConfig) -> VQBeTPolicy:
+    """As after the training of its codes, without which it warns at every call."""
+    policy = VQBeTPolicy(config)
+    policy.vqbet.action_head.vqvae_model.discretized.fill_(True)
+    return policy
 
 
 def act_of(folder: Path, cameras: tuple[str, ...], side: int, state: int, action: int) -> Path:

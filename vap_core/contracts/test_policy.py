@@ -33,6 +33,22 @@ def actions(of: Sequence[Episode]) -> np.ndarray:
     return np.array(taken)
 
 
+class AskedTwice:
+    """A policy whose every call is made twice with the same states; the second one counts."""
+
+    def __init__(self, policy: Any) -> None:
+        self.label = policy.label
+        self.execute = policy.execute
+        self.start = policy.start
+        self.name = "plan" if hasattr(policy, "plan") else "plan_from_simulation"
+        self.call = getattr(policy, self.name)
+        setattr(self, self.name, self.again)
+
+    def again(self, states: Any, given: Any) -> Any:
+        self.call(states, given)
+        return self.call(states, given)
+
+
 def test_it_has_label_execute_start_and_plan(policy: Any) -> None:
     check_policy(policy)
 
@@ -53,3 +69,10 @@ def test_an_episode_repeats_its_actions(policy: Any, where: str) -> None:
 def test_a_batch_equals_one_by_one(policy: Any, where: str) -> None:
     together = actions(episodes(policy, where, batch=2))
     assert np.allclose(together, actions(episodes(policy, where, batch=1)), atol=1e-3)
+
+
+def test_the_states_it_is_given_stay_as_they_were(policy: Any, where: str) -> None:
+    """Where one episode fails a batch, the rollout asks again for each of the others."""
+    once = actions(episodes(policy, where, batch=2))
+    again = actions(episodes(AskedTwice(policy), where, batch=2))
+    assert np.allclose(once, again, atol=1e-3)

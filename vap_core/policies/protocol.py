@@ -29,9 +29,11 @@ class PolicyInput:
 class Policy[S](Protocol):
     """A frozen policy over a batch of episodes.
 
-    What one episode carries is state, an argument and a result. `label` names it wherever its
-    numbers appear. `execute` rows of every chunk are executed before it is called again. A rollout
-    needs all four, and ends with an error at a chunk of another shape or type than `Chunk`.
+    What one episode carries is state, an argument and a result. `plan` leaves the states that it is
+    given as they are: where one episode fails a batch, the others are asked again. `label` names it
+    wherever its numbers appear. `execute` rows of every chunk are executed before it is called
+    again. A rollout needs all four, and ends with an error at a chunk of another shape or type than
+    `Chunk`.
     """
 
     label: str

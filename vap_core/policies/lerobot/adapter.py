@@ -54,6 +54,8 @@ TOKEN_MASK = "observation.language.attention_mask"
 """lerobot's feature keys; a checkpoint fills its empty cameras itself."""
 DRAWS_NOTHING = ("act",)
 """Policies whose chunk is a function of the observation alone."""
+OF_MODULES = frozenset(vars(torch.nn.Module()))
+"""Where torch keeps the weights and hooks of every module."""
 Shapes = dict[str, tuple[int, ...]]
 """The shape of every feature, by its key."""
 
@@ -167,10 +169,13 @@ class LeRobot:
         if self.batched:
             return list(states), self._plan_batch(states, inputs)
         self.predict.stay_eager("it has a memory, which is no input of its calls")
-        chunks = []
+        after: list[LeRobotState] = []
+        chunks: list[Chunk] = []
         for i, (state, policy_input) in enumerate(zip(states, inputs, strict=True)):
-            chunks.append(self._plan_step(i, state, policy_input))
-        return list(states), chunks
+            # A copy remembers this call, so that one that fails can be made again.
+            after.append(copy.deepcopy(state))
+            chunks.append(self._plan_step(i, after[i], policy_input))
+        return after, chunks
 
     def check(self, cameras: Sequence[str], state_size: int, action_size: int) -> None:
         """Check that the checkpoint fits these cameras and these sizes.
@@ -361,9 +366,8 @@ def _copy_policy(policy: "PreTrainedPolicy") -> "PreTrainedPolicy":
     """A copy that shares weights and configuration, and keeps its own memory of observations."""
     own = copy.copy(policy)
     for name, attribute in vars(policy).items():
-        if name.startswith("_") or name == "config":
-            continue
-        if not isinstance(attribute, torch.nn.Module):
+        shared = name in OF_MODULES or name == "config" or isinstance(attribute, torch.nn.Module)
+        if not shared:
             setattr(own, name, copy.deepcopy(attribute))
     return own
 

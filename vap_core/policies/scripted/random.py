@@ -3,6 +3,7 @@
 What it solves, the task gives away.
 """
 
+import copy
 from collections.abc import Sequence
 
 import numpy as np
@@ -42,18 +43,20 @@ class Random:
         next_states = []
         chunks = []
         for state, env in zip(states, envs, strict=True):
-            action = _draw_action(state, env)
-            next_states.append(RandomState(state.rng, action))
+            rng = copy.deepcopy(state.rng)
+            action = _draw_action(rng, state.last, env)
+            next_states.append(RandomState(rng, action))
             chunks.append(action[None])
         return next_states, chunks
 
 
-def _draw_action(state: RandomState, env: Env) -> Float32[np.ndarray, " a"]:
+def _draw_action(
+    rng: np.random.Generator, last: Float32[np.ndarray, " before"], env: Env
+) -> Float32[np.ndarray, " a"]:
     """The next action: a share of the last one and fresh noise."""
-    last = state.last
     if not len(last):
         last = np.zeros(env.action_size, np.float32)
-    fresh = state.rng.standard_normal(env.action_size) * _scales(env)
+    fresh = rng.standard_normal(env.action_size) * _scales(env)
     action = KEEP * last + np.sqrt(1 - KEEP**2) * fresh
     gripper = np.clip(0.5 + action[-1], 0.0, 1.0)
     return np.array([*action[:-1], gripper], np.float32)
