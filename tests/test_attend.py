@@ -180,6 +180,15 @@ def test_boxes_by_hand_replace_the_detector() -> None:
     assert len(attended.groundings["front"][0].candidates) == 2
 
 
+def test_a_view_without_boxes_by_hand_passes_unmodified() -> None:
+    one = Boxes(np.array([[4, 20, 16, 32]], np.float32), np.ones(1, np.float32), "by hand")
+    views = {"front": LINE, "wrist": LINE}
+    _, attended = Attender(TOYS, MEMORY).start(views, "bring my cup", boxes={"front": one})
+    assert (attended.images["front"] != LINE).any()
+    assert np.array_equal(attended.images["wrist"], LINE)
+    assert attended.groundings["wrist"][0].ballot.winner is None
+
+
 def test_what_cannot_be_matched_is_said() -> None:
     attender = Attender(TOYS, {**MEMORY, "other": personal("other", "cup", GREY)})
     with pytest.raises(
@@ -188,6 +197,8 @@ def test_what_cannot_be_matched_is_said() -> None:
         attender.start({"front": LINE}, "bring my cup")
     with pytest.raises(UnknownName, match="no 'shoe' is remembered"):
         attender.start({"front": LINE}, "bring my shoe")
+    with pytest.raises(UnknownName, match="'mug' is the name of a cup; say \"my cup\""):
+        attender.start({"front": LINE}, "bring my mug")
     with pytest.raises(UnknownName, match=r"'nobody' is unknown; known: ming, mug, other"):
         attender.start({"front": LINE}, "bring my cup", objects=["nobody"])
     with pytest.raises(BadInstruction, match="one each"):

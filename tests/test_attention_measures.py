@@ -11,7 +11,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from tests.command import vap
+from tests.command import refused, vap
 from vap_core.analysis.attention import (
     examples,
     figures,
@@ -340,6 +340,11 @@ def test_tables_are_published_beside_those_of_other_suites(tmp_path: Path) -> No
     metadata = pq.read_schema(tmp_path / "kept" / "attention_calls.parquet").metadata
     about = json.loads(metadata[tables.ABOUT])
     assert [each["runs"][0]["digest"] for each in about] == ["a", "b", "c"]
+
+
+def test_a_folder_that_is_no_run_gets_no_folder_of_attention(tmp_path: Path) -> None:
+    assert "run.json is absent or damaged" in refused("attention", tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.sweep

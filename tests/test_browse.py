@@ -3,18 +3,21 @@
 import io
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from PIL import Image
 
 from tests.command import vap
 from tests.drawn import ROW, K, opening, record
 from tests.test_why import fail
-from vap_core.base.errors import BadRecording
+from vap_core.base.errors import BadOutput, BadRecording
 from vap_core.base.video import frames as video_frames
-from vap_core.recording import Votes, serve_run, write_film
+from vap_core.recording import Votes, clicks, serve_run, write_film
 from vap_core.recording.film import read_verdict
+from vap_core.recording.reading import read_chunks
 from vap_core.recording.stored_pictures import prompted_entities, read_pictures
 
 
@@ -86,6 +89,40 @@ def test_pictures_come_back_from_jpeg_and_from_video(tmp_path: Path) -> None:
         assert sorted(pictures) == list(range(6))
         true = frame(5, start).prompted["front"].astype(int)
         assert np.abs(pictures[5].astype(int) - true).mean() < 6
+
+
+def test_a_film_that_cannot_be_written_is_one_line(run: Path, tmp_path: Path) -> None:
+    path = run / "recordings" / "wrong.rrd"
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BadOutput, match="cannot be written"):
+        write_film(path, tmp_path / "file" / "film.mp4")
+    with pytest.raises(BadOutput, match=r"is a folder; name a file that ends with \.mp4"):
+        write_film(path, tmp_path)
+    assert [one.name for one in tmp_path.iterdir()] == ["file"]
+
+
+def test_of_two_votes_of_a_view_a_click_tells_the_one_that_is_shown(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sub-goals hold a vote each."""
+    recording = run / "recordings" / "fine.rrd"
+    entity = "/observation.images.side/candidates"
+    told = Votes(recording).answer(entity, 2)
+    first, *_ = [c for c in read_chunks(recording) if c.entity_path == "/vap/candidates/side"]
+
+    class Later:
+        """The same vote for another candidate, at a later step."""
+
+        entity_path = first.entity_path
+
+        def to_record_batch(self) -> Any:
+            table = first.to_record_batch().to_pydict()
+            del table["winner"]
+            return pa.RecordBatch.from_pydict(table)
+
+    chunks = [*read_chunks(recording), Later()]
+    monkeypatch.setattr(clicks, "read_chunks", lambda path: chunks)
+    assert Votes(recording).answer(entity, 2) == told
 
 
 def test_a_click_on_a_candidate_says_its_cosines(run: Path) -> None:

@@ -10,12 +10,15 @@ from PIL import Image
 from tests.command import refused, vap
 from tests.toys import MeanColour, SameColour, detector, scene, segmenter
 from vap_core.analysis import ground_clip
+from vap_core.analysis.ground import claimed_paths
+from vap_core.attend import Attender
 from vap_core.base import video
 from vap_core.base.types import Boxes
 from vap_core.memory import remember, save
 from vap_core.perception import stacks, tiles
 from vap_core.perception.protocols import Stack
 from vap_core.perception.tiles import GRID, TiledDetector, tile_corners
+from vap_core.recording.file import temporary_path
 
 RED, GREEN = (250, 0, 0), (0, 250, 0)
 
@@ -82,6 +85,35 @@ def test_a_clip_without_the_object_says_so(bank, tmp_path):
     assert done.returncode == 0, done.stderr
     assert "not in view in any of 3 frames" in done.stdout
     assert len(list(video.frames(tmp_path / "clip.mp4"))) == 3
+
+
+def test_always_tint_reaches_a_clip(bank, tmp_path, monkeypatch):
+    asked = []
+
+    class Asked(Attender):
+        def __init__(self, stack, memory, prompting=None, **how) -> None:
+            asked.append(prompting.always_tint)
+            super().__init__(stack, memory, prompting, **how)
+
+    monkeypatch.setattr(ground_clip, "Attender", Asked)
+    clip = frames(tmp_path / "clip", [[(26, 26, RED)]] * 2)
+    where = ("--stack", "toy", "--memory", bank, "--out", tmp_path / "out")
+    for option in ((), ("--always-tint",)):
+        assert vap("ground", clip, "bring my cup", *where, *option).returncode == 0
+    assert asked == [False, True]
+
+
+def test_two_at_once_write_two_films_and_two_recordings(tmp_path):
+    with claimed_paths(tmp_path, "desk", ".mp4") as first:
+        with claimed_paths(tmp_path, "desk", ".mp4") as second:
+            pass
+        assert [path.name for path in first] == ["desk.mp4", "desk.rrd"]
+        assert [path.name for path in second] == ["desk-2.mp4", "desk-2.rrd"]
+    temporary_path(first[1]).unlink()
+    with pytest.raises(ValueError, match="fails"), claimed_paths(tmp_path, "desk", ".mp4") as third:
+        raise ValueError("fails")
+    assert third == first
+    assert not temporary_path(third[1]).exists()
 
 
 def test_bad_clips_are_one_line(bank, tmp_path):

@@ -17,7 +17,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import _call_make_env, _import_hub_module, _normalize_hub_result
 from lerobot.processor import ProcessorStepRegistry
 
-from tests.command import vap
+from tests.command import refused, vap
 from vap_core.evaluation.policy_names import shipped
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import make_trial, register_personal
@@ -160,3 +160,6 @@ def test_attach_says_what_it_wrote_and_refuses_a_second_time(tmp_path: Path) -> 
     again = vap(*words)
     assert again.returncode == 2
     assert "exists; choose another folder" in again.stderr
+    (tmp_path / "file").write_text("")
+    inside = refused("attach", shipped(SUITE), tmp_path / "file" / "out", "--memory", words[4])
+    assert "cannot be written" in inside

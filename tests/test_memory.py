@@ -123,6 +123,13 @@ def test_what_a_killed_save_left_is_removed_when_it_is_old(
     assert young.exists()
 
 
+def test_a_bank_may_be_named_by_text(tmp_path: Path) -> None:
+    mug = remember("mug", "cup", [np.full((4, 4, 3), TEAL, np.uint8)], TOYS.encoder)
+    path = save(str(tmp_path), mug)
+    assert load(str(path)).name == "mug"
+    assert list(load_bank(str(tmp_path))) == ["mug"]
+
+
 def test_a_bank_in_a_file_is_no_bank(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(BadOutput, match="choose another folder"):

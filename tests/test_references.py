@@ -105,12 +105,46 @@ def test_boxes_and_masks_are_read_by_the_photos_name(tmp_path):
         ("1,2,3,4", "names no single photo"),
         ("mug-0.png=1,2,3", "is not PHOTO=x0,y0,x1,y1"),
         ("mug-0.png=5,5,5,9", "has no area"),
+        ("mug-0.png=1,2,inf,9", "has no area"),
     ):
         with pytest.raises(BadPhoto, match=message):
             registering.parse_given([text], [], photos)
     outside = {0: np.array([0, 0, 90, 20], np.float32)}
     with pytest.raises(BadPhoto, match="not inside"):
         registering.choose(photos, "cup", STACK, outside, whole=False)
+    with pytest.raises(BadPhoto, match="--whole uses photos as they are; leave --box and --mask"):
+        registering.choose(photos, "cup", STACK, {0: given[0]}, whole=True)
+
+
+def test_a_mask_is_as_large_as_its_photo_and_ends_where_it_is_transparent(tmp_path):
+    photos = save(tmp_path, [scene([(6, 6, RED)])])
+    small = tmp_path / "small.png"
+    Image.fromarray(np.full((32, 32), 255, np.uint8)).save(small)
+    with pytest.raises(BadPhoto, match="small.png has 32x32 pixels, its photo 64x64; save it as"):
+        registering.parse_given([], [f"mug-0.png={small}"], photos)
+    white = np.full((64, 64, 4), 255, np.uint8)
+    white[..., 3] = 0
+    white[6:18, 6:18, 3] = 255
+    Image.fromarray(white).save(tmp_path / "cut.png")
+    given = registering.parse_given([], [f"mug-0.png={tmp_path / 'cut.png'}"], photos)
+    assert given[0].tolist() == [6, 6, 18, 18]
+    Image.fromarray(np.zeros((64, 64), np.uint8)).save(tmp_path / "dark.png")
+    with pytest.raises(BadPhoto, match="dark all over"):
+        registering.parse_given([], [f"mug-0.png={tmp_path / 'dark.png'}"], photos)
+
+
+def test_photos_of_the_same_name_are_told_apart_by_their_paths(tmp_path):
+    photos = []
+    for day in ("monday", "tuesday"):
+        (tmp_path / day).mkdir()
+        photos += save(tmp_path / day, [scene([(10, 26, RED), (42, 26, GREEN)])])
+    with pytest.raises(BadPhoto, match=rf"with one of {photos[0]}, {photos[1]}\.$"):
+        registering.parse_given(["mug-0.png=1,2,3,4"], [], photos)
+    references = registering.choose(photos, "cup", STACK, {}, whole=False)
+    with pytest.raises(BadPhoto, match=f"give --box {photos[0]}=") as said:
+        registering.refuse_doubtful(references, photos, tmp_path / "sheet.png")
+    assert f"{photos[0]}: " in str(said.value)
+    assert list(registering.parse_given([f"{photos[1]}=1,2,30,40"], [], photos)) == [1]
 
 
 def test_a_sheet_says_how_every_box_was_chosen(tmp_path):
@@ -215,6 +249,7 @@ def test_a_photo_of_a_phone_is_read(tmp_path):
 def test_a_folder_gives_its_pictures(tmp_path):
     photos = save(tmp_path / "..", []) + save(tmp_path, [scene([(6, 6, RED)])] * 2)
     (tmp_path / "notes.txt").write_text("no picture")
+    (tmp_path / "._mug-0.png").write_bytes(b"what macOS writes beside its files")
     assert registering.gather_photos([tmp_path]) == photos
     (tmp_path / "empty").mkdir()
     with pytest.raises(BadPhoto, match="holds no picture"):

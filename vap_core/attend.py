@@ -139,8 +139,9 @@ class Attender:
         """Ground every target of `instruction` in every view (t = 0).
 
         `objects` names the remembered object of each target in turn, where its category alone does
-        not decide. `boxes` replaces the detector by candidates given by hand, per camera. `cameras`
-        are the calibrated cameras at this moment, which association by geometry needs.
+        not decide. `boxes` replaces the detector by candidates given by hand; a camera that it
+        leaves out has none. `cameras` are the calibrated cameras at this moment, which association
+        by geometry needs.
 
         Raises:
             BadInstruction, UnknownName: the instruction does not match the memory.
@@ -355,11 +356,11 @@ class Attender:
     def _judge(self, views: Views, phrase: str, given: Mapping[str, Boxes]) -> dict[str, Boxes]:
         """Boxes given by hand, with whether their view is familiar."""
         detector = self.stack.detector
-        boxes = dict(given)
+        boxes = {camera: given.get(camera, Boxes.empty(phrase)) for camera in views}
         if isinstance(detector, FamiliarityJudge):
             for camera, rgb in views.items():
                 familiar = detector.is_familiar(rgb, phrase)
-                boxes[camera] = replace(given[camera], familiar=familiar)
+                boxes[camera] = replace(boxes[camera], familiar=familiar)
         return boxes
 
     @property

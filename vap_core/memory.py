@@ -164,6 +164,11 @@ def recall(
             f"recall: {len(fitting)} objects are a {target.category!r}: {names}; choose with "
             "--object."
         )
+    named = memory.get(target.category)
+    if named is not None:
+        raise UnknownName(
+            f'recall: {named.name!r} is the name of a {named.category}; say "my {named.category}".'
+        )
     contents = ", ".join(sorted(known)) or "nothing yet"
     raise UnknownName(
         f"recall: no {target.category!r} is remembered; the memory holds {contents}. Register one, "
@@ -171,7 +176,7 @@ def recall(
     )
 
 
-def save(bank: Path, obj: PersonalObject, *, replace: bool = False) -> Path:
+def save(bank: Path | str, obj: PersonalObject, *, replace: bool = False) -> Path:
     """Write one object into the bank (a folder), atomically.
 
     Raises:
@@ -180,6 +185,7 @@ def save(bank: Path, obj: PersonalObject, *, replace: bool = False) -> Path:
     """
     check_names(obj.name, obj.category)
     check_owner(obj.owner, obj.known_as, obj.note)
+    bank = Path(bank)
     path = object_path(bank, obj.name)
     tensors = {"embeddings": obj.embeddings}
     for i, reference in enumerate(obj.crops):
@@ -221,12 +227,13 @@ def taken(path: Path) -> BadOutput:
     return BadOutput(f"save: {path} exists; choose another name or pass --replace.")
 
 
-def load(path: Path, encoder: str | None = None) -> PersonalObject:
+def load(path: Path | str, encoder: str | None = None) -> PersonalObject:
     """Read one object; the file is parsed, never executed.
 
     Raises:
         BadMemory: missing, damaged, of another version, or embedded by another encoder.
     """
+    path = Path(path)
     header, tensors = _read(path)
     if header.get("format") != FORMAT or header.get("version") != str(VERSION):
         raise BadMemory(
@@ -274,10 +281,10 @@ def load(path: Path, encoder: str | None = None) -> PersonalObject:
         ) from error
 
 
-def load_bank(bank: Path, encoder: str | None = None) -> dict[str, PersonalObject]:
+def load_bank(bank: Path | str, encoder: str | None = None) -> dict[str, PersonalObject]:
     """Every object of a bank by name; a bank that does not exist yet is empty."""
     objects = {}
-    for path in sorted(bank.glob(f"*{SUFFIX}")):
+    for path in sorted(Path(bank).glob(f"*{SUFFIX}")):
         obj = load(path, encoder)
         objects[obj.name] = obj
     return objects

@@ -3,7 +3,8 @@
 The answer is the candidates, the votes, the margin and the rewritten instruction.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -141,27 +142,29 @@ def write_evidence(folder: Path, stem: str, found: Found) -> tuple[Path, Path]:
     from vap_core.base.figures import write_png
     from vap_core.recording import record_grounding
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        png, rrd = free_paths(folder, stem, (".png", ".rrd"))
-        figure = grounding_figure(found.rgb, found.attended, found.objects, CAMERA)
-        write_png(figure, png)
-    except OSError as error:
-        raise BadOutput(
-            f"write_evidence: {folder} cannot be written ({error.strerror}); "
-            "choose another folder with --out."
-        ) from error
     first = found.attended.groundings[CAMERA][0]
-    record_grounding(
-        path=rrd,
-        image=found.rgb,
-        grounding=first,
-        obj=found.objects[0],
-        instruction=found.instruction,
-        rewritten=found.attended.text,
-        prompted=found.attended.images[CAMERA],
-    )
+    figure = grounding_figure(found.rgb, found.attended, found.objects, CAMERA)
+    try:
+        with claimed_paths(folder, stem, ".png") as (png, rrd):
+            write_png(figure, png)
+            record_grounding(
+                path=rrd,
+                image=found.rgb,
+                grounding=first,
+                obj=found.objects[0],
+                instruction=found.instruction,
+                rewritten=found.attended.text,
+                prompted=found.attended.images[CAMERA],
+            )
+    except OSError as error:
+        raise cannot_write(folder, error) from error
     return png, rrd
+
+
+def cannot_write(folder: Path, error: OSError) -> BadOutput:
+    return BadOutput(
+        f"ground: {folder} cannot be written ({error.strerror}); choose another folder with --out."
+    )
 
 
 def _parse_box(text: str, width: int, height: int) -> list[float]:
@@ -201,14 +204,40 @@ def _grounding_to_json(grounding: Grounding) -> dict[str, Any]:
     }
 
 
-def free_paths(folder: Path, stem: str, suffixes: tuple[str, str]) -> tuple[Path, Path]:
-    """Two files of the same name and number, of which neither exists."""
+@contextmanager
+def claimed_paths(folder: Path, stem: str, suffix: str) -> Iterator[tuple[Path, Path]]:
+    """A picture or film and a recording of the same name and number, of which neither exists.
+
+    The recording's temporary file stands there from now on, so that another process takes another
+    number. Where the block fails before anything was recorded, it is removed.
+
+    Raises: OSError.
+    """
+    from vap_core.recording.file import temporary_path
+
+    shown, recording = _claim(folder, stem, suffix)
+    try:
+        yield shown, recording
+    except BaseException:
+        claim = temporary_path(recording)
+        with suppress(FileNotFoundError):
+            if not claim.stat().st_size:
+                claim.unlink()
+        raise
+
+
+def _claim(folder: Path, stem: str, suffix: str) -> tuple[Path, Path]:
+    from vap_core.recording.file import temporary_path
+
+    folder.mkdir(parents=True, exist_ok=True)
     number = 1
     while True:
         name = stem if number == 1 else f"{stem}-{number}"
-        one, other = (folder / f"{name}{suffix}" for suffix in suffixes)
-        if not (one.exists() or other.exists()):
-            return one, other
+        shown, recording = folder / f"{name}{suffix}", folder / f"{name}.rrd"
+        if not (shown.exists() or recording.exists()):
+            with suppress(FileExistsError):
+                temporary_path(recording).touch(exist_ok=False)
+                return shown, recording
         number += 1
 
 

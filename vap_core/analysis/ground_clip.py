@@ -1,16 +1,16 @@
 """Ground a clip, track through it, and write it as a recording and as a video."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from itertools import chain
 from pathlib import Path
 
-from vap_core.analysis.ground import free_paths
-from vap_core.attend import Attender, AttendState
+from vap_core.analysis.ground import cannot_write, claimed_paths
+from vap_core.attend import Attender, AttendState, Prompting
 from vap_core.base import video
-from vap_core.base.errors import BadOutput, BadPhoto
+from vap_core.base.errors import BadPhoto
 from vap_core.base.photos import load_photo, photos_in
-from vap_core.base.types import Attended, Rgb, Track, value
+from vap_core.base.types import Attended, PersonalObject, Rgb, Track, value
 from vap_core.instruction.parsers import Parsing
 from vap_core.memory import load_bank
 from vap_core.perception.stacks import load_own
@@ -62,13 +62,14 @@ def ground_clip(
     *,
     objects: Sequence[str] | None = None,
     parsing: Parsing | None = None,
+    always_tint: bool = False,
 ) -> tuple[ClipSummary, Path, Path]:
     """Follow the first target of `instruction` through a clip; write an .rrd and an .mp4.
 
+    `always_tint` is Prompting's.
+
     Raises: BadPhoto, BadInstruction, UnknownName, BadOutput.
     """
-    from vap_core.recording import ClipRecorder, ClipStep
-
     frames, hz = _open(path)
     first = next(frames, None)
     if first is None:
@@ -77,15 +78,46 @@ def ground_clip(
     bank = load_bank(memory, models.encoder.name)
     parsing = parsing or Parsing()
     parser = parsing.load(memory, bank)
-    attender = Attender(models, bank, parser=parser, speaker=parsing.speaker)
+    prompting = Prompting(always_tint=always_tint)
+    attender = Attender(models, bank, prompting, parser=parser, speaker=parsing.speaker)
     _, (obj, *_) = attender.understand(instruction, objects)
-    mp4, rrd = _new_files(out, path.stem)
+    try:
+        with claimed_paths(out, path.stem, ".mp4") as (mp4, rrd):
+            summary = _follow(
+                attender=attender,
+                frames=chain([first], frames),
+                hz=hz,
+                instruction=instruction,
+                objects=objects,
+                obj=obj,
+                mp4=mp4,
+                rrd=rrd,
+            )
+    except OSError as error:
+        raise cannot_write(out, error) from error
+    return summary, rrd, mp4
+
+
+def _follow(
+    *,
+    attender: Attender,
+    frames: Iterable[Rgb],
+    hz: float,
+    instruction: str,
+    objects: Sequence[str] | None,
+    obj: PersonalObject,
+    mp4: Path,
+    rrd: Path,
+) -> ClipSummary:
+    """Ground, track, and write every frame."""
+    from vap_core.recording import ClipRecorder, ClipStep
+
     grounded, visible, text = None, [], instruction
     with ExitStack() as files:
         recorder = files.enter_context(ClipRecorder(rrd, CAMERA, obj.name, hz))
         film = files.enter_context(video.Mp4(mp4, hz))
         state: AttendState | None = None
-        for number, rgb in enumerate(chain([first], frames)):
+        for number, rgb in enumerate(frames):
             at = number / hz
             state, attended = _attend(attender, state, rgb, instruction, number, objects)
             track, prompted = Track(None, 0.0), rgb
@@ -100,7 +132,7 @@ def ground_clip(
             visible.append(track.mask is not None)
             recorder.add(ClipStep(number, at, rgb, prompted, track))
             film.add(prompted)
-    summary = ClipSummary(
+    return ClipSummary(
         frames=len(visible),
         grounded=grounded,
         tracked=sum(visible),
@@ -108,7 +140,6 @@ def ground_clip(
         text=text,
         object=obj.name,
     )
-    return summary, rrd, mp4
 
 
 def _open(path: Path) -> tuple[Iterator[Rgb], float]:
@@ -158,15 +189,3 @@ def _spans(visible: Sequence[bool], grounded: int | None) -> tuple[tuple[int, in
         else:
             spans.append((number, number))
     return tuple(spans)
-
-
-def _new_files(folder: Path, stem: str) -> tuple[Path, Path]:
-    """An .mp4 and an .rrd that do not exist, in a folder that does. Raises: BadOutput."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BadOutput(
-            f"ground: {folder} cannot be written ({error.strerror}); choose another folder with "
-            "--out."
-        ) from error
-    return free_paths(folder, stem, (".mp4", ".rrd"))

@@ -24,7 +24,7 @@ MAX_PIXELS = 50_000_000
 MAX_BYTES = 200_000_000
 LONG_SIDE = 1024
 BRIGHT = 127
-"""Mean of the channels above which a pixel of a mask's picture belongs to the object."""
+"""Mean of the channels, and opacity, above which a pixel of a mask's picture is the object's."""
 
 
 def load_photo(path: Path | str, long_side: int | None = LONG_SIDE) -> Rgb:
@@ -34,6 +34,21 @@ def load_photo(path: Path | str, long_side: int | None = LONG_SIDE) -> Rgb:
     Raises:
         BadPhoto: missing, empty, not an image, truncated, or more than 50 megapixels.
     """
+    return _decode(path, "RGB", long_side)
+
+
+def load_mask(path: Path | str) -> Mask:
+    """A mask from a picture that is bright on the object, in its own size.
+
+    What is transparent is not the object. Raises: BadPhoto.
+    """
+    pixels = _decode(path, "RGBA")
+    bright = pixels[..., :3].mean(axis=2) > BRIGHT
+    return bright & (pixels[..., 3] > BRIGHT)
+
+
+def _decode(path: Path | str, mode: str, long_side: int | None = None) -> np.ndarray:
+    """The pixels of a picture file, upright, as RGB or RGBA. Raises: BadPhoto."""
     from PIL import Image, ImageOps, UnidentifiedImageError
     from pillow_heif import register_heif_opener
 
@@ -52,7 +67,7 @@ def load_photo(path: Path | str, long_side: int | None = LONG_SIDE) -> Rgb:
                     f"load_photo: {path} has {image.mode} pixels, more than 8 bits each; save it "
                     "as an 8-bit JPEG or PNG."
                 )
-            upright = ImageOps.exif_transpose(image).convert("RGB")
+            upright = ImageOps.exif_transpose(image).convert(mode)
             if long_side is not None:
                 upright.thumbnail((long_side, long_side))
             return np.array(upright, dtype=np.uint8)
@@ -70,14 +85,16 @@ def load_photo(path: Path | str, long_side: int | None = LONG_SIDE) -> Rgb:
         ) from error
 
 
-def load_mask(path: Path | str) -> Mask:
-    """A mask from a picture that is bright on the object, in its own size. Raises: BadPhoto."""
-    return load_photo(path, long_side=None).mean(axis=2) > BRIGHT
-
-
 def photos_in(folder: Path) -> list[Path]:
-    """The picture files of a folder by their suffixes, in the order of their names."""
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES)
+    """The picture files of a folder by their suffixes, in the order of their names.
+
+    Hidden ones, such as the `._NAME` that macOS writes beside its files, are left out.
+    """
+    found = []
+    for path in folder.iterdir():
+        if path.suffix.lower() in PICTURE_SUFFIXES and not path.name.startswith("."):
+            found.append(path)
+    return sorted(found)
 
 
 def _check_file(path: Path) -> None:

@@ -80,14 +80,18 @@ class Mp4:
     def __init__(self, path: Path, hz: float) -> None:
         import av
 
+        if path.is_dir():
+            raise BadOutput(f"video: {path} is a folder; name a file that ends with .mp4.")
         self.path = path
         self._hz = Fraction(hz).limit_denominator(1000)
         self._stream: Any = None
         self._files = ExitStack()
-        part = self._files.enter_context(replacing(path))
         try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            part = self._files.enter_context(replacing(path))
             self._container: Any = av.open(str(part), "w", format="mp4")
         except (av.FFmpegError, OSError) as error:
+            self._files.close()
             raise BadOutput(
                 f"video: {path} cannot be written ({error!s:.120}); choose another folder with "
                 "--out."

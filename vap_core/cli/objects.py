@@ -231,12 +231,19 @@ def ground(
                 "clip."
             )
         summary, rrd, mp4 = ground_clip(
-            image, instruction, memory, stack, out, objects=object, parsing=parsing
+            image,
+            instruction,
+            memory,
+            stack,
+            out,
+            objects=object,
+            parsing=parsing,
+            always_tint=always_tint,
         )
         if summary.grounded is not None:
             note_uses(memory, [summary.object], speaker)
         note = missing_threshold(stack)
-        if note:
+        if note and not always_tint:
             print(f"note: {note}", file=sys.stderr)
         print(summary)
         print(f"wrote {mp4} and {rrd}; look: python -m vap_core view {rrd}")

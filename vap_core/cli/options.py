@@ -42,5 +42,5 @@ def stack_of(stack: str, detector: str, encoder: str, tracker: str) -> str:
 
 
 def names(text: str) -> list[str]:
-    """The names in "a,b,c"; empty ones are left out."""
-    return [name for name in text.split(",") if name]
+    """The names in "a, b,c"; empty ones are left out."""
+    return [name.strip() for name in text.split(",") if name.strip()]

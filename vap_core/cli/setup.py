@@ -373,7 +373,7 @@ def eval_tokens(
     from vap_core.evaluation.tokens.study import publish as write_tables
     from vap_core.simulation.suites import BENCHMARKS
 
-    ks = tuple(int(number) for number in names(k) if number.isdigit() and int(number))
+    ks = tuple(int(number) for number in names(k) if number.isdecimal() and int(number))
     if len(ks) != len(names(k)) or not ks:
         raise BadStudy(f"eval-tokens: --k {k}: give numbers of photos, such as 1,3,5,7.")
     asked = Tokens(tuple(dict.fromkeys(suite or BENCHMARKS)), ks, epochs, tuple(names(learn_in)))

@@ -209,7 +209,7 @@ def record_of(option: str) -> "Record":
     match option:
         case "all" | "failures" | "none":
             return option
-        case _ if option.isdigit():
+        case _ if option.isdecimal():
             return int(option)
     raise BadStudy(f"--record {option}: say all, failures, none, or how many per task and method.")
 

@@ -49,8 +49,8 @@ class ChatEndpoint:
     def __post_init__(self) -> None:
         if not _is_web_address(self.url):
             raise BadEndpoint(
-                f"chat: {self.url!r} is no address of a chat endpoint; "
-                "give one like https://api.openai.com/v1."
+                f"chat: {self.url!r} is no address of a chat endpoint; give one like "
+                f"https://api.openai.com/v1, or set {URL}."
             )
         if not self.model:
             raise BadEndpoint(f"chat: no model named for {self.url}; set {MODEL}.")

@@ -38,7 +38,8 @@ class Votes:
             if chunk.entity_path.startswith(prefix):
                 batch = chunk.to_record_batch()
                 cells = {name: batch[name][0].as_py() for name in batch.schema.names}
-                self._numbers[chunk.entity_path.removeprefix(prefix)] = cells
+                # The first vote, as its picture: sub-goals hold one each.
+                self._numbers.setdefault(chunk.entity_path.removeprefix(prefix), cells)
         if not self._numbers:
             raise BadRecording(
                 f"inspect_votes: {recording} has no vote; take one of a vap episode."

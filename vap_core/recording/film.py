@@ -48,7 +48,6 @@ def write_film(recording: Path, mp4: Path) -> int:
         deciding = steps[-1]
     shown: dict[str, Rgb] = {}
     n_pictures = 0
-    mp4.parent.mkdir(parents=True, exist_ok=True)
     with Mp4(mp4, hz) as film:
         for step in range(steps[0], int(summary["frames"])):
             for camera, of_camera in views.items():

@@ -48,7 +48,10 @@ def read_summary(path: Path) -> dict[str, Any]:
     """
     path = Path(path)
     if not path.is_file():
-        raise BadRecording(f"read_summary: there is no recording at {path}.")
+        raise BadRecording(
+            f"read_summary: there is no recording at {path}; check the path, or make one: eval or "
+            "rollout with --record all."
+        )
     summary: dict[str, Any] = {}
     steps: set[int] = set()
     try:

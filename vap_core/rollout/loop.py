@@ -439,6 +439,8 @@ def _act(
     if prompts:
         opening = episode.judge.steps == episode.judge.first
         coverage = mask_coverage(attended, truth, episode.goal.target, opening=opening)
+    # The method counts its own calls, from the beginning of a sub-goal.
+    events = [replace(event, frame_index=episode.judge.steps) for event in attended.events]
     frame = Frame(
         frame_index=episode.judge.steps,
         timestamp_s=episode.env.time_s,
@@ -449,7 +451,7 @@ def _act(
         state=observation.state,
         action=action,
         truth=truth,
-        events=(*episode.notes, *attended.events, *episode.judge.events),
+        events=(*episode.notes, *events, *episode.judge.events),
         coverage=coverage,
         attention=episode.attention,
         subgoal=subgoal_number(episode),

@@ -151,10 +151,6 @@ class Episode:
         """One flat row of a results table."""
         row = self.header.row
         outcome = self.outcome
-        margins = []
-        for per_view in self.header.groundings.values():
-            for grounding in per_view:
-                margins.append(grounding.ballot.margin)
         timings = {f"seconds_{part}": seconds for part, seconds in self.seconds.items()}
         return {
             "suite": row.suite,
@@ -174,11 +170,24 @@ class Episode:
             "first_object_correct": outcome.first_object_correct,
             "touched": outcome.touched,
             "steps": outcome.steps,
-            "margin": min(margins) if margins else None,
+            "margin": self._least_margin(),
             "detail": outcome.detail,
             **self._subgoal_columns(),
             **timings,
         }
+
+    def _least_margin(self) -> float | None:
+        """The least margin of all votes that had a candidate.
+
+        0 where no view had one, None where no vote was held.
+        """
+        ballots = []
+        for per_view in self.header.groundings.values():
+            ballots += [grounding.ballot for grounding in per_view]
+        if not ballots:
+            return None
+        held = [ballot.margin for ballot in ballots if ballot.winner is not None]
+        return min(held, default=0.0)
 
     def _subgoal_columns(self) -> dict[str, Any]:
         """`subgoals_done` counts those that succeeded, `subgoal_1` says whether the first did."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from vap_core.analysis.attention import tables
 from vap_core.analysis.attention.observer import NOTHING, Observer, Rows
-from vap_core.base.errors import BadStudy
+from vap_core.base.errors import BadOutput, BadStudy
 from vap_core.evaluation import measurements
 from vap_core.evaluation.diagnosis.recordings import listed_row, study_of
 from vap_core.evaluation.engine import spread_evenly
@@ -77,9 +77,15 @@ def run_replay(
     """
     from tqdm import tqdm
 
-    folder.mkdir(parents=True, exist_ok=True)
+    jobs = plan(source, folder / "memory", wanted)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadOutput(
+            f"attention: {folder} cannot be written ({error.strerror}); choose another folder with "
+            "--out."
+        ) from error
     with locked(folder):
-        jobs = plan(source, folder / "memory", wanted)
         parts = folder / "parts"
         parts.mkdir(exist_ok=True)
         missing = []

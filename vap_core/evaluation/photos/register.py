@@ -76,10 +76,7 @@ def parse_given(
         given[number] = _parse_box(text, words)
     for text in masks:
         number, words = _split(text, photos, "--mask", "MASK.png")
-        box = mask_box(load_mask(words))
-        if box is None:
-            raise BadPhoto(f"register: the mask {words} is dark all over; paint the object white.")
-        given[number] = box
+        given[number] = _box_of_mask(Path(words), photos[number])
     return given
 
 
@@ -90,6 +87,8 @@ def choose(
     if not photos:
         raise BadPhoto("register: no photos; name picture files, a folder of them, or --video.")
     pictures = [load_photo(photo, long_side=None) for photo in photos]
+    if whole and given:
+        raise BadPhoto("register: --whole uses photos as they are; leave --box and --mask out.")
     if whole:
         return whole_photos(pictures)
     for number, box in given.items():
@@ -108,12 +107,13 @@ def refuse_doubtful(references: Sequence[Reference], photos: Sequence[Path], she
     if not doubtful:
         return
     first = doubtful[0]
+    name = _shortest_name(photos[first], photos)
     more = ""
     if len(doubtful) > 1:
         more = f" ({len(doubtful) - 1} more are doubtful)"
     raise BadPhoto(
-        f"register: {photos[first].name}: {references[first].doubt}{more}; look at {sheet}, then "
-        f"give --box {photos[first].name}=x0,y0,x1,y1 in pixels, or pass --accept."
+        f"register: {name}: {references[first].doubt}{more}; look at {sheet}, then give --box "
+        f"{name}=x0,y0,x1,y1 in pixels, or pass --accept."
     )
 
 
@@ -200,12 +200,33 @@ def _split(text: str, photos: Sequence[Path], option: str, form: str) -> tuple[i
     if not photo and len(photos) == 1:
         fitting = [0]
     if len(fitting) != 1:
-        known = ", ".join(path.name for path in photos[:6])
+        known = ", ".join(_shortest_name(path, photos) for path in photos[:6])
         raise BadPhoto(
             f"register: {option} {text!r} names no single photo; write {option} PHOTO={form} with "
             f"one of {known}."
         )
     return fitting[0], words
+
+
+def _shortest_name(photo: Path, photos: Sequence[Path]) -> str:
+    """A photo's file name; its path where another has the same name."""
+    alike = [path for path in photos if path.name == photo.name]
+    return photo.name if len(alike) == 1 else str(photo)
+
+
+def _box_of_mask(mask_path: Path, photo: Path) -> Box:
+    """Around what is bright in a mask of the photo's size. Raises: BadPhoto."""
+    mask = load_mask(mask_path)
+    height, width = load_photo(photo, long_side=None).shape[:2]
+    if mask.shape != (height, width):
+        raise BadPhoto(
+            f"register: the mask {mask_path} has {mask.shape[1]}x{mask.shape[0]} pixels, its photo "
+            f"{width}x{height}; save it as large as the upright photo."
+        )
+    box = mask_box(mask)
+    if box is None:
+        raise BadPhoto(f"register: the mask {mask_path} is dark all over; paint the object white.")
+    return box
 
 
 def _parse_box(text: str, words: str) -> Box:
@@ -216,7 +237,7 @@ def _parse_box(text: str, words: str) -> Box:
             f"register: --box {text!r} is not PHOTO=x0,y0,x1,y1; for example --box "
             "mug-1.jpg=40,60,180,220."
         ) from error
-    if not (x1 - x0 >= 1 and y1 - y0 >= 1):
+    if not (np.isfinite([x0, y0, x1, y1]).all() and x1 - x0 >= 1 and y1 - y0 >= 1):
         raise BadPhoto(
             f"register: --box {text!r} has no area; x to the right, y down, far corner last."
         )

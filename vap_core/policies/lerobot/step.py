@@ -14,6 +14,7 @@ commands find all this.
 
 import json
 import os
+import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -249,11 +250,20 @@ def attach(checkpoint: str | Path, out: Path, memory: Path, **options: Any) -> P
         ) from error
     entry = {"class": STEP_CLASS, "config": step.get_config()}
     pipeline["steps"].insert(place, entry)
-    out.mkdir(parents=True)
-    for file in source.iterdir():
-        if file.name != PIPELINES[0]:
-            os.symlink(file, out / file.name)
-    (out / PIPELINES[0]).write_text(json.dumps(pipeline, indent=2))
+    made = False
+    try:
+        out.mkdir(parents=True)
+        made = True
+        for file in source.iterdir():
+            if file.name != PIPELINES[0]:
+                os.symlink(file, out / file.name)
+        (out / PIPELINES[0]).write_text(json.dumps(pipeline, indent=2))
+    except OSError as error:
+        if made:
+            shutil.rmtree(out, ignore_errors=True)
+        raise BadOutput(
+            f"attach: {out} cannot be written ({error.strerror}); choose another folder."
+        ) from error
     return out
 
 

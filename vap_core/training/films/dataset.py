@@ -252,8 +252,8 @@ def _write_part(known: Suite, seed: int, numbers: Sequence[int], cache: Path, fo
         return
     scratch = folder.with_name(f".{folder.name}")
     shutil.rmtree(scratch, ignore_errors=True)
-    scratch.parent.mkdir(parents=True, exist_ok=True)
     try:
+        scratch.parent.mkdir(parents=True, exist_ok=True)
         with _quiet():
             episodes = _write_stages(
                 known=known, seed=seed, numbers=numbers, cache=cache, folder=scratch
