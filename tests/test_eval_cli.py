@@ -12,6 +12,7 @@ import pytest
 
 from tests.command import process, vap
 from vap_core.base.errors import BadOutput, VapError
+from vap_core.cli.options import names
 from vap_core.evaluation.rescore import rescore
 from vap_core.evaluation.store import read
 from vap_core.simulation.suites import BENCHMARKS
@@ -219,6 +220,10 @@ REFUSED = {
     ),
     "no run": (("rescore", "nowhere"), "rescore: nowhere holds no results; name the folder"),
 }
+
+
+def test_names_in_an_option_may_stand_apart() -> None:
+    assert names(" generic, vap,, ") == ["generic", "vap"]
 
 
 @pytest.mark.slow

@@ -36,6 +36,11 @@ def test_golden(text: str, category: str, rewritten: str) -> None:
     assert rewrite(instruction, [RED]) == rewritten
 
 
+def test_a_compound_of_a_known_category_is_another_category() -> None:
+    (target,) = parse("bring my cup-holder", ["cup"]).targets
+    assert target.category == "cup-holder"
+
+
 def test_owner_is_kept() -> None:
     assert parse("bring my brother's cup").targets[0].owner == "my brother's"
     assert parse("bring my old brother's cup").targets[0].category == "cup"

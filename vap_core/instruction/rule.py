@@ -100,7 +100,7 @@ def leading_category(rest: str, categories: Collection[str] = ()) -> tuple[str, 
     """The category phrase that `rest` begins with, lower case, and its length in characters."""
     for known in sorted(categories, key=len, reverse=True):
         pattern = r"\s+".join(re.escape(word) for word in known.split())
-        match = re.match(rf"{pattern}s?\b", rest, re.IGNORECASE)
+        match = re.match(rf"{pattern}s?(?![\w-])", rest, re.IGNORECASE)
         if match:
             return known, match.end()
     words: list[str] = []
