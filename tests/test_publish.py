@@ -27,6 +27,7 @@ def run(
     done: int = 2,
     methods: tuple[str, ...] = ("generic",),
     version: str = "1",
+    first: int = 0,
 ) -> Path:
     study = {
         "tasks": [["widowx-pick", "pick-cup"]],
@@ -42,7 +43,7 @@ def run(
         [
             {**ROW, "method": method, "episode": i, "seed": seed, "detail": "Traceback ..."}
             | {"seconds_ik": 0.1, "steps": int(version)}
-            for i in range(done)
+            for i in range(first, first + done)
             for method in methods
         ],
     )
@@ -142,3 +143,22 @@ def test_a_part_of_a_list_supersedes_nothing(tmp_path: Path) -> None:
     part = run(tmp_path / "part", 0, episodes=1, done=1, version="2")
     with pytest.raises(BadOutput, match="only a part of the episodes of generic"):
         publish([whole, part], tmp_path / "t.parquet", supersede=True)
+
+
+def test_two_parts_supersede_a_whole_list_together(tmp_path: Path) -> None:
+    whole = run(tmp_path / "whole", 0, methods=("generic", "vap"))
+    parts = []
+    for i in range(2):
+        part = run(tmp_path / f"part-{i}", 0, episodes=1, done=1, methods=("vap",), version=str(2 + i), first=i)  # fmt: skip
+        parts.append(part)
+    target = tmp_path / "t.parquet"
+    assert publish([whole, *parts], target, supersede=True) == 4
+    table = pq.read_table(target).to_pandas()
+    of_vap = table[table["method"] == "vap"]
+    assert dict(zip(of_vap["episode"], of_vap["steps"], strict=True)) == {0: 2, 1: 3}
+    older, one, other = json.loads(pq.read_schema(target).metadata[b"runs"])
+    assert older["configuration"]["methods"] == ["generic"]
+    assert older["superseded"] == [
+        {"methods": ["vap"], "by": one["digest"]},
+        {"methods": ["vap"], "by": other["digest"]},
+    ]

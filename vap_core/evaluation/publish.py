@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import check_regular, parse_json, write_atomic
 from vap_core.evaluation.measurements import encode_table
@@ -68,8 +70,8 @@ def publish(
     A source is a run's folder, or a table that `publish` wrote, whose runs are taken as they are.
     Tracebacks, wall times and memory use are left out. What the runs read of shipped lists is
     entered in the log beside the table (readings.publish_readings). With `supersede`, a method that
-    a later source has read again, for the same episodes and policy, leaves the earlier source
-    (`superseded` in its manifest).
+    later sources have read again, for all the same episodes and with the same policy, leaves the
+    earlier source (`superseded` in its manifest).
 
     Returns: the number of episodes.
 
@@ -84,10 +86,9 @@ def publish(
         raise _exists(target)
     runs: list[Run] = []
     for source in sources:
-        found = _finished_runs(source)
-        if supersede:
-            runs = _without_superseded(runs, found)
-        runs += found
+        runs += _finished_runs(source)
+    if supersede:
+        runs = _without_superseded(runs)
     tables = []
     for manifest, episodes in runs:
         kept = episodes[_published_columns(episodes)].assign(configuration=manifest["digest"])
@@ -120,46 +121,46 @@ def _finished_runs(source: Path) -> "list[Run]":
     return found
 
 
-def _without_superseded(earlier: "list[Run]", later: "list[Run]") -> "list[Run]":
-    """The earlier runs without the methods that the later ones have for all the same episodes."""
+def _without_superseded(runs: "list[Run]") -> "list[Run]":
+    """The runs without the methods that later ones have for all the same episodes."""
     kept = []
-    for manifest, episodes in earlier:
-        for newer, again in later:
-            manifest, episodes = _supersede(manifest, episodes, newer=newer, again=again)
+    for i, run in enumerate(runs):
+        manifest, episodes = _supersede(run, runs[i + 1 :])
         if len(episodes):
             kept.append((manifest, episodes))
     return kept
 
 
-def _supersede(
-    manifest: dict[str, Any],
-    episodes: "pd.DataFrame",
-    *,
-    newer: dict[str, Any],
-    again: "pd.DataFrame",
-) -> "Run":
-    """A run without the methods that a newer one has read again.
+def _supersede(run: "Run", later: "list[Run]") -> "Run":
+    """A run without the methods that later ones, one or several together, have read again.
 
-    Raises: BadOutput where that one has only a part of a method's episodes.
+    Raises: BadOutput where they have only a part of a method's episodes.
     """
+    manifest, episodes = run
     names = [*KEY, "policy"]
-    repeated = episodes[names].merge(again[names], how="left", indicator=True)
-    gone = (repeated["_merge"] == "both").to_numpy()
+    gone = np.zeros(len(episodes), bool)
+    notes = []
+    for newer, again in later:
+        merged = episodes[names].merge(again[names], how="left", indicator=True)
+        repeated = (merged["_merge"] == "both").to_numpy()
+        if repeated.any():
+            of_newer = sorted(set(episodes["method"][repeated]))
+            notes.append({"methods": of_newer, "by": newer["digest"]})
+        gone |= repeated
     methods = sorted(set(episodes["method"][gone]))
     if not methods:
-        return manifest, episodes
+        return run
     if gone.sum() < episodes["method"].isin(methods).sum():
         raise BadOutput(
-            f"publish: the later run has only a part of the episodes of {', '.join(methods)}; "
-            "supersede a method by a run of the whole list."
+            f"publish: the later runs have only a part of the episodes of {', '.join(methods)}; "
+            "supersede a method by runs of the whole list."
         )
     configuration = manifest["configuration"]
     left = [method for method in configuration["methods"] if method not in methods]
-    note = {"methods": methods, "by": newer["digest"]}
     changed = {
         **manifest,
         "configuration": {**configuration, "methods": left},
-        "superseded": [*manifest.get("superseded", []), note],
+        "superseded": [*manifest.get("superseded", []), *notes],
     }
     return changed, episodes[~gone]
 
