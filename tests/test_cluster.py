@@ -1,14 +1,15 @@
 """A Ray cluster of two nodes on this machine gives the table, traces and recordings of local processes."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from vap_core.base.errors import BadCluster, WorkerDied
+from vap_core.base.errors import BadCluster, BadSuite, WorkerDied
 from vap_core.evaluation import cluster, engine
-from vap_core.evaluation.jobs import Job, Rows
+from vap_core.evaluation.jobs import Job, Rows, run_job
 from vap_core.evaluation.processes import results
 from vap_core.evaluation.state_log import read as read_traces
 from vap_core.evaluation.store import open_run
@@ -27,6 +28,16 @@ def address() -> Iterator[str]:
     nodes.add_node(**local)
     yield nodes.address
     nodes.shutdown()
+
+
+def test_another_machine_opens_the_files_of_own_suites_first(tmp_path: Path) -> None:
+    """A study that comes by pickle has checked nothing there."""
+    away = tmp_path / "desk.py"
+    study = replace(STUDY)
+    object.__setattr__(study, "suite_files", (str(away),))
+    job = Job(study, "generic", (), (), 1, tmp_path, "none")
+    with pytest.raises(BadSuite, match=r"desk\.py"):
+        cluster._run_remotely(run_job, job, {}, {"digest": ""})
 
 
 @pytest.mark.sweep

@@ -15,8 +15,10 @@ import pandas as pd
 import pytest
 
 from tests.command import vap
+from vap_core.base.files import DATA
 from vap_core.evaluation import engine, store, trials
 from vap_core.evaluation.engine import missing_jobs, result_key
+from vap_core.evaluation.jobs import Job, row_of_dead_worker
 from vap_core.evaluation.state_log import read as read_traces
 from vap_core.evaluation.store import append, open_run, read, read_manifest
 from vap_core.evaluation.study import Study
@@ -293,6 +295,18 @@ def test_an_episode_that_ends_its_workers_is_an_error_and_the_others_are_kept(
     assert "one episode at a time (2 of 2 deaths)" in capsys.readouterr().err
     again = engine.run(study, tmp_path / "run", record="none", executor=deadly, progress=False)
     assert len(again) == 3
+
+
+def test_an_episode_whose_worker_died_counts_with_the_others_of_its_policy(tmp_path: Path) -> None:
+    published = pd.read_parquet(DATA / "results" / "mini_pi0.parquet", columns=["suite", "policy"])
+    (known,) = set(published[published.suite == "simpler-bridge"].policy)
+    study = Study((("simpler-bridge", "pick-shaver"),), ("vap",), policy="mini-pi0")
+    row = study.rows("simpler-bridge", "pick-shaver")[0]
+    job = Job(study, "vap", (row,), ("key",), 2, tmp_path, "none")
+    assert row_of_dead_worker(job, "died")["policy"] == known
+    hot = replace(study, temperature=0.5)
+    assert hot.policy_label("simpler-bridge") == f"{known}, temperature 0.5"
+    assert STUDY.policy_label(STUDY.tasks[0][0]) == STUDY.policy
 
 
 def test_where_every_worker_dies_the_run_ends_and_blames_no_episode(tmp_path: Path) -> None:

@@ -85,6 +85,11 @@ def test_the_form_is_read(folder):
         ("scenes.csv", HEADER + "a.png,mug,9,2,3,4\n", "without area"),
         ("scenes.csv", HEADER + "a.png,ghost,,,,\n", "no references of 'ghost'"),
         ("scenes.csv", HEADER + "a.png,mug,1,2,3,4\n", "no line for b.png"),
+        (
+            "scenes.csv",
+            HEADER + "a.png,mugg,1,2,9,9\nb.png,mugg,1,2,9,9\n",
+            "names mugg, references are there of mug, .*; name an object alike",
+        ),
         ("objects.csv", "object,category\nmgu,cup\n", "line 2 names 'mgu'"),
         ("objects.csv", "object,category\nmug,3!\n", "'3!' cannot be a category"),
         ("references/boxes.csv", "photo,x0,y0,x1,y1\nmug/7.png,1,2,3,4\n", "names 'mug/7.png'"),

@@ -41,6 +41,19 @@ def test_a_run_enters_once_with_what_it_reads(tmp_path: Path, logs: tuple[Path, 
     assert len(read_log(logs[0])) == 1, "a warm-up suite has no list"
 
 
+def test_a_run_whose_reading_could_not_be_logged_is_logged_by_its_next_start(
+    tmp_path: Path, logs: tuple[Path, Path]
+) -> None:
+    logs[0].parent.mkdir()
+    logs[0].write_text("date,suite\n2026-11-26,x\n")
+    study = Study(TASKS, ("generic",), episodes=6)
+    with pytest.raises(BadOutput, match="restore it, or delete it to begin anew"):
+        _open_run(study, tmp_path / "run", "a look")
+    logs[0].unlink()
+    _open_run(study, tmp_path / "run", "a look")
+    assert [line.what_for for line in read_log(logs[0])] == ["a look"]
+
+
 def test_to_publish_copies_the_lines_of_a_run_once(tmp_path: Path, logs: tuple[Path, Path]) -> None:
     local, published = logs
     for name, seed in (("kept", 0), ("private", 1)):

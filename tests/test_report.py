@@ -14,10 +14,10 @@ from PIL import Image
 
 from tests.command import vap
 from vap_core.base import palette
-from vap_core.base.errors import BadOutput
+from vap_core.base.errors import BadOutput, BadRecording
 from vap_core.base.tables import escape, latex, markdown
 from vap_core.evaluation.publish import publish
-from vap_core.evaluation.report import report
+from vap_core.evaluation.report import page, report
 from vap_core.evaluation.report.pictures import (
     differences_figure,
     forest_figure,
@@ -27,6 +27,7 @@ from vap_core.evaluation.report.results import errors, results
 from vap_core.evaluation.report.runs import load_runs
 from vap_core.evaluation.statistics import ALL_TASKS, compare
 from vap_core.evaluation.store import append, open_run
+from vap_core.recording import recording_file_name
 from vap_core.simulation import suites
 
 BRIDGE = (("simpler-bridge", "pick-shaver"), ("simpler-bridge", "put-camera"))
@@ -332,6 +333,27 @@ def test_the_command_prints_what_it_writes(tmp_path: Path) -> None:
     assert refused.stderr.startswith("error: run: ")
 
 
+def test_a_failure_is_pictured_by_the_recording_of_its_own_policy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two runs of one suite and method, with different policies, name their files alike."""
+    name = recording_file_name("simpler-bridge", "put-camera", 3, 0, "vap")
+    sources = [tmp_path / run for run in ("a", "b", "damaged")]
+    for source in sources:
+        (source / "recordings").mkdir(parents=True)
+        (source / "recordings" / name).write_bytes(b"")
+
+    def summary(path: Path) -> dict[str, str]:
+        if "damaged" in path.parts:
+            raise BadRecording("damaged")
+        return {"policy": path.parts[-3]}
+
+    monkeypatch.setattr("vap_core.recording.read_summary", summary)
+    row = {"suite": "simpler-bridge", "task": "put-camera", "episode": 3, "seed": 0, "method": "vap"}  # fmt: skip
+    for policy, found in (("b", sources[1] / "recordings" / name), ("c", None)):
+        assert page._recording({**row, "policy": policy}, sources) == found
+
+
 def test_the_command_of_a_run_is_told() -> None:
     whole = [["simpler-bridge", task.name] for task in suites.suite("simpler-bridge").tasks]
     study = {
@@ -352,6 +374,10 @@ def test_the_command_of_a_run_is_told() -> None:
     assert (
         command_line({**study, "seeds": 1, "follow": "step", "images_every": 4})
         == f"{told} --follow step --images-every 4"
+    )
+    assert (
+        command_line({**study, "split": "visual matching", "temperature": 0.5})
+        == f"{told} --split 'visual matching' --temperature 0.5"
     )
     demo = [["widowx-pick", "pick-straw-cup"], ["franka-pick", "pick-cup"]]
     assert (

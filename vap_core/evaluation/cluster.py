@@ -124,8 +124,10 @@ def _run_remotely(
 ) -> "tuple[Rows, Files]":
     """Run one job on another machine, in a folder of its own.
 
-    Raises: BadCluster when that machine has other weights, lists or code.
+    Raises: BadCluster when that machine has other weights, lists or code; BadSuite when the file of
+        an own suite is not at the same path there.
     """
+    job.study.open_suites()
     configuration = job.study.configuration()
     if digest(configuration) != manifest["digest"]:
         raise BadCluster(

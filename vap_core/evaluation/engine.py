@@ -152,12 +152,12 @@ def _split(job: Job) -> list[Job]:
 
 
 def _open_run(study: Study, folder: Path, what_for: str) -> None:
-    """Begin the run in `folder`, and log what it will read; or go on with the one there."""
-    begins = not (folder / store.MANIFEST).exists()
+    """Begin the run in `folder`, or go on with the one there; log once what it reads."""
     configuration = study.configuration()
     store.open_run(folder, configuration)
-    if begins:
-        run_digest = store.digest(configuration)
+    run_digest = store.digest(configuration)
+    logged = {reading.run for reading in readings.read_log(readings.LOCAL)}
+    if run_digest not in logged:
         readings.append(readings.readings_of(configuration, run_digest, what_for), readings.LOCAL)
 
 

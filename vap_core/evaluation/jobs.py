@@ -105,7 +105,7 @@ def row_of_dead_worker(job: Job, why: str) -> dict[str, Any]:
     header = EpisodeHeader(
         row=row,
         method=job.method,
-        policy=job.study.policy,
+        policy=job.study.policy_label(row.suite),
         hz=suites.suite(row.suite).hz,
         cameras=(),
         instruction=row.instruction,

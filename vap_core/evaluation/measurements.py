@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import parse_json, read_file, write_atomic
+from vap_core.base.parquet import read_arrow
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -63,16 +64,17 @@ def add_rows(path: Path, table: "pd.DataFrame", key: list[str], about: dict[byte
 
     Kept rows that are equal to a new one in `key` are left out. The metadata hold, under the name
     in `about`, a list: what they held, and its value unless that is there.
+
+    Raises: BadOutput for a damaged table.
     """
     import pandas as pd
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     ((name, new),) = about.items()
     held: list[Any] = []
     whole = table
     if path.exists():
-        kept = pq.read_table(path)
+        kept = read_arrow(path, "publish", "restore it, or delete it and publish again")
         held = parse_json((kept.schema.metadata or {}).get(name, b"[]"))
         old = kept.to_pandas()
         replaced = pd.MultiIndex.from_frame(old[key]).isin(pd.MultiIndex.from_frame(table[key]))

@@ -23,7 +23,7 @@ from vap_core.evaluation.policy_names import MINI, POLICIES, PRIVILEGED, SHIPPED
 from vap_core.perception.embedded.weights import weights_sha256
 from vap_core.perception.stacks import check_stack
 from vap_core.policies.lerobot import checkpoints
-from vap_core.policies.names import check_policy_name
+from vap_core.policies.names import check_policy_name, label_of
 from vap_core.rollout.loop import Follow
 from vap_core.simulation import robots, suites
 from vap_core.simulation.assets.objects import get_object
@@ -93,6 +93,11 @@ class Study:
         if self.policy == MINI:
             return str(shipped(suite))
         return "" if self.policy in POLICIES else self.policy
+
+    def policy_label(self, suite: str) -> str:
+        """What the rows of a suite call the policy. Raises: BadPolicy."""
+        checkpoint = self.checkpoint(suite)
+        return label_of(checkpoint, self.temperature) if checkpoint else self.policy
 
     def any_method(self, holds: Callable[[str], bool]) -> bool:
         """Whether something holds for any of its methods."""

@@ -1,5 +1,7 @@
 """The names of policies, and where those that ship are."""
 
+from pathlib import Path
+
 from vap_core.base.errors import one_of
 from vap_core.base.files import SHIPPED as SHIPPED
 
@@ -9,8 +11,6 @@ POLICIES = ("scripted", "expert", "random")
 """Policies without weights; each is built for one scene."""
 PRIVILEGED = ("expert", "random")
 """Policies that read the simulator, or nothing at all: bounds, never results."""
-
-
 TEMPERATURE = ", temperature "
 """What follows a label where the policy's sampling noise was scaled, before the factor."""
 
@@ -18,6 +18,24 @@ TEMPERATURE = ", temperature "
 def policy_label(kind: str, name: str, digest: str) -> str:
     """What a run's rows call a lerobot checkpoint: its type, its folder's name, its fingerprint."""
     return f"{kind}:{name}@{digest[:8]}"
+
+
+def label_of(checkpoint: str | Path, temperature: float | None = None) -> str:
+    """The label of a checkpoint on this machine, with its own or another sampling noise.
+
+    Raises: BadPolicy.
+    """
+    from vap_core.policies.lerobot.checkpoints import (
+        config_field,
+        fingerprint,
+        local_folder,
+        locate,
+    )
+
+    folder = locate(checkpoint)
+    name = str(checkpoint) if local_folder(checkpoint) is None else folder.name
+    label = policy_label(config_field(folder, "type"), name, fingerprint(folder))
+    return label if temperature is None else f"{label}{TEMPERATURE}{temperature:g}"
 
 
 def checkpoint_of(label: str) -> str:

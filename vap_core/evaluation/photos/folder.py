@@ -85,6 +85,7 @@ def read_photo_set(folder: Path) -> PhotoSet:
         raise BadPhotoSet(f"eval-photos: {folder} is no folder; {FORM}.")
     photos = _read_references(folder)
     scenes = _read_scenes(folder, photos)
+    _refuse_unasked(folder, photos, scenes)
     named = set(photos)
     for scene in scenes:
         named |= set(scene.boxes)
@@ -98,6 +99,18 @@ def read_photo_set(folder: Path) -> PhotoSet:
         categories=categories,
         sha256=_sha256(folder),
     )
+
+
+def _refuse_unasked(folder: Path, photos: Mapping[str, Any], scenes: Iterable["Scene"]) -> None:
+    """Refuse a set in whose scenes no object with references is named, as where it is misspelt."""
+    shown: set[str] = set()
+    for scene in scenes:
+        shown |= set(scene.boxes)
+    if photos and shown.isdisjoint(photos):
+        raise BadPhotoSet(
+            f"eval-photos: {folder / SCENES_CSV} names {', '.join(sorted(shown)[:4])}, references "
+            f"are there of {', '.join(sorted(photos)[:4])}; name an object alike in both."
+        )
 
 
 def _read_references(folder: Path) -> dict[str, tuple[ReferencePhoto, ...]]:

@@ -6,6 +6,7 @@ Pictures are inside the page; links to recordings are relative to its folder.
 import base64
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from html import escape
 from io import BytesIO
 from pathlib import Path
@@ -109,7 +110,8 @@ def _failures(table: "pd.DataFrame", sources: Sequence[Path], out: Path) -> list
 
 
 def _recording(row: Mapping[str, Any], sources: Sequence[Path]) -> Path | None:
-    from vap_core.recording import recording_file_name
+    """The episode's recording; files of runs of other policies have the same name."""
+    from vap_core.recording import read_summary, recording_file_name
 
     name = recording_file_name(
         row["suite"], row["task"], int(row["episode"]), int(row["seed"]), row["method"]
@@ -117,7 +119,9 @@ def _recording(row: Mapping[str, Any], sources: Sequence[Path]) -> Path | None:
     for source in sources:
         path = Path(source) / "recordings" / name
         if path.is_file():
-            return path
+            with suppress(BadRecording):  # a damaged one is no picture
+                if read_summary(path).get("policy") == row["policy"]:
+                    return path
     return None
 
 

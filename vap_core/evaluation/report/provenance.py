@@ -70,7 +70,7 @@ def _are_whole_suites(tasks_by_suite: dict[str, list[str]]) -> bool:
 def _options(study: dict[str, Any], whole: bool) -> dict[str, Any]:
     """The options of a command and their settings, None where the default holds."""
     options = {}
-    for name in ("episodes", "seed", "policy", "stack", "robots", "object"):
+    for name in ("episodes", "seed", "policy", "stack", "robots", "object", "split", "temperature"):
         options[name] = study.get(name)
     if whole:
         options["seeds"] = None

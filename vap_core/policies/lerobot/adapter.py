@@ -32,12 +32,12 @@ from vap_core.policies.hooks import (
     report_input,
 )
 from vap_core.policies.lerobot.attention_hooks import can_watch, reporting_attention
-from vap_core.policies.lerobot.checkpoints import PIPELINES, fingerprint, local_folder, locate
+from vap_core.policies.lerobot.checkpoints import PIPELINES, locate
 from vap_core.policies.lerobot.loading import build
 from vap_core.policies.lerobot.module_hooks import overriding_tokens
 from vap_core.policies.lerobot.token_positions import positions
 from vap_core.policies.lerobot.traced import ChunkPredictor
-from vap_core.policies.names import TEMPERATURE, policy_label
+from vap_core.policies.names import label_of
 from vap_core.policies.protocol import Chunk, PolicyInput
 from vap_core.simulation.env import Env
 from vap_core.simulation.scenes import Scene
@@ -314,19 +314,19 @@ def load_policy(
     """
     folder = locate(checkpoint)
     policy, preprocessor, postprocessor = build(folder, device)
-    name = str(checkpoint) if local_folder(checkpoint) is None else folder.name
-    label = policy_label(policy.config.type, name, fingerprint(folder))
     if temperature is not None:
         config: Any = policy.config
         if not hasattr(config, "temperature"):
             raise BadPolicy(
-                f"load: {label} has no temperature; leave it out, or take a mini-pi0, whose "
+                f"load: {checkpoint} has no temperature; leave it out, or take a mini-pi0, whose "
                 "sampling noise is scaled by one."
             )
         config.temperature = temperature
-        label = f"{label}{TEMPERATURE}{temperature:g}"
     return LeRobot(
-        policy=policy, preprocessor=preprocessor, postprocessor=postprocessor, label=label
+        policy=policy,
+        preprocessor=preprocessor,
+        postprocessor=postprocessor,
+        label=label_of(checkpoint, temperature),
     )
 
 
