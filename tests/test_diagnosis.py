@@ -21,6 +21,7 @@ from vap_core.evaluation.report.failures import (
     funnel_table,
     sub_cases_text,
 )
+from vap_core.evaluation.report.funnel import funnel_figure
 from vap_core.evaluation.study import Study
 from vap_core.recording import Recorder, read_summary
 from vap_core.recording.index import FOLDER
@@ -100,6 +101,19 @@ def test_as_text_every_share_has_its_interval() -> None:
         sub_cases_text(breakdown(TABLE)).splitlines()[0]
         == "vlabench vap: 3 x case 2: views disagree, 1 x case 3: timeout"
     )
+
+
+def test_what_several_policies_did_is_not_added_up() -> None:
+    two = pd.concat([TABLE.assign(policy="a"), TABLE.assign(policy="b")], ignore_index=True)
+    counts = breakdown(two)
+    assert counts.method.tolist() == ["vap, a", "generic, a", "vap, b", "generic, b"]
+    assert counts.n.tolist() == [9, 2, 9, 2]
+    assert [line.method for line in funnel_table(two)] == counts.method.tolist()
+    alone = two[(two.policy == "a") | (two.method == "vap")]
+    assert breakdown(alone).method.tolist() == ["vap, a", "generic", "vap, b"]
+    lines = funnel_figure(funnel_table(two), {"vap": "red"}).legends[0].get_texts()
+    assert [line.get_text() for line in lines][:2] == ["vap, a", "vap, b"]
+    assert breakdown(TABLE.assign(policy="a")).equals(breakdown(TABLE))
 
 
 def test_the_road_narrows_and_ends_with_the_successes() -> None:

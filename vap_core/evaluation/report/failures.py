@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 BY = ["suite", "method"]
 """The columns that name a group of episodes here."""
+APART = ", "
+"""Between a method and a policy in the name of a group."""
 SUBGOAL = "subgoal"
 """The column of the sub-goal that was diagnosed, counted from 1, where there are several."""
 DIAGNOSIS_COLUMNS = ("case", "sub_case", "deciding_frame")
@@ -37,9 +39,10 @@ def breakdown(table: "pd.DataFrame") -> "pd.DataFrame":
     `n` episodes, `failed`, a column of counts for each case (`case 1`, ...) and sub-case
     (`case 1: drift`, ...), and `mean_confidence`. The cases of a row sum to `failed`; errors are in
     `n` alone. Where there are sub-goals, `sub-goal 1`, ... count the failures by the first that
-    failed.
+    failed. A method that ran with several policies on a suite has a row for each, and is named with
+    it.
     """
-    episodes = diagnosed(table)
+    episodes = _by_policy(diagnosed(table))
     if "case_confidence" not in episodes:  # no episode failed
         episodes = episodes.assign(case_confidence=float("nan"))
     flat = episodes[BY].assign(n=1, failed=episodes["outcome"].eq("failure").astype(int))
@@ -56,6 +59,15 @@ def breakdown(table: "pd.DataFrame") -> "pd.DataFrame":
     with_case = episodes[episodes["case"].ne("")].groupby(BY, sort=False)
     confidence = with_case["case_confidence"].mean().rename("mean_confidence").reset_index()
     return counts.merge(confidence, on=BY, how="left")
+
+
+def _by_policy(episodes: "pd.DataFrame") -> "pd.DataFrame":
+    """The methods that ran with several policies on one suite named "METHOD, POLICY"."""
+    if "policy" not in episodes:
+        return episodes
+    several = episodes.groupby(BY)["policy"].transform("nunique") > 1
+    named = episodes["method"] + APART + episodes["policy"]
+    return episodes.assign(method=episodes["method"].mask(several, named))
 
 
 def _subgoals(episodes: "pd.DataFrame") -> list[int]:
@@ -135,10 +147,11 @@ type FunnelTable = list[FunnelRow]
 def funnel_table(table: "pd.DataFrame") -> FunnelTable:
     """How many episodes are left after each stage.
 
-    An episode counts up to the first stage that it does not pass.
+    An episode counts up to the first stage that it does not pass. Methods that ran with several
+    policies are named as in `breakdown`.
     """
     rows = []
-    for (suite, method), part in diagnosed(table).groupby(BY, sort=False):
+    for (suite, method), part in _by_policy(diagnosed(table)).groupby(BY, sort=False):
         left: list[int | None] = []
         passing = part["outcome"].ne("error")
         for stage in STAGES:
