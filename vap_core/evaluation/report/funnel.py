@@ -40,9 +40,9 @@ def funnel_figure(
 ) -> "Figure":
     """Per suite, the share of episodes that are left after each stage of the funnel.
 
-    A line per method of `colours` and policy, methods that read the simulator dashed. A method that highlights
-    nothing begins with the stage "touched". The last tick has two marks: a dot for episodes that
-    succeed with every stage right, a diamond for all that succeed (SR).
+    A line per method of `colours` and policy, methods that read the simulator dashed. A method that
+    highlights nothing begins with the stage "touched". The last tick has two marks: a dot for
+    episodes that succeed with every stage right, a diamond for all that succeed (SR).
     """
     by_suite: dict[str, list[FunnelRow]] = {}
     for row in rows:
@@ -165,9 +165,8 @@ def _plain(row: FunnelRow) -> str:
 def _first_on_top(counts: "pd.DataFrame", first: str) -> "pd.DataFrame":
     """The lines suite by suite, that of the method `first` before the others."""
     suites = list(dict.fromkeys(counts["suite"]))
-    rank = counts["suite"].map(suites.index) + 0.5 * (
-        counts["method"].str.partition(APART)[0] != first
-    )
+    others = counts["method"].str.partition(APART)[0] != first
+    rank = counts["suite"].map(suites.index) + 0.5 * others
     return counts.assign(rank=rank).sort_values("rank", kind="stable").reset_index(drop=True)
 
 
