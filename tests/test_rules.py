@@ -267,6 +267,15 @@ def test_wrong_object_is_three_centimetres_of_another_or_a_touch_when_selecting(
     assert not judged(SELECT, truth(touched=(TARGET,))).outcome().wrong_object
 
 
+def test_what_lies_in_the_goal_already_rides_along_and_is_moved_when_it_is_taken_out():
+    episode = replace(PUT, inside=(OTHER,))
+    together = truth(at={name: (WHERE[name][0] + 0.04, WHERE[name][1]) for name in (GOAL, OTHER)})
+    assert not judged(episode, together).outcome().wrong_object
+    assert judged(PUT, together).outcome().wrong_object
+    assert judged(episode, moved(OTHER, 0.04)).outcome().wrong_object
+    assert not judged(episode, moved(OTHER, 0.02)).outcome().wrong_object
+
+
 def test_first_object_is_the_first_touched_or_moved():
     assert (
         judged(PICK, truth(touched=(TARGET,)), truth(touched=(OTHER,)))

@@ -12,7 +12,7 @@ upright, its middle above the receptacle's foot, its underside no more than 2 cm
 touching the receptacle and besides it at most the robot, and what an earlier sub-goal put there.
 *Selected*: pressed by the gripper for more than 10 ms, no other object touched by the robot before.
 The goal of a task is no object to be confused with: touching or moving it is neither right nor
-wrong.
+wrong, and what an earlier sub-goal put into it moves when it moves within it.
 *CMR* (P 5.1): the target moved more than 3 cm from where it settled, at least once, whatever the
 outcome; undefined for selection.
 """
@@ -91,7 +91,7 @@ class Judge:
         target = self.row.target
         moved = set(self.moved)
         for name in self.start_world:
-            if self.travel_m(name, truth) > MOVED_M:
+            if self._strayed_m(name, truth) > MOVED_M:
                 moved.add(name)
         order = list(self.order)
         for name in (*truth.touched, *sorted(moved)):
@@ -119,6 +119,18 @@ class Judge:
         """How far the middle of an object is from where it settled: toppling is moving."""
         start = _middle(self.start_world[name], self.sizes_m[name])
         return math.dist(_middle_of(self, truth or self.now, name), start)
+
+    def _strayed_m(self, name: str, truth: Truth) -> float:
+        """`travel_m`; of what lies in the goal already, within it: it rides along."""
+        if name not in self.row.inside:
+            return self.travel_m(name, truth)
+        ridden = []
+        for poses in (self.start_world, truth.objects_world):
+            middle, carrier = (
+                _middle(poses[one], self.sizes_m[one]) for one in (name, self.row.goal)
+            )
+            ridden.append([a - b for a, b in zip(middle, carrier, strict=True)])
+        return math.dist(*ridden)
 
     @property
     def over(self) -> bool:
