@@ -120,6 +120,22 @@ def test_what_more_steps_on_the_same_scenes_reach() -> None:
     assert f"generic {generic} and {generic_elsewhere} %." in PROSE
 
 
+def test_what_more_scenes_reach() -> None:
+    played = pd.concat([episodes for _, episodes in read_runs(RESULTS / "more_scenes.parquet")])
+    assert set(played.outcome) <= {"success", "failure"}
+    listed, others = played[played.seed == 0], played[played.seed > 0]
+    assert (len(listed), len(others)) == (2 * 96, 2 * 192)
+    vap, elsewhere = _of_way(listed, "vap"), _of_way(others, "vap")
+    generic, generic_elsewhere = _of_way(listed, "generic"), _of_way(others, "generic")
+    assert f"it reaches {vap} % with VAP as listed" in PROSE
+    assert f"and {elsewhere} % from other starts (192" in PROSE
+    assert f"generic {generic} and {generic_elsewhere} %. The loss" in PROSE
+    assert (
+        f"has {vap} % with VAP as listed and {elsewhere} % from other starts, generic {generic} and "
+        f"{generic_elsewhere} %"
+    ) in PROSE
+
+
 def _of_way(told: pd.DataFrame, way: str) -> str:
     won = told[told.method == way].success
     return _percent(rate(int(won.sum()), len(won))) if len(won) else ""

@@ -24,6 +24,7 @@ BY_TODAYS_RECIPE = {
     "simpler-bridge-tint-share-0.1": (0.1, 0.04),
     "simpler-bridge-tint-share-0.2": (0.2, 0.04),
     "simpler-bridge-tint-share-0.5": (0.5, 0.04),
+    "simpler-bridge-wide": (0.2, 0.02),
 }
 """Policies that grew from the model that never saw a tint: the share of their scenes that were tinted, and the noise (rad) on the arm's angles."""
 
