@@ -129,7 +129,7 @@ def test_what_more_scenes_reach() -> None:
     generic, generic_elsewhere = _of_way(listed, "generic"), _of_way(others, "generic")
     assert f"it reaches {vap} % with VAP as listed" in PROSE
     assert f"and {elsewhere} % from other starts (192" in PROSE
-    assert f"generic {generic} and {generic_elsewhere} %. The loss" in PROSE
+    assert f"generic {generic} and {generic_elsewhere} %. The paper" in PROSE
     assert (
         f"has {vap} % with VAP as listed and {elsewhere} % from other starts, generic {generic} and "
         f"{generic_elsewhere} %"
