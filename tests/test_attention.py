@@ -37,7 +37,7 @@ from vap_core.recording import Recorder
 from vap_core.recording.entities.attention import attention_overlay
 from vap_core.rollout.loop import rollout
 from vap_core.rollout.queries import QUERIES, named_queries, only_queries
-from vap_core.rollout.types import EpisodeHeader
+from vap_core.rollout.types import Episode, EpisodeHeader
 from vap_core.simulation.types import Outcome
 
 CAMERAS = ("front", "side")

@@ -49,6 +49,7 @@ def test_a_run_whose_reading_could_not_be_logged_is_logged_by_its_next_start(
     study = Study(TASKS, ("generic",), episodes=6)
     with pytest.raises(BadOutput, match="restore it, or delete it to begin anew"):
         _open_run(study, tmp_path / "run", "a look")
+    _open_run(Study((("widowx-pick", "pick-cup"),), ("generic",)), tmp_path / "no list", "")
     logs[0].unlink()
     _open_run(study, tmp_path / "run", "a look")
     assert [line.what_for for line in read_log(logs[0])] == ["a look"]

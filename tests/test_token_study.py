@@ -33,6 +33,7 @@ from vap_core.policies.mini_pi0 import learned_token, teach_token, token_alignme
 from vap_core.policies.mini_pi0.learned_token import TokenTraining
 from vap_core.policies.mini_pi0.vlm import load_from_policy, load_vlm
 from vap_core.policies.token_groups import token_groups
+from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import ObjectModel
 from vap_core.training.words import vocabulary
 

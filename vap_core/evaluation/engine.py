@@ -156,9 +156,9 @@ def _open_run(study: Study, folder: Path, what_for: str) -> None:
     configuration = study.configuration()
     store.open_run(folder, configuration)
     run_digest = store.digest(configuration)
-    logged = {reading.run for reading in readings.read_log(readings.LOCAL)}
-    if run_digest not in logged:
-        readings.append(readings.readings_of(configuration, run_digest, what_for), readings.LOCAL)
+    reads = readings.readings_of(configuration, run_digest, what_for)
+    if reads and run_digest not in {line.run for line in readings.read_log(readings.LOCAL)}:
+        readings.append(reads, readings.LOCAL)
 
 
 def missing_jobs(
