@@ -109,24 +109,14 @@ def test_what_policies_of_other_tint_shares_reach() -> None:
 
 
 def test_what_more_steps_on_the_same_scenes_reach() -> None:
-    played = pd.concat([episodes for _, episodes in read_runs(RESULTS / "more_steps.parquet")])
-    assert set(played.outcome) <= {"success", "failure"}
-    listed, others = played[played.seed == 0], played[played.seed > 0]
-    assert (len(listed), len(others)) == (4 * 96, 2 * 192)
-    vap, elsewhere = _of_way(listed, "vap"), _of_way(others, "vap")
-    generic, generic_elsewhere = _of_way(listed, "generic"), _of_way(others, "generic")
+    (vap, elsewhere), (generic, generic_elsewhere) = _starts("more_steps", listed=4 * 96)
     assert f"reaches {vap} % with VAP on simpler-bridge" in PROSE
     assert f"and {elsewhere} % from other starts" in PROSE
     assert f"generic {generic} and {generic_elsewhere} %." in PROSE
 
 
 def test_what_more_scenes_reach() -> None:
-    played = pd.concat([episodes for _, episodes in read_runs(RESULTS / "more_scenes.parquet")])
-    assert set(played.outcome) <= {"success", "failure"}
-    listed, others = played[played.seed == 0], played[played.seed > 0]
-    assert (len(listed), len(others)) == (2 * 96, 2 * 192)
-    vap, elsewhere = _of_way(listed, "vap"), _of_way(others, "vap")
-    generic, generic_elsewhere = _of_way(listed, "generic"), _of_way(others, "generic")
+    (vap, elsewhere), (generic, generic_elsewhere) = _starts("more_scenes", listed=2 * 96)
     assert f"it reaches {vap} % with VAP as listed" in PROSE
     assert f"and {elsewhere} % from other starts (192" in PROSE
     assert f"generic {generic} and {generic_elsewhere} %. The paper" in PROSE
@@ -134,6 +124,15 @@ def test_what_more_scenes_reach() -> None:
         f"has {vap} % with VAP as listed and {elsewhere} % from other starts, generic {generic} and "
         f"{generic_elsewhere} %"
     ) in PROSE
+
+
+def _starts(name: str, listed: int) -> list[tuple[str, str]]:
+    """Of VAP and of generic: what it reaches as listed, and from other starts."""
+    played = pd.concat([episodes for _, episodes in read_runs(RESULTS / f"{name}.parquet")])
+    assert set(played.outcome) <= {"success", "failure"}
+    at_home, others = played[played.seed == 0], played[played.seed > 0]
+    assert (len(at_home), len(others)) == (listed, 2 * 192)
+    return [(_of_way(at_home, way), _of_way(others, way)) for way in ("vap", "generic")]
 
 
 def _of_way(told: pd.DataFrame, way: str) -> str:

@@ -53,7 +53,7 @@ def funnel_figure(
     panels = figure.subplots(lines, columns, squeeze=False, sharey=True).ravel()
     drawn: dict[str, Line2D] = {}
     for axes, (suite, of_suite) in zip(panels, by_suite.items(), strict=False):
-        shown = [row for row in of_suite if _plain(row) in colours]
+        shown = [row for row in of_suite if _plain(row.method) in colours]
         drawn |= _draw_funnel(axes, shown, colours)
         axes.set_xticks(range(len(STAGES)), STAGES, fontsize=8, rotation=20)
         axes.set_xlim(-0.25, len(STAGES) - 0.4)
@@ -124,7 +124,7 @@ def _draw_funnel(
             if left is not None:
                 stages.append(i)
                 percent.append(100 * left / row.n)
-        colour = colours[_plain(row)]
+        colour = colours[_plain(row.method)]
         (drawn[row.method],) = axes.plot(
             stages,
             percent,
@@ -157,15 +157,15 @@ def _draw_funnel(
     return drawn
 
 
-def _plain(row: FunnelRow) -> str:
-    """The method of a row, without its policy."""
-    return row.method.partition(APART)[0]
+def _plain(method: str) -> str:
+    """The method without its policy."""
+    return method.partition(APART)[0]
 
 
 def _first_on_top(counts: "pd.DataFrame", first: str) -> "pd.DataFrame":
     """The lines suite by suite, that of the method `first` before the others."""
     suites = list(dict.fromkeys(counts["suite"]))
-    others = counts["method"].str.partition(APART)[0] != first
+    others = counts["method"].map(_plain) != first
     rank = counts["suite"].map(suites.index) + 0.5 * others
     return counts.assign(rank=rank).sort_values("rank", kind="stable").reset_index(drop=True)
 
@@ -188,7 +188,7 @@ def _name_bars(axes: "Axes", lines: "pd.DataFrame", places: Sequence[float], fir
     axes.tick_params(axis="y", length=0)
     headed: set[str] = set()
     for place, label, line in zip(places, axes.get_yticklabels(), lines.itertuples(), strict=True):
-        label.set_fontweight("bold" if line.method.partition(APART)[0] == first else "normal")
+        label.set_fontweight("bold" if _plain(line.method) == first else "normal")
         if line.suite not in headed:
             headed.add(line.suite)
             axes.text(0, place - 0.85, line.suite, fontsize=9, fontweight="bold", va="center")

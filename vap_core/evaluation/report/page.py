@@ -95,8 +95,10 @@ def _failures(table: "pd.DataFrame", sources: Sequence[Path], out: Path) -> list
     parts = [f"<h2>Failures ({len(rows)})</h2>"]
     pictured: list[str] = []
     for row in rows:
+        if len(pictured) == MOST_FAILURES:
+            break
         recording = _recording(row, sources)
-        if recording is not None and len(pictured) < MOST_FAILURES:
+        if recording is not None:
             pictured.append(_card(row, recording, out))
     if pictured:
         parts.append(f"<div class='failures'>{''.join(pictured)}</div>")
