@@ -45,7 +45,7 @@ def known(films: list[Film]) -> Known:
     return Known({name: Description("white", "a tall camera, mostly white") for name in names})
 
 
-def test_a_training_that_was_stopped_ends_like_one_that_was_not(
+def test_a_training_that_was_stopped_ends_like_one_that_was_not_in_more_processes_too(
     stage: tuple[Path, list[Film]],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -56,9 +56,9 @@ def test_a_training_that_was_stopped_ends_like_one_that_was_not(
     recipe = replace(TINY, stages=2, steps=3, batch=3, draws=2)
     cache = folder.parent
     whole = policy.train(recipe, tmp_path / "whole", cache=cache, jobs=1)
-    first = policy.train(recipe, tmp_path / "torn", cache=cache, minutes=0.0)
+    first = policy.train(recipe, tmp_path / "torn", cache=cache, minutes=0.0, jobs=2)
     assert [line["step"] for line in first["log"]] == [1]
-    policy.train(recipe, tmp_path / "torn", cache=cache)
+    policy.train(recipe, tmp_path / "torn", cache=cache, jobs=2)
     one, other = (load_file(tmp_path / name / "model.safetensors") for name in ("whole", "torn"))
     assert one.keys() == other.keys()
     assert all(torch.equal(one[name], other[name]) for name in one)
@@ -102,7 +102,7 @@ def vlm_inputs(
         for t in range(0, len(film.action), 6)
     ]
     monkeypatch.setattr(vlm, "views", lambda *args, **kwargs: (pool, 36.0))
-    monkeypatch.setattr(vlm, "captions", lambda names, file: (known(films).captions, 0.0))
+    monkeypatch.setattr(vlm, "captions", lambda names, file, jobs: (known(films).captions, 0.0))
     recipe = vlm.Recipe(
         stages=1,
         steps=3,
@@ -123,7 +123,7 @@ def test_a_vision_language_model_learns_and_resumes(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     _, recipe = vlm_inputs(stage, monkeypatch)
-    whole = vlm.train(recipe, tmp_path / "whole")
+    whole = vlm.train(recipe, tmp_path / "whole", jobs=1)
     vlm.train(recipe, tmp_path / "torn", minutes=0.0)
     vlm.train(recipe, tmp_path / "torn")
     one, other = (load_vlm(tmp_path / name).sha256() for name in ("whole", "torn"))
@@ -133,7 +133,8 @@ def test_a_vision_language_model_learns_and_resumes(
     monkeypatch.setattr(taught, "TRAINING", TokenTraining(epochs=1, augmentations=1))
     monkeypatch.setattr(taught, "LEAST_ACCURACY", 0.0)
     grown = replace(TINY, stages=1, steps=4, batch=4, draws=1, taught=1, learned=1.0)
-    about = policy.train(grown, tmp_path / "policy", vlm=tmp_path / "whole", cache=stage[0].parent)
+    options = {"cache": stage[0].parent, "jobs": 1}
+    about = policy.train(grown, tmp_path / "policy", vlm=tmp_path / "whole", **options)
     shown = capsys.readouterr().err
     assert "descriptions: 100%" in shown
     assert "learned words: 100%" in shown
@@ -144,7 +145,7 @@ def test_a_vision_language_model_learns_and_resumes(
     words = losses.embeddings(trained)
     taught_in = load_vlm(tmp_path / "whole").towers.paligemma.model.language_model
     assert torch.equal(words, taught_in.embed_tokens.weight), "words keep their meaning"
-    begun = policy.train(replace(grown, steps=1), tmp_path / "begun", cache=stage[0].parent)
+    begun = policy.train(replace(grown, steps=1), tmp_path / "begun", **options)
     assert about["taught"]
     assert not begun["taught"], "without a model there is nothing to learn a word in"
 
@@ -162,7 +163,7 @@ def test_a_training_goes_on_from_another_policys_weights(
 
     def train(out: str, vlm: str, **changes: object) -> dict[str, object]:
         recipe = replace(short, **changes)
-        return policy.train(recipe, tmp_path / out, vlm=tmp_path / vlm, cache=folder.parent)
+        return policy.train(recipe, tmp_path / out, vlm=tmp_path / vlm, cache=folder.parent, jobs=1)
 
     train("first", "grown-from", rate=1.0)
     about = train("second", "grown-from", start=str(tmp_path / "first"), rate=0.0)
@@ -198,7 +199,7 @@ def test_a_training_that_is_ended_again_and_again_ends_like_one_that_was_not(
             load_file(torn / "model.safetensors")
 
     def train(out: Path) -> dict[str, object]:
-        return policy.train(recipe, out, cache=folder.parent, every=1)
+        return policy.train(recipe, out, cache=folder.parent, every=1, jobs=1)
 
     about = train(whole)
     ends = die_before_each_rename(lambda: train(torn), weights_are_absent_or_whole)

@@ -147,6 +147,17 @@ def policy(
     steps: Annotated[
         int | None, typer.Option(min=1, help="Optimiser steps. Default the recipe's.")
     ] = None,
+    batch: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Frames a step. Default the recipe's; a GPU takes more in the same time.",
+        ),
+    ] = None,
+    rate: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="The highest learning rate. Default the recipe's."),
+    ] = None,
     vlm: Annotated[
         Path | None,
         typer.Option(
@@ -174,7 +185,18 @@ def policy(
         typer.Option(help="Folder of rendered films and scenes. Default data/cache."),
     ] = None,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Processes that render. Default one a core.")
+        int | None,
+        typer.Option(
+            min=1,
+            help="Processes that render, teach words and draw batches. Default one a core.",
+        ),
+    ] = None,
+    device: Annotated[
+        str | None,
+        typer.Option(
+            help="Where the policy's steps run: cpu or cuda; default VAP_DEVICE, or a GPU where "
+            "there is one."
+        ),
     ] = None,
     minutes: Annotated[
         float | None,
@@ -186,6 +208,8 @@ def policy(
 
     Example: python -m vap_core train policy --suite simpler-bridge --stages 40 --steps 500
         --out data/runs/small-policy
+    Example: python -m vap_core train policy --suite simpler-fractal --stages 320 --steps 5100
+        --batch 128 --rate 0.0014 --device cuda
     """
     from dataclasses import replace
 
@@ -206,6 +230,8 @@ def policy(
         angle_noise_rad=standard.angle_noise_rad if angle_noise is None else angle_noise,
         stages=stages or standard.stages,
         steps=steps or standard.steps,
+        batch=batch or standard.batch,
+        rate=standard.rate if rate is None else rate,
         start=standard.start if start is None else str(start),
     )
     rendered = cache or CACHE
@@ -220,6 +246,7 @@ def policy(
         minutes=minutes,
         cache=rendered,
         jobs=jobs,
+        device=device,
     )
     print(json.dumps(about["held_out"], indent=1))
     print(f"CPU hours: {json.dumps(about['cpu_hours'])}")

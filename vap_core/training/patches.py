@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor, nn
 
 from vap_core.training.films.demonstrations import SIDE
@@ -57,7 +56,7 @@ def patch_loss(scores: Tensor, patches: Tensor) -> tuple[Tensor, Tensor]:
     if shown.any():
         loss = -(target * scores.log_softmax(-1)).sum(1)[shown].mean()
     else:
-        loss = torch.zeros(())
+        loss = scores.new_zeros(())
     best = scores.argmax(1, keepdim=True)
     hits = patches.gather(1, best).squeeze(1) > 0
     return loss, hits[shown].float().mean()

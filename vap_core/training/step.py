@@ -37,13 +37,18 @@ class Schedule:
 
 
 def train_steps[M: nn.Module](
-    model: M, losses: Callable[[M, int], tuple[Tensor, Figures]], run: Schedule, out: Path
+    model: M,
+    losses: Callable[[M, int], tuple[Tensor, Figures]],
+    run: Schedule,
+    out: Path,
+    helpers_cpu_s: Callable[[], float] = float,
 ) -> tuple[M, list[Any]]:
     """Train `model`, or go on where an earlier call stopped.
 
     The rate warms up over WARM steps and then falls with a cosine; gradients are clipped. Returns
     the moving average of the weights, and the log, whose `cpu_s` are the CPU seconds until then.
-    `losses` gives the loss of one step, drawn from streams of its number, and figures to log.
+    `losses` gives the loss of one step, drawn from streams of its number, and figures to log;
+    `helpers_cpu_s`, the CPU seconds of other processes since this call began.
 
     Raises: BadOutput when `out` holds another training.
     """
@@ -79,7 +84,7 @@ def train_steps[M: nn.Module](
         recent.append(figures)
         last = step + 1 == run.steps or _is_time_up(run, started)
         if last or (step + 1) % run.every == 0:
-            cpu_s = earlier_cpu_s + time.process_time() - started_cpu
+            cpu_s = earlier_cpu_s + time.process_time() - started_cpu + helpers_cpu_s()
             log.append({"step": step + 1, "cpu_s": cpu_s, **average_of(recent)})
             recent = []
             saved: dict[str, Any] = {"step": step + 1, "log": log, "made_of": made_of}

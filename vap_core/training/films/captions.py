@@ -16,6 +16,7 @@ import numpy as np
 
 from vap_core.base.files import parse_json, write_atomic
 from vap_core.base.types import Boxes, Description, Mask, Rgb
+from vap_core.evaluation.processes import results_here
 from vap_core.perception.attributes import CropAttributes, measure_crop
 from vap_core.perception.boxes import crop
 from vap_core.perception.describe import phrase_attributes
@@ -33,10 +34,13 @@ AT_ONCE = 16
 """Objects that are photographed, and then kept, at a time."""
 
 
-def captions(names: Iterable[str], file: Path) -> tuple[dict[str, Description], float]:
+def captions(
+    names: Iterable[str], file: Path, jobs: int = 1
+) -> tuple[dict[str, Description], float]:
     """The descriptions of generic objects, and the CPU seconds that they took.
 
-    Those that `file` lacks are made and kept there, so that an earlier call goes on.
+    Those that `file` lacks are made, in `jobs` processes, and kept there, so that an earlier call
+    goes on.
     """
     from tqdm import tqdm
 
@@ -44,13 +48,11 @@ def captions(names: Iterable[str], file: Path) -> tuple[dict[str, Description], 
     if file.exists():
         kept = parse_json(file.read_bytes())
     missing = sorted(set(names) - set(kept["captions"]))
-    for first in tqdm(range(0, len(missing), AT_ONCE), desc="descriptions", mininterval=10):
-        started = time.process_time()
-        models = [get_object(name) for name in missing[first : first + AT_ONCE]]
-        only_generic(models)
-        for name, described in describe(models).items():
-            kept["captions"][name] = (described.short, described.long)
-        kept["cpu_s"] += time.process_time() - started
+    batches = [tuple(missing[i : i + AT_ONCE]) for i in range(0, len(missing), AT_ONCE)]
+    work = results_here(_describe_some, batches, workers=jobs, remedy="jobs")
+    for _, (made, cpu_s) in tqdm(work, desc="descriptions", total=len(batches), mininterval=10):
+        kept["captions"].update(made)
+        kept["cpu_s"] += cpu_s
         file.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(file, json.dumps(kept, indent=0).encode())
     found = {}
@@ -80,6 +82,17 @@ def distinguishes(described: Mapping[str, Description], names: Sequence[str], le
     """
     clauses = [set(CLAUSES.split(getattr(described[name], length))) for name in names]
     return all(clauses[0] - others for others in clauses[1:])
+
+
+def _describe_some(names: Sequence[str]) -> tuple[dict[str, tuple[str, str]], float]:
+    """The short and long descriptions of objects, and the CPU seconds that they took."""
+    started = time.process_time()
+    models = [get_object(name) for name in names]
+    only_generic(models)
+    made = {}
+    for name, described in describe(models).items():
+        made[name] = (described.short, described.long)
+    return made, time.process_time() - started
 
 
 def _measure(rgb: Rgb, mask: Mask) -> CropAttributes:

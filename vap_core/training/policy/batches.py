@@ -5,11 +5,11 @@ there.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, UInt8
 from torch import Tensor
 
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
@@ -48,8 +48,8 @@ STEADY = 0.01
 class Batch:
     """Tensors of one step.
 
-    Pictures (b x c x 3 x s x s in 0..1), tokens and where there are any, scaled state and chunk; of
-    target and goal, the share of either in every patch (b x 2 x p) and its place (b x 2 x 3,
+    Pictures (b x c x 3 x s x s, 0 to 255), tokens and where there are any, scaled state and chunk;
+    of target and goal, the share of either in every patch (b x 2 x p) and its place (b x 2 x 3,
     metres, nan without a goal); how the hand will close on the target (b x 2, `turn`); embeddings
     of learned words (b x d, zeros where the command has none).
     """
@@ -63,6 +63,11 @@ class Batch:
     place: Tensor
     turn: Tensor
     learned: Tensor
+
+    def to(self, device: torch.device) -> "Batch":
+        """The same batch on a device."""
+        moved = {part.name: getattr(self, part.name).to(device) for part in fields(self)}
+        return Batch(**moved)
 
 
 class Frames:
@@ -284,10 +289,10 @@ class _Sample:
     turn: tuple[float, float]
 
 
-def _stack_images(commands: Sequence[Command]) -> Float[Tensor, "b c 3 s s"]:
-    """Views as a policy takes them, in 0..1."""
+def _stack_images(commands: Sequence[Command]) -> UInt8[Tensor, "b c 3 s s"]:
+    """Views, the colours before rows and columns."""
     views = np.stack([each.images for each in commands])
-    return torch.from_numpy(views).permute(0, 1, 4, 2, 3).float() / 255
+    return torch.from_numpy(views).permute(0, 1, 4, 2, 3)
 
 
 def _stack_learned(commands: Sequence[Command], width: int) -> Float[Tensor, "b d"]:

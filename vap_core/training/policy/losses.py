@@ -72,7 +72,7 @@ class Questions(nn.Module):
             guess = self.turn(seen[closes])
             answers["turn"] = F.smooth_l1_loss(guess, batch.turn[closes])
         else:
-            answers["turn"] = torch.zeros(())
+            answers["turn"] = hidden.new_zeros(())
         for name, answer in goal_answers.items():
             answers[f"goal_{name}"] = answer
         return answers
@@ -92,9 +92,9 @@ class Questions(nn.Module):
             place = batch.place[there, i]
             where = F.smooth_l1_loss(guess[there] * 0.1, place, beta=CLOSE_M) / 0.02
         else:
-            heat = torch.zeros(())
-            where = torch.zeros(())
-            hit = torch.tensor(torch.nan)
+            heat = hidden.new_zeros(())
+            where = hidden.new_zeros(())
+            hit = hidden.new_tensor(torch.nan)
         return {"heat": heat, "where": where, "hit": hit}, seen
 
 
@@ -173,7 +173,7 @@ def _look(policy: MiniPI0Policy, batch: Batch) -> tuple[list[Tensor], Tensor, An
     model = policy.model
     views = {}
     for i, name in enumerate(policy.config.image_features):
-        views[name] = batch.images[:, i]
+        views[name] = batch.images[:, i].float() / 255
     images, there = policy._preprocess_images(views)
     decoder = model.paligemma_with_expert.paligemma.model.language_model
     with _speaking_learned_words(policy, batch):
@@ -227,16 +227,24 @@ def _flow_loss(
     draws: int,
     generator: torch.Generator,
 ) -> Tensor:
-    """The mean error of the flow over `draws` noises and times."""
-    flow = torch.zeros(())
+    """The mean error of the flow over `draws` noises and times, all of them in one pass."""
+    noises = []
+    times = []
     for _ in range(draws):
-        noise = torch.randn(batch.actions.shape, generator=generator)
-        times = _times(len(noise), policy.config, generator)
-        share = times[:, None, None]
-        noisy = share * noise + (1 - share) * batch.actions
-        velocity = policy.model.denoise_step(batch.state, pad, cache, noisy, times)
-        flow = flow + F.mse_loss(velocity, noise - batch.actions) / draws
-    return flow
+        noises.append(torch.randn(batch.actions.shape, generator=generator))
+        times.append(_times(len(batch.actions), policy.config, generator))
+    # Drawn on the CPU: the same noise on every device. The draws of a row follow each other.
+    device = batch.actions.device
+    noise = torch.stack(noises, 1).flatten(0, 1).to(device)
+    time = torch.stack(times, 1).flatten(0, 1).to(device)
+    cache.batch_repeat_interleave(draws)
+    state, seen, actions = (
+        part.repeat_interleave(draws, 0) for part in (batch.state, pad, batch.actions)
+    )
+    share = time[:, None, None]
+    noisy = share * noise + (1 - share) * actions
+    velocity = policy.model.denoise_step(state, seen, cache, noisy, time)
+    return F.mse_loss(velocity, noise - actions)
 
 
 def _times(n: int, config: MiniPI0Config, generator: torch.Generator) -> Float[Tensor, " n"]:

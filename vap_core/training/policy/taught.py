@@ -7,7 +7,7 @@ Each is learned in the frozen model that the policy is initialised from, as a so
 import json
 import time
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,10 @@ import numpy as np
 
 from vap_core.base.files import parse_json, write_atomic
 from vap_core.base.types import Rgb
+from vap_core.evaluation.processes import results_here
 from vap_core.policies.mini_pi0 import learned_token, token_file
 from vap_core.policies.mini_pi0.learned_token import Photos, TokenTraining
-from vap_core.policies.mini_pi0.vlm import MiniVlm
+from vap_core.policies.mini_pi0.vlm import load_vlm
 from vap_core.simulation.assets import objects
 from vap_core.simulation.studio import photograph, reference_shots
 from vap_core.training.films.demonstrations import Film
@@ -50,11 +51,12 @@ def crews(films: Sequence[Film], count: int) -> list[tuple[str, ...]]:
 
 
 def learn_words(
-    vlm: MiniVlm, films: Sequence[Film], count: int, folder: Path
+    vlm: Path, films: Sequence[Film], count: int, folder: Path, jobs: int = 1
 ) -> tuple[dict[str, Embedding], dict[str, Any]]:
     """The usable words of about `count` objects of the films, and what learning them took.
 
-    `folder` keeps them; an earlier call goes on.
+    They are learned in `jobs` processes, in the mini-PaliGemma of the folder `vlm`. `folder` keeps
+    them; an earlier call goes on.
     """
     from tqdm import tqdm
 
@@ -62,21 +64,40 @@ def learn_words(
     kept: dict[str, Any] = {"cpu_s": 0.0, "accuracy": {}}
     if file.exists():
         kept = parse_json(file.read_bytes())
-    model = vlm.sha256()
+    crew_of: dict[str, tuple[str, ...]] = {}
+    for crew in crews(films, count):
+        for name in crew:
+            crew_of.setdefault(name, crew)
+    missing = [pair for pair in crew_of.items() if pair[0] not in kept["accuracy"]]
+    work = results_here(
+        partial(_learn, vlm, folder, TRAINING), missing, workers=jobs, remedy="jobs"
+    )
+    for (name, _), (accuracy, cpu_s) in tqdm(
+        work, desc="learned words", total=len(missing), mininterval=10
+    ):
+        kept["accuracy"][name] = accuracy
+        kept["cpu_s"] += cpu_s
+        write_atomic(file, json.dumps(kept, indent=1).encode())
+    # In the films' order, whichever was learned first.
+    kept["accuracy"] = {name: kept["accuracy"][name] for name in crew_of}
+    model = load_vlm(vlm).sha256()
     words = {}
-    pairs = [(name, crew) for crew in crews(films, count) for name in crew]
-    for name, crew in tqdm(pairs, desc="learned words", mininterval=10):
-        if name not in kept["accuracy"]:
-            started = time.process_time()
-            taught, unseen = (_photos(name, crew, seed) for seed in (0, 1))
-            token = learned_token.learn(vlm, name, taught, unseen, TRAINING)
-            token_file.save(folder, token)
-            kept["accuracy"][name] = token.accuracy
-            kept["cpu_s"] += time.process_time() - started
-            write_atomic(file, json.dumps(kept, indent=1).encode())
-        if kept["accuracy"][name] >= LEAST_ACCURACY:
+    for name, accuracy in kept["accuracy"].items():
+        if accuracy >= LEAST_ACCURACY:
             words[name] = token_file.load(folder, name, model).embedding
     return words, kept
+
+
+def _learn(
+    vlm: Path, folder: Path, training: TokenTraining, pair: tuple[str, Sequence[str]]
+) -> tuple[float, float]:
+    """Learn the word of an object with a crew; its accuracy, and the CPU seconds that it took."""
+    started = time.process_time()
+    name, crew = pair
+    taught, unseen = (_photos(name, crew, seed) for seed in (0, 1))
+    token = learned_token.learn(load_vlm(vlm), name, taught, unseen, training)
+    token_file.save(folder, token)
+    return token.accuracy, time.process_time() - started
 
 
 def _photos(name: str, crew: Sequence[str], seed: int) -> Photos:

@@ -20,6 +20,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
+from vap_core.base.device import device_name
 from vap_core.base.errors import BadOutput, BadPolicy, first_line
 from vap_core.base.files import parse_json, sha256_of, write_atomic
 from vap_core.base.version import code_version
@@ -35,6 +36,7 @@ from vap_core.training.films.dataset import about, data_sha256, read, shoot_stag
 from vap_core.training.films.demonstrations import SIDE, Film, cached, cost_s
 from vap_core.training.films.scenes import CACHE, only_generic
 from vap_core.training.patches import model_options
+from vap_core.training.policy.ahead import Ahead
 from vap_core.training.policy.batches import Frames, statistics
 from vap_core.training.policy.commands import Known, nameable
 from vap_core.training.policy.losses import Learner, embedding_cosine, losses
@@ -136,6 +138,7 @@ def train(
     cache: Path = CACHE,
     every: int = 100,
     jobs: int | None = None,
+    device: str | None = None,
 ) -> dict[str, Any]:
     """Train, or go on where an earlier call stopped, and write a checkpoint that lerobot loads.
 
@@ -143,10 +146,14 @@ def train(
     policy goes on from the recipe's `start`; without one it grows from the mini-PaliGemma in `vlm`,
     or, None, begins with nothing. Learned words are taught in `vlm`, from which the start must have
     grown; None: none are. `demonstrations` is a dataset of train demonstrations; None: the cache.
+    The steps run on `device` (`base.device`); `jobs` processes, None: one a core, film, photograph,
+    teach the words and draw the batches.
 
     Raises: BadOutput when `out` holds another training; BadPolicy for a start that is no mini-pi0,
-        or one of other cameras or sizes, or of another mini-PaliGemma.
+        or one of other cameras or sizes, or of another mini-PaliGemma; UnknownName: no such device.
     """
+    place = torch.device(device_name(device))
+    jobs = jobs or os.cpu_count() or 1
     films = load_films(recipe, cache, demonstrations, jobs)
     if not films.train:
         raise BadOutput(
@@ -180,11 +187,12 @@ def train(
     made_of["vlm"] = config.vlm
     cost_cpu_s = {"films": films.cpu_s, "vlm": _vlm_cost_s(vlm)}
     # After the start was checked: words take minutes.
-    known, taught = _prepare_words(recipe, films, teacher, out, cost_cpu_s)
+    known, taught = _prepare_words(recipe, films, vlm, out, cost_cpu_s, jobs)
     frames = Frames(recipe=recipe, films=films.train, stats=stats, config=config, known=known)
+    ahead = Ahead(frames, jobs)
 
     def step(model: Learner, at: int) -> tuple[Tensor, Figures]:
-        batch = frames.draw(recipe.batch, np.random.default_rng([73, recipe.seed, at]))
+        batch = ahead.take(at).to(place)
         generator = torch.Generator().manual_seed(recipe.seed * 1_000_003 + at)
         with fused_attention():
             return losses(
@@ -203,7 +211,9 @@ def train(
         every=every,
         made_of=made_of,
     )
-    mean, log = train_steps(learner, step, run, out)
+    mean, log = train_steps(learner.to(place), step, run, out, lambda: ahead.cpu_s)
+    ahead.close()
+    mean = mean.cpu()
     cost_cpu_s["steps"] = log[-1]["cpu_s"]
     card = {
         **made_of,
@@ -306,19 +316,20 @@ def _go_on_from(
 def _prepare_words(
     recipe: Recipe,
     films: Films,
-    teacher: MiniVlm | None,
+    vlm: Path | None,
     out: Path,
     cost_cpu_s: dict[str, float],
+    jobs: int,
 ) -> tuple[Known, dict[str, Any]]:
     """What can be said of the films' objects, and about the learned words; adds to the cost."""
     names: dict[str, None] = {}
     for film in films.all:
         for i in nameable(film, recipe.suite):
             names[film.names[i]] = None
-    described, cost_cpu_s["captions"] = captions(names, out / CAPTIONS)
-    if teacher is None or not recipe.taught:
+    described, cost_cpu_s["captions"] = captions(names, out / CAPTIONS, jobs)
+    if vlm is None or not recipe.taught:
         return Known(described), {}
-    words, kept = learn_words(teacher, films.train, recipe.taught, out / WORDS)
+    words, kept = learn_words(vlm, films.train, recipe.taught, out / WORDS, jobs)
     cost_cpu_s["words"] = kept["cpu_s"]
     accuracy = list(kept["accuracy"].values())
     about_words = {

@@ -197,7 +197,7 @@ def train(
     n_held_out = min(HELD_OUT, recipe.stages)
     held_out, more_s = views(n_held_out, recipe.seed, cache, held_out=True, jobs=jobs)
     names = dict.fromkeys(chain.from_iterable(view.names for view in [*pool, *held_out]))
-    looks, captions_s = captions(names, out / "captions.json")
+    looks, captions_s = captions(names, out / "captions.json", jobs)
     config = configuration(recipe)
     # Initial weights only; every other draw comes from the step's stream.
     torch.manual_seed(recipe.seed)
