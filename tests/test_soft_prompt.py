@@ -12,12 +12,14 @@ from vap_core.base.errors import BadMemory, BadStudy
 from vap_core.evaluation import engine, trials
 from vap_core.evaluation.jobs import run_job
 from vap_core.evaluation.study import Study
+from vap_core.policies.lerobot.checkpoints import config_field
 from vap_core.policies.mini_pi0 import learned_token, teach_token
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.learned_token import WORD, TokenTraining
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
 from vap_core.policies.mini_pi0.teach_token import photographs
 from vap_core.policies.mini_pi0.vlm import MiniVlm, initialise_policy, load_vlm
+from vap_core.policies.names import SHIPPED
 from vap_core.rollout.prompters.text import TextPrompter, soft_prompt
 from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
@@ -81,7 +83,7 @@ def test_it_runs_as_a_method_and_the_policy_stays(
     grown: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     home, far = grown
-    monkeypatch.setattr(trials, "MODEL", home)
+    monkeypatch.setattr(teach_token, "MODEL", home)
     monkeypatch.setattr(teach_token, "VIEWS", 2)
     monkeypatch.setattr(
         learned_token, "TokenTraining", lambda: TokenTraining(epochs=2, augmentations=1)
@@ -103,6 +105,13 @@ def test_it_runs_as_a_method_and_the_policy_stays(
     token.unlink()
     with pytest.raises(BadMemory, match="no learned word"):
         trials.make_trial(study, [row], "soft", bank)
+
+
+def test_the_shipped_model_that_a_policy_grew_from_is_found() -> None:
+    for name, model in (("simpler-bridge", ""), ("simpler-bridge-wide", "-tint-free")):
+        grew_from = config_field(SHIPPED / f"mini-pi0-{name}", "vlm")
+        assert teach_token.model_of(grew_from) == SHIPPED / f"mini-paligemma{model}"
+    assert teach_token.model_of("f" * 64) == teach_token.MODEL, "which is then refused"
 
 
 def test_a_policy_of_another_model_is_refused(grown: tuple[Path, Path], tmp_path: Path) -> None:

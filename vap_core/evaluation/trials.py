@@ -27,7 +27,7 @@ from vap_core.perception.stacks import load_stack
 from vap_core.policies.lerobot import checkpoints
 from vap_core.policies.mini_pi0 import token_file
 from vap_core.policies.mini_pi0.learned_token import WORD
-from vap_core.policies.mini_pi0.teach_token import MODEL, teach, teach_own
+from vap_core.policies.mini_pi0.teach_token import model_of, teach, teach_own
 from vap_core.policies.protocol import Policy, PrivilegedPolicy
 from vap_core.rollout.loop import Trial
 from vap_core.simulation import suites
@@ -68,7 +68,7 @@ def register_personal(study: Study, bank: Path, captioner: Captioner | None = No
         spaces = {token_space(method) for method in study.methods}
         if spaces & {"copied", "aligned"}:
             initialised_from = checkpoints.config_field(study.checkpoint(suite), "vlm")
-            teach(rows, bank, initialised_from, MODEL)
+            teach(rows, bank, initialised_from)
         if "own" in spaces:
             teach_own(rows, bank, checkpoints.locate(study.checkpoint(suite)))
         if obj is not known.get(target):
@@ -148,9 +148,10 @@ def _token_embedding(
     if space == "own":
         own = load_from_policy(folder).sha256()
         return token_file.load(bank, target, own, token_file.OWN_SUFFIX).embedding
-    token = token_file.load(bank, target, checkpoints.config_field(folder, "vlm"))
+    initialised_from = checkpoints.config_field(folder, "vlm")
+    token = token_file.load(bank, target, initialised_from)
     if space == "aligned":
-        return align(token.embedding, MODEL, folder)
+        return align(token.embedding, model_of(initialised_from), folder)
     return token.embedding
 
 

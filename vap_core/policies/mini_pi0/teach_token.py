@@ -22,7 +22,10 @@ if TYPE_CHECKING:
     from vap_core.policies.mini_pi0.vlm import MiniVlm
 
 MODEL = DATA / "policies" / "mini-paligemma"
-"""The shipped vision-language model that the shipped policies were initialised from."""
+"""The shipped vision-language model that the default policies were initialised from.
+
+Those of other policies lie beside it, their names beginning with its name (`model_of`).
+"""
 K = 5
 """Photos of the object to learn from."""
 VIEWS = 12
@@ -69,19 +72,30 @@ def other_objects(rows: Sequence[EpisodeRow], seed: int) -> tuple[Rgb, ...]:
     return tuple(photos)
 
 
+def model_of(initialised_from: str) -> Path:
+    """The folder of the shipped model with this SHA-256; that of MODEL where none has it."""
+    from vap_core.policies.mini_pi0.vlm import load_vlm
+
+    for folder in sorted(MODEL.parent.glob(f"{MODEL.name}*")):
+        if load_vlm(folder).sha256() == initialised_from:
+            return folder
+    return MODEL
+
+
 def teach(
-    rows: Iterable[EpisodeRow], folder: Path, initialised_from: str, model: Path = MODEL
+    rows: Iterable[EpisodeRow], folder: Path, initialised_from: str, model: Path | None = None
 ) -> Token:
     """Learn the token of the rows' target from K photos, and keep it in `folder`.
 
     It is measured on other photos. A token that is there already stays. `initialised_from` is the
-    SHA-256 of the model that the policy was initialised from. A token that is not learned well is
-    noted on stderr.
+    SHA-256 of the model that the policy was initialised from; `model` is its folder, by default the
+    shipped one's. A token that is not learned well is noted on stderr.
 
     Raises: BadPolicy without the model; BadStudy when the policy was initialised from another one.
     """
     from vap_core.policies.mini_pi0 import vlm
 
+    model = model or model_of(initialised_from)
     teacher = vlm.load_vlm(model)
     if teacher.sha256() != initialised_from:
         known = f"mini-PaliGemma {initialised_from[:8]}" if initialised_from else "none"

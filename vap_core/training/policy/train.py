@@ -219,6 +219,7 @@ def train(
         **made_of,
         "taught": taught,
         "embedding_cosine": embedding_cosine(mean.policy, teacher),
+        "device": torch.cuda.get_device_name(place) if place.type == "cuda" else place.type,
         "cpu_hours": _hours(cost_cpu_s),
         "log": log,
     }
