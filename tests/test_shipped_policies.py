@@ -15,6 +15,7 @@ from vap_core.policies.mini_pi0.teach_token import MODEL
 from vap_core.policies.mini_pi0.vlm import load_vlm
 from vap_core.simulation import suites
 from vap_core.training.policy.probe import probe
+from vap_core.training.recipe import RECIPES
 
 FOLDERS = sorted(SHIPPED.glob(f"{MINI}-*"))
 BRIDGE = shipped("simpler-bridge")
@@ -25,8 +26,13 @@ BY_TODAYS_RECIPE = {
     "simpler-bridge-tint-share-0.2": (0.2, 0.04),
     "simpler-bridge-tint-share-0.5": (0.5, 0.04),
     "simpler-bridge-wide": (0.2, 0.02),
+    "simpler-fractal-wide": (0.2, 0.02),
+    "simpler-fractal-tint-free": (0.0, 0.02),
 }
 """Policies that grew from the model that never saw a tint: the share of their scenes that were tinted, and the noise (rad) on the arm's angles."""
+
+STOPPED = {"simpler-fractal-tint-free": 5076}
+"""The step at which a training's time was up; the others took all of their recipe's."""
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
@@ -51,15 +57,21 @@ def test_it_is_whole_small_and_grown_from_the_model_that_ships(folder: Path) -> 
         model = MODEL.with_name(f"{MODEL.name}-tint-free")
         noise = told["recipe"].get("angle_noise_rad", 0.0)
         assert (told["recipe"]["tint_share"], noise) == BY_TODAYS_RECIPE[name]
-        assert told["recipe"]["held_out_category"] == "owl figurine"
+        assert told["recipe"]["held_out_category"] == RECIPES[known.name].held_out_category
         assert {"magenta", "yellow"} <= set(told["recipe"]["held_out_tints"])
     else:
         assert name == known.name
         model = MODEL
     assert policy.config.vlm == load_vlm(model).sha256()
     assert len(told["data_sha256"]) == 64
-    assert told["log"][-1]["step"] == told["recipe"]["steps"]
+    assert told["log"][-1]["step"] == STOPPED.get(name, told["recipe"]["steps"])
     assert sum(file.stat().st_size for file in folder.iterdir()) < 16e6
+
+
+def test_fractals_recipe_is_what_made_its_policy() -> None:
+    told = json.loads((SHIPPED / f"{MINI}-simpler-fractal-wide" / "training.json").read_text())
+    recipe = RECIPES["simpler-fractal"].as_json()
+    assert told["recipe"] == json.loads(json.dumps(recipe))
 
 
 def test_it_is_taken_when_nobody_names_another() -> None:

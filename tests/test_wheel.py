@@ -27,7 +27,10 @@ SHIPPED = (
     "suites",
     "weights",
 )
-LEFT_OUT = "data/policies/mini-pi0-simpler-bridge-tint-free/"
+LEFT_OUT = tuple(
+    f"data/policies/mini-pi0-{name}/"
+    for name in ("simpler-bridge-tint-free", "simpler-fractal-tint-free", "simpler-fractal-wide")
+)
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
 

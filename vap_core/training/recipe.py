@@ -75,7 +75,16 @@ class Recipe(Sizes):
 
 RECIPES: dict[str, Recipe] = {
     "simpler-bridge": Recipe(suite="simpler-bridge", held_out_category="owl figurine"),
-    "simpler-fractal": Recipe(suite="simpler-fractal", held_out_category="bottle", execute=2),
+    "simpler-fractal": Recipe(
+        suite="simpler-fractal",
+        held_out_category="bottle",
+        stages=320,
+        steps=5_100,
+        batch=128,
+        execute=2,
+        rate=1.4e-3,
+        angle_noise_rad=0.02,
+    ),
     "vlabench": Recipe(
         suite="vlabench",
         held_out_category="cat figurine",
