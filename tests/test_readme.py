@@ -126,6 +126,25 @@ def test_what_more_scenes_reach() -> None:
     ) in PROSE
 
 
+def test_what_simpler_fractals_policies_of_todays_recipe_reach() -> None:
+    played = pd.concat([rows for _, rows in read_runs(RESULTS / "fractal_today.parquet")])
+    assert set(played.outcome) <= {"success", "failure"}
+    assert set(played.split) == {"visual matching"}
+    played["name"] = played.policy.map(checkpoint_of).str.removeprefix("mini-pi0-simpler-fractal-")
+    head, *body = table("| policy | method | pick-pen-holder")
+    assert len(body) == len(played[played.seed == 0].groupby(["name", "method"]))
+    for name, method, *cells in body:
+        of_row = played[(played.name == name) & (played.method == method.strip("*").lower())]
+        listed = of_row[of_row.seed == 0]
+        tasks = [listed[listed.task == task] for task in (head[2], "move-bottle-near-coke-can")]
+        assert [len(part) for part in tasks] == [300, 160]
+        parts = [*tasks, listed, of_row[of_row.seed == 1]]
+        assert cells == [
+            _percent(rate(int(part.success.sum()), len(part))) if len(part) else ""
+            for part in parts
+        ]
+
+
 def _starts(name: str, listed: int) -> list[tuple[str, str]]:
     """Of VAP and of generic: what it reaches as listed, and from other starts."""
     played = pd.concat([episodes for _, episodes in read_runs(RESULTS / f"{name}.parquet")])
