@@ -15,9 +15,12 @@ from torch.utils.data import DataLoader, Dataset
 from vap_core.base.errors import WorkerDied
 from vap_core.training.policy.batches import Batch, Frames
 
+MOST = 8
+"""Processes that draw, at most: six keep up with an H100."""
+
 
 class Ahead:
-    """The batches of steps that follow each other, drawn ahead by `jobs` processes.
+    """The batches of steps that follow each other, drawn ahead by `jobs` processes, or by MOST.
 
     With one job they are drawn in this process, when they are asked for. A step's batch depends on
     its number alone. `cpu_s` are the CPU seconds of other processes for the batches taken so far.
@@ -26,7 +29,7 @@ class Ahead:
     def __init__(self, frames: Frames, jobs: int) -> None:
         self.cpu_s = 0.0
         self._steps = _Steps(frames)
-        self._jobs = jobs
+        self._jobs = min(jobs, MOST)
         self._drawn: Iterator[tuple[Batch, float]] | None = None
 
     def take(self, step: int) -> Batch:
