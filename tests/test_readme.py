@@ -126,6 +126,22 @@ def test_what_more_scenes_reach() -> None:
     ) in PROSE
 
 
+def test_what_the_policy_of_more_scenes_reaches_under_every_method() -> None:
+    played = pd.concat([rows for _, rows in read_runs(RESULTS / "wide.parquet")])
+    assert set(played.outcome) <= {"success", "failure"}
+    _, *body = table("| method of wide")
+    quoted = {method.split(" (")[0].strip("*").lower(): cell for method, cell in body}
+    assert set(played.groupby("method").size()) == {96}
+    assert quoted == {method: _of_way(played, method) for method in played.method.unique()}
+    again = pd.concat([rows for _, rows in read_runs(RESULTS / "more_scenes.parquet")])
+    one, other = (
+        rows[rows.seed == 0].set_index(["method", "task", "episode"]).success
+        for rows in (again, played)
+    )
+    assert (other.reindex(one.index) == one).all()
+    assert len(one) == 192
+
+
 def test_what_simpler_fractals_policies_of_todays_recipe_reach() -> None:
     played = pd.concat([rows for _, rows in read_runs(RESULTS / "fractal_today.parquet")])
     assert set(played.outcome) <= {"success", "failure"}
