@@ -208,8 +208,7 @@ def policy(
 
     Example: python -m vap_core train policy --suite simpler-bridge --stages 40 --steps 500
         --out data/runs/small-policy
-    Example: python -m vap_core train policy --suite simpler-fractal --stages 320 --steps 5100
-        --batch 128 --rate 0.0014 --device cuda
+    Example: python -m vap_core train policy --suite simpler-fractal --seed 1 --device cuda
     """
     from dataclasses import replace
 
