@@ -161,6 +161,14 @@ def test_what_simpler_fractals_policies_of_todays_recipe_reach() -> None:
         ]
 
 
+def test_what_simpler_fractals_policy_does_with_generic_objects() -> None:
+    (_, *ways), (_, *cells) = table("| policy of simpler-fractal")
+    told = pd.read_parquet(RESULTS / "fractal_generic.parquet")
+    assert set(told.policy.map(checkpoint_of)) == {"mini-pi0-simpler-fractal-wide"}
+    assert cells == [_of_way(told, way) for way in ways]
+    assert set(ways) == set(told.method)
+
+
 def _starts(name: str, listed: int) -> list[tuple[str, str]]:
     """Of VAP and of generic: what it reaches as listed, and from other starts."""
     played = pd.concat([episodes for _, episodes in read_runs(RESULTS / f"{name}.parquet")])
