@@ -144,7 +144,7 @@ def test_tokens_of_other_spaces_are_methods(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     home, far = tiny
-    monkeypatch.setattr(trials, "MODEL", home)
+    monkeypatch.setattr(teach_token, "MODEL", home)
     monkeypatch.setattr(
         learned_token, "TokenTraining", lambda: TokenTraining(epochs=1, augmentations=1)
     )
@@ -323,7 +323,7 @@ def test_the_report_compares_the_shipped_policies_beside_the_paper() -> None:
     assert "words of simpler-bridge" in found.output
     assert found.output.count("paper: pi0") == 4
     assert "0.945626 ± 0.066187" in found.output
-    kept = pd.read_parquet(trials.MODEL.parents[1] / "results" / "token_spaces.parquet")
+    kept = pd.read_parquet(teach_token.MODEL.parents[1] / "results" / "token_spaces.parquet")
     whole = kept[kept.group == embedding_report.WHOLE]
     assert (whole.tokens == 113).all()
     for row in whole.itertuples():
@@ -359,8 +359,8 @@ def test_real_checkpoints_are_compared_with_their_words(tmp_path: Path) -> None:
 def test_words_that_no_film_says_are_left_out_of_the_rotation(grown: tuple[Path, Path]) -> None:  # noqa: F811
     home, far = grown
     assert len(rotation_cosines(home, home)["copied"]) == 0
-    shipped = trials.MODEL.parent
-    found = rotation_cosines(trials.MODEL, shipped / f"mini-pi0-{SUITE}")
+    shipped = teach_token.MODEL.parent
+    found = rotation_cosines(teach_token.MODEL, shipped / f"mini-pi0-{SUITE}")
     assert len(found["copied"]) == 56
     assert (found["copied"] < 0.9999).all()
     whole = mean_cosine(found["copied"])
@@ -372,9 +372,9 @@ def test_words_that_no_film_says_are_left_out_of_the_rotation(grown: tuple[Path,
     assert longest_word(far) == pytest.approx(np.sqrt((rows**2).sum(1)).max())
     assert rotation_deg(rows[15], home, home) < 0.1
     bridge = shipped / f"mini-pi0-{SUITE}"
-    word = open_table(trials.MODEL).block(15, 16)[0]
-    moved = token_alignment.align(word, trials.MODEL, bridge)
-    cosine = np.cos(np.radians(rotation_deg(word, trials.MODEL, bridge)))
+    word = open_table(teach_token.MODEL).block(15, 16)[0]
+    moved = token_alignment.align(word, teach_token.MODEL, bridge)
+    cosine = np.cos(np.radians(rotation_deg(word, teach_token.MODEL, bridge)))
     assert cosine * np.linalg.norm(word) ** 2 == pytest.approx(float(word @ moved), rel=1e-3)
     words = nearest_words(open_table(far).block(15, 16)[0], far, 3)
     assert words[0] == (vocabulary()[15], pytest.approx(1))
