@@ -149,10 +149,7 @@ def policy(
     ] = None,
     batch: Annotated[
         int | None,
-        typer.Option(
-            min=1,
-            help="Frames a step. Default the recipe's; a GPU takes more in the same time.",
-        ),
+        typer.Option(min=1, help="Frames a step. Default the recipe's."),
     ] = None,
     rate: Annotated[
         float | None,

@@ -5,6 +5,7 @@ It says which photos the token is learned from, and where it is kept.
 
 import sys
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -74,12 +75,18 @@ def other_objects(rows: Sequence[EpisodeRow], seed: int) -> tuple[Rgb, ...]:
 
 def model_of(initialised_from: str) -> Path:
     """The folder of the shipped model with this SHA-256; that of MODEL where none has it."""
-    from vap_core.policies.mini_pi0.vlm import load_vlm
-
     for folder in sorted(MODEL.parent.glob(f"{MODEL.name}*")):
-        if load_vlm(folder).sha256() == initialised_from:
+        if _sha256(folder) == initialised_from:
             return folder
     return MODEL
+
+
+@lru_cache
+def _sha256(model: Path) -> str:
+    """Of the model in a folder; every trial of a method asks for it."""
+    from vap_core.policies.mini_pi0.vlm import load_vlm
+
+    return load_vlm(model).sha256()
 
 
 def teach(
