@@ -7,7 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from vap_core.base.errors import BadOutput
-from vap_core.evaluation.publish import publish
+from vap_core.evaluation.publish import publish, read_runs
 from vap_core.evaluation.store import KEY, append, open_run
 
 ROW = {
@@ -162,3 +162,23 @@ def test_two_parts_supersede_a_whole_list_together(tmp_path: Path) -> None:
         {"methods": ["vap"], "by": one["digest"]},
         {"methods": ["vap"], "by": other["digest"]},
     ]
+
+
+def test_of_a_run_only_the_methods_and_suites_that_are_named_are_taken(tmp_path: Path) -> None:
+    folder = run(tmp_path / "run", 0, methods=("generic", "vap", "soft"))
+    target = tmp_path / "part.parquet"
+    assert publish([folder], target, methods=["vap", "generic"], suite_names=["widowx-pick"]) == 4
+    table = pq.read_table(target)
+    assert set(table["method"].to_pylist()) == {"generic", "vap"}
+    (note,) = json.loads(table.schema.metadata[b"runs"])
+    assert note["configuration"]["methods"] == ["generic", "vap"]
+    rest = tmp_path / "rest.parquet"
+    assert publish([folder], rest, methods=["soft"]) == 2
+    whole = tmp_path / "whole.parquet"
+    assert publish([target, rest], whole) == 6, "parts of one run fit together"
+    assert [len(episodes) for _, episodes in read_runs(whole)] == [4, 2]
+    with pytest.raises(BadOutput, match="lack tap; they have generic, soft, vap"):
+        publish([folder], tmp_path / "t.parquet", methods=["vap", "tap"])
+    with pytest.raises(BadOutput, match="hold no run of franka-pick"):
+        publish([folder], tmp_path / "t.parquet", suite_names=["franka-pick"])
+    assert not (tmp_path / "t.parquet").exists()

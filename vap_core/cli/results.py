@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from vap_core.cli.options import names
+
 app = typer.Typer()
 
 
@@ -304,6 +306,12 @@ def publish(
             help="Where a later source has read a method again, leave the earlier rows out.",
         ),
     ] = False,
+    suite: Annotated[
+        list[str] | None, typer.Option(help="Take the runs of this suite alone; repeatable.")
+    ] = None,
+    methods: Annotated[
+        str, typer.Option(help="Take these methods alone, divided by commas. Default all.")
+    ] = "",
 ) -> None:
     """Keep the results of finished runs as one small table, with their configurations.
 
@@ -313,10 +321,19 @@ def publish(
         --to data/results/mine.parquet --replace
     Example: python -m vap_core publish data/results/mine.parquet data/runs/vap-again
         --to data/results/mine.parquet --replace --supersede
+    Example: python -m vap_core publish data/results/mine.parquet --suite simpler-bridge
+        --methods generic,vap --to data/results/bridge.parquet
     """
     from vap_core.evaluation.publish import publish as write_table
 
-    n_episodes = write_table(runs, to, replace=replace, supersede=supersede)
+    n_episodes = write_table(
+        runs,
+        to,
+        replace=replace,
+        supersede=supersede,
+        suite_names=suite or (),
+        methods=names(methods),
+    )
     print(f"wrote {to}: {n_episodes} episodes")
 
 

@@ -10,6 +10,7 @@ from vap_core.policies.names import MINI as MINI
 from vap_core.policies.names import POLICIES as POLICIES
 from vap_core.policies.names import PRIVILEGED as PRIVILEGED
 from vap_core.policies.names import SHIPPED as SHIPPED
+from vap_core.policies.names import shipped_checkpoint
 from vap_core.policies.protocol import Policy, PrivilegedPolicy
 from vap_core.policies.scripted.expert import Expert
 from vap_core.policies.scripted.random import Random
@@ -48,7 +49,7 @@ def make_policy(
 
 def shipped(suite: str) -> Path:
     """Where the shipped policy of a suite is, if there is one."""
-    return SHIPPED / f"{MINI}-{benchmark_name(suite)}"
+    return shipped_checkpoint(benchmark_name(suite))
 
 
 def default_policy(suites: Iterable[str]) -> str:

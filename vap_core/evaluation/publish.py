@@ -38,7 +38,9 @@ def read_published(path: Path) -> "list[Run]":
         table = arrow.to_pandas()
         runs = []
         for manifest in manifests:
-            episodes = table[table["configuration"] == manifest["digest"]]
+            # Parts of one run have its digest each.
+            of_run = table["configuration"] == manifest["digest"]
+            episodes = table[of_run & table["method"].isin(manifest["configuration"]["methods"])]
             runs.append((manifest, episodes.drop(columns="configuration")))
             check_run(path, *runs[-1])
     except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
@@ -63,7 +65,13 @@ def read_runs(source: Path) -> "list[Run]":
 
 
 def publish(
-    sources: Sequence[Path], target: Path, *, replace: bool = False, supersede: bool = False
+    sources: Sequence[Path],
+    target: Path,
+    *,
+    replace: bool = False,
+    supersede: bool = False,
+    suite_names: Sequence[str] = (),
+    methods: Sequence[str] = (),
 ) -> int:
     """Write every episode of the runs, with their manifests in the file's metadata.
 
@@ -71,12 +79,13 @@ def publish(
     Tracebacks, wall times and memory use are left out. What the runs read of shipped lists is
     entered in the log beside the table (readings.publish_readings). With `supersede`, a method that
     later sources have read again, for all the same episodes and with the same policy, leaves the
-    earlier source (`superseded` in its manifest).
+    earlier source (`superseded` in its manifest). Of the runs only those of `suite_names`, and of
+    each only its `methods`, are taken, where these are given.
 
     Returns: the number of episodes.
 
     Raises: BadOutput for a folder that holds no run or an unfinished one, for two runs of the same
-        episodes, or a target that is no new Parquet file.
+        episodes, for sources of which nothing is left, or a target that is no new Parquet file.
     """
     import pyarrow as pa
 
@@ -87,6 +96,10 @@ def publish(
     runs: list[Run] = []
     for source in sources:
         runs += _finished_runs(source)
+    if suite_names:
+        runs = _of_suites(runs, suite_names)
+    if methods:
+        runs = _of_methods(runs, methods)
     if supersede:
         runs = _without_superseded(runs)
     tables = []
@@ -119,6 +132,45 @@ def _finished_runs(source: Path) -> "list[Run]":
                 "command again to finish it."
             )
     return found
+
+
+def _of_suites(runs: "list[Run]", names: Sequence[str]) -> "list[Run]":
+    """The runs of these suites. Raises: BadOutput for none, and for a run of others, too."""
+    kept = []
+    for manifest, episodes in runs:
+        there = {suite for suite, _ in manifest["configuration"]["tasks"]}
+        if there.isdisjoint(names):
+            continue
+        if not there.issubset(names):
+            raise BadOutput(
+                f"publish: one run has {', '.join(sorted(there))}, and is taken whole; name all of "
+                "them with --suite, or none."
+            )
+        kept.append((manifest, episodes))
+    if not kept:
+        raise BadOutput(f"publish: the sources hold no run of {', '.join(names)}.")
+    return kept
+
+
+def _of_methods(runs: "list[Run]", names: Sequence[str]) -> "list[Run]":
+    """The runs with these methods alone. Raises: BadOutput for a method that none has."""
+    there = {method for manifest, _ in runs for method in manifest["configuration"]["methods"]}
+    missing = [name for name in names if name not in there]
+    if missing:
+        raise BadOutput(
+            f"publish: the sources lack {', '.join(missing)}; they have {', '.join(sorted(there))}."
+        )
+    kept = []
+    for manifest, episodes in runs:
+        left = [name for name in manifest["configuration"]["methods"] if name in names]
+        if left:
+            part = episodes[episodes["method"].isin(left)]
+            kept.append((_with_methods(manifest, left), part))
+    return kept
+
+
+def _with_methods(manifest: dict[str, Any], methods: list[str]) -> dict[str, Any]:
+    return {**manifest, "configuration": {**manifest["configuration"], "methods": methods}}
 
 
 def _without_superseded(runs: "list[Run]") -> "list[Run]":
@@ -155,13 +207,9 @@ def _supersede(run: "Run", later: "list[Run]") -> "Run":
             f"publish: the later runs have only a part of the episodes of {', '.join(methods)}; "
             "supersede a method by runs of the whole list."
         )
-    configuration = manifest["configuration"]
-    left = [method for method in configuration["methods"] if method not in methods]
-    changed = {
-        **manifest,
-        "configuration": {**configuration, "methods": left},
-        "superseded": [*manifest.get("superseded", []), *notes],
-    }
+    left = [name for name in manifest["configuration"]["methods"] if name not in methods]
+    changed = _with_methods(manifest, left)
+    changed["superseded"] = [*manifest.get("superseded", []), *notes]
     return changed, episodes[~gone]
 
 

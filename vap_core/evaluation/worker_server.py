@@ -8,7 +8,7 @@ from pathlib import Path
 
 from vap_core.evaluation.processes import prepare
 from vap_core.evaluation.store import MANIFEST
-from vap_core.policies.names import MINI, POLICIES, SHIPPED
+from vap_core.policies.names import MINI, POLICIES, shipped_checkpoint
 
 
 def worker_modules(policy: str) -> tuple[str, ...]:
@@ -45,6 +45,6 @@ def start_server(policy: str, folder: Path) -> None:
 def probable_policy(suite_names: Sequence[str]) -> str:
     """The default policy of suites, as far as their names alone say it; else ""."""
     for name in suite_names:
-        if name != "all" and not (SHIPPED / f"{MINI}-{name}").is_dir():
+        if name != "all" and not shipped_checkpoint(name).is_dir():
             return ""
     return MINI

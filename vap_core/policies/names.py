@@ -7,6 +7,8 @@ from vap_core.base.files import SHIPPED as SHIPPED
 
 MINI = "mini-pi0"
 """The shipped frozen policy, one checkpoint a suite."""
+_NEWER = {"simpler-bridge": f"{MINI}-simpler-bridge-wide"}
+"""The checkpoint of a benchmark whose first one, `mini-pi0-BENCHMARK`, was replaced."""
 POLICIES = ("scripted", "expert", "random")
 """Policies without weights; each is built for one scene."""
 PRIVILEGED = ("expert", "random")
@@ -41,6 +43,11 @@ def label_of(checkpoint: str | Path, temperature: float | None = None) -> str:
 def checkpoint_of(label: str) -> str:
     """The folder's name in a `policy_label`; nothing for a policy without weights."""
     return label.partition(":")[2].rpartition("@")[0]
+
+
+def shipped_checkpoint(benchmark: str) -> Path:
+    """Where the shipped policy of a benchmark is, if there is one."""
+    return SHIPPED / _NEWER.get(benchmark, f"{MINI}-{benchmark}")
 
 
 def check_policy_name(name: str) -> None:
