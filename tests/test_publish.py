@@ -172,6 +172,7 @@ def test_of_a_run_only_the_methods_and_suites_that_are_named_are_taken(tmp_path:
     assert set(table["method"].to_pylist()) == {"generic", "vap"}
     (note,) = json.loads(table.schema.metadata[b"runs"])
     assert note["configuration"]["methods"] == ["generic", "vap"]
+    assert note["left_out"] == ["soft"]
     rest = tmp_path / "rest.parquet"
     assert publish([folder], rest, methods=["soft"]) == 2
     whole = tmp_path / "whole.parquet"

@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING
 from vap_core.base.figures import empty_figure
 from vap_core.base.palette import CASES
 from vap_core.evaluation.ablations.arms import ABLATIONS
-from vap_core.evaluation.ablations.picture import CLEAR, PAPER, draw_effects, legend_handles
+from vap_core.evaluation.ablations.picture import (
+    CLEAR,
+    PAPER,
+    draw_effects,
+    draw_other,
+    legend_handles,
+)
 from vap_core.evaluation.ablations.picture import policies_figure as policies_figure
 from vap_core.evaluation.ablations.table import ArmResult, arm_results
 from vap_core.evaluation.ablations.table import across_policies as across_policies
@@ -26,8 +32,9 @@ if TYPE_CHECKING:
 
 Results = dict[str, list[ArmResult]]
 """The arms of every ablation, by its name."""
-Block = list[tuple[str, ArmResult]]
-"""Arms of one ablation on one suite, each with its label; the first is what they are against."""
+Block = list[tuple[str, ArmResult, ArmResult | None]]
+"""Arms of one ablation on one suite, each with its label, and the same arm of another policy; the
+first is what they are against."""
 
 
 def ablation_episodes(path: Path) -> "pd.DataFrame":
@@ -54,11 +61,16 @@ def ablation_results(episodes: "pd.DataFrame", suite: str = "") -> Results:
     return found
 
 
-def all_effects_figure(results: Results, columns: int = 2) -> "Figure":
-    """Every arm of every ablation: points of success against the first arm of its suite."""
+def all_effects_figure(
+    results: Results, columns: int = 2, beside: Results | None = None, whose: str = ""
+) -> "Figure":
+    """Every arm of every ablation: points of success against the first arm of its suite.
+
+    `beside` are the results of another policy, drawn below each, and `whose` says which.
+    """
     blocks: list[Block] = []
     for name, arms in results.items():
-        blocks += _blocks(name, arms)
+        blocks += _blocks(name, arms, (beside or {}).get(name, ()))
     parts = _split_evenly(blocks, columns)
     most = max(sum(map(len, part)) for part in parts)
     figure = empty_figure(5.2 * len(parts), 0.9 + 0.17 * most)
@@ -68,22 +80,24 @@ def all_effects_figure(results: Results, columns: int = 2) -> "Figure":
         axes.set_xlim(-103, 45)
         axes.set_xlabel("points of success against the first arm (95 %)", fontsize=8)
     figure.legend(
-        handles=legend_handles(), loc="outside lower center", ncols=3, frameon=False, fontsize=8
-    )
+        handles=legend_handles(whose), loc="outside lower center", ncols=4, frameon=False,
+        fontsize=8,
+    )  # fmt: skip
     return figure
 
 
-def _blocks(name: str, arms: Sequence[ArmResult]) -> list[Block]:
+def _blocks(name: str, arms: Sequence[ArmResult], beside: Sequence[ArmResult]) -> list[Block]:
     """One block a suite of an ablation: its first arm, with the block's heading, and the others."""
     several = len({one.suite for one in arms}) > 1
+    others = {(one.suite, one.arm): one for one in beside}
     blocks: list[Block] = []
     for one in arms:
         if one.against is None:
             where = f" on {one.suite}" if several else ""
             rate = f"{100 * one.sr.value:.0f} % of {one.sr.n}"
-            blocks.append([(f"{name}{where}: against {one.arm}, {rate}", one)])
+            blocks.append([(f"{name}{where}: against {one.arm}, {rate}", one, None)])
         else:
-            blocks[-1].append((one.arm, one))
+            blocks[-1].append((one.arm, one, others.get((one.suite, one.arm))))
     return blocks
 
 
@@ -103,9 +117,11 @@ def _split_evenly(blocks: Sequence[Block], columns: int) -> list[list[Block]]:
 def _draw_blocks(axes: "Axes", blocks: Sequence[Block]) -> None:
     labels: list[str] = []
     for block in blocks:
-        heading, first = block[0]
+        heading, first, _ = block[0]
         labels.append(heading)
-        for label, one in block[1:]:
+        for label, one, other in block[1:]:
+            if other is not None:
+                draw_other(axes, other, -len(labels) - 0.3)
             draw_effects(axes, one, [first], -len(labels))
             labels.append(label)
     ticks = axes.set_yticks([-y for y in range(len(labels))], labels, fontsize=7)

@@ -80,7 +80,8 @@ def publish(
     entered in the log beside the table (readings.publish_readings). With `supersede`, a method that
     later sources have read again, for all the same episodes and with the same policy, leaves the
     earlier source (`superseded` in its manifest). Of the runs only those of `suite_names`, and of
-    each only its `methods`, are taken, where these are given.
+    each only its `methods` (the others are `left_out` in its manifest), are taken, where these are
+    given.
 
     Returns: the number of episodes.
 
@@ -162,10 +163,13 @@ def _of_methods(runs: "list[Run]", names: Sequence[str]) -> "list[Run]":
         )
     kept = []
     for manifest, episodes in runs:
-        left = [name for name in manifest["configuration"]["methods"] if name in names]
+        of_run = manifest["configuration"]["methods"]
+        left = [name for name in of_run if name in names]
         if left:
-            part = episodes[episodes["method"].isin(left)]
-            kept.append((_with_methods(manifest, left), part))
+            changed = _with_methods(manifest, left)
+            out = [name for name in of_run if name not in names]
+            changed["left_out"] = [*manifest.get("left_out", []), *out]
+            kept.append((changed, episodes[episodes["method"].isin(left)]))
     return kept
 
 

@@ -17,6 +17,8 @@ CLEAR, UNCLEAR = "#0072b2", "#9aa0a6"
 LEVEL = 0.05
 """The exact p, corrected over the arms of a suite, below which a difference counts as shown."""
 PAPER = "#d55e00"
+OTHER = "#cc79a7"
+"""Another policy's differences."""
 
 
 def effects_figure(results: Sequence[ArmResult], title: str) -> "Figure":
@@ -48,9 +50,7 @@ def draw_effects(
 ) -> None:
     """An arm's difference from the first arm of its suite among `results`, at height `y`."""
     assert one.against is not None
-    low, mid, high = (
-        100 * bound for bound in (one.against.low, one.against.difference, one.against.high)
-    )
+    low, mid, high = _points(one.against)
     colour = CLEAR if is_shown(one.against) else UNCLEAR
     axes.plot([low, high], [y, y], color=colour, linewidth=2)
     axes.plot(mid, y, "o", color=colour)
@@ -58,6 +58,18 @@ def draw_effects(
     theirs = 100 * (one.paper - first.paper)
     if theirs == theirs:
         axes.plot(theirs, y, "D", color=PAPER, markersize=5, fillstyle="none")
+
+
+def draw_other(axes: "Axes", one: ArmResult, y: float) -> None:
+    """The difference of the same arm with another policy, at height `y`."""
+    assert one.against is not None
+    low, mid, high = _points(one.against)
+    axes.plot([low, high], [y, y], color=OTHER, linewidth=1)
+    axes.plot(mid, y, "s", color=OTHER, markersize=2.5)
+
+
+def _points(found: Comparison) -> tuple[float, float, float]:
+    return 100 * found.low, 100 * found.difference, 100 * found.high
 
 
 def policies_figure(of_policies: Mapping[str, Sequence[ArmResult]], label: str) -> "Figure":
@@ -100,15 +112,18 @@ def is_shown(found: Comparison) -> bool:
     return found.p_holm < LEVEL
 
 
-def legend_handles() -> "list[Line2D]":
-    """What the marks of `draw_effects` mean."""
+def legend_handles(whose: str = "") -> "list[Line2D]":
+    """What the marks of `draw_effects` mean, and those of `draw_other`: `whose` they are."""
     from matplotlib.lines import Line2D
 
-    return [
+    handles = [
         Line2D([], [], color=CLEAR, marker="o", label=f"a difference (exact p < {LEVEL:g}, Holm)"),
         Line2D([], [], color=UNCLEAR, marker="o", label="none shown"),
         Line2D([], [], color=PAPER, marker="D", fillstyle="none", linewidth=0, label="the paper's"),
     ]
+    if whose:
+        handles.append(Line2D([], [], color=OTHER, marker="s", linewidth=1, label=whose))
+    return handles
 
 
 def _label(one: ArmResult, first: dict[str, ArmResult]) -> str:
