@@ -11,11 +11,13 @@ from vap_core.cli.bench import eval_report, measured, measurement
 from vap_core.evaluation.ablations.arms import ABLATIONS, TINT_SHARES
 from vap_core.evaluation.diagnosis.failures import list_failures
 from vap_core.evaluation.metrics import Rate, rate
+from vap_core.evaluation.policy_names import shipped
 from vap_core.evaluation.publish import read_runs
 from vap_core.evaluation.report.failures import breakdown
 from vap_core.evaluation.report.results import results
 from vap_core.evaluation.report.runs import load_runs
 from vap_core.evaluation.statistics import ALL_TASKS
+from vap_core.policies.lerobot.checkpoints import fingerprint
 from vap_core.policies.names import checkpoint_of
 
 RESULTS = ROOT / "data" / "results"
@@ -70,7 +72,7 @@ def test_no_hand_of_the_published_table_closes_after_the_last_action() -> None:
     """A terminal frame has no action: 65 time-outs were once missed grasps that it decided."""
     rows = pd.read_parquet(RESULTS / "mini_pi0.parquet")
     missed = rows[rows["sub_case"] == "missed grasp"]
-    assert len(missed) == 1887
+    assert len(missed) == 1937
     assert (missed["deciding_frame"] < missed["steps"]).all()
 
 
@@ -126,17 +128,19 @@ def test_what_more_scenes_reach() -> None:
     ) in PROSE
 
 
-def test_what_the_policy_of_more_scenes_reaches_under_every_method() -> None:
-    played = pd.concat([rows for _, rows in read_runs(RESULTS / "wide.parquet")])
-    assert set(played.outcome) <= {"success", "failure"}
-    _, *body = table("| method of wide")
-    quoted = {method.split(" (")[0].strip("*").lower(): cell for method, cell in body}
-    assert set(played.groupby("method").size()) == {96}
-    assert quoted == {method: _of_way(played, method) for method in played.method.unique()}
-    again = pd.concat([rows for _, rows in read_runs(RESULTS / "more_scenes.parquet")])
+def test_the_policy_of_more_scenes_is_the_default_and_came_out_the_same_again() -> None:
+    default = shipped("simpler-bridge")
+    again, main = (
+        pd.concat([rows for _, rows in read_runs(RESULTS / f"{name}.parquet")])
+        for name in ("more_scenes", "mini_pi0")
+    )
+    main = main[main.suite == "simpler-bridge"]
+    assert set(main.policy.map(checkpoint_of)) == {default.name}
+    digests = {label.rpartition("@")[2] for label in (*again.policy, *main.policy)}
+    assert digests == {fingerprint(default)[:8]}
     one, other = (
         rows[rows.seed == 0].set_index(["method", "task", "episode"]).success
-        for rows in (again, played)
+        for rows in (again, main)
     )
     assert (other.reindex(one.index) == one).all()
     assert len(one) == 192
