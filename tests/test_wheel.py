@@ -29,7 +29,12 @@ SHIPPED = (
 )
 LEFT_OUT = tuple(
     f"data/policies/mini-pi0-{name}/"
-    for name in ("simpler-bridge-tint-free", "simpler-fractal-tint-free", "simpler-fractal-wide")
+    for name in (
+        "simpler-bridge",
+        "simpler-bridge-tint-free",
+        "simpler-fractal-tint-free",
+        "simpler-fractal-wide",
+    )
 )
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
