@@ -9,12 +9,13 @@ import pytest
 
 from tests.command import vap
 from vap_core.base.errors import BadOutput, BadStudy
+from vap_core.base.files import DATA
 from vap_core.base.tables import align
 from vap_core.evaluation import engine
 from vap_core.evaluation.diagnosis import STAGES
 from vap_core.evaluation.diagnosis.failures import deciding_frame, failures_text, list_failures
-from vap_core.evaluation.diagnosis.recordings import correct_failure, recording_of
-from vap_core.evaluation.publish import publish
+from vap_core.evaluation.diagnosis.recordings import correct_failure, recording_of, study_of
+from vap_core.evaluation.publish import publish, read_published
 from vap_core.evaluation.report.failures import (
     breakdown,
     breakdown_rows,
@@ -200,6 +201,19 @@ def test_a_recording_of_older_weights_is_made_anew(
     assert read_summary(path)["policy"] == failures.table.policy[0]
     made = path.stat().st_mtime_ns
     assert recording_of(failures, 0).stat().st_mtime_ns == made
+
+
+def test_a_run_of_an_earlier_default_policy_is_run_again_with_that_one() -> None:
+    """Some of its manifests name the folder, others the default of the suite."""
+    named = set()
+    for manifest, episodes in read_published(DATA / "results" / "first_policy.parquet"):
+        row = episodes.iloc[0].to_dict()
+        named.add(manifest["configuration"]["policy"])
+        assert study_of(manifest, row).policy_label("simpler-bridge") == row["policy"]
+        for label in ("mini_pi0:0000000000", "mini_pi0:mini-pi0-of-nobody@00000000", "scripted"):
+            study = study_of(manifest, {**row, "policy": label})
+            assert study.policy == manifest["configuration"]["policy"]
+    assert named == {"mini-pi0", "data/policies/mini-pi0-simpler-bridge"}
 
 
 @pytest.mark.parametrize(

@@ -16,10 +16,12 @@ from vap_core.evaluation.diagnosis.failures import (
     deciding_frame,
     failure_row,
 )
+from vap_core.evaluation.policy_names import MINI, SHIPPED, shipped
 from vap_core.evaluation.stills import write_provenance
 from vap_core.evaluation.store import ROW_KEY
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import make_trial, register_personal
+from vap_core.policies.names import checkpoint_of
 from vap_core.simulation.types import EpisodeRow
 
 
@@ -146,7 +148,10 @@ def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
 
 
 def study_of(manifest: Mapping[str, Any], row: Mapping[str, Any]) -> Study:
-    """The study of a run, of one task and method alone."""
+    """The study of a run, of one task and method alone, with the policy of the row.
+
+    A run of a default policy that has a successor names the earlier one's folder, if it ships.
+    """
     configuration = manifest["configuration"]
     settings = {}
     for field in fields(Study):
@@ -154,6 +159,10 @@ def study_of(manifest: Mapping[str, Any], row: Mapping[str, Any]) -> Study:
             settings[field.name] = configuration[field.name]
     settings["tasks"] = ((row["suite"], row["task"]),)
     settings["methods"] = (row["method"],)
+    name = checkpoint_of(str(row.get("policy", "")))
+    replaced = name not in ("", shipped(row["suite"]).name) and (SHIPPED / name).is_dir()
+    if settings["policy"] == MINI and replaced:
+        settings["policy"] = str(SHIPPED / name)
     return replace(Study(**settings), audit=False)
 
 
