@@ -323,11 +323,30 @@ def test_the_report_compares_the_shipped_policies_beside_the_paper() -> None:
     assert "words of simpler-bridge" in found.output
     assert found.output.count("paper: pi0") == 4
     assert "0.945626 ± 0.066187" in found.output
-    kept = pd.read_parquet(teach_token.MODEL.parents[1] / "results" / "token_spaces.parquet")
+    assert "mini-pi0-simpler-bridge-wide with mini-paligemma-tint-free." in found.output
+    shipped = teach_token.MODEL.parent
+    kept = pd.read_parquet(shipped.parent / "results" / "token_spaces.parquet")
+    measured = [str(shipped / name) for name in kept.policy.unique()]
+    named = CliRunner().invoke(app, ["embeddings", str(teach_token.MODEL), *measured])
     whole = kept[kept.group == embedding_report.WHOLE]
     assert (whole.tokens == 113).all()
     for row in whole.itertuples():
-        assert f"{row.cosine_mean:.6f} ± {row.cosine_std:.6f}" in found.output
+        cosine = f"{row.cosine_mean:.6f} ± {row.cosine_std:.6f}"
+        assert cosine in named.output
+        default = row.policy != "mini-pi0-simpler-bridge"  # which has a successor
+        assert (cosine in found.output) == default
+
+
+def test_a_policy_is_measured_beside_the_model_that_it_grew_from() -> None:
+    folders = {name: study._model_folder(name).name for name in suites.BENCHMARKS}
+    assert folders.pop(SUITE) == "mini-paligemma-tint-free"
+    assert set(folders.values()) == {"mini-paligemma"}
+    successor = teach_token.MODEL.parent / f"mini-pi0-{SUITE}-wide"
+    table = embedding_report.spaces(None, [successor])
+    assert list(table.group) == [embedding_report.WHOLE, f"words of {SUITE}", "reserved"]
+    assert (table.cosine_min > 0.999999).all()
+    beside_another = embedding_report.spaces(teach_token.MODEL, [successor])
+    assert beside_another.cosine_mean[0] < 0.9
 
 
 def test_real_checkpoints_are_compared_with_their_words(tmp_path: Path) -> None:

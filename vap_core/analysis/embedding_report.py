@@ -12,6 +12,8 @@ from vap_core.base.files import write_atomic
 from vap_core.base.tables import align
 from vap_core.evaluation.paper import ledger
 from vap_core.policies.embedding_table import open_table
+from vap_core.policies.lerobot.checkpoints import config_field
+from vap_core.policies.mini_pi0.teach_token import model_of
 from vap_core.policies.token_groups import token_groups
 from vap_core.simulation.suites import BENCHMARKS
 
@@ -36,30 +38,32 @@ NOTE = (
 
 
 def spaces(
-    vlm: Path, policies: Sequence[Path], suite: str = "", watch: Watch | None = None
+    vlm: Path | None, policies: Sequence[Path], suite: str = "", watch: Watch | None = None
 ) -> "pd.DataFrame":
     """A row per policy and group of tokens: the whole table, the suite's words, reserved ones.
 
-    The words are those of the instructions of `suite`, or of the benchmark that ends the policy's
-    name, or of all. Raises: BadPolicy.
+    Without `vlm` each is compared with the shipped model that it grew from. The words are those of
+    the instructions of `suite`, or of the benchmark in the policy's name, or of all.
+
+    Raises: BadPolicy.
     """
     import pandas as pd
 
-    ours = open_table(vlm)
     rows = []
     for policy in policies:
-        theirs = open_table(policy)
+        model = vlm or model_of(config_field(policy, "vlm"))
+        ours, theirs = open_table(model), open_table(policy)
         found = {WHOLE: compare(ours, theirs, watch)}
         names = _suites_of(policy, suite)
         n = found[WHOLE].tokens
         label = f"words of {names[0]}" if len(names) == 1 else "words of all suites"
-        for group, tokens in token_groups((policy, vlm), _instructions(names)).items():
+        for group, tokens in token_groups((policy, model), _instructions(names)).items():
             shared = tokens[tokens < n]
             if len(shared):
                 name = label if group == "words" else group
                 found[name] = compare_tokens(ours, theirs, shared)
         for group, comparison in found.items():
-            about: dict[str, Any] = {"vlm": vlm.name, "policy": policy.name, "group": group}
+            about: dict[str, Any] = {"vlm": model.name, "policy": policy.name, "group": group}
             rows.append({**about, "features": ours.shape[1], **asdict(comparison)})
     return pd.DataFrame(rows)
 
@@ -89,7 +93,7 @@ def report(table: "pd.DataFrame") -> str:
     for row in paper_spaces().to_dict("records"):
         rows.append(_cells({**row, "policy": f"paper: {row['policy']}"}))
     left_out = table[table.without_direction > 0]
-    note = NOTE
+    note = f"{NOTE} {_compared(table)}"
     if len(left_out):
         note += f" Without rows of zeros, at most {left_out.without_direction.max()} a group."
     return f"{align(rows)}\n\n{note}"
@@ -112,6 +116,14 @@ def keep(table: "pd.DataFrame", path: Path) -> None:
         ) from error
 
 
+def _compared(table: "pd.DataFrame") -> str:
+    """Which policies stand beside which model."""
+    parts = []
+    for vlm, part in table.groupby("vlm", sort=False):
+        parts.append(f"{', '.join(part.policy.unique())} with {vlm}")
+    return f"Compared: {'; '.join(parts)}."
+
+
 def _cells(row: dict[str, Any]) -> list[str]:
     cells = [str(row["policy"]), str(row["group"]), str(row["tokens"])]
     cells.append(f"{row['cosine_mean']:.6f} ± {row['cosine_std']:.6f}")
@@ -127,7 +139,7 @@ def _suites_of(policy: Path, suite: str) -> list[str]:
             raise BadPolicy(f"embeddings: no suite {suite!r}; known: {', '.join(BENCHMARKS)}.")
         return [suite]
     for name in BENCHMARKS:
-        if policy.name.endswith(name):
+        if name in policy.name:
             return [name]
     return list(BENCHMARKS)
 

@@ -121,14 +121,15 @@ def embeddings(
     vlm: Annotated[
         Path | None,
         typer.Argument(
-            help="Folder of a vision-language model, such as PaliGemma's. Default the shipped one."
+            help="Folder of a vision-language model, such as PaliGemma's. Default the shipped one "
+            "that each policy grew from."
         ),
     ] = None,
     policies: Annotated[
         list[Path] | None,
         typer.Argument(
             help="Folders of policies that were initialised from it: pi0, pi0.5, mini-pi0. Default "
-            "the shipped ones."
+            "the suites' default policies."
         ),
     ] = None,
     suite: Annotated[
@@ -150,7 +151,6 @@ def embeddings(
     from vap_core.analysis.embedding_report import keep, report, spaces
     from vap_core.base.errors import BadPolicy
     from vap_core.evaluation.policy_names import shipped
-    from vap_core.policies.mini_pi0.teach_token import MODEL
     from vap_core.simulation.suites import BENCHMARKS
 
     folders = list(policies or ())
@@ -158,7 +158,7 @@ def embeddings(
         folders = [shipped(name) for name in BENCHMARKS if shipped(name).is_dir()]
     if not folders:
         raise BadPolicy("embeddings: name the folder of a policy after the model's.")
-    table = spaces(vlm or MODEL, folders, suite, _with_bar)
+    table = spaces(vlm, folders, suite, _with_bar)
     print(report(table))
     if out is not None:
         keep(table, out)

@@ -22,7 +22,7 @@ from vap_core.evaluation import measurements, store
 from vap_core.evaluation.policy_names import shipped
 from vap_core.evaluation.processes import results
 from vap_core.evaluation.tokens import choices
-from vap_core.policies.lerobot.checkpoints import fingerprint
+from vap_core.policies.lerobot.checkpoints import config_field, fingerprint
 from vap_core.policies.mini_pi0 import teach_token
 from vap_core.policies.mini_pi0.learned_token import Photos, TokenTraining, lessons, recognized
 from vap_core.policies.mini_pi0.token_alignment import align
@@ -78,11 +78,12 @@ class Tokens:
     def configuration(self) -> dict[str, Any]:
         """What the results depend on, as JSON; suites and numbers of photos may be added to."""
         policies = {name: fingerprint(shipped(name)) for name in suites.BENCHMARKS}
+        models = {name: _model(_model_folder(name)).sha256() for name in suites.BENCHMARKS}
         return {
             "survey": "tokens",
             "epochs": self.epochs,
             "views": teach_token.VIEWS,
-            "vlm": _model().sha256(),
+            "vlms": models,
             "policies": policies,
         }
 
@@ -123,8 +124,8 @@ def run_job(job: Job) -> dict[str, list[Row]]:
     target = suites.rows(job.suite, job.task, 1)[0].target
     taught = _photos(job.suite, job.task, 0, job.k)
     shown = _shown(job.suite, job.task)
-    policy_folder = shipped(job.suite)
-    teacher = _model() if job.where == "vlm" else _policy_model(job.suite)
+    policy_folder, model_folder = shipped(job.suite), _model_folder(job.suite)
+    teacher = _model(model_folder) if job.where == "vlm" else _policy_model(job.suite)
     training = TokenTraining(epochs=job.epochs)
     about = {"suite": job.suite, "task": job.task, "object": target, "k": job.k}
     about |= {"learned_in": job.where, "epochs": job.epochs}
@@ -145,7 +146,7 @@ def run_job(job: Job) -> dict[str, list[Row]]:
             chosen += choices.scores({**where, "seen_in": name}, teacher, embedding, part)
         if job.where == "vlm":
             reader = _policy_model(job.suite)
-            aligned = align(embedding, teach_token.MODEL, policy_folder)
+            aligned = align(embedding, model_folder, policy_folder)
             for token, read in (("copied", embedding), ("aligned", aligned)):
                 where = {**about, "step": step, "token": token, "read_by": "policy"}
                 answers += _answers(where, reader, read, shown)
@@ -264,11 +265,16 @@ def _shown(suite: str, task: str) -> dict[str, Sequence[Rgb]]:
     return {target: photos.own, **rivals, OTHER: others}
 
 
-@lru_cache(maxsize=1)
-def _model() -> "MiniVlm":
+def _model_folder(suite: str) -> Path:
+    """The shipped model that a suite's policy grew from."""
+    return teach_token.model_of(config_field(shipped(suite), "vlm"))
+
+
+@lru_cache(maxsize=2)
+def _model(folder: Path) -> "MiniVlm":
     from vap_core.policies.mini_pi0.vlm import load_vlm
 
-    return load_vlm(teach_token.MODEL)
+    return load_vlm(folder)
 
 
 @lru_cache(maxsize=1)
