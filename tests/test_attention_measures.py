@@ -453,7 +453,7 @@ def test_an_episode_is_named_and_found_in_its_run(
         return None, []
 
     monkeypatch.setattr(examples, "run_again", run_again)
-    table = DATA / "results" / "mini_pi0.parquet"
+    table = DATA / "results" / "first_policy.parquet"
     name = "simpler-bridge/put-camera/soft/22"
     path, step = examples.record(table, name, tmp_path / "new", tmp_path)
     assert (path, step) == (tmp_path / "new" / "simpler-bridge.put-camera.soft.22.rrd", 0)

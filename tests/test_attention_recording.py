@@ -22,7 +22,8 @@ from vap_core.recording.attention_picture import attended
 from vap_core.recording.entities.attention import attention_overlay
 from vap_core.recording.stored_pictures import read_pictures
 
-RUN = DATA / "results" / "mini_pi0.parquet"
+RUN = DATA / "results" / "first_policy.parquet"
+"""simpler-bridge's first policy, whose token is kept."""
 NAME = "simpler-bridge/pick-shaver/soft/12"
 IMAGE = "/observation.images.front"
 QUERIES = ("token", "action")
@@ -190,11 +191,11 @@ def test_only_the_policy_of_the_run_is_run_again(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Weights that were trained since would be recorded under the run's name."""
-    table = pd.read_parquet(RUN)
-    changed = table.assign(policy="mini_pi0:0000000000")
-    published = examples.read_runs(RUN)
+    run = DATA / "results" / "mini_pi0.parquet"
+    changed = pd.read_parquet(run).assign(policy="mini_pi0:0000000000")
+    published = examples.read_runs(run)
     monkeypatch.setattr(examples, "read_runs", lambda _: [(published[0][0], changed)])
     monkeypatch.setattr(pictures, "register_personal", lambda *_: None)
     with pytest.raises(BadStudy, match="was run with mini_pi0:0000000000"):
-        examples.record(RUN, "simpler-fractal/pick-pen-holder/generic/0", tmp_path, tmp_path)
+        examples.record(run, "simpler-fractal/pick-pen-holder/generic/0", tmp_path, tmp_path)
     assert not list(tmp_path.rglob("*.rrd"))

@@ -65,8 +65,8 @@ def attention(
     record one of them with its maps.
 
     Example: python -m vap_core attention data/results/mini_pi0.parquet --method soft,vap
-        --suite simpler-bridge
-    Example: python -m vap_core attention data/results/mini_pi0.parquet
+        --suite vlabench
+    Example: python -m vap_core attention data/results/first_policy.parquet
         --record simpler-bridge/put-camera/soft/22
     """
     from vap_core.analysis.attention import examples, replay, report

@@ -2,11 +2,11 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vap_core.evaluation.policy_names import shipped
 from vap_core.policies.hooks import observe_attention
 from vap_core.policies.lerobot.adapter import IMAGE, STATE, LeRobot, load_policy
 from vap_core.policies.protocol import Chunk, PolicyInput
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 SIDE = 112
 
 
-def layer_effects(suite: str) -> "pd.DataFrame":
-    """Largest change of an action of the shipped pi0 when a layer attends evenly.
+def layer_effects(folder: Path) -> "pd.DataFrame":
+    """Largest change of an action of the pi0 in a folder when a layer attends evenly.
 
     Two rows: the vision-language model, whose queries are patches and words, and the action expert.
     The input is noise under a real instruction.
     """
     import pandas as pd
 
-    policy = load_policy(shipped(suite))
+    policy = load_policy(folder)
     towers = policy.policy.model.paligemma_with_expert
     look = _noise(policy)
     plain = _chunk(policy, look)
