@@ -3,10 +3,14 @@
 import pandas as pd
 import pytest
 
+from tests.pages import ROOT
 from vap_core.analysis import shared_films, shared_scenes
-from vap_core.base.files import DATA
+from vap_core.base.files import DATA, SHIPPED
 from vap_core.evaluation.paper import ledger
 from vap_core.evaluation.parsers import report
+from vap_core.evaluation.publish import read_runs
+from vap_core.policies.lerobot.checkpoints import fingerprint
+from vap_core.policies.names import checkpoint_of
 
 SUITE = "shared-sequence-bridge"
 
@@ -143,3 +147,14 @@ def test_a_policy_that_was_taught_pairs_is_named_apart_from_the_benchmarks_own()
         "expert",
     ]
     assert [shared_scenes._policy_name(name) for name in names] == list(shared_scenes.POLICY_ORDER)
+
+
+def test_the_page_names_the_frozen_policy_of_the_published_rows():
+    """The rows of the WidowX are of simpler-bridge's first policy, whatever is the default now."""
+    ran = pd.concat([rows for _, rows in read_runs(DATA / "results" / "shared.parquet")])
+    ran = ran[ran["suite"] == SUITE]
+    (label,) = {label for label in ran["policy"] if checkpoint_of(label)}
+    checkpoint = SHIPPED / checkpoint_of(label)
+    assert label.endswith(f"@{fingerprint(checkpoint)[:8]}")
+    page = (ROOT / "docs" / "shared.md").read_text()
+    assert f"`data/policies/{checkpoint.name}`." in page
