@@ -43,8 +43,8 @@ class Recipe(Sizes):
     look at the pictures; frames close to the start, a grasp, a release or the end come `focus`
     times as often as others. `execute` actions of each chunk of `chunk` are carried out. The arm's
     angles are read with noise of the deviation `angle_noise_rad`: in films the arm starts alike,
-    and some angles hardly change. Without it simpler-bridge's policy falls from 92 to 14 % where
-    every joint starts up to 0.03 rad off (docs/benchmarks.md, other starts).
+    and some angles hardly change. Without it simpler-bridge's first policy falls from 92 to 14 %
+    where every joint starts up to 0.03 rad off (docs/benchmarks.md, other starts).
     """
 
     suite: str
