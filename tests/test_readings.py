@@ -9,11 +9,13 @@ from vap_core.base.errors import BadOutput
 from vap_core.base.files import DATA
 from vap_core.evaluation import readings
 from vap_core.evaluation.engine import _open_run
+from vap_core.evaluation.policy_names import shipped
 from vap_core.evaluation.publish import read_published
 from vap_core.evaluation.readings import Reading, all_readings, append, publish_readings, read_log
 from vap_core.evaluation.report.sections import readings_section
 from vap_core.evaluation.store import read_manifest
 from vap_core.evaluation.study import Study
+from vap_core.policies.lerobot.checkpoints import fingerprint
 from vap_core.simulation import suites
 
 TASKS = (("simpler-bridge", "pick-shaver"), ("simpler-bridge", "put-camera"))
@@ -144,3 +146,10 @@ def test_the_docs_count_the_published_readings() -> None:
         f"tabletop with {desk[1]}, {fractal[0]} of simpler-fractal with {fractal[1]}, and "
         f"{vlabench[0]} of vlabench with {vlabench[1]}." in text
     )
+    own = fingerprint(shipped("simpler-bridge"))
+    of_default = {"simpler-bridge": 0, "simpler-bridge-red": 0}
+    for line in read_log(DATA / "results" / readings.FILE):
+        if line.suite in of_default and own.startswith(line.weights or "-"):
+            of_default[line.suite] += 1
+    assert of_default == {"simpler-bridge": 7, "simpler-bridge-red": 1}
+    assert "simpler-bridge read its list 7 times, and once with a red look-alike" in text
