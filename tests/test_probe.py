@@ -9,6 +9,7 @@ import pytest
 
 from vap_core.base.errors import BadPolicy, UnknownName
 from vap_core.policies.lerobot.adapter import load_policy
+from vap_core.policies.names import label_of, shipped_checkpoint
 from vap_core.policies.protocol import PolicyInput
 from vap_core.prompt import PALETTE
 from vap_core.rollout.prompters.protocol import PromptContext, SceneTruth
@@ -16,7 +17,7 @@ from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
 from vap_core.training.films.demonstrations import draw_objects, row
 from vap_core.training.policy import probe
-from vap_core.training.policy.probe import WAYS, ProbePrompter, conclude, keep
+from vap_core.training.policy.probe import WAYS, ProbePrompter, conclude, keep, of_shipped
 
 from .test_soft_prompt import SUITE, grown  # noqa: F401
 from .toys import observation
@@ -92,6 +93,16 @@ def test_a_scene_is_played_in_every_way(
     assert "detail" not in held
     (shorter,) = probe._scene(str(grown[1]), SUITE, ("plain",), 1, 0, 0)
     assert shorter["policy"] == f"{table['policy'][0]}, 1 of 4"
+
+
+def test_episodes_of_the_policy_that_ships_go_before_those_of_others() -> None:
+    ships, other = label_of(shipped_checkpoint(SUITE)), "mini_pi0:mini-pi0-older@00c47015"
+    table = pd.DataFrame({"suite": [SUITE, SUITE, "vlabench"], "policy": [other, ships, other]})
+    chosen = of_shipped(table)
+    assert list(chosen.itertuples(index=False, name=None)) == [
+        (SUITE, ships, ""),
+        ("vlabench", other, other),
+    ]
 
 
 def test_what_cannot_be_asked_for_is_told_in_a_line(grown: tuple[Path, Path]) -> None:  # noqa: F811

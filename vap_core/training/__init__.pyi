@@ -4,5 +4,6 @@ from .films.dataset import read as read
 from .films.demonstrations import after_a_miss as after_a_miss
 from .policy.commands import Known as Known
 from .policy.commands import command as command
+from .policy.probe import of_shipped as of_shipped
 from .policy.probe import probe as probe
 from .recipe import RECIPES as RECIPES

@@ -25,11 +25,12 @@ from vap_core.base.types import Attended, Colour, Description, Rgb, value
 from vap_core.evaluation.metrics import rate
 from vap_core.evaluation.processes import results
 from vap_core.policies.lerobot import adapter as lerobot
+from vap_core.policies.names import label_of, shipped_checkpoint
 from vap_core.prompt import ALPHA, PALETTE
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters.protocol import PromptContext, unchanged
 from vap_core.simulation.assets.objects import get_object
-from vap_core.simulation.suites import Suite, Task, suite
+from vap_core.simulation.suites import Suite, Task, benchmark_name, suite
 from vap_core.simulation.suites.open_row import build_scene
 from vap_core.simulation.types import EpisodeRow, Observation
 from vap_core.training.films.captions import describe, distinguishes
@@ -223,6 +224,20 @@ def keep(table: "pd.DataFrame", path: Path) -> None:
             f"probe: {path} cannot be added to ({type(error).__name__}); "
             "name another table with --out."
         ) from error
+
+
+def of_shipped(table: "pd.DataFrame") -> "pd.DataFrame":
+    """The episodes of the policies that ship; a suite without any keeps those of others.
+
+    The column `whose` holds the label of such others, and nothing for a policy that ships.
+    """
+    labels = {}
+    for name in table["suite"].unique():
+        folder = shipped_checkpoint(benchmark_name(name))
+        labels[name] = label_of(folder) if folder.is_dir() else ""
+    ships = table["policy"] == table["suite"].map(labels)
+    without = ~ships.groupby(table["suite"]).transform("any")
+    return table.assign(whose=table["policy"].where(without, ""))[ships | without]
 
 
 def _scene(
