@@ -23,14 +23,15 @@ from vap_core.base.parquet import read_parquet
 from vap_core.base.tables import align
 from vap_core.base.types import Attended, Colour, Description, Rgb, value
 from vap_core.evaluation.metrics import rate
+from vap_core.evaluation.policy_names import shipped
 from vap_core.evaluation.processes import results
 from vap_core.policies.lerobot import adapter as lerobot
-from vap_core.policies.names import label_of, shipped_checkpoint
+from vap_core.policies.names import label_of
 from vap_core.prompt import ALPHA, PALETTE
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters.protocol import PromptContext, unchanged
 from vap_core.simulation.assets.objects import get_object
-from vap_core.simulation.suites import Suite, Task, benchmark_name, suite
+from vap_core.simulation.suites import Suite, Task, suite
 from vap_core.simulation.suites.open_row import build_scene
 from vap_core.simulation.types import EpisodeRow, Observation
 from vap_core.training.films.captions import describe, distinguishes
@@ -233,7 +234,7 @@ def of_shipped(table: "pd.DataFrame") -> "pd.DataFrame":
     """
     labels = {}
     for name in table["suite"].unique():
-        folder = shipped_checkpoint(benchmark_name(name))
+        folder = shipped(name)
         labels[name] = label_of(folder) if folder.is_dir() else ""
     ships = table["policy"] == table["suite"].map(labels)
     without = ~ships.groupby(table["suite"]).transform("any")
