@@ -5,7 +5,7 @@ import hashlib
 import subprocess
 from collections.abc import Collection
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 
@@ -13,7 +13,7 @@ from pathlib import Path
 def code_version(folder: Path | None = None) -> str:
     """The commit of a checkout (default: this one), with `+` when the tree differs.
 
-    Where there is none, the installed version.
+    Where there is none, the installed version; "unknown" for a copy that is neither.
     """
     command = ["git", "describe", "--always", "--dirty=+", "--abbrev=10"]
     folder = folder or Path(__file__).resolve().parent
@@ -22,7 +22,7 @@ def code_version(folder: Path | None = None) -> str:
             command, cwd=folder, capture_output=True, text=True, timeout=10, check=True
         )
     except (OSError, subprocess.SubprocessError):
-        return f"vap-core {version('vap-core')}"
+        return _installed_version()
     return done.stdout.strip()
 
 
@@ -39,6 +39,13 @@ def code_digest(folder: Path, without: Collection[str] = ()) -> str:
         found.update(path.relative_to(folder).as_posix().encode())
         found.update(ast.dump(_without_docstrings(ast.parse(path.read_text()))).encode())
     return found.hexdigest()[:16]
+
+
+def _installed_version() -> str:
+    try:
+        return f"vap-core {version('vap-core')}"
+    except PackageNotFoundError:
+        return "unknown"
 
 
 def _without_docstrings(tree: ast.Module) -> ast.Module:
