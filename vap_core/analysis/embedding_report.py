@@ -12,8 +12,7 @@ from vap_core.base.files import write_atomic
 from vap_core.base.tables import align
 from vap_core.evaluation.paper import ledger
 from vap_core.policies.embedding_table import open_table
-from vap_core.policies.lerobot.checkpoints import config_field
-from vap_core.policies.mini_pi0.teach_token import model_of
+from vap_core.policies.mini_pi0.teach_token import model_of_policy
 from vap_core.policies.token_groups import token_groups
 from vap_core.simulation.suites import BENCHMARKS
 
@@ -51,7 +50,7 @@ def spaces(
 
     rows = []
     for policy in policies:
-        model = vlm or model_of(config_field(policy, "vlm"))
+        model = vlm or model_of_policy(policy)
         ours, theirs = open_table(model), open_table(policy)
         found = {WHOLE: compare(ours, theirs, watch)}
         names = _suites_of(policy, suite)

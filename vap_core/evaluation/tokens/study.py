@@ -22,7 +22,7 @@ from vap_core.evaluation import measurements, store
 from vap_core.evaluation.policy_names import shipped
 from vap_core.evaluation.processes import results
 from vap_core.evaluation.tokens import choices
-from vap_core.policies.lerobot.checkpoints import config_field, fingerprint
+from vap_core.policies.lerobot.checkpoints import fingerprint
 from vap_core.policies.mini_pi0 import teach_token
 from vap_core.policies.mini_pi0.learned_token import Photos, TokenTraining, lessons, recognized
 from vap_core.policies.mini_pi0.token_alignment import align
@@ -267,7 +267,7 @@ def _shown(suite: str, task: str) -> dict[str, Sequence[Rgb]]:
 
 def _model_folder(suite: str) -> Path:
     """The shipped model that a suite's policy grew from."""
-    return teach_token.model_of(config_field(shipped(suite), "vlm"))
+    return teach_token.model_of_policy(shipped(suite))
 
 
 @lru_cache(maxsize=2)

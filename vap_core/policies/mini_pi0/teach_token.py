@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from vap_core.base.errors import BadStudy
 from vap_core.base.files import DATA
 from vap_core.base.types import Rgb
+from vap_core.policies.lerobot.checkpoints import config_field
 from vap_core.policies.mini_pi0 import learned_token, token_file
 from vap_core.policies.mini_pi0.learned_token import Photos
 from vap_core.policies.mini_pi0.token_file import Token
@@ -79,6 +80,11 @@ def model_of(initialised_from: str) -> Path:
         if _sha256(folder) == initialised_from:
             return folder
     return MODEL
+
+
+def model_of_policy(policy: Path) -> Path:
+    """The folder of the shipped model that the policy in a folder grew from. Raises: BadPolicy."""
+    return model_of(config_field(policy, "vlm"))
 
 
 @lru_cache
