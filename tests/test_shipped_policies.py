@@ -26,12 +26,14 @@ BY_TODAYS_RECIPE = {
     "simpler-bridge-tint-share-0.2": (0.2, 0.04),
     "simpler-bridge-tint-share-0.5": (0.5, 0.04),
     "simpler-bridge-wide": (0.2, 0.02),
+    "simpler-bridge-wide-seed-0": (0.2, 0.02),
     "simpler-fractal-wide": (0.2, 0.02),
     "simpler-fractal-tint-free": (0.0, 0.02),
+    "vlabench-wide": (0.2, 0.01),
 }
 """Policies that grew from the model that never saw a tint: the share of their scenes that were tinted, and the noise (rad) on the arm's angles."""
 
-STOPPED = {"simpler-fractal-tint-free": 5076}
+STOPPED = {"simpler-bridge-wide-seed-0": 5693, "simpler-fractal-tint-free": 5076}
 """The step at which a training's time was up; the others took all of their recipe's."""
 
 
@@ -68,9 +70,12 @@ def test_it_is_whole_small_and_grown_from_the_model_that_ships(folder: Path) -> 
     assert sum(file.stat().st_size for file in folder.iterdir()) < 16e6
 
 
-def test_fractals_recipe_is_what_made_its_policy() -> None:
-    told = json.loads((SHIPPED / f"{MINI}-simpler-fractal-wide" / "training.json").read_text())
-    recipe = RECIPES["simpler-fractal"].as_json()
+@pytest.mark.parametrize(
+    "made", ["simpler-bridge-wide-seed-0", "simpler-fractal-wide", "vlabench-wide"]
+)
+def test_a_suites_recipe_is_what_made_a_policy_that_ships(made: str) -> None:
+    told = json.loads((SHIPPED / f"{MINI}-{made}" / "training.json").read_text())
+    recipe = RECIPES[told["recipe"]["suite"]].as_json()
     assert told["recipe"] == json.loads(json.dumps(recipe))
 
 

@@ -49,16 +49,16 @@ class Recipe(Sizes):
 
     suite: str
     held_out_category: str
-    stages: int = 250
-    steps: int = 12_000
-    batch: int = 64
+    stages: int = 320
+    steps: int = 6_400
+    batch: int = 128
     chunk: int = 4
     execute: int = 4
     draws: int = 4
-    rate: float = 1e-3
+    rate: float = 1.4e-3
     seed: int = 0
     focus: float = 3.0
-    angle_noise_rad: float = 0.04
+    angle_noise_rad: float = 0.02
     tint_share: float = 0.2
     held_out_tints: tuple[str, ...] = ("magenta", "yellow")
     opacities: tuple[tuple[float, float], ...] = ((0.25, 0.42), (0.58, 0.75))
@@ -78,25 +78,24 @@ RECIPES: dict[str, Recipe] = {
     "simpler-fractal": Recipe(
         suite="simpler-fractal",
         held_out_category="bottle",
-        stages=320,
         steps=5_100,
-        batch=128,
         execute=2,
-        rate=1.4e-3,
-        angle_noise_rad=0.02,
     ),
     "vlabench": Recipe(
         suite="vlabench",
         held_out_category="cat figurine",
-        stages=160,
-        steps=8_000,
-        batch=32,
+        stages=240,
+        steps=1_840,
+        angle_noise_rad=0.01,
     ),
     "tabletop": Recipe(
         suite="tabletop",
         held_out_category="slipper",
         stages=160,
+        steps=12_000,
         batch=32,
+        rate=1e-3,
+        angle_noise_rad=0.04,
         chunk=32,
         execute=10,
     ),
@@ -108,6 +107,8 @@ RECIPES: dict[str, Recipe] = {
         stages=20,
         steps=700,
         batch=32,
+        rate=1e-3,
+        angle_noise_rad=0.04,
         chunk=32,
         execute=10,
         taught=0,
