@@ -166,6 +166,22 @@ def test_what_simpler_fractals_policies_of_todays_recipe_reach() -> None:
         ]
 
 
+def test_what_two_more_trainings_by_todays_recipe_reach() -> None:
+    played = pd.concat([rows for _, rows in read_runs(RESULTS / "by_recipe.parquet")])
+    assert set(played.outcome) <= {"success", "failure"}
+    played["name"] = played.policy.map(checkpoint_of).str.removeprefix("mini-pi0-")
+    unseen = {"simpler-bridge-wide-seed-0": "put-owl-figurine", "vlabench-wide": "select-cat-figurine"}  # fmt: skip
+    _, *body = table("| policy by the recipe | method")
+    assert len(body) == len(played[played.seed == 0].groupby(["name", "method"]))
+    for name, method, *cells in body:
+        method = method.split(" (")[0].strip("*").lower()
+        of_row = played[(played.name == name) & (played.method == method)]
+        listed = of_row[of_row.seed == 0]
+        assert len(listed) == (96 if "bridge" in name else 250)
+        parts = [listed, listed[listed.task == unseen[name]], of_row[of_row.seed > 0]]
+        assert cells == [_of_way(part, method) for part in parts]
+
+
 def test_what_simpler_fractals_policy_does_with_generic_objects() -> None:
     (_, *ways), (_, *cells) = table("| policy of simpler-fractal")
     told = pd.read_parquet(RESULTS / "fractal_generic.parquet")
