@@ -25,6 +25,7 @@ from vap_core.training.films import demonstrations, pairs
 from vap_core.training.films.demonstrations import Film
 from vap_core.training.policy import train
 from vap_core.training.policy.commands import Command, Known, command, phrase_pair
+from vap_core.training.policy.start import SCALES
 from vap_core.training.recipe import RECIPES, every, filmed_tasks
 
 SUITE = "shared-pair"
@@ -179,8 +180,8 @@ def test_the_training_goes_on_from_the_shipped_policy(filmed: Path, tmp_path: Pa
     assert len(moved) > len(before) / 2
     far = max(float((before[name].float() - after[name].float()).abs().max()) for name in moved)
     assert far < 0.05, "it goes on, and does not begin anew"
-    scales = load_file(tmp_path / "pairs" / train.SCALES)
-    for name, tensor in load_file(START / train.SCALES).items():
+    scales = load_file(tmp_path / "pairs" / SCALES)
+    for name, tensor in load_file(START / SCALES).items():
         assert torch.equal(tensor, scales[name])
     trained = load_policy(tmp_path / "pairs")
     assert trained.execute == load_policy(START).execute

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,14 +21,13 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from vap_core.base.device import device_name
-from vap_core.base.errors import BadOutput, BadPolicy, first_line
+from vap_core.base.errors import BadOutput
 from vap_core.base.files import parse_json, sha256_of, write_atomic
 from vap_core.base.version import code_version
 from vap_core.policies.lerobot.checkpoints import CAPTIONS, TRAINING_CARD, WORDS
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
-from vap_core.policies.mini_pi0.vlm import MiniVlm, initialise_policy, load_vlm, store_in_bfloat16
-from vap_core.policies.names import SHIPPED
+from vap_core.policies.mini_pi0.vlm import initialise_policy, load_vlm, store_in_bfloat16
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import suite
 from vap_core.training.films.captions import captions
@@ -40,6 +39,7 @@ from vap_core.training.policy.ahead import Ahead
 from vap_core.training.policy.batches import Frames, statistics
 from vap_core.training.policy.commands import Known, nameable
 from vap_core.training.policy.losses import Learner, embedding_cosine, losses
+from vap_core.training.policy.start import go_on_from, start_folder
 from vap_core.training.policy.taught import learn_words
 from vap_core.training.recipe import Recipe, filmed_tasks
 from vap_core.training.step import Figures, Schedule, average_of, train_steps
@@ -50,8 +50,6 @@ HELD_OUT = 19
 
 It is a prime, as tasks take turns.
 """
-SCALES = "policy_preprocessor_step_4_normalizer_processor.safetensors"
-"""The file in which lerobot keeps a policy's statistics."""
 TEMPERATURE = 0.0
 """Of the trained policy's sampling noise.
 
@@ -171,8 +169,8 @@ def train(
     first = films.train[0]
     config = configuration(recipe, first.state.shape[1], first.action.shape[1])
     if recipe.start:
-        start = _start_folder(recipe.start)
-        learner, stats = _go_on_from(start, config, teacher)
+        start = start_folder(recipe.start)
+        learner, stats = go_on_from(start, config, teacher)
         config = learner.policy.config
         made_of["start"] = {
             "name": recipe.start,
@@ -268,50 +266,6 @@ def save(
     }
     write_atomic(out / TRAINING_CARD, json.dumps(card, indent=1).encode())
     return card
-
-
-def _start_folder(start: str) -> Path:
-    """The folder of the shipped policy with this name, or the folder that it names."""
-    shipped = SHIPPED / start
-    return shipped if shipped.is_dir() else Path(start)
-
-
-def _go_on_from(
-    folder: Path, wanted: MiniPI0Config, teacher: MiniVlm | None
-) -> tuple[Learner, dict[str, dict[str, Tensor]]]:
-    """A learner with a policy's weights, and how its processors scale states and actions.
-
-    Raises: BadPolicy when it can't be read, does not look and act as in `wanted`, or did not grow
-        from the `teacher`.
-    """
-    from lerobot.configs import PreTrainedConfig
-
-    try:
-        config = cast(MiniPI0Config, PreTrainedConfig.from_pretrained(folder))
-        learner = Learner(config)
-        learner.policy.load_state_dict(load_file(folder / "model.safetensors"))
-        kept = load_file(folder / SCALES)
-        stats: dict[str, dict[str, Tensor]] = {}
-        for name in ("observation.state", "action"):
-            stats[name] = {part: kept[f"{name}.{part}"] for part in ("mean", "std")}
-    except Exception as error:
-        raise BadPolicy(
-            f"train policy: {folder} is no mini-pi0 to go on from ({type(error).__name__}: "
-            f"{first_line(error):.120}); name a checkpoint's folder, or get the repository's "
-            "data/policies again: git checkout data/policies"
-        ) from error
-    for name in ("input_features", "output_features", "chunk_size", "width"):
-        if getattr(config, name) != getattr(wanted, name):
-            raise BadPolicy(
-                f"train policy: {folder} differs from the recipe in {name}; go on from a policy "
-                "of the same suite, or leave out --start."
-            )
-    if teacher is not None and config.vlm != teacher.sha256():
-        raise BadPolicy(
-            f"train policy: {folder} did not grow from this mini-PaliGemma; name the one that it "
-            "grew from with --vlm, or leave it out to teach no learned word."
-        )
-    return learner, stats
 
 
 def _prepare_words(

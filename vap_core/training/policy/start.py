@@ -1,0 +1,63 @@
+"""The policy that a training goes on from, instead of beginning with nothing.
+
+learner, scales = go_on_from(start_folder("mini-pi0-tabletop"), config, teacher)
+"""
+
+from pathlib import Path
+from typing import cast
+
+from safetensors.torch import load_file
+from torch import Tensor
+
+from vap_core.base.errors import BadPolicy, first_line
+from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
+from vap_core.policies.mini_pi0.vlm import MiniVlm
+from vap_core.policies.names import SHIPPED
+from vap_core.training.policy.losses import Learner
+
+SCALES = "policy_preprocessor_step_4_normalizer_processor.safetensors"
+"""The file in which lerobot keeps a policy's statistics."""
+
+
+def start_folder(start: str) -> Path:
+    """The folder of the shipped policy with this name, or the folder that it names."""
+    shipped = SHIPPED / start
+    return shipped if shipped.is_dir() else Path(start)
+
+
+def go_on_from(
+    folder: Path, wanted: MiniPI0Config, teacher: MiniVlm | None
+) -> tuple[Learner, dict[str, dict[str, Tensor]]]:
+    """A learner with a policy's weights, and how its processors scale states and actions.
+
+    Raises: BadPolicy when it can't be read, does not look and act as in `wanted`, or did not grow
+        from the `teacher`.
+    """
+    from lerobot.configs import PreTrainedConfig
+
+    try:
+        config = cast(MiniPI0Config, PreTrainedConfig.from_pretrained(folder))
+        learner = Learner(config)
+        learner.policy.load_state_dict(load_file(folder / "model.safetensors"))
+        kept = load_file(folder / SCALES)
+        stats: dict[str, dict[str, Tensor]] = {}
+        for name in ("observation.state", "action"):
+            stats[name] = {part: kept[f"{name}.{part}"] for part in ("mean", "std")}
+    except Exception as error:
+        raise BadPolicy(
+            f"train policy: {folder} is no mini-pi0 to go on from ({type(error).__name__}: "
+            f"{first_line(error):.120}); name a checkpoint's folder, or get the repository's "
+            "data/policies again: git checkout data/policies"
+        ) from error
+    for name in ("input_features", "output_features", "chunk_size", "width"):
+        if getattr(config, name) != getattr(wanted, name):
+            raise BadPolicy(
+                f"train policy: {folder} differs from the recipe in {name}; go on from a policy "
+                "of the same suite, or leave out --start."
+            )
+    if teacher is not None and config.vlm != teacher.sha256():
+        raise BadPolicy(
+            f"train policy: {folder} did not grow from this mini-PaliGemma; name the one that it "
+            "grew from with --vlm, or leave it out to teach no learned word."
+        )
+    return learner, stats
