@@ -23,9 +23,8 @@ from vap_core.simulation.suites.layout import radius_m
 from vap_core.simulation.suites.rules import NEAR_M
 from vap_core.training.films import demonstrations, pairs
 from vap_core.training.films.demonstrations import Film
-from vap_core.training.policy import train
+from vap_core.training.policy import start, train
 from vap_core.training.policy.commands import Command, Known, command, phrase_pair
-from vap_core.training.policy.start import SCALES
 from vap_core.training.recipe import RECIPES, every, filmed_tasks
 
 SUITE = "shared-pair"
@@ -180,8 +179,8 @@ def test_the_training_goes_on_from_the_shipped_policy(filmed: Path, tmp_path: Pa
     assert len(moved) > len(before) / 2
     far = max(float((before[name].float() - after[name].float()).abs().max()) for name in moved)
     assert far < 0.05, "it goes on, and does not begin anew"
-    scales = load_file(tmp_path / "pairs" / SCALES)
-    for name, tensor in load_file(START / SCALES).items():
+    scales = load_file(tmp_path / "pairs" / start.SCALES)
+    for name, tensor in load_file(START / start.SCALES).items():
         assert torch.equal(tensor, scales[name])
     trained = load_policy(tmp_path / "pairs")
     assert trained.execute == load_policy(START).execute
@@ -190,7 +189,7 @@ def test_the_training_goes_on_from_the_shipped_policy(filmed: Path, tmp_path: Pa
 def test_a_start_that_is_no_policy_is_named(
     filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(train, "SHIPPED", tmp_path)
+    monkeypatch.setattr(start, "SHIPPED", tmp_path)
     recipe = replace(RECIPE, stages=2, steps=1)
     with pytest.raises(BadPolicy, match=r"mini-pi0-tabletop is no mini-pi0 to go on from"):
         train.train(recipe, tmp_path / "out", cache=filmed, jobs=1)
