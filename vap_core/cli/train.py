@@ -133,7 +133,7 @@ def policy(
         typer.Option(
             min=0.0,
             help="Deviation (rad) of the noise with which the arm's angles are read. Default the "
-            "recipe's; the default policies were made with 0.",
+            "recipe's.",
         ),
     ] = None,
     stages: Annotated[
