@@ -182,10 +182,17 @@ def test_what_two_more_trainings_by_todays_recipe_reach() -> None:
         assert cells == [_of_way(part, method) for part in parts]
 
 
-def test_what_simpler_fractals_policy_does_with_generic_objects() -> None:
-    (_, *ways), (_, *cells) = table("| policy of simpler-fractal")
-    told = pd.read_parquet(RESULTS / "fractal_generic.parquet")
-    assert set(told.policy.map(checkpoint_of)) == {"mini-pi0-simpler-fractal-wide"}
+@pytest.mark.parametrize(
+    ("suite", "name"),
+    [
+        ("fractal", "mini-pi0-simpler-fractal-wide"),
+        ("bridge", "mini-pi0-simpler-bridge-wide-seed-0"),
+    ],
+)
+def test_what_a_policy_of_todays_recipe_does_with_generic_objects(suite: str, name: str) -> None:
+    (_, *ways), (_, *cells) = table(f"| policy of simpler-{suite}")
+    told = pd.read_parquet(RESULTS / f"{suite}_generic.parquet")
+    assert set(told.policy.map(checkpoint_of)) == {name}
     assert cells == [_of_way(told, way) for way in ways]
     assert set(ways) == set(told.method)
 
