@@ -1,6 +1,8 @@
 """The policy that a training goes on from, instead of beginning with nothing.
 
-learner, scales = go_on_from(start_folder("mini-pi0-tabletop"), config, teacher)
+    learner, scales = go_on_from(start_folder("mini-pi0-tabletop"), config, teacher)
+
+It has to look and act as the recipe says, and to have grown from the same mini-PaliGemma.
 """
 
 from pathlib import Path
