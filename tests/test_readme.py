@@ -91,9 +91,7 @@ def test_what_the_true_mask_at_every_step_reaches() -> None:
 
 def test_what_policies_of_other_tint_shares_reach() -> None:
     shares = ABLATIONS["tint-share"]
-    runs = read_runs(RESULTS / "tint_share.parquet")
-    played = pd.concat([episodes for _, episodes in runs])
-    assert set(played.outcome) <= {"success", "failure"}
+    played = _played("tint_share")
     listed = played[played.seed == 0]
     held = {}
     for share, name in SHARES.items():
@@ -147,8 +145,7 @@ def test_the_policy_of_more_scenes_is_the_default_and_came_out_the_same_again() 
 
 
 def test_what_simpler_fractals_policies_of_todays_recipe_reach() -> None:
-    played = pd.concat([rows for _, rows in read_runs(RESULTS / "fractal_today.parquet")])
-    assert set(played.outcome) <= {"success", "failure"}
+    played = _played("fractal_today")
     assert set(played.split) == {"visual matching"}
     played["name"] = played.policy.map(checkpoint_of).str.removeprefix("mini-pi0-simpler-fractal-")
     head, *body = table("| policy | method | pick-pen-holder")
@@ -160,15 +157,11 @@ def test_what_simpler_fractals_policies_of_todays_recipe_reach() -> None:
         tasks = [listed[listed.task == task] for task in (head[2], "move-bottle-near-coke-can")]
         assert [len(part) for part in tasks] == [300, 160]
         parts = [*tasks, listed, of_row[of_row.seed == 1]]
-        assert cells == [
-            _percent(rate(int(part.success.sum()), len(part))) if len(part) else ""
-            for part in parts
-        ]
+        assert cells == [_of_way(part, method) for part in parts]
 
 
 def test_what_two_more_trainings_by_todays_recipe_reach() -> None:
-    played = pd.concat([rows for _, rows in read_runs(RESULTS / "by_recipe.parquet")])
-    assert set(played.outcome) <= {"success", "failure"}
+    played = _played("by_recipe")
     played["name"] = played.policy.map(checkpoint_of).str.removeprefix("mini-pi0-")
     unseen = {"simpler-bridge-wide-seed-0": "put-owl-figurine", "vlabench-wide": "select-cat-figurine"}  # fmt: skip
     _, *body = table("| policy by the recipe | method")
@@ -199,11 +192,17 @@ def test_what_a_policy_of_todays_recipe_does_with_generic_objects(suite: str, na
 
 def _starts(name: str, listed: int, others: int) -> list[tuple[str, str]]:
     """Of VAP and of generic: what it reaches as listed, and from so many other seeds."""
-    played = pd.concat([episodes for _, episodes in read_runs(RESULTS / f"{name}.parquet")])
-    assert set(played.outcome) <= {"success", "failure"}
+    played = _played(name)
     at_home, elsewhere = played[played.seed == 0], played[played.seed > 0]
     assert (len(at_home), len(elsewhere)) == (listed, others * 192)
     return [(_of_way(at_home, way), _of_way(elsewhere, way)) for way in ("vap", "generic")]
+
+
+def _played(name: str) -> pd.DataFrame:
+    """The episodes of a published table, none of which ended in an error."""
+    played = pd.concat([episodes for _, episodes in read_runs(RESULTS / f"{name}.parquet")])
+    assert set(played.outcome) <= {"success", "failure"}
+    return played
 
 
 def _of_way(told: pd.DataFrame, way: str) -> str:
