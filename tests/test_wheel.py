@@ -32,10 +32,10 @@ LEFT_OUT = tuple(
     for name in (
         "simpler-bridge",
         "simpler-bridge-tint-free",
-        "simpler-bridge-wide-seed-0",
+        "simpler-bridge-wide",
         "simpler-fractal-tint-free",
         "simpler-fractal-wide",
-        "vlabench-wide",
+        "vlabench",
     )
 )
 Run = Callable[..., subprocess.CompletedProcess[str]]

@@ -7,7 +7,10 @@ from vap_core.base.files import SHIPPED as SHIPPED
 
 MINI = "mini-pi0"
 """The shipped frozen policy, one checkpoint a suite."""
-_NEWER = {"simpler-bridge": f"{MINI}-simpler-bridge-wide"}
+_NEWER = {
+    "simpler-bridge": f"{MINI}-simpler-bridge-wide-seed-0",
+    "vlabench": f"{MINI}-vlabench-wide",
+}
 """The checkpoint of a benchmark whose first one, `mini-pi0-BENCHMARK`, was replaced."""
 POLICIES = ("scripted", "expert", "random")
 """Policies without weights; each is built for one scene."""
