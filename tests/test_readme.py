@@ -120,22 +120,28 @@ def test_what_more_scenes_reach() -> None:
     assert f"it reaches {vap} % with VAP as listed" in PROSE
     assert f"and {elsewhere} % from other starts (864" in PROSE
     assert f"generic {generic} and {generic_elsewhere} %. The paper" in PROSE
+    _, *body = table("| policy | method | as listed (seed 0)")
+    quoted = {tuple(row[:2]): row[3].strip("*").split(" of ")[0] for row in body}
+    assert quoted["the other training, wide", "VAP"].replace("**", "") == elsewhere
+    assert quoted["the other training, wide", "generic"] == generic_elsewhere
+
+
+def test_what_ten_seeds_reach() -> None:
+    (vap, elsewhere), (generic, generic_elsewhere) = _starts("ten_seeds", listed=192, others=9)
     assert (
         f"has {vap} % with VAP as listed and {elsewhere} % from other starts, generic {generic} and "
         f"{generic_elsewhere} %"
     ) in PROSE
+    digests = {label.rpartition("@")[2] for label in _played("ten_seeds").policy}
+    assert digests == {fingerprint(shipped("simpler-bridge"))[:8]}
 
 
-def test_the_policy_of_more_scenes_is_the_default_and_came_out_the_same_again() -> None:
-    default = shipped("simpler-bridge")
-    again, main = (
-        pd.concat([rows for _, rows in read_runs(RESULTS / f"{name}.parquet")])
-        for name in ("more_scenes", "mini_pi0")
-    )
-    main = main[main.suite == "simpler-bridge"]
-    assert set(main.policy.map(checkpoint_of)) == {default.name}
+def test_the_policy_of_more_scenes_came_out_the_same_again() -> None:
+    folder = RESULTS.parent / "policies" / "mini-pi0-simpler-bridge-wide"
+    again, main = _played("more_scenes"), _played("by_recipe")
+    assert set(main.policy.map(checkpoint_of)) == {folder.name}
     digests = {label.rpartition("@")[2] for label in (*again.policy, *main.policy)}
-    assert digests == {fingerprint(default)[:8]}
+    assert digests == {fingerprint(folder)[:8]}
     one, other = (
         rows[rows.seed == 0].set_index(["method", "task", "episode"]).success
         for rows in (again, main)
@@ -160,10 +166,18 @@ def test_what_simpler_fractals_policies_of_todays_recipe_reach() -> None:
         assert cells == [_of_way(part, method) for part in parts]
 
 
-def test_what_two_more_trainings_by_todays_recipe_reach() -> None:
-    played = _played("by_recipe")
+def test_what_the_defaults_by_todays_recipe_reach() -> None:
+    unseen = {
+        "simpler-bridge-wide-seed-0": "put-owl-figurine",
+        "simpler-bridge-wide": "put-owl-figurine",
+        "vlabench-wide": "select-cat-figurine",
+    }
+    listed = pd.concat([_played(name) for name in ("mini_pi0", "oracle_track", "by_recipe")])
+    others = pd.concat([_played(name) for name in ("ten_seeds", "more_scenes")])
+    played = pd.concat([listed, others[others.seed > 0]])
     played["name"] = played.policy.map(checkpoint_of).str.removeprefix("mini-pi0-")
-    unseen = {"simpler-bridge-wide-seed-0": "put-owl-figurine", "vlabench-wide": "select-cat-figurine"}  # fmt: skip
+    played["name"] = played.name.replace("wide", "simpler-bridge-wide")
+    played = played[played.name.isin(unseen)]
     _, *body = table("| policy by the recipe | method")
     assert len(body) == len(played[played.seed == 0].groupby(["name", "method"]))
     for name, method, *cells in body:
