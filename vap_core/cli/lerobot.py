@@ -43,8 +43,8 @@ def attach_command(
 
     Its files are linked, not changed; one step is added to its preprocessor.
 
-    Example: python -m vap_core attach data/policies/mini-pi0-simpler-bridge-wide-seed-0 data/runs/mine
-        --memory data/runs/bridge/memory
+    Example: python -m vap_core attach data/policies/mini-pi0-simpler-bridge-wide-seed-0
+        data/runs/mine --memory data/runs/bridge/memory
     """
     from vap_core.base.extras import require
 
