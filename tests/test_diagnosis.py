@@ -209,11 +209,22 @@ def test_a_run_of_an_earlier_default_policy_is_run_again_with_that_one() -> None
     for manifest, episodes in read_published(DATA / "results" / "first_policy.parquet"):
         row = episodes.iloc[0].to_dict()
         named.add(manifest["configuration"]["policy"])
-        assert study_of(manifest, row).policy_label("simpler-bridge") == row["policy"]
+        assert study_of(manifest, row).policy_label(row["suite"]) == row["policy"]
         for label in ("mini_pi0:0000000000", "mini_pi0:mini-pi0-of-nobody@00000000", "scripted"):
             study = study_of(manifest, {**row, "policy": label})
             assert study.policy == manifest["configuration"]["policy"]
-    assert named == {"mini-pi0", "data/policies/mini-pi0-simpler-bridge"}
+    first = {f"data/policies/mini-pi0-{suite}" for suite in ("simpler-bridge", "vlabench")}
+    assert named == {"mini-pi0", *first}
+
+
+def test_a_run_of_a_policy_that_has_moved_is_run_again_with_the_shipped_one() -> None:
+    """Manifests name the folder of their day; the label's digest is checked before it is run."""
+    moved = 0
+    for manifest, episodes in read_published(DATA / "results" / "mini_pi0.parquet"):
+        row = episodes.iloc[0].to_dict()
+        moved += manifest["configuration"]["policy"].startswith("data/runs/")
+        assert study_of(manifest, row).policy_label(row["suite"]) == row["policy"]
+    assert moved
 
 
 @pytest.mark.parametrize(

@@ -323,7 +323,8 @@ def test_the_report_compares_the_shipped_policies_beside_the_paper() -> None:
     assert "words of simpler-bridge" in found.output
     assert found.output.count("paper: pi0") == 4
     assert "0.945626 ± 0.066187" in found.output
-    assert "mini-pi0-simpler-bridge-wide with mini-paligemma-tint-free." in found.output
+    by_recipe = "mini-pi0-simpler-bridge-wide-seed-0, mini-pi0-vlabench-wide"
+    assert f"{by_recipe} with mini-paligemma-tint-free" in found.output
     shipped = teach_token.MODEL.parent
     kept = pd.read_parquet(shipped.parent / "results" / "token_spaces.parquet")
     measured = [str(shipped / name) for name in kept.policy.unique()]
@@ -333,15 +334,16 @@ def test_the_report_compares_the_shipped_policies_beside_the_paper() -> None:
     for row in whole.itertuples():
         cosine = f"{row.cosine_mean:.6f} ± {row.cosine_std:.6f}"
         assert cosine in named.output
-        default = row.policy != "mini-pi0-simpler-bridge"  # which has a successor
-        assert (cosine in found.output) == default
+        replaced = row.policy in ("mini-pi0-simpler-bridge", "mini-pi0-vlabench")
+        assert (cosine in found.output) != replaced
 
 
 def test_a_policy_is_measured_beside_the_model_that_it_grew_from() -> None:
     folders = {name: study._model_folder(name).name for name in suites.BENCHMARKS}
-    assert folders.pop(SUITE) == "mini-paligemma-tint-free"
+    for suite in (SUITE, "vlabench"):
+        assert folders.pop(suite) == "mini-paligemma-tint-free"
     assert set(folders.values()) == {"mini-paligemma"}
-    successor = teach_token.MODEL.parent / f"mini-pi0-{SUITE}-wide"
+    successor = teach_token.MODEL.parent / f"mini-pi0-{SUITE}-wide-seed-0"
     table = embedding_report.spaces(None, [successor])
     assert list(table.group) == [embedding_report.WHOLE, f"words of {SUITE}", "reserved"]
     assert (table.cosine_min > 0.999999).all()

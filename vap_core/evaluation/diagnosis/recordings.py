@@ -21,6 +21,7 @@ from vap_core.evaluation.stills import write_provenance
 from vap_core.evaluation.store import ROW_KEY
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import make_trial, register_personal
+from vap_core.policies.lerobot.checkpoints import is_checkpoint_name
 from vap_core.policies.names import checkpoint_of
 from vap_core.simulation.types import EpisodeRow
 
@@ -150,7 +151,8 @@ def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
 def study_of(manifest: Mapping[str, Any], row: Mapping[str, Any]) -> Study:
     """The study of a run, of one task and method alone, with the policy of the row.
 
-    A run of a default policy that has a successor names the earlier one's folder, if it ships.
+    A run of a default policy that has a successor names the earlier one's folder, if it ships; one
+    whose policy's folder is not here takes the shipped policy of that name.
     """
     configuration = manifest["configuration"]
     settings = {}
@@ -160,8 +162,12 @@ def study_of(manifest: Mapping[str, Any], row: Mapping[str, Any]) -> Study:
     settings["tasks"] = ((row["suite"], row["task"]),)
     settings["methods"] = (row["method"],)
     name = checkpoint_of(str(row.get("policy", "")))
-    replaced = name not in ("", shipped(row["suite"]).name) and (SHIPPED / name).is_dir()
-    if settings["policy"] == MINI and replaced:
+    ran = settings["policy"]
+    if ran == MINI:
+        other = name not in ("", shipped(row["suite"]).name)
+    else:
+        other = Path(ran).name == name and not is_checkpoint_name(ran)
+    if other and (SHIPPED / name).is_dir():
         settings["policy"] = str(SHIPPED / name)
     return replace(Study(**settings), audit=False)
 
