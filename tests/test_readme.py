@@ -192,13 +192,14 @@ def test_what_the_defaults_by_todays_recipe_reach() -> None:
 @pytest.mark.parametrize(
     ("suite", "name"),
     [
-        ("fractal", "mini-pi0-simpler-fractal-wide"),
-        ("bridge", "mini-pi0-simpler-bridge-wide-seed-0"),
+        ("simpler-fractal", "mini-pi0-simpler-fractal-wide"),
+        ("simpler-bridge", "mini-pi0-simpler-bridge-wide-seed-0"),
+        ("vlabench", "mini-pi0-vlabench-wide"),
     ],
 )
 def test_what_a_policy_of_todays_recipe_does_with_generic_objects(suite: str, name: str) -> None:
-    (_, *ways), (_, *cells) = table(f"| policy of simpler-{suite}")
-    told = pd.read_parquet(RESULTS / f"{suite}_generic.parquet")
+    (_, *ways), (_, *cells) = table(f"| policy of {suite}")
+    told = pd.read_parquet(RESULTS / f"{suite.removeprefix('simpler-')}_generic.parquet")
     assert set(told.policy.map(checkpoint_of)) == {name}
     assert cells == [_of_way(told, way) for way in ways]
     assert set(ways) == set(told.method)
