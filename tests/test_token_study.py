@@ -12,14 +12,6 @@ from scipy import stats
 from scipy.stats import ortho_group
 from typer.testing import CliRunner
 
-from vap_core.analysis import embedding_report
-from vap_core.analysis.token_space import (
-    longest_word,
-    mean_cosine,
-    nearest_words,
-    rotation_cosines,
-    rotation_deg,
-)
 from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadStudy, UnknownName
 from vap_core.base.types import Rgb
 from vap_core.cli import app
@@ -32,12 +24,9 @@ from vap_core.policies.embedding_table import open_table
 from vap_core.policies.mini_pi0 import learned_token, teach_token, token_alignment, token_file
 from vap_core.policies.mini_pi0.learned_token import TokenTraining
 from vap_core.policies.mini_pi0.vlm import load_from_policy, load_vlm
-from vap_core.policies.token_groups import token_groups
 from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import ObjectModel
-from vap_core.training.words import vocabulary
 
-from . import tiny_lerobot
 from .test_soft_prompt import SUITE, TASK, grown  # noqa: F401
 
 
@@ -315,87 +304,3 @@ def test_the_highest_score_is_the_choice() -> None:
     cost = choices.cost_of_policy(both, pd.DataFrame(rows, columns=columns))
     assert (cost.value, cost.n) == (0, 3), "one of three in the scene, and one of three touched"
     assert cost.low <= 0 <= cost.high
-
-
-def test_the_report_compares_the_shipped_policies_beside_the_paper() -> None:
-    found = CliRunner().invoke(app, ["embeddings"])
-    assert found.exit_code == 0, found.output
-    assert "words of simpler-bridge" in found.output
-    assert found.output.count("paper: pi0") == 4
-    assert "0.945626 ± 0.066187" in found.output
-    by_recipe = "mini-pi0-simpler-bridge-wide-seed-0, mini-pi0-vlabench-wide"
-    assert f"{by_recipe} with mini-paligemma-tint-free" in found.output
-    shipped = teach_token.MODEL.parent
-    kept = pd.read_parquet(shipped.parent / "results" / "token_spaces.parquet")
-    measured = [str(shipped / name) for name in kept.policy.unique()]
-    named = CliRunner().invoke(app, ["embeddings", str(teach_token.MODEL), *measured])
-    whole = kept[kept.group == embedding_report.WHOLE]
-    assert (whole.tokens == 113).all()
-    for row in whole.itertuples():
-        cosine = f"{row.cosine_mean:.6f} ± {row.cosine_std:.6f}"
-        assert cosine in named.output
-        replaced = row.policy in ("mini-pi0-simpler-bridge", "mini-pi0-vlabench")
-        assert (cosine in found.output) != replaced
-
-
-def test_a_policy_is_measured_beside_the_model_that_it_grew_from() -> None:
-    folders = {name: study._model_folder(name).name for name in suites.BENCHMARKS}
-    for suite in (SUITE, "vlabench"):
-        assert folders.pop(suite) == "mini-paligemma-tint-free"
-    assert set(folders.values()) == {"mini-paligemma"}
-    successor = teach_token.MODEL.parent / f"mini-pi0-{SUITE}-wide-seed-0"
-    table = embedding_report.spaces(None, [successor])
-    assert list(table.group) == [embedding_report.WHOLE, f"words of {SUITE}", "reserved"]
-    assert (table.cosine_min > 0.999999).all()
-    beside_another = embedding_report.spaces(teach_token.MODEL, [successor])
-    assert beside_another.cosine_mean[0] < 0.9
-
-
-def test_real_checkpoints_are_compared_with_their_words(tmp_path: Path) -> None:
-    """A tiny pi0 and pi0.5 of lerobot's classes, whose tokenizer lies beside the weights."""
-    one, other = tiny_lerobot.pi0(tmp_path / "pi0"), tiny_lerobot.pi05(tmp_path / "pi05")
-    table = embedding_report.spaces(one, [one, other], SUITE)
-    assert list(table.policy) == ["pi0", "pi0", "pi05", "pi05"]
-    assert list(table.group) == [embedding_report.WHOLE, f"words of {SUITE}"] * 2
-    assert (table.cosine_mean[:2] > 0.999999).all()
-    words = token_groups([one], ["put my camera on the plate", "put my camera"])["words"]
-    vocabulary = tiny_lerobot.tokenizer(tmp_path / "again").get_vocab()
-    expected = sorted(
-        vocabulary[word]
-        for word in ("put", "my", "camera", "on", "the", "plate")
-        if word in vocabulary
-    )
-    assert words.tolist() == sorted({*expected})
-    embedding_report.keep(table, tmp_path / "new" / "rows.csv")
-    assert len(pd.read_csv(tmp_path / "new" / "rows.csv")) == 4
-    with pytest.raises(BadOutput, match="neither"):
-        embedding_report.keep(table, tmp_path / "rows.txt")
-    with pytest.raises(BadPolicy, match="no suite 'nowhere'"):
-        embedding_report.spaces(one, [other], "nowhere")
-    (one / "tokenizer" / "tokenizer.json").write_text("{}")
-    with pytest.raises(BadPolicy, match="is no tokenizer"):
-        token_groups([one], ["put"])
-
-
-def test_words_that_no_film_says_are_left_out_of_the_rotation(grown: tuple[Path, Path]) -> None:  # noqa: F811
-    home, far = grown
-    assert len(rotation_cosines(home, home)["copied"]) == 0
-    shipped = teach_token.MODEL.parent
-    found = rotation_cosines(teach_token.MODEL, shipped / f"mini-pi0-{SUITE}")
-    assert len(found["copied"]) == 56
-    assert (found["copied"] < 0.9999).all()
-    whole = mean_cosine(found["copied"])
-    assert (whole.value, whole.n) == (pytest.approx(found["copied"].mean()), 56)
-    assert whole.low < whole.value < whole.high
-    assert found["rotated, fitted"].mean() > found["copied"].mean()
-    table = open_table(far)
-    rows = table.block(0, table.shape[0])
-    assert longest_word(far) == pytest.approx(np.sqrt((rows**2).sum(1)).max())
-    assert rotation_deg(rows[15], home, home) < 0.1
-    bridge = shipped / f"mini-pi0-{SUITE}"
-    word = open_table(teach_token.MODEL).block(15, 16)[0]
-    moved = token_alignment.align(word, teach_token.MODEL, bridge)
-    cosine = np.cos(np.radians(rotation_deg(word, teach_token.MODEL, bridge)))
-    assert cosine * np.linalg.norm(word) ** 2 == pytest.approx(float(word @ moved), rel=1e-3)
-    words = nearest_words(open_table(far).block(15, 16)[0], far, 3)
-    assert words[0] == (vocabulary()[15], pytest.approx(1))
