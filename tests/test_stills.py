@@ -32,8 +32,12 @@ def still(tmp_path: Path) -> Path:
 
 
 def test_every_committed_still_shows_what_ships() -> None:
-    found = {path.name for path in FIGURES.glob("*.png") if stills.read_provenance(path)}
-    assert found == COMMITTED
+    about = {path.name: stills.read_provenance(path) for path in FIGURES.glob("*.png")}
+    assert {name for name, provenance in about.items() if provenance} == COMMITTED
+    for name in COMMITTED:
+        assert not Path(about[name]["study"]["policy"]).is_absolute(), (
+            f"{name} names a folder of one machine: take the picture with a policy that ships"
+        )
     differences = {name: stills.stale(FIGURES / name) for name in sorted(COMMITTED)}
     assert not any(differences.values()), (
         f"{differences}; set RECOMPUTE in the notebook and execute it again"

@@ -151,8 +151,8 @@ def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
 def study_of(manifest: Mapping[str, Any], row: Mapping[str, Any]) -> Study:
     """The study of a run, of one task and method alone, with the policy of the row.
 
-    A run of a default policy that has a successor names the earlier one's folder, if it ships; one
-    whose policy's folder is not here takes the shipped policy of that name.
+    Where the run names no folder that is here, the policy is the shipped one that the row's label
+    names: the suite's default, or a folder below data/policies.
     """
     configuration = manifest["configuration"]
     settings = {}
@@ -162,13 +162,9 @@ def study_of(manifest: Mapping[str, Any], row: Mapping[str, Any]) -> Study:
     settings["tasks"] = ((row["suite"], row["task"]),)
     settings["methods"] = (row["method"],)
     name = checkpoint_of(str(row.get("policy", "")))
-    ran = settings["policy"]
-    if ran == MINI:
-        other = name not in ("", shipped(row["suite"]).name)
-    else:
-        other = Path(ran).name == name and not is_checkpoint_name(ran)
-    if other and (SHIPPED / name).is_dir():
-        settings["policy"] = str(SHIPPED / name)
+    if name and (SHIPPED / name).is_dir() and not is_checkpoint_name(settings["policy"]):
+        is_default = name == shipped(row["suite"]).name
+        settings["policy"] = MINI if is_default else f"data/policies/{name}"
     return replace(Study(**settings), audit=False)
 
 
