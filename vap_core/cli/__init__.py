@@ -16,12 +16,16 @@ from vap_core.cli import (
     ablate,
     attention,
     benches,
+    doctor,
     evaluate,
     lerobot,
     objects,
     parsers,
+    perception,
+    photos,
+    policies,
+    recordings,
     results,
-    setup,
     train,
     weights,
 )
@@ -39,8 +43,12 @@ app = typer.Typer(
     rich_markup_mode=None,
     help=HELP,
 )
-for module in (objects, evaluate, ablate, results, attention, parsers, lerobot, setup, benches):
+for module in (
+    photos, evaluate, ablate, recordings, results, attention, parsers, lerobot, perception,
+    policies, doctor, benches,
+):  # fmt: skip
     app.add_typer(module.app)
+app.add_typer(objects.app, name="objects")
 app.add_typer(train.app, name="train")
 app.add_typer(weights.app, name="weights")
 

@@ -1,4 +1,4 @@
-"""What works on this machine, and the remedy for what does not."""
+"""The command doctor: what works on this machine, and the remedy for what does not."""
 
 import os
 import platform
@@ -9,8 +9,12 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
+import typer
+
 from vap_core.base.errors import VapError
 from vap_core.base.extras import require
+
+app = typer.Typer()
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,22 @@ class Finding:
         if not self.works:
             mark = "MISSING" if self.needed else "absent "
         return f"{mark}  {self.what:<20} {self.detail}"
+
+
+@app.command()
+def doctor() -> None:
+    """Say what works on this machine, and how to repair what does not; status 1 when the main job
+    cannot run.
+
+    Example: python -m vap_core doctor
+    """
+    able = True
+    for finding in examine():
+        print(finding)
+        if finding.needed and not finding.works:
+            able = False
+    if not able:
+        raise typer.Exit(1)
 
 
 def examine() -> list[Finding]:

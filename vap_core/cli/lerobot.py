@@ -5,7 +5,6 @@ from typing import Annotated, Literal
 
 import typer
 
-from vap_core.cli.objects import BANK, Memory
 from vap_core.cli.options import (
     DetectorName,
     EncoderName,
@@ -14,6 +13,7 @@ from vap_core.cli.options import (
     TrackerName,
     stack_of,
 )
+from vap_core.cli.photos import BANK, Memory
 
 app = typer.Typer()
 

@@ -1,306 +1,16 @@
-"""Commands about your own objects.
+"""The group objects: the objects of the scenes, and your own 3-D scans."""
 
-Remember them from photos, find them in a picture, import them as 3-D scans.
-"""
-
-import json
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from vap_core.cli.options import (
-    DetectorName,
-    EncoderName,
-    ObjectNames,
-    StackName,
-    TrackerName,
-    stack_of,
-)
-
-app = typer.Typer()
-objects_app = typer.Typer(
+app = typer.Typer(
     no_args_is_help=True, help="The objects of the scenes: what there is, and your own 3-D scans."
 )
-app.add_typer(objects_app, name="objects")
-
-Memory = Annotated[Path, typer.Option(help="Folder of remembered objects.")]
-BANK = Path("data/memory")
 
 
-@app.command()
-def register(
-    name: Annotated[str, typer.Argument(help="What to call the object, for example mug.")],
-    category: Annotated[
-        str, typer.Option(help="What kind of thing it is: the word you will use after 'my'.")
-    ],
-    photos: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            help="One to about ten photos of this very object, or folders of them; five are best."
-        ),
-    ] = None,
-    video: Annotated[
-        Path | None,
-        typer.Option(help="A short clip around the object: sharp frames of it are the photos."),
-    ] = None,
-    frames: Annotated[int, typer.Option(min=1, help="Frames that --video gives.")] = 5,
-    box: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="PHOTO=X0,Y0,X1,Y1",
-            help="Where the object is in a photo, in pixels of the upright photo; repeatable.",
-        ),
-    ] = None,
-    mask: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="PHOTO=MASK",
-            help="A picture as large as the photo, bright on the object; its box is cropped.",
-        ),
-    ] = None,
-    accept: Annotated[
-        bool, typer.Option("--accept", help="Use doubtful crops as the contact sheet shows them.")
-    ] = False,
-    whole: Annotated[
-        bool,
-        typer.Option(
-            "--whole", help="The photos are cut out already: use them whole, without the detector."
-        ),
-    ] = False,
-    memory: Memory = BANK,
-    stack: StackName = "embedded",
-    detector: DetectorName = "",
-    encoder: EncoderName = "",
-    tracker: TrackerName = "",
-    describe: Annotated[
-        str,
-        typer.Option(
-            help="Who puts it into words: offline, chat (OPENAI_BASE_URL, _MODEL, _API_KEY), "
-            "or a URL."
-        ),
-    ] = "offline",
-    owner: Annotated[
-        str, typer.Option(help="Whose it is, for example anna; default nobody in particular.")
-    ] = "",
-    known_as: Annotated[
-        list[str] | None,
-        typer.Option(
-            help='Another word for the owner, for example brother or "anna\'s brother"; repeatable.'
-        ),
-    ] = None,
-    note: Annotated[
-        str, typer.Option(help='What it is for, for example "for the morning coffee".')
-    ] = "",
-    replace: Annotated[
-        bool, typer.Option("--replace", help="Overwrite an object of this name.")
-    ] = False,
-) -> None:
-    """Remember a personal object from photos; a contact sheet beside the memory shows the crops.
-
-    Example: python -m vap_core register mug --category cup photos/mug-*.jpg
-    Example: python -m vap_core register mug --category cup mug.jpg --box mug.jpg=40,60,180,220
-    Example: python -m vap_core register mug --category cup --video mug.mp4
-    Example: python -m vap_core register mug --category cup photos/mug-*.jpg --encoder dinov2-small
-    Example: python -m vap_core register mug --category cup photos/mug-*.jpg --owner anna
-        --note "for the morning coffee"
-    """
-    import dataclasses
-
-    from vap_core.evaluation.photos import register as registering
-    from vap_core.evaluation.photos.trust import leave_one_out, warnings
-    from vap_core.instruction.owners import check_owner
-    from vap_core.memory import check_names, load_bank, object_path, save, taken
-    from vap_core.perception.describe import load_captioner, with_description
-    from vap_core.perception.stacks import load_stack
-
-    stack = stack_of(stack, detector, encoder, tracker)
-    check_names(name, category)
-    check_owner(owner, known_as or [], note)
-    if object_path(memory, name).exists() and not replace:
-        raise taken(object_path(memory, name))
-    paths = registering.gather_photos(photos or [])
-    if video is not None:
-        paths += registering.film_photos(video, memory / f"{name}.frames", frames)
-    given = registering.parse_given(box or [], mask or [], paths)
-    models = load_stack(stack)
-    references = registering.choose(paths, category, models, given, whole=whole)
-    sheet = memory / f"{name}.references.png"
-    registering.write_sheet(sheet, references, paths)
-    if not accept:
-        registering.refuse_doubtful(references, paths, sheet)
-    obj = registering.remember_references(name, category, references, models)
-    for line in warnings(obj, references, [path.name for path in paths]):
-        print(f"note: {line}", file=sys.stderr)
-    obj = with_description(obj, load_captioner(models.segmenter, describe))
-    obj = dataclasses.replace(obj, owner=owner, known_as=tuple(known_as or []), note=note)
-    path = save(memory, obj, replace=replace)
-    trust = leave_one_out(obj, references, load_bank(memory), models.encoder)
-    print(f"{obj.name}: a {obj.category} with {len(obj.crops)} references, saved to {path}")
-    print(f"look at the crops: {sheet}")
-    print(trust)
-    print(f'next: python -m vap_core ground IMAGE "bring my {obj.category}" --memory {memory}')
-
-
-@app.command()
-def ground(
-    image: Annotated[
-        Path,
-        typer.Argument(
-            help="Picture of the scene; or a video or a folder of frames, which is tracked through."
-        ),
-    ],
-    instruction: Annotated[
-        str, typer.Argument(help='What you would tell the robot, for example "bring my cup".')
-    ],
-    object: ObjectNames = None,
-    memory: Memory = BANK,
-    stack: StackName = "embedded",
-    detector: DetectorName = "",
-    encoder: EncoderName = "",
-    tracker: TrackerName = "",
-    box: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="A candidate x0,y0,x1,y1 in pixels, instead of the detector; repeatable."
-        ),
-    ] = None,
-    tiles: Annotated[
-        bool | None,
-        typer.Option(
-            help="Look for small objects in nine overlapping tiles, too; default from 3 megapixels "
-            "on."
-        ),
-    ] = None,
-    always_tint: Annotated[
-        bool,
-        typer.Option(
-            "--always-tint", help="Highlight the best candidate, however unlike it is (the paper)."
-        ),
-    ] = False,
-    parser: Annotated[
-        str,
-        typer.Option(
-            help="Who parses: rule, embedding (implicit references, offline), chat "
-            "(OPENAI_BASE_URL, _MODEL, _API_KEY), or a URL."
-        ),
-    ] = "rule",
-    speaker: Annotated[str, typer.Option(help='Whom "my" means, for example anna.')] = "",
-    fall_back: Annotated[
-        bool,
-        typer.Option("--fall-back", help="Where the chat endpoint fails, warn and take the rule."),
-    ] = False,
-    out: Annotated[Path, typer.Option(help="Folder for the overlay PNG and the recording.")] = Path(
-        "data/runs/ground"
-    ),
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object and nothing else.")
-    ] = False,
-) -> None:
-    """Find a remembered object in a picture, and show why that box won; or track it through a clip.
-
-    Example: python -m vap_core ground desk.jpg "bring my cup"
-    Example: python -m vap_core ground desk.jpg "bring my cup" --box 40,60,180,220
-        --box 300,80,420,230
-    Example: python -m vap_core ground desk.mp4 "bring my cup"
-    Example: python -m vap_core ground desk.jpg "bring the one I used last" --parser embedding
-        --speaker anna
-    """
-    from vap_core.analysis.ground import (
-        GROUND_SIDE,
-        ground_image,
-        missing_threshold,
-        parse_boxes,
-        to_json,
-        write_evidence,
-    )
-    from vap_core.analysis.ground_clip import ground_clip, is_clip
-    from vap_core.base.errors import BadInstruction
-    from vap_core.instruction.parsers import Parsing
-    from vap_core.memory import load_photo
-    from vap_core.perception.tiles import SMALL_MEGAPIXELS
-
-    stack = stack_of(stack, detector, encoder, tracker)
-    parsing = Parsing(parser=parser, speaker=speaker, fall_back=fall_back)
-    if is_clip(image):
-        if box or as_json or tiles:
-            raise BadInstruction(
-                "ground: --box, --tiles and --json are for single pictures; leave them out for a "
-                "clip."
-            )
-        summary, rrd, mp4 = ground_clip(
-            image,
-            instruction,
-            memory,
-            stack,
-            out,
-            objects=object,
-            parsing=parsing,
-            always_tint=always_tint,
-        )
-        if summary.grounded is not None:
-            note_uses(memory, [summary.object], speaker)
-        note = missing_threshold(stack)
-        if note and not always_tint:
-            print(f"note: {note}", file=sys.stderr)
-        print(summary)
-        print(f"wrote {mp4} and {rrd}; look: python -m vap_core view {rrd}")
-        return
-    rgb = load_photo(image, long_side=None if box else GROUND_SIDE)
-    boxes = parse_boxes(box, rgb) if box else None
-    if max(rgb.shape[:2]) == GROUND_SIDE:
-        print(
-            f"note: boxes are pixels of the picture at {rgb.shape[1]}x{rgb.shape[0]}.",
-            file=sys.stderr,
-        )
-    if tiles is None:
-        tiles = boxes is None and rgb.shape[0] * rgb.shape[1] >= SMALL_MEGAPIXELS * 1e6
-    if tiles:
-        print(
-            "note: looking at the whole picture and at nine overlapping half-size tiles of it, for "
-            "small objects; --no-tiles turns it off.",
-            file=sys.stderr,
-        )
-    found = ground_image(
-        rgb,
-        instruction,
-        memory,
-        stack,
-        objects=object,
-        boxes=boxes,
-        always_tint=always_tint,
-        tiles=tiles,
-        parsing=parsing,
-    )
-    note_uses(memory, found.used, speaker)
-    note = missing_threshold(stack)
-    if note and not always_tint:
-        print(f"note: {note}", file=sys.stderr)
-    written = write_evidence(out, image.stem, found)
-    if as_json:
-        print(json.dumps(to_json(found)))
-        return
-    print(found)
-    paths = " and ".join(map(str, written))
-    print(f"wrote {paths}; look: python -m vap_core view {written[1]}")
-
-
-def note_uses(memory: Path, objects: Sequence[str], speaker: str) -> None:
-    """Add what was found to the memory's history; a note where that cannot be written."""
-    from datetime import datetime
-
-    from vap_core.base.errors import BadOutput
-    from vap_core.instruction.history import add_uses
-
-    try:
-        add_uses(memory, objects, speaker, datetime.now().astimezone())
-    except BadOutput as error:
-        print(f"note: {error}", file=sys.stderr)
-
-
-@objects_app.command("import")
+@app.command("import")
 def import_object(
     file: Annotated[Path, typer.Argument(help="A closed, coloured GLB, OBJ, PLY or STL file.")],
     category: Annotated[
@@ -395,7 +105,7 @@ def import_object(
     )
 
 
-@objects_app.command("designs")
+@app.command("designs")
 def designs(
     out: Annotated[Path, typer.Argument(help="Folder for the GLB files and objects.csv.")],
     count: Annotated[int, typer.Option(min=1, max=200, help="How many.")] = 24,
@@ -415,7 +125,7 @@ def designs(
     print(f"next: python -m vap_core eval-objects {out}")
 
 
-@objects_app.command("list")
+@app.command("list")
 def list_objects() -> None:
     """Every object there is, your own last.
 
@@ -426,7 +136,7 @@ def list_objects() -> None:
     print(object_table())
 
 
-@objects_app.command()
+@app.command()
 def photograph(
     name: Annotated[str, typer.Argument(help="An object; see python -m vap_core objects list.")],
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("data/photos"),
