@@ -138,7 +138,7 @@ def test_limits_of_time_are_of_a_clock_that_nobody_sets() -> None:
             if name in ("time.time", "datetime.now", "datetime.utcnow", "date.today"):
                 of_the_day.add(path.name)
     assert of_the_day == {
-        "files.py", "readings.py", "objects.py", "measurement.py", "context.py", "failure_picker.py"
+        "files.py", "readings.py", "photos.py", "measurement.py", "context.py", "failure_picker.py"
     }  # fmt: skip
 
 

@@ -1,8 +1,14 @@
 """The structure of the package: few entries at the top, imports in one direction, and lines near the anchors' (STYLE.md section 0)."""
 
 import ast
+import builtins
+import dis
 import json
+from collections.abc import Iterator
 from pathlib import Path
+from types import CodeType
+
+import pytest
 
 import vap_core
 from vap_core.cli.bench.style import measure
@@ -141,3 +147,50 @@ def test_a_notebook_imports_the_surface_and_at_most_three_more_modules() -> None
                 if line.startswith("from vap_core"):
                     used.add(line.split()[1])
         assert len(used - {"vap_core"}) <= 3, (path.name, sorted(used))
+
+
+def codes(code: CodeType) -> Iterator[CodeType]:
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from codes(constant)
+
+
+def undefined(source: str) -> set[str]:
+    """The names that functions of a module read and nothing in it defines; imports for type checkers alone define nothing."""
+    tree = ast.parse(source)
+    tree.body = [
+        node
+        for node in tree.body
+        if not (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING")
+    ]
+    module = compile(tree, "module", "exec")
+    defined = {*vars(builtins), "__file__"}
+    read = set()
+    for code in codes(module):
+        for each in dis.get_instructions(code):
+            if each.opname == "STORE_GLOBAL" or (code is module and each.opname == "STORE_NAME"):
+                defined.add(each.argval)
+            elif each.opname == "LOAD_GLOBAL":
+                read.add(each.argval)
+    return read - defined
+
+
+def test_every_name_is_defined() -> None:
+    """The linter and the type checker are not asked: shapes in annotations are names to them."""
+    found = {name: undefined(path.read_text()) for name, path in modules().items()}
+    assert {name: names for name, names in found.items() if names} == {}
+
+
+@pytest.mark.parametrize(
+    ("source", "names"),
+    [
+        ("import sys\ndef f(): return sys", set()),
+        ("def f(): return sys", {"sys"}),
+        ("class A:\n    def f(self): return [sys for _ in self]", {"sys"}),
+        ("if TYPE_CHECKING:\n    import sys\ndef f(x: 'sys'): return 1", set()),
+        ("if TYPE_CHECKING:\n    import sys\ndef f(): return sys", {"sys"}),
+    ],
+)
+def test_a_name_without_a_definition_is_found(source: str, names: set[str]) -> None:
+    assert undefined(source) == names

@@ -1,5 +1,6 @@
 """The group objects: the objects of the scenes, and your own 3-D scans."""
 
+import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
