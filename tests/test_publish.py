@@ -95,10 +95,27 @@ def test_what_is_there_is_left_alone(tmp_path: Path) -> None:
     assert not list(tmp_path.glob(".*tmp"))
 
 
+def test_methods_that_are_finished_need_not_wait_for_the_others(tmp_path: Path) -> None:
+    folder = run(tmp_path / "run", 0, methods=("generic", "vap"), done=1)
+    append(folder, [{**ROW, "method": "vap", "episode": 1, "seed": 0, "steps": 1}])
+    target = tmp_path / "vap.parquet"
+    assert publish([folder], target, methods=["vap"]) == 2
+    ((manifest, episodes),) = read_runs(target)
+    assert set(episodes.method) == {"vap"}
+    assert manifest["left_out"] == ["generic"]
+    for methods in ((), ("generic",), ("generic", "vap")):
+        with pytest.raises(
+            BadOutput, match="of 2 episodes of generic|3 of 4 episodes of generic, vap"
+        ):
+            publish([folder], tmp_path / "other.parquet", methods=methods)
+    assert not (tmp_path / "other.parquet").exists()
+
+
 def test_only_finished_runs_and_each_once(tmp_path: Path) -> None:
     whole, half = run(tmp_path / "one", 0), run(tmp_path / "half", 1, episodes=5, done=3)
     with pytest.raises(
-        BadOutput, match="half holds 3 of 5 episodes; run the same command again to finish it"
+        BadOutput,
+        match="half holds 3 of 5 episodes of generic; run the same command again to finish it",
     ):
         publish([half], tmp_path / "t.parquet")
     with pytest.raises(BadOutput, match="hold the same episodes; name each run once"):

@@ -73,7 +73,11 @@ def publish(
         list[str] | None, typer.Option(help="Take the runs of this suite alone; repeatable.")
     ] = None,
     methods: Annotated[
-        str, typer.Option(help="Take these methods alone, divided by commas. Default all.")
+        str,
+        typer.Option(
+            help="Take these methods alone, divided by commas; the others may be unfinished. "
+            "Default all."
+        ),
     ] = "",
 ) -> None:
     """Keep the results of finished runs as one small table, with their configurations.

@@ -80,8 +80,8 @@ def publish(
     entered in the log beside the table (readings.publish_readings). With `supersede`, a method that
     later sources have read again, for all the same episodes and with the same policy, leaves the
     earlier source (`superseded` in its manifest). Of the runs only those of `suite_names`, and of
-    each only its `methods` (the others are `left_out` in its manifest), are taken, where these are
-    given.
+    each only its `methods` (the others are `left_out` in its manifest, and may be unfinished), are
+    taken, where these are given.
 
     Returns: the number of episodes.
 
@@ -96,7 +96,10 @@ def publish(
         raise _exists(target)
     runs: list[Run] = []
     for source in sources:
-        runs += _finished_runs(source)
+        found = read_runs(source)
+        for manifest, episodes in found:
+            _require_finished(source, manifest, episodes, methods)
+        runs += found
     if suite_names:
         runs = _of_suites(runs, suite_names)
     if methods:
@@ -123,16 +126,19 @@ def publish(
     return whole.num_rows
 
 
-def _finished_runs(source: Path) -> "list[Run]":
-    found = read_runs(source)
-    for manifest, episodes in found:
-        wanted = _count_wanted(manifest["configuration"])
-        if len(episodes) < wanted:
-            raise BadOutput(
-                f"publish: {source} holds {len(episodes)} of {wanted} episodes; run the same "
-                "command again to finish it."
-            )
-    return found
+def _require_finished(
+    source: Path, manifest: dict[str, Any], episodes: "pd.DataFrame", methods: Sequence[str]
+) -> None:
+    """Raises: BadOutput for a run whose `methods` (all, where none is named) lack episodes."""
+    of_run = manifest["configuration"]["methods"]
+    names = [name for name in of_run if name in methods] if methods else of_run
+    n_wanted = _count_wanted(_with_methods(manifest, names)["configuration"])
+    n_there = int(episodes["method"].isin(names).sum())
+    if n_there < n_wanted:
+        raise BadOutput(
+            f"publish: {source} holds {n_there} of {n_wanted} episodes of {', '.join(names)}; run "
+            "the same command again to finish it, or name what is finished with --methods."
+        )
 
 
 def _of_suites(runs: "list[Run]", names: Sequence[str]) -> "list[Run]":
