@@ -151,8 +151,8 @@ def test_the_policy_of_more_scenes_came_out_the_same_again() -> None:
 
 
 def test_what_simpler_fractals_policies_of_todays_recipe_reach() -> None:
-    played = _played("fractal_today")
-    assert set(played.split) == {"visual matching"}
+    published = _played("fractal_today")
+    played = published[published.split == "visual matching"].copy()
     played["name"] = played.policy.map(checkpoint_of).str.removeprefix("mini-pi0-simpler-fractal-")
     head, *body = table("| policy | method | pick-pen-holder")
     assert len(body) == len(played[played.seed == 0].groupby(["name", "method"]))
@@ -164,6 +164,15 @@ def test_what_simpler_fractals_policies_of_todays_recipe_reach() -> None:
         assert [len(part) for part in tasks] == [300, 160]
         parts = [*tasks, listed, of_row[of_row.seed == 1]]
         assert cells == [_of_way(part, method) for part in parts]
+    other_looks = published[published.split == "variant aggregation"]
+    assert set(other_looks.policy) == set(played.policy[played.name == "wide"])
+    pens = other_looks[other_looks.task == "pick-pen-holder"]
+    bottles = other_looks[other_looks.task == "move-bottle-near-coke-can"]
+    assert (len(pens), len(bottles)) == (825, 400)
+    assert (
+        f"with wide VAP reaches {_of_way(other_looks, 'vap')} % (pen holder {_of_way(pens, 'vap')} "
+        f"of 825, bottle {_of_way(bottles, 'vap')} of 400;"
+    ) in PROSE
 
 
 def test_what_the_defaults_by_todays_recipe_reach() -> None:
