@@ -45,7 +45,7 @@ def demo(
     out: Annotated[Path, typer.Option(help="Run folder; a run found there is resumed.")] = Path(
         "data/runs/demo"
     ),
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+    workers: Workers = 2,
     episodes: Annotated[int, typer.Option(min=1, help="Episodes per task and method.")] = 20,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the episode list.")] = 0,
 ) -> None:

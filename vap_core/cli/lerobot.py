@@ -6,14 +6,15 @@ from typing import Annotated, Literal
 import typer
 
 from vap_core.cli.options import (
+    BANK,
     DetectorName,
     EncoderName,
+    Memory,
     ObjectNames,
     StackName,
     TrackerName,
     stack_of,
 )
-from vap_core.cli.photos import BANK, Memory
 
 app = typer.Typer()
 

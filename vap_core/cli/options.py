@@ -1,5 +1,6 @@
 """Options that several commands share."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -31,6 +32,8 @@ ObjectNames = Annotated[
         help="Remembered object of each 'my ...', where the category alone does not decide.",
     ),
 ]
+Memory = Annotated[Path, typer.Option(help="Folder of remembered objects.")]
+BANK = Path("data/memory")
 Workers = Annotated[int, typer.Option(min=1, help="Processes.")]
 
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from vap_core.cli.options import StackName
+from vap_core.cli.options import StackName, Workers
 
 app = typer.Typer()
 
@@ -22,7 +22,7 @@ def eval_perception(
             min=1, help="Opening frames per task, as episodes spread evenly over its list."
         ),
     ] = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+    jobs: Workers = 2,
     out: Annotated[Path, typer.Option(help="Run folder; a run found there is resumed.")] = Path(
         "data/runs/perception"
     ),

@@ -9,8 +9,10 @@ from typing import Annotated
 import typer
 
 from vap_core.cli.options import (
+    BANK,
     DetectorName,
     EncoderName,
+    Memory,
     ObjectNames,
     StackName,
     TrackerName,
@@ -18,9 +20,6 @@ from vap_core.cli.options import (
 )
 
 app = typer.Typer()
-
-Memory = Annotated[Path, typer.Option(help="Folder of remembered objects.")]
-BANK = Path("data/memory")
 
 
 @app.command()

@@ -96,7 +96,7 @@ def eval_tokens(
         str,
         typer.Option(help="vlm, policy or both: whose weights a token is learned in."),
     ] = "vlm,policy",
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    workers: Workers = 1,
     out: Annotated[Path, typer.Option(help="Run folder; a run found there is resumed.")] = Path(
         "data/runs/tokens"
     ),

@@ -8,6 +8,11 @@ import typer
 
 app = typer.Typer()
 
+PictureInstead = Annotated[
+    Path | None,
+    typer.Option(help="With --open: save a picture of it instead, without a display."),
+]
+
 
 @app.command()
 def diagnose(
@@ -46,10 +51,7 @@ def diagnose(
             help="Open this one of the list in the Rerun viewer, at its deciding frame.",
         ),
     ] = None,
-    png: Annotated[
-        Path | None,
-        typer.Option(help="With --open: save a picture of it instead, without a display."),
-    ] = None,
+    png: PictureInstead = None,
     mp4: Annotated[
         Path | None,
         typer.Option(help="With --open: write it as a film of what the policy saw instead."),
@@ -132,10 +134,7 @@ def query(
             help="Open this one of the list in the Rerun viewer, at the first such step.",
         ),
     ] = None,
-    png: Annotated[
-        Path | None,
-        typer.Option(help="With --open: save a picture of it instead, without a display."),
-    ] = None,
+    png: PictureInstead = None,
     serve: Annotated[
         bool,
         typer.Option(
