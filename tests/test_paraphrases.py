@@ -26,16 +26,24 @@ from vap_core.instruction.context import Context
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import BENCHMARKS
 
-EVERY = {
-    suite: [one for part in PARTS for one in paraphrases(suite, part)] for suite in suite_names()
-}
 ROOT = Path(__file__).resolve().parents[1]
 PUBLISHED = ROOT / "data" / "results" / report.TABLE
 
 
-def test_every_benchmark_has_over_200_paraphrases_of_every_kind() -> None:
-    assert set(EVERY) == set(BENCHMARKS)
-    for suite, found in EVERY.items():
+@pytest.fixture(scope="module")
+def every() -> dict[str, list[Paraphrase]]:
+    """The paraphrases of every suite."""
+    found = {}
+    for suite in suite_names():
+        found[suite] = [one for part in PARTS for one in paraphrases(suite, part)]
+    return found
+
+
+def test_every_benchmark_has_over_200_paraphrases_of_every_kind(
+    every: dict[str, list[Paraphrase]],
+) -> None:
+    assert set(every) == set(BENCHMARKS)
+    for suite, found in every.items():
         assert len(found) >= 200
         assert len({(one.text, one.family) for one in found}) == len(found)
         held_out = Counter(one.kind for one in found if one.part == "test")
@@ -52,8 +60,10 @@ def test_no_family_and_no_purpose_is_in_two_parts() -> None:
         assert sum(said.values()) - len(said) <= 3, said
 
 
-def test_what_is_meant_is_in_the_memory_and_in_the_catalogue() -> None:
-    for found in EVERY.values():
+def test_what_is_meant_is_in_the_memory_and_in_the_catalogue(
+    every: dict[str, list[Paraphrase]],
+) -> None:
+    for found in every.values():
         for one in found:
             assert (one.object is None) == (one.kind == "none")
             assert one.object is None or one.object in one.context.objects
@@ -65,8 +75,8 @@ def test_what_is_meant_is_in_the_memory_and_in_the_catalogue() -> None:
             assert get_object(about[which]["object"]).category == about["category"]
 
 
-def test_what_was_used_is_the_users_last_on_that_day() -> None:
-    for found in EVERY.values():
+def test_what_was_used_is_the_users_last_on_that_day(every: dict[str, list[Paraphrase]]) -> None:
+    for found in every.values():
         for one in found:
             if one.kind != "history":
                 continue
@@ -86,9 +96,11 @@ def oracle(one: Paraphrase) -> Instruction:
     return Instruction(one.text, (Target(one.start, one.start + 2, "", obj.category, obj.name),))
 
 
-def test_rates_are_counted_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rates_are_counted_exactly(
+    every: dict[str, list[Paraphrase]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A parser that knows the answers to implicit ones, takes the first object elsewhere, and so on."""
-    by_text = {one.text: one for one in EVERY["simpler-bridge"] if one.part == "tune"}
+    by_text = {one.text: one for one in every["simpler-bridge"] if one.part == "tune"}
 
     def load(context: Context):
         def parser(text: str, categories: object = ()) -> Instruction:
@@ -136,12 +148,12 @@ def test_the_command_prints_and_publishes(tmp_path: Path) -> None:
     assert "'magic' is unknown; known: rule" in refused("eval-parsers", *some, "--parser", "magic")
 
 
-def test_the_published_table_is_of_these_paraphrases() -> None:
+def test_the_published_table_is_of_these_paraphrases(every: dict[str, list[Paraphrase]]) -> None:
     arrow = pq.read_table(PUBLISHED)
     about = json.loads((arrow.schema.metadata or {})[b"about"])
     assert about["paraphrases"] == paraphrase_digest(), "run eval-parsers --publish data/results"
     table: pd.DataFrame = arrow.to_pandas()
-    assert len(table) == 2 * sum(map(len, EVERY.values()))
+    assert len(table) == 2 * sum(map(len, every.values()))
 
 
 def test_the_page_quotes_the_published_table() -> None:

@@ -102,13 +102,17 @@ def mcnemar(only_one: int, only_other: int) -> float:
 
 
 def holm(p: Sequence[float]) -> list[float]:
-    """Holm's step-down correction of a family of p values."""
-    from statsmodels.stats.multitest import multipletests
+    """Holm's step-down correction of a family of p values.
 
-    if not p:
-        return []
-    corrected: list[float] = multipletests(list(p), method="holm")[1].tolist()
-    return corrected
+    statsmodels' own (`multipletests`) collects garbage at every call, which takes a tenth of a
+    second in a process that has torch: four fifths of the time of a notebook's tables.
+    """
+    values = np.array(p, float)
+    order = np.argsort(values)
+    stepped = values[order] * np.arange(len(values), 0, -1)
+    corrected = np.empty(len(values))
+    corrected[order] = np.minimum(1.0, np.maximum.accumulate(stepped))
+    return [float(value) for value in corrected]
 
 
 def ratio(slow: Sequence[float], fast: Sequence[float]) -> tuple[float, float, float]:
