@@ -5,6 +5,7 @@ import builtins
 import dis
 import json
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from types import CodeType
 
@@ -45,6 +46,7 @@ def modules() -> dict[str, Path]:
     return found
 
 
+@cache
 def imported(path: Path) -> set[str]:
     """Every module or name that a file imports, in dotted form; those for type checkers only count as well."""
     names = set()

@@ -155,11 +155,10 @@ def _context(suite: str, key: str, family: Mapping[str, str], meant: str | None)
     vocabulary = read_vocabulary()
     objects = {}
     for other in vocabulary["suites"][suite]["objects"]:
-        about = vocabulary["objects"][other]
         which = ["first"] if family["memory"] == "own" else ["first", "second"]
         for place in which:
             owner = "ben" if family["memory"] == "shared" and place == "second" else "anna"
-            obj = _object(about, place, owner)
+            obj = _object(other, place, owner)
             objects[obj.name] = obj
     return Context(
         objects=objects,
@@ -197,8 +196,10 @@ def _uses(
     return tuple(sorted(uses, key=lambda use: use.at))
 
 
-def _object(about: Mapping[str, Any], place: str, owner: str) -> PersonalObject:
+@cache
+def _object(key: str, place: str, owner: str) -> PersonalObject:
     """A remembered object in words; its one reference is empty."""
+    about = read_vocabulary()["objects"][key]
     people = read_vocabulary()["people"]
     return PersonalObject(
         name=about[place]["object"],
