@@ -1,5 +1,6 @@
 """The notebooks' controls: defaults, what a choice changes, and what is kept."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -133,6 +134,15 @@ def test_failures_are_picked_by_suite_and_case(picker: failure_picker.FailurePic
     assert picker.failure.options == ()
     assert "no failure" in picker.why.value
     assert "vlabench put-cup 0, case 1" in picker._repr_mimebundle_()["text/html"]
+
+
+def test_a_run_without_failures_has_nothing_to_pick(
+    picker: failure_picker.FailurePicker, tmp_path: Path
+) -> None:
+    none = replace(picker.failures, table=picker.failures.table.iloc[:0])
+    empty = failure_picker.FailurePicker(none, tmp_path / "labels.csv")
+    assert (empty.failure.value, empty.why.value) == (None, "no failure of this kind")
+    assert empty._repr_mimebundle_()["text/plain"] == "no failures"
 
 
 def test_labels_are_kept_and_the_last_one_counts(picker: failure_picker.FailurePicker) -> None:

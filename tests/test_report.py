@@ -27,6 +27,7 @@ from vap_core.evaluation.report.results import errors, results
 from vap_core.evaluation.report.runs import load_runs
 from vap_core.evaluation.statistics import ALL_TASKS, compare
 from vap_core.evaluation.store import append, open_run
+from vap_core.evaluation.study import Study
 from vap_core.recording import recording_file_name
 from vap_core.simulation import suites
 
@@ -384,6 +385,18 @@ def test_the_command_of_a_run_is_told() -> None:
         command_line({**study, "tasks": demo, "episodes": 20})
         == "python -m vap_core demo --episodes 20 --seed 2"
     )
+
+
+def test_a_run_that_no_command_makes_is_told_in_code() -> None:
+    several = {"tasks": [["widowx-pick", "pick-straw-cup"], ["simpler-bridge", "pick-shaver"]]}
+    study = several | {"methods": ["vap"], "episodes": 3, "seed": 0, "policy": "scripted"}
+    told = "Study(tasks=(('widowx-pick', 'pick-straw-cup'), ('simpler-bridge', 'pick-shaver')), methods=('vap',), episodes=3)"
+    assert command_line(study) == told
+    part = {**study, "tasks": [["simpler-bridge", "pick-shaver"]], "follow": "call"}
+    told = "Study(tasks=(('simpler-bridge', 'pick-shaver'),), methods=('vap',), episodes=3, follow='call')"
+    assert command_line(part) == told
+    made = Study((("simpler-bridge", "pick-shaver"),), ("vap",), episodes=3, follow="call")
+    assert command_line(made.configuration()) == told
 
 
 def test_pictures_show_every_line_and_overlap_nothing(tmp_path: Path) -> None:

@@ -114,8 +114,11 @@ class FailurePicker(Control):
             self.said,
             self.shown,
         ]
-        words = f"{_name(table.iloc[0].to_dict())}: {table.iloc[0]['case_sentence']}"
-        super().__init__(ipywidgets.VBox(rows), f"{words} · in JupyterLab: pick, open, label.")
+        words = "no failures"
+        if len(table):
+            first = table.iloc[0].to_dict()
+            words = f"{_name(first)}: {first['case_sentence']} · in JupyterLab: pick, open, label."
+        super().__init__(ipywidgets.VBox(rows), words)
 
     @property
     def row(self) -> dict[str, Any]:

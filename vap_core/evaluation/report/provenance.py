@@ -1,13 +1,18 @@
 """Where the numbers of a report come from: digests, versions, and the commands of the runs."""
 
 import shlex
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from vap_core.evaluation.report.runs import Runs
+from vap_core.evaluation.study import DEMO, Study
 from vap_core.simulation import suites
 
 if TYPE_CHECKING:
     import pandas as pd
+
+EVAL_ONLY = ("seeds", "temperature", "images_every", "follow", "split", "audit")
+"""Fields of a study that `eval` has options for, and `rollout` has none."""
 
 
 def provenance(runs: Runs) -> "pd.DataFrame":
@@ -36,14 +41,16 @@ def provenance(runs: Runs) -> "pd.DataFrame":
 
 
 def command_line(study: dict[str, Any]) -> str:
-    """The command line that runs a configuration, without --out."""
+    """The command line that runs a configuration, without --out; in code where no command does."""
     tasks_by_suite: dict[str, list[str]] = {}
     for suite, task in study["tasks"]:
         tasks_by_suite.setdefault(suite, []).append(task)
     whole = _are_whole_suites(tasks_by_suite)
-    if not whole and len(tasks_by_suite) > 1:
-        # Only the demo runs some tasks of several suites.
+    if [tuple(task) for task in study["tasks"]] == list(DEMO.tasks):
         return f"python -m vap_core demo --episodes {study.get('episodes')} --seed {study['seed']}"
+    changed = _changed(study)
+    if not whole and (len(tasks_by_suite) > 1 or not changed.keys().isdisjoint(EVAL_ONLY)):
+        return f"Study({', '.join(f'{name}={setting!r}' for name, setting in changed.items())})"
     words = ["eval" if whole else "rollout"]
     for suite, tasks in tasks_by_suite.items():
         words += ["--suite", suite]
@@ -58,6 +65,19 @@ def command_line(study: dict[str, Any]) -> str:
     if study.get("audit"):
         words.append("--audit")
     return "python -m vap_core " + shlex.join(words)
+
+
+def _changed(study: dict[str, Any]) -> dict[str, Any]:
+    """The fields of a configuration that differ from a study's defaults."""
+    changed: dict[str, Any] = {
+        "tasks": tuple(tuple(task) for task in study["tasks"]),
+        "methods": tuple(study["methods"]),
+    }
+    for field in fields(Study)[len(changed) :]:
+        setting = study.get(field.name, field.default)
+        if setting != field.default:
+            changed[field.name] = setting
+    return changed
 
 
 def _are_whole_suites(tasks_by_suite: dict[str, list[str]]) -> bool:
