@@ -19,6 +19,7 @@ EPISODES = [
 
 def test_the_curve_by_hand() -> None:
     table = pd.DataFrame(EPISODES, columns=["suite", "method", "margin", "success", "touched"])
+    table = table.assign(policy="scripted")
     found = abstentions(table)
     assert [(line.suite, line.method) for line in found] == [("tabletop", "vap")] * len(THRESHOLDS)
     by_threshold = {line.threshold: line for line in found}
@@ -35,3 +36,13 @@ def test_the_curve_by_hand() -> None:
     header, first, *_ = abstention_rows(found)
     assert dict(zip(header, first, strict=True))["SR when it acts [95 %]"] == "50 % [15, 85]"
     assert abstentions(table.drop(columns="margin")) == []
+
+
+def test_policies_are_counted_apart() -> None:
+    table = pd.DataFrame(EPISODES, columns=["suite", "method", "margin", "success", "touched"])
+    one, other = table.assign(policy="one"), table.assign(policy="other", success=True)
+    rows = abstention_rows(abstentions(pd.concat([one, other])))
+    assert [row for row in rows if "one" in row] == abstention_rows(abstentions(one))[1:]
+    assert [row for row in rows if "other" in row] == abstention_rows(abstentions(other))[1:]
+    halves = pd.concat([one[one.suite == "tabletop"], other[other.suite != "tabletop"]])
+    assert abstentions(halves) == []

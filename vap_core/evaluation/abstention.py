@@ -20,7 +20,7 @@ THRESHOLDS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 
 @dataclass(frozen=True)
 class Abstention:
-    """One method at one threshold, by suite.
+    """One method with one policy at one threshold, by suite.
 
     `acts` is the share of the episodes with a target in which it acts, `success` that of those in
     which it then succeeds; `acts_absent` the share of the episodes without one in which it acts,
@@ -29,6 +29,7 @@ class Abstention:
 
     suite: str
     method: str
+    policy: str
     threshold: float
     acts: Rate
     success: Rate
@@ -37,14 +38,15 @@ class Abstention:
 
 
 def abstentions(episodes: "pd.DataFrame") -> list[Abstention]:
-    """Every method that votes, in every suite that was run with and without its targets."""
+    """Every method that votes, by policy, in every suite that was run with and without targets."""
     found: list[Abstention] = []
     if "margin" not in episodes or "touched" not in episodes:
         return found
     voted = episodes[episodes["margin"].notna()]
-    for (suite, method), present in voted.groupby(["suite", "method"], sort=False):
-        absent = voted[voted["suite"].eq(f"{suite}{ABSENT}") & voted["method"].eq(method)]
-        if absent.empty:
+    groups = dict(list(voted.groupby(["suite", "method", "policy"], sort=False)))
+    for (suite, method, policy), present in groups.items():
+        absent = groups.get((f"{suite}{ABSENT}", method, policy))
+        if absent is None:
             continue
         for threshold in THRESHOLDS:
             acting = present[present["margin"] >= threshold]
@@ -54,6 +56,7 @@ def abstentions(episodes: "pd.DataFrame") -> list[Abstention]:
                 Abstention(
                     suite=str(suite),
                     method=str(method),
+                    policy=str(policy),
                     threshold=threshold,
                     acts=rate(len(acting), len(present)),
                     success=rate(int(acting["success"].eq(True).sum()), len(acting)),
@@ -70,6 +73,7 @@ def abstention_rows(found: list[Abstention]) -> list[list[str]]:
         [
             "suite",
             "method",
+            "policy",
             "least margin",
             "acts [95 %]",
             "SR when it acts [95 %]",
@@ -79,5 +83,6 @@ def abstention_rows(found: list[Abstention]) -> list[list[str]]:
     ]
     for line in found:
         rates = (line.acts, line.success, line.acts_absent, line.touches_absent)
-        rows.append([line.suite, line.method, f"{line.threshold:g}", *map(str, rates)])
+        named = [line.suite, line.method, line.policy]
+        rows.append([*named, f"{line.threshold:g}", *map(str, rates)])
     return rows
