@@ -113,7 +113,16 @@ def test_a_damaged_log_is_named(logs: tuple[Path, Path]) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["mini_pi0", "oracle_track", "by_recipe", "first_policy", "ten_seeds", "scripted", "bounds"],
+    [
+        "mini_pi0",
+        "oracle_track",
+        "by_recipe",
+        "first_policy",
+        "ten_seeds",
+        "second_machine",
+        "scripted",
+        "bounds",
+    ],
 )
 def test_every_published_run_is_in_the_log_that_ships(name: str) -> None:
     logged = {}

@@ -227,6 +227,25 @@ def _starts(name: str, listed: int, others: int) -> list[tuple[str, str]]:
     return [(_of_way(at_home, way), _of_way(elsewhere, way)) for way in ("vap", "generic")]
 
 
+def test_what_a_policy_reaches_that_was_made_again() -> None:
+    again, ships = _played("second_machine"), _played("mini_pi0")
+    ships = ships[(ships.suite == "vlabench") & ships.method.isin(["generic", "vap"])]
+    assert again.groupby("method").size().to_dict() == {"generic": 250, "vap": 250}
+    assert set(again.policy).isdisjoint(set(ships.policy))
+    page = PAGES["docs/policy.md"]
+    differing = []
+    for name, rows in (("that ships, made beside a GPU", ships), ("made again", again)):
+        assert f"| {name} | {_of_way(rows, 'generic')} | {_of_way(rows, 'vap')} |" in page
+    for method in ("generic", "vap"):
+        pair = [
+            rows[rows.method == method].set_index(["task", "episode"]).success
+            for rows in (again, ships)
+        ]
+        differing.append(int((pair[0] != pair[1]).sum()))
+    assert f"{differing[0]} of generic's episodes and {differing[1]} of VAP's end otherwise" in page
+    assert f"{_of_way(again, 'vap')} % with VAP and {_of_way(again, 'generic')} without" in PROSE
+
+
 def _played(name: str) -> pd.DataFrame:
     """The episodes of a published table, none of which ended in an error."""
     played = pd.concat([episodes for _, episodes in read_runs(RESULTS / f"{name}.parquet")])
