@@ -105,7 +105,7 @@ def holm(p: Sequence[float]) -> list[float]:
     """Holm's step-down correction of a family of p values.
 
     statsmodels' own (`multipletests`) collects garbage at every call, which takes a tenth of a
-    second in a process that has torch: four fifths of the time of a notebook's tables.
+    second in a process that has torch: more than half of the time of the ablations' tables.
     """
     values = np.array(p, float)
     order = np.argsort(values)
