@@ -31,6 +31,7 @@ from vap_core.evaluation.diagnosis import explain
 from vap_core.recording import Recorder, read_summary, record_grounding, recording_name, screenshot
 from vap_core.recording.entities.labels import are_disjoint, place_labels
 from vap_core.recording.entities.masks import class_image
+from vap_core.recording.index import STEPS, ensure_index
 from vap_core.recording.texts import describe_vote
 from vap_core.rollout.types import EpisodeHeader, Frame
 
@@ -246,6 +247,17 @@ def test_a_method_that_grounds_nothing_records_too(tmp_path: Path) -> None:
         summary["deciding_frame"],
     ) == ("unprompted", "timeout", 0)
     assert "/vap/vote_margin/front" not in entities(tmp_path / "one.rrd")
+
+
+def test_a_view_without_candidates_has_no_margin(tmp_path: Path) -> None:
+    """Drawn as 0 it would be the least of all views, and no vote was held there."""
+    record(tmp_path / "one.rrd", opening(none="side"))
+    for cam, steps in (("front", 12), ("side", 0), ("wrist", 12)):
+        entity = f"/vap/vote_margin/{cam}"
+        margins = columns(tmp_path / "one.rrd", entity, "Scalars:scalars")
+        assert len([step for step in margins if step is not None]) == steps
+    least = columns(ensure_index(tmp_path / "one.rrd"), STEPS, "margin")
+    assert least == {step: [0.6] for step in range(12)}
 
 
 def test_an_episode_that_fails_before_its_first_step_records_its_error(tmp_path: Path) -> None:

@@ -76,12 +76,16 @@ def send_method(
     index: Sequence[rr.TimeColumn],
     frames: Sequence[Frame],
 ) -> None:
-    """The vote margin of every target and view at all steps, its track score where tracked."""
+    """The vote margin of every target and view at all steps, its track score where tracked.
+
+    A view without candidates has had no vote, and no margin.
+    """
     for camera, groundings in header.groundings.items():
         for j, grounding in enumerate(groundings):
-            name = f"{camera}{target_suffix(j)}"
-            margins = np.full(len(frames), grounding.ballot.margin)
-            send_curve(rec, f"/vap/vote_margin/{name}", index, margins)
+            if grounding.ballot.winner is not None:
+                name = f"{camera}{target_suffix(j)}"
+                margins = np.full(len(frames), grounding.ballot.margin)
+                send_curve(rec, f"/vap/vote_margin/{name}", index, margins)
             _send_track_scores(rec, camera, j, frames)
 
 
