@@ -23,8 +23,8 @@ LEFT_OUT = (
     "policies/mini-pi0-simpler-bridge",
     "policies/mini-pi0-simpler-bridge-tint-free",
     "policies/mini-pi0-simpler-bridge-wide",
+    "policies/mini-pi0-simpler-fractal",
     "policies/mini-pi0-simpler-fractal-tint-free",
-    "policies/mini-pi0-simpler-fractal-wide",
     "policies/mini-pi0-vlabench",
 )
 """Studied in notebooks and docs, and named by no command: they stay in the repository alone."""

@@ -51,6 +51,22 @@ def test_success_rates() -> None:
     assert f"its VAP lies in {' and '.join(over)}" in PROSE
 
 
+def test_what_the_first_policies_reach() -> None:
+    (_, *tracks), *body = table("| first policy of | simpler-fractal")
+    played = _played("first_policy")
+    assert set(played.policy.map(checkpoint_of)) == {
+        f"mini-pi0-{suite}" for suite in ("simpler-bridge", "simpler-fractal", "vlabench")
+    }
+    played["track"] = played.suite.where(
+        played.split == "", played.suite + ", " + played.split.astype(str)
+    )
+    assert set(played.track) == set(tracks)
+    assert {method.split(" (")[0].strip("*").lower() for method, *_ in body} == set(played.method)
+    for method, *cells in body:
+        name = method.split(" (")[0].strip("*").lower()
+        assert cells == [_of_way(played[played.track == track], name) for track in tracks]
+
+
 @pytest.mark.parametrize("suite", ["simpler-fractal", "simpler-bridge", "vlabench", "tabletop"])
 def test_cases_of_failure(suite: str) -> None:
     counts = breakdown(
@@ -72,7 +88,7 @@ def test_no_hand_of_the_published_table_closes_after_the_last_action() -> None:
     """A terminal frame has no action: 65 time-outs were once missed grasps that it decided."""
     rows = pd.read_parquet(RESULTS / "mini_pi0.parquet")
     missed = rows[rows["sub_case"] == "missed grasp"]
-    assert len(missed) == 1895
+    assert len(missed) == 1314
     assert (missed["deciding_frame"] < missed["steps"]).all()
 
 
@@ -151,7 +167,10 @@ def test_the_policy_of_more_scenes_came_out_the_same_again() -> None:
 
 
 def test_what_simpler_fractals_policies_of_todays_recipe_reach() -> None:
-    published = _played("fractal_today")
+    by_recipe = ("mini-pi0-simpler-fractal-wide", "mini-pi0-simpler-fractal-tint-free")
+    names = ("mini_pi0", "oracle_track", "fractal_today")
+    published = pd.concat([_played(name) for name in names])
+    published = published[published.policy.map(checkpoint_of).isin(by_recipe)]
     played = published[published.split == "visual matching"].copy()
     played["name"] = played.policy.map(checkpoint_of).str.removeprefix("mini-pi0-simpler-fractal-")
     head, *body = table("| policy | method | pick-pen-holder")

@@ -33,8 +33,8 @@ LEFT_OUT = tuple(
         "simpler-bridge",
         "simpler-bridge-tint-free",
         "simpler-bridge-wide",
+        "simpler-fractal",
         "simpler-fractal-tint-free",
-        "simpler-fractal-wide",
         "vlabench",
     )
 )

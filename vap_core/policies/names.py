@@ -9,6 +9,7 @@ MINI = "mini-pi0"
 """The shipped frozen policy, one checkpoint a suite."""
 _NEWER = {
     "simpler-bridge": f"{MINI}-simpler-bridge-wide-seed-0",
+    "simpler-fractal": f"{MINI}-simpler-fractal-wide",
     "vlabench": f"{MINI}-vlabench-wide",
 }
 """The checkpoint of a benchmark whose first one, `mini-pi0-BENCHMARK`, was replaced."""
