@@ -1,6 +1,10 @@
 """The command, or the code, that makes a run: what a report tells of where its numbers are from."""
 
-from vap_core.evaluation.report.provenance import command_line
+from pathlib import Path
+
+from vap_core.evaluation.policy_names import shipped
+from vap_core.evaluation.report.provenance import command_line, provenance
+from vap_core.evaluation.report.runs import load_runs
 from vap_core.evaluation.study import Study
 from vap_core.simulation import suites
 
@@ -41,6 +45,21 @@ def test_the_command_of_a_run_is_told() -> None:
         command_line({**study, "tasks": demo, "episodes": 20})
         == "python -m vap_core demo --episodes 20 --seed 2"
     )
+
+
+def test_the_command_names_the_policy_that_was_run_and_not_todays_default() -> None:
+    """Published runs name the default of their day, or the folder of a training."""
+    told = {}
+    for name in ("first_policy", "mini_pi0"):
+        table = Path(__file__).parents[1] / "data" / "results" / f"{name}.parquet"
+        commands = provenance(load_runs([table])).command
+        named = commands.str.extract(r"--suite (\S+) .*--policy (\S+)").drop_duplicates()
+        told[name] = sorted(named.itertuples(index=False, name=None))
+    first = ("simpler-bridge", "simpler-fractal", "vlabench")
+    assert told["first_policy"] == [(suite, f"data/policies/mini-pi0-{suite}") for suite in first]
+    assert {suite for suite, _ in told["mini_pi0"]} == set(suites.BENCHMARKS)
+    for suite, policy in told["mini_pi0"]:
+        assert policy in ("mini-pi0", f"data/policies/{shipped(suite).name}")
 
 
 def test_a_run_that_no_command_makes_is_told_in_code() -> None:

@@ -10,7 +10,7 @@ from vap_core.policies.names import MINI as MINI
 from vap_core.policies.names import POLICIES as POLICIES
 from vap_core.policies.names import PRIVILEGED as PRIVILEGED
 from vap_core.policies.names import SHIPPED as SHIPPED
-from vap_core.policies.names import shipped_checkpoint
+from vap_core.policies.names import checkpoint_of, shipped_checkpoint
 from vap_core.policies.protocol import Policy, PrivilegedPolicy
 from vap_core.policies.scripted.expert import Expert
 from vap_core.policies.scripted.random import Random
@@ -50,6 +50,20 @@ def make_policy(
 def shipped(suite: str) -> Path:
     """Where the shipped policy of a suite is, if there is one."""
     return shipped_checkpoint(benchmark_name(suite))
+
+
+def policy_today(policy: str, label: str, suite: str) -> str:
+    """How the policy of a run is named here, of which a row of the suite has this label.
+
+    Where the run names no folder that is here, it is the shipped one that the label names: the
+    suite's default, or a folder below data/policies.
+    """
+    from vap_core.policies.lerobot.checkpoints import is_checkpoint_name
+
+    name = checkpoint_of(label)
+    if not name or not (SHIPPED / name).is_dir() or is_checkpoint_name(policy):
+        return policy
+    return MINI if name == shipped(suite).name else f"data/policies/{name}"
 
 
 def default_policy(suites: Iterable[str]) -> str:

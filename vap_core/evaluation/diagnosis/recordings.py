@@ -16,13 +16,11 @@ from vap_core.evaluation.diagnosis.failures import (
     deciding_frame,
     failure_row,
 )
-from vap_core.evaluation.policy_names import MINI, SHIPPED, shipped
+from vap_core.evaluation.policy_names import policy_today
 from vap_core.evaluation.stills import write_provenance
 from vap_core.evaluation.store import ROW_KEY
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import make_trial, register_personal
-from vap_core.policies.lerobot.checkpoints import is_checkpoint_name
-from vap_core.policies.names import checkpoint_of
 from vap_core.simulation.types import EpisodeRow
 
 
@@ -149,11 +147,7 @@ def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
 
 
 def study_of(manifest: Mapping[str, Any], row: Mapping[str, Any]) -> Study:
-    """The study of a run, of one task and method alone, with the policy of the row.
-
-    Where the run names no folder that is here, the policy is the shipped one that the row's label
-    names: the suite's default, or a folder below data/policies.
-    """
+    """The study of a run, of one task and method alone; its policy as it is named here today."""
     configuration = manifest["configuration"]
     settings = {}
     for field in fields(Study):
@@ -161,10 +155,8 @@ def study_of(manifest: Mapping[str, Any], row: Mapping[str, Any]) -> Study:
             settings[field.name] = configuration[field.name]
     settings["tasks"] = ((row["suite"], row["task"]),)
     settings["methods"] = (row["method"],)
-    name = checkpoint_of(str(row.get("policy", "")))
-    if name and (SHIPPED / name).is_dir() and not is_checkpoint_name(settings["policy"]):
-        is_default = name == shipped(row["suite"]).name
-        settings["policy"] = MINI if is_default else f"data/policies/{name}"
+    label = str(row.get("policy", ""))
+    settings["policy"] = policy_today(settings["policy"], label, row["suite"])
     return replace(Study(**settings), audit=False)
 
 

@@ -2,8 +2,10 @@
 
 import shlex
 from dataclasses import fields
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vap_core.evaluation.policy_names import policy_today
 from vap_core.evaluation.report.runs import Runs
 from vap_core.evaluation.study import DEMO, Study
 from vap_core.simulation import suites
@@ -16,12 +18,17 @@ EVAL_ONLY = ("seeds", "temperature", "images_every", "follow", "split", "audit")
 
 
 def provenance(runs: Runs) -> "pd.DataFrame":
-    """One row per run: its digest, versions, seed, checksums, and the command that makes it."""
+    """One row per run: its digest, versions, seed, checksums, and the command that makes it.
+
+    `policy` is what the run was given; the command names it as it is named here today, so that a
+    default that has been replaced since is told by its folder.
+    """
     import pandas as pd
 
     lines = []
     for name, manifest in runs.manifests.items():
         study: dict[str, Any] = manifest["configuration"]
+        today = {**study, "policy": _policy(runs, name)}
         lines.append(
             {
                 "run": str(name),
@@ -34,10 +41,19 @@ def provenance(runs: Runs) -> "pd.DataFrame":
                 "world": study.get("world", ""),
                 "weights": _shortened(study.get("weights", {})),
                 "lists": _shortened(study.get("lists", {})),
-                "command": str(manifest.get("command") or command_line(study)),
+                "command": str(manifest.get("command") or command_line(today)),
             }
         )
     return pd.DataFrame(lines)
+
+
+def _policy(runs: Runs, name: Path) -> str:
+    """How the policy of a run is named here; as the run named it, where its suites have several."""
+    given = str(runs.manifests[name]["configuration"]["policy"])
+    of_run = runs.wanted[runs.wanted["run"] == str(name)]
+    pairs = of_run[["policy", "suite"]].drop_duplicates().itertuples(index=False, name=None)
+    named = {policy_today(given, label, suite) for label, suite in pairs}
+    return named.pop() if len(named) == 1 else given
 
 
 def command_line(study: dict[str, Any]) -> str:
