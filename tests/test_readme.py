@@ -35,7 +35,7 @@ def test_success_rates() -> None:
     quoted = {}
     for method, *cells in body:
         for track, cell in zip(head[1:], cells, strict=True):
-            quoted[method.split(" (")[0].strip("*").lower(), track] = cell.split("·")[0].strip(" *")
+            quoted[_method(method), track] = cell.split("·")[0].strip(" *")
     held = {}
     for line in whole.itertuples():
         track = ", ".join(filter(None, (line.suite, line.split, f"n = {line.n} of {line.listed}")))
@@ -57,14 +57,12 @@ def test_what_the_first_policies_reach() -> None:
     assert set(played.policy.map(checkpoint_of)) == {
         f"mini-pi0-{suite}" for suite in ("simpler-bridge", "simpler-fractal", "vlabench")
     }
-    played["track"] = played.suite.where(
-        played.split == "", played.suite + ", " + played.split.astype(str)
-    )
+    played["track"] = (played.suite + ", " + played.split.astype(str)).str.removesuffix(", ")
     assert set(played.track) == set(tracks)
-    assert {method.split(" (")[0].strip("*").lower() for method, *_ in body} == set(played.method)
+    assert {_method(method) for method, *_ in body} == set(played.method)
     for method, *cells in body:
-        name = method.split(" (")[0].strip("*").lower()
-        assert cells == [_of_way(played[played.track == track], name) for track in tracks]
+        of_tracks = [played[played.track == track] for track in tracks]
+        assert cells == [_of_way(part, _method(method)) for part in of_tracks]
 
 
 @pytest.mark.parametrize("suite", ["simpler-fractal", "simpler-bridge", "vlabench", "tabletop"])
@@ -176,7 +174,7 @@ def test_what_simpler_fractals_policies_of_todays_recipe_reach() -> None:
     head, *body = table("| policy | method | pick-pen-holder")
     assert len(body) == len(played[played.seed == 0].groupby(["name", "method"]))
     for name, method, *cells in body:
-        method = method.split(" (")[0].strip("*").lower()
+        method = _method(method)
         of_row = played[(played.name == name) & (played.method == method)]
         listed = of_row[of_row.seed == 0]
         tasks = [listed[listed.task == task] for task in (head[2], "move-bottle-near-coke-can")]
@@ -214,7 +212,7 @@ def test_what_the_defaults_by_todays_recipe_reach() -> None:
     _, *body = table("| policy by the recipe | method")
     assert len(body) == len(played[played.seed == 0].groupby(["name", "method"]))
     for name, method, *cells in body:
-        method = method.split(" (")[0].strip("*").lower()
+        method = _method(method)
         of_row = played[(played.name == name) & (played.method == method)]
         listed = of_row[of_row.seed == 0]
         assert len(listed) == (96 if "bridge" in name else 250)
@@ -270,6 +268,11 @@ def _played(name: str) -> pd.DataFrame:
     played = pd.concat([episodes for _, episodes in read_runs(RESULTS / f"{name}.parquet")])
     assert set(played.outcome) <= {"success", "failure"}
     return played
+
+
+def _method(cell: str) -> str:
+    """The method of a table's line, which may be bold or marked as a bound."""
+    return cell.split(" (")[0].strip("*").lower()
 
 
 def _of_way(told: pd.DataFrame, way: str) -> str:

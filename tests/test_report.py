@@ -1,4 +1,7 @@
-"""The report of synthetic runs: to the letter for a tiny one, in seconds for a large one, honest about what is missing, one line about damage."""
+"""The report of synthetic runs: to the letter for a tiny one, in seconds for a large one.
+
+It tells what is missing, and of damage one line.
+"""
 
 import csv
 import json
@@ -10,37 +13,47 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from PIL import Image
 
 from tests.command import vap
-from vap_core.base import palette
-from vap_core.base.errors import BadOutput, BadRecording
+from vap_core.base.errors import BadOutput
 from vap_core.base.tables import escape, latex, markdown
 from vap_core.evaluation.publish import publish
-from vap_core.evaluation.report import page, report
-from vap_core.evaluation.report.pictures import (
-    differences_figure,
-    forest_figure,
-)
+from vap_core.evaluation.report import report
 from vap_core.evaluation.report.results import errors, results
 from vap_core.evaluation.report.runs import load_runs
 from vap_core.evaluation.statistics import ALL_TASKS, compare
 from vap_core.evaluation.store import append, open_run
-from vap_core.recording import recording_file_name
 from vap_core.simulation import suites
 
 BRIDGE = (("simpler-bridge", "pick-shaver"), ("simpler-bridge", "put-camera"))
 GOLDEN = Path(__file__).parent / "golden_report.md"
+FELL_OFF = "Traceback (most recent call last):\n  ...\nRuntimeError: the arm | fell off\n"
 
 
 def run(
-    folder: Path, tasks: tuple[tuple[str, str], ...] = BRIDGE, episodes: int | None = 6, seed: int = 0, keep: float = 1.0,
-    label: str = "scripted", **changes: Any,
-) -> Path:  # fmt: skip
-    """A run whose outcomes follow from the episode alone: vap wins all but every third, generic every third; vap's last one is an error."""
+    folder: Path,
+    tasks: tuple[tuple[str, str], ...] = BRIDGE,
+    episodes: int | None = 6,
+    seed: int = 0,
+    keep: float = 1.0,
+    label: str = "scripted",
+    **changes: Any,
+) -> Path:
+    """A run whose outcomes follow from the episode alone.
+
+    vap wins all but every third, generic every third; vap's last one is an error.
+    """
     names = dict.fromkeys(suite for suite, _ in tasks)
-    study = {"tasks": [list(task) for task in tasks], "methods": ["generic", "vap"], "episodes": episodes, "seed": seed, "policy": "scripted",
-             "lists": {name: suites.lists.digest(name) for name in names if name in suites.BENCHMARKS}, "version": "0.1.0", **changes}  # fmt: skip
+    study = {
+        "tasks": [list(task) for task in tasks],
+        "methods": ["generic", "vap"],
+        "episodes": episodes,
+        "seed": seed,
+        "policy": "scripted",
+        "lists": {name: suites.lists.digest(name) for name in names if name in suites.BENCHMARKS},
+        "version": "0.1.0",
+        **changes,
+    }
     rows = []
     for suite, task in tasks:
         listed = suites.rows(suite, task, episodes, seed)
@@ -50,14 +63,29 @@ def run(
                     (i % 3 > 0) if method == "vap" else (i % 3 == 1),
                     method == "vap" and i == len(listed) - 1,
                 )
-                rows.append({
-                    "suite": suite, "task": task, "split": row.split, "variant": row.variant, "episode": row.episode, "seed": seed, "method": method,
-                    "policy": label, "outcome": "error" if error else "success" if won else "failure", "success": won and not error,
-                    "success_once": won, "held_steps": 0, "cmr": None if row.rule == "selected" else i % 3 > 0,
-                    "wrong_object": method == "generic" and i == 0, "first_object_correct": won, "steps": 10, "margin": None,
-                    "attempt": 2 if i == 2 else 1,
-                    "detail": "Traceback (most recent call last):\n  ...\nRuntimeError: the arm | fell off\n" if error else "",
-                })  # fmt: skip
+                rows.append(
+                    {
+                        "suite": suite,
+                        "task": task,
+                        "split": row.split,
+                        "variant": row.variant,
+                        "episode": row.episode,
+                        "seed": seed,
+                        "method": method,
+                        "policy": label,
+                        "outcome": "error" if error else "success" if won else "failure",
+                        "success": won and not error,
+                        "success_once": won,
+                        "held_steps": 0,
+                        "cmr": None if row.rule == "selected" else i % 3 > 0,
+                        "wrong_object": method == "generic" and i == 0,
+                        "first_object_correct": won,
+                        "steps": 10,
+                        "margin": None,
+                        "attempt": 2 if i == 2 else 1,
+                        "detail": FELL_OFF if error else "",
+                    }
+                )
     open_run(folder, study)
     append(folder, rows[: round(keep * len(rows))])
     return folder
@@ -81,9 +109,18 @@ def test_a_tiny_run_is_reported_to_the_letter(
     assert (out / "report.md").read_text() == text + "\n"
     assert plain(text, folder) + "\n" == GOLDEN.read_text()
     assert sorted(path.name for path in out.iterdir()) == [
-        "comparisons.csv", "comparisons.tex", "forest.png", "outcomes.csv", "outcomes.tex", "paired.png", "provenance.csv", "report.html", "report.md",
-        "results.csv", "results.tex",
-    ]  # fmt: skip
+        "comparisons.csv",
+        "comparisons.tex",
+        "forest.png",
+        "outcomes.csv",
+        "outcomes.tex",
+        "paired.png",
+        "provenance.csv",
+        "report.html",
+        "report.md",
+        "results.csv",
+        "results.tex",
+    ]
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     report([folder], out)
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before, (
@@ -186,8 +223,8 @@ def test_an_unfinished_run_is_reported_as_it_is(tmp_path: Path) -> None:
     text = report([folder], tmp_path / "out")
     assert "18 of the 24 episodes that 1 run asked for." in text
     assert (
-        f"**Unfinished**: {folder} is unfinished: 18 of 24 episodes; run the same command again to finish it."
-        in text
+        f"**Unfinished**: {folder} is unfinished: 18 of 24 episodes; run the same command again to "
+        "finish it." in text
     )
     lines = results(load_runs([folder])).set_index(["task", "method"])
     assert lines.loc["put-camera", "n"].tolist() == [3, 3]
@@ -273,7 +310,10 @@ def damage(folder: Path, how: str) -> str:
         return "holds no finished episode yet; run the same command again"
     if how == "other rows":
         table.assign(episode=table.episode + 100).to_parquet(part)
-        return "run is damaged: it was never asked for 24 of its episodes, the first simpler-bridge/pick-shaver episode 100 seed 0 of method generic"
+        return (
+            "run is damaged: it was never asked for 24 of its episodes, the first "
+            "simpler-bridge/pick-shaver episode 100 seed 0 of method generic"
+        )
     if how == "another method":
         table.replace({"vap": "nap"}).to_parquet(part)
         return "run is damaged: it was never asked for 12 of its episodes"
@@ -292,8 +332,18 @@ def damage(folder: Path, how: str) -> str:
 
 
 @pytest.mark.parametrize(
-    "how", ["no note", "torn part", "no rows", "other rows", "another method", "old columns", "other list", "another command"]
-)  # fmt: skip
+    "how",
+    [
+        "no note",
+        "torn part",
+        "no rows",
+        "other rows",
+        "another method",
+        "old columns",
+        "other list",
+        "another command",
+    ],
+)
 def test_damage_is_told_in_one_line(tmp_path: Path, how: str) -> None:
     folder = run(tmp_path / "run")
     wanted = damage(folder, how)
@@ -332,62 +382,9 @@ def test_the_command_prints_what_it_writes(tmp_path: Path) -> None:
     assert refused.stderr.startswith("error: run: ")
 
 
-def test_a_failure_is_pictured_by_the_recording_of_its_own_policy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Two runs of one suite and method, with different policies, name their files alike."""
-    name = recording_file_name("simpler-bridge", "put-camera", 3, 0, "vap")
-    sources = [tmp_path / run for run in ("a", "b", "damaged")]
-    for source in sources:
-        (source / "recordings").mkdir(parents=True)
-        (source / "recordings" / name).write_bytes(b"")
-
-    def summary(path: Path) -> dict[str, str]:
-        if "damaged" in path.parts:
-            raise BadRecording("damaged")
-        return {"policy": path.parts[-3]}
-
-    monkeypatch.setattr("vap_core.recording.read_summary", summary)
-    row = {"suite": "simpler-bridge", "task": "put-camera", "episode": 3, "seed": 0, "method": "vap"}  # fmt: skip
-    for policy, found in (("b", sources[1] / "recordings" / name), ("c", None)):
-        assert page._recording({**row, "policy": policy}, sources) == found
-
-
-def test_pictures_show_every_line_and_overlap_nothing(tmp_path: Path) -> None:
-    tasks = tuple(
-        (name, task.name) for name in suites.BENCHMARKS for task in suites.suite(name).tasks
-    )
-    runs = load_runs([run(tmp_path / "run", tasks)])
-    lines, compared = results(runs), compare(runs.table, runs.methods)
-    for figure, count in (
-        (forest_figure(lines), len(lines) // 2),
-        (differences_figure(compared), len(compared)),
-    ):
-        figure.savefig(tmp_path / "drawn.png")
-        (axes,) = figure.axes
-        assert len(axes.get_yticks()) == count
-        boxes = [
-            text.get_window_extent()
-            for text in (*axes.get_yticklabels(), *axes.texts, *figure.legends[0].get_texts())
-        ]
-        assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
-        assert all(text.get_fontsize() >= 8 for text in (*axes.get_yticklabels(), *axes.texts))
-    assert np.asarray(Image.open(tmp_path / "drawn.png").convert("L")).std() > 10
-
-
-def test_methods_are_told_apart_by_colour_and_by_marker() -> None:
-    marks = palette.method_marks(["generic", "vap", "mask-only", "rewrite-only", "vap-associated"])
-    assert (
-        len({colour for colour, _ in marks.values()})
-        == len({marker for _, marker in marks.values()})
-        == 5
-    )
-    assert marks["vap"] == palette.METHODS["vap"]
-
-
 @pytest.mark.sweep
 def test_a_hundred_thousand_rows_take_seconds(tmp_path: Path) -> None:
-    """Processor time of the whole report, shapes checked as in every test; 23 seeds of all four lists under two methods."""
+    """Processor time, shapes checked as in every test: 23 seeds of all four lists, two methods."""
     tasks = tuple(
         (name, task.name) for name in suites.BENCHMARKS for task in suites.suite(name).tasks
     )
