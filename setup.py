@@ -26,6 +26,7 @@ LEFT_OUT = (
     "policies/mini-pi0-simpler-fractal",
     "policies/mini-pi0-simpler-fractal-tint-free",
     "policies/mini-pi0-vlabench",
+    "policies/mini-pi0-vlabench-tint-free",
 )
 """Studied in notebooks and docs, and named by no command: they stay in the repository alone."""
 

@@ -1,6 +1,7 @@
 """From a run's table to the frame: failures divided, listed, narrowed down, run again and opened; what is refused, in one line."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import pandas as pd
 import pytest
 
 from tests.command import vap
+from vap_core.base import figures
 from vap_core.base.errors import BadOutput, BadStudy
 from vap_core.base.files import DATA
 from vap_core.base.tables import align
@@ -23,11 +25,13 @@ from vap_core.evaluation.report.failures import (
     sub_cases_text,
 )
 from vap_core.evaluation.report.funnel import funnel_figure
+from vap_core.evaluation.report.page import report_page
 from vap_core.evaluation.study import Study
 from vap_core.recording import Recorder, read_summary
 from vap_core.recording.index import FOLDER
 from vap_core.rollout.failure import CASES
 
+STAGE_COLUMNS = [f"stage_{stage}" for stage in STAGES]
 STUDY = Study((("widowx-pick", "pick-straw-cup"),), ("generic",), episodes=3, policy="random")
 
 
@@ -124,6 +128,33 @@ def test_the_road_narrows_and_ends_with_the_successes() -> None:
     assert all(a >= b for a, b in zip(vap.left, vap.left[1:], strict=False))  # type: ignore[operator]
 
 
+def test_a_method_that_has_errors_alone_has_no_line() -> None:
+    """`report` fell on it."""
+    of_vap = TABLE[TABLE.method == "vap"]
+    errors = pd.DataFrame([{**row("soft", outcome="error"), **dict.fromkeys(STAGE_COLUMNS)}] * 2)
+    lines = funnel_table(pd.concat([of_vap, errors], ignore_index=True))
+    assert lines[1].left == (None,) * len(STAGES)
+    figure = funnel_figure(lines, {"vap": "red", "soft": "grey"})
+    assert [text.get_text() for text in figure.legends[0].get_texts()][:-1] == ["vap"]
+    assert figure.axes[0].get_title() == "vlabench (n 2 to 9)"
+
+
+def test_a_method_that_reads_the_simulator_is_dashed() -> None:
+    table = pd.concat([TABLE.assign(bound=False), TABLE.assign(bound=True, method="wrong-mask")])
+    figure = funnel_figure(funnel_table(table), {"vap": "red", "wrong-mask": "black"})
+    drawn = [line for line in figure.axes[0].lines if line.get_linestyle() != "None"]
+    styles = {line.get_color(): line.get_linestyle() for line in drawn}
+    assert (styles["red"], styles["black"]) == ("-", "--")
+
+
+def test_a_report_of_methods_that_highlight_nothing_has_their_failures(tmp_path: Path) -> None:
+    of_generic = TABLE[TABLE.method == "generic"].dropna(axis="columns", how="all")
+    table = of_generic.assign(task="select-cup", episode=[0, 1], seed=0, policy="p")
+    page = report_page(table, {}, figures.empty_figure(1.0, 1.0), [], tmp_path)
+    assert "Where episodes are lost" in page
+    assert "Failures (2)" in page
+
+
 def test_a_run_lists_its_failures_with_their_reasons(run: Path) -> None:
     failures = list_failures(run)
     assert len(failures.table) == 3
@@ -181,6 +212,32 @@ def test_a_published_table_opens_too(
     path = recording_of(failures, 0)
     assert path.parent == Path("data/runs/mine-diagnosed/recordings")
     assert path.exists()
+
+
+def test_a_correction_is_of_the_policy_that_was_recorded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Policies of one table that play the same rows name their recordings alike."""
+    runs = []
+    for policy in ("random", "scripted"):
+        runs.append(tmp_path / policy)
+        study = replace(STUDY, policy=policy, episodes=2)
+        engine.run(study, runs[-1], record="none", executor=here, progress=False)
+    publish(runs, tmp_path / "mine.parquet")
+    monkeypatch.chdir(tmp_path)
+    listed = partial(list_failures, tmp_path / "mine.parquet", where="policy = 'random'")
+    layer = correct_failure(listed(), 0, "unprompted: slip")
+    assert layer.parent == Path("data/runs/mine-diagnosed/random/corrections")
+    assert listed().table.corrected.tolist() == [True, False]
+    everything = list_failures(tmp_path / "mine.parquet").all_episodes
+    assert everything.corrected.sum() == 1
+    flat = Path("data/runs/mine-diagnosed/corrections")
+    flat.mkdir()
+    layer.replace(flat / layer.name)
+    publish(runs[1:], tmp_path / "mine.parquet", replace=True)
+    left = list_failures(tmp_path / "mine.parquet").all_episodes
+    assert left.policy.tolist() == ["scripted"] * 2
+    assert not left.corrected.any(), "it was of the policy before"
 
 
 def test_a_recording_of_older_weights_is_made_anew(

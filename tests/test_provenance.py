@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from vap_core.evaluation.policy_names import shipped
+from vap_core.evaluation.publish import read_published
 from vap_core.evaluation.report.provenance import command_line, provenance
 from vap_core.evaluation.report.runs import load_runs
 from vap_core.evaluation.study import Study
@@ -45,6 +46,21 @@ def test_the_command_of_a_run_is_told() -> None:
         command_line({**study, "tasks": demo, "episodes": 20})
         == "python -m vap_core demo --episodes 20 --seed 2"
     )
+    for other in ({"methods": ["vap"]}, {"policy": "expert"}, {"seeds": 2}, {"episodes": None}):
+        told = command_line({**study, "tasks": demo, "episodes": 20, **other})
+        assert told.startswith("Study("), "demo has no option for it"
+        assert all(name in told for name in other if other[name] is not None)
+
+
+def test_parts_of_one_run_are_told_apart() -> None:
+    """Published parts of a run share its digest: one command stood for both."""
+    table = Path(__file__).parents[1] / "data" / "results" / "mini_pi0.parquet"
+    told = provenance(load_runs([table]))
+    assert len(told) == len(read_published(table))
+    assert told.run.is_unique
+    shared = told[told.digest.duplicated(keep=False)]
+    assert sorted(shared.run.str.extract(r"\((.+)\)$")[0]) == ["generic", "vap"]
+    assert shared.command.str.extract("--method (.+?) --")[0].tolist() == ["generic", "vap"]
 
 
 def test_the_command_names_the_policy_that_was_run_and_not_todays_default() -> None:

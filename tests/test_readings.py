@@ -1,6 +1,8 @@
 """The log of readings: a run enters once, to publish copies its lines, and a run of one's own
 leaves the repository as it is."""
 
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -104,6 +106,24 @@ def test_readings_are_counted_by_weights() -> None:
     assert readings_section([]) == ""
 
 
+def test_runs_that_begin_at_once_lose_no_line(
+    logs: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted = readings.readings_of(Study(TASKS, ("generic",)).configuration(), "a")
+    read = readings.read_log
+
+    def slowly(path: Path) -> list[Reading]:
+        lines = read(path)
+        time.sleep(0.2)
+        return lines
+
+    monkeypatch.setattr(readings, "read_log", slowly)
+    with ThreadPoolExecutor(4) as pool:
+        for begun in [pool.submit(append, wanted, logs[0]) for _ in range(4)]:
+            begun.result()
+    assert len(read(logs[0])) == 4 * len(wanted)
+
+
 def test_a_damaged_log_is_named(logs: tuple[Path, Path]) -> None:
     logs[0].parent.mkdir()
     logs[0].write_text("date,suite\n2026-01-01,vlabench\n")
@@ -158,12 +178,21 @@ def test_the_docs_count_the_published_readings() -> None:
         f"tabletop with {desk[1]}, {fractal[0]} of simpler-fractal with {fractal[1]}, and "
         f"{vlabench[0]} of vlabench with {vlabench[1]}." in text
     )
-    expected = {"simpler-bridge": 6, "simpler-bridge-red": 1, "simpler-fractal": 6, "vlabench": 3}
-    of_default = dict.fromkeys(expected, 0)
+    expected = {
+        "simpler-bridge": [6, 56],
+        "simpler-bridge-red": [1, 3],
+        "simpler-fractal": [6, 19],
+        "vlabench": [3, 13],
+    }
+    of_default = {suite: [0, 0] for suite in expected}
     for line in read_log(DATA / "results" / readings.FILE):
-        if line.suite in of_default and line.weights:
-            own = fingerprint(shipped(line.suite))
-            of_default[line.suite] += own.startswith(line.weights)
+        if line.suite not in of_default or not line.weights:
+            continue
+        if fingerprint(shipped(line.suite)).startswith(line.weights):
+            of_default[line.suite][0] += 1
+            of_default[line.suite][1] += len(line.methods.split())
     assert of_default == expected
-    assert "simpler-bridge read its list 6 times, and once with a red look-alike" in text
-    assert "that of vlabench three times, that of simpler-fractal 6 times" in text
+    assert (
+        "simpler-bridge read its list in 6 runs (56 methods and arms), and in one with a red "
+        "look-alike (3), that of vlabench in 3 runs (13), that of simpler-fractal in 6 runs (19;"
+    ) in text

@@ -236,6 +236,24 @@ def test_what_a_policy_of_todays_recipe_does_with_generic_objects(suite: str, na
     assert set(ways) == set(told.method)
 
 
+def test_what_policies_reach_that_never_saw_a_tint() -> None:
+    played = _played("tint_free")
+    for heading, suite, apart in (
+        ("| method | SR | CMR | wrong object moved", "simpler-bridge", "cmr"),
+        ("| vlabench, tint-free | SR", "vlabench", "select-cat-figurine"),
+    ):
+        of_suite = played[played.suite == suite]
+        _, *body = table(heading)
+        assert {_method(method) for method, *_ in body} == set(of_suite.method)
+        for method, *cells in body:
+            rows = of_suite[of_suite.method == _method(method)]
+            assert len(rows) == (96 if suite == "simpler-bridge" else 250)
+            one = rows.cmr if apart == "cmr" else rows[rows.task == apart].success
+            columns = (rows.success, one, rows.wrong_object, rows.first_object_correct)
+            shares = [_percent(rate(int(column.sum()), len(column))) for column in columns]
+            assert [cell.strip("*") for cell in cells] == shares
+
+
 def _starts(name: str, listed: int, others: int) -> list[tuple[str, str]]:
     """Of VAP and of generic: what it reaches as listed, and from so many other seeds."""
     played = _played(name)

@@ -30,6 +30,7 @@ BY_TODAYS_RECIPE = {
     "simpler-fractal-wide": (0.2, 0.02),
     "simpler-fractal-tint-free": (0.0, 0.02),
     "vlabench-wide": (0.2, 0.01),
+    "vlabench-tint-free": (0.0, 0.01),
 }
 """Policies that grew from the model that never saw a tint: the share of their scenes that were tinted, and the noise (rad) on the arm's angles."""
 

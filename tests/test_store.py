@@ -1,5 +1,6 @@
 """Results are appended, never mixed and never overwritten."""
 
+import json
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -131,6 +132,27 @@ def test_a_manifest_nested_too_deep_is_damaged(tmp_path: Path) -> None:
     (run / "run.json").write_bytes(b"[" * 100_000)
     with pytest.raises(BadOutput, match="is absent or damaged"):
         read_manifest(run)
+
+
+@pytest.mark.parametrize("damaged", [[], "x", None])
+def test_a_configuration_that_is_no_object_is_damaged(tmp_path: Path, damaged: object) -> None:
+    run = open_run(tmp_path / "run", {})
+    (run / "run.json").write_text(json.dumps({"digest": "x", "configuration": damaged}))
+    for use in (lambda: read_manifest(run), lambda: open_run(run, {"seed": 0})):
+        with pytest.raises(BadOutput, match="is absent or damaged"):
+            use()
+
+
+def test_parts_that_do_not_fit_together_are_named_by_who_reads_and_who_joins(
+    tmp_path: Path,
+) -> None:
+    run = open_run(tmp_path / "run", {})
+    append(run, [ROW])
+    append(run, [{**ROW, "episode": "three"}])
+    for use in (read, compact):
+        with pytest.raises(BadOutput, match="do not fit together"):
+            use(run)
+    assert len(list((run / "parts").glob("*.parquet"))) == 2
 
 
 def test_a_run_of_an_older_version_is_said_to_be_one(tmp_path: Path) -> None:

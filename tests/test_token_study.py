@@ -195,6 +195,9 @@ def test_the_study_measures_every_token_and_goes_on(
     again = study.run(asked, tmp_path / "run", progress=False)
     assert again["answers"].equals(answers)
     monkeypatch.setattr(study, "run_job", run_job)
+    next((tmp_path / "run" / "answers").glob("*.parquet")).unlink()
+    mended = study.run(asked, tmp_path / "run", progress=False)
+    assert mended["answers"].equals(answers), "a part that was deleted is made again"
     other = study.run(Tokens((SUITE,), (5,), epochs=1), tmp_path / "other", progress=False)
     for _ in range(2):
         for path in study.publish(tmp_path / "run", tmp_path / "kept"):
@@ -215,6 +218,8 @@ def test_the_usual_number_of_photos_comes_first_and_once_in_the_policy() -> None
     assert [(job.k, job.where) for job in jobs[:2]] == [(5, "vlm"), (5, "policy")]
     assert len(jobs) == 4 * 3
     assert {job.where for job in plan(Tokens((SUITE,), places=("vlm",)))} == {"vlm"}
+    with pytest.raises(BadStudy, match="from 5 photos alone"):
+        study.run(Tokens((SUITE,), (3,), places=("policy",)), Path("none"), progress=False)
     with pytest.raises(UnknownName, match="eval-tokens: --learn-in"):
         Tokens((SUITE,), places=("here",))
     with pytest.raises(UnknownName, match="eval-tokens: suite"):

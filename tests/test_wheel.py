@@ -36,6 +36,7 @@ LEFT_OUT = tuple(
         "simpler-fractal",
         "simpler-fractal-tint-free",
         "vlabench",
+        "vlabench-tint-free",
     )
 )
 Run = Callable[..., subprocess.CompletedProcess[str]]

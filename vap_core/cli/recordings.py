@@ -84,13 +84,14 @@ def diagnose(
     Example: python -m vap_core diagnose data/runs/demo --open 0 --correct "case 3: slip"
         --note "it held for a moment"
     """
+    from vap_core.base.errors import BadStudy
     from vap_core.evaluation.diagnosis.failures import (
-        deciding_frame,
         failures_text,
         list_failures,
     )
     from vap_core.evaluation.diagnosis.recordings import (
         correct_failure,
+        opening_frame,
         recording_of,
         side_by_side_recording,
     )
@@ -100,17 +101,20 @@ def diagnose(
     )
     number = show or 0
     if correct is not None:
+        if show is None:
+            raise BadStudy(
+                "diagnose: --correct is of one failure; name it by --open and its number."
+            )
         layer = correct_failure(failures, number, correct, note)
         print(f"wrote {layer}")
         return
     if show is None and png is None and mp4 is None:
         print(failures_text(failures, limit))
         return
+    path = recording_of(failures, number)
+    frame = opening_frame(failures, number, path)
     if against:
         path = side_by_side_recording(failures, number, against)
-    else:
-        path = recording_of(failures, number)
-    frame = deciding_frame(failures, number)
     print(f"{path}, frame {frame}: {failures.table['case_sentence'].iloc[number]}")
     _show_frame(path, frame, png, mp4)
 

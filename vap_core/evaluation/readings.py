@@ -9,8 +9,11 @@ for that, and not logged. A run is entered once, when it begins, with what it wi
 """
 
 import csv
+import fcntl
 import io
-from collections.abc import Iterable, Mapping, Sequence
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import astuple, dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
@@ -109,22 +112,37 @@ def read_log(path: Path) -> list[Reading]:
 
 
 def append(readings: Sequence[Reading], path: Path) -> None:
-    """Add lines to a log, which is begun where it does not exist. Raises: BadOutput."""
+    """Add lines to a log, which is begun where it does not exist.
+
+    Runs that begin at the same time wait for each other. Raises: BadOutput.
+    """
     if not readings:
         return
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
     writer.writerow(COLUMNS)
-    for reading in (*read_log(path), *readings):
-        writer.writerow(astuple(reading))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, table.getvalue().encode())
+        with _locked(path.parent):
+            for reading in (*read_log(path), *readings):
+                writer.writerow(astuple(reading))
+            write_atomic(path, table.getvalue().encode())
     except OSError as error:
         raise BadOutput(
             f"readings: {path} cannot be written ({error.strerror}); make room, or run the command "
             "in a folder where data/runs can be written."
         ) from error
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keep other processes that add to a log out of its folder."""
+    held = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(held)
 
 
 def publish_readings(manifests: Iterable[Mapping[str, Any]], target: Path) -> None:

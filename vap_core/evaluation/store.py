@@ -129,6 +129,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         raise BadOutput(damaged) from error
     if not isinstance(manifest, dict) or not {"digest", "configuration"} <= manifest.keys():
         raise BadOutput(damaged)
+    if not isinstance(manifest["configuration"], dict):
+        raise BadOutput(damaged)
     return manifest
 
 
@@ -165,8 +167,8 @@ def append(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     write_part(folder, "parts", rows, caller="append")
 
 
-def write_part(folder: Path, kind: str, rows: Sequence[Mapping[str, Any]], caller: str) -> None:
-    """Add `rows` as one new part to the table `kind` of a run.
+def write_part(folder: Path, kind: str, rows: Sequence[Mapping[str, Any]], caller: str) -> Path:
+    """Add `rows` as one new part to the table `kind` of a run; returns the part.
 
     Raises: BadOutput, which names the `caller`, when the disk is full.
     """
@@ -176,7 +178,9 @@ def write_part(folder: Path, kind: str, rows: Sequence[Mapping[str, Any]], calle
         (folder / kind).mkdir(exist_ok=True)
         table = pd.DataFrame(list(rows))
         data = table.to_parquet(index=False, compression="zstd")
-        write_atomic(folder / kind / f"{uuid4().hex}.parquet", data)
+        path = folder / kind / f"{uuid4().hex}.parquet"
+        write_atomic(path, data)
+        return path
     except OSError as error:
         raise BadOutput(
             f"{caller}: {folder} cannot be written ({error.strerror}); make room and run the same "
@@ -191,13 +195,10 @@ def compact(folder: Path) -> None:
 
     Raises: BadOutput.
     """
-    from pyarrow import concat_tables
-
     paths = sorted((folder / "parts").glob("*.parquet"))
     if len(paths) < 2:
         return
-    parts = [_read_part(path) for path in paths]
-    table = concat_tables(parts, promote_options="permissive").to_pandas()
+    table = _joined(folder, [_read_part(path) for path in paths])
     key = table.columns.intersection([*KEY, "attempt"]).tolist()
     append(folder, table.drop_duplicates(key).to_dict("records"))
     for path in paths:
@@ -207,20 +208,27 @@ def compact(folder: Path) -> None:
 def read(folder: Path) -> "pd.DataFrame":
     """Every finished episode, in the order of KEY; of several attempts the last one."""
     import pandas as pd
-    from pyarrow import ArrowException, concat_tables
 
     parts = _read_parts(folder)
     if not parts:
         return pd.DataFrame(columns=KEY)
+    table = _joined(folder, parts)
+    if not {*KEY, "attempt"} <= set(table.columns):
+        raise BadOutput(
+            f"read: {folder} was written by an older version; run the same command again with "
+            "another --out."
+        )
+    return table.drop_duplicates(KEY, keep="last", ignore_index=True)
+
+
+def _joined(folder: Path, parts: "Sequence[pa.Table]") -> "pd.DataFrame":
+    """The rows of all parts, in the order of KEY and attempts where they have them."""
+    from pyarrow import ArrowException, concat_tables
+
     try:
         table = concat_tables(parts, promote_options="permissive").to_pandas()
-        if not {*KEY, "attempt"} <= set(table.columns):
-            raise BadOutput(
-                f"read: {folder} was written by an older version; run the same command again with "
-                "another --out."
-            )
-        table = table.sort_values([*KEY, "attempt"], ignore_index=True)
-        return table.drop_duplicates(KEY, keep="last", ignore_index=True)
+        order = [name for name in (*KEY, "attempt") if name in table.columns]
+        return table.sort_values(order, ignore_index=True) if order else table
     except (ArrowException, ValueError, TypeError) as error:
         raise BadOutput(
             f"read: the parts in {folder} do not fit together ({type(error).__name__}); run the "

@@ -3,7 +3,7 @@
 The recording itself is never rewritten.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import rerun as rr
@@ -20,11 +20,15 @@ CORRECTIONS = "corrections"
 
 @dataclass(frozen=True)
 class Correction:
-    """What a researcher concluded: the case and sub-case of a failure, and a note why."""
+    """What a researcher concluded: the case and sub-case of a failure, and a note why.
+
+    `policy` is the label of the one that was recorded, "" where a layer does not say.
+    """
 
     case: str
     sub_case: str
     note: str = ""
+    policy: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
         if self.case not in CASES:
@@ -64,6 +68,7 @@ def write_correction(recording: Path, correction: Correction, frame_index: int) 
         sub_case=correction.sub_case,
         case_sentence=correction.note or str(correction),
         was=summary["case"],
+        policy=summary.get("policy", ""),
     )
     log_properties(rec, "correction", values)
     event = rr.TextLog(str(correction), level="ERROR")
@@ -96,7 +101,8 @@ def _read_correction(path: Path) -> Correction:
     for chunk in read_chunks(path):
         if property_group(chunk) == "correction":
             values = read_properties(chunk)
-    return Correction(values["case"], values["sub_case"], values["case_sentence"])
+    note, policy = values["case_sentence"], str(values.get("policy", ""))
+    return Correction(values["case"], values["sub_case"], note, policy)
 
 
 def _recording_id(recording: Path) -> str:

@@ -41,6 +41,10 @@ COLUMNS = {
     "case_sentence": "why",
 }
 """The columns that `failures_text` shows, and their titles; the sub-goal where there are any."""
+PLAYED = ["suite", "task", "episode", "seed", "method"]
+"""The columns that name a recording."""
+UNSAFE = r"[^\w.@-]"
+"""What no folder's name here has."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +53,8 @@ class Failures:
 
     `manifests` are the runs' run.json by digest. `all_episodes` are all episodes of the runs,
     failed or not; `episodes` those of the suite, task and method asked for; `table` the failures
-    among them that are left. Each table has the run's digest as `configuration`, and its `source`.
+    among them that are left. Each table has the run's digest as `configuration`, its `source`, and
+    as `folder` where the recordings and corrections of the row are.
     """
 
     manifests: Mapping[str, dict[str, Any]]
@@ -88,7 +93,7 @@ def list_failures(
         raise BadOutput(
             f"diagnose: {' and '.join(map(str, sources))} hold no finished episode; run eval first."
         )
-    all_episodes = _with_corrections(pd.concat(tables, ignore_index=True))
+    all_episodes = _with_corrections(_with_folders(pd.concat(tables, ignore_index=True)))
     selected = all_episodes
     for column, wanted in (("suite", suite), ("task", task), ("method", method)):
         selected = _select(selected, column, wanted)
@@ -137,29 +142,43 @@ def deciding_frame(failures: Failures, number: int) -> int:
     return max(0, int(failure_row(failures, number)["deciding_frame"]))
 
 
-def artifacts_folder(source: Path) -> Path:
-    """Where the recordings and corrections of a run are.
+def _with_folders(table: "pd.DataFrame") -> "pd.DataFrame":
+    """With the folder of each row's recordings and corrections.
 
-    That is its folder; a published table has a folder of its own.
+    That is the run's; a published table has one of its own, and in it one a policy where several
+    played the same rows.
     """
-    if source.suffix == ".parquet":
-        return Path("data/runs") / f"{source.stem}-diagnosed"
+    folders = table["source"].map(_artifacts_folder)
+    if "policy" in table:
+        several = table.groupby(["source", *PLAYED])["policy"].transform("nunique") > 1
+        by_policy = folders + "/" + table["policy"].str.replace(UNSAFE, "-", regex=True)
+        folders = folders.mask(several, by_policy)
+    return table.assign(folder=folders)
+
+
+def _artifacts_folder(source: str) -> str:
+    path = Path(source)
+    if path.suffix == ".parquet":
+        return str(Path("data/runs") / f"{path.stem}-diagnosed")
     return source
 
 
 def _with_corrections(table: "pd.DataFrame") -> "pd.DataFrame":
-    """With the corrections of researchers, marked in the column `corrected`."""
+    """With the corrections of researchers, marked in the column `corrected`.
+
+    A correction holds for a failure of the policy that was recorded.
+    """
     from vap_core.recording import read_corrections, recording_file_name
 
     table = table.assign(corrected=False)
-    for source, part in table.groupby("source", sort=False):
-        folder = artifacts_folder(Path(str(source)))
-        corrections = read_corrections(folder)
+    failed = table[table["outcome"].eq("failure")]
+    for folder, part in failed.groupby("folder", sort=False):
+        corrections = read_corrections(Path(str(folder)))
         if not corrections:
             continue
-        for index, row in part[["suite", "task", "episode", "seed", "method"]].iterrows():
-            correction = corrections.get(recording_file_name(*row))
-            if correction is None:
+        for index, row in part.iterrows():
+            correction = corrections.get(recording_file_name(*row[PLAYED]))
+            if correction is None or correction.policy not in ("", row.get("policy")):
                 continue
             cells = {
                 "case": correction.case,

@@ -12,7 +12,6 @@ from vap_core.base.errors import BadStudy
 from vap_core.evaluation.diagnosis import explain
 from vap_core.evaluation.diagnosis.failures import (
     Failures,
-    artifacts_folder,
     deciding_frame,
     failure_row,
 )
@@ -54,7 +53,7 @@ def side_by_side_recording(failures: Failures, number: int, method: str) -> Path
     for each in (row, other.iloc[0].to_dict()):
         paths[each["method"]] = _recording_of_row(failures, each)
     stem = paths[row["method"]].stem
-    out = artifacts_folder(Path(row["source"])) / "together" / f"{stem}-{method}.rrd"
+    out = Path(row["folder"]) / "together" / f"{stem}-{method}.rrd"
     out.unlink(missing_ok=True)
     combine_recordings(paths, out)
     return out
@@ -104,11 +103,9 @@ def correct_failure(failures: Failures, number: int, case: str, note: str = "") 
     from vap_core.recording import Correction, write_correction
 
     name, _, sub_case = case.partition(":")
-    return write_correction(
-        recording_of(failures, number),
-        Correction(name.strip(), sub_case.strip(), note),
-        deciding_frame(failures, number),
-    )
+    path = recording_of(failures, number)
+    correction = Correction(name.strip(), sub_case.strip(), note)
+    return write_correction(path, correction, opening_frame(failures, number, path))
 
 
 def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
@@ -117,7 +114,7 @@ def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
 
     study = study_of(failures.manifests[row["configuration"]], row)
     episode_row = listed_row(study, row)
-    folder = artifacts_folder(Path(row["source"]))
+    folder = Path(row["folder"])
     path = folder / "recordings" / recording_name(episode_row, row["method"])
     if path.exists() and read_summary(path)["policy"] == row["policy"]:
         return path

@@ -130,7 +130,7 @@ class FunnelRow:
     """How many of `n` episodes are left after each of STAGES.
 
     None where a method has no such stage. `succeeded` counts every success, also one that failed
-    an earlier stage.
+    an earlier stage. `bound` marks a method or policy that reads the simulator.
     """
 
     suite: str
@@ -138,6 +138,7 @@ class FunnelRow:
     n: int
     left: tuple[int | None, ...]
     succeeded: int
+    bound: bool = False
 
 
 type FunnelTable = list[FunnelRow]
@@ -155,8 +156,8 @@ def funnel_table(table: "pd.DataFrame") -> FunnelTable:
         left: list[int | None] = []
         passing = part["outcome"].ne("error")
         for stage in STAGES:
-            passed = part[f"stage_{stage}"]
-            if passed.isna().all():
+            passed = part.get(f"stage_{stage}")
+            if passed is None or passed.isna().all():
                 left.append(None)
                 continue
             passing &= passed.eq(True)
@@ -167,6 +168,7 @@ def funnel_table(table: "pd.DataFrame") -> FunnelTable:
             n=len(part),
             left=tuple(left),
             succeeded=int(part["outcome"].eq("success").sum()),
+            bound="bound" in part and bool(part["bound"].eq(True).any()),
         )
         rows.append(row)
     return rows

@@ -41,8 +41,9 @@ def funnel_figure(
     """Per suite, the share of episodes that are left after each stage of the funnel.
 
     A line per method of `colours` and policy, methods that read the simulator dashed. A method that
-    highlights nothing begins with the stage "touched". The last tick has two marks: a dot for
-    episodes that succeed with every stage right, a diamond for all that succeed (SR).
+    highlights nothing begins with the stage "touched"; one that has errors alone has no line. The
+    last tick has two marks: a dot for episodes that succeed with every stage right, a diamond for
+    all that succeed (SR).
     """
     by_suite: dict[str, list[FunnelRow]] = {}
     for row in rows:
@@ -57,7 +58,9 @@ def funnel_figure(
         drawn |= _draw_funnel(axes, shown, colours)
         axes.set_xticks(range(len(STAGES)), STAGES, fontsize=8, rotation=20)
         axes.set_xlim(-0.25, len(STAGES) - 0.4)
-        axes.set(title=f"{suite} (n {of_suite[0].n})", ylim=(0, 104))
+        counts = sorted({row.n for row in shown})
+        axes.set(title=f"{suite} (n {' to '.join(map(str, counts[:: len(counts) - 1 or 1]))})")
+        axes.set_ylim(0, 104)
         axes.grid(color="#eeeeee")
         axes.spines[["top", "right"]].set_visible(False)
     for axes in panels[len(by_suite) :]:
@@ -124,11 +127,13 @@ def _draw_funnel(
             if left is not None:
                 stages.append(i)
                 percent.append(100 * left / row.n)
+        if not percent:
+            continue
         colour = colours[_plain(row.method)]
         (drawn[row.method],) = axes.plot(
             stages,
             percent,
-            "--" if row.method.startswith("oracle") else "-",
+            "--" if row.bound else "-",
             marker="o",
             markersize=4,
             color=colour,

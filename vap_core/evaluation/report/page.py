@@ -16,7 +16,6 @@ from urllib.parse import quote
 from vap_core.base.errors import BadRecording
 from vap_core.base.palette import METHODS, method_marks
 from vap_core.base.tables import Rows
-from vap_core.evaluation.diagnosis import STAGES
 from vap_core.evaluation.report.failures import DIAGNOSIS_COLUMNS, funnel_table
 from vap_core.evaluation.report.funnel import funnel_figure
 
@@ -62,8 +61,7 @@ def report_page(
     for title, of_title in tables.items():
         parts.append(f"<h2>{escape(title)}</h2>")
         parts += [_html_table(rows) for rows in of_title]
-    stages = {f"stage_{stage}" for stage in STAGES}
-    if set(DIAGNOSIS_COLUMNS) | stages <= set(table.columns):
+    if set(DIAGNOSIS_COLUMNS) <= set(table.columns):
         parts.append("<h2>Where episodes are lost</h2>")
         parts.append(_picture(_funnel(table), "episodes that are left after each stage"))
         parts += _failures(table, sources, out)

@@ -62,9 +62,9 @@ def command_line(study: dict[str, Any]) -> str:
     for suite, task in study["tasks"]:
         tasks_by_suite.setdefault(suite, []).append(task)
     whole = _are_whole_suites(tasks_by_suite)
-    if [tuple(task) for task in study["tasks"]] == list(DEMO.tasks):
-        return f"python -m vap_core demo --episodes {study.get('episodes')} --seed {study['seed']}"
     changed = _changed(study)
+    if _is_demo(study, changed):
+        return f"python -m vap_core demo --episodes {study['episodes']} --seed {study['seed']}"
     if not whole and (len(tasks_by_suite) > 1 or not changed.keys().isdisjoint(EVAL_ONLY)):
         return f"Study({', '.join(f'{name}={setting!r}' for name, setting in changed.items())})"
     words = ["eval" if whole else "rollout"]
@@ -81,6 +81,14 @@ def command_line(study: dict[str, Any]) -> str:
     if study.get("audit"):
         words.append("--audit")
     return "python -m vap_core " + shlex.join(words)
+
+
+def _is_demo(study: dict[str, Any], changed: dict[str, Any]) -> bool:
+    """Whether `demo` makes it, which has options for the number of episodes and the seed alone."""
+    if (changed["tasks"], changed["methods"]) != (DEMO.tasks, DEMO.methods):
+        return False
+    rest = changed.keys() - {"tasks", "methods", "seed"}
+    return study.get("episodes") is not None and rest == {"episodes"}
 
 
 def _changed(study: dict[str, Any]) -> dict[str, Any]:

@@ -91,13 +91,20 @@ def load_runs(sources: Sequence[Path]) -> Runs:
 
 
 def _named_runs(sources: Sequence[Path]) -> "Iterator[tuple[Path, dict[str, Any], pd.DataFrame]]":
-    """Every run with a name of its own: its folder, or the published table and the run's digest."""
+    """Every run with a name of its own: its folder, or the published table and the run's digest.
+
+    Published parts of one run share its digest and are told apart by their methods.
+    """
     for source in dict.fromkeys(sources):
-        for manifest, table in read_runs(source):
-            name = source
+        found = read_runs(source)
+        shared = Counter(manifest["digest"] for manifest, _ in found)
+        for manifest, table in found:
+            name = str(source)
             if source.suffix == ".parquet":
-                name = Path(f"{source}@{manifest['digest'][:8]}")
-            yield name, manifest, table
+                name += f"@{manifest['digest'][:8]}"
+                if shared[manifest["digest"]] > 1:
+                    name += f" ({', '.join(manifest['configuration']['methods'])})"
+            yield Path(name), manifest, table
 
 
 def _check_run(name: Path, study: dict[str, Any], table: "pd.DataFrame") -> None:

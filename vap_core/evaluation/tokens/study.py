@@ -159,16 +159,22 @@ def run(
 ) -> "dict[str, pd.DataFrame]":
     """Do what `folder` lacks, and return the tables.
 
-    Raises: BadOutput when the folder holds another run, or is in use; WorkerDied.
+    Raises: BadOutput when the folder holds another run, or is in use; BadStudy when nothing is
+        asked for; WorkerDied.
     """
     from tqdm import tqdm
 
+    jobs = plan(asked)
+    if not jobs:
+        raise BadStudy(
+            f"eval-tokens: in the policy a token is learned from {USUAL_K} photos alone; ask for "
+            f"--k {USUAL_K}, or for --learn-in vlm."
+        )
     store.open_run(folder, asked.configuration())
     with store.locked(folder):
         done = folder / "done"
         done.mkdir(exist_ok=True)
-        jobs = plan(asked)
-        missing = [job for job in jobs if not (done / job.name).exists()]
+        missing = [job for job in jobs if not _is_done(folder, job)]
         with tqdm(
             total=len(jobs),
             initial=len(jobs) - len(missing),
@@ -176,11 +182,22 @@ def run(
             disable=not progress,
         ) as bar:
             for job, tables in results(run_job, missing, workers=workers, remedy="--workers"):
+                parts = []
                 for name, rows in tables.items():
-                    store.write_part(folder, name, rows, caller="eval-tokens")
-                (done / job.name).touch()
+                    part = store.write_part(folder, name, rows, caller="eval-tokens")
+                    parts.append(f"{part.relative_to(folder)}\n")
+                (done / job.name).write_text("".join(parts))
                 bar.update()
     return read(folder)
+
+
+def _is_done(folder: Path, job: Job) -> bool:
+    """Whether a training has ended and every part that it wrote is still there."""
+    try:
+        parts = (folder / "done" / job.name).read_text().splitlines()
+    except OSError:
+        return False
+    return all((folder / part).exists() for part in parts)
 
 
 def read(folder: Path) -> "dict[str, pd.DataFrame]":
