@@ -189,6 +189,13 @@ def test_a_view_without_boxes_by_hand_passes_unmodified() -> None:
     assert attended.groundings["wrist"][0].ballot.winner is None
 
 
+def test_a_view_keeps_its_size() -> None:
+    attender = Attender(TOYS, MEMORY)
+    state, _ = attender.start({"front": LINE}, "bring my cup")
+    with pytest.raises(BadViews, match="'front' is 80x64, but the episode started with 64x64"):
+        attender.step(state, {"front": np.zeros((64, 80, 3), np.uint8)})
+
+
 def test_what_cannot_be_matched_is_said() -> None:
     attender = Attender(TOYS, {**MEMORY, "other": personal("other", "cup", GREY)})
     with pytest.raises(

@@ -1,6 +1,8 @@
 """A run's recordings as a table, as films and as a page; a click on a candidate."""
 
 import io
+import shutil
+import socket
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,14 @@ from tests.drawn import ROW, K, opening, record
 from tests.test_why import fail
 from vap_core.base.errors import BadOutput, BadRecording
 from vap_core.base.video import frames as video_frames
-from vap_core.recording import Votes, clicks, serve_run, write_film
+from vap_core.recording import (
+    Correction,
+    Votes,
+    clicks,
+    serve_run,
+    write_correction,
+    write_film,
+)
 from vap_core.recording.film import read_verdict
 from vap_core.recording.reading import read_chunks
 from vap_core.recording.stored_pictures import prompted_entities, read_pictures
@@ -48,6 +57,30 @@ def test_the_browser_links_every_recording_to_its_deciding_frame(run: Path) -> N
         assert client.get_dataset("recordings").default_blueprint()
     none = run / "recordings" / "none"
     with pytest.raises(BadRecording, match="there is no recording in"), serve_run(none):
+        pass
+
+
+def test_the_browser_shows_corrected_cases_and_leaves_a_damaged_layer_out(
+    run: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(run / "recordings", tmp_path / "recordings")
+    recording = tmp_path / "recordings" / "wrong.rrd"
+    layer = write_correction(recording, Correction("case 3", "slip", "it held"), 4)
+    with serve_run(tmp_path) as browser:
+        (row,) = [row for row in browser.rows if row["file"] == "wrong.rrd"]
+        assert (row["case"], row["sub_case"], row["case_sentence"]) == ("case 3", "slip", "it held")
+    layer.write_bytes(b"noise" * 99)
+    with serve_run(tmp_path) as browser:
+        assert layer in browser.unreadable
+        assert {row["case"] for row in browser.rows} == {"case 1", ""}
+
+
+def test_a_port_that_is_taken_is_one_line(run: Path) -> None:
+    with (
+        socket.create_server(("127.0.0.1", 0)) as taken,
+        pytest.raises(BadOutput, match="cannot be served .* choose another by --port"),
+        serve_run(run, port=taken.getsockname()[1]),
+    ):
         pass
 
 
@@ -123,6 +156,19 @@ def test_of_two_votes_of_a_view_a_click_tells_the_one_that_is_shown(
     chunks = [*read_chunks(recording), Later()]
     monkeypatch.setattr(clicks, "read_chunks", lambda path: chunks)
     assert Votes(recording).answer(entity, 2) == told
+
+
+@pytest.mark.parametrize(
+    ("winner", "rejected", "elected", "top"),
+    [(2, -1, 0, 2), (-1, 1, 0, 1), (-1, -1, 0, 0), (-1, -1, -1, None)],
+)
+def test_candidates_are_counted_as_they_are_drawn(
+    winner: int, rejected: int, elected: int, top: int | None
+) -> None:
+    """One that is chosen and not like enough is drawn on top."""
+    numbers = {"winner": [winner], "rejected": [rejected], "elected": [elected]}
+    order = Votes._drawing_order(numbers, 3)
+    assert order == ([0, 1, 2] if top is None else [*({0, 1, 2} - {top}), top])
 
 
 def test_a_click_on_a_candidate_says_its_cosines(run: Path) -> None:

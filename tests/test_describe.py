@@ -19,6 +19,7 @@ from vap_core.base.types import Boxes, Description
 from vap_core.perception.attributes import pattern_of
 from vap_core.perception.chat import (
     ChatEndpoint,
+    answer_in_time,
     data_url,
     endpoint_from_environment,
     request_answer,
@@ -263,6 +264,22 @@ def test_no_server_and_a_silent_one_are_said() -> None:
             ChatEndpoint(f"http://127.0.0.1:{mute.getsockname()[1]}/v1", "seer-1", timeout_s=0.2),
             "what?",
         )
+
+
+@pytest.mark.parametrize("url", ["http://api..example.com/v1", "http://127.0.0.1:1/vü1"])
+def test_an_address_that_cannot_be_asked_is_said_at_once(url: str) -> None:
+    """It left the one who waits for the answer waiting ten minutes."""
+    endpoint = ChatEndpoint(url, "seer-1", total_s=60.0)
+    with pytest.raises(BadEndpoint, match="gives no answer"):
+        ChatCaptioner(endpoint)([np.zeros((8, 8, 3), np.uint8)], "cup")
+
+
+def test_whatever_ends_a_question_ends_the_wait() -> None:
+    def ask() -> str:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        answer_in_time(ChatEndpoint("http://127.0.0.1:1/v1", "m"), ask, doing="x", instead="y")
 
 
 @contextmanager

@@ -1,7 +1,9 @@
 """ground on clips and on large pictures: tracks through, what is written, and tiles."""
 
+import errno
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,11 +15,14 @@ from vap_core.analysis import ground_clip
 from vap_core.analysis.ground import claimed_paths
 from vap_core.attend import Attender
 from vap_core.base import video
+from vap_core.base.errors import BadOutput
 from vap_core.base.types import Boxes
 from vap_core.memory import remember, save
 from vap_core.perception import stacks, tiles
 from vap_core.perception.protocols import Stack
 from vap_core.perception.tiles import GRID, TiledDetector, tile_corners
+from vap_core.recording import film as film_pictures
+from vap_core.recording import write_film
 from vap_core.recording.file import temporary_path
 
 RED, GREEN = (250, 0, 0), (0, 250, 0)
@@ -132,6 +137,52 @@ def test_bad_clips_are_one_line(bank, tmp_path):
         assert message in line
 
 
+def test_frames_of_two_sizes_are_one_line(bank, tmp_path):
+    clip = frames(tmp_path / "clip", [[(26, 26, RED)]] * 2)
+    Image.fromarray(np.zeros((48, 64, 3), np.uint8)).save(clip / "002.png")
+    line = refused("ground", clip, "bring my cup", "--stack", "toy", "--memory", bank)
+    assert "002.png is 64x48, and the first frame 64x64; frames have one size" in line
+
+
+def test_a_film_of_a_clip_keeps_its_shape_and_its_pace(bank, tmp_path):
+    clip = tmp_path / "wide.mp4"
+    with video.Mp4(clip, hz=20.0) as file:
+        for x in range(20, 60, 2):
+            file.add(np.hstack([scene([(x, 26, RED)], size=96)] * 2))
+    done = vap(
+        "ground", clip, "bring my cup", "--stack", "toy", "--memory", bank, "--out", tmp_path / "o"
+    )
+    assert done.returncode == 0, done.stderr
+    write_film(tmp_path / "o" / "wide.rrd", tmp_path / "film.mp4")
+    film = list(video.frames(tmp_path / "film.mp4"))
+    assert round(video.frame_rate(tmp_path / "film.mp4")) == 20
+    assert film[0].shape == (film_pictures.SIDE_PX + 2 * film_pictures.BAR_PX, 960, 3)
+    assert len(film) == 20 + 30 + 50, "the last frame is the deciding one, and stands still"
+
+
+def test_a_film_on_a_full_disk_is_one_line(tmp_path):
+    """Packets reach the disk with a later picture, or when the file is closed."""
+
+    def full(packets: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def write(pictures: int) -> None:
+        with video.Mp4(tmp_path / "film.mp4", hz=10.0) as file:
+            whole = file._container
+            file._container = SimpleNamespace(
+                add_stream=whole.add_stream, mux=full, close=whole.close
+            )
+            for _ in range(pictures):
+                file.add(scene([]))
+
+    for pictures in (1, 100):
+        with pytest.raises(BadOutput, match="No space left on device.*make room"):
+            write(pictures)
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(BadOutput, match="cannot be written"), video.Mp4(Path("/proc/f.mp4"), 10.0):
+        pass
+
+
 def test_tiles_cover_the_picture_and_overlap_by_half():
     corners = tile_corners(61, 100)
     assert len(corners) == GRID**2
@@ -174,3 +225,25 @@ def test_large_pictures_are_tiled_and_it_is_said(bank, tmp_path, monkeypatch):
     assert answer["size"] == [200, 200]
     assert answer["candidates"][answer["winner"]] == [150, 90, 162, 102]
     assert "tiles" not in vap(*words, *where, "--no-tiles").stderr
+
+
+def test_boxes_by_hand_are_judged_by_the_detector_itself(bank, tmp_path, monkeypatch):
+    """With --tiles it stood behind another one, which could not tell a photo from a render."""
+    asked = []
+
+    class Judge:
+        def __call__(self, images, phrase, threshold):
+            return detector(images, phrase, threshold)
+
+        def is_familiar(self, rgb, phrase) -> bool:
+            asked.append(phrase)
+            return True
+
+    stack = Stack("toy", Judge(), MeanColour(), segmenter, SameColour())
+    monkeypatch.setitem(stacks.STACKS, "toy", lambda: stack)
+    Image.fromarray(scene([(26, 26, RED)])).save(tmp_path / "desk.png")
+    words = ("ground", tmp_path / "desk.png", "bring my cup", "--stack", "toy", "--memory", bank)
+    done = vap(*words, "--out", tmp_path, "--box", "26,26,38,38", "--tiles")
+    assert done.returncode == 0, done.stderr
+    assert asked == ["cup"]
+    assert "tiles" not in done.stderr

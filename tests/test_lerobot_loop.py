@@ -254,6 +254,9 @@ def test_attaching_links_the_frozen_files_and_adds_one_step(whole):
             assert file.resolve() == kept[file.name].resolve()
     with pytest.raises(BadOutput, match="personal exists; choose another folder"):
         attach(whole / "act", whole / "personal", whole / "memory")
+    with pytest.raises(BadPolicy, match="has VAP attached; give the checkpoint without it"):
+        attach(whole / "personal", whole / "twice", whole / "memory")
+    assert not (whole / "twice").exists()
     with pytest.raises(BadPolicy, match="has VAP attached for lerobot's own loops"):
         load_policy(whole / "personal")
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -189,6 +189,17 @@ def test_labels_of_the_same_frame_come_back() -> None:
     found = cells.propagate(keys, [cells.FrameMemory(keys, labels)], grid, local=False)
     assert (np.abs(found - labels) < 0.5).mean() > 0.98
     assert cells.to_pixels(labels, grid, (224, 224)).shape == (3, 224, 224)
+
+
+@given(st.integers(40, 2000), st.integers(40, 2000))
+@example(550, 640)
+@example(732, 1024)
+def test_labels_become_masks_of_the_image_whatever_its_size(h: int, w: int) -> None:
+    """A side that rounds down to a whole cell gave planes a pixel or two short."""
+    scale = cells.SIDE / max(h, w)
+    grid = tuple(-(-max(1, round(side * scale)) // cells.CELL_PX) for side in (h, w))
+    labels = np.zeros((1, grid[0] * grid[1]), np.float32)
+    assert cells.to_pixels(labels, grid, (h, w)).shape == (1, h, w)
 
 
 @given(hnp.arrays(np.float32, (3, 4, 5), elements=st.floats(0, 1, width=16)))

@@ -26,6 +26,19 @@ def test_a_checkout_is_its_commit_and_whether_it_was_changed(tmp_path: Path) -> 
     assert version.code_version(tmp_path) == f"{commit}+"
 
 
+def test_what_is_installed_inside_another_repository_is_not_its_commit(tmp_path: Path) -> None:
+    subprocess.run(["git", "init", "-q"], cwd=tmp_path, check=True)
+    subprocess.run(
+        ["git", "-c", "user.name=a", "-c", "user.email=a@b", "commit", "-qm", "a", "--allow-empty"],
+        cwd=tmp_path,
+        check=True,
+    )
+    installed = tmp_path / ".venv" / "vap_core"
+    installed.mkdir(parents=True)
+    (installed / "module.py").write_text("")
+    assert version.code_version(installed) == f"vap-core {version.version('vap-core')}"
+
+
 def test_a_copy_is_the_installed_version_or_unknown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

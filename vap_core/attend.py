@@ -278,7 +278,8 @@ class Attender:
         """Track every target and prompt the new images (t > 0). Consumes `state`.
 
         Raises:
-            BadViews: `views` are not of the cameras that the episode started with.
+            BadViews: `views` are not of the cameras that the episode started with, or a view has
+                another size than it had there.
         """
         return self.steps([state], [views])[0]
 
@@ -299,6 +300,13 @@ class Attender:
                 )
         for state, images_now in zip(states, views, strict=True):
             for camera, tracker in state.trackers.items():
+                size = state.groundings[camera][0].masks.shape[1:]
+                if images_now[camera].shape[:2] != size:
+                    raise BadViews(
+                        f"Attender.step: view {camera!r} is "
+                        f"{_size_text(images_now[camera].shape)}, but the episode started with "
+                        f"{_size_text(size)}; a view keeps its size."
+                    )
                 trackers.append(tracker)
                 images.append(images_now[camera])
         trackers, tracks = self.stack.tracker.step(trackers, images)
@@ -496,3 +504,7 @@ def _visible(tracks: Mapping[str, tuple[Track, ...]]) -> Visible:
             if track.mask is not None:
                 pairs.add((camera, j))
     return frozenset(pairs)
+
+
+def _size_text(shape: Sequence[int]) -> str:
+    return f"{shape[1]}x{shape[0]}"

@@ -72,8 +72,8 @@ def ground_image(
 ) -> Found:
     """Run the method's first step on one picture with the remembered objects of a bank.
 
-    With `tiles` the detector also looks at nine overlapping tiles. Without `parsing` the rule
-    parses.
+    With `tiles` the detector also looks at nine overlapping tiles; boxes that are given are taken
+    as they are. Without `parsing` the rule parses.
     """
     from vap_core.attend import Attender, Prompting
     from vap_core.memory import load_bank
@@ -81,7 +81,7 @@ def ground_image(
     from vap_core.perception.tiles import TiledDetector
 
     models = load_own(stack)
-    if tiles:
+    if tiles and boxes is None:
         models = replace(models, detector=TiledDetector(models.detector))
     bank = load_bank(memory, models.encoder.name)
     parsing = parsing or Parsing()

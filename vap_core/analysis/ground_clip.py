@@ -150,7 +150,21 @@ def _open(path: Path) -> tuple[Iterator[Rgb], float]:
     photos = photos_in(path)
     if not photos:
         raise BadPhoto(f"ground: {path} holds no picture; name a folder of frames.")
-    return (load_photo(photo, SIDE) for photo in photos), FOLDER_HZ
+    return _of_one_size(photos), FOLDER_HZ
+
+
+def _of_one_size(photos: Sequence[Path]) -> Iterator[Rgb]:
+    """The pictures of a folder. Raises: BadPhoto for one of another size than the first."""
+    size: tuple[int, ...] = ()
+    for photo in photos:
+        rgb = load_photo(photo, SIDE)
+        size = size or rgb.shape
+        if rgb.shape != size:
+            raise BadPhoto(
+                f"ground: {photo} is {rgb.shape[1]}x{rgb.shape[0]}, and the first frame "
+                f"{size[1]}x{size[0]}; frames have one size. Name single pictures one by one."
+            )
+        yield rgb
 
 
 def _attend(

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 
 
-def first_line(error: BaseException) -> str:
+def first_line(error: BaseException | str) -> str:
     """The first line of an error's text, "" where it has none."""
     return (str(error).strip().splitlines() or [""])[0]
 

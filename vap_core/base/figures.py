@@ -12,7 +12,6 @@ if TYPE_CHECKING:
 WINNER, OTHER = TARGET, LOOKALIKES[0]
 """The elected candidate or the target; every other one."""
 GENERIC, OURS = FRAME, METHODS["vap"][0]
-METHOD_COLOURS = {name: colour for name, (colour, _) in METHODS.items()}
 TIER_COLOURS = TIERS
 LINE_COLOURS = tuple(SUITES[name][0] for name in ("simpler-fractal", "vlabench", "simpler-bridge"))
 """The curves of what is no suite."""

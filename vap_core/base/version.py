@@ -15,14 +15,19 @@ def code_version(folder: Path | None = None) -> str:
 
     Where there is none, the installed version; "unknown" for a copy that is neither.
     """
-    command = ["git", "describe", "--always", "--dirty=+", "--abbrev=10"]
     folder = folder or Path(__file__).resolve().parent
     try:
-        done = subprocess.run(
-            command, cwd=folder, capture_output=True, text=True, timeout=10, check=True
-        )
+        if not _git(folder, "ls-files"):  # installed inside another project's repository
+            return _installed_version()
+        return _git(folder, "describe", "--always", "--dirty=+", "--abbrev=10")
     except (OSError, subprocess.SubprocessError):
         return _installed_version()
+
+
+def _git(folder: Path, *words: str) -> str:
+    done = subprocess.run(
+        ["git", *words], cwd=folder, capture_output=True, text=True, timeout=10, check=True
+    )
     return done.stdout.strip()
 
 

@@ -1,7 +1,7 @@
 """Video files: their frames as pictures, and pictures as an mp4."""
 
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
@@ -85,17 +85,11 @@ class Mp4:
         self.path = path
         self._hz = Fraction(hz).limit_denominator(1000)
         self._stream: Any = None
-        self._files = ExitStack()
-        try:
+        with self._told(), ExitStack() as files:
             path.parent.mkdir(parents=True, exist_ok=True)
-            part = self._files.enter_context(replacing(path))
+            part = files.enter_context(replacing(path))
             self._container: Any = av.open(str(part), "w", format="mp4")
-        except (av.FFmpegError, OSError) as error:
-            self._files.close()
-            raise BadOutput(
-                f"video: {path} cannot be written ({error!s:.120}); choose another folder with "
-                "--out."
-            ) from error
+            self._files = files.pop_all()
         self._files.callback(self._finish)
 
     def __enter__(self) -> "Mp4":
@@ -107,7 +101,21 @@ class Mp4:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._files.__exit__(kind, error, trace)
+        with self._told():
+            self._files.__exit__(kind, error, trace)
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        """A full disk, or a folder that cannot be written, in one line."""
+        import av
+
+        try:
+            yield
+        except (av.FFmpegError, OSError) as error:
+            raise BadOutput(
+                f"video: {self.path} cannot be written ({error!s:.120}); make room, or choose "
+                "another folder."
+            ) from error
 
     def _finish(self) -> None:
         if self._stream is not None:
@@ -125,7 +133,8 @@ class Mp4:
             self._stream.pix_fmt = "yuv420p"
         even = np.ascontiguousarray(rgb[:height, :width])
         frame = av.VideoFrame.from_ndarray(even, format="rgb24")
-        self._container.mux(self._stream.encode(frame))
+        with self._told():
+            self._container.mux(self._stream.encode(frame))
 
 
 def frame_rate(path: Path) -> float:

@@ -88,7 +88,7 @@ def main() -> None:
     except SystemExit as stop:
         if stop.code == INTERRUPTED:
             print(
-                "interrupted; run the same command again, it goes on where it stopped.",
+                "interrupted; run the same command again: what keeps a run folder goes on there.",
                 file=sys.stderr,
             )
         raise

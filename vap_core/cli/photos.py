@@ -247,7 +247,7 @@ def ground(
             f"note: boxes are pixels of the picture at {rgb.shape[1]}x{rgb.shape[0]}.",
             file=sys.stderr,
         )
-    if tiles is None:
+    if tiles is None or boxes is not None:
         tiles = boxes is None and rgb.shape[0] * rgb.shape[1] >= SMALL_MEGAPIXELS * 1e6
     if tiles:
         print(

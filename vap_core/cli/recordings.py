@@ -148,7 +148,8 @@ def query(
         ),
     ] = False,
     port: Annotated[
-        int | None, typer.Option(help="With --serve: the port. Default a free one.")
+        int | None,
+        typer.Option(min=1, max=65535, help="With --serve: the port. Default a free one."),
     ] = None,
 ) -> None:
     """Ask all recordings of a run at once: in which of them, and at which steps, does a

@@ -106,12 +106,12 @@ def answer_in_time[T](
 
     Raises: BadEndpoint: `ask`'s, or that of an answer that is not complete in time.
     """
-    answers: SimpleQueue[T | BadEndpoint] = SimpleQueue()
+    answers: SimpleQueue[T | Exception] = SimpleQueue()
 
     def run() -> None:
         try:
             answers.put(ask())
-        except BadEndpoint as error:
+        except Exception as error:
             answers.put(error)
 
     Thread(target=run, daemon=True).start()
@@ -122,7 +122,7 @@ def answer_in_time[T](
             f"{doing}: {endpoint.url} gives no whole answer within {endpoint.total_s:g} s; take a "
             f"smaller model, or {instead}."
         ) from None
-    if isinstance(answer, BadEndpoint):
+    if isinstance(answer, Exception):
         raise answer
     return answer
 
@@ -178,7 +178,7 @@ def _fetch(endpoint: ChatEndpoint, body: dict[str, Any]) -> bytes:
                 f"chat: {endpoint.url} refuses ({error.code}: {_refusal_reason(error)}); "
                 f"check {URL}, {MODEL} and {KEY}."
             ) from error
-    except (URLError, HTTPException, OSError) as error:
+    except (URLError, HTTPException, OSError, ValueError) as error:  # ValueError: of an address
         cause: object = error
         if isinstance(error, URLError):
             cause = error.reason

@@ -26,8 +26,6 @@ TEXT = "text"
 
 Images are reported under their camera's name.
 """
-InputDigests = dict[int, dict[str, str]]
-"""By episode of the batch, then by TEXT or camera: hexadecimal SHA-256."""
 ACTION = "action"
 """The query of the action expert's tokens; the other queries are words of the instruction."""
 Phrases = Mapping[str, tuple[str, ...]]

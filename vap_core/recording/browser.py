@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any
 import rerun as rr
 import rerun.blueprint as rrb
 
-from vap_core.base.errors import BadRecording, VapError
+from vap_core.base.errors import BadOutput, BadRecording, VapError, first_line
 from vap_core.recording.blueprint import full_window
 from vap_core.recording.catalog import register_files
+from vap_core.recording.corrections import CORRECTIONS, layer_path, read_correction
 from vap_core.recording.reading import read_summary
 from vap_core.recording.stored_pictures import prompted_entities
 from vap_core.recording.viewer import free_port
@@ -71,7 +72,8 @@ def serve_run(run: Path, where: str | None = None, port: int | None = None) -> I
 
     `where` is a SQL condition on COLUMNS; the viewer shows it as a filter that can be changed.
 
-    Raises: BadRecording, when there is no recording that can be read.
+    Raises: BadRecording, when there is no recording that can be read; BadOutput, when the port
+        cannot be served.
     """
     import pyarrow as pa
 
@@ -88,14 +90,12 @@ def serve_run(run: Path, where: str | None = None, port: int | None = None) -> I
             summaries[path] = read_summary(path)
         except VapError as error:
             unreadable[path] = str(error)
-    port = port or free_port()
-    with (
-        tempfile.TemporaryDirectory() as scratch,
-        rr.server.Server(host="127.0.0.1", port=port) as server,
-    ):
+    layers = _correct(summaries, unreadable)
+    with tempfile.TemporaryDirectory() as scratch, _server(port or free_port()) as server:
         client = server.client()
         dataset = client.create_dataset("recordings")
         register_files(dataset, {path: path for path in summaries}, unreadable)
+        register_files(dataset, {path: path for path in layers}, unreadable, layer=CORRECTIONS)
         rows = _rows(dataset, summaries, unreadable)
         if not rows:
             raise BadRecording(
@@ -109,6 +109,36 @@ def serve_run(run: Path, where: str | None = None, port: int | None = None) -> I
         _table_layout(where).save("vap", blueprint)
         table.register_blueprint(blueprint.resolve().as_uri())
         yield Browser(f"{client.url}/entry/{table.id}", rows, unreadable)
+
+
+def _correct(summaries: dict[Path, dict[str, Any]], unreadable: dict[Path, str]) -> list[Path]:
+    """Put corrected cases in place of the recorded ones; returns the layers that hold them."""
+    layers = []
+    for path, summary in summaries.items():
+        layer = layer_path(path)
+        if not layer.exists():
+            continue
+        try:
+            correction = read_correction(layer)
+        except VapError as error:
+            unreadable[layer] = str(error)
+            continue
+        summary["case"], summary["sub_case"] = correction.case, correction.sub_case
+        summary["case_sentence"] = correction.note
+        layers.append(layer)
+    return layers
+
+
+@contextmanager
+def _server(port: int) -> Iterator[rr.server.Server]:
+    try:
+        server = rr.server.Server(host="127.0.0.1", port=port)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise BadOutput(
+            f"query: port {port} cannot be served ({first_line(error)}); choose another by --port."
+        ) from error
+    with server:
+        yield server
 
 
 def _schema() -> "pa.Schema":

@@ -16,7 +16,7 @@ from urllib.parse import unquote, urlparse
 
 import rerun as rr
 
-from vap_core.base.errors import BadRecording
+from vap_core.base.errors import BadRecording, first_line
 from vap_core.recording.corrections import CORRECTIONS
 from vap_core.recording.index import CURVES, STEPS, index_path
 from vap_core.recording.isolated import index_isolated
@@ -136,7 +136,7 @@ def register_files(
         results = list(dataset.register(urls, layer_name=layer).iter_results())
     except ValueError as error:
         if len(paths) == 1:
-            unreadable[paths[0]] = _first_line(error)
+            unreadable[paths[0]] = first_line(error)[:160]
             return
         middle = len(paths) // 2
         for half in (paths[:middle], paths[middle:]):
@@ -144,11 +144,7 @@ def register_files(
         return
     for path, result in zip(paths, results, strict=True):
         if result.error:
-            unreadable[path] = _first_line(result.error)
-
-
-def _first_line(error: object) -> str:
-    return str(error).splitlines()[0][:160]
+            unreadable[path] = first_line(str(result.error))[:160]
 
 
 def _join_steps(dataset: "DatasetEntry", recordings: Mapping[Path, Path]) -> "pd.DataFrame":

@@ -77,9 +77,9 @@ class Votes:
     @staticmethod
     def _drawing_order(numbers: dict[str, Any], n: int) -> list[int]:
         order = list(range(n))
-        top = numbers["winner"][0]
-        if top < 0:
-            top = numbers["elected"][0]
+        # As entities.votes draws them: a chosen one that is not like enough is `rejected`.
+        named = [numbers[name][0] for name in ("winner", "rejected", "elected") if name in numbers]
+        top = next((int(i) for i in named if i >= 0), -1)
         if top >= 0:
             order.remove(top)
             order.append(top)

@@ -84,25 +84,23 @@ def read_corrections(folder: Path) -> dict[str, Correction]:
 
     Raises: BadRecording for one that is damaged.
     """
-    corrections = {}
-    for path in sorted((folder / CORRECTIONS).glob("*.rrd")):
-        try:
-            corrections[path.name] = _read_correction(path)
-        except (RuntimeError, ValueError, OSError, KeyError) as error:
-            raise BadRecording(
-                f"corrections: {path} is damaged ({error}); "
-                "delete it and correct that failure again."
-            ) from error
-    return corrections
+    paths = sorted((folder / CORRECTIONS).glob("*.rrd"))
+    return {path.name: read_correction(path) for path in paths}
 
 
-def _read_correction(path: Path) -> Correction:
+def read_correction(path: Path) -> Correction:
+    """The correction of one layer. Raises: BadRecording, when it is damaged."""
     values = {}
-    for chunk in read_chunks(path):
-        if property_group(chunk) == "correction":
-            values = read_properties(chunk)
-    note, policy = values["case_sentence"], str(values.get("policy", ""))
-    return Correction(values["case"], values["sub_case"], note, policy)
+    try:
+        for chunk in read_chunks(path):
+            if property_group(chunk) == "correction":
+                values = read_properties(chunk)
+        note, policy = values["case_sentence"], str(values.get("policy", ""))
+        return Correction(values["case"], values["sub_case"], note, policy)
+    except (RuntimeError, ValueError, OSError, KeyError) as error:
+        raise BadRecording(
+            f"corrections: {path} is damaged ({error}); delete it and correct that failure again."
+        ) from error
 
 
 def _recording_id(recording: Path) -> str:

@@ -41,8 +41,11 @@ def write_film(recording: Path, mp4: Path) -> int:
     steps = sorted({step for of_camera in views.values() for step in of_camera})
     if not steps:
         raise BadRecording(f"film: {recording} holds no pictures; record the episode again.")
-    hz = float(summary.get("hz") or 1.0)
-    verdict = read_verdict(recording) or str(summary.get("outcome", "unfinished")).upper()
+    hz = float(summary.get("hz") or _frame_rate(recording, set(entities.values())))
+    verdict = read_verdict(recording)
+    if not verdict and "suite" in summary:
+        verdict = str(summary.get("outcome", "unfinished")).upper()
+    title = _title(summary) if "instruction" in summary else recording.stem
     deciding = int(summary.get("deciding_frame", -1))
     if deciding < 0:
         deciding = steps[-1]
@@ -54,7 +57,7 @@ def write_film(recording: Path, mp4: Path) -> int:
                 if step in of_camera:
                     shown[camera] = of_camera[step]
             below = verdict if step >= deciding else ""
-            picture = compose(shown, _title(summary), below, f"{step / hz:.1f} s")
+            picture = compose(shown, title, below, f"{step / hz:.1f} s")
             repeats = 1
             if step == deciding:
                 repeats += round(HOLD_S * hz)
@@ -64,6 +67,25 @@ def write_film(recording: Path, mp4: Path) -> int:
                 film.add(picture)
             n_pictures += repeats
     return n_pictures
+
+
+def _frame_rate(recording: Path, entities: set[str]) -> float:
+    """Frames a second of a recording that does not say, by its timeline; 1 of a single frame."""
+    seconds: dict[int, float] = {}
+    for chunk in read_chunks(recording):
+        if chunk.entity_path not in entities:
+            continue
+        batch = chunk.to_record_batch()
+        if {"frame_index", "timestamp"} <= set(batch.schema.names):
+            times = batch["timestamp"].cast("int64").to_pylist()
+            seconds |= {
+                step: time * 1e-9
+                for step, time in zip(batch["frame_index"].to_pylist(), times, strict=True)
+            }
+    first, last = min(seconds, default=0), max(seconds, default=0)
+    if last == first or seconds[last] <= seconds[first]:
+        return 1.0
+    return (last - first) / (seconds[last] - seconds[first])
 
 
 def read_verdict(recording: Path) -> str:
@@ -82,15 +104,19 @@ def compose(views: Mapping[str, Rgb], title: str, verdict: str, time: str) -> Rg
     """One picture: the title, every view under its camera's name, the verdict."""
     from PIL import Image, ImageDraw
 
-    scaled = [Image.fromarray(rgb).resize((SIDE_PX, SIDE_PX)) for rgb in views.values()]
-    width = max(SIDE_PX * len(scaled), 2 * SIDE_PX)
+    scaled = []
+    for rgb in views.values():
+        height, width = rgb.shape[:2]
+        scaled.append(Image.fromarray(rgb).resize((round(SIDE_PX * width / height), SIDE_PX)))
+    taken = sum(view.width for view in scaled)
+    width = max(taken, 2 * SIDE_PX)
     picture = Image.new("RGB", (width, SIDE_PX + 2 * BAR_PX), PAPER)
     draw = ImageDraw.Draw(picture)
-    left = (width - SIDE_PX * len(scaled)) // 2
-    for i, (camera, view) in enumerate(zip(views, scaled, strict=True)):
-        x = left + i * SIDE_PX
-        picture.paste(view, (x, BAR_PX))
-        draw.text((x + 8, BAR_PX + 6), camera, fill=INK, font=_font(18))
+    left = (width - taken) // 2
+    for camera, view in zip(views, scaled, strict=True):
+        picture.paste(view, (left, BAR_PX))
+        draw.text((left + 8, BAR_PX + 6), camera, fill=INK, font=_font(18))
+        left += view.width
     _line(draw, title, BAR_PX // 2, width, QUIET)
     _line(draw, verdict, BAR_PX + SIDE_PX + BAR_PX // 2, width - 90, INK)
     foot = (width - 12, BAR_PX + SIDE_PX + BAR_PX // 2)

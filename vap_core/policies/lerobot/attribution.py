@@ -52,7 +52,7 @@ def gradient_maps(
     for camera, activation in zip(policy.cameras(), activations, strict=False):
         assert activation.grad is not None
         relevance = (activation.grad * activation).sum(-1).abs().detach()
-        maps[camera] = relevance.reshape(side, side).numpy()
+        maps[camera] = relevance.reshape(side, side).cpu().numpy()
     return maps
 
 
@@ -78,7 +78,7 @@ def masking_maps(policy: LeRobot, state: LeRobotState, policy_input: PolicyInput
                 images = {**policy_input.images, camera: painted}
                 masked.append(replace(policy_input, images=images))
         change = _planned(policy, state, masked) - plain
-        maps[camera] = change.flatten(1).norm(dim=1).reshape(side, side).numpy()
+        maps[camera] = change.flatten(1).norm(dim=1).reshape(side, side).cpu().numpy()
     return maps
 
 

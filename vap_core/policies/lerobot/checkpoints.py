@@ -3,6 +3,7 @@
 import hashlib
 import re
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +98,12 @@ def fingerprint(checkpoint: str | Path) -> str:
     return digest.hexdigest()
 
 
+def is_vap_step(step: Mapping[str, Any]) -> bool:
+    """Whether a step of a checkpoint's pipeline is VAP's, of this version or an earlier one."""
+    name = str(step.get("class", ""))
+    return step.get("registry_name") == STEP_NAME or ANY_STEP_CLASS.fullmatch(name) is not None
+
+
 def refuse_code(folder: Path) -> None:
     """Check that the pipelines of a checkpoint name steps of lerobot only.
 
@@ -107,7 +114,7 @@ def refuse_code(folder: Path) -> None:
     for file in PIPELINES:
         for step in _steps(folder / file):
             name = str(step.get("class", ""))
-            if step.get("registry_name") == STEP_NAME or ANY_STEP_CLASS.fullmatch(name):
+            if is_vap_step(step):
                 raise BadPolicy(
                     f"load: {folder} has VAP attached for lerobot's own loops; here give the plain "
                     "checkpoint, and the method by --method."

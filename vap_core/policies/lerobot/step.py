@@ -37,7 +37,13 @@ from vap_core.base.files import parse_json
 from vap_core.base.types import Rgb, Views
 from vap_core.memory import load_bank
 from vap_core.perception.stacks import check_stack, load_stack
-from vap_core.policies.lerobot.checkpoints import PIPELINES, STEP_CLASS, STEP_NAME, locate
+from vap_core.policies.lerobot.checkpoints import (
+    PIPELINES,
+    STEP_CLASS,
+    STEP_NAME,
+    is_vap_step,
+    locate,
+)
 from vap_core.prompt import Tint
 from vap_core.simulation import suites
 from vap_core.simulation.gym_env import VapEnv, env_id
@@ -243,11 +249,14 @@ def attach(checkpoint: str | Path, out: Path, memory: Path, **options: Any) -> P
     try:
         pipeline = parse_json(file.read_text())
         place = _place_of_step(pipeline["steps"])
+        attached = any(map(is_vap_step, pipeline["steps"]))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise BadPolicy(
             f"attach: {file} is no processor pipeline ({type(error).__name__}); save it again with "
             "lerobot 0.6."
         ) from error
+    if attached:
+        raise BadPolicy(f"attach: {source} has VAP attached; give the checkpoint without it.")
     entry = {"class": STEP_CLASS, "config": step.get_config()}
     pipeline["steps"].insert(place, entry)
     made = False

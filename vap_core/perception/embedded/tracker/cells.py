@@ -130,7 +130,8 @@ def to_pixels(labels: Labels, grid: Grid, hw: tuple[int, int]) -> Float32[np.nda
     rows, cols = grid
     h, w = hw
     scale = max(hw) / SIDE
-    whole = (round(cols * CELL_PX * scale), round(rows * CELL_PX * scale))
+    # A side that is rounded down may fall a pixel or two short of the image.
+    whole = (max(w, round(cols * CELL_PX * scale)), max(h, round(rows * CELL_PX * scale)))
     planes: list[np.ndarray] = []
     for row in labels:
         plane = cv2.resize(row.reshape(grid), whole, interpolation=cv2.INTER_LINEAR)
