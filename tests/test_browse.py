@@ -25,6 +25,7 @@ from vap_core.recording import (
     write_correction,
     write_film,
 )
+from vap_core.recording.entities.votes import _drawing_order
 from vap_core.recording.film import read_verdict
 from vap_core.recording.reading import read_chunks
 from vap_core.recording.stored_pictures import prompted_entities, read_pictures
@@ -158,17 +159,21 @@ def test_of_two_votes_of_a_view_a_click_tells_the_one_that_is_shown(
     assert Votes(recording).answer(entity, 2) == told
 
 
-@pytest.mark.parametrize(
-    ("winner", "rejected", "elected", "top"),
-    [(2, -1, 0, 2), (-1, 1, 0, 1), (-1, -1, 0, 0), (-1, -1, -1, None)],
-)
+@pytest.mark.parametrize(("winner", "rejected"), [(2, None), (None, 1), (None, None)])
 def test_candidates_are_counted_as_they_are_drawn(
-    winner: int, rejected: int, elected: int, top: int | None
+    tmp_path: Path, winner: int | None, rejected: int | None
 ) -> None:
     """One that is chosen and not like enough is drawn on top."""
-    numbers = {"winner": [winner], "rejected": [rejected], "elected": [elected]}
-    order = Votes._drawing_order(numbers, 3)
-    assert order == ([0, 1, 2] if top is None else [*({0, 1, 2} - {top}), top])
+    start = opening(1)
+    (grounding,) = start.groundings["front"]
+    grounding = replace(grounding, winner=winner, rejected=rejected, threshold=0.9)
+    path = tmp_path / "recordings" / "one.rrd"
+    record(path, replace(start, groundings={"front": (grounding,)}), steps=2)
+    votes = Votes(path)
+    for instance, candidate in enumerate(_drawing_order(grounding)):
+        told = votes.answer("/observation.images.front/candidates", instance)
+        assert told is not None
+        assert f"candidate #{candidate}," in told[1]
 
 
 def test_a_click_on_a_candidate_says_its_cosines(run: Path) -> None:

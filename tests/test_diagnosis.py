@@ -136,7 +136,10 @@ def test_a_method_that_has_errors_alone_has_no_line() -> None:
     assert lines[1].left == (None,) * len(STAGES)
     figure = funnel_figure(lines, {"vap": "red", "soft": "grey"})
     assert [text.get_text() for text in figure.legends[0].get_texts()][:-1] == ["vap"]
-    assert figure.axes[0].get_title() == "vlabench (n 2 to 9)"
+    assert figure.axes[0].get_title() == "vlabench (n 9)"
+    both = funnel_figure(funnel_table(TABLE), {"vap": "red", "generic": "grey"})
+    assert both.axes[0].get_title() == "vlabench (n 2 to 9)"
+    assert funnel_figure(lines, {"soft": "grey"}).axes[0].get_title() == "vlabench"
 
 
 def test_a_method_that_reads_the_simulator_is_dashed() -> None:
@@ -231,13 +234,12 @@ def test_a_correction_is_of_the_policy_that_was_recorded(
     assert listed().table.corrected.tolist() == [True, False]
     everything = list_failures(tmp_path / "mine.parquet").all_episodes
     assert everything.corrected.sum() == 1
-    flat = Path("data/runs/mine-diagnosed/corrections")
-    flat.mkdir()
-    layer.replace(flat / layer.name)
-    publish(runs[1:], tmp_path / "mine.parquet", replace=True)
-    left = list_failures(tmp_path / "mine.parquet").all_episodes
-    assert left.policy.tolist() == ["scripted"] * 2
-    assert not left.corrected.any(), "it was of the policy before"
+    for policies in (runs[:1], runs, runs[1:]):
+        publish(policies, tmp_path / "mine.parquet", replace=True)
+        found = list_failures(tmp_path / "mine.parquet").all_episodes
+        of_random = found.policy.eq("random")
+        assert found.corrected[of_random].sum() == of_random.any(), "found where it was written"
+        assert not found.corrected[~of_random].any(), "it is of the other policy"
 
 
 def test_a_recording_of_older_weights_is_made_anew(

@@ -298,15 +298,15 @@ class Attender:
                     f"Attender.step: views of {sorted(images_now)}, but the episode started with "
                     f"{sorted(state.groundings)}; give the same cameras."
                 )
+            for camera, of_view in state.groundings.items():
+                shape, began = images_now[camera].shape, of_view[0].masks.shape[1:]
+                if shape[:2] != began:
+                    raise BadViews(
+                        f"Attender.step: view {camera!r} is {shape[1]}x{shape[0]}, but the episode "
+                        f"started with {began[1]}x{began[0]}; a view keeps its size."
+                    )
         for state, images_now in zip(states, views, strict=True):
             for camera, tracker in state.trackers.items():
-                size = state.groundings[camera][0].masks.shape[1:]
-                if images_now[camera].shape[:2] != size:
-                    raise BadViews(
-                        f"Attender.step: view {camera!r} is "
-                        f"{_size_text(images_now[camera].shape)}, but the episode started with "
-                        f"{_size_text(size)}; a view keeps its size."
-                    )
                 trackers.append(tracker)
                 images.append(images_now[camera])
         trackers, tracks = self.stack.tracker.step(trackers, images)
@@ -504,7 +504,3 @@ def _visible(tracks: Mapping[str, tuple[Track, ...]]) -> Visible:
             if track.mask is not None:
                 pairs.add((camera, j))
     return frozenset(pairs)
-
-
-def _size_text(shape: Sequence[int]) -> str:
-    return f"{shape[1]}x{shape[0]}"

@@ -161,8 +161,9 @@ def _of_one_size(photos: Sequence[Path]) -> Iterator[Rgb]:
         size = size or rgb.shape
         if rgb.shape != size:
             raise BadPhoto(
-                f"ground: {photo} is {rgb.shape[1]}x{rgb.shape[0]}, and the first frame "
-                f"{size[1]}x{size[0]}; frames have one size. Name single pictures one by one."
+                f"ground: {photo} has another shape than the first frame "
+                f"({rgb.shape[1]}x{rgb.shape[0]} and {size[1]}x{size[0]} pixels, shrunk); "
+                "frames have one size. Name single pictures one by one."
             )
         yield rgb
 

@@ -88,7 +88,8 @@ def main() -> None:
     except SystemExit as stop:
         if stop.code == INTERRUPTED:
             print(
-                "interrupted; run the same command again: what keeps a run folder goes on there.",
+                "interrupted; run the same command again. With a run folder it goes on where it "
+                "stopped.",
                 file=sys.stderr,
             )
         raise

@@ -247,9 +247,9 @@ def ground(
             f"note: boxes are pixels of the picture at {rgb.shape[1]}x{rgb.shape[0]}.",
             file=sys.stderr,
         )
-    if tiles is None or boxes is not None:
-        tiles = boxes is None and rgb.shape[0] * rgb.shape[1] >= SMALL_MEGAPIXELS * 1e6
-    if tiles:
+    if tiles is None:
+        tiles = rgb.shape[0] * rgb.shape[1] >= SMALL_MEGAPIXELS * 1e6
+    if tiles and boxes is None:
         print(
             "note: looking at the whole picture and at nine overlapping half-size tiles of it, for "
             "small objects; --no-tiles turns it off.",

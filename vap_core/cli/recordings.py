@@ -111,10 +111,10 @@ def diagnose(
     if show is None and png is None and mp4 is None:
         print(failures_text(failures, limit))
         return
-    path = recording_of(failures, number)
-    frame = opening_frame(failures, number, path)
-    if against:
-        path = side_by_side_recording(failures, number, against)
+    together = side_by_side_recording(failures, number, against) if against else None
+    single = recording_of(failures, number)
+    path = together or single
+    frame = opening_frame(failures, number, single)
     print(f"{path}, frame {frame}: {failures.table['case_sentence'].iloc[number]}")
     _show_frame(path, frame, png, mp4)
 

@@ -123,6 +123,8 @@ def _correct(summaries: dict[Path, dict[str, Any]], unreadable: dict[Path, str])
         except VapError as error:
             unreadable[layer] = str(error)
             continue
+        if correction.policy not in ("", summary.get("policy")):
+            continue  # of a recording that has been made again with another policy
         summary["case"], summary["sub_case"] = correction.case, correction.sub_case
         summary["case_sentence"] = correction.note
         layers.append(layer)

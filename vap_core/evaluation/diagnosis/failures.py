@@ -7,6 +7,7 @@
 `recordings` has the functions that open a failure.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,7 +45,7 @@ COLUMNS = {
 PLAYED = ["suite", "task", "episode", "seed", "method"]
 """The columns that name a recording."""
 UNSAFE = r"[^\w.@-]"
-"""What no folder's name here has."""
+"""Characters of a policy's label that are replaced in the name of a folder."""
 
 
 @dataclass(frozen=True)
@@ -156,6 +157,16 @@ def _with_folders(table: "pd.DataFrame") -> "pd.DataFrame":
     return table.assign(folder=folders)
 
 
+def _places(source: str, table: "pd.DataFrame") -> list[str]:
+    """The folders that hold, or once held, the corrections of a source."""
+    base = _artifacts_folder(source)
+    places = [base]
+    if base != source and "policy" in table:
+        for policy in table["policy"].unique():
+            places.append(f"{base}/{re.sub(UNSAFE, '-', str(policy))}")
+    return places
+
+
 def _artifacts_folder(source: str) -> str:
     path = Path(source)
     if path.suffix == ".parquet":
@@ -166,19 +177,28 @@ def _artifacts_folder(source: str) -> str:
 def _with_corrections(table: "pd.DataFrame") -> "pd.DataFrame":
     """With the corrections of researchers, marked in the column `corrected`.
 
-    A correction holds for a failure of the policy that was recorded.
+    A correction holds for a failure of the policy that was recorded. It is looked for wherever one
+    of the table may have been written: the table may have had other policies then.
     """
     from vap_core.recording import read_corrections, recording_file_name
 
     table = table.assign(corrected=False)
     failed = table[table["outcome"].eq("failure")]
-    for folder, part in failed.groupby("folder", sort=False):
-        corrections = read_corrections(Path(str(folder)))
-        if not corrections:
+    for source, part in failed.groupby("source", sort=False):
+        written = []
+        for folder in _places(str(source), part):
+            written.append((folder, read_corrections(Path(folder))))
+        if not any(corrections for _, corrections in written):
             continue
         for index, row in part.iterrows():
-            correction = corrections.get(recording_file_name(*row[PLAYED]))
-            if correction is None or correction.policy not in ("", row.get("policy")):
+            correction = None
+            for folder, corrections in written:
+                found = corrections.get(recording_file_name(*row[PLAYED]))
+                # A layer that does not name its policy holds where it lies.
+                here = "" if folder == row["folder"] else None
+                if found is not None and found.policy in (here, row.get("policy")):
+                    correction = found
+            if correction is None:
                 continue
             cells = {
                 "case": correction.case,

@@ -69,11 +69,12 @@ def save_screenshot(failures: Failures, number: int, png: Path, against: str | N
     """
     from vap_core.recording import screenshot
 
-    path = recording_of(failures, number)
-    frame = opening_frame(failures, number, path)
+    together = None
     if against is not None:
-        path = side_by_side_recording(failures, number, against)
-    screenshot(path, png, frame_index=frame, size=(1920, 1080))
+        together = side_by_side_recording(failures, number, against)
+    single = recording_of(failures, number)
+    frame = opening_frame(failures, number, single)
+    screenshot(together or single, png, frame_index=frame, size=(1920, 1080))
     row = failure_row(failures, number)
     write_provenance(png, study_of(failures.manifests[row["configuration"]], row))
     return str(row["case_sentence"])

@@ -58,9 +58,7 @@ def funnel_figure(
         drawn |= _draw_funnel(axes, shown, colours)
         axes.set_xticks(range(len(STAGES)), STAGES, fontsize=8, rotation=20)
         axes.set_xlim(-0.25, len(STAGES) - 0.4)
-        counts = sorted({row.n for row in shown})
-        axes.set(title=f"{suite} (n {' to '.join(map(str, counts[:: len(counts) - 1 or 1]))})")
-        axes.set_ylim(0, 104)
+        axes.set(title=f"{suite}{_count_text(shown)}", ylim=(0, 104))
         axes.grid(color="#eeeeee")
         axes.spines[["top", "right"]].set_visible(False)
     for axes in panels[len(by_suite) :]:
@@ -160,6 +158,16 @@ def _draw_funnel(
             va="center",
         )
     return drawn
+
+
+def _count_text(rows: Sequence[FunnelRow]) -> str:
+    """How many episodes the lines are of."""
+    counts = {row.n for row in rows if any(left is not None for left in row.left)}
+    if not counts:
+        return ""
+    if len(counts) == 1:
+        return f" (n {counts.pop()})"
+    return f" (n {min(counts)} to {max(counts)})"
 
 
 def _plain(method: str) -> str:
