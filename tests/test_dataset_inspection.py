@@ -117,8 +117,10 @@ def test_the_same_call_goes_on_and_another_question_is_refused(
     again = inspect_dataset(recorded, TOLD, bank, "toys", out)
     assert [str(report) for report in again] == [str(report) for report in whole]
     assert (out / "episode_000000.rrd").stat().st_mtime_ns == kept
-    with pytest.raises(BadOutput, match="holds another inspection; choose another --out"):
-        inspect_dataset(recorded, "pick my mug", bank, "toys", out)
+    for told, remembered in (("pick my mug", BLUE), (TOLD, GREEN)):
+        memory.save(bank, personal("mug", "mug", remembered), replace=True)
+        with pytest.raises(BadOutput, match="holds another inspection.*choose another --out"):
+            inspect_dataset(recorded, told, bank, "toys", out)
 
 
 def test_a_copy_has_what_the_method_would_show_and_all_else_as_it_was(

@@ -25,6 +25,12 @@ def test_every_suite_passes_gymnasiums_checker(suite, task):
     env.close()
 
 
+def test_an_episode_with_sub_goals_is_refused():
+    """Its reward was that of the first sub-goal."""
+    with pytest.raises(BadSuite, match="shared-sequence have sub-goals.*vap_core eval"):
+        gym.make(env_id("shared-sequence", suites.suite("shared-sequence").tasks[0].name))
+
+
 def test_the_name_in_the_manual_works_and_other_names_read_as_before():
     assert gym.spec("vap/simpler-bridge/put-camera-v0").kwargs == {
         "suite": "simpler-bridge",

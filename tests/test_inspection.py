@@ -67,6 +67,7 @@ def squares(hidden: bool) -> dict[str, Mask]:
 def test_an_episode_is_found_by_its_number() -> None:
     assert episode("vlabench", "select-cup", 7).episode == 7
     assert episode("widowx-pick", "pick-straw-cup", 3).episode == 3
+    assert episode("simpler-bridge-red", "put-camera", 3).episode == 3
     with pytest.raises(
         UnknownName, match="no episode 50 of vlabench/select-cup; its list has 0 to 49"
     ):

@@ -55,6 +55,17 @@ def test_other_commands_find_it_by_the_environment(
     assert suites.suite("my-desk").robot == "wx250s"
 
 
+@pytest.mark.parametrize("name", ["simpler-bridge", "my-absent"])
+def test_the_environment_takes_no_name_that_is_another_suites(
+    file: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """A list of one's own was run under the benchmark's name."""
+    file.write_text(DOCUMENTED.replace('"my-desk"', f'"{name}"'))
+    monkeypatch.setenv("VAP_SUITES", str(file))
+    with pytest.raises(BadSuite, match=f"another suite '{name}'|the name '{name}' will not do"):
+        suites.digest("simpler-bridge")
+
+
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
@@ -64,6 +75,7 @@ def test_other_commands_find_it_by_the_environment(
         (("def rows", "def episodes"), "must define SUITE"),
         (('"wx250s"', '"wx25"'), r"no robot 'wx25'|robot.*'wx25'"),
         (('("front",)', '("back",)'), "camera 'back'"),
+        (("hz=5.0", "hz=10.0"), "wx250s is controlled at hz=5, and not 10"),
         (('"my-desk"', '"tabletop"'), "another suite 'tabletop'"),
         (('"my-desk"', '"my-absent"'), "the name 'my-absent' will not do"),
         (('"my-desk"', '"../desk"'), "the name '../desk' will not do"),

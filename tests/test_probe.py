@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vap_core.base.errors import BadPolicy, UnknownName
+from vap_core.base.errors import BadPolicy, BadStudy, UnknownName
 from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.names import label_of, shipped_checkpoint
 from vap_core.policies.protocol import PolicyInput
@@ -108,6 +108,10 @@ def test_episodes_of_the_policy_that_ships_go_before_those_of_others() -> None:
 def test_what_cannot_be_asked_for_is_told_in_a_line(grown: tuple[Path, Path]) -> None:  # noqa: F811
     with pytest.raises(UnknownName, match="way 'shouted' is unknown"):
         probe.probe(str(grown[1]), SUITE, ways=("shouted",))
+    with pytest.raises(UnknownName, match="suite 'simpler-bridge-dev' is unknown"):
+        probe.probe(str(grown[1]), "simpler-bridge-dev")
+    with pytest.raises(BadStudy, match="name one by --ways"):
+        probe.probe(str(grown[1]), SUITE, ways=())
     with pytest.raises(BadPolicy, match="decides on 4 actions at a time; ask for 1 to 4"):
         load_policy(str(grown[1])).with_execute(5)
 

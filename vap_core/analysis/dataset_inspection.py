@@ -4,11 +4,13 @@ Every episode is grounded in its first frame and tracked through the others, as 
 There is no ground truth: what can be told is whether views elect something, keep it, and agree.
 """
 
+import hashlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
@@ -17,9 +19,9 @@ from vap_core.attend import Attender, AttendState, Prompting
 from vap_core.base.errors import BadDataset, BadOutput
 from vap_core.base.files import parse_json, write_atomic
 from vap_core.base.tables import Rows, align
-from vap_core.base.types import Attended, Views, value
+from vap_core.base.types import Attended, PersonalObject, Views, value
 from vap_core.memory import load_bank
-from vap_core.perception.stacks import load_stack
+from vap_core.perception.stacks import load_own
 from vap_core.policies.lerobot.datasets import Copy, Recorded, open_dataset
 
 TABLE = "views.csv"
@@ -68,10 +70,17 @@ def inspect_dataset(
     Raises: BadDataset, BadInstruction, UnknownName, BadOutput, BadMemory.
     """
     recorded = open_dataset(path)
-    models = load_stack(stack)
+    models = load_own(stack)
     bank = load_bank(memory, models.encoder.name)
     attender = Attender(models, bank)
-    _check_folder(out, path, instruction, objects)
+    about = {
+        "dataset": str(path.resolve()),
+        "instruction": instruction,
+        "objects": None if objects is None else list(objects),
+        "stack": [models.name, models.encoder.name],
+        "memory": _memory_digest(bank),
+    }
+    _check_folder(out, about)
     count = recorded.episodes if episodes is None else min(episodes, recorded.episodes)
     reports: list[ViewReport] = []
     with ExitStack() as files:
@@ -244,16 +253,25 @@ def _stretches(seen: Sequence[bool]) -> list[int]:
     return lengths
 
 
-def _check_folder(out: Path, path: Path, instruction: str, objects: Sequence[str] | None) -> None:
+def _memory_digest(bank: Mapping[str, PersonalObject]) -> str:
+    """What is remembered, as one number."""
+    digest = hashlib.sha256()
+    for name, obj in sorted(bank.items()):
+        digest.update(f"{name} {obj.category} {obj.embeddings.shape}".encode())
+        digest.update(obj.embeddings.tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _check_folder(out: Path, about: Mapping[str, Any]) -> None:
     """Begin in `out`, or go on there with the same question. Raises: BadOutput."""
-    about = {"dataset": str(path.resolve()), "instruction": instruction, "objects": objects}
     file = out / "inspection.json"
     try:
         out.mkdir(parents=True, exist_ok=True)
         if file.is_file():
             if parse_json(file.read_text()) != about:
                 raise BadOutput(
-                    f"inspect-dataset: {out} holds another inspection; choose another --out."
+                    f"inspect-dataset: {out} holds another inspection (dataset, instruction, "
+                    "stack or memory differ); choose another --out."
                 )
             return
         write_atomic(file, json.dumps(about).encode())

@@ -223,7 +223,8 @@ def main() -> None:
     """Write the pages of ./notebooks: python -m vap_core.analysis.notebook_pages."""
     for page in write_pages(Path("notebooks"), OUT):
         print(page)
-    print(f"open {OUT}/index.html; for the viewer: python -m http.server --directory {OUT}")
+    serve = f"python -m http.server --bind 127.0.0.1 --directory {OUT}"
+    print(f"open {OUT}/index.html; for the viewer: {serve}")
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ CHARSET = "".join(map(chr, range(32, 127)))
 
 
 class VapEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
-    """One task of one suite.
+    """One task of one suite, whose episodes have no sub-goals.
 
     `reset(options={"episode": i})` starts episode i of its list, else one is drawn by the seed.
     `reset(options={"row": row})` starts any EpisodeRow of the same robot, for suites of your own.
@@ -149,6 +149,11 @@ class VapEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         return self.rows[number]
 
     def _start(self, row: EpisodeRow) -> None:
+        if row.subgoals:
+            raise BadSuite(
+                f"gym: episodes of {row.suite} have sub-goals, and the reward here is of one; run "
+                "them by: python -m vap_core eval"
+            )
         scene = self._scene(row)
         self._env = make_env(scene, self.suite.name, image_size=self.image_size)
         self._env.reset(row)

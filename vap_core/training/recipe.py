@@ -1,7 +1,7 @@
 """How the small policies are made: one recipe, and what differs from suite to suite.
 
     RECIPES["simpler-bridge"]                     # `train policy --suite simpler-bridge`
-    FILMED["simpler-bridge"].tasks                # what its films show
+    FILMED["simpler-bridge"]                      # what its films show
 
 Every number that a training depends on is here, is written into its training.json, and is what
 `train policy` takes when nothing else is asked for.

@@ -39,13 +39,15 @@ ABSENT = "-absent"
 """Ends the name of a suite whose target is left out."""
 RED = objects.RED
 """Ends the name of a suite whose first look-alike is red by nature; -absent may follow it."""
+ENDINGS = (ABSENT, RED, development.SUFFIX)
+"""No suite of one's own ends so."""
 
 
 def suite(name: str) -> Suite:
     """The suite called `name`. Raises: UnknownName."""
     if name in SUITES:
         return SUITES[name]
-    own_suite = own.find(name)
+    own_suite = _find_own(name)
     if own_suite is not None:
         return own_suite.suite
     if not is_listed(name):
@@ -81,12 +83,17 @@ def is_listed(name: str) -> bool:
 
 def open_file(path: Path) -> Suite:
     """Make the suite known that a Python file of the user's own defines. Raises: BadSuite."""
-    return own.open_file(path, taken=SUITES, endings=(ABSENT, RED, development.SUFFIX))
+    return own.open_file(path, taken=SUITES, endings=ENDINGS)
+
+
+def _find_own(name: str) -> own.OwnSuite | None:
+    """A suite of the user's own. Raises: BadSuite."""
+    return own.find(name, taken=SUITES, endings=ENDINGS)
 
 
 def has_list(name: str) -> bool:
     """Whether a suite's rows are a list, the same for every seed: all but the warm-up suites'."""
-    return is_listed(name) or own.find(name) is not None
+    return is_listed(name) or _find_own(name) is not None
 
 
 def is_development(name: str) -> bool:
@@ -95,7 +102,7 @@ def is_development(name: str) -> bool:
 
 def digest(name: str) -> str:
     """The sha256 of a suite's list. Raises: BadSuite."""
-    own_suite = own.find(name)
+    own_suite = _find_own(name)
     if own_suite is not None:
         return own_suite.sha256
     return lists.digest(list_name(name))
@@ -114,7 +121,7 @@ def benchmark(name: str) -> tuple[EpisodeRow, ...]:
         return tuple(replace(row, suite=name, start=left_out) for row in whole)
     if name.endswith(RED):
         return tuple(_with_red_lookalike(row, name) for row in benchmark(name.removesuffix(RED)))
-    own_suite = own.find(name)
+    own_suite = _find_own(name)
     if own_suite is not None:
         return own_suite.rows
     episodes = lists.read(name)

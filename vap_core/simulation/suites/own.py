@@ -40,16 +40,16 @@ OPENED: dict[str, OwnSuite] = {}
 """The suites of one's own that are open in this process."""
 
 
-def find(name: str) -> OwnSuite | None:
+def find(name: str, taken: Iterable[str] = (), endings: tuple[str, ...] = ()) -> OwnSuite | None:
     """The suite of that name that was opened, or that a file of VAP_SUITES defines.
 
-    Raises: BadSuite.
+    `taken` and `endings` are `open_file`'s. Raises: BadSuite.
     """
     if name not in OPENED:
         opened = {own.file for own in OPENED.values()}
         for part in os.environ.get(VARIABLE, "").split(os.pathsep):
             if part and Path(part).resolve() not in opened:
-                open_file(Path(part))
+                open_file(Path(part), taken, endings)
     return OPENED.get(name)
 
 
@@ -125,6 +125,8 @@ def _checked_rows(
     """The suite's list, once it names only what exists. Raises: BadSuite."""
     try:
         robot = robots.get(suite.robot)
+        if suite.hz != robot.hz:
+            raise BadSuite(f"{robot.name} is controlled at hz={robot.hz:g}, and not {suite.hz:g}")
         rigs = {rig.name for rig in RIGS[robot.name]}
         for camera in suite.cameras:
             if camera not in rigs:

@@ -96,7 +96,8 @@ def checkpoint(path: Path, resume: bool) -> tuple[dict[str, Any], Callable[[dict
 
     state: dict[str, Any] = {}
     if resume and path.exists():
-        state = torch.load(path, weights_only=True)
+        # Begun on a GPU, a training goes on where there is none.
+        state = torch.load(path, map_location="cpu", weights_only=True)
     return state, save
 
 

@@ -38,6 +38,7 @@ from vap_core.training.films.captions import describe, distinguishes
 from vap_core.training.films.demonstrations import draw_objects, row
 from vap_core.training.policy.colouring import natural_colours, painted, tinted
 from vap_core.training.policy.commands import describe_instruction, phrase_instruction
+from vap_core.training.recipe import FILMED
 from vap_core.training.words import distinct_colours
 
 if TYPE_CHECKING:
@@ -164,6 +165,10 @@ def probe(
     import pandas as pd
     from tqdm import tqdm
 
+    if suite_name not in FILMED:
+        raise one_of("eval-policy: suite", suite_name, FILMED)
+    if not ways:
+        raise BadStudy("eval-policy: there is no way to ask; name one by --ways.")
     for way in ways:
         parse_way(way)
     work = partial(_scene, checkpoint, suite_name, tuple(ways), execute, seed)
