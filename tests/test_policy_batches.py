@@ -6,11 +6,13 @@ from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from torch.nn import functional as F  # noqa: N812
 
 from tests.test_policy_training import SUITE, TINY, known
+from vap_core.base.files import DATA
 from vap_core.policies.mini_pi0.learned_token import WORD
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy, fused_attention
 from vap_core.simulation.control import arm, rotation_vector
@@ -291,3 +293,24 @@ def test_one_batch_can_be_learned_by_heart(stage: tuple[Path, list[Film]]) -> No
     assert late["where"] < 0.5 * early["where"]
     assert late["turn"] < 0.5 * early["turn"]
     assert late["hit"] > early["hit"]
+
+
+@pytest.mark.parametrize(
+    ("shown", "rms", "most"), [("bridge", 0.14, 0.52), ("fractal", 0.16, 0.58)]
+)
+def test_how_far_the_planned_turn_is_from_the_one_that_was_made(
+    shown: str, rms: float, most: float
+) -> None:
+    """docs/policy.md tells it: knocks that follow are not in the plan that `turn_otherwise` adds."""
+    off = []
+    for path in sorted((DATA / "demonstrations" / f"simpler-{shown}" / "data").rglob("*.parquet")):
+        for _, film in pd.read_parquet(path).groupby("episode_index"):
+            state, action = np.stack(film["observation.state"]), np.stack(film["action"])
+            for t in range(len(action)):
+                close = int(np.argmax(action[t:, -1] < 0.5))
+                if close:
+                    turned = state[t + close, SPIN_Z] - state[t, SPIN_Z]
+                    off.append(action[t : t + close, SPIN_Z].sum() - turned)
+    away = np.abs((np.array(off) + np.pi) % (2 * np.pi) - np.pi)
+    assert np.sqrt((away**2).mean()) == pytest.approx(rms, abs=0.005)
+    assert away.max() == pytest.approx(most, abs=0.005)
