@@ -298,8 +298,8 @@ class Attender:
                     f"Attender.step: views of {sorted(images_now)}, but the episode started with "
                     f"{sorted(state.groundings)}; give the same cameras."
                 )
-            for camera, of_view in state.groundings.items():
-                shape, began = images_now[camera].shape, of_view[0].masks.shape[1:]
+            for camera, of_targets in state.groundings.items():
+                shape, began = images_now[camera].shape, of_targets[0].masks.shape[1:]
                 if shape[:2] != began:
                     raise BadViews(
                         f"Attender.step: view {camera!r} is {shape[1]}x{shape[0]}, but the episode "
