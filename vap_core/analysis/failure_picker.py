@@ -16,7 +16,7 @@ from vap_core.base.errors import BadOutput
 from vap_core.base.extras import require
 from vap_core.base.files import write_atomic
 from vap_core.evaluation.diagnosis.failures import Failures, failure_row
-from vap_core.evaluation.diagnosis.recordings import opening_frame, recording_of
+from vap_core.evaluation.diagnosis.recordings import recording_to_show
 from vap_core.rollout.failure import CASES
 
 if TYPE_CHECKING:
@@ -129,9 +129,8 @@ class FailurePicker(Control):
         """Rerun's viewer with the picked failure's recording at its deciding frame."""
         from vap_core.recording import view
 
-        path = recording_of(self.failures, self.failure.value)
+        path, frame = recording_to_show(self.failures, self.failure.value)
         viewer = view(path)
-        frame = opening_frame(self.failures, self.failure.value, path)
         viewer.set_time_ctrl(sequence=frame, timeline="frame_index", play=False)
         return viewer
 

@@ -85,16 +85,8 @@ def diagnose(
         --note "it held for a moment"
     """
     from vap_core.base.errors import BadStudy
-    from vap_core.evaluation.diagnosis.failures import (
-        failures_text,
-        list_failures,
-    )
-    from vap_core.evaluation.diagnosis.recordings import (
-        correct_failure,
-        opening_frame,
-        recording_of,
-        side_by_side_recording,
-    )
+    from vap_core.evaluation.diagnosis.failures import failures_text, list_failures
+    from vap_core.evaluation.diagnosis.recordings import correct_failure, recording_to_show
 
     failures = list_failures(
         *runs, suite=suite, task=task, method=method, case=case, sub_case=sub_case, where=where
@@ -111,10 +103,7 @@ def diagnose(
     if show is None and png is None and mp4 is None:
         print(failures_text(failures, limit))
         return
-    together = side_by_side_recording(failures, number, against) if against else None
-    single = recording_of(failures, number)
-    path = together or single
-    frame = opening_frame(failures, number, single)
+    path, frame = recording_to_show(failures, number, against)
     print(f"{path}, frame {frame}: {failures.table['case_sentence'].iloc[number]}")
     _show_frame(path, frame, png, mp4)
 

@@ -106,8 +106,8 @@ def compose(views: Mapping[str, Rgb], title: str, verdict: str, time: str) -> Rg
 
     scaled = []
     for rgb in views.values():
-        height, width = rgb.shape[:2]
-        scaled.append(Image.fromarray(rgb).resize((round(SIDE_PX * width / height), SIDE_PX)))
+        h, w = rgb.shape[:2]
+        scaled.append(Image.fromarray(rgb).resize((round(SIDE_PX * w / h), SIDE_PX)))
     taken = sum(view.width for view in scaled)
     width = max(taken, 2 * SIDE_PX)
     picture = Image.new("RGB", (width, SIDE_PX + 2 * BAR_PX), PAPER)

@@ -152,8 +152,7 @@ def _with_folders(table: "pd.DataFrame") -> "pd.DataFrame":
     folders = table["source"].map(_artifacts_folder)
     if "policy" in table:
         several = table.groupby(["source", *PLAYED])["policy"].transform("nunique") > 1
-        by_policy = folders + "/" + table["policy"].str.replace(UNSAFE, "-", regex=True)
-        folders = folders.mask(several, by_policy)
+        folders = folders.mask(several, folders + "/" + table["policy"].map(_folder_name))
     return table.assign(folder=folders)
 
 
@@ -163,8 +162,12 @@ def _places(source: str, table: "pd.DataFrame") -> list[str]:
     places = [base]
     if base != source and "policy" in table:
         for policy in table["policy"].unique():
-            places.append(f"{base}/{re.sub(UNSAFE, '-', str(policy))}")
+            places.append(f"{base}/{_folder_name(policy)}")
     return places
+
+
+def _folder_name(policy: object) -> str:
+    return re.sub(UNSAFE, "-", str(policy))
 
 
 def _artifacts_folder(source: str) -> str:
@@ -192,8 +195,9 @@ def _with_corrections(table: "pd.DataFrame") -> "pd.DataFrame":
             continue
         for index, row in part.iterrows():
             correction = None
+            name = recording_file_name(*row[PLAYED])
             for folder, corrections in written:
-                found = corrections.get(recording_file_name(*row[PLAYED]))
+                found = corrections.get(name)
                 # A layer that does not name its policy holds where it lies.
                 here = "" if folder == row["folder"] else None
                 if found is not None and found.policy in (here, row.get("policy")):

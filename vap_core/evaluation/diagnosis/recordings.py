@@ -59,6 +59,22 @@ def side_by_side_recording(failures: Failures, number: int, method: str) -> Path
     return out
 
 
+def recording_to_show(
+    failures: Failures, number: int, against: str | None = None
+) -> tuple[Path, int]:
+    """The recording of a listed failure and the frame that decided it.
+
+    `against` is another method on the same episode, to be shown next to it.
+
+    Raises: as `side_by_side_recording`.
+    """
+    together = None
+    if against is not None:  # a wrong name is said before anything is run
+        together = side_by_side_recording(failures, number, against)
+    single = recording_of(failures, number)
+    return together or single, _opening_frame(failures, number, single)
+
+
 def save_screenshot(failures: Failures, number: int, png: Path, against: str | None = None) -> str:
     """Save the viewer's picture of a listed failure at its deciding frame; return why it failed.
 
@@ -69,18 +85,14 @@ def save_screenshot(failures: Failures, number: int, png: Path, against: str | N
     """
     from vap_core.recording import screenshot
 
-    together = None
-    if against is not None:
-        together = side_by_side_recording(failures, number, against)
-    single = recording_of(failures, number)
-    frame = opening_frame(failures, number, single)
-    screenshot(together or single, png, frame_index=frame, size=(1920, 1080))
+    path, frame = recording_to_show(failures, number, against)
+    screenshot(path, png, frame_index=frame, size=(1920, 1080))
     row = failure_row(failures, number)
     write_provenance(png, study_of(failures.manifests[row["configuration"]], row))
     return str(row["case_sentence"])
 
 
-def opening_frame(failures: Failures, number: int, recording: Path) -> int:
+def _opening_frame(failures: Failures, number: int, recording: Path) -> int:
     """The frame that decided a recorded failure.
 
     An episode that was run again may end a little otherwise than the table says: its own recording
@@ -104,9 +116,8 @@ def correct_failure(failures: Failures, number: int, case: str, note: str = "") 
     from vap_core.recording import Correction, write_correction
 
     name, _, sub_case = case.partition(":")
-    path = recording_of(failures, number)
-    correction = Correction(name.strip(), sub_case.strip(), note)
-    return write_correction(path, correction, opening_frame(failures, number, path))
+    path, frame = recording_to_show(failures, number)
+    return write_correction(path, Correction(name.strip(), sub_case.strip(), note), frame)
 
 
 def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:

@@ -40,7 +40,7 @@ OPENED: dict[str, OwnSuite] = {}
 """The suites of one's own that are open in this process."""
 
 
-def find(name: str, taken: Iterable[str] = (), endings: tuple[str, ...] = ()) -> OwnSuite | None:
+def find(name: str, taken: Iterable[str], endings: tuple[str, ...]) -> OwnSuite | None:
     """The suite of that name that was opened, or that a file of VAP_SUITES defines.
 
     `taken` and `endings` are `open_file`'s. Raises: BadSuite.
@@ -53,7 +53,7 @@ def find(name: str, taken: Iterable[str] = (), endings: tuple[str, ...] = ()) ->
     return OPENED.get(name)
 
 
-def open_file(path: Path, taken: Iterable[str] = (), endings: tuple[str, ...] = ()) -> Suite:
+def open_file(path: Path, taken: Iterable[str], endings: tuple[str, ...]) -> Suite:
     """Execute a file, check its suite and list, and make the suite known by its name.
 
     The same file is executed once in a process. Names in `taken` are other suites', names with one

@@ -1,0 +1,133 @@
+"""How failures divide into cases, and at which stages episodes are lost: tables and pictures."""
+
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from vap_core.base import figures
+from vap_core.base.tables import align
+from vap_core.evaluation.diagnosis import STAGES
+from vap_core.evaluation.report.failures import (
+    breakdown,
+    breakdown_rows,
+    funnel_table,
+    sub_cases_text,
+)
+from vap_core.evaluation.report.funnel import funnel_figure
+from vap_core.evaluation.report.page import report_page
+from vap_core.rollout.failure import CASES
+
+STAGE_COLUMNS = [f"stage_{stage}" for stage in STAGES]
+
+
+def row(
+    method: str = "vap",
+    case: str = "",
+    sub_case: str = "",
+    stages: int = 7,
+    outcome: str = "",
+    suite: str = "vlabench",
+) -> dict[str, Any]:
+    """One episode that passes so many stages."""
+    ended = outcome or ("failure" if case else "success")
+    passed = {
+        f"stage_{name}": i < stages if method == "vap" or i > 3 else None
+        for i, name in enumerate(STAGES)
+    }
+    about = {"suite": suite, "method": method, "outcome": ended, "success": ended == "success"}
+    return {
+        **about,
+        "case": case,
+        "sub_case": sub_case,
+        "case_confidence": 0.5 if case else float("nan"),
+        "deciding_frame": 3.0,
+        **passed,
+    }
+
+
+TABLE = pd.DataFrame(
+    [
+        *[row()] * 4,
+        *[row(case="case 2", sub_case="views disagree", stages=1)] * 3,
+        row(case="case 3", sub_case="timeout", stages=4),
+        row(outcome="error", stages=0),
+        *[row("generic", "unprompted", "wrong object", stages=5)] * 2,
+    ]
+)
+
+
+def test_the_cases_of_a_row_sum_to_its_failures() -> None:
+    counts = breakdown(TABLE).set_index("method")
+    assert (counts.loc["vap", ["n", "failed", "case 1", "case 2", "case 3"]].tolist()) == [
+        9,
+        4,
+        0,
+        3,
+        1,
+    ]
+    assert (counts[list(CASES)].sum(axis=1) == counts["failed"]).all()
+    for case, parts in CASES.items():
+        assert (counts[[f"{case}: {part}" for part in parts]].sum(axis=1) == counts[case]).all()
+    assert counts.loc["vap", "mean_confidence"] == 0.5
+
+
+def test_as_text_every_share_has_its_interval() -> None:
+    told = align(breakdown_rows(breakdown(TABLE)))
+    assert "44 % [19, 73]" in told
+    assert "75 % [30, 95]" in told
+    assert "case 1 %" not in told, "no row has any"
+    assert (
+        sub_cases_text(breakdown(TABLE)).splitlines()[0]
+        == "vlabench vap: 3 x case 2: views disagree, 1 x case 3: timeout"
+    )
+
+
+def test_what_several_policies_did_is_not_added_up() -> None:
+    two = pd.concat([TABLE.assign(policy="a"), TABLE.assign(policy="b")], ignore_index=True)
+    counts = breakdown(two)
+    assert counts.method.tolist() == ["vap, a", "generic, a", "vap, b", "generic, b"]
+    assert counts.n.tolist() == [9, 2, 9, 2]
+    assert [line.method for line in funnel_table(two)] == counts.method.tolist()
+    alone = two[(two.policy == "a") | (two.method == "vap")]
+    assert breakdown(alone).method.tolist() == ["vap, a", "generic", "vap, b"]
+    lines = funnel_figure(funnel_table(two), {"vap": "red"}).legends[0].get_texts()
+    assert [line.get_text() for line in lines][:2] == ["vap, a", "vap, b"]
+    assert breakdown(TABLE.assign(policy="a")).equals(breakdown(TABLE))
+
+
+def test_the_road_narrows_and_ends_with_the_successes() -> None:
+    vap, generic = funnel_table(TABLE)
+    assert (vap.n, vap.left, vap.succeeded) == (9, (8, 5, 5, 5, 4, 4, 4), 4)
+    assert (generic.n, generic.left) == (2, (None, None, None, None, 2, 0, 0))
+    assert all(a >= b for a, b in zip(vap.left, vap.left[1:], strict=False))  # type: ignore[operator]
+
+
+def test_a_method_that_has_errors_alone_has_no_line() -> None:
+    """`report` fell on it."""
+    of_vap = TABLE[TABLE.method == "vap"]
+    errors = pd.DataFrame([{**row("soft", outcome="error"), **dict.fromkeys(STAGE_COLUMNS)}] * 2)
+    lines = funnel_table(pd.concat([of_vap, errors], ignore_index=True))
+    assert lines[1].left == (None,) * len(STAGES)
+    figure = funnel_figure(lines, {"vap": "red", "soft": "grey"})
+    assert [text.get_text() for text in figure.legends[0].get_texts()][:-1] == ["vap"]
+    assert figure.axes[0].get_title() == "vlabench (n 9)"
+    both = funnel_figure(funnel_table(TABLE), {"vap": "red", "generic": "grey"})
+    assert both.axes[0].get_title() == "vlabench (n 2 to 9)"
+    assert funnel_figure(lines, {"soft": "grey"}).axes[0].get_title() == "vlabench"
+
+
+def test_a_method_that_reads_the_simulator_is_dashed() -> None:
+    table = pd.concat([TABLE.assign(bound=False), TABLE.assign(bound=True, method="wrong-mask")])
+    figure = funnel_figure(funnel_table(table), {"vap": "red", "wrong-mask": "black"})
+    drawn = [line for line in figure.axes[0].lines if line.get_linestyle() != "None"]
+    styles = {line.get_color(): line.get_linestyle() for line in drawn}
+    assert (styles["red"], styles["black"]) == ("-", "--")
+
+
+def test_a_report_of_methods_that_highlight_nothing_has_their_failures(tmp_path: Path) -> None:
+    of_generic = TABLE[TABLE.method == "generic"].dropna(axis="columns", how="all")
+    table = of_generic.assign(task="select-cup", episode=[0, 1], seed=0, policy="p")
+    page = report_page(table, {}, figures.empty_figure(1.0, 1.0), [], tmp_path)
+    assert "Where episodes are lost" in page
+    assert "Failures (2)" in page
