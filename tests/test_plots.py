@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.test_diagnosis import TABLE, row
+from tests.test_breakdown import TABLE, row
 from tests.toys import TOYS, personal, scene
 from vap_core.analysis.inspection import grounding_table
 from vap_core.analysis.plots import (
