@@ -248,6 +248,18 @@ def bank(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_a_methods_photos_do_not_depend_on_what_else_is_run(bank: Path, tmp_path: Path) -> None:
+    (five,) = load_bank(bank).values()
+    register_personal(replace(STUDY, methods=("vap",)), tmp_path)
+    register_personal(replace(STUDY, methods=("vap", "references-7", "hard-short")), tmp_path)
+    (seven,) = load_bank(tmp_path).values()
+    assert len(seven.crops) == 7
+    first = seven.first(5)
+    assert all(map(np.array_equal, first.crops, five.crops))
+    assert (first.embeddings == five.embeddings).all()
+    assert str(seven.description) == str(five.description)
+
+
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """pi0's real classes, tiny, with random weights."""

@@ -128,10 +128,16 @@ def test_training_is_a_command_that_resumes(
     exported: list[Path] = []  # test_runtime exports: code whose shapes are checked is not traced
     monkeypatch.setattr(perception, "export_graphs", exported.append)
     cache = tmp_path / "cache"
-    perception.train(tmp_path / "halted", scenes=12, seed=1, minutes=0.0, cache=cache, jobs=1)
+    halted = perception.train(
+        tmp_path / "halted", scenes=12, seed=1, minutes=0.0, cache=cache, jobs=1
+    )
+    assert halted is None
+    assert not list((tmp_path / "halted").iterdir()), "heads that were not trained to the end"
     resumed = perception.train(tmp_path / "out", scenes=12, seed=1, cache=cache)
     straight = perception.train(tmp_path / "again", scenes=12, seed=1, resume=False, cache=cache)
-    assert exported == [tmp_path / name for name in ("halted", "out", "again")]
+    assert resumed is not None
+    assert straight is not None
+    assert exported == [tmp_path / name for name in ("out", "again")]
     assert resumed["measured"] == straight["measured"]
     assert resumed["views"] == 12
     assert (tmp_path / "out" / perception.PERCEPTION).read_bytes() == (

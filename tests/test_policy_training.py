@@ -11,10 +11,11 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from tests.command import refused
 from tests.deaths import die_before_each_rename
 from tests.random_kills import kill_in, serving
 from vap_core.base.errors import BadOutput, BadPolicy
-from vap_core.base.files import sha256_of
+from vap_core.base.files import SHIPPED, sha256_of
 from vap_core.base.types import Description
 from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.mini_pi0.learned_token import TokenTraining
@@ -274,3 +275,23 @@ def test_a_model_that_is_whole_is_not_trained_again(
         (tmp_path / "training.json").write_text(json.dumps(card | {"trained_steps": steps}))
         assert vlm.make(tmp_path) == tmp_path
         assert len(calls) == trained
+
+
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        (("perception",), "--out"),
+        (("vlm",), "--out"),
+        (("policy", "--suite", SUITE, "--vlm", SHIPPED / "mini-paligemma"), "--out"),
+        (("policy", "--suite", SUITE, "--vlm", SHIPPED / "mini-paligemma"), "--cache"),
+        (("demonstrations", "--suite", SUITE), "--out"),
+    ],
+)
+def test_a_folder_that_cannot_be_written_is_said_before_the_work(
+    words: tuple[str | Path, ...], option: str, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("no folder")
+    out = () if option == "--out" else ("--out", tmp_path / "out")
+    line = refused("train", *words, *out, option, tmp_path / "file" / "in-it")
+    assert f"{tmp_path}/file/in-it cannot be written (Not a directory)" in line
+    assert f"choose another folder with {option}" in line

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from vap_core.analysis.embedding_search import Watch
 from vap_core.analysis.embedding_space import compare, compare_tokens
 from vap_core.base.errors import BadOutput, BadPolicy
-from vap_core.base.files import write_atomic
+from vap_core.base.files import write_atomic, writing
 from vap_core.base.tables import align
 from vap_core.evaluation.paper import ledger
 from vap_core.policies.embedding_table import open_table
@@ -100,7 +100,7 @@ def report(table: "pd.DataFrame") -> str:
 
 def keep(table: "pd.DataFrame", path: Path) -> None:
     """Write the rows as Parquet or CSV, by the name's ending. Raises: BadOutput."""
-    try:
+    with writing(path, "embeddings", "choose another --out"):
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.suffix == ".csv":
             data = table.to_csv(index=False).encode()
@@ -109,10 +109,6 @@ def keep(table: "pd.DataFrame", path: Path) -> None:
         else:
             raise BadOutput(f"embeddings: {path} ends with neither .parquet nor .csv.")
         write_atomic(path, data)
-    except OSError as error:
-        raise BadOutput(
-            f"embeddings: {path} cannot be written ({error.strerror}); choose another --out."
-        ) from error
 
 
 def _compared(table: "pd.DataFrame") -> str:

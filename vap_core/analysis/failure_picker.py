@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from vap_core.analysis.controls import ALL, Control
 from vap_core.base.errors import BadOutput
 from vap_core.base.extras import require
-from vap_core.base.files import write_atomic
+from vap_core.base.files import write_atomic, writing
 from vap_core.evaluation.diagnosis.failures import Failures, failure_row
 from vap_core.evaluation.diagnosis.recordings import recording_to_show
 from vap_core.rollout.failure import CASES
@@ -61,15 +61,13 @@ def write_label(path: Path, row: dict[str, Any], label: str, note: str = "") -> 
     }
     text = StringIO()
     writer = csv.DictWriter(text, LABELS)
-    try:
+    with writing(path, "write_label", "make room, or name another file"):
         if not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
             writer.writeheader()
         writer.writerow(line)
         before = path.read_bytes() if path.exists() else b""
         write_atomic(path, before + text.getvalue().encode())
-    except OSError as error:
-        raise BadOutput(f"write_label: cannot write {path} ({error.strerror}).") from error
 
 
 def label_names() -> list[str]:

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from vap_core.base.errors import BadInstruction, BadOutput
+from vap_core.base.errors import BadInstruction
 from vap_core.base.events import describe_rejection
+from vap_core.base.files import writing
 from vap_core.base.types import Attended, Boxes, Grounding, PersonalObject, Rgb, value
 from vap_core.instruction.parsers import Parsing
 
@@ -144,27 +145,18 @@ def write_evidence(folder: Path, stem: str, found: Found) -> tuple[Path, Path]:
 
     first = found.attended.groundings[CAMERA][0]
     figure = grounding_figure(found.rgb, found.attended, found.objects, CAMERA)
-    try:
-        with claimed_paths(folder, stem, ".png") as (png, rrd):
-            write_png(figure, png)
-            record_grounding(
-                path=rrd,
-                image=found.rgb,
-                grounding=first,
-                obj=found.objects[0],
-                instruction=found.instruction,
-                rewritten=found.attended.text,
-                prompted=found.attended.images[CAMERA],
-            )
-    except OSError as error:
-        raise cannot_write(folder, error) from error
+    with claimed_paths(folder, stem, ".png") as (png, rrd):
+        write_png(figure, png)
+        record_grounding(
+            path=rrd,
+            image=found.rgb,
+            grounding=first,
+            obj=found.objects[0],
+            instruction=found.instruction,
+            rewritten=found.attended.text,
+            prompted=found.attended.images[CAMERA],
+        )
     return png, rrd
-
-
-def cannot_write(folder: Path, error: OSError) -> BadOutput:
-    return BadOutput(
-        f"ground: {folder} cannot be written ({error.strerror}); choose another folder with --out."
-    )
 
 
 def _parse_box(text: str, width: int, height: int) -> list[float]:
@@ -211,19 +203,20 @@ def claimed_paths(folder: Path, stem: str, suffix: str) -> Iterator[tuple[Path, 
     The recording's temporary file stands there from now on, so that another process takes another
     number. Where the block fails before anything was recorded, it is removed.
 
-    Raises: OSError.
+    Raises: BadOutput, also for an OSError inside.
     """
     from vap_core.recording.file import temporary_path
 
-    shown, recording = _claim(folder, stem, suffix)
-    try:
-        yield shown, recording
-    except BaseException:
-        claim = temporary_path(recording)
-        with suppress(FileNotFoundError):
-            if not claim.stat().st_size:
-                claim.unlink()
-        raise
+    with writing(folder, "ground", "choose another folder with --out"):
+        shown, recording = _claim(folder, stem, suffix)
+        try:
+            yield shown, recording
+        except BaseException:
+            claim = temporary_path(recording)
+            with suppress(FileNotFoundError):
+                if not claim.stat().st_size:
+                    claim.unlink()
+            raise
 
 
 def _claim(folder: Path, stem: str, suffix: str) -> tuple[Path, Path]:

@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from itertools import chain
 from pathlib import Path
 
-from vap_core.analysis.ground import cannot_write, claimed_paths
+from vap_core.analysis.ground import claimed_paths
 from vap_core.attend import Attender, AttendState, Prompting
 from vap_core.base import video
 from vap_core.base.errors import BadPhoto
@@ -81,20 +81,17 @@ def ground_clip(
     prompting = Prompting(always_tint=always_tint)
     attender = Attender(models, bank, prompting, parser=parser, speaker=parsing.speaker)
     _, (obj, *_) = attender.understand(instruction, objects)
-    try:
-        with claimed_paths(out, path.stem, ".mp4") as (mp4, rrd):
-            summary = _follow(
-                attender=attender,
-                frames=chain([first], frames),
-                hz=hz,
-                instruction=instruction,
-                objects=objects,
-                obj=obj,
-                mp4=mp4,
-                rrd=rrd,
-            )
-    except OSError as error:
-        raise cannot_write(out, error) from error
+    with claimed_paths(out, path.stem, ".mp4") as (mp4, rrd):
+        summary = _follow(
+            attender=attender,
+            frames=chain([first], frames),
+            hz=hz,
+            instruction=instruction,
+            objects=objects,
+            obj=obj,
+            mp4=mp4,
+            rrd=rrd,
+        )
     return summary, rrd, mp4
 
 

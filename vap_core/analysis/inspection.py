@@ -15,6 +15,7 @@ from vap_core.associate import PAIRINGS, Pairing, compare_views
 from vap_core.attend import Attender, Prompting
 from vap_core.base.errors import BadOutput, UnknownName
 from vap_core.base.figures import GENERIC, OTHER, WINNER, empty_figure
+from vap_core.base.files import writing
 from vap_core.base.parquet import read_parquet
 from vap_core.base.types import Grounding, Mask, PersonalObject
 from vap_core.evaluation.perception.episodes import OFF
@@ -284,15 +285,10 @@ def write_photo(folder: Path, row: EpisodeRow, camera: str, size: int = 448) -> 
 
     references = folder / "references"
     photo = folder / "photo.png"
-    try:
+    with writing(folder, "inspection.write_photo", "choose another folder"):
         write_views(get_object(row.target), references)
         images = camera_images(row, size=size)
         Image.fromarray(images[camera]).save(photo)
-    except OSError as error:
-        raise BadOutput(
-            f"inspection.write_photo: {folder} cannot be written ({error.strerror}); "
-            "choose another folder."
-        ) from error
     return photo, references
 
 

@@ -19,9 +19,8 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from vap_core.analysis.notebook_links import notebook_files, notebook_title, read_notebook
-from vap_core.base.errors import BadOutput
 from vap_core.base.extras import require
-from vap_core.base.files import write_atomic
+from vap_core.base.files import write_atomic, writing
 
 if TYPE_CHECKING:
     from nbformat import NotebookNode
@@ -79,7 +78,7 @@ def write_pages(notebooks: Path, out: Path) -> list[Path]:
     """
     pages = []
     listed = []
-    try:
+    with writing(out, "notebook_pages", "choose another folder"):
         _write_viewer(out / "viewer")
         for path in notebook_files(notebooks):
             page = out / f"{path.stem}.html"
@@ -90,10 +89,6 @@ def write_pages(notebooks: Path, out: Path) -> list[Path]:
         index = f"<!doctype html><meta charset='utf-8'><title>Notebooks</title>{STYLE}"
         index += f"<main><h1>Notebooks</h1><ul>{''.join(listed)}</ul></main>\n"
         write_atomic(out / "index.html", index.encode())
-    except OSError as error:
-        raise BadOutput(
-            f"notebook_pages: cannot write {out} ({error.strerror}); choose another folder."
-        ) from error
     return pages
 
 

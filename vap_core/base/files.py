@@ -11,8 +11,11 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
+
+from vap_core.base.errors import BadOutput
 
 if TYPE_CHECKING:
     import numpy as np
@@ -37,6 +40,33 @@ def kept_folder(name: str) -> Path:
         return DATA / name
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(cache) / "vap-core" / name
+
+
+@contextmanager
+def writing(
+    path: Path, caller: str, mend: str = "make room and run the same command again"
+) -> Iterator[None]:
+    """Inside, something is written to `path`, a file or a folder.
+
+    Raises: BadOutput, which says how to mend it, for an OSError inside.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise BadOutput(
+            f"{caller}: {path} cannot be written ({error.strerror or error}); {mend}."
+        ) from error
+
+
+def make_folder(folder: Path, caller: str, mend: str = "choose another folder with --out") -> None:
+    """Make a folder, before the work whose results it will hold.
+
+    Raises: BadOutput when it cannot be made, or no file in it.
+    """
+    with writing(folder, caller, mend):
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder):
+            pass
 
 
 @contextmanager

@@ -19,7 +19,10 @@ def perception(
     ),
     scenes: Annotated[int, typer.Option(min=1, help="Rendered training views.")] = 6480,
     seed: Annotated[int, typer.Option(min=0)] = 0,
-    minutes: Annotated[float | None, typer.Option(help="Stop training after this long.")] = None,
+    minutes: Annotated[
+        float | None,
+        typer.Option(help="Stop after this long, with nothing written; the same command goes on."),
+    ] = None,
 ) -> None:
     """Train the heads of detector, segmenter and encoder on rendered generic objects, and evaluate
     them on unseen ones.
@@ -29,6 +32,11 @@ def perception(
     from vap_core.training.perception.train import train
 
     entry = train(out, scenes=scenes, seed=seed, minutes=minutes)
+    if entry is None:
+        print(
+            f"stopped after {minutes:g} minutes; nothing is written yet, the same command goes on."
+        )
+        return
     print(json.dumps(entry, indent=1))
 
 

@@ -15,8 +15,8 @@ from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from vap_core.base.errors import BadCluster, BadOutput, WorkerDied
-from vap_core.base.files import write_atomic
+from vap_core.base.errors import BadCluster, WorkerDied
+from vap_core.base.files import write_atomic, writing
 from vap_core.evaluation.store import differences, digest, read_manifest
 
 if TYPE_CHECKING:
@@ -165,12 +165,7 @@ def _write_files(folder: Path, files: Files) -> None:
                 f"cluster: a worker sent a file named {name[:80]!r}, outside the run's folder; "
                 "join clusters that you trust only."
             )
-    try:
+    with writing(folder, "cluster"):
         for name, data in files.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             write_atomic(folder / name, data)
-    except OSError as error:
-        raise BadOutput(
-            f"cluster: {folder} cannot be written ({error.strerror}); make room and run the same "
-            "command again."
-        ) from error

@@ -7,7 +7,8 @@ from pathlib import Path
 from resource import RUSAGE_SELF, getrusage
 from typing import TYPE_CHECKING, Any, Literal
 
-from vap_core.base.errors import BadOutput, BadRecording, BadStudy
+from vap_core.base.errors import BadRecording, BadStudy
+from vap_core.base.files import writing
 from vap_core.evaluation import diagnosis, hiding, input_audit, state_log, switching
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import make_trial
@@ -146,13 +147,8 @@ def _recorders(job: Job) -> Callable[[EpisodeHeader], "Recorder | DeferredRecord
     )
 
     folder = job.folder / "recordings"
-    try:
+    with writing(folder, "engine"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BadOutput(
-            f"engine: {folder} cannot be written ({error.strerror}); make room and run the same "
-            "command again."
-        ) from error
     keys = {}
     for row, key in zip(job.rows, job.keys, strict=True):
         keys[row.key, row.seed] = key

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import parse_json, read_file, write_atomic
+from vap_core.base.files import parse_json, read_file, write_atomic, writing
 from vap_core.base.parquet import read_arrow
 
 if TYPE_CHECKING:
@@ -21,14 +21,9 @@ def write_json_part(
     path: Path, content: Any, caller: str, default: Callable[[Any], Any] | None = None
 ) -> None:
     """Keep one finished part; its folder is made. `default` is json's. Raises: BadOutput."""
-    try:
+    with writing(path.parent, caller):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, json.dumps(content, default=default).encode())
-    except OSError as error:
-        raise BadOutput(
-            f"{caller}: {path.parent} cannot be written ({error.strerror}); make room and run the "
-            "same command again."
-        ) from error
 
 
 def read_json_part(path: Path, caller: str) -> Any:
@@ -88,13 +83,8 @@ def add_rows(path: Path, table: "pd.DataFrame", key: list[str], about: dict[byte
 
 def publish_tables(tables: Mapping[str, bytes], to: Path, caller: str) -> list[Path]:
     """Write files by name into a folder, which is made; returns their paths. Raises: BadOutput."""
-    try:
+    with writing(to, caller, "choose another folder with --publish"):
         to.mkdir(parents=True, exist_ok=True)
         for name, data in tables.items():
             write_atomic(to / name, data)
-    except OSError as error:
-        raise BadOutput(
-            f"{caller}: {to} cannot be written ({error.strerror}); choose another folder with "
-            "--publish."
-        ) from error
     return [to / name for name in tables]

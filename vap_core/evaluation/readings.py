@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import DATA, read_file, write_atomic
+from vap_core.base.files import DATA, read_file, write_atomic, writing
 from vap_core.simulation import suites
 
 FILE = "readings.csv"
@@ -121,17 +121,14 @@ def append(readings: Sequence[Reading], path: Path) -> None:
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
     writer.writerow(COLUMNS)
-    try:
+    with writing(
+        path, "readings", "make room, or run the command in a folder where data/runs can be written"
+    ):
         path.parent.mkdir(parents=True, exist_ok=True)
         with _locked(path.parent):
             for reading in (*read_log(path), *readings):
                 writer.writerow(astuple(reading))
             write_atomic(path, table.getvalue().encode())
-    except OSError as error:
-        raise BadOutput(
-            f"readings: {path} cannot be written ({error.strerror}); make room, or run the command "
-            "in a folder where data/runs can be written."
-        ) from error
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from vap_core.base.files import (
     read_file,
     remove_scratch,
     write_atomic,
+    writing,
 )
 from vap_core.base.parquet import read_arrow
 
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 MANIFEST = "run.json"
 LOCK = ".lock"
 """The file that `locked` locks; it is never renamed or removed, so all processes lock the same."""
+CHOOSE = "choose another folder with --out"
 KEY = ["suite", "task", "method", "seed", "episode"]
 """The columns that name an episode of a run; the table is in this order."""
 ROW_KEY = ["suite", "task", "seed", "episode"]
@@ -57,12 +59,10 @@ def open_run(folder: Path, configuration: Mapping[str, Any]) -> Path:
         raise BadOutput(f"open_run: {folder} is a file; choose another folder with --out.")
     if not (folder / MANIFEST).exists():
         _check_empty(folder)
-        try:
+        with writing(folder, "open_run", CHOOSE):
             folder.mkdir(parents=True, exist_ok=True)
             with locked(folder):
                 _begin_run(folder, configuration)
-        except OSError as error:
-            raise _unwritable(folder, error) from error
     manifest = read_manifest(folder)
     if manifest["digest"] != digest(configuration):
         raise BadOutput(
@@ -92,13 +92,6 @@ def _begin_run(folder: Path, configuration: Mapping[str, Any]) -> None:
         return
     manifest = {"digest": digest(configuration), "configuration": dict(configuration)}
     write_atomic(folder / MANIFEST, json.dumps(manifest, indent=1, sort_keys=True).encode())
-
-
-def _unwritable(folder: Path, error: OSError) -> BadOutput:
-    return BadOutput(
-        f"open_run: {folder} cannot be written ({error.strerror}); choose another folder with "
-        "--out."
-    )
 
 
 def differences(manifest: Mapping[str, Any], configuration: Mapping[str, Any]) -> str:
@@ -147,10 +140,8 @@ def locked(folder: Path) -> Iterator[None]:
 
     Raises: BadOutput when another process holds it, or the folder cannot be written.
     """
-    try:
+    with writing(folder, "open_run", CHOOSE):
         file = (folder / LOCK).open("ab")
-    except OSError as error:
-        raise _unwritable(folder, error) from error
     with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -174,18 +165,13 @@ def write_part(folder: Path, kind: str, rows: Sequence[Mapping[str, Any]], calle
     """
     import pandas as pd
 
-    try:
+    with writing(folder, caller):
         (folder / kind).mkdir(exist_ok=True)
         table = pd.DataFrame(list(rows))
         data = table.to_parquet(index=False, compression="zstd")
         path = folder / kind / f"{uuid4().hex}.parquet"
         write_atomic(path, data)
         return path
-    except OSError as error:
-        raise BadOutput(
-            f"{caller}: {folder} cannot be written ({error.strerror}); make room and run the same "
-            "command again."
-        ) from error
 
 
 def compact(folder: Path) -> None:

@@ -1,6 +1,7 @@
 """What a batch of a study needs: personal objects in memory, a scene, models and a policy."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
+from vap_core.base.types import Rgb
 from vap_core.evaluation.methods import (
+    FEWEST_REFERENCES,
     hidden_calls,
     make_prompter,
     needs_description,
@@ -31,7 +34,7 @@ from vap_core.policies.mini_pi0.teach_token import model_of, teach, teach_own
 from vap_core.policies.protocol import Policy, PrivilegedPolicy
 from vap_core.rollout.loop import Trial
 from vap_core.simulation import suites
-from vap_core.simulation.assets.objects import get_object
+from vap_core.simulation.assets.objects import ObjectModel, get_object
 from vap_core.simulation.occluder import Occlusion
 from vap_core.simulation.scenes import Meshes, Scene
 from vap_core.simulation.studio import reference_views
@@ -46,25 +49,29 @@ _last_scene: dict[tuple[str, tuple[str, ...], str, Meshes], Scene] = {}
 
 
 def register_personal(study: Study, bank: Path, captioner: Captioner | None = None) -> None:
-    """Remember the personal object of every task from five rendered reference views.
+    """Remember the personal object of every task from five rendered reference views, or more where
+    a method wants them.
 
-    An object that is in memory stays. Where a method needs its description, it is described too, by
-    `captioner`, or offline; for the soft prompt its token is learned. A study that prompts nothing
-    needs no memory.
+    An object that is in memory with enough of them stays. Where a method needs its description, it
+    is described too, by `captioner`, or offline; for the soft prompt its token is learned. A study
+    that prompts nothing needs no memory.
     """
     if not study.any_method(needs_memory):
         return
     stack = load_stack(study.stack)
     known = load_bank(bank)
+    n_references = max(map(references_needed, study.methods))
     for suite, task, target in _remembered(study):
         rows = study.rows(suite, task)
         obj = known.get(target)
-        if obj is None:
+        if obj is None or len(obj.crops) < n_references:
             model = get_object(target)
-            views = reference_views(model, max(map(references_needed, study.methods)))
-            obj, _ = register(target, model.category, views, stack.detector, stack.encoder)
+            photos = _photos(model, n_references)
+            obj, _ = register(target, model.category, photos, stack.detector, stack.encoder)
         if study.any_method(needs_description) and obj.description is None:
-            obj = with_description(obj, captioner or AttributeCaptioner(stack.segmenter))
+            seen = obj.first(FEWEST_REFERENCES)
+            described = with_description(seen, captioner or AttributeCaptioner(stack.segmenter))
+            obj = replace(obj, description=described.description)
         spaces = {token_space(method) for method in study.methods}
         if spaces & {"copied", "aligned"}:
             initialised_from = checkpoints.config_field(study.checkpoint(suite), "vlm")
@@ -74,6 +81,17 @@ def register_personal(study: Study, bank: Path, captioner: Captioner | None = No
         if obj is not known.get(target):
             save(bank, obj, replace=True)
             known[target] = obj
+
+
+def _photos(model: ObjectModel, n: int) -> list[Rgb]:
+    """The reference photos of which each method takes as many as it wants, the first of them.
+
+    The first five do not depend on `n`: methods differ in nothing else, whatever else is run.
+    """
+    photos = reference_views(model, FEWEST_REFERENCES)
+    if n > FEWEST_REFERENCES:
+        photos += reference_views(model, n - FEWEST_REFERENCES, seed=1)
+    return photos
 
 
 def _remembered(study: Study) -> list[tuple[str, str, str]]:

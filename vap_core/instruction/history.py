@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 
-from vap_core.base.errors import BadMemory, BadOutput
-from vap_core.base.files import check_regular, parse_json
+from vap_core.base.errors import BadMemory
+from vap_core.base.files import check_regular, parse_json, writing
 from vap_core.base.types import value
 
 FILE = "history.jsonl"
@@ -56,12 +56,7 @@ def add_uses(bank: Path, objects: Sequence[str], by: str, at: datetime) -> None:
     for name in objects:
         row = {"object": name, "by": by, "at": at.isoformat(timespec="seconds")}
         lines += json.dumps(row, ensure_ascii=False) + "\n"
-    try:
+    with writing(bank, "history", "choose another folder with --memory"):
         bank.mkdir(parents=True, exist_ok=True)
         with (bank / FILE).open("a", encoding="utf-8") as file:
             file.write(lines)
-    except OSError as error:
-        raise BadOutput(
-            f"history: {bank} cannot be written ({error.strerror}); choose another folder with "
-            "--memory."
-        ) from error

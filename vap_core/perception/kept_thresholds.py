@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import parse_json, write_atomic
+from vap_core.base.files import parse_json, write_atomic, writing
 from vap_core.perception.protocols import Thresholds
 
 
@@ -22,14 +22,9 @@ def keep_thresholds(folder: Path, kind: str, encoder: str, thresholds: Threshold
         "familiar": thresholds.familiar,
         "unfamiliar": thresholds.unfamiliar,
     }
-    try:
+    with writing(path, "calibrate", "make room, or point VAP_WEIGHTS at another folder"):
         folder.mkdir(parents=True, exist_ok=True)
         write_atomic(path, (json.dumps(about, indent=1) + "\n").encode())
-    except OSError as error:
-        raise BadOutput(
-            f"calibrate: {path} cannot be written ({error.strerror}); make room, or point "
-            "VAP_WEIGHTS at another folder."
-        ) from error
     return path
 
 

@@ -14,6 +14,7 @@ from vap_core.simulation.gl import ensure_gl
 ensure_gl()
 import mujoco  # noqa: E402
 
+from vap_core.simulation.geoms import hand_geoms, object_of_geoms  # noqa: E402
 from vap_core.simulation.light import PLAIN_LIGHT, Light, dim  # noqa: E402
 from vap_core.simulation.occluder import Screen, draw_screens  # noqa: E402
 
@@ -130,21 +131,6 @@ def project(cam: Camera, points_world: Float64[np.ndarray, "n 3"]) -> Float64[np
     return (local @ cam.k.T)[:, :2] / depth[:, None]
 
 
-def backproject_to_plane(
-    cam: Camera, pixels: Float64[np.ndarray, "n 2"], z_world: float
-) -> Float64[np.ndarray, "n 3"]:
-    """World points, metres, where the pixels' rays meet the level plane z = `z_world`.
-
-    NaN for rays that never do.
-    """
-    homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
-    rays = homogeneous @ np.linalg.inv(cam.k).T @ cam.pose_world[:3, :3].T
-    eye = cam.pose_world[:3, 3]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        along = (z_world - eye[2]) / rays[:, 2]
-    return eye + rays * np.where(along > 0, along, np.nan)[:, None]
-
-
 class Renderer:
     """Renders a model's cameras: colours, and object masks on demand.
 
@@ -161,8 +147,8 @@ class Renderer:
         self.shadows = shadows
         self._renderers: dict[tuple[int, int, bool], mujoco.Renderer] = {}
         self._groups = model.geom_group.copy()
-        self._owner = _object_of_geoms(model, self.objects)
-        self._hand = _hand_geoms(model)
+        self._owner = object_of_geoms(model, self.objects)
+        self._hand = hand_geoms(model)
 
     def __enter__(self) -> "Renderer":
         return self
@@ -269,22 +255,3 @@ class Renderer:
         flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 0
         flags[mujoco.mjtRndFlag.mjRND_HAZE] = 0
         flags[mujoco.mjtRndFlag.mjRND_SHADOW] = int(self.shadows)
-
-
-def _object_of_geoms(model: mujoco.MjModel, objects: Sequence[str]) -> np.ndarray:
-    """Index into `objects` of each geom's object, -1 for the rest of the scene."""
-    owners = np.full(model.nbody, -1, np.int64)
-    for i, name in enumerate(objects):
-        owners[model.body(name).id] = i
-    return owners[model.body_rootid[model.geom_bodyid]]
-
-
-def _hand_geoms(model: mujoco.MjModel) -> np.ndarray:
-    """Whether a geom is of the gripper: of the body that bears the tcp, or of one below it."""
-    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, "tcp")
-    of_hand = np.zeros(model.nbody, bool)
-    if site >= 0:
-        of_hand[model.site_bodyid[site]] = True
-    for body in range(1, model.nbody):  # a parent comes before its children
-        of_hand[body] |= of_hand[model.body_parentid[body]]
-    return of_hand[model.geom_bodyid]

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Int64
 
 from vap_core.base.types import value
+from vap_core.simulation.geoms import object_of_geoms
 from vap_core.simulation.scenes import Scene
 
 ARM = -1
@@ -77,23 +78,11 @@ class ContactWatch:
 def geom_roles(scene: Scene) -> Int64[np.ndarray, " g"]:
     """Of each geom: the index of its object, or ARM, or STILL."""
     model = scene.model
+    owners = object_of_geoms(model, tuple(scene.objects))
+    roles = np.where(owners >= 0, owners, STILL)
     base = int(model.body(scene.robot.links[0]).rootid[0])
-    roles = np.full(model.nbody, STILL, np.int64)
-    for i, name in enumerate(scene.objects):
-        roles[model.body(name).id] = i
-    roles[base] = ARM
-    return roles[model.body_rootid[model.geom_bodyid]]
-
-
-def gripper_geoms(scene: Scene) -> Bool[np.ndarray, " g"]:
-    """Of each geom: whether it belongs to the gripper, the tcp's body and the bodies below it."""
-    model = scene.model
-    palm = int(model.site("tcp").bodyid[0])
-    bodies = [palm]
-    for body in range(palm + 1, model.nbody):  # children come after their parents
-        if int(model.body_parentid[body]) in bodies:
-            bodies.append(body)
-    return np.isin(model.geom_bodyid, bodies)
+    roles[model.body_rootid[model.geom_bodyid] == base] = ARM
+    return roles
 
 
 def contact_partners(pairs: Int64[np.ndarray, "c 2"]) -> dict[int, set[int]]:

@@ -166,8 +166,8 @@ def follow(
     start = _limit_lead(command.tcp_base, measured_base)
     delta = action.astype(np.float64)
     goal = start.copy()
-    goal[:3, 3] += _capped(delta[:3], limits.speed_m_s * seconds)
-    goal[:3, :3] = rotation(_capped(delta[3:6], limits.turn_rad_s * seconds)) @ start[:3, :3]
+    goal[:3, 3] += capped(delta[:3], limits.speed_m_s * seconds)
+    goal[:3, :3] = rotation(capped(delta[3:6], limits.turn_rad_s * seconds)) @ start[:3, :3]
     joints = arm.solve(command.joints, goal, seconds)
     reached = arm.forward(joints)
     off = np.linalg.norm(reached[:3, 3] - goal[:3, 3])
@@ -248,7 +248,8 @@ def _lean_and_twist(
     return lean, float(np.linalg.norm(rotation_vector(found @ leant.T)))
 
 
-def _capped(vector: Float64[np.ndarray, "3"], longest: float) -> Float64[np.ndarray, "3"]:
+def capped(vector: Float64[np.ndarray, "3"], longest: float) -> Float64[np.ndarray, "3"]:
+    """The vector, shortened to `longest` where it is longer."""
     length = float(np.linalg.norm(vector))
     return vector if length <= longest else vector * (longest / length)
 
@@ -260,7 +261,7 @@ def _limit_lead(
     ahead = commanded[:3, 3] - measured[:3, 3]
     turn = rotation_vector(commanded[:3, :3] @ measured[:3, :3].T)
     limited = commanded.copy()
-    limited[:3, 3] = measured[:3, 3] + _capped(ahead, LEAD_M)
+    limited[:3, 3] = measured[:3, 3] + capped(ahead, LEAD_M)
     if np.linalg.norm(turn) > LEAD_RAD:
-        limited[:3, :3] = rotation(_capped(turn, LEAD_RAD)) @ measured[:3, :3]
+        limited[:3, :3] = rotation(capped(turn, LEAD_RAD)) @ measured[:3, :3]
     return limited

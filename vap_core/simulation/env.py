@@ -21,7 +21,6 @@ from vap_core.simulation.contacts import (
     Touch,
     contact_partners,
     geom_roles,
-    gripper_geoms,
 )
 from vap_core.simulation.control import (
     Setpoint,
@@ -31,6 +30,7 @@ from vap_core.simulation.control import (
     is_beyond,
     rotation_vector,
 )
+from vap_core.simulation.geoms import hand_geoms
 from vap_core.simulation.light import PLAIN_LIGHT, Light
 from vap_core.simulation.occluder import Occlusion, Screen, occluder_screens
 from vap_core.simulation.scenes import Scene, parked
@@ -113,7 +113,7 @@ class Env:
         self._fingers = _qpos_addresses(self._model, self.robot.fingers)
         self._ctrl = _actuator_ids(self._model, (*self.robot.joints, *self.robot.fingers))
         self._roles = geom_roles(scene)
-        self._gripper = gripper_geoms(scene)
+        self._gripper = hand_geoms(scene.model)
         self._body_ids = {}
         for name in (*scene.objects, *self.robot.links):
             self._body_ids[name] = self._model.body(name).id

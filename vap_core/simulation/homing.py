@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from vap_core.base.types import value
-from vap_core.simulation.control import arm, rotation, rotation_vector
+from vap_core.simulation.control import arm, capped, rotation, rotation_vector
 from vap_core.simulation.env import Env
 from vap_core.simulation.types import Action
 
@@ -66,8 +66,8 @@ def action(homing: Homing, env: Env) -> Action:
         return np.array([*turn, gripper], np.float32)
     now = command.tcp_base
     goal = _goal(homing, env)
-    move = _capped(goal[:3, 3] - now[:3, 3], SPEED_M_S * seconds)
-    turn = _capped(rotation_vector(goal[:3, :3] @ now[:3, :3].T), TURN_RAD_S * seconds)
+    move = capped(goal[:3, 3] - now[:3, 3], SPEED_M_S * seconds)
+    turn = capped(rotation_vector(goal[:3, :3] @ now[:3, :3].T), TURN_RAD_S * seconds)
     if env.control == "ee":
         return np.array([*move, *turn, gripper], np.float32)
     step = np.eye(4)
@@ -98,9 +98,3 @@ def _is_done(homing: Homing, env: Env) -> bool:
     if env.control == "joint":
         return bool(np.abs(env.robot.home - command.joints).max() < ARRIVED_RAD)
     return bool(np.linalg.norm(off) < ARRIVED_M)
-
-
-def _capped(way: np.ndarray, longest: float) -> np.ndarray:
-    """A way, shortened to `longest`."""
-    length = float(np.linalg.norm(way))
-    return way * min(1.0, longest / max(length, 1e-9))

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 from PIL import Image
 
-from vap_core.base.errors import BadOutput
+from vap_core.base.files import writing
 from vap_core.base.types import Mask, Rgb, value
 from vap_core.simulation.assets.mujoco_object import VISUAL_GROUP, add_object
 from vap_core.simulation.assets.objects import ObjectModel, extent_m
@@ -149,15 +149,10 @@ def reference_shots(model: ObjectModel, n: int, seed: int) -> list[Shot]:
 def write_views(model: ObjectModel, folder: Path, n: int = 5) -> list[Path]:
     """Reference photos as `<name>-<i>.png`. Raises: BadOutput."""
     paths = [folder / f"{model.name}-{i}.png" for i in range(n)]
-    try:
+    with writing(folder, "photograph", "choose another folder with --out"):
         folder.mkdir(parents=True, exist_ok=True)
         for path, rgb in zip(paths, reference_views(model, n), strict=True):
             Image.fromarray(rgb).save(path)
-    except OSError as error:
-        raise BadOutput(
-            f"photograph: {folder} cannot be written ({error.strerror}); "
-            "choose another folder with --out."
-        ) from error
     return paths
 
 
@@ -167,13 +162,8 @@ def write_preview(model: ObjectModel, path: Path, size: int = 320) -> None:
     for azimuth, elevation in ((0.0, 0.3), (np.pi / 2, 0.3), (np.pi, 0.3), (0.4, 1.2)):
         shots.append(Shot(float(azimuth), elevation, fill=0.75))
     picture = np.concatenate(photograph(model, shots, size), axis=1)
-    try:
+    with writing(path, "preview", "choose another folder with --out"):
         Image.fromarray(picture).save(path)
-    except OSError as error:
-        raise BadOutput(
-            f"preview: {path} cannot be written ({error.strerror}); choose another folder with "
-            "--out."
-        ) from error
 
 
 def _set_up_table(spec: mujoco.MjSpec, size: int) -> None:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from vap_core.base.errors import BadOutput
+from vap_core.base.files import make_folder, writing
 from vap_core.training.perception.fitting import checkpoint
 
 KEEP = 0.999
@@ -50,7 +51,7 @@ def train_steps[M: nn.Module](
     `losses` gives the loss of one step, drawn from streams of its number, and figures to log;
     `helpers_cpu_s`, the CPU seconds of other processes since this call began.
 
-    Raises: BadOutput when `out` holds another training.
+    Raises: BadOutput when `out` holds another training or cannot be written.
     """
     from tqdm import tqdm
 
@@ -59,7 +60,7 @@ def train_steps[M: nn.Module](
     )
     mean = copy.deepcopy(model)
     parts: dict[str, Any] = {"model": model, "mean": mean, "optimiser": optimiser}
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out, "train")
     state, save = checkpoint(out / "training.pt", resume=True)
     made_of = json.dumps(run.made_of, sort_keys=True)
     if state:
@@ -90,7 +91,8 @@ def train_steps[M: nn.Module](
             saved: dict[str, Any] = {"step": step + 1, "log": log, "made_of": made_of}
             for name, part in parts.items():
                 saved[name] = part.state_dict()
-            save(saved)
+            with writing(out, "train"):
+                save(saved)
         if last:
             break
     return mean, log

@@ -10,7 +10,8 @@ from typing import Any
 from vap_core.analysis.attention.patterns import WORDS
 from vap_core.analysis.attention.pictures import run_again, strip
 from vap_core.analysis.plots import Tile
-from vap_core.base.errors import BadOutput, BadStudy
+from vap_core.base.errors import BadStudy
+from vap_core.base.files import writing
 from vap_core.evaluation.publish import read_runs
 from vap_core.policies.hooks import AttentionMap, heat_map
 
@@ -34,12 +35,8 @@ def record(source: Path, name: str, folder: Path, memory: Path) -> tuple[Path, i
     """
     manifest, line = _find(source, name)
     path = folder / f"{name.replace('/', '.')}.rrd"
-    try:
+    with writing(folder, "attention", "choose another --out"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BadOutput(
-            f"attention: {folder} cannot be written ({error.strerror}); choose another --out."
-        ) from error
     _, frames = run_again(manifest, line, memory, path)
     return path, clearest({frame.frame_index: frame.attention for frame in frames})
 

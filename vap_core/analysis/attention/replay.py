@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from vap_core.analysis.attention import tables
 from vap_core.analysis.attention.observer import NOTHING, Observer, Rows
-from vap_core.base.errors import BadOutput, BadStudy
+from vap_core.base.errors import BadStudy
+from vap_core.base.files import writing
 from vap_core.evaluation import measurements
 from vap_core.evaluation.diagnosis.recordings import listed_row, study_of
 from vap_core.evaluation.engine import spread_evenly
@@ -78,13 +79,8 @@ def run_replay(
     from tqdm import tqdm
 
     jobs = plan(source, folder / "memory", wanted)
-    try:
+    with writing(folder, "attention", "choose another folder with --out"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BadOutput(
-            f"attention: {folder} cannot be written ({error.strerror}); choose another folder with "
-            "--out."
-        ) from error
     with locked(folder):
         parts = folder / "parts"
         parts.mkdir(exist_ok=True)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import write_atomic
+from vap_core.base.files import write_atomic, writing
 from vap_core.base.tables import Rows, align, markdown
 from vap_core.base.version import code_version
 
@@ -71,13 +71,9 @@ def _cores() -> str:
 def write(measurement: Measurement, path: Path) -> None:
     """Raises: BadOutput."""
     text = json.dumps(asdict(measurement), indent=1) + "\n"
-    try:
+    with writing(path, "bench", "give --json another name"):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, text.encode())
-    except OSError as error:
-        raise BadOutput(
-            f"bench: {path} cannot be written ({error.strerror}); give --json another name."
-        ) from error
 
 
 def read(path: Path) -> Measurement:

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from vap_core.base.errors import BadOutput, BadPhoto, BadPhotoSet
-from vap_core.base.files import write_atomic
+from vap_core.base.files import write_atomic, writing
 from vap_core.base.photos import load_mask, load_photo, photos_in
 from vap_core.base.types import Boxes, Mask, Rgb, value
 from vap_core.evaluation.photos.folder import (
@@ -256,14 +256,10 @@ def _pictures_of(scenes: Path) -> list[Path]:
 
 
 def _copy(photos: Sequence[Path], folder: Path) -> None:
-    try:
+    with writing(folder, "paste-photos", "choose another folder"):
         folder.mkdir(parents=True, exist_ok=True)
         for photo in photos:
             shutil.copyfile(photo, folder / photo.name)
-    except OSError as error:
-        raise BadOutput(
-            f"paste-photos: {folder} cannot be written ({error.strerror}); choose another folder."
-        ) from error
 
 
 def _cover(rgb: Rgb, asked: Pasting) -> Rgb:

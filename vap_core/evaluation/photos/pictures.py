@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from vap_core.base.errors import BadOutput
+from vap_core.base.files import writing
 from vap_core.base.types import Rgb
 
 if TYPE_CHECKING:
@@ -90,10 +90,6 @@ def write_picture(path: Path, rgb: Rgb) -> None:
     """Raises: BadOutput."""
     from PIL import Image
 
-    try:
+    with writing(path, "write_picture", "choose another folder"):
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(rgb).save(path)
-    except OSError as error:
-        raise BadOutput(
-            f"write_picture: {path} cannot be written ({error.strerror}); choose another folder."
-        ) from error

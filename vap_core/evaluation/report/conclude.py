@@ -5,9 +5,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vap_core.base.errors import BadOutput
 from vap_core.base.figures import write_png
-from vap_core.base.files import write_atomic
+from vap_core.base.files import write_atomic, writing
 from vap_core.base.tables import align
 from vap_core.evaluation.metrics import Score, rate, score, step_times
 from vap_core.evaluation.report.pictures import forest_figure, scores_table
@@ -29,14 +28,9 @@ def conclude(study: "Study", table: "pd.DataFrame", folder: Path) -> str:
     lines = []
     for each in scores:
         lines.append({**each.to_json(), "seed": study.seed, "seeds": study.seeds})
-    try:
+    with writing(folder, "conclude"):
         write_atomic(summary, json.dumps(lines, indent=1).encode())
         write_png(forest_figure(scores_table(scores)), figure)
-    except OSError as error:
-        raise BadOutput(
-            f"conclude: {folder} cannot be written ({error.strerror}); make room and run the same "
-            "command again."
-        ) from error
     text = [
         results_table(scores),
         *_totals(scores),

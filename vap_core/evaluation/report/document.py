@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vap_core.base.errors import BadOutput
 from vap_core.base.figures import write_png
-from vap_core.base.files import write_atomic
+from vap_core.base.files import write_atomic, writing
 from vap_core.base.tables import latex
 from vap_core.evaluation.metrics import RATES
 from vap_core.evaluation.readings import readings_of_lists
@@ -118,7 +117,7 @@ def _rate_columns() -> list[str]:
 
 def _write(out: Path, files: dict[str, str], figures: "dict[str, Figure]") -> None:
     """Write a report, and remove the comparisons of an earlier one that this one has not."""
-    try:
+    with writing(out, "report", "choose another folder with --out"):
         out.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
             write_atomic(out / name, content.encode())
@@ -127,7 +126,3 @@ def _write(out: Path, files: dict[str, str], figures: "dict[str, Figure]") -> No
         for name in COMPARISON_FILES:
             if name not in files and name not in figures:
                 (out / name).unlink(missing_ok=True)
-    except OSError as error:
-        raise BadOutput(
-            f"report: {out} cannot be written ({error.strerror}); choose another folder with --out."
-        ) from error

@@ -28,7 +28,7 @@ from jaxtyping import Float32, UInt8
 from PIL import Image
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import parse_json, read_file, write_atomic
+from vap_core.base.files import parse_json, read_file, write_atomic, writing
 from vap_core.base.version import code_version
 from vap_core.evaluation.processes import results
 from vap_core.evaluation.store import locked, open_run
@@ -253,19 +253,18 @@ def _write_part(known: Suite, seed: int, numbers: Sequence[int], cache: Path, fo
     scratch = folder.with_name(f".{folder.name}")
     shutil.rmtree(scratch, ignore_errors=True)
     try:
-        scratch.parent.mkdir(parents=True, exist_ok=True)
-        with _quiet():
-            episodes = _write_stages(
-                known=known, seed=seed, numbers=numbers, cache=cache, folder=scratch
-            )
-            if episodes:
-                for _ in _films(known, scratch, episodes):
-                    pass
-        (scratch / ABOUT).parent.mkdir(parents=True, exist_ok=True)
-        (scratch / ABOUT).write_text(json.dumps(episodes))
-        os.replace(scratch, folder)
-    except OSError as error:
-        raise _cannot_write(folder, error) from error
+        with writing(folder, "demonstrations"):
+            scratch.parent.mkdir(parents=True, exist_ok=True)
+            with _quiet():
+                episodes = _write_stages(
+                    known=known, seed=seed, numbers=numbers, cache=cache, folder=scratch
+                )
+                if episodes:
+                    for _ in _films(known, scratch, episodes):
+                        pass
+            (scratch / ABOUT).parent.mkdir(parents=True, exist_ok=True)
+            (scratch / ABOUT).write_text(json.dumps(episodes))
+            os.replace(scratch, folder)
     except ValueError as error:
         raise BadOutput(
             f"demonstrations: {folder} was not written as it was filmed ({_line(error)}); "
@@ -374,7 +373,7 @@ def _join(known: Suite, recipe: dict[str, Any], folders: Sequence[Path], out: Pa
     for name in ("data", "videos", ".whole"):
         shutil.rmtree(out / name, ignore_errors=True)
     whole = out / ".whole"
-    try:
+    with writing(out, "demonstrations"):
         with _quiet():
             aggregate_datasets(
                 repo_ids=[f"vap/{known.name}"] * len(full),
@@ -386,8 +385,6 @@ def _join(known: Suite, recipe: dict[str, Any], folders: Sequence[Path], out: Pa
         for name in ("data", "videos", "meta"):
             os.replace(whole / name, out / name)
         shutil.rmtree(whole)
-    except OSError as error:
-        raise _cannot_write(out, error) from error
 
 
 def _write_card(recipe: dict[str, Any], episodes: Sequence[dict[str, Any]], path: Path) -> None:
@@ -442,13 +439,6 @@ def _films(
 
 def _line(error: Exception) -> str:
     return f"{type(error).__name__}: {error}".strip().splitlines()[0]
-
-
-def _cannot_write(folder: Path, error: OSError) -> BadOutput:
-    return BadOutput(
-        f"demonstrations: {folder} cannot be written ({error}); "
-        "make room and run the same command again."
-    )
 
 
 def _table(folder: Path, kind: str) -> "pa.Table":

@@ -19,7 +19,7 @@ import torch
 from torch import nn
 from tqdm import tqdm
 
-from vap_core.base.files import kept_folder
+from vap_core.base.files import kept_folder, make_folder
 from vap_core.evaluation.processes import results
 from vap_core.perception.embedded.export import export_graphs, require_onnx
 from vap_core.perception.embedded.weights import PERCEPTION, save_weights
@@ -43,25 +43,35 @@ def train(
     resume: bool = True,
     cache: Path = CACHE,
     jobs: int | None = None,
-) -> dict[str, Any]:
+) -> dict[str, Any] | None:
     """Train the heads on about `scenes` rendered views; returns the manifest's entry.
 
     Writes `out`/perception.safetensors, the networks' graphs, and their manifest entries. `minutes`
-    stops training after the epoch that runs then; `resume` off forgets earlier epochs but keeps the
-    rendered stages. `jobs` processes (all cores) render.
+    stops training after the epoch that runs then: where that is not the last, nothing is written or
+    returned, and the same call goes on. `resume` off forgets earlier epochs but keeps the rendered
+    stages. `jobs` processes (all cores) render.
 
-    Raises: MissingWeights: `onnx`, which writes the graphs, is not installed.
+    Raises: MissingWeights: `onnx`, which writes the graphs, is not installed; BadOutput: `out`
+        cannot be written.
     """
     from vap_core.training.perception.evaluation import evaluate
 
     require_onnx()
+    make_folder(out, "train perception")
     started = time.monotonic()
+    trained: dict[str, int] = {}
 
     def expired() -> bool:
         return minutes is not None and time.monotonic() - started > 60 * minutes
 
     def run(name: str, rate: float, decay: float) -> Run:
         state, save = checkpoint(cache / f"{name}-{seed}-{n}.pt", resume)
+        trained[name] = state.get("epoch", 0)
+
+        def keep(state: dict[str, Any]) -> None:
+            save(state)
+            trained[name] = state["epoch"]
+
         return Run(
             name=name,
             seed=seed,
@@ -69,7 +79,7 @@ def train(
             rate=rate,
             decay=decay,
             state=state,
-            save=save,
+            save=keep,
             expired=expired,
         )
 
@@ -80,6 +90,8 @@ def train(
     detect = detector.fit_detector(views, categories, run("detector", 2e-3, 1e-3))
     look = instance_head.fit_instance_head(crops, run("looks", 2e-3, 1e-2))
     segment = segmenter.fit_segmenter(stages, CROPS_PER_EPOCH, run("segmenter", 2e-3, 1e-4))
+    if trained != EPOCHS:
+        return None
     n_held_out = min(HELD_OUT_STAGES, max(1, n // 10))
     unseen = prepare(cache, seed, n_held_out, held_out=True, jobs=jobs)
     about = _describe_training(scenes, seed, stages)

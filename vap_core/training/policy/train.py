@@ -22,7 +22,7 @@ from torch import Tensor
 
 from vap_core.base.device import device_name
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import parse_json, sha256_of, write_atomic
+from vap_core.base.files import make_folder, parse_json, sha256_of, write_atomic
 from vap_core.base.version import code_version
 from vap_core.policies.lerobot.checkpoints import CAPTIONS, TRAINING_CARD, WORDS
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
@@ -147,10 +147,14 @@ def train(
     The steps run on `device` (`base.device`); `jobs` processes, None: one a core, film, photograph,
     teach the words and draw the batches.
 
-    Raises: BadOutput when `out` holds another training; BadPolicy for a start that is no mini-pi0,
-        or one of other cameras or sizes, or of another mini-PaliGemma; UnknownName: no such device.
+    Raises: BadOutput when `out` holds another training, or it or `cache` cannot be written;
+        BadPolicy for a start that is no mini-pi0, or one of other cameras or sizes, or of another
+        mini-PaliGemma; UnknownName: no such device.
     """
     place = torch.device(device_name(device))
+    make_folder(out, "train policy")
+    if demonstrations is None:
+        make_folder(cache, "train policy", "choose another folder with --cache")
     jobs = jobs or os.cpu_count() or 1
     films = load_films(recipe, cache, demonstrations, jobs)
     if not films.train:

@@ -22,7 +22,7 @@ from jaxtyping import UInt8
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
-from vap_core.base.files import parse_json, write_atomic
+from vap_core.base.files import make_folder, parse_json, write_atomic
 from vap_core.base.types import Description, Rgb, value
 from vap_core.evaluation.processes import results
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
@@ -192,7 +192,11 @@ def train(
 
     Writes the model to `out`, and what was measured on unseen objects and the cost, which it
     returns.
+
+    Raises: BadOutput when `out` holds another training, or it or `cache` cannot be written.
     """
+    make_folder(out, "train vlm")
+    make_folder(cache, "train vlm", "choose another folder with --cache")
     pool, scenes_s = views(recipe.stages, recipe.seed, cache, jobs=jobs)
     n_held_out = min(HELD_OUT, recipe.stages)
     held_out, more_s = views(n_held_out, recipe.seed, cache, held_out=True, jobs=jobs)

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from vap_core.base.errors import BadOutput
+from vap_core.base.files import writing
 from vap_core.base.types import Rgb, value
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.scans.closed_parts import (
@@ -53,7 +53,7 @@ def write_designs(folder: Path, count: int, seed: int) -> list[Path]:
     """
     lines = ["file,category,height_cm,groups"]
     paths = []
-    try:
+    with writing(folder, "designs", "choose another folder"):
         folder.mkdir(parents=True, exist_ok=True)
         for i in range(count):
             design = draw_design(i, seed)
@@ -62,10 +62,6 @@ def write_designs(folder: Path, count: int, seed: int) -> list[Path]:
             paths.append(path)
             lines.append(f"{path.name},{design.category},,{';'.join(design.groups)}")
         (folder / TABLE).write_text("\n".join(lines) + "\n")
-    except OSError as error:
-        raise BadOutput(
-            f"designs: {folder} cannot be written ({error.strerror}); choose another folder."
-        ) from error
     return paths
 
 
