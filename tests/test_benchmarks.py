@@ -172,6 +172,19 @@ def test_chance_does_not_solve_it(bench):
     assert episode.outcome.steps == bench.task.max_steps
 
 
+def test_chance_closes_the_gripper_as_often_as_it_opens_it(bench):
+    env = bench.env()
+    env.reset(bench.rows[0])
+    chance = Random()
+    states = [chance.start(np.random.default_rng(0))]
+    opening = []
+    for _ in range(2000):
+        states, (chunk,) = chance.plan_from_simulation(states, [env])
+        opening.append(chunk[0, -1])
+    assert np.mean(opening) == pytest.approx(0.5, abs=0.05)
+    assert np.mean(np.array(opening) < 0.2) > 0.3
+
+
 def test_an_action_of_the_wrong_length_is_refused(bench):
     env = bench.env()
     env.reset(bench.rows[0])

@@ -454,6 +454,15 @@ def test_the_best_proposal_counts_at_the_opening(xyxy, best):
     assert found.proposal == pytest.approx(best)
 
 
+def test_a_method_that_finds_nothing_first_has_no_proposal():
+    without = replace(attended(SQUARE, []), groundings={})
+    (found,) = mask_coverage(without, seen_by({TARGET: SQUARE}), TARGET, opening=True)
+    assert found.object == TARGET
+    assert np.isnan(found.proposal)
+    nothing = replace(without, tracks={"front": ()})
+    assert mask_coverage(nothing, seen_by({TARGET: SQUARE}), TARGET, opening=True) == ()
+
+
 def test_a_mask_belongs_to_what_most_of_it_covers():
     half = SQUARE | np.roll(SQUARE, 4, axis=0)
     assert covered_object(half, {TARGET: SQUARE, OTHER: BESIDE}) == TARGET

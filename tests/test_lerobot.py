@@ -24,7 +24,7 @@ from vap_core.policies.lerobot.checkpoints import (
 )
 from vap_core.policies.lerobot.loading import compare
 from vap_core.policies.lerobot.toy_pi0 import toy_sizes
-from vap_core.policies.names import SHIPPED, checkpoint_of
+from vap_core.policies.names import SHIPPED, checkpoint_of, label_of
 from vap_core.policies.protocol import Policy, PolicyInput
 from vap_core.rollout import audit
 from vap_core.rollout.loop import Trial, rollout
@@ -51,6 +51,13 @@ def folders(tmp_path_factory):
 def policies(folders):
     with toy_sizes(tiny.TOY):
         return {name: load_policy(folder) for name, folder in folders.items()}
+
+
+def test_a_checkpoint_is_called_by_its_folder_from_inside_it_too(folders, monkeypatch):
+    outside = label_of(folders["act"])
+    assert checkpoint_of(outside) == "act"
+    monkeypatch.chdir(folders["act"])
+    assert label_of(".") == outside
 
 
 def test_a_policy_without_a_temperature_is_given_none(folders):

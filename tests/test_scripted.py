@@ -67,6 +67,8 @@ def look(rgb: Rgb, text: str) -> PolicyInput:
         ("put my straw cup in the basket", "put", None, "straw cup", "basket"),
         ("put the red pouch into the plastic bowl", "put", "red", "pouch", "plastic bowl"),
         ("move the red bottle near coke can", "near", "red", "bottle", "coke can"),
+        ("put my pouch near the blue vase", "near", None, "pouch", "vase"),
+        ("put my cup on the blue plate", "put", None, "cup", "plate"),
         ("select my leather bag", "touch", None, "leather bag", ""),
     ],
 )

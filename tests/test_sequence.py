@@ -213,6 +213,48 @@ def test_the_first_step_that_failed_is_diagnosed(episode):
     assert "sub-goal 2 % of failures" in breakdown_rows(counts)[0]
 
 
+class Stateless(Grounding):
+    """Keeps nothing, and looks at the truth only when it begins."""
+
+    needs_truth = "start"
+    calls = ""
+
+    def start(self, observation, context):
+        self.calls += "S" if context.truth else "s"
+        return None, unchanged(observation.images, "")
+
+    def steps(self, states, observations, contexts):
+        self.calls += "T" if contexts[0].truth else "t"
+        return [(None, unchanged(seen.images, "")) for seen in observations]
+
+
+def test_a_prompter_without_a_state_begins_once_a_sub_goal():
+    row = lists.read("shared-sequence-bridge")[0]
+    first, second = row.subgoals
+    short = replace(row, subgoals=(replace(first, max_steps=2), replace(second, max_steps=3)))
+    prompter = Stateless()
+    with build_scene(row.suite, [place.model for place in row.placements]) as scene:
+        rollout_of = rollout(Trial("generic", scene, Expert(), prompter, images_every=1), [short])
+        assert len(list(rollout_of)) == 1
+    assert prompter.calls == "St" + "Sttt"
+
+
+def test_an_error_on_the_way_home_leaves_the_sub_goals_that_ended(monkeypatch):
+    row = lists.read("shared-sequence-bridge")[0]
+    short = replace(row, subgoals=(replace(row.subgoals[0], max_steps=2), row.subgoals[1]))
+
+    def fails(*_):
+        raise OSError("the arm is stuck")
+
+    with build_scene(row.suite, [place.model for place in row.placements]) as scene:
+        monkeypatch.setattr(homing, "advance", fails)
+        (done,) = rollout(Trial("generic", scene, Expert(), generic()), [short])
+    assert (done.outcome.status, done.outcome.success) == ("error", False)
+    assert "the arm is stuck" in done.outcome.detail
+    assert [each.status for each in done.outcome.subgoals] == ["failure"]
+    assert done.outcome.steps >= 2
+
+
 def test_a_step_out_of_time_is_followed_by_the_next():
     row = lists.read("shared-sequence-bridge")[0]
     short = replace(row, subgoals=(replace(row.subgoals[0], max_steps=2), row.subgoals[1]))

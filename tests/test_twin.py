@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from lerobot.robots.utils import make_robot_from_config
 from lerobot.teleoperators.utils import make_teleoperator_from_config
 
 from tests.test_lerobot_plugin import PLUGIN, ROOT, site
-from vap_core.base.errors import BadStudy, UnknownName
+from vap_core.base.errors import BadAction, BadStudy, UnknownName
 from vap_core.policies.lerobot.config_twin import VapExpertConfig, VapSo101TwinConfig
 from vap_core.policies.lerobot.datasets import open_dataset
 from vap_core.policies.lerobot.twin import VapSo101Twin
@@ -68,6 +69,11 @@ def test_a_far_goal_is_cut_to_the_joints_speed_and_what_was_sent_is_told(twin) -
     assert 0 < sent["shoulder_pan.pos"] - here < most + 2
 
 
+def test_a_position_that_is_no_number_is_not_taken_for_one_that_is_not_named(twin) -> None:
+    with pytest.raises(BadAction, match="finite"):
+        twin.send_action({"shoulder_pan.pos": float("nan")})
+
+
 def test_the_expert_leads_it_to_success(twin: VapSo101Twin, tmp_path: Path) -> None:
     leader = make_teleoperator_from_config(VapExpertConfig(calibration_dir=tmp_path))
     leader.connect()
@@ -80,12 +86,20 @@ def test_the_expert_leads_it_to_success(twin: VapSo101Twin, tmp_path: Path) -> N
     leader.disconnect()
 
 
-def test_what_it_cannot_be_is_refused(tmp_path: Path) -> None:
+def test_what_it_cannot_be_is_refused(tmp_path: Path, monkeypatch) -> None:
+    find = suites.suite
+
     def made(**options) -> VapSo101Twin:
         return VapSo101Twin(VapSo101TwinConfig(calibration_dir=tmp_path, **options))
 
-    with pytest.raises(UnknownName, match=r"vlabench has a panda; take a task of tabletop"):
+    with pytest.raises(UnknownName, match=r"vlabench has a panda under joint control; take a task"):
         made(task="vlabench/select-shoe")
+    with pytest.raises(BadStudy, match=r"have sub-goals, and the outcome here is of one"):
+        made(task="shared-sequence/put-plant-scrubber")
+    monkeypatch.setattr(suites, "suite", lambda name: replace(find(name), control="ee"))
+    with pytest.raises(UnknownName, match=r'so101 under ee control; .* and control="joint"'):
+        made()
+    monkeypatch.undo()
     with pytest.raises(BadStudy, match=r"no episode 20; tabletop/select-cup has 0 \.\. 19"):
         made(episode=20)
     with pytest.raises(ConnectionError, match="call connect first"):

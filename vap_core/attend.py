@@ -275,7 +275,7 @@ class Attender:
         return state, self._prompt(state, views, tracks, others, events)
 
     def step(self, state: AttendState, views: Views) -> tuple[AttendState, Attended]:
-        """Track every target and prompt the new images (t > 0). Consumes `state`.
+        """Track every target and prompt the new images (t > 0).
 
         Raises:
             BadViews: `views` are not of the cameras that the episode started with, or a view has

@@ -81,7 +81,8 @@ class Segmenter(Protocol):
 class Tracker(Protocol):
     """Follows every identity of each view (P 3.3).
 
-    State is argument and result, and may be consumed.
+    State is argument and result. A step leaves the states that it is given as they are: where one
+    episode fails, those of the others are stepped again.
     """
 
     def start(

@@ -39,7 +39,9 @@ def label_of(checkpoint: str | Path, temperature: float | None = None) -> str:
     )
 
     folder = locate(checkpoint)
-    name = str(checkpoint) if local_folder(checkpoint) is None else folder.name
+    name = str(checkpoint)
+    if local_folder(checkpoint) is not None:
+        name = folder.name or folder.resolve().name  # "." has none
     label = policy_label(config_field(folder, "type"), name, fingerprint(folder))
     return label if temperature is None else f"{label}{TEMPERATURE}{temperature:g}"
 

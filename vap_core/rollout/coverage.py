@@ -21,10 +21,12 @@ def mask_coverage(
 ) -> tuple[MaskCoverage, ...]:
     """Every view's prompt for the first target of the instruction; `truth` has masks.
 
-    `opening`: t = 0, when proposals count too.
+    `opening`: t = 0, when proposals count too, of a method that grounds.
     """
     found = []
     for camera, tracks in attended.tracks.items():
+        if not tracks:
+            continue
         mask = tracks[0].mask
         masks = truth.masks[camera]
         true = masks.get(target)
@@ -33,8 +35,9 @@ def mask_coverage(
         if mask is not None and true is not None and mask.any():
             overlap = mask_iou(mask, true)
         proposal = float("nan")
-        if opening and true is not None and pixels:
-            proposal = best_proposal(attended.groundings[camera][0], true)
+        groundings = attended.groundings.get(camera, ())
+        if opening and groundings and true is not None and pixels:
+            proposal = best_proposal(groundings[0], true)
         coverage = MaskCoverage(
             camera=camera,
             object=covered_object(mask, masks),

@@ -174,7 +174,7 @@ def _observe_and_prompt(
     following = []
     for episode in live:
         observation = observations.get(id(episode))
-        if episode.prompter_state is not None and observation is not None and observation.images:
+        if episode.prompting and observation is not None and observation.images:
             following.append(episode)
     prompted = _prompt_batch(trial, following, observations)
 
@@ -229,6 +229,7 @@ def _start_prompting(trial: Trial, episode: RunningEpisode, observation: Observa
     with _timed(episode.seconds, "attend"):
         state, attended = trial.prompter.start(observation, context)
     episode.prompter_state = state
+    episode.prompting = True
     return attended
 
 
@@ -279,10 +280,9 @@ def _call_prompter(
 
 def _context(trial: Trial, episode: RunningEpisode) -> PromptContext:
     """What the prompter may know; ground truth only if it declares that it needs it now."""
-    started = episode.prompter_state is not None
     needs = trial.prompter.needs_truth
     truth = None
-    if needs == "always" or (needs == "start" and not started):
+    if needs == "always" or (needs == "start" and not episode.prompting):
         masks = episode.env.truth(masks=True).masks
         judge = episode.judge
         truth = SceneTruth(episode.goal, masks, step=judge.steps, moved=judge.moved)

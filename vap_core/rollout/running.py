@@ -62,6 +62,8 @@ class RunningEpisode:
     notes: list[Event] = field(default_factory=list)
     """Events of this step that neither judge nor prompter gives."""
     policy_state: Any = None
+    prompting: bool = False
+    """Whether the prompter has begun, with a state that may be anything."""
     prompter_state: Any = None
     header: EpisodeHeader | None = None
     sink: Sink | None = None

@@ -5,6 +5,7 @@ and the next sub-goal starts as an episode does: grounded on the scene as it is 
 that begins anew and a judge that measures from here.
 """
 
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -33,7 +34,7 @@ def next_subgoal(episode: RunningEpisode, policy: AnyPolicy) -> None:
         text = f"sub-goal {episode.stage + 1} of {episode.row.stages} ends: {ended.status}"
         episode.notes.append(Event(step, "INFO" if ended.success else "WARN", text))
         episode.homing = homing.begin(episode.env)
-        episode.prompter_state = None
+        episode.prompting = False
     else:
         episode.homing = homing.advance(episode.homing, episode.env)
     episode.queue.clear()
@@ -71,7 +72,8 @@ def ending(
     last = episode.judge.outcome(status, detail)
     if not episode.row.subgoals:
         return last
-    outcomes = [*episode.ended, last]
-    if episode.homing is not None and status is None:
-        outcomes = episode.ended
-    return of_subgoals(outcomes, episode.row.stages, episode.judge.steps)
+    if episode.homing is None:
+        return of_subgoals([*episode.ended, last], episode.row.stages, episode.judge.steps)
+    # On the way home no sub-goal is under way: those that ended stay as they are.
+    whole = of_subgoals(episode.ended, episode.row.stages, episode.judge.steps)
+    return replace(whole, status=last.status, success=False, detail=last.detail)

@@ -167,10 +167,13 @@ class Copy:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if error is None:
-            self._dataset.finalize()
-            self._stage.rename(self.out)
-        else:
+        try:
+            if error is None:
+                self._dataset.finalize()
+                self._stage.rename(self.out)
+        except OSError as full:
+            raise _unwritable(self.out, full) from full
+        finally:
             shutil.rmtree(self._stage, ignore_errors=True)
 
     def add(

@@ -124,11 +124,11 @@ class VapSo101Twin(Robot):
         """
         env = self.env
         command = env.command
-        goals = [float(action.get(f"{joint}.pos", np.nan)) for joint in self._joints]
-        held = [*np.rad2deg(command.joints).tolist(), OPEN * command.gripper]
-        for i, goal in enumerate(goals):
-            if np.isnan(goal):  # a joint that is not named holds its place
-                goals[i] = held[i]
+        # A joint that is not named holds its place.
+        goals = [*np.rad2deg(command.joints).tolist(), OPEN * command.gripper]
+        for i, joint in enumerate(self._joints):
+            if f"{joint}.pos" in action:
+                goals[i] = float(action[f"{joint}.pos"])
         moves = np.deg2rad(goals[:-1]) - command.joints
         gripper = float(np.clip(goals[-1] / OPEN, 0.0, 1.0))
         env.step(np.array([*moves, gripper], np.float32))
@@ -237,14 +237,20 @@ def _row(config: VapSo101TwinConfig) -> EpisodeRow:
     """The row of the configured episode. Raises: UnknownName, BadStudy."""
     suite_name, _, task = config.task.partition("/")
     suite = suites.suite(suite_name)
-    if suite.robot != ROBOT:
+    if suite.robot != ROBOT or suite.control != "joint":
         raise UnknownName(
-            f"vap_so101_twin: {suite_name} has a {suite.robot}; take a task of tabletop, or of a "
-            "suite of your own with an SO-101."
+            f"vap_so101_twin: {suite_name} has a {suite.robot} under {suite.control} control; take "
+            'a task of tabletop, or of a suite of your own with an SO-101 and control="joint".'
         )
     rows = suites.listed(suite_name, task, own_target=config.object)
     if config.episode not in range(len(rows)):
         raise BadStudy(
             f"vap_so101_twin: no episode {config.episode}; {config.task} has 0 .. {len(rows) - 1}."
         )
-    return rows[config.episode]
+    row = rows[config.episode]
+    if row.subgoals:
+        raise BadStudy(
+            f"vap_so101_twin: episodes of {config.task} have sub-goals, and the outcome here is of "
+            "one; run them by: python -m vap_core eval"
+        )
+    return row

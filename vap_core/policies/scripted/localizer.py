@@ -194,8 +194,11 @@ def coloured(rgb: Rgb, boxes: Boxes, colour: Colour) -> Float64[np.ndarray, " n"
 
 
 def _target_span(text: str) -> re.Match[str] | None:
-    """The first span that names a colour, else the first one."""
+    """The first span that names a colour, else the first one; of those before a place, if any."""
     spans = list(SPAN.finditer(text))
+    place = PLACE.search(text)
+    if place and spans and spans[0].start() < place.start():
+        spans = [span for span in spans if span.start() < place.start()]
     for span in spans:
         if span["colour"]:
             return span

@@ -22,7 +22,7 @@ JOINT_RAD_S = 0.6
 
 @value
 class RandomState:
-    """The episode's own stream, and the last action."""
+    """The episode's own stream, and the last draw, whose mean is zero."""
 
     rng: np.random.Generator
     last: Float32[np.ndarray, " a"]
@@ -44,22 +44,26 @@ class Random:
         chunks = []
         for state, env in zip(states, envs, strict=True):
             rng = copy.deepcopy(state.rng)
-            action = _draw_action(rng, state.last, env)
-            next_states.append(RandomState(rng, action))
-            chunks.append(action[None])
+            drawn = _draw(rng, state.last, env)
+            next_states.append(RandomState(rng, drawn))
+            chunks.append(_action(drawn)[None])
         return next_states, chunks
 
 
-def _draw_action(
+def _draw(
     rng: np.random.Generator, last: Float32[np.ndarray, " before"], env: Env
 ) -> Float32[np.ndarray, " a"]:
-    """The next action: a share of the last one and fresh noise."""
+    """The next draw: a share of the last one and fresh noise."""
     if not len(last):
         last = np.zeros(env.action_size, np.float32)
     fresh = rng.standard_normal(env.action_size) * _scales(env)
-    action = KEEP * last + np.sqrt(1 - KEEP**2) * fresh
-    gripper = np.clip(0.5 + action[-1], 0.0, 1.0)
-    return np.array([*action[:-1], gripper], np.float32)
+    return (KEEP * last + np.sqrt(1 - KEEP**2) * fresh).astype(np.float32)
+
+
+def _action(drawn: Float32[np.ndarray, " a"]) -> Float32[np.ndarray, " a"]:
+    """The action of a draw; the gripper is as often nearly closed as nearly open."""
+    gripper = np.clip(0.5 + drawn[-1], 0.0, 1.0)
+    return np.array([*drawn[:-1], gripper], np.float32)
 
 
 def _scales(env: Env) -> Float64[np.ndarray, " a"]:

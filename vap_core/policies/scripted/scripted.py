@@ -117,7 +117,8 @@ class Scripted:
         camera = self.localizer.camera.name
         for i, (state, policy_input) in enumerate(zip(states, inputs, strict=True)):
             report_input(i, TEXT, policy_input.text)
-            if state.phase in LOCALIZING:
+            looks_for_goal = state.spot is None and bool(read(policy_input.text).goal)
+            if state.phase in LOCALIZING or looks_for_goal:
                 report_input(i, camera, policy_input.images[camera])
         next_states = []
         chunks = []
