@@ -161,6 +161,9 @@ def test_kept_thresholds_hold_for_their_encoder(tmp_path):
 def test_keep_is_for_stacks_that_ship_none(tmp_path, monkeypatch):
     with pytest.raises(BadOutput, match="leave --keep out"):
         run.refuse_keep("embedded")
+    with pytest.raises(BadOutput, match="embedded:tracker=edgetam ships its thresholds"):
+        run.refuse_keep("embedded:tracker=edgetam")
+    run.refuse_keep("embedded:encoder=dinov2-small")
     run.refuse_keep("foundation")
     run.refuse_keep("embedded", [tmp_path])
     monkeypatch.setattr(run, "load_stack", lambda name: TOY)

@@ -92,6 +92,24 @@ def test_a_clip_without_the_object_says_so(bank, tmp_path):
     assert len(list(video.frames(tmp_path / "clip.mp4"))) == 3
 
 
+def test_while_the_first_target_is_not_in_view_no_other_is_tinted(bank, tmp_path, monkeypatch):
+    def bowls(images, phrase, threshold=None):
+        found = detector(images, phrase)
+        nothing = Boxes(np.zeros((0, 4), np.float32), np.zeros(0, np.float32), phrase)
+        return found if phrase == "bowl" else [nothing] * len(images)
+
+    stack = Stack("toy", bowls, MeanColour(), segmenter, SameColour())
+    monkeypatch.setitem(stacks.STACKS, "toy", lambda: stack)
+    save(bank, remember("dish", "bowl", [scene([(26, 26, GREEN)])], MeanColour()))
+    clip = frames(tmp_path / "clip", [[(26, 26, GREEN)]] * 2)
+    words = ("ground", clip, "put my cup near my bowl", "--stack", "toy", "--memory", bank)
+    done = vap(*words, "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    for shown in video.frames(tmp_path / "clip.mp4"):
+        changed = np.abs(shown.astype(int) - scene([(26, 26, GREEN)])).mean(axis=2) > 60
+        assert changed.mean() < 0.02
+
+
 def test_always_tint_reaches_a_clip(bank, tmp_path, monkeypatch):
     asked = []
 

@@ -302,3 +302,22 @@ def test_every_colour_mode_becomes_rgb(tmp_path: Path, mode: str) -> None:
     path = tmp_path / ("a.jpg" if mode == "CMYK" else "a.png")
     Image.new(mode, (8, 6)).save(path)
     assert load_photo(path).shape == (6, 8, 3)
+
+
+def test_grey_stands_where_a_photo_is_transparent(tmp_path: Path) -> None:
+    erased = Image.new("RGBA", (4, 2), (10, 200, 30, 0))
+    erased.putpixel((0, 0), (10, 200, 30, 255))
+    erased.save(tmp_path / "cutout.png")
+    rgb = load_photo(tmp_path / "cutout.png")
+    assert rgb[0, 0].tolist() == [10, 200, 30]
+    assert rgb[1, 3].tolist() == [127, 127, 127]
+    indexed = Image.new("P", (4, 2))
+    indexed.putpalette([10, 200, 30])
+    indexed.save(tmp_path / "indexed.png", transparency=0)
+    assert load_photo(tmp_path / "indexed.png")[0, 0].tolist() == [127, 127, 127]
+
+
+def test_what_macos_writes_beside_a_memory_file_is_no_object(tmp_path: Path) -> None:
+    save(tmp_path, personal("mug", "cup", (200, 30, 30)))
+    (tmp_path / "._mug.object.safetensors").write_bytes(b"Mac OS X")
+    assert list(load_bank(tmp_path)) == ["mug"]

@@ -282,9 +282,14 @@ def load(path: Path | str, encoder: str | None = None) -> PersonalObject:
 
 
 def load_bank(bank: Path | str, encoder: str | None = None) -> dict[str, PersonalObject]:
-    """Every object of a bank by name; a bank that does not exist yet is empty."""
+    """Every object of a bank by name; a bank that does not exist yet is empty.
+
+    Hidden files, such as the `._NAME` that macOS writes beside its files, are left out.
+    """
     objects = {}
     for path in sorted(Path(bank).glob(f"*{SUFFIX}")):
+        if path.name.startswith("."):
+            continue
         obj = load(path, encoder)
         objects[obj.name] = obj
     return objects

@@ -119,7 +119,9 @@ def _follow(
             state, attended = _attend(attender, state, rgb, instruction, number, objects)
             track, prompted = Track(None, 0.0), rgb
             if attended is not None:
-                track, prompted = attended.tracks[CAMERA][0], attended.images[CAMERA]
+                track = attended.tracks[CAMERA][0]
+                if state is not None:
+                    prompted = attended.images[CAMERA]
                 grounding = attended.groundings[CAMERA][0]
                 is_first = grounded is None and state is not None
                 if is_first or number == 0:

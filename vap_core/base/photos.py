@@ -26,10 +26,13 @@ LONG_SIDE = 1024
 BRIGHT = 127
 """Mean of the channels, and opacity, above which a pixel of a mask's picture is the object's."""
 
+BEHIND = 127
+"""The grey behind what is transparent, which is also what encoders see beside an object."""
+
 
 def load_photo(path: Path | str, long_side: int | None = LONG_SIDE) -> Rgb:
     """Read a picture file upright and shrink its longer side to `long_side` pixels (None keeps its
-    size).
+    size). Grey stands where it is transparent.
 
     Raises:
         BadPhoto: missing, empty, not an image, truncated, or more than 50 megapixels.
@@ -67,7 +70,12 @@ def _decode(path: Path | str, mode: str, long_side: int | None = None) -> np.nda
                     f"load_photo: {path} has {image.mode} pixels, more than 8 bits each; save it "
                     "as an 8-bit JPEG or PNG."
                 )
-            upright = ImageOps.exif_transpose(image).convert(mode)
+            upright = ImageOps.exif_transpose(image)
+            if mode == "RGB" and upright.has_transparency_data:
+                # What is hidden in the file is no part of the picture.
+                grey = Image.new("RGBA", upright.size, (BEHIND, BEHIND, BEHIND, 255))
+                upright = Image.alpha_composite(grey, upright.convert("RGBA"))
+            upright = upright.convert(mode)
             if long_side is not None:
                 upright.thumbnail((long_side, long_side))
             return np.array(upright, dtype=np.uint8)

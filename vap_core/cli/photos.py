@@ -113,6 +113,7 @@ def register(
     check_owner(owner, known_as or [], note)
     if object_path(memory, name).exists() and not replace:
         raise taken(object_path(memory, name))
+    known = load_bank(memory)
     paths = registering.gather_photos(photos or [])
     if video is not None:
         paths += registering.film_photos(video, memory / f"{name}.frames", frames)
@@ -129,7 +130,7 @@ def register(
     obj = with_description(obj, load_captioner(models.segmenter, describe))
     obj = dataclasses.replace(obj, owner=owner, known_as=tuple(known_as or []), note=note)
     path = save(memory, obj, replace=replace)
-    trust = leave_one_out(obj, references, load_bank(memory), models.encoder)
+    trust = leave_one_out(obj, references, {**known, name: obj}, models.encoder)
     print(f"{obj.name}: a {obj.category} with {len(obj.crops)} references, saved to {path}")
     print(f"look at the crops: {sheet}")
     print(trust)

@@ -32,7 +32,7 @@ def load_parser(name: str, context: Context, *, fall_back: bool = False) -> Pars
     """
     if name == "rule":
         return rule_parser(context.objects)
-    if not context.objects and name in ("embedding", "chat"):
+    if not context.objects and (name in NAMES or "://" in name):
         raise UnknownName("parser: the memory is empty; register an object first.")
     if name == "embedding":
         from vap_core.instruction.embedding import EmbeddingParser

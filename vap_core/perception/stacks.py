@@ -7,7 +7,7 @@ from typing import Any
 
 from vap_core.base.device import check_device
 from vap_core.base.errors import one_of
-from vap_core.perception.foundation.sources import EMBEDDED, parts_of
+from vap_core.perception.foundation.sources import EMBEDDED, KINDS, parts_of
 from vap_core.perception.foundation.sources import mixed as mixed
 from vap_core.perception.protocols import Stack, Thresholds
 
@@ -75,6 +75,18 @@ def load_own(name: str) -> Stack:
     return replace(stack, thresholds=replace(stack.thresholds, unfamiliar=kept.unfamiliar))
 
 
+def ships_thresholds(name: str) -> bool:
+    """Whether a stack has thresholds without a measurement on this machine.
+
+    They belong to a detector and an encoder together: those of the embedded stack ship. A stack of
+    another name than those of `sources` is the caller's, with its own. Raises: UnknownName.
+    """
+    if ":" not in name and name not in KINDS:
+        return True
+    parts = parts_of(name)
+    return parts["detector"] == parts["encoder"] == EMBEDDED
+
+
 def load_stack(name: str) -> Stack:
     """The stack of that name, or a mixed one (`mixed`); loading its weights takes about a second.
 
@@ -98,18 +110,17 @@ def check_stack(name: str, what: str = "load_stack") -> None:
 def load_mixed(name: str, device: str | None = None) -> Stack:
     """A stack of parts of several; loads those alone that it has.
 
-    A threshold belongs to a detector and an encoder together: there is one where both are the
-    embedded stack's, or where `calibrate --keep` has measured this very mixture.
+    It has thresholds where it `ships_thresholds`, or where `calibrate --keep` has measured this very
+    mixture.
 
     Raises: UnknownName, MissingPart, MissingWeights, BadOutput.
     """
     from vap_core.perception import foundation
 
-    parts = parts_of(name)
-    if not set(parts.values()) - {EMBEDDED}:
+    if set(parts_of(name).values()) == {EMBEDDED}:
         return load_embedded()
     stack = _mixture(name, foundation.load_parts(name, device))
-    if parts["detector"] == parts["encoder"] == EMBEDDED:
+    if ships_thresholds(name):
         return stack
     return replace(stack, thresholds=foundation.kept_thresholds(name, stack.encoder.name))
 

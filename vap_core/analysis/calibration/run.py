@@ -15,11 +15,10 @@ from vap_core.evaluation import store
 from vap_core.evaluation.measurements import read_json_part, write_json_part
 from vap_core.evaluation.photos.run import TABLE, measure_photos
 from vap_core.perception.embedded.weights import weights_sha256
-from vap_core.perception.foundation.sources import KINDS
 from vap_core.perception.foundation.store import store_folder
 from vap_core.perception.kept_thresholds import keep_thresholds
 from vap_core.perception.protocols import Stack
-from vap_core.perception.stacks import load_stack
+from vap_core.perception.stacks import load_stack, ships_thresholds
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -56,11 +55,6 @@ def calibrate(
         write_atomic(out / "report.txt", f"{report}\n".encode())
         write_atomic(out / "answers.csv", table.round(4).to_csv(index=False).encode())
     return f"{report}\n\nwrote {out / 'report.txt'} and {out / 'answers.csv'}", chosen
-
-
-def ships_thresholds(stack_name: str) -> bool:
-    """Whether a stack has thresholds without a measurement on this machine."""
-    return stack_name not in KINDS and ":" not in stack_name
 
 
 def refuse_keep(stack_name: str, photos: Sequence[Path] = ()) -> None:
