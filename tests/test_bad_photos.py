@@ -55,7 +55,9 @@ def test_a_photo_that_cannot_be_used_is_one_line(folder: Path, name: str, messag
     assert not (folder / "bank" / "new.object.safetensors").exists()
 
 
-def test_a_damaged_neighbour_is_named_before_anything_is_saved(folder: Path, tmp_path: Path) -> None:
+def test_a_damaged_neighbour_is_named_before_anything_is_saved(
+    folder: Path, tmp_path: Path
+) -> None:
     (tmp_path / "old.object.safetensors").write_bytes(b"damaged")
     words = ("--category", "cup", "--whole", "--memory", tmp_path)
     line = refused("register", "new", folder / "good-0.png", *words)

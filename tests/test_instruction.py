@@ -47,6 +47,24 @@ def test_owner_is_kept() -> None:
     assert rewrite(parse("bring my friends' cup"), [RED]) == "bring the red cup"
 
 
+@pytest.mark.parametrize(
+    ("text", "category"),
+    [
+        ("put my hat near Anna's cup", "hat"),
+        ("bring my phone and Anna's bag", "phone"),
+        ("bring my hat from Anna's desk", "hat"),
+    ],
+)
+def test_an_owner_ends_before_the_next_phrase(text: str, category: str) -> None:
+    (target,) = parse(text, ["cup", "bag"]).targets
+    assert (target.owner, target.category) == ("my", category)
+
+
+@pytest.mark.parametrize(("word", "category"), [("glasses", "glass"), ("boxes", "box")])
+def test_every_plural_counts(word: str, category: str) -> None:
+    assert parse(f"bring my {word}", [category]).targets[0].category == category
+
+
 def test_several_targets() -> None:
     instruction = parse("put my pouch near my vase")
     assert [t.category for t in instruction.targets] == ["pouch", "vase"]

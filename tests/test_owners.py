@@ -13,10 +13,13 @@ from vap_core.attend import Attender
 from vap_core.base.errors import BadInstruction, BadMemory, BadOutput, UnknownName
 from vap_core.base.types import PersonalObject
 from vap_core.instruction import parse, rewrite
+from vap_core.instruction.context import Context
+from vap_core.instruction.embedding import EmbeddingParser
 from vap_core.instruction.history import FILE, add_uses, read_uses
 from vap_core.instruction.owners import owners_of
 from vap_core.instruction.parsers import Parsing, rule_parser
 from vap_core.memory import load, load_bank, recall, save
+from vap_core.perception.text_encoder import embed_text
 from vap_core.prompt import PALETTE
 
 TEAL = (40, 120, 110)
@@ -39,6 +42,29 @@ HOUSE = {
         cup("pot", category="pot"),
     )
 }
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "rewritten"),
+    [
+        ("bring James' cup", "j", "bring the red cup"),
+        ("bring James's cup", "j", "bring the red cup"),
+        ("Bring Mary Jane's cup", "m", "Bring the red cup"),
+        ("Mary  Jane’s cup, please", "m", "The red cup, please"),
+        ("put Jane's pot on the plate", "p", "put the red pot on the plate"),
+    ],
+)
+def test_every_name_that_can_be_registered_can_be_said(
+    text: str, name: str, rewritten: str
+) -> None:
+    known = (cup("j", "James"), cup("m", "Mary Jane"), cup("p", "jane", category="pot"))
+    bank = {obj.name: obj for obj in known}
+    context = Context(bank)
+    for parser in (rule_parser(bank), EmbeddingParser(context, embed_text)):
+        parsed = parser(text, {"cup", "pot"})
+        (target,) = parsed.targets
+        assert recall(bank, target).name == name
+        assert rewrite(parsed, PALETTE[:1]) == rewritten
 
 
 def meant(text: str, speaker: str) -> str:

@@ -92,6 +92,42 @@ def test_two_targets_of_two_owners() -> None:
     )
 
 
+THINGS = [thing("cup", "james"), thing("bag"), thing("pen"), thing("mug", "mary jane")]
+
+
+@pytest.mark.parametrize(
+    ("text", "names", "rewritten"),
+    [
+        ("bring my bag and my pen", ["bag", "pen"], "bring the red bag and the blue pen"),
+        ("bring my bag & James' cup", ["bag", "cup"], "bring the red bag & the blue cup"),
+        (
+            "put both my pen and Mary Jane's mug into the box",
+            ["pen", "mug"],
+            "put both the red pen and the blue mug into the box",
+        ),
+        (
+            "bring James' cup, my bag and my pen",
+            ["cup", "bag", "pen"],
+            "bring the red cup, the blue bag and the green pen",
+        ),
+        ("bring my pen, my bag is dirty", ["pen"], "bring the red pen, my bag is dirty"),
+        ("bring my bag for my cup and my pen", ["bag"], "bring the red bag"),
+    ],
+)
+def test_a_list_of_objects_is_every_one_of_them(
+    text: str, names: list[str], rewritten: str
+) -> None:
+    parsed = EmbeddingParser(Context({obj.name: obj for obj in THINGS}), embed_text)(text)
+    assert found(parsed) == names
+    assert rewrite(parsed, PALETTE[: len(names)]) == rewritten
+
+
+def test_one_of_a_list_that_nobody_remembers_is_named() -> None:
+    parser = EmbeddingParser(Context({obj.name: obj for obj in THINGS}), embed_text)
+    with pytest.raises(UnknownName, match="'my hat' is remembered"):
+        parser("bring my hat and my bag")
+
+
 @pytest.mark.parametrize(
     ("text", "error", "said"),
     [
@@ -215,6 +251,18 @@ def test_no_object_is_an_abstention() -> None:
         pytest.raises(BadInstruction, match="reader-1 finds no personal object in 'open the door'"),
     ):
         ChatParser(CONTEXT, ChatEndpoint(server.url, "reader-1"))("open the door")
+
+
+def test_an_expression_is_whole_words_and_an_object_is_one_target() -> None:
+    text = "open my cameraman's bag and bring my camera, the grey camera"
+    said = answer(("my camera", "camera"), ("the grey camera", "camera"))
+    with serving(said) as server:
+        parsed = ChatParser(CONTEXT, ChatEndpoint(server.url, "reader-1", "secret"))(text)
+    assert found(parsed) == ["camera"]
+    assert (
+        rewrite(parsed, [RED])
+        == "open my cameraman's bag and bring the red camera, the grey camera"
+    )
 
 
 @pytest.mark.parametrize(

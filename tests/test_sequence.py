@@ -44,6 +44,10 @@ MISSED = Outcome("failure", False, False, 0, False, True, False, 60)
             ("Put my cup on the plate", "put my mug in the basket"),
         ),
         ("pick up my cup then my mug", ("pick up my cup", "pick up my mug")),
+        ("bring my cup and after that my bag", ("bring my cup", "bring my bag")),
+        ("First bring my cup, then my mug", ("First bring my cup", "bring my mug")),
+        ("Could you bring my cup, then my bag", ("Could you bring my cup", "bring my bag")),
+        ("bring Dr. Brown's cup", ("bring Dr. Brown's cup",)),
     ],
 )
 def test_an_instruction_is_taken_apart(text, steps):

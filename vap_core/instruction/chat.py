@@ -6,6 +6,7 @@ executed.
 """
 
 import json
+import re
 from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import pairwise
@@ -108,19 +109,19 @@ class ChatParser:
         }
 
     def _targets(self, text: str, answer: str) -> tuple[Target, ...]:
-        """The checked targets, left to right. Raises: BadEndpoint."""
+        """The checked targets, left to right, the first of each object. Raises: BadEndpoint."""
         targets: list[Target] = []
         try:
             for row in parse_json(answer)["targets"]:
                 obj = self.context.objects[row["object"]]
                 said = row["expression"]
-                start = text.lower().find(said.lower())
-                if start < 0 or not said.strip():
+                place = re.search(rf"(?<!\w){re.escape(said)}(?!\w)", text, re.IGNORECASE)
+                if place is None or not said.strip():
                     raise ValueError("no part of the instruction")
                 targets.append(
                     Target(
-                        start=start,
-                        stop=start + len(said),
+                        start=place.start(),
+                        stop=place.end(),
                         owner=obj.owner,
                         category=obj.category,
                         object=obj.name,
@@ -136,7 +137,8 @@ class ChatParser:
                 f"that was asked for ({type(error).__name__}: {_line(str(error))[:60]!r}); try "
                 f"another model in {MODEL}, or --parser rule."
             ) from error
-        return tuple(targets)
+        first = {target.object: target for target in reversed(targets)}
+        return tuple(target for target in targets if first[target.object] is target)
 
 
 class _Verbatim(str):

@@ -5,10 +5,12 @@ Nothing here knows what objects look like or are for: `embedding` decides which 
 
 import re
 from collections.abc import Collection, Iterator
+from functools import cache
 
 from vap_core.base.types import value
 from vap_core.instruction.context import Context
 from vap_core.instruction.owners import MINE
+from vap_core.instruction.rule import category_pattern, spaced
 
 PLACING = "put|place|set|lay|move|drop|push|stack|store|leave|slide|stand|stow"
 ACTION = (
@@ -40,16 +42,13 @@ GENERIC = frozenset(
 )
 """Words that say nothing about which object is meant."""
 _OWNED = r"(?!(?:it|that|what|who|where|here|there|let|how|she|he)['’]s)[\w-]+['’]s"
-START = re.compile(
-    r"\b(?:(?P<several>(?:one|some|any) of (?:my|his|her|their|our))"
-    rf"|(?P<owner>(?:my|his|her|their|our)\b(?:\s+(?:[\w-]+\s+)?{_OWNED})?|{_OWNED}(?:\s+[\w-]+['’]s)?)"
-    r"|(?P<alone>mine|hers|theirs|ours)"
-    r"|(?P<definite>(?:the|that|this|those|these)\b(?!['’])"
-    r"(?!\s+(?:time|way|you|I|we|he|she|they)\b))"
-    r"|(?P<pronoun>what|whatever|whichever|something)|(?P<it>it)"
-    r"|(?P<indefinite>an?|any|some|another|one))\b",
-    re.IGNORECASE,
+_RELATIVE = re.compile(
+    r"\b(?:that|which|who|whose|what|where|when|I|you|we|he|she|they|for|with|of)\b", re.IGNORECASE
 )
+"""Words after which "and my cup" may belong to what is said of the object before."""
+_JOINED = r"(?:\s*,)?\s+(?:and|as well as|plus|&)\s+"
+VERB = r"\s(?:is|are|was|were|goes|go|stays|stay|has|can|cannot|will|would|should|must|comes)\b"
+"""A verb whose subject stands before it."""
 EXCLUSION = re.compile(
     r"(?:\b(?:but|only|and|just)\s+)?(?:\b(?:not|never)\b|n['’]t\b(?:\s+(?:want|mean|need))?"
     r"|\binstead of\b|\brather than\b|\bother than\b|\bexcept(?: for)?\b|\bapart from\b"
@@ -77,8 +76,9 @@ class Exclusion:
 class Expression:
     """`text[start:stop]`, which may refer to an object.
 
-    `kind` is the group of START that it begins with. `argument` says whether an action's verb
-    stands before it, `destination` whether it is where something is put.
+    `kind` is the group of `_beginning` that it begins with. `argument` says whether an action's
+    verb stands before it, `destination` whether it is where something is put; in a list, before the
+    first.
     """
 
     start: int
@@ -120,7 +120,8 @@ def find_expressions(
 
     `people` is a `person_pattern`: "my brother" is a person, "my brother's cup" is not.
     """
-    for match in START.finditer(text):
+    before: Expression | None = None
+    for match in _beginning(people).finditer(text):
         start = match.start()
         if _inside(start, exclusions):
             continue
@@ -132,6 +133,8 @@ def find_expressions(
         stop = _before_destination(text, start, match.end(), stop)
         if match.lastgroup == "it":
             stop = match.end()
+        if match.lastgroup == "owner":
+            stop = _before_coordinated(text, match.end(), stop, people)
         for exclusion in exclusions:
             if start < exclusion.start < stop:
                 stop = exclusion.start
@@ -139,19 +142,24 @@ def find_expressions(
         for exclusion in exclusions:
             if not text[stop : exclusion.start].strip(" ,") and exclusion.start >= stop:
                 stop = _trim(text, start, exclusion.stop)
-        before = text[:start].rstrip()
+        ahead = text[:start].rstrip()
         kind = str(match.lastgroup)
         if kind in ("owner", "definite") and stop <= match.end():
             kind = "alone" if kind == "owner" and match.group().lower() not in MINE else kind
-        yield Expression(
+        acted = re.search(rf"\b(?:{ACTION})(?: me| us)?(?: both)?$", ahead, re.IGNORECASE)
+        placed = re.search(rf"\b(?:{DESTINATION})$", ahead, re.IGNORECASE)
+        further = before is not None and kind == "owner" and _continues(text, before, start, stop)
+        expression = Expression(
             start=start,
             stop=stop,
             said=text[start:stop],
             kind=kind,
-            argument=re.search(rf"\b(?:{ACTION})(?: me| us)?$", before, re.IGNORECASE) is not None,
-            destination=re.search(rf"\b(?:{DESTINATION})$", before, re.IGNORECASE) is not None,
+            argument=acted is not None or (further and before.argument),
+            destination=placed is not None or (further and before.destination),
             clause=text[start:clause_end],
         )
+        yield expression
+        before = expression
 
 
 def content(said: str, without: Collection[str] = ()) -> str:
@@ -167,8 +175,7 @@ def content(said: str, without: Collection[str] = ()) -> str:
 def find_category(said: str, categories: Collection[str]) -> str | None:
     """The longest category that is named; a plural counts."""
     for category in sorted(categories, key=len, reverse=True):
-        pattern = r"\s+".join(re.escape(word) for word in category.split())
-        if re.search(rf"\b{pattern}(?:s|es)?\b", said, re.IGNORECASE):
+        if re.search(rf"\b{category_pattern(category)}", said, re.IGNORECASE):
             return category
     return None
 
@@ -177,17 +184,56 @@ def person_pattern(context: Context) -> str:
     """A regular expression for anybody whom the memory knows, and for the speaker."""
     words = ["I", "me"]
     for name, known_as in context.owners.items():
-        words.append(re.escape(name))
+        words.append(spaced(name))
         for word in known_as:
-            own = re.escape(word.split("'s ")[-1])
+            own = spaced(word.split("'s ")[-1])
             words.append(f"my {own}")
             if "'s " in word:
-                words.append(re.escape(word))
+                words.append(spaced(word))
     return "|".join(sorted(words, key=len, reverse=True))
 
 
 def _inside(place: int, exclusions: Collection[Exclusion]) -> bool:
     return any(one.start <= place < one.stop for one in exclusions)
+
+
+@cache
+def _beginning(people: str) -> re.Pattern[str]:
+    """What an expression begins with, by kind; `people` is a `person_pattern`."""
+    owned = rf"(?:(?:{people})(?:['’]s|(?<=s)['’])|{_OWNED})"
+    return re.compile(
+        r"\b(?:(?P<several>(?:one|some|any) of (?:my|his|her|their|our))"
+        rf"|(?P<owner>(?:my|his|her|their|our)\b(?:\s+(?:[\w-]+\s+)?{_OWNED})?"
+        rf"|{owned}(?:\s+[\w-]+['’]s)?)"
+        r"|(?P<alone>mine|hers|theirs|ours)"
+        r"|(?P<definite>(?:the|that|this|those|these)\b(?!['’])"
+        r"(?!\s+(?:time|way|you|I|we|he|she|they)\b))"
+        r"|(?P<pronoun>what|whatever|whichever|something)|(?P<it>it)"
+        r"|(?P<indefinite>an?|any|some|another|one))(?!\w)",
+        re.IGNORECASE,
+    )
+
+
+def _before_coordinated(text: str, begin: int, stop: int, people: str) -> int:
+    """Where an owned object ends in "my cup and my bag", which are two; `stop` where it is one.
+
+    A person is no object: "and my brother", but "and my brother's bag".
+    """
+    owner = rf"(?:my|his|her|their|our)\s|(?:{people})['’]|{_OWNED}"
+    joined = re.search(rf"{_JOINED}(?=(?:{owner}))", text[begin:stop], re.IGNORECASE)
+    if joined is None or _RELATIVE.search(text[begin : begin + joined.start()]):
+        return stop
+    if re.match(rf"(?:{people})\b(?!['’])", text[begin + joined.end() :], re.IGNORECASE):
+        return stop
+    return begin + joined.start()
+
+
+def _continues(text: str, before: Expression, start: int, stop: int) -> bool:
+    """Whether an owned object is one more of a list: "my cup, my bag and my pen"."""
+    between = text[before.stop : start]
+    if before.kind != "owner" or not re.fullmatch(rf"\s*,\s*|{_JOINED}", between, re.IGNORECASE):
+        return False
+    return re.match(VERB, text[stop:], re.IGNORECASE) is None
 
 
 def _clause_end(text: str, start: int) -> int:
@@ -206,11 +252,7 @@ def _clause_end(text: str, start: int) -> int:
 
 def _before_verb(text: str, start: int, begin: int, stop: int) -> int:
     """Where a noun phrase from `start` ends: before its verb, unless a relative clause has it."""
-    verb = re.search(
-        r"\s(?:is|are|was|were|goes|go|stays|stay|has|can|cannot|will|would|should|must|comes)\b",
-        text[begin:stop],
-        re.IGNORECASE,
-    )
+    verb = re.search(VERB, text[begin:stop], re.IGNORECASE)
     if verb is None:
         return stop
     said = text[start : begin + verb.start()]

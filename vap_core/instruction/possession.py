@@ -8,12 +8,11 @@ from vap_core.instruction.context import Context
 from vap_core.instruction.expressions import Expression, find_category, person_pattern
 from vap_core.instruction.owners import MINE, OTHERS, fold
 
-BEGINNING = re.compile(
+BEGINNING = (
     r"(?:my|his|her|their|our)(?:\s+(?:[\w-]+\s+)?[\w-]+['’]s)?(?=\W|$)|mine|hers|theirs|ours|"
-    r"[\w-]+['’]s(?:\s+[\w-]+['’]s)?",
-    re.IGNORECASE,
+    r"(?:(?:PEOPLE)(?:['’]s|(?<=s)['’])|[\w-]+['’]s)(?:\s+[\w-]+['’]s)?"
 )
-"""An owner that an expression begins with."""
+"""An owner that an expression begins with; PEOPLE stands for the known ones."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +38,8 @@ class Possession:
         if expression.kind == "several":
             return said.split()[2]
         if expression.kind in ("owner", "alone"):
-            beginning = BEGINNING.match(said)
-            return beginning and self.antecedent(expression, beginning.group())
+            beginning = self._beginning(said)
+            return beginning and self.antecedent(expression, beginning)
         categories = {obj.category for obj in self.context.objects.values()}
         if find_category(said, categories) is not None:
             for other in self.expressions:
@@ -53,10 +52,16 @@ class Possession:
         owners = set()
         for other in self.expressions:
             if other.kind in ("owner", "alone") and other is not expression:
-                beginning = BEGINNING.match(other.said)
+                beginning = self._beginning(other.said)
                 if beginning:
-                    owners.add(fold(beginning.group()))
+                    owners.add(fold(beginning))
         return owners.pop() if len(owners) == 1 else None
+
+    def _beginning(self, said: str) -> str | None:
+        """The owner that an expression begins with: "my", "Anna's", "James'"."""
+        pattern = BEGINNING.replace("PEOPLE", person_pattern(self.context))
+        match = re.match(pattern, said, re.IGNORECASE)
+        return match and match.group()
 
     def antecedent(self, expression: Expression, owner: str) -> str:
         """The person that "his" refers to, where one is named before; else the words themselves."""

@@ -2,27 +2,22 @@
 
 import re
 from collections.abc import Collection, Sequence
+from functools import cache
 from typing import Protocol, runtime_checkable
 
 from vap_core.base.errors import BadInstruction
 from vap_core.base.types import Colour, Instruction, Target
-
-OWNER = re.compile(r"\bmy\s+(?:(?:[\w-]+\s+){0,2}?[\w-]+(?:['’]s|s['’])\s+)?", re.IGNORECASE)
-"""A possessive trigger: "my cup", or with an owner beside the speaker, "my brother's cup"."""
-
-ANY_OWNER = re.compile(
-    r"\b(?:my|his|her|their|our|(?!(?:it|that|what|who|where|here|there|let|how)['’])[\w-]+['’]s)\s+"
-    r"(?:(?:[\w-]+\s+){0,2}?[\w-]+(?:['’]s|s['’])\s+)?",
-    re.IGNORECASE,
-)
-"""As OWNER, and "his cup", "Anna's cup", "Anna's brother's cup"."""
 
 STOP_WORDS = frozenset(
     """and or to into onto in on near next beside behind under over from with at by off up down left
     right of then before after please that which is it inside toward towards between against above
     below around away out back here there now if while for until so""".split()
 )
-"""Words that end a category phrase when no known category matches."""
+"""Words that end a category phrase when no known category matches, and that name no person."""
+_WORD = rf"(?!(?:{'|'.join(sorted(STOP_WORDS))})\b)[\w-]+"
+_PERSON = rf"(?:(?:{_WORD}\s+){{0,2}}?{_WORD}(?:['’]s|s['’])\s+)?"
+OWNER = re.compile(rf"\bmy\s+{_PERSON}", re.IGNORECASE)
+"""A possessive trigger: "my cup", or with an owner beside the speaker, "my brother's cup"."""
 
 
 @runtime_checkable
@@ -36,7 +31,7 @@ def parse(text: str, categories: Collection[str] = (), owners: Collection[str] =
     """Parse by rule, left to right.
 
     Every "my <category>" or "my <person>'s <category>" becomes a target. The longest of
-    `categories` (a plural s allowed) that follows the trigger wins; otherwise the words up to
+    `categories` (a plural allowed) that follows the trigger wins; otherwise the words up to
     punctuation or the first stop word are the category, so unseen nouns work too. Where objects
     have `owners`, "Anna's <category>" and "his <category>" of a known category are targets as well.
 
@@ -44,7 +39,7 @@ def parse(text: str, categories: Collection[str] = (), owners: Collection[str] =
         BadInstruction: the text holds no possessive span.
     """
     targets: list[Target] = []
-    pattern = ANY_OWNER if owners else OWNER
+    pattern = _any_owner(tuple(owners)) if owners else OWNER
     trigger = pattern.search(text)
     while trigger is not None:
         start, stop = trigger.span()
@@ -90,17 +85,46 @@ def rewrite(instruction: Instruction, colours: Sequence[Colour | None]) -> str:
 def _has_capital(text: str, target: Target) -> bool:
     """Whether a span begins with a capital letter that is not a name's ("Anna's cup")."""
     before = text[: target.start].rstrip()
-    named = re.match(r"(?!my\b)[\w-]+['’]s?\b", text[target.start : target.stop], re.IGNORECASE)
+    span = text[target.start : target.stop]
+    named = re.match(r"(?!my\b)[\w-]+(?:\s+[\w-]+){0,4}?['’]s?(?!\w)", span, re.IGNORECASE)
     if named and before and before[-1] not in ".!?":
         return False
     return text[target.start].isupper()
 
 
+def category_pattern(category: str) -> str:
+    """A regular expression for a category that is named; a plural counts, "cup-holder" does not."""
+    return rf"{spaced(category)}(?:s|es)?(?![\w-])"
+
+
+def spaced(phrase: str) -> str:
+    """A regular expression for words with any space between them."""
+    return r"\s+".join(re.escape(word) for word in phrase.split())
+
+
+def names_pattern(names: Collection[str]) -> str:
+    """A regular expression for "Mary Jane's" and "James'", the longest name first; names are not
+    empty."""
+    words = [spaced(name) for name in sorted(names, key=len, reverse=True)]
+    return rf"(?:{'|'.join(words)})(?:['’]s|(?<=s)['’])"
+
+
+@cache
+def _any_owner(owners: tuple[str, ...]) -> re.Pattern[str]:
+    """As OWNER, and "his cup", "Anna's cup", "Anna's brother's cup"; for one of `owners` also
+    "James' cup" and "Mary Jane's cup"."""
+    return re.compile(
+        rf"\b(?:my|his|her|their|our|{names_pattern(owners)}"
+        r"|(?!(?:it|that|what|who|where|here|there|let|how)['’])[\w-]+['’]s)\s+"
+        rf"{_PERSON}",
+        re.IGNORECASE,
+    )
+
+
 def leading_category(rest: str, categories: Collection[str] = ()) -> tuple[str, int]:
     """The category phrase that `rest` begins with, lower case, and its length in characters."""
     for known in sorted(categories, key=len, reverse=True):
-        pattern = r"\s+".join(re.escape(word) for word in known.split())
-        match = re.match(rf"{pattern}s?(?![\w-])", rest, re.IGNORECASE)
+        match = re.match(category_pattern(known), rest, re.IGNORECASE)
         if match:
             return known, match.end()
     words: list[str] = []

@@ -11,12 +11,14 @@ from vap_core.instruction.expressions import ACTION, PLACING
 
 STEP = re.compile(
     r"\s*(?:[,;.]\s*(?:and\s+)?(?:then|after that|afterwards)\b"
-    r"|\s(?:and\s+)?then\b|[;.](?=\s+\S))\s*,?\s*",
+    r"|\s(?:and\s+)?(?:then|after that|afterwards)\b"
+    r"|(?:;|(?<!\bDr)(?<!\bMr)(?<!\bMrs)(?<!\bMs)(?<!\bSt)\.)(?=\s+\S))\s*,?\s*",
     re.IGNORECASE,
 )
 """What stands between two steps: "then", "and then", "after that", or the end of a sentence."""
-VERB = re.compile(rf"(?:now\s+|please\s+)*(?P<verb>{ACTION})\b", re.IGNORECASE)
-PLACE = re.compile(rf"(?:now\s+|please\s+)*(?:{PLACING})\b", re.IGNORECASE)
+_BEFORE = r"(?:(?:first|now|please|(?:could|can|would|will) you)\s*,?\s+)*"
+VERB = re.compile(rf"{_BEFORE}(?P<verb>{ACTION})\b", re.IGNORECASE)
+PLACE = re.compile(rf"{_BEFORE}(?:{PLACING})\b", re.IGNORECASE)
 DESTINATION = re.compile(
     r"\s(?:into|onto|in|on|near|next to|beside|to|at|inside|under)\s.*", re.IGNORECASE
 )

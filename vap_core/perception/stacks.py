@@ -110,8 +110,8 @@ def check_stack(name: str, what: str = "load_stack") -> None:
 def load_mixed(name: str, device: str | None = None) -> Stack:
     """A stack of parts of several; loads those alone that it has.
 
-    It has thresholds where it `ships_thresholds`, or where `calibrate --keep` has measured this very
-    mixture.
+    It has thresholds where it `ships_thresholds`, or where `calibrate --keep` has measured this
+    very mixture.
 
     Raises: UnknownName, MissingPart, MissingWeights, BadOutput.
     """
