@@ -96,6 +96,15 @@ def test_the_table_by_hand() -> None:
     assert labels == ["rewrite-only, n 10", "mask-only, n 10"]
 
 
+def test_an_error_is_a_failure_and_has_no_cmr_where_none_is_defined() -> None:
+    table = pd.concat([outcomes("vap", [True] * 9 + [False]), outcomes("mask-only", [True] * 10)])
+    table = table.reset_index(drop=True).assign(cmr=None)
+    table.loc[9, "outcome"] = "error"
+    vap_arm, *_ = arm_results(ABLATIONS["rewrite"], table)
+    assert (vap_arm.sr.k, vap_arm.sr.n, vap_arm.cmr.n) == (9, 10, 0)
+    assert "-" in arm_rows([vap_arm])[1][4]
+
+
 def test_an_arm_takes_one_line() -> None:
     own = Ablation(question="Is green better?", arms={"green": Prompting(palette=PALETTE[2:3])})
     assert own.names == ("vap", "green")

@@ -38,6 +38,14 @@ def test_the_curve_by_hand() -> None:
     assert abstentions(table.drop(columns="margin")) == []
 
 
+def test_an_episode_that_ended_before_the_vote_does_not_act() -> None:
+    columns = ["suite", "method", "margin", "success", "touched"]
+    died = ("tabletop", "vap", None, False, False)
+    table = pd.DataFrame([*EPISODES, died], columns=columns).assign(policy="scripted")
+    first = abstentions(table)[0]
+    assert (first.threshold, first.acts.k, first.acts.n) == (0.0, 4, 5)
+
+
 def test_policies_are_counted_apart() -> None:
     table = pd.DataFrame(EPISODES, columns=["suite", "method", "margin", "success", "touched"])
     one, other = table.assign(policy="one"), table.assign(policy="other", success=True)

@@ -6,13 +6,17 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from tqdm import tqdm
 
 from tests.command import vap
 from vap_core.base.files import DATA
@@ -183,6 +187,18 @@ def stored(out: Path, names: list[str], **cells: object) -> None:
         }
         rows.append({"key": name, "attempt": job.attempt, **about, **cells})
     append(out, rows)
+
+
+def test_a_second_attempt_is_no_further_episode() -> None:
+    bar = tqdm(total=3, disable=False, file=StringIO())
+    counts: dict[str, Counter[str]] = {}
+    counted: set[tuple[Any, ...]] = set()
+    row = {"suite": "s", "task": "t", "method": "vap", "seed": 0, "success": False}
+    for episode, success in ((0, True), (1, False), (1, True), (2, False)):
+        rows = [{**row, "episode": episode, "success": success}]
+        engine._show_progress(bar, counts, counted, "vap", rows)
+    assert bar.n == 3
+    assert counts == {"vap": Counter(success=2, n=3)}
 
 
 def test_only_what_is_missing_runs_and_errors_run_again_recorded(tmp_path: Path) -> None:

@@ -2,15 +2,18 @@
 
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
+from tqdm import tqdm
 
 from tests.command import refused, vap
 from tests.scanned import box, put
-from vap_core.base.errors import BadObject
-from vap_core.evaluation.own_objects.folder import VARIABLE, objects_in, read_source
+from vap_core.base.errors import BadObject, BadStudy
+from vap_core.evaluation.own_objects import run as own
+from vap_core.evaluation.own_objects.folder import VARIABLE, Source, objects_in, read_source
 from vap_core.evaluation.own_objects.report import Tables, group_rows, object_rows, text_report
 from vap_core.simulation.assets.scans.closed_parts import blob, hollow, lathe, ring, tube
 from vap_core.simulation.assets.scans.design_paint import LOUD, QUIET, SIDE, draw_colours
@@ -211,3 +214,27 @@ def test_rows_count_what_they_say():
 
 def test_folders_that_are_none_are_one_line(tmp_path: Path):
     assert "is no folder" in refused("eval-objects", tmp_path / "none", "--out", tmp_path / "out")
+
+
+def test_an_object_that_is_left_out_at_a_later_task_has_no_rows(tmp_path, monkeypatch):
+    def views(study, out, stack):
+        if (study.object, study.tasks[0][1]) == ("wide", "select-shoe"):
+            raise BadStudy("too wide")
+        return [{"object": study.object}]
+
+    tasks = [("vlabench", "select-mug"), ("vlabench", "select-shoe")]
+    monkeypatch.setattr(own, "load_stack", lambda name: None)
+    monkeypatch.setattr(own, "_tasks", lambda name, suites: tasks)
+    monkeypatch.setattr(own, "_views", views)
+    monkeypatch.setattr(own, "_episodes", lambda study, out: views(study, out, None))
+
+    def study(asked, suite, task, name):
+        return SimpleNamespace(object=name, tasks=((suite, task),))
+
+    monkeypatch.setattr(own.ObjectSurvey, "study", study)
+    asked = own.ObjectSurvey(suites=("vlabench",))
+    source = Source(groups={"wide": (), "slim": ()}, files={}, sha256="")
+    refused: dict[str, str] = {}
+    seen, played = own._measure(source, tmp_path, asked, refused, tqdm(disable=True))
+    assert refused == {"wide": "too wide"}
+    assert seen["object"].tolist() == played["object"].tolist() == ["slim", "slim"]

@@ -52,6 +52,22 @@ def test_the_command_of_a_run_is_told() -> None:
         assert all(name in told for name in other if other[name] is not None)
 
 
+def test_a_whole_list_of_one_task_is_told_in_code_and_an_own_object_by_eval() -> None:
+    study = {"methods": ["vap"], "policy": "scripted", "seed": 0, "episodes": None}
+    part = {**study, "tasks": [["vlabench", "select-cup"]]}
+    assert command_line(part).startswith("Study("), "rollout plays 20 by itself"
+    assert command_line({**part, "episodes": 5}).startswith("python -m vap_core rollout")
+    warm_up = {**study, "tasks": [["widowx-pick", "pick-straw-cup"]], "follow": "call"}
+    del warm_up["follow"]
+    assert "rollout --suite widowx-pick --task pick-straw-cup" in command_line(warm_up)
+    tabletop = [["tabletop", "select-cup"]]
+    told = command_line({**study, "tasks": tabletop, "object": "cup-lookalike-1"})
+    assert told.startswith("python -m vap_core eval --suite tabletop --method vap")
+    assert "--object cup-lookalike-1" in told
+    elsewhere = command_line({**study, "tasks": tabletop, "object": "nowhere-known"})
+    assert elsewhere.startswith("Study(")
+
+
 def test_parts_of_one_run_are_told_apart() -> None:
     """Published parts of a run share its digest: one command stood for both."""
     table = Path(__file__).parents[1] / "data" / "results" / "mini_pi0.parquet"

@@ -111,6 +111,15 @@ def test_methods_that_are_finished_need_not_wait_for_the_others(tmp_path: Path) 
     assert not (tmp_path / "other.parquet").exists()
 
 
+def test_an_unfinished_run_of_another_suite_is_not_asked_for(tmp_path: Path) -> None:
+    whole = run(tmp_path / "one", 0)
+    half = tmp_path / "half"
+    open_run(half, {"tasks": [["franka-pick", "pick-cup"]], "methods": ["vap"], "episodes": 5})
+    target = tmp_path / "t.parquet"
+    assert publish([whole, half], target, suite_names=["widowx-pick"]) > 0
+    assert {episodes.suite.iloc[0] for _, episodes in read_runs(target)} == {"widowx-pick"}
+
+
 def test_only_finished_runs_and_each_once(tmp_path: Path) -> None:
     whole, half = run(tmp_path / "one", 0), run(tmp_path / "half", 1, episodes=5, done=3)
     with pytest.raises(

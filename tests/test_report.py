@@ -16,6 +16,7 @@ import pytest
 
 from tests.command import vap
 from vap_core.base.errors import BadOutput
+from vap_core.base.files import DATA
 from vap_core.base.tables import escape, latex, markdown
 from vap_core.evaluation.publish import publish
 from vap_core.evaluation.report import report
@@ -216,6 +217,19 @@ def test_what_reads_the_simulator_is_marked(tmp_path: Path) -> None:
     marked = results(runs).groupby("method")["bound"].agg(["all", "any"])
     assert marked.loc["vap"].all()
     assert not marked.loc["generic"].any()
+
+
+def test_a_policy_that_reads_the_simulator_is_marked_in_runs_that_do_not_say_so() -> None:
+    bounds = results(load_runs([DATA / "results" / "bounds.parquet"]))
+    assert set(bounds["policy"]) == {"expert", "random"}
+    assert bounds["bound"].all()
+
+
+def test_the_tables_of_a_page_say_of_which_list_they_are(tmp_path: Path) -> None:
+    tasks = (*BRIDGE, ("tabletop", "select-cup"))
+    report([run(tmp_path / "run", tasks)], tmp_path / "out")
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert re.findall(r"<h3>(.+?)</h3>", page) == ["simpler-bridge", "tabletop"]
 
 
 def test_an_unfinished_run_is_reported_as_it_is(tmp_path: Path) -> None:

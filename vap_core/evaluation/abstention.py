@@ -42,8 +42,11 @@ def abstentions(episodes: "pd.DataFrame") -> list[Abstention]:
     found: list[Abstention] = []
     if "margin" not in episodes or "touched" not in episodes:
         return found
-    voted = episodes[episodes["margin"].notna()]
-    groups = dict(list(voted.groupby(["suite", "method", "policy"], sort=False)))
+    groups = {}
+    for key, of_key in episodes.groupby(["suite", "method", "policy"], sort=False):
+        # An episode that ended before the vote has no margin: it does not act.
+        if of_key["margin"].notna().any():
+            groups[key] = of_key
     for (suite, method, policy), present in groups.items():
         absent = groups.get((f"{suite}{ABSENT}", method, policy))
         if absent is None:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import WorkerDied
 from vap_core.evaluation import readings, store
@@ -87,6 +87,7 @@ def run(
             smoothing=0.05,
         ) as bar:
             counts = _count_by_method(table)
+            counted = set(map(store.key_of, table.to_dict("records")))
             deaths = 0
             jobs = missing()
             while jobs:
@@ -98,7 +99,7 @@ def run(
                     for job, rows in finished:
                         store.append(folder, rows)
                         deaths = 0
-                        _show_progress(bar, counts, job, rows)
+                        _show_progress(bar, counts, counted, job.method, rows)
                 except WorkerDied:
                     deaths += 1
                     if deaths > retries + 1:
@@ -260,14 +261,24 @@ def _count_by_method(table: "pd.DataFrame") -> dict[str, Counter[str]]:
     return counts
 
 
-def _show_progress(bar: "tqdm", counts: dict[str, Counter[str]], job: Job, rows: Rows) -> None:
-    """Advance the bar by a finished job, and print the success rates so far."""
-    count = counts.setdefault(job.method, Counter())
+def _show_progress(
+    bar: "tqdm",
+    counts: dict[str, Counter[str]],
+    counted: set[tuple[Any, ...]],
+    method: str,
+    rows: Rows,
+) -> None:
+    """Advance the bar by a finished job's rows, and print the success rates so far.
+
+    `counted` are the keys of the episodes that `counts` has: a second attempt is none more.
+    """
+    count = counts.setdefault(method, Counter())
     for row in rows:
         count["success"] += row["success"]
-    if job.attempt == 1:
-        count["n"] += len(rows)
-        bar.update(len(rows))
+    fresh = set(map(store.key_of, rows)) - counted
+    counted |= fresh
+    count["n"] += len(fresh)
+    bar.update(len(fresh))
     rates = []
     for method, count in sorted(counts.items()):
         if count["n"]:

@@ -37,10 +37,11 @@ def read_json_part(path: Path, caller: str) -> Any:
 
 
 def write_table(table: "pd.DataFrame", out: Path, name: str) -> list[Path]:
-    """The table as Parquet, for programs, and as CSV, for people."""
+    """The table as Parquet, for programs, and as CSV, for people. Raises: BadOutput."""
     paths = [out / f"{name}.parquet", out / f"{name}.csv"]
-    write_atomic(paths[0], table.to_parquet(index=False, compression="zstd"))
-    write_atomic(paths[1], table.round(4).to_csv(index=False).encode())
+    with writing(out, name):
+        write_atomic(paths[0], table.to_parquet(index=False, compression="zstd"))
+        write_atomic(paths[1], table.round(4).to_csv(index=False).encode())
     return paths
 
 

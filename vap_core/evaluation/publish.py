@@ -96,12 +96,12 @@ def publish(
         raise _exists(target)
     runs: list[Run] = []
     for source in sources:
-        found = read_runs(source)
-        for manifest, episodes in found:
-            _require_finished(source, manifest, episodes, methods)
-        runs += found
+        for manifest, episodes in read_runs(source):
+            if not suite_names or _is_of(manifest, suite_names):
+                _require_finished(source, manifest, episodes, methods)
+                runs.append((manifest, episodes))
     if suite_names:
-        runs = _of_suites(runs, suite_names)
+        _require_whole(runs, suite_names)
     if methods:
         runs = _of_methods(runs, methods)
     if supersede:
@@ -141,22 +141,22 @@ def _require_finished(
         )
 
 
-def _of_suites(runs: "list[Run]", names: Sequence[str]) -> "list[Run]":
-    """The runs of these suites. Raises: BadOutput for none, and for a run of others, too."""
-    kept = []
-    for manifest, episodes in runs:
+def _is_of(manifest: dict[str, Any], names: Sequence[str]) -> bool:
+    """Whether a run has one of these suites."""
+    return any(suite in names for suite, _ in manifest["configuration"]["tasks"])
+
+
+def _require_whole(runs: "list[Run]", names: Sequence[str]) -> None:
+    """Raises: BadOutput for no run of these suites, and for one of others, too."""
+    for manifest, _ in runs:
         there = {suite for suite, _ in manifest["configuration"]["tasks"]}
-        if there.isdisjoint(names):
-            continue
         if not there.issubset(names):
             raise BadOutput(
                 f"publish: one run has {', '.join(sorted(there))}, and is taken whole; name all of "
                 "them with --suite, or none."
             )
-        kept.append((manifest, episodes))
-    if not kept:
+    if not runs:
         raise BadOutput(f"publish: the sources hold no run of {', '.join(names)}.")
-    return kept
 
 
 def _of_methods(runs: "list[Run]", names: Sequence[str]) -> "list[Run]":

@@ -5,6 +5,8 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vap_core.base.figures import write_png
+from vap_core.base.files import writing
 from vap_core.base.tables import align
 from vap_core.evaluation import store
 from vap_core.evaluation.ablations.arms import ABLATIONS
@@ -43,7 +45,8 @@ def ablate_text(
         results = arm_results(ablation, episodes)
         tables, figure = [align(arm_rows(results))], effects_figure(results, ablation.question)
         policy = study.policy
-    figure.savefig(picture, dpi=200)
+    with writing(picture, "ablate"):
+        write_png(figure, picture, dpi=200)
     errors = int(episodes["outcome"].eq("error").sum())
     first = arm_folder(study, root, ablation.names[0])
     lines = [

@@ -146,8 +146,8 @@ def _against_default(arms: Sequence[str], of_suite: "pd.DataFrame") -> dict[str,
 
 
 def _share(rows: "pd.DataFrame", column: str) -> Rate:
-    """The share of episodes in which it holds, of those that can say."""
-    told = rows[rows[column].notna() | rows["outcome"].eq("error")]
+    """The share of episodes in which it holds, of those that can say, as `metrics.count` does."""
+    told = rows[rows[column].notna()]
     won = told[column].eq(True) & told["outcome"].ne("error")
     return rate(int(won.sum()), len(told))
 

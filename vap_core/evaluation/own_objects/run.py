@@ -110,12 +110,16 @@ def _measure(
     for name in source.groups:
         bar.set_postfix_str(name)
         if name not in refused:
+            seen: Rows = []
+            played: Rows = []
             try:
                 for suite, task in _tasks(name, asked.suites):
                     study = asked.study(suite, task, name)
-                    views += _views(study, out, stack)
+                    seen += _views(study, out, stack)
                     if not asked.views_only:
-                        episodes += _episodes(study, out)
+                        played += _episodes(study, out)
+                views += seen
+                episodes += played
             except (BadObject, BadStudy) as error:
                 refused[name] = str(error)
         bar.update()

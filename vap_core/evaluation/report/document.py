@@ -10,7 +10,7 @@ from vap_core.base.tables import latex
 from vap_core.evaluation.metrics import RATES
 from vap_core.evaluation.readings import readings_of_lists
 from vap_core.evaluation.report import sections
-from vap_core.evaluation.report.cells import comparison_rows, outcome_rows, result_rows
+from vap_core.evaluation.report.cells import comparison_rows, outcome_rows, result_rows, track_title
 from vap_core.evaluation.report.latex import main_tables
 from vap_core.evaluation.report.page import report_page
 from vap_core.evaluation.report.pictures import differences_figure, forest_figure
@@ -68,8 +68,8 @@ def report(sources: Sequence[Path], out: Path) -> str:
     files["report.html"] = report_page(
         table=runs.table,
         tables={
-            "Results": [result_rows(part, lines.iloc[:0]) for part in _by_track(lines)],
-            "Outcomes": [outcome_rows(ends)],
+            "Results": _rows_by_track(lines),
+            "Outcomes": {"": outcome_rows(ends)},
         },
         forest=figures["forest.png"],
         sources=sources,
@@ -92,9 +92,12 @@ def _lists(runs: Runs) -> set[str]:
     return digests
 
 
-def _by_track(lines: "pd.DataFrame") -> "list[pd.DataFrame]":
-    """The results of each suite and track."""
-    return [part for _, part in lines.groupby(["suite", "split"], sort=False)]
+def _rows_by_track(lines: "pd.DataFrame") -> dict[str, list[list[str]]]:
+    """The rows of results of each suite and track, by its title."""
+    rows = {}
+    for (suite, split), part in lines.groupby(["suite", "split"], sort=False):
+        rows[track_title(str(suite), str(split))] = result_rows(part, lines.iloc[:0])
+    return rows
 
 
 def _csv_text(table: "pd.DataFrame", fractions: Sequence[str] = ()) -> str:

@@ -6,6 +6,7 @@ from vap_core.base.errors import BadOutput
 from vap_core.base.types import value
 from vap_core.evaluation.diagnosis import STAGES
 from vap_core.evaluation.metrics import rate
+from vap_core.evaluation.report.results import reads_simulator
 from vap_core.rollout.failure import CASES
 
 if TYPE_CHECKING:
@@ -168,7 +169,7 @@ def funnel_table(table: "pd.DataFrame") -> FunnelTable:
             n=len(part),
             left=tuple(left),
             succeeded=int(part["outcome"].eq("success").sum()),
-            bound="bound" in part and bool(part["bound"].eq(True).any()),
+            bound=bool(len(reads_simulator(part))),
         )
         rows.append(row)
     return rows

@@ -42,15 +42,15 @@ h3{font-size:14px;margin:6px 0 2px}.wide{overflow-x:auto}
 
 def report_page(
     table: "pd.DataFrame",
-    tables: Mapping[str, Sequence[Rows]],
+    tables: Mapping[str, Mapping[str, Rows]],
     forest: "Figure",
     sources: Sequence[Path],
     out: Path,
 ) -> str:
     """The page that stands in the folder `out`.
 
-    `table` has one row per episode, `tables` the rows of the report's tables by title; `sources`
-    are the runs, whose recordings give the pictures of failures.
+    `table` has one row per episode, `tables` the rows of the report's tables by section and title;
+    `sources` are the runs, whose recordings give the pictures of failures.
     """
     parts = [
         "<!doctype html><html lang='en'><head><meta charset='utf-8'><title>Report</title>",
@@ -58,9 +58,12 @@ def report_page(
         f"<p>{escape(_summary(table))}</p>",
         _picture(forest, "success rates with 95 % intervals"),
     ]
-    for title, of_title in tables.items():
-        parts.append(f"<h2>{escape(title)}</h2>")
-        parts += [_html_table(rows) for rows in of_title]
+    for section, by_title in tables.items():
+        parts.append(f"<h2>{escape(section)}</h2>")
+        for title, rows in by_title.items():
+            if title:
+                parts.append(f"<h3>{escape(title)}</h3>")
+            parts.append(_html_table(rows))
     if set(DIAGNOSIS_COLUMNS) <= set(table.columns):
         parts.append("<h2>Where episodes are lost</h2>")
         parts.append(_picture(_funnel(table), "episodes that are left after each stage"))

@@ -5,10 +5,12 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vap_core.base.errors import VapError
 from vap_core.evaluation.policy_names import policy_today
 from vap_core.evaluation.report.runs import Runs
 from vap_core.evaluation.study import DEMO, Study
 from vap_core.simulation import suites
+from vap_core.simulation.assets.objects import get_object
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -61,11 +63,11 @@ def command_line(study: dict[str, Any]) -> str:
     tasks_by_suite: dict[str, list[str]] = {}
     for suite, task in study["tasks"]:
         tasks_by_suite.setdefault(suite, []).append(task)
-    whole = _are_whole_suites(tasks_by_suite)
+    whole = _are_whole_suites(tasks_by_suite, study.get("object", ""))
     changed = _changed(study)
     if _is_demo(study, changed):
         return f"python -m vap_core demo --episodes {study['episodes']} --seed {study['seed']}"
-    if not whole and (len(tasks_by_suite) > 1 or not changed.keys().isdisjoint(EVAL_ONLY)):
+    if not whole and not _suits_rollout(study, changed):
         return f"Study({', '.join(f'{name}={setting!r}' for name, setting in changed.items())})"
     words = ["eval" if whole else "rollout"]
     for suite, tasks in tasks_by_suite.items():
@@ -104,9 +106,28 @@ def _changed(study: dict[str, Any]) -> dict[str, Any]:
     return changed
 
 
-def _are_whole_suites(tasks_by_suite: dict[str, list[str]]) -> bool:
+def _suits_rollout(study: dict[str, Any], changed: dict[str, Any]) -> bool:
+    """Whether `rollout` runs some tasks: of one suite, and of a list never the whole."""
+    names = {suite for suite, _ in study["tasks"]}
+    if len(names) > 1 or not changed.keys().isdisjoint(EVAL_ONLY):
+        return False
+    return study.get("episodes") is not None or not suites.has_list(names.pop())
+
+
+def _are_whole_suites(tasks_by_suite: dict[str, list[str]], own: str = "") -> bool:
+    """Whether `eval` runs these tasks: every one, or with an `own` object those of its category."""
+    category = ""
+    if own:
+        try:
+            category = get_object(own).category
+        except VapError:  # it was imported elsewhere
+            return False
     for suite, tasks in tasks_by_suite.items():
-        if tasks != [task.name for task in suites.suite(suite).tasks]:
+        whole = []
+        for task in suites.suite(suite).tasks:
+            if not own or task.category == category:
+                whole.append(task.name)
+        if tasks != whole:
             return False
     return True
 

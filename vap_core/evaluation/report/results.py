@@ -11,6 +11,7 @@ import numpy as np
 
 from vap_core.evaluation import paper
 from vap_core.evaluation.metrics import MEASURES, RATES, SCORE_KEY, TRACK, count, intervals
+from vap_core.evaluation.policy_names import PRIVILEGED
 from vap_core.evaluation.report.runs import Runs
 from vap_core.evaluation.statistics import ALL_TASKS, Comparison, bootstrap_interval
 
@@ -45,7 +46,7 @@ def results(runs: Runs) -> "pd.DataFrame":
     for name in RATES:
         _add_rate(lines, name)
     lines = lines.merge(_layout_intervals(table), on=key, how="left")
-    reading = pd.MultiIndex.from_frame(_reads_simulator(table)[key])
+    reading = pd.MultiIndex.from_frame(reads_simulator(table)[key])
     lines["bound"] = pd.MultiIndex.from_frame(lines[key]).isin(reading)
     lines["layouts"] = lines["layouts"].fillna(0).astype(int)
     published = paper.main_results().rename(columns={"sr": "paper_sr", "cmr": "paper_cmr"})
@@ -145,8 +146,11 @@ def _layout_intervals(table: "pd.DataFrame") -> "pd.DataFrame":
     return pd.DataFrame(lines, columns=[*key, "layouts", "sr_layout_low", "sr_layout_high"])
 
 
-def _reads_simulator(table: "pd.DataFrame") -> "pd.DataFrame":
-    """The episodes whose method or policy reads the simulator; older runs do not say."""
-    if "bound" not in table:
-        return table[:0]
-    return table[table["bound"].fillna(False).astype(bool)]
+def reads_simulator(table: "pd.DataFrame") -> "pd.DataFrame":
+    """The episodes whose method or policy reads the simulator; older runs say it of no method."""
+    bound = np.zeros(len(table), bool)
+    if "policy" in table:
+        bound |= table["policy"].isin(PRIVILEGED)
+    if "bound" in table:
+        bound |= table["bound"].eq(True)
+    return table[bound]

@@ -21,6 +21,7 @@ from vap_core.base.types import Rgb
 from vap_core.evaluation import measurements, store
 from vap_core.evaluation.policy_names import shipped
 from vap_core.evaluation.processes import results
+from vap_core.evaluation.study import Study
 from vap_core.evaluation.tokens import choices
 from vap_core.policies.lerobot.checkpoints import fingerprint
 from vap_core.policies.mini_pi0 import teach_token
@@ -79,12 +80,15 @@ class Tokens:
         """What the results depend on, as JSON; suites and numbers of photos may be added to."""
         policies = {name: fingerprint(shipped(name)) for name in suites.BENCHMARKS}
         models = {name: _model(_model_folder(name)).sha256() for name in suites.BENCHMARKS}
+        tasks = tuple((name, task.name) for name in policies for task in suites.suite(name).tasks)
+        shown = Study(tasks=tasks, methods=("generic",), policy="expert").configuration()
         return {
             "survey": "tokens",
             "epochs": self.epochs,
             "views": teach_token.VIEWS,
             "vlms": models,
             "policies": policies,
+            **{name: shown[name] for name in ("version", "lists", "world")},
         }
 
 
