@@ -20,6 +20,7 @@ from vap_core.base.video import frames as video_frames
 from vap_core.recording import (
     Correction,
     Votes,
+    browser,
     clicks,
     serve_run,
     write_correction,
@@ -59,6 +60,26 @@ def test_the_browser_links_every_recording_to_its_deciding_frame(run: Path) -> N
     none = run / "recordings" / "none"
     with pytest.raises(BadRecording, match="there is no recording in"), serve_run(none):
         pass
+
+
+def test_recordings_open_with_every_camera_that_any_of_them_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "recordings"
+    fail(folder / "one.rrd", "owl_b")
+    start = replace(opening(1), row=replace(ROW, episode=5))
+    record(folder / "a-single.rrd", start, steps=2)
+    drawn: list[str] = []
+
+    def coverage(camera: str) -> Any:
+        drawn.append(camera)
+        return browser.events_view()
+
+    monkeypatch.setattr(browser, "coverage_view", coverage)
+    with serve_run(tmp_path):
+        pass
+    assert sorted(drawn) == sorted(prompted_entities(folder / "one.rrd"))
+    assert len(drawn) > len(prompted_entities(folder / "a-single.rrd"))
 
 
 def test_the_browser_shows_corrected_cases_and_leaves_a_damaged_layer_out(
@@ -187,9 +208,15 @@ def test_a_click_on_a_candidate_says_its_cosines(run: Path) -> None:
     assert "candidate #0, elected: 4 of 5 votes" in words
     assert words.count("(its vote)") == 4
     assert words.count("photo ") == K
-    other = votes.answer(f"{entity}/labels", 0)
+    other = votes.answer(entity, 0)
     assert other is not None
     assert "candidate #1, not elected" in other[1]
+    label = votes.answer(f"{entity}/labels", 0)  # of the labels the elected one's is the first
+    assert label is not None
+    assert "candidate #0, elected" in label[1]
+    beyond = votes.answer(f"{entity}/labels", 99)
+    assert beyond is not None
+    assert "click a box" in beyond[1]
     assert votes.answer("/world/table", 0) is None
     beside = votes.answer(entity, None)
     assert beside is not None

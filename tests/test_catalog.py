@@ -75,6 +75,18 @@ def test_every_step_is_a_row_and_what_cannot_be_read_is_named(run: Path) -> None
     assert set(wrong["case"]) == {"case 1"}
 
 
+def test_a_correction_without_its_recording_is_left_out(run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    for name in ("wrong", "apart"):
+        (folder / f"{name}.rrd").write_bytes((run / "recordings" / f"{name}.rrd").read_bytes())
+        write_correction(folder / f"{name}.rrd", Correction("case 3", "slip"), 3)
+    (folder / "apart.rrd").unlink()
+    held = load_steps(folder)
+    assert set(held.table["file"]) == {str(folder / "wrong.rrd")}
+    assert set(held.table["case"]) == {"case 3"}
+
+
 POISON = """
 import os
 import vap_core.recording.isolated as isolated

@@ -1,6 +1,7 @@
 """A scan imported by the command is an object like any other; its files are checked on loading."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from tests.scanned import mug, put
 from vap_core.base.errors import BadObject, BadOutput, UnknownName
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.scans import convex_parts, storage
-from vap_core.simulation.assets.scans.import_scan import import_scan
+from vap_core.simulation.assets.scans.import_scan import default_name, import_scan
 from vap_core.simulation.gl import ensure_gl
 from vap_core.simulation.scenes import build
 from vap_core.simulation.studio import reference_views
@@ -45,7 +46,7 @@ def shelf(tmp_path_factory):
         with Image.open(folder / "objects" / "my-mug.preview.png") as preview:
             assert preview.size == (1280, 320)
         assert "my-mug: a cup, 7.0 x 7.0 x 9.0 cm" in done.stdout
-        assert "next: python -m vap_core objects photograph 'my-mug'" in done.stdout
+        assert "next: python -m vap_core eval --suite SUITE --object 'my-mug'" in done.stdout
         yield folder
 
 
@@ -114,6 +115,12 @@ def test_a_name_that_is_taken_needs_replace(shelf):
         BadObject, match="one of the workspace's own objects; choose another --name"
     ):
         import_scan(file, "cup-personal", "cup")
+    for part in ("floor", "gripper", "base", "hand", "robot", "rest", "world"):
+        with pytest.raises(BadObject, match="part of the room or of a robot is called"):
+            import_scan(file, part, "cup")
+    with pytest.raises(BadObject, match="ends in -red"):
+        import_scan(file, "cup-personal-red", "cup")
+    assert default_name(Path("杯子.glb")) == "my-object"
     with pytest.raises(BadObject, match="cannot name an object"):
         import_scan(file, "../mug", "cup")
     with pytest.raises(BadObject, match="cannot be a category"):

@@ -411,9 +411,24 @@ def test_what_was_just_written_is_what_is_read(tmp_path):
 
 def test_check_refuses_a_row_made_in_memory():
     (row,) = suites.rows("simpler-bridge", "put-camera", 1)
-    lists.check([row])
+    suite = suites.suite("simpler-bridge")
+    lists.check([row], suite)
     with pytest.raises(BadSuite, match="row 2, field 'goal'"):
-        lists.check([row, replace(row, goal="moon")])
+        lists.check([row, replace(row, goal="moon")], suite)
+
+
+def test_check_refuses_a_start_and_cameras_that_do_not_fit():
+    (row,) = suites.rows("simpler-bridge", "put-camera", 1, seed=3)
+    suite = suites.suite("simpler-bridge")
+    lists.check([row], suite)
+    fewer = replace(row, placements=row.placements[:2], goal="", rule="picked")
+    with pytest.raises(BadSuite, match=r"row 1, field 'start.offsets': 4 entries, and not 2"):
+        lists.check([fewer], suite)
+    five = replace(row, start=replace(row.start, joints_rad=(0.0,) * 5))
+    with pytest.raises(BadSuite, match=r"field 'start.joints_rad': 5 entries, and not 6"):
+        lists.check([five], suite)
+    with pytest.raises(BadSuite, match="field 'cameras': 'nope' is none of front"):
+        lists.check([replace(row, cameras=("nope",))], suite)
 
 
 def test_neither_yaw_nor_place_tells_the_target():

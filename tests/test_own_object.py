@@ -82,6 +82,16 @@ def test_what_does_not_fit_is_refused(task, name, words):
         listed("tabletop", task, own_target=name)
 
 
+@pytest.mark.parametrize(
+    ("suite", "task"),
+    [("shared-sequence", "select-cup-put-plant"), ("shared-pair", "put-pouch-near-cup")],
+)
+def test_a_scene_that_people_share_takes_no_other_object(suite, task):
+    name = "mug" if suite == "shared-sequence" else "pouch-generic-9501"
+    with pytest.raises(BadStudy, match="people share, and names the objects that they own"):
+        listed(suite, task, own_target=name)
+
+
 def test_the_expert_says_what_can_be_done():
     study = Study(TASKS, ("generic",), episodes=1, object="mug")
     rows = study.rows(*TASKS[0])

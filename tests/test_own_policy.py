@@ -35,6 +35,10 @@ def test_the_documented_policy_runs_when_pasted(
     assert len(printed) == 2
     for line in printed:
         assert line.startswith("failure Diagnosis(case='case 3', sub_case='timeout'")
+    exec(compile(documented("found +=").replace("=20", "=1"), "pasted", "exec"), names)
+    printed = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in printed] == list(names["methods"])
+    assert all(line.endswith("of 1") for line in printed)
 
 
 @pytest.mark.parametrize("method", ["generic", "vap"])

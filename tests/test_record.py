@@ -322,3 +322,31 @@ def test_a_grounding_alone_records(tmp_path: Path) -> None:
         "/observation.images.front/mask/target",
     } <= entities(tmp_path / "g.rrd")
     assert masks
+
+
+def test_a_later_sub_goal_has_votes_and_an_agreement_of_its_own(tmp_path: Path) -> None:
+    def agreed(candidate: int) -> Association:
+        return Association(
+            chosen={"front": candidate},
+            support={"front": np.ones(3)},
+            total=1.0,
+            margin=0.5,
+            terms={"geometry": 1.0},
+        )
+
+    first = replace(opening(1), associations=(agreed(0),))
+    second = replace(opening(1, none="front"), associations=(agreed(2),))
+    path = tmp_path / "one.rrd"
+    with Recorder(path, first) as recorder:
+        recorder.frame(frame(0, first))
+        recorder.begin_subgoal(second)
+        recorder.frame(frame(1, second))
+        recorder.close(replace(SUCCESS, steps=2))
+    entity = "/observation.images.front/candidates"
+    boxes = columns(path, entity, "Boxes2D:centers")
+    assert {step: len(cells) for step, cells in boxes.items()} == {0: 3, 1: 0}
+    labels = columns(path, f"{entity}/labels", "Points2D:positions")
+    assert labels[0]
+    assert not labels[1]
+    chosen = columns(path, "/vap/association", "chosen")
+    assert chosen == {0: [0], 1: [2]}

@@ -274,6 +274,8 @@ def test_what_lies_in_the_goal_already_rides_along_and_is_moved_when_it_is_taken
     assert judged(PUT, together).outcome().wrong_object
     assert judged(episode, moved(OTHER, 0.04)).outcome().wrong_object
     assert not judged(episode, moved(OTHER, 0.02)).outcome().wrong_object
+    pushed = judged(episode, moved(GOAL, 0.035)).outcome()
+    assert not pushed.wrong_object, "it never got there, and stands still"
 
 
 def test_first_object_is_the_first_touched_or_moved():

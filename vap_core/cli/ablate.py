@@ -7,7 +7,6 @@ import typer
 
 from vap_core.cli.options import Workers
 from vap_core.cli.studies import (
-    POLICIES,
     PerTask,
     Recorded,
     SplitName,
@@ -39,7 +38,10 @@ def ablate(
     ] = Path("data/runs/ablations"),
     policy: Annotated[
         str | None,
-        typer.Option(help=f"{POLICIES} Default: mini-pi0 where one ships, else scripted."),
+        typer.Option(
+            help="scripted; mini-pi0; or a lerobot checkpoint, as folder or hub id. Default: "
+            "mini-pi0 where one ships, else scripted."
+        ),
     ] = None,
     episodes: PerTask = None,
     seeds: Annotated[int, typer.Option(min=1, help="Run every episode with so many seeds.")] = 1,
@@ -48,7 +50,7 @@ def ablate(
     record: Recorded = "none",
 ) -> None:
     """Change one thing of the method at a time, and compare every arm with the method itself on the
-    same episodes. Interrupted, the same command goes on.
+    same episodes; draws OUT/NAME.png. Interrupted, the same command goes on.
 
     Example: python -m vap_core ablate
     Example: python -m vap_core ablate form --suite simpler-bridge --episodes 6

@@ -24,6 +24,12 @@ def attention(
             "--methods", "--method", help="Only these methods, with commas. Default: all."
         ),
     ] = "",
+    policy: Annotated[
+        str,
+        typer.Option(
+            help="Only the policy whose label in the table holds this, such as mini-pi0-tabletop@."
+        ),
+    ] = "",
     episodes: Annotated[
         int | None,
         typer.Option(
@@ -76,13 +82,14 @@ def attention(
         table = run.suffix == ".parquet"
         out = Path("data/runs") / f"attention-{run.stem}" if table else run / "attention"
     if record:
-        path, step = examples.record(run, record, out / "recordings", out / "memory")
+        path, step = examples.record(run, record, out / "recordings", out / "memory", policy)
         picture = f"{path} {path.stem}.png --attention --frame {step}"
         print(f"wrote {path}\nnext: python -m vap_core show {picture}")
         return
     wanted = replay.Wanted(
         suites=tuple(names(suite)),
         methods=tuple(names(method)),
+        policy=policy,
         episodes=episodes,
         explain=explain,
     )

@@ -90,6 +90,7 @@ def import_object(
     write_preview(model, preview)
     print(f"look: {preview}")
     setting = ""
+    use = f"eval --suite SUITE --object '{metadata.name}' --out data/runs/{metadata.name}"
     if folder == storage.scans_folder():
         too_wide = too_wide_for(metadata.name)
         if too_wide:
@@ -100,10 +101,7 @@ def import_object(
             )
     else:
         setting = f"VAP_OBJECTS={folder} "
-    print(
-        f"next: {setting}python -m vap_core objects photograph '{metadata.name}', or in Python "
-        f"scenes.build('wx250s', ['{metadata.name}'])"
-    )
+    print(f"next: {setting}python -m vap_core {use}  # of a suite that asks for a {category}")
 
 
 @app.command("designs")

@@ -88,6 +88,10 @@ def diagnose(
     from vap_core.evaluation.diagnosis.failures import failures_text, list_failures
     from vap_core.evaluation.diagnosis.recordings import correct_failure, recording_to_show
 
+    if against is not None and mp4 is not None:
+        raise BadStudy(
+            "diagnose: --mp4 films one recording, --against lays two side by side; leave one out."
+        )
     failures = list_failures(
         *runs, suite=suite, task=task, method=method, case=case, sub_case=sub_case, where=where
     )
@@ -98,7 +102,9 @@ def diagnose(
                 "diagnose: --correct is of one failure; name it by --open and its number."
             )
         layer = correct_failure(failures, number, correct, note)
-        print(f"wrote {layer}")
+        row = failures.table.iloc[number]
+        named = f"{row['suite']} {row['task']} {row['method']} {row['episode']}"
+        print(f"{named}: was {row['case']}, {row['sub_case']}; is {correct}\nwrote {layer}")
         return
     if show is None and png is None and mp4 is None:
         print(failures_text(failures, limit))

@@ -35,7 +35,8 @@ def report(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for report.md, CSV and LaTeX tables and pictures. Default RUN/report."
+            help="Folder for report.md, CSV and LaTeX tables and pictures. Default RUN/report; of "
+            "a table data/runs/TABLE-report."
         ),
     ] = None,
 ) -> None:

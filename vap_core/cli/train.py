@@ -131,7 +131,7 @@ def policy(
             "data/runs/trained/mini-pi0-SUITE."
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of films, order and noise.")] = 0,
     tint_share: Annotated[
         float | None,
         typer.Option(min=0.0, max=1.0, help="Share of tinted scenes. Default the recipe's."),
@@ -208,11 +208,11 @@ def policy(
         typer.Option(help="Stop the policy's steps after this long; the same command goes on."),
     ] = None,
 ) -> None:
-    """Train a mini-pi0, the small frozen policy, from nothing, by the recipe of its suite.
-    Interrupted, the same command goes on.
+    """Train a mini-pi0, the small frozen policy, from nothing, by the recipe of its suite: one to
+    five CPU hours. Interrupted, the same command goes on.
 
     Example: python -m vap_core train policy --suite simpler-bridge --stages 40 --steps 500
-        --out data/runs/small-policy
+        --vlm data/policies/mini-paligemma-tint-free --out data/runs/small-policy
     Example: python -m vap_core train policy --suite simpler-fractal --seed 1 --device cuda
     """
     from dataclasses import replace

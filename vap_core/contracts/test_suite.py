@@ -9,7 +9,7 @@ from vap_core.simulation.suites import Suite, shared
 
 def test_its_robot_and_cameras_exist(suite: Suite) -> None:
     robot = robots.get(suite.robot)
-    assert suite.hz > 0
+    assert suite.hz == robot.hz
     assert suite.cameras
     assert set(suite.cameras) <= {rig.name for rig in RIGS[robot.name]}
 

@@ -18,7 +18,7 @@ import rerun as rr
 
 from vap_core.base.errors import BadRecording, first_line
 from vap_core.recording.corrections import CORRECTIONS
-from vap_core.recording.index import CURVES, STEPS, index_path
+from vap_core.recording.index import CURVES, FOLDER, STEPS, index_path
 from vap_core.recording.isolated import index_isolated
 from vap_core.recording.legacy_names import former_name
 
@@ -75,7 +75,7 @@ def load_steps(folder: Path) -> StepTable:
         )
     unreadable: dict[Path, str] = {}
     with tempfile.TemporaryDirectory() as scratch, rr.server.Server(host="127.0.0.1") as server:
-        index_folder = None if os.access(folder, os.W_OK) else Path(scratch)
+        index_folder = None if _can_index(Path(folder)) else Path(scratch)
         indexes = _ensure_indexes(files, index_folder, unreadable)
         if not indexes:
             raise BadRecording(
@@ -88,6 +88,12 @@ def load_steps(folder: Path) -> StepTable:
         register_files(dataset, {path: path for path in layers}, unreadable, layer=CORRECTIONS)
         recordings = {index.resolve(): file for file, index in indexes.items()}
         return StepTable(_join_steps(dataset, recordings), unreadable)
+
+
+def _can_index(folder: Path) -> bool:
+    """Whether indexes can be written beside the recordings of a folder."""
+    indexes = folder / FOLDER
+    return os.access(indexes if indexes.exists() else folder, os.W_OK)
 
 
 def _ensure_indexes(
@@ -164,7 +170,7 @@ def _property_table(dataset: "DatasetEntry", recordings: Mapping[Path, Path]) ->
     segments = pa.Table.from_batches(dataset.segment_table().collect())
     table = pd.DataFrame({"segment": segments["rerun_segment_id"].to_pandas()})
     table["file"] = [
-        str(recordings[_url_path(urls[0])]) for urls in segments["rerun_storage_urls"].to_pylist()
+        _recording_of(urls, recordings) for urls in segments["rerun_storage_urls"].to_pylist()
     ]
     for group, names in PROPERTY_COLUMNS.items():
         for name in names:
@@ -173,7 +179,16 @@ def _property_table(dataset: "DatasetEntry", recordings: Mapping[Path, Path]) ->
     for name in CORRECTED_COLUMNS:
         correction = _property(segments, "correction", name)
         table[name] = correction.where(table["corrected"], table[name])
-    return table
+    # A correction of a recording that is gone, or was made again with another policy, is alone.
+    return table[table["file"].notna()]
+
+
+def _recording_of(urls: Sequence[str], recordings: Mapping[Path, Path]) -> str | None:
+    """The recording whose index is among the files of a segment; None where there is none."""
+    for url in urls:
+        if _url_path(url) in recordings:
+            return str(recordings[_url_path(url)])
+    return None
 
 
 def _curve_table(dataset: "DatasetEntry") -> "pd.DataFrame":

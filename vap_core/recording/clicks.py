@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ipywidgets import VBox
 
 CANDIDATES = re.compile(
-    rf"^{re.escape(image_root(''))}(?P<camera>[^/]+)/candidates(?:_(?P<j>\d+))?"
+    rf"^{re.escape(image_root(''))}(?P<camera>[^/]+)/candidates(?:_(?P<j>\d+))?(?P<label>/labels)?$"
 )
 
 
@@ -33,6 +33,7 @@ class Votes:
 
     def __init__(self, recording: Path) -> None:
         self._numbers: dict[str, dict[str, Any]] = {}
+        self._labelled: dict[str, list[int]] = {}
         prefix = "/vap/candidates/"
         for chunk in read_chunks(recording):
             if chunk.entity_path.startswith(prefix):
@@ -40,6 +41,10 @@ class Votes:
                 cells = {name: batch[name][0].as_py() for name in batch.schema.names}
                 # The first vote, as its picture: sub-goals hold one each.
                 self._numbers.setdefault(chunk.entity_path.removeprefix(prefix), cells)
+            elif chunk.entity_path.endswith("/labels") and CANDIDATES.match(chunk.entity_path):
+                batch = chunk.to_record_batch()
+                if "candidate" in batch.schema.names:
+                    self._labelled.setdefault(chunk.entity_path, batch["candidate"][0].as_py())
         if not self._numbers:
             raise BadRecording(
                 f"inspect_votes: {recording} has no vote; take one of a vap episode."
@@ -60,7 +65,8 @@ class Votes:
     def answer(self, entity: str, instance: int | None) -> tuple[str, str] | None:
         """The view that a click is about, and one candidate in words; None for another entity.
 
-        Candidates are drawn with the elected one last: `instance` counts in that order.
+        Boxes are drawn with the elected one last: `instance` counts in that order, or the labels
+        that have room.
         """
         match = CANDIDATES.match(entity)
         if match is None:
@@ -70,9 +76,12 @@ class Votes:
             return None
         numbers = self._numbers[name]
         n = len(numbers.get("score") or [])
-        if instance is None or not 0 <= instance < n:
+        order = self._drawing_order(numbers, n)
+        if match["label"]:
+            order = self._labelled.get(entity, [])
+        if instance is None or not 0 <= instance < len(order):
             return name, f"{name}: {n} candidates; click a box for its cosines"
-        return name, self._candidate(name, numbers, self._drawing_order(numbers, n)[instance])
+        return name, self._candidate(name, numbers, order[instance])
 
     @staticmethod
     def _drawing_order(numbers: dict[str, Any], n: int) -> list[int]:

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from vap_core.base.errors import BadRecording
+from vap_core.base.errors import VapError
 from vap_core.recording.index import ensure_index
 
 ENDED_READER = "its damaged bytes ended the process that read it"
@@ -44,7 +44,7 @@ def main() -> None:
         reason = None
         try:
             ensure_index(Path(path), folder)
-        except BadRecording as error:
+        except VapError as error:  # also a disk that is full
             reason = str(error)
         print(json.dumps(reason), flush=True)
 

@@ -153,8 +153,7 @@ class Recorder:
             self._log_first_frame(frame)
         elif self._spans and self._spans[-1].first == frame.frame_index:
             self._log_roles(frame)
-            for camera in frame.images:
-                self._log_votes(frame, camera)
+            self._log_choice(frame, again=True)
         self._pictures.add(frame)
         self._frames.append(frame.without_images())
         self._unsent.append(frame)
@@ -232,15 +231,19 @@ class Recorder:
         log_status_styles(rec)
         log_links(rec, frame.truth)
         self._log_roles(frame)
-        for camera in frame.images:
-            self._log_votes(frame, camera)
-        for j, association in enumerate(self._header.associations):
-            if association is not None:
-                log_association(rec, association, j, frame_times([frame]))
+        self._log_choice(frame)
         for of_queries in frame.attention.values():
             self._queries = tuple(of_queries)
 
-    def _log_votes(self, frame: Frame, camera: str) -> None:
+    def _log_choice(self, frame: Frame, again: bool = False) -> None:
+        """The votes of every view, and what the views agreed on, for the present sub-goal."""
+        for camera in frame.images:
+            self._log_votes(frame, camera, again)
+        for j, association in enumerate(self._goal.associations):
+            if association is not None:
+                log_association(self._open_stream(), association, j, frame_times([frame]))
+
+    def _log_votes(self, frame: Frame, camera: str, again: bool) -> None:
         """The votes of one view, over the first one's picture."""
         rec = self._open_stream()
         at = frame_times([frame])
@@ -251,9 +254,9 @@ class Recorder:
             log_row(rec, f"{image_root(camera)}/candidates", jpeg_image(jpeg), at=at)
             return
         right = _elected_target(frame, camera, self._goal.row.target)
-        log_vote(rec, groundings[0], 0, jpeg, at, right)
+        log_vote(rec, groundings[0], 0, jpeg, at, right, again)
         for j, grounding in enumerate(groundings[1:], start=1):
-            log_vote(rec, grounding, j, jpeg, at)
+            log_vote(rec, grounding, j, jpeg, at, again=again)
         for j, grounding in enumerate(groundings):
             references = self._header.references.get(grounding.object, ())
             log_vote_picture(

@@ -111,6 +111,7 @@ def _start_viewer() -> ViewerClient:
     try:
         return connect_viewer(process, port)
     except (RuntimeError, ConnectionError) as err:
+        _end(process)
         raise MissingGL(
             f"open_viewer: the viewer did not come up ({err}); add --png FILE for a picture."
         ) from err
@@ -160,9 +161,13 @@ def headless_viewer(size: tuple[int, int]) -> Iterator[ViewerClient]:
                 f"install a software driver: apt-get install -y {DRIVER}"
             ) from err
         finally:
-            # The command is a launcher, and its child is the viewer: end both.
-            with suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
+            _end(process)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a viewer: the command is a launcher, and its child is the viewer."""
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
 
 
 def connect_viewer(process: subprocess.Popen[bytes], port: int) -> ViewerClient:

@@ -72,7 +72,7 @@ class Env:
 
     The same row in the same scene gives bit-identical states and images, whatever else runs.
     `image_size` is the side of the views, or their height and width, in pixels.
-    `control` says what an action is (values.Action); `sensor` how the cameras change their images;
+    `control` says what an action is (types.Action); `sensor` how the cameras change their images;
     `occlusion` what hides the target from them, and when. `seconds` sums wall time by part:
     "physics", "ik", "render", "truth". Raises: UnknownName for a camera that the scene lacks.
     """

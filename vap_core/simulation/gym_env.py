@@ -3,7 +3,7 @@
 `import vap_core.simulation.gym_env`, then `gym.make("vap/simpler-bridge/put-camera-v0")`. An
 observation is what a policy may read (values.PolicyInput): the suite's camera images, the
 proprioception, and the instruction. An action is one control step in the suite's control
-(values.Action). The reward is 1 in the step in which the rule is met, else 0.
+(types.Action). The reward is 1 in the step in which the rule is met, else 0.
 """
 
 import re
@@ -88,7 +88,7 @@ class VapEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
                 f"reset: {row!r:.80} is no EpisodeRow for {self.suite.robot}; "
                 "take one of vap_core.simulation.suites.rows and replace its fields."
             )
-        check([row])
+        check([row], self.suite)
         self._start(row if seed is None else replace(row, seed=seed))
         return self._observe(), self._info()
 

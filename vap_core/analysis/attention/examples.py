@@ -25,15 +25,17 @@ def name_of(line: Mapping[str, Any]) -> str:
     return f"{name}/{line['seed']}" if line["seed"] else name
 
 
-def record(source: Path, name: str, folder: Path, memory: Path) -> tuple[Path, int]:
+def record(source: Path, name: str, policy: str, folder: Path, memory: Path) -> tuple[Path, int]:
     """Record the named episode of a run with the maps of every query, in `folder`.
+
+    It is of the first policy whose label holds `policy`.
 
     Returns: the recording, and the step of the call whose map of a word is highest.
 
     Raises: BadOutput for a folder that cannot be written; BadStudy for an episode that the run does
         not hold.
     """
-    manifest, line = _find(source, name)
+    manifest, line = _find(source, name, policy)
     path = folder / f"{name.replace('/', '.')}.rrd"
     with writing(folder, "attention", "choose another --out"):
         folder.mkdir(parents=True, exist_ok=True)
@@ -58,12 +60,12 @@ def clearest(calls: Mapping[int, Mapping[str, Mapping[str, AttentionMap]]]) -> i
 
 def example_tiles(source: Path, line: Mapping[str, Any], memory: Path) -> list[Tile]:
     """The tiles of an episode of `patterns.per_episode`, run again from the run of `source`."""
-    manifest, listed = _find(source, name_of(line))
+    manifest, listed = _find(source, name_of(line), str(line.get("policy", "")))
     episode, frames = run_again(manifest, listed, memory)
     return strip(episode, frames, str(line["query"]))
 
 
-def _find(source: Path, name: str) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+def _find(source: Path, name: str, policy: str = "") -> tuple[Mapping[str, Any], Mapping[str, Any]]:
     """The manifest of the run that holds an episode, and its row there."""
     parts = name.split("/")
     if len(parts) not in (len(PARTS), len(PARTS) + 1) or not all(map(str.isdigit, parts[3:])):
@@ -81,6 +83,7 @@ def _find(source: Path, name: str) -> tuple[Mapping[str, Any], Mapping[str, Any]
             & (episodes["method"] == method)
             & (episodes["episode"] == number)
             & (episodes["seed"] == seed)
+            & episodes["policy"].str.contains(policy, regex=False)
         ]
         if len(found):
             return manifest, found.iloc[0].to_dict()

@@ -27,6 +27,7 @@ from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.rollout.loop import rollout
 from vap_core.rollout.queries import QUERIES
 from vap_core.rollout.types import Episode, EpisodeHeader
+from vap_core.simulation import suites
 from vap_core.simulation.types import EpisodeRow
 
 if TYPE_CHECKING:
@@ -55,13 +56,15 @@ class Job:
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which episodes of a run: of these suites and methods ("" all), so many a task and method.
+    """Which episodes of a run: of these suites and methods (none named: all), of policies whose
+    label holds `policy`, so many a task and method.
 
     `explain` of them get the causal measures, which take as long as many calls.
     """
 
     suites: tuple[str, ...] = ()
     methods: tuple[str, ...] = ()
+    policy: str = ""
     episodes: int | None = None
     explain: int = 2
 
@@ -112,23 +115,45 @@ def run_replay(
 def plan(source: Path, memory: Path, wanted: Wanted) -> list[Job]:
     """The jobs of the wanted episodes of a run. Raises: BadOutput, BadStudy."""
     jobs: list[Job] = []
+    policies: dict[Any, set[str]] = {}
     for manifest, episodes in read_runs(source):
+        if wanted.policy:
+            episodes = episodes[episodes["policy"].str.contains(wanted.policy, regex=False)]
         if wanted.suites:
             episodes = episodes[episodes["suite"].isin(wanted.suites)]
         if wanted.methods:
             episodes = episodes[episodes["method"].isin(wanted.methods)]
         ended = episodes[episodes["outcome"] != "error"]
-        for _, group in ended.groupby(["suite", "task", "method"], sort=False):
+        _require_measurable(source, ended)
+        for key, group in ended.groupby(["suite", "task", "method"], sort=False):
             lines = group.sort_values(["seed", "episode"]).to_dict("records")
             if wanted.episodes is not None:
                 lines = spread_evenly(lines, wanted.episodes)
             jobs += _jobs_of(manifest, lines, memory, wanted.explain)
+            policies.setdefault(key, set()).update(str(line["policy"]) for line in lines)
     if not jobs:
         raise BadStudy(
-            f"attention: {source} holds no episode of what was asked for; leave --suite or "
-            "--method out."
+            f"attention: {source} holds no episode of what was asked for; leave --suite, --method "
+            "or --policy out."
         )
+    for names in policies.values():
+        if len(names) > 1:
+            raise BadStudy(
+                f"attention: {source} holds the same episodes by {' and '.join(sorted(names))}; "
+                "choose one with --policy."
+            )
     return jobs
+
+
+def _require_measurable(source: Path, episodes: "pd.DataFrame") -> None:
+    """Raises: BadStudy for sub-goals, whose targets change on the way."""
+    for name in episodes["suite"].unique():
+        row = suites.rows(str(name), suites.suite(str(name)).tasks[0].name, 1)[0]
+        if row.subgoals:
+            raise BadStudy(
+                f"attention: episodes of {name} in {source} have sub-goals, and what is measured "
+                "here is one target's; choose other suites with --suite."
+            )
 
 
 def _jobs_of(

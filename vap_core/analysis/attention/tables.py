@@ -63,6 +63,8 @@ def publish(folder: Path, to: Path) -> list[Path]:
 
     files = {}
     for name, table in read(folder).items():
+        if table.empty:
+            continue  # nothing was explained, or asked
         metadata = pq.read_schema(folder / file_name(name)).metadata or {}
         (about,) = parse_json(metadata[ABOUT])
         files[file_name(name)] = measurements.add_rows(

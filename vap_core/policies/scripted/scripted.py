@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64
 
+from vap_core.base.errors import one_of
 from vap_core.base.types import Camera, value
 from vap_core.perception.protocols import Detector
 from vap_core.policies.hooks import TEXT, report_input
@@ -95,6 +96,8 @@ class Scripted:
         hz: float,
         control: Literal["ee", "joint"] = "ee",
     ) -> None:
+        if robot.name not in MOTIONS:
+            raise one_of("scripted: motion of robot", robot.name, MOTIONS)
         self.robot = robot
         self.motion = MOTIONS[robot.name]
         self.localizer = MonocularLocalizer(

@@ -25,10 +25,12 @@ def log_vote(
     jpeg: np.ndarray | None,
     at: Sequence[rr.TimeColumn],
     right: bool | None = None,
+    again: bool = False,
 ) -> None:
     """The vote of target j in one view: labelled boxes over the picture, and numbers.
 
-    `right` says whether it elected the target, where that is known.
+    `right` says whether it elected the target, where that is known. Where it is held `again`, for
+    another sub-goal, a vote without candidates takes the boxes of the one before away.
     """
     name = f"{grounding.camera}{target_suffix(j)}"
     order = _drawing_order(grounding)
@@ -39,6 +41,11 @@ def log_vote(
         _log_boxes(rec, entity, grounding, order, at, right)
         counts = rr.AnyValues(counts=grounding.ballot.votes)
         log_row(rec, f"/vap/votes/{name}", counts, at=at)
+    elif again:
+        nothing = np.zeros((0, 4), np.float32)
+        log_row(rec, entity, rr.Boxes2D(array=nothing, array_format=rr.Box2DFormat.XYXY), at=at)
+        log_row(rec, f"{entity}/labels", rr.Points2D(np.zeros((0, 2), np.float32)), at=at)
+        log_row(rec, f"/vap/votes/{name}", rr.AnyValues(counts=np.zeros(1, np.int64)), at=at)
     log_row(rec, f"/vap/candidates/{name}", _candidate_numbers(grounding), at=at)
 
 
@@ -122,7 +129,9 @@ def _log_boxes(
         colors=[colours[i] for i in spots],
         show_labels=True,
     )
-    log_row(rec, f"{entity}/labels", points, at=at)
+    # A label says "#2"; where some have no room, its place in the list does not.
+    candidates = rr.AnyValues(candidate=np.array([order[i] for i in spots], np.int64))
+    log_row(rec, f"{entity}/labels", points, candidates, at=at)
 
 
 def _long_label(grounding: Grounding, i: int) -> str:

@@ -187,7 +187,11 @@ def get_object(name: str) -> ObjectModel:
     if name in scanned:
         return load_scanned_object(scanned[name])
     generic_names = [f"{stem}-generic-NNNN" for stem in FAMILY_NUMBERS]
-    raise one_of("objects: object", name, [*OBJECTS, *generic_names, *scanned])
+    unknown = one_of("objects: object", name, [*OBJECTS, *generic_names, *scanned])
+    raise type(unknown)(
+        f"{unknown} One that was registered has photos alone: bring its scan by objects import, or "
+        "point VAP_OBJECTS at its folder."
+    )
 
 
 def _generic_of_name(name: str) -> ObjectModel | None:

@@ -3,7 +3,8 @@
 The episode lists of benchmarks and shared scenes are hashed files; those of the warm-up suites are
 generated. Every benchmark has a development list, the suite NAME-dev. NAME-absent and
 NAME-dev-absent are the same lists with the target left out; NAME-red and NAME-dev-red have a
-look-alike that is red by nature. A user's own suites come from files (own.py).
+look-alike that is red by nature. Where a suite's sensor has noise (tabletop), each of these draws
+its own. A user's own suites come from files (own.py).
 """
 
 from dataclasses import replace
@@ -195,7 +196,7 @@ def listed(
     `own_target` takes the listed target's place (own_object.with_object).
     """
     if own_target:
-        everything = tuple(SUITES.values())
+        everything = tuple(known for known in SUITES.values() if known.name not in SHARED)
         own_object.check_category(own_target, suite(suite_name), task_name, everything)
     episodes: list[EpisodeRow] = []
     for row_seed in range(seed, seed + seeds):

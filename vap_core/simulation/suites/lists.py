@@ -12,7 +12,9 @@ from typing import Any, get_args
 
 from vap_core.base.errors import BadSuite
 from vap_core.base.files import DATA, parse_json, read_file, write_atomic
+from vap_core.simulation import robots
 from vap_core.simulation.suites.shared_fields import BadField, from_json, to_json
+from vap_core.simulation.suites.suite import Suite
 from vap_core.simulation.suites.variants import VARIANTS
 from vap_core.simulation.types import EpisodeRow, Placement, SuccessRule
 
@@ -96,11 +98,25 @@ def digest(name: str, folder: Path = FOLDER) -> str:
         ) from error
 
 
-def check(rows: Iterable[EpisodeRow]) -> None:
+def check(rows: Iterable[EpisodeRow], suite: Suite) -> None:
     """Refuse rows that could not be run. Raises: BadSuite, naming row and field."""
+    n_joints = len(robots.get(suite.robot).joints)
     for i, row in enumerate(rows, 1):
         text = json.dumps(_to_json(row))
         _parse_row(text, f"row {i}")
+        start = row.start
+        for field, n, most in (
+            ("start.offsets", len(start.offsets), len(row.placements)),
+            ("start.joints_rad", len(start.joints_rad), n_joints),
+        ):
+            if n not in (0, most):
+                raise BadSuite(f"suites: row {i}, field {field!r}: {n} entries, and not {most}.")
+        for camera in row.cameras:
+            if camera not in suite.cameras:
+                raise BadSuite(
+                    f"suites: row {i}, field 'cameras': {camera!r} is none of "
+                    f"{', '.join(suite.cameras)}."
+                )
 
 
 def to_line(row: EpisodeRow) -> str:

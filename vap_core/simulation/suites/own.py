@@ -20,7 +20,7 @@ from vap_core.simulation.assets import objects
 from vap_core.simulation.cameras import RIGS
 from vap_core.simulation.suites import lists
 from vap_core.simulation.suites.suite import Suite
-from vap_core.simulation.types import EpisodeRow
+from vap_core.simulation.types import AS_LISTED, EpisodeRow
 
 VARIABLE = "VAP_SUITES"
 NAME = re.compile(r"[\w-]+")
@@ -132,7 +132,7 @@ def _checked_rows(
             if camera not in rigs:
                 raise one_of(f"suite {suite.name}: camera", camera, sorted(rigs))
         rows = tuple(make_rows())
-        lists.check(rows)
+        lists.check(rows, suite)
         keys = set()
         for row in rows:
             suite.task(row.task)
@@ -156,4 +156,6 @@ def _digest(rows: Iterable[EpisodeRow]) -> str:
     digest = hashlib.sha256()
     for row in rows:
         digest.update(lists.to_line(row).encode())
+        if str(row.start) != str(AS_LISTED):
+            digest.update(repr(row.start).encode())
     return digest.hexdigest()

@@ -27,8 +27,14 @@ def with_object(
     nearest target place of the task's `whole` list that has room.
 
     Raises: UnknownName; BadObject; BadStudy for an object of another category, one that stands
-        there already, or one that fits nowhere.
+        there already, or one that fits nowhere, and for a shared scene, which names its objects.
     """
+    for row in rows:
+        if row.owned or row.subgoals:
+            raise BadStudy(
+                f"--object: {row.suite}/{row.task} is a scene that people share, and names the "
+                "objects that they own; take a task of another suite."
+            )
     spots = _target_spots(whole)
     radii_m = _disc_radii_m(rows, name)
     return tuple(_replaced(row, name, spots, radii_m) for row in rows)

@@ -121,16 +121,20 @@ class Judge:
         return math.dist(_middle_of(self, truth or self.now, name), start)
 
     def _strayed_m(self, name: str, truth: Truth) -> float:
-        """`travel_m`; of what lies in the goal already, within it: it rides along."""
+        """`travel_m`; of what lies in the goal already, within it: it rides along.
+
+        What an earlier sub-goal failed to put there stands still where the goal is moved.
+        """
+        travel_m = self.travel_m(name, truth)
         if name not in self.row.inside:
-            return self.travel_m(name, truth)
+            return travel_m
         ridden = []
         for poses in (self.start_world, truth.objects_world):
             middle, carrier = (
                 _middle(poses[one], self.sizes_m[one]) for one in (name, self.row.goal)
             )
             ridden.append([a - b for a, b in zip(middle, carrier, strict=True)])
-        return math.dist(*ridden)
+        return min(travel_m, math.dist(*ridden))
 
     @property
     def over(self) -> bool:

@@ -69,4 +69,6 @@ def _subgoal(given: Any, placed: list[str]) -> SubGoal:
     needs_goal = given["rule"] in ("near", "put")
     if given["target"] not in placed or (needs_goal and given["goal"] not in placed):
         raise BadField("subgoals", f"{given['target']!r} or {given['goal']!r} is not placed")
+    if given["goal"] == given["target"] or (given["goal"] and not needs_goal):
+        raise BadField("subgoals", f"{given['rule']} has no goal {given['goal']!r}")
     return SubGoal(**given)

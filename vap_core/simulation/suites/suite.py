@@ -40,7 +40,7 @@ class Task:
 class Suite:
     """A set of tasks on one robot.
 
-    `control` says what an action is (values.Action), `sensor` how the cameras change their images.
+    `control` says what an action is (types.Action), `sensor` how the cameras change their images.
     """
 
     name: str

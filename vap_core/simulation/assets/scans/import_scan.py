@@ -8,6 +8,7 @@ decomposition.
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Literal
@@ -18,6 +19,7 @@ from vap_core import __version__
 from vap_core.base.errors import BadObject
 from vap_core.base.limits import bounded
 from vap_core.memory import CATEGORY, NAME
+from vap_core.simulation import robots
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.scans.bake import (
     ColouredPoints,
@@ -30,6 +32,7 @@ from vap_core.simulation.assets.scans.mesh_file import ScannedSurface, read_mesh
 from vap_core.simulation.assets.scans.mesh_repair import close_surface, count_edge_flaws
 from vap_core.simulation.assets.scans.storage import Scan, ScanMetadata
 from vap_core.simulation.assets.triangles import area_vectors, decimate
+from vap_core.simulation.types import REST, ROBOT
 
 VISUAL_FACES, TEXTURE_PX = 3000, 1024
 MEMORY_BYTES, CPU_LIMIT_S = 6_000_000_000, 300.0
@@ -38,6 +41,8 @@ MOST_VISUAL_FACES = 5 * VISUAL_FACES
 """A surface of which more faces remain than this is refused: it crosses itself all over."""
 SMALLEST_M, LARGEST_M, THINNEST_M = 0.01, 0.6, 0.002
 DENSITY_KG_M3, MASS_KG = 400.0, (0.03, 0.5)
+ROOM_NAMES = ("floor", "wall", "wall_back", "wall_left", "legs", "planks", "table", "lamp")
+"""What the parts of a room are called in a scene."""
 HEAVIEST_KG = 5
 UpAxis = Literal["y", "z"]
 OBJECT_FROM_FILE: dict[UpAxis, np.ndarray] = {
@@ -109,7 +114,7 @@ def import_scan(
 
 def default_name(path: Path) -> str:
     """A name for the object in a file."""
-    return re.sub(r"[^A-Za-z0-9]+", "-", path.stem).strip("-")[:64]
+    return re.sub(r"[^A-Za-z0-9]+", "-", path.stem).strip("-")[:64] or "my-object"
 
 
 def guess_up(surface: ScannedSurface, path: Path) -> UpAxis:
@@ -141,6 +146,16 @@ def _check_arguments(name: str, category: str, mass_kg: float | None) -> None:
             f"objects: {name!r} is one of the workspace's own objects; choose another --name, for "
             f"example my-{name}."
         )
+    if name in _scene_names():
+        raise BadObject(
+            f"objects: {name!r} is what a part of the room or of a robot is called; choose another "
+            f"--name, for example my-{name}."
+        )
+    if name.endswith(objects.RED):
+        raise BadObject(
+            f"objects: a name that ends in {objects.RED} is of an object that was made red; choose "
+            "another --name."
+        )
     if not CATEGORY.fullmatch(category.strip()):
         raise BadObject(
             f"objects: {category!r} cannot be a category; name the kind of thing in words, for "
@@ -151,6 +166,19 @@ def _check_arguments(name: str, category: str, mass_kg: float | None) -> None:
             f"objects: a mass of {mass_kg:g} kg is beyond what the arms lift; give --mass-kg "
             f"between 0 and {HEAVIEST_KG}."
         )
+
+
+@cache
+def _scene_names() -> frozenset[str]:
+    """What the room and the robots are made of, and what contacts call them."""
+    import mujoco
+
+    names = {*ROOM_NAMES, ROBOT, REST}
+    for robot in robots.ROBOTS.values():
+        spec = mujoco.MjSpec.from_file(str(robot.xml))
+        for part in (*spec.bodies, *spec.materials, *spec.meshes, *spec.textures):
+            names.add(part.name)
+    return frozenset(names)
 
 
 def _check_closed(surface: ScannedSurface, path: Path, repaired: bool) -> None:
