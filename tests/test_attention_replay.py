@@ -133,6 +133,21 @@ def test_methods_without_a_token_come_first_and_are_kept(
     assert [path.name for path in (tmp_path / "parts").iterdir()] == ["vap.json"]
 
 
+def test_of_several_policies_one_is_asked_for_and_sub_goals_are_refused(tmp_path: Path) -> None:
+    table = DATA / "results" / "shared.parquet"
+    pair = replay.Wanted(suites=("shared-pair",), methods=("vap",))
+    with pytest.raises(
+        BadStudy, match=r"by mini_pi0:mini-pi0-shared-pair@.* choose one with --pol"
+    ):
+        replay.plan(table, tmp_path, pair)
+    for policy in ("mini-pi0-shared-pair@", "mini-pi0-tabletop@"):
+        jobs = replay.plan(table, tmp_path, replace(pair, policy=policy))
+        assert {policy in job.policy for job in jobs} == {True}
+        assert sum(len(job.rows) for job in jobs) == 100
+    with pytest.raises(BadStudy, match=r"shared-sequence in .* have sub-goals"):
+        replay.plan(table, tmp_path, replace(pair, suites=("shared-sequence",)))
+
+
 def test_an_episode_is_named_and_found_in_its_run(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -25,7 +25,9 @@ def name_of(line: Mapping[str, Any]) -> str:
     return f"{name}/{line['seed']}" if line["seed"] else name
 
 
-def record(source: Path, name: str, policy: str, folder: Path, memory: Path) -> tuple[Path, int]:
+def record(
+    source: Path, name: str, folder: Path, memory: Path, policy: str = ""
+) -> tuple[Path, int]:
     """Record the named episode of a run with the maps of every query, in `folder`.
 
     It is of the first policy whose label holds `policy`.
