@@ -148,14 +148,16 @@ def find_expressions(
             kind = "alone" if kind == "owner" and match.group().lower() not in MINE else kind
         acted = re.search(rf"\b(?:{ACTION})(?: me| us)?(?: both)?$", ahead, re.IGNORECASE)
         placed = re.search(rf"\b(?:{DESTINATION})$", ahead, re.IGNORECASE)
-        further = before is not None and kind == "owner" and _continues(text, before, start, stop)
+        first = None
+        if before is not None and kind == "owner" and _continues(text, before, start, stop):
+            first = before
         expression = Expression(
             start=start,
             stop=stop,
             said=text[start:stop],
             kind=kind,
-            argument=acted is not None or (further and before.argument),
-            destination=placed is not None or (further and before.destination),
+            argument=acted is not None or (first is not None and first.argument),
+            destination=placed is not None or (first is not None and first.destination),
             clause=text[start:clause_end],
         )
         yield expression
