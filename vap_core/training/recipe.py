@@ -91,8 +91,7 @@ RECIPES: dict[str, Recipe] = {
     "tabletop": Recipe(
         suite="tabletop",
         held_out_category="slipper",
-        stages=160,
-        steps=12_000,
+        stages=240,
         batch=32,
         rate=1e-3,
         angle_noise_rad=0.04,
