@@ -257,7 +257,7 @@ def cost_s(folder: Path, seed: int, number: int, held_out: bool) -> float:
 
 
 def boxes_of(
-    ids: UInt8[np.ndarray, "h w"], n: int, least_px: int = 40
+    ids: UInt8[np.ndarray, "_h _w"], n: int, least_px: int = 40
 ) -> Iterator[tuple[int, tuple[int, int, int, int]]]:
     """Index and visible box of every object with at least `least_px` visible pixels.
 
