@@ -166,24 +166,16 @@ def all_tasks(suite_names: list[str], object: str = "") -> tuple[tuple[str, str]
     Raises: BadStudy when no task has its category.
     """
     from vap_core.base.errors import BadStudy
-    from vap_core.simulation.suites import suite
+    from vap_core.simulation.assets.objects import get_object
+    from vap_core.simulation.suites import tasks_of
 
-    category = ""
-    if object:
-        from vap_core.simulation.assets.objects import get_object
-
-        category = get_object(object).category
-    tasks = []
-    for name in suite_names:
-        for task in suite(name).tasks:
-            if not object or task.category == category:
-                tasks.append((name, task.name))
+    tasks = tasks_of(suite_names, object)
     if not tasks:
         raise BadStudy(
-            f"--object: {object} is a {category}, and no task of {', '.join(suite_names)} asks for "
-            "one; python -m vap_core suites lists the tasks."
+            f"--object: {object} is a {get_object(object).category}, and no task of "
+            f"{', '.join(suite_names)} asks for one; python -m vap_core suites lists the tasks."
         )
-    return tuple(tasks)
+    return tasks
 
 
 def study_of(

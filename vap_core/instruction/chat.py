@@ -137,8 +137,10 @@ class ChatParser:
                 f"that was asked for ({type(error).__name__}: {_line(str(error))[:60]!r}); try "
                 f"another model in {MODEL}, or --parser rule."
             ) from error
-        first = {target.object: target for target in reversed(targets)}
-        return tuple(target for target in targets if first[target.object] is target)
+        first: dict[str | None, Target] = {}
+        for target in targets:
+            first.setdefault(target.object, target)
+        return tuple(first.values())
 
 
 class _Verbatim(str):

@@ -10,7 +10,7 @@ from functools import cache
 from vap_core.base.types import value
 from vap_core.instruction.context import Context
 from vap_core.instruction.owners import MINE
-from vap_core.instruction.rule import category_pattern, spaced
+from vap_core.instruction.rule import category_pattern, possessive, spaced
 
 PLACING = "put|place|set|lay|move|drop|push|stack|store|leave|slide|stand|stow"
 ACTION = (
@@ -202,7 +202,7 @@ def _inside(place: int, exclusions: Collection[Exclusion]) -> bool:
 @cache
 def _beginning(people: str) -> re.Pattern[str]:
     """What an expression begins with, by kind; `people` is a `person_pattern`."""
-    owned = rf"(?:(?:{people})(?:['’]s|(?<=s)['’])|{_OWNED})"
+    owned = rf"(?:{possessive(people)}|{_OWNED})"
     return re.compile(
         r"\b(?:(?P<several>(?:one|some|any) of (?:my|his|her|their|our))"
         rf"|(?P<owner>(?:my|his|her|their|our)\b(?:\s+(?:[\w-]+\s+)?{_OWNED})?"

@@ -7,12 +7,7 @@ from dataclasses import dataclass
 from vap_core.instruction.context import Context
 from vap_core.instruction.expressions import Expression, find_category, person_pattern
 from vap_core.instruction.owners import MINE, OTHERS, fold
-
-BEGINNING = (
-    r"(?:my|his|her|their|our)(?:\s+(?:[\w-]+\s+)?[\w-]+['’]s)?(?=\W|$)|mine|hers|theirs|ours|"
-    r"(?:(?:PEOPLE)(?:['’]s|(?<=s)['’])|[\w-]+['’]s)(?:\s+[\w-]+['’]s)?"
-)
-"""An owner that an expression begins with; PEOPLE stands for the known ones."""
+from vap_core.instruction.rule import possessive
 
 
 @dataclass(frozen=True)
@@ -59,7 +54,11 @@ class Possession:
 
     def _beginning(self, said: str) -> str | None:
         """The owner that an expression begins with: "my", "Anna's", "James'"."""
-        pattern = BEGINNING.replace("PEOPLE", person_pattern(self.context))
+        known = possessive(person_pattern(self.context))
+        pattern = (
+            r"(?:my|his|her|their|our)(?:\s+(?:[\w-]+\s+)?[\w-]+['’]s)?(?=\W|$)"
+            rf"|mine|hers|theirs|ours|(?:{known}|[\w-]+['’]s)(?:\s+[\w-]+['’]s)?"
+        )
         match = re.match(pattern, said, re.IGNORECASE)
         return match and match.group()
 

@@ -102,19 +102,18 @@ def spaced(phrase: str) -> str:
     return r"\s+".join(re.escape(word) for word in phrase.split())
 
 
-def names_pattern(names: Collection[str]) -> str:
-    """A regular expression for "Mary Jane's" and "James'", the longest name first; names are not
-    empty."""
-    words = [spaced(name) for name in sorted(names, key=len, reverse=True)]
-    return rf"(?:{'|'.join(words)})(?:['’]s|(?<=s)['’])"
+def possessive(people: str) -> str:
+    """A regular expression for "Mary Jane's" and "James'", of one for people."""
+    return rf"(?:{people})(?:['’]s|(?<=s)['’])"
 
 
 @cache
 def _any_owner(owners: tuple[str, ...]) -> re.Pattern[str]:
     """As OWNER, and "his cup", "Anna's cup", "Anna's brother's cup"; for one of `owners` also
     "James' cup" and "Mary Jane's cup"."""
+    names = "|".join(spaced(name) for name in sorted(owners, key=len, reverse=True))
     return re.compile(
-        rf"\b(?:my|his|her|their|our|{names_pattern(owners)}"
+        rf"\b(?:my|his|her|their|our|{possessive(names)}"
         r"|(?!(?:it|that|what|who|where|here|there|let|how)['’])[\w-]+['’]s)\s+"
         rf"{_PERSON}",
         re.IGNORECASE,

@@ -7,7 +7,7 @@ The catalog server is on 127.0.0.1 alone and holds nothing but the run's own fil
 """
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +21,7 @@ from vap_core.recording.blueprint import full_window
 from vap_core.recording.catalog import register_files
 from vap_core.recording.corrections import CORRECTIONS, layer_path, read_correction
 from vap_core.recording.reading import read_summary
-from vap_core.recording.stored_pictures import prompted_entities
+from vap_core.recording.stored_pictures import by_camera
 from vap_core.recording.viewer import free_port
 from vap_core.recording.views import (
     coverage_view,
@@ -102,7 +102,7 @@ def serve_run(run: Path, where: str | None = None, port: int | None = None) -> I
                 f"query: none of {len(files)} files in {folder} can be read; "
                 f"the first: {next(iter(unreadable.values()))}."
             )
-        _register_layout(dataset, [folder / row["file"] for row in rows], Path(scratch))
+        _register_layout(dataset, Path(scratch))
         table = client.create_table("episodes", _schema())
         table.append(pa.RecordBatch.from_pylist(rows, schema=_schema()))
         blueprint = Path(scratch) / "episodes.rbl"
@@ -175,17 +175,14 @@ def _rows(
     return rows
 
 
-def _register_layout(dataset: "DatasetEntry", recordings: Sequence[Path], scratch: Path) -> None:
+def _register_layout(dataset: "DatasetEntry", scratch: Path) -> None:
     """Recordings of a catalog open with one layout for all: the verdict, every view, the curves.
 
-    A recording's own layout, with the evidence of its case, opens with its file. The layout has
-    every camera that any of `recordings` has.
+    A recording's own layout, with the evidence of its case, opens with its file. This one has every
+    camera that any recording has.
     """
-    cameras: dict[str, None] = {}
-    for recording in recordings:
-        cameras.update(dict.fromkeys(prompted_entities(recording)))
     columns: list[rrb.Container | rrb.View] = []
-    for camera in cameras:
+    for camera in by_camera(dataset.schema().entity_paths()):
         pictures = rrb.Horizontal(vote_view(camera, "vote"), policy_view(camera))
         columns.append(rrb.Vertical(coverage_view(camera), pictures, row_shares=[1.6, 1]))
     course = rrb.Horizontal(instruction_view(), gripper_view(), events_view())

@@ -1,6 +1,6 @@
 """The pictures of a recording, read back: JPEG or AV1, as they were kept."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +16,17 @@ BLOB, SAMPLE = "EncodedImage:blob", "VideoStream:sample"
 
 def prompted_entities(path: Path) -> dict[str, str]:
     """The entity of what the policy saw, by camera, in the order of the file."""
-    entities: dict[str, str] = {}
+    return by_camera(chunk.entity_path for chunk in read_chunks(path))
+
+
+def by_camera(entities: Iterable[str]) -> dict[str, str]:
+    """Those of some entities that are what the policy saw, by camera."""
     root = image_root("")
-    for chunk in read_chunks(path):
-        name = chunk.entity_path
+    found: dict[str, str] = {}
+    for name in entities:
         if name.startswith(root) and name.endswith("/prompted"):
-            entities[name.removeprefix(root).removesuffix("/prompted")] = name
-    return entities
+            found[name.removeprefix(root).removesuffix("/prompted")] = name
+    return found
 
 
 def read_pictures(path: Path, entities: set[str]) -> dict[str, dict[int, Rgb]]:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import make_folder, writing
+from vap_core.base.files import writing
 from vap_core.training.perception.fitting import checkpoint
 
 KEEP = 0.999
@@ -60,7 +60,7 @@ def train_steps[M: nn.Module](
     )
     mean = copy.deepcopy(model)
     parts: dict[str, Any] = {"model": model, "mean": mean, "optimiser": optimiser}
-    make_folder(out, "train")
+    out.mkdir(parents=True, exist_ok=True)
     state, save = checkpoint(out / "training.pt", resume=True)
     made_of = json.dumps(run.made_of, sort_keys=True)
     if state:

@@ -27,7 +27,6 @@ from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.rollout.loop import rollout
 from vap_core.rollout.queries import QUERIES
 from vap_core.rollout.types import Episode, EpisodeHeader
-from vap_core.simulation import suites
 from vap_core.simulation.types import EpisodeRow
 
 if TYPE_CHECKING:
@@ -124,7 +123,6 @@ def plan(source: Path, memory: Path, wanted: Wanted) -> list[Job]:
         if wanted.methods:
             episodes = episodes[episodes["method"].isin(wanted.methods)]
         ended = episodes[episodes["outcome"] != "error"]
-        _require_measurable(source, ended)
         for key, group in ended.groupby(["suite", "task", "method"], sort=False):
             lines = group.sort_values(["seed", "episode"]).to_dict("records")
             if wanted.episodes is not None:
@@ -139,27 +137,19 @@ def plan(source: Path, memory: Path, wanted: Wanted) -> list[Job]:
     for names in policies.values():
         if len(names) > 1:
             raise BadStudy(
-                f"attention: {source} holds the same episodes by {' and '.join(sorted(names))}; "
-                "choose one with --policy."
+                f"attention: {source} holds episodes of one task and method by "
+                f"{' and '.join(sorted(names))}; choose one with --policy."
             )
     return jobs
-
-
-def _require_measurable(source: Path, episodes: "pd.DataFrame") -> None:
-    """Raises: BadStudy for sub-goals, whose targets change on the way."""
-    for name in episodes["suite"].unique():
-        row = suites.rows(str(name), suites.suite(str(name)).tasks[0].name, 1)[0]
-        if row.subgoals:
-            raise BadStudy(
-                f"attention: episodes of {name} in {source} have sub-goals, and what is measured "
-                "here is one target's; choose other suites with --suite."
-            )
 
 
 def _jobs_of(
     manifest: dict[str, Any], lines: Sequence[dict[str, Any]], memory: Path, explain: int
 ) -> Iterator[Job]:
-    """The jobs of some episodes of one task and method."""
+    """The jobs of some episodes of one task and method.
+
+    Raises: BadStudy for sub-goals, whose targets change on the way.
+    """
     study = study_of(manifest, lines[0])
     chosen = [id(line) for line in spread_evenly(lines, explain)] if explain else []
     by_variant: dict[str, list[dict[str, Any]]] = {}
@@ -169,6 +159,11 @@ def _jobs_of(
         for first in range(0, len(same), BATCH):
             batch = same[first : first + BATCH]
             rows = tuple(listed_row(study, line) for line in batch)
+            if rows[0].subgoals:
+                raise BadStudy(
+                    f"attention: episodes of {rows[0].suite} in this run have sub-goals, and what "
+                    "is measured here is one target's; choose other suites with --suite."
+                )
             method = str(batch[0]["method"])
             known = tuple((str(line["outcome"]), int(line["steps"])) for line in batch)
             explained = tuple(id(line) in chosen for line in batch)

@@ -126,16 +126,11 @@ def _measure(
     return pd.DataFrame(views), pd.DataFrame(episodes)
 
 
-def _tasks(name: str, names: Sequence[str]) -> list[tuple[str, str]]:
+def _tasks(name: str, names: Sequence[str]) -> tuple[tuple[str, str], ...]:
     """The tasks for an object of its category. Raises: BadObject where there is none."""
-    category = get_object(name).category
-    found = []
-    for suite in names:
-        for task in suites.suite(suite).tasks:
-            if task.category == category:
-                found.append((suite, task.name))
+    found = suites.tasks_of(names, name)
     if not found:
-        raise BadObject(f"no task of {', '.join(names)} asks for a {category}")
+        raise BadObject(f"no task of {', '.join(names)} asks for a {get_object(name).category}")
     return found
 
 

@@ -92,14 +92,11 @@ class Survey:
 
     def configuration(self) -> dict[str, Any]:
         """What the results depend on, as JSON: the world, weights and lists by their checksums."""
-        tasks = []
         counts = {}
         for name in self.suites:
             counts[name] = {"openings": self.n_openings(name), "tracks": self.n_tracked(name)}
-            for task in suites.suite(name).tasks:
-                tasks.append((name, task.name))
         study = Study(
-            tasks=tuple(tasks),
+            tasks=suites.tasks_of(self.suites),
             methods=("generic",),
             policy="expert",
             stack=self.stack,

@@ -10,7 +10,6 @@ from vap_core.evaluation.policy_names import policy_today
 from vap_core.evaluation.report.runs import Runs
 from vap_core.evaluation.study import DEMO, Study
 from vap_core.simulation import suites
-from vap_core.simulation.assets.objects import get_object
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -63,8 +62,8 @@ def command_line(study: dict[str, Any]) -> str:
     tasks_by_suite: dict[str, list[str]] = {}
     for suite, task in study["tasks"]:
         tasks_by_suite.setdefault(suite, []).append(task)
-    whole = _are_whole_suites(tasks_by_suite, study.get("object", ""))
     changed = _changed(study)
+    whole = _are_whole_suites(changed["tasks"], study.get("object", ""))
     if _is_demo(study, changed):
         return f"python -m vap_core demo --episodes {study['episodes']} --seed {study['seed']}"
     if not whole and not _suits_rollout(study, changed):
@@ -114,22 +113,14 @@ def _suits_rollout(study: dict[str, Any], changed: dict[str, Any]) -> bool:
     return study.get("episodes") is not None or not suites.has_list(names.pop())
 
 
-def _are_whole_suites(tasks_by_suite: dict[str, list[str]], own: str = "") -> bool:
+def _are_whole_suites(tasks: tuple[tuple[str, str], ...], own: str) -> bool:
     """Whether `eval` runs these tasks: every one, or with an `own` object those of its category."""
-    category = ""
-    if own:
-        try:
-            category = get_object(own).category
-        except VapError:  # it was imported elsewhere
-            return False
-    for suite, tasks in tasks_by_suite.items():
-        whole = []
-        for task in suites.suite(suite).tasks:
-            if not own or task.category == category:
-                whole.append(task.name)
-        if tasks != whole:
-            return False
-    return True
+    try:
+        return tasks == suites.tasks_of(dict(tasks), own)
+    except VapError:
+        if not own:
+            raise
+        return False  # the object was imported elsewhere
 
 
 def _options(study: dict[str, Any], whole: bool) -> dict[str, Any]:

@@ -80,7 +80,7 @@ class Tokens:
         """What the results depend on, as JSON; suites and numbers of photos may be added to."""
         policies = {name: fingerprint(shipped(name)) for name in suites.BENCHMARKS}
         models = {name: _model(_model_folder(name)).sha256() for name in suites.BENCHMARKS}
-        tasks = tuple((name, task.name) for name in policies for task in suites.suite(name).tasks)
+        tasks = suites.tasks_of(suites.BENCHMARKS)
         shown = Study(tasks=tasks, methods=("generic",), policy="expert").configuration()
         return {
             "survey": "tokens",

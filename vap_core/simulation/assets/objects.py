@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from vap_core.base.errors import one_of
+from vap_core.base.errors import UnknownName, one_of
 from vap_core.base.types import Rgb, value
 from vap_core.simulation.assets.atlas import render_atlas
 from vap_core.simulation.assets.catalogue import FAMILIES, Family
@@ -188,7 +188,7 @@ def get_object(name: str) -> ObjectModel:
         return load_scanned_object(scanned[name])
     generic_names = [f"{stem}-generic-NNNN" for stem in FAMILY_NUMBERS]
     unknown = one_of("objects: object", name, [*OBJECTS, *generic_names, *scanned])
-    raise type(unknown)(
+    raise UnknownName(
         f"{unknown} One that was registered has photos alone: bring its scan by objects import, or "
         "point VAP_OBJECTS at its folder."
     )

@@ -7,6 +7,7 @@ look-alike that is red by nature. Where a suite's sensor has noise (tabletop), e
 its own. A user's own suites come from files (own.py).
 """
 
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -180,6 +181,20 @@ def _seeded(suite_name: str, task_name: str, seed: int) -> tuple[EpisodeRow, ...
         if row.task == task_name:
             episodes.append(starts.seeded(row, seed, joints))
     return tuple(episodes)
+
+
+def tasks_of(suite_names: Iterable[str], own_target: str = "") -> tuple[tuple[str, str], ...]:
+    """Suite and task of every task of some suites; with an own object, those of its category.
+
+    Raises: UnknownName; BadObject.
+    """
+    category = objects.get_object(own_target).category if own_target else ""
+    found = []
+    for name in suite_names:
+        for task in suite(name).tasks:
+            if not own_target or task.category == category:
+                found.append((name, task.name))
+    return tuple(found)
 
 
 def listed(

@@ -156,6 +156,7 @@ def _digest(rows: Iterable[EpisodeRow]) -> str:
     digest = hashlib.sha256()
     for row in rows:
         digest.update(lists.to_line(row).encode())
-        if str(row.start) != str(AS_LISTED):
-            digest.update(repr(row.start).encode())
+        start = repr(row.start)
+        if start != repr(AS_LISTED):
+            digest.update(start.encode())
     return digest.hexdigest()

@@ -59,19 +59,16 @@ def train(
     require_onnx()
     make_folder(out, "train perception")
     started = time.monotonic()
-    trained: dict[str, int] = {}
+    halted = False
 
     def expired() -> bool:
-        return minutes is not None and time.monotonic() - started > 60 * minutes
+        """Whether to leave out the epochs that are left; asked where there are some."""
+        nonlocal halted
+        halted = minutes is not None and time.monotonic() - started > 60 * minutes
+        return halted
 
     def run(name: str, rate: float, decay: float) -> Run:
         state, save = checkpoint(cache / f"{name}-{seed}-{n}.pt", resume)
-        trained[name] = state.get("epoch", 0)
-
-        def keep(state: dict[str, Any]) -> None:
-            save(state)
-            trained[name] = state["epoch"]
-
         return Run(
             name=name,
             seed=seed,
@@ -79,7 +76,7 @@ def train(
             rate=rate,
             decay=decay,
             state=state,
-            save=keep,
+            save=save,
             expired=expired,
         )
 
@@ -90,7 +87,7 @@ def train(
     detect = detector.fit_detector(views, categories, run("detector", 2e-3, 1e-3))
     look = instance_head.fit_instance_head(crops, run("looks", 2e-3, 1e-2))
     segment = segmenter.fit_segmenter(stages, CROPS_PER_EPOCH, run("segmenter", 2e-3, 1e-4))
-    if trained != EPOCHS:
+    if halted:
         return None
     n_held_out = min(HELD_OUT_STAGES, max(1, n // 10))
     unseen = prepare(cache, seed, n_held_out, held_out=True, jobs=jobs)
