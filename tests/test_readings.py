@@ -180,20 +180,28 @@ def test_the_docs_count_the_published_readings() -> None:
         f"{vlabench[0]} of vlabench with {vlabench[1]}." in text
     )
     expected = {
-        "simpler-bridge": [7, 83],
-        "simpler-bridge-red": [1, 3],
-        "simpler-fractal": [6, 19],
-        "vlabench": [3, 13],
+        "simpler-bridge": (7, 83, 52),
+        "simpler-bridge-red": (1, 3, 3),
+        "simpler-fractal": (6, 19, 10),
+        "vlabench": (3, 13, 13),
+        "tabletop": (4, 10, 8),
     }
-    of_default = {suite: [0, 0] for suite in expected}
+    of_default: dict[str, list[list[str]]] = {suite: [] for suite in expected}
     for line in read_log(DATA / "results" / readings.FILE):
         if line.suite not in of_default or not line.weights:
             continue
         if fingerprint(shipped(line.suite)).startswith(line.weights):
-            of_default[line.suite][0] += 1
-            of_default[line.suite][1] += len(line.methods.split())
-    assert of_default == expected
+            of_default[line.suite].append(line.methods.split())
+    counted = {}
+    for suite, runs in of_default.items():
+        read = [method for run in runs for method in run]
+        counted[suite] = len(runs), len(read), len(set(read))
+    assert counted == expected
     assert (
-        "simpler-bridge read its list in 7 runs (83 methods and arms), and in one with a red "
-        "look-alike (3), that of vlabench in 3 runs (13), that of simpler-fractal in 6 runs (19;"
+        "simpler-bridge read its list in 7 runs (83 readings of 52 methods and arms), and in one with "
+        "a red look-alike (3 of 3), that of vlabench in 3 runs (13 of 13), that of simpler-fractal in "
+        "6 runs (19 of 10;"
     ) in text
+    assert "Each was run on its list 3 to 7 times, with 8 to 52 methods;" in " ".join(
+        (DATA.parent / "README.md").read_text().split()
+    )

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from vap_core.base.errors import UnknownName
+from vap_core.base.files import DATA
+from vap_core.simulation.scene_style import DEFAULT_STYLE
 from vap_core.simulation.suites import BENCHMARKS, VARIANTS, benchmark, simpler
 from vap_core.simulation.suites.variants import Variant
 from vap_core.training.films import looks
 from vap_core.training.films.demonstrations import DISTRACTORS, draw_objects
 from vap_core.training.films.looks import APART, FIRST_GRAIN, distance, draw_look
-from vap_core.training.films.scenes import TRAIN_INSTANCES
+from vap_core.training.films.scenes import TRAIN_INSTANCES, draw_style
 from vap_core.training.recipe import FILMED, RECIPES, filmed_task, filmed_tasks
 
 
@@ -104,3 +106,11 @@ def test_distractors_of_films_are_no_distractors_of_the_evaluation() -> None:
     assert scenes / 360 == pytest.approx(FILMED[known.name].distractors, abs=0.1)
     stems = {name.partition("-generic-")[0] for name in filmed | evaluated}
     assert stems <= {kind.replace(" ", "-") for kind in DISTRACTORS}
+
+
+def test_the_pages_say_which_rooms_the_heads_of_perception_know() -> None:
+    drawn = [draw_style(np.random.default_rng(i)) for i in range(500)]
+    known = np.mean([style.planks == DEFAULT_STYLE.planks for style in drawn])
+    assert known == pytest.approx(0.4, abs=0.05)
+    for page in (DATA.parent / "docs" / "stacks.md", DATA / "weights" / "README.md"):
+        assert "two in five of the" in " ".join(page.read_text().lower().split())

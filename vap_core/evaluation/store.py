@@ -8,10 +8,10 @@ process that works there) and the tables `parts` (episodes), `traces` (state_log
 import fcntl
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 from uuid import uuid4
 
 from vap_core.base.errors import BadOutput
@@ -135,8 +135,11 @@ def sweep(folder: Path) -> None:
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path, lock: Callable[[IO[bytes], int], None] = fcntl.flock) -> Iterator[None]:
     """Keep other processes out of a run while this one works on it.
+
+    With `fcntl.flock` the processes that this one forks hold the folder, too, until all have ended;
+    with `fcntl.lockf` they do not.
 
     Raises: BadOutput when another process holds it, or the folder cannot be written.
     """
@@ -144,7 +147,7 @@ def locked(folder: Path) -> Iterator[None]:
         file = (folder / LOCK).open("ab")
     with file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise BadOutput(
                 f"locked: another process is working in {folder}; wait for it, or choose another "

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import writing
-from vap_core.training.perception.fitting import checkpoint
+from vap_core.training.folder import STATE, checkpoint
 
 KEEP = 0.999
 """Of the moving average of the weights, a step; the average is what is saved."""
@@ -61,7 +61,7 @@ def train_steps[M: nn.Module](
     mean = copy.deepcopy(model)
     parts: dict[str, Any] = {"model": model, "mean": mean, "optimiser": optimiser}
     out.mkdir(parents=True, exist_ok=True)
-    state, save = checkpoint(out / "training.pt", resume=True)
+    state, save = checkpoint(out / STATE, resume=True)
     made_of = json.dumps(run.made_of, sort_keys=True)
     if state:
         _require_same_training(state, made_of, out)

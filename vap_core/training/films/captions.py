@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from vap_core.base.files import parse_json, write_atomic
+from vap_core.base.files import parse_json, write_atomic, writing
 from vap_core.base.types import Boxes, Description, Mask, Rgb
 from vap_core.evaluation.processes import results_here
 from vap_core.perception.attributes import CropAttributes, measure_crop
@@ -23,6 +23,7 @@ from vap_core.perception.describe import phrase_attributes
 from vap_core.simulation.assets.objects import ObjectModel, get_object
 from vap_core.simulation.studio import Stage, reference_shots
 from vap_core.training.films.scenes import only_generic
+from vap_core.training.folder import reading_kept
 
 VIEWS = 5
 """Photos of an object, as a user takes them."""
@@ -41,25 +42,30 @@ def captions(
 
     Those that `file` lacks are made, in `jobs` processes, and kept there, so that an earlier call
     goes on.
+
+    Raises: BadOutput when `file` is damaged or cannot be written.
     """
     from tqdm import tqdm
 
     kept: dict[str, Any] = {"cpu_s": 0.0, "captions": {}}
     if file.exists():
-        kept = parse_json(file.read_bytes())
+        with reading_kept(file, "train"):
+            found = parse_json(file.read_bytes())
+            kept = {"cpu_s": float(found["cpu_s"]), "captions": dict(found["captions"])}
     missing = sorted(set(names) - set(kept["captions"]))
     batches = [tuple(missing[i : i + AT_ONCE]) for i in range(0, len(missing), AT_ONCE)]
     work = results_here(_describe_some, batches, workers=jobs, remedy="jobs")
     for _, (made, cpu_s) in tqdm(work, desc="descriptions", total=len(batches), mininterval=10):
         kept["captions"].update(made)
         kept["cpu_s"] += cpu_s
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(file, json.dumps(kept, indent=0).encode())
-    found = {}
+        with writing(file, "train"):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_atomic(file, json.dumps(kept, indent=0).encode())
+    described = {}
     for name in names:
         short, long = kept["captions"][name]
-        found[name] = Description(short, long)
-    return found, float(kept["cpu_s"])
+        described[name] = Description(short, long)
+    return described, kept["cpu_s"]
 
 
 def describe(models: Sequence[ObjectModel]) -> dict[str, Description]:

@@ -19,7 +19,7 @@ from jaxtyping import Float32, UInt8
 from PIL import Image
 
 from vap_core.base.errors import OutOfReach
-from vap_core.base.files import write_atomic
+from vap_core.base.files import write_atomic, writing
 from vap_core.base.types import Mask, Rgb, value
 from vap_core.policies.scripted.expert import Expert, ExpertState
 from vap_core.rollout.expert_loop import expert_steps
@@ -33,6 +33,7 @@ from vap_core.simulation.types import EpisodeRow, Placement
 from vap_core.training.films import pairs
 from vap_core.training.films.looks import draw_look
 from vap_core.training.films.scenes import HELD_OUT, TRAIN_INSTANCES, only_generic
+from vap_core.training.folder import kept_arrays
 from vap_core.training.recipe import FILMED, every, filmed_tasks
 
 SIDE = 112
@@ -260,13 +261,16 @@ def small(rgb: Rgb) -> UInt8[np.ndarray, "s s 3"]:
 
 
 def cached(folder: Path, suite_name: str, seed: int, number: int) -> list[Film]:
-    """The stage's films from `folder`, shot first if they are not there."""
+    """The stage's films from `folder`, shot first if they are not there.
+
+    Raises: BadOutput when their file is damaged or cannot be written.
+    """
     path = stage_file(folder, suite_name, seed, number)
     if not path.exists():
         started = time.process_time()
         made = films(suite_name, seed, number)
         _write_stage(path, made, time.process_time() - started)
-    with np.load(path) as arrays:
+    with kept_arrays(path, "train") as arrays:
         found = []
         for i in range(int(arrays["n"])):
             found.append(_read_film(arrays, i))
@@ -280,7 +284,8 @@ def stage_file(folder: Path, suite_name: str, seed: int, number: int) -> Path:
 
 def cost_s(folder: Path, suite_name: str, seed: int, number: int) -> float:
     """CPU seconds that a stage in `folder` took to film."""
-    with np.load(stage_file(folder, suite_name, seed, number)) as arrays:
+    path = stage_file(folder, suite_name, seed, number)
+    with kept_arrays(path, "train") as arrays:
         return float(arrays["cpu_s"])
 
 
@@ -395,8 +400,9 @@ def _write_stage(path: Path, made: Sequence[Film], cpu_s: float) -> None:
             arrays[f"{part}{i}"] = getattr(film, part)
     buffer = io.BytesIO()
     np.savez_compressed(buffer, n=len(made), cpu_s=cpu_s, **arrays)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomic(path, buffer.getvalue())
+    with writing(path, "train"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, buffer.getvalue())
 
 
 def _read_film(arrays: Mapping[str, np.ndarray], i: int) -> Film:

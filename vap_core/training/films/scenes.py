@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int64, UInt8
 
-from vap_core.base.files import kept_folder, replacing
+from vap_core.base.files import kept_folder, replacing, writing
 from vap_core.base.types import value
 from vap_core.simulation import robots, scenes
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.objects import ObjectModel
 from vap_core.simulation.scene_style import DEFAULT_STYLE, Colour3, SceneStyle
 from vap_core.simulation.studio import Shot, Stage
+from vap_core.training.folder import kept_arrays
 
 import mujoco  # isort: skip  (scenes has chosen a GL back end)
 
@@ -222,7 +223,10 @@ def scatter(
 def cached(
     folder: Path, seed: int, number: int, *, held_out: bool = False, look: Look = draw_style
 ) -> Shots:
-    """The stage from `folder`, rendered first if it is not there."""
+    """The stage from `folder`, rendered first if it is not there.
+
+    Raises: BadOutput when its file is damaged or cannot be written.
+    """
     path = stage_file(folder, seed, number, held_out)
     if not path.exists():
         started = time.process_time()
@@ -230,10 +234,11 @@ def cached(
         arrays: dict[str, Any] = {"cpu_s": np.array(time.process_time() - started)}
         for name in PARTS:
             arrays[name] = getattr(shots, name)
-        folder.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as part, part.open("wb") as file:
-            np.savez(file, **arrays)
-    with np.load(path) as file:
+        with writing(path, "train"):
+            folder.mkdir(parents=True, exist_ok=True)
+            with replacing(path) as part, part.open("wb") as file:
+                np.savez(file, **arrays)
+    with kept_arrays(path, "train") as file:
         return Shots(
             rgb=file["rgb"],
             ids=file["ids"],
@@ -252,7 +257,8 @@ def stage_file(folder: Path, seed: int, number: int, held_out: bool) -> Path:
 
 def cost_s(folder: Path, seed: int, number: int, held_out: bool) -> float:
     """CPU seconds that a stage in `folder` took to render."""
-    with np.load(stage_file(folder, seed, number, held_out)) as file:
+    path = stage_file(folder, seed, number, held_out)
+    with kept_arrays(path, "train") as file:
         return float(file["cpu_s"])
 
 

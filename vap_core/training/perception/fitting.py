@@ -6,22 +6,22 @@ Epochs can be interrupted; the rate warms up and falls with a cosine; a bar show
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from vap_core.base.files import replacing
+from vap_core.base.errors import BadOutput
+from vap_core.base.files import writing
+from vap_core.training.folder import checkpoint
 
 
 @dataclass(frozen=True)
 class Run:
     """How long and how fast.
 
-    `state` is what an earlier run saved, or nothing; `save` keeps each epoch; training stops early
-    once `expired`.
+    `file` keeps each epoch; with `resume`, training goes on from it. It stops early once `expired`.
     """
 
     name: str
@@ -29,8 +29,8 @@ class Run:
     epochs: int
     rate: float
     decay: float
-    state: dict[str, Any]
-    save: Callable[[dict[str, Any]], None]
+    file: Path
+    resume: bool
     expired: Callable[[], bool]
 
 
@@ -52,12 +52,27 @@ def fit(
 
     `losses` yields the loss of each of an epoch's `per_epoch` batches, drawn from the stream it is
     given.
+
+    Raises: BadOutput when the file is damaged, or of a head that was trained otherwise.
     """
     optimiser = torch.optim.AdamW(head.parameters(), run.rate, weight_decay=run.decay)
-    if run.state:
-        head.load_state_dict(run.state["head"])
-        optimiser.load_state_dict(run.state["optimiser"])
-    for epoch in range(run.state.get("epoch", 0), run.epochs):
+    state, save = checkpoint(run.file, run.resume)
+    made_of = {
+        "epochs": run.epochs,
+        "rate": run.rate,
+        "decay": run.decay,
+        "batches": per_epoch,
+        "shapes": {name: list(tensor.shape) for name, tensor in head.state_dict().items()},
+    }
+    if state:
+        if state.get("made_of") != made_of:
+            raise BadOutput(
+                f"train perception: {run.file} is of a {run.name} head that was trained otherwise; "
+                "delete it and run the same command again."
+            )
+        head.load_state_dict(state["head"])
+        optimiser.load_state_dict(state["optimiser"])
+    for epoch in range(state.get("epoch", 0), run.epochs):
         if run.expired():
             return
         rng = np.random.default_rng([run.seed, *run.name.encode(), epoch])
@@ -74,31 +89,15 @@ def fit(
             optimiser.step()
             total += loss.item()
             bar.set_postfix(loss=f"{total / batch:.3f}", refresh=False)
-        run.save(
-            {
-                "head": head.state_dict(),
-                "optimiser": optimiser.state_dict(),
-                "epoch": epoch + 1,
-                "loss": total / max(batch, 1),
-            }
-        )
-
-
-def checkpoint(path: Path, resume: bool) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
-    """What an interrupted run left at `path`, and a function that replaces it atomically.
-
-    The first is empty where there is nothing, or without `resume`.
-    """
-
-    def save(state: dict[str, Any]) -> None:
-        with replacing(path) as part:
-            torch.save(state, part)
-
-    state: dict[str, Any] = {}
-    if resume and path.exists():
-        # Begun on a GPU, a training goes on where there is none.
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    return state, save
+        saved = {
+            "made_of": made_of,
+            "head": head.state_dict(),
+            "optimiser": optimiser.state_dict(),
+            "epoch": epoch + 1,
+            "loss": total / max(batch, 1),
+        }
+        with writing(run.file, "train perception"):
+            save(saved)
 
 
 def _set_rate(optimiser: torch.optim.Optimizer, rate: float, done: float) -> None:

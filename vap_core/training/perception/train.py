@@ -24,9 +24,9 @@ from vap_core.evaluation.processes import results
 from vap_core.perception.embedded.export import export_graphs, require_onnx
 from vap_core.perception.embedded.weights import PERCEPTION, save_weights
 from vap_core.simulation.assets import objects
-from vap_core.training.films.scenes import VIEWS, Shots, cached, only_generic
+from vap_core.training.films.scenes import VIEWS, Shots, cached, only_generic, stage_file
 from vap_core.training.perception import detector, instance_head, segmenter
-from vap_core.training.perception.fitting import Run, checkpoint
+from vap_core.training.perception.fitting import Run
 
 CACHE = kept_folder("cache") / "perception"
 HELD_OUT_STAGES = 30
@@ -68,15 +68,14 @@ def train(
         return halted
 
     def run(name: str, rate: float, decay: float) -> Run:
-        state, save = checkpoint(cache / f"{name}-{seed}-{n}.pt", resume)
         return Run(
             name=name,
             seed=seed,
             epochs=EPOCHS[name],
             rate=rate,
             decay=decay,
-            state=state,
-            save=save,
+            file=cache / f"{name}-{seed}-{n}.pt",
+            resume=resume,
             expired=expired,
         )
 
@@ -179,8 +178,7 @@ def _name_tensors(heads: dict[str, nn.Module]) -> dict[str, torch.Tensor]:
 
 def _stage_name(seed: int, number: int, held_out: bool = False) -> str:
     """The name of a stage's files, without their endings."""
-    kind = "held" if held_out else "train"
-    return f"{kind}-{seed}-{number:05d}"
+    return stage_file(Path(), seed, number, held_out).stem
 
 
 def _is_ready(cache: Path, seed: int, number: int, held_out: bool) -> bool:

@@ -51,7 +51,8 @@ class Ahead:
         try:
             batch, cpu_s = next(self._drawn)
         except RuntimeError as error:
-            if "DataLoader worker" not in str(error):
+            # An error of `draw` itself says "in DataLoader worker process".
+            if "DataLoader worker (pid" not in str(error):
                 raise
             raise WorkerDied(
                 "a process that draws batches died, perhaps for lack of memory; run the same "

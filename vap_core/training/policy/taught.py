@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from vap_core.base.files import parse_json, write_atomic
+from vap_core.base.files import parse_json, write_atomic, writing
 from vap_core.base.types import Rgb
 from vap_core.evaluation.processes import results_here
 from vap_core.policies.mini_pi0 import learned_token, token_file
@@ -23,6 +23,7 @@ from vap_core.simulation.assets import objects
 from vap_core.simulation.studio import photograph, reference_shots
 from vap_core.training.films.demonstrations import Film
 from vap_core.training.films.scenes import TRAIN_INSTANCES, only_generic
+from vap_core.training.folder import reading_kept
 from vap_core.training.policy.commands import Embedding
 
 PHOTOS = 5
@@ -57,13 +58,17 @@ def learn_words(
 
     They are learned in `jobs` processes, in the mini-PaliGemma of the folder `vlm`. `folder` keeps
     them; an earlier call goes on.
+
+    Raises: BadOutput when words.json is damaged or cannot be written.
     """
     from tqdm import tqdm
 
     file = folder / "words.json"
     kept: dict[str, Any] = {"cpu_s": 0.0, "accuracy": {}}
     if file.exists():
-        kept = parse_json(file.read_bytes())
+        with reading_kept(file, "train"):
+            found = parse_json(file.read_bytes())
+            kept = {"cpu_s": float(found["cpu_s"]), "accuracy": dict(found["accuracy"])}
     crew_of: dict[str, tuple[str, ...]] = {}
     for crew in crews(films, count):
         for name in crew:
@@ -77,7 +82,8 @@ def learn_words(
     ):
         kept["accuracy"][name] = accuracy
         kept["cpu_s"] += cpu_s
-        write_atomic(file, json.dumps(kept, indent=1).encode())
+        with writing(file, "train"):
+            write_atomic(file, json.dumps(kept, indent=1).encode())
     # In the films' order, whichever was learned first.
     kept["accuracy"] = {name: kept["accuracy"][name] for name in crew_of}
     model = load_vlm(vlm).sha256()
@@ -96,7 +102,8 @@ def _learn(
     name, crew = pair
     taught, unseen = (_photos(name, crew, seed) for seed in (0, 1))
     token = learned_token.learn(load_vlm(vlm), name, taught, unseen, training)
-    token_file.save(folder, token)
+    with writing(folder, "train"):
+        token_file.save(folder, token)
     return token.accuracy, time.process_time() - started
 
 

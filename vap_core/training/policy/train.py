@@ -22,7 +22,7 @@ from torch import Tensor
 
 from vap_core.base.device import device_name
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import make_folder, parse_json, sha256_of, write_atomic
+from vap_core.base.files import make_folder, parse_json, sha256_of, write_atomic, writing
 from vap_core.base.version import code_version
 from vap_core.policies.lerobot.checkpoints import CAPTIONS, TRAINING_CARD, WORDS
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
@@ -34,6 +34,7 @@ from vap_core.training.films.captions import captions
 from vap_core.training.films.dataset import about, data_sha256, read, shoot_stages
 from vap_core.training.films.demonstrations import SIDE, Film, cached, cost_s
 from vap_core.training.films.scenes import CACHE, only_generic
+from vap_core.training.folder import training_folder
 from vap_core.training.patches import model_options
 from vap_core.training.policy.ahead import Ahead
 from vap_core.training.policy.batches import Frames, statistics
@@ -147,88 +148,89 @@ def train(
     The steps run on `device` (`base.device`); `jobs` processes, None: one a core, film, photograph,
     teach the words and draw the batches.
 
-    Raises: BadOutput when `out` holds another training, or it or `cache` cannot be written;
-        BadPolicy for a start that is no mini-pi0, or one of other cameras or sizes, or of another
+    Raises: BadOutput when `out` holds another training or a model without what it would go on from,
+        another process trains there, or it or `cache` cannot be written or is damaged; BadPolicy
+        for a start that is no mini-pi0, or one of other cameras or sizes, or of another
         mini-PaliGemma; UnknownName: no such device.
     """
     place = torch.device(device_name(device))
-    make_folder(out, "train policy")
-    if demonstrations is None:
-        make_folder(cache, "train policy", "choose another folder with --cache")
-    jobs = jobs or os.cpu_count() or 1
-    films = load_films(recipe, cache, demonstrations, jobs)
-    if not films.train:
-        raise BadOutput(
-            f"train policy: {demonstrations or recipe.suite} holds no film to learn from; "
-            "make more stages."
-        )
-    _require_trainable(recipe, films.all)
-    teacher = None if vlm is None else load_vlm(vlm)
-    made_of: dict[str, Any] = {
-        "recipe": recipe.as_json(),
-        "data_sha256": data_sha256(films.all),
-    }
-    # Of initial weights only; every other draw comes from the step's stream.
-    torch.manual_seed(recipe.seed)
-    first = films.train[0]
-    config = configuration(recipe, first.state.shape[1], first.action.shape[1])
-    if recipe.start:
-        start = start_folder(recipe.start)
-        learner, stats = go_on_from(start, config, teacher)
-        config = learner.policy.config
-        made_of["start"] = {
-            "name": recipe.start,
-            "sha256": sha256_of(start / "model.safetensors"),
-        }
-    else:
-        stats = statistics(films.train, recipe.angle_noise_rad)
-        learner = Learner(config)
-        if teacher is not None:
-            config.vlm = teacher.sha256()
-            initialise_policy(teacher, learner.policy)
-    made_of["vlm"] = config.vlm
-    cost_cpu_s = {"films": films.cpu_s, "vlm": _vlm_cost_s(vlm)}
-    # After the start was checked: words take minutes.
-    known, taught = _prepare_words(recipe, films, vlm, out, cost_cpu_s, jobs)
-    frames = Frames(recipe=recipe, films=films.train, stats=stats, config=config, known=known)
-    ahead = Ahead(frames, jobs)
-
-    def step(model: Learner, at: int) -> tuple[Tensor, Figures]:
-        batch = ahead.take(at).to(place)
-        generator = torch.Generator().manual_seed(recipe.seed * 1_000_003 + at)
-        with fused_attention():
-            return losses(
-                policy=model.policy,
-                asked=model.asked,
-                batch=batch,
-                draws=recipe.draws,
-                generator=generator,
+    with training_folder(out, "train policy", recipe.as_json()):
+        if demonstrations is None:
+            make_folder(cache, "train policy", "choose another folder with --cache")
+        jobs = jobs or os.cpu_count() or 1
+        films = load_films(recipe, cache, demonstrations, jobs)
+        if not films.train:
+            raise BadOutput(
+                f"train policy: {demonstrations or recipe.suite} holds no film to learn from; "
+                "make more stages."
             )
+        _require_trainable(recipe, films.all)
+        teacher = None if vlm is None else load_vlm(vlm)
+        made_of: dict[str, Any] = {
+            "recipe": recipe.as_json(),
+            "data_sha256": data_sha256(films.all),
+        }
+        # Of initial weights only; every other draw comes from the step's stream.
+        torch.manual_seed(recipe.seed)
+        first = films.train[0]
+        config = configuration(recipe, first.state.shape[1], first.action.shape[1])
+        if recipe.start:
+            start = start_folder(recipe.start)
+            learner, stats = go_on_from(start, config, teacher)
+            config = learner.policy.config
+            made_of["start"] = {
+                "name": recipe.start,
+                "sha256": sha256_of(start / "model.safetensors"),
+            }
+        else:
+            stats = statistics(films.train, recipe.angle_noise_rad)
+            learner = Learner(config)
+            if teacher is not None:
+                config.vlm = teacher.sha256()
+                initialise_policy(teacher, learner.policy)
+        made_of["vlm"] = config.vlm
+        cost_cpu_s = {"films": films.cpu_s, "vlm": _vlm_cost_s(vlm)}
+        # After the start was checked: words take minutes.
+        known, taught = _prepare_words(recipe, films, vlm, out, cost_cpu_s, jobs)
+        frames = Frames(recipe=recipe, films=films.train, stats=stats, config=config, known=known)
+        ahead = Ahead(frames, jobs)
 
-    run = Schedule(
-        name=recipe.suite,
-        steps=recipe.steps,
-        rate=recipe.rate,
-        minutes=minutes,
-        every=every,
-        made_of=made_of,
-    )
-    mean, log = train_steps(learner.to(place), step, run, out, lambda: ahead.cpu_s)
-    ahead.close()
-    mean = mean.cpu()
-    cost_cpu_s["steps"] = log[-1]["cpu_s"]
-    card = {
-        **made_of,
-        "taught": taught,
-        "embedding_cosine": embedding_cosine(mean.policy, teacher),
-        "device": torch.cuda.get_device_name(place) if place.type == "cuda" else place.type,
-        "cpu_hours": _hours(cost_cpu_s),
-        "log": log,
-    }
-    held = Frames(
-        recipe=recipe, films=films.held_out, stats=stats, config=mean.policy.config, known=known
-    )
-    return save(learner=mean, stats=stats, held=held, card=card, out=out)
+        def step(model: Learner, at: int) -> tuple[Tensor, Figures]:
+            batch = ahead.take(at).to(place)
+            generator = torch.Generator().manual_seed(recipe.seed * 1_000_003 + at)
+            with fused_attention():
+                return losses(
+                    policy=model.policy,
+                    asked=model.asked,
+                    batch=batch,
+                    draws=recipe.draws,
+                    generator=generator,
+                )
+
+        run = Schedule(
+            name=recipe.suite,
+            steps=recipe.steps,
+            rate=recipe.rate,
+            minutes=minutes,
+            every=every,
+            made_of=made_of,
+        )
+        mean, log = train_steps(learner.to(place), step, run, out, lambda: ahead.cpu_s)
+        ahead.close()
+        mean = mean.cpu()
+        cost_cpu_s["steps"] = log[-1]["cpu_s"]
+        card = {
+            **made_of,
+            "taught": taught,
+            "embedding_cosine": embedding_cosine(mean.policy, teacher),
+            "device": torch.cuda.get_device_name(place) if place.type == "cuda" else place.type,
+            "cpu_hours": _hours(cost_cpu_s),
+            "log": log,
+        }
+        held = Frames(
+            recipe=recipe, films=films.held_out, stats=stats, config=mean.policy.config, known=known
+        )
+        return save(learner=mean, stats=stats, held=held, card=card, out=out)
 
 
 def save(
@@ -237,12 +239,14 @@ def save(
     """Write weights, configuration and processors as lerobot keeps them, and what was measured.
 
     Returns training.json; its `held_out` are the losses on the films of `held`.
+
+    Raises: BadOutput when the disk is full.
     """
     from lerobot.policies import make_pre_post_processors
 
     policy = learner.policy
     # Killed at any moment, every file that has its name is whole.
-    with TemporaryDirectory(prefix=".saving-", dir=out) as name:
+    with writing(out, "train policy"), TemporaryDirectory(prefix=".saving-", dir=out) as name:
         part = Path(name)
         policy.save_pretrained(part)
         store_in_bfloat16(part / "model.safetensors")
@@ -268,7 +272,8 @@ def save(
         "written_by": code_version(),
         "held_out": average_of(measured),
     }
-    write_atomic(out / TRAINING_CARD, json.dumps(card, indent=1).encode())
+    with writing(out, "train policy"):
+        write_atomic(out / TRAINING_CARD, json.dumps(card, indent=1).encode())
     return card
 
 

@@ -6,6 +6,7 @@ The views show generic objects; policies grow from the model. Its loss is of the
 in training only, of the patches that show the object meant, asked of the penultimate layer.
 """
 
+import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -22,16 +23,19 @@ from jaxtyping import UInt8
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
-from vap_core.base.files import make_folder, parse_json, write_atomic
+from vap_core.base.files import make_folder, parse_json, write_atomic, writing
 from vap_core.base.types import Description, Rgb, value
 from vap_core.evaluation.processes import results
+from vap_core.policies.lerobot.checkpoints import CAPTIONS, TRAINING_CARD
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
 from vap_core.policies.mini_pi0.vlm import ANSWER, MiniVlm, load_vlm
+from vap_core.simulation.assets.objects import get_object
 from vap_core.training.films.captions import captions
 from vap_core.training.films.demonstrations import SIDE, small
 from vap_core.training.films.looks import draw_look
-from vap_core.training.films.scenes import CACHE, Shots, cached, cost_s, stage_file
+from vap_core.training.films.scenes import CACHE, Shots, cached, cost_s, only_generic, stage_file
+from vap_core.training.folder import reading_kept, training_folder
 from vap_core.training.patches import PatchScores, model_options, patch_loss, patch_shares
 from vap_core.training.recipe import Sizes
 from vap_core.training.step import Figures, Schedule, average_of, train_steps
@@ -102,6 +106,8 @@ def views(
     """Views and every other portrait of so many stages, scaled down, and their CPU seconds.
 
     `jobs` processes render the stages that are missing.
+
+    Raises: ValueError for a stage that shows an object of the evaluation.
     """
     from tqdm import tqdm
 
@@ -119,6 +125,7 @@ def views(
     spent_s = 0.0
     for number in range(stages):
         shots = cached(folder, seed, number, held_out=held_out, look=draw_look)
+        only_generic([get_object(name) for name in shots.names])
         spent_s += cost_s(folder, seed, number, held_out)
         pictures = zip(shots.rgb, shots.ids, strict=True)
         portraits = zip(shots.portraits[::2], shots.portrait_ids[::2], strict=True)
@@ -193,68 +200,88 @@ def train(
     Writes the model to `out`, and what was measured on unseen objects and the cost, which it
     returns.
 
-    Raises: BadOutput when `out` holds another training, or it or `cache` cannot be written.
+    Raises: BadOutput when `out` holds another training or a model without what it would go on from,
+        another process trains there, or it or `cache` cannot be written or is damaged.
     """
-    make_folder(out, "train vlm")
-    make_folder(cache, "train vlm", "choose another folder with --cache")
-    pool, scenes_s = views(recipe.stages, recipe.seed, cache, jobs=jobs)
-    n_held_out = min(HELD_OUT, recipe.stages)
-    held_out, more_s = views(n_held_out, recipe.seed, cache, held_out=True, jobs=jobs)
-    names = dict.fromkeys(chain.from_iterable(view.names for view in [*pool, *held_out]))
-    looks, captions_s = captions(names, out / "captions.json", jobs)
-    config = configuration(recipe)
-    # Initial weights only; every other draw comes from the step's stream.
-    torch.manual_seed(recipe.seed)
-    learner = Learner(config)
-    number = learner.vlm.vocabulary
+    with training_folder(out, "train vlm", vars(recipe)):
+        make_folder(cache, "train vlm", "choose another folder with --cache")
+        pool, scenes_s = views(recipe.stages, recipe.seed, cache, jobs=jobs)
+        n_held_out = min(HELD_OUT, recipe.stages)
+        held_out, more_s = views(n_held_out, recipe.seed, cache, held_out=True, jobs=jobs)
+        names = dict.fromkeys(chain.from_iterable(view.names for view in [*pool, *held_out]))
+        looks, captions_s = captions(names, out / CAPTIONS, jobs)
+        config = configuration(recipe)
+        # Initial weights only; every other draw comes from the step's stream.
+        torch.manual_seed(recipe.seed)
+        learner = Learner(config)
+        number = learner.vlm.vocabulary
 
-    def step_losses(model: Learner, step: int) -> tuple[Tensor, Figures]:
-        rng = np.random.default_rng([75, recipe.seed, step])
-        with fused_attention():
-            batch = collate(recipe, pool, looks, number, rng, config)
-            return losses(model, batch)
+        def step_losses(model: Learner, step: int) -> tuple[Tensor, Figures]:
+            rng = np.random.default_rng([75, recipe.seed, step])
+            with fused_attention():
+                batch = collate(recipe, pool, looks, number, rng, config)
+                return losses(model, batch)
 
-    run = Schedule(
-        name="mini-paligemma",
-        steps=recipe.steps,
-        rate=recipe.rate,
-        minutes=minutes,
-        every=100,
-        made_of={"recipe": vars(recipe), "words": config.words},
-    )
-    mean, log = train_steps(learner, step_losses, run, out)
-    mean.vlm.save(out)
-    # What is measured is what was saved.
-    mean.vlm = load_vlm(out)
-    figures = []
-    with torch.no_grad():
-        for i in range(HELD_OUT_BATCHES):
-            rng = np.random.default_rng([76, i])
-            batch = collate(recipe, held_out, looks, number, rng, config)
-            figures.append(losses(mean, batch)[1])
-    spent_s = scenes_s + more_s + captions_s + log[-1]["cpu_s"]
-    about = {
-        "recipe": vars(recipe),
-        "trained_steps": log[-1]["step"],
-        "cpu_hours": {"total": round(spent_s / 3600, 3)},
-        "held_out": average_of(figures),
-        "log": log,
-    }
-    write_atomic(out / "training.json", json.dumps(about, indent=1).encode())
-    return about
+        run = Schedule(
+            name="mini-paligemma",
+            steps=recipe.steps,
+            rate=recipe.rate,
+            minutes=minutes,
+            every=100,
+            made_of={
+                "recipe": vars(recipe),
+                "words": config.words,
+                "data_sha256": data_sha256(pool, looks),
+            },
+        )
+        mean, log = train_steps(learner, step_losses, run, out)
+        with writing(out, "train vlm"):
+            mean.vlm.save(out)
+        # What is measured is what was saved.
+        mean.vlm = load_vlm(out)
+        figures = []
+        with torch.no_grad():
+            for i in range(HELD_OUT_BATCHES):
+                rng = np.random.default_rng([76, i])
+                batch = collate(recipe, held_out, looks, number, rng, config)
+                figures.append(losses(mean, batch)[1])
+        spent_s = scenes_s + more_s + captions_s + log[-1]["cpu_s"]
+        about = {
+            "recipe": vars(recipe),
+            "trained_steps": log[-1]["step"],
+            "cpu_hours": {"total": round(spent_s / 3600, 3)},
+            "held_out": average_of(figures),
+            "log": log,
+        }
+        with writing(out, "train vlm"):
+            write_atomic(out / TRAINING_CARD, json.dumps(about, indent=1).encode())
+        return about
 
 
 def make(out: Path, *, cache: Path = CACHE, jobs: int | None = None) -> Path:
-    """`out`, once it holds the model of the standard recipe, trained to the end."""
+    """`out`, once it holds the model of the standard recipe, trained to the end.
+
+    Raises: BadOutput as `train`.
+    """
     recipe = Recipe()
-    file = out / "training.json"
+    file = out / TRAINING_CARD
     if file.is_file():
-        about = parse_json(file.read_bytes())
-        same = json.dumps(about.get("recipe")) == json.dumps(vars(recipe))
-        if same and about.get("trained_steps") == recipe.steps:
+        with reading_kept(file, "train vlm"):
+            about = dict(parse_json(file.read_bytes()))
+        if about.get("recipe") == vars(recipe) and about.get("trained_steps") == recipe.steps:
             return out
     train(recipe, out, cache=cache, jobs=jobs or os.cpu_count() or 1)
     return out
+
+
+def data_sha256(pool: Sequence[View], looks: Mapping[str, Description]) -> str:
+    """A checksum of what a model learns from: the views, and the words for their objects."""
+    digest = hashlib.sha256()
+    for view in pool:
+        digest.update(view.image.tobytes() + view.ids.tobytes() + " ".join(view.names).encode())
+    for name in sorted(looks):
+        digest.update(f"{name}: {looks[name].short}; {looks[name].long}.".encode())
+    return digest.hexdigest()
 
 
 def _view(rgb: Rgb, ids: UInt8[np.ndarray, "h w"], shots: Shots) -> View:

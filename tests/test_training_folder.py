@@ -1,0 +1,229 @@
+"""What a training leaves in folders: never lost to another training, told when it is damaged."""
+
+import errno
+import json
+import subprocess
+import sys
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from shutil import copytree
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tests.test_policy_ahead import frames_of
+from tests.test_policy_training import SUITE, TINY, known, vlm_inputs
+from vap_core.base.errors import BadOutput, VapError
+from vap_core.base.files import SHIPPED, sha256_of
+from vap_core.simulation.suites import suite
+from vap_core.training.films import demonstrations, scenes
+from vap_core.training.films.captions import captions
+from vap_core.training.films.demonstrations import Film, draw_objects, row
+from vap_core.training.films.looks import draw_look
+from vap_core.training.folder import checkpoint
+from vap_core.training.perception.fitting import Run, fit
+from vap_core.training.policy import taught
+from vap_core.training.policy import train as policy
+from vap_core.training.policy.ahead import Ahead
+from vap_core.training.recipe import FILMED, RECIPES, filmed_tasks
+from vap_core.training.vlm import train as vlm
+
+
+def test_a_model_that_ships_is_not_trained_over(tmp_path: Path) -> None:
+    grown = copytree(SHIPPED / "mini-pi0-simpler-bridge-wide-seed-0", tmp_path / "mini-pi0")
+    root = copytree(SHIPPED / "mini-paligemma", tmp_path / "mini-paligemma")
+    weights = [grown / "model.safetensors", root / "vlm.safetensors"]
+    before = [sha256_of(path) for path in weights]
+    with pytest.raises(BadOutput, match=r"holds a model without training\.pt.*another --out"):
+        policy.train(RECIPES[SUITE], grown, cache=tmp_path, minutes=0.0)
+    with pytest.raises(BadOutput, match=r"holds a model without training\.pt.*another --out"):
+        vlm.make(root, cache=tmp_path)
+    assert [sha256_of(path) for path in weights] == before
+
+
+def test_another_recipe_is_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    began = []
+
+    def load_films(*args: object) -> policy.Films:
+        began.append(args)
+        return policy.Films([], [])
+
+    monkeypatch.setattr(policy, "load_films", load_films)
+    out = tmp_path / "out"
+    with pytest.raises(BadOutput, match="holds no film"):
+        policy.train(replace(TINY, seed=2), out, cache=tmp_path)  # of which nothing is kept
+    (out / "captions.json").write_text("{}")
+    (out / "recipe.json").unlink()
+    for recipe, message in (
+        (TINY, "holds no film"),
+        (replace(TINY, seed=1), "another recipe .seed 0 there, 1 now."),
+        (TINY, "holds no film"),
+    ):
+        with pytest.raises(BadOutput, match=message):
+            policy.train(recipe, out, cache=tmp_path)
+    assert len(began) == 3
+
+
+HOLD = """
+import fcntl, pathlib, sys
+from vap_core.evaluation.store import locked
+with locked(pathlib.Path(sys.argv[1]), fcntl.lockf):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("train", [lambda out: policy.train(TINY, out), vlm.make])
+def test_one_process_trains_in_a_folder(train: Callable[[Path], object], tmp_path: Path) -> None:
+    command = [sys.executable, "-c", HOLD, str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == b"held\n"
+        with pytest.raises(BadOutput, match="another process is working in"):
+            train(tmp_path)
+        other.kill()
+    assert not list(tmp_path.glob("[!.]*"))
+
+
+def _half(data: bytes) -> bytes:
+    return data[: len(data) // 2]
+
+
+def _bit(data: bytes) -> bytes:
+    return data[: len(data) // 2] + bytes([data[len(data) // 2] ^ 1]) + data[len(data) // 2 + 1 :]
+
+
+@pytest.mark.parametrize("damage", [lambda data: b"", _half, _bit])
+def test_damaged_films_are_told(
+    damage: Callable[[bytes], bytes], stage: tuple[Path, list[Film]], tmp_path: Path
+) -> None:
+    whole = demonstrations.stage_file(stage[0], SUITE, 0, 1).read_bytes()
+    film = demonstrations.stage_file(tmp_path, SUITE, 0, 0)
+    film.write_bytes(damage(whole))
+    with pytest.raises(BadOutput, match=f"{film} is damaged .*; delete it and run the same"):
+        demonstrations.cached(tmp_path, SUITE, 0, 0)
+
+
+@pytest.mark.parametrize("content", [b"", b"\x00\xff", b"{", b"[]", b"{}", b"PK\x03\x04half"])
+def test_other_damaged_files_of_a_training_are_told(content: bytes, tmp_path: Path) -> None:
+    scene = scenes.stage_file(tmp_path, 0, 0, False)
+    state = tmp_path / "training.pt"
+    described = tmp_path / "captions.json"
+    words = tmp_path / "words.json"
+    readers: dict[Path, Callable[[], object]] = {
+        scene: lambda: scenes.cached(tmp_path, 0, 0),
+        state: lambda: checkpoint(state, resume=True),
+        described: lambda: captions(["camera-0"], described),
+        words: lambda: taught.learn_words(tmp_path, [], 1, tmp_path),
+    }
+    for path, read in readers.items():
+        path.write_bytes(content)
+        with pytest.raises(BadOutput, match=f"{path} is damaged"):
+            read()
+        path.unlink()
+
+
+@pytest.mark.parametrize("at", ["films", "recipe", "weights"])
+def test_a_full_disk_is_one_line(
+    at: str, stage: tuple[Path, list[Film]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*args: object, **kwargs: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(demonstrations, "EPISODES", 2)
+    recipe = replace(TINY, stages=2, steps=1, batch=3, draws=2)
+    place = {
+        "films": "vap_core.training.films.demonstrations.write_atomic",
+        "recipe": "vap_core.training.folder.write_atomic",
+        "weights": "vap_core.training.policy.train.store_in_bfloat16",
+    }[at]
+    monkeypatch.setattr(place, full)
+    if at == "films":
+        with pytest.raises(BadOutput, match="cannot be written .No space left on device"):
+            demonstrations.cached(tmp_path, SUITE, 0, 0)
+        return
+    with pytest.raises(BadOutput, match="cannot be written .No space left on device"):
+        policy.train(recipe, tmp_path / "out", cache=stage[0].parent, jobs=1)
+
+
+def test_a_model_does_not_go_on_with_other_views(
+    stage: tuple[Path, list[Film]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pool, recipe = vlm_inputs(stage, monkeypatch)
+    vlm.train(recipe, tmp_path, minutes=0.0)
+    monkeypatch.setattr(vlm, "views", lambda *args, **kwargs: (pool[1:], 0.0))
+    with pytest.raises(BadOutput, match="another recipe or other data"):
+        vlm.train(recipe, tmp_path)
+    looks = known(stage[1]).captions
+    assert vlm.data_sha256(pool, looks) != vlm.data_sha256(pool[::-1], looks)
+
+
+def test_a_head_that_was_trained_otherwise_is_not_taken(tmp_path: Path) -> None:
+    def losses(rng: np.random.Generator) -> Iterator[Tensor]:
+        yield head(torch.ones(1, 2)).sum()
+
+    def run(rate: float) -> Run:
+        return Run(
+            name="looks",
+            seed=0,
+            epochs=1,
+            rate=rate,
+            decay=0.0,
+            file=tmp_path / "looks.pt",
+            resume=True,
+            expired=lambda: False,
+        )
+
+    head = nn.Linear(2, 1)
+    fit(head, losses, 1, run(0.1))
+    fit(head, losses, 1, run(0.1))
+    with pytest.raises(BadOutput, match=r"looks\.pt is of a looks head that was trained otherwise"):
+        fit(head, losses, 1, run(0.2))
+    head = nn.Linear(2, 2)
+    with pytest.raises(BadOutput, match="trained otherwise"):
+        fit(head, losses, 1, run(0.1))
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_an_error_of_drawing_is_no_lack_of_memory(
+    jobs: int, stage: tuple[Path, list[Film]]
+) -> None:
+    frames = frames_of(stage[1], steps=4)
+
+    def draw(size: int, rng: np.random.Generator) -> None:
+        raise RuntimeError("sizes do not match")
+
+    object.__setattr__(frames, "draw", draw)
+    ahead = Ahead(frames, jobs)
+    with pytest.raises(RuntimeError, match="sizes do not match") as caught:
+        ahead.take(0)
+    assert not isinstance(caught.value, VapError)
+    ahead.close()
+
+
+SHOT = {
+    "simpler-bridge": 2180977730,
+    "simpler-fractal": 2855412502,
+    "vlabench": 1813732699,
+    "tabletop": 1040410494,
+    "shared-pair": 2897129562,
+}
+"""A checksum of the first stage's look, objects and places, by suite."""
+
+
+@pytest.mark.parametrize("name", sorted(FILMED))
+def test_films_that_change_are_kept_elsewhere(name: str) -> None:
+    """A cache holds films of older code: where films change, `FILMS` needs another name, too."""
+    rng = np.random.default_rng([71, 0, *name.encode(), 0])
+    task = filmed_tasks(name)[0]
+    look = draw_look(rng)
+    names = draw_objects(suite(name), task, rng)
+    start = row(suite(name), task, names, 0, rng)
+    shown = json.dumps([repr(look), names, repr(start.placements)])
+    assert (policy.FILMS, zlib.crc32(shown.encode())) == ("films", SHOT[name])
