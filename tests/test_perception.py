@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as hnp
 
 from vap_core.base.errors import MissingWeights
 from vap_core.base.types import Boxes
-from vap_core.contracts.given import rendered_scene
+from vap_core.contracts.given import noise, rendered_scene
 from vap_core.perception import text_encoder as text
 from vap_core.perception.boxes import MAX_BOXES, NMS_IOU, box_iou, crop, suppress_overlaps
 from vap_core.perception.embedded import backbone as features
@@ -31,10 +31,6 @@ def scene() -> tuple[np.ndarray, np.ndarray, Boxes]:
     """A rendered table: picture, masks and boxes of its objects."""
     rendered = rendered_scene()
     return rendered.rgb, rendered.masks, rendered.boxes
-
-
-def noise(seed: int, h: int = 96, w: int = 128) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 255, (h, w, 3), dtype=np.uint8)
 
 
 def test_detector_finds_nothing_on_an_empty_wall() -> None:

@@ -17,10 +17,10 @@ from vap_core.policies.scripted.expert import (
     Expert,
     ExpertState,
     Waypoint,
-    _action_towards,
     _clear_pose,
     _raised_within_reach,
     _reached,
+    _step_towards,
 )
 from vap_core.rollout.failure import Diagnosis
 from vap_core.rollout.loop import Trial, rollout
@@ -127,7 +127,7 @@ class Plans(Still, ABC):
             plan, waited = plan[1:], 0.0
         else:
             waited = state.waited_s + 0.2 / env.hz
-        return ExpertState("planned", plan, waited), _action_towards(plan[0], env)
+        return ExpertState("planned", plan, waited), _step_towards(plan[0], env)
 
 
 class Misses(Plans):
@@ -197,7 +197,7 @@ class Slips(Drops):
 
     def after(self, env: Env) -> Action:
         up = Waypoint(_raised_within_reach(env, env.command.tcp_base, 0.02), 0.0)
-        return _action_towards(up, env)
+        return _step_towards(up, env)
 
 
 class LetsGo(Drops):

@@ -1,5 +1,6 @@
 """The server that workers are forked from."""
 
+import ast
 import subprocess
 import sys
 
@@ -21,8 +22,15 @@ sys.argv = ["vap_core", *{arguments!r}]
 try:
     main()
 finally:
-    heavy = ("mujoco", "pandas", "cv2", "beartype", "numpy")
+    heavy = ("mujoco", "pandas", "cv2", "torch", "beartype", "numpy")
     print([name for name in heavy if name in sys.modules])
+"""
+
+WITHOUT_TORCH = """
+import sys
+
+sys.modules["torch"] = None
+import vap_core.cli.bench.{name}
 """
 
 
@@ -51,3 +59,26 @@ def test_a_wrong_argument_is_told_before_anything_large_is_imported(
     assert says in done.stderr
     assert done.returncode == 2
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says", "absent"),
+    [
+        (("bench", "nonsense"), "known: embeddings, engine, eval, loop", {"mujoco", "cv2"}),
+        (("train", "policy", "--suite", "nonsense"), "'nonsense' is unknown", {"torch"}),
+        (("train", "demonstrations", "--suite", "nonsense"), "'nonsense' is unknown", {"torch"}),
+    ],
+)
+def test_a_wrong_name_is_told_before_what_it_would_choose_is_imported(
+    arguments: tuple[str, ...], says: str, absent: set[str]
+) -> None:
+    done = run(STARTS.format(arguments=arguments))
+    assert says in done.stderr
+    assert done.returncode == 2
+    assert not absent & set(ast.literal_eval(done.stdout))
+
+
+@pytest.mark.parametrize("name", ["suites", "query"])
+def test_a_benchmark_of_simulator_or_recordings_needs_no_torch(name: str) -> None:
+    done = run(WITHOUT_TORCH.format(name=name))
+    assert done.returncode == 0, done.stderr[-500:]

@@ -9,8 +9,6 @@ from vap_core.perception.protocols import Stack
 from vap_core.rollout.types import Frame
 from vap_core.simulation.types import Observation, Outcome
 
-BACKGROUND = 0
-
 
 def scene(
     squares: Sequence[tuple[int, int, tuple[int, int, int]]], size: int = 64, side: int = 12

@@ -43,6 +43,8 @@ def tint(rgb: Rgb, mask: Mask, colour: Colour, alpha: float = ALPHA) -> Rgb:
     """I~ = (1 - alpha) I + alpha * colour inside the mask, rounded to the nearest level.
 
     Pixels outside the mask are bit-identical.
+
+    Raises: ValueError: the mask has another size, or alpha is outside [0, 1].
     """
     if rgb.shape[:2] != mask.shape:
         raise ValueError(f"tint: image {rgb.shape[:2]} and mask {mask.shape} differ in size")

@@ -62,8 +62,6 @@ from .plots import learning_figure as learning_figure
 from .plots import rates_figure as rates_figure
 from .plots import sheet as sheet
 from .prompt_forms import forms_figure as forms_figure
-from .prompt_forms import marked_frames as marked_frames
-from .prompt_forms import tinted_frames as tinted_frames
 from .prompt_forms import tints_figure as tints_figure
 from .shared_films import first_success as first_success
 from .shared_films import run_episode as run_episode

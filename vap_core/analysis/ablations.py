@@ -134,9 +134,7 @@ def _draw_blocks(axes: "Axes", blocks: Sequence[Block]) -> None:
     axes.tick_params(axis="y", length=0)
 
 
-def sweep_figure(
-    results: Sequence[ArmResult], places: Mapping[str, float], label: str, log: bool = False
-) -> "Figure":
+def sweep_figure(results: Sequence[ArmResult], places: Mapping[str, float], label: str) -> "Figure":
     """Success rates along a quantity, ours with 95 % intervals, the paper's dashed."""
     figure = empty_figure(4.2, 2.5)
     axes = figure.subplots()
@@ -151,8 +149,6 @@ def sweep_figure(
     if theirs:
         px, py = zip(*theirs, strict=True)
         axes.plot(px, py, "D--", color=PAPER, fillstyle="none", label="the paper, WidowX")
-    if log:
-        axes.set_xscale("log")
     axes.set_xticks(xs, [f"{x:g}" for x in xs])
     axes.minorticks_off()
     axes.set_xlabel(label)

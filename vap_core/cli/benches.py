@@ -1,7 +1,6 @@
 """The command that measures what a step, a start and a query cost."""
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,6 +19,20 @@ if TYPE_CHECKING:
     from vap_core.cli.bench.measurement import Measurement, Table
 
 app = typer.Typer()
+BENCHES = (
+    "loop",
+    "suites",
+    "stack",
+    "policy",
+    "eval",
+    "profile",
+    "scale",
+    "engine",
+    "embeddings",
+    "query",
+    "style",
+    "measured",
+)
 
 
 @app.command()
@@ -90,52 +103,77 @@ def bench(
     Example: python -m vap_core bench profile --json data/results/bench_profile.json
     """
     from vap_core.base.errors import one_of
-    from vap_core.cli.bench import embeddings as bench_embeddings
-    from vap_core.cli.bench import engine as bench_engine
-    from vap_core.cli.bench import eval as bench_eval
-    from vap_core.cli.bench import eval_report, measured, scale_report
-    from vap_core.cli.bench import loop as bench_loop
-    from vap_core.cli.bench import policy as bench_policy
-    from vap_core.cli.bench import profile as bench_profile
-    from vap_core.cli.bench import query as bench_query
-    from vap_core.cli.bench import scale as bench_scale
-    from vap_core.cli.bench import stack as bench_stack
-    from vap_core.cli.bench import style as bench_style
-    from vap_core.cli.bench import suites as bench_suites
-
-    def kept(
-        measure: "Callable[[], Measurement]", tables: "Callable[[Measurement], list[Table]]"
-    ) -> str:
-        from vap_core.cli.bench.measurement import as_text, write
-
-        measurement = measure()
-        if json is not None:
-            write(measurement, json)
-            json.with_suffix(".part.json").unlink(missing_ok=True)
-        return as_text(measurement, tables(measurement))
 
     parts = stack_of(stack, detector, encoder, tracker)
     part = None if json is None else json.with_suffix(".part.json")
-    against_lerobot = partial(
-        bench_eval.measure, workers, lerobot_from, repeats=repeats, quick=quick, part=part
-    )
-    by_part = partial(bench_profile.measure, quick=quick)
-    scale = partial(bench_scale.measure, episodes, quick)
-    of_tables = partial(bench_embeddings.measure, quick)
-    benchmarks: dict[str, Callable[[], str]] = {
-        "loop": partial(bench_loop.run, steps),
-        "suites": partial(bench_suites.run, workers),
-        "stack": partial(bench_stack.run, parts, random=random_weights, device=device),
-        "policy": partial(bench_policy.run, quick),
-        "eval": partial(kept, against_lerobot, eval_report.tables),
-        "profile": partial(kept, by_part, bench_profile.tables),
-        "scale": partial(kept, scale, scale_report.tables),
-        "engine": partial(bench_engine.run, workers, quick),
-        "embeddings": partial(kept, of_tables, bench_embeddings.tables),
-        "query": partial(bench_query.run, quick=quick),
-        "style": bench_style.run,
-        "measured": measured.run,
-    }
-    if what not in benchmarks:
-        raise one_of("bench:", what, benchmarks)
-    print(benchmarks[what]())
+    # Each case imports its own benchmark alone: most are large, and some need an extra.
+    match what:
+        case "loop":
+            from vap_core.cli.bench import loop
+
+            text = loop.run(steps)
+        case "suites":
+            from vap_core.cli.bench import suites
+
+            text = suites.run(workers)
+        case "stack":
+            from vap_core.cli.bench import stack as bench_stack
+
+            text = bench_stack.run(parts, random=random_weights, device=device)
+        case "policy":
+            from vap_core.cli.bench import policy
+
+            text = policy.run(quick)
+        case "eval":
+            from vap_core.cli.bench import eval as bench_eval
+            from vap_core.cli.bench import eval_report
+
+            found = bench_eval.measure(
+                workers, lerobot_from, repeats=repeats, quick=quick, part=part
+            )
+            text = _kept(found, eval_report.tables, json)
+        case "profile":
+            from vap_core.cli.bench import profile
+
+            text = _kept(profile.measure(quick=quick), profile.tables, json)
+        case "scale":
+            from vap_core.cli.bench import scale, scale_report
+
+            text = _kept(scale.measure(episodes, quick), scale_report.tables, json)
+        case "engine":
+            from vap_core.cli.bench import engine
+
+            text = engine.run(workers, quick)
+        case "embeddings":
+            from vap_core.cli.bench import embeddings
+
+            text = _kept(embeddings.measure(quick), embeddings.tables, json)
+        case "query":
+            from vap_core.cli.bench import query
+
+            text = query.run(quick=quick)
+        case "style":
+            from vap_core.cli.bench import style
+
+            text = style.run()
+        case "measured":
+            from vap_core.cli.bench import measured
+
+            text = measured.run()
+        case _:
+            raise one_of("bench:", what, BENCHES)
+    print(text)
+
+
+def _kept(
+    measurement: "Measurement",
+    tables: "Callable[[Measurement], list[Table]]",
+    json: Path | None,
+) -> str:
+    """A measurement as text; it is kept in the file `json`, too, where one is named."""
+    from vap_core.cli.bench.measurement import as_text, write
+
+    if json is not None:
+        write(measurement, json)
+        json.with_suffix(".part.json").unlink(missing_ok=True)
+    return as_text(measurement, tables(measurement))

@@ -1,5 +1,6 @@
 """Options that several commands share."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -47,3 +48,10 @@ def stack_of(stack: str, detector: str, encoder: str, tracker: str) -> str:
 def names(text: str) -> list[str]:
     """The names in "a, b,c"; empty ones are left out."""
     return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def with_bar(starts: Iterable[int], label: str) -> Iterable[int]:
+    """The starts of blocks, with a bar on a terminal."""
+    from tqdm import tqdm
+
+    return tqdm(starts, desc=label, unit="block", disable=None, leave=False)

@@ -1,12 +1,11 @@
 """Commands that measure policies: eval-policy, eval-tokens, embeddings."""
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from vap_core.cli.options import Workers, names
+from vap_core.cli.options import Workers, names, with_bar
 
 app = typer.Typer()
 
@@ -171,15 +170,8 @@ def embeddings(
         folders = [shipped(name) for name in BENCHMARKS if shipped(name).is_dir()]
     if not folders:
         raise BadPolicy("embeddings: name the folder of a policy after the model's.")
-    table = spaces(vlm, folders, suite, _with_bar)
+    table = spaces(vlm, folders, suite, with_bar)
     print(report(table))
     if out is not None:
         keep(table, out)
         print(f"wrote {out}")
-
-
-def _with_bar(starts: Iterable[int], label: str) -> Iterable[int]:
-    """The starts of blocks, with a bar on a terminal."""
-    from tqdm import tqdm
-
-    return tqdm(starts, desc=label, unit="block", disable=None, leave=False)

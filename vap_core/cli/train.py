@@ -70,13 +70,14 @@ def demonstrations(
     """
     from vap_core.base.errors import one_of
     from vap_core.simulation.suites import BENCHMARKS
+
+    if suite not in BENCHMARKS:
+        raise one_of("train demonstrations: suite", suite, BENCHMARKS)
     from vap_core.training.films.dataset import ABOUT, write
     from vap_core.training.films.scenes import CACHE
     from vap_core.training.policy.train import FILMS
     from vap_core.training.recipe import RECIPES
 
-    if suite not in BENCHMARKS:
-        raise one_of("train demonstrations: suite", suite, BENCHMARKS)
     folder = out or Path(f"data/runs/demonstrations-{suite}")
     was_complete = (folder / ABOUT).exists()
     stages = stages or RECIPES[suite].stages
@@ -218,13 +219,14 @@ def policy(
     from dataclasses import replace
 
     from vap_core.base.errors import one_of
-    from vap_core.training.films.scenes import CACHE
-    from vap_core.training.policy.train import train
     from vap_core.training.recipe import RECIPES
-    from vap_core.training.vlm.train import make
 
     if suite not in RECIPES:
         raise one_of("train policy: suite", suite, RECIPES)
+    from vap_core.training.films.scenes import CACHE
+    from vap_core.training.policy.train import train
+    from vap_core.training.vlm.train import make
+
     folder = out or Path(f"data/runs/trained/mini-pi0-{suite}")
     standard = RECIPES[suite]
     recipe = replace(

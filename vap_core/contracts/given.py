@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from vap_core.base.errors import UnknownName
-from vap_core.base.types import Boxes, Mask, Rgb, value
+from vap_core.base.types import Boxes, Rgb, value
 from vap_core.rollout.loop import Trial
 from vap_core.rollout.prompters.text import generic
 from vap_core.simulation import suites
@@ -83,10 +83,6 @@ def rendered_scene() -> RenderedScene:
 def noise(seed: int, h: int = 96, w: int = 128) -> Rgb:
     """A picture of nothing."""
     return np.random.default_rng(seed).integers(0, 255, (h, w, 3), dtype=np.uint8)
-
-
-def iou(a: Mask, b: Mask) -> float:
-    return float((a & b).sum() / max((a | b).sum(), 1))
 
 
 def short_rows(where: str, steps: int, n: int = 2) -> list[EpisodeRow]:

@@ -3,7 +3,8 @@
 import numpy as np
 
 from vap_core.base.types import Boxes
-from vap_core.contracts.given import RenderedScene, iou, noise
+from vap_core.contracts.given import RenderedScene, noise
+from vap_core.perception.boxes import mask_iou
 from vap_core.perception.protocols import Segmenter
 
 
@@ -28,4 +29,4 @@ def test_a_box_always_has_a_mask(segmenter: Segmenter) -> None:
 
 def test_sanity_masks_are_of_the_objects(segmenter: Segmenter, scene: RenderedScene) -> None:
     found = segmenter(scene.rgb, scene.boxes)
-    assert np.mean([iou(a, b) for a, b in zip(found, scene.masks, strict=True)]) >= 0.7
+    assert np.mean([mask_iou(a, b) for a, b in zip(found, scene.masks, strict=True)]) >= 0.7

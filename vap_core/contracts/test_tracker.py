@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from vap_core.base.types import Rgb, Track
-from vap_core.contracts.given import RenderedScene, iou
+from vap_core.contracts.given import RenderedScene
+from vap_core.perception.boxes import mask_iou
 from vap_core.perception.protocols import Tracker
 
 
@@ -65,7 +66,7 @@ def test_sanity_a_still_scene_keeps_its_masks(tracker: Tracker, scene: RenderedS
         states, (tracks,) = tracker.step(states, [scene.rgb])
     kept = []
     for track, mask in zip(tracks, scene.masks, strict=True):
-        kept.append(0.0 if track.mask is None else iou(track.mask, mask))
+        kept.append(0.0 if track.mask is None else mask_iou(track.mask, mask))
     assert np.mean(kept) >= 0.7
 
 
@@ -80,5 +81,5 @@ def test_sanity_what_is_gone_has_no_mask_and_what_is_back_has_one(
         states, (back,) = tracker.step(states, [scene.rgb])
     right = []
     for track, mask in zip(back, scene.masks, strict=True):
-        right.append(track.mask is not None and iou(track.mask, mask) > 0.5)
+        right.append(track.mask is not None and mask_iou(track.mask, mask) > 0.5)
     assert np.mean(right) >= 0.6

@@ -53,8 +53,8 @@ def hiding_lines(episodes: "pd.DataFrame") -> list[str]:
     if "track_kept" not in episodes:
         return []
     lines = []
-    told = episodes[episodes["track_kept"].notna()]
-    for (suite, method), part in told.groupby(["suite", "method"], sort=False):
+    hidden = episodes[episodes["track_kept"].notna()]
+    for (suite, method), part in hidden.groupby(["suite", "method"], sort=False):
         kept = rate(int(part["track_kept"].eq(True).sum()), len(part))
         seconds = float(part["hidden_s"].iloc[0])
         lines.append(f"{suite} {method}: hidden for {seconds:.1f} s, track kept in {kept}")

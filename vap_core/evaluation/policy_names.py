@@ -35,7 +35,7 @@ def scripted(detector: Detector, scene: Scene, suite: Suite) -> Scripted:
 def make_policy(
     name: str, scene: Scene, suite: Suite, stack: Stack | None
 ) -> Policy[Any] | PrivilegedPolicy[Any]:
-    """One of `POLICIES`; only the scripted one needs a stack."""
+    """One of `POLICIES`; only the scripted one needs a stack. Raises: UnknownName."""
     match name:
         case "scripted":
             assert stack is not None, "the scripted policy needs a detector"

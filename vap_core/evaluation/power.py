@@ -8,6 +8,9 @@ from vap_core.evaluation.layouts import layout_name
 from vap_core.simulation import suites
 from vap_core.simulation.types import EpisodeRow
 
+POWER = 0.8
+"""The chance with which a difference is to be detected."""
+
 
 def power(pairs: int, effect: float, *, alpha: float = 0.05, discordant: float = 0.5) -> float:
     """The chance that McNemar's exact two-sided test detects a true difference of success rates.
@@ -27,10 +30,8 @@ def power(pairs: int, effect: float, *, alpha: float = 0.05, discordant: float =
     return float((binom.pmf(m, pairs, discordant) * np.where(reject < 0, 0.0, detected)).sum())
 
 
-def minimum_detectable_effect(
-    pairs: int, *, alpha: float = 0.05, power_wanted: float = 0.8, discordant: float = 0.5
-) -> float:
-    """The least difference of two success rates that is detected with the wanted power.
+def minimum_detectable_effect(pairs: int, *, discordant: float = 0.5) -> float:
+    """The least difference of two success rates that is detected with the power `POWER`.
 
     nan where McNemar's exact test on `pairs` episodes detects none. Assumes that on the share
     `discordant` of the episodes exactly one method succeeds: 0.5 is what two unrelated methods of
@@ -40,7 +41,7 @@ def minimum_detectable_effect(
     from scipy.optimize import brentq
 
     def excess(effect: float) -> float:
-        return power(pairs, effect, alpha=alpha, discordant=discordant) - power_wanted
+        return power(pairs, effect, discordant=discordant) - POWER
 
     if excess(discordant) <= 0:
         return float("nan")

@@ -62,9 +62,7 @@ class Reading:
 COLUMNS = tuple(field.name for field in fields(Reading))
 
 
-def readings_of(
-    configuration: Mapping[str, Any], run: str, what_for: str = "", date: str = ""
-) -> list[Reading]:
+def readings_of(configuration: Mapping[str, Any], run: str, what_for: str = "") -> list[Reading]:
     """What a run reads: one line for each of its suites that has a shipped list to report."""
     found = []
     weights = _weights_by_suite(configuration)
@@ -80,7 +78,7 @@ def readings_of(
             n_rows += len(suites.rows(suite, task, configuration["episodes"], split=split))
         found.append(
             Reading(
-                date=date or datetime.now(UTC).date().isoformat(),
+                date=datetime.now(UTC).date().isoformat(),
                 suite=suite,
                 list=str(configuration.get("lists", {}).get(suite, ""))[:SHORT],
                 weights=weights.get(suite, ""),

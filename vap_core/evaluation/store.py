@@ -195,7 +195,10 @@ def compact(folder: Path) -> None:
 
 
 def read(folder: Path) -> "pd.DataFrame":
-    """Every finished episode, in the order of KEY; of several attempts the last one."""
+    """Every finished episode, in the order of KEY; of several attempts the last one.
+
+    Raises: BadOutput when a part is damaged or of an older version, or does not fit the others.
+    """
     import pandas as pd
 
     parts = _read_parts(folder)

@@ -43,8 +43,8 @@ def switching_lines(episodes: "pd.DataFrame") -> list[str]:
     if "switched_s" not in episodes:
         return []
     lines = []
-    told = episodes[episodes["switched_s"].notna()]
-    for (name, method), part in told.groupby(["suite", "method"], sort=False):
+    switched = episodes[episodes["switched_s"].notna()]
+    for (name, method), part in switched.groupby(["suite", "method"], sort=False):
         turned = part["turned_s"].dropna().astype(float)
         obeyed = rate(int(part["obeyed"].eq(True).sum()), len(part))
         line = f"{name} {method}: switched in {len(part)} episodes, obeyed in {obeyed}"

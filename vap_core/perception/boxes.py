@@ -35,22 +35,26 @@ def crop(image: Rgb, box_xyxy: Float[np.ndarray, "4"], margin: float = MARGIN) -
 
 def box_iou(a: Float[np.ndarray, "n 4"], b: Float[np.ndarray, "m 4"]) -> Float[np.ndarray, "n m"]:
     """Intersection over union of every pair of boxes."""
-    near = np.maximum(a[:, None, :2], b[None, :, :2])
-    far = np.minimum(a[:, None, 2:], b[None, :, 2:])
-    both = np.clip(far - near, 0, None).prod(-1)
-    area_a = (a[:, 2:] - a[:, :2]).prod(-1)
-    area_b = (b[:, 2:] - b[:, :2]).prod(-1)
-    return both / np.maximum(area_a[:, None] + area_b[None] - both, 1e-9)
+    both, area_a, area_b = _overlaps(a, b)
+    return both / np.maximum(area_a + area_b - both, 1e-9)
 
 
 def box_cover(a: Float[np.ndarray, "n 4"], b: Float[np.ndarray, "m 4"]) -> Float[np.ndarray, "n m"]:
     """Intersection over the smaller box's area, of every pair of boxes."""
+    both, area_a, area_b = _overlaps(a, b)
+    return both / np.maximum(np.minimum(area_a, area_b), 1e-9)
+
+
+def _overlaps(
+    a: Float[np.ndarray, "n 4"], b: Float[np.ndarray, "m 4"]
+) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, "n 1"], Float[np.ndarray, "1 m"]]:
+    """The area (px^2) that every pair of boxes shares, and the areas of the two boxes."""
     near = np.maximum(a[:, None, :2], b[None, :, :2])
     far = np.minimum(a[:, None, 2:], b[None, :, 2:])
     both = np.clip(far - near, 0, None).prod(-1)
     area_a = (a[:, 2:] - a[:, :2]).prod(-1)
     area_b = (b[:, 2:] - b[:, :2]).prod(-1)
-    return both / np.maximum(np.minimum(area_a[:, None], area_b[None]), 1e-9)
+    return both, area_a[:, None], area_b[None]
 
 
 def suppress_overlaps(

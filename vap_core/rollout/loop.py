@@ -191,7 +191,7 @@ def _observe_and_prompt(
         if episode.header is None:
             _guard(episode, _open_sink, trial, episode, attended, sink)
         if episode.row.subgoals and episode.homing is None:
-            _guard(episode, _open_subgoal, trial, episode, attended)
+            _guard(episode, _open_subgoal, episode, attended)
         if episode.outcome is None:
             steps[id(episode)] = observation, attended
     return steps
@@ -301,7 +301,7 @@ def _open_sink(
         episode.sink.draw_by(episode.late.draw)
 
 
-def _open_subgoal(trial: Trial, episode: RunningEpisode, attended: Attended) -> None:
+def _open_subgoal(episode: RunningEpisode, attended: Attended) -> None:
     """Keep what is known of a sub-goal at its first step, and pass it on to the sink."""
     if len(episode.spans) > episode.stage:
         return

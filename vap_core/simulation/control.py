@@ -14,6 +14,7 @@ from vap_core.base.errors import BadAction, OutOfReach
 from vap_core.base.types import value
 from vap_core.simulation import robots
 from vap_core.simulation.robots import Robot
+from vap_core.simulation.types import Action, Pose
 
 ROUNDS = 12
 """Most iterations of one solution; it stops as soon as the pose is met."""
@@ -208,6 +209,33 @@ def follow_joints(
     return Setpoint(arm.forward(joints), joints, float(np.clip(delta[-1], 0.0, 1.0)))
 
 
+def action_towards(
+    arm: Arm,
+    command: Setpoint,
+    goal: Float64[np.ndarray, "4 4"],
+    gripper: float,
+    *,
+    control: str,
+    seconds: float,
+    limits: MotionLimits,
+) -> Action:
+    """One step from the commanded pose of the tcp towards `goal` (robot base frame).
+
+    It lasts `seconds`, is as fast as `limits` allow, and is in the `control` that the suite has,
+    "ee" or "joint". `gripper` is 0..1 at its end.
+    """
+    now = command.tcp_base
+    move = capped(goal[:3, 3] - now[:3, 3], limits.speed_m_s * seconds)
+    turn = capped(rotation_vector(goal[:3, :3] @ now[:3, :3].T), limits.turn_rad_s * seconds)
+    if control == "ee":
+        return np.array([*move, *turn, gripper], np.float32)
+    step = np.eye(4)
+    step[:3, :3] = rotation(turn) @ now[:3, :3]
+    step[:3, 3] = now[:3, 3] + move
+    joints = arm.solve(command.joints, step, seconds)
+    return np.array([*(joints - command.joints), gripper], np.float32)
+
+
 def is_beyond(
     action: Float32[np.ndarray, " m"],
     robot: Robot,
@@ -235,6 +263,11 @@ def rotation_vector(matrix: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "
     """The rotation vector, rad, of a rotation matrix; its length is at most pi."""
     turn = mink.SO3.from_matrix(np.ascontiguousarray(matrix))
     return np.asarray(turn.log())
+
+
+def pose_transform(pose: Pose) -> mink.SE3:
+    """World from body, for a pose `x y z qw qx qy qz`."""
+    return mink.SE3.from_rotation_and_translation(mink.SO3(pose[3:]), pose[:3])
 
 
 def _lean_and_twist(

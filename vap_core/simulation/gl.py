@@ -34,6 +34,8 @@ def works(backend: str) -> bool:
     """Whether `backend` can make a context here.
 
     A child process tries it, so that a crash in a driver does not end this one.
+
+    Raises: MissingGL: mujoco is not installed.
     """
     if importlib.util.find_spec("mujoco") is None:
         raise MissingGL(

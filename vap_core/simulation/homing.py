@@ -9,12 +9,13 @@ from typing import Literal
 import numpy as np
 
 from vap_core.base.types import value
-from vap_core.simulation.control import arm, capped, rotation, rotation_vector
+from vap_core.simulation.control import MotionLimits, action_towards, arm
 from vap_core.simulation.env import Env
 from vap_core.simulation.types import Action
 
 SPEED_M_S = 0.20
 TURN_RAD_S = 1.2
+LIMITS = MotionLimits(SPEED_M_S, TURN_RAD_S)
 JOINT_RAD_S = 0.8
 GRIP_S = 3.0
 """Share of the gripper's travel in a second."""
@@ -64,17 +65,15 @@ def action(homing: Homing, env: Env) -> Action:
         longest = JOINT_RAD_S * seconds
         turn = np.clip(env.robot.home - command.joints, -longest, longest)
         return np.array([*turn, gripper], np.float32)
-    now = command.tcp_base
-    goal = _goal(homing, env)
-    move = capped(goal[:3, 3] - now[:3, 3], SPEED_M_S * seconds)
-    turn = capped(rotation_vector(goal[:3, :3] @ now[:3, :3].T), TURN_RAD_S * seconds)
-    if env.control == "ee":
-        return np.array([*move, *turn, gripper], np.float32)
-    step = np.eye(4)
-    step[:3, :3] = rotation(turn) @ now[:3, :3]
-    step[:3, 3] = now[:3, 3] + move
-    joints = arm(env.robot.name).solve(command.joints, step, seconds)
-    return np.array([*(joints - command.joints), gripper], np.float32)
+    return action_towards(
+        arm(env.robot.name),
+        command,
+        _goal(homing, env),
+        gripper,
+        control=env.control,
+        seconds=seconds,
+        limits=LIMITS,
+    )
 
 
 def _goal(homing: Homing, env: Env) -> np.ndarray:

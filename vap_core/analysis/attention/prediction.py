@@ -24,17 +24,13 @@ Labels = Bool[np.ndarray, " n"]
 
 @dataclass(frozen=True)
 class Auc:
-    """Chance that a positive has a higher score than a negative, with its 95 % interval.
-
-    `n` episodes in `clusters` layouts, of which `positives` are positive.
-    """
+    """Chance that a positive has a higher score than a negative, of `n` episodes, and its 95 %
+    interval."""
 
     value: float
     low: float
     high: float
     n: int
-    positives: int
-    clusters: int
 
     def __str__(self) -> str:
         if np.isnan(self.value):
@@ -59,8 +55,6 @@ def auc_interval(
         low=low,
         high=high,
         n=len(labels),
-        positives=int(labels.sum()),
-        clusters=len(set(clusters)),
     )
 
 
@@ -81,8 +75,6 @@ def auc_gain(
         low=low,
         high=high,
         n=len(labels),
-        positives=int(labels.sum()),
-        clusters=len(set(clusters)),
     )
 
 

@@ -9,7 +9,6 @@ import resource
 import struct
 import tempfile
 import time
-from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ import numpy as np
 from vap_core.analysis.embedding_search import BLOCK
 from vap_core.analysis.embedding_space import compare
 from vap_core.cli.bench.measurement import Measurement, Table, provenance
+from vap_core.cli.options import with_bar
 from vap_core.evaluation import processes
 from vap_core.policies.embedding_table import open_table
 
@@ -72,7 +72,7 @@ def _compare(plan: tuple[tuple[int, int], float]) -> dict[str, Any]:
         folders = [Path(scratch) / "vlm", Path(scratch) / "policy"]
         _write(folders, size, noise)
         start = time.process_time()
-        found = compare(open_table(folders[0]), open_table(folders[1]), _with_bar)
+        found = compare(open_table(folders[0]), open_table(folders[1]), with_bar)
         seconds = time.process_time() - start
     peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     return {**asdict(found), "cpu_s": seconds, "peak_gb": peak_gb}
@@ -98,9 +98,3 @@ def _write(folders: list[Path], size: tuple[int, int], noise: float) -> None:
             file.write((block.view(np.uint32) >> 16).astype("<u2").tobytes())
     for file in files:
         file.close()
-
-
-def _with_bar(starts: Iterable[int], label: str) -> Iterable[int]:
-    from tqdm import tqdm
-
-    return tqdm(starts, desc=label, unit="block", disable=None, leave=False)

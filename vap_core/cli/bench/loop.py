@@ -17,7 +17,6 @@ from vap_core.base.tables import align
 from vap_core.cli.bench.timing import median_seconds, seconds_of
 from vap_core.evaluation.study import DEMO
 from vap_core.evaluation.trials import make_trial, register_personal
-from vap_core.perception.embedded.backbone import features
 from vap_core.recording import DeferredRecorder
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters.tint import TintPrompter
@@ -113,6 +112,8 @@ def median_ms(work: Callable[[], object]) -> float:
 
 def _pass_ms(trial: Trial) -> float:
     """A pass of the backbone."""
+    from vap_core.perception.embedded.backbone import features
+
     env = Env(trial.scene)
     rgb = next(iter(env.observe().images.values()))
     return median_ms(lambda: features([rgb], ["head"]))

@@ -10,7 +10,6 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64
-from mink import SE3, SO3
 
 from vap_core.attend import Attender, AttendState
 from vap_core.base.types import Attended, Camera, Rgb
@@ -18,6 +17,7 @@ from vap_core.evaluation.ablations.forms import draw_arrow
 from vap_core.rollout.prompters.protocol import PromptContext
 from vap_core.rollout.prompters.tint import TintPrompter
 from vap_core.simulation.cameras import project
+from vap_core.simulation.control import pose_transform
 from vap_core.simulation.types import Observation, Pose
 
 FARTHEST_PX = 4096.0
@@ -78,11 +78,6 @@ class ArrowPrompter:
                 if track.mask is not None and start is not None:
                     images[camera] = draw_arrow(images[camera], track.mask, colour, start)
         return replace(attended, images=images)
-
-
-def pose_transform(pose: Pose) -> SE3:
-    """The transform of a position and a quaternion."""
-    return SE3.from_rotation_and_translation(SO3(pose[3:]), pose[:3])
 
 
 def hand_pixel(camera: Camera, hand_world: Float64[np.ndarray, "3"]) -> tuple[int, int] | None:

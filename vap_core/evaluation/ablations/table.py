@@ -147,9 +147,9 @@ def _against_default(arms: Sequence[str], of_suite: "pd.DataFrame") -> dict[str,
 
 def _share(rows: "pd.DataFrame", column: str) -> Rate:
     """The share of episodes in which it holds, of those that can say, as `metrics.count` does."""
-    told = rows[rows[column].notna()]
-    won = told[column].eq(True) & told["outcome"].ne("error")
-    return rate(int(won.sum()), len(told))
+    measured = rows[rows[column].notna()]
+    won = measured[column].eq(True) & measured["outcome"].ne("error")
+    return rate(int(won.sum()), len(measured))
 
 
 def _paper_sr(ablation: Ablation, suite: str, arm: str) -> float:

@@ -1,6 +1,6 @@
 """Measures the objects of a folder one by one; what an interrupted run had finished is kept."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,7 @@ from vap_core.base.files import write_atomic
 from vap_core.base.types import value
 from vap_core.evaluation import engine, measurements, store
 from vap_core.evaluation.feasibility import feasible
-from vap_core.evaluation.jobs import Job, Rows, run_job
+from vap_core.evaluation.jobs import Rows
 from vap_core.evaluation.own_objects.folder import (
     Source,
     import_missing,
@@ -22,6 +22,7 @@ from vap_core.evaluation.own_objects.openings import measure_openings
 from vap_core.evaluation.own_objects.report import Tables, text_report, write_sheets
 from vap_core.evaluation.photos.pictures import write_picture
 from vap_core.evaluation.policy_names import default_policy
+from vap_core.evaluation.processes import results_here
 from vap_core.evaluation.study import Study
 from vap_core.perception.embedded.weights import weights_sha256
 from vap_core.perception.stacks import check_stack, load_stack
@@ -61,7 +62,7 @@ class ObjectSurvey:
         )
 
 
-def measure_objects(folder: Path, out: Path, asked: ObjectSurvey, *, progress: bool = True) -> str:
+def measure_objects(folder: Path, out: Path, asked: ObjectSurvey) -> str:
     """Do what `out` lacks of the measurement, write tables and sheets, and return the report.
 
     Raises: BadObject; UnknownName; BadOutput when `out` holds another run.
@@ -73,7 +74,7 @@ def measure_objects(folder: Path, out: Path, asked: ObjectSurvey, *, progress: b
     store.open_run(out, _configuration(source, asked))
     shelf = out / "objects" if source.files else folder
     with store.locked(out), objects_in(shelf):
-        with tqdm(total=len(source.groups), unit="object", disable=not progress) as bar:
+        with tqdm(total=len(source.groups), unit="object") as bar:
             refused = import_missing(source, folder, shelf, bar.set_postfix_str)
             views, episodes = _measure(source, out, asked, refused, bar)
         tables = Tables(views=views, episodes=episodes, groups=source.groups, refused=refused)
@@ -155,27 +156,20 @@ def _episodes(study: Study, out: Path) -> Rows:
         measurements.write_json_part(path, list(feasible(rows)), caller=CALLER)
     expert = measurements.read_json_part(path, caller=CALLER)
     can = {row.episode: good for row, good in zip(rows, expert, strict=True)}
+    # In this process, models and policy are loaded once for all objects.
     table = engine.run(
         study,
         out / "episodes" / _slug(study),
         workers=1,
         record="none",
         progress=False,
-        executor=_in_this_process,
+        executor=results_here,
         what_for=CALLER,
     )
     found: Rows = []
     for row in table.to_dict("records"):
         found.append({**row, "object": study.object, "expert": can[row["episode"]]})
     return found
-
-
-def _in_this_process(
-    run: Any, jobs: Sequence[Job], workers: int, remedy: str
-) -> Iterator[tuple[Job, Rows]]:
-    """Jobs one after the other, so that models and policy are loaded once for all objects."""
-    for job in jobs:
-        yield job, run_job(job)
 
 
 def _slug(study: Study) -> str:

@@ -89,7 +89,7 @@ def _of_family(suite: str, family: Mapping[str, str], number: int) -> Iterator[P
         if marked in said:
             continue
         said.add(marked)
-        meant = _meant(suite, key, family, second)
+        meant = _meant(key, family, second)
         yield Paraphrase(
             suite=suite,
             family=family["family"],
@@ -99,7 +99,7 @@ def _of_family(suite: str, family: Mapping[str, str], number: int) -> Iterator[P
             object=meant,
             start=max(marked.find("["), 0),
             kept=action["where"] if "{where}" in family["text"] else "",
-            context=_context(suite, key, family, meant),
+            context=_context(suite, family, meant),
         )
 
 
@@ -137,7 +137,7 @@ def _words(key: str, family: Mapping[str, str], second: bool, turn: int) -> dict
     return words
 
 
-def _meant(suite: str, key: str, family: Mapping[str, str], second: bool) -> str | None:
+def _meant(key: str, family: Mapping[str, str], second: bool) -> str | None:
     """The name of the object that is meant."""
     about = read_vocabulary()["objects"][key]
     if not family["means"]:
@@ -150,7 +150,7 @@ def _meant(suite: str, key: str, family: Mapping[str, str], second: bool) -> str
     return str(about["second" if owner == "ben" else "first"]["object"])
 
 
-def _context(suite: str, key: str, family: Mapping[str, str], meant: str | None) -> Context:
+def _context(suite: str, family: Mapping[str, str], meant: str | None) -> Context:
     """The memory, and a history in which the object that is meant was used as the family says."""
     vocabulary = read_vocabulary()
     objects = {}

@@ -14,6 +14,7 @@ from vap_core.base.types import value
 from vap_core.evaluation.perception.estimates import NONE, Estimate, mean, precision, share
 from vap_core.evaluation.perception.first_frames import KS, RULES, USUAL_K
 from vap_core.evaluation.perception.speed import LIMITS_MS
+from vap_core.evaluation.perception.tracking import HIDDEN
 from vap_core.simulation import suites
 
 if TYPE_CHECKING:
@@ -24,8 +25,6 @@ Survey = Mapping[str, "pd.DataFrame"]
 Statistic = Callable[["pd.DataFrame"], Estimate]
 Cells = Sequence[str]
 ALL = "all"
-HIDDEN = 3
-"""Frames for which the target is hidden in the measures of identity."""
 CASES = ("right", "case 1", "case 2", "nothing")
 TIERS = ("standard", "hard")
 NOTE = (

@@ -44,7 +44,6 @@ QUICK = 2
 
 It tracks one episode of each suite, and hides its target once.
 """
-HIDDEN = 3
 CHUNK = 6
 """Episodes of one job: little is lost when a run is killed."""
 TABLES = (
@@ -241,7 +240,7 @@ def _first_of_each_suite(
     first: dict[str, tracking.Job] = {}
     for job in tracked:
         first.setdefault(job.row.suite, job)
-    return [replace(first[name], hidden=(HIDDEN,)) for name in names]
+    return [replace(first[name], hidden=(tracking.HIDDEN,)) for name in names]
 
 
 def _opening_jobs(asked: Survey) -> list[Job]:

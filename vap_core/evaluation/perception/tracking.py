@@ -40,6 +40,8 @@ KEPT = 0.5
 """IoU above which a track is on its object."""
 WRONG = 0.1
 """IoU below which a track is on something else."""
+HIDDEN = 3
+"""Frames for which the target is hidden in the measures of identity."""
 MOST_HIDDEN = 6
 BINS = 20
 """Points of the IoU over normalised time."""
@@ -104,7 +106,7 @@ def plan(
         for task in suite.tasks:
             rows = suites.rows(suite.name, task.name, count[suite.name])
             for i, row in enumerate(rows):
-                hidden: tuple[int, ...] = (3,)
+                hidden: tuple[int, ...] = (HIDDEN,)
                 if i < n_all_hidden:
                     hidden = tuple(range(1, MOST_HIDDEN + 1))
                 kind: Literal["plate", "arm"] = "arm" if i % 4 == 3 else "plate"

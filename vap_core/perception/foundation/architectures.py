@@ -56,7 +56,7 @@ TRACKERS: dict[str, tuple[type[SamTracker], Normalisation]] = {
 
 
 def network_class(role: str, model: str) -> str:
-    """transformers' class of a model of `sources.PARTS` in a role."""
+    """transformers' class of a model of `sources.PARTS` in a role. Raises: KeyError."""
     for beginning, name in CLASSES[role].items():
         if model.startswith(beginning):
             return name

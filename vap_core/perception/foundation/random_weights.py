@@ -50,7 +50,7 @@ def random_network(role: str, model: str, seed: int = 0) -> Any:
 
 
 def published_config(name: str, model: str) -> Any:
-    """The configuration of a model, for transformers' class of that name."""
+    """The configuration of a model, for transformers' class of that name. Raises: KeyError."""
     import transformers
 
     hf: Any = transformers  # its configurations take more than they declare

@@ -59,9 +59,7 @@ class Words(ProcessorStep):
     def get_config(self) -> dict[str, Any]:
         return {"words": self.words, "longest": self.longest}
 
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+    def transform_features(self, features: Features) -> Features:
         language = PolicyFeature(FeatureType.LANGUAGE, (self.longest,))
         features[PipelineFeatureType.OBSERVATION] |= {
             OBS_LANGUAGE_TOKENS: language,

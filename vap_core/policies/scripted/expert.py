@@ -13,13 +13,14 @@ from jaxtyping import Float64
 from vap_core.base.errors import OutOfReach
 from vap_core.base.types import value
 from vap_core.policies.protocol import Chunk
-from vap_core.simulation.control import arm, rotation, rotation_vector
+from vap_core.simulation.control import MotionLimits, action_towards, arm, rotation, rotation_vector
 from vap_core.simulation.env import Env
 from vap_core.simulation.grasps import Grasp, grasps, points_world
 from vap_core.simulation.types import Action, Truth
 
 SPEED_M_S = 0.22
 TURN_RAD_S = 1.4
+LIMITS = MotionLimits(SPEED_M_S, TURN_RAD_S)
 GRIP_S = 3.0
 """Share of the gripper's travel in a second: a jaw that slams knocks light things over."""
 ABOVE_M = 0.04
@@ -97,7 +98,7 @@ class Expert:
             next_states.append(self._advance(state, env))
         chunks = []
         for state, env in zip(next_states, envs, strict=True):
-            chunks.append(_action_towards(state.plan[0], env)[None])
+            chunks.append(_step_towards(state.plan[0], env)[None])
         return next_states, chunks
 
     def _advance(self, state: ExpertState, env: Env) -> ExpertState:
@@ -133,34 +134,21 @@ class Expert:
         return ExpertState("grasp", (_retreat_waypoint(env),), attempt=attempt)
 
 
-def _action_towards(waypoint: Waypoint, env: Env) -> Action:
-    """One step from the commanded pose to the waypoint, as fast as allowed.
-
-    It is in the control that the suite has.
-    """
+def _step_towards(waypoint: Waypoint, env: Env) -> Action:
+    """One step from the commanded pose to the waypoint, as fast as allowed."""
     seconds = 1.0 / env.hz
-    now = env.command.tcp_base
-    goal = waypoint.tcp_base
-    move = goal[:3, 3] - now[:3, 3]
-    turn = rotation_vector(goal[:3, :3] @ now[:3, :3].T)
-    move *= _share_of_step(move, SPEED_M_S * seconds)
-    turn *= _share_of_step(turn, TURN_RAD_S * seconds)
-    grip = waypoint.gripper - env.command.gripper
+    command = env.command
+    grip = waypoint.gripper - command.gripper
     grip = float(np.clip(grip, -GRIP_S * seconds, GRIP_S * seconds))
-    gripper = env.command.gripper + grip
-    if env.control == "ee":
-        return np.array([*move, *turn, gripper], np.float32)
-    step = np.eye(4)
-    step[:3, :3] = rotation(turn) @ now[:3, :3]
-    step[:3, 3] = now[:3, 3] + move
-    joints = arm(env.robot.name).solve(env.command.joints, step, seconds)
-    return np.array([*(joints - env.command.joints), gripper], np.float32)
-
-
-def _share_of_step(way: Float64[np.ndarray, "3"], longest: float) -> float:
-    """The share of a way that one step covers when it is `longest` at most."""
-    length = float(np.linalg.norm(way))
-    return min(1.0, longest / max(length, 1e-9))
+    return action_towards(
+        arm(env.robot.name),
+        command,
+        waypoint.tcp_base,
+        command.gripper + grip,
+        control=env.control,
+        seconds=seconds,
+        limits=LIMITS,
+    )
 
 
 def _reached(waypoint: Waypoint, env: Env, waited_s: float) -> bool:

@@ -123,7 +123,9 @@ class OraclePrompter:
             tracks = {}
             for camera in observation.images:
                 mask = truth.masks[camera].get(prompted)
-                tracks[camera] = (_track(None if mask is None else self._spoil(mask)),)
+                if mask is not None:
+                    mask = spoil(mask, self.oracle.area, self.oracle.shift)
+                tracks[camera] = (_track(mask),)
             results.append(self.attender.follow(state, observation.images, tracks, state.trackers))
         return results
 
@@ -146,26 +148,27 @@ class OraclePrompter:
         if self.oracle.reveal == "box":
             drawn = self.attender.stack.segmenter(rgb, boxes)
         else:
-            spoiled = [self._spoil(mask) for mask in masks]
+            spoiled = [spoil(mask, self.oracle.area, self.oracle.shift) for mask in masks]
             drawn = np.array(spoiled, bool).reshape(-1, *rgb.shape[:2])
         embeddings = self.attender.stack.encoder([crop(rgb, box) for box in xyxy])
         ids = tuple(range(len(xyxy)))
         return Candidates(boxes=boxes, embeddings=embeddings, masks=drawn, ids=ids)
 
-    def _spoil(self, mask: Mask) -> Mask:
-        """The mask, of the oracle's area and moved by its shift."""
-        box = mask_box(mask)
-        if box is None or (self.oracle.area == 1.0 and self.oracle.shift == 0.0):
-            return mask
-        scale = self.oracle.area**0.5
-        middle = (box[:2] + box[2:] - 1) / 2
-        moved = middle + np.array([self.oracle.shift * (box[2] - box[0]), 0])
-        warp = np.array(
-            [[scale, 0, moved[0] - scale * middle[0]], [0, scale, moved[1] - scale * middle[1]]]
-        )
-        h, w = mask.shape
-        spoiled = cv2.warpAffine(mask.astype(np.uint8), warp, (w, h), flags=cv2.INTER_NEAREST)
-        return spoiled > 0
+
+def spoil(mask: Mask, area: float, shift: float) -> Mask:
+    """The mask, of `area` times its pixels, and moved right by `shift` times its width."""
+    box = mask_box(mask)
+    if box is None or (area == 1.0 and shift == 0.0):
+        return mask
+    scale = area**0.5
+    middle = (box[:2] + box[2:] - 1) / 2
+    moved = middle + np.array([shift * (box[2] - box[0]), 0])
+    warp = np.array(
+        [[scale, 0, moved[0] - scale * middle[0]], [0, scale, moved[1] - scale * middle[1]]]
+    )
+    h, w = mask.shape
+    spoiled = cv2.warpAffine(mask.astype(np.uint8), warp, (w, h), flags=cv2.INTER_NEAREST)
+    return spoiled > 0
 
 
 def _truth(context: PromptContext) -> SceneTruth:

@@ -56,9 +56,9 @@ class Judge:
 
     `events` are those of the last step alone. `run` counts the current unbroken run of steps in
     which the rule's condition held, `held_steps` the longest; `order` names the objects in the
-    order in which the robot touched or moved them (`earlier`: before the last step); it begins with
-    the target, or the first object was not the right one. `step_m` is how far the target moved in
-    the last step. `first` is the step at which it began: 0, or the end of an earlier sub-goal.
+    order in which the robot touched or moved them; it begins with the target, or the first object
+    was not the right one. `step_m` is how far the target moved in the last step. `first` is the
+    step at which it began: 0, or the end of an earlier sub-goal.
     """
 
     row: EpisodeRow
@@ -71,7 +71,6 @@ class Judge:
     run: int = 0
     held_steps: int = 0
     success_once: bool = False
-    earlier: tuple[str, ...] = ()
     order: tuple[str, ...] = ()
     moved: frozenset[str] = frozenset()
     events: tuple[Event, ...] = ()
@@ -107,7 +106,6 @@ class Judge:
             run=run,
             held_steps=max(self.held_steps, run),
             success_once=self.success_once or run >= HELD_STEPS[self.row.rule],
-            earlier=self.order,
             order=tuple(order),
             moved=frozenset(moved),
             events=(),
