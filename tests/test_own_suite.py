@@ -64,6 +64,7 @@ def test_a_run_of_a_suite_that_is_not_open_names_the_remedy(file: Path) -> None:
         suites.digest("my-desk")
 
 
+@pytest.mark.slow
 def test_the_commands_told_at_the_end_find_the_suite_and_are_quoted(tmp_path: Path) -> None:
     (tmp_path / "my desk").mkdir()
     file = tmp_path / "my desk" / "desk.py"
