@@ -72,6 +72,13 @@ def test_the_cases_of_a_row_sum_to_its_failures() -> None:
     assert counts.loc["vap", "mean_confidence"] == 0.5
 
 
+def test_an_error_that_an_older_version_diagnosed_counts_as_no_failure() -> None:
+    broken = {**row(case="case 3", sub_case="slip", outcome="error"), "case_confidence": 1.0}
+    counts = breakdown(pd.concat([TABLE, pd.DataFrame([broken])], ignore_index=True))
+    assert counts.drop(columns="n").equals(breakdown(TABLE).drop(columns="n"))
+    assert counts["n"].tolist() == [10, 2]
+
+
 def test_as_text_every_share_has_its_interval() -> None:
     told = align(breakdown_rows(breakdown(TABLE)))
     assert "44 % [19, 73]" in told

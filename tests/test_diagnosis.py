@@ -1,18 +1,28 @@
 """From a run's table to the frame: failures listed, narrowed down, run again and opened; what is refused, in one line."""
 
+import json
+import shutil
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 
-from tests.command import vap
+from tests.command import refused, vap
 from tests.test_breakdown import TABLE
 from vap_core.base.errors import BadOutput, BadStudy
 from vap_core.base.files import DATA
 from vap_core.evaluation import engine
-from vap_core.evaluation.diagnosis.failures import deciding_frame, failures_text, list_failures
+from vap_core.evaluation.diagnosis import recordings
+from vap_core.evaluation.diagnosis.failures import (
+    Failures,
+    deciding_frame,
+    failures_text,
+    list_failures,
+)
 from vap_core.evaluation.diagnosis.recordings import correct_failure, recording_of, study_of
 from vap_core.evaluation.publish import publish, read_published
 from vap_core.evaluation.report.failures import (
@@ -46,10 +56,25 @@ def test_a_run_lists_its_failures_with_their_reasons(run: Path) -> None:
     assert failures.table["deciding_frame"].between(0, 60).all()
 
 
-def test_several_places_are_one_list(run: Path, tmp_path: Path) -> None:
-    publish([run], tmp_path / "mine.parquet")
-    both = list_failures(run, tmp_path / "mine.parquet")
-    assert both.table["source"].tolist() == [str(run)] * 3 + [str(tmp_path / "mine.parquet")] * 3
+def test_several_places_are_one_list_of_every_episode_once(run: Path, tmp_path: Path) -> None:
+    mine, other = tmp_path / "mine.parquet", tmp_path / "other"
+    publish([run], mine)
+    study = replace(STUDY, policy="scripted", episodes=1)
+    engine.run(study, other, record="none", executor=here, progress=False)
+    listed = list_failures(run, run, mine, other)
+    assert listed.all_episodes["source"].tolist() == [str(run)] * 3 + [str(other)]
+    assert breakdown(listed.episodes)["n"].tolist() == [3, 1]
+    assert set(listed.all_episodes.index) == {0, 1, 2, 3}
+
+
+def test_an_episode_with_another_object_or_stack_is_another(run: Path, tmp_path: Path) -> None:
+    for name, changed in (("robots", "menagerie"), ("object", "mug"), ("stack", "foundation")):
+        shutil.copytree(run, tmp_path / name)
+        path = tmp_path / name / "run.json"
+        manifest = json.loads(path.read_text())
+        manifest["configuration"][name] = changed
+        path.write_text(json.dumps({**manifest, "digest": name}))
+        assert len(list_failures(run, tmp_path / name).table) == 6
 
 
 def test_a_condition_narrows_them_down(run: Path) -> None:
@@ -261,3 +286,68 @@ def test_a_correction_changes_the_table_and_nothing_else(run: Path) -> None:
     assert "* as corrected by hand" in failures_text(again)
     layer.unlink()
     assert not list_failures(run).table.corrected.any()
+
+
+@pytest.mark.parametrize(
+    ("words", "match"),
+    [
+        ("diagnose R --open 0 --note x", "--note is of a correction; leave --note out"),
+        ("diagnose R --against vap", "--against is of one failure; name it by --open"),
+        ("diagnose R --open 0 --correct c --png a", "--correct shows nothing; leave --png out"),
+        ("diagnose R --open 0 --correct c --mp4 a", "--correct shows nothing; leave --mp4 out"),
+        ("diagnose R --open 0 --correct c --against vap", "shows nothing; leave --against out"),
+        ("query R steps>1 --port 9", "--port is of --serve; leave --port out"),
+        ("query R --serve --open 0 --png a", "in a browser; leave --open and --png out"),
+        ("query R --serve --limit 20", "in a browser; leave --limit out"),
+    ],
+)
+def test_an_option_that_would_do_nothing_is_refused(words: str, match: str) -> None:
+    assert match in refused(*words.split())
+
+
+def test_a_picture_and_a_film_are_both_made(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    made = []
+    monkeypatch.setattr("vap_core.recording.write_film", lambda _, mp4: made.append(mp4) or 1)
+    monkeypatch.setattr("vap_core.recording.screenshot", lambda _, png, **__: made.append(png))
+    done = vap("view", "a.rrd", "--png", tmp_path / "a.png", "--mp4", tmp_path / "a.mp4")
+    assert (done.returncode, done.stdout.count("wrote")) == (0, 2)
+    assert made == [tmp_path / "a.mp4", tmp_path / "a.png"]
+
+
+def test_the_other_method_is_of_the_same_episode_policy_and_scene(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    manifests = {
+        "menagerie": {"configuration": {"robots": "menagerie"}},
+        "plain": {"configuration": {}},
+    }
+    rows = []
+    for of_run, policy, episode, method in product(
+        manifests, ("a", "b"), (0, 1), ("generic", "vap")
+    ):
+        about = {"suite": "s", "task": "t", "seed": 0, "folder": str(tmp_path)}
+        played = {"episode": episode, "policy": policy, "method": method}
+        rows.append({**about, **played, "configuration": of_run})
+    table = pd.DataFrame(rows)
+    generic = table[table["method"] == "generic"].reset_index(drop=True)
+    failures = Failures(manifests, table, table, generic)
+    opened: list[dict[str, Any]] = []
+
+    def recorded(_: Failures, row: dict[str, Any]) -> Path:
+        opened.append(row)
+        return tmp_path / f"{row['method']}.rrd"
+
+    combined = []
+    monkeypatch.setattr(recordings, "_recording_of_row", recorded)
+    monkeypatch.setattr("vap_core.recording.combine_recordings", lambda *of: combined.append(of))
+    last = len(generic) - 1
+    out = recordings.side_by_side_recording(failures, last, "vap")
+    assert opened == [rows[-2], rows[-1]]
+    paths = {"generic": tmp_path / "generic.rrd", "vap": tmp_path / "vap.rrd"}
+    assert combined == [(paths, out)]
+    with pytest.raises(
+        BadStudy, match="'soft' did not run this episode here; there is generic, vap[.]$"
+    ):
+        recordings.side_by_side_recording(failures, last, "soft")

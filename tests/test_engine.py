@@ -22,10 +22,12 @@ from tests.command import vap
 from vap_core.base.files import DATA
 from vap_core.evaluation import engine, store, trials
 from vap_core.evaluation.engine import missing_jobs, result_key
-from vap_core.evaluation.jobs import Job, row_of_dead_worker
+from vap_core.evaluation.jobs import Job, Record, row_of_dead_worker
 from vap_core.evaluation.state_log import read as read_traces
 from vap_core.evaluation.store import append, open_run, read, read_manifest
 from vap_core.evaluation.study import Study
+from vap_core.policies.scripted.expert import Expert
+from vap_core.recording import read_summary
 
 STUDY = Study(
     (("simpler-bridge", "pick-shaver"), ("simpler-bridge", "put-camera")),
@@ -212,7 +214,7 @@ def test_only_what_is_missing_runs_and_errors_run_again_recorded(tmp_path: Path)
     assert [name for job in missing_jobs(STUDY, out) for name in job.keys] == names[5:]
     again = [job for job in missing_jobs(STUDY, out, retries=1) if job.attempt == 2]
     assert [name for job in again for name in job.keys] == names[3:5]
-    assert {job.record for job in again} == {"failures"}
+    assert {job.record for job in again} == {"all"}
     assert {job.record for job in missing_jobs(STUDY, out, "all", retries=1)} == {"all"}
     stored(out, names[3:4], outcome="failure")
     stored(out, names[4:5], outcome="error")
@@ -365,3 +367,30 @@ def test_an_episode_that_always_breaks_is_an_error_with_its_recording(
     ]
     assert read_manifest(tmp_path / "run")["configuration"]["seeds"] == 1
     assert not table.success[0]
+
+
+@pytest.mark.parametrize("record", ["none", "failures", 2])
+def test_an_error_that_succeeds_when_it_is_tried_again_is_recorded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: Record
+) -> None:
+    class BreaksOnce(Expert):
+        broken = False
+
+        def plan_from_simulation(self, states, envs):  # type: ignore[no-untyped-def]
+            if not self.broken:
+                self.broken = True
+                raise RuntimeError("the policy fell over")
+            return super().plan_from_simulation(states, envs)
+
+    policy = BreaksOnce()
+    monkeypatch.setattr(trials, "make_policy", lambda *_: policy)
+    study = replace(STUDY, tasks=STUDY.tasks[:1], policy="expert", episodes=1, seeds=1)
+
+    def here(work, jobs, workers, mend):  # type: ignore[no-untyped-def]
+        return ((job, work(job)) for job in jobs)
+
+    out = tmp_path / "run"
+    table = engine.run(study, out, record=record, executor=here, progress=False)
+    assert (table.outcome.tolist(), table.attempt.tolist()) == (["success"], [2])
+    (path,) = (out / "recordings").glob("*.rrd")
+    assert read_summary(path)["outcome"] == "success"

@@ -164,6 +164,19 @@ def test_a_late_drift_onto_what_is_then_touched_is_one():
     )
 
 
+@pytest.mark.parametrize(("wrong", "frame"), [((3, 2, 6), 7), ((3, 2, 2), 2)])
+def test_the_longest_wrong_run_decides_where_the_prompts_are_wrong_as_a_whole(wrong, frame):
+    first, between, last = wrong
+    steps = still(2) + still(first, [view(OTHER)]) + still(between) + still(last, [view(OTHER)])
+    assert label(told("picked", steps)) == ("case 1", "drift", frame, "front")
+
+
+def test_the_last_wrong_run_decides_where_the_hand_was_misled_late():
+    steps = still(2) + still(3, [view(OTHER)]) + still(9) + still(1, [view(OTHER)])
+    found = told("picked", [*steps, *still(1, [view(OTHER)], truth(touched=(OTHER,)))])
+    assert label(found) == ("case 1", "drift", 14, "front")
+
+
 def test_what_a_track_does_after_the_touch_is_not_held_against_it_unless_the_hand_follows():
     steps = still(3) + still(3, now=held(0.03)) + still(20, [view(OTHER)])
     assert label(told("picked", steps, candidates=2))[:2] == ("case 3", "slip")
@@ -233,6 +246,7 @@ took = truth(up={OTHER: 0.1}, contacts={OTHER: (ROBOT,)}, touched=(OTHER,))
         ("picked", "", still(3) + still(2, now=truth(at={OTHER: (0.3, 0.54)}, touched=(OTHER,))) + still(2, where=NEAR), "collision", 3),
         ("picked", "", still(3) + still(2, now=truth(at={OTHER: (0.3, 0.54)})) + still(3, now=truth(touched=(TARGET,))), "collision", 3),
         ("picked", "", still(3) + still(2, now=truth(at={OTHER: (0.3, 0.52)})) + still(3, now=truth(touched=(TARGET,))), "missed grasp", 5),
+        ("picked", "", still(3) + still(3, now=truth(touched=(TARGET,))) + still(2, now=truth(at={OTHER: (0.3, 0.54)})), "missed grasp", 3),
         ("selected", "", still(3) + still(2, now=truth(touched=(OTHER,))), "wrong object", 3),
         ("selected", "", still(3) + still(2, now=truth(touched=(OTHER,))) + still(2, now=truth(touched=(TARGET,))), "collision", 3),
         ("selected", "", still(3) + still(9, where=NEAR), "timeout", 3),
@@ -331,6 +345,18 @@ def test_the_road_of_an_episode():
     ]
     way = stages(episode("picked", still(3, [])))
     assert [way[f"stage_{name}"] for name in failures.STAGES[:5]] == [None, None, None, None, False]
+
+
+def test_a_track_is_held_that_is_right_up_to_the_touch():
+    steps = still(3) + still(1, now=truth(touched=(TARGET,))) + still(9, [view(OTHER)])
+    way = stages(episode("picked", steps))
+    assert (way["stage_tracked"], way["track_right"]) == (True, 1.0)
+
+
+def test_a_view_that_hardly_shows_the_target_has_no_stages():
+    wrist = view(OTHER, pixels=20, camera="wrist", proposal=0.0)
+    way = stages(episode("picked", still(3, [RIGHT, wrist])))
+    assert (way["stage_proposed"], way["stage_voted"], way["stage_masked"]) == (True, True, True)
 
 
 @pytest.mark.parametrize(

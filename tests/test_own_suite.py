@@ -1,11 +1,15 @@
 """A suite of one's own from a Python file: the documented one runs; what is wrong in a file is one line."""
 
+import os
 import re
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from tests.command import refused, vap
+from tests.command import process, refused, vap
 from vap_core.base.errors import BadSuite, UnknownName
 from vap_core.evaluation.feasibility import feasible
 from vap_core.evaluation.rescore import rescore
@@ -53,6 +57,37 @@ def test_other_commands_find_it_by_the_environment(
         suites.suite("my-desk")
     monkeypatch.setenv("VAP_SUITES", str(file))
     assert suites.suite("my-desk").robot == "wx250s"
+
+
+def test_a_run_of_a_suite_that_is_not_open_names_the_remedy(file: Path) -> None:
+    with pytest.raises(UnknownName, match="your own by its file or VAP_SUITES"):
+        suites.digest("my-desk")
+
+
+@pytest.mark.slow
+def test_the_commands_told_at_the_end_find_the_suite_and_are_quoted(tmp_path: Path) -> None:
+    (tmp_path / "my desk").mkdir()
+    file = tmp_path / "my desk" / "desk.py"
+    file.write_text(DOCUMENTED)
+    words = ("eval", "--suite", file, "--policy", "expert", "--episodes", 1, "--record", "none")
+    out = tmp_path / "my desk" / "run"
+    done = process(*words, "--workers", 1, "--out", out, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (command,) = re.findall("tables, paired tests, a page: (.*)", done.stdout)
+    setting, *rest = shlex.split(command)
+    assert (setting, rest) == (
+        f"VAP_SUITES={file}",
+        ["python", "-m", "vap_core", "report", str(out)],
+    )
+    told = subprocess.run(
+        command.replace(" python ", f" {shlex.quote(sys.executable)} "),
+        shell=True,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    assert told.returncode == 0, told.stderr
 
 
 @pytest.mark.parametrize("name", ["simpler-bridge", "my-absent"])

@@ -28,6 +28,8 @@ def run(
     methods: tuple[str, ...] = ("generic",),
     version: str = "1",
     first: int = 0,
+    policy: str = ROW["policy"],
+    **changes: str,
 ) -> Path:
     study = {
         "tasks": [["widowx-pick", "pick-cup"]],
@@ -36,12 +38,14 @@ def run(
         "episodes": episodes,
         "seed": seed,
         "seeds": 1,
+        **changes,
     }
     open_run(folder, study)
     append(
         folder,
         [
             {**ROW, "method": method, "episode": i, "seed": seed, "detail": "Traceback ..."}
+            | {"policy": policy}
             | {"seconds_ik": 0.1, "steps": int(version)}
             for i in range(first, first + done)
             for method in methods
@@ -133,6 +137,12 @@ def test_only_finished_runs_and_each_once(tmp_path: Path) -> None:
         publish([tmp_path / "nothing"], tmp_path / "t.parquet")
 
 
+def test_runs_of_other_scenes_make_no_table(tmp_path: Path) -> None:
+    one, other = run(tmp_path / "one", 0), run(tmp_path / "two", 1, robots="menagerie")
+    with pytest.raises(BadOutput, match="menagerie robots in .*two: .*in tables of their own"):
+        publish([one, other], tmp_path / "t.parquet")
+
+
 def test_a_published_table_and_a_new_run_become_one_table(tmp_path: Path) -> None:
     old, both = tmp_path / "old.parquet", tmp_path / "both.parquet"
     publish([run(tmp_path / "one", 0)], old)
@@ -162,6 +172,12 @@ def test_a_method_that_was_read_again_takes_the_place_of_the_earlier_rows(tmp_pa
     everything = run(tmp_path / "all", 0, methods=("generic", "vap"), version="3")
     assert publish([new, everything], new, replace=True, supersede=True) == 4
     assert len(json.loads(pq.read_schema(new).metadata[b"runs"])) == 1
+
+
+def test_another_policy_supersedes_nothing(tmp_path: Path) -> None:
+    one = run(tmp_path / "one", 0, methods=("generic", "vap"))
+    other = run(tmp_path / "other", 0, methods=("vap",), version="2", policy="another")
+    assert publish([one, other], tmp_path / "t.parquet", supersede=True) == 6
 
 
 def test_a_part_of_a_list_supersedes_nothing(tmp_path: Path) -> None:

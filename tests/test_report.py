@@ -7,6 +7,7 @@ import csv
 import json
 import re
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from tests.command import vap
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import DATA
 from vap_core.base.tables import escape, latex, markdown
+from vap_core.evaluation.metrics import rate
 from vap_core.evaluation.publish import publish
 from vap_core.evaluation.report import report
 from vap_core.evaluation.report.results import errors, results
@@ -260,6 +262,15 @@ def test_seeds_of_a_benchmark_are_one_report_with_layouts_for_units(tmp_path: Pa
     assert once["sr_layout_low"].isna().all(), "no layout returns: Wilson alone"
 
 
+def test_layouts_that_all_succeed_leave_room_for_one_that_fails(tmp_path: Path) -> None:
+    sources = [run(tmp_path / str(seed), BRIDGE[:1], seed=seed) for seed in range(2)]
+    runs = load_runs(sources)
+    won = replace(runs, table=runs.table.assign(success=True, outcome="success"))
+    line = results(won).iloc[0]
+    assert (line.sr, line.layouts, line.sr_layout_high) == (1.0, 6, 1.0)
+    assert line.sr_layout_low == 1 - rate(0, 6, conservative=True).high
+
+
 def test_one_run_of_several_seeds_is_several_runs_of_one(tmp_path: Path) -> None:
     apart = [run(tmp_path / str(seed), seed=seed) for seed in range(2)]
     held = json.loads((apart[0] / "run.json").read_text())["configuration"]
@@ -375,6 +386,36 @@ def test_the_same_episodes_twice_are_refused_and_a_run_named_twice_counts_once(
     with pytest.raises(BadOutput, match="hold the same episodes; name each run once"):
         load_runs([one, other])
     assert len(load_runs([one, one]).table) == len(load_runs([one]).table)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"object": "mug"}, "has plain robots in .*one, and plain robots and the object mug in"),
+        ({"robots": "menagerie"}, "put-camera has plain robots in .*one, and menagerie robots in"),
+    ],
+)
+def test_runs_of_other_scenes_are_no_pair(
+    tmp_path: Path, changes: dict[str, Any], match: str
+) -> None:
+    one = run(tmp_path / "one", methods=["generic"], robots="plain")
+    other = run(tmp_path / "other", methods=["vap"], tasks=BRIDGE[1:], **changes)
+    with pytest.raises(BadOutput, match=f"{match} .*other: .*; report them one by one.") as caught:
+        load_runs([one, other])
+    assert "\n" not in str(caught.value)
+
+
+def test_the_paper_has_no_number_of_an_object_of_ones_own(tmp_path: Path) -> None:
+    listed = run(tmp_path / "listed", tasks=BRIDGE[:1])
+    assert results(load_runs([listed]))["paper_sr"].notna().all()
+    own = run(tmp_path / "own", tasks=BRIDGE[1:], object="mug")
+    lines = results(load_runs([own]))
+    assert lines["paper_sr"].isna().all()
+    assert lines["paper_method"].isna().all()
+    text = report([listed, own], tmp_path / "out")
+    rows = [line for line in text.splitlines() if line.startswith("| put-camera")]
+    assert rows
+    assert not any("pi0" in line for line in rows), "nor in rows of its own"
 
 
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """The pictures of a report: every line of its tables, methods told apart, the right recording."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ from tests.test_report import run
 from vap_core.base import palette
 from vap_core.base.errors import BadRecording
 from vap_core.evaluation.report import page
+from vap_core.evaluation.report.failures import FunnelRow
+from vap_core.evaluation.report.funnel import funnel_figure
 from vap_core.evaluation.report.pictures import differences_figure, forest_figure
 from vap_core.evaluation.report.results import results
 from vap_core.evaluation.report.runs import load_runs
@@ -75,3 +78,57 @@ def test_methods_are_told_apart_by_colour_and_by_marker() -> None:
         == 5
     )
     assert marks["vap"] == palette.METHODS["vap"]
+
+
+def test_policies_of_one_method_are_told_apart(tmp_path: Path) -> None:
+    shaver = (("simpler-bridge", "pick-shaver"),)
+    sources = []
+    for name in "abcd":
+        sources.append(
+            run(tmp_path / name, tasks=shaver, methods=["generic", "vap"], label=name, policy=name)
+        )
+    handles, labels = forest_figure(results(load_runs(sources))).axes[0].get_legend_handles_labels()
+    marks = {}
+    for handle, label in zip(handles, labels, strict=True):
+        marks[label] = (
+            handle[0].get_color(),
+            handle[0].get_marker(),
+            handle[0].get_markerfacecolor(),
+        )
+    assert len(labels) == len(set(marks.values())) == 8
+    colour, marker = palette.METHODS["vap"]
+    assert marks["vap, a policy"] == (colour, marker, colour)
+    assert marks["vap, b policy"] == (colour, marker, "white")
+
+
+def test_policies_of_one_method_have_a_marker_each_in_the_funnel() -> None:
+    left = (None, None, None, None, 3, 2, 1)
+    names = ("vap", "vap, a", "vap, b", "generic, a", "generic, b")
+    rows = [FunnelRow(suite="s", method=name, n=4, left=left, succeeded=1) for name in names]
+    figure = funnel_figure(rows)
+    lines = [line for line in figure.axes[0].lines if len(line.get_xdata()) > 1]
+    assert [line.get_marker() for line in lines] == ["o", "^", "s", "o", "^"]
+
+
+def test_a_difference_is_filled_after_holms_correction_alone(tmp_path: Path) -> None:
+    runs = load_runs([run(tmp_path / "run")])
+    compared = compare(runs.table, runs.methods)[0]
+    pictured = []
+    for p_holm in (0.08, 0.04):
+        figure = differences_figure([replace(compared, p=0.03, p_holm=p_holm)])
+        (container,) = figure.axes[0].containers
+        pictured.append(container.lines[0].get_markerfacecolor())
+    assert pictured == ["white", palette.METHODS["vap"][0]]
+
+
+def test_a_rate_is_drawn_with_the_interval_over_layouts(tmp_path: Path) -> None:
+    shaver = (("simpler-bridge", "pick-shaver"),)
+    sources = []
+    for seed in range(2):
+        sources.append(run(tmp_path / str(seed), shaver, seed=seed, methods=["vap"]))
+    lines = results(load_runs(sources))
+    (container,) = forest_figure(lines).axes[0].containers
+    ((low, _), (high, _)) = container.lines[2][0].get_segments()[0]
+    assert low == pytest.approx(100 * lines["sr_layout_low"][0])
+    assert high == pytest.approx(100 * lines["sr_layout_high"][0])
+    assert low != pytest.approx(100 * lines["sr_low"][0])

@@ -217,6 +217,16 @@ def test_the_first_step_that_failed_is_diagnosed(episode):
     assert "sub-goal 2 % of failures" in breakdown_rows(counts)[0]
 
 
+def test_an_error_after_a_step_that_failed_is_no_failure(episode):
+    done, _ = episode
+    missed = replace(done.outcome.subgoals[0], status="failure", success=False)
+    broken = replace(MISSED, status="error", detail="why")
+    ended = replace(done, outcome=of_subgoals([missed, broken], 2, done.outcome.steps))
+    found = diagnosis.columns(ended)
+    assert (ended.outcome.status, found["case"], found.get("subgoal")) == ("error", "", None)
+    assert all(found[f"stage_{stage}"] is None for stage in diagnosis.STAGES)
+
+
 class Stateless(Grounding):
     """Keeps nothing, and looks at the truth only when it begins."""
 

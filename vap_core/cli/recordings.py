@@ -1,6 +1,7 @@
 """Commands that find and open recordings: diagnose, query, view, show."""
 
 import threading
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -10,7 +11,7 @@ app = typer.Typer()
 
 PictureInstead = Annotated[
     Path | None,
-    typer.Option(help="With --open: save a picture of it instead, without a display."),
+    typer.Option(help="With --open (default 0): save a picture of it instead, without a display."),
 ]
 
 
@@ -54,7 +55,9 @@ def diagnose(
     png: PictureInstead = None,
     mp4: Annotated[
         Path | None,
-        typer.Option(help="With --open: write it as a film of what the policy saw instead."),
+        typer.Option(
+            help="With --open (default 0): write it as a film of what the policy saw instead."
+        ),
     ] = None,
     against: Annotated[
         str | None,
@@ -92,15 +95,19 @@ def diagnose(
         raise BadStudy(
             "diagnose: --mp4 films one recording, --against lays two side by side; leave one out."
         )
+    if correct is None:
+        _refuse_dropped("diagnose: --note is of a correction", {"--note": note or None})
+    else:
+        shown = {"--png": png, "--mp4": mp4, "--against": against}
+        _refuse_dropped("diagnose: --correct shows nothing", shown)
+    if show is None and (correct is not None or (against is not None and png is None)):
+        option = "--against" if correct is None else "--correct"
+        raise BadStudy(f"diagnose: {option} is of one failure; name it by --open and its number.")
     failures = list_failures(
         *runs, suite=suite, task=task, method=method, case=case, sub_case=sub_case, where=where
     )
     number = show or 0
     if correct is not None:
-        if show is None:
-            raise BadStudy(
-                "diagnose: --correct is of one failure; name it by --open and its number."
-            )
         layer = correct_failure(failures, number, correct, note)
         row = failures.table.iloc[number]
         named = f"{row['suite']} {row['task']} {row['method']} {row['episode']}"
@@ -124,7 +131,9 @@ def query(
             "method, outcome, case, steps, ...; with --serve on recordings."
         ),
     ] = None,
-    limit: Annotated[int, typer.Option(min=1, help="Recordings to list.")] = 20,
+    limit: Annotated[
+        int | None, typer.Option(min=1, help="Recordings to list. Default 20.")
+    ] = None,
     show: Annotated[
         int | None,
         typer.Option(
@@ -160,13 +169,16 @@ def query(
     from vap_core.recording.query import first_match, format_result, run_query
 
     if serve:
+        shown = {"--open": show, "--png": png, "--limit": limit}
+        _refuse_dropped("query: --serve shows every recording in a browser", shown)
         _serve(run, where, port)
         return
     if where is None:
         raise BadStudy('query: name a condition, such as "margin < 0.05", or add --serve.')
+    _refuse_dropped("query: --port is of --serve", {"--port": port})
     result = run_query(run, where)
     if show is None and png is None:
-        print(format_result(result, limit))
+        print(format_result(result, limit or 20))
         return
     path, frame = first_match(result, show or 0)
     print(f"{path}, frame {frame}")
@@ -220,6 +232,15 @@ def show(
     print(f"wrote {png}")
 
 
+def _refuse_dropped(why: str, given: Mapping[str, object]) -> None:
+    """Refuse options that would do nothing. Raises: BadStudy, which names them."""
+    from vap_core.base.errors import BadStudy
+
+    named = [name for name, setting in given.items() if setting is not None]
+    if named:
+        raise BadStudy(f"{why}; leave {' and '.join(named)} out.")
+
+
 def _serve(run: Path, where: str | None, port: int | None) -> None:
     """Serve a run's recordings until Ctrl-C, and open the viewer where there is a display."""
     from vap_core.recording.browser import serve_run
@@ -242,14 +263,14 @@ def _serve(run: Path, where: str | None, port: int | None) -> None:
 
 
 def _show_frame(recording: Path, frame: int, png: Path | None, mp4: Path | None = None) -> None:
-    """Open a recording in the viewer at one step, or make a picture or a film of it."""
+    """Open a recording in the viewer at one step, or make a picture of it, a film, or both."""
     from vap_core.recording import open_viewer, screenshot, write_film
 
     if mp4 is not None:
         n_pictures = write_film(recording, mp4)
         print(f"wrote {mp4}: {n_pictures} pictures")
-    elif png is None:
-        open_viewer(recording, frame_index=frame)
-    else:
+    if png is not None:
         screenshot(recording, png, frame_index=frame, size=(1920, 1080))
         print(f"wrote {png}")
+    if png is None and mp4 is None:
+        open_viewer(recording, frame_index=frame)

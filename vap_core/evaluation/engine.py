@@ -179,9 +179,7 @@ def missing_jobs(
             rows = [(row, result_key(row, method, run_digest)) for row in study.rows(suite, task)]
             chosen = _chosen_keys(rows, record)
             for (_, attempt), group in _missing_groups(rows, attempts, retries).items():
-                record_now = record
-                if attempt > 1 and record != "all":
-                    record_now = "failures"
+                record_now: Record = record if attempt == 1 else "all"
                 first = 0
                 while first < len(group):
                     size = 1 if given < short else BATCH

@@ -1,7 +1,7 @@
 """Keeps the results of finished runs as one small table, with their manifests (run.json)."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,6 +51,36 @@ def read_published(path: Path) -> "list[Run]":
     return runs
 
 
+def scene_of(study: Mapping[str, Any]) -> str:
+    """What a configuration's scenes have beside what its lists say, in words."""
+    scene = f"{study.get('robots', 'plain')} robots"
+    if study.get("object"):
+        scene += f" and the object {study['object']}"
+    return scene
+
+
+def require_same_scenes(
+    named: Iterable[tuple[Path, Mapping[str, Any]]], command: str, mend: str
+) -> None:
+    """Refuse runs that play one task with another object or with other robots.
+
+    Their rows have the same names, and are other episodes. `named` are runs with their manifests.
+
+    Raises: BadOutput, with `mend`.
+    """
+    scenes: dict[tuple[str, str], tuple[Path, str]] = {}
+    for name, manifest in named:
+        study = manifest["configuration"]
+        scene = scene_of(study)
+        for suite, task in study["tasks"]:
+            first, before = scenes.setdefault((suite, task), (name, scene))
+            if scene != before:
+                raise BadOutput(
+                    f"{command}: {suite}/{task} has {before} in {first}, and {scene} in {name}: "
+                    f"these are other episodes; {mend}."
+                )
+
+
 def read_runs(source: Path) -> "list[Run]":
     """The run of a folder, or every run of a published table: its manifest, and its episodes.
 
@@ -86,7 +116,8 @@ def publish(
     Returns: the number of episodes.
 
     Raises: BadOutput for a folder that holds no run or an unfinished one, for two runs of the same
-        episodes, for sources of which nothing is left, or a target that is no new Parquet file.
+        episodes or of one task with other objects or robots, for sources of which nothing is left,
+        or a target that is no new Parquet file.
     """
     import pyarrow as pa
 
@@ -95,11 +126,14 @@ def publish(
     if target.exists() and not replace:
         raise _exists(target)
     runs: list[Run] = []
+    named = []
     for source in sources:
         for manifest, episodes in read_runs(source):
             if not suite_names or _is_of(manifest, suite_names):
                 _require_finished(source, manifest, episodes, methods)
                 runs.append((manifest, episodes))
+                named.append((source, manifest))
+    require_same_scenes(named, "publish", "publish them in tables of their own")
     if suite_names:
         _require_whole(runs, suite_names)
     if methods:

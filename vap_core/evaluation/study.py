@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import os
+import shlex
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
@@ -102,6 +104,13 @@ class Study:
     def any_method(self, holds: Callable[[str], bool]) -> bool:
         """Whether something holds for any of its methods."""
         return any(holds(method) for method in self.methods)
+
+    def next_command(self, *words: str | Path) -> str:
+        """A command to print, to be run next; it finds the study's own suites."""
+        line = shlex.join(["python", "-m", "vap_core", *map(str, words)])
+        if not self.suite_files:
+            return line
+        return f"{suites.own.VARIABLE}={shlex.quote(os.pathsep.join(self.suite_files))} {line}"
 
     def configuration(self) -> dict[str, Any]:
         """What the results depend on, as JSON.

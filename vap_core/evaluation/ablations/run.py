@@ -58,7 +58,7 @@ def ablate_text(
         f"{errors} errors. Intervals: Wilson's for rates, cluster bootstrap over layouts for "
         "differences; p exact, Holm's correction over the arms of a suite.",
         f"picture: {picture}",
-        f"every arm is a run of its own: python -m vap_core diagnose {first}",
+        f"every arm is a run of its own: {study.next_command('diagnose', first)}",
     ]
     return "\n".join(lines)
 

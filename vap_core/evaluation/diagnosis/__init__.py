@@ -84,8 +84,9 @@ def columns(episode: Episode) -> dict[str, Any]:
     """The diagnosis and the stages (`stages`) of an episode, as columns of a results table.
 
     Of several sub-goals they are of the first that failed, or of the last; `subgoal` is its number.
+    An error has no diagnosis, no stages and no such sub-goal, whatever its sub-goals did.
     """
-    if episode.subgoals:
+    if episode.subgoals and episode.outcome.status != "error":
         stage = deciding_subgoal(episode)
         return {**columns(episode.part(stage)), "subgoal": stage + 1}
     trace = None

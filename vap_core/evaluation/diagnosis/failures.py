@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from vap_core.base.condition import rows_matching
 from vap_core.base.errors import BadOutput, BadStudy
 from vap_core.base.tables import align
-from vap_core.evaluation.publish import read_runs
+from vap_core.evaluation.publish import read_runs, scene_of
 from vap_core.evaluation.report.failures import (
     SUBGOAL,
     breakdown,
@@ -24,6 +24,7 @@ from vap_core.evaluation.report.failures import (
     diagnosed,
     sub_cases_text,
 )
+from vap_core.evaluation.store import KEY
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -75,6 +76,8 @@ def list_failures(
 ) -> Failures:
     """The failures in run folders or published tables, narrowed down.
 
+    An episode that several sources hold is of the first of them.
+
     `where` is a SQL condition on the table's columns.
 
     Raises: BadOutput when there is no such run, or it was never diagnosed; BadStudy for a name or a
@@ -84,7 +87,7 @@ def list_failures(
 
     manifests = {}
     tables = []
-    for source in sources:
+    for source in dict.fromkeys(sources):
         for manifest, episodes in read_runs(source):
             manifests[manifest["digest"]] = manifest
             if not episodes.empty:
@@ -94,7 +97,8 @@ def list_failures(
         raise BadOutput(
             f"diagnose: {' and '.join(map(str, sources))} hold no finished episode; run eval first."
         )
-    all_episodes = _with_corrections(_with_folders(pd.concat(tables, ignore_index=True)))
+    once = _without_repeated(pd.concat(tables, ignore_index=True), manifests)
+    all_episodes = _with_corrections(_with_folders(once))
     selected = all_episodes
     for column, wanted in (("suite", suite), ("task", task), ("method", method)):
         selected = _select(selected, column, wanted)
@@ -141,6 +145,19 @@ def failure_row(failures: Failures, number: int) -> dict[str, Any]:
 def deciding_frame(failures: Failures, number: int) -> int:
     """The control step that decides a listed failure; 0 where none does."""
     return max(0, int(failure_row(failures, number)["deciding_frame"]))
+
+
+def _without_repeated(
+    table: "pd.DataFrame", manifests: Mapping[str, dict[str, Any]]
+) -> "pd.DataFrame":
+    """Every episode once; those of other scenes or another perception stack are others."""
+    settings = {}
+    for digest, manifest in manifests.items():
+        study = manifest["configuration"]
+        settings[digest] = f"{scene_of(study)}, {study.get('stack', '')}"
+    names = [name for name in (*KEY, "policy") if name in table]
+    keys = table[names].assign(setting=table["configuration"].map(settings))
+    return table[~keys.duplicated()].reset_index(drop=True)
 
 
 def _with_folders(table: "pd.DataFrame") -> "pd.DataFrame":

@@ -6,7 +6,7 @@ A failure that was not recorded is run again: the same row, weights and seed giv
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadStudy
 from vap_core.evaluation.diagnosis import explain
@@ -16,11 +16,15 @@ from vap_core.evaluation.diagnosis.failures import (
     failure_row,
 )
 from vap_core.evaluation.policy_names import policy_today
+from vap_core.evaluation.publish import scene_of
 from vap_core.evaluation.stills import write_provenance
 from vap_core.evaluation.store import ROW_KEY
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.simulation.types import EpisodeRow
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def recording_of(failures: Failures, number: int) -> Path:
@@ -40,7 +44,7 @@ def side_by_side_recording(failures: Failures, number: int, method: str) -> Path
     from vap_core.recording import combine_recordings
 
     row = failure_row(failures, number)
-    same = failures.all_episodes
+    same = _in_scene_of(row, failures)
     for name in (*ROW_KEY, "policy"):
         same = same[same[name] == row[name]]
     other = same[same["method"] == method]
@@ -57,6 +61,15 @@ def side_by_side_recording(failures: Failures, number: int, method: str) -> Path
     out.unlink(missing_ok=True)
     combine_recordings(paths, out)
     return out
+
+
+def _in_scene_of(row: Mapping[str, Any], failures: Failures) -> "pd.DataFrame":
+    """The episodes of runs with the robots and the object of a row's."""
+    scenes = {}
+    for digest, manifest in failures.manifests.items():
+        scenes[digest] = scene_of(manifest["configuration"])
+    table = failures.all_episodes
+    return table[table["configuration"].map(scenes) == scenes[row["configuration"]]]
 
 
 def recording_to_show(

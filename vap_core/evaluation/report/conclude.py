@@ -38,11 +38,11 @@ def conclude(study: "Study", table: "pd.DataFrame", folder: Path) -> str:
         "time per control step, ms by part:",
         _times_table(scores, table),
         "",
-        *_written(folder, f"wrote {summary}, {figure}"),
+        *_written(study, folder, f"wrote {summary}, {figure}"),
     ]
     if table["outcome"].eq("failure").any():
-        text.append(f"why they failed: python -m vap_core diagnose {folder}")
-    text.append(f"tables, paired tests, a page: python -m vap_core report {folder}")
+        text.append(f"why they failed: {study.next_command('diagnose', folder)}")
+    text.append(f"tables, paired tests, a page: {study.next_command('report', folder)}")
     return "\n".join(text)
 
 
@@ -130,7 +130,7 @@ def _times_table(scores: Sequence[Score], table: "pd.DataFrame") -> str:
     return align(rows)
 
 
-def _written(folder: Path, written: str) -> list[str]:
+def _written(study: "Study", folder: Path, written: str) -> list[str]:
     """What was written, and how to look at a recording of a prompted episode."""
     recordings = sorted((folder / "recordings").glob("*.rrd"))
     if not recordings:
@@ -138,7 +138,7 @@ def _written(folder: Path, written: str) -> list[str]:
     size_mb = sum(path.stat().st_size for path in recordings) / 1e6
     return [
         f"{written}, {len(recordings)} recordings ({size_mb:.0f} MB) in {folder / 'recordings'}",
-        f"look at one: python -m vap_core view {_example(recordings)}",
+        f"look at one: {study.next_command('view', _example(recordings))}",
     ]
 
 

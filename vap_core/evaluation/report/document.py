@@ -15,7 +15,7 @@ from vap_core.evaluation.report.latex import main_tables
 from vap_core.evaluation.report.page import report_page
 from vap_core.evaluation.report.pictures import differences_figure, forest_figure
 from vap_core.evaluation.report.provenance import provenance
-from vap_core.evaluation.report.results import comparisons, outcomes, results
+from vap_core.evaluation.report.results import comparisons, outcomes, paper_results, results
 from vap_core.evaluation.report.runs import Runs, load_runs
 from vap_core.evaluation.statistics import compare
 
@@ -39,6 +39,7 @@ def report(sources: Sequence[Path], out: Path) -> str:
     """
     runs = load_runs(sources)
     lines = results(runs)
+    published = paper_results(runs)
     ends = outcomes(runs)
     origins = provenance(runs)
     compared = compare(runs.table, runs.methods)
@@ -46,7 +47,7 @@ def report(sources: Sequence[Path], out: Path) -> str:
     parts = [
         "# Report",
         sections.opening_section(runs),
-        sections.results_section(lines),
+        sections.results_section(lines, published),
         sections.outcomes_section(runs, ends),
         sections.failures_section(runs),
         sections.comparisons_section(differences),
@@ -59,7 +60,7 @@ def report(sources: Sequence[Path], out: Path) -> str:
     files = {
         "report.md": f"{text}\n",
         "results.csv": _csv_text(lines, fractions=_rate_columns()),
-        "results.tex": main_tables(lines),
+        "results.tex": main_tables(lines, published),
         "outcomes.csv": _csv_text(ends),
         "outcomes.tex": latex(outcome_rows(ends)),
         "provenance.csv": _csv_text(origins),

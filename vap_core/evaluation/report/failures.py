@@ -46,18 +46,20 @@ def breakdown(table: "pd.DataFrame") -> "pd.DataFrame":
     episodes = _by_policy(diagnosed(table))
     if "case_confidence" not in episodes:  # no episode failed
         episodes = episodes.assign(case_confidence=float("nan"))
-    flat = episodes[BY].assign(n=1, failed=episodes["outcome"].eq("failure").astype(int))
+    failed = episodes["outcome"].eq("failure")
+    flat = episodes[BY].assign(n=1, failed=failed.astype(int))
     for case, sub_cases in CASES.items():
-        of_case = episodes["case"].eq(case)
+        # Older versions gave some errors a case, too.
+        of_case = failed & episodes["case"].eq(case)
         flat[case] = of_case.astype(int)
         for sub_case in sub_cases:
             both = of_case & episodes["sub_case"].eq(sub_case)
             flat[f"{case}: {sub_case}"] = both.astype(int)
     for number in _subgoals(episodes):
-        failed_there = episodes[SUBGOAL].eq(number) & episodes["outcome"].eq("failure")
+        failed_there = failed & episodes[SUBGOAL].eq(number)
         flat[f"sub-goal {number}"] = failed_there.astype(int)
     counts = flat.groupby(BY, sort=False).sum().reset_index()
-    with_case = episodes[episodes["case"].ne("")].groupby(BY, sort=False)
+    with_case = episodes[failed & episodes["case"].ne("")].groupby(BY, sort=False)
     confidence = with_case["case_confidence"].mean().rename("mean_confidence").reset_index()
     return counts.merge(confidence, on=BY, how="left")
 

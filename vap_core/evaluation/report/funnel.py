@@ -1,5 +1,6 @@
 """The pictures of failures: their cases, and the funnel of stages at which episodes are lost."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -31,6 +32,8 @@ PERCENT_A_LETTER = 0.95
 FUNNEL_COLOURS = {name: METHODS[name][0] for name in ("generic", "soft", "vap", "oracle-mask")}
 """The methods of a funnel."""
 SUCCESS_MARK = "D"
+POLICY_MARKERS = ("o", "^", "s", "v", "X")
+"""Markers of the lines of one method with several policies, in the order of appearance."""
 LABEL_APART = 6.0
 """Percent between two numbers at the ends of lines, so that both can be read."""
 
@@ -40,7 +43,8 @@ def funnel_figure(
 ) -> "Figure":
     """Per suite, the share of episodes that are left after each stage of the funnel.
 
-    A line per method of `colours` and policy, methods that read the simulator dashed. A method that
+    A line per method of `colours` and policy, methods that read the simulator dashed, the policies
+    of one method with a marker each. A method that
     highlights nothing begins with the stage "touched"; one that has errors alone has no line. The
     last tick has two marks: a dot for episodes that succeed with every stage right, a diamond for
     all that succeed (SR).
@@ -52,10 +56,11 @@ def funnel_figure(
     lines = -(-len(by_suite) // columns)
     figure = empty_figure(5.4 * columns, 2.9 * lines + 0.4)
     panels = figure.subplots(lines, columns, squeeze=False, sharey=True).ravel()
+    markers = _policy_markers(rows)
     drawn: dict[str, Line2D] = {}
     for axes, (suite, of_suite) in zip(panels, by_suite.items(), strict=False):
         shown = [row for row in of_suite if _plain(row.method) in colours]
-        drawn |= _draw_funnel(axes, shown, colours)
+        drawn |= _draw_funnel(axes, shown, colours, markers)
         axes.set_xticks(range(len(STAGES)), STAGES, fontsize=8, rotation=20)
         axes.set_xlim(-0.25, len(STAGES) - 0.4)
         axes.set(title=f"{suite}{_count_text(shown)}", ylim=(0, 104))
@@ -112,8 +117,23 @@ def cases_figure(counts: "pd.DataFrame", first: str = "vap") -> "Figure":
     return figure
 
 
+def _policy_markers(rows: Sequence[FunnelRow]) -> dict[str, str]:
+    """The marker of every line: the policies of one method have one each."""
+    markers: dict[str, str] = {}
+    n_policies: Counter[str] = Counter()
+    for row in rows:
+        if row.method not in markers:
+            method = _plain(row.method)
+            markers[row.method] = POLICY_MARKERS[n_policies[method] % len(POLICY_MARKERS)]
+            n_policies[method] += 1
+    return markers
+
+
 def _draw_funnel(
-    axes: "Axes", rows: Sequence[FunnelRow], colours: Mapping[str, str]
+    axes: "Axes",
+    rows: Sequence[FunnelRow],
+    colours: Mapping[str, str],
+    markers: Mapping[str, str],
 ) -> "dict[str, Line2D]":
     """A line per method with the percentage at its end; the lines by method."""
     drawn: dict[str, Line2D] = {}
@@ -132,7 +152,7 @@ def _draw_funnel(
             stages,
             percent,
             "--" if row.bound else "-",
-            marker="o",
+            marker=markers[row.method],
             markersize=4,
             color=colour,
             linewidth=1.8,

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vap_core.base.tables import escape
-from vap_core.evaluation import paper
 from vap_core.evaluation.metrics import TRACK
 from vap_core.evaluation.report.cells import track_title
 
@@ -22,12 +21,11 @@ ABOVE_PAPER = r"\textit{The paper's own numbers: another world}"
 HEADS = {"cmr": "CMR (\\%)", "sr": "SR (\\%)"}
 
 
-def main_tables(lines: "pd.DataFrame") -> str:
+def main_tables(lines: "pd.DataFrame", published: "pd.DataFrame") -> str:
     """A tabular per suite and track: methods as rows, n, CMR and SR of every task as columns.
 
-    `lines` are of `results.results`.
+    `lines` are of `results.results`, `published` of `results.paper_results`.
     """
-    published = paper.main_results()
     tables = ["% needs \\usepackage{booktabs}; intervals: Wilson, 95 %\n"]
     for (suite, split), part in lines.groupby(TRACK, sort=False):
         of_track = (published["suite"] == suite) & (published["split"] == split)

@@ -5,6 +5,7 @@ Pictures are inside the page; links to recordings are relative to its folder.
 
 import base64
 import os
+import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from html import escape
@@ -136,7 +137,8 @@ def _card(row: Mapping[str, Any], recording: Path, out: Path) -> str:
     images = []
     for camera, rgb in _views(recording, frame).items():
         images.append(f"<img alt='{escape(camera)}' title='{escape(camera)}' src='{_jpeg(rgb)}'>")
-    command = f"python -m vap_core view {recording} --frame {frame}"
+    view = ["view", str(recording), "--frame", str(frame)]
+    command = shlex.join(["python", "-m", "vap_core", *view])
     return (
         f"<article><h3>✗ {escape(words)}</h3><div>{escape(about)}</div>"
         f"<div>{''.join(images)}</div><p>{escape(str(row['case_sentence']))}</p>"

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 Line = tuple[str, ...]
 """What a line of a forest plot is about: the words of its heading, then the task."""
+POLICY_MARKERS = ("d", "*", "8")
+"""Markers of a method's third policy and all further ones, each filled and then hollow."""
 
 
 def forest_figure(results: "pd.DataFrame") -> "Figure":
@@ -46,7 +48,7 @@ def forest_figure(results: "pd.DataFrame") -> "Figure":
             at + _offset(i, len(series)),
             xerr=np.maximum([middle - low, high - middle], 0),
             label=method if len(policies) == 1 else f"{method}, {policy} policy",
-            **_mark_style(colour, marker, filled=policy == policies[0]),
+            **_policy_style(colour, marker, policies.index(policy)),
         )
     axes.set(xlim=(-2, 102), xlabel="% of episodes that succeed, 95 % interval")
     figure.legend(
@@ -151,6 +153,12 @@ def _forest_axes(
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     return figure, axes, places
+
+
+def _policy_style(colour: str, marker: str, i: int) -> dict[str, Any]:
+    """The mark of the i-th policy: the method's own, filled and hollow, then POLICY_MARKERS."""
+    markers = (marker, *POLICY_MARKERS)
+    return _mark_style(colour, markers[i // 2 % len(markers)], filled=i % 2 == 0)
 
 
 def _mark_style(colour: str, marker: str, filled: bool) -> dict[str, Any]:

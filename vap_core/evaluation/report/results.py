@@ -49,8 +49,23 @@ def results(runs: Runs) -> "pd.DataFrame":
     reading = pd.MultiIndex.from_frame(reads_simulator(table)[key])
     lines["bound"] = pd.MultiIndex.from_frame(lines[key]).isin(reading)
     lines["layouts"] = lines["layouts"].fillna(0).astype(int)
-    published = paper.main_results().rename(columns={"sr": "paper_sr", "cmr": "paper_cmr"})
+    published = paper_results(runs).rename(columns={"sr": "paper_sr", "cmr": "paper_cmr"})
     return lines.merge(published, on=[*TRACK, "task", "method"], how="left")
+
+
+def paper_results(runs: Runs) -> "pd.DataFrame":
+    """The paper's main results, without tasks that a run plays with an object of one's own."""
+    import pandas as pd
+
+    published = paper.main_results()
+    own = []
+    for manifest in runs.manifests.values():
+        if manifest["configuration"].get("object"):
+            own += [tuple(task) for task in manifest["configuration"]["tasks"]]
+    if not own:
+        return published
+    tasks = pd.MultiIndex.from_frame(published[["suite", "task"]])
+    return published[~tasks.isin(own)]
 
 
 def outcomes(runs: Runs) -> "pd.DataFrame":

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from vap_core.base.errors import BadOutput
 from vap_core.evaluation.layouts import layout_names
 from vap_core.evaluation.metrics import MEASURES, SCORE_KEY, TRACK
-from vap_core.evaluation.publish import read_runs
+from vap_core.evaluation.publish import read_runs, require_same_scenes
 from vap_core.evaluation.statistics import PAIR_KEY
 from vap_core.evaluation.store import ROW_KEY
 from vap_core.simulation import suites
@@ -50,8 +50,8 @@ def load_runs(sources: Sequence[Path]) -> Runs:
     """Read runs of eval, rollout or demo: their folders, or tables that `publish` made of them.
 
     Raises: BadOutput for a folder that holds no run, no episode, damaged parts or episodes it was
-        not asked for, for two runs of the same episodes, and for a run whose episode list has
-        changed since; BadSuite.
+        not asked for, for two runs of the same episodes or of one task with other objects or
+        robots, and for a run whose episode list has changed since; BadSuite.
     """
     import pandas as pd
 
@@ -75,6 +75,7 @@ def load_runs(sources: Sequence[Path]) -> Runs:
             )
         tables.append(table)
         wanted.append(asked.assign(run=str(name)))
+    require_same_scenes(manifests.items(), "report", "report them one by one")
     whole = _joined(tables)
     if whole.duplicated([*PAIR_KEY, "method"]).any():
         raise BadOutput(

@@ -79,10 +79,12 @@ def opening_section(runs: Runs) -> str:
     return "\n".join(lines)
 
 
-def results_section(lines: "pd.DataFrame") -> str:
-    """A table per track, and footnotes to the paper's numbers per suite."""
+def results_section(lines: "pd.DataFrame", published: "pd.DataFrame") -> str:
+    """A table per track, and footnotes to the paper's numbers per suite.
+
+    `published` is of `results.paper_results`.
+    """
     parts = ["## Results", RESULTS_NOTE]
-    published = paper.main_results()
     for suite, of_suite in lines.groupby("suite", sort=False):
         for (_, split), part in of_suite.groupby(TRACK, sort=False):
             of_track = (published["suite"] == suite) & (published["split"] == split)

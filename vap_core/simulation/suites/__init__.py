@@ -103,10 +103,11 @@ def is_development(name: str) -> bool:
 
 
 def digest(name: str) -> str:
-    """The sha256 of a suite's list. Raises: BadSuite."""
+    """The sha256 of a suite's list. Raises: UnknownName; BadSuite."""
     own_suite = _find_own(name)
     if own_suite is not None:
         return own_suite.sha256
+    suite(name)  # refuses a name that no suite has
     return lists.digest(list_name(name))
 
 
