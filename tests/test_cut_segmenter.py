@@ -16,10 +16,10 @@ cv2.circle(TRUE, (120, 100), 58, 1, -1)
 DISC = TRUE > 0
 
 
-def picture():
+def picture(disc: np.ndarray = DISC):
     """A noisy red disc on a noisy green ground."""
     rgb = np.full((240, 320, 3), (60, 120, 60), np.uint8)
-    rgb[DISC] = (190, 60, 50)
+    rgb[disc] = (190, 60, 50)
     noise = np.random.default_rng(0).normal(0, 8, rgb.shape)
     return np.clip(rgb + noise, 0, 255).astype(np.uint8)
 
@@ -72,3 +72,13 @@ def test_familiar_views_and_small_boxes_stay_with_the_segmenter():
     assert (cut[1] == plain[1]).all()
     assert mask_iou(cut[0], DISC) > 0.97
     assert not len(segment(rgb, replace(Boxes.empty("disc"), familiar=False)))
+
+
+def test_an_object_that_a_corner_cuts_is_outlined():
+    disc = np.zeros_like(DISC)
+    disc[:170, :220] = DISC[70:, 100:]
+    likely = np.full(disc.shape, 0.5, np.float32)
+    likely[20:40, 10:30] = 0.95
+    mask = refine(picture(disc), np.array([0, 0, 80, 90], np.float32), likely)
+    assert mask is not None
+    assert mask_iou(mask, disc) > 0.95

@@ -133,14 +133,14 @@ def test_the_command_imports_looks_runs_and_resumes(tmp_path):
     folder, out = tmp_path / "mine", tmp_path / "out"
     folder.mkdir()
     put(folder, "crate.glb", box(rgb=(200, 60, 30)))
-    put(folder, "lamp.glb", box(rgb=(20, 60, 30)))
+    put(folder, "desk-lamp.glb", box(rgb=(20, 60, 30)))
     (folder / "objects.csv").write_text(
-        "file,category,height_cm,groups\ncrate.glb,cup,6,loud\nlamp.glb,lamp,,\n"
+        "file,category,height_cm,groups\ncrate.glb,cup,6,loud\ndesk-lamp.glb,lamp,,\n"
     )
     words = ("eval-objects", folder, "--episodes", "1", "--policy", "scripted", "--out", out)
     done = vap(*words)
     assert done.returncode == 0, done.stderr
-    assert "left out: lamp: no task of tabletop asks for a lamp" in done.stdout
+    assert "left out: desk-lamp: no task of tabletop asks for a lamp" in done.stdout
     views = pd.read_parquet(out / "views.parquet")
     assert sorted(views.camera) == ["front", "side", "wrist"]
     assert set(views.target) == {"crate"}

@@ -275,3 +275,10 @@ def test_the_box_that_is_dragged_is_the_photos(size):
     assert dragged_box(widget, photo) == pytest.approx([0, 10, 30, 30])
     widget.bboxes = []
     assert dragged_box(widget, photo) is None
+
+
+def test_the_middle_of_a_wide_photo_is_its_middle():
+    photo = np.zeros((64, 200, 3), np.uint8)
+    photo[26:38, 94:106] = photo[26:38, 26:38] = RED
+    (reference,) = choose([photo])
+    assert reference.box[:2].tolist() == [94, 26]

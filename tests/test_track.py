@@ -25,16 +25,18 @@ def wood() -> np.ndarray:
     return np.clip(np.array([200, 170, 130]) + grain[..., None], 0, 255).astype(np.uint8)
 
 
-def paint(*discs: tuple[tuple[int, int, int], int, int]) -> tuple[np.ndarray, np.ndarray]:
+def paint(
+    *discs: tuple[tuple[int, int, int], int, int], shape: tuple[int, int] = (SIZE, SIZE)
+) -> tuple[np.ndarray, np.ndarray]:
     """Striped discs, 13 pixels in radius, on a wooden table: (colour, x, y) each; the picture and one mask per disc."""
-    image, masks = wood().copy(), []
-    rows, cols = np.mgrid[0:SIZE, 0:SIZE]
+    image, masks = np.resize(wood()[:, 0], (shape[0], 1, 3)).repeat(shape[1], axis=1), []
+    rows, cols = np.mgrid[0 : shape[0], 0 : shape[1]]
     for colour, x, y in discs:
         mask = (rows - y) ** 2 + (cols - x) ** 2 <= 13**2
         image[mask] = colour
         image[mask & ((rows - y) // 4 % 3 == 0)] = (240, 235, 225)
         masks.append(mask)
-    return image, np.array(masks, bool).reshape(-1, SIZE, SIZE)
+    return image, np.array(masks, bool).reshape(-1, *shape)
 
 
 def follow(images: list[np.ndarray], masks: np.ndarray) -> list[tuple[Track, ...]]:
@@ -254,3 +256,32 @@ def test_the_largest_numbers_of_every_row_are_those_that_sorting_finds() -> None
     assert np.array_equal(values, expected)
     assert np.array_equal(np.take_along_axis(rows, columns, axis=1), expected)
     assert columns[0].tolist() == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("shape", [(112, 224), (224, 112)])
+def test_a_picture_that_is_not_square_is_followed_as_well(shape: tuple[int, int]) -> None:
+    height, width = shape
+    down = 3 if height > width else 1
+
+    def film(t: int) -> tuple[np.ndarray, np.ndarray]:
+        red = (RED, width - 50 + 3 * t, height // 2 - 20 + down * t)
+        return paint(red, (BLUE, 30, height - 30 - 2 * t), shape=shape)
+
+    films = [film(t) for t in range(6)]
+    for (_, masks), tracks in zip(
+        films[1:], follow([i for i, _ in films], films[0][1]), strict=True
+    ):
+        for found, mask in zip(tracks, masks, strict=True):
+            assert found.mask is not None
+            assert mask_iou(found.mask, mask) > 0.7
+
+
+def test_a_target_that_is_not_the_first_identity_is_followed() -> None:
+    films = [paint((BLUE, 90, 40), (RED, 30 + 4 * t, 60)) for t in range(6)]
+    tracker = track.load()
+    states = tracker.start_targets([films[0][0]], [films[0][1]], [[1]])
+    for image, masks in films[1:]:
+        states, ((other, target),) = tracker.step(states, [image])
+        assert other.mask is None
+        assert target.mask is not None
+        assert mask_iou(target.mask, masks[1]) > 0.7
