@@ -101,6 +101,22 @@ class AttendState:
     visible: Visible
 
 
+def check_views(views: Any) -> None:
+    """Raises: BadViews: there is no view, or one is not RGB, height x width x 3, uint8."""
+    if not isinstance(views, Mapping) or not views:
+        raise BadViews("Attender: no views; give the picture of every camera, by its name.")
+    for camera, rgb in views.items():
+        is_array = isinstance(rgb, np.ndarray)
+        if is_array and rgb.dtype == np.uint8 and rgb.ndim == 3 and rgb.shape[2] == 3 and rgb.size:
+            continue
+        kind = rgb.dtype if is_array else type(rgb).__name__
+        sides = "x".join(map(str, getattr(rgb, "shape", ())))
+        raise BadViews(
+            f"Attender: view {camera!r} is {f'{kind} {sides}'.strip()}; give RGB, height x width x "
+            "3, uint8."
+        )
+
+
 class Attender:
     """Grounds personal objects at t = 0, tracks them afterwards, and prompts every image.
 
@@ -145,8 +161,16 @@ class Attender:
 
         Raises:
             BadInstruction, UnknownName: the instruction does not match the memory.
-            BadViews: the views cannot be associated.
+            BadViews: a view is no RGB picture, there are boxes of a camera that gives none, or the
+                views cannot be associated.
         """
+        check_views(views)
+        unknown = sorted(set(boxes or {}) - set(views))
+        if unknown:
+            raise BadViews(
+                f"Attender.start: boxes of {', '.join(unknown)}, but the views are of "
+                f"{', '.join(sorted(views))}; name the boxes after the views."
+            )
         parsed, wanted = self.understand(instruction, objects)
         phrases = [target.category for target in parsed.targets]
         proposals = self._propose(views, phrases, boxes)
@@ -278,8 +302,8 @@ class Attender:
         """Track every target and prompt the new images (t > 0).
 
         Raises:
-            BadViews: `views` are not of the cameras that the episode started with, or a view has
-                another size than it had there.
+            BadViews: a view is no RGB picture, `views` are not of the cameras that the episode
+                started with, or a view has another size than it had there.
         """
         return self.steps([state], [views])[0]
 
@@ -293,6 +317,7 @@ class Attender:
         trackers = []
         images = []
         for state, images_now in zip(states, views, strict=True):
+            check_views(images_now)
             if set(images_now) != set(state.groundings):
                 raise BadViews(
                     f"Attender.step: views of {sorted(images_now)}, but the episode started with "
