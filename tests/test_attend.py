@@ -11,7 +11,7 @@ import pytest
 from tests.toys import TOYS, SameColour, personal, scene
 from vap_core.associate import PAIRINGS, compare_views
 from vap_core.attend import Attender, Prompting
-from vap_core.base.errors import BadInstruction, BadViews, UnknownName
+from vap_core.base.errors import BadInstruction, BadStudy, BadViews, UnknownName
 from vap_core.base.types import Attended, Boxes, Camera, Grounding
 from vap_core.evaluation.ablations.forms import NumberedMarker
 from vap_core.perception.protocols import Thresholds
@@ -170,6 +170,24 @@ def test_mirrored_views_mirror_the_answer() -> None:
 def test_switches(prompting: Prompting, tinted: bool, text: str) -> None:
     _, attended = Attender(TOYS, MEMORY, prompting).start({"front": LINE}, "bring my cup")
     assert ((attended.images["front"] != LINE).any(), attended.text) == (tinted, text)
+
+
+@pytest.mark.parametrize(
+    ("field", "wrong", "error", "said"),
+    [
+        ("rule", "mean", UnknownName, "Prompting: rule 'mean' is unknown; known: average, best"),
+        ("associate", "geometry", BadStudy, "associate is 'geometry'; give a Pairing"),
+        ("references", 0, BadStudy, "references is 0; give 1 or more, or None for all"),
+    ],
+)
+def test_what_is_no_switch_is_refused(
+    field: str, wrong: Any, error: type[Exception], said: str
+) -> None:
+    """Set past the check of signatures, which users do not have."""
+    prompting = Prompting()
+    object.__setattr__(prompting, field, wrong)
+    with pytest.raises(error, match=said):
+        prompting.__post_init__()
 
 
 def test_boxes_by_hand_replace_the_detector() -> None:

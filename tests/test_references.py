@@ -258,6 +258,22 @@ def test_a_folder_gives_its_pictures(tmp_path):
         registering.choose([], "cup", STACK, {}, whole=False)
 
 
+def test_a_photo_named_twice_is_one(tmp_path):
+    for name in ("my mug.png", "other.png"):
+        Image.fromarray(scene([(20, 20, RED)])).save(tmp_path / name)
+    photo, other = tmp_path / "my mug.png", tmp_path / "other.png"
+    again = tmp_path / "." / ".." / tmp_path.name / "my mug.png"
+    paths = registering.gather_photos([photo, again, tmp_path, other])
+    assert paths == [photo, other]
+    with pytest.raises(BadPhoto, match="with one of 'my mug.png', other.png"):
+        registering.parse_given(["mug=1,2,3,4"], [], paths)
+
+
+def test_a_box_none_is_not_given():
+    first, _ = choose([scene([(20, 20, RED)]), scene([(22, 22, RED)])], {0: None})
+    assert first.chosen_by == "proposed"
+
+
 @pytest.mark.filterwarnings(
     "ignore:Traits should be given as instances"
 )  # the widget library's own
@@ -273,5 +289,8 @@ def test_the_box_that_is_dragged_is_the_photos(size):
     moved = {"x": -5, "y": 10 * scale, "width": 5 + 30 * scale, "height": 20 * scale}
     widget.bboxes = [*widget.bboxes, moved | {"label": "mug"}]
     assert dragged_box(widget, photo) == pytest.approx([0, 10, 30, 30])
+    for side in ("width", "height"):
+        widget.bboxes = [moved | {side: 0.4 * scale, "label": "mug"}]
+        assert dragged_box(widget, photo) is None, "a click"
     widget.bboxes = []
     assert dragged_box(widget, photo) is None

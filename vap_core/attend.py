@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from vap_core.associate import Pairing, associate_targets
-from vap_core.base.errors import BadInstruction, BadViews
+from vap_core.base.errors import BadInstruction, BadStudy, BadViews
 from vap_core.base.events import Visible, grounding_events, visibility_events
 from vap_core.base.types import (
     Association,
@@ -55,7 +55,7 @@ from vap_core.perception.candidates import (
 )
 from vap_core.perception.protocols import FamiliarityJudge, Stack, TargetTracker
 from vap_core.prompt import PALETTE, PromptForm, Tint, choose_colours
-from vap_core.vote import VoteRule, compare, nominate, vote
+from vap_core.vote import VoteRule, check_rule, compare, nominate, vote
 
 PerTarget = tuple[Grounding, ...]
 """One grounding per target of the instruction, in the order of its targets."""
@@ -70,6 +70,8 @@ class Prompting:
     the best candidate wins, however unlike the references it is. Without it an object whose best
     candidate is below the stack's threshold is not in view. `references` is how many of an object's
     references are used, the first ones; None uses all.
+
+    Raises: UnknownName, BadStudy, when it is built from what is no rule, pairing or count.
     """
 
     form: PromptForm = field(default_factory=Tint)
@@ -80,6 +82,18 @@ class Prompting:
     associate: Pairing | None = None
     always_tint: bool = False
     references: int | None = None
+
+    def __post_init__(self) -> None:
+        check_rule(self.rule, "Prompting")
+        if not isinstance(self.associate, Pairing | None):
+            raise BadStudy(
+                f"Prompting: associate is {self.associate!r}; give a Pairing, for example "
+                'PAIRINGS["geometry"], or None.'
+            )
+        if self.references is not None and self.references < 1:
+            raise BadStudy(
+                f"Prompting: references is {self.references}; give 1 or more, or None for all."
+            )
 
 
 @value

@@ -25,7 +25,7 @@ from vap_core.base.csv_rows import read_rows
 from vap_core.base.errors import BadPhotoSet
 from vap_core.base.photos import photos_in
 from vap_core.base.types import value
-from vap_core.memory import CATEGORY
+from vap_core.memory import CATEGORY, plain_category
 
 BOX = ("x0", "y0", "x1", "y1")
 MASKS = "masks"
@@ -250,6 +250,7 @@ def read_categories(
                 f"{caller}: {category!r} cannot be a category; write {name},KIND into {table} "
                 "with the kind in words, for example mug-1,cup."
             )
+        categories[name] = plain_category(category)
     return categories
 
 
