@@ -18,6 +18,7 @@ numbers, each row of length 1. Cosines are n x k.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 from jaxtyping import Bool
@@ -219,10 +220,12 @@ class Attender:
     ) -> tuple[Instruction, list[PersonalObject]]:
         """Parse an instruction, and recall the object of each of its targets.
 
+        A letter that is written as two characters, such as an umlaut, is made one (NFC).
+
         Raises: BadInstruction, UnknownName.
         """
         categories = {obj.category for obj in self.memory.values()}
-        parsed = self.parser(instruction, categories)
+        parsed = self.parser(normalize("NFC", instruction), categories)
         n = len(parsed.targets)
         if objects is not None and len(objects) != n:
             raise BadInstruction(

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 from jaxtyping import Float32
@@ -102,8 +103,8 @@ def remember(name: str, category: str, crops: Sequence[Rgb], encoder: Encoder) -
 
 
 def plain_category(category: str) -> str:
-    """A category as it is remembered: lower case, with single spaces."""
-    return " ".join(category.lower().split())
+    """A category as it is remembered: lower case, with single spaces, an umlaut one character."""
+    return " ".join(normalize("NFC", category).lower().split())
 
 
 def check_names(name: str, category: str) -> None:
@@ -113,7 +114,7 @@ def check_names(name: str, category: str) -> None:
             f"remember: {name!r} cannot name an object; use letters, digits, space, dot, dash or "
             "underscore."
         )
-    if not CATEGORY.fullmatch(category.strip()):
+    if not CATEGORY.fullmatch(plain_category(category)):
         raise BadMemory(
             f"remember: {category!r} cannot be a category; name the kind of thing in words, for "
             "example --category cup."

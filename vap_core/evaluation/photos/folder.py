@@ -245,12 +245,12 @@ def read_categories(
                 )
             categories[row["object"]] = row["category"]
     for name, category in categories.items():
-        if not CATEGORY.fullmatch(category):
+        categories[name] = plain_category(category)
+        if not CATEGORY.fullmatch(categories[name]):
             raise BadPhotoSet(
                 f"{caller}: {category!r} cannot be a category; write {name},KIND into {table} "
                 "with the kind in words, for example mug-1,cup."
             )
-        categories[name] = plain_category(category)
     return categories
 
 
