@@ -173,6 +173,14 @@ def test_a_doubtful_crop_stops_it_with_the_photo_the_sheet_and_the_remedy(tmp_pa
     registering.refuse_doubtful(whole_photos([scene([(6, 6, RED)])]), photos, sheet)
 
 
+def test_the_remedy_can_be_pasted_where_a_name_has_spaces(tmp_path):
+    photo = tmp_path / "my mug.png"
+    Image.fromarray(scene([(10, 26, RED), (42, 26, GREEN)])).save(photo)
+    references = registering.choose([photo], "cup", STACK, {}, whole=False)
+    with pytest.raises(BadPhoto, match="give --box 'my mug.png'=x0,y0,x1,y1 in"):
+        registering.refuse_doubtful(references, [photo], tmp_path / "sheet.png")
+
+
 def test_leave_one_out_finds_what_the_references_confuse():
     mine = [scene([(26, 26, RED)]), scene([(20, 20, RED)]), scene([(30, 30, RED)])]
     references = choose(mine)
