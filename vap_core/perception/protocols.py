@@ -158,9 +158,13 @@ class Stack:
         With another encoder it has no `unfamiliar_encoder`, with another detector or encoder
         neither `thresholds` nor a `verifier`.
         """
-        given = {"detector": detector, "encoder": encoder}
-        given |= {"segmenter": segmenter, "tracker": tracker}
-        changed: dict[str, Any] = {role: part for role, part in given.items() if part is not None}
+        given: dict[str, Any] = {
+            "detector": detector,
+            "encoder": encoder,
+            "segmenter": segmenter,
+            "tracker": tracker,
+        }
+        changed = {role: part for role, part in given.items() if part is not None}
         if encoder is not None:
             changed["unfamiliar_encoder"] = None
         if detector is not None or encoder is not None:
