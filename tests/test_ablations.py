@@ -1,5 +1,6 @@
 """Ablations: arms by name, the table by hand, and the command."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +21,8 @@ from vap_core.analysis.ablations import (
 )
 from vap_core.analysis.agreements import gate_figure, gated_cases
 from vap_core.attend import Prompting
-from vap_core.evaluation import hiding, paper
+from vap_core.base.types import Colour, Mask, Rgb
+from vap_core.evaluation import hiding, methods, paper
 from vap_core.evaluation.ablations.arms import ABLATIONS, ARMS, TINT_SHARES, Ablation, Hidden
 from vap_core.evaluation.ablations.arrow import Arrow
 from vap_core.evaluation.ablations.picture import effects_figure, policies_figure
@@ -31,10 +33,10 @@ from vap_core.evaluation.ablations.table import (
     arm_rows,
     policy_results,
 )
-from vap_core.evaluation.methods import METHODS, find, known_methods, references_needed
+from vap_core.evaluation.methods import METHODS, PUBLISHED, find, known_methods, references_needed
 from vap_core.evaluation.statistics import Comparison
 from vap_core.evaluation.study import Study
-from vap_core.prompt import PALETTE
+from vap_core.prompt import PALETTE, PromptForm, Tint, tint
 from vap_core.rollout.types import MaskCoverage
 
 WORDS = ("--suite", "widowx-pick", "--policy", "scripted", "--episodes", "1", "--workers", "1")
@@ -181,6 +183,30 @@ def test_an_arm_runs_once_for_all_ablations(tmp_path: Path) -> None:
     assert arm_folder(study, tmp_path, "opaque") == arm_folder(other, tmp_path, "opaque")
     longer = replace(study, episodes=2)
     assert arm_folder(study, tmp_path, "vap") != arm_folder(longer, tmp_path, "vap")
+
+
+def test_another_definition_of_an_own_arm_is_another_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    forms: list[PromptForm] = [Tint(1.0), Tint(0.2), _all_red, _red_box]
+    folders = []
+    for form in forms * 2:
+        monkeypatch.setitem(methods._ALL, "mine", Prompting(form=form))
+        study = Study((("widowx-pick", "pick-bottle"),), ("mine",), episodes=1)
+        folders.append(arm_folder(study, tmp_path, "mine"))
+    assert len(set(folders)) == len(forms)
+    assert folders[: len(forms)] == folders[len(forms) :], "an unchanged arm goes on"
+    shipped = replace(study, methods=("vap", "opaque")).configuration()
+    assert "arms" not in shipped, "digests are those of versions without it"
+    assert set(known_methods()) >= PUBLISHED
+
+
+def _all_red(rgb: Rgb, mask: Mask, colour: Colour, others: Sequence[Mask]) -> Rgb:
+    return np.full_like(rgb, colour.rgb)
+
+
+def _red_box(rgb: Rgb, mask: Mask, colour: Colour, others: Sequence[Mask]) -> Rgb:
+    return tint(rgb, mask, colour)
 
 
 def test_figures_of_published_ablations() -> None:

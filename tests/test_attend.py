@@ -1,7 +1,9 @@
 """The whole method on a world whose every answer is known."""
 
+import inspect
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ import pytest
 from tests.toys import TOYS, SameColour, personal, scene
 from vap_core.associate import PAIRINGS, compare_views
 from vap_core.attend import Attender, Prompting
-from vap_core.base.errors import BadInstruction, BadViews, UnknownName
+from vap_core.base.errors import BadInstruction, BadStudy, BadViews, UnknownName
 from vap_core.base.types import Attended, Boxes, Camera, Grounding
 from vap_core.evaluation.ablations.forms import NumberedMarker
 from vap_core.perception.protocols import Thresholds
@@ -170,6 +172,24 @@ def test_switches(prompting: Prompting, tinted: bool, text: str) -> None:
     assert ((attended.images["front"] != LINE).any(), attended.text) == (tinted, text)
 
 
+@pytest.mark.parametrize(
+    ("field", "wrong", "error", "said"),
+    [
+        ("rule", "mean", UnknownName, "Prompting: rule 'mean' is unknown; known: average, best"),
+        ("associate", "geometry", BadStudy, "associate is 'geometry'; give a Pairing"),
+        ("references", 0, BadStudy, "references is 0; give 1 or more, or None for all"),
+    ],
+)
+def test_what_is_no_switch_is_refused(
+    field: str, wrong: Any, error: type[Exception], said: str
+) -> None:
+    """Set past the check of signatures, which users do not have."""
+    prompting = Prompting()
+    object.__setattr__(prompting, field, wrong)
+    with pytest.raises(error, match=said):
+        prompting.__post_init__()
+
+
 def test_boxes_by_hand_replace_the_detector() -> None:
     by_hand = Boxes(
         np.array([[44, 20, 56, 32], [4, 20, 16, 32]], np.float32), np.ones(2, np.float32), "by hand"
@@ -194,6 +214,40 @@ def test_a_view_keeps_its_size() -> None:
     state, _ = attender.start({"front": LINE}, "bring my cup")
     with pytest.raises(BadViews, match="'front' is 80x64, but the episode started with 64x64"):
         attender.step(state, {"front": np.zeros((64, 80, 3), np.uint8)})
+
+
+@pytest.mark.parametrize(
+    ("views", "said"),
+    [
+        ({}, "no views; give the picture of every camera, by its name"),
+        (LINE, "no views"),
+        ({"front": None}, "view 'front' is NoneType; give RGB, height x width x 3, uint8"),
+        ({"front": LINE.astype(np.float32)}, "view 'front' is float32 64x64x3; give RGB"),
+        ({"front": LINE.transpose(2, 0, 1)}, "view 'front' is uint8 3x64x64; give RGB"),
+        ({"front": np.dstack([LINE, LINE[..., :1]])}, "view 'front' is uint8 64x64x4; give RGB"),
+        ({"front": LINE[..., 0]}, "view 'front' is uint8 64x64; give RGB"),
+        ({"front": LINE[None]}, "view 'front' is uint8 1x64x64x3; give RGB"),
+        ({"front": LINE[:0]}, "view 'front' is uint8 0x64x3; give RGB"),
+        ({"front": LINE, "wrist": LINE.tolist()}, "view 'wrist' is list; give RGB"),
+    ],
+)
+def test_a_view_that_is_no_rgb_picture_is_refused_at_every_step(views: Any, said: str) -> None:
+    """Without the check of signatures, which users do not have."""
+    attender = Attender(TOYS, MEMORY)
+    state, _ = attender.start({"front": LINE}, "bring my cup")
+    start, steps = inspect.unwrap(Attender.start), inspect.unwrap(Attender.steps)
+    with pytest.raises(BadViews, match=said):
+        start(attender, views, "bring my cup")
+    with pytest.raises(BadViews, match=said):
+        steps(attender, [state], [views])
+
+
+def test_boxes_of_an_unknown_camera_are_refused() -> None:
+    one = Boxes(np.array([[4, 20, 16, 32]], np.float32), np.ones(1, np.float32), "by hand")
+    with pytest.raises(BadViews, match="boxes of fornt, but the views are of front, side; name"):
+        Attender(TOYS, MEMORY).start(
+            {"front": LINE, "side": LINE}, "bring my cup", boxes={"fornt": one}
+        )
 
 
 def test_what_cannot_be_matched_is_said() -> None:

@@ -58,6 +58,19 @@ def bank(photos: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_what_register_and_ground_say_next_can_be_pasted(
+    photos: list[Path], tmp_path: Path
+) -> None:
+    """Where a folder's name has a space."""
+    bank, out = tmp_path / "my memory", tmp_path / "my run"
+    words = ("--category", "cup", "--whole", "--memory", bank)
+    done = vap("register", "mug", *words, photos[0])
+    assert f"--memory '{bank}'" in done.stdout, done.stderr
+    done = vap("ground", photos[0], "bring my cup", "--memory", bank, "--out", out)
+    (line,) = (line for line in done.stdout.splitlines() if line.startswith("wrote "))
+    assert line.split(" view ")[1] == f"'{out / photos[0].stem}.rrd'"
+
+
 def leaves(command: Any, *above: str) -> list[tuple[str, ...]]:
     """Every command, as the words that one types to run it."""
     inner = getattr(command, "commands", {})

@@ -272,7 +272,14 @@ def test_what_names_nothing_is_one_line(name: str) -> None:
         given.made(name)
 
 
-def test_objects_classes_and_functions_can_be_named() -> None:
+def test_objects_classes_and_functions_can_be_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.chdir(tmp_path)
+    Path("lazy_load.py").write_text("def load():\n    import beside\n    return beside.PART\n")
+    Path("beside.py").write_text("PART = 7\n")
+    assert given.made("lazy_load:load") == 7, "what is imported late is found, too"
     assert isinstance(given.made("vap_core.policies.scripted.random:Random"), Random)
     assert given.made("vap_core.simulation.suites.pick:WIDOWX") is SUITES["widowx-pick"]
     assert given.made("vap_core.perception.embedded.encoder:load").name.startswith("lite0")

@@ -150,6 +150,27 @@ def test_a_copy_has_what_the_method_would_show_and_all_else_as_it_was(
         inspect_dataset(recorded, TOLD, bank, "toys", tmp_path / "out", copy=copy)
 
 
+def test_a_dataset_of_two_tasks_is_inspected_but_not_copied(bank: Path, tmp_path: Path) -> None:
+    """The task of the first would be written over the second's."""
+    h, w = scene([]).shape[:2]
+    feature = {"dtype": "image", "shape": (h, w, 3), "names": ["height", "width", "channels"]}
+    dataset = LeRobotDataset.create(
+        "me/two", fps=5, features={"observation.images.top": feature}, root=tmp_path / "two", use_videos=False
+    )  # fmt: skip
+    for task in ("bring the mug", "open the drawer"):
+        dataset.add_frame({"observation.images.top": picture(0, "top", 0), "task": task})
+        dataset.save_episode()
+    dataset.finalize()
+    out, copy = tmp_path / "out", tmp_path / "copy"
+    with pytest.raises(BadDataset, match=r"2 tasks \('bring the mug', 'open the drawer'\).*split"):
+        inspect_dataset(tmp_path / "two", TOLD, bank, "toys", out, copy=copy)
+    assert not out.exists()
+    assert not copy.exists()
+    assert len(inspect_dataset(tmp_path / "two", TOLD, bank, "toys", out)) == 2
+    inspect_dataset(tmp_path / "two", TOLD, bank, "toys", out, episodes=1, copy=copy)
+    assert open_dataset(copy).episodes == 1
+
+
 def test_a_copy_that_was_interrupted_is_not_there(
     recorded: Path, bank: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

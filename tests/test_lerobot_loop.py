@@ -188,6 +188,48 @@ def test_a_camera_that_fails_is_named_and_nothing_reaches_the_policy(bank):
     assert (rgb(later) == direct(bank, [at(4), at(6)])[1].images["top"]).all(), "it goes on"
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            lambda rgb: (255 * rgb).byte(),
+            r"top is Tensor torch.uint8 of \(1, 3, 64, 64\); give a ten",
+        ),
+        (lambda rgb: 255 * rgb, "top has numbers from 0 to 255; give floats in 0..1"),
+        (lambda rgb: 2 * rgb - 1, "top has numbers from -1 to 1; give floats in 0..1"),
+        (lambda rgb: torch.cat([rgb, rgb[:, :1]], 1), r"of \(1, 4, 64, 64\)"),
+        (lambda rgb: rgb[:, :1], r"of \(1, 1, 64, 64\)"),
+        (lambda rgb: rgb.permute(0, 2, 3, 1), r"of \(1, 64, 64, 3\)"),
+        (lambda rgb: rgb[None], r"of \(1, 1, 3, 64, 64\)"),
+        (lambda rgb: rgb[..., :0], r"of \(1, 3, 64, 0\)"),
+        (lambda rgb: rgb.numpy(), r"top is ndarray float32 of \(1, 3, 64, 64\)"),
+        (lambda rgb: None, r"top is NoneType of \(\)"),
+        (lambda rgb: rgb.repeat(2, 1, 1, 1), "of 2 environments, but there are 1 tasks and 1 step"),
+    ],
+)
+def test_a_picture_that_is_not_lerobots_is_refused(bank, change, said):
+    shown = batch([at(4)], [0])
+    shown["observation.images.top"] = change(shown["observation.images.top"])
+    with pytest.raises(BadViews, match=said):
+        pipeline(bank)(shown)
+
+
+def test_two_environments_need_a_task_each(bank):
+    shown = {**batch([at(4), at(6)], [0, 0]), "task": "bring my mug"}
+    with pytest.raises(BadViews, match="of 2 environments, but there are 1 tasks and 2 steps"):
+        pipeline(bank)(shown)
+
+
+def test_depth_passes_and_half_precision_is_prompted(bank):
+    shown = batch([at(4)], [0])
+    depth = 5 * torch.ones(1, 1, 64, 64)
+    shown["observation.images.top"] = shown["observation.images.top"].half()
+    out = pipeline(bank)({**shown, "observation.images.top_depth": depth})
+    assert torch.equal(out["observation.images.top_depth"], depth)
+    wanted = direct(bank, [at(4)])[0].images["top"].astype(int)
+    assert abs(rgb(out).astype(int) - wanted).max() <= 1
+
+
 def test_the_configuration_is_json_and_comes_back(bank, tmp_path):
     step = VapPrompt(str(bank), stack="toys", objects=["mug"], rewrite=False, alpha=0.3)
     assert VapPrompt(**json.loads(json.dumps(step.get_config()))).get_config() == step.get_config()

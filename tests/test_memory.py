@@ -3,7 +3,8 @@
 import json
 import os
 import struct
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,18 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from tests.scanned import EPS, fake_ghostscript
-from tests.toys import TOYS, personal, scene
+from tests.toys import TOYS, MeanColour, personal, scene
 from vap_core.base.errors import BadMemory, BadOutput, BadPhoto
-from vap_core.base.types import Description
-from vap_core.memory import load, load_bank, load_photo, register, remember, save
+from vap_core.base.types import Description, Rgb
+from vap_core.memory import (
+    load,
+    load_bank,
+    load_photo,
+    reference_rows,
+    register,
+    remember,
+    save,
+)
 
 TEAL = (40, 120, 110)
 
@@ -315,6 +324,22 @@ def test_grey_stands_where_a_photo_is_transparent(tmp_path: Path) -> None:
     indexed.putpalette([10, 200, 30])
     indexed.save(tmp_path / "indexed.png", transparency=0)
     assert load_photo(tmp_path / "indexed.png")[0, 0].tolist() == [127, 127, 127]
+
+
+def test_an_encoder_need_not_be_hashable() -> None:
+    """A plain dataclass is not; its rows are made once an encoder, not once a name."""
+
+    @dataclass
+    class Plain(MeanColour):
+        sign: float
+        name: str = "plain"
+
+        def __call__(self, crops: Sequence[Rgb]) -> np.ndarray:
+            return np.float32(self.sign) * super().__call__(crops)
+
+    obj = personal("mug", "cup", TEAL)
+    for sign in (1.0, -1.0):
+        assert np.array_equal(reference_rows(obj, Plain(sign)), np.float32(sign) * obj.embeddings)
 
 
 def test_what_macos_writes_beside_a_memory_file_is_no_object(tmp_path: Path) -> None:

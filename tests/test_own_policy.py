@@ -1,15 +1,23 @@
 """A policy of one's own: the documented one runs when pasted, and its episodes are diagnosed without a recording."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from tests.toys import MeanColour
+from vap_core.base.files import DATA
+from vap_core.base.photos import load_photo, photos_in
+from vap_core.base.types import Rgb
 from vap_core.evaluation.diagnosis import diagnose, explain
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import make_trial, register_personal
+from vap_core.memory import remember, save
+from vap_core.perception.stacks import load_stack
 from vap_core.recording import Recorder
 from vap_core.rollout.loop import rollout
 
@@ -23,6 +31,37 @@ def documented(words: str) -> str:
         blocks += re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
     (found,) = (block for block in blocks if words in block)
     return found
+
+
+def test_the_documented_encoder_is_called_and_has_no_thresholds_of_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a photo, where `dataclasses.replace` would leave the shipped encoder of photos in place."""
+    monkeypatch.chdir(tmp_path)
+    photos = DATA / "photo-set"
+    crops = [load_photo(path) for path in photos_in(photos / "references" / "cookies")]
+    shipped = load_stack("embedded")
+    save(Path("data/memory"), remember("cookies", "cookies", crops, shipped.encoder))
+    calls: list[int] = []
+
+    class Counting(MeanColour):
+        name = "own"
+
+        def __call__(self, crops: Sequence[Rgb]) -> np.ndarray:
+            calls.append(len(crops))
+            return super().__call__(crops)
+
+    names: dict[str, Any] = {"MeanColour": Counting}
+    exec(compile(documented("with_parts("), "pasted", "exec"), names)
+    scene = load_photo(photos / "scenes" / "box_in_scene.png", long_side=None)
+    _, attended = names["attender"].start({"front": scene}, "bring my cookies")
+    (grounding,) = attended.groundings["front"]
+    assert sum(calls) >= len(crops) + len(grounding.candidates) > len(crops)
+    assert grounding.threshold is None
+    stack = names["stack"]
+    assert (stack.name, stack.verifier, stack.detector) == ("mine", None, shipped.detector)
+    again = shipped.with_parts("mine", segmenter=stack.segmenter)
+    assert (again.thresholds, again.verifier) == (shipped.thresholds, shipped.verifier)
 
 
 def test_the_documented_policy_runs_when_pasted(

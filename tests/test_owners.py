@@ -67,6 +67,32 @@ def test_every_name_that_can_be_registered_can_be_said(
         assert rewrite(parsed, PALETTE[:1]) == rewritten
 
 
+NFD = "J\u0075\u0308rgen"  # u and a diaeresis: two characters
+
+
+@pytest.mark.parametrize(
+    "name", ["O'Brien", "J.R.", "Dr. Smith", "D'Angelo", "Smith Jr.", "Jürgen", NFD]
+)
+def test_names_of_any_spelling_are_names(name: str, tmp_path: Path) -> None:
+    """Their capital is not the sentence's, and ’ is '."""
+    save(tmp_path, cup("mug", name))
+    attender = Attender(TOYS, load_bank(tmp_path))
+    for said in (name, name.replace("'", "’"), name.replace(NFD, "Jürgen")):
+        for text, rewritten in (
+            (f"bring {said}'s cup to me", "bring the red cup to me"),
+            (f"{said}’s cup", "The red cup"),
+            (f"Wait. {said}'s cup, please", "Wait. The red cup, please"),
+        ):
+            parsed, (obj,) = attender.understand(text)
+            assert obj.name == "mug"
+            assert rewrite(parsed, PALETTE[:1]) == rewritten
+
+
+def test_an_unknown_name_with_an_apostrophe_is_said_whole() -> None:
+    with pytest.raises(UnknownName, match='nobody is "o\'brien"; the memory knows anna'):
+        meant("bring O'Brien's cup", "anna")
+
+
 def meant(text: str, speaker: str) -> str:
     categories = {obj.category for obj in HOUSE.values()}
     (target,) = rule_parser(HOUSE)(text, categories).targets

@@ -87,6 +87,42 @@ def test_given_boxes_and_masks_are_taken(things):
     assert "is not as large as its photo" in line
 
 
+@pytest.mark.parametrize(
+    ("file", "said"),
+    [
+        (
+            "boxes.csv",
+            "boxes.csv names 'mug/9.png', which is not there; name photos as OBJECT/FILE",
+        ),
+        ("masks/mug/9.png", "masks/mug/9.png is the mask of no photo"),
+        ("masks/mugs/2.png", "masks/mugs/2.png is the mask of no photo"),
+        ("masks/2.png", "masks/2.png is the mask of no photo"),
+        ("masks/mug/2.jpg", "masks/mug/2.jpg is the mask of no photo"),
+        ("masks/mug/2.png", "masks/mug/2.png is not as large as its photo"),
+    ],
+)
+def test_boxes_and_masks_of_no_photo_are_refused_and_the_command_can_be_repeated(
+    things, file, said
+):
+    wrong = things / "things" / file
+    wrong.parent.mkdir(parents=True, exist_ok=True)
+    if file == "boxes.csv":
+        wrong.write_text("photo,x0,y0,x1,y1\nmug/9.png,20,20,44,44\n")
+    else:
+        Image.fromarray(np.full((60, 64), 255, np.uint8)).save(wrong)
+    words = ("paste-photos", things / "things", things / "set", "--scenes", things / "place")
+    assert said in refused(*words, "--stack", "toy")
+    wrong.unlink()
+    assert "4 objects" in paste(things, "set")
+
+
+def test_a_background_that_cannot_be_read_leaves_nothing(things):
+    (things / "place" / "desk.png").write_bytes(b"no picture")
+    words = ("paste-photos", things / "things", things / "set", "--scenes", things / "place")
+    refused(*words, "--stack", "toy")
+    assert not (things / "set").exists()
+
+
 def test_the_same_seed_is_the_same_set_and_no_set_is_written_over(things):
     paste(things, "one")
     paste(things, "two")

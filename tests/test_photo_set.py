@@ -75,6 +75,13 @@ def test_the_form_is_read(folder):
     assert read_photo_set(folder).sha256 != photo_set.sha256
 
 
+def test_kinds_are_told_apart_as_they_are_remembered(folder):
+    """A capital or a space more would make look-alikes things of other kinds."""
+    (folder / "objects.csv").write_text("object,category\nmug,Coffee  Cup\nold_mug,coffee cup\n")
+    categories = read_photo_set(folder).categories
+    assert categories["mug"] == categories["old_mug"] == "coffee cup"
+
+
 @pytest.mark.parametrize(
     ("file", "text", "message"),
     [

@@ -173,6 +173,14 @@ def test_a_doubtful_crop_stops_it_with_the_photo_the_sheet_and_the_remedy(tmp_pa
     registering.refuse_doubtful(whole_photos([scene([(6, 6, RED)])]), photos, sheet)
 
 
+def test_the_remedy_can_be_pasted_where_a_name_has_spaces(tmp_path):
+    photo = tmp_path / "my mug.png"
+    Image.fromarray(scene([(10, 26, RED), (42, 26, GREEN)])).save(photo)
+    references = registering.choose([photo], "cup", STACK, {}, whole=False)
+    with pytest.raises(BadPhoto, match="give --box 'my mug.png'=x0,y0,x1,y1 in"):
+        registering.refuse_doubtful(references, [photo], tmp_path / "sheet.png")
+
+
 def test_leave_one_out_finds_what_the_references_confuse():
     mine = [scene([(26, 26, RED)]), scene([(20, 20, RED)]), scene([(30, 30, RED)])]
     references = choose(mine)
@@ -258,6 +266,22 @@ def test_a_folder_gives_its_pictures(tmp_path):
         registering.choose([], "cup", STACK, {}, whole=False)
 
 
+def test_a_photo_named_twice_is_one(tmp_path):
+    for name in ("my mug.png", "other.png"):
+        Image.fromarray(scene([(20, 20, RED)])).save(tmp_path / name)
+    photo, other = tmp_path / "my mug.png", tmp_path / "other.png"
+    again = tmp_path / "." / ".." / tmp_path.name / "my mug.png"
+    paths = registering.gather_photos([photo, again, tmp_path, other])
+    assert paths == [photo, other]
+    with pytest.raises(BadPhoto, match="with one of 'my mug.png', other.png"):
+        registering.parse_given(["mug=1,2,3,4"], [], paths)
+
+
+def test_a_box_none_is_not_given():
+    first, _ = choose([scene([(20, 20, RED)]), scene([(22, 22, RED)])], {0: None})
+    assert first.chosen_by == "proposed"
+
+
 @pytest.mark.filterwarnings(
     "ignore:Traits should be given as instances"
 )  # the widget library's own
@@ -273,6 +297,9 @@ def test_the_box_that_is_dragged_is_the_photos(size):
     moved = {"x": -5, "y": 10 * scale, "width": 5 + 30 * scale, "height": 20 * scale}
     widget.bboxes = [*widget.bboxes, moved | {"label": "mug"}]
     assert dragged_box(widget, photo) == pytest.approx([0, 10, 30, 30])
+    for side in ("width", "height"):
+        widget.bboxes = [moved | {side: 0.4 * scale, "label": "mug"}]
+        assert dragged_box(widget, photo) is None, "a click"
     widget.bboxes = []
     assert dragged_box(widget, photo) is None
 

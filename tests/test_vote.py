@@ -1,5 +1,7 @@
 """The vote against a slow readable reference, exact cases and properties."""
 
+import inspect
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from tests.toys import TOYS, personal
-from vap_core.base.errors import BadEncoder
+from vap_core.base.errors import BadEncoder, UnknownName
 from vap_core.base.types import Boxes
 from vap_core.perception.candidates import Proposals
 from vap_core.vote import compare, similarity, vote
@@ -31,6 +33,11 @@ def slow_vote(cosine: np.ndarray) -> int:
 @given(cosines)
 def test_equals_the_readable_reference(cosine: np.ndarray) -> None:
     assert vote(cosine).winner == slow_vote(cosine)
+
+
+def test_another_rule_is_refused() -> None:
+    with pytest.raises(UnknownName, match="vote: rule 'mean' is unknown; known: average, best, vo"):
+        inspect.unwrap(vote)(np.ones((2, 3), np.float32), "mean")
 
 
 @given(cosines, st.randoms(use_true_random=False))

@@ -18,12 +18,13 @@ numbers, each row of length 1. Cosines are n x k.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 from jaxtyping import Bool
 
 from vap_core.associate import Pairing, associate_targets
-from vap_core.base.errors import BadInstruction, BadViews
+from vap_core.base.errors import BadInstruction, BadStudy, BadViews
 from vap_core.base.events import Visible, grounding_events, visibility_events
 from vap_core.base.types import (
     Association,
@@ -55,7 +56,7 @@ from vap_core.perception.candidates import (
 )
 from vap_core.perception.protocols import FamiliarityJudge, Stack, TargetTracker
 from vap_core.prompt import PALETTE, PromptForm, Tint, choose_colours
-from vap_core.vote import VoteRule, compare, nominate, vote
+from vap_core.vote import VoteRule, check_rule, compare, nominate, vote
 
 PerTarget = tuple[Grounding, ...]
 """One grounding per target of the instruction, in the order of its targets."""
@@ -70,6 +71,8 @@ class Prompting:
     the best candidate wins, however unlike the references it is. Without it an object whose best
     candidate is below the stack's threshold is not in view. `references` is how many of an object's
     references are used, the first ones; None uses all.
+
+    Raises: UnknownName, BadStudy, when it is built from what is no rule, pairing or count.
     """
 
     form: PromptForm = field(default_factory=Tint)
@@ -80,6 +83,18 @@ class Prompting:
     associate: Pairing | None = None
     always_tint: bool = False
     references: int | None = None
+
+    def __post_init__(self) -> None:
+        check_rule(self.rule, "Prompting")
+        if not isinstance(self.associate, Pairing | None):
+            raise BadStudy(
+                f"Prompting: associate is {self.associate!r}; give a Pairing, for example "
+                'PAIRINGS["geometry"], or None.'
+            )
+        if self.references is not None and self.references < 1:
+            raise BadStudy(
+                f"Prompting: references is {self.references}; give 1 or more, or None for all."
+            )
 
 
 @value
@@ -99,6 +114,22 @@ class AttendState:
     ids: Mapping[str, tuple[int | None, ...]]
     trackers: Mapping[str, Any]
     visible: Visible
+
+
+def check_views(views: Any) -> None:
+    """Raises: BadViews: there is no view, or one is not RGB, height x width x 3, uint8."""
+    if not isinstance(views, Mapping) or not views:
+        raise BadViews("Attender: no views; give the picture of every camera, by its name.")
+    for camera, rgb in views.items():
+        is_array = isinstance(rgb, np.ndarray)
+        if is_array and rgb.dtype == np.uint8 and rgb.ndim == 3 and rgb.shape[2] == 3 and rgb.size:
+            continue
+        kind = rgb.dtype if is_array else type(rgb).__name__
+        sides = "x".join(map(str, getattr(rgb, "shape", ())))
+        raise BadViews(
+            f"Attender: view {camera!r} is {f'{kind} {sides}'.strip()}; give RGB, height x width x "
+            "3, uint8."
+        )
 
 
 class Attender:
@@ -145,8 +176,16 @@ class Attender:
 
         Raises:
             BadInstruction, UnknownName: the instruction does not match the memory.
-            BadViews: the views cannot be associated.
+            BadViews: a view is no RGB picture, there are boxes of a camera that gives none, or the
+                views cannot be associated.
         """
+        check_views(views)
+        unknown = sorted(set(boxes or {}) - set(views))
+        if unknown:
+            raise BadViews(
+                f"Attender.start: boxes of {', '.join(unknown)}, but the views are of "
+                f"{', '.join(sorted(views))}; name the boxes after the views."
+            )
         parsed, wanted = self.understand(instruction, objects)
         phrases = [target.category for target in parsed.targets]
         proposals = self._propose(views, phrases, boxes)
@@ -181,10 +220,12 @@ class Attender:
     ) -> tuple[Instruction, list[PersonalObject]]:
         """Parse an instruction, and recall the object of each of its targets.
 
+        A letter that is written as two characters, such as an umlaut, is made one (NFC).
+
         Raises: BadInstruction, UnknownName.
         """
         categories = {obj.category for obj in self.memory.values()}
-        parsed = self.parser(instruction, categories)
+        parsed = self.parser(normalize("NFC", instruction), categories)
         n = len(parsed.targets)
         if objects is not None and len(objects) != n:
             raise BadInstruction(
@@ -278,8 +319,8 @@ class Attender:
         """Track every target and prompt the new images (t > 0).
 
         Raises:
-            BadViews: `views` are not of the cameras that the episode started with, or a view has
-                another size than it had there.
+            BadViews: a view is no RGB picture, `views` are not of the cameras that the episode
+                started with, or a view has another size than it had there.
         """
         return self.steps([state], [views])[0]
 
@@ -293,6 +334,7 @@ class Attender:
         trackers = []
         images = []
         for state, images_now in zip(states, views, strict=True):
+            check_views(images_now)
             if set(images_now) != set(state.groundings):
                 raise BadViews(
                     f"Attender.step: views of {sorted(images_now)}, but the episode started with "

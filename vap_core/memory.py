@@ -7,10 +7,11 @@ import json
 import re
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 from jaxtyping import Float32
@@ -92,14 +93,18 @@ def remember(name: str, category: str, crops: Sequence[Rgb], encoder: Encoder) -
     check_names(name, category)
     if not crops:
         raise BadPhoto(f"remember: {name!r} has no photos; give at least one, five are best.")
-    category = " ".join(category.lower().split())
     return PersonalObject(
         name=name,
-        category=category,
+        category=plain_category(category),
         embeddings=encoder(crops),
         crops=tuple(crops),
         encoder=encoder.name,
     )
+
+
+def plain_category(category: str) -> str:
+    """A category as it is remembered: lower case, with single spaces, an umlaut one character."""
+    return " ".join(normalize("NFC", category).lower().split())
 
 
 def check_names(name: str, category: str) -> None:
@@ -109,7 +114,7 @@ def check_names(name: str, category: str) -> None:
             f"remember: {name!r} cannot name an object; use letters, digits, space, dot, dash or "
             "underscore."
         )
-    if not CATEGORY.fullmatch(category.strip()):
+    if not CATEGORY.fullmatch(plain_category(category)):
         raise BadMemory(
             f"remember: {category!r} cannot be a category; name the kind of thing in words, for "
             "example --category cup."
@@ -120,7 +125,7 @@ def reference_rows(obj: PersonalObject, encoder: Encoder) -> Float32[np.ndarray,
     """Z_o by this encoder: the remembered rows if they are its own, else from the kept crops."""
     if encoder.name == obj.encoder:
         return obj.embeddings
-    return _embed_crops(obj, encoder)  # type: ignore[arg-type]  # encoders are hashable
+    return _embed_crops(obj, _ByIdentity(encoder))
 
 
 def recall(
@@ -295,9 +300,22 @@ def load_bank(bank: Path | str, encoder: str | None = None) -> dict[str, Persona
     return objects
 
 
+@dataclass(frozen=True, eq=False)
+class _ByIdentity:
+    """An encoder as a key, for it need not be hashable."""
+
+    encoder: Encoder
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _ByIdentity) and self.encoder is other.encoder
+
+    def __hash__(self) -> int:
+        return id(self.encoder)
+
+
 @lru_cache(maxsize=256)
-def _embed_crops(obj: PersonalObject, encoder: Encoder) -> Float32[np.ndarray, "k d"]:
-    return encoder(obj.crops)
+def _embed_crops(obj: PersonalObject, by: _ByIdentity) -> Float32[np.ndarray, "k d"]:
+    return by.encoder(obj.crops)
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

@@ -1,11 +1,11 @@
 """Which candidate is the user's object: each reference votes for its most similar one (P 3.3)."""
 
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float32
 
-from vap_core.base.errors import BadEncoder
+from vap_core.base.errors import BadEncoder, one_of
 from vap_core.base.types import (
     SAME,
     Ballot,
@@ -21,6 +21,7 @@ from vap_core.perception.proof import MOST_COMPARED, prove
 from vap_core.perception.protocols import Stack
 
 VoteRule = Literal["vote", "average", "best"]
+RULES: tuple[str, ...] = get_args(VoteRule)
 
 SAME_PLACE = 0.5
 """Of two boxes of which the smaller is covered by more than this share, one is a candidate."""
@@ -84,6 +85,12 @@ def shortlist(
     return proposals.take(np.array(kept, np.int64))
 
 
+def check_rule(rule: str, what: str) -> None:
+    """Raises: UnknownName: no rule of the vote."""
+    if rule not in RULES:
+        raise one_of(f"{what}: rule", rule, RULES)
+
+
 def vote(cosine: Float32[np.ndarray, "n k"], rule: VoteRule = "vote") -> Ballot:
     """Elect one of n candidates by K references, given cosines or `election_scores`.
 
@@ -93,8 +100,9 @@ def vote(cosine: Float32[np.ndarray, "n k"], rule: VoteRule = "vote") -> Ballot:
     cosine with any one reference. Votes are still counted. Exact duplicates go to the candidate
     listed first, the detector's more confident one.
 
-    Raises: ValueError, when there are candidates but no references.
+    Raises: UnknownName: no such rule; ValueError, when there are candidates but no references.
     """
+    check_rule(rule, "vote")
     n, k = cosine.shape
     if n == 0:
         return Ballot(

@@ -34,14 +34,18 @@ def drag_box(photo: Rgb, box: Box, label: str) -> "BBoxWidget":
 
 
 def dragged_box(widget: "BBoxWidget", photo: Rgb) -> Box | None:
-    """The last box of the widget, in the photo's pixels and inside it; None where none is left."""
+    """The last box of the widget, in the photo's pixels and inside it.
+
+    None where none is left, or a side is less than a pixel: a click drags no box.
+    """
     if not widget.bboxes:
         return None
     drawn = widget.bboxes[-1]
     x, y = drawn["x"], drawn["y"]
     box = np.array([x, y, x + drawn["width"], y + drawn["height"]]) / _scale(photo)
     height, width = photo.shape[:2]
-    return np.clip(box, 0, (width, height, width, height)).astype(np.float32)
+    inside = np.clip(box, 0, (width, height, width, height)).astype(np.float32)
+    return inside if (inside[2:] - inside[:2] >= 1).all() else None
 
 
 def _scale(photo: Rgb) -> float:

@@ -67,9 +67,13 @@ def inspect_dataset(
     pictures and rewritten tasks, and with `masks` the target's masks in it. Interrupted, the same
     call goes on with the episode that was not finished; a copy is written in one go.
 
-    Raises: BadDataset, BadInstruction, UnknownName, BadOutput, BadMemory.
+    Raises: BadDataset, which a copy of several tasks is, too: one instruction is not theirs all;
+        BadInstruction, UnknownName, BadOutput, BadMemory.
     """
     recorded = open_dataset(path)
+    count = recorded.episodes if episodes is None else min(episodes, recorded.episodes)
+    if copy is not None:
+        _check_one_task(recorded, count)
     models = load_own(stack)
     bank = load_bank(memory, models.encoder.name)
     attender = Attender(models, bank)
@@ -81,7 +85,6 @@ def inspect_dataset(
         "memory": _memory_digest(bank),
     }
     _check_folder(out, about)
-    count = recorded.episodes if episodes is None else min(episodes, recorded.episodes)
     reports: list[ViewReport] = []
     with ExitStack() as files:
         writer = None if copy is None else files.enter_context(Copy(recorded, copy, masks))
@@ -97,6 +100,17 @@ def inspect_dataset(
             reports += found
     write_atomic(out / TABLE, _csv(reports).encode())
     return reports
+
+
+def _check_one_task(recorded: Recorded, episodes: int) -> None:
+    """Raises: BadDataset: the episodes are of several tasks."""
+    tasks = recorded.tasks(episodes)
+    if len(tasks) > 1:
+        named = ", ".join(map(repr, tasks[:4])) + (", ..." if len(tasks) > 4 else "")
+        raise BadDataset(
+            f"inspect-dataset: {recorded.folder} has {len(tasks)} tasks ({named}), and --copy "
+            "writes one instruction over all; split it by task (lerobot-edit-dataset), copy each."
+        )
 
 
 def report_table(reports: Iterable[ViewReport]) -> str:

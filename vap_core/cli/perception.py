@@ -230,8 +230,9 @@ def calibrate(
         typer.Option(
             "--keep",
             help="Write the chosen thresholds beside the weights of a foundation stack, which then "
-            "uses them. Of the embedded stack it is the threshold for photos, which ground then "
-            "uses; it needs --photos.",
+            "uses them. Of the embedded stack it is the threshold for photos, which ground and "
+            "inspect-dataset then use, and eval-photos and attached checkpoints do not; it needs "
+            "--photos.",
         ),
     ] = False,
     out: Annotated[

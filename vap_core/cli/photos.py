@@ -1,6 +1,7 @@
 """Commands about photos of your own objects: register remembers them, ground finds them."""
 
 import json
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -134,7 +135,8 @@ def register(
     print(f"{obj.name}: a {obj.category} with {len(obj.crops)} references, saved to {path}")
     print(f"look at the crops: {sheet}")
     print(trust)
-    print(f'next: python -m vap_core ground IMAGE "bring my {obj.category}" --memory {memory}')
+    bank = shlex.quote(str(memory))
+    print(f'next: python -m vap_core ground IMAGE "bring my {obj.category}" --memory {bank}')
 
 
 @app.command()
@@ -239,7 +241,7 @@ def ground(
         if note and not always_tint:
             print(f"note: {note}", file=sys.stderr)
         print(summary)
-        print(f"wrote {mp4} and {rrd}; look: python -m vap_core view {rrd}")
+        print(f"wrote {mp4} and {rrd}; look: python -m vap_core view {shlex.quote(str(rrd))}")
         return
     rgb = load_photo(image, long_side=None if box else GROUND_SIDE)
     boxes = parse_boxes(box, rgb) if box else None
@@ -277,7 +279,7 @@ def ground(
         return
     print(found)
     paths = " and ".join(map(str, written))
-    print(f"wrote {paths}; look: python -m vap_core view {written[1]}")
+    print(f"wrote {paths}; look: python -m vap_core view {shlex.quote(str(written[1]))}")
 
 
 def note_uses(memory: Path, objects: Sequence[str], speaker: str) -> None:

@@ -35,10 +35,14 @@ class RenderedScene:
 def made(name: str) -> Any:
     """What MODULE:NAME names; a class, or a function that needs no argument, is called.
 
+    The folder stays on the path of imports, for what is named may import a file beside it later.
+
     Raises: UnknownName.
     """
     module_name, _, attribute = name.partition(":")
-    sys.path.insert(0, str(Path.cwd()))
+    folder = str(Path.cwd())
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
     try:
         found = getattr(import_module(module_name), attribute)
     except (ImportError, AttributeError, ValueError) as error:
@@ -46,8 +50,6 @@ def made(name: str) -> Any:
             f"contracts: {name!r} names nothing ({error}); write MODULE:NAME, as in "
             "my.module:Detector, from the folder in which `import my.module` works."
         ) from error
-    finally:
-        sys.path.pop(0)
     if inspect.isclass(found):
         return found()
     if inspect.isroutine(found) and not _needed(found):

@@ -1,7 +1,12 @@
 """The methods that the paper compares, by name, and the prompter of each (P 5.2)."""
 
-from dataclasses import replace
+import hashlib
+import inspect
+import re
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from vap_core.associate import PAIRINGS
 from vap_core.attend import Attender, Prompting
@@ -57,6 +62,21 @@ what results can be."""
 FEWEST_REFERENCES = 5
 """Reference photos of an object, unless a method needs more."""
 
+PUBLISHED = frozenset(
+    """
+    generic hard-short hard-long soft soft-aligned soft-own vap vap-always-tint mask-only
+    rewrite-only vap-associated oracle-box oracle-mask oracle-track wrong-mask
+    average-rule best-rule references-1 references-3 references-7
+    opaque contour box point circle arrow marker dimmed others-erased
+    opacity-0.1 opacity-0.3 opacity-0.7 only-red only-blue only-green only-magenta only-cyan
+    only-yellow only-orange only-purple hidden-1 hidden-2 hidden-3 hidden-4 hidden-5 hidden-6
+    blank-text other-text mask-area-0.25 mask-area-0.5 mask-area-1.5 mask-area-2.0 mask-shifted
+    associated-embedding associated-both associated-decisive associated-likest
+    switched-early switched-moved
+""".split()
+)
+"""Methods whose runs are published: their names alone are in the digests of these. Every other one
+enters by its description, so that another definition of it is another run."""
 
 _ALL: dict[str, Method] = {**METHODS, **ARMS}
 
@@ -69,6 +89,39 @@ def known_methods() -> tuple[str, ...]:
 def find(method: str) -> Method:
     """What a method, or an arm of an ablation, changes. Raises: KeyError."""
     return _ALL[method]
+
+
+def describe(how: Any) -> Any:
+    """What a method changes, as JSON: kinds and numbers, and a digest of the code of its form.
+
+    Where a function has no source, its name stands for it.
+    """
+    if how is None or isinstance(how, str | int | float):
+        return how
+    if isinstance(how, list | tuple):
+        return [describe(part) for part in how]
+    if isinstance(how, Mapping):
+        return {str(key): describe(part) for key, part in how.items()}
+    if is_dataclass(how) and not isinstance(how, type):
+        about: dict[str, Any] = {"kind": type(how).__qualname__}
+        for field in fields(how):
+            about[field.name] = describe(getattr(how, field.name))
+    else:
+        about = {"kind": re.sub(r" at 0x[0-9a-fA-F]+", "", repr(how))}
+        about |= describe(getattr(how, "__dict__", {}))
+    if callable(how):
+        about["code"] = _code_digest(how)
+    return about
+
+
+def _code_digest(form: Any) -> str:
+    """A digest of the source of a function, or of the class of a callable; "" where it has none."""
+    code = form if inspect.isroutine(form) or inspect.isclass(form) else type(form)
+    try:
+        source = inspect.getsource(code)
+    except (OSError, TypeError):  # of a console, or built in
+        return ""
+    return hashlib.sha256(source.encode()).hexdigest()[:16]
 
 
 def hidden_calls(method: str) -> int:

@@ -16,6 +16,9 @@ from vap_core.base.errors import BadStudy, one_of
 from vap_core.base.extras import require
 from vap_core.evaluation.methods import (
     METHODS,
+    PUBLISHED,
+    describe,
+    find,
     has_no_command,
     known_methods,
     needs_token,
@@ -115,7 +118,8 @@ class Study:
     def configuration(self) -> dict[str, Any]:
         """What the results depend on, as JSON.
 
-        Weights, episode lists, and the world (robots, objects, styles, sensors) enter by checksum.
+        Weights, episode lists, and the world (robots, objects, styles, sensors) enter by checksum,
+        methods by name, and those that are not published by what they change, too.
         """
         digests = {}
         for suite, _ in self.tasks:
@@ -137,6 +141,9 @@ class Study:
             about["checkpoint"] = fingerprints[0]
         elif names:
             about["checkpoints"] = fingerprints
+        own = sorted(set(self.methods) - PUBLISHED)
+        if own:
+            about["arms"] = {method: describe(find(method)) for method in own}
         about |= {"version": __version__, "weights": weights_sha256(), "lists": digests}
         if digests and self.seed + self.seeds > 1:
             about["starts"] = starts.settings()

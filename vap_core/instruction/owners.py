@@ -17,6 +17,7 @@ An owner that nobody has, and words that fit several people, are errors.
 
 import re
 from collections.abc import Iterable, Sequence
+from unicodedata import normalize
 
 from vap_core.base.errors import BadInstruction, BadMemory, UnknownName
 from vap_core.base.types import PersonalObject
@@ -32,7 +33,7 @@ OTHERS = ("his", "her", "hers", "their", "theirs", "he", "she", "they", "him", "
 def check_owner(owner: str, known_as: Sequence[str], note: str) -> None:
     """Raises: BadMemory: no usable owner, other word for one, or note."""
     for word in (owner, *known_as):
-        if word and not PERSON.fullmatch(word):
+        if word and not PERSON.fullmatch(normalize("NFC", word)):
             raise BadMemory(
                 f"remember: {word[:64]!r} cannot be a person; use letters, spaces and 's, for "
                 'example --owner anna, or --known-as "anna\'s brother".'
@@ -123,8 +124,11 @@ def describe(owners: dict[str, tuple[str, ...]]) -> str:
 
 
 def fold(person: str) -> str:
-    """A person's words without case, with single spaces, and without the final 's."""
-    words = " ".join(person.lower().replace("’", "'").split())
+    """A person's words without case, with single spaces, and without the final 's.
+
+    An umlaut of two characters, as macOS writes it, is one.
+    """
+    words = " ".join(normalize("NFC", person).lower().replace("’", "'").split())
     return re.sub(r"('s|(?<=s)')$", "", words)
 
 

@@ -86,7 +86,7 @@ def _has_capital(text: str, target: Target) -> bool:
     """Whether a span begins with a capital letter that is not a name's ("Anna's cup")."""
     before = text[: target.start].rstrip()
     span = text[target.start : target.stop]
-    named = re.match(r"(?!my\b)[\w-]+(?:\s+[\w-]+){0,4}?['’]s?(?!\w)", span, re.IGNORECASE)
+    named = re.match(r"(?!my\b)[\w.'’-]+(?:\s+[\w.'’-]+){0,4}?['’]s?(?!\w)", span, re.IGNORECASE)
     if named and before and before[-1] not in ".!?":
         return False
     return text[target.start].isupper()
@@ -111,10 +111,11 @@ def possessive(people: str) -> str:
 def _any_owner(owners: tuple[str, ...]) -> re.Pattern[str]:
     """As OWNER, and "his cup", "Anna's cup", "Anna's brother's cup"; for one of `owners` also
     "James' cup" and "Mary Jane's cup"."""
-    names = "|".join(spaced(name) for name in sorted(owners, key=len, reverse=True))
+    longest_first = sorted(owners, key=len, reverse=True)
+    names = "|".join(spaced(name).replace("'", "['’]") for name in longest_first)
     return re.compile(
         rf"\b(?:my|his|her|their|our|{possessive(names)}"
-        r"|(?!(?:it|that|what|who|where|here|there|let|how)['’])[\w-]+['’]s)\s+"
+        r"|(?!(?:it|that|what|who|where|here|there|let|how)['’])[\w-]+(?:['’][\w-]+)*['’]s)\s+"
         rf"{_PERSON}",
         re.IGNORECASE,
     )

@@ -1,7 +1,7 @@
 """The four frozen models of the method as protocols, and the stack that holds one of each."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -143,6 +143,33 @@ class Stack:
     unfamiliar_encoder: Encoder | None = None
     thresholds: Thresholds | None = None
     verifier: Verifier | None = None
+
+    def with_parts(
+        self,
+        name: str,
+        *,
+        detector: Detector | None = None,
+        encoder: Encoder | None = None,
+        segmenter: Segmenter | None = None,
+        tracker: Tracker | None = None,
+    ) -> "Stack":
+        """A stack with parts of your own, without what was measured for those that they replace.
+
+        With another encoder it has no `unfamiliar_encoder`, with another detector or encoder
+        neither `thresholds` nor a `verifier`.
+        """
+        given: dict[str, Any] = {
+            "detector": detector,
+            "encoder": encoder,
+            "segmenter": segmenter,
+            "tracker": tracker,
+        }
+        changed = {role: part for role, part in given.items() if part is not None}
+        if encoder is not None:
+            changed["unfamiliar_encoder"] = None
+        if detector is not None or encoder is not None:
+            changed |= {"thresholds": None, "verifier": None}
+        return replace(self, name=name, **changed)
 
     @property
     def category_detector(self) -> Detector:

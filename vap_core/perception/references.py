@@ -68,24 +68,24 @@ def choose_references(
     category: str,
     detector: Detector,
     encoder: Encoder,
-    given: Mapping[int, Box] | None = None,
+    given: Mapping[int, Box | None] | None = None,
 ) -> tuple[Reference, ...]:
     """The box of every photo: the given one (by the photo's number), else the one that is chosen.
 
-    A photo in which nothing is proposed is used whole, and its doubt says so.
+    A box None is none. A photo in which nothing is proposed is used whole, and its doubt says so.
     """
-    given = given or {}
+    boxes_given = {i: box for i, box in (given or {}).items() if box is not None}
     proposals = []
     rows = []
     for i, photo in enumerate(photos):
-        boxes = _boxes_of(photo, category, detector, given.get(i))
+        boxes = _boxes_of(photo, category, detector, boxes_given.get(i))
         proposals.append(boxes)
         rows.append(encoder([crop(photo, box) for box in boxes.xyxy]))
     references = []
     for i, photo in enumerate(photos):
         others = rows[:i] + rows[i + 1 :]
         support = _support(rows[i], [part for part in others if len(part)])
-        references.append(_choose(photo, proposals[i], support, i in given))
+        references.append(_choose(photo, proposals[i], support, i in boxes_given))
     return tuple(references)
 
 

@@ -1,7 +1,8 @@
 """Other forms of a prompt than the method's tint (P tab:ablation_prompt), each a few lines.
 
 A form is called with the picture, the target's mask, the colour, and the masks of the other
-candidates where it marks them; it returns a marked copy. `prompt.PromptForm` is the protocol.
+candidates, which are none unless its `marks_others` is true; it returns a marked copy.
+`prompt.PromptForm` is the protocol.
 """
 
 from collections.abc import Sequence

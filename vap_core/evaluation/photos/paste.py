@@ -84,15 +84,20 @@ def parse_pasting(size: str, share: str, *, pictures: int, objects: int, seed: i
 def paste_photos(photos: Path, scenes: Path, out: Path, asked: Pasting, stack: Stack) -> str:
     """Write the set, a sheet of the cuts (cuts.png) beside it, and say what became of each object.
 
-    Raises: BadPhoto, BadPhotoSet, BadOutput: a folder lacks what is needed, or `out` is there.
+    Where it fails nothing is left of `out`, so that the same call can follow.
+
+    Raises: BadPhoto, BadPhotoSet, BadOutput: a folder lacks what is needed or has boxes or masks of
+        other photos, or `out` is there.
     """
     if out.exists():
         raise BadOutput(f"paste-photos: {out} is there already; choose another folder.")
     sources = _sources(photos)
     categories = read_categories(photos, sources, "paste-photos")
     boxes = read_boxes(photos / "boxes.csv")
+    _refuse_others(photos, sources, boxes)
     backgrounds = _pictures_of(scenes)
     cuts: dict[str, list[Cut]] = {}
+    kept: dict[str, list[Path]] = {}
     left_out = []
     known = [",".join(("photo", *BOX))]
     for name, paths in sources.items():
@@ -104,15 +109,34 @@ def paste_photos(photos: Path, scenes: Path, out: Path, asked: Pasting, stack: S
             left_out.append(f"left out: {name}: none of {len(rest)} photos gives a clean cut")
             continue
         cuts[name] = found
-        _copy(references, out / "references" / name)
+        kept[name] = references
         for path, box in zip(references, given, strict=False):
             if box is not None:
                 known.append(f"{name}/{path.name},{','.join(f'{x:g}' for x in box)}")
     if len(cuts) < 2:
         raise BadPhotoSet(f"paste-photos: {photos} gives fewer than two objects to paste.")
-    _write_cuts(out / "cuts.png", cuts)
-    if len(known) > 1:
-        write_atomic(out / BOXES_CSV, ("\n".join(known) + "\n").encode())
+    try:
+        for name, references in kept.items():
+            _copy(references, out / "references" / name)
+        if len(known) > 1:
+            write_atomic(out / BOXES_CSV, ("\n".join(known) + "\n").encode())
+        _write_cuts(out / "cuts.png", cuts)
+        questions = _write_pictures(out, backgrounds, cuts, categories, asked)
+    except BaseException:  # an interruption, too
+        shutil.rmtree(out, ignore_errors=True)
+        raise
+    found_text = f"{len(cuts)} objects in {asked.pictures} pictures, {questions} questions"
+    return "\n".join([*left_out, found_text])
+
+
+def _write_pictures(
+    out: Path,
+    backgrounds: Sequence[Path],
+    cuts: Mapping[str, Sequence[Cut]],
+    categories: Mapping[str, str],
+    asked: Pasting,
+) -> int:
+    """The scenes and their tables; returns how many questions they ask. Raises: BadPhoto."""
     rows = ["scene,object,x0,y0,x1,y1"]
     for number in range(asked.pictures):
         rng = np.random.default_rng([asked.seed, number])
@@ -127,8 +151,7 @@ def paste_photos(photos: Path, scenes: Path, out: Path, asked: Pasting, stack: S
     kinds = [f"{name},{categories[name]}" for name in cuts]
     write_atomic(out / SCENES_CSV, ("\n".join(rows) + "\n").encode())
     write_atomic(out / OBJECTS_CSV, ("\n".join(["object,category", *kinds]) + "\n").encode())
-    found_text = f"{len(cuts)} objects in {asked.pictures} pictures, {len(rows) - 1} questions"
-    return "\n".join([*left_out, found_text])
+    return len(rows) - 1
 
 
 def split(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
@@ -246,6 +269,33 @@ def _sources(photos: Path) -> dict[str, list[Path]]:
             f"{photos}/OBJECT."
         )
     return sources
+
+
+def _refuse_others(
+    photos: Path, sources: Mapping[str, Sequence[Path]], boxes: Mapping[str, Box]
+) -> None:
+    """Raises: BadPhotoSet: a box or a mask belongs to no photo."""
+    named = set()
+    masks = set()
+    for name, paths in sources.items():
+        for path in paths:
+            named.add(f"{name}/{path.name}")
+            masks.add(photos / MASKS / name / f"{path.stem}.png")
+    for photo in boxes:
+        if photo not in named:
+            raise BadPhotoSet(
+                f"paste-photos: {photos / 'boxes.csv'} names {photo!r}, which is not there; name "
+                "photos as OBJECT/FILE."
+            )
+    root = photos / MASKS
+    folders = [root, *sorted(root.iterdir())] if root.is_dir() else []
+    for folder in folders:
+        for path in photos_in(folder) if folder.is_dir() else []:
+            if path not in masks:
+                raise BadPhotoSet(
+                    f"paste-photos: {path} is the mask of no photo; name masks as "
+                    f"{MASKS}/OBJECT/FILE.png after {photos}/OBJECT/FILE.jpg."
+                )
 
 
 def _pictures_of(scenes: Path) -> list[Path]:

@@ -3,6 +3,7 @@
 A box is chosen in every photo, all are shown on a contact sheet, and a doubtful one stops it.
 """
 
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -33,7 +34,10 @@ TILE_PX = 260
 
 
 def gather_photos(paths: Sequence[Path]) -> list[Path]:
-    """Picture files; a folder gives its own in the order of their names. Raises: BadPhoto."""
+    """Picture files, each once; a folder gives its own in the order of their names.
+
+    Raises: BadPhoto.
+    """
     found: list[Path] = []
     for path in paths:
         if not path.is_dir():
@@ -43,7 +47,10 @@ def gather_photos(paths: Sequence[Path]) -> list[Path]:
         if not inside:
             raise BadPhoto(f"register: {path} holds no picture; name a folder of photos.")
         found.extend(inside)
-    return found
+    once: dict[Path, Path] = {}
+    for path in found:
+        once.setdefault(path.resolve(), path)
+    return list(once.values())
 
 
 def film_photos(video: Path, folder: Path, count: int) -> list[Path]:
@@ -113,7 +120,7 @@ def refuse_doubtful(references: Sequence[Reference], photos: Sequence[Path], she
         more = f" ({len(doubtful) - 1} more are doubtful)"
     raise BadPhoto(
         f"register: {name}: {references[first].doubt}{more}; look at {sheet}, then give --box "
-        f"{name}=x0,y0,x1,y1 in pixels, or pass --accept."
+        f"{shlex.quote(name)}=x0,y0,x1,y1 in pixels, or pass --accept."
     )
 
 
@@ -200,7 +207,8 @@ def _split(text: str, photos: Sequence[Path], option: str, form: str) -> tuple[i
     if not photo and len(photos) == 1:
         fitting = [0]
     if len(fitting) != 1:
-        known = ", ".join(_shortest_name(path, photos) for path in photos[:6])
+        names = [shlex.quote(_shortest_name(path, photos)) for path in photos[:6]]
+        known = ", ".join(names)
         raise BadPhoto(
             f"register: {option} {text!r} names no single photo; write {option} PHOTO={form} with "
             f"one of {known}."

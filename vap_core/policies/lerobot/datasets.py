@@ -53,6 +53,13 @@ class Recorded:
         """Frames of an episode."""
         return int(self.dataset.meta.episodes[episode]["length"])
 
+    def tasks(self, episodes: int) -> tuple[str, ...]:
+        """The tasks of the first `episodes` episodes, each once, in their order."""
+        found: dict[str, None] = {}
+        for episode in range(episodes):
+            found |= dict.fromkeys(map(str, self.dataset.meta.episodes[episode]["tasks"]))
+        return tuple(found)
+
     def frames(self, episode: int) -> Iterator[RecordedFrame]:
         """The frames of an episode, in order. Raises: BadDataset."""
         about = self.dataset.meta.episodes[episode]

@@ -51,6 +51,8 @@ from vap_core.simulation.types import EpisodeRow
 
 IMAGES = "observation.images."
 STEP = "observation.vap_step"
+SLACK = 1e-3
+"""By how much a picture's numbers may lie outside 0..1."""
 RENAMING_STEP = "rename_observations_processor"
 """The step of lerobot's preprocessors behind which the prompting step stands."""
 
@@ -69,6 +71,9 @@ class OngoingEpisode:
 @dataclass
 class VapPrompt(ProcessorStep):
     """Tints the remembered object in every `observation.images.*`, and rewrites `task`.
+
+    Pictures are lerobot's: floats in 0..1, 3 x H x W or B x 3 x H x W. Those of one channel whose
+    key says depth pass as they are.
 
     Views in which it is not seen pass bit for bit. `memory` is the folder of remembered objects,
     `objects` names those meant where the category alone does not decide. `episodes` says how an
@@ -101,7 +106,8 @@ class VapPrompt(ProcessorStep):
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         """Prompt every view and the task of a batch.
 
-        Raises: BadViews when it cannot be known which episode a picture belongs to.
+        Raises: BadViews when a picture is none of lerobot's, or it cannot be known which episode it
+            belongs to.
         """
         prompted = transition.copy()
         observation = dict(prompted.get(TransitionKey.OBSERVATION) or {})
@@ -178,16 +184,16 @@ class VapPrompt(ProcessorStep):
         self, views: Mapping[str, torch.Tensor], texts: Sequence[str], steps: Sequence[int]
     ) -> tuple[dict[str, torch.Tensor], list[str]]:
         """The prompted views and texts, one per environment; pixels that stay are not touched."""
-        single = next(iter(views.values())).ndim == 3
         pixels = {}
         prompted = {}
         for key, tensor in views.items():
-            if not torch.isfinite(tensor).all():
+            batch = tensor[None] if tensor.ndim == 3 else tensor
+            if not len(batch) == len(texts) == len(steps):
                 raise BadViews(
-                    f"VapPrompt: {key} has numbers that are not finite; mend the camera, or skip "
-                    "the frame."
+                    f"VapPrompt: {key} is of {len(batch)} environments, but there are {len(texts)} "
+                    f"tasks and {len(steps)} steps; give one of each per environment."
                 )
-            pixels[key.removeprefix(IMAGES)] = _pixels(tensor[None] if single else tensor)
+            pixels[key.removeprefix(IMAGES)] = _pixels(batch)
             prompted[key] = tensor.clone()
         new_texts = []
         for i, (step, text) in enumerate(zip(steps, texts, strict=True)):
@@ -199,7 +205,7 @@ class VapPrompt(ProcessorStep):
                 if rgb is images[camera] or not (rgb != images[camera]).any():
                     continue
                 batch = prompted[IMAGES + camera]
-                tensor = batch if single else batch[i]
+                tensor = batch if batch.ndim == 3 else batch[i]
                 tensor.copy_(torch.from_numpy(rgb).permute(2, 0, 1).float() / 255)
         return prompted, new_texts
 
@@ -390,12 +396,38 @@ class VapEnvConfig(EnvConfig):
 
 
 def _views(observation: Mapping[str, Any]) -> dict[str, torch.Tensor]:
-    """The images of an observation, by their key."""
+    """The images of an observation, by their key; those of depth are left out. Raises: BadViews."""
     views = {}
-    for key, tensor in observation.items():
-        if key.startswith(IMAGES):
-            views[key] = tensor
+    for key, picture in observation.items():
+        if key.startswith(IMAGES) and not _is_depth(key, picture):
+            _check_picture(key, picture)
+            views[key] = picture
     return views
+
+
+def _is_depth(key: str, picture: Any) -> bool:
+    return "depth" in key and tuple(np.shape(picture))[-3:-2] == (1,)
+
+
+def _check_picture(key: str, picture: Any) -> None:
+    """Raises: BadViews: it is not as lerobot's pictures are."""
+    fits = isinstance(picture, torch.Tensor) and picture.is_floating_point()
+    if not fits or picture.ndim not in (3, 4) or picture.shape[-3] != 3 or not picture.numel():
+        kind = f"{type(picture).__name__} {getattr(picture, 'dtype', '')}".strip()
+        raise BadViews(
+            f"VapPrompt: {key} is {kind} of {tuple(np.shape(picture))}; give a tensor of floats in "
+            "0..1, 3 x height x width, or a batch of them."
+        )
+    if not torch.isfinite(picture).all():
+        raise BadViews(
+            f"VapPrompt: {key} has numbers that are not finite; mend the camera, or skip the frame."
+        )
+    low, high = picture.min().item(), picture.max().item()
+    if low < -SLACK or high > 1 + SLACK:
+        raise BadViews(
+            f"VapPrompt: {key} has numbers from {low:g} to {high:g}; give floats in 0..1, and let "
+            "the normaliser come after this step."
+        )
 
 
 def _place_of_step(steps: Sequence[Mapping[str, Any]]) -> int:
