@@ -501,3 +501,43 @@ def around(mask: np.ndarray) -> list[int]:
 def test_unknown_stack() -> None:
     with pytest.raises(UnknownName, match="embedded"):
         load_stack("psychic")
+
+
+def test_episodes_that_are_stepped_together_are_as_if_alone():
+    attender = Attender(TOYS, MEMORY)
+    other = scene([(4, 4, GREY), (24, 44, TEAL), (44, 4, SAND)])
+    states = [
+        attender.start({"front": LINE}, "bring my cup")[0],
+        attender.start({"front": other}, "bring my vase")[0],
+    ]
+    views = [{"front": LINE[:, ::-1].copy()}, {"front": other[::-1].copy()}]
+    together = attender.steps(states, views)
+    for (_, attended), state, seen in zip(together, states, views, strict=True):
+        alone = attender.step(state, seen)[1]
+        assert (attended.images["front"] == alone.images["front"]).all()
+        assert attended.text == alone.text
+
+
+def test_the_palette_gives_the_colour():
+    attender = Attender(TOYS, MEMORY, Prompting(palette=PALETTE[2:3]))
+    assert attender.start({"front": LINE}, "bring my cup")[1].text == "bring the green cup"
+
+
+@pytest.mark.parametrize("cameras", [("front", "side"), ("side", "front")])
+def test_a_colour_that_any_view_shows_is_not_chosen(cameras):
+    red = scene([(4, 20, (250, 10, 10)), (24, 20, TEAL)])
+    views = dict(zip(cameras, (LINE, red), strict=True))
+    assert Attender(TOYS, MEMORY).start(views, "bring my cup")[1].text == "bring the blue cup"
+
+
+def test_a_small_rivals_colour_is_not_chosen():
+    wide = scene([(4, 20, (250, 10, 10)), (100, 100, TEAL)], size=256)
+    shown = Attender(TOYS, MEMORY).start({"front": wide}, "bring my cup")[1]
+    assert shown.text == "bring the blue cup"
+
+
+def test_a_calibrated_view_may_be_oblong():
+    wide = np.pad(LINE, ((0, 0), (0, 32), (0, 0)))
+    cameras = {name: replace(overhead(name, 0.0), width=96) for name in ("a", "b")}
+    attender = Attender(TOYS, MEMORY, Prompting(associate=PAIRINGS["geometry"]))
+    attender.start(dict.fromkeys(cameras, wide), "bring my cup", cameras=cameras)

@@ -11,6 +11,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tests.command import refused, vap
 from tests.toys import TOYS, personal, scene
 from vap_core import memory
+from vap_core.analysis import dataset_inspection
 from vap_core.analysis.dataset_inspection import (
     ViewReport,
     _stretches,
@@ -211,6 +212,14 @@ def test_stretches_and_views_that_disagree() -> None:
         losses=0, longest=0, agrees=False,
     )  # fmt: skip
     assert "1 of 1 views disagree" in report_table([report])
+
+
+def test_more_views_than_are_chosen_together_are_not_compared(bank: Path) -> None:
+    views = dict.fromkeys("abcde", picture(0, "top", 0))
+    attender = Attender(TOYS, memory.load_bank(bank))
+    _, attended = attender.start(views, TOLD)
+    agrees = dataset_inspection._agreement(attender, views, TOLD, None, attended)
+    assert agrees == dict.fromkeys(views)
 
 
 def test_the_command(recorded: Path, bank: Path, tmp_path: Path) -> None:

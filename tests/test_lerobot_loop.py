@@ -21,6 +21,7 @@ from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadViews, Unkn
 from vap_core.perception.stacks import STACKS, load_stack
 from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.lerobot.step import LeRobotEnv, VapEnvConfig, VapPrompt, attach
+from vap_core.prompt import PALETTE, tint
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters.text import generic
 from vap_core.rollout.prompters.tint import TintPrompter
@@ -97,6 +98,34 @@ def test_an_episode_that_is_over_stands_still(bank):
     moved = step(batch([at(6), at(8)], [1, 1]))
     still = step(batch([at(6), at(10)], [1, 2]))
     assert torch.equal(moved["observation.images.top"][0], still["observation.images.top"][0])
+
+
+def test_one_step_does_not_serve_two_tasks_at_a_time(bank):
+    memory.save(bank, personal("jar", "jar", GREEN))
+    step = pipeline(bank)
+    step(batch([at(4)], [0], text="bring my mug"))
+    step(batch([at(20)], [0], text="bring my jar"))
+    with pytest.raises(BadViews, match="'bring my mug' at step 1, and was 'bring my jar'"):
+        step(batch([at(6)], [1], text="bring my mug"))
+    step(batch([at(22)], [1], text="bring my jar"))
+    with pytest.raises(BadViews, match="at step 1 twice, with another picture"):
+        step(batch([at(6)], [1], text="bring my jar"))
+
+
+def test_pixels_beside_the_mask_stay_bit_for_bit(bank):
+    given = batch([at(4)], [0])
+    given["observation.images.top"] *= 0.9999  # not whole numbers of 255ths
+    out = pipeline(bank)(given)["observation.images.top"][0]
+    stay = torch.from_numpy(~(at(4) == BLUE).all(-1))
+    assert torch.equal(out[:, stay], given["observation.images.top"][0][:, stay])
+    assert not torch.equal(out, given["observation.images.top"][0])
+
+
+def test_an_object_is_meant_by_its_owner_or_its_name_and_tinted_as_strongly_as_wanted(bank):
+    memory.save(bank, replace(personal("annas", "mug", GREEN), owner="anna"))
+    tinted = tint(at(4), (at(4) == GREEN).all(-1), PALETTE[0], 0.25)
+    for how in ({"speaker": "anna"}, {"objects": ["annas"]}):
+        assert (rgb(pipeline(bank, alpha=0.25, **how)(batch([at(4)], [0]))) == tinted).all()
 
 
 def test_views_without_the_object_and_a_batch_in_hand_pass_bit_for_bit(bank):

@@ -159,7 +159,8 @@ def recall(
         who = f"{speaker} speaks" if speaker else "nobody is named with --speaker"
         raise UnknownName(
             f"recall: no {target.category!r} is {target.owner!r} where {who}; the memory holds "
-            f"{', '.join(sorted(known))[:120]}. Say whose it is, or name the --speaker."
+            f"{', '.join(sorted(known))[:120]}. Say whose it is, name the --speaker, "
+            "or name it with --object."
         )
     if len(fitting) == 1:
         return fitting[0]

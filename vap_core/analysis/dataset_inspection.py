@@ -14,7 +14,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from vap_core.associate import PAIRINGS
+from vap_core.associate import MOST_VIEWS, PAIRINGS
 from vap_core.attend import Attender, AttendState, Prompting
 from vap_core.base.errors import BadDataset, BadOutput
 from vap_core.base.files import parse_json, write_atomic
@@ -57,6 +57,7 @@ def inspect_dataset(
     out: Path,
     *,
     objects: Sequence[str] | None = None,
+    speaker: str = "",
     episodes: int | None = None,
     copy: Path | None = None,
     masks: bool = False,
@@ -76,7 +77,7 @@ def inspect_dataset(
         _check_one_task(recorded, count)
     models = load_own(stack)
     bank = load_bank(memory, models.encoder.name)
-    attender = Attender(models, bank)
+    attender = Attender(models, bank, speaker=speaker)
     about = {
         "dataset": str(path.resolve()),
         "instruction": instruction,
@@ -84,6 +85,8 @@ def inspect_dataset(
         "stack": [models.name, models.encoder.name],
         "memory": _memory_digest(bank),
     }
+    if speaker:
+        about["speaker"] = speaker
     _check_folder(out, about)
     reports: list[ViewReport] = []
     with ExitStack() as files:
@@ -242,9 +245,14 @@ def _agreement(
     attended: Attended,
 ) -> dict[str, bool | None]:
     """Whether the views, asked together by their embeddings, elect what each elected by itself."""
-    if len(views) < 2:
+    if not 2 <= len(views) <= MOST_VIEWS:
         return dict.fromkeys(views)
-    jointly = Attender(attender.stack, attender.memory, Prompting(associate=PAIRINGS["embedding"]))
+    jointly = Attender(
+        attender.stack,
+        attender.memory,
+        Prompting(associate=PAIRINGS["embedding"]),
+        speaker=attender.speaker,
+    )
     _, together = jointly.start(views, instruction, objects=objects)
     agrees: dict[str, bool | None] = {}
     for camera in views:

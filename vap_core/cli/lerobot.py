@@ -11,6 +11,7 @@ from vap_core.cli.options import (
     EncoderName,
     Memory,
     ObjectNames,
+    Speaker,
     StackName,
     TrackerName,
     stack_of,
@@ -27,6 +28,7 @@ def attach_command(
     out: Annotated[Path, typer.Argument(help="Folder for the checkpoint with VAP.")],
     memory: Memory = BANK,
     object: ObjectNames = None,
+    speaker: Speaker = "",
     stack: StackName = "embedded",
     detector: DetectorName = "",
     encoder: EncoderName = "",
@@ -53,7 +55,16 @@ def attach_command(
     from vap_core.policies.lerobot.step import attach
 
     stack = stack_of(stack, detector, encoder, tracker)
-    attach(checkpoint, out, memory, stack=stack, objects=object, alpha=alpha, episodes=episodes)
+    attach(
+        checkpoint,
+        out,
+        memory,
+        stack=stack,
+        objects=object,
+        speaker=speaker,
+        alpha=alpha,
+        episodes=episodes,
+    )
     print(f"wrote {out}: the checkpoint, and VAP before it in its preprocessor")
     print(
         f"next: lerobot-eval --policy.path={out} --env.type=vap "
@@ -69,6 +80,7 @@ def inspect_dataset_command(
     ],
     memory: Memory = BANK,
     object: ObjectNames = None,
+    speaker: Speaker = "",
     stack: StackName = "embedded",
     detector: DetectorName = "",
     encoder: EncoderName = "",
@@ -115,6 +127,7 @@ def inspect_dataset_command(
         stack_of(stack, detector, encoder, tracker),
         out,
         objects=object,
+        speaker=speaker,
         episodes=episodes,
         copy=copy,
         masks=masks,

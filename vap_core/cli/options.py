@@ -33,6 +33,7 @@ ObjectNames = Annotated[
         help="Remembered object of each 'my ...', where the category alone does not decide.",
     ),
 ]
+Speaker = Annotated[str, typer.Option(help='Whom "my" means, for example anna.')]
 Memory = Annotated[Path, typer.Option(help="Folder of remembered objects.")]
 BANK = Path("data/memory")
 Workers = Annotated[int, typer.Option(min=1, help="Processes.")]

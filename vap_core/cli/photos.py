@@ -15,6 +15,7 @@ from vap_core.cli.options import (
     EncoderName,
     Memory,
     ObjectNames,
+    Speaker,
     StackName,
     TrackerName,
     stack_of,
@@ -182,7 +183,7 @@ def ground(
             "(OPENAI_BASE_URL, _MODEL, _API_KEY), or a URL."
         ),
     ] = "rule",
-    speaker: Annotated[str, typer.Option(help='Whom "my" means, for example anna.')] = "",
+    speaker: Speaker = "",
     fall_back: Annotated[
         bool,
         typer.Option("--fall-back", help="Where the chat endpoint fails, warn and take the rule."),

@@ -59,9 +59,10 @@ RENAMING_STEP = "rename_observations_processor"
 
 @dataclass
 class OngoingEpisode:
-    """One environment's episode: its last step, the method's state, and the prompted input."""
+    """One environment's episode: its last step, what was given, the method's state, the result."""
 
     step: int
+    given: tuple[Views, str]
     state: AttendState
     images: Views
     text: str
@@ -76,7 +77,8 @@ class VapPrompt(ProcessorStep):
     key says depth pass as they are.
 
     Views in which it is not seen pass bit for bit. `memory` is the folder of remembered objects,
-    `objects` names those meant where the category alone does not decide. `episodes` says how an
+    `objects` names those meant where the category alone does not decide, `speaker` is whom "my"
+    means. `episodes` says how an
     episode's beginning is known: by `observation.vap_step` being 0, or by `reset()` (then of one
     environment only). With "auto" it is the former where that observation is there, else the
     latter in a loop that has called `reset()`.
@@ -85,6 +87,7 @@ class VapPrompt(ProcessorStep):
     memory: str
     stack: str = "embedded"
     objects: list[str] | None = None
+    speaker: str = ""
     highlight: bool = True
     rewrite: bool = True
     alpha: float = 0.5
@@ -206,7 +209,9 @@ class VapPrompt(ProcessorStep):
                     continue
                 batch = prompted[IMAGES + camera]
                 tensor = batch if batch.ndim == 3 else batch[i]
-                tensor.copy_(torch.from_numpy(rgb).permute(2, 0, 1).float() / 255)
+                changed = torch.from_numpy((rgb != images[camera]).any(-1)).to(tensor.device)
+                new = (torch.from_numpy(rgb).permute(2, 0, 1).float() / 255).to(tensor)
+                tensor[:, changed] = new[:, changed]
         return prompted, new_texts
 
     def _follow(self, i: int, step: int, images: Views, text: str) -> OngoingEpisode:
@@ -220,11 +225,22 @@ class VapPrompt(ProcessorStep):
                 f"VapPrompt: environment {i} is at step {step} after {last}; give every picture, "
                 "in order."
             )
+        elif text != episode.given[1]:
+            raise BadViews(
+                f"VapPrompt: the task of environment {i} is {text!r} at step {step}, and was "
+                f"{episode.given[1]!r}; begin an episode with it, and let one step serve one task "
+                "at a time."
+            )
         elif step == episode.step:
+            if any((rgb != episode.given[0][camera]).any() for camera, rgb in images.items()):
+                raise BadViews(
+                    f"VapPrompt: environment {i} is at step {step} twice, with another picture; "
+                    "number its steps, and let one step serve one environment."
+                )
             return episode  # it is over, and stands still until the others are done
         else:
             state, attended = self._load().step(episode.state, images)
-        return OngoingEpisode(step=step, state=state, images=attended.images, text=attended.text)
+        return OngoingEpisode(step, (images, text), state, attended.images, attended.text)
 
     def _load(self) -> Attender:
         if self._attender is None:
@@ -233,7 +249,7 @@ class VapPrompt(ProcessorStep):
             prompting = Prompting(
                 form=Tint(self.alpha), highlight=self.highlight, rewrite=self.rewrite
             )
-            self._attender = Attender(stack, memory, prompting)
+            self._attender = Attender(stack, memory, prompting, speaker=self.speaker)
         return self._attender
 
 
