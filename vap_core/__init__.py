@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from vap_core.attend import Prompting as Prompting
     from vap_core.base.errors import VapError as VapError
     from vap_core.base.photos import load_photo as load_photo
+    from vap_core.base.photos import photos_in as photos_in
     from vap_core.evaluation.diagnosis import diagnose as diagnose
     from vap_core.evaluation.methods import METHODS as METHODS
     from vap_core.evaluation.metrics import rate as rate
@@ -57,7 +58,7 @@ _load, __dir__, __all__ = lazy_loader.attach(
     submod_attrs={
         "attend": ["Attender", "Prompting"],
         "base.errors": ["VapError"],
-        "base.photos": ["load_photo"],
+        "base.photos": ["load_photo", "photos_in"],
         "evaluation.diagnosis": ["diagnose"],
         "evaluation.methods": ["METHODS"],
         "evaluation.metrics": ["rate"],
