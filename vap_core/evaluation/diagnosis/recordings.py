@@ -16,6 +16,7 @@ from vap_core.evaluation.diagnosis.failures import (
     failure_row,
 )
 from vap_core.evaluation.policy_names import policy_today
+from vap_core.evaluation.run_schema import EXECUTED
 from vap_core.evaluation.stills import write_provenance
 from vap_core.evaluation.store import ROW_KEY
 from vap_core.evaluation.study import Study
@@ -156,11 +157,14 @@ def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
 
 
 def study_of(manifest: Mapping[str, Any], row: Mapping[str, Any]) -> Study:
-    """The study of a run, of one task and method alone; its policy as it is named here today."""
+    """The study of a run, of one task and method alone; its policy as it is named here today.
+
+    Nothing is executed that the manifest names.
+    """
     configuration = manifest["configuration"]
     settings = {}
     for field in fields(Study):
-        if field.name in configuration:
+        if field.name in configuration and field.name != EXECUTED:
             settings[field.name] = configuration[field.name]
     settings["tasks"] = ((row["suite"], row["task"]),)
     settings["methods"] = (row["method"],)
