@@ -1,10 +1,12 @@
 """All recordings of a run asked at once, corrections as layers beside them, and files that are no recordings."""
 
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -24,6 +26,7 @@ from vap_core.recording import (
     read_summary,
     write_correction,
 )
+from vap_core.recording.catalog import register_files
 from vap_core.recording.index import FOLDER
 from vap_core.recording.query import first_match, format_result, run_query
 
@@ -141,6 +144,53 @@ def test_from_inside_the_folder_its_recordings_have_short_names(
     assert result.matches["file"].tolist() == [
         f"{run.name}/recordings/{name}.rrd" for name in ("apart", "fine", "wrong")
     ]
+
+
+def test_from_inside_the_recordings_corrections_count_and_are_written_beside_them(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    shutil.copy(run / "recordings" / "wrong.rrd", folder)
+    monkeypatch.chdir(folder)
+    layer = write_correction(Path("wrong.rrd"), Correction("case 3", "slip"), 3)
+    assert layer.resolve() == tmp_path / "corrections" / "wrong.rrd"
+    assert set(run_query(Path(), "frame_index >= 0").matches["case"]) == {"case 3"}
+
+
+def test_a_damaged_index_is_made_again(run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    for name in ("wrong", "fine"):
+        shutil.copy(run / "recordings" / f"{name}.rrd", folder)
+    whole = load_steps(folder).table
+    for damage in (b"", b"noise" * 99, ensure_index(folder / "wrong.rrd").read_bytes()[:3000]):
+        ensure_index(folder / "wrong.rrd").write_bytes(damage)
+        held = load_steps(folder)
+        assert held.unreadable == {}
+        assert held.table.equals(whole)
+
+
+class Reordered:
+    """A data set whose files are done in another order than they were named."""
+
+    def register(self, urls: list[str], layer_name: str) -> "Reordered":
+        self.urls = urls
+        return self
+
+    def iter_results(self) -> list[SimpleNamespace]:
+        error = "Registration failed for the segments below.\n- Segment a: already exists"
+        return [
+            SimpleNamespace(uri=url, error=error if "copy" in url else None)
+            for url in reversed(self.urls)
+        ]
+
+
+def test_the_file_that_is_no_part_of_a_catalog_is_named_with_the_reason(tmp_path: Path) -> None:
+    files = [tmp_path / f"{name}.rrd" for name in ("a é copy", "b", "c")]
+    unreadable: dict[Path, str] = {}
+    register_files(Reordered(), {path: path for path in files}, unreadable)  # type: ignore[arg-type]
+    assert unreadable == {files[0]: "- Segment a: already exists"}
 
 
 def test_a_condition_leads_to_recordings_and_frames(run: Path) -> None:
