@@ -13,11 +13,26 @@ from vap_core.recording.legacy_names import with_current_names
 PROPERTIES = "/__properties"
 """Rerun's reserved entity; below it is one entity per property group."""
 
+UNREADABLE = (RuntimeError, ValueError, OSError, Warning)
+"""What rerun and the checks here raise at a file that is no whole recording."""
+
 
 def read_chunks(path: Path) -> LazyChunkStream:
     """The chunks of a recording, in the order of the file."""
     check_regular(path)
     return RrdReader(path).stream()
+
+
+def open_whole(path: Path) -> RrdReader:
+    """A reader of a recording that was finished.
+
+    Raises: one of UNREADABLE, for any other file.
+    """
+    check_regular(path)
+    with warnings.catch_warnings():
+        # Without a footer rerun only warns, and can read no single entity.
+        warnings.simplefilter("error")
+        return RrdReader(path)
 
 
 def property_group(chunk: Chunk) -> str | None:
@@ -65,7 +80,7 @@ def read_summary(path: Path) -> dict[str, Any]:
                 batch = chunk.to_record_batch()
                 if "frame_index" in batch.schema.names:
                     steps.update(batch["frame_index"].to_pylist())
-    except (RuntimeError, ValueError, OSError, Warning) as err:
+    except UNREADABLE as err:
         raise unreadable(path, err) from err
     return {**summary, "frames": len(steps)}
 
