@@ -26,6 +26,7 @@ from vap_core.recording import (
     read_summary,
     write_correction,
 )
+from vap_core.recording.browser import serve_run
 from vap_core.recording.catalog import register_files
 from vap_core.recording.index import FOLDER
 from vap_core.recording.query import first_match, format_result, run_query
@@ -113,6 +114,27 @@ def test_a_recording_that_ends_its_reader_is_named_and_the_others_are_read(
     held = load_steps(folder)
     assert set(held.table["file"]) == {str(folder / "a.rrd")}
     assert held.unreadable == {folder / f"{name}.rrd": isolated.ENDED_READER for name in ("b", "c")}
+
+
+POISONED_SUMMARY = POISON.replace("isolated.ensure_index", "isolated.read_summary").replace(
+    "path, folder", "path"
+)
+
+
+def test_a_recording_that_ends_its_reader_is_no_part_of_a_browser_and_cannot_be_opened(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("a", "b"):
+        shutil.copy(run / "recordings" / "fine.rrd", tmp_path / f"{name}.rrd")
+    monkeypatch.setattr(isolated, "START", POISONED_SUMMARY)
+    with serve_run(tmp_path) as browser:
+        assert [row["file"] for row in browser.rows] == ["a.rrd"]
+        assert browser.unreadable == {tmp_path / "b.rrd": isolated.ENDED_READER}
+    isolated.check_recording(tmp_path / "a.rrd")
+    with pytest.raises(BadRecording, match=isolated.ENDED_READER):
+        isolated.check_recording(tmp_path / "b.rrd")
+    with pytest.raises(BadRecording, match="there is no recording at"):
+        isolated.check_recording(tmp_path / "absent.rrd")
 
 
 @pytest.mark.sweep

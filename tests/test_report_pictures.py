@@ -1,5 +1,6 @@
 """The pictures of a report: every line of its tables, methods told apart, the right recording."""
 
+from collections.abc import Generator
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,6 @@ from PIL import Image
 
 from tests.test_report import run
 from vap_core.base import palette
-from vap_core.base.errors import BadRecording
 from vap_core.evaluation.report import page
 from vap_core.evaluation.report.pictures import differences_figure, forest_figure
 from vap_core.evaluation.report.results import results
@@ -28,12 +28,12 @@ def test_a_failure_is_pictured_by_the_recording_of_its_own_policy(
         (source / "recordings").mkdir(parents=True)
         (source / "recordings" / name).write_bytes(b"")
 
-    def summary(path: Path) -> dict[str, str]:
-        if "damaged" in path.parts:
-            raise BadRecording("damaged")
-        return {"policy": path.parts[-3]}
+    def summaries(paths: list[Path]) -> Generator[tuple[Path, dict[str, str] | None, str]]:
+        for path in paths:
+            damaged = "damaged" in path.parts
+            yield path, None if damaged else {"policy": path.parts[-3]}, "damaged"
 
-    monkeypatch.setattr("vap_core.recording.read_summary", summary)
+    monkeypatch.setattr("vap_core.recording.isolated.read_summaries", summaries)
     row = {
         "suite": "simpler-bridge",
         "task": "put-camera",
@@ -41,8 +41,9 @@ def test_a_failure_is_pictured_by_the_recording_of_its_own_policy(
         "seed": 0,
         "method": "vap",
     }
-    for policy, found in (("b", sources[1] / "recordings" / name), ("c", None)):
-        assert page._recording({**row, "policy": policy}, sources) == found
+    for policy, found in (("b", [sources[1] / "recordings" / name]), ("c", [])):
+        recorded = list(page._recorded([{**row, "policy": policy}], sources))
+        assert [path for _, path in recorded] == found
 
 
 def test_pictures_show_every_line_and_overlap_nothing(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from vap_core.base.errors import BadOutput, BadRecording, VapError, first_line
 from vap_core.recording.blueprint import full_window
 from vap_core.recording.catalog import register_files
 from vap_core.recording.corrections import CORRECTIONS, layer_path, read_correction
-from vap_core.recording.reading import read_summary
+from vap_core.recording.isolated import read_summaries
 from vap_core.recording.stored_pictures import by_camera
 from vap_core.recording.viewer import free_port
 from vap_core.recording.views import (
@@ -85,11 +85,11 @@ def serve_run(run: Path, where: str | None = None, port: int | None = None) -> I
         )
     unreadable: dict[Path, str] = {}
     summaries: dict[Path, dict[str, Any]] = {}
-    for path in files:
-        try:
-            summaries[path] = read_summary(path)
-        except VapError as error:
-            unreadable[path] = str(error)
+    for path, summary, reason in read_summaries(files):
+        if summary is None:
+            unreadable[path] = reason
+        else:
+            summaries[path] = summary
     layers = _correct(summaries, unreadable)
     with tempfile.TemporaryDirectory() as scratch, _server(port or free_port()) as server:
         client = server.client()

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from vap_core.base.errors import BadStudy
+from vap_core.base.files import writing
 from vap_core.evaluation.diagnosis import explain
 from vap_core.evaluation.diagnosis.failures import (
     Failures,
@@ -55,7 +56,7 @@ def side_by_side_recording(failures: Failures, number: int, method: str) -> Path
         paths[each["method"]] = _recording_of_row(failures, each)
     stem = paths[row["method"]].stem
     out = Path(row["folder"]) / "together" / f"{stem}-{method}.rrd"
-    out.unlink(missing_ok=True)
+    _unlink(out)
     combine_recordings(paths, out)
     return out
 
@@ -117,19 +118,21 @@ def correct_failure(failures: Failures, number: int, case: str, note: str = "") 
     from vap_core.recording import Correction, write_correction
 
     name, _, sub_case = case.partition(":")
+    # A wrong name is said before the episode is run again.
+    correction = Correction(name.strip(), sub_case.strip(), note)
     path, frame = recording_to_show(failures, number)
-    return write_correction(path, Correction(name.strip(), sub_case.strip(), note), frame)
+    return write_correction(path, correction, frame)
 
 
 def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
-    from vap_core.recording import Recorder, read_summary, recording_name
+    from vap_core.recording import Recorder, recording_name
     from vap_core.rollout.loop import rollout
 
     study = study_of(failures.manifests[row["configuration"]], row)
     episode_row = listed_row(study, row)
     folder = Path(row["folder"])
     path = folder / "recordings" / recording_name(episode_row, row["method"])
-    if path.exists() and read_summary(path)["policy"] == row["policy"]:
+    if path.exists() and _recorded_policy(path) == row["policy"]:
         return path
     memory = folder / "memory"
     register_personal(study, memory)
@@ -139,8 +142,8 @@ def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
             f"diagnose: this was run with {row['policy']}, and {trial.policy.label} is here now; "
             "run eval again."
         )
-    # Made with the weights that a table was published with before.
-    path.unlink(missing_ok=True)
+    # Damaged, or made with the weights that a table was published with before.
+    _unlink(path)
     (episode,) = rollout(
         trial,
         [episode_row],
@@ -154,6 +157,20 @@ def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
             f"(was {row['outcome']} after {row['steps']})."
         )
     return path
+
+
+def _recorded_policy(recording: Path) -> str | None:
+    """The policy of a recording; None where it cannot be read."""
+    from vap_core.recording.isolated import read_summaries
+
+    ((_, summary, _),) = read_summaries([recording])
+    return None if summary is None else summary.get("policy")
+
+
+def _unlink(path: Path) -> None:
+    """Remove what is made again. Raises: BadOutput."""
+    with writing(path.parent, "diagnose", "copy the run to where you may write"):
+        path.unlink(missing_ok=True)
 
 
 def study_of(manifest: Mapping[str, Any], row: Mapping[str, Any]) -> Study:
