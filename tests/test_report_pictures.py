@@ -46,6 +46,12 @@ def test_a_failure_is_pictured_by_the_recording_of_its_own_policy(
         assert [path for _, path in recorded] == found
 
 
+def test_a_card_gives_a_command_for_a_shell(tmp_path: Path) -> None:
+    row = dict.fromkeys(("suite", "task", "method", "case", "sub_case", "case_sentence"), "a")
+    card = page._card({**row, "episode": 1, "deciding_frame": 2}, tmp_path / "a b.rrd", tmp_path)
+    assert f"view &#x27;{tmp_path}/a b.rrd&#x27; --frame 2" in card
+
+
 def test_pictures_show_every_line_and_overlap_nothing(tmp_path: Path) -> None:
     tasks = tuple(
         (name, task.name) for name in suites.BENCHMARKS for task in suites.suite(name).tasks

@@ -229,6 +229,8 @@ def _serve(run: Path, where: str | None, port: int | None) -> None:
     with serve_run(run, where, port) as browser:
         n_failures = sum(row["outcome"] == "failure" for row in browser.rows)
         print(f"{len(browser.rows)} recordings, {n_failures} of failures, at {browser.url}")
+        if where is not None:
+            print(f"{browser.n_matching} match: {where}")
         for path, reason in browser.unreadable.items():
             print(f"note: {path} was left out: {reason}")
         if has_display():

@@ -5,6 +5,7 @@ Pictures are inside the page; links to recordings are relative to its folder.
 
 import base64
 import os
+import shlex
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing
 from html import escape
@@ -145,7 +146,7 @@ def _card(row: Mapping[str, Any], recording: Path, out: Path) -> str:
     images = []
     for camera, rgb in _views(recording, frame).items():
         images.append(f"<img alt='{escape(camera)}' title='{escape(camera)}' src='{_jpeg(rgb)}'>")
-    command = f"python -m vap_core view {recording} --frame {frame}"
+    command = f"python -m vap_core view {shlex.quote(str(recording))} --frame {frame}"
     return (
         f"<article><h3>✗ {escape(words)}</h3><div>{escape(about)}</div>"
         f"<div>{''.join(images)}</div><p>{escape(str(row['case_sentence']))}</p>"
