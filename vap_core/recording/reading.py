@@ -107,9 +107,9 @@ def _checked(values: dict[str, Any]) -> dict[str, Any]:
         if kind is not None:
             if value is None:
                 continue
-            if isinstance(value, bool) or not isinstance(value, kind):
+            if type(value) is bool or not isinstance(value, kind):
                 raise ValueError(f"its property {name} is {str(value)[:40]!r}")
-            if name == "hz" and not 0 <= value < math.inf:
+            if name == "hz" and not 0 <= float(values[name]) < math.inf:
                 raise ValueError(f"its property hz is {value}")
         checked[name] = value
     return checked
