@@ -5,6 +5,7 @@ import shutil
 import socket
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,13 +16,14 @@ from PIL import Image
 from tests.command import vap
 from tests.drawn import ROW, K, opening, record
 from tests.test_why import fail
-from vap_core.base.errors import BadOutput, BadRecording
+from vap_core.base.errors import BadOutput, BadRecording, BadStudy
 from vap_core.base.video import frames as video_frames
 from vap_core.recording import (
     Correction,
     Votes,
     browser,
     clicks,
+    reading,
     serve_run,
     write_correction,
     write_film,
@@ -29,7 +31,7 @@ from vap_core.recording import (
 from vap_core.recording.entities.votes import _drawing_order
 from vap_core.recording.film import read_verdict
 from vap_core.recording.reading import read_chunks
-from vap_core.recording.stored_pictures import prompted_entities, read_pictures
+from vap_core.recording.stored_pictures import _decode_jpeg, prompted_entities, read_pictures
 
 
 @pytest.fixture(scope="module")
@@ -154,6 +156,52 @@ def test_a_film_that_cannot_be_written_is_one_line(run: Path, tmp_path: Path) ->
     with pytest.raises(BadOutput, match=r"is a folder; name a file that ends with \.mp4"):
         write_film(path, tmp_path)
     assert [one.name for one in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_condition_is_checked_before_it_is_served(run: Path) -> None:
+    with serve_run(run, "outcome = 'failure'") as browser:
+        assert (browser.n_matching, len(browser.rows)) == (1, 2)
+    with pytest.raises(BadStudy, match="its columns are link, outcome"), serve_run(run, "colour"):
+        pass
+
+
+def test_what_is_no_recording_has_no_votes(run: Path) -> None:
+    for name in ("noise", "absent"):
+        with pytest.raises(BadRecording, match=r"rerun rrd optimize|there is no recording at"):
+            Votes(run / "recordings" / f"{name}.rrd")
+
+
+def test_a_click_shows_words_as_they_are(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import ipywidgets
+
+    class Viewer(ipywidgets.HTML):
+        def on_event(self, answer: Any) -> None:
+            self.answer = answer
+
+    monkeypatch.setattr(clicks, "view", lambda *_, **__: Viewer())
+    monkeypatch.setattr(Votes, "answer", lambda *_: ("front", "<b>named</b>"))
+    viewer, words, _ = clicks.inspect_votes(run / "recordings" / "fine.rrd").children
+    clicked = SimpleNamespace(entity_path="/x", instance_id=0)
+    viewer.answer(SimpleNamespace(type="selection_change", items=[clicked]))
+    assert words.value == "&lt;b&gt;named&lt;/b&gt;"
+
+
+def test_a_picture_that_is_no_jpeg_is_named() -> None:
+    for blob in (np.zeros(0, np.uint8), np.zeros(99, np.uint8)):
+        with pytest.raises(BadRecording, match="a picture that is no JPEG"):
+            _decode_jpeg(blob)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("deciding_frame", "six"), ("episode", 1.5), ("hz", -1.0), ("hz", np.inf), ("outcome", 3)],
+)
+def test_a_recording_of_odd_properties_is_refused(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, value: Any
+) -> None:
+    monkeypatch.setattr(reading, "read_properties", lambda chunk: {name: value})
+    with pytest.raises(BadRecording, match=f"its property {name} is"):
+        write_film(run / "recordings" / "fine.rrd", tmp_path / "odd.mp4")
 
 
 def test_of_two_votes_of_a_view_a_click_tells_the_one_that_is_shown(

@@ -1,10 +1,12 @@
 """All recordings of a run asked at once, corrections as layers beside them, and files that are no recordings."""
 
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -24,6 +26,8 @@ from vap_core.recording import (
     read_summary,
     write_correction,
 )
+from vap_core.recording.browser import serve_run
+from vap_core.recording.catalog import register_files
 from vap_core.recording.index import FOLDER
 from vap_core.recording.query import first_match, format_result, run_query
 
@@ -112,6 +116,27 @@ def test_a_recording_that_ends_its_reader_is_named_and_the_others_are_read(
     assert held.unreadable == {folder / f"{name}.rrd": isolated.ENDED_READER for name in ("b", "c")}
 
 
+POISONED_SUMMARY = POISON.replace("isolated.ensure_index", "isolated.read_summary").replace(
+    "path, folder", "path"
+)
+
+
+def test_a_recording_that_ends_its_reader_is_no_part_of_a_browser_and_cannot_be_opened(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("a", "b"):
+        shutil.copy(run / "recordings" / "fine.rrd", tmp_path / f"{name}.rrd")
+    monkeypatch.setattr(isolated, "START", POISONED_SUMMARY)
+    with serve_run(tmp_path) as browser:
+        assert [row["file"] for row in browser.rows] == ["a.rrd"]
+        assert browser.unreadable == {tmp_path / "b.rrd": isolated.ENDED_READER}
+    isolated.check_recording(tmp_path / "a.rrd")
+    with pytest.raises(BadRecording, match=isolated.ENDED_READER):
+        isolated.check_recording(tmp_path / "b.rrd")
+    with pytest.raises(BadRecording, match="there is no recording at"):
+        isolated.check_recording(tmp_path / "absent.rrd")
+
+
 @pytest.mark.sweep
 def test_flipped_bits_leave_a_query_its_other_recordings(
     run: Path, tmp_path: Path, record_property: Callable[[str, object], None]
@@ -141,6 +166,53 @@ def test_from_inside_the_folder_its_recordings_have_short_names(
     assert result.matches["file"].tolist() == [
         f"{run.name}/recordings/{name}.rrd" for name in ("apart", "fine", "wrong")
     ]
+
+
+def test_from_inside_the_recordings_corrections_count_and_are_written_beside_them(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    shutil.copy(run / "recordings" / "wrong.rrd", folder)
+    monkeypatch.chdir(folder)
+    layer = write_correction(Path("wrong.rrd"), Correction("case 3", "slip"), 3)
+    assert layer.resolve() == tmp_path / "corrections" / "wrong.rrd"
+    assert set(run_query(Path(), "frame_index >= 0").matches["case"]) == {"case 3"}
+
+
+def test_a_damaged_index_is_made_again(run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    for name in ("wrong", "fine"):
+        shutil.copy(run / "recordings" / f"{name}.rrd", folder)
+    whole = load_steps(folder).table
+    for damage in (b"", b"noise" * 99, ensure_index(folder / "wrong.rrd").read_bytes()[:3000]):
+        ensure_index(folder / "wrong.rrd").write_bytes(damage)
+        held = load_steps(folder)
+        assert held.unreadable == {}
+        assert held.table.equals(whole)
+
+
+class Reordered:
+    """A data set whose files are done in another order than they were named."""
+
+    def register(self, urls: list[str], layer_name: str) -> "Reordered":
+        self.urls = urls
+        return self
+
+    def iter_results(self) -> list[SimpleNamespace]:
+        error = "Registration failed for the segments below.\n- Segment a: already exists"
+        return [
+            SimpleNamespace(uri=url, error=error if "copy" in url else None)
+            for url in reversed(self.urls)
+        ]
+
+
+def test_the_file_that_is_no_part_of_a_catalog_is_named_with_the_reason(tmp_path: Path) -> None:
+    files = [tmp_path / f"{name}.rrd" for name in ("a é copy", "b", "c")]
+    unreadable: dict[Path, str] = {}
+    register_files(Reordered(), {path: path for path in files}, unreadable)  # type: ignore[arg-type]
+    assert unreadable == {files[0]: "- Segment a: already exists"}
 
 
 def test_a_condition_leads_to_recordings_and_frames(run: Path) -> None:

@@ -52,3 +52,9 @@ def test_what_could_end_the_process_is_refused(condition: str, message: str) -> 
 
 def test_a_column_of_any_name_can_be_asked() -> None:
     assert rows_matching(TABLE.assign(line=[7, 8, 9]), "line = 8")["steps"].tolist() == [20]
+
+
+def test_of_a_table_without_rows_none_match() -> None:
+    assert rows_matching(TABLE.iloc[:0], "steps > 3").empty
+    with pytest.raises(BadStudy, match="is none on this table"):
+        rows_matching(TABLE.iloc[:0], "nonesuch > 3")

@@ -160,6 +160,12 @@ def test_labels_are_kept_and_the_last_one_counts(picker: failure_picker.FailureP
     assert len(picker.labels.read_text().splitlines()) == 4
 
 
+def test_words_of_a_table_are_no_html(picker: failure_picker.FailurePicker) -> None:
+    picker.failures.table.loc[2, "case_sentence"] = "<img src=x onerror=alert(1)>"
+    picker.suite.value = "tabletop"
+    assert picker.why.value.startswith("&lt;img")
+
+
 def test_a_label_that_is_no_case_and_a_file_of_something_else_are_named(
     picker: failure_picker.FailurePicker, tmp_path: Path
 ) -> None:

@@ -1,6 +1,8 @@
 """From a run's table to the frame: failures listed, narrowed down, run again and opened; what is refused, in one line."""
 
+import errno
 import json
+import os
 import shutil
 from dataclasses import replace
 from functools import partial
@@ -13,7 +15,7 @@ import pytest
 
 from tests.command import refused, vap
 from tests.test_breakdown import TABLE
-from vap_core.base.errors import BadOutput, BadStudy
+from vap_core.base.errors import BadOutput, BadStudy, UnknownName
 from vap_core.base.files import DATA
 from vap_core.evaluation import engine
 from vap_core.evaluation.diagnosis import recordings
@@ -107,6 +109,35 @@ def test_an_episode_that_was_not_recorded_is_run_again_alike(
     assert recording_of(failures, 1) == path
     assert path.stat().st_mtime_ns == before, "what is recorded is not run again"
     assert capsys.readouterr().out == ""
+
+
+def test_a_damaged_recording_is_made_again_where_that_can_be_written(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failures = list_failures(run)
+    path = recording_of(failures, 2)
+    frames = read_summary(path)["frames"]
+    path.write_bytes(path.read_bytes()[:5000])
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", read_only)
+        with pytest.raises(BadOutput, match=r"cannot be written \(Read-only file system\)"):
+            recording_of(failures, 2)
+    assert read_summary(recording_of(failures, 2))["frames"] == frames
+
+
+def read_only(path: Path, missing_ok: bool = False) -> None:
+    raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+
+def test_a_misspelt_correction_is_said_before_the_episode_is_run_again(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*args: object) -> None:
+        raise AssertionError("run again")
+
+    monkeypatch.setattr(recordings, "recording_to_show", never)
+    with pytest.raises(UnknownName, match="case 33"):
+        correct_failure(list_failures(run), 0, "case 33: slip")
 
 
 def test_a_published_table_opens_too(

@@ -1,6 +1,7 @@
 """Files are parsed and never executed, servers are on loopback, and keys stay where they are."""
 
 import ast
+import errno
 import os
 import re
 import socket
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import vap_core
-from vap_core.base import files
+from vap_core.base import files, parquet
 from vap_core.base.errors import LONGEST, BadObject, BadOutput, BadSuite, one_of
 from vap_core.recording import viewer
 from vap_core.simulation.suites import lists
@@ -176,6 +177,26 @@ def test_a_damaged_table_is_one_line_wherever_it_is_read(tmp_path: Path) -> None
         with pytest.raises(BadOutput, match=r"parquet is damaged; ") as told:
             list(read(tmp_path))
         assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (PermissionError(errno.EACCES, "Permission denied"), "Permission denied"),
+        (OSError(errno.EMFILE, "Too many open files"), "Too many open files"),
+        (UnicodeEncodeError("utf-8", "\udce4", 0, 1, "surrogates"), "a name that is no text"),
+    ],
+)
+def test_a_table_that_cannot_be_opened_is_not_to_be_deleted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, reason: str
+) -> None:
+    def refuse(path: Path) -> None:
+        raise error
+
+    monkeypatch.setattr("pyarrow.parquet.read_table", refuse)
+    with pytest.raises(BadOutput, match=reason) as told:
+        parquet.read_parquet(damaged(tmp_path / "a.parquet"), "x", "delete it")
+    assert "delete" not in str(told.value)
 
 
 def test_arrays_of_objects_are_refused_wherever_arrays_are_read(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from vap_core.base.errors import BadOutput, BadRecording
 from vap_core.evaluation.diagnosis import explain
 from vap_core.recording import Recorder, read_summary, recover
 from vap_core.recording.entities.images import encode_jpeg
-from vap_core.recording.file import temporary_path
+from vap_core.recording.file import LEFTOVER, temporary_path
 from vap_core.rollout.types import EpisodeHeader, Frame
 
 
@@ -33,10 +33,11 @@ def test_a_killed_episode_keeps_all_flushed_steps(tmp_path: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], check=False)
     assert done.returncode == -signal.SIGKILL
-    assert [p.name for p in tmp_path.iterdir()] == [".killed.rrd.tmp"]
+    (leftover,) = tmp_path.iterdir()
+    assert re.fullmatch(r"\.killed\.rrd\.\d+\.tmp", leftover.name)
     with pytest.raises(BadRecording, match="rerun rrd optimize"):
-        read_summary(temporary_path(path))
-    assert recover(temporary_path(path)) == path
+        read_summary(leftover)
+    assert recover(leftover) == path
     summary = read_summary(path)
     assert (summary["frames"], summary["task"], "outcome" in summary) == (
         10,
@@ -55,8 +56,9 @@ def test_an_exception_keeps_every_step_under_the_temporary_name(tmp_path: Path) 
 
     with pytest.raises(ZeroDivisionError):
         crash()
-    assert [p.name for p in tmp_path.iterdir()] == [".one.rrd.tmp"]
-    assert read_summary(recover(tmp_path / ".one.rrd.tmp"))["frames"] == 1
+    leftover = temporary_path(tmp_path / "one.rrd")
+    assert list(tmp_path.iterdir()) == [leftover]
+    assert read_summary(recover(leftover))["frames"] == 1
 
 
 def test_a_process_that_records_much_keeps_neither_threads_nor_memory(tmp_path: Path) -> None:
@@ -120,8 +122,53 @@ def test_nothing_is_ever_overwritten(
         with pytest.raises(BadOutput, match="kept as"):
             recorder.close(SUCCESS)
     with pytest.raises(BadOutput, match="left as it is"):
-        recover(tmp_path / ".two.rrd.tmp")
+        recover(temporary_path(tmp_path / "two.rrd"))
     assert {p.read_bytes() for p in tmp_path.glob("*.rrd")} == {b"precious"}
+
+
+def test_two_that_record_one_episode_leave_one_whole(tmp_path: Path) -> None:
+    path, start = tmp_path / "one.rrd", opening(1)
+    program = (
+        f"import sys, pathlib; sys.path.insert(0, {str(Path(__file__).parents[1])!r})\n"
+        "from tests import drawn as t\n"
+        "start = t.opening(1)\n"
+        f"with t.Recorder(pathlib.Path({str(path)!r}), start) as other:\n"
+        "    other.frame(t.frame(0, start))\n"
+    )
+    recorder = Recorder(path, start)
+    for step in range(3):
+        recorder.frame(frame(step, start))
+    subprocess.run([sys.executable, "-c", program], check=True)
+    (other,) = {*tmp_path.iterdir()} - {temporary_path(path)}
+    assert LEFTOVER.fullmatch(other.name)["name"] == "one.rrd"
+    recorder.close(SUCCESS)
+    assert read_summary(path)["frames"] == 3
+    assert other.exists(), "it is young: its process may be alive"
+
+
+@pytest.mark.parametrize("n_bytes", [30_000, 200_000])
+def test_on_a_full_disk_nothing_is_left_of_a_recording(tmp_path: Path, n_bytes: int) -> None:
+    path = tmp_path / "full.rrd"
+    program = (
+        f"import sys, pathlib, resource, signal; sys.path.insert(0, {str(Path(__file__).parents[1])!r})\n"
+        "from tests import drawn as t\n"
+        "from vap_core.base.errors import BadOutput\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({n_bytes}, {n_bytes}))\n"
+        "start = t.opening(1)\n"
+        "try:\n"
+        f"    recorder = t.Recorder(pathlib.Path({str(path)!r}), start, flush_every=500)\n"
+        "    for step in range(30): recorder.frame(t.frame(step, start))\n"
+        "    recorder.close(t.SUCCESS)\n"
+        "except BadOutput as error: print(error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == (
+        f"record: {path} cannot be written; make room and run the same command again.\n"
+    )
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_that_cannot_be_written_says_so(tmp_path: Path) -> None:

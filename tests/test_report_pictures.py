@@ -1,5 +1,6 @@
 """The pictures of a report: every line of its tables, methods told apart, the right recording."""
 
+from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,6 @@ from PIL import Image
 
 from tests.test_report import run
 from vap_core.base import palette
-from vap_core.base.errors import BadRecording
 from vap_core.evaluation.report import page
 from vap_core.evaluation.report.failures import FunnelRow
 from vap_core.evaluation.report.funnel import funnel_figure
@@ -31,12 +31,12 @@ def test_a_failure_is_pictured_by_the_recording_of_its_own_policy(
         (source / "recordings").mkdir(parents=True)
         (source / "recordings" / name).write_bytes(b"")
 
-    def summary(path: Path) -> dict[str, str]:
-        if "damaged" in path.parts:
-            raise BadRecording("damaged")
-        return {"policy": path.parts[-3]}
+    def summaries(paths: list[Path]) -> Generator[tuple[Path, dict[str, str] | None, str]]:
+        for path in paths:
+            damaged = "damaged" in path.parts
+            yield path, None if damaged else {"policy": path.parts[-3]}, "damaged"
 
-    monkeypatch.setattr("vap_core.recording.read_summary", summary)
+    monkeypatch.setattr("vap_core.recording.isolated.read_summaries", summaries)
     row = {
         "suite": "simpler-bridge",
         "task": "put-camera",
@@ -44,8 +44,15 @@ def test_a_failure_is_pictured_by_the_recording_of_its_own_policy(
         "seed": 0,
         "method": "vap",
     }
-    for policy, found in (("b", sources[1] / "recordings" / name), ("c", None)):
-        assert page._recording({**row, "policy": policy}, sources) == found
+    for policy, found in (("b", [sources[1] / "recordings" / name]), ("c", [])):
+        recorded = list(page._recorded([{**row, "policy": policy}], sources))
+        assert [path for _, path in recorded] == found
+
+
+def test_a_card_gives_a_command_for_a_shell(tmp_path: Path) -> None:
+    row = dict.fromkeys(("suite", "task", "method", "case", "sub_case", "case_sentence"), "a")
+    card = page._card({**row, "episode": 1, "deciding_frame": 2}, tmp_path / "a b.rrd", tmp_path)
+    assert f"view &#x27;{tmp_path}/a b.rrd&#x27; --frame 2" in card
 
 
 def test_pictures_show_every_line_and_overlap_nothing(tmp_path: Path) -> None:

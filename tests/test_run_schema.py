@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from tests.test_report import run
 from vap_core.base.errors import VapError
 from vap_core.evaluation.diagnosis.failures import list_failures
-from vap_core.evaluation.publish import publish
+from vap_core.evaluation.diagnosis.recordings import study_of
+from vap_core.evaluation.publish import publish, read_runs
 from vap_core.evaluation.report import report
 
 JUNK: list[Any] = [None, -1, 10**30, 1.5, True, "", "nowhere", [], [1], {}, {"a": [None]}]
@@ -106,3 +107,23 @@ def test_a_published_table_with_other_notes_is_refused(
     pq.write_table(table.replace_schema_metadata({b"runs": notes}), bad)
     with pytest.raises(VapError, match="is no table of finished runs|no configuration"):
         list_failures(bad)
+
+
+def test_no_run_or_table_is_opened_that_names_code(whole: Path, tmp_path: Path) -> None:
+    """A study's own suites are executed; results of others may not name them."""
+    marker, code = tmp_path / "executed", tmp_path / "code.py"
+    code.write_text(f"open({str(marker)!r}, 'w')\n")
+    folder, good, bad = (tmp_path / name for name in ("run", "good.parquet", "bad.parquet"))
+    shutil.copytree(whole, folder)
+    held = json.loads((folder / "run.json").read_text())
+    held["configuration"]["suite_files"] = [str(code)]
+    (folder / "run.json").write_text(json.dumps(held))
+    publish([whole], good)
+    notes = json.dumps([held]).encode()
+    pq.write_table(pq.read_table(good).replace_schema_metadata({b"runs": notes}), bad)
+    for source in (folder, bad):
+        with pytest.raises(VapError, match="suite_files, which name code to execute"):
+            list_failures(source)
+    _, episodes = read_runs(whole)[0]
+    study_of(held, episodes.iloc[0].to_dict())
+    assert not marker.exists()

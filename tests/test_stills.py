@@ -1,11 +1,13 @@
 """Stills of recordings say what they show, and none that is committed shows something else than what ships."""
 
+import json
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from vap_core.analysis.plots import keep_png
 from vap_core.base.errors import BadOutput
@@ -70,3 +72,16 @@ def test_a_picture_that_says_nothing_is_named(tmp_path: Path) -> None:
     path.write_bytes(b"no picture")
     with pytest.raises(BadOutput, match="is no PNG"):
         stills.write_provenance(path, STUDY)
+
+
+def test_no_file_is_executed_that_a_picture_names(still: Path, tmp_path: Path) -> None:
+    marker, code = tmp_path / "executed", tmp_path / "code.py"
+    code.write_text(f"open({str(marker)!r}, 'w')\n")
+    about = stills.read_provenance(still)
+    about["study"]["suite_files"] = [str(code)]
+    info = PngInfo()
+    info.add_text(stills.KEY, json.dumps(about))
+    with Image.open(still) as picture:
+        picture.save(still, pnginfo=info)
+    assert stills.stale(still) == ""
+    assert not marker.exists()

@@ -7,6 +7,7 @@ Labels are what a person concluded, beside the diagnosis; they change no table a
 
 import csv
 from datetime import UTC, datetime
+from html import escape
 from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -159,13 +160,14 @@ class FailurePicker(Control):
             return
         row = self.row
         self.label.value = f"{row['case']}: {row['sub_case']}"
-        self.why.value = str(row["case_sentence"])
+        self.why.value = escape(str(row["case_sentence"]))
 
     def _keep(self) -> None:
         write_label(self.labels, self.row, self.label.value, self.note.value)
         found = read_labels(self.labels)
         same = found["sub_case"].eq(found["diagnosed_sub_case"]).sum()
-        self.said.value = f"{len(found)} labelled in {self.labels.name}, {same} as diagnosed"
+        file = escape(self.labels.name)
+        self.said.value = f"{len(found)} labelled in {file}, {same} as diagnosed"
 
 
 def _name(row: dict[str, Any]) -> str:

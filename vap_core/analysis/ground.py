@@ -200,28 +200,19 @@ def _grounding_to_json(grounding: Grounding) -> dict[str, Any]:
 def claimed_paths(folder: Path, stem: str, suffix: str) -> Iterator[tuple[Path, Path]]:
     """A picture or film and a recording of the same name and number, of which neither exists.
 
-    The recording's temporary file stands there from now on, so that another process takes another
-    number. Where the block fails before anything was recorded, it is removed.
+    A claim stands there until the block ends, so that another process takes another number.
 
     Raises: BadOutput, also for an OSError inside.
     """
-    from vap_core.recording.file import temporary_path
-
     with writing(folder, "ground", "choose another folder with --out"):
         shown, recording = _claim(folder, stem, suffix)
         try:
             yield shown, recording
-        except BaseException:
-            claim = temporary_path(recording)
-            with suppress(FileNotFoundError):
-                if not claim.stat().st_size:
-                    claim.unlink()
-            raise
+        finally:
+            _claim_path(recording).unlink(missing_ok=True)
 
 
 def _claim(folder: Path, stem: str, suffix: str) -> tuple[Path, Path]:
-    from vap_core.recording.file import temporary_path
-
     folder.mkdir(parents=True, exist_ok=True)
     number = 1
     while True:
@@ -229,9 +220,13 @@ def _claim(folder: Path, stem: str, suffix: str) -> tuple[Path, Path]:
         shown, recording = folder / f"{name}{suffix}", folder / f"{name}.rrd"
         if not (shown.exists() or recording.exists()):
             with suppress(FileExistsError):
-                temporary_path(recording).touch(exist_ok=False)
+                _claim_path(recording).touch(exist_ok=False)
                 return shown, recording
         number += 1
+
+
+def _claim_path(recording: Path) -> Path:
+    return recording.with_name(f".{recording.stem}.claim")
 
 
 def _format_grounding(grounding: Grounding) -> list[str]:

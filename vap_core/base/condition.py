@@ -33,7 +33,9 @@ def rows_matching(table: "pd.DataFrame", condition: str) -> "pd.DataFrame":
     lines: list[int] = []
     try:
         context = _small_context()
-        context.register_record_batches("episodes", [arrow.to_batches()])
+        # A table without rows has no batch, and datafusion panics at none.
+        batches = arrow.to_batches() or [pa.RecordBatch.from_pylist([], schema=arrow.schema)]
+        context.register_record_batches("episodes", [batches])
         for batch in context.table("episodes").filter(condition).select(LINE).collect():
             lines += batch[LINE].to_pylist()
     except Exception as error:  # datafusion raises bare exceptions

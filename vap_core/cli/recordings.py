@@ -222,9 +222,10 @@ def show(
 
     Example: python -m vap_core show data/runs/demo/recordings/NAME.rrd shot.png --frame 20
     """
-    from vap_core.recording import screenshot
+    from vap_core.recording import check_recording, screenshot
     from vap_core.recording.attention_picture import attention_screenshot
 
+    check_recording(recording)
     if attention:
         attention_screenshot(recording, png, frame_index=frame)
     else:
@@ -249,6 +250,8 @@ def _serve(run: Path, where: str | None, port: int | None) -> None:
     with serve_run(run, where, port) as browser:
         n_failures = sum(row["outcome"] == "failure" for row in browser.rows)
         print(f"{len(browser.rows)} recordings, {n_failures} of failures, at {browser.url}")
+        if where is not None:
+            print(f"{browser.n_matching} match: {where}")
         for path, reason in browser.unreadable.items():
             print(f"note: {path} was left out: {reason}")
         if has_display():
@@ -264,8 +267,9 @@ def _serve(run: Path, where: str | None, port: int | None) -> None:
 
 def _show_frame(recording: Path, frame: int, png: Path | None, mp4: Path | None = None) -> None:
     """Open a recording in the viewer at one step, or make a picture of it, a film, or both."""
-    from vap_core.recording import open_viewer, screenshot, write_film
+    from vap_core.recording import check_recording, open_viewer, screenshot, write_film
 
+    check_recording(recording)
     if mp4 is not None:
         n_pictures = write_film(recording, mp4)
         print(f"wrote {mp4}: {n_pictures} pictures")

@@ -15,6 +15,9 @@ WHOLE_NUMBER_COLUMNS = ("seed", "episode", "steps")
 NUMBER_COLUMNS = ("attempt", "deciding_frame", "case_confidence")
 FLAG_COLUMNS = ("success", "success_once", "cmr", "wrong_object", "first_object_correct", "touched")
 """True, False, or nothing."""
+EXECUTED = "suite_files"
+"""A study's files of own suites. They are the user's to name: none is taken from a file of results.
+"""
 LARGEST = 1_000_000
 """Seeds and counts are smaller."""
 
@@ -88,6 +91,8 @@ def _wrong_setting(manifest: Any) -> str:
     if not _is_text(manifest.get("digest")):
         return "its manifest has no digest"
     configuration = manifest["configuration"]
+    if EXECUTED in configuration:  # no run writes it
+        return f"its manifest has {EXECUTED}, which name code to execute"
     for name, fits in SETTINGS.items():
         if name in configuration and not fits(configuration[name]):
             return f"the setting {name} is {str(configuration[name])[:40]!r}"

@@ -13,6 +13,7 @@ from typing import Any
 from vap_core.base.errors import BadOutput
 from vap_core.base.version import code_digest, code_version
 from vap_core.evaluation import store
+from vap_core.evaluation.run_schema import EXECUTED
 from vap_core.evaluation.study import Study
 
 KEY = "vap_core"
@@ -80,6 +81,8 @@ def read_provenance(png: Path) -> dict[str, Any]:
 def stale(png: Path) -> str:
     """How what a still picture shows differs from what is here now, "" where it does not.
 
+    Nothing is executed that the picture names.
+
     Raises: BadOutput for a picture without provenance.
     """
     about = read_provenance(png)
@@ -87,7 +90,7 @@ def stale(png: Path) -> str:
         raise BadOutput(f"stale: {png} does not say what it shows; take the picture again.")
     if about["recorder"] != recorder_digest():
         return "the recorder shows episodes otherwise now"
-    settings = dict(about["study"])
+    settings = {name: value for name, value in about["study"].items() if name != EXECUTED}
     settings["tasks"] = tuple(tuple(task) for task in settings["tasks"])
     settings["methods"] = tuple(settings["methods"])
     if about["configuration"] != store.digest(Study(**settings).configuration()):

@@ -27,6 +27,7 @@ from vap_core.recording.grounding import ClipRecorder as ClipRecorder
 from vap_core.recording.grounding import ClipStep as ClipStep
 from vap_core.recording.grounding import record_grounding as record_grounding
 from vap_core.recording.index import ensure_index as ensure_index
+from vap_core.recording.isolated import check_recording as check_recording
 from vap_core.recording.query import format_result as format_result
 from vap_core.recording.query import run_query as run_query
 from vap_core.recording.reading import read_chunks as read_chunks

@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING, Any
 import rerun as rr
 import rerun.blueprint as rrb
 
+from vap_core.base.condition import rows_matching
 from vap_core.base.errors import BadOutput, BadRecording, VapError, first_line
 from vap_core.recording.blueprint import full_window
 from vap_core.recording.catalog import register_files
 from vap_core.recording.corrections import CORRECTIONS, layer_path, read_correction
-from vap_core.recording.reading import read_summary
+from vap_core.recording.isolated import read_summaries
 from vap_core.recording.stored_pictures import by_camera
 from vap_core.recording.viewer import free_port
 from vap_core.recording.views import (
@@ -59,11 +60,15 @@ NUMBERS = ("episode", "seed", "steps", "deciding_frame")
 
 @dataclass(frozen=True)
 class Browser:
-    """A running server: the address of its table, its rows, and the files that were left out."""
+    """A running server: the address of its table, its rows, and the files that were left out.
+
+    `n_matching` rows fit the condition; all of them, where there is none.
+    """
 
     url: str
     rows: list[dict[str, Any]]
     unreadable: dict[Path, str]
+    n_matching: int
 
 
 @contextmanager
@@ -72,9 +77,10 @@ def serve_run(run: Path, where: str | None = None, port: int | None = None) -> I
 
     `where` is a SQL condition on COLUMNS; the viewer shows it as a filter that can be changed.
 
-    Raises: BadRecording, when there is no recording that can be read; BadOutput, when the port
-        cannot be served.
+    Raises: BadRecording, when there is no recording that can be read; BadStudy for a condition
+        that does not fit COLUMNS; BadOutput, when the port cannot be served.
     """
+    import pandas as pd
     import pyarrow as pa
 
     folder = run / "recordings" if (run / "recordings").is_dir() else run
@@ -85,11 +91,11 @@ def serve_run(run: Path, where: str | None = None, port: int | None = None) -> I
         )
     unreadable: dict[Path, str] = {}
     summaries: dict[Path, dict[str, Any]] = {}
-    for path in files:
-        try:
-            summaries[path] = read_summary(path)
-        except VapError as error:
-            unreadable[path] = str(error)
+    for path, summary, reason in read_summaries(files):
+        if summary is None:
+            unreadable[path] = reason
+        else:
+            summaries[path] = summary
     layers = _correct(summaries, unreadable)
     with tempfile.TemporaryDirectory() as scratch, _server(port or free_port()) as server:
         client = server.client()
@@ -102,13 +108,16 @@ def serve_run(run: Path, where: str | None = None, port: int | None = None) -> I
                 f"query: none of {len(files)} files in {folder} can be read; "
                 f"the first: {next(iter(unreadable.values()))}."
             )
+        n_matching = len(rows)
+        if where is not None:
+            n_matching = len(rows_matching(pd.DataFrame(rows), where))
         _register_layout(dataset, Path(scratch))
         table = client.create_table("episodes", _schema())
         table.append(pa.RecordBatch.from_pylist(rows, schema=_schema()))
         blueprint = Path(scratch) / "episodes.rbl"
         _table_layout(where).save("vap", blueprint)
         table.register_blueprint(blueprint.resolve().as_uri())
-        yield Browser(f"{client.url}/entry/{table.id}", rows, unreadable)
+        yield Browser(f"{client.url}/entry/{table.id}", rows, unreadable, n_matching)
 
 
 def _correct(summaries: dict[Path, dict[str, Any]], unreadable: dict[Path, str]) -> list[Path]:

@@ -9,6 +9,7 @@ A file that cannot be read is named in `steps.unreadable`; the rest of the query
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +18,7 @@ from urllib.parse import unquote, urlparse
 import rerun as rr
 
 from vap_core.base.errors import BadRecording, first_line
-from vap_core.recording.corrections import CORRECTIONS
+from vap_core.recording.corrections import CORRECTIONS, corrections_folder
 from vap_core.recording.index import CURVES, FOLDER, STEPS, index_path
 from vap_core.recording.isolated import index_isolated
 from vap_core.recording.legacy_names import former_name
@@ -83,8 +84,8 @@ def load_steps(folder: Path) -> StepTable:
                 f"the first: {next(iter(unreadable.values()))}."
             )
         dataset = server.client().create_dataset("recordings")
-        register_files(dataset, indexes, unreadable)
-        layers = sorted((Path(folder).parent / CORRECTIONS).glob("*.rrd"))
+        _register_indexes(dataset, indexes, index_folder, unreadable)
+        layers = sorted(corrections_folder(Path(folder)).glob("*.rrd"))
         register_files(dataset, {path: path for path in layers}, unreadable, layer=CORRECTIONS)
         recordings = {index.resolve(): file for file, index in indexes.items()}
         return StepTable(_join_steps(dataset, recordings), unreadable)
@@ -124,6 +125,21 @@ def _has_index(path: Path, folder: Path | None) -> bool:
         return False
 
 
+def _register_indexes(
+    dataset: "DatasetEntry",
+    indexes: Mapping[Path, Path],
+    folder: Path | None,
+    unreadable: dict[Path, str],
+) -> None:
+    """Register every index; one that cannot be, as it is damaged, is made again once."""
+    refused: dict[Path, str] = {}
+    register_files(dataset, indexes, refused)
+    for path in refused:
+        with suppress(OSError):
+            indexes[path].unlink()
+    register_files(dataset, _ensure_indexes(list(refused), folder, unreadable), unreadable)
+
+
 def register_files(
     dataset: "DatasetEntry",
     files: Mapping[Path, Path],
@@ -148,9 +164,10 @@ def register_files(
         for half in (paths[:middle], paths[middle:]):
             register_files(dataset, {path: files[path] for path in half}, unreadable, layer)
         return
-    for path, result in zip(paths, results, strict=True):
+    of_url = dict(zip(urls, paths, strict=True))
+    for result in results:  # in the order in which they were finished
         if result.error:
-            unreadable[path] = first_line(str(result.error))[:160]
+            unreadable[of_url[result.uri]] = str(result.error).strip().splitlines()[-1][:160]
 
 
 def _join_steps(dataset: "DatasetEntry", recordings: Mapping[Path, Path]) -> "pd.DataFrame":

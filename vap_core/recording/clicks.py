@@ -6,6 +6,7 @@ Another box, another row; a click beside all boxes shows the whole vote again.
 """
 
 import re
+from html import escape
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +17,7 @@ from vap_core.base.errors import BadRecording
 from vap_core.base.types import Boxes, Rgb, best_of_references, election_scores
 from vap_core.recording.entities.comparison import vote_picture_entity
 from vap_core.recording.entities.paths import image_root
-from vap_core.recording.reading import read_chunks
+from vap_core.recording.reading import read_chunks, read_summary
 from vap_core.recording.stored_pictures import read_pictures
 from vap_core.recording.viewer import view
 
@@ -29,9 +30,13 @@ CANDIDATES = re.compile(
 
 
 class Votes:
-    """The votes of a recording, read once: `answer` says what a click on an entity is about."""
+    """The votes of a recording, read once: `answer` says what a click on an entity is about.
+
+    Raises: BadRecording, when it cannot be read or has no vote.
+    """
 
     def __init__(self, recording: Path) -> None:
+        read_summary(recording)
         self._numbers: dict[str, dict[str, Any]] = {}
         self._labelled: dict[str, list[int]] = {}
         prefix = "/vap/candidates/"
@@ -138,7 +143,7 @@ def inspect_votes(recording: Path, *, width: int = 1100, height: int = 680) -> "
     words = ipywidgets.HTML()
 
     def show(name: str, text: str) -> None:
-        words.value = text
+        words.value = escape(text)
         picture = votes.picture(name)
         if picture is not None:
             shown.value = _png(picture)

@@ -3,6 +3,7 @@
 The recording itself is never rewritten.
 """
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -43,7 +44,12 @@ class Correction:
 
 def layer_path(recording: Path) -> Path:
     """Where the correction of a recording is."""
-    return recording.parent.parent / CORRECTIONS / recording.name
+    return corrections_folder(recording.parent) / recording.name
+
+
+def corrections_folder(recordings: Path) -> Path:
+    """The folder beside a folder of recordings; also beside ".", which has no parent by name."""
+    return Path(os.path.normpath(recordings / os.pardir / CORRECTIONS))
 
 
 def write_correction(recording: Path, correction: Correction, frame_index: int) -> Path:

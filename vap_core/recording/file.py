@@ -10,6 +10,8 @@ from vap_core.base.errors import BadOutput, BadRecording
 from vap_core.recording.reading import read_summary, unreadable
 from vap_core.simulation.types import EpisodeRow
 
+LEFTOVER = re.compile(r"\.(?P<name>.+\.rrd)(?:\.\d+)?\.tmp")
+"""The temporary file of a recording; those of earlier versions have no number."""
 NO_PROXY_THERE = "http://127.0.0.1:9"
 """Port 9 is the discard service's, and nothing listens on it."""
 
@@ -26,8 +28,11 @@ def recording_file_name(suite: str, task: str, episode: int, seed: int, method: 
 
 
 def temporary_path(path: Path) -> Path:
-    """Where a recording grows until it is finished: same folder, leading dot, suffix `.tmp`."""
-    return path.with_name(f".{path.name}.tmp")
+    """Where a recording grows until it is finished: same folder, leading dot, suffix `.tmp`.
+
+    Each process has its own, so that two that record one episode do not write one file.
+    """
+    return path.with_name(f".{path.name}.{os.getpid()}.tmp")
 
 
 def rerun_command(*arguments: str | Path) -> list[str]:
@@ -58,12 +63,13 @@ def recover(leftover: Path) -> Path:
     Raises: BadOutput, when the recording exists; BadRecording, when nothing can be saved.
     """
     leftover = Path(leftover)
-    path = leftover.with_name(leftover.name.removeprefix(".").removesuffix(".tmp"))
-    if leftover != temporary_path(path) or not leftover.is_file():
+    named = LEFTOVER.fullmatch(leftover.name)
+    if named is None or not leftover.is_file():
         raise BadRecording(
             f"recover: {leftover} is no leftover of a recording; "
-            f"expected an existing file named like {temporary_path(path).name}."
+            f"expected an existing file named like {temporary_path(Path('NAME.rrd')).name}."
         )
+    path = leftover.with_name(named["name"])
     if path.exists():
         raise BadOutput(
             f"recover: {path} already exists and is never overwritten; "

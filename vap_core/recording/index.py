@@ -3,7 +3,6 @@
 A query reads these instead of the recordings: a thousand of them in seconds.
 """
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,8 @@ import rerun as rr
 from rerun.chunk import Chunk, RrdReader
 
 from vap_core.base.errors import BadOutput, BadRecording
-from vap_core.base.files import check_regular
 from vap_core.recording.file import temporary_path
-from vap_core.recording.reading import PROPERTIES, property_group
+from vap_core.recording.reading import PROPERTIES, UNREADABLE, open_whole, property_group
 from vap_core.recording.stream import finish_stream, open_stream
 
 CURVES = {
@@ -57,7 +55,7 @@ def ensure_index(recording: Path, folder: Path | None = None) -> Path:
     except BadOutput:
         if not path.exists():  # otherwise another process wrote it meanwhile
             raise
-    except (RuntimeError, ValueError, OSError, Warning) as error:
+    except UNREADABLE as error:
         raise BadRecording(str(error).splitlines()[0][:160]) from error
     return path
 
@@ -69,11 +67,7 @@ def index_path(recording: Path, folder: Path | None = None) -> Path:
 
 
 def _write_index(recording: Path, path: Path) -> None:
-    check_regular(recording)
-    with warnings.catch_warnings():
-        # Without a footer rerun warns, and can read no single entity.
-        warnings.simplefilter("error")
-        reader = RrdReader(recording)
+    reader = open_whole(recording)
     recording_id = reader.recordings()[0].recording_id
     properties, state, curves = _read_indexed(reader)
     groups = [property_group(chunk) for chunk in properties]

@@ -1,4 +1,4 @@
-"""Indexes recordings in a process of its own, because a damaged one can end the process.
+"""Reads and indexes recordings in a process of its own: a damaged one can end the process.
 
 Rerun's reader stops the whole process where some bytes are wrong, and no exception can be caught.
 """
@@ -7,11 +7,13 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from vap_core.base.errors import VapError
+from vap_core.base.errors import BadRecording, VapError
 from vap_core.recording.index import ensure_index
+from vap_core.recording.reading import read_summary, unreadable
 
 ENDED_READER = "its damaged bytes ended the process that read it"
 START = "from vap_core.recording.isolated import main; main()"
@@ -24,37 +26,62 @@ def index_isolated(
 
     `folder` is ensure_index's.
     """
-    left = list(recordings)
-    while left:
-        done = 0
-        for reason in _run_reader(left, folder):
-            yield left[done], reason
-            done += 1
-        if done < len(left):
-            yield left[done], ENDED_READER
-            done += 1
-        left = left[done:]
+    asked = {"folder": None if folder is None else str(folder)}
+    for path, answer in _answers(recordings, asked):
+        yield path, answer["reason"]
+
+
+def read_summaries(
+    recordings: Sequence[Path],
+) -> Generator[tuple[Path, dict[str, Any] | None, str]]:
+    """Every recording with its summary (`read_summary`), None where a reason says why not."""
+    for path, answer in _answers(recordings, {"summary": True}):
+        yield path, answer.get("summary"), answer["reason"] or ""
+
+
+def check_recording(recording: Path) -> None:
+    """Check that a recording can be read, before this process reads it. Raises: BadRecording."""
+    for path, _, reason in read_summaries([Path(recording)]):
+        if reason == ENDED_READER:
+            raise unreadable(path, reason)
+        if reason:
+            raise BadRecording(reason)
 
 
 def main() -> None:
     """The other process: a line of JSON in with the paths, a line out for each of them."""
     asked = json.loads(sys.stdin.readline())
-    folder = None if asked["folder"] is None else Path(asked["folder"])
+    folder = None if asked.get("folder") is None else Path(asked["folder"])
     for path in asked["recordings"]:
-        reason = None
+        answer: dict[str, Any] = {"reason": None}
         try:
-            ensure_index(Path(path), folder)
+            if asked.get("summary"):
+                answer["summary"] = read_summary(Path(path))
+            else:
+                ensure_index(Path(path), folder)
         except VapError as error:  # also a disk that is full
-            reason = str(error)
-        print(json.dumps(reason), flush=True)
+            answer["reason"] = str(error)
+        print(json.dumps(answer, default=str), flush=True)
 
 
-def _run_reader(recordings: Sequence[Path], folder: Path | None) -> Iterator[str | None]:
-    """The reasons that the other process gives until it ends."""
-    asked = {
-        "folder": None if folder is None else str(folder),
-        "recordings": [str(path) for path in recordings],
-    }
+def _answers(
+    recordings: Sequence[Path], asked: Mapping[str, Any]
+) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """What other processes answer about every recording; a new one begins where one ends."""
+    left = list(recordings)
+    while left:
+        done = 0
+        for answer in _run_reader({**asked, "recordings": [str(path) for path in left]}):
+            yield left[done], answer
+            done += 1
+        if done < len(left):
+            yield left[done], {"reason": ENDED_READER}
+            done += 1
+        left = left[done:]
+
+
+def _run_reader(asked: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """The answers that the other process gives until it ends."""
     process = subprocess.Popen(
         [sys.executable, "-c", START],
         stdin=subprocess.PIPE,

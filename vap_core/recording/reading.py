@@ -1,7 +1,9 @@
 """Reading recordings back: their chunks and their properties."""
 
+import math
 import warnings
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from rerun.chunk import Chunk, LazyChunkStream, RrdReader
@@ -13,11 +15,35 @@ from vap_core.recording.legacy_names import with_current_names
 PROPERTIES = "/__properties"
 """Rerun's reserved entity; below it is one entity per property group."""
 
+KINDS: dict[str, type | tuple[type, ...]] = {
+    **dict.fromkeys(
+        ("suite", "task", "method", "policy", "git", "instruction", "rewritten", "outcome"), str
+    ),
+    **dict.fromkeys(("detail", "case", "sub_case", "deciding_camera", "case_sentence"), str),
+    **dict.fromkeys(("episode", "seed", "steps", "held_steps", "deciding_frame"), int),
+    **dict.fromkeys(("hz", "case_confidence"), (int, float)),
+}
+"""What properties of a recording must be where they are there."""
+UNREADABLE = (RuntimeError, ValueError, OSError, Warning)
+"""What rerun and the checks here raise at a file that is no whole recording."""
+
 
 def read_chunks(path: Path) -> LazyChunkStream:
     """The chunks of a recording, in the order of the file."""
     check_regular(path)
     return RrdReader(path).stream()
+
+
+def open_whole(path: Path) -> RrdReader:
+    """A reader of a recording that was finished.
+
+    Raises: one of UNREADABLE, for any other file.
+    """
+    check_regular(path)
+    with warnings.catch_warnings():
+        # Without a footer rerun only warns, and can read no single entity.
+        warnings.simplefilter("error")
+        return RrdReader(path)
 
 
 def property_group(chunk: Chunk) -> str | None:
@@ -60,14 +86,33 @@ def read_summary(path: Path) -> dict[str, Any]:
             warnings.simplefilter("error")
             for chunk in read_chunks(path):
                 if property_group(chunk) in ("rollout", "outcome"):
-                    summary |= read_properties(chunk)
+                    summary |= _checked(read_properties(chunk))
                     continue
                 batch = chunk.to_record_batch()
                 if "frame_index" in batch.schema.names:
                     steps.update(batch["frame_index"].to_pylist())
-    except (RuntimeError, ValueError, OSError, Warning) as err:
+    except UNREADABLE as err:
         raise unreadable(path, err) from err
     return {**summary, "frames": len(steps)}
+
+
+def _checked(values: dict[str, Any]) -> dict[str, Any]:
+    """Properties without those that hold nothing where something is expected.
+
+    Raises: ValueError, for a property of another kind than a recorder writes.
+    """
+    checked = {}
+    for name, value in values.items():
+        kind = KINDS.get(name)
+        if kind is not None:
+            if value is None:
+                continue
+            if type(value) is bool or not isinstance(value, kind):
+                raise ValueError(f"its property {name} is {str(value)[:40]!r}")
+            if name == "hz" and not 0 <= float(values[name]) < math.inf:
+                raise ValueError(f"its property hz is {value}")
+        checked[name] = value
+    return checked
 
 
 def unreadable(path: Path, reason: object) -> BadRecording:
@@ -75,5 +120,5 @@ def unreadable(path: Path, reason: object) -> BadRecording:
     line = " ".join(str(reason).split())[-160:]
     return BadRecording(
         f"{path} cannot be read as a recording ({line}); "
-        f"`rerun rrd optimize {path} -o mended.rrd` saves what can be saved."
+        f"`rerun rrd optimize {quote(str(path))} -o mended.rrd` saves what can be saved."
     )

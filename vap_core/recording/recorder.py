@@ -69,6 +69,7 @@ from vap_core.recording.file import temporary_path
 from vap_core.recording.properties import outcome_properties, rollout_properties
 from vap_core.recording.stream import (
     finish_stream,
+    flush_stream,
     frame_times,
     log_properties,
     log_row,
@@ -142,10 +143,12 @@ class Recorder:
         trace: TracebackType | None,
     ) -> None:
         if self._rec is not None:
-            self._flush()
-            self._rec.flush()
-            self._rec.disconnect()
-            self._rec = None
+            try:
+                self._flush()
+                flush_stream(self._rec, self.path)
+            finally:
+                self._rec.disconnect()
+                self._rec = None
 
     def frame(self, frame: Frame) -> None:
         """Record one control step."""
@@ -176,7 +179,8 @@ class Recorder:
     def close(self, outcome: Outcome) -> None:
         """Flush, write outcome, diagnosis and footer, and give the recording its name.
 
-        Raises: BadOutput, when a file of that name appeared meanwhile.
+        Raises: BadOutput, when it cannot be written whole, or a file of that name appeared
+            meanwhile.
         """
         rec = self._open_stream()
         self._flush()
@@ -287,7 +291,7 @@ class Recorder:
         )
         self._subgoal = send_subgoals(rec, frames, self._header.row, self._subgoal)
         self._send_events([event for frame in frames for event in frame.events])
-        rec.flush()
+        flush_stream(rec, self.path)
         self._unsent = []
 
     def _send_views(self, frames: list[Frame]) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from vap_core.base.errors import BadRecording
 from vap_core.base.types import Rgb
 from vap_core.recording.entities.paths import image_root
 from vap_core.recording.reading import read_chunks
@@ -30,7 +31,10 @@ def by_camera(entities: Iterable[str]) -> dict[str, str]:
 
 
 def read_pictures(path: Path, entities: set[str]) -> dict[str, dict[int, Rgb]]:
-    """The pictures of some entities, by entity and control step."""
+    """The pictures of some entities, by entity and control step.
+
+    Raises: BadRecording, for a JPEG that cannot be decoded.
+    """
     jpegs: dict[str, dict[int, Any]] = {entity: {} for entity in entities}
     packets: dict[str, dict[int, Any]] = {entity: {} for entity in entities}
     for chunk in read_chunks(path):
@@ -56,7 +60,11 @@ def read_pictures(path: Path, entities: set[str]) -> dict[str, dict[int, Rgb]]:
 
 
 def _decode_jpeg(blob: np.ndarray) -> Rgb:
-    bgr: Any = cv2.imdecode(blob, cv2.IMREAD_COLOR)
+    bgr: Any = cv2.imdecode(blob, cv2.IMREAD_COLOR) if blob.size else None
+    if bgr is None:
+        raise BadRecording(
+            "pictures: the recording holds a picture that is no JPEG; record the episode again."
+        )
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(np.uint8)
 
 

@@ -1,7 +1,9 @@
 """Writing to a recording: the stream into its file, one row, and time columns."""
 
+import os
 from collections.abc import Sequence
 from datetime import timedelta
+from glob import escape
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,9 @@ import rerun.blueprint as rrb
 import rerun_bindings
 
 from vap_core.base.errors import BadOutput
+from vap_core.base.files import remove_scratch, writing
 from vap_core.recording.file import temporary_path
+from vap_core.recording.reading import UNREADABLE, open_whole
 from vap_core.rollout.types import Frame
 
 type Moment = tuple[int, float]
@@ -53,15 +57,44 @@ def open_stream(path: Path, recording_id: str) -> rr.RecordingStream:
 
 
 def finish_stream(rec: rr.RecordingStream, path: Path) -> None:
-    """Write the footer, then give the recording its name."""
-    rec.flush()
+    """Write the footer, then give the recording its name, if nothing has it at that moment.
+
+    Raises: BadOutput, when it cannot be written whole, or a file of that name appeared meanwhile.
+    """
+    flush_stream(rec, path)
     rec.disconnect()
-    if path.exists():
-        raise BadOutput(
-            f"record: {path} appeared meanwhile; "
-            f"this run's recording is kept as {temporary_path(path)}."
-        )
-    temporary_path(path).replace(path)
+    scratch = temporary_path(path)
+    try:
+        open_whole(scratch)  # rerun only logs that a disk is full
+    except UNREADABLE as error:
+        raise _unwritten(path) from error
+    with writing(path, "record"):
+        try:
+            os.link(scratch, path)
+        except FileExistsError as error:
+            raise BadOutput(
+                f"record: {path} appeared meanwhile; this run's recording is kept as {scratch}."
+            ) from error
+        scratch.unlink()
+    # Of killed processes that recorded it before.
+    remove_scratch(path.parent, f".{escape(path.name)}.*tmp")
+
+
+def flush_stream(rec: rr.RecordingStream, path: Path) -> None:
+    """Write what was sent so far.
+
+    Raises: BadOutput, when it cannot be written; nothing is left of the recording then.
+    """
+    try:
+        rec.flush()
+    except RuntimeError as error:
+        raise _unwritten(path) from error
+
+
+def _unwritten(path: Path) -> BadOutput:
+    """The error of a recording that has not become whole; its temporary file is removed."""
+    temporary_path(path).unlink(missing_ok=True)
+    return BadOutput(f"record: {path} cannot be written; make room and run the same command again.")
 
 
 class StoredBlueprint(rrb.Blueprint):

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadStudy
+from vap_core.base.files import writing
 from vap_core.evaluation.diagnosis import explain
 from vap_core.evaluation.diagnosis.failures import (
     Failures,
@@ -17,6 +18,7 @@ from vap_core.evaluation.diagnosis.failures import (
 )
 from vap_core.evaluation.policy_names import policy_today
 from vap_core.evaluation.publish import scene_of
+from vap_core.evaluation.run_schema import EXECUTED
 from vap_core.evaluation.stills import write_provenance
 from vap_core.evaluation.store import ROW_KEY
 from vap_core.evaluation.study import Study
@@ -58,7 +60,7 @@ def side_by_side_recording(failures: Failures, number: int, method: str) -> Path
         paths[each["method"]] = _recording_of_row(failures, each)
     stem = paths[row["method"]].stem
     out = Path(row["folder"]) / "together" / f"{stem}-{method}.rrd"
-    out.unlink(missing_ok=True)
+    _unlink(out)
     combine_recordings(paths, out)
     return out
 
@@ -129,19 +131,21 @@ def correct_failure(failures: Failures, number: int, case: str, note: str = "") 
     from vap_core.recording import Correction, write_correction
 
     name, _, sub_case = case.partition(":")
+    # A wrong name is said before the episode is run again.
+    correction = Correction(name.strip(), sub_case.strip(), note)
     path, frame = recording_to_show(failures, number)
-    return write_correction(path, Correction(name.strip(), sub_case.strip(), note), frame)
+    return write_correction(path, correction, frame)
 
 
 def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
-    from vap_core.recording import Recorder, read_summary, recording_name
+    from vap_core.recording import Recorder, recording_name
     from vap_core.rollout.loop import rollout
 
     study = study_of(failures.manifests[row["configuration"]], row)
     episode_row = listed_row(study, row)
     folder = Path(row["folder"])
     path = folder / "recordings" / recording_name(episode_row, row["method"])
-    if path.exists() and read_summary(path)["policy"] == row["policy"]:
+    if path.exists() and _recorded_policy(path) == row["policy"]:
         return path
     memory = folder / "memory"
     register_personal(study, memory)
@@ -151,8 +155,8 @@ def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
             f"diagnose: this was run with {row['policy']}, and {trial.policy.label} is here now; "
             "run eval again."
         )
-    # Made with the weights that a table was published with before.
-    path.unlink(missing_ok=True)
+    # Damaged, or made with the weights that a table was published with before.
+    _unlink(path)
     (episode,) = rollout(
         trial,
         [episode_row],
@@ -168,12 +172,29 @@ def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
     return path
 
 
+def _recorded_policy(recording: Path) -> str | None:
+    """The policy of a recording; None where it cannot be read."""
+    from vap_core.recording.isolated import read_summaries
+
+    ((_, summary, _),) = read_summaries([recording])
+    return None if summary is None else summary.get("policy")
+
+
+def _unlink(path: Path) -> None:
+    """Remove what is made again. Raises: BadOutput."""
+    with writing(path.parent, "diagnose", "copy the run to where you may write"):
+        path.unlink(missing_ok=True)
+
+
 def study_of(manifest: Mapping[str, Any], row: Mapping[str, Any]) -> Study:
-    """The study of a run, of one task and method alone; its policy as it is named here today."""
+    """The study of a run, of one task and method alone; its policy as it is named here today.
+
+    Nothing is executed that the manifest names.
+    """
     configuration = manifest["configuration"]
     settings = {}
     for field in fields(Study):
-        if field.name in configuration:
+        if field.name in configuration and field.name != EXECUTED:
             settings[field.name] = configuration[field.name]
     settings["tasks"] = ((row["suite"], row["task"]),)
     settings["methods"] = (row["method"],)

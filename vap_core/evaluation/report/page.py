@@ -6,10 +6,11 @@ Pictures are inside the page; links to recordings are relative to its folder.
 import base64
 import os
 import shlex
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import closing
 from html import escape
 from io import BytesIO
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -96,11 +97,8 @@ def _failures(table: "pd.DataFrame", sources: Sequence[Path], out: Path) -> list
     rows = failed.to_dict("records")
     parts = [f"<h2>Failures ({len(rows)})</h2>"]
     pictured: list[str] = []
-    for row in rows:
-        if len(pictured) == MOST_FAILURES:
-            break
-        recording = _recording(row, sources)
-        if recording is not None:
+    with closing(_recorded(rows, sources)) as recorded:
+        for row, recording in islice(recorded, MOST_FAILURES):
             pictured.append(_card(row, recording, out))
     if pictured:
         parts.append(f"<div class='failures'>{''.join(pictured)}</div>")
@@ -113,20 +111,31 @@ def _failures(table: "pd.DataFrame", sources: Sequence[Path], out: Path) -> list
     return parts
 
 
-def _recording(row: Mapping[str, Any], sources: Sequence[Path]) -> Path | None:
-    """The episode's recording; files of runs of other policies have the same name."""
-    from vap_core.recording import read_summary, recording_file_name
+def _recorded(
+    rows: Sequence[Mapping[str, Any]], sources: Sequence[Path]
+) -> Generator[tuple[Mapping[str, Any], Path]]:
+    """Each episode that has a recording, and the first such; a damaged one is none.
 
-    name = recording_file_name(
-        row["suite"], row["task"], int(row["episode"]), int(row["seed"]), row["method"]
-    )
-    for source in sources:
-        path = Path(source) / "recordings" / name
-        if path.is_file():
-            with suppress(BadRecording):  # a damaged one is no picture
-                if read_summary(path).get("policy") == row["policy"]:
-                    return path
-    return None
+    Files of runs of other policies have the same name.
+    """
+    from vap_core.recording import isolated, recording_file_name
+
+    candidates = []
+    for number, row in enumerate(rows):
+        name = recording_file_name(
+            row["suite"], row["task"], int(row["episode"]), int(row["seed"]), row["method"]
+        )
+        for source in sources:
+            path = Path(source) / "recordings" / name
+            if path.is_file():
+                candidates.append((number, path))
+    found = -1
+    summaries = isolated.read_summaries([path for _, path in candidates])
+    with closing(summaries):
+        for (number, _), (path, summary, _) in zip(candidates, summaries, strict=True):
+            if summary and number != found and summary.get("policy") == rows[number]["policy"]:
+                found = number
+                yield rows[number], path
 
 
 def _card(row: Mapping[str, Any], recording: Path, out: Path) -> str:
@@ -137,8 +146,7 @@ def _card(row: Mapping[str, Any], recording: Path, out: Path) -> str:
     images = []
     for camera, rgb in _views(recording, frame).items():
         images.append(f"<img alt='{escape(camera)}' title='{escape(camera)}' src='{_jpeg(rgb)}'>")
-    view = ["view", str(recording), "--frame", str(frame)]
-    command = shlex.join(["python", "-m", "vap_core", *view])
+    command = f"python -m vap_core view {shlex.quote(str(recording))} --frame {frame}"
     return (
         f"<article><h3>✗ {escape(words)}</h3><div>{escape(about)}</div>"
         f"<div>{''.join(images)}</div><p>{escape(str(row['case_sentence']))}</p>"
