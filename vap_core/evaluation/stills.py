@@ -28,6 +28,7 @@ NOT_DRAWN = {
     "deferred",
     "film",
     "index",
+    "isolated",
     "legacy_names",
     "query",
     "reading",
