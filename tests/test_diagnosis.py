@@ -340,6 +340,7 @@ def test_a_picture_and_a_film_are_both_made(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     made = []
+    monkeypatch.setattr("vap_core.recording.check_recording", lambda _: None)
     monkeypatch.setattr("vap_core.recording.write_film", lambda _, mp4: made.append(mp4) or 1)
     monkeypatch.setattr("vap_core.recording.screenshot", lambda _, png, **__: made.append(png))
     done = vap("view", "a.rrd", "--png", tmp_path / "a.png", "--mp4", tmp_path / "a.mp4")

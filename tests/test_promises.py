@@ -71,7 +71,7 @@ def test_no_module_reads_what_can_execute() -> None:
 READERS = {
     "trimesh.load_scene": {"mesh_parts.py"},
     "av.open": {"video.py"},
-    "torch.load": {"fitting.py"},
+    "torch.load": {"folder.py"},
     "safe_open": {"loading.py"},
 }
 """Meshes, videos and checkpoints have one reader each."""

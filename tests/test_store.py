@@ -1,6 +1,8 @@
 """Results are appended, never mixed and never overwritten."""
 
+import errno
 import json
+import os
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -8,6 +10,7 @@ import pandas as pd
 import pytest
 
 from vap_core.base.errors import BadOutput
+from vap_core.base.files import write_atomic
 from vap_core.evaluation import store
 from vap_core.evaluation.store import (
     KEY,
@@ -206,3 +209,18 @@ def test_a_run_can_be_read_while_another_process_makes_one_part_of_many(
     (run / "parts" / "lost.parquet").symlink_to(tmp_path / "nowhere")
     with pytest.raises(BadOutput, match="lost.parquet is damaged"):
         read(run)
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_a_file_takes_its_name_once_where_there_are_no_hard_links_too(
+    links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def link(*paths: Path) -> None:
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    if not links:
+        monkeypatch.setattr(os, "link", link)
+    write_atomic(tmp_path / "a", b"1", replace=False)
+    with pytest.raises(FileExistsError):
+        write_atomic(tmp_path / "a", b"2", replace=False)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"a": b"1"}

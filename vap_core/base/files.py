@@ -27,6 +27,8 @@ DATA = _INSTALLED if _INSTALLED.is_dir() else _PACKAGE.parent / "data"
 there), beside the package in a checkout."""
 SHIPPED = DATA / "policies"
 """The folder of the checkpoints that ship."""
+NO_LINKS = (errno.EPERM, errno.ENOSYS, errno.EOPNOTSUPP, errno.EMLINK)
+"""What a file system without hard links says of one."""
 ABANDONED_S = 3600.0
 """A scratch file that was last written so long ago belongs to no process that runs."""
 
@@ -69,6 +71,26 @@ def make_folder(folder: Path, caller: str, mend: str = "choose another folder wi
             pass
 
 
+def take_name(scratch: Path, path: Path) -> None:
+    """Give a finished file its name, unless something has it.
+
+    Where there are no hard links (exFAT, some network drives), two processes that do so at one
+    moment may replace each other's file.
+
+    Raises: FileExistsError; OSError.
+    """
+    try:
+        os.link(scratch, path)
+    except OSError as error:
+        if error.errno not in NO_LINKS:
+            raise
+        if path.exists():
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path)) from error
+        os.replace(scratch, path)
+    else:
+        scratch.unlink()
+
+
 @contextmanager
 def replacing(path: Path, *, replace: bool = True) -> Iterator[Path]:
     """A path to write to, which replaces `path` when the block ends without an error.
@@ -84,7 +106,7 @@ def replacing(path: Path, *, replace: bool = True) -> Iterator[Path]:
         if replace:
             os.replace(scratch, path)
         else:
-            os.link(scratch, path)
+            take_name(scratch, path)
     finally:
         scratch.unlink(missing_ok=True)
 

@@ -1,6 +1,5 @@
 """Writing to a recording: the stream into its file, one row, and time columns."""
 
-import os
 from collections.abc import Sequence
 from datetime import timedelta
 from glob import escape
@@ -12,7 +11,7 @@ import rerun.blueprint as rrb
 import rerun_bindings
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import remove_scratch, writing
+from vap_core.base.files import remove_scratch, take_name, writing
 from vap_core.recording.file import temporary_path
 from vap_core.recording.reading import UNREADABLE, open_whole
 from vap_core.rollout.types import Frame
@@ -70,12 +69,11 @@ def finish_stream(rec: rr.RecordingStream, path: Path) -> None:
         raise _unwritten(path) from error
     with writing(path, "record"):
         try:
-            os.link(scratch, path)
+            take_name(scratch, path)
         except FileExistsError as error:
             raise BadOutput(
                 f"record: {path} appeared meanwhile; this run's recording is kept as {scratch}."
             ) from error
-        scratch.unlink()
     # Of killed processes that recorded it before.
     remove_scratch(path.parent, f".{escape(path.name)}.*tmp")
 

@@ -2,9 +2,6 @@
 
 import fcntl
 import json
-import pickle
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,18 +19,6 @@ RECIPE = "recipe.json"
 STATE = "training.pt"
 """The file that a training goes on from."""
 WEIGHTS = ("model.safetensors", "vlm.safetensors")
-_DAMAGE = (
-    OSError,
-    EOFError,
-    KeyError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-    pickle.UnpicklingError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
-"""What numpy, torch and JSON raise for a file that is not whole."""
 
 
 @contextmanager
@@ -55,7 +40,7 @@ def reading_kept(path: Path, caller: str) -> Iterator[None]:
     """Inside, a file is read that an earlier call wrote. Raises: BadOutput when it is damaged."""
     try:
         yield
-    except _DAMAGE as error:
+    except Exception as error:  # numpy and torch raise anything for a damaged file
         raise BadOutput(
             f"{caller}: {path} is damaged ({type(error).__name__}); delete it and run the same "
             "command again."
@@ -102,7 +87,7 @@ def _begin(out: Path, caller: str, recipe: Mapping[str, Any]) -> None:
     if kept and file.exists():
         with reading_kept(file, caller):
             begun = dict(parse_json(file.read_bytes()))
-        if begun != json.loads(json.dumps(dict(recipe))):
+        if begun != parse_json(json.dumps(dict(recipe))):
             changed = differences({"configuration": begun}, recipe)
             raise BadOutput(
                 f"{caller}: {out} holds a training with another recipe ({changed}); go on with "
