@@ -3,12 +3,12 @@
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from mink import SE3, SO3
 
 from vap_core.evaluation.diagnosis.thresholds import Thresholds
 from vap_core.rollout.failure import EpisodeTrace
 from vap_core.rollout.types import Episode, Frame
 from vap_core.simulation import robots
+from vap_core.simulation.control import pose_transform
 from vap_core.simulation.suites import suite
 from vap_core.simulation.suites.rules import Judge
 from vap_core.simulation.types import Pose
@@ -107,16 +107,11 @@ def _gap_m(frame: Frame, pose: Pose, size: tuple[float, float, float], base: Pos
 
     The object's origin is the centre of its base.
     """
-    tcp = _transform(base).apply(frame.state[:3].astype(np.float64))
-    local = _transform(pose).inverse().apply(tcp) - [0.0, 0.0, size[2] / 2]
+    tcp = pose_transform(base).apply(frame.state[:3].astype(np.float64))
+    local = pose_transform(pose).inverse().apply(tcp) - [0.0, 0.0, size[2] / 2]
     outside = np.maximum(np.abs(local) - np.asarray(size) / 2, 0.0)
     return float(np.linalg.norm(outside))
 
 
 def _without(names: Iterable[str], excluded: str) -> list[str]:
     return [name for name in names if name != excluded]
-
-
-def _transform(pose: Pose) -> SE3:
-    """World from body, for a pose `x y z qw qx qy qz`."""
-    return SE3.from_rotation_and_translation(SO3(pose[3:]), pose[:3])

@@ -44,10 +44,9 @@ def funnel_figure(
     """Per suite, the share of episodes that are left after each stage of the funnel.
 
     A line per method of `colours` and policy, methods that read the simulator dashed, the policies
-    of one method with a marker each. A method that
-    highlights nothing begins with the stage "touched"; one that has errors alone has no line. The
-    last tick has two marks: a dot for episodes that succeed with every stage right, a diamond for
-    all that succeed (SR).
+    of one method with a marker each. A method that highlights nothing begins with the stage
+    "touched"; one that has errors alone has no line. The last tick has two marks: a dot for
+    episodes that succeed with every stage right, a diamond for all that succeed (SR).
     """
     by_suite: dict[str, list[FunnelRow]] = {}
     for row in rows:
