@@ -178,6 +178,7 @@ class Attender:
             BadInstruction, UnknownName: the instruction does not match the memory.
             BadViews: a view is no RGB picture, there are boxes of a camera that gives none, or the
                 views cannot be associated.
+            BadEncoder: an encoder gives numbers that are not finite.
         """
         check_views(views)
         unknown = sorted(set(boxes or {}) - set(views))
@@ -240,7 +241,10 @@ class Attender:
         return parsed, wanted
 
     def ground(self, camera: str, obj: PersonalObject, candidates: Candidates) -> Grounding:
-        """The vote of one view for one object."""
+        """The vote of one view for one object.
+
+        Raises: BadEncoder when the encoder gives numbers that are not finite.
+        """
         boxes = candidates.boxes
         cosine = compare(obj, candidates, self.stack)
         ballot = vote(election_scores(cosine, boxes), self.prompting.rule)
@@ -281,6 +285,8 @@ class Attender:
 
         `candidates[camera][j]` are those of target j; `chosen_by` names what overruled the vote,
         where something did.
+
+        Raises: BadInstruction for more targets than the palette has tints.
         """
         ids: dict[str, tuple[int | None, ...]] = {}
         masks: dict[str, Bool[np.ndarray, "n h w"]] = {}
@@ -330,6 +336,8 @@ class Attender:
         """`step` for a batch of episodes, whose views reach the tracker in one call.
 
         The result for one episode does not depend on the others.
+
+        Raises: BadViews, as `step`.
         """
         trackers = []
         images = []

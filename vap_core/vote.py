@@ -57,6 +57,8 @@ def nominate(rgb: Rgb, obj: PersonalObject, offered: Proposals, stack: Stack) ->
     """The candidates for an object among the proposals of a view.
 
     Where the stack has a verifier, crops of unfamiliar views are compared point by point first.
+
+    Raises: BadEncoder when the encoder gives numbers that are not finite.
     """
     cosine = compare(obj, offered, stack)
     if stack.verifier is None or offered.boxes.familiar:

@@ -123,7 +123,10 @@ class Mp4:
         self._container.close()
 
     def add(self, rgb: Rgb) -> None:
-        """Append one picture; an odd last row or column is cut off."""
+        """Append one picture; an odd last row or column is cut off.
+
+        Raises: BadOutput, when it cannot be written.
+        """
         import av
 
         height, width = (side - side % 2 for side in rgb.shape[:2])

@@ -31,7 +31,8 @@ class EmbeddingParser:
     def __call__(self, text: str, categories: Collection[str] = ()) -> Instruction:
         """Parse one instruction; every target names its object.
 
-        Raises: BadInstruction: no personal object, or several fit; UnknownName: none is remembered.
+        Raises: BadInstruction: no personal object, or several fit; UnknownName: none is remembered;
+            MissingWeights: `embed` has no weights here.
         """
         exclusions = find_exclusions(text)
         found: list[tuple[Expression, PersonalObject]] = []

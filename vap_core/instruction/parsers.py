@@ -28,7 +28,7 @@ def load_parser(name: str, context: Context, *, fall_back: bool = False) -> Pars
     "chat" is at OPENAI_BASE_URL. With `fall_back` the rule parses what the endpoint does not
     answer, with a note on stderr.
 
-    Raises: UnknownName, BadEndpoint, MissingWeights.
+    Raises: UnknownName: no such parser, or nothing is remembered; BadEndpoint.
     """
     if name == "rule":
         return rule_parser(context.objects)
@@ -75,7 +75,10 @@ class Parsing:
     fall_back: bool = False
 
     def load(self, bank: Path, objects: Mapping[str, PersonalObject]) -> Parser:
-        """The parser for the objects of a bank, and for its history. Raises: as `load_parser`."""
+        """The parser for the objects of a bank, and for its history.
+
+        Raises: as `load_parser`; BadMemory: a damaged line of the history.
+        """
         uses = () if self.parser == "rule" else read_uses(bank)
         context = Context(objects=objects, speaker=self.speaker, uses=uses)
         return ask_once(load_parser(self.parser, context, fall_back=self.fall_back))

@@ -65,6 +65,8 @@ def rewrite(instruction: Instruction, colours: Sequence[Colour | None]) -> str:
 
     There is one colour per target; None leaves its span as it is. The rest of the text is
     unchanged, character for character.
+
+    Raises: BadInstruction when there are more or fewer colours than targets.
     """
     n = len(instruction.targets)
     if len(colours) != n:

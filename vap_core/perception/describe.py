@@ -95,6 +95,10 @@ class ChatCaptioner:
     endpoint: ChatEndpoint
 
     def __call__(self, crops: Sequence[Rgb], category: str) -> Description:
+        """Ask for the short description, then for the long one.
+
+        Raises: BadEndpoint: the endpoint fails, or its answer is no short line of text.
+        """
         return Description(
             short=self._request_phrase(SHORT_QUESTION.format(category=category), crops),
             long=self._request_phrase(LONG_QUESTION.format(category=category), crops),

@@ -20,7 +20,11 @@ least that like it, 5 % of 869 where the kind is absent, and 25 % of 40 with onl
 
 
 def load_embedded() -> Stack:
-    """Boxes of a COCO detector; EfficientNet-Lite0 features with heads trained on renders."""
+    """Boxes of a COCO detector; EfficientNet-Lite0 features with heads trained on renders.
+
+    Raises: MissingWeights: a file of weights is absent, or its checksum differs from the
+        manifest's.
+    """
     from vap_core.perception.embedded import (
         cut_segmenter,
         detector,
@@ -44,7 +48,10 @@ def load_embedded() -> Stack:
 
 
 def load_foundation(kind: str = "foundation") -> Stack:
-    """Grounding DINO, DINOv2 and SAM 2.1 (P 5.1), on a GPU where there is one."""
+    """Grounding DINO, DINOv2 and SAM 2.1 (P 5.1), on a GPU where there is one.
+
+    Raises: as `foundation.load`.
+    """
     from vap_core.perception import foundation
 
     return foundation.load(kind)
@@ -90,7 +97,8 @@ def ships_thresholds(name: str) -> bool:
 def load_stack(name: str) -> Stack:
     """The stack of that name, or a mixed one (`mixed`); loading its weights takes about a second.
 
-    Raises: UnknownName: no such stack, or `VAP_DEVICE` names no device of this machine.
+    Raises: UnknownName: no such stack, or `VAP_DEVICE` names no device of this machine;
+        MissingPart, MissingWeights, BadOutput, as `load_mixed`.
     """
     check_stack(name)
     check_device()

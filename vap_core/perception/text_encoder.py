@@ -34,6 +34,8 @@ def embed_text(phrases: Sequence[str]) -> Float32[np.ndarray, "n 384"]:
     """L2-normalised sentence embeddings, one row per phrase, case ignored.
 
     Each phrase is computed once per process.
+
+    Raises: MissingWeights: the text encoder is not on this machine and cannot be fetched.
     """
     rows = np.zeros((len(phrases), WIDTH), np.float32)
     for row, phrase in zip(rows, phrases, strict=True):

@@ -70,7 +70,11 @@ def kept_thresholds(name: str, encoder: str) -> Thresholds | None:
 
 
 def random_parts(name: str, device: str | None = None) -> dict[str, Any]:
-    """As `load_parts`, with random weights in the real architectures."""
+    """As `load_parts`, with random weights in the real architectures.
+
+    Raises: MissingPart: torch or transformers is not installed; UnknownName: no such stack or
+        device.
+    """
     require("foundation", f"the stack {name}")
     from vap_core.perception.foundation import architectures, random_weights
     from vap_core.perception.foundation.runtime import select_runtime

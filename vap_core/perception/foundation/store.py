@@ -83,7 +83,7 @@ def _refuse_problems(kind: str, names: tuple[str, ...], store: Path, quick: bool
 
 
 def remedy(kind: str) -> str:
-    """How to get a stack's weights, online and offline."""
+    """How to get a stack's weights, online and offline. Raises: UnknownName: no such stack."""
     pull = f"python -m vap_core weights pull --stack {kind}"
     if any(not MODELS[name].sha256 for name in models_of(kind)):
         pull += " --unpinned"
