@@ -208,7 +208,10 @@ class LeRobot:
     def prepare(
         self, states: Sequence[LeRobotState], inputs: Sequence[PolicyInput]
     ) -> tuple[dict[str, Any], torch.Tensor | None]:
-        """The preprocessed batch of some episodes, and their sampling noise if it takes any."""
+        """The preprocessed batch of some episodes, and their sampling noise if it takes any.
+
+        Raises: BadPolicy when the inputs do not fit.
+        """
         batch = self.preprocessor(self._observation(inputs))
         return batch, self._noise(states) if self.noisy else None
 

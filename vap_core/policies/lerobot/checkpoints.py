@@ -71,6 +71,8 @@ def base_models(folder: Path) -> list[str]:
     """Models of the hub that a checkpoint builds on.
 
     These are the backbone whose sizes it takes, and the tokenizer that reads its commands.
+
+    Raises: BadPolicy when a file is missing or damaged.
     """
     names = [config_field(folder, "vlm_model_name")]
     for step in _steps(folder / PIPELINES[0]):
@@ -85,7 +87,10 @@ def base_models(folder: Path) -> list[str]:
 
 
 def fingerprint(checkpoint: str | Path) -> str:
-    """SHA-256 of everything in a checkpoint that decides what it does, without loading it."""
+    """SHA-256 of everything in a checkpoint that decides what it does, without loading it.
+
+    Raises: BadPolicy when a file is missing.
+    """
     folder = locate(checkpoint)
     digest = hashlib.sha256()
     for file in sorted(folder.rglob("*")):

@@ -186,7 +186,10 @@ class Copy:
     def add(
         self, frame: RecordedFrame, views: Views, task: str, masks: Mapping[str, Mask | None]
     ) -> None:
-        """The frame with these views, this task, and perhaps the target's mask in every view."""
+        """The frame with these views, this task, and perhaps the target's mask in every view.
+
+        Raises: BadDataset when `out` cannot be written.
+        """
         copied: dict[str, Any] = {"task": task}
         for key, feature in self._features.items():
             copied[key] = _as_stored(frame.item[key], feature)
@@ -201,6 +204,10 @@ class Copy:
             raise _unwritable(self.out, error) from error
 
     def end_episode(self) -> None:
+        """Save the frames that were added as one episode.
+
+        Raises: BadDataset when `out` cannot be written.
+        """
         try:
             with redirect_stderr(io.StringIO()):
                 self._dataset.save_episode(parallel_encoding=False)

@@ -82,6 +82,9 @@ class VapPrompt(ProcessorStep):
     episode's beginning is known: by `observation.vap_step` being 0, or by `reset()` (then of one
     environment only). With "auto" it is the former where that observation is there, else the
     latter in a loop that has called `reset()`.
+
+    Raises: UnknownName for a stack, or a value of `episodes`, that there is not; BadMemory when
+        `memory` is no folder.
     """
 
     memory: str
@@ -303,6 +306,8 @@ class LeRobotEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
 
     `vap_step` is the number of steps since the episode began. Seed s starts episode s of the task's
     list, modulo its length, exactly as our own rollout does; `max_steps` shortens it.
+
+    Raises: UnknownName for a suite or a task that no registry holds; BadSuite for a damaged list.
     """
 
     def __init__(

@@ -46,7 +46,12 @@ class TwinCamera:
 
 
 class VapSo101Twin(Robot):
-    """One episode of a suite, from `connect` to `disconnect`. Reads and acts in one thread."""
+    """One episode of a suite, from `connect` to `disconnect`. Reads and acts in one thread.
+
+    Raises: UnknownName for a suite, a task or an object that it cannot take; BadStudy for an
+        episode that the list does not have, one with sub-goals, or an object that does not fit the
+        task; BadObject for a damaged scan.
+    """
 
     config_class = VapSo101TwinConfig
     name = "vap_so101_twin"

@@ -42,6 +42,8 @@ def photographs(rows: Iterable[EpisodeRow], seed: int, k: int) -> Photos:
     """Photos of the rows' target, of every look-alike beside it, and of other objects.
 
     There are `k` of the target, as its owner takes them.
+
+    Raises: UnknownName, BadObject, as `get_object`.
     """
     rows = list(rows)
     own = reference_views(objects.get_object(rows[0].target), k, seed)
@@ -52,7 +54,10 @@ def photographs(rows: Iterable[EpisodeRow], seed: int, k: int) -> Photos:
 
 
 def lookalikes(rows: Iterable[EpisodeRow]) -> list[str]:
-    """The objects of the target's category that the rows place beside it, sorted."""
+    """The objects of the target's category that the rows place beside it, sorted.
+
+    Raises: UnknownName, BadObject, as `get_object`.
+    """
     rows = list(rows)
     target = objects.get_object(rows[0].target)
     names = []
@@ -63,7 +68,10 @@ def lookalikes(rows: Iterable[EpisodeRow]) -> list[str]:
 
 
 def other_objects(rows: Sequence[EpisodeRow], seed: int) -> tuple[Rgb, ...]:
-    """Photos of personal objects of other categories than the rows' target."""
+    """Photos of personal objects of other categories than the rows' target.
+
+    Raises: UnknownName, BadObject, as `get_object`.
+    """
     category = objects.get_object(rows[0].target).category
     kinds = [kind for kind in objects.CATEGORIES if kind != category]
     first = objects.CATEGORIES.index(category)
@@ -75,7 +83,10 @@ def other_objects(rows: Sequence[EpisodeRow], seed: int) -> tuple[Rgb, ...]:
 
 
 def model_of(initialised_from: str) -> Path:
-    """The folder of the shipped model with this SHA-256; that of MODEL where none has it."""
+    """The folder of the shipped model with this SHA-256; that of MODEL where none has it.
+
+    Raises: BadPolicy when a shipped model is damaged.
+    """
     for folder in sorted(MODEL.parent.glob(f"{MODEL.name}*")):
         if _sha256(folder) == initialised_from:
             return folder

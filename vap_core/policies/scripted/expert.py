@@ -93,6 +93,10 @@ class Expert:
     def plan_from_simulation(
         self, states: Sequence[ExpertState], envs: Sequence[Env]
     ) -> tuple[list[ExpertState], list[Chunk]]:
+        """One action of every episode, towards its next waypoint.
+
+        Raises: OutOfReach when the next phase cannot be planned.
+        """
         next_states = []
         for state, env in zip(states, envs, strict=True):
             next_states.append(self._advance(state, env))

@@ -84,7 +84,10 @@ class ScriptedState:
 
 
 class Scripted:
-    """The scripted policy for one robot, one calibrated fixed camera and one control."""
+    """The scripted policy for one robot, one calibrated fixed camera and one control.
+
+    Raises: UnknownName for a robot that MOTIONS does not hold.
+    """
 
     label = "scripted"
 
