@@ -170,6 +170,8 @@ def missing_jobs(
     Also for episodes in error that were tried at most `retries` times; these are recorded. The
     slower, prompted method comes first, so that workers finish together. The first `short` jobs
     have one episode each.
+
+    Raises: BadOutput when the run's manifest is absent, or a part is damaged.
     """
     run_digest = store.read_manifest(folder)["digest"]
     attempts = _attempts(store.read(folder))

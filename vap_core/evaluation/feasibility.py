@@ -33,7 +33,10 @@ class Tried:
 
 
 def feasible(rows: Sequence[EpisodeRow]) -> tuple[bool, ...]:
-    """Whether the expert succeeds in each row; rows of one suite. About a second a row."""
+    """Whether the expert succeeds in each row; rows of one suite. About a second a row.
+
+    Raises: UnknownName for a suite or an object that no registry holds.
+    """
     succeeded: dict[int, bool] = {}
     for variant in dict.fromkeys(row.variant for row in rows):
         numbers = [i for i, row in enumerate(rows) if row.variant == variant]

@@ -43,7 +43,10 @@ def read(folder: Path) -> "pd.DataFrame":
 
 
 def verdict(folder: Path) -> str:
-    """A line per method: what the policy consumed, and where it is not as the prompt says."""
+    """A line per method: what the policy consumed, and where it is not as the prompt says.
+
+    Raises: BadOutput, as `read`.
+    """
     table = read(folder)
     lines = []
     for method, of_method in table.groupby("method"):

@@ -101,7 +101,10 @@ def run_job(job: Job) -> Rows:
 
 
 def row_of_dead_worker(job: Job, why: str) -> dict[str, Any]:
-    """The row of a job's only episode, whose worker died: an error before its first step."""
+    """The row of a job's only episode, whose worker died: an error before its first step.
+
+    Raises: BadPolicy when the policy's checkpoint is not on this machine.
+    """
     (row,), (key,) = job.rows, job.keys
     header = EpisodeHeader(
         row=row,

@@ -149,6 +149,8 @@ def main_results() -> "pd.DataFrame":
 
     Columns: suite, split, task, method, paper_method; `sr` and `cmr` as fractions, nan where not
     given.
+
+    Raises: BadOutput, as `ledger`.
     """
     import pandas as pd
 
@@ -170,6 +172,8 @@ def failure_cases() -> "pd.DataFrame":
 
     `fail` is a fraction of the episodes, each case a fraction of the failures; nan where the paper
     says that a case does not apply.
+
+    Raises: BadOutput, as `ledger`.
     """
     facts = ledger()
     facts = facts[facts["table"] == "error_case_breakdown_simple"]
@@ -179,7 +183,10 @@ def failure_cases() -> "pd.DataFrame":
 
 
 def real_arm() -> str:
-    """The paper's results on its real arm, which it does not give by task."""
+    """The paper's results on its real arm, which it does not give by task.
+
+    Raises: BadOutput, as `ledger`.
+    """
     facts = ledger()
     facts = facts[(facts["table"] == REAL) & facts["row"].isin(["pi0.5", "pi0.5 + VAP"])]
     parts = []

@@ -21,7 +21,10 @@ from vap_core.simulation.suites import Suite, benchmark_name
 
 
 def scripted(detector: Detector, scene: Scene, suite: Suite) -> Scripted:
-    """The scripted policy, calibrated to the suite's first camera."""
+    """The scripted policy, calibrated to the suite's first camera.
+
+    Raises: UnknownName for a camera that the scene lacks, or a robot without a scripted motion.
+    """
     (camera,) = Env(scene, cameras=suite.cameras[:1]).cameras()
     return Scripted(
         detector=detector,

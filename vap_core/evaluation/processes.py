@@ -82,7 +82,10 @@ def results[J, R](
 def results_here[J, R](
     work: Callable[[J], R], jobs: Sequence[J], workers: int, remedy: str
 ) -> Iterator[tuple[J, R]]:
-    """`results`, but with one worker in this process: its start would take longer than it saves."""
+    """`results`, but with one worker in this process: its start would take longer than it saves.
+
+    Raises: as `results`.
+    """
     if workers > 1:
         yield from results(work, jobs, workers, remedy)
         return

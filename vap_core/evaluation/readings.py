@@ -63,7 +63,10 @@ COLUMNS = tuple(field.name for field in fields(Reading))
 
 
 def readings_of(configuration: Mapping[str, Any], run: str, what_for: str = "") -> list[Reading]:
-    """What a run reads: one line for each of its suites that has a shipped list to report."""
+    """What a run reads: one line for each of its suites that has a shipped list to report.
+
+    Raises: UnknownName for a task that its suite does not have; BadSuite for a damaged list.
+    """
     found = []
     weights = _weights_by_suite(configuration)
     split = configuration.get("split", "")
@@ -180,7 +183,7 @@ def readings_rows(readings: Sequence[Reading]) -> list[list[str]]:
 
 
 def all_readings() -> list[Reading]:
-    """The published log and this machine's, every run once."""
+    """The published log and this machine's, every run once. Raises: BadOutput, as `read_log`."""
     published = read_log(PUBLISHED)
     known = {reading.run for reading in published if reading.run}
     return [*published, *(r for r in read_log(LOCAL) if r.run not in known)]

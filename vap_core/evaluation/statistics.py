@@ -66,6 +66,8 @@ def compare(
     several. `methods` gives their order (default: of appearance); the later is compared against the
     earlier. Episodes are one row each (`Episode.summary`); the column `layout` is added where it is
     absent.
+
+    Raises: BadSuite, as `layouts.layout_names`.
     """
     order = list(methods or dict.fromkeys(episodes["method"]))
     won = (episodes["success"].eq(True) & episodes["outcome"].ne("error")).astype(int)

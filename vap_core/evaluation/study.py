@@ -53,7 +53,8 @@ class Study:
     the files of own suites; they are executed (suites.own). `split` takes the episodes of one split
     of a suite's list, for example visual matching.
 
-    Raises: UnknownName, BadStudy, when it is built from what does not fit together; MissingPart.
+    Raises: UnknownName, BadStudy, when it is built from what does not fit together; BadSuite for a
+        file or a list of a suite that is damaged; MissingPart.
     """
 
     tasks: tuple[tuple[str, str], ...]
@@ -120,6 +121,10 @@ class Study:
 
         Weights, episode lists, and the world (robots, objects, styles, sensors) enter by checksum,
         methods by name, and those that are not published by what they change, too.
+
+        Raises: BadPolicy for a checkpoint that is not on this machine; MissingWeights when the
+            backbone's package is not installed; BadSuite for a list without a checksum; BadObject
+            for a damaged scan.
         """
         digests = {}
         for suite, _ in self.tasks:

@@ -55,6 +55,10 @@ def register_personal(study: Study, bank: Path, captioner: Captioner | None = No
     An object that is in memory with enough of them stays. Where a method needs its description, it
     is described too, by `captioner`, or offline; for the soft prompt its token is learned. A study
     that prompts nothing needs no memory.
+
+    Raises: as `load_stack`; BadMemory for a damaged memory; BadObject for a damaged scan;
+        BadEndpoint when the chat endpoint of the `captioner` fails; BadPolicy, BadStudy, as `teach`
+        and `teach_own`; BadOutput when `bank` cannot be written.
     """
     if not study.any_method(needs_memory):
         return
@@ -108,6 +112,10 @@ def make_trial(study: Study, rows: Sequence[EpisodeRow], method: str, bank: Path
     """The scene, models and policy of some rows of one task and variant, built or cached.
 
     The scene holds only what the rows place. It is closed when the next one is built.
+
+    Raises: UnknownName for a suite that no registry holds; BadPolicy when the checkpoint is not on
+        this machine or does not fit the suite; BadMemory when a description or a token that the
+        method needs is not in `bank`; MissingMeshes for a robot whose meshes are not here.
     """
     first = rows[0]
     suite = suites.suite(first.suite)

@@ -82,6 +82,8 @@ def run_arms(
 
     Each arm is a run in a folder of its own, so that ablations share the arms that they have in
     common; so is each arm with each policy, where the ablation has policies.
+
+    Raises: what `engine.run` raises.
     """
     import pandas as pd
 

@@ -41,6 +41,8 @@ class ArmResult:
 def arm_results(ablation: Ablation, episodes: "pd.DataFrame") -> list[ArmResult]:
     """The arms of every suite in `episodes` (rows of a results table) that ran the first arm and
     another.
+
+    Raises: BadSuite, as `statistics.compare`; BadOutput, as `paper.ledger`.
     """
     results = []
     for suite in dict.fromkeys(episodes["suite"]):

@@ -143,7 +143,10 @@ def failure_row(failures: Failures, number: int) -> dict[str, Any]:
 
 
 def deciding_frame(failures: Failures, number: int) -> int:
-    """The control step that decides a listed failure; 0 where none does."""
+    """The control step that decides a listed failure; 0 where none does.
+
+    Raises: BadStudy for a number that is not listed.
+    """
     return max(0, int(failure_row(failures, number)["deciding_frame"]))
 
 

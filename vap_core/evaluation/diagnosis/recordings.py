@@ -190,6 +190,8 @@ def study_of(manifest: Mapping[str, Any], row: Mapping[str, Any]) -> Study:
     """The study of a run, of one task and method alone; its policy as it is named here today.
 
     Nothing is executed that the manifest names.
+
+    Raises: as `Study`, when something that the manifest names is not here today.
     """
     configuration = manifest["configuration"]
     settings = {}

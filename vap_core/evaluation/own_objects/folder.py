@@ -70,6 +70,8 @@ def import_missing(
     """Import the files of a source that `target` lacks; why others cannot be, by name.
 
     Some ten seconds of CPU an object.
+
+    Raises: BadOutput when `target` cannot be written.
     """
     refused = {}
     for name, row in source.files.items():

@@ -33,6 +33,8 @@ TILE_PX = 224
 def measure_openings(rows: Sequence[EpisodeRow], stack: Stack) -> tuple[list[Row], Rgb]:
     """A row for every camera of every episode, and a picture: a reference, and the first episode's
     views with the true box (white) and the elected one.
+
+    Raises: UnknownName, BadObject, as `registered_object`; BadEncoder, as `Attender.ground`.
     """
     personal, _ = registered_object(stack, rows[0].target, USUAL_K)
     attender = Attender(stack, {personal.name: personal})

@@ -51,6 +51,7 @@ class ObjectSurvey:
     views_only: bool = False
 
     def study(self, suite: str, task: str, name: str) -> Study:
+        """The study of one task with an object in its target's place. Raises: as `Study`."""
         return Study(
             tasks=((suite, task),),
             methods=(METHOD,),

@@ -56,6 +56,8 @@ def agreements(
 
     `case` is the comparison of the views (SPEC section 7); `right` is in how many of the `views`
     that show the target it is highlighted. A box on no object is another thing in every view.
+
+    Raises: BadViews, as `associate`; BadEncoder, as `compare`.
     """
     few = []
     for view, of_view in zip(episode, candidates, strict=True):

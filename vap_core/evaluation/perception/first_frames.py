@@ -108,6 +108,8 @@ def opening_views(rows: Sequence[EpisodeRow], size: int = 224) -> Iterator[list[
 
     Rows of one suite and variant share a scene and come together. Pictures are `size` pixels wide
     and high.
+
+    Raises: UnknownName for a suite or an object that no registry holds.
     """
     groups: dict[tuple[str, str], list[EpisodeRow]] = {}
     for row in rows:
@@ -125,6 +127,8 @@ def registered_object(stack: Stack, target: str, k: int) -> tuple[PersonalObject
     """The personal object from `k` rendered reference photos; rendered once per process.
 
     The second value names the photos that no detector cut.
+
+    Raises: UnknownName, BadObject, as `objects.get_object`.
     """
     model = objects.get_object(target)
     photos = reference_views(model, k)
@@ -151,6 +155,8 @@ def survey_view(
     `memory` holds the target as registered from each number of photos; USUAL_K must be among them.
     "choices" and the figures of the mask are given for views that show the target; "detections" and
     "objects" for all.
+
+    Raises: BadEncoder when the encoder gives numbers that are not finite.
     """
     boxes = view.boxes()
     alike = _same_category(view)

@@ -65,6 +65,8 @@ class Survey:
     """What is asked for.
 
     `episodes` None takes `EPISODES` opening frames a task, and tracking.plan's episodes.
+
+    Raises: UnknownName for a suite that is no benchmark, or a stack that does not exist.
     """
 
     stack: str = "embedded"
@@ -90,7 +92,10 @@ class Survey:
         return min(usual, self.episodes or usual)
 
     def configuration(self) -> dict[str, Any]:
-        """What the results depend on, as JSON: the world, weights and lists by their checksums."""
+        """What the results depend on, as JSON: the world, weights and lists by their checksums.
+
+        Raises: BadSuite, MissingWeights, as `Study.configuration`.
+        """
         counts = {}
         for name in self.suites:
             counts[name] = {"openings": self.n_openings(name), "tracks": self.n_tracked(name)}
@@ -126,7 +131,10 @@ class Job:
 
 
 def plan(asked: Survey) -> list[Job]:
-    """Every job, the long ones first, so that processes finish together."""
+    """Every job, the long ones first, so that processes finish together.
+
+    Raises: BadSuite for a damaged list.
+    """
     return [*_tracking_jobs(asked), *_opening_jobs(asked)]
 
 

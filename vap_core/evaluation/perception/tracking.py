@@ -95,6 +95,8 @@ def plan(
     """The default survey: every task of the benchmarks, or of `suite_names`.
 
     `episodes` overrides how many of each task's list, spread evenly over it, by suite.
+
+    Raises: UnknownName for a suite that no registry holds; BadSuite for a damaged list.
     """
     count = {**EPISODES, **(episodes or {})}
     if suite_names is None:
@@ -119,6 +121,8 @@ def steps_per_frame(row: EpisodeRow) -> int:
     """Control steps from one tracked frame to the next.
 
     Two for the long put tasks on the tabletop, at 30 a second, else one.
+
+    Raises: UnknownName for a suite that no registry holds.
     """
     if suites.suite(row.suite).hz >= 30 and row.rule == "put":
         return 2
@@ -129,6 +133,9 @@ def track_episode(job: Job, stack: Stack) -> list[TableRow]:
     """Run the episode's expert, track, and compare.
 
     The same job gives the same rows but for their times.
+
+    Raises: UnknownName for a suite or an object that no registry holds; OutOfReach, as
+        `record_film`.
     """
     models = [place.model for place in job.row.placements]
     with build_scene(job.row.suite, models, job.row.variant) as scene:
@@ -140,6 +147,9 @@ def record_film(job: Job, scene: Scene, size: int = 224) -> Film:
     """The expert's episode, to its end, in pictures and masks.
 
     The target is hidden from a moment that the episode's number decides.
+
+    Raises: OutOfReach when the expert cannot reach the target or its goal; UnknownName when the row
+        places an object that the scene lacks.
     """
     row = job.row
     expert = Expert()

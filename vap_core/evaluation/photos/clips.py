@@ -69,6 +69,8 @@ def follow_scene(scene: Scene, photo_set: PhotoSet, stack: Stack) -> list[Row]:
 
     `end` is what the mask lies on when the window is back: object, twin, other, or "" for no mask.
     `on_object` counts frames, of the `in_view` ones, `on_twin` of all `frames`.
+
+    Raises: BadPhoto when the scene's photo cannot be read.
     """
     rgb = load_photo(scene.path, long_side=None)
     pan = pan_over(rgb)

@@ -15,7 +15,10 @@ MATCHED = (
 
 
 def suites_table() -> str:
-    """Benchmarks and shared scenes as their hashed lists hold them; the warm-up suites."""
+    """Benchmarks and shared scenes as their hashed lists hold them; the warm-up suites.
+
+    Raises: BadSuite for a damaged list.
+    """
     notes = "\n".join([MATCHED, *_development_lists(), *_warm_ups()])
     parts = [align(_track_rows()), align(_task_rows()), notes]
     return "\n\n".join(parts)

@@ -42,6 +42,8 @@ def breakdown(table: "pd.DataFrame") -> "pd.DataFrame":
     `n` alone. Where there are sub-goals, `sub-goal 1`, ... count the failures by the first that
     failed. A method that ran with several policies on a suite has a row for each, and is named with
     it.
+
+    Raises: BadOutput when the table is older than the diagnosis.
     """
     episodes = _by_policy(diagnosed(table))
     if "case_confidence" not in episodes:  # no episode failed
@@ -153,6 +155,8 @@ def funnel_table(table: "pd.DataFrame") -> FunnelTable:
 
     An episode counts up to the first stage that it does not pass. Methods that ran with several
     policies are named as in `breakdown`.
+
+    Raises: BadOutput when the table is older than the diagnosis.
     """
     rows = []
     for (suite, method), part in _by_policy(diagnosed(table)).groupby(BY, sort=False):

@@ -74,7 +74,10 @@ def photo_crop(rgb: Rgb, mask: Mask) -> Rgb | None:
 
 @lru_cache(maxsize=1)
 def scenes(suite: str, task: str) -> tuple[Scene, ...]:
-    """The first views of a task's share of EPISODES, cut into objects."""
+    """The first views of a task's share of EPISODES, cut into objects.
+
+    Raises: UnknownName for a suite or a task that no registry holds; BadSuite for a damaged list.
+    """
     n = max(1, EPISODES // len(suites.suite(suite).tasks))
     found = []
     for views in opening_views(spread_evenly(suites.rows(suite, task), n), SIZE):

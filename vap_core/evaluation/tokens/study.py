@@ -56,7 +56,11 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Tokens:
-    """What is asked for: the suites, numbers of photos, epochs of a training, and where."""
+    """What is asked for: the suites, numbers of photos, epochs of a training, and where.
+
+    Raises: UnknownName for a place that is none of PLACES, or a suite that is no benchmark;
+        BadStudy for a suite for which no mini-pi0 ships.
+    """
 
     suites: tuple[str, ...] = tuple(suites.BENCHMARKS)
     ks: tuple[int, ...] = KS
@@ -77,7 +81,11 @@ class Tokens:
                 )
 
     def configuration(self) -> dict[str, Any]:
-        """What the results depend on, as JSON; suites and numbers of photos may be added to."""
+        """What the results depend on, as JSON; suites and numbers of photos may be added to.
+
+        Raises: BadPolicy for a shipped policy or model that is absent or damaged; BadSuite,
+            MissingWeights, as `Study.configuration`.
+        """
         policies = {name: fingerprint(shipped(name)) for name in suites.BENCHMARKS}
         models = {name: _model(_model_folder(name)).sha256() for name in suites.BENCHMARKS}
         tasks = suites.tasks_of(suites.BENCHMARKS)
@@ -122,7 +130,11 @@ def plan(asked: Tokens) -> list[Job]:
 
 
 def run_job(job: Job) -> dict[str, list[Row]]:
-    """Learn one token, and return the rows of every table."""
+    """Learn one token, and return the rows of every table.
+
+    Raises: BadPolicy for a shipped policy or model that is absent or damaged; BadMemory when a kind
+        of photo is missing; BadSuite for a damaged list.
+    """
     from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
 
     target = suites.rows(job.suite, job.task, 1)[0].target
