@@ -18,7 +18,10 @@ SIDE_PX = 800
 
 
 def drag_box(photo: Rgb, box: Box, label: str) -> "BBoxWidget":
-    """The photo with `box` on it; drag its corners or draw another one, then ask `dragged_box`."""
+    """The photo with `box` on it; drag its corners or draw another one, then ask `dragged_box`.
+
+    Raises: MissingPart: the extra `notebooks` is not installed.
+    """
     require("notebooks", "a box to drag")
     from jupyter_bbox_widget import BBoxWidget
 

@@ -43,7 +43,8 @@ class EpisodeChoice(Control):
         where = EpisodeChoice("vlabench", "select-cup", 0, "front")
         suite, task, number, camera = where.chosen
 
-    Raises: UnknownName for a default that there is not.
+    Raises: UnknownName for a default that there is not; MissingPart: the extra `notebooks` is not
+        installed.
     """
 
     def __init__(self, suite_name: str, task: str, number: int = 0, camera: str = "front") -> None:
@@ -87,6 +88,8 @@ class OwnPhotos(Control):
     """A photo of one's own, photos of the object alone, and what kind of thing it is.
 
     `folder` is where what is chosen is kept; nothing leaves this machine.
+
+    Raises: MissingPart: the extra `notebooks` is not installed.
     """
 
     def __init__(self, folder: Path, category: str) -> None:
@@ -125,6 +128,8 @@ class Abstention(Control):
     """How many references, and how large a lead of the vote: what is answered, and rightly.
 
     `choices` is the survey's table of that name.
+
+    Raises: MissingPart: the extra `notebooks` is not installed.
     """
 
     def __init__(self, choices: "pd.DataFrame", k: int = 5, threshold: float = 0.6) -> None:

@@ -68,7 +68,10 @@ def spaces(
 
 
 def paper_spaces() -> "pd.DataFrame":
-    """The paper's rows (tab:embedding_comparison), under our names."""
+    """The paper's rows (tab:embedding_comparison), under our names.
+
+    Raises: BadOutput, as `paper.ledger`.
+    """
     import pandas as pd
 
     table = ledger()

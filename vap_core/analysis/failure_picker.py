@@ -80,7 +80,10 @@ def label_names() -> list[str]:
 
 
 class FailurePicker(Control):
-    """Pick a failure, open it, label it. The first one stands as words where there is no kernel."""
+    """Pick a failure, open it, label it. The first one stands as words where there is no kernel.
+
+    Raises: MissingPart: the extra `notebooks` is not installed.
+    """
 
     def __init__(self, failures: Failures, labels: Path) -> None:
         require("notebooks", "a control")
@@ -125,7 +128,10 @@ class FailurePicker(Control):
         return failure_row(self.failures, self.failure.value)
 
     def viewer(self) -> Any:
-        """Rerun's viewer with the picked failure's recording at its deciding frame."""
+        """Rerun's viewer with the picked failure's recording at its deciding frame.
+
+        Raises: as `recording_to_show` and `view`.
+        """
         from vap_core.recording import view
 
         path, frame = recording_to_show(self.failures, self.failure.value)

@@ -206,6 +206,8 @@ def camera_images(row: EpisodeRow, steps: int = 0, size: int = 224) -> dict[str,
     """The images of the suite's cameras after `steps` control steps of the expert.
 
     The room is that of the row's variant, and the images pass the suite's sensor.
+
+    Raises: UnknownName, as `open_row`; OutOfReach when the expert cannot reach its next pose.
     """
     expert = Expert()
     with open_row(row, image_size=size) as env:
@@ -247,7 +249,10 @@ def same_layout(rows: Sequence[EpisodeRow], like: EpisodeRow) -> dict[str, Episo
 
 
 def bounds(path: Path) -> list[Score]:
-    """The scores of the episodes in a parquet file, in the order of the suites and their tasks."""
+    """The scores of the episodes in a parquet file, in the order of the suites and their tasks.
+
+    Raises: BadOutput when the file is absent or damaged.
+    """
 
     positions: dict[tuple[str, str], int] = {}
     for suite in BENCHMARKS.values():

@@ -75,6 +75,9 @@ def ground_image(
 
     With `tiles` the detector also looks at nine overlapping tiles; boxes that are given are taken
     as they are. Without `parsing` the rule parses.
+
+    Raises: as `load_own`, `Parsing.load` and `Attender.start`; BadMemory for a memory that is
+        damaged or of another encoder.
     """
     from vap_core.attend import Attender, Prompting
     from vap_core.memory import load_bank
@@ -105,7 +108,10 @@ def ground_image(
 
 
 def missing_threshold(stack: str) -> str:
-    """One line where a stack cannot say "not in view", with the remedy; else ""."""
+    """One line where a stack cannot say "not in view", with the remedy; else "".
+
+    Raises: as `load_own`.
+    """
     from vap_core.perception.stacks import load_own
 
     if load_own(stack).thresholds is not None:

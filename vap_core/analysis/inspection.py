@@ -94,6 +94,8 @@ def associations(stack: Stack, mine: PersonalObject, views: Sequence[View]) -> W
 
     The candidates are the same, the choices perhaps others. Geometry is used if all views have
     `optics`.
+
+    Raises: as `Attender.start`.
     """
     images = {view.camera: view.rgb for view in views}
     optics = {}
@@ -263,6 +265,8 @@ def contradicted(agreements: "pd.DataFrame") -> EpisodeRow | None:
 
     Grounded one by one they differ, and associated by geometry they do not. Where there is no such
     episode, the first whose views contradict each other; None where there is none of these.
+
+    Raises: UnknownName for an episode that the list of today does not have.
     """
     key = ["suite", "task", "episode"]
     alone = agreements[(agreements.associate == OFF) & (agreements.case == "case 2")]

@@ -75,7 +75,10 @@ def map_text(notebooks: dict[Path, dict[str, Any]]) -> str:
 
 
 def write_links(folder: Path) -> list[Path]:
-    """Write the map and every notebook's links; returns the notebooks that have changed."""
+    """Write the map and every notebook's links; returns the notebooks that have changed.
+
+    Raises: BadOutput where there is no notebook, or one is damaged.
+    """
     notebooks = {path: read_notebook(path) for path in notebook_files(folder)}
     titles = {path: notebook_title(notebook) for path, notebook in notebooks.items()}
     table = map_text(notebooks)

@@ -93,7 +93,10 @@ def write_pages(notebooks: Path, out: Path) -> list[Path]:
 
 
 def page_of(path: Path, out: Path) -> str:
-    """A notebook as the HTML page that stands in `out`; its recordings are copied there."""
+    """A notebook as the HTML page that stands in `out`; its recordings are copied there.
+
+    Raises: MissingPart: the extra `notebooks` is not installed.
+    """
     require("notebooks", "notebooks as pages")
     import nbformat
 

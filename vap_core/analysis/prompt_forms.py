@@ -36,7 +36,10 @@ ROUND_PX = 14
 
 
 def marked_frames(row: EpisodeRow) -> dict[str, Rgb]:
-    """The first camera's opening frame by arm, the default first, cut to the objects alike."""
+    """The first camera's opening frame by arm, the default first, cut to the objects alike.
+
+    Raises: UnknownName, as `open_row`.
+    """
     base = robots.get(suite(row.suite).robot).base_world
     with open_row(row) as env:
         camera = env.cameras()[0]
@@ -69,6 +72,8 @@ def tinted_frames(row: EpisodeRow) -> dict[str, Rgb]:
     """The first camera's opening frame without a tint, with the one chosen for it, and with red.
 
     Each has its tint as key; the frames are cut to the objects alike.
+
+    Raises: UnknownName, as `open_row`.
     """
     with open_row(row) as env:
         camera = env.cameras()[0].name

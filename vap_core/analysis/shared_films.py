@@ -31,7 +31,10 @@ def run_episode(
     method: str = "vap",
     policy: str = "mini-pi0",
 ) -> Episode:
-    """One episode of a list with its pictures kept; the objects are remembered in `bank`."""
+    """One episode of a list with its pictures kept; the objects are remembered in `bank`.
+
+    Raises: as `Study`, `register_personal` and `make_trial`.
+    """
     study = Study(((suite, task),), (method,), policy=policy)
     register_personal(study, bank)
     rows = [row for row in suites.rows(suite, task, None) if row.episode == number]

@@ -102,6 +102,8 @@ def area_table(episodes: "pd.DataFrame") -> "pd.DataFrame":
     """VAP's first steps on the WidowX, by whether the target stands where films showed objects.
 
     The list's grid has a column on either side beyond that area (training.recipe.FILMED).
+
+    Raises: BadSuite for a damaged list.
     """
     import pandas as pd
 
@@ -139,14 +141,20 @@ def pair_table(episodes: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def paper_pair(task: str) -> float:
-    """The paper's SR in % on one of the pairs, or their mean (P tab:multi_object)."""
+    """The paper's SR in % on one of the pairs, or their mean (P tab:multi_object).
+
+    Raises: BadOutput, as `paper.ledger`.
+    """
     published = paper.ledger()
     rates = published[published["table"] == "multi_object"].set_index("row")["value"]
     return float(rates.mean() if task == ALL else rates[PAPER_PAIRS[task]])
 
 
 def paper_sequence() -> dict[str, float]:
-    """The paper's shares in %: both steps, a wrong object, other failures (P tab:multiuser_seq)."""
+    """The paper's shares in %: both steps, a wrong object, other failures (P tab:multiuser_seq).
+
+    Raises: BadOutput, as `paper.ledger`.
+    """
     published = paper.ledger()
     shares = published[published["table"] == "multiuser_seq"].set_index("metric")["value"]
     return {
@@ -157,7 +165,10 @@ def paper_sequence() -> dict[str, float]:
 
 
 def paper_parser() -> "pd.DataFrame":
-    """The paper's parser, %: a line per task (P tab:llm_parser)."""
+    """The paper's parser, %: a line per task (P tab:llm_parser).
+
+    Raises: BadOutput, as `paper.ledger`.
+    """
     published = paper.ledger()
     rates = published[published["table"] == "llm_parser"]
     named = rates.assign(what=rates["column"] + ", " + rates["metric"])

@@ -24,20 +24,29 @@ READ = 0.9999
 def nearest_words(
     embedding: Float32[np.ndarray, " d"], model: Path, k: int = 6
 ) -> list[tuple[str, float]]:
-    """The words of a small model that are nearest to an embedding, and their cosines."""
+    """The words of a small model that are nearest to an embedding, and their cosines.
+
+    Raises: BadPolicy, as `open_table`.
+    """
     words = parse_json((model / "config.json").read_text())["words"]
     found = nearest_tokens(embedding, open_table(model), k)
     return [(words[token], cosine) for token, cosine in found]
 
 
 def longest_word(model: Path) -> float:
-    """The largest length of a row in a model's table of embeddings."""
+    """The largest length of a row in a model's table of embeddings.
+
+    Raises: BadPolicy, as `open_table`.
+    """
     table = open_table(model)
     return float(np.linalg.norm(table.block(0, table.shape[0]), axis=1).max())
 
 
 def rotation_deg(embedding: Float32[np.ndarray, " d"], model: Path, policy: Path) -> float:
-    """By how many degrees the rotation into a policy's space turns an embedding."""
+    """By how many degrees the rotation into a policy's space turns an embedding.
+
+    Raises: BadPolicy, as `align`.
+    """
     rotated = align(embedding, model, policy)
     lengths = np.linalg.norm(embedding) * np.linalg.norm(rotated)
     return float(np.degrees(np.arccos(np.clip(embedding @ rotated / lengths, -1, 1))))
@@ -48,6 +57,8 @@ def rotation_cosines(model: Path, policy: Path) -> dict[str, Float64[np.ndarray,
 
     They are copied as they are; rotated by the best orthogonal map over the shared vocabulary; or
     rotated by the map that was fitted without the word itself.
+
+    Raises: BadPolicy, as `shared_tables`.
     """
     source, target = shared_tables(model, policy)
     copied = paired_cosines(source, target)

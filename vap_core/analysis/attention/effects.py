@@ -22,6 +22,8 @@ def layer_effects(folder: Path) -> "pd.DataFrame":
 
     Two rows: the vision-language model, whose queries are patches and words, and the action expert.
     The input is noise under a real instruction.
+
+    Raises: BadPolicy, as `load_policy`.
     """
     import pandas as pd
 

@@ -61,7 +61,11 @@ def clearest(calls: Mapping[int, Mapping[str, Mapping[str, AttentionMap]]]) -> i
 
 
 def example_tiles(source: Path, line: Mapping[str, Any], memory: Path) -> list[Tile]:
-    """The tiles of an episode of `patterns.per_episode`, run again from the run of `source`."""
+    """The tiles of an episode of `patterns.per_episode`, run again from the run of `source`.
+
+    Raises: BadOutput when `source` is no run; BadStudy for an episode that it does not hold, and as
+        `run_again`.
+    """
     manifest, listed = _find(source, name_of(line), str(line.get("policy", "")))
     episode, frames = run_again(manifest, listed, memory)
     return strip(episode, frames, str(line["query"]))

@@ -27,7 +27,7 @@ Areas = Mapping[str, Heat]
 
 
 def kind_of(name: str, row: EpisodeRow) -> str:
-    """The region that an object belongs to."""
+    """The region that an object belongs to. Raises: UnknownName, BadObject, as `get_object`."""
     if name == row.target:
         return TARGET
     if name == row.goal:

@@ -105,7 +105,10 @@ def run_again(
 
 
 def strip(episode: Episode, frames: Sequence[Frame], query: str) -> list[Tile]:
-    """The tiles of one row: references, and FRAMES calls with the map of a query."""
+    """The tiles of one row: references, and FRAMES calls with the map of a query.
+
+    Raises: UnknownName, BadObject, as `get_object`.
+    """
     header = episode.header
     tiles = []
     for photo in reference_views(get_object(header.row.target))[:REFERENCES]:
