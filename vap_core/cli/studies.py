@@ -144,6 +144,8 @@ def named_suites(given: list[str]) -> tuple[list[str], tuple[str, ...]]:
     """The suites that are named, each once, and the files of own suites among them.
 
     "all" names every benchmark; a name that ends in .py is a file, which is executed.
+
+    Raises: BadSuite for a file that is no suite.
     """
     from vap_core.simulation.suites import BENCHMARKS, open_file
 
@@ -184,6 +186,8 @@ def study_of(
     """The study of some tasks.
 
     Without `methods`, they are generic, and vap unless the policy reads the simulator.
+
+    Raises: as `Study`.
     """
     from vap_core.evaluation.policy_names import PRIVILEGED
     from vap_core.evaluation.study import Study
@@ -219,7 +223,11 @@ def run_study(
     video: bool = False,
     attention: str = "",
 ) -> None:
-    """Run a study, on the Ray cluster at `address` if there is one, and print its table."""
+    """Run a study, on the Ray cluster at `address` if there is one, and print its table.
+
+    Raises: BadStudy for options that exclude each other; UnknownName, as `named_queries`;
+        BadCluster when there is none at `address`; BadOutput, WorkerDied, as `engine.run`.
+    """
     from vap_core.base.errors import BadStudy
     from vap_core.evaluation.cluster import ray_executor
     from vap_core.evaluation.engine import run

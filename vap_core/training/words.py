@@ -75,7 +75,10 @@ def vocabulary() -> tuple[str, ...]:
 
 @cache
 def pattern_words(name: str) -> frozenset[str]:
-    """The word for an object's motif; nothing for one without a texture."""
+    """The word for an object's motif; nothing for one without a texture.
+
+    Raises: UnknownName, BadObject, as `objects.get_object`.
+    """
     texture = objects.get_object(name).texture
     if not isinstance(texture, Texture):
         return frozenset()

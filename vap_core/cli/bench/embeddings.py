@@ -32,7 +32,10 @@ LIMIT_GB = 4.0
 
 
 def measure(quick: bool = False) -> Measurement:
-    """Compare random tables; about ten minutes of one core and 2 GB of disk, `quick` seconds."""
+    """Compare random tables; about ten minutes of one core and 2 GB of disk, `quick` seconds.
+
+    Raises: WorkerDied.
+    """
     size = QUICK if quick else SIZE
     found = []
     for label, noise in NOISE.items():

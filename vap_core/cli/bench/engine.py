@@ -93,7 +93,11 @@ def seconds_beyond_start_up(arrivals: Sequence[Arrival], workers: int) -> float:
 
 
 def run(workers: int = 2, quick: bool = False) -> str:
-    """Measure and report it; about five minutes on two cores, `quick` a smoke test."""
+    """Measure and report it; about five minutes on two cores, `quick` a smoke test.
+
+    Raises: BadCluster: ray is not installed; BadStudy for so many `workers` that no job is left
+        beyond start-up.
+    """
     from tqdm import tqdm
 
     study = _study(quick)

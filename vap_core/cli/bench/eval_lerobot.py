@@ -69,7 +69,10 @@ class LoopProcess:
             self._process.communicate()
 
     def run(self, **arm: Any) -> Cost:
-        """One evaluation of all episodes: n_envs, in_processes, threads, videos."""
+        """One evaluation of all episodes: n_envs, in_processes, threads, videos.
+
+        Raises: BadStudy when the process has ended.
+        """
         assert self._process.stdin is not None
         # Where the process has died, the answer says why.
         with suppress(BrokenPipeError):
@@ -93,6 +96,8 @@ def lerobot_arms(
     """lerobot as it comes (one environment, videos of the first ten episodes) and at its best.
 
     Of the checkout `earlier` first, where there is one of another version.
+
+    Raises: BadStudy, as `LoopProcess`.
     """
     checkouts = [HERE]
     if earlier is not None and code_version(earlier) != code_version(HERE):

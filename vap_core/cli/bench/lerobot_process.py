@@ -50,7 +50,10 @@ def main() -> None:
 
 
 def prepare(plan: dict[str, Any], toy: Toy, folder: Path) -> None:
-    """The memory of the personal object, a toy PI0, and the same one with VAP for lerobot."""
+    """The memory of the personal object, a toy PI0, and the same one with VAP for lerobot.
+
+    Raises: BadOutput when `folder` cannot be written, or holds them already.
+    """
     suite, task = plan["suite"], plan["task"]
     stack = load_stack("embedded")
     row = suites.rows(suite, task)[0]

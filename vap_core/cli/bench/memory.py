@@ -23,7 +23,10 @@ Series = list[tuple[int, float]]
 
 
 def measure(episodes: int, every: int, folder: Path) -> Series:
-    """The memory of a fresh process at its start and after every so many episodes."""
+    """The memory of a fresh process at its start and after every so many episodes.
+
+    Raises: WorkerDied.
+    """
     plan = (episodes, every, folder)
     _, series = next(processes.results(_run, [plan], 1, "--workers"))
     return series

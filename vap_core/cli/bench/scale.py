@@ -80,7 +80,10 @@ CONDITIONS = (
 
 
 def measure(episodes: int = 200, quick: bool = False) -> Measurement:
-    """All axes and the memory over `episodes`; five minutes on two cores, `quick` one."""
+    """All axes and the memory over `episodes`; five minutes on two cores, `quick` one.
+
+    Raises: WorkerDied.
+    """
     repeats = 1 if quick else REPEATS
     steps = 2 if quick else STEPS
     with tempfile.TemporaryDirectory() as scratch:

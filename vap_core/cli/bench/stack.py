@@ -46,6 +46,9 @@ def run(kind: str, *, random: bool = False, device: str | None = None) -> str:
     """Time every part and report it: elapsed time on a GPU, CPU time of one thread otherwise.
 
     Large models need several minutes on a CPU.
+
+    Raises: UnknownName: no such stack or device; MissingPart, MissingWeights, BadOutput,
+        as `load_stack`.
     """
     import torch
 

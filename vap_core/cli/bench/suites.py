@@ -30,7 +30,10 @@ LIST = "simpler-bridge"
 
 
 def run(workers: int = 2) -> str:
-    """Measure every benchmark, then one whole list with its expert; takes about two minutes."""
+    """Measure every benchmark, then one whole list with its expert; takes about two minutes.
+
+    Raises: WorkerDied.
+    """
     rows = [["suite", "part", "CPU ms", "x one physics step of 2 ms"]]
     limits = []
     for suite in suites.BENCHMARKS.values():

@@ -139,7 +139,7 @@ def write(
 def shoot_stages(
     suite_name: str, stages: int, cache: Path, *, seed: int = 0, jobs: int | None = None
 ) -> None:
-    """Shoot the stages that `cache` lacks, in processes."""
+    """Shoot the stages that `cache` lacks, in processes. Raises: WorkerDied, as `results`."""
     from tqdm import tqdm
 
     missing = []
@@ -183,7 +183,10 @@ def features(
 
 
 def generic_instruction(known: Suite, task: str) -> str:
-    """The task in generic words."""
+    """The task in generic words.
+
+    Raises: UnknownName for a task that the suite's films do not show.
+    """
     return filmed_task(known.name, task).instruction.replace("my ", "the ", 1)
 
 

@@ -171,7 +171,10 @@ def row(
 
 
 def films(suite_name: str, seed: int, number: int) -> list[Film]:
-    """The successful episodes of one stage."""
+    """The successful episodes of one stage.
+
+    Raises: UnknownName for a suite that no registry holds.
+    """
     known = suite(suite_name)
     rng = np.random.default_rng([71, seed, *suite_name.encode(), number])
     miss_rng = np.random.default_rng([72, seed, *suite_name.encode(), number])
@@ -206,6 +209,9 @@ def shoot(
     """The expert's episode, filmed; None when it fails.
 
     With `slips`, the film begins where a first grasp has missed.
+
+    Raises: OutOfReach when the expert cannot reach its next pose; UnknownName when `start` places
+        an object that the scene lacks.
     """
     env = make_env(scene, known.name, image_size=SEEN)
     expert = Expert()
@@ -283,7 +289,10 @@ def stage_file(folder: Path, suite_name: str, seed: int, number: int) -> Path:
 
 
 def cost_s(folder: Path, suite_name: str, seed: int, number: int) -> float:
-    """CPU seconds that a stage in `folder` took to film."""
+    """CPU seconds that a stage in `folder` took to film.
+
+    Raises: BadOutput when its file is absent or damaged.
+    """
     path = stage_file(folder, suite_name, seed, number)
     with kept_arrays(path, "train") as arrays:
         return float(arrays["cpu_s"])

@@ -256,7 +256,10 @@ def stage_file(folder: Path, seed: int, number: int, held_out: bool) -> Path:
 
 
 def cost_s(folder: Path, seed: int, number: int, held_out: bool) -> float:
-    """CPU seconds that a stage in `folder` took to render."""
+    """CPU seconds that a stage in `folder` took to render.
+
+    Raises: BadOutput when its file is absent or damaged.
+    """
     path = stage_file(folder, seed, number, held_out)
     with kept_arrays(path, "train") as file:
         return float(file["cpu_s"])

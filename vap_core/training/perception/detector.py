@@ -203,7 +203,10 @@ def sample_phrases(
 def fit_detector(
     views: Sequence[tuple[UInt16[np.ndarray, " f"], Objects]], categories: Sequence[str], run: Run
 ) -> DetectHead:
-    """Train the head on `views`: features, as `featurise` keeps them, and objects."""
+    """Train the head on `views`: features, as `featurise` keeps them, and objects.
+
+    Raises: BadOutput, as `fit`; MissingWeights, as `embed_text`.
+    """
     phrases: list[str] = []
     for category in categories:
         phrases += training_phrases(category)

@@ -148,7 +148,10 @@ def contrastive_loss(cosine: Float[Tensor, "a k"], same: Bool[Tensor, "a k"]) ->
 
 
 def fit_instance_head(stages: Sequence[StageCrops], run: Run) -> InstanceHead:
-    """Train the head: portraits find crops of their object in views, and these find portraits."""
+    """Train the head: portraits find crops of their object in views, and these find portraits.
+
+    Raises: BadOutput, as `fit`.
+    """
     # Initial weights only; every other draw comes from the epoch's stream.
     torch.manual_seed(run.seed)
     head = InstanceHead()

@@ -108,7 +108,10 @@ def mask_loss(logits: Float[Tensor, "n h w"], wanted: Float[Tensor, "n h w"]) ->
 
 
 def fit_segmenter(stages: Sequence[Shots], crops_per_epoch: int, run: Run) -> MaskHead:
-    """Train the head on windows around the objects of the stages' views."""
+    """Train the head on windows around the objects of the stages' views.
+
+    Raises: BadOutput, as `fit`; MissingWeights when the backbone's package is not installed.
+    """
     # Initial weights only; every other draw comes from the epoch's stream.
     torch.manual_seed(run.seed)
     head = MaskHead()

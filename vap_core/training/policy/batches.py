@@ -74,6 +74,8 @@ class Frames:
     """The frames of some films of one suite, to draw batches from.
 
     Every task is drawn as often, and in it a frame as often as `emphasis` says.
+
+    Raises: UnknownName for a recipe of a suite that no registry holds.
     """
 
     def __init__(

@@ -74,7 +74,10 @@ class Command:
 
 
 def command(film: Film, t: int, recipe: Recipe, known: Known, rng: np.random.Generator) -> Command:
-    """Step t of a film, which has a picture, with a command that its action answers."""
+    """Step t of a film, which has a picture, with a command that its action answers.
+
+    Raises: UnknownName for a film of a task that the recipe's suite does not film.
+    """
     task = filmed_task(recipe.suite, film.task)
     pairs = FILMED[recipe.suite].pairs
     things = nameable(film, recipe.suite)
@@ -144,7 +147,10 @@ def nameable(film: Film, suite_name: str) -> list[int]:
 
 
 def near(film: Film, t: int, suite_name: str, rivals: Sequence[int]) -> bool:
-    """Whether the hand is nearer to the target than to every rival, seen from above."""
+    """Whether the hand is nearer to the target than to every rival, seen from above.
+
+    Raises: UnknownName for a suite that no registry holds.
+    """
     robot = robots.get(suite(suite_name).robot)
     hand = film.state[t, :2] + robot.base_world[:2]
     distances = np.linalg.norm(film.places[t, :, :2] - hand, axis=1)
@@ -166,7 +172,10 @@ def phrase_instruction(task: Task, word: str, rng: np.random.Generator) -> str:
 
 
 def phrase_pair(task: Task, word: str, goal_word: str) -> str:
-    """A pair's instruction with both its objects named by their colours, as VAP does it."""
+    """A pair's instruction with both its objects named by their colours, as VAP does it.
+
+    Raises: UnknownName, BadObject, as `get_object`.
+    """
     text = task.instruction.replace("my ", f"the {word} ", 1)
     goal = get_object(task.goal).category
     return re.sub(rf"\b\w+ (?={goal}$)", f"the {goal_word} ", text)

@@ -63,7 +63,10 @@ class Tinting:
 
 
 class ProbePrompter:
-    """Colours the target by ground-truth masks at every step, and says which object is meant."""
+    """Colours the target by ground-truth masks at every step, and says which object is meant.
+
+    Raises: UnknownName, as `parse_way`.
+    """
 
     needs_truth: Literal["never", "start", "always"] = "always"
     highlights = False
@@ -236,6 +239,8 @@ def of_shipped(table: "pd.DataFrame") -> "pd.DataFrame":
     """The episodes of the policies that ship; a suite without any keeps those of others.
 
     The column `whose` holds the label of such others, and nothing for a policy that ships.
+
+    Raises: BadPolicy when a policy that ships lacks a file, or one is damaged.
     """
     labels = {}
     for name in table["suite"].unique():

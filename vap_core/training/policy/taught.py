@@ -38,7 +38,10 @@ LEAST_ACCURACY = 0.75
 
 
 def crews(films: Sequence[Film], count: int) -> list[tuple[str, ...]]:
-    """The look-alikes of the first films, a tuple a stage, `count` objects in all or a few more."""
+    """The look-alikes of the first films, a tuple a stage, `count` objects in all or a few more.
+
+    Raises: UnknownName, BadObject, as `objects.get_object`.
+    """
     found: dict[tuple[str, ...], None] = {}
     for film in films:
         category = objects.get_object(film.names[0]).category

@@ -75,7 +75,10 @@ class Films:
 
 
 def configuration(recipe: Recipe, state_size: int, action_size: int) -> MiniPI0Config:
-    """The policy's configuration for states and actions of these sizes."""
+    """The policy's configuration for states and actions of these sizes.
+
+    Raises: UnknownName for a recipe of a suite that no registry holds.
+    """
     from lerobot.configs import FeatureType, PolicyFeature
 
     inputs = {}

@@ -86,6 +86,8 @@ def ask(
     """Paint some objects of a view, where `ids` is i + 1 at names[i], and ask `n` questions.
 
     `looks` are the captioner's descriptions of the objects.
+
+    Raises: UnknownName, BadObject, as `get_object`.
     """
     images = image[None]
     visible = _visible_objects(ids, names, looks)
