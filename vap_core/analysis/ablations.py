@@ -49,6 +49,8 @@ def ablation_results(episodes: "pd.DataFrame", suite: str = "") -> Results:
 
     Of the suites that an ablation runs on where none is named, or of `suite` alone. Those of
     policies are not among them (`policy_results`, `across_policies`).
+
+    Raises: as `arm_results`.
     """
     found = {}
     for name, ablation in ABLATIONS.items():

@@ -88,7 +88,7 @@ def paper_spaces() -> "pd.DataFrame":
 
 
 def report(table: "pd.DataFrame") -> str:
-    """The table as text, with the paper's below it."""
+    """The table as text, with the paper's below it. Raises: BadOutput, as `paper.ledger`."""
     rows = [HEADER]
     for row in table.to_dict("records"):
         rows.append(_cells(row))

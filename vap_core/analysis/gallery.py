@@ -219,7 +219,10 @@ def camera_images(row: EpisodeRow, steps: int = 0, size: int = 224) -> dict[str,
 
 
 def frame_sheet(episodes: Sequence[Sequence[EpisodeRow]]) -> dict[str, list[Tile]]:
-    """One row per suite: the opening frame of each of its `episodes`, by every camera."""
+    """One row per suite: the opening frame of each of its `episodes`, by every camera.
+
+    Raises: as `camera_images`.
+    """
     sheet = {}
     for rows in episodes:
         tiles = []

@@ -60,7 +60,7 @@ def marked_frames(row: EpisodeRow) -> dict[str, Rgb]:
 
 
 def forms_figure(row: EpisodeRow) -> "Figure":
-    """A sheet of `marked_frames`, each with the name of its arm."""
+    """A sheet of `marked_frames`, each with the name of its arm. Raises: as `marked_frames`."""
     from vap_core.analysis.plots import Tile, sheet
 
     tiles = [Tile(frame, arm) for arm, frame in marked_frames(row).items()]
@@ -90,7 +90,7 @@ def tinted_frames(row: EpisodeRow) -> dict[str, Rgb]:
 
 
 def tints_figure(row: EpisodeRow) -> "Figure":
-    """A sheet of `tinted_frames`, each with its tint."""
+    """A sheet of `tinted_frames`, each with its tint. Raises: as `tinted_frames`."""
     from vap_core.analysis.plots import Tile, sheet
 
     tiles = [Tile(frame, label) for label, frame in tinted_frames(row).items()]

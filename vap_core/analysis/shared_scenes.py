@@ -124,7 +124,10 @@ def area_table(episodes: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def pair_table(episodes: "pd.DataFrame") -> "pd.DataFrame":
-    """Two targets at once: a line per policy, method and task, the paper's SR in % beside."""
+    """Two targets at once: a line per policy, method and task, the paper's SR in % beside.
+
+    Raises: BadOutput, as `paper.ledger`.
+    """
     import pandas as pd
 
     lines = []
@@ -209,7 +212,10 @@ def parser_table(answers: "pd.DataFrame", part: str = "test") -> "pd.DataFrame":
 
 
 def parser_figure(table: "pd.DataFrame", title: str = "") -> "Figure":
-    """Accuracy of every parser by kind, 95 % over families; the paper's range of tasks shaded."""
+    """Accuracy of every parser by kind, 95 % over families; the paper's range of tasks shaded.
+
+    Raises: BadOutput, as `paper.ledger`.
+    """
     figure = empty_figure(6.4, 3.2)
     axes = figure.subplots()
     theirs = paper_parser()["implicit, parsing accuracy"]
@@ -233,7 +239,10 @@ def parser_figure(table: "pd.DataFrame", title: str = "") -> "Figure":
 
 
 def shared_figure(episodes: "pd.DataFrame", title: str = "") -> "Figure":
-    """Success in all tasks of each suite, and of the first step alone; diamonds: the paper's."""
+    """Success in all tasks of each suite, and of the first step alone; diamonds: the paper's.
+
+    Raises: BadOutput, as `paper.ledger`.
+    """
     sequences = sequence_table(episodes)
     sequences = sequences[sequences["task"] == ALL]
     pairs = pair_table(episodes)

@@ -190,7 +190,7 @@ def all_readings() -> list[Reading]:
 
 
 def readings_of_lists(digests: Iterable[str]) -> list[Reading]:
-    """All readings of the lists with these digests."""
+    """All readings of the lists with these digests. Raises: BadOutput, as `read_log`."""
     wanted = {digest[:SHORT] for digest in digests}
     return [reading for reading in all_readings() if reading.list in wanted]
 

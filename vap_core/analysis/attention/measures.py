@@ -36,7 +36,7 @@ def kind_of(name: str, row: EpisodeRow) -> str:
 
 
 def patch_areas(row: EpisodeRow, truth: Truth, camera: str, side: int) -> Areas:
-    """The share of every patch of a view that each region covers."""
+    """The share of every patch of a view that each region covers. Raises: as `kind_of`."""
     masks = truth.masks[camera]
     areas: dict[str, np.ndarray] = {}
     for region in REGIONS:

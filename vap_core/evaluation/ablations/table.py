@@ -72,6 +72,8 @@ def arm_results(ablation: Ablation, episodes: "pd.DataFrame") -> list[ArmResult]
 def policy_results(ablation: Ablation, episodes: "pd.DataFrame") -> dict[str, list[ArmResult]]:
     """The methods of an ablation of policies, by the label of the policy that was run; each method
     against the first one with the same policy.
+
+    Raises: as `arm_results`.
     """
     found = {}
     for label, checkpoint in ablation.policies.items():
@@ -84,6 +86,8 @@ def policy_results(ablation: Ablation, episodes: "pd.DataFrame") -> dict[str, li
 def across_policies(ablation: Ablation, episodes: "pd.DataFrame") -> list[ArmResult]:
     """The last method of an ablation of policies; its arms are the labels of the policies, each
     against the first one on the same episodes.
+
+    Raises: as `arm_results`.
     """
     import pandas as pd
 

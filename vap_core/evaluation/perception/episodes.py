@@ -30,6 +30,8 @@ def survey(episode: Sequence[View], stack: Stack, ks: Sequence[int] = KS) -> Tab
     """Every table of `survey_view` with its keys, and "agreements".
 
     "agreements" has a row per way to associate the views; none for a single view.
+
+    Raises: as `registered_object` and `agreements`.
     """
     target = episode[0].row.target
     memory = {}

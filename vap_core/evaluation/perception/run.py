@@ -139,7 +139,10 @@ def plan(asked: Survey) -> list[Job]:
 
 
 def run_job(job: Job) -> Tables:
-    """Do one job in this process, and return its part of the tables."""
+    """Do one job in this process, and return its part of the tables.
+
+    Raises: as `tracking.track_episode`, `opening_views` and `survey`.
+    """
     stack = _load_stack(job.stack)
     if isinstance(job.what, tracking.Job):
         return {"tracks": tracking.track_episode(job.what, stack)}

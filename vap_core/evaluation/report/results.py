@@ -54,7 +54,10 @@ def results(runs: Runs) -> "pd.DataFrame":
 
 
 def paper_results(runs: Runs) -> "pd.DataFrame":
-    """The paper's main results, without tasks that a run plays with an object of one's own."""
+    """The paper's main results, without tasks that a run plays with an object of one's own.
+
+    Raises: BadOutput, as `paper.ledger`.
+    """
     import pandas as pd
 
     published = paper.main_results()

@@ -83,6 +83,8 @@ def results_section(lines: "pd.DataFrame", published: "pd.DataFrame") -> str:
     """A table per track, and footnotes to the paper's numbers per suite.
 
     `published` is of `results.paper_results`.
+
+    Raises: BadOutput, as `paper.ledger`.
     """
     parts = ["## Results", RESULTS_NOTE]
     for suite, of_suite in lines.groupby("suite", sort=False):

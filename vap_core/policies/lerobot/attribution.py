@@ -31,6 +31,8 @@ def gradient_maps(
 
     The scalar is half the squared length of the normalised actions that are executed. Activations
     are the patches' embeddings, as the vision-language model reads them.
+
+    Raises: BadPolicy when the inputs do not fit.
     """
     batch, noise = policy.prepare([state], [policy_input])
     activations: list[torch.Tensor] = []
@@ -61,6 +63,8 @@ def masking_maps(policy: LeRobot, state: LeRobotState, policy_input: PolicyInput
     """Change of the normalised actions that are executed when a patch is masked, by camera.
 
     A patch is painted with the mean colour of its view.
+
+    Raises: BadPolicy when the inputs do not fit.
     """
     side = layout(policy.policy, policy.cameras()).side
     plain = _planned(policy, state, [policy_input])

@@ -187,6 +187,8 @@ def sample_phrases(
     """One phrase per category and some that name nothing: what each names, and its embedding.
 
     The embeddings carry a little noise.
+
+    Raises: MissingWeights, as `embed_text`.
     """
     asked: list[str | None] = [*categories]
     asked += [None] * negatives

@@ -102,7 +102,7 @@ class Frames:
         self.share = self.totals / np.bincount(task_of, self.totals)[task_of] / len(tasks)
 
     def draw(self, n: int, rng: np.random.Generator) -> Batch:
-        """A batch of `n` frames, drawn anew."""
+        """A batch of `n` frames, drawn anew. Raises: as `command`."""
         commands: list[Command] = []
         states = []
         chunks = []

@@ -145,6 +145,8 @@ def collate(
     """One batch: views drawn anew, coloured anew, with questions of their own.
 
     `looks` describes the objects, `number` gives the token of each word.
+
+    Raises: as `ask`.
     """
     images = []
     questions = []
