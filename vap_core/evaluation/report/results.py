@@ -29,6 +29,8 @@ def results(runs: Runs) -> "pd.DataFrame":
     `sr_high` are Wilson's, `sr_cp_*` Clopper and Pearson's. `sr_layout_*` is the cluster bootstrap
     over starting layouts where a layout was run more than once, else nan. `bound` marks a method or
     policy that reads the simulator. `paper_*` are the paper's numbers.
+
+    Raises: BadOutput, as `paper.ledger`.
     """
     import pandas as pd
 
