@@ -12,6 +12,8 @@ from vap_core.evaluation.ablations.table import policy_results
 from vap_core.evaluation.publish import read_runs
 from vap_core.evaluation.report.runs import load_runs
 from vap_core.evaluation.statistics import ALL_TASKS, compare
+from vap_core.training.recipe import RECIPES
+from vap_core.training.words import PAINTS
 
 RESULTS = ROOT / "data" / "results"
 BENCHMARKS = PAGES["docs/benchmarks.md"]
@@ -138,3 +140,21 @@ def test_no_p_is_corrected_over_a_family_that_no_command_prints() -> None:
     of_fractal = of_fractal[of_fractal.task == ALL_TASKS].set_index("methods").p_holm
     for words in ("hard-short", "hard-long", "soft"):
         assert of_fractal[frozenset(("generic", words))] == 1
+
+
+def test_the_held_out_tints_are_called_unseen_as_tints_alone() -> None:
+    """Objects of the training are painted in both, and its commands name them."""
+    held_out = {name for recipe in RECIPES.values() for name in recipe.held_out_tints}
+    assert held_out == {"magenta", "yellow"}
+    assert held_out <= {paint.name for paint in PAINTS}
+    caveat = "held out as tints (as paint, and by name, they are in the training)"
+    prose = " ".join(BENCHMARKS.split())
+    assert prose.count(caveat) == 3
+    assert "a test of unseen tints only" in prose
+    for page, text in PAGES.items():
+        if page == "CHANGELOG.md":
+            continue
+        prose = " ".join(text.split())
+        for found in re.finditer(r"[Mm]agenta(?:,| and) yellow", prose):
+            around = prose[found.start() : found.end() + 40]
+            assert "tints" in around, f"{page}: {around}"
