@@ -6,9 +6,10 @@ from functools import cache
 import pandas as pd
 import pytest
 
-from tests.pages import PAGES, ROOT
+from tests.pages import PAGES, ROOT, table
 from vap_core.evaluation.ablations.arms import ABLATIONS
 from vap_core.evaluation.ablations.table import policy_results
+from vap_core.evaluation.metrics import rate
 from vap_core.evaluation.publish import read_runs
 from vap_core.evaluation.report.runs import load_runs
 from vap_core.evaluation.statistics import ALL_TASKS, compare
@@ -158,3 +159,32 @@ def test_the_held_out_tints_are_called_unseen_as_tints_alone() -> None:
         for found in re.finditer(r"[Mm]agenta(?:,| and) yellow", prose):
             around = prose[found.start() : found.end() + 40]
             assert "tints" in around, f"{page}: {around}"
+
+
+def test_the_bounds_have_the_intervals_of_their_counts() -> None:
+    _, *body = table("| suite | expert (reads the simulator), SR [95 %]")
+    for _, *cells in body:
+        for cell in cells:
+            k, n, text = re.fullmatch(r"(\d+) of (\d+), (.+)", cell).groups()
+            assert text == str(rate(int(k), int(n)))
+
+
+def test_no_zero_of_the_shared_scenes_hides_a_success() -> None:
+    """0 in the table is 0 episodes: a rate of 1 of 72 has a bound above it."""
+    _, *body = table("| suite | method | n | both steps, or SR")
+    played = pd.concat([rows for _, rows in read_runs(RESULTS / "shared.parquet")])
+    policies = {
+        "generic": ("mini_pi0:mini-pi0-tabletop", "mini_pi0:mini-pi0-simpler-bridge"),
+        "VAP": ("mini_pi0:mini-pi0-tabletop", "mini_pi0:mini-pi0-simpler-bridge"),
+        "VAP, scripted policy": ("scripted",),
+        "VAP, taught pairs": ("mini_pi0:mini-pi0-shared-pair",),
+    }
+    suite = ""
+    for named, cell, n, success, *_ in body:
+        suite = named.strip("`") or suite
+        method = cell.strip("*")
+        rows = played[(played.suite == suite) & (played.method == method.split(",")[0].lower())]
+        rows = rows[rows.policy.str.split("@").str[0].isin(policies[method])]
+        assert len(rows) == int(n)
+        told = str(rate(int(rows.success.sum()), len(rows))).replace(" %", "")
+        assert success.split(" · ")[0].strip("*") == told
