@@ -188,3 +188,10 @@ def test_no_zero_of_the_shared_scenes_hides_a_success() -> None:
         assert len(rows) == int(n)
         told = str(rate(int(rows.success.sum()), len(rows))).replace(" %", "")
         assert success.split(" · ")[0].strip("*") == told
+
+
+def test_the_first_policy_of_fractal_places_as_many_bottles_as_its_table_holds() -> None:
+    rows = pd.read_parquet(RESULTS / "first_policy.parquet")
+    rows = rows[(rows.task == "move-bottle-near-coke-can") & (rows.method == "vap")]
+    held = f"in {rows.success.sum()} of {len(rows)} episodes of `data/results/first_policy.parquet`"
+    assert held in " ".join(PAGES["docs/policy.md"].split())
