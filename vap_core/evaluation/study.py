@@ -32,7 +32,7 @@ from vap_core.policies.names import check_policy_name, label_of
 from vap_core.rollout.loop import Follow
 from vap_core.simulation import robots, suites
 from vap_core.simulation.assets.objects import get_object
-from vap_core.simulation.cameras import RIGS
+from vap_core.simulation.cameras import RIGS, SHIPPED_RIGS
 from vap_core.simulation.scenes import Meshes
 from vap_core.simulation.suites import starts
 from vap_core.simulation.suites.variants import VARIANTS
@@ -232,7 +232,15 @@ def _check_policy(study: Study) -> None:
 
 
 def _world_digest(study: Study) -> str:
-    found = hashlib.sha256(_canonical((RIGS, VARIANTS)))
+    """Over the cameras that ship and those of the study's robots, styles, suites, robots, objects.
+
+    What an own suite's file enters for its own robot changes no other suite's digest.
+    """
+    rigs = dict(SHIPPED_RIGS)
+    for suite, _ in study.tasks:
+        robot_name = suites.suite(suite).robot
+        rigs[robot_name] = RIGS[robot_name]
+    found = hashlib.sha256(_canonical((rigs, VARIANTS)))
     for suite, task in study.tasks:
         known = suites.suite(suite)
         robot = robots.get(known.robot)
