@@ -145,7 +145,12 @@ def load_random(name: str, device: str | None = None) -> Stack:
 
 
 def _mixture(name: str, loaded: dict[str, Any]) -> Stack:
-    """The loaded fields, and the embedded stack's where its parts are in the mixture."""
-    if EMBEDDED in parts_of(name).values():
-        return replace(load_embedded(), name=name, **loaded)
-    return Stack(name=name, **loaded)
+    """The loaded fields, and the embedded stack's where its parts are in the mixture.
+
+    The rule is that of `Stack.with_parts`; fields that are loaded as None are empty.
+    """
+    if EMBEDDED not in parts_of(name).values():
+        return Stack(name=name, **loaded)
+    parts = {field: part for field, part in loaded.items() if part is not None}
+    empty = {field: None for field, part in loaded.items() if part is None}
+    return replace(load_embedded().with_parts(name, **parts), **empty)

@@ -15,8 +15,9 @@ from vap_core.evaluation import store
 from vap_core.evaluation.measurements import read_json_part, write_json_part
 from vap_core.evaluation.photos.run import TABLE, measure_photos
 from vap_core.perception.embedded.weights import weights_sha256
+from vap_core.perception.foundation.sources import needs_photos
 from vap_core.perception.foundation.store import store_folder
-from vap_core.perception.kept_thresholds import keep_thresholds
+from vap_core.perception.kept_thresholds import keep_command, keep_thresholds
 from vap_core.perception.protocols import Stack
 from vap_core.perception.stacks import load_stack, ships_thresholds
 
@@ -58,12 +59,19 @@ def calibrate(
 
 
 def refuse_keep(stack_name: str, photos: Sequence[Path] = ()) -> None:
-    """Raises: BadOutput for a stack that ships thresholds, unless there are own photos."""
-    if ships_thresholds(stack_name) and not photos:
+    """Raises: BadOutput without own photos, for a stack that ships thresholds or needs photos."""
+    if photos:
+        return
+    if ships_thresholds(stack_name):
         raise BadOutput(
             f"calibrate: the stack {stack_name} ships its thresholds, so that results stay "
             "comparable; name photos of your own with --photos to keep a threshold for photos, or "
             "leave --keep out."
+        )
+    if needs_photos(stack_name):
+        raise BadOutput(
+            f"calibrate: the stack {stack_name} has a threshold of its own for photos, and rendered "
+            f"scenes show too few objects as photos do; {keep_command(stack_name, photos=True)}."
         )
 
 
