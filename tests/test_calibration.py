@@ -247,7 +247,8 @@ def test_photos_are_measured_without_scenes(tmp_path, monkeypatch):
     with pytest.raises(BadOutput, match="no scenes and no photos"):
         run.calibrate("toy", tmp_path / "none", scenes=0, progress=False)
 
-    def measured(folder, out, stack, progress):
+    def measured(folder, out, stack, kept, progress):
+        assert not kept
         rows = {
             "scene": [str(i) for i in range(40)],
             "familiar": False,
