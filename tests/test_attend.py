@@ -38,6 +38,16 @@ def test_the_right_one_is_tinted_and_named() -> None:
     assert (grounding.winner, ballot.votes.tolist(), ballot.margin) == (1, [0, 3, 0], 1.0)
     assert attended.text == "bring the red cup"
     assert (attended.images["front"] == tint(LINE, where(LINE, TEAL), RED)).all()
+    assert [e.text for e in attended.events] == ["front: elects candidate 1 for mug with 3/3 votes"]
+
+
+def test_a_wrong_vote_is_not_said_to_be_the_object() -> None:
+    """Only a look-alike is in view: it is elected, and no event says that it is the mug."""
+    alone = scene([(4, 20, GREY)])
+    _, attended = Attender(TOYS, MEMORY).start({"front": alone}, "bring my cup")
+    (event,) = attended.events
+    assert event.text == "front: elects candidate 0 for mug with 3/3 votes"
+    assert "mug is" not in event.text
 
 
 def test_tracking_follows_and_never_detects_again() -> None:
@@ -376,7 +386,7 @@ def test_views_by_themselves_contradict_each_other_and_together_agree() -> None:
     said = [e.text for e in attended.events]
     assert any(
         text.startswith(
-            "side: mug is candidate 1 with 0/3 votes by association, over candidate 0 with 3"
+            "side: takes candidate 1 for mug with 0/3 votes by association, over candidate 0 with 3"
         )
         for text in said
     )

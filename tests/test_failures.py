@@ -4,10 +4,12 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from tests.test_rules import GOAL, OTHER, SIZES, TARGET, WHERE, row, truth
 from vap_core.base import events
+from vap_core.base.files import DATA
 from vap_core.base.types import Attended, Ballot, Boxes, Grounding, Track
 from vap_core.evaluation import diagnosis as failures
 from vap_core.evaluation.diagnosis import (
@@ -146,6 +148,38 @@ def test_drift_opens_where_the_track_leaves():
     found = told("picked", still(4) + still(5, [view(OTHER)]))
     assert label(found) == ("case 1", "drift", 4, "front")
     assert f"from step 4 on the track is on {OTHER}" in found.sentence
+    lost = told("picked", still(4) + still(5, [view(None)]))
+    assert "from step 4 on the track is on nothing" in lost.sentence
+
+
+def test_a_track_that_stays_on_the_target_drifts_by_covering_it_badly():
+    found = told("picked", still(4) + still(5, [view(TARGET, 0.29)]))
+    assert label(found) == ("case 1", "drift", 4, "front")
+    words = "right at first, from step 4 on the track covers the target badly (IoU 0.29)"
+    assert words in found.sentence
+    assert TARGET not in found.sentence
+
+
+def test_no_drift_of_a_published_table_is_told_to_be_onto_its_target():
+    """Tables keep the sentences of their day, so every drift is told again from its evidence."""
+    drifts = 0
+    for path in sorted((DATA / "results").glob("*.parquet")):
+        table = pd.read_parquet(path)
+        if "case_sentence" not in table:
+            continue
+        for row in table[table.sub_case == "drift"].itertuples():
+            drifts += 1
+            evidence = json.loads(row.case_evidence)
+            shown = evidence[f"shows_{row.deciding_camera}"]
+            names = {"nothing": None, f"nothing in {row.deciding_camera}": ""}
+            if shown.endswith("-personal"):
+                shown = TARGET
+            seen = view(names.get(shown, shown), evidence["iou"], max(int(evidence["pixels"]), 100))
+            found = told("picked", still(4) + still(5, [seen]))
+            assert found.sub_case == "drift"
+            assert f"is on {TARGET}" not in found.sentence
+            assert ("covers the target badly" in found.sentence) == (shown == TARGET)
+    assert drifts > 0
 
 
 def test_a_prompt_that_is_wrong_for_less_than_half_of_the_time_is_no_excuse():
@@ -273,6 +307,21 @@ def test_an_open_hand_beside_the_target_at_time_out_missed_no_grasp():
     ) == ("case 3", "missed grasp", 4, "")
     lost = [*still(3), *still(3, now=held(0.03), grip=0.0), *still(1, grip=None)]
     assert told("picked", lost).sub_case == "slip", "nor does the missing action open the hand"
+
+
+def test_a_missed_grasp_is_told_with_its_distance_from_the_bounding_box():
+    closed = still(2, where=NEAR, grip=0.0)
+    beside = told("picked", still(3) + closed).sentence
+    assert beside == f"closes beside {TARGET} (10 mm from its bounding box) at step 3"
+    inside = still(2, where=(0.3, 0.0, 0.05), grip=0.0)
+    around = told("picked", still(3) + inside).sentence
+    assert around == f"closes around {TARGET} without touching it at step 3"
+    touched = truth(touched=(TARGET,))
+    reached = told("picked", still(3) + still(2, now=touched, where=NEAR)).sentence
+    assert reached == f"touches but does not grasp {TARGET} (10 mm from its bounding box) at step 3"
+    inside = still(2, now=touched, where=(0.3, 0.0, 0.05))
+    reached = told("picked", still(3) + inside).sentence
+    assert reached == f"touches but does not grasp {TARGET} at step 3"
 
 
 def test_touching_the_goal_is_no_mistake():

@@ -110,7 +110,7 @@ def test_the_vote_is_kept_beside_the_truth_that_overrules_it() -> None:
     assert (attended.images["front"] == tint(LINE, where(LINE, TEAL), RED)).all()
     assert (
         attended.events[1].text
-        == "front: mug is candidate 0 with 0/1 votes by the simulator, over candidate 1 with 1"
+        == "front: takes candidate 0 for mug with 0/1 votes by the simulator, over candidate 1 with 1"
     )
 
 

@@ -145,6 +145,7 @@ def test_the_funnel_has_a_panel_per_suite_and_a_line_per_method() -> None:
 def test_a_bar_of_cases_is_as_long_as_the_share_of_failures_and_vap_is_on_top() -> None:
     counts = breakdown(TABLE).set_index("method")
     axes = cases_figure(breakdown(TABLE)).axes[0]
+    assert axes.get_xlabel() == "failures, % of episodes"
     ends: dict[float, float] = {}
     for patch in axes.patches:
         middle = patch.get_y() + patch.get_height() / 2
@@ -230,6 +231,22 @@ def test_rates_are_bars_as_high_as_they_are_with_their_intervals() -> None:
     assert {(round(low, 6), round(high, 6)) for low, high in spread} == {
         (round(100 * r.low, 6), round(100 * r.high, 6)) for r in (half, all_)
     }
+
+
+@pytest.mark.parametrize(("n", "rows", "columns"), [(1, 1, 1), (4, 1, 4), (5, 2, 3), (8, 2, 4)])
+def test_many_panels_of_rates_are_in_several_rows(n: int, rows: int, columns: int) -> None:
+    panels = {f"suite {i}": {"tinted": {"succeeds": rate(1, 2)}} for i in range(n)}
+    figure = rates_figure(panels, "% of episodes", "instruction")
+    drawn = [axes for axes in figure.axes if axes.axison]
+    assert [axes.get_title() for axes in drawn] == list(panels)
+    grid = drawn[0].get_gridspec()
+    assert (grid.nrows, grid.ncols) == (rows, columns)
+    first = [axes for axes in drawn if axes.get_subplotspec().is_first_col()]
+    assert [axes.get_ylabel() for axes in first] == ["% of episodes"] * rows
+    named = [axes for axes in drawn if axes.get_xlabel()]
+    assert len(named) == 1
+    assert named[0].get_subplotspec().is_last_row()
+    assert figure.get_figwidth() < 13
 
 
 def test_groups_and_colours_have_one_order_in_every_panel() -> None:

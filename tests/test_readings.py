@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import DATA
+from vap_core.base.files import DATA, SHIPPED
 from vap_core.evaluation import readings
 from vap_core.evaluation.engine import _open_run
 from vap_core.evaluation.policy_names import shipped
@@ -202,6 +202,15 @@ def test_the_docs_count_the_published_readings() -> None:
         "a red look-alike (3 of 3), that of vlabench in 3 runs (13 of 13), that of simpler-fractal in "
         "6 runs (19 of 10;"
     ) in text
+    wide = fingerprint(SHIPPED / "mini-pi0-simpler-bridge-wide")
+    of_wide = [
+        line.suite
+        for line in read_log(DATA / "results" / readings.FILE)
+        if line.weights and wide.startswith(line.weights)
+    ]
+    assert (of_wide.count("simpler-bridge"), of_wide.count("simpler-bridge-red")) == (9, 1)
+    page = " ".join((DATA.parent / "docs" / "policy.md").read_text().split())
+    assert "by arms of ablations: in nine runs in all, and in one with a red look-alike" in page
     assert "Each was run on its list 3 to 7 times, with 8 to 52 methods;" in " ".join(
         (DATA.parent / "README.md").read_text().split()
     )

@@ -39,9 +39,7 @@ def test_success_rates() -> None:
     held = {}
     for line in whole.itertuples():
         track = ", ".join(filter(None, (line.suite, line.split, f"n = {line.n} of {line.listed}")))
-        held[line.method, track] = (
-            f"{100 * line.sr:.0f} [{100 * line.sr_low:.0f}, {100 * line.sr_high:.0f}]"
-        )
+        held[line.method, track] = _percent(Rate(0, line.n, line.sr, line.sr_low, line.sr_high))
     assert quoted == held
     vap = whole[(whole.method == "vap") & (whole.suite == "simpler-fractal")]
     over = [
@@ -95,7 +93,7 @@ def test_what_the_true_mask_at_every_step_reaches() -> None:
     cells = []
     for line in found[found.task == ALL_TASKS].itertuples():
         assert (line.n, line.errors) == (line.listed, 0)
-        cells.append(f"{100 * line.sr:.0f} [{100 * line.sr_low:.0f}, {100 * line.sr_high:.0f}]")
+        cells.append(_percent(Rate(0, line.n, line.sr, line.sr_low, line.sr_high)))
     matching, variants, bridge, vlabench, tabletop = cells
     assert (
         f"simpler-fractal {matching} and {variants}, simpler-bridge {bridge}, "
@@ -327,7 +325,8 @@ def _over_layouts(told: pd.DataFrame, way: str) -> str:
 
 
 def _percent(found: Rate) -> str:
-    return f"{100 * found.value:.0f} [{100 * found.low:.0f}, {100 * found.high:.0f}]"
+    """A rate as the pages print it, without the sign: only 0 is 0, and only 1 is 100."""
+    return str(found).replace(" %", "")
 
 
 def test_times_as_fast_as_lerobots_loop() -> None:

@@ -11,6 +11,8 @@ from vap_core.evaluation.parsers import report
 from vap_core.evaluation.publish import read_runs
 from vap_core.policies.lerobot.checkpoints import fingerprint
 from vap_core.policies.names import checkpoint_of
+from vap_core.prompt import PALETTE
+from vap_core.training.recipe import RECIPES
 
 SUITE = "shared-sequence-bridge"
 
@@ -109,6 +111,8 @@ def test_parsers_are_as_the_command_prints_them():
         assert f"{line['right']} [{low}, {high}]" == cells[5]
     figure = shared_scenes.parser_figure(ours, "finding")
     assert figure.get_suptitle() == "finding"
+    (axes,) = figure.axes
+    assert "95 % interval" in axes.get_xlabel()
 
 
 def test_first_steps_divide_by_where_the_films_had_objects():
@@ -123,6 +127,7 @@ def test_the_figure_has_a_panel_a_suite():
     figure = shared_scenes.shared_figure(pd.concat([sequence(ENDS), pairs]))
     titles = [axes.get_title().partition("\n")[0] for axes in figure.axes]
     assert titles == [SUITE, "shared-pair"]
+    assert "95 % interval" in figure.get_supxlabel()
 
 
 def test_the_first_success_is_shown_or_else_the_first_episode():
@@ -130,6 +135,20 @@ def test_the_first_success_is_shown_or_else_the_first_episode():
     assert shared_films.first_success(episodes, SUITE, "mini-pi0") == ("put-cameras", 0)
     assert shared_films.first_success(episodes[1:], SUITE, "mini-pi0") == ("put-cameras", 1)
     assert shared_films.first_success(episodes[2:], SUITE, "mini-pi0") == ("put-cameras", 2)
+
+
+def test_the_page_tells_what_the_pairs_training_lacked_and_reached():
+    recipe = RECIPES["shared-pair"]
+    assert recipe.held_out_category == "slipper"
+    tints = len(PALETTE)
+    assert (tints, tints - len(recipe.held_out_tints)) == (6, 4)
+    page = " ".join((ROOT / "docs" / "shared.md").read_text().split())
+    assert "Its films have no slipper and only four of the six tints; the policy" in page
+    ran = pd.concat([rows for _, rows in read_runs(DATA / "results" / "shared.parquet")])
+    desk = ran[(ran.suite == "shared-pair") & ran.policy.str.contains("mini-pi0-tabletop")]
+    moved = desk.groupby("method").cmr.sum().to_dict()
+    assert moved == {"generic": 1, "vap": 0}
+    assert "With VAP tabletop's policy never moves the target of a pair." in page
 
 
 @pytest.mark.sweep

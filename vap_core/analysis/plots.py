@@ -1,5 +1,6 @@
 """Values in, matplotlib figures out; nothing here computes what it shows."""
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from io import BytesIO
 from itertools import chain
@@ -37,6 +38,8 @@ LEGEND_DOT = 36.0
 """Area of a dot in a legend, points squared."""
 SHARE_TOP = 1.03
 """The end of an axis of shares: a line at 1 is not cut."""
+PANELS_IN_A_ROW = 4
+"""More would be too small to read on a page."""
 LAYERS = ("other objects", "look-alike", "target", "goal")
 """The roles of `layouts_figure`, the first one drawn below the others."""
 
@@ -256,7 +259,7 @@ def rates_figure(
 ) -> "Figure":
     """Grouped bars: a panel per key, a group per inner key, a colour per innermost key.
 
-    Rates are drawn in percent with their intervals. Groups and colours keep one order over all
+    A row has PANELS_IN_A_ROW panels at most; the rows of more are as even as they can be. Rates are drawn in percent with their intervals. Groups and colours keep one order over all
     panels, that in which they first appear. `groups_label` says what the groups are.
     """
     groups: dict[str, None] = {}
@@ -265,10 +268,14 @@ def rates_figure(
         groups |= dict.fromkeys(panel)
         for rates in panel.values():
             names |= dict.fromkeys(rates)
-    figure = empty_figure(0.9 + 2.9 * len(panels), 3.2)
-    all_axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
+    n_rows = math.ceil(len(panels) / PANELS_IN_A_ROW)
+    n_columns = math.ceil(len(panels) / n_rows)
+    figure = empty_figure(0.9 + 2.9 * n_columns, 0.6 + 2.6 * n_rows)
+    grid = figure.subplots(n_rows, n_columns, squeeze=False, sharey=True)
+    for axes in grid.flat[len(panels) :]:
+        axes.set_axis_off()
     drawn: dict[str, BarContainer] = {}
-    for axes, (title, panel) in zip(all_axes, panels.items(), strict=True):
+    for axes, (title, panel) in zip(grid.flat[: len(panels)], panels.items(), strict=True):
         own = [group for group in groups if group in panel]
         for i, name in enumerate(names):
             at = []
@@ -290,8 +297,10 @@ def rates_figure(
         axes.set_xticks(range(len(own)), own, fontsize=8)
         axes.set(title=title, ylim=(0, 105))
         axes.spines[["top", "right"]].set_visible(False)
-    all_axes[0].set_ylabel(label)
-    all_axes[len(all_axes) // 2].set_xlabel(groups_label)
+    for axes in grid[:, 0]:
+        axes.set_ylabel(label)
+    used = len(panels) - (n_rows - 1) * n_columns
+    grid[-1, used // 2].set_xlabel(groups_label)
     figure.legend(
         handles=list(drawn.values()),
         labels=list(drawn),

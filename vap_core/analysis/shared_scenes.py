@@ -232,7 +232,7 @@ def parser_figure(table: "pd.DataFrame", title: str = "") -> "Figure":
     counts = {line.kind: line.n for line in table.itertuples()}
     axes.set_yticks(range(len(kinds)), [f"{kind}, n {counts[kind]}" for kind in kinds])
     axes.set(xlim=(-3, 103), ylim=(len(kinds) - 0.5, -0.5))
-    axes.set_xlabel("% of held-out sentences that are understood, 95 % over families", fontsize=9)
+    axes.set_xlabel("% of held-out sentences that are understood, 95 % interval over families", fontsize=9)
     figure.legend(loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     _finish(axes, figure, title)
     return figure
@@ -258,7 +258,7 @@ def shared_figure(episodes: "pd.DataFrame", title: str = "") -> "Figure":
         figure.subplots(1, len(names), squeeze=False)[0], tables.items(), strict=True
     ):
         _draw_suite(axes, name, table.to_dict("records"))
-    figure.supxlabel("% of episodes, 95 %; diamonds: the paper, another world", fontsize=9)
+    figure.supxlabel("% of episodes, 95 % interval; diamonds: the paper, another world", fontsize=9)
     if title:
         figure.suptitle(title, fontsize=11, fontweight="bold")
     return figure

@@ -91,7 +91,11 @@ def _elected(grounding: Grounding, chosen_by: str) -> Event:
     if grounding.winner is None:
         text = f"{camera}: {name} is none of {n} candidates by {chosen_by}, {UNMODIFIED}"
         return Event(0, "WARN", text)
-    text = f"{camera}: {name} is candidate {grounding.winner} with "
+    # Whether the candidate is the named object is not known here, so the text does not say it.
+    verb = "elects"
+    if grounding.overruled:
+        verb = "takes"
+    text = f"{camera}: {verb} candidate {grounding.winner} for {name} with "
     text += f"{ballot.votes[grounding.winner]}/{k} votes"
     if grounding.overruled:
         text += (

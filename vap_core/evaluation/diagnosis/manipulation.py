@@ -90,14 +90,29 @@ def _missed_grasp(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | No
     closing = first_true((near & (trace.grip < thresholds.closed)).tolist())
     if closing is not None and (touched is None or closing < touched):
         at = closing
-        what = "closes beside"
+        sentence = _closing_words(trace, at)
     elif touched is not None:
         at = touched
-        what = "touches but does not grasp"
+        sentence = f"touches but does not grasp {trace.target}{_distance_words(trace, at)}"
     else:
         return None
-    sentence = f"{what} {trace.target} ({1000 * trace.gap_m[at]:.0f} mm away)"
     return _diagnosis(trace, "missed grasp", at, sentence)
+
+
+def _closing_words(trace: EpisodeTrace, at: int) -> str:
+    """How the hand closes at step index `at`, at which it does not touch the target."""
+    distance = _distance_words(trace, at)
+    if not distance:
+        return f"closes around {trace.target} without touching it"
+    return f"closes beside {trace.target}{distance}"
+
+
+def _distance_words(trace: EpisodeTrace, at: int) -> str:
+    """How far the tcp is from the target's bounding box; "" where it is in it, or at 0 mm."""
+    gap_mm = round(1000 * trace.gap_m[at])
+    if gap_mm == 0:
+        return ""
+    return f" ({gap_mm} mm from its bounding box)"
 
 
 def _timeout(trace: EpisodeTrace) -> Diagnosis:

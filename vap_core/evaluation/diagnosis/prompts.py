@@ -39,7 +39,10 @@ def wrong_prompt(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | Non
         sub_case = "drift"
     share = float(np.mean(wrong))
     chosen_by_vote = view.camera not in trace.overruled
-    words = _sentence(sub_case, view, labels, trace.steps[at], chosen_by_vote=chosen_by_vote)
+    if sub_case == "drift":
+        words = _drift_words(view, trace.target, trace.steps[at])
+    else:
+        words = _sentence(sub_case, view, labels, trace.steps[at], chosen_by_vote=chosen_by_vote)
     return Diagnosis(
         case=case,
         sub_case=sub_case,
@@ -224,11 +227,17 @@ def _sentence(
             return f"{camera}: the target was proposed (IoU {proposal}), and {choice}"
         case "poor mask":
             return f"{camera}: the mask misses most of the target (IoU {iou})"
-        case "drift":
-            return f"{camera}: right at first, from step {step} on the track is on {name}"
         case "views disagree":
             return f"the views show different things from the start: {shown}"
     return f"the views agreed at first; at step {step} they show different things: {shown}"
+
+
+def _drift_words(view: MaskCoverage, target: str, step: int) -> str:
+    """A track that still lies on the target drifted by covering it badly."""
+    found = f"is on {_named(view.object)}"
+    if view.object == target:
+        found = f"covers the target badly (IoU {view.iou:.2f})"
+    return f"{view.camera}: right at first, from step {step} on the track {found}"
 
 
 def _wrong_words(wrong: Sequence[bool]) -> str:

@@ -103,7 +103,7 @@ def cases_figure(counts: "pd.DataFrame", first: str = "vap") -> "Figure":
             va="center",
         )
     _name_bars(axes, lines, places, first)
-    axes.set(xlim=(0, 112), xticks=range(0, 101, 20), xlabel="% of episodes that fail")
+    axes.set(xlim=(0, 112), xticks=range(0, 101, 20), xlabel="failures, % of episodes")
     axes.spines[["top", "right", "left"]].set_visible(False)
     figure.legend(
         handles=list(drawn.values()),
