@@ -250,7 +250,9 @@ def test_a_folder_that_will_not_do_leaves_the_store_as_it_is(
     tiny_foundation.placeholder(other / pinned.folder, pinned)
     with (other / pinned.folder / TENSORS).open("ab") as file:
         file.write(b"more")
-    with pytest.raises(MissingWeights, match=r"in .*other.* is expected; nothing was changed\. Copy"):
+    with pytest.raises(
+        MissingWeights, match=r"in .*other.* is expected; nothing was changed\. Copy"
+    ):
         pull([NAME], place, origin=other, say=silent)
     assert contents(place / pinned.folder) == kept
 
@@ -268,7 +270,9 @@ def test_a_damaged_small_file_of_another_store_is_noticed(
     """The lock of the store that is copied says what it should be."""
     pull([NAME], tmp_path / "usb", origin=origin, say=silent)
     (tmp_path / "usb" / pinned.folder / "config.json").write_bytes(b"{")
-    with pytest.raises(MissingWeights, match=r"config\.json of .* is expected; nothing was changed"):
+    with pytest.raises(
+        MissingWeights, match=r"config\.json of .* is expected; nothing was changed"
+    ):
         pull([NAME], tmp_path / "store", origin=tmp_path / "usb", say=silent)
 
 

@@ -176,5 +176,5 @@ def _mixture(name: str, loaded: dict[str, Any]) -> Stack:
     if EMBEDDED not in parts_of(name).values():
         return Stack(name=name, **loaded)
     parts = {field: part for field, part in loaded.items() if part is not None}
-    empty = {field: None for field, part in loaded.items() if part is None}
+    empty: dict[str, Any] = dict.fromkeys(loaded.keys() - parts.keys())
     return replace(load_embedded().with_parts(name, **parts), **empty)

@@ -69,8 +69,8 @@ def refuse_keep(stack_name: str, photos: Sequence[Path] = ()) -> None:
         )
     if needs_photos(stack_name):
         raise BadOutput(
-            f"calibrate: the stack {stack_name} has a threshold of its own for photos, and rendered "
-            f"scenes show too few objects as photos do; {keep_command(stack_name, photos=True)}."
+            f"calibrate: the stack {stack_name} has a threshold of its own for photos, and "
+            f"rendered scenes are no photos; run {keep_command(stack_name, photos=True)}."
         )
 
 
