@@ -232,7 +232,9 @@ def parser_figure(table: "pd.DataFrame", title: str = "") -> "Figure":
     counts = {line.kind: line.n for line in table.itertuples()}
     axes.set_yticks(range(len(kinds)), [f"{kind}, n {counts[kind]}" for kind in kinds])
     axes.set(xlim=(-3, 103), ylim=(len(kinds) - 0.5, -0.5))
-    axes.set_xlabel("% of held-out sentences that are understood, 95 % interval over families", fontsize=9)
+    axes.set_xlabel(
+        "% of held-out sentences that are understood, 95 % interval over families", fontsize=9
+    )
     figure.legend(loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     _finish(axes, figure, title)
     return figure
