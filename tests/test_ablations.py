@@ -21,6 +21,7 @@ from vap_core.analysis.ablations import (
 )
 from vap_core.analysis.agreements import gate_figure, gated_cases
 from vap_core.attend import Prompting
+from vap_core.base.errors import BadOutput
 from vap_core.base.types import Colour, Mask, Rgb
 from vap_core.evaluation import hiding, methods, paper
 from vap_core.evaluation.ablations.arms import ABLATIONS, ARMS, TINT_SHARES, Ablation, Hidden
@@ -96,6 +97,18 @@ def test_the_table_by_hand() -> None:
     figure = effects_figure([vap_arm, mask_only, rewrite_only], "why")
     labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
     assert labels == ["rewrite-only, n 10", "mask-only, n 10"]
+
+
+def test_several_policies_of_a_suite_are_refused() -> None:
+    """Their episodes would be pooled, and compared by the last policy alone."""
+    ablation = ABLATIONS["rewrite"]
+    of_one = pd.concat([outcomes("vap", [True] * 9), outcomes("mask-only", [False] * 9)])
+    of_two = pd.concat([of_one, of_one.assign(policy="q")], ignore_index=True)
+    with pytest.raises(BadOutput, match=r"2 policies \(p, q\); name one.* policy_results compares"):
+        arm_results(ablation, of_two)
+    other_arm = outcomes("generic", [True] * 9).assign(policy="q")
+    beside = pd.concat([of_one, other_arm, of_two.assign(suite="vlabench", method="vap")])
+    assert [one.arm for one in arm_results(ablation, beside)] == ["vap", "mask-only"]
 
 
 def test_an_error_is_a_failure_and_has_no_cmr_where_none_is_defined() -> None:

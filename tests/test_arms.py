@@ -116,15 +116,21 @@ def test_reaction_and_obedience_are_read_from_an_episode() -> None:
     assert columns(replace(played, frames=played.frames[:3])) != {}
     stays = replace(played, frames=played.frames[:4])
     assert columns(stays) == {"switched_s": found["switched_s"], "turned_s": None, "obeyed": False}
+    switched = replace(played.frames[4], events=played.frames[1].events)
+    there = replace(played, frames=(switched, played.frames[2], played.frames[5]))
+    assert columns(there)["turned_s"] is None, "it was nearer to the rival before the switch"
+    stored_before = {**columns(there), "turned_s": 0.0}
     table = pd.DataFrame(
         [
             {"suite": TASK[0], "method": "switched-early", **columns(played)},
             {"suite": TASK[0], "method": "switched-early", **columns(stays)},
+            {"suite": TASK[0], "method": "switched-early", **stored_before},
             {"suite": TASK[0], "method": "oracle-track"},
         ]
     )
     (line,) = switching_lines(table)
-    assert "switched in 2 episodes, obeyed in 50 % [9, 91]; 1 hands turned, median 0.6 s" in line
+    assert "switched in 3 episodes, obeyed in 33 % [6, 79]; the hand turned in 1" in line
+    assert line.endswith("median 0.6 s after the switch")
     assert switching_lines(table[["suite", "method"]]) == []
 
 

@@ -260,6 +260,35 @@ def test_boxes_of_an_unknown_camera_are_refused() -> None:
         )
 
 
+def given_by_hand(*xyxy: tuple[float, float, float, float]) -> dict[str, Boxes]:
+    return {"front": Boxes(np.array(xyxy, np.float32), np.ones(len(xyxy), np.float32), "by hand")}
+
+
+def test_boxes_by_hand_are_clipped_to_their_view() -> None:
+    """What crops and masks are cut from; a box inside its view stays as it is."""
+    inside = (4.3, 20.7, 16.1, 32.9)
+    boxes = given_by_hand(inside, (24, -9e9, 36, 9e9), (-5, -5, 64.5, 70))
+    _, attended = Attender(TOYS, MEMORY).start({"front": LINE}, "bring my cup", boxes=boxes)
+    found = attended.groundings["front"][0].candidates.xyxy
+    assert np.array_equal(found[0], np.array(inside, np.float32))
+    assert found[1:].tolist() == [[24, 0, 36, 64], [0, 0, 64, 64]]
+    assert found.dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    "box",
+    [(64, 0, 90, 20), (-20, -20, 0, 0), (63.5, 0, 80, 20), (10, 1e12, 20, 2e12), (0, 3, 9, 3.5)],
+)
+def test_a_box_by_hand_without_a_pixel_of_its_view_is_refused(
+    box: tuple[float, float, float, float],
+) -> None:
+    """There is nothing to embed in it, and a mask of it would be empty."""
+    attender = Attender(TOYS, MEMORY)
+    with pytest.raises(BadViews, match=r"of view 'front' has less than one .* 64x64 picture") as it:
+        attender.start({"front": LINE}, "bring my cup", boxes=given_by_hand((4, 20, 16, 32), box))
+    assert str(np.array(box, np.float32).tolist()) in str(it.value)
+
+
 def test_what_cannot_be_matched_is_said() -> None:
     attender = Attender(TOYS, {**MEMORY, "other": personal("other", "cup", GREY)})
     with pytest.raises(

@@ -21,6 +21,7 @@ from vap_core.recording import Recorder, read_summary
 from vap_core.recording.attention_picture import attended
 from vap_core.recording.entities.attention import attention_overlay
 from vap_core.recording.stored_pictures import read_pictures
+from vap_core.simulation import suites
 
 RUN = DATA / "results" / "first_policy.parquet"
 """simpler-bridge's first policy, whose token is kept."""
@@ -39,7 +40,8 @@ def put_token(memory: Path) -> None:
     (row,) = kept[kept["object"] == "shaver-personal"].to_dict("records")
     embedding = np.array(row["embedding"], np.float32)
     model = load_vlm(teach_token.MODEL).sha256()
-    token_file.save(memory, token_file.Token("shaver-personal", embedding, 1.0, model))
+    suffix = teach_token.file_suffix(suites.rows("simpler-bridge", "pick-shaver"), model)
+    token_file.save(memory, token_file.Token("shaver-personal", embedding, 1.0, model), suffix)
 
 
 @pytest.fixture(scope="module")

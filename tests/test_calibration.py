@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.command import refused
 from tests.toys import MeanColour, SameColour, segmenter
 from vap_core.analysis import ground
 from vap_core.analysis.calibration import report, run, scenes
@@ -163,7 +164,7 @@ def test_keep_is_for_stacks_that_ship_none(tmp_path, monkeypatch):
         run.refuse_keep("embedded")
     with pytest.raises(BadOutput, match="embedded:tracker=edgetam ships its thresholds"):
         run.refuse_keep("embedded:tracker=edgetam")
-    run.refuse_keep("embedded:encoder=dinov2-small")
+    run.refuse_keep("embedded:encoder=dinov2-small", [tmp_path])
     run.refuse_keep("foundation")
     run.refuse_keep("embedded", [tmp_path])
     monkeypatch.setattr(run, "load_stack", lambda name: TOY)
@@ -174,6 +175,59 @@ def test_keep_is_for_stacks_that_ship_none(tmp_path, monkeypatch):
     assert kept == Thresholds(0.6, 0.6)
     with pytest.raises(BadOutput, match="more --scenes"):
         run.keep_choice("foundation", report.Choice(None, None))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "embedded:encoder=dinov2-small",
+        "embedded:detector=grounding-dino-tiny",
+        "foundation:tracker=embedded",
+    ],
+)
+def test_a_stack_with_an_embedded_part_is_calibrated_on_photos(name, tmp_path, monkeypatch):
+    """It judges views, so that the scenes alone give too few that are not familiar."""
+    with pytest.raises(BadOutput, match=f"calibrate --stack {name} --photos SET --keep"):
+        run.refuse_keep(name)
+    run.refuse_keep(name, [tmp_path])
+    judged = replace(TOY, detector=Judge())
+    monkeypatch.setattr(stacks, "load_own", lambda name: judged)
+    assert f"calibrate --stack {name} --photos SET --keep" in ground.missing_threshold(name)
+    monkeypatch.setattr(run, "load_stack", lambda name: judged)
+    monkeypatch.setenv(store.VARIABLE, str(tmp_path))
+    with pytest.raises(BadOutput, match="more photos in the set"):
+        run.keep_choice(name, report.Choice(0.6, None))
+    run.keep_choice(name, report.Choice(0.6, 0.5))
+    kept = kept_thresholds.read_thresholds(tmp_path, name, TOY.encoder.name)
+    assert kept == Thresholds(0.6, 0.5)
+
+
+def test_calibrate_refuses_before_it_measures(tmp_path):
+    arguments = ("--stack", "embedded:encoder=dinov2-small", "--keep", "--out", tmp_path / "out")
+    assert "--photos SET --keep" in refused("calibrate", *arguments)
+    assert not (tmp_path / "out").exists()
+
+
+def test_too_few_photos_are_answered_by_photos():
+    table = answers([0.8] * 3, [0.3], familiar=False)
+    text = report.text_report(table, report.choose(table), replace(TOY, detector=Judge()))
+    assert "none is chosen; name a photo set with --photos, or one with more photos." in text
+
+
+@pytest.mark.parametrize("wrong", ["nan", "inf", "-inf"])
+@pytest.mark.parametrize("kind", ["familiar", "unfamiliar"])
+def test_a_kept_threshold_is_a_number(tmp_path, kind, wrong):
+    thresholds = replace(Thresholds(0.5, 0.5), **{kind: float(wrong)})
+    kept_thresholds.keep_thresholds(tmp_path, "foundation", "dino", thresholds)
+    with pytest.raises(BadOutput, match="thresholds-foundation.json is damaged; delete it and run"):
+        kept_thresholds.read_thresholds(tmp_path, "foundation", "dino")
+
+
+@pytest.mark.parametrize("name", ["embedded", "embedded:encoder=dinov2-small"])
+def test_the_remedy_for_a_damaged_threshold_is_one_that_is_not_refused(name, tmp_path):
+    kept_thresholds.thresholds_file(tmp_path, name).write_text("{")
+    with pytest.raises(BadOutput, match=f"run .* calibrate --stack {name} --photos SET --keep"):
+        kept_thresholds.read_thresholds(tmp_path, name, "dino")
 
 
 def test_a_threshold_for_own_photos_is_kept_and_runs_do_not_depend_on_it(tmp_path, monkeypatch):
@@ -193,7 +247,8 @@ def test_photos_are_measured_without_scenes(tmp_path, monkeypatch):
     with pytest.raises(BadOutput, match="no scenes and no photos"):
         run.calibrate("toy", tmp_path / "none", scenes=0, progress=False)
 
-    def measured(folder, out, stack, progress):
+    def measured(folder, out, stack, kept, progress):
+        assert not kept
         rows = {
             "scene": [str(i) for i in range(40)],
             "familiar": False,

@@ -2,7 +2,9 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +22,8 @@ from vap_core.analysis.dataset_inspection import (
 )
 from vap_core.attend import Attender
 from vap_core.base.errors import BadDataset, BadOutput
+from vap_core.perception.kept_thresholds import keep_thresholds, thresholds_file
+from vap_core.perception.protocols import Thresholds
 from vap_core.perception.stacks import STACKS
 from vap_core.policies.lerobot.datasets import open_dataset
 from vap_core.recording import read_summary
@@ -122,6 +126,50 @@ def test_the_same_call_goes_on_and_another_question_is_refused(
         memory.save(bank, personal("mug", "mug", remembered), replace=True)
         with pytest.raises(BadOutput, match="holds another inspection.*choose another --out"):
             inspect_dataset(recorded, told, bank, "toys", out)
+
+
+def test_answers_of_another_threshold_owner_or_version_are_not_taken_for_these(
+    recorded: Path, bank: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What `calibrate --keep` writes changes what is grounded, and so does whose an object is."""
+    out = tmp_path / "out"
+
+    def refuses(differs: str) -> None:
+        with pytest.raises(BadOutput, match=rf"another inspection \({differs} differ\); choose"):
+            inspect_dataset(recorded, TOLD, bank, "toys", out, episodes=1)
+
+    monkeypatch.setenv("VAP_WEIGHTS", str(tmp_path / "weights"))
+    shipped = replace(TOYS, thresholds=Thresholds(0.5, 0.5))
+    monkeypatch.setitem(STACKS, "toys", lambda: shipped)
+    inspect_dataset(recorded, TOLD, bank, "toys", out, episodes=1)
+    keep_thresholds(tmp_path / "weights", "toys", TOYS.encoder.name, Thresholds(0.5, 0.99))
+    refuses("thresholds")
+    thresholds_file(tmp_path / "weights", "toys").unlink()
+    inspect_dataset(recorded, TOLD, bank, "toys", out, episodes=1)
+    monkeypatch.setattr(dataset_inspection, "__version__", "later")
+    refuses("version")
+
+
+@pytest.mark.parametrize("whose", [{"owner": "ben"}, {"known_as": ("brother",)}])
+def test_an_inspection_is_of_the_owners_that_it_knew(
+    recorded: Path, bank: Path, tmp_path: Path, whose: dict[str, Any]
+) -> None:
+    known = {"owner": "anna", "known_as": ("sister",)}
+    mug = personal("mug", "mug", BLUE)
+    memory.save(bank, replace(mug, **known), replace=True)
+    ask = (recorded, "bring anna's mug", bank, "toys", tmp_path / "out")
+    inspect_dataset(*ask, episodes=1)
+    memory.save(bank, replace(mug, **(known | whose)), replace=True)
+    with pytest.raises(BadOutput, match=r"another inspection \(memory differ\); choose another"):
+        inspect_dataset(*ask, episodes=1)
+
+
+def test_a_damaged_record_of_an_inspection_is_one_line(
+    recorded: Path, bank: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "inspection.json").write_text("3")
+    with pytest.raises(BadOutput, match=r"cannot be used .*; choose another --out"):
+        inspect_dataset(recorded, TOLD, bank, "toys", tmp_path, episodes=1)
 
 
 def test_a_copy_has_what_the_method_would_show_and_all_else_as_it_was(

@@ -167,11 +167,11 @@ def test_no_drift_of_a_published_table_is_told_to_be_onto_its_target():
         table = pd.read_parquet(path)
         if "case_sentence" not in table:
             continue
-        for line in table[table.sub_case == "drift"].itertuples():
+        for drift in table[table.sub_case == "drift"].itertuples():
             drifts += 1
-            evidence = json.loads(line.case_evidence)
-            shown = evidence[f"shows_{line.deciding_camera}"]
-            names = {"nothing": None, f"nothing in {line.deciding_camera}": ""}
+            evidence = json.loads(drift.case_evidence)
+            shown = evidence[f"shows_{drift.deciding_camera}"]
+            names = {"nothing": None, f"nothing in {drift.deciding_camera}": ""}
             if shown.endswith("-personal"):
                 shown = TARGET
             seen = view(names.get(shown, shown), evidence["iou"], max(int(evidence["pixels"]), 100))

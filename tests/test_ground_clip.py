@@ -11,7 +11,7 @@ from PIL import Image
 
 from tests.command import refused, vap
 from tests.toys import MeanColour, SameColour, detector, scene, segmenter
-from vap_core.analysis import ground_clip
+from vap_core.analysis import ground, ground_clip
 from vap_core.analysis.ground import claimed_paths
 from vap_core.attend import Attender
 from vap_core.base import video
@@ -249,6 +249,21 @@ def test_large_pictures_are_tiled_and_it_is_said(bank, tmp_path, monkeypatch):
     assert answer["size"] == [200, 200]
     assert answer["candidates"][answer["winner"]] == [150, 90, 162, 102]
     assert "tiles" not in vap(*words, *where, "--no-tiles").stderr
+
+
+@pytest.mark.parametrize(("width", "tiled"), [(400, True), (380, False)])
+def test_a_picture_is_tiled_by_the_size_of_its_file(bank, tmp_path, monkeypatch, width, tiled):
+    """A long one is shrunk below the limit before it is looked at."""
+    monkeypatch.setattr(tiles, "SMALL_MEGAPIXELS", 0.07)
+    monkeypatch.setattr(ground, "GROUND_SIDE", 256)
+    rgb = np.zeros((180, width, 3), np.uint8)
+    rgb[90:130, 200:240] = RED
+    Image.fromarray(rgb).save(tmp_path / "long.png")
+    words = ("ground", tmp_path / "long.png", "bring my cup", "--stack", "toy", "--memory", bank)
+    done = vap(*words, "--out", tmp_path, "--json")
+    assert done.returncode == 0, done.stderr
+    assert ("nine overlapping half-size tiles" in done.stderr) == tiled
+    assert json.loads(done.stdout)["size"] == [256, round(256 * 180 / width)]
 
 
 def test_boxes_by_hand_are_judged_by_the_detector_itself(bank, tmp_path, monkeypatch):

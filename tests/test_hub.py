@@ -239,6 +239,75 @@ def test_pull_from_a_folder_says_what_it_lacks(origin: Path, tmp_path: Path) -> 
         pull([NAME], tmp_path / "store", origin=tmp_path, say=silent)
 
 
+def test_a_folder_that_will_not_do_leaves_the_store_as_it_is(
+    pinned: Source, origin: Path, tmp_path: Path
+) -> None:
+    """Whole weights survive a wrong, a damaged and an incomplete folder, and a store pulled twice."""
+    place = tmp_path / "store"
+    pull([NAME], place, origin=origin, say=silent)
+    kept = contents(place / pinned.folder)
+    other = tmp_path / "other"
+    tiny_foundation.placeholder(other / pinned.folder, pinned)
+    with (other / pinned.folder / TENSORS).open("ab") as file:
+        file.write(b"more")
+    with pytest.raises(
+        MissingWeights, match=r"in .*other.* is expected; nothing was changed\. Copy"
+    ):
+        pull([NAME], place, origin=other, say=silent)
+    assert contents(place / pinned.folder) == kept
+
+    (origin / pinned.repo / "config.json").unlink()
+    for folder in (origin, tmp_path):
+        with pytest.raises(MissingWeights, match=r"lacks config\.json|no model\.safetensors"):
+            pull([NAME], place, origin=folder, say=silent)
+    assert contents(place / pinned.folder) == kept
+    assert find_problem(NAME, place) is None
+
+
+def test_a_damaged_small_file_of_another_store_is_noticed(
+    pinned: Source, origin: Path, tmp_path: Path
+) -> None:
+    """The lock of the store that is copied says what it should be."""
+    pull([NAME], tmp_path / "usb", origin=origin, say=silent)
+    (tmp_path / "usb" / pinned.folder / "config.json").write_bytes(b"{")
+    with pytest.raises(
+        MissingWeights, match=r"config\.json of .* is expected; nothing was changed"
+    ):
+        pull([NAME], tmp_path / "store", origin=tmp_path / "usb", say=silent)
+
+
+def test_a_copy_that_breaks_off_leaves_the_store_as_it_is(
+    pinned: Source, origin: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = tmp_path / "store"
+    pull([NAME], place, origin=origin, say=silent)
+    kept = contents(place / pinned.folder)
+
+    def full(source: Path, target: Path) -> None:
+        target.write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("shutil.copyfile", full)
+    with pytest.raises(MissingWeights, match="cannot be written .No space left on device"):
+        pull([NAME], place, origin=origin, say=silent)
+    assert contents(place / pinned.folder) == kept
+
+
+def test_a_store_with_other_weights_is_not_emptied_by_a_pull_from_itself(
+    origin: Path, tmp_path: Path
+) -> None:
+    place = tmp_path / "store"
+    pull([NAME], place, origin=origin, unpinned=True, say=silent)
+    kept = contents(place / SOURCE.folder)
+    with pytest.raises(MissingWeights, match="pass --unpinned to use other weights on purpose"):
+        pull([NAME], place, origin=place, say=silent)
+    assert contents(place / SOURCE.folder) == kept
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
 def test_a_store_taken_in_place_needs_its_lock_only(
     pinned: Source, origin: Path, tmp_path: Path
 ) -> None:

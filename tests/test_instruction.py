@@ -26,7 +26,12 @@ RED, BLUE = PALETTE[0], PALETTE[1]
         ),
         ("move my bottle near coke can", "bottle", "move the red bottle near coke can"),
         ("give me my  pen   holder now", "pen holder", "give me the red pen holder now"),
-        ("bring MY CUP", "cup", "bring The red cup"),
+        ("bring MY CUP", "cup", "bring the red cup"),
+        ("Bring My Cup.", "cup", "Bring the red cup."),
+        ("Wait! My cup, please", "cup", "Wait! The red cup, please"),
+        ("Wait. My cup; now", "cup", "Wait. The red cup; now"),
+        ("Ready? MY CUP", "cup", "Ready? The red cup"),
+        ("Please, My cup", "cup", "Please, the red cup"),
         ("fetch my teddy-bear", "teddy-bear", "fetch the red teddy-bear"),
     ],
 )

@@ -25,7 +25,7 @@ from vap_core.perception.foundation.random_weights import letter_tokenizer
 from vap_core.perception.foundation.sources import KINDS, MODELS, PARTS, models_of, parts_of
 from vap_core.perception.foundation.store import weights_table
 from vap_core.perception.kept_thresholds import keep_thresholds
-from vap_core.perception.protocols import Thresholds
+from vap_core.perception.protocols import JudgedDetector, Thresholds
 from vap_core.perception.stacks import EMBEDDED_THRESHOLDS, check_stack, load_stack, mixed
 
 __all__ = ["scene"]
@@ -175,7 +175,8 @@ def test_the_row_is_the_models_own_feature(store: Path) -> None:
 def test_parts_mix_freely_and_thresholds_belong_to_detector_and_encoder(here: Path) -> None:
     embedded = load_stack("embedded")
     both = load_stack(mixed("embedded", detector="llmdet-tiny", encoder="siglip2-base"))
-    assert (type(both.detector).__name__, type(both.encoder).__name__) == ("GroundingDino", "PooledEncoder")  # fmt: skip
+    assert isinstance(both.detector, JudgedDetector), "the embedded segmenter tells photos apart"
+    assert (type(both.detector.detector).__name__, type(both.encoder).__name__) == ("GroundingDino", "PooledEncoder")  # fmt: skip
     assert type(both.tracker) is type(embedded.tracker)
     assert both.unfamiliar_encoder is None
     assert both.category_detector is both.detector
@@ -183,6 +184,7 @@ def test_parts_mix_freely_and_thresholds_belong_to_detector_and_encoder(here: Pa
     name = mixed("embedded", encoder="dinov3-small")
     one = load_stack(name)
     assert one.by_category is not None
+    assert one.verifier is None
     assert one.thresholds is None
     keep_thresholds(here, name, one.encoder.name, Thresholds(0.4, 0.5))
     assert load_stack(name).thresholds == Thresholds(0.4, 0.5)

@@ -121,6 +121,29 @@ def test_a_target_out_of_the_picture_needs_no_occluder(scene: Scene, row: Episod
     assert np.array_equal(*pictures)
 
 
+@pytest.mark.parametrize("size", [(180, 320), (320, 180)])
+def test_a_plate_hides_all_in_views_that_are_not_square(
+    scene: Scene, row: EpisodeRow, size: tuple[int, int]
+) -> None:
+    height, width = size
+    beyond_the_square = 0
+    for y in np.linspace(-0.4, 0.4, 17).tolist():
+        target = replace(row.placements[0], x=0.25, y=y)
+        masks = []
+        for occlusion in (None, Occlusion(0, 1)):
+            env = Env(scene, image_size=size, cameras=("front", "side"), occlusion=occlusion)
+            env.reset(replace(row, placements=(target, *row.placements[1:])))
+            masks.append(env.truth(masks=True).masks)
+        free, behind = masks
+        for camera in ("front", "side"):
+            seen = free[camera][row.target]
+            rim = (width - height) // 2
+            if rim > 0 and (seen[:, :rim].any() or seen[:, width - rim :].any()):
+                beyond_the_square += 1
+            assert not behind[camera][row.target].any()
+    assert beyond_the_square >= 4 or width < height
+
+
 def test_an_unknown_camera_is_named(scene: Scene) -> None:
     with pytest.raises(UnknownName, match="camera of the occlusion.*front"):
         env_of(scene, Occlusion(0, 1, cameras=("rear",)))

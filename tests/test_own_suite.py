@@ -5,6 +5,7 @@ import re
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,8 +15,13 @@ from vap_core.base.errors import BadSuite, UnknownName
 from vap_core.evaluation.feasibility import feasible
 from vap_core.evaluation.rescore import rescore
 from vap_core.evaluation.store import read, read_manifest
-from vap_core.simulation import suites
+from vap_core.evaluation.study import Study
+from vap_core.evaluation.trials import make_trial
+from vap_core.rollout.loop import rollout
+from vap_core.simulation import robots, suites
 from vap_core.simulation.suites import own
+from vap_core.simulation.suites.open_row import open_row
+from vap_core.simulation.types import EpisodeRow
 
 ROOT = Path(__file__).resolve().parents[1]
 BLOCKS = re.findall(r"```python\n(.*?)```", (ROOT / "docs/extend.md").read_text(), re.DOTALL)
@@ -116,6 +122,10 @@ def test_the_environment_takes_no_name_that_is_another_suites(
         (('"my-desk"', '"../desk"'), "the name '../desk' will not do"),
         (("bottle-lookalike-1", "bottle-lookalike-99"), "bottle-lookalike-99"),
         (("PICK, episode,", "PICK, 0,"), "is there twice"),
+        (
+            ("tuple(places))", "tuple(places), seed=3)"),
+            r"row my-desk\.pick-bottle\.000 has seed=3; leave it 0: seeds come from --seed\.",
+        ),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_one_line_that_names_the_file(
@@ -127,6 +137,93 @@ def test_what_is_wrong_is_one_line_that_names_the_file(
         suites.open_file(file)
     assert "desk.py" in str(refusal.value)
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (("hz=5.0", "hz=5"), "hz is 5; it must be a float, as in 5.0."),
+        (("y0=-0.15", "y0=0"), "y0 is 0; it must be a float, as in 0.0."),
+        (("y0=-0.15", 'y0="a"'), "y0 is 'a'; it must be a float."),
+        (
+            ('("front",)', '["front"]'),
+            "cameras is ['front']; it must be a tuple, in round brackets, as in ('front',).",
+        ),
+        (("(PICK,)", "[PICK]"), "...; it must be a tuple, in round brackets."),
+        (
+            ("(PICK,)", '(PICK,), control="hand"'),
+            "control is 'hand'; it must be of type Literal['ee', 'joint'].",
+        ),
+        (("max_steps=60", "max_steps=60.0"), "max_steps is 60.0; it must be of type int."),
+    ],
+)
+def test_a_field_of_another_type_is_one_short_line(
+    file: Path, edit: tuple[str, str], words: str
+) -> None:
+    assert edit[0] in DOCUMENTED
+    file.write_text(DOCUMENTED.replace(*edit))
+    with pytest.raises(BadSuite) as refusal:
+        suites.open_file(file)
+    said = str(refusal.value).removeprefix(f"suites: {file}, line ")
+    assert said.endswith(words)
+    assert "\n" not in said
+    assert len(said) < 150
+
+
+def test_a_row_without_cameras_has_its_suites_everywhere(file: Path, tmp_path: Path) -> None:
+    text = DOCUMENTED.replace('"wx250s", hz=5.0', '"panda", hz=10.0')
+    text = text.replace("x0=0.20, x1=0.32", "x0=0.40, x1=0.52")
+    text = text.replace("SUITE.row(", "without_cameras(")
+    text += """
+
+def without_cameras(*of_row):
+    from dataclasses import replace
+
+    return replace(SUITE.row(*of_row), cameras=())
+"""
+    file.write_text(text)
+    study = Study(
+        (("my-desk", "pick-bottle"),), ("generic",), policy="random", suite_files=(str(file),)
+    )
+    row = replace(study.rows("my-desk", "pick-bottle")[0], max_steps=1)
+    assert row.cameras == ()
+    trial = make_trial(study, [row], "generic", tmp_path / "bank")
+    (episode,) = rollout(trial, [row])
+    with open_row(row) as env:
+        opened = [camera.name for camera in env.cameras()]
+    assert [camera.name for camera in episode.header.cameras] == opened == ["front"]
+
+
+def listed_rows(robot: str) -> list[EpisodeRow]:
+    """Every row of every list for a robot; 200 of each task of the warm-up suites."""
+    found: list[EpisodeRow] = []
+    for name in (*suites.BENCHMARKS, *suites.SHARED, *(f"{n}-dev" for n in suites.BENCHMARKS)):
+        if suites.suite(name).robot == robot:
+            found.extend(suites.benchmark(name))
+    for name, suite in suites.WARM_UPS.items():
+        if suite.robot == robot:
+            for task in suite.tasks:
+                found.extend(suites.rows(name, task.name, 200))
+    return found
+
+
+@pytest.mark.parametrize("robot", sorted(robots.ROBOTS))
+def test_the_documented_table_is_that_of_the_lists(robot: str) -> None:
+    page = (ROOT / "docs/extend.md").read_text()
+    (line,) = re.findall(rf"^\| {robot} \| (.*) \|$", page, re.MULTILINE)
+    hz, cameras, places, steps, control = line.split(" | ")
+    known = [suite for suite in suites.SUITES.values() if suite.robot == robot]
+    rows = listed_rows(robot)
+    spots = [place for row in rows for place in row.placements]
+    xs = [place.x for place in spots]
+    widest = max(abs(place.y) for place in spots)
+    least, most = (limit(row.max_steps for row in rows) for limit in (min, max))
+    assert {f"{suite.hz:g}" for suite in known} == {hz}
+    assert {", ".join(suite.cameras) for suite in known} == {cameras}
+    assert ", ".join(sorted({suite.control for suite in known})) == control
+    written = f"{min(xs):.3f} to {max(xs):.3f}, ±{widest:.3f}"
+    assert written.replace("0.", ".") == places
+    assert (f"{least} to {most}" if least < most else f"{least}") == steps
 
 
 @pytest.mark.slow

@@ -67,6 +67,44 @@ def test_every_name_that_can_be_registered_can_be_said(
         assert rewrite(parsed, PALETTE[:1]) == rewritten
 
 
+@pytest.mark.parametrize(
+    ("text", "names", "rewritten"),
+    [
+        ("bring the neighbour's cup", "n", "bring the red cup"),
+        ("Bring the  doctor’s cup, please", "d", "Bring the red cup, please"),
+        ("The neighbour's cup, please", "n", "The red cup, please"),
+        ("bring a neighbour's cup", "n", "bring the red cup"),
+        ("bring the boss's pot", "b", "bring the red pot"),
+        ("put Anna's cup near the doctor's cup", "ad", "put the red cup near the blue cup"),
+        ("give the doctor Anna's cup", "a", "give the doctor the red cup"),
+        ("bring my neighbour's cup", "n", "bring the red cup"),
+    ],
+)
+def test_the_article_of_a_person_is_rewritten_with_the_person(
+    text: str, names: str, rewritten: str
+) -> None:
+    """ "the neighbour's cup" becomes "the red cup", with one article."""
+    known = (
+        cup("n", "nils", "neighbour"),
+        cup("d", "dora", "doctor"),
+        cup("a", "anna"),
+        cup("b", "the boss", category="pot"),
+    )
+    bank = {obj.name: obj for obj in known}
+    for parser in (rule_parser(bank), EmbeddingParser(Context(bank), embed_text)):
+        parsed = parser(text, {"cup", "pot"})
+        assert "".join(recall(bank, target).name for target in parsed.targets) == names
+        assert rewrite(parsed, PALETTE[: len(names)]) == rewritten
+
+
+def test_the_embedding_parser_knows_a_person_by_article() -> None:
+    bank = {"n": cup("n", "nils", "neighbour"), "a": cup("a", "anna")}
+    parser = EmbeddingParser(Context(bank), embed_text)
+    for text in ("bring the cup of the neighbour", "bring the cup that belongs to the neighbour"):
+        (target,) = parser(text, {"cup"}).targets
+        assert target.object == "n"
+
+
 NFD = "J\u0075\u0308rgen"  # u and a diaeresis: two characters
 
 

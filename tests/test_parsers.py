@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from huggingface_hub import get_session
 
 from tests.chat_server import says, serving
 from tests.toys import personal
@@ -237,12 +238,18 @@ def test_without_a_key_no_stored_token_is_sent(monkeypatch: pytest.MonkeyPatch) 
     assert "hf_secret" not in str(server.asked)
 
 
-def test_a_redirect_to_another_server_carries_no_key() -> None:
+@pytest.mark.parametrize("status", [301, 302, 303, 307, 308])
+def test_a_redirect_to_another_server_is_not_followed(status: int) -> None:
+    """Neither the key nor the instruction and the people; other requests of the hub still are."""
     with serving((404, b"")) as other:
-        moved = (307, b"", ("Location", f"{other.url}/chat/completions"))
-        with serving(moved) as server, pytest.raises(BadEndpoint, match="refuses"):
+        moved = (status, b"", ("Location", f"{other.url}/chat/completions"))
+        with serving(moved) as server, pytest.raises(BadEndpoint, match="refuses") as caught:
             ChatParser(CONTEXT, ChatEndpoint(server.url, "reader-1", "secret"))("bring my cup")
     assert "secret" not in str(other.asked)
+    assert not other.asked
+    assert f"({status}: it redirects to {other.url}" in str(caught.value)
+    assert not get_session().event_hooks["response"]
+    assert get_session().follow_redirects
 
 
 def test_no_object_is_an_abstention() -> None:

@@ -142,6 +142,14 @@ class Numbered(Bare):
     label, execute = 3, 1
 
 
+class Whole(Named):
+    execute = np.int64(1)
+
+
+class Half(Named):
+    execute = np.float64(1.5)
+
+
 @pytest.mark.parametrize(
     ("policy", "message"),
     [
@@ -150,6 +158,7 @@ class Numbered(Bare):
         (object(), "the policy object lacks label, execute, start, plan"),
         (Zero(), "Zero.execute is 0; it must be a whole number from 1 on"),
         (Numbered(), "Numbered.label is 3; it must be a string"),
+        (Half(), "Half.execute is np.float64(1.5); it must be a whole number from 1 on"),
     ],
 )
 def test_a_policy_that_lacks_a_part_is_refused_before_the_first_step(
@@ -157,6 +166,11 @@ def test_a_policy_that_lacks_a_part_is_refused_before_the_first_step(
 ) -> None:
     with pytest.raises(BadPolicy, match=re.escape(message)):
         check_policy(policy)
+
+
+def test_a_whole_number_of_numpy_is_one(trial: Trial) -> None:
+    (episode,) = rollout(replace(trial, policy=Whole()), ROWS[:1])
+    assert (episode.outcome.status, episode.outcome.steps) == ("failure", 3)
 
 
 def test_a_trial_checks_its_policy(trial: Trial) -> None:

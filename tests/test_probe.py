@@ -95,6 +95,26 @@ def test_a_scene_is_played_in_every_way(
     assert shorter["policy"] == f"{table['policy'][0]}, 1 of 4"
 
 
+def test_another_way_to_ask_is_kept_beside_those_of_before(tmp_path: Path) -> None:
+    """Only what was asked again, by suite, policy and way, takes the place of what was kept."""
+
+    def asked(way: str, steps: int) -> pd.DataFrame:
+        said = {"suite": SUITE, "policy": "mini_pi0:one", "method": way, "steps": steps}
+        return pd.DataFrame([said])
+
+    path = tmp_path / "probe.parquet"
+    keep(asked("tinted", 5), path)
+    keep(asked("plain", 6), path)
+    keep(asked("tinted", 7).assign(policy="mini_pi0:other"), path)
+    keep(asked("tinted", 8), path)
+    held = pd.read_parquet(path)[["policy", "method", "steps"]]
+    assert list(held.itertuples(index=False, name=None)) == [
+        ("mini_pi0:one", "plain", 6),
+        ("mini_pi0:other", "tinted", 7),
+        ("mini_pi0:one", "tinted", 8),
+    ]
+
+
 def test_episodes_of_the_policy_that_ships_go_before_those_of_others() -> None:
     ships, other = label_of(shipped_checkpoint(SUITE)), "mini_pi0:mini-pi0-older@00c47015"
     table = pd.DataFrame({"suite": [SUITE, SUITE, "vlabench"], "policy": [other, ships, other]})

@@ -16,7 +16,7 @@ from vap_core.evaluation.publish import read_runs
 from vap_core.evaluation.report.failures import breakdown
 from vap_core.evaluation.report.results import results
 from vap_core.evaluation.report.runs import load_runs
-from vap_core.evaluation.statistics import ALL_TASKS
+from vap_core.evaluation.statistics import ALL_TASKS, rate_over_layouts
 from vap_core.policies.lerobot.checkpoints import fingerprint
 from vap_core.policies.names import checkpoint_of
 
@@ -148,6 +148,28 @@ def test_what_ten_seeds_reach() -> None:
     assert digests == {fingerprint(shipped("simpler-bridge"))[:8]}
 
 
+def test_what_policies_reach_from_other_starts() -> None:
+    """A row of several seeds has its interval over the layouts, which return under each."""
+    digests = {
+        "the default, wide-seed-0": "a3e5dd45",
+        "the other training, wide": "c54c3c4e",
+        "the first one": "00c47015",
+        "the first one, three angles scaled by 0.1 rad": "dd729043",
+        "tint-free": "2e02225c",
+        "any-start: never saw a tint, angles with noise": "c657f21c",
+        "any-start": "c657f21c",
+    }
+    played = pd.concat([_played(name) for name in ("starts", "ten_seeds", "more_scenes")])
+    elsewhere = played[(played.suite == "simpler-bridge") & (played.seed > 0)]
+    _, *body = table("| policy | method | as listed (seed 0)")
+    assert {row[0] for row in body} == set(digests)
+    for name, method, _, cell in body:
+        rows = elsewhere[elsewhere.policy.str.endswith(digests[name])]
+        quoted, n = re.fullmatch(r"(.+) of (\d+) \(.*", cell.replace("*", "")).groups()
+        assert quoted == _over_layouts(rows, _method(method)), name
+        assert int(n) == len(rows[rows.method == _method(method)])
+
+
 def test_the_policy_of_more_scenes_came_out_the_same_again() -> None:
     folder = RESULTS.parent / "policies" / "mini-pi0-simpler-bridge-wide"
     again, main = _played("more_scenes"), _played("by_recipe")
@@ -178,7 +200,7 @@ def test_what_simpler_fractals_policies_of_todays_recipe_reach() -> None:
         tasks = [listed[listed.task == task] for task in (head[2], "move-bottle-near-coke-can")]
         assert [len(part) for part in tasks] == [300, 160]
         parts = [*tasks, listed, of_row[of_row.seed == 1]]
-        assert cells == [_of_way(part, method) for part in parts]
+        assert cells == [_over_layouts(part, method) for part in parts]
     other_looks = published[published.split == "variant aggregation"]
     assert set(other_looks.policy) == set(played.policy[played.name == "wide"])
     pens = other_looks[other_looks.task == "pick-pen-holder"]
@@ -215,7 +237,7 @@ def test_what_the_defaults_by_todays_recipe_reach() -> None:
         listed = of_row[of_row.seed == 0]
         assert len(listed) == (96 if "bridge" in name else 250)
         parts = [listed, listed[listed.task == unseen[name]], of_row[of_row.seed > 0]]
-        assert cells == [_of_way(part, method) for part in parts]
+        assert cells == [_over_layouts(part, method) for part in parts]
 
 
 @pytest.mark.parametrize(
@@ -257,7 +279,7 @@ def _starts(name: str, listed: int, others: int) -> list[tuple[str, str]]:
     played = _played(name)
     at_home, elsewhere = played[played.seed == 0], played[played.seed > 0]
     assert (len(at_home), len(elsewhere)) == (listed, others * 192)
-    return [(_of_way(at_home, way), _of_way(elsewhere, way)) for way in ("vap", "generic")]
+    return [(_of_way(at_home, way), _over_layouts(elsewhere, way)) for way in ("vap", "generic")]
 
 
 def test_what_a_policy_reaches_that_was_made_again() -> None:
@@ -294,6 +316,12 @@ def _method(cell: str) -> str:
 def _of_way(told: pd.DataFrame, way: str) -> str:
     won = told[told.method == way].success
     return _percent(rate(int(won.sum()), len(won))) if len(won) else ""
+
+
+def _over_layouts(told: pd.DataFrame, way: str) -> str:
+    """As `_of_way`; where a layout returns, the interval is over layouts."""
+    rows = told[told.method == way]
+    return _percent(rate_over_layouts(rows)) if len(rows) else ""
 
 
 def _percent(found: Rate) -> str:

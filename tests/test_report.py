@@ -21,11 +21,12 @@ from vap_core.base.files import DATA
 from vap_core.base.tables import escape, latex, markdown
 from vap_core.evaluation.metrics import rate
 from vap_core.evaluation.publish import publish
-from vap_core.evaluation.report import report
+from vap_core.evaluation.report import conclude, report
 from vap_core.evaluation.report.results import errors, results
 from vap_core.evaluation.report.runs import load_runs
-from vap_core.evaluation.statistics import ALL_TASKS, compare
+from vap_core.evaluation.statistics import ALL_TASKS, compare, rate_over_layouts
 from vap_core.evaluation.store import append, open_run
+from vap_core.evaluation.study import Study
 from vap_core.simulation import suites
 
 BRIDGE = (("simpler-bridge", "pick-shaver"), ("simpler-bridge", "put-camera"))
@@ -260,6 +261,24 @@ def test_seeds_of_a_benchmark_are_one_report_with_layouts_for_units(tmp_path: Pa
     assert (c.pairs, c.layouts) == (18, 6)
     once = results(load_runs([tmp_path / "0"])).set_index(["task", "method"]).loc["pick-shaver"]
     assert once["sr_layout_low"].isna().all(), "no layout returns: Wilson alone"
+    rows = runs.table[(runs.table.task == "pick-shaver") & (runs.table.method == "vap")]
+    found = rate_over_layouts(rows.drop(columns="layout"))
+    assert (found.value, found.low, found.high) == tuple(
+        shaver[["sr", "sr_layout_low", "sr_layout_high"]]
+    )
+    alone = rows[rows.seed == 0]
+    assert rate_over_layouts(alone).low == rate(int(alone.success.sum()), 6).low
+
+
+def test_the_end_of_a_run_says_where_layouts_return(tmp_path: Path) -> None:
+    """Its table's intervals are Wilson's, which take every episode for one by itself."""
+    study = Study(BRIDGE, ("generic", "vap"), episodes=6, policy="scripted")
+    parts = [load_runs([run(tmp_path / str(seed), seed=seed)]).table for seed in range(3)]
+    once = conclude(study, parts[0].drop(columns="layout"), tmp_path)
+    assert "layouts" not in once
+    table = pd.concat(parts, ignore_index=True).drop(columns="layout")
+    again = conclude(replace(study, seeds=3), table, tmp_path)
+    assert "36 episodes a method on 12 layouts; for intervals over layouts: python -m" in again
 
 
 def test_layouts_that_all_succeed_leave_room_for_one_that_fails(tmp_path: Path) -> None:

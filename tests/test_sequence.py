@@ -48,6 +48,16 @@ MISSED = Outcome("failure", False, False, 0, False, True, False, 60)
         ("First bring my cup, then my mug", ("First bring my cup", "bring my mug")),
         ("Could you bring my cup, then my bag", ("Could you bring my cup", "bring my bag")),
         ("bring Dr. Brown's cup", ("bring Dr. Brown's cup",)),
+        ("Bring my cup! Bring my bag!", ("Bring my cup", "Bring my bag")),
+        ("Could you bring my cup? Bring my bag?!", ("Could you bring my cup", "Bring my bag")),
+        (
+            "bring my cup\nbring my bag\r\n\r\nmy pen",
+            ("bring my cup", "bring my bag", "bring my pen"),
+        ),
+        ("bring my cup!\nThen my bag", ("bring my cup", "bring my bag")),
+        ("bring my cup?! then my bag", ("bring my cup", "bring my bag")),
+        ("bring my cup, then", ("bring my cup",)),
+        ("bring my cup; then; my bag", ("bring my cup", "bring my bag")),
     ],
 )
 def test_an_instruction_is_taken_apart(text, steps):
@@ -57,8 +67,19 @@ def test_an_instruction_is_taken_apart(text, steps):
 def test_it_in_a_later_step_and_no_step_are_one_line_each():
     with pytest.raises(BadInstruction, match="'it' in .* could be any object .*; name the object."):
         decompose("put my cup on the plate, then put it in the basket")
-    with pytest.raises(BadInstruction, match="no command in"):
-        decompose(" . ")
+    for nothing in (
+        " . ",
+        "then",
+        "Then.",
+        "and then!",
+        "after that,",
+        "?",
+        "\n",
+        ", ;",
+        "Then\nthen",
+    ):
+        with pytest.raises(BadInstruction, match="no command in"):
+            decompose(nothing)
 
 
 def test_a_sequence_succeeds_where_every_step_did():

@@ -1,5 +1,6 @@
 """The soft prompt as a method: the word is learned from photos, said in place of "my cup", and no weight of the policy moves."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -42,8 +43,14 @@ def config(vlm: str = "") -> MiniPI0Config:
 def grown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A tiny model, and a tiny policy that grew from it."""
     home, far = tmp_path_factory.mktemp("vlm"), tmp_path_factory.mktemp("policy")
+    grow(home, far, 0)
+    return home, far
+
+
+def grow(home: Path, far: Path, seed: int) -> None:
+    """Write a tiny model, and a tiny policy that grew from it."""
     with torch.random.fork_rng():
-        torch.manual_seed(0)
+        torch.manual_seed(seed)
         MiniVlm(config()).save(home)
         vlm = load_vlm(home)
         policy = MiniPI0Policy(config(vlm.sha256()))
@@ -55,7 +62,6 @@ def grown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     }
     for pipeline in make_pre_post_processors(policy.config, dataset_stats=stats):
         pipeline.save_pretrained(far)
-    return home, far
 
 
 def test_my_cup_becomes_a_word() -> None:
@@ -105,6 +111,40 @@ def test_it_runs_as_a_method_and_the_policy_stays(
     token.unlink()
     with pytest.raises(BadMemory, match="no learned word"):
         trials.make_trial(study, [row], "soft", bank)
+
+
+def test_one_object_has_a_token_for_every_model_and_its_look_alikes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three tasks ask for one camera: two policies grew from one model, the third from another."""
+    for name, seed in (("tiny", 0), ("tiny-other", 1)):
+        home, far = tmp_path / name, tmp_path / f"policy-{name}"
+        home.mkdir()
+        far.mkdir()
+        grow(home, far, seed)
+    policies = {SUITE: "tiny", "widowx-pick": "tiny-other", "franka-pick": "tiny"}
+    monkeypatch.setattr(
+        "vap_core.evaluation.study.shipped", lambda suite: tmp_path / f"policy-{policies[suite]}"
+    )
+    monkeypatch.setattr(teach_token, "MODEL", tmp_path / "tiny")
+    monkeypatch.setattr(teach_token, "VIEWS", 2)
+    monkeypatch.setattr(
+        learned_token, "TokenTraining", lambda: TokenTraining(epochs=1, augmentations=1)
+    )
+    tasks = ((SUITE, TASK), ("widowx-pick", "pick-camera"), ("franka-pick", "pick-camera"))
+    study = Study(tasks, ("soft",), policy="mini-pi0")
+    assert {study.rows(*task)[0].target for task in tasks} == {"camera-personal"}
+    trials.register_personal(study, tmp_path / "memory")
+    used = []
+    for task in tasks:
+        row = study.rows(*task)[0]
+        used.append(trials._token_embedding(study, "soft", row, tmp_path / "memory").tolist())
+    assert len(list((tmp_path / "memory").glob("camera-personal.*.token.safetensors"))) == 3
+    assert len(set(map(tuple, used))) == 3
+    alone = replace(study, tasks=tasks[2:])
+    trials.register_personal(alone, tmp_path / "alone")
+    row = alone.rows(*tasks[2])[0]
+    assert trials._token_embedding(alone, "soft", row, tmp_path / "alone").tolist() == used[2]
 
 
 def test_the_shipped_model_that_a_policy_grew_from_is_found() -> None:

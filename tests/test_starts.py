@@ -1,5 +1,7 @@
 """Seeds of a benchmark: 0 is the list, another moves arm, objects and light a little."""
 
+import hashlib
+import json
 from dataclasses import asdict, replace
 from itertools import combinations
 
@@ -14,11 +16,13 @@ from vap_core.evaluation.engine import result_key
 from vap_core.evaluation.publish import read_published
 from vap_core.evaluation.study import Study
 from vap_core.simulation import robots, suites
-from vap_core.simulation.suites import BENCHMARKS, starts
+from vap_core.simulation.suites import BENCHMARKS, SHARED, starts
 from vap_core.simulation.suites.open_row import build_scene, make_env
-from vap_core.simulation.types import AS_LISTED, EpisodeRow, Placement
+from vap_core.simulation.types import AS_LISTED, EpisodeRow, Placement, Start
 
 LEAST_GAP_M = 0.01
+RECEPTACLES = {"plate-prop", "basket-prop"}
+"""Of shared-sequence-bridge; where they stand side by side the list leaves 7 mm, under every seed."""
 TASK = ("simpler-bridge", "put-camera")
 
 
@@ -84,13 +88,69 @@ def test_a_start_depends_on_seed_and_layout_alone() -> None:
             assert (row.start.joints_rad, row.start.lamp) == (first.joints_rad, first.lamp)
 
 
-@pytest.mark.parametrize("name", sorted(BENCHMARKS))
+def test_a_lists_own_start_stays_and_the_seeds_change_comes_on_top() -> None:
+    plain = suites.benchmark(TASK[0])[0]
+    n = len(plain.placements)
+    listed = Start(
+        joints_rad=(0.1, 0.0, -0.05, 0.0, 0.2, 0.0),
+        offsets=((0.02, -0.01, 0.5),) * n,
+        lamp=0.5,
+        ambient=1.5,
+        absent=True,
+    )
+    own = replace(plain, start=listed)
+    assert asdict(starts.seeded(own, 0, 6).start) == asdict(listed)
+    change = starts.seeded(plain, 3, 6).start
+    start = starts.seeded(own, 3, 6).start
+    assert start.absent
+    assert start.lamp == 0.5 * change.lamp
+    assert start.ambient == 1.5 * change.ambient
+    assert start.joints_rad == tuple(np.add(listed.joints_rad, change.joints_rad).tolist())
+    assert np.array_equal(start.offsets, np.add(listed.offsets, change.offsets))
+    partly = starts.seeded(replace(plain, start=Start(lamp=0.5)), 3, 6).start
+    assert asdict(partly) == asdict(replace(change, lamp=0.5 * change.lamp))
+
+
+KNOWN_STARTS = {
+    "simpler-fractal": "8c07faf850079474",
+    "simpler-bridge": "51d1cc34ed618574",
+    "vlabench": "e0a88b0d2b4280d8",
+    "tabletop": "bba88a45559720c6",
+    "tabletop-dev": "e460e806c99aaf03",
+    "tabletop-absent": "2c8acb9bf052ed34",
+    "shared-sequence": "1368b7b2c22e673d",
+    "shared-pair": "f2a0f2a9fbd341f7",
+}
+"""The first 16 digits of the sha256 of all starts of a suite under seed 1."""
+
+
+@pytest.mark.parametrize("name", sorted(KNOWN_STARTS))
+def test_the_starts_of_the_shipped_lists_are_those_of_runs_before(name: str) -> None:
+    joints = len(robots.get(suites.suite(name).robot).joints)
+    found = [asdict(starts.seeded(row, 1, joints).start) for row in suites.benchmark(name)]
+    digest = hashlib.sha256(json.dumps(found).encode()).hexdigest()
+    assert digest[:16] == KNOWN_STARTS[name]
+
+
+def test_receptacles_that_stand_side_by_side_stay_in_their_places() -> None:
+    """Moved like the rest, a plate could reach 12 mm into the basket beside it."""
+    moved = set()
+    for seed, row in enumerate(suites.benchmark("shared-sequence-bridge"), 1):
+        start = starts.seeded(row, seed, 6).start
+        for place, offset in zip(row.placements, start.offsets, strict=True):
+            if offset != (0.0, 0.0, 0.0):
+                moved.add(place.model)
+    assert not moved & RECEPTACLES
+    assert len(moved) >= 6
+
+
+@pytest.mark.parametrize("name", [*sorted(BENCHMARKS), *sorted(SHARED)])
 def test_objects_of_every_seed_keep_apart_and_starts_stay_within_the_spread(name: str) -> None:
-    joints = len(robots.get(BENCHMARKS[name].robot).joints)
+    joints = len(robots.get(suites.suite(name).robot).joints)
     spread = starts.SPREAD
     least = np.inf
     drawn = []
-    for seed, row in enumerate(suites.benchmark(name)[::11], 1):
+    for seed, row in enumerate(suites.benchmark(name)[:: 11 if name in BENCHMARKS else 3], 1):
         row = starts.seeded(row, seed, joints)
         assert len(row.start.joints_rad) == joints
         drawn.append([*row.start.joints_rad[:5], *row.start.offsets[0]])
@@ -99,7 +159,8 @@ def test_objects_of_every_seed_keep_apart_and_starts_stay_within_the_spread(name
             x, y, yaw = place.x + dx, place.y + dy, place.yaw + turn
             stands.append(Placement(model=place.model, x=x, y=y, yaw=yaw))
         for one, other in combinations(stands, 2):
-            least = min(least, gap_m(one, other))
+            if name != "shared-sequence-bridge" or {one.model, other.model} != RECEPTACLES:
+                least = min(least, gap_m(one, other))
     assert least >= LEAST_GAP_M
     most = [*[spread.joints_rad] * 5, spread.place_m, spread.place_m, spread.yaw_rad]
     reached = np.abs(drawn).max(axis=0)

@@ -147,6 +147,8 @@ def test_tokens_of_other_spaces_are_methods(
     (used,) = trial.policy.learned.values()
     suffix = token_file.OWN_SUFFIX if method == "soft-own" else token_file.SUFFIX
     model = load_from_policy(far) if method == "soft-own" else load_vlm(home)
+    rows = asked.rows(SUITE, TASK)
+    suffix = teach_token.file_suffix(rows, model.sha256(), suffix)
     token = token_file.load(bank, row.target, model.sha256(), suffix)
     expected = token.embedding
     if method == "soft-aligned":

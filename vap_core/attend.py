@@ -132,6 +132,30 @@ def check_views(views: Any) -> None:
         )
 
 
+def _clip_to_views(boxes: Mapping[str, Boxes], views: Views) -> dict[str, Boxes]:
+    """Boxes given by hand, each inside its view. Raises: BadViews."""
+    unknown = sorted(set(boxes) - set(views))
+    if unknown:
+        raise BadViews(
+            f"Attender.start: boxes of {', '.join(unknown)}, but the views are of "
+            f"{', '.join(sorted(views))}; name the boxes after the views."
+        )
+    clipped = {}
+    for camera, given in boxes.items():
+        height, width = views[camera].shape[:2]
+        far = np.array([width, height, width, height], np.float32)
+        xyxy = np.clip(given.xyxy, np.float32(0), far)
+        outside = np.flatnonzero((xyxy[:, 2:] - xyxy[:, :2] < 1).any(axis=1))
+        if len(outside):
+            raise BadViews(
+                f"Attender.start: box {given.xyxy[outside[0]].tolist()} of view {camera!r} has "
+                f"less than one pixel inside its {width}x{height} picture; give x0, y0, x1, y1 in "
+                "its pixels, far corner last."
+            )
+        clipped[camera] = replace(given, xyxy=xyxy)
+    return clipped
+
+
 class Attender:
     """Grounds personal objects at t = 0, tracks them afterwards, and prompts every image.
 
@@ -170,23 +194,19 @@ class Attender:
         """Ground every target of `instruction` in every view (t = 0).
 
         `objects` names the remembered object of each target in turn, where its category alone does
-        not decide. `boxes` replaces the detector by candidates given by hand; a camera that it
-        leaves out has none. `cameras` are the calibrated cameras at this moment, which association
-        by geometry needs.
+        not decide. `boxes` replaces the detector by candidates given by hand, clipped to their
+        view; a camera that it leaves out has none. `cameras` are the calibrated cameras at this
+        moment, which association by geometry needs.
 
         Raises:
             BadInstruction, UnknownName: the instruction does not match the memory.
-            BadViews: a view is no RGB picture, there are boxes of a camera that gives none, or the
-                views cannot be associated.
+            BadViews: a view is no RGB picture, there are boxes of a camera that gives none or
+                outside its view, or the views cannot be associated.
             BadEncoder: an encoder gives numbers that are not finite.
         """
         check_views(views)
-        unknown = sorted(set(boxes or {}) - set(views))
-        if unknown:
-            raise BadViews(
-                f"Attender.start: boxes of {', '.join(unknown)}, but the views are of "
-                f"{', '.join(sorted(views))}; name the boxes after the views."
-            )
+        if boxes is not None:
+            boxes = _clip_to_views(boxes, views)
         parsed, wanted = self.understand(instruction, objects)
         phrases = [target.category for target in parsed.targets]
         proposals = self._propose(views, phrases, boxes)

@@ -14,6 +14,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from vap_core import __version__
 from vap_core.associate import MOST_VIEWS, PAIRINGS
 from vap_core.attend import Attender, AttendState, Prompting
 from vap_core.base.errors import BadDataset, BadOutput
@@ -83,7 +84,9 @@ def inspect_dataset(
         "instruction": instruction,
         "objects": None if objects is None else list(objects),
         "stack": [models.name, models.encoder.name],
+        "thresholds": None if models.thresholds is None else asdict(models.thresholds),
         "memory": _memory_digest(bank),
+        "version": __version__,
     }
     if speaker:
         about["speaker"] = speaker
@@ -279,7 +282,8 @@ def _memory_digest(bank: Mapping[str, PersonalObject]) -> str:
     """What is remembered, as one number."""
     digest = hashlib.sha256()
     for name, obj in sorted(bank.items()):
-        digest.update(f"{name} {obj.category} {obj.embeddings.shape}".encode())
+        about = [name, obj.category, obj.owner, obj.known_as, obj.embeddings.shape]
+        digest.update(json.dumps(about).encode())
         digest.update(obj.embeddings.tobytes())
     return digest.hexdigest()[:16]
 
@@ -290,14 +294,17 @@ def _check_folder(out: Path, about: Mapping[str, Any]) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
         if file.is_file():
-            if parse_json(file.read_text()) != about:
+            found = dict(parse_json(file.read_text()))
+            keys = dict.fromkeys([*about, *found])
+            differing = [key for key in keys if found.get(key) != about.get(key)]
+            if differing:
                 raise BadOutput(
-                    f"inspect-dataset: {out} holds another inspection (dataset, instruction, "
-                    "stack or memory differ); choose another --out."
+                    f"inspect-dataset: {out} holds another inspection ({', '.join(differing)} "
+                    "differ); choose another --out."
                 )
             return
         write_atomic(file, json.dumps(about).encode())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError) as error:
         raise BadOutput(
             f"inspect-dataset: {out} cannot be used ({error}); choose another --out."
         ) from error

@@ -112,13 +112,17 @@ def missing_threshold(stack: str) -> str:
 
     Raises: as `load_own`.
     """
+    from vap_core.perception.kept_thresholds import keep_command
+    from vap_core.perception.protocols import FamiliarityJudge
     from vap_core.perception.stacks import load_own
 
-    if load_own(stack).thresholds is not None:
+    models = load_own(stack)
+    if models.thresholds is not None:
         return ""
+    command = keep_command(stack, photos=isinstance(models.detector, FamiliarityJudge))
     return (
         f'the stack {stack} has no threshold of "not in view": the best candidate is highlighted, '
-        f"however unlike it is; measure one: python -m vap_core calibrate --stack {stack} --keep"
+        f"however unlike it is; measure one: {command}"
     )
 
 

@@ -259,9 +259,9 @@ def rates_figure(
 ) -> "Figure":
     """Grouped bars: a panel per key, a group per inner key, a colour per innermost key.
 
-    A row has PANELS_IN_A_ROW panels at most; more panels are in several rows of one length. Rates
-    are drawn in percent with their intervals. Groups and colours keep one order over all panels,
-    that in which they first appear. `groups_label` says what the groups are.
+    A row has PANELS_IN_A_ROW panels at most; the rows of more are as even as they can be. Rates are
+    drawn in percent with their intervals. Groups and colours keep one order over all panels, that
+    in which they first appear. `groups_label` says what the groups are.
     """
     groups: dict[str, None] = {}
     names: dict[str, None] = {}

@@ -94,6 +94,10 @@ class BadSuite(VapError):
     """An episode list with a malformed row, or one that changed since it was hashed."""
 
 
+class BadRobot(VapError):
+    """A robot whose MJCF file is absent or lacks a part, or with a camera that cannot look so."""
+
+
 class BadViews(VapError):
     """Views that cannot be used: too many, without calibration, or not those of the start."""
 

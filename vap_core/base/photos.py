@@ -37,7 +37,17 @@ def load_photo(path: Path | str, long_side: int | None = LONG_SIDE) -> Rgb:
     Raises:
         BadPhoto: missing, empty, not an image, truncated, or more than 50 megapixels.
     """
-    return _decode(path, "RGB", long_side)
+    rgb = _decode(path, "RGB")
+    return rgb if long_side is None else shrink(rgb, long_side)
+
+
+def shrink(rgb: Rgb, long_side: int) -> Rgb:
+    """The picture with a longer side of `long_side` pixels; a smaller one as it is."""
+    from PIL import Image
+
+    image = Image.fromarray(rgb)
+    image.thumbnail((long_side, long_side))
+    return np.array(image, dtype=np.uint8)
 
 
 def load_mask(path: Path | str) -> Mask:
@@ -50,7 +60,7 @@ def load_mask(path: Path | str) -> Mask:
     return bright & (pixels[..., 3] > BRIGHT)
 
 
-def _decode(path: Path | str, mode: str, long_side: int | None = None) -> np.ndarray:
+def _decode(path: Path | str, mode: str) -> np.ndarray:
     """The pixels of a picture file, upright, as RGB or RGBA. Raises: BadPhoto."""
     from PIL import Image, ImageOps, UnidentifiedImageError
     from pillow_heif import register_heif_opener
@@ -75,10 +85,7 @@ def _decode(path: Path | str, mode: str, long_side: int | None = None) -> np.nda
                 # What is hidden in the file is no part of the picture.
                 grey = Image.new("RGBA", upright.size, (BEHIND, BEHIND, BEHIND, 255))
                 upright = Image.alpha_composite(grey, upright.convert("RGBA"))
-            upright = upright.convert(mode)
-            if long_side is not None:
-                upright.thumbnail((long_side, long_side))
-            return np.array(upright, dtype=np.uint8)
+            return np.array(upright.convert(mode), dtype=np.uint8)
     except BadPhoto:
         raise
     except UnidentifiedImageError as error:

@@ -214,8 +214,8 @@ def ground(
     )
     from vap_core.analysis.ground_clip import ground_clip, is_clip
     from vap_core.base.errors import BadInstruction
+    from vap_core.base.photos import load_photo, shrink
     from vap_core.instruction.parsers import Parsing
-    from vap_core.memory import load_photo
     from vap_core.perception.tiles import SMALL_MEGAPIXELS
 
     stack = stack_of(stack, detector, encoder, tracker)
@@ -244,15 +244,17 @@ def ground(
         print(summary)
         print(f"wrote {mp4} and {rrd}; look: python -m vap_core view {shlex.quote(str(rrd))}")
         return
-    rgb = load_photo(image, long_side=None if box else GROUND_SIDE)
+    rgb = load_photo(image, long_side=None)
+    if tiles is None:  # by the file's own size
+        tiles = rgb.shape[0] * rgb.shape[1] >= SMALL_MEGAPIXELS * 1e6
+    if not box:
+        rgb = shrink(rgb, GROUND_SIDE)
     boxes = parse_boxes(box, rgb) if box else None
     if max(rgb.shape[:2]) == GROUND_SIDE:
         print(
             f"note: boxes are pixels of the picture at {rgb.shape[1]}x{rgb.shape[0]}.",
             file=sys.stderr,
         )
-    if tiles is None:
-        tiles = rgb.shape[0] * rgb.shape[1] >= SMALL_MEGAPIXELS * 1e6
     if tiles and boxes is None:
         print(
             "note: looking at the whole picture and at nine overlapping half-size tiles of it, for "

@@ -40,7 +40,8 @@ def eval_policy(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="A table to add the episodes to, for example data/results/probe.parquet."
+            help="A table to add the episodes to, for example data/results/probe.parquet; those of "
+            "the same suite, policy and way in it are replaced."
         ),
     ] = None,
 ) -> None:

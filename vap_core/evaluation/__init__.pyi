@@ -18,5 +18,6 @@ from .report.result_figures import tasks_figure as tasks_figure
 from .report.runs import load_runs as load_runs
 from .statistics import ALL_TASKS as ALL_TASKS
 from .statistics import compare as compare
+from .statistics import rate_over_layouts as rate_over_layouts
 from .stills import write_provenance as write_provenance
 from .switching import switching_lines as switching_lines

@@ -14,7 +14,7 @@ from jaxtyping import Float64
 
 from vap_core.base.types import value
 from vap_core.evaluation.layouts import layout_names
-from vap_core.evaluation.metrics import rate
+from vap_core.evaluation.metrics import Rate, rate
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -131,6 +131,29 @@ def ratio(slow: Sequence[float], fast: Sequence[float]) -> tuple[float, float, f
         float(np.exp(logs.mean() - half)),
         float(np.exp(logs.mean() + half)),
     )
+
+
+def rate_over_layouts(episodes: "pd.DataFrame") -> Rate:
+    """The success of episodes; its interval is over layouts where one returns, else Wilson's.
+
+    It is that of a report's `sr_layout_low` and `sr_layout_high`. The column `layout` is added
+    where it is absent.
+    """
+    won = episodes["success"].eq(True) & episodes["outcome"].ne("error")
+    found = rate(int(won.sum()), len(won))
+    clusters = won.astype(float).groupby(_layouts_of(episodes), sort=True).agg(["sum", "size"])
+    low, high = layout_interval(clusters["sum"].to_numpy(), clusters["size"].to_numpy(float))
+    return found if np.isnan(low) else replace(found, low=low, high=high)
+
+
+def layout_interval(won: PerCluster, n: PerCluster) -> tuple[float, float]:
+    """95 % interval of a rate over layouts, of which each has `won` of `n` episodes.
+
+    nan where no layout returns: then every episode is one by itself.
+    """
+    if len(n) == 0 or n.max() <= 1:
+        return float("nan"), float("nan")
+    return bootstrap_interval(won, n, least=0.0)
 
 
 def bootstrap_interval(gain: PerCluster, n: PerCluster, least: float = -1.0) -> tuple[float, float]:

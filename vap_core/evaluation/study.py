@@ -21,18 +21,18 @@ from vap_core.evaluation.methods import (
     find,
     has_no_command,
     known_methods,
+    needs_memory,
     needs_token,
     suits_shared,
 )
 from vap_core.evaluation.policy_names import MINI, POLICIES, PRIVILEGED, SHIPPED, shipped
-from vap_core.perception.embedded.weights import weights_sha256
-from vap_core.perception.stacks import check_stack
+from vap_core.perception.stacks import check_stack, checksums
 from vap_core.policies.lerobot import checkpoints
 from vap_core.policies.names import check_policy_name, label_of
 from vap_core.rollout.loop import Follow
 from vap_core.simulation import robots, suites
 from vap_core.simulation.assets.objects import get_object
-from vap_core.simulation.cameras import RIGS
+from vap_core.simulation.cameras import RIGS, SHIPPED_RIGS
 from vap_core.simulation.scenes import Meshes
 from vap_core.simulation.suites import starts
 from vap_core.simulation.suites.variants import VARIANTS
@@ -109,6 +109,10 @@ class Study:
         """Whether something holds for any of its methods."""
         return any(holds(method) for method in self.methods)
 
+    def uses_stack(self) -> bool:
+        """Whether anything of it loads the stack."""
+        return self.policy == "scripted" or self.any_method(needs_memory)
+
     def next_command(self, *words: str | Path) -> str:
         """A command to print, to be run next; it finds the study's own suites."""
         line = shlex.join(["python", "-m", "vap_core", *map(str, words)])
@@ -120,11 +124,12 @@ class Study:
         """What the results depend on, as JSON.
 
         Weights, episode lists, and the world (robots, objects, styles, sensors) enter by checksum,
-        methods by name, and those that are not published by what they change, too.
+        methods by name, and those that are not published by what they change, too. Of a stack whose
+        parts are not all embedded so do its models' files and the thresholds kept on this machine.
 
         Raises: BadPolicy for a checkpoint that is not on this machine; MissingWeights when the
-            backbone's package is not installed; BadSuite for a list without a checksum; BadObject
-            for a damaged scan.
+            backbone's package is not installed or the stack's models are not here; BadSuite for a
+            list without a checksum; BadObject for a damaged scan.
         """
         digests = {}
         for suite, _ in self.tasks:
@@ -149,7 +154,8 @@ class Study:
         own = sorted(set(self.methods) - PUBLISHED)
         if own:
             about["arms"] = {method: describe(find(method)) for method in own}
-        about |= {"version": __version__, "weights": weights_sha256(), "lists": digests}
+        about |= {"version": __version__, "lists": digests}
+        about |= checksums(self.stack if self.uses_stack() else "embedded")
         if digests and self.seed + self.seeds > 1:
             about["starts"] = starts.settings()
         return {**about, "world": _world_digest(self)}
@@ -232,7 +238,15 @@ def _check_policy(study: Study) -> None:
 
 
 def _world_digest(study: Study) -> str:
-    found = hashlib.sha256(_canonical((RIGS, VARIANTS)))
+    """Over the cameras that ship and those of the study's robots, styles, suites, robots, objects.
+
+    What an own suite's file enters for its own robot changes no other suite's digest.
+    """
+    rigs = dict(SHIPPED_RIGS)
+    for suite, _ in study.tasks:
+        robot_name = suites.suite(suite).robot
+        rigs[robot_name] = RIGS[robot_name]
+    found = hashlib.sha256(_canonical((rigs, VARIANTS)))
     for suite, task in study.tasks:
         known = suites.suite(suite)
         robot = robots.get(known.robot)

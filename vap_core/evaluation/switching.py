@@ -19,8 +19,8 @@ def columns(episode: Episode) -> dict[str, Any]:
     """What a results table keeps of an episode whose tint was switched; nothing of any other.
 
     `switched_s` is when. `turned_s` is how long after it the gripper was nearer to the object that
-    is tinted now than to the target, across the table; None where it never was. `obeyed` says
-    whether the robot touched that object afterwards.
+    is tinted now than to the target, across the table; None where it never was, and where it was so
+    already at the switch. `obeyed` says whether the robot touched that object afterwards.
     """
     switch = _switch(episode)
     if switch is None:
@@ -32,24 +32,31 @@ def columns(episode: Episode) -> dict[str, Any]:
     turned_s = None
     for frame in frames:
         if _away_m(robot, frame, rival) < _away_m(robot, frame, target):
-            turned_s = frame.timestamp_s - frames[0].timestamp_s
+            if frame is not frames[0]:
+                turned_s = frame.timestamp_s - frames[0].timestamp_s
             break
     obeyed = any(rival in frame.truth.touched for frame in frames[1:])
     return {"switched_s": frames[0].timestamp_s, "turned_s": turned_s, "obeyed": obeyed}
 
 
 def switching_lines(episodes: "pd.DataFrame") -> list[str]:
-    """What the robot did, by suite and method; of a table without such episodes nothing."""
+    """What the robot did, by suite and method; of a table without such episodes nothing.
+
+    Tables of earlier versions have `turned_s` 0 where the gripper was nearer to the other object
+    already at the switch; that hand did not turn.
+    """
     if "switched_s" not in episodes:
         return []
     lines = []
     switched = episodes[episodes["switched_s"].notna()]
     for (name, method), part in switched.groupby(["suite", "method"], sort=False):
         turned = part["turned_s"].dropna().astype(float)
+        turned = turned[turned > 0]
         obeyed = rate(int(part["obeyed"].eq(True).sum()), len(part))
         line = f"{name} {method}: switched in {len(part)} episodes, obeyed in {obeyed}"
         if len(turned):
-            line += f"; {len(turned)} hands turned, median {turned.median():.1f} s after the switch"
+            line += f"; the hand turned in {len(turned)}, "
+            line += f"median {turned.median():.1f} s after the switch"
         lines.append(line)
     return lines
 

@@ -30,7 +30,7 @@ from vap_core.perception.stacks import load_stack
 from vap_core.policies.lerobot import checkpoints
 from vap_core.policies.mini_pi0 import token_file
 from vap_core.policies.mini_pi0.learned_token import WORD
-from vap_core.policies.mini_pi0.teach_token import model_of, teach, teach_own
+from vap_core.policies.mini_pi0.teach_token import file_suffix, model_of, teach, teach_own
 from vap_core.policies.protocol import Policy, PrivilegedPolicy
 from vap_core.rollout.loop import Trial
 from vap_core.simulation import suites
@@ -158,24 +158,26 @@ def _policy(
     )
     if not needs_token(method):
         return policy
-    embedding = _token_embedding(study.checkpoint(row.suite), method, row.target, bank)
+    embedding = _token_embedding(study, method, row, bank)
     return policy.with_tokens({WORD: embedding})
 
 
 def _token_embedding(
-    checkpoint: str, method: str, target: str, bank: Path
+    study: Study, method: str, row: EpisodeRow, bank: Path
 ) -> Float32[np.ndarray, " d"]:
     """The embedding that the target's word has under a method with a soft prompt."""
     from vap_core.policies.mini_pi0.token_alignment import align
     from vap_core.policies.mini_pi0.vlm import load_from_policy
 
-    folder = checkpoints.locate(checkpoint)
+    folder = checkpoints.locate(study.checkpoint(row.suite))
+    rows = study.rows(row.suite, row.task)
     space = token_space(method)
     if space == "own":
         own = load_from_policy(folder).sha256()
-        return token_file.load(bank, target, own, token_file.OWN_SUFFIX).embedding
+        suffix = file_suffix(rows, own, token_file.OWN_SUFFIX)
+        return token_file.load(bank, row.target, own, suffix).embedding
     initialised_from = checkpoints.config_field(folder, "vlm")
-    token = token_file.load(bank, target, initialised_from)
+    token = token_file.load(bank, row.target, initialised_from, file_suffix(rows, initialised_from))
     if space == "aligned":
         return align(token.embedding, model_of(initialised_from), folder)
     return token.embedding

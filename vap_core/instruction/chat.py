@@ -7,10 +7,12 @@ executed.
 
 import json
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from threading import Lock, get_ident
+from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadEndpoint, BadInstruction
 from vap_core.base.files import parse_json
@@ -24,6 +26,9 @@ from vap_core.perception.chat import (
     ChatEndpoint,
     answer_in_time,
 )
+
+if TYPE_CHECKING:
+    from httpx import Response
 
 TASK = (
     "A user tells a robot what to do. Find every expression of the instruction that refers to one "
@@ -41,6 +46,8 @@ NO_KEY = "none"
 MAX_TOKENS = 400
 MAX_USES = 20
 """So many of the last uses the model sees."""
+_HOOKS = Lock()
+"""Of the shared client's hooks, while they change."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +190,7 @@ def _ask(endpoint: ChatEndpoint, messages: list[dict[str, str]], schema: dict[st
         base_url=endpoint.url, api_key=endpoint.key or NO_KEY, timeout=endpoint.timeout_s
     )
     try:
-        with client:
+        with client, _refusing_redirects(endpoint):
             answer = client.chat_completion(
                 messages=list[Any](messages),
                 model=endpoint.model,
@@ -224,6 +231,37 @@ def _ask(endpoint: ChatEndpoint, messages: list[dict[str, str]], schema: dict[st
             f"parse: {endpoint.url} does not answer as a chat endpoint does "
             f"({type(error).__name__}); give the address that ends in /v1."
         ) from error
+
+
+@contextmanager
+def _refusing_redirects(endpoint: ChatEndpoint) -> Iterator[None]:
+    """What this thread asks goes to no other server: it would get the instruction and the people.
+
+    All requests of huggingface_hub share one client, which follows redirects. Its hooks see a
+    response before that. Raises: BadEndpoint: the server redirects.
+    """
+    from huggingface_hub import get_session
+
+    shared = get_session()
+    asking = get_ident()
+
+    def refuse(response: "Response") -> None:
+        if response.has_redirect_location and get_ident() == asking:
+            raise BadEndpoint(
+                f"parse: {endpoint.url} refuses ({response.status_code}: it redirects to "
+                f"{_line(response.headers['location'])}, which is not followed); check {URL}."
+            )
+
+    with _HOOKS:
+        hooks = shared.event_hooks
+        shared.event_hooks = {**hooks, "response": [*hooks["response"], refuse]}
+    try:
+        yield
+    finally:
+        with _HOOKS:
+            hooks = shared.event_hooks
+            others = [hook for hook in hooks["response"] if hook is not refuse]
+            shared.event_hooks = {**hooks, "response": others}
 
 
 def _line(text: str) -> str:

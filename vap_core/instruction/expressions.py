@@ -10,7 +10,7 @@ from functools import cache
 from vap_core.base.types import value
 from vap_core.instruction.context import Context
 from vap_core.instruction.owners import MINE
-from vap_core.instruction.rule import category_pattern, possessive, spaced
+from vap_core.instruction.rule import ARTICLE, category_pattern, possessive, spaced
 
 PLACING = "put|place|set|lay|move|drop|push|stack|store|leave|slide|stand|stow"
 ACTION = (
@@ -186,10 +186,10 @@ def person_pattern(context: Context) -> str:
     """A regular expression for anybody whom the memory knows, and for the speaker."""
     words = ["I", "me"]
     for name, known_as in context.owners.items():
-        words.append(spaced(name))
+        words += [spaced(name), f"{ARTICLE}{spaced(name)}"]
         for word in known_as:
             own = spaced(word.split("'s ")[-1])
-            words.append(f"my {own}")
+            words += [f"my {own}", f"{ARTICLE}{own}"]
             if "'s " in word:
                 words.append(spaced(word))
     return "|".join(sorted(words, key=len, reverse=True))

@@ -16,8 +16,10 @@ STOP_WORDS = frozenset(
 """Words that end a category phrase when no known category matches, and that name no person."""
 _WORD = rf"(?!(?:{'|'.join(sorted(STOP_WORDS))})\b)[\w-]+"
 _PERSON = rf"(?:(?:{_WORD}\s+){{0,2}}?{_WORD}(?:['’]s|s['’])\s+)?"
-OWNER = re.compile(rf"\bmy\s+{_PERSON}", re.IGNORECASE)
+OWNER = re.compile(rf"\b(?P<owner>my\s+{_PERSON})", re.IGNORECASE)
 """A possessive trigger: "my cup", or with an owner beside the speaker, "my brother's cup"."""
+ARTICLE = r"(?:the|an?)\s+"
+"""What may stand before a person: "the neighbour's cup" is rewritten with its article."""
 
 
 @runtime_checkable
@@ -33,7 +35,8 @@ def parse(text: str, categories: Collection[str] = (), owners: Collection[str] =
     Every "my <category>" or "my <person>'s <category>" becomes a target. The longest of
     `categories` (a plural allowed) that follows the trigger wins; otherwise the words up to
     punctuation or the first stop word are the category, so unseen nouns work too. Where objects
-    have `owners`, "Anna's <category>" and "his <category>" of a known category are targets as well.
+    have `owners`, "Anna's <category>" and "his <category>" of a known category are targets as well;
+    the article of "the neighbour's <category>" is part of the span.
 
     Raises:
         BadInstruction: the text holds no possessive span.
@@ -43,11 +46,12 @@ def parse(text: str, categories: Collection[str] = (), owners: Collection[str] =
     trigger = pattern.search(text)
     while trigger is not None:
         start, stop = trigger.span()
-        first = re.match(r"[\w'’-]+\s+", text[start:])
-        if first and leading_category(text[start + first.end() :], categories)[0] in categories:
-            stop = start + first.end()  # "my cup near Anna's" is about my cup
+        begin = trigger.start("owner")
+        first = re.match(r"[\w'’-]+\s+", text[begin:])
+        if first and leading_category(text[begin + first.end() :], categories)[0] in categories:
+            stop = begin + first.end()  # "my cup near Anna's" is about my cup
         category, length = leading_category(text[stop:], categories)
-        owner = text[start:stop].strip()
+        owner = text[begin:stop].strip()
         if category and (category in categories or owner.lower().startswith("my")):
             stop += length
             targets.append(Target(start=start, stop=stop, owner=owner, category=category))
@@ -85,11 +89,10 @@ def rewrite(instruction: Instruction, colours: Sequence[Colour | None]) -> str:
 
 
 def _has_capital(text: str, target: Target) -> bool:
-    """Whether a span begins with a capital letter that is not a name's ("Anna's cup")."""
+    """Whether a span begins a sentence with a capital letter; within one it is a name's or a style
+    of writing ("Bring Anna's cup", "Bring My Cup")."""
     before = text[: target.start].rstrip()
-    span = text[target.start : target.stop]
-    named = re.match(r"(?!my\b)[\w.'’-]+(?:\s+[\w.'’-]+){0,4}?['’]s?(?!\w)", span, re.IGNORECASE)
-    if named and before and before[-1] not in ".!?":
+    if before and before[-1] not in ".!?":
         return False
     return text[target.start].isupper()
 
@@ -112,13 +115,14 @@ def possessive(people: str) -> str:
 @cache
 def _any_owner(owners: tuple[str, ...]) -> re.Pattern[str]:
     """As OWNER, and "his cup", "Anna's cup", "Anna's brother's cup"; for one of `owners` also
-    "James' cup" and "Mary Jane's cup"."""
+    "James' cup" and "Mary Jane's cup". An article before them is no part of the owner, unless the
+    name has it."""
     longest_first = sorted(owners, key=len, reverse=True)
     names = "|".join(spaced(name).replace("'", "['’]") for name in longest_first)
     return re.compile(
-        rf"\b(?:my|his|her|their|our|{possessive(names)}"
+        rf"\b(?:{ARTICLE})??(?P<owner>(?:my|his|her|their|our|{possessive(names)}"
         r"|(?!(?:it|that|what|who|where|here|there|let|how)['’])[\w-]+(?:['’][\w-]+)*['’]s)\s+"
-        rf"{_PERSON}",
+        rf"{_PERSON})",
         re.IGNORECASE,
     )
 

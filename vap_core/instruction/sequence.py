@@ -9,13 +9,17 @@ import re
 from vap_core.base.errors import BadInstruction
 from vap_core.instruction.expressions import ACTION, PLACING
 
+_NEXT = r"(?:and\s+)?(?:then|after that|afterwards)\b"
 STEP = re.compile(
-    r"\s*(?:[,;.]\s*(?:and\s+)?(?:then|after that|afterwards)\b"
-    r"|\s(?:and\s+)?(?:then|after that|afterwards)\b"
-    r"|(?:;|(?<!\bDr)(?<!\bMr)(?<!\bMrs)(?<!\bMs)(?<!\bSt)\.)(?=\s+\S))\s*,?\s*",
+    rf"\s*(?:[,;.!?]+\s*{_NEXT}|\s{_NEXT}"
+    r"|(?:[;!?]+|(?<!\bDr)(?<!\bMr)(?<!\bMrs)(?<!\bMs)(?<!\bSt)\.)(?=\s+\S)"
+    r"|[\r\n]+)\s*,?\s*",
     re.IGNORECASE,
 )
-"""What stands between two steps: "then", "and then", "after that", or the end of a sentence."""
+"""What stands between two steps: "then", "and then", "after that", the end of a sentence, of which
+"!" and "?" are one, too, or of a line."""
+_NOTHING = re.compile(rf"(?:and|{_NEXT})?\W*", re.IGNORECASE)
+"""What is no command: "then" or "and" alone, or no word at all."""
 _BEFORE = r"(?:(?:first|now|please|(?:could|can|would|will) you)\s*,?\s+)*"
 VERB = re.compile(rf"{_BEFORE}(?P<verb>{ACTION})\b", re.IGNORECASE)
 PLACE = re.compile(rf"{_BEFORE}(?:{PLACING})\b", re.IGNORECASE)
@@ -34,9 +38,9 @@ def decompose(text: str) -> tuple[str, ...]:
     Raises: BadInstruction: no step, or "it" in a later step, which could be several objects.
     """
     steps: list[str] = []
-    for part in STEP.split(text.strip().rstrip(".!")):
+    for part in STEP.split(text.strip().rstrip(".!?")):
         step = " ".join(part.split())
-        if not step:
+        if _NOTHING.fullmatch(step):
             continue
         if steps and IT.search(step):
             raise BadInstruction(

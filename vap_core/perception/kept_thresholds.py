@@ -1,6 +1,7 @@
 """Thresholds of a stack that ships none, measured on this machine: a file beside its weights."""
 
 import json
+import math
 import re
 from pathlib import Path
 
@@ -12,6 +13,12 @@ from vap_core.perception.protocols import Thresholds
 def thresholds_file(folder: Path, kind: str) -> Path:
     """Where the thresholds of a stack are kept."""
     return folder / f"thresholds-{re.sub(r'[^\w.=-]+', '_', kind)}.json"
+
+
+def keep_command(kind: str, photos: bool) -> str:
+    """The command that measures a stack's thresholds and keeps them, on photos too where asked."""
+    on_photos = " --photos SET" if photos else ""
+    return f"python -m vap_core calibrate --stack {kind}{on_photos} --keep"
 
 
 def keep_thresholds(folder: Path, kind: str, encoder: str, thresholds: Thresholds) -> Path:
@@ -33,6 +40,8 @@ def read_thresholds(folder: Path, kind: str, encoder: str) -> Thresholds | None:
 
     Raises: BadOutput: the file is damaged.
     """
+    from vap_core.perception.foundation.sources import needs_photos
+
     path = thresholds_file(folder, kind)
     if not path.is_file():
         return None
@@ -40,9 +49,12 @@ def read_thresholds(folder: Path, kind: str, encoder: str) -> Thresholds | None:
         about = parse_json(path.read_bytes())
         if about["encoder"] != encoder:
             return None
-        return Thresholds(float(about["familiar"]), float(about["unfamiliar"]))
+        thresholds = Thresholds(float(about["familiar"]), float(about["unfamiliar"]))
+        if not (math.isfinite(thresholds.familiar) and math.isfinite(thresholds.unfamiliar)):
+            raise ValueError(f"{thresholds} are no thresholds")
+        return thresholds
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise BadOutput(
-            f"load_stack: {path} is damaged; delete it and run python -m vap_core calibrate "
-            f"--stack {kind} --keep."
+            f"load_stack: {path} is damaged; delete it and run "
+            f"{keep_command(kind, needs_photos(kind))}."
         ) from error

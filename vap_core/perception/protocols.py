@@ -115,6 +115,43 @@ class TargetTracker(Protocol):
         ...
 
 
+class JudgedDetector:
+    """A detector of any boxes, and what another says of their views: whether these are familiar."""
+
+    def __init__(self, detector: Detector, judge: FamiliarityJudge) -> None:
+        self.detector = detector
+        self.judge = judge
+
+    def __call__(
+        self, images: Sequence[Rgb], phrase: str, threshold: float | None = None
+    ) -> list[Boxes]:
+        """The detector's boxes; a view without any is judged, too."""
+        judged = []
+        for image, boxes in zip(images, self.detector(images, phrase, threshold), strict=True):
+            judged.append(replace(boxes, familiar=self.is_familiar(image, phrase)))
+        return judged
+
+    def is_familiar(self, image: Rgb, phrase: str) -> bool:
+        return self.judge.is_familiar(image, phrase)
+
+
+class JudgedCropper(JudgedDetector):
+    """The same of a `ReferenceCropper`."""
+
+    def reference_boxes(self, photo: Rgb, phrase: str, threshold: float) -> Boxes:
+        assert isinstance(self.detector, ReferenceCropper)
+        return self.detector.reference_boxes(photo, phrase, threshold)
+
+
+def judged_by(judge: FamiliarityJudge, detector: Detector) -> Detector:
+    """The detector with the judge's word on familiarity, unless it has one of its own."""
+    if isinstance(detector, FamiliarityJudge):
+        return detector
+    if isinstance(detector, ReferenceCropper):
+        return JudgedCropper(detector, judge)
+    return JudgedDetector(detector, judge)
+
+
 @dataclass(frozen=True)
 class Thresholds:
     """The least `Grounding.likeness` of an object that is in view, in familiar and other views."""
@@ -156,7 +193,9 @@ class Stack:
         """A stack with parts of your own, without what was measured for those that they replace.
 
         With another encoder it has no `unfamiliar_encoder`, with another detector or encoder
-        neither `thresholds` nor a `verifier`.
+        neither `thresholds` nor a `verifier`. Where the encoder or the segmenter stays, which tell
+        familiar views from others, this stack's detector still says which are, unless `detector`
+        does itself (`FamiliarityJudge`).
         """
         given: dict[str, Any] = {
             "detector": detector,
@@ -167,6 +206,9 @@ class Stack:
         changed = {role: part for role, part in given.items() if part is not None}
         if encoder is not None:
             changed["unfamiliar_encoder"] = None
+        stays = encoder is None or segmenter is None
+        if detector is not None and stays and isinstance(self.detector, FamiliarityJudge):
+            changed["detector"] = judged_by(self.detector, detector)
         if detector is not None or encoder is not None:
             changed |= {"thresholds": None, "verifier": None}
         return replace(self, name=name, **changed)

@@ -7,6 +7,7 @@ from typing import Any
 
 from vap_core.base.device import check_device
 from vap_core.base.errors import one_of
+from vap_core.base.files import sha256_of
 from vap_core.perception.foundation.sources import EMBEDDED, KINDS, parts_of
 from vap_core.perception.foundation.sources import mixed as mixed
 from vap_core.perception.protocols import Stack, Thresholds
@@ -94,6 +95,29 @@ def ships_thresholds(name: str) -> bool:
     return parts["detector"] == parts["encoder"] == EMBEDDED
 
 
+def checksums(name: str, kept: bool = True) -> dict[str, Any]:
+    """What a stack's answers depend on, by SHA-256: entries of a run's configuration.
+
+    `weights` has every file that the embedded stack reads; of a stack whose parts are not all
+    embedded also the files of its other models, as their lock.json says. `thresholds` is that of
+    the file that `calibrate --keep` wrote; it is left out where there is none, of a stack that
+    `ships_thresholds`, and where not `kept`.
+
+    Raises: UnknownName; MissingWeights: a model's files are not here.
+    """
+    from vap_core.perception.embedded.weights import weights_sha256
+    from vap_core.perception.foundation.store import locked_sha256, store_folder
+    from vap_core.perception.kept_thresholds import thresholds_file
+
+    found: dict[str, Any] = {"weights": weights_sha256()}
+    if ":" in name or name in KINDS:
+        found["weights"] = {**found["weights"], **locked_sha256(name)}
+    file = thresholds_file(store_folder(), name)
+    if kept and not ships_thresholds(name) and file.is_file():
+        found["thresholds"] = sha256_of(file)
+    return found
+
+
 def load_stack(name: str) -> Stack:
     """The stack of that name, or a mixed one (`mixed`); loading its weights takes about a second.
 
@@ -145,7 +169,12 @@ def load_random(name: str, device: str | None = None) -> Stack:
 
 
 def _mixture(name: str, loaded: dict[str, Any]) -> Stack:
-    """The loaded fields, and the embedded stack's where its parts are in the mixture."""
-    if EMBEDDED in parts_of(name).values():
-        return replace(load_embedded(), name=name, **loaded)
-    return Stack(name=name, **loaded)
+    """The loaded fields, and the embedded stack's where its parts are in the mixture.
+
+    The rule is that of `Stack.with_parts`; fields that are loaded as None are empty.
+    """
+    if EMBEDDED not in parts_of(name).values():
+        return Stack(name=name, **loaded)
+    parts = {field: part for field, part in loaded.items() if part is not None}
+    empty: dict[str, Any] = dict.fromkeys(loaded.keys() - parts.keys())
+    return replace(load_embedded().with_parts(name, **parts), **empty)

@@ -22,7 +22,13 @@ from vap_core.rollout import audit
 from vap_core.rollout.coverage import mask_coverage
 from vap_core.rollout.late_masks import LateMasks
 from vap_core.rollout.policy_call import check_chunks, check_policy, checked_plan, policy_call
-from vap_core.rollout.prompters.protocol import PromptContext, Prompter, SceneTruth, unchanged
+from vap_core.rollout.prompters.protocol import (
+    PromptContext,
+    Prompter,
+    SceneTruth,
+    checked_steps,
+    unchanged,
+)
 from vap_core.rollout.queries import only_queries, query_phrases
 from vap_core.rollout.running import RunningEpisode, SubGoalSink, WaitingSink
 from vap_core.rollout.running import Sink as Sink
@@ -39,6 +45,7 @@ from vap_core.simulation.env import Control, Env
 from vap_core.simulation.occluder import Occlusion
 from vap_core.simulation.scenes import Scene
 from vap_core.simulation.sensor import PERFECT, Sensor
+from vap_core.simulation.suites.open_row import cameras_of
 from vap_core.simulation.suites.rules import Judge
 from vap_core.simulation.types import EpisodeRow, Observation
 
@@ -100,9 +107,9 @@ def rollout(
 
     Episodes do not depend on each other. Only the rounding of a policy that is called for several
     episodes at once depends on `batch`: `batch` 1 and 5 can differ in the last bits of an action.
-    An exception inside an episode, or a call of sys.exit, ends that episode with status "error" and
-    its traceback in `detail`; the others go on. Frames keep their images only with `keep_images`; a
-    sink always gets them.
+    An exception inside an episode, a call of sys.exit, or what a prompter returns against its
+    protocol ends that episode with status "error" and its traceback in `detail`; the others go on.
+    Frames keep their images only with `keep_images`; a sink always gets them.
 
     Raises: VapError: the user has to act: weights are absent, or the policy returns arrays of
         another shape or type than its protocol's.
@@ -138,7 +145,7 @@ def _env(trial: Trial, row: EpisodeRow) -> Env:
     return Env(
         trial.scene,
         image_size=trial.image_size,
-        cameras=row.cameras or None,
+        cameras=cameras_of(row),
         control=trial.control,
         sensor=trial.sensor,
         occlusion=trial.occlusion,
@@ -275,7 +282,8 @@ def _call_prompter(
         states.append(episode.prompter_state)
         images.append(observations[id(episode)])
         contexts.append(_context(trial, episode))
-    return trial.prompter.steps(states, images, contexts)
+    returned = trial.prompter.steps(states, images, contexts)
+    return checked_steps(returned, trial.prompter, len(following))
 
 
 def _context(trial: Trial, episode: RunningEpisode) -> PromptContext:

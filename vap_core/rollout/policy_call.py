@@ -5,6 +5,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -66,7 +67,7 @@ def check_policy(policy: Any) -> None:
         )
     if not isinstance(policy.label, str):
         raise BadPolicy(f"rollout: {name}.label is {policy.label!r}; it must be a string.")
-    if not isinstance(policy.execute, int) or policy.execute < 1:
+    if not isinstance(policy.execute, Integral) or policy.execute < 1:
         raise BadPolicy(
             f"rollout: {name}.execute is {policy.execute!r}; it must be a whole number from 1 on."
         )

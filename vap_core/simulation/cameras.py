@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 
 import numpy as np
 from jaxtyping import Float64
 
-from vap_core.base.errors import one_of
+from vap_core.base.errors import BadRobot, UnknownName
 from vap_core.base.types import Camera, Mask, Rgb, value
 from vap_core.simulation.gl import ensure_gl
 
@@ -23,13 +23,16 @@ HIDDEN_GROUP = 5
 _FLIP = np.diag([1.0, -1.0, -1.0])
 """OpenGL camera axes (y up, looking along -z) to OpenCV's (y down, looking along +z)."""
 
+LEAST_SINE = 1e-6
+"""Of the angle between a camera's view and its up."""
+
 
 @value
 class Rig:
     """A camera fixed to `body`.
 
     It stands at `pos_m` and looks at `aim_m`, both in the body's frame; `up` points up in the
-    picture.
+    picture. Raises: BadRobot when `aim_m` is where it stands, or `up` is along its view.
     """
 
     name: str
@@ -38,6 +41,19 @@ class Rig:
     aim_m: tuple[float, float, float]
     fovy_rad: float
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        back = np.subtract(self.pos_m, self.aim_m)
+        distance = np.linalg.norm(back)
+        if not distance > 0.0:
+            raise BadRobot(
+                f"camera {self.name!r} stands where it aims, at {self.pos_m}; give another aim_m."
+            )
+        right = np.cross(self.up, back / distance)
+        if not np.linalg.norm(right) > LEAST_SINE * np.linalg.norm(self.up):
+            upright = abs(back[2]) > LEAST_SINE * distance
+            other = "(1, 0, 0)" if upright else "(0, 0, 1)"
+            raise BadRobot(f"camera {self.name!r} looks along its up; give up={other}.")
 
     def rotation(self) -> Float64[np.ndarray, "3 3"]:
         """Body from camera, OpenGL axes."""
@@ -78,25 +94,37 @@ RIGS: dict[str, tuple[Rig, ...]] = {
 }
 
 
+SHIPPED_RIGS: Mapping[str, tuple[Rig, ...]] = MappingProxyType(dict(RIGS))
+"""The cameras of the robots that ship, whatever the file of an own suite enters in RIGS."""
+
+
 def add_rigs(
     spec: mujoco.MjSpec, robot: str, shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> tuple[str, ...]:
     """Mount the cameras of `robot` in `spec`, and return their names.
 
-    All but a wrist camera are moved by `shift_m`. Raises: UnknownName.
+    All but a wrist camera are moved by `shift_m`.
+    Raises: UnknownName for a robot without cameras; BadRobot where its MJCF lacks a camera's body.
     """
     if robot not in RIGS:
-        raise one_of("cameras.add_rigs: robot", robot, RIGS)
+        raise UnknownName(
+            f"cameras.add_rigs: robot {robot!r} has no cameras; enter them in RIGS, which has "
+            f"those of {', '.join(sorted(RIGS))}."
+        )
     for rig in RIGS[robot]:
         if rig.name != "wrist":
             x, y, z = rig.pos_m
             dx, dy, dz = shift_m
             rig = replace(rig, pos_m=(x + dx, y + dy, z + dz))
+        body = spec.body(rig.body)
+        if body is None:
+            raise BadRobot(
+                f"camera {rig.name!r} of {robot} is fixed to the body {rig.body!r}, which the "
+                "robot's MJCF lacks; correct Rig.body."
+            )
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, rig.rotation().ravel())
-        spec.body(rig.body).add_camera(
-            name=rig.name, pos=rig.pos_m, quat=quat, fovy=np.rad2deg(rig.fovy_rad)
-        )
+        body.add_camera(name=rig.name, pos=rig.pos_m, quat=quat, fovy=np.rad2deg(rig.fovy_rad))
     return tuple(rig.name for rig in RIGS[robot])
 
 

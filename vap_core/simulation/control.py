@@ -6,14 +6,13 @@ It runs on a model of the robot alone, whose base frame is the world frame.
 from functools import cache
 
 import mink
-import mujoco
 import numpy as np
 from jaxtyping import Float32, Float64
 
 from vap_core.base.errors import BadAction, OutOfReach
 from vap_core.base.types import value
 from vap_core.simulation import robots
-from vap_core.simulation.robots import Robot
+from vap_core.simulation.robots import Robot, mjcf
 from vap_core.simulation.types import Action, Pose
 
 ROUNDS = 12
@@ -60,10 +59,11 @@ class Arm:
     """The kinematics of one robot.
 
     It holds mink's buffers and nothing of an episode: every answer depends on the arguments alone.
+    Raises: BadRobot for a robot whose MJCF is absent or lacks a part.
     """
 
     def __init__(self, robot: Robot) -> None:
-        spec = mujoco.MjSpec.from_file(str(robot.xml))
+        spec = mjcf.load(robot)
         for finger in robot.fingers:
             spec.delete(spec.actuator(finger))
         for equality in list(spec.equalities):
@@ -158,7 +158,7 @@ def follow(
     seconds: float,
     limits: MotionLimits = MOTION_LIMITS,
 ) -> Setpoint:
-    """The command after one action (a row of values.Chunk) that lasts `seconds`.
+    """The command after one action (a row of policies.protocol.Chunk) that lasts `seconds`.
 
     The delta applies to the *commanded* pose, so that the arm's droop does not add up; the command
     is first limited to within 5 cm and 0.5 rad of the measured pose, so that it does not run away

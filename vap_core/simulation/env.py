@@ -456,6 +456,7 @@ class Env:
             target=self._row.target,
             links=self.robot.links,
             tilt=float(rng.uniform(-1.0, 1.0)),
+            size=self.image_hw,
         )
 
     def _step(self) -> int:

@@ -1,8 +1,8 @@
 """The benchmarks as gymnasium environments.
 
 `import vap_core.simulation.gym_env`, then `gym.make("vap/simpler-bridge/put-camera-v0")`. An
-observation is what a policy may read (values.PolicyInput): the suite's camera images, the
-proprioception, and the instruction. An action is one control step in the suite's control
+observation is what a policy may read (policies.protocol.PolicyInput): the suite's camera images,
+the proprioception, and the instruction. An action is one control step in the suite's control
 (types.Action). The reward is 1 in the step in which the rule is met, else 0.
 """
 

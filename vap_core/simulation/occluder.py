@@ -72,17 +72,19 @@ def occluder_screens(
     target: str,
     links: Sequence[str],
     tilt: float,
+    size: tuple[int, int],
 ) -> tuple[Screen, ...]:
     """The solids between `camera` and body `target`; none when the target is out of the picture.
 
     `links` are the robot's bodies, whose colours an arm takes; `tilt`, -1 .. 1, says from which
-    side it reaches in.
+    side it reaches in. `size` is the picture's (height, width) in pixels.
     """
     eye = data.camera(camera)
     axes = eye.xmat.reshape(3, 3)
     fovy_rad = np.deg2rad(model.camera(camera).fovy[0])
-    slope = float(np.tan(0.5 * fovy_rad))
-    outline = _outline((_points_world(model, data, target) - eye.xpos) @ axes, slope)
+    height, width = size
+    slopes = np.tan(0.5 * fovy_rad) * np.array([width / height, 1.0])
+    outline = _outline((_points_world(model, data, target) - eye.xpos) @ axes, slopes)
     if outline is None:
         return ()
     centre, half = outline
@@ -90,9 +92,9 @@ def occluder_screens(
     thin = min(0.2 * away, 0.5 * (away - 0.8 * NEAREST_M))
     if kind == "plate":
         wide, tall = MARGIN * half + 0.01 * away
-        size = (wide, 0.1 * thin, tall)
+        extents = (wide, 0.1 * thin, tall)
         box = mujoco.mjtGeom.mjGEOM_BOX
-        parts = [_Part(shape=box, size_m=size, centre_m=centre, turn_rad=0.0, rgb=GREY)]
+        parts = [_Part(shape=box, size_m=extents, centre_m=centre, turn_rad=0.0, rgb=GREY)]
     else:
         sleeve, skin = _colours(model, links)
         parts = _arm_parts(centre, half, thin, lean=TILT_RAD * tilt, sleeve=sleeve, skin=skin)
@@ -201,19 +203,19 @@ def _points_world(
 
 
 def _outline(
-    local: Float64[np.ndarray, "n 3"], slope: float
+    local: Float64[np.ndarray, "n 3"], slopes: Float64[np.ndarray, "2"]
 ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "2"]] | None:
     """The upright rectangle, facing the camera, that hides the points.
 
     Its middle (camera frame, metres) and half extents (metres); None when all points are outside
-    the picture. `slope` is the tangent of half the field of view of a square picture.
+    the picture. `slopes` are the tangents of half the field of view across and down.
     """
     depth = -local[:, 2]
     if depth.max() <= 0:
         return None
-    edge = 1.05 * slope
+    edge = 1.05 * slopes
     if depth.min() < 1.6 * NEAREST_M:  # it reaches past the camera, where it has no outline
-        return np.array([0.0, 0.0, -NEAREST_M]), np.full(2, edge * NEAREST_M)
+        return np.array([0.0, 0.0, -NEAREST_M]), edge * NEAREST_M
     points = local[:, :2] / depth[:, None]
     low = np.maximum(points.min(axis=0), -edge)
     high = np.minimum(points.max(axis=0), edge)

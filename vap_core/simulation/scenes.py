@@ -17,7 +17,7 @@ from vap_core.simulation import robots
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.mujoco_object import add_object
 from vap_core.simulation.cameras import Renderer, add_rigs
-from vap_core.simulation.robots import Robot
+from vap_core.simulation.robots import Robot, mjcf
 from vap_core.simulation.scene_style import DEFAULT_STYLE, Colour3, SceneStyle
 
 import mujoco  # isort: skip  (cameras has chosen a GL back end)
@@ -71,10 +71,11 @@ def build(
 
     `meshes` "menagerie" draws the robot with MuJoCo Menagerie's meshes; only its look changes.
 
-    Raises: UnknownName for a robot or an object that no registry holds.
+    Raises: UnknownName for a robot or an object that no registry holds, or a robot without cameras;
+        BadRobot for a robot whose MJCF is absent or lacks a part.
     """
     arm = robots.get(robot)
-    spec = mujoco.MjSpec.from_file(str(arm.xml))
+    spec = mjcf.load(arm)
     physics(spec, arm.hz)
     if meshes == "menagerie":
         from vap_core.simulation.robots.menagerie import replace_visuals

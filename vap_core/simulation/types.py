@@ -86,8 +86,8 @@ class Placement:
 
 @value
 class Start:
-    """What differs at the start of an episode from its list: by its seed (suites.starts), or for
-    want of its target.
+    """What differs at the start of an episode from its placements and its robot's home: by its
+    seed (suites.starts), by an own suite's row, or for want of its target.
 
     `joints_rad` are added to the robot's home; `offsets` (x, y in metres, yaw in radians) to the
     placements, in their order. `lamp` and `ambient` multiply the lamp's and the room's light. An
@@ -139,7 +139,8 @@ class EpisodeRow:
 
     `placements[0]` is the target; `goal` names the placed object that it goes to ("" when there is
     none). `split` is the track within the suite, `variant` the scene style (suites.VARIANTS),
-    `cameras` the views that the policy gets. `start` says what differs from the list.
+    `cameras` the views that the policy gets, the suite's where it names none. `start` says what
+    differs from the list.
 
     In a shared scene objects are `owned`, and `speaker` is whom "my" means. An instruction in
     several steps has ordered `subgoals`; target, category, rule and goal are then the first one's,

@@ -72,9 +72,12 @@ def text_report(table: "pd.DataFrame", chosen: Choice, stack: Stack) -> str:
         current = None if stack.thresholds is None else getattr(stack.thresholds, name)
         lines = [f"{name} views:"]
         if threshold is None:
+            more = "take more --scenes, or name a photo set with --photos"
+            if not familiar:
+                more = "name a photo set with --photos, or one with more photos"
             lines.append(
                 f"{int(part.right.sum())} rightly elected objects, fewer than {LEAST_RIGHT}: none "
-                "is chosen; take more --scenes, or name a photo set with --photos."
+                f"is chosen; {more}."
             )
         if threshold is not None or current is not None:
             lines.append(align(threshold_rows(part, threshold, current)))

@@ -14,11 +14,11 @@ from vap_core.base.parquet import read_parquet
 from vap_core.evaluation import store
 from vap_core.evaluation.measurements import read_json_part, write_json_part
 from vap_core.evaluation.photos.run import TABLE, measure_photos
-from vap_core.perception.embedded.weights import weights_sha256
+from vap_core.perception.foundation.sources import needs_photos
 from vap_core.perception.foundation.store import store_folder
-from vap_core.perception.kept_thresholds import keep_thresholds
+from vap_core.perception.kept_thresholds import keep_command, keep_thresholds
 from vap_core.perception.protocols import Stack
-from vap_core.perception.stacks import load_stack, ships_thresholds
+from vap_core.perception.stacks import checksums, load_stack, ships_thresholds
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -58,12 +58,19 @@ def calibrate(
 
 
 def refuse_keep(stack_name: str, photos: Sequence[Path] = ()) -> None:
-    """Raises: BadOutput for a stack that ships thresholds, unless there are own photos."""
-    if ships_thresholds(stack_name) and not photos:
+    """Raises: BadOutput without own photos, for a stack that ships thresholds or needs photos."""
+    if photos:
+        return
+    if ships_thresholds(stack_name):
         raise BadOutput(
             f"calibrate: the stack {stack_name} ships its thresholds, so that results stay "
             "comparable; name photos of your own with --photos to keep a threshold for photos, or "
             "leave --keep out."
+        )
+    if needs_photos(stack_name):
+        raise BadOutput(
+            f"calibrate: the stack {stack_name} has a threshold of its own for photos, and "
+            f"rendered scenes are no photos; run {keep_command(stack_name, photos=True)}."
         )
 
 
@@ -89,14 +96,17 @@ def keep_choice(stack_name: str, chosen: Choice) -> Path:
 
 
 def _configuration(stack: Stack) -> dict[str, object]:
-    """What the answers depend on; more scenes and photo sets only add some."""
+    """What the answers depend on; more scenes and photo sets only add some.
+
+    Thresholds are what is measured here: those that were kept do not count.
+    """
     return {
         "measurement": "calibration",
         "stack": stack.name,
         "encoder": stack.encoder.name,
         "seed": SEED,
         "version": __version__,
-        "weights": weights_sha256(),
+        **checksums(stack.name, kept=False),
     }
 
 
@@ -119,7 +129,7 @@ def _measure(
     for folder in photos:
         name = folder.resolve().name
         run = out / f"photos-{name}"
-        measure_photos(folder, run, stack.name, progress=progress)
+        measure_photos(folder, run, stack.name, kept=False, progress=progress)
         if not (run / f"{TABLE}.parquet").exists():
             raise BadPhotoSet(
                 f"calibrate: {folder} has no references; put each object's photos into "

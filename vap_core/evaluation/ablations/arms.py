@@ -73,7 +73,10 @@ TINT_SHARES = {
 """Policies of one recipe, of the same films, seed and mini-PaliGemma, by the share of their
 training scenes that were tinted."""
 UNTRAINED = (Colour("orange", (255, 128, 0)), Colour("purple", (128, 0, 255)))
-"""Tints that no shipped policy was trained with; their names are words of its vocabulary."""
+"""Colours that no shipped policy was trained with as tints.
+
+In its films things are painted in them (training.words.PAINTS), and commands name them.
+"""
 
 
 def _tints() -> dict[str, Arm]:

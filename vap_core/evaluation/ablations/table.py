@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vap_core.base.errors import BadOutput
 from vap_core.base.types import value
 from vap_core.evaluation import paper
 from vap_core.evaluation.ablations.arms import Ablation
@@ -42,7 +43,8 @@ def arm_results(ablation: Ablation, episodes: "pd.DataFrame") -> list[ArmResult]
     """The arms of every suite in `episodes` (rows of a results table) that ran the first arm and
     another.
 
-    Raises: BadSuite, as `statistics.compare`; BadOutput, as `paper.ledger`.
+    Raises: BadOutput when they are of several policies in a suite, and as `paper.ledger`;
+        BadSuite, as `statistics.compare`.
     """
     results = []
     for suite in dict.fromkeys(episodes["suite"]):
@@ -51,6 +53,7 @@ def arm_results(ablation: Ablation, episodes: "pd.DataFrame") -> list[ArmResult]
         arms = [arm for arm in ablation.names if arm in ran]
         if ablation.names[0] not in ran or len(arms) < 2:
             continue
+        _refuse_policies(suite, of_suite[of_suite["method"].isin(arms)])
         against = _against_default(arms, of_suite)
         for arm in arms:
             rows = of_suite[of_suite["method"] == arm]
@@ -149,6 +152,17 @@ def _against_default(arms: Sequence[str], of_suite: "pd.DataFrame") -> dict[str,
     for (arm, comparison), p in zip(found.items(), p_holm, strict=True):
         corrected[arm] = replace(comparison, p_holm=p)
     return corrected
+
+
+def _refuse_policies(suite: str, of_arms: "pd.DataFrame") -> None:
+    """Raises: BadOutput for more than one policy."""
+    policies = sorted(map(str, of_arms["policy"].unique()))
+    if len(policies) > 1:
+        raise BadOutput(
+            f"arm_results: the arms on {suite} are of {len(policies)} policies "
+            f"({', '.join(policies)}); name one: keep its rows alone. policy_results compares "
+            "several."
+        )
 
 
 def _share(rows: "pd.DataFrame", column: str) -> Rate:

@@ -24,8 +24,7 @@ from vap_core.evaluation.photos.pictures import write_picture
 from vap_core.evaluation.policy_names import default_policy
 from vap_core.evaluation.processes import results_here
 from vap_core.evaluation.study import Study
-from vap_core.perception.embedded.weights import weights_sha256
-from vap_core.perception.stacks import check_stack, load_stack
+from vap_core.perception.stacks import check_stack, checksums, load_stack
 from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import get_object
 
@@ -66,7 +65,7 @@ class ObjectSurvey:
 def measure_objects(folder: Path, out: Path, asked: ObjectSurvey) -> str:
     """Do what `out` lacks of the measurement, write tables and sheets, and return the report.
 
-    Raises: BadObject; UnknownName; BadOutput when `out` holds another run.
+    Raises: BadObject; UnknownName; MissingWeights; BadOutput when `out` holds another run.
     """
     from tqdm import tqdm
 
@@ -96,7 +95,7 @@ def _configuration(source: Source, asked: ObjectSurvey) -> dict[str, Any]:
         "suites": list(asked.suites),
         "lists": lists,
         "version": __version__,
-        "weights": weights_sha256(),
+        **checksums(asked.stack),
     }
 
 

@@ -26,7 +26,7 @@ from vap_core.evaluation.perception.first_frames import (
 )
 from vap_core.evaluation.processes import results
 from vap_core.evaluation.study import Study
-from vap_core.perception.stacks import check_stack, load_stack
+from vap_core.perception.stacks import check_stack, checksums, load_stack
 from vap_core.simulation import suites
 from vap_core.simulation.types import EpisodeRow
 
@@ -56,7 +56,7 @@ TABLES = (
     "tracks",
     "speed",
 )
-WORLD = ("version", "weights", "lists", "world")
+WORLD = ("version", "lists", "world")
 """What a survey's configuration takes from a study's."""
 
 
@@ -94,7 +94,7 @@ class Survey:
     def configuration(self) -> dict[str, Any]:
         """What the results depend on, as JSON: the world, weights and lists by their checksums.
 
-        Raises: BadSuite, MissingWeights, as `Study.configuration`.
+        Raises: BadSuite, as `Study.configuration`; MissingWeights: the stack's models are not here.
         """
         counts = {}
         for name in self.suites:
@@ -115,7 +115,7 @@ class Survey:
         }
         for key in WORLD:
             configuration[key] = of_study[key]
-        return configuration
+        return configuration | checksums(self.stack)
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.env import Env
 from vap_core.simulation.occluder import Occlusion
 from vap_core.simulation.scenes import Scene
-from vap_core.simulation.suites.open_row import build_scene, make_env
+from vap_core.simulation.suites.open_row import build_scene, cameras_of, make_env
 from vap_core.simulation.types import EpisodeRow
 
 KEPT = 0.5
@@ -153,7 +153,7 @@ def record_film(job: Job, scene: Scene, size: int = 224) -> Film:
     """
     row = job.row
     expert = Expert()
-    env = make_env(scene, row.suite, image_size=size, cameras=row.cameras)
+    env = make_env(scene, row.suite, image_size=size, cameras=cameras_of(row))
     env.reset(row)
     state = expert.start(np.random.default_rng([row.seed, row.episode]))
     frames = []
@@ -165,7 +165,9 @@ def record_film(job: Job, scene: Scene, size: int = 224) -> Film:
     fraction = float(np.random.default_rng([13, row.episode]).uniform(0.2, 0.45))
     start = round(len(frames) * fraction)
     occlusion = Occlusion(0, row.max_steps + 1, job.kind)
-    screened = make_env(scene, row.suite, image_size=size, cameras=row.cameras, occlusion=occlusion)
+    screened = make_env(
+        scene, row.suite, image_size=size, cameras=cameras_of(row), occlusion=occlusion
+    )
     covered = []
     for moment in moments[start : start + max(job.hidden, default=0)]:
         screened.restore(moment)

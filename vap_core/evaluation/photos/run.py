@@ -1,6 +1,7 @@
 """Measures a photo set scene by scene; what an interrupted run had finished is kept."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,8 +22,7 @@ from vap_core.evaluation.photos.report import (
     text_report,
 )
 from vap_core.evaluation.photos.sheet import write_sheets
-from vap_core.perception.embedded.weights import weights_sha256
-from vap_core.perception.stacks import load_stack
+from vap_core.perception.stacks import checksums, load_stack, ships_thresholds
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,22 +31,31 @@ TABLE, CLIPS, MASKS, SINGLE = "questions", "clips", "masks", "single"
 
 
 def measure_photos(
-    folder: Path, out: Path, stack_name: str, *, clips: bool = False, progress: bool = True
+    folder: Path,
+    out: Path,
+    stack_name: str,
+    *,
+    clips: bool = False,
+    kept: bool = True,
+    progress: bool = True,
 ) -> str:
     """Do what `out` lacks of the measurement, write tables and sheets, and return the report.
 
-    With `clips` objects are followed through clips made of the scenes, too (clips.py).
+    With `clips` objects are followed through clips made of the scenes, too (clips.py). Where not
+    `kept`, thresholds that were kept on this machine do not count: the best candidate wins.
 
-    Raises: BadPhotoSet, BadPhoto; BadOutput when `out` holds another run.
+    Raises: BadPhotoSet, BadPhoto; MissingWeights; BadOutput when `out` holds another run.
     """
     import pandas as pd
 
     photo_set = read_photo_set(folder)
-    store.open_run(out, _configuration(photo_set, stack_name))
+    store.open_run(out, _configuration(photo_set, stack_name, kept))
     parts: list[str] = []
     written: list[Path] = []
     with store.locked(out):
         stack = load_stack(stack_name)
+        if not kept and not ships_thresholds(stack_name):
+            stack = replace(stack, thresholds=None)
         if photo_set.subjects:
             memory = remember_subjects(photo_set.subjects, stack, out / "memory")
             attender = Attender(stack, memory)
@@ -81,14 +90,14 @@ def measure_photos(
     return f"{report}\n\nwrote {names}"
 
 
-def _configuration(photo_set: PhotoSet, stack_name: str) -> dict[str, object]:
+def _configuration(photo_set: PhotoSet, stack_name: str, kept: bool) -> dict[str, object]:
     """What the results depend on."""
     return {
         "measurement": "photos",
         "photos": photo_set.sha256,
         "stack": stack_name,
         "version": __version__,
-        "weights": weights_sha256(),
+        **checksums(stack_name, kept),
     }
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from vap_core.base.figures import write_png
 from vap_core.base.files import write_atomic, writing
 from vap_core.base.tables import align
+from vap_core.evaluation.layouts import layout_names
 from vap_core.evaluation.metrics import Score, rate, score, step_times
 from vap_core.evaluation.report.pictures import forest_figure, scores_table
 
@@ -34,6 +35,7 @@ def conclude(study: "Study", table: "pd.DataFrame", folder: Path) -> str:
     text = [
         results_table(scores),
         *_totals(scores),
+        *_layouts_note(study, table, folder),
         "",
         "time per control step, ms by part:",
         _times_table(scores, table),
@@ -109,6 +111,20 @@ def _totals(scores: Sequence[Score]) -> list[str]:
     if lines:
         lines.insert(0, "")
     return lines
+
+
+def _layouts_note(study: "Study", table: "pd.DataFrame", folder: Path) -> list[str]:
+    """That the intervals above count episodes whose layouts return; nothing where none does."""
+    placed = table[["split", "method"]].assign(layout=layout_names(table))
+    if not placed.duplicated().any():
+        return []
+    layouts = placed["layout"].nunique()
+    episodes = len(placed) // placed["method"].nunique()
+    command = study.next_command("report", folder)
+    return [
+        "",
+        f"{episodes} episodes a method on {layouts} layouts; for intervals over layouts: {command}",
+    ]
 
 
 def _times_table(scores: Sequence[Score], table: "pd.DataFrame") -> str:

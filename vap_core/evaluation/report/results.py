@@ -13,7 +13,7 @@ from vap_core.evaluation import paper
 from vap_core.evaluation.metrics import MEASURES, RATES, SCORE_KEY, TRACK, count, intervals
 from vap_core.evaluation.policy_names import PRIVILEGED
 from vap_core.evaluation.report.runs import Runs
-from vap_core.evaluation.statistics import ALL_TASKS, Comparison, bootstrap_interval
+from vap_core.evaluation.statistics import ALL_TASKS, Comparison, layout_interval
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -159,9 +159,7 @@ def _layout_intervals(table: "pd.DataFrame") -> "pd.DataFrame":
     clusters = episodes.groupby([*key, "layout"], sort=True)[["won", "n"]].sum().reset_index()
     lines = []
     for names, part in clusters.groupby(key, sort=False):
-        low = high = float("nan")
-        if part["n"].max() > 1:
-            low, high = bootstrap_interval(part["won"].to_numpy(), part["n"].to_numpy(), least=0.0)
+        low, high = layout_interval(part["won"].to_numpy(), part["n"].to_numpy())
         lines.append((*names, len(part), low, high))
     return pd.DataFrame(lines, columns=[*key, "layouts", "sr_layout_low", "sr_layout_high"])
 

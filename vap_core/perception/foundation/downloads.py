@@ -17,6 +17,7 @@ from vap_core.perception.foundation.store import (
     LOCK,
     VARIABLE,
     find_problem,
+    read_lock,
     write_lock,
 )
 
@@ -38,8 +39,9 @@ def pull(
     """Bring models into the store, from the hub or from `origin`.
 
     Models that are complete and undamaged are left alone. `origin` may be another store, a hub
-    cache, or hold owner/name folders. `unpinned` takes other weights of the same kind. A second
-    process that pulls the same model waits for the first.
+    cache, or hold owner/name folders; it is checked before anything in the store changes.
+    `unpinned` takes other weights of the same kind. A second process that pulls the same model
+    waits for the first.
 
     Raises: MissingWeights: unreachable, absent, or with another checksum than the pinned one.
     """
@@ -102,13 +104,17 @@ def _pull_model(name: str, store: Path, origin: Path | None, unpinned: bool) -> 
             f"weights pull: no checksum of {name} ({source.repo}) is pinned here; pass --unpinned "
             f"to take it as it is there{first}."
         )
-    if origin is None and find_problem(name, store) is None:
+    copied = None
+    if origin is not None:
+        copied = find_folder(source, origin)
+        _check_origin(source, copied, unpinned)
+    elif find_problem(name, store) is None:
         return False
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with WeakFileLock(store / f".{source.folder}.lock"):
-            if origin is not None:
-                _copy_model(source, find_folder(source, origin), folder)
+            if copied is not None:
+                _copy_model(source, copied, folder)
             elif find_problem(name, store) is None:  # another process has just pulled it
                 return False
             else:
@@ -122,18 +128,51 @@ def _pull_model(name: str, store: Path, origin: Path | None, unpinned: bool) -> 
     return True
 
 
-def _copy_model(source: Source, origin: Path, folder: Path) -> None:
-    (folder / LOCK).unlink(missing_ok=True)
-    for file in source.files:
-        if not (origin / file).is_file():
+def _check_origin(source: Source, origin: Path, unpinned: bool) -> None:
+    """Raises: MissingWeights: a folder to copy from lacks a file, or holds another than expected.
+
+    Its tensors are compared with their pin, and all files with its own lock.json where it has one,
+    unless `unpinned`.
+    """
+    absent = [file for file in source.files if not (origin / file).is_file()]
+    if absent:
+        raise MissingWeights(
+            f"weights pull: {origin} lacks {', '.join(absent)} of {source.repo}; "
+            f"copy all of {', '.join(source.files)}."
+        )
+    if unpinned:
+        return
+    expected = read_lock(origin) | {TENSORS: source.sha256}
+    try:
+        digests = {file: sha256_of(origin / file) for file in source.files}
+    except OSError as error:
+        raise MissingWeights(
+            f"weights pull: {origin} cannot be read ({error.strerror or error}); copy it again."
+        ) from error
+    for file, digest in digests.items():
+        if digest != expected.get(file, digest):
             raise MissingWeights(
-                f"weights pull: {origin} lacks {file} of {source.repo}; "
-                f"copy all of {', '.join(source.files)}."
+                f"weights pull: {file} of {source.repo} in {origin} has SHA-256 {digest[:12]}.., "
+                f"{expected[file][:12]}.. is expected; nothing was changed. Copy it again, or pass "
+                "--unpinned to use other weights on purpose."
             )
-        if (origin / file).resolve() != (folder / file).resolve():
-            scratch = folder / f".{file}.part"
-            shutil.copyfile(origin / file, scratch)
-            os.replace(scratch, folder / file)
+
+
+def _copy_model(source: Source, origin: Path, folder: Path) -> None:
+    """Every file, copied beside its place first: an error while copying leaves the model whole."""
+    scratches: dict[Path, Path] = {}
+    try:
+        for file in source.files:
+            path = folder / file
+            if (origin / file).resolve() != path.resolve():
+                scratches[path] = folder / f".{file}.part"
+                shutil.copyfile(origin / file, scratches[path])
+        (folder / LOCK).unlink(missing_ok=True)
+        for path, scratch in scratches.items():
+            os.replace(scratch, path)
+    finally:
+        for scratch in scratches.values():
+            scratch.unlink(missing_ok=True)
 
 
 def _download_model(source: Source, folder: Path) -> None:

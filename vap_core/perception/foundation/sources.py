@@ -157,6 +157,19 @@ def parts_of(name: str) -> dict[str, str]:
     return parts
 
 
+def needs_photos(name: str) -> bool:
+    """Whether `calibrate --keep` needs photos of a stack.
+
+    It does where a part is embedded: rendered scenes give too few views that are not familiar. A
+    stack of another name than those here is the caller's, with its own thresholds for other views.
+
+    Raises: UnknownName.
+    """
+    if ":" not in name and name not in KINDS:
+        return True
+    return EMBEDDED in parts_of(name).values()
+
+
 def models_of(kind: str) -> tuple[str, ...]:
     """The models of a stack, of a mixed one those that do not ship. Raises: UnknownName."""
     if kind == EMBEDDED:

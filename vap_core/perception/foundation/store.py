@@ -70,6 +70,20 @@ def check_present(kind: str) -> None:
         _refuse_problems(kind, models_of(kind), store_folder(), quick=True)
 
 
+def locked_sha256(kind: str) -> dict[str, str]:
+    """The SHA-256 in lock.json of every file of a stack's models, by "MODEL/FILE"; hashes none.
+
+    Raises: UnknownName; MissingWeights, as `verify_stack`, for what is absent.
+    """
+    check_present(kind)
+    digests: dict[str, str] = {}
+    for name in models_of(kind):
+        lock = read_lock(store_folder() / MODELS[name].folder)
+        for file in MODELS[name].files:
+            digests[f"{name}/{file}"] = lock[file]
+    return digests
+
+
 def _refuse_problems(kind: str, names: tuple[str, ...], store: Path, quick: bool) -> None:
     problems: list[str] = []
     for name in names:

@@ -3,6 +3,7 @@
 It says which photos the token is learned from, and where it is kept.
 """
 
+import hashlib
 import sys
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
@@ -65,6 +66,16 @@ def lookalikes(rows: Iterable[EpisodeRow]) -> list[str]:
         if objects.get_object(name).category == target.category:
             names.append(name)
     return names
+
+
+def file_suffix(rows: Iterable[EpisodeRow], model: str, suffix: str = token_file.SUFFIX) -> str:
+    """What a token's file is called after its object's name: `suffix`, and before it a digest.
+
+    The digest is of what one object's tokens differ by: the SHA-256 of the model, and the
+    look-alikes beside the object.
+    """
+    differ_by = "\n".join([model, *lookalikes(rows)])
+    return f".{hashlib.sha256(differ_by.encode()).hexdigest()[:12]}{suffix}"
 
 
 def other_objects(rows: Sequence[EpisodeRow], seed: int) -> tuple[Rgb, ...]:
@@ -145,6 +156,7 @@ def _teach(teacher: "MiniVlm", rows: Sequence[EpisodeRow], folder: Path, suffix:
     from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
 
     name = rows[0].target
+    suffix = file_suffix(rows, teacher.sha256(), suffix)
     if (folder / f"{name}{suffix}").exists():
         return token_file.load(folder, name, teacher.sha256(), suffix)
     taught = photographs(rows, 0, K)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import field
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from vap_core.base.types import Attended, Camera, Mask, Rgb, Views, value
 from vap_core.simulation.types import EpisodeRow, Observation
@@ -72,6 +72,26 @@ class Prompter[S](Protocol):
         The result for one does not depend on the others.
         """
         ...
+
+
+def checked_steps(returned: object, prompter: object, n: int) -> list[tuple[Any, Attended]]:
+    """What `steps` of a prompter returned for `n` episodes.
+
+    Raises: ValueError when it is not a list of one state and one Attended for each episode.
+    """
+    who = f"prompter {type(prompter).__name__}: steps returned"
+    if not isinstance(returned, list | tuple):
+        raise ValueError(f"{who} {type(returned).__name__}; return a list, one result per episode")
+    if len(returned) != n:
+        episodes = "1 episode" if n == 1 else f"{n} episodes"
+        raise ValueError(f"{who} {len(returned)} results for {episodes}; return one for each")
+    for result in returned:
+        is_pair = isinstance(result, list | tuple) and len(result) == 2
+        if not is_pair or not isinstance(result[1], Attended):
+            raise ValueError(
+                f"{who} {type(result).__name__} as a result; return the state and an Attended"
+            )
+    return [(state, attended) for state, attended in returned]
 
 
 def unchanged(images: Views, text: str) -> Attended:

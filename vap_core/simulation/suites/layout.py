@@ -50,7 +50,12 @@ def scatter(
 
 
 def radius_m(model: str) -> float:
-    """Half the diagonal of an object's outline on the table."""
+    """Half the diagonal of the box around an object's outline on the table.
+
+    A disc of that radius around the object's spot covers the outline where the spot is the box's
+    centre. Of objects with a handle or a strap on one side the spot is the centre of the body's
+    base, up to 1 cm beside it.
+    """
     x, y, _ = objects.extent_m(objects.get_object(model))
     return 0.5 * float(np.hypot(x, y))
 

@@ -46,6 +46,14 @@ def make_env(
     )
 
 
+def cameras_of(row: EpisodeRow) -> tuple[str, ...]:
+    """The views of the row's episode: the row's own, or its suite's where it names none.
+
+    Raises: UnknownName, for the suite of a row that names none.
+    """
+    return row.cameras or suite_called(row.suite).cameras
+
+
 @contextmanager
 def open_row(
     row: EpisodeRow,
@@ -60,9 +68,8 @@ def open_row(
     """
     models = [place.model for place in row.placements]
     with build_scene(row.suite, models, row.variant, meshes) as scene:
-        cameras = row.cameras or None
         env = make_env(
-            scene, row.suite, image_size=image_size, cameras=cameras, occlusion=occlusion
+            scene, row.suite, image_size=image_size, cameras=cameras_of(row), occlusion=occlusion
         )
         env.reset(row)
         yield env

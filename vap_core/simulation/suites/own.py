@@ -13,17 +13,29 @@ from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
 
+from jaxtyping import TypeCheckError
+
 from vap_core.base.errors import BadSuite, VapError, one_of
 from vap_core.base.types import value
 from vap_core.simulation import robots
 from vap_core.simulation.assets import objects
-from vap_core.simulation.cameras import RIGS
+from vap_core.simulation.cameras import add_rigs
+from vap_core.simulation.robots import mjcf
 from vap_core.simulation.suites import lists
 from vap_core.simulation.suites.suite import Suite
 from vap_core.simulation.types import AS_LISTED, EpisodeRow
 
 VARIABLE = "VAP_SUITES"
 NAME = re.compile(r"[\w-]+")
+WHOLE_NUMBER = re.compile(r"-?\d+")
+WRONG_TYPE = re.compile(
+    r"parameter '(?P<name>\w+)'\.\s*Actual value: (?P<found>.*?)\s*"
+    r"Expected type: (?P<wanted>.*?)\.\s*(?:----|$)",
+    re.DOTALL,
+)
+"""What jaxtyping says of a field whose value has another type than its annotation."""
+LONGEST_VALUE = 60
+"""Characters of a field's value in an error."""
 
 
 @value
@@ -115,8 +127,34 @@ def _place(path: Path, file: Path, error: BaseException) -> str:
 
 def _said(error: BaseException) -> str:
     """An error as one line."""
+    if isinstance(error, TypeCheckError):
+        wrong = WRONG_TYPE.search(str(error))
+        if wrong is not None:
+            return _wrong_type(**wrong.groupdict())
     words = " ".join(str(error).split()).removesuffix(".")
     return f"{words}." if isinstance(error, VapError) else f"{type(error).__name__}: {words}."
+
+
+def _wrong_type(name: str, found: str, wanted: str) -> str:
+    """A field of another type than its annotation, as one line."""
+    mend = f"it must be of type {wanted.removeprefix('typing.')}"
+    if wanted == "<class 'float'>":
+        mend = "it must be a float"
+        if WHOLE_NUMBER.fullmatch(found):
+            mend += f", as in {found}.0"
+    elif found.startswith("[") and wanted.startswith("tuple"):
+        mend = "it must be a tuple, in round brackets"
+        if len(found) <= LONGEST_VALUE:
+            mend += f", as in ({found[1:-1]},)"
+    elif wanted.startswith("<class '"):
+        mend = f"it must be of type {wanted[8:-2].rpartition('.')[2]}"
+    return f"{name} is {_short(found)}; {mend}."
+
+
+def _short(text: str) -> str:
+    """The text on one line, cut where it is long."""
+    line = " ".join(text.split())
+    return line if len(line) <= LONGEST_VALUE else f"{line[:LONGEST_VALUE]}..."
 
 
 def _checked_rows(
@@ -127,7 +165,9 @@ def _checked_rows(
         robot = robots.get(suite.robot)
         if suite.hz != robot.hz:
             raise BadSuite(f"{robot.name} is controlled at hz={robot.hz:g}, and not {suite.hz:g}")
-        rigs = {rig.name for rig in RIGS[robot.name]}
+        spec = mjcf.load(robot)
+        rigs = add_rigs(spec, robot.name)
+        spec.compile()
         for camera in suite.cameras:
             if camera not in rigs:
                 raise one_of(f"suite {suite.name}: camera", camera, sorted(rigs))
@@ -142,6 +182,10 @@ def _checked_rows(
                 raise BadSuite(
                     f"row {row.key} is there twice, or of another suite; make rows by "
                     "SUITE.row(task, episode, placements)"
+                )
+            if row.seed != 0:
+                raise BadSuite(
+                    f"row {row.key} has seed={row.seed}; leave it 0: seeds come from --seed"
                 )
             keys.add(row.key)
         for task in suite.tasks:

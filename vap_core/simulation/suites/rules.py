@@ -260,7 +260,7 @@ def _half_diagonal_m(size: Size) -> float:
 
 
 def _apart_m(judge: Judge, truth: Truth, first: str, second: str) -> float:
-    """Between two objects' centres, across the table."""
+    """Between two objects' middles (_middle), across the table."""
     return math.dist(_middle_of(judge, truth, first)[:2], _middle_of(judge, truth, second)[:2])
 
 
@@ -269,7 +269,11 @@ def _middle_of(judge: Judge, truth: Truth, name: str) -> Point:
 
 
 def _middle(pose: Pose, size: Size) -> Point:
-    """The middle of the bounding box; an object's origin is the centre of its base."""
+    """Half the bounding box's height above an object's origin.
+
+    Of most objects that is the middle of the box. Of those with a handle or a strap on one side the
+    origin is the centre of the body's base, and the box's middle is up to 1 cm beside it.
+    """
     x, y, z, *quat = pose.tolist()
     along_x, along_y, along_z = _axis_z(*quat)
     half = 0.5 * size[2]
@@ -277,7 +281,7 @@ def _middle(pose: Pose, size: Size) -> Point:
 
 
 def _lowest_m(pose: Pose, size: Size) -> float:
-    """The height of the bounding box's lowest corner."""
+    """The height of the lowest corner of the bounding box, were it centred on the origin."""
     w, x, y, z = pose[3:].tolist()
     norm = w * w + x * x + y * y + z * z
     slope_x = 2 * (x * z - w * y) / norm

@@ -1,8 +1,10 @@
 """What a seed changes at the start of a listed episode: the arm, the objects and the light.
 
 Seed 0 changes nothing: it is the list itself. Every other seed moves each object within the free
-space that all layouts keep around it, so that no layout becomes another one. An episode's start
-depends on its seed and its layout alone: the variants of a layout start alike.
+space that all layouts keep around it, so that no layout becomes another one. Where an episode has
+several receptacles (shared-sequence-bridge), these may stand closer together than that, and stay in
+their places. What a list's own start changes remains, and the seed's change comes on top of it. The
+seed's change depends on the seed and the layout alone: the variants of a layout start alike.
 """
 
 import zlib
@@ -10,12 +12,12 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from vap_core.simulation.types import EpisodeRow
+from vap_core.simulation.types import EpisodeRow, Start
 
 
 @dataclass(frozen=True)
 class Spread:
-    """How far a start may be from its list's: uniform within, in both directions.
+    """How far a seed's start may be from the list's: uniform within, in both directions.
 
     `joints_rad` of every joint, `place_m` of an object along x and along y, `yaw_rad` of its turn;
     the light is multiplied by 1 - `light` to 1 + `light`.
@@ -40,17 +42,49 @@ def seeded(row: EpisodeRow, seed: int, joints: int) -> EpisodeRow:
     lamp, ambient = _rounded(rng.uniform(1 - SPREAD.light, 1 + SPREAD.light, 2))
     arm = _rounded(rng.uniform(-SPREAD.joints_rad, SPREAD.joints_rad, joints))
     most = (SPREAD.place_m, SPREAD.place_m, SPREAD.yaw_rad)
+    standing = _standing(row)
     offsets = []
-    for _ in row.placements:
+    for place in row.placements:
         dx, dy, turn = _rounded(rng.uniform(-1, 1, 3) * most)
-        offsets.append((dx, dy, turn))
-    start = replace(row.start, joints_rad=arm, offsets=tuple(offsets), lamp=lamp, ambient=ambient)
-    return replace(row, seed=seed, start=start)
+        offsets.append((0.0, 0.0, 0.0) if place.model in standing else (dx, dy, turn))
+    change = Start(joints_rad=arm, offsets=tuple(offsets), lamp=lamp, ambient=ambient)
+    return replace(row, seed=seed, start=_on_top(row.start, change))
 
 
 def settings() -> dict[str, float]:
     """The spread as JSON, for the configuration of a run whose seeds are not 0."""
     return asdict(SPREAD)
+
+
+def _standing(row: EpisodeRow) -> frozenset[str]:
+    """The objects that no seed moves: the receptacles, where there are several."""
+    receptacles = {subgoal.goal for subgoal in row.subgoals if subgoal.rule == "put"}
+    return frozenset(receptacles) if len(receptacles) > 1 else frozenset()
+
+
+def _on_top(listed: Start, change: Start) -> Start:
+    """A list's start with a seed's change: angles and offsets are added, light is multiplied."""
+    joints = change.joints_rad
+    if listed.joints_rad:
+        joints = _sum(listed.joints_rad, change.joints_rad)
+    offsets = change.offsets
+    if listed.offsets:
+        sums = []
+        for one, other in zip(listed.offsets, change.offsets, strict=True):
+            dx, dy, turn = _sum(one, other)
+            sums.append((dx, dy, turn))
+        offsets = tuple(sums)
+    return replace(
+        listed,
+        joints_rad=joints,
+        offsets=offsets,
+        lamp=listed.lamp * change.lamp,
+        ambient=listed.ambient * change.ambient,
+    )
+
+
+def _sum(one: tuple[float, ...], other: tuple[float, ...]) -> tuple[float, ...]:
+    return tuple(np.add(one, other).tolist())
 
 
 def _rounded(values: np.ndarray) -> tuple[float, ...]:

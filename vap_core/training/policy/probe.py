@@ -207,20 +207,20 @@ def conclude(table: "pd.DataFrame") -> str:
 
 
 def keep(table: "pd.DataFrame", path: Path) -> None:
-    """Add the episodes to a table; those of the same suite and policy in it are replaced.
+    """Add the episodes to a table; those of the same suite, policy and way are replaced.
 
     Raises: BadOutput.
     """
     import pandas as pd
 
     columns = [name for name in table if name != "detail" and not name.startswith("seconds_")]
-    policies = table[["suite", "policy"]].drop_duplicates()
-    keys = list(policies.itertuples(index=False, name=None))
+    asked = ["suite", "policy", "method"]
+    keys = list(table[asked].drop_duplicates().itertuples(index=False, name=None))
     old = table[:0]
     if path.exists():
         old = read_parquet(path, "probe", "name another table with --out")
     try:
-        old_keys = pd.MultiIndex.from_frame(old[["suite", "policy"]])
+        old_keys = pd.MultiIndex.from_frame(old[asked])
         parts = []
         for part in (old[~old_keys.isin(keys)], table[columns]):
             if len(part):

@@ -1,0 +1,134 @@
+"""A run's folder belongs to the weights and thresholds of its stack, those that do not ship too."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from vap_core.analysis.calibration import run as calibration
+from vap_core.base.errors import BadOutput, MissingWeights
+from vap_core.evaluation.own_objects import run as own_objects
+from vap_core.evaluation.own_objects.folder import Source
+from vap_core.evaluation.perception.run import Survey
+from vap_core.evaluation.photos import run as photos
+from vap_core.evaluation.photos.folder import PhotoSet
+from vap_core.evaluation.store import open_run
+from vap_core.evaluation.study import Study
+from vap_core.perception.embedded.weights import weights_sha256
+from vap_core.perception.foundation.sources import MODELS, TENSORS
+from vap_core.perception.foundation.store import LOCK, VARIABLE
+from vap_core.perception.kept_thresholds import keep_thresholds
+from vap_core.perception.protocols import Stack, Thresholds
+from vap_core.perception.stacks import checksums
+
+from .test_photo_set import folder  # noqa: F401
+from .toys import MeanColour, SameColour, detector, segmenter
+
+MIXED, MODEL = "embedded:encoder=dinov2-small", "dinov2-small"
+TASKS = (("simpler-bridge", "put-camera"),)
+
+
+def of_study(stack: str) -> dict[str, Any]:
+    return Study(TASKS, ("vap",), stack=stack).configuration()
+
+
+def of_survey(stack: str) -> dict[str, Any]:
+    return Survey(stack, ("simpler-bridge",)).configuration()
+
+
+def of_photos(stack: str) -> dict[str, Any]:
+    return photos._configuration(PhotoSet((), (), {}, "the photos'"), stack, kept=True)
+
+
+def of_objects(stack: str) -> dict[str, Any]:
+    source = Source({}, {}, "the objects'")
+    return own_objects._configuration(source, own_objects.ObjectSurvey(stack=stack))
+
+
+def of_calibration(stack: str) -> dict[str, Any]:
+    toy = Stack(stack, detector, MeanColour(), segmenter, SameColour())
+    return calibration._configuration(toy)
+
+
+def write_model(store: Path, tensors: str) -> None:
+    """A model's files in a store, the tensors with such a checksum."""
+    place = store / MODELS[MODEL].folder
+    place.mkdir(exist_ok=True)
+    for file in MODELS[MODEL].files:
+        (place / file).touch()
+    digests = {"config.json": "0" * 64, TENSORS: tensors}
+    (place / LOCK).write_text(json.dumps({"sha256": digests}))
+
+
+@pytest.fixture
+def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A store with one model."""
+    store = tmp_path / "weights"
+    store.mkdir()
+    monkeypatch.setenv(VARIABLE, str(store))
+    write_model(store, "a" * 64)
+    return store
+
+
+@pytest.mark.parametrize(
+    "configuration", [of_study, of_survey, of_photos, of_objects, of_calibration]
+)
+def test_a_folder_never_mixes_models_or_kept_thresholds(
+    tmp_path: Path, weights: Path, configuration: Callable[[str], dict[str, Any]]
+) -> None:
+    shipped = configuration("embedded")
+    assert shipped["weights"] == weights_sha256()
+    assert "thresholds" not in shipped
+    run = open_run(tmp_path / "run", configuration(MIXED))
+    keep_thresholds(weights, MIXED, "dino", Thresholds(0.6, 0.5))
+    if configuration is of_calibration:  # which measures them
+        open_run(run, configuration(MIXED))
+    else:
+        with pytest.raises(BadOutput, match="holds another run .thresholds unset there"):
+            open_run(run, configuration(MIXED))
+        open_run(tmp_path / "kept", configuration(MIXED))
+        keep_thresholds(weights, MIXED, "dino", Thresholds(0.7, 0.5))
+        with pytest.raises(BadOutput, match="holds another run .thresholds"):
+            open_run(tmp_path / "kept", configuration(MIXED))
+    before = configuration(MIXED)
+    write_model(weights, "b" * 64)
+    with pytest.raises(BadOutput, match="holds another run .other weights"):
+        open_run(open_run(tmp_path / "third", before), configuration(MIXED))
+    assert configuration("embedded") == shipped
+
+
+def test_of_what_is_not_there_no_run_is_begun(weights: Path) -> None:
+    """And a study that asks nothing of its stack does not need it."""
+    with pytest.raises(MissingWeights, match="weights pull --stack foundation"):
+        of_study("foundation")
+    assert checksums("embedded:tracker=embedded") == {"weights": weights_sha256()}
+    generic = Study(TASKS, ("generic",), policy="random", stack="foundation").configuration()
+    assert generic["weights"] == weights_sha256()
+    keep_thresholds(weights, "embedded", "lite0", Thresholds(0.6, 0.5))
+    assert "thresholds" not in of_study("embedded"), "no run depends on them"
+
+
+def test_calibration_measures_photos_without_the_thresholds_that_it_kept(
+    folder: Path,  # noqa: F811
+    tmp_path: Path,
+    weights: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nothing is as like as the kept threshold asks; the same calibration goes on after it."""
+    strict = Stack(
+        MIXED, detector, MeanColour(), segmenter, SameColour(), thresholds=Thresholds(2.0, 2.0)
+    )
+    monkeypatch.setattr(photos, "load_stack", lambda name: strict)
+    monkeypatch.setattr(calibration, "load_stack", lambda name: strict)
+    for _ in range(2):
+        calibration.calibrate(
+            MIXED, tmp_path / "calibrated", scenes=0, photos=[folder], progress=False
+        )
+        keep_thresholds(weights, MIXED, "dino", strict.thresholds)
+    answers = pd.read_parquet(tmp_path / "calibrated" / "photos-set" / "questions.parquet")
+    assert answers["tinted"].all()
+    photos.measure_photos(folder, tmp_path / "photos", MIXED, progress=False)
+    assert not pd.read_parquet(tmp_path / "photos" / "questions.parquet")["tinted"].any()

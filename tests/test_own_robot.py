@@ -1,0 +1,204 @@
+"""A robot of one's own: what its MJCF lacks, and a camera that cannot look, are one line; it changes no other run's digest."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.command import refused
+from tests.test_own_suite import DOCUMENTED
+from vap_core.base.errors import BadRobot, BadSuite, UnknownName
+from vap_core.evaluation.study import DEMO, Study
+from vap_core.simulation import suites
+from vap_core.simulation.cameras import RIGS, Rig
+from vap_core.simulation.control import Arm
+from vap_core.simulation.robots import ROBOTS
+from vap_core.simulation.scenes import build
+from vap_core.simulation.suites import own
+
+MJCF = ROBOTS["wx250s"].xml.read_text()
+ENTERS = """
+from dataclasses import replace
+from pathlib import Path
+
+from vap_core.simulation.cameras import RIGS, Rig
+from vap_core.simulation.robots import ROBOTS
+
+ROBOTS["mine"] = replace(ROBOTS["wx250s"], name="mine", xml=Path(__file__).parent / "mine.xml")
+RIGS["mine"] = (Rig("front", "world", (0.76, 0.0, 0.35), (0.24, 0.0, 0.105), 0.77),)
+"""
+TASK = ("my-desk", "pick-bottle")
+WORLDS = {
+    "simpler-fractal": "f60637c20f57d384",
+    "simpler-bridge": "fa457f4ded33f930",
+    "vlabench": "dc64346f272d34f3",
+    "tabletop": "e1b03dd6f8515ee3",
+    "shared-sequence-bridge": "95c31c1cb4a6d88e",
+    "widowx-pick": "ee47f69f84d42fa9",
+}
+"""The digests of the worlds of runs that there are."""
+
+
+@pytest.fixture
+def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The documented suite on a robot of its own; all that it enters is forgotten after a test."""
+    monkeypatch.setattr(own, "OPENED", {})
+    suites._seeded.cache_clear()
+    suites.benchmark.cache_clear()
+    rigs, robots = dict(RIGS), dict(ROBOTS)
+    (tmp_path / "mine.xml").write_text(MJCF)
+    path = tmp_path / "desk.py"
+    path.write_text(ENTERS + DOCUMENTED.replace('"wx250s"', '"mine"'))
+    yield path
+    for registry, before in ((RIGS, rigs), (ROBOTS, robots)):
+        registry.clear()
+        registry.update(before)
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+def refusal_of(file: Path) -> str:
+    with pytest.raises(BadSuite) as refusal:
+        suites.open_file(file)
+    said = str(refusal.value)
+    assert said.startswith(f"suites: {file}")
+    assert "\n" not in said
+    return said
+
+
+def test_the_robot_of_a_suite_is_a_robot_like_any_other(file: Path) -> None:
+    assert suites.open_file(file).robot == "mine"
+    with build("mine", ["cup-personal"]) as scene:
+        assert scene.cameras == ("front",)
+    assert np.isfinite(Arm(ROBOTS["mine"]).forward(ROBOTS["mine"].home)).all()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('<site name="tcp"', '<site name="tip"', "lacks the site 'tcp' (it has tip); add it"),
+        (
+            '<position class="wx" name="elbow" joint="elbow"/>',
+            "",
+            "lacks the actuator 'elbow' (it has waist, shoulder, forearm_roll, ",
+        ),
+        ('body name="wrist_link"', 'body name="wrist"', "lacks the body 'wrist_link' (it has"),
+        (
+            'name="elbow"',
+            'name="knee"',
+            "lacks the joint 'elbow' (it has waist, shoulder, knee, ",
+        ),
+        ("<worldbody>", "<worldbody", "is no MJCF (XML parse error"),
+        (
+            '<joint name="elbow" range="-2.14675 1.6057"/>',
+            '<joint name="elbow" range="-2.14675 1.6057"/><joint name="spare" range="0 1"/>',
+            "has the joints waist, shoulder, elbow, spare, ",
+        ),
+    ],
+)
+def test_what_an_mjcf_lacks_is_one_line(file: Path, old: str, new: str, words: str) -> None:
+    mjcf = file.parent / "mine.xml"
+    edit(mjcf, old, new)
+    if old == 'name="elbow"':
+        edit(mjcf, 'joint="elbow"', 'joint="knee"')
+    said = refusal_of(file)
+    assert f"robot 'mine': {mjcf} {words}" in said
+    for make in (lambda: Arm(ROBOTS["mine"]), lambda: build("mine", [])):
+        with pytest.raises(BadRobot) as refusal:
+            make()
+        assert words in str(refusal.value)
+
+
+def test_fingers_that_the_mjcf_lacks_are_named(file: Path) -> None:
+    edit(file, 'name="mine", xml', 'name="mine", fingers=("thumb", "right_finger"), xml')
+    assert "lacks the joint 'thumb' (it has waist, " in refusal_of(file)
+    with pytest.raises(BadRobot, match=r"'thumb' .*; correct Robot\.fingers or the file"):
+        build("mine", [])
+
+
+def test_a_file_that_is_not_there_is_named(file: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine.xml").unlink()
+    words = "mine.xml is no file; give Robot.xml the path of its MJCF."
+    assert refusal_of(file).endswith(words)
+    said = refused("eval", "--suite", file, "--policy", "expert", "--out", tmp_path / "run")
+    assert said.endswith(words)
+    with pytest.raises(BadRobot, match="is no file; give Robot.xml"):
+        build("mine", [])
+
+
+def test_a_robot_without_cameras_is_named(file: Path) -> None:
+    edit(file, 'RIGS["mine"] =', "unused =")
+    words = "robot 'mine' has no cameras; enter them in RIGS, which has those of google, panda"
+    assert words in refusal_of(file)
+    with pytest.raises(UnknownName, match=words):
+        build("mine", [])
+
+
+def test_a_camera_on_a_body_that_is_not_there_is_named(file: Path) -> None:
+    edit(file, '"world", (0.76', '"hand", (0.76')
+    said = refusal_of(file)
+    assert "camera 'front' of mine is fixed to the body 'hand', which the robot's MJCF" in said
+
+
+def test_a_camera_that_looks_along_its_up_is_refused_with_the_mend(file: Path) -> None:
+    edit(file, "(0.24, 0.0, 0.105)", "(0.76, 0.0, 0.0)")
+    said = refusal_of(file)
+    assert said.endswith(": camera 'front' looks along its up; give up=(1, 0, 0).")
+
+
+@pytest.mark.parametrize(
+    ("aim_m", "up", "words"),
+    [
+        ((0.3, 0.0, 0.0), (0.0, 0.0, 1.0), r"looks along its up; give up=\(1, 0, 0\)"),
+        ((0.3, 0.0, 0.9), (0.0, 0.0, -2.0), r"looks along its up; give up=\(1, 0, 0\)"),
+        ((0.0, 0.0, 0.5), (1.0, 0.0, 0.0), r"looks along its up; give up=\(0, 0, 1\)"),
+        ((0.0, 0.0, 0.5), (0.0, 0.0, 0.0), r"looks along its up; give up=\(0, 0, 1\)"),
+        ((0.3, 0.0, 0.5), (0.0, 0.0, 1.0), r"stands where it aims, at .*; give another aim_m"),
+    ],
+)
+def test_a_camera_without_an_upright_picture_is_refused(
+    aim_m: tuple[float, float, float], up: tuple[float, float, float], words: str
+) -> None:
+    with pytest.raises(BadRobot, match=f"camera 'front' {words}"):
+        Rig("front", "world", (0.3, 0.0, 0.5), aim_m, 0.7, up)
+
+
+def test_the_mend_of_a_camera_that_looks_down_works() -> None:
+    rig = Rig("front", "world", (0.3, 0.0, 0.5), (0.3, 0.0, 0.0), 0.7, (1.0, 0.0, 0.0))
+    turn = rig.rotation()
+    assert turn.T @ turn == pytest.approx(np.eye(3))
+    assert turn[:, 2].tolist() == [0.0, 0.0, 1.0]
+
+
+def test_worlds_are_those_of_the_runs_that_there_are_whatever_robots_are_entered(
+    file: Path,
+) -> None:
+    suites.open_file(file)
+    RIGS["panda"] = RIGS["panda"][:1]
+    for name, digest in WORLDS.items():
+        tasks = tuple((name, task.name) for task in suites.suite(name).tasks)
+        if suites.suite(name).robot != "panda":
+            study = Study(tasks, ("generic",), policy="random")
+            assert study.configuration()["world"] == digest
+
+
+def test_worlds_are_those_of_the_runs_that_there_are() -> None:
+    for name, digest in WORLDS.items():
+        tasks = tuple((name, task.name) for task in suites.suite(name).tasks)
+        assert Study(tasks, ("generic",), policy="random").configuration()["world"] == digest
+    assert DEMO.configuration()["world"] == "398940a634c1a2d4"
+
+
+def test_the_cameras_of_an_own_robot_are_in_its_runs_digest(file: Path) -> None:
+    study = Study((TASK,), ("generic",), policy="random", suite_files=(str(file),))
+    before = study.configuration()["world"]
+    RIGS["other"] = RIGS["mine"]
+    assert study.configuration()["world"] == before
+    RIGS["mine"] = tuple(replace(rig, fovy_rad=0.9) for rig in RIGS["mine"])
+    assert study.configuration()["world"] != before
