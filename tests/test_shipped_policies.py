@@ -29,6 +29,7 @@ BY_TODAYS_RECIPE = {
     "simpler-bridge-wide-seed-0": (0.2, 0.02),
     "simpler-fractal-wide": (0.2, 0.02),
     "simpler-fractal-tint-free": (0.0, 0.02),
+    "tabletop-wide": (0.2, 0.04),
     "vlabench-wide": (0.2, 0.01),
     "vlabench-tint-free": (0.0, 0.01),
 }
@@ -72,7 +73,8 @@ def test_it_is_whole_small_and_grown_from_the_model_that_ships(folder: Path) -> 
 
 
 @pytest.mark.parametrize(
-    "made", ["simpler-bridge-wide-seed-0", "simpler-fractal-wide", "vlabench-wide"]
+    "made",
+    ["simpler-bridge-wide-seed-0", "simpler-fractal-wide", "tabletop-wide", "vlabench-wide"],
 )
 def test_a_suites_recipe_is_what_made_a_policy_that_ships(made: str) -> None:
     told = json.loads((SHIPPED / f"{MINI}-{made}" / "training.json").read_text())
