@@ -211,7 +211,7 @@ def _foundation() -> list[Finding]:
 
 def _not_in_view() -> Finding:
     """Whether every foundation stack can say that an object is not in view."""
-    from vap_core.perception.foundation.sources import KINDS, needs_photos
+    from vap_core.perception.foundation.sources import KINDS
     from vap_core.perception.foundation.store import store_folder
     from vap_core.perception.kept_thresholds import keep_command, thresholds_file
     from vap_core.perception.stacks import EMBEDDED_THRESHOLDS
@@ -222,6 +222,6 @@ def _not_in_view() -> Finding:
     if lacking:
         detail += (
             f"; {', '.join(lacking)}: no threshold, so the best candidate is always highlighted; "
-            f"{keep_command(lacking[0], needs_photos(lacking[0]))} measures one"
+            f"{keep_command(lacking[0], photos=False)} measures one"
         )
     return Finding('"not in view"', not lacking, detail, needed=False)
