@@ -257,6 +257,39 @@ def test_arms_of_another_suite_are_read_by_its_name() -> None:
     assert (default.paper, tint_alone.paper) == pytest.approx((0.627, 0.073))
 
 
+def test_pictures_of_two_suites_have_a_part_and_the_papers_robot_each() -> None:
+    rates = {
+        "simpler-bridge": {"vap": 9, "references-1": 6, "references-3": 8},
+        "simpler-fractal": {"vap": 7, "references-1": 2},
+    }
+    table = pd.concat([
+        outcomes(arm, [True] * k + [False] * (10 - k)).assign(suite=suite)
+        for suite, arms in rates.items() for arm, k in arms.items()
+    ], ignore_index=True)  # fmt: skip
+    arms = ablation_results(table, *rates)["references"]
+    places = {"references-1": 1.0, "references-3": 3.0, "vap": 5.0, "references-7": 7.0}
+    parts = sweep_figure(arms, places, "reference photos").axes
+    assert [part.get_title() for part in parts] == ["simpler-bridge, n 10", "simpler-fractal, n 10"]
+    ours = [part.containers[0][0].get_ydata().tolist() for part in parts]
+    assert ours == [pytest.approx([60, 80, 90]), pytest.approx([20, 70])]
+    drawn = [[line for line in part.lines if line.get_marker() == "D"] for part in parts]
+    assert [line.get_label() for (line,) in drawn] == [
+        "the paper, WidowX",
+        "the paper, Google Robot",
+    ]
+    theirs = [line.get_ydata().tolist() for (line,) in drawn]
+    assert theirs == [pytest.approx([61.9, 78.4, 83.5]), pytest.approx([45.6, 62.7])]
+
+    left, right = rates_of_arms_figure(arms).axes
+    names = [tick.get_text() for tick in left.get_yticklabels()]
+    assert names == ["references-3", "references-1", "vap"], "the first arm stands at the top"
+    places_right = {
+        (float(line.get_xdata()[0]), float(line.get_ydata()[0]))
+        for line in right.lines if line.get_marker() == "o"
+    }  # fmt: skip
+    assert places_right == {(pytest.approx(70), 2.0), (pytest.approx(20), 1.0)}, "none for 3"
+
+
 def test_an_ablation_of_two_suites_has_a_heading_each() -> None:
     arms = {"vap": [True] * 4 + [False] * 6, "vap-associated": [True] * 7 + [False] * 3}
     table = pd.concat([

@@ -20,7 +20,7 @@ from vap_core.evaluation.ablations.picture import (
     legend_handles,
 )
 from vap_core.evaluation.ablations.picture import policies_figure as policies_figure
-from vap_core.evaluation.ablations.table import ArmResult, arm_results
+from vap_core.evaluation.ablations.table import PAPER_SUITES, ArmResult, arm_results
 from vap_core.evaluation.ablations.table import across_policies as across_policies
 from vap_core.evaluation.ablations.table import policy_results as policy_results
 from vap_core.evaluation.publish import read_runs
@@ -44,11 +44,11 @@ def ablation_episodes(path: Path) -> "pd.DataFrame":
     return pd.concat([episodes for _, episodes in read_runs(path)], ignore_index=True)
 
 
-def ablation_results(episodes: "pd.DataFrame", suite: str = "") -> Results:
+def ablation_results(episodes: "pd.DataFrame", *suites: str) -> Results:
     """The arms of every ablation that has been run, each against the first of its ablation.
 
-    Of the suites that an ablation runs on where none is named, or of `suite` alone. Those of
-    policies are not among them (`policy_results`, `across_policies`).
+    Of these suites, or of those that an ablation runs on where none is named. Those of policies are
+    not among them (`policy_results`, `across_policies`).
 
     Raises: as `arm_results`.
     """
@@ -56,7 +56,7 @@ def ablation_results(episodes: "pd.DataFrame", suite: str = "") -> Results:
     for name, ablation in ABLATIONS.items():
         if ablation.policies:
             continue
-        wanted = [suite] if suite else ablation.suites
+        wanted = suites or ablation.suites
         results = arm_results(ablation, episodes[episodes["suite"].isin(wanted)])
         if results:
             found[name] = results
@@ -80,7 +80,7 @@ def all_effects_figure(
         _draw_blocks(axes, part)
         axes.set_ylim(-most + 0.4, 0.6)
         axes.set_xlim(-103, 45)
-        axes.set_xlabel("points of success against the first arm (95 %)", fontsize=8)
+        axes.set_xlabel("points of success against the first arm (95 % interval)", fontsize=8)
     figure.legend(
         handles=legend_handles(whose), loc="outside lower center", ncols=4, frameon=False,
         fontsize=8,
@@ -137,43 +137,59 @@ def _draw_blocks(axes: "Axes", blocks: Sequence[Block]) -> None:
 
 
 def sweep_figure(results: Sequence[ArmResult], places: Mapping[str, float], label: str) -> "Figure":
-    """Success rates along a quantity, ours with 95 % intervals, the paper's dashed."""
-    figure = empty_figure(4.2, 2.5)
-    axes = figure.subplots()
-    by_arm = {one.arm: one for one in results}
-    present = sorted((place, by_arm[arm]) for arm, place in places.items() if arm in by_arm)
-    xs = [place for place, _ in present]
-    ours = [100 * one.sr.value for _, one in present]
-    low = [100 * (one.sr.value - one.sr.low) for _, one in present]
-    high = [100 * (one.sr.high - one.sr.value) for _, one in present]
-    axes.errorbar(xs, ours, [low, high], color=CLEAR, marker="o", capsize=2, label="here, 95 %")
-    theirs = [(place, 100 * one.paper) for place, one in present if one.paper == one.paper]
-    if theirs:
-        px, py = zip(*theirs, strict=True)
-        axes.plot(px, py, "D--", color=PAPER, fillstyle="none", label="the paper, WidowX")
-    axes.set_xticks(xs, [f"{x:g}" for x in xs])
-    axes.minorticks_off()
-    axes.set_xlabel(label)
-    _finish(axes)
+    """Success rates along a quantity, one part a suite: ours with 95 % intervals, the paper's
+    dashed."""
+    suites = _by_suite(results)
+    figure = empty_figure(4.2 if len(suites) == 1 else 3.4 * len(suites), 2.6)
+    parts = figure.subplots(1, len(suites), squeeze=False, sharey=True)[0]
+    for axes, (suite, arms) in zip(parts, suites.items(), strict=True):
+        by_arm = {one.arm: one for one in arms}
+        present = sorted((place, by_arm[arm]) for arm, place in places.items() if arm in by_arm)
+        xs = [place for place, _ in present]
+        ours = [100 * one.sr.value for _, one in present]
+        low = [100 * (one.sr.value - one.sr.low) for _, one in present]
+        high = [100 * (one.sr.high - one.sr.value) for _, one in present]
+        axes.errorbar(
+            xs, ours, [low, high], color=CLEAR, marker="o", capsize=2, label="here, 95 % interval"
+        )
+        theirs = [(place, 100 * one.paper) for place, one in present if one.paper == one.paper]
+        if theirs:
+            px, py = zip(*theirs, strict=True)
+            robot = f"the paper, {PAPER_SUITES[suite]}"
+            axes.plot(px, py, "D--", color=PAPER, fillstyle="none", label=robot)
+        axes.set_xticks(xs, [f"{x:g}" for x in xs])
+        axes.minorticks_off()
+        axes.set_ylim(-3, 103)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.legend(frameon=False, fontsize=8)
+        if len(suites) > 1:
+            axes.set_title(_heading(suite, arms), fontsize=9)
+    parts[0].set_ylabel("success rate, %")
+    figure.supxlabel(label, fontsize=10)
     return figure
 
 
 def rates_of_arms_figure(results: Sequence[ArmResult]) -> "Figure":
-    """The success rate of every arm, ours with 95 % intervals, the paper's as diamonds."""
-    figure = empty_figure(4.6, 0.8 + 0.24 * len(results))
-    axes = figure.subplots()
-    _draw_rates(axes, results)
-    axes.set_xlabel("success rate, % (95 %; diamonds: the paper)", fontsize=8)
+    """The success rate of every arm, one part a suite: ours with 95 % intervals, the paper's as
+    diamonds."""
+    suites = _by_suite(results)
+    names = list(dict.fromkeys(one.arm for one in results))
+    figure = empty_figure(1.6 + 3.0 * len(suites), 0.9 + 0.24 * len(names))
+    parts = figure.subplots(1, len(suites), squeeze=False, sharey=True)[0]
+    for axes, (suite, arms) in zip(parts, suites.items(), strict=True):
+        _draw_rates(axes, arms, names)
+        axes.set_title(_heading(suite, arms), fontsize=9)
+    figure.supxlabel("success rate, % (95 % interval; diamonds: the paper)", fontsize=8)
     return figure
 
 
 def cases_figure(results: Sequence[ArmResult]) -> "Figure":
     """The share of episodes that failed by Case 1 and by Case 2, one part a suite."""
-    suites = list(dict.fromkeys(one.suite for one in results))
-    most = max(sum(one.suite == suite for one in results) for suite in suites)
+    suites = _by_suite(results)
+    most = max(map(len, suites.values()))
     figure = empty_figure(3.9 * len(suites), 1.0 + 0.3 * most)
-    for axes, suite in zip(figure.subplots(1, len(suites), squeeze=False)[0], suites, strict=True):
-        arms = [one for one in results if one.suite == suite]
+    parts = figure.subplots(1, len(suites), squeeze=False)[0]
+    for axes, (suite, arms) in zip(parts, suites.items(), strict=True):
         ys = range(len(arms) - 1, -1, -1)
         first = [100 * one.case_1.value for one in arms]
         second = [100 * one.case_2.value for one in arms]
@@ -215,22 +231,30 @@ def effect_text(results: Sequence[ArmResult], arm: str, suite: str = "") -> str:
     return f"{mid:+.0f} [{low:+.0f}, {high:+.0f}]"
 
 
-def _draw_rates(axes: "Axes", results: Sequence[ArmResult]) -> None:
-    for y, one in enumerate(reversed(results)):
+def _by_suite(results: Sequence[ArmResult]) -> dict[str, list[ArmResult]]:
+    """The arms of each suite, in their order."""
+    found: dict[str, list[ArmResult]] = {}
+    for one in results:
+        found.setdefault(one.suite, []).append(one)
+    return found
+
+
+def _heading(suite: str, arms: Sequence[ArmResult]) -> str:
+    """The name of a suite, and how many episodes each of its arms has."""
+    n = ", ".join(dict.fromkeys(str(one.sr.n) for one in arms))
+    return f"{suite}, n {n}"
+
+
+def _draw_rates(axes: "Axes", results: Sequence[ArmResult], names: Sequence[str]) -> None:
+    """One line for each of `names`, from the top."""
+    for one in results:
+        y = len(names) - 1 - names.index(one.arm)
         low, mid, high = (100 * x for x in (one.sr.low, one.sr.value, one.sr.high))
         axes.plot([low, high], [y, y], color=CLEAR, linewidth=2)
         axes.plot(mid, y, "o", color=CLEAR)
         if one.paper == one.paper:
             axes.plot(100 * one.paper, y, "D", color=PAPER, fillstyle="none", markersize=5)
-    names = [f"{one.arm}, n {one.sr.n}" for one in reversed(results)]
-    axes.set_yticks(range(len(results)), names, fontsize=8)
-    axes.set_ylim(-0.5, len(results) - 0.5)
+    axes.set_yticks(range(len(names)), names[::-1], fontsize=8)
+    axes.set_ylim(-0.5, len(names) - 0.5)
     axes.set_xlim(-3, 103)
     axes.spines[["top", "right"]].set_visible(False)
-
-
-def _finish(axes: "Axes") -> None:
-    axes.set_ylim(-3, 103)
-    axes.set_ylabel("success rate, %")
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=8)

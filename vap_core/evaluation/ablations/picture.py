@@ -36,7 +36,7 @@ def effects_figure(results: Sequence[ArmResult], title: str) -> "Figure":
         draw_effects(axes, one, results, y)
     axes.axvline(0, color="black", linewidth=0.8)
     axes.set_yticks(range(len(shown)), [_label(one, first) for one in reversed(shown)])
-    axes.set_xlabel("success rate against the first arm, points (95 %)")
+    axes.set_xlabel("success rate against the first arm, points (95 % interval)")
     axes.set_title(title, loc="left", fontsize=10)
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(
