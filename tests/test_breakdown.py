@@ -1,9 +1,11 @@
 """How failures divide into cases, and at which stages episodes are lost: tables and pictures."""
 
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import pytest
 
 from vap_core.base import figures
 from vap_core.base.tables import align
@@ -16,6 +18,7 @@ from vap_core.evaluation.report.failures import (
 )
 from vap_core.evaluation.report.funnel import funnel_figure
 from vap_core.evaluation.report.page import report_page
+from vap_core.recording import recording_file_name
 from vap_core.rollout.failure import CASES
 
 STAGE_COLUMNS = [f"stage_{stage}" for stage in STAGES]
@@ -138,3 +141,29 @@ def test_a_report_of_methods_that_highlight_nothing_has_their_failures(tmp_path:
     page = report_page(table, {}, figures.empty_figure(1.0, 1.0), [], tmp_path)
     assert "Where episodes are lost" in page
     assert "Failures (2)" in page
+
+
+def test_a_page_leaves_out_recorded_failures_of_runs_older_than_the_diagnosis(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their case, sub-case and deciding frame are not numbers and texts, but nothing."""
+
+    def summaries(paths: list[Path]) -> Generator[tuple[Path, dict[str, str], str]]:
+        for path in paths:
+            yield path, {"policy": "p"}, ""
+
+    monkeypatch.setattr("vap_core.recording.isolated.read_summaries", summaries)
+    about = {"task": "select-cup", "seed": 0, "policy": "p", "case_sentence": "because"}
+    new = {**row("generic", "unprompted", "wrong object"), **about, "episode": 0}
+    old = {name: new[name] for name in ("suite", "method", "outcome", "success", *about)}
+    rows = [new, {**old, "episode": 1}, {**old, "episode": 2}]
+    (tmp_path / "recordings").mkdir()
+    for each in rows:
+        name = recording_file_name("vlabench", "select-cup", each["episode"], 0, "generic")
+        (tmp_path / "recordings" / name).write_bytes(b"")
+    forest = figures.empty_figure(1.0, 1.0)
+    page = report_page(pd.DataFrame(rows), {}, forest, [tmp_path], tmp_path)
+    assert "Failures (1)" in page
+    assert page.count("<article>") == 1
+    assert "episode 0 · generic" in page
+    assert "2 more of runs older than the diagnosis are left out" in page
