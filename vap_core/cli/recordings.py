@@ -3,6 +3,7 @@
 import threading
 from pathlib import Path
 from typing import Annotated
+from urllib.parse import urlsplit
 
 import typer
 
@@ -253,12 +254,25 @@ def _serve(run: Path, where: str | None, port: int | None) -> None:
         if has_display():
             open_address(browser.url)
         else:
-            print(f"open it with: python -m rerun {browser.url}")
+            print(_tunnel_text(browser.url))
         print("Ctrl-C ends it.", flush=True)
         try:
             threading.Event().wait()
         except KeyboardInterrupt:
             print()
+
+
+def _tunnel_text(url: str) -> str:
+    """How to open an address of this machine, which has no display, from one that has one.
+
+    The links in the table hold the port, so it is the same one at both ends.
+    """
+    port = urlsplit(url).port
+    return (
+        "there is no display here; on a machine that has one, with the name of this one for HOST:\n"
+        f"  ssh -N -L {port}:127.0.0.1:{port} HOST\n"
+        f"  python -m rerun {url}"
+    )
 
 
 def _show_frame(recording: Path, frame: int, png: Path | None, mp4: Path | None = None) -> None:
