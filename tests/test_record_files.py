@@ -1,6 +1,7 @@
 """Recordings as files: how large they are, and how they survive."""
 
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.command import refused, vap
 from tests.drawn import SUCCESS, frame, opening, record, rerun
 from vap_core.base.errors import BadOutput, BadRecording
 from vap_core.evaluation.diagnosis import explain
@@ -59,6 +61,32 @@ def test_an_exception_keeps_every_step_under_the_temporary_name(tmp_path: Path) 
     leftover = temporary_path(tmp_path / "one.rrd")
     assert list(tmp_path.iterdir()) == [leftover]
     assert read_summary(recover(leftover))["frames"] == 1
+
+
+def test_view_names_the_mend_of_a_leftover_and_makes_a_recording_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[Path] = []
+    monkeypatch.setattr("vap_core.recording.open_viewer", lambda path, **_: shown.append(path))
+    with Recorder(tmp_path / "one.rrd", opening(1)) as recorder:
+        recorder.frame(frame(0, opening(1)))
+    whole = next(tmp_path.iterdir()).read_bytes()
+    (tmp_path / "of a").mkdir()
+    leftover = tmp_path / "of a" / ".two.rrd.7.tmp"
+    leftover.write_bytes(whole[: len(whole) - 300])
+    for words in (("view", leftover), ("show", leftover, tmp_path / "a.png")):
+        message = refused(*words)
+        assert "is a recording that was not finished" in message
+        assert f"vap_core view {shlex.quote(str(leftover))} --recover" in message
+    done = vap("view", leftover, "--recover")
+    path = leftover.with_name("two.rrd")
+    assert (done.returncode, done.stdout) == (0, f"wrote {path}\n"), done.stderr
+    assert shown == [path]
+    assert read_summary(path)["frames"] == 1
+    assert not leftover.exists()
+    assert "is no leftover of a recording" in refused("view", path, "--recover")
+    (tmp_path / "noise.rrd").write_bytes(b"noise")
+    assert "--recover" not in refused("view", tmp_path / "noise.rrd")
 
 
 def test_a_process_that_records_much_keeps_neither_threads_nor_memory(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Commands that find and open recordings: diagnose, query, view, show."""
 
+import shlex
 import threading
 from pathlib import Path
 from typing import Annotated
@@ -200,6 +201,13 @@ def view(
         Path | None,
         typer.Option(help="Write a film of what the policy saw, with the verdict, instead."),
     ] = None,
+    recover: Annotated[
+        bool,
+        typer.Option(
+            "--recover",
+            help="First make a recording of .NAME.rrd.PID.tmp, which a killed process left.",
+        ),
+    ] = False,
 ) -> None:
     """Open a recording in Rerun's viewer, with its analytics and its look for updates turned off;
     or make a picture or a film of it.
@@ -209,6 +217,11 @@ def view(
     """
     if mp4 is not None and png is None:
         refuse_dropped("view: --mp4 films every step", {"--frame": frame})
+    if recover:
+        from vap_core.recording import recover as recovered
+
+        recording = recovered(recording)
+        print(f"wrote {recording}")
     _show_frame(recording, frame or 0, png, mp4)
 
 
@@ -228,10 +241,10 @@ def show(
 
     Example: python -m vap_core show data/runs/demo/recordings/NAME.rrd shot.png --frame 20
     """
-    from vap_core.recording import check_recording, screenshot
+    from vap_core.recording import screenshot
     from vap_core.recording.attention_picture import attention_screenshot
 
-    check_recording(recording)
+    _check(recording)
     if attention:
         attention_screenshot(recording, png, frame_index=frame)
     else:
@@ -275,11 +288,28 @@ def _tunnel_text(url: str) -> str:
     )
 
 
+def _check(recording: Path) -> None:
+    """Check that a recording can be read. Raises: BadRecording; of a leftover it names the mend."""
+    from vap_core.base.errors import BadRecording
+    from vap_core.recording import check_recording, is_leftover
+
+    try:
+        check_recording(recording)
+    except BadRecording as error:
+        if not is_leftover(recording):
+            raise
+        raise BadRecording(
+            f"{recording} is a recording that was not finished; once the process that makes it has "
+            f"ended, `python -m vap_core view {shlex.quote(str(recording))} --recover` saves its "
+            "steps."
+        ) from error
+
+
 def _show_frame(recording: Path, frame: int, png: Path | None, mp4: Path | None = None) -> None:
     """Open a recording in the viewer at one step, or make a picture of it, a film, or both."""
-    from vap_core.recording import check_recording, open_viewer, screenshot, write_film
+    from vap_core.recording import open_viewer, screenshot, write_film
 
-    check_recording(recording)
+    _check(recording)
     if mp4 is not None:
         n_pictures = write_film(recording, mp4)
         print(f"wrote {mp4}: {n_pictures} pictures")

@@ -128,7 +128,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def sweep(folder: Path) -> None:
-    """Remove the scratch of killed processes; unfinished recordings stay, for `recover`."""
+    """Remove the scratch of killed processes; unfinished recordings stay (`view --recover`)."""
     for kind in ("parts", "traces", "audit", "recordings/.index-*"):
         for place in folder.glob(kind):
             remove_scratch(place)
