@@ -347,6 +347,7 @@ def test_another_policys_effects_stand_beside_each_arm() -> None:
     (-0.1, 0.1, 0.7, -0.2, "not here: as much is excluded"),
     (-0.1, 0.1, 0.7, 0.05, "cannot tell"),
     (-0.1, -0.02, 0.06, -0.05, "cannot tell"),
+    (-0.1, -0.02, 0.06, -0.01, "cannot tell"),
 ])  # fmt: skip
 def test_what_a_difference_says_about_the_papers_finding(
     low: float, high: float, p: float, theirs: float, said: str
