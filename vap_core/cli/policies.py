@@ -55,7 +55,7 @@ def eval_policy(
     from vap_core.base.errors import BadStudy
     from vap_core.evaluation.study import Study
     from vap_core.simulation import suites
-    from vap_core.training.policy.probe import conclude, keep, probe
+    from vap_core.training.policy.probe import conclude, keep, kept, probe
 
     tasks = tuple((suite, task.name) for task in suites.suite(suite).tasks)
     study = Study(tasks, ("generic",), policy=policy)
@@ -65,6 +65,8 @@ def eval_policy(
             f"eval-policy: {policy!r} has no weights; "
             "take mini-pi0, or a lerobot checkpoint's folder or hub id."
         )
+    if out is not None:
+        kept(out)  # said before the work
     table = probe(
         checkpoint,
         suite,

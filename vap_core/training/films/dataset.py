@@ -210,6 +210,8 @@ def about(folder: Path) -> dict[str, Any]:
         info = parse_json(read_file(folder / "meta" / "info.json"))
         lerobot = info["codebase_version"]
         version = card["version"]
+        if not isinstance(card["suite"], str) or not isinstance(card["episodes"], list):
+            raise TypeError(f"{ABOUT} names no suite or no episodes")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise BadOutput(
             f"read: meta/ of {folder} is absent or damaged ({_line(error)}); {AGAIN}."
