@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from tests.command import refused, vap
 from tests.scanned import box, put
-from vap_core.base.errors import BadObject, BadStudy
+from vap_core.base.errors import BadObject, BadOutput, BadStudy
 from vap_core.evaluation.own_objects import run as own
 from vap_core.evaluation.own_objects.folder import VARIABLE, Source, objects_in, read_source
 from vap_core.evaluation.own_objects.report import Tables, group_rows, object_rows, text_report
@@ -96,6 +96,22 @@ def test_the_folder_of_designs_is_read_and_depends_on_all_of_it(tmp_path):
     text = (tmp_path / "objects.csv").read_text()
     (tmp_path / "objects.csv").write_text(text.replace("vase,", "cup,"))
     assert source.sha256 != read_source(tmp_path).sha256
+
+
+def test_designs_replace_no_file_of_anothers(tmp_path):
+    """The same designs again are no error: nothing is lost."""
+    (tmp_path / "objects.csv").write_text("file,category\nmug.glb,cup\n")
+    line = refused("objects", "designs", tmp_path, "--count", "2")
+    assert "objects.csv exists with other contents; choose another folder" in line
+    assert [path.name for path in tmp_path.iterdir()] == ["objects.csv"]
+    assert (tmp_path / "objects.csv").read_text() == "file,category\nmug.glb,cup\n"
+    (tmp_path / "objects.csv").unlink()
+    paths = write_designs(tmp_path, 2, 0)
+    assert write_designs(tmp_path, 2, 0) == paths
+    paths[0].write_bytes(b"mine")
+    with pytest.raises(BadOutput, match="exists with other contents"):
+        write_designs(tmp_path, 2, 0)
+    assert paths[0].read_bytes() == b"mine"
 
 
 @pytest.mark.parametrize(
