@@ -90,6 +90,8 @@ def test_kinds_are_told_apart_as_they_are_remembered(folder):
         ("scenes.csv", HEADER + "c.png,mug,1,2,3,4\n", "line 2 names the scene 'c.png'"),
         ("scenes.csv", HEADER + "a.png,mug,1,2,3\n", "line 2 has the box"),
         ("scenes.csv", HEADER + "a.png,mug,9,2,3,4\n", "without area"),
+        ("scenes.csv", HEADER + "a.png,mug,0.1,0.1,0.9,0.9\n", "line 2 .* pixels, not fractions"),
+        ("scenes.csv", HEADER + "a.png,mug,4,4,4.5,16\n", "line 2 .* pixels, not fractions"),
         ("scenes.csv", HEADER + "a.png,ghost,,,,\n", "no references of 'ghost'"),
         ("scenes.csv", HEADER + "a.png,mug,1,2,3,4\n", "no line for b.png"),
         (
@@ -100,6 +102,12 @@ def test_kinds_are_told_apart_as_they_are_remembered(folder):
         ("objects.csv", "object,category\nmgu,cup\n", "line 2 names 'mgu'"),
         ("objects.csv", "object,category\nmug,3!\n", "'3!' cannot be a category"),
         ("references/boxes.csv", "photo,x0,y0,x1,y1\nmug/7.png,1,2,3,4\n", "names 'mug/7.png'"),
+        (
+            "references/boxes.csv",
+            "photo,x0,y0,x1,y1\nmug/0.png,0.1,0.1,0.9,0.9\n",
+            "boxes.csv line 2 .* pixels, not fractions",
+        ),
+        ("references/boxes.csv", "photo,x0,y0,x1,y1\nmug/0.png,0,0,1,1\n", "not fractions"),
         ("scenes.csv", "\xff\xfe", "lacks the column|cannot be read"),
     ],
 )

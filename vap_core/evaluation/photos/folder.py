@@ -276,6 +276,11 @@ def _parse_box(row: Mapping[str, str], where: str) -> Box | None:
             f"eval-photos: {where} has the box {','.join(cells)!r} without area; x to the right, "
             "y down, far corner last."
         )
+    if (box[2:] - box[:2] < 1).any() or box.max() <= 1:
+        raise BadPhotoSet(
+            f"eval-photos: {where} has the box {','.join(cells)!r} with a side of a pixel or less; "
+            "give pixels, not fractions of the picture."
+        )
     return box
 
 
