@@ -1,6 +1,7 @@
 """eval-photos: the folder form, what is wrong with bad folders, the figures, and resuming."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,15 @@ from PIL import Image
 
 from tests.command import refused, vap
 from tests.toys import MeanColour, SameColour, detector, personal, scene, segmenter
+from vap_core.attend import Attender
 from vap_core.base.errors import BadPhotoSet
 from vap_core.base.files import DATA
 from vap_core.evaluation.metrics import rate
 from vap_core.evaluation.photos import run
-from vap_core.evaluation.photos.apart import single_rows
+from vap_core.evaluation.photos.apart import mask_rows, single_rows
+from vap_core.evaluation.photos.clips import follow_scene
 from vap_core.evaluation.photos.folder import read_photo_set
+from vap_core.evaluation.photos.measure import measure_scene
 from vap_core.evaluation.photos.pictures import fit_line, labelled
 from vap_core.evaluation.photos.report import (
     clustered_mean,
@@ -30,6 +34,7 @@ from vap_core.perception.protocols import Stack
 
 RED, GREEN, BLUE, DARK = (250, 0, 0), (0, 250, 0), (0, 0, 250), (120, 10, 0)
 HEADER = "scene,object,x0,y0,x1,y1\n"
+TOY = Stack("toy", detector, MeanColour(), segmenter, SameColour())
 
 
 @pytest.fixture
@@ -54,8 +59,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def toy(monkeypatch: pytest.MonkeyPatch) -> None:
-    stack = Stack("toy", detector, MeanColour(), segmenter, SameColour())
-    monkeypatch.setattr(run, "load_stack", lambda name: stack)
+    monkeypatch.setattr(run, "load_stack", lambda name: TOY)
 
 
 def test_the_form_is_read(folder):
@@ -172,6 +176,34 @@ def test_a_box_outside_its_photo_is_named(folder, toy, tmp_path):
     line = refused("eval-photos", folder, "--stack", "toy", "--out", tmp_path / "out")
     assert "lies outside" in line
     assert "64x64" in line
+
+
+def test_a_box_that_reaches_far_beyond_its_photo_is_named(folder, toy, tmp_path):
+    """Of a digit too many the overlap would be near 0, whatever is found."""
+    (folder / "scenes.csv").write_text(HEADER + "a.png,mug,4,4,160,16\nb.png,mug,,,,\n")
+    line = refused("eval-photos", folder, "--stack", "toy", "--out", tmp_path / "out")
+    assert "'mug' reaches beyond" in line
+    assert "64x64" in line
+    photo_set = read_photo_set(folder)
+    far = replace(photo_set.scenes[0], masks={"mug": folder / "scenes" / "a.png"})
+    with pytest.raises(BadPhotoSet, match="reaches beyond"):
+        mask_rows(far, TOY)
+    with pytest.raises(BadPhotoSet, match="reaches beyond"):
+        follow_scene(far, photo_set, TOY)
+
+
+def test_a_box_that_reaches_a_pixel_beyond_its_photo_is_clipped(folder, toy):
+    at_the_edge = np.array([[52, 4, 64, 16]], np.float32)
+    Image.fromarray(scene([(52, 4, RED)])).save(folder / "scenes" / "a.png")
+    memory = {"mug": personal("mug", "cup", RED)}
+    photo_set = read_photo_set(folder)
+    ious = []
+    for beyond in (0, 1):
+        boxes = {"mug": at_the_edge + np.array([0, 0, beyond, 0], np.float32)}
+        first = replace(photo_set.scenes[0], boxes=boxes)
+        (answer,) = measure_scene(first, photo_set, memory, Attender(TOY, memory))
+        ious.append(answer["iou"])
+    assert ious == [1.0, 1.0]
 
 
 def row(**changed: object) -> dict[str, object]:
