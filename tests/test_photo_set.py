@@ -157,6 +157,7 @@ def test_the_command_measures_writes_and_resumes(folder, toy, tmp_path):
     assert (absent.present, absent.tinted, absent.iou) == (False, True, 0.0)
     assert "object in view" in done.stdout
     assert "vote among" in done.stdout
+    assert "note: scenes.csv names ball without references: taken as rivals" in done.stderr
     assert (out / "sheet-01.png").stat().st_size > 1000
     assert (out / "memory" / "mug.references.png").exists()
     assert len(pd.read_csv(out / "questions.csv")) == 6
@@ -169,6 +170,20 @@ def test_the_command_measures_writes_and_resumes(folder, toy, tmp_path):
     assert again.stdout.split("ms a photo")[0] == done.stdout.split("ms a photo")[0]
     (folder / "scenes.csv").write_text(HEADER + "a.png,mug,4,4,16,16\nb.png,mug,,,,\n")
     assert "holds another run" in refused("eval-photos", folder, "--stack", "toy", "--out", out)
+
+
+def test_a_name_that_is_misspelt_in_one_line_is_told(folder, toy, tmp_path):
+    """Its object is asked for once less, and the table does not show that."""
+    text = (folder / "scenes.csv").read_text()
+    (folder / "scenes.csv").write_text(text.replace("a.png,mug", "a.png,mugg"))
+    done = vap("eval-photos", folder, "--stack", "toy", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    lines = [line for line in done.stderr.splitlines() if line.startswith("note:")]
+    assert lines == [
+        "note: scenes.csv names ball, mugg without references: taken as rivals, not asked for; "
+        "where one is misspelt, mend it and measure anew"
+    ]
+    assert read_photo_set(DATA / "photo-set").rivals == ("book", "rice")
 
 
 def test_a_box_outside_its_photo_is_named(folder, toy, tmp_path):

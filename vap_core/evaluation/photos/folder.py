@@ -75,6 +75,12 @@ class PhotoSet:
     categories: Mapping[str, str]
     sha256: str
 
+    @property
+    def rivals(self) -> tuple[str, ...]:
+        """The objects of scenes without references, which are never asked for."""
+        asked = {subject.name for subject in self.subjects}
+        return tuple(sorted(set(self.categories) - asked))
+
 
 def read_photo_set(folder: Path) -> PhotoSet:
     """Read a folder in this form.
