@@ -125,6 +125,8 @@ def test_a_name_that_is_taken_needs_replace(shelf):
         import_scan(file, "../mug", "cup")
     with pytest.raises(BadObject, match="cannot be a category"):
         import_scan(file, "mug", "cup!")
+    with pytest.raises(BadObject, match="'my cup' cannot be a category; leave 'my' out"):
+        import_scan(file, "mug", "my cup")
 
 
 @pytest.mark.parametrize("name", storage.FILES)

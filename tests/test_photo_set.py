@@ -105,6 +105,7 @@ def test_kinds_are_told_apart_as_they_are_remembered(folder):
         ),
         ("objects.csv", "object,category\nmgu,cup\n", "line 2 names 'mgu'"),
         ("objects.csv", "object,category\nmug,3!\n", "'3!' cannot be a category"),
+        ("objects.csv", "object,category\nmug,my cup\n", "'my cup' cannot be a category"),
         ("references/boxes.csv", "photo,x0,y0,x1,y1\nmug/7.png,1,2,3,4\n", "names 'mug/7.png'"),
         (
             "references/boxes.csv",

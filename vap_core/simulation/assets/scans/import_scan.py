@@ -18,7 +18,7 @@ import numpy as np
 from vap_core import __version__
 from vap_core.base.errors import BadObject
 from vap_core.base.limits import bounded
-from vap_core.memory import CATEGORY, NAME
+from vap_core.memory import NAME, category_remedy, plain_category
 from vap_core.simulation import robots
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.scans.bake import (
@@ -102,7 +102,7 @@ def import_scan(
         mass_kg = float(np.clip(DENSITY_KG_M3 * volume_m3, *MASS_KG))
     metadata = ScanMetadata(
         name=name,
-        category=" ".join(category.lower().split()),
+        category=plain_category(category),
         mass_kg=round(mass_kg, 4),
         source=path.name,
         source_sha256=sha256(path.read_bytes()).hexdigest(),
@@ -156,11 +156,9 @@ def _check_arguments(name: str, category: str, mass_kg: float | None) -> None:
             f"objects: a name that ends in {objects.RED} is of an object that was made red; choose "
             "another --name."
         )
-    if not CATEGORY.fullmatch(category.strip()):
-        raise BadObject(
-            f"objects: {category!r} cannot be a category; name the kind of thing in words, for "
-            "example --category cup."
-        )
+    remedy = category_remedy(category)
+    if remedy:
+        raise BadObject(f"objects: {category!r} cannot be a category; {remedy}.")
     if mass_kg is not None and not 0 < mass_kg <= HEAVIEST_KG:
         raise BadObject(
             f"objects: a mass of {mass_kg:g} kg is beyond what the arms lift; give --mass-kg "
