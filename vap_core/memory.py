@@ -32,7 +32,7 @@ REFERENCE_THRESHOLD = 0.05
 """A photo of the object shows one of its category, so a reference's box needs a lower score than a
 proposal does."""
 CATEGORY = re.compile(r"[^\W\d_][\w -]*")
-OWNED = re.compile(r"(?:my|our|his|her|their|the|an?) (?=.)")
+OWNED = re.compile(r"(?:(?:my|our|his|her|their|the|an?) )+(?=.)")
 """What stands before a category in an instruction, and is no part of it."""
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,63}")
 AGAIN = "register the object again with --replace, or delete the file"
@@ -110,16 +110,13 @@ def plain_category(category: str) -> str:
     return " ".join(normalize("NFC", category).lower().split())
 
 
-def category_remedy(category: str) -> str:
-    """What to write instead of a category that will not do; "" where it will."""
+def kind_instead(category: str) -> str:
+    """A word to write instead of a category that will not do; "" where it will."""
     plain = plain_category(category)
     if not CATEGORY.fullmatch(plain):
-        return "name the kind of thing in words, for example --category cup"
+        return "cup"
     before = OWNED.match(plain)
-    if before:
-        kind = plain[before.end() :]
-        return f"leave {before[0].strip()!r} out: --category {shlex.quote(kind)}"
-    return ""
+    return plain[before.end() :] if before else ""
 
 
 def check_names(name: str, category: str) -> None:
@@ -129,9 +126,12 @@ def check_names(name: str, category: str) -> None:
             f"remember: {name!r} cannot name an object; use letters, digits, space, dot, dash or "
             "underscore."
         )
-    remedy = category_remedy(category)
-    if remedy:
-        raise BadMemory(f"remember: {category!r} cannot be a category; {remedy}.")
+    kind = kind_instead(category)
+    if kind:
+        raise BadMemory(
+            f"remember: {category!r} cannot be a category; name the kind of thing alone, in words, "
+            f"for example --category {shlex.quote(kind)}."
+        )
 
 
 def reference_rows(obj: PersonalObject, encoder: Encoder) -> Float32[np.ndarray, "k d"]:

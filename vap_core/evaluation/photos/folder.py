@@ -25,7 +25,7 @@ from vap_core.base.csv_rows import read_rows
 from vap_core.base.errors import BadPhotoSet
 from vap_core.base.photos import photos_in
 from vap_core.base.types import value
-from vap_core.memory import category_remedy, plain_category
+from vap_core.memory import kind_instead, plain_category
 
 BOX = ("x0", "y0", "x1", "y1")
 MASKS = "masks"
@@ -252,7 +252,7 @@ def read_categories(
             categories[row["object"]] = row["category"]
     for name, category in categories.items():
         categories[name] = plain_category(category)
-        if category_remedy(category):
+        if kind_instead(category):
             raise BadPhotoSet(
                 f"{caller}: {category!r} cannot be a category; write {name},KIND into {table} "
                 "with the kind in words, for example mug-1,cup."

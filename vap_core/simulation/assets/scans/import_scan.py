@@ -6,6 +6,7 @@ decomposition.
 """
 
 import re
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -18,7 +19,7 @@ import numpy as np
 from vap_core import __version__
 from vap_core.base.errors import BadObject
 from vap_core.base.limits import bounded
-from vap_core.memory import NAME, category_remedy, plain_category
+from vap_core.memory import NAME, kind_instead, plain_category
 from vap_core.simulation import robots
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.scans.bake import (
@@ -156,9 +157,12 @@ def _check_arguments(name: str, category: str, mass_kg: float | None) -> None:
             f"objects: a name that ends in {objects.RED} is of an object that was made red; choose "
             "another --name."
         )
-    remedy = category_remedy(category)
-    if remedy:
-        raise BadObject(f"objects: {category!r} cannot be a category; {remedy}.")
+    kind = kind_instead(category)
+    if kind:
+        raise BadObject(
+            f"objects: {category!r} cannot be a category; name the kind of thing alone, in words, "
+            f"for example --category {shlex.quote(kind)}."
+        )
     if mass_kg is not None and not 0 < mass_kg <= HEAVIEST_KG:
         raise BadObject(
             f"objects: a mass of {mass_kg:g} kg is beyond what the arms lift; give --mass-kg "
