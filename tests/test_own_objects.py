@@ -1,6 +1,7 @@
 """eval-objects: made-up designs, the folder form, what is wrong with bad folders, the figures, and resuming."""
 
 import os
+import shlex
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -123,6 +124,7 @@ def test_designs_replace_no_file_of_anothers(tmp_path):
         ("file,category\nmug.glb,cup\nmug.glb,cup\n", "line 3 names a second 'mug'"),
         ("file,category,height_cm\nmug.glb,cup,tall\n", "the height 'tall'"),
         ("file,category\n", "names no file"),
+        ("file,category\nmug.glb,my cup\n", "line 2 has the category 'my cup'; .* example cup"),
     ],
 )
 def test_what_is_wrong_with_a_folder_is_one_line(tmp_path, text, message):
@@ -131,6 +133,30 @@ def test_what_is_wrong_with_a_folder_is_one_line(tmp_path, text, message):
         (tmp_path / "objects.csv").write_text(text)
     with pytest.raises(BadObject, match=message):
         read_source(tmp_path)
+
+
+def test_where_every_object_is_left_out_the_remedy_is_one_that_there_is(tmp_path):
+    """The option that mends an open surface is that of `objects import`."""
+    folder, out = tmp_path / "a b's", tmp_path / "out"
+    folder.mkdir()
+    open_box = box(rgb=(200, 60, 30))
+    open_box.update_faces(np.arange(10))
+    for name in ("open.ply", "other.ply"):
+        put(folder, name, open_box)
+    table = "file,category,height_cm\nopen.ply,coffee cup,6\nother.ply,cup,\n"
+    (folder / "objects.csv").write_text(table)
+    line = refused("eval-objects", folder, "--views-only", "--out", out)
+    assert "eval-objects: every object was left out. open: " in line
+    assert "is not watertight" in line
+    assert f"Of 1 more {out / 'report.txt'} says why." in line
+    command, _, then = line.partition("python -m vap_core ")[2].partition("; ")
+    assert shlex.split(command) == [
+        "objects", "import", str(folder / "open.ply"), "--category", "coffee cup",
+        "--height-cm", "6", "--repair", "--out", "DIR",
+    ]  # fmt: skip
+    assert then.startswith("then measure with eval-objects DIR.")
+    report = (out / "report.txt").read_text()
+    assert [words.split(":")[1] for words in report.splitlines()] == [" open", " other"]
 
 
 def test_where_objects_are_looked_up_is_as_before_afterwards(tmp_path, monkeypatch):
