@@ -23,7 +23,6 @@ from vap_core.simulation.assets.scans import import_scan, storage
 
 TABLE = "objects.csv"
 COLUMNS = ("file", "category", "height_cm", "groups")
-VARIABLE = "VAP_OBJECTS"
 
 
 @value
@@ -115,15 +114,15 @@ def _by_itself(folder: Path, row: Mapping[str, str], error: str) -> str:
 @contextmanager
 def objects_in(folder: Path) -> Iterator[None]:
     """Look own objects up in `folder`, in this process and in those that it starts."""
-    before = os.environ.get(VARIABLE)
-    os.environ[VARIABLE] = str(folder.resolve())
+    before = os.environ.get(storage.VARIABLE)
+    os.environ[storage.VARIABLE] = str(folder.resolve())
     try:
         yield
     finally:
         if before is None:
-            del os.environ[VARIABLE]
+            del os.environ[storage.VARIABLE]
         else:
-            os.environ[VARIABLE] = before
+            os.environ[storage.VARIABLE] = before
 
 
 def _imported(folder: Path) -> Source:
