@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from tests.command import process, vap
+from tests.command import process, refused, vap
 from vap_core.base.errors import BadOutput, VapError
 from vap_core.cli.options import names
 from vap_core.evaluation.rescore import rescore
@@ -224,6 +224,17 @@ REFUSED = {
 
 def test_names_in_an_option_may_stand_apart() -> None:
     assert names(" generic, vap,, ") == ["generic", "vap"]
+
+
+@pytest.mark.parametrize("given", ["", ",", " , "])
+@pytest.mark.parametrize("command", ["eval", "rollout"])
+def test_methods_that_name_none_are_refused(command: str, given: str, tmp_path: Path) -> None:
+    """As of a shell variable that is not set, which would run the default for hours."""
+    task = ("--task", "put-camera") if command == "rollout" else ()
+    words = ("--suite", "simpler-bridge", *task, "--policy", "scripted", "--methods", given)
+    line = refused(command, *words, "--out", tmp_path / "out")
+    assert "--methods names no method; name one, for example --methods generic,vap" in line
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow

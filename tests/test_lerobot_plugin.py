@@ -18,9 +18,11 @@ from lerobot.envs.utils import _call_make_env, _import_hub_module, _normalize_hu
 from lerobot.processor import ProcessorStepRegistry
 
 from tests.command import refused, vap
+from tests.toys import personal
 from vap_core.evaluation.policy_names import shipped
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import make_trial, register_personal
+from vap_core.memory import save
 from vap_core.policies.lerobot.adapter import IMAGE, _resize, load_policy
 from vap_core.policies.protocol import PolicyInput
 from vap_core.rollout.loop import rollout
@@ -150,7 +152,7 @@ def test_lerobots_own_command_gives_the_successes_of_our_engine(
 
 
 def test_attach_says_what_it_wrote_and_refuses_a_second_time(tmp_path: Path) -> None:
-    (tmp_path / "memory").mkdir()
+    save(tmp_path / "memory", personal("mug", "cup", (40, 120, 110)))
     words = ("attach", shipped(SUITE), tmp_path / "out", "--memory", tmp_path / "memory")
     done = vap(*words)
     assert done.returncode == 0, done.stderr
@@ -160,6 +162,10 @@ def test_attach_says_what_it_wrote_and_refuses_a_second_time(tmp_path: Path) -> 
     again = vap(*words)
     assert again.returncode == 2
     assert "exists; choose another folder" in again.stderr
+    (tmp_path / "empty").mkdir()
+    words_of_empty = (*words[:2], tmp_path / "late", "--memory", tmp_path / "empty")
+    assert f"{tmp_path / 'empty'} holds no object" in refused(*words_of_empty)
+    assert not (tmp_path / "late").exists()
     (tmp_path / "file").write_text("")
     inside = refused("attach", shipped(SUITE), tmp_path / "file" / "out", "--memory", words[4])
     assert "cannot be written" in inside

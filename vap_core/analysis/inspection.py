@@ -290,7 +290,7 @@ def write_photo(folder: Path, row: EpisodeRow, camera: str, size: int = 448) -> 
     references = folder / "references"
     photo = folder / "photo.png"
     with writing(folder, "inspection.write_photo", "choose another folder"):
-        write_views(get_object(row.target), references)
+        write_views(get_object(row.target), references, replace=True)
         images = camera_images(row, size=size)
         Image.fromarray(images[camera]).save(photo)
     return photo, references

@@ -187,14 +187,20 @@ def study_of(
 
     Without `methods`, they are generic, and vap unless the policy reads the simulator.
 
-    Raises: as `Study`.
+    Raises: BadStudy where `methods` are given and name none; else as `Study`.
     """
+    from vap_core.base.errors import BadStudy
     from vap_core.evaluation.policy_names import PRIVILEGED
     from vap_core.evaluation.study import Study
 
-    chosen = tuple(dict.fromkeys(names(",".join(methods or ()))))
+    if methods is None:
+        methods = ["generic"] if policy in PRIVILEGED else ["generic", "vap"]
+    chosen = tuple(dict.fromkeys(names(",".join(methods))))
     if not chosen:
-        chosen = ("generic",) if policy in PRIVILEGED else ("generic", "vap")
+        raise BadStudy(
+            "--methods names no method; name one, for example --methods generic,vap, or leave the "
+            "option out."
+        )
     return Study(tasks, chosen, policy=policy, **options)
 
 

@@ -46,7 +46,9 @@ def text_report(tables: Tables) -> str:
     if tables.refused:
         lines = [f"left out: {name}: {why}" for name, why in tables.refused.items()]
         parts.append("\n".join(lines))
-    return "\n\n".join([*parts, NOTE])
+    if len(tables.views):
+        parts.append(NOTE)
+    return "\n\n".join(parts)
 
 
 def object_rows(tables: Tables) -> Rows:
