@@ -1,13 +1,12 @@
 """A study: which tasks, methods and policy, and how many episodes."""
 
-import os
-import shlex
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from vap_core import __version__
+from vap_core.base.commands import command
 from vap_core.base.errors import BadStudy, one_of
 from vap_core.base.extras import require
 from vap_core.evaluation import world
@@ -109,10 +108,7 @@ class Study:
 
     def next_command(self, *words: str | Path) -> str:
         """A command to print, to be run next; it finds the study's own suites."""
-        line = shlex.join(["python", "-m", "vap_core", *map(str, words)])
-        if not self.suite_files:
-            return line
-        return f"{suites.own.VARIABLE}={shlex.quote(os.pathsep.join(self.suite_files))} {line}"
+        return command(*words, environment=suites.own.environment(self.suite_files))
 
     def configuration(self) -> dict[str, Any]:
         """What the results depend on, as JSON.

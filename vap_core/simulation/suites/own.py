@@ -8,7 +8,7 @@ import hashlib
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
@@ -50,6 +50,11 @@ class OwnSuite:
 
 OPENED: dict[str, OwnSuite] = {}
 """The suites of one's own that are open in this process."""
+
+
+def environment(files: Sequence[str]) -> dict[str, str]:
+    """The variables by which another process finds the suites of some files."""
+    return {VARIABLE: os.pathsep.join(files)} if files else {}
 
 
 def find(name: str, taken: Iterable[str], endings: tuple[str, ...]) -> OwnSuite | None:
