@@ -116,6 +116,7 @@ def inspect_dataset_command(
 
     require("policy", "inspect-dataset")
     from vap_core.analysis.dataset_inspection import TABLE, inspect_dataset, report_table
+    from vap_core.base.commands import command
     from vap_core.base.errors import BadDataset
 
     if masks and copy is None:
@@ -136,4 +137,4 @@ def inspect_dataset_command(
     first = out / "episode_000000.rrd"
     copied = f" and the dataset {copy}" if copy is not None else ""
     print(f"wrote {out / TABLE}, {len({r.episode for r in reports})} recordings{copied}")
-    print(f"look: python -m vap_core view {first}")
+    print(f"look: {command('view', first)}")
