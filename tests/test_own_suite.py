@@ -159,6 +159,23 @@ def test_the_environment_takes_no_name_that_is_another_suites(
         (('"my-desk"', '"../desk"'), "the name '../desk' will not do"),
         (("bottle-lookalike-1", "bottle-lookalike-99"), "bottle-lookalike-99"),
         (("PICK, episode,", "PICK, 0,"), "is there twice"),
+        (('("front",)', "()"), r"desk\.py: cameras is empty; wx250s has front\.$"),
+        (
+            ('category="bottle"', 'category="botle"'),
+            r"task pick-bottle: the instruction 'pick up my bottle' asks for my bottle, and the "
+            r"category is 'botle'; write \"my botle\" in it once, or correct the category\.$",
+        ),
+        (("up my bottle", "up the bottle"), "task pick-bottle: .* names no personal object; write"),
+        (("up my bottle", "up my cup"), "asks for my cup, and the category is 'bottle'; write"),
+        (
+            ("up my bottle", "up my bottle and my cup"),
+            "asks for my bottle and my cup, and the category is 'bottle'; write",
+        ),
+        (
+            ('"bottle-personal", "bottle-lookalike-1"', '"cup-personal", "bottle-lookalike-1"'),
+            r"row my-desk\.pick-bottle\.000: its first object, the target, is cup-personal, a cup, "
+            "and the task's category is 'bottle'; place the target first, or correct",
+        ),
         (
             ("tuple(places))", "tuple(places), seed=3)"),
             r"row my-desk\.pick-bottle\.000 has seed=3; leave it 0: seeds come from --seed\.",
