@@ -185,7 +185,7 @@ def study_of(
 ) -> "Study":
     """The study of some tasks.
 
-    Without `methods`, they are generic, and vap unless the policy reads the simulator.
+    Where `methods` is None they are generic, and vap unless the policy reads the simulator.
 
     Raises: BadStudy where `methods` are given and name none; else as `Study`.
     """
@@ -198,8 +198,8 @@ def study_of(
     chosen = tuple(dict.fromkeys(names(",".join(methods))))
     if not chosen:
         raise BadStudy(
-            "--methods names no method; name one, for example --methods generic,vap, or leave the "
-            "option out."
+            f"--methods: {','.join(methods)!r} names no method; name one, or leave the option out "
+            "for the default, generic,vap."
         )
     return Study(tasks, chosen, policy=policy, **options)
 

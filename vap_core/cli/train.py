@@ -111,13 +111,14 @@ def vlm(
 
     Example: python -m vap_core train vlm --stages 20 --steps 100 --out data/runs/small-vlm
     """
+    from vap_core.base.commands import command
     from vap_core.training.vlm.train import Recipe, train
 
     recipe = Recipe(stages=stages, steps=steps, seed=seed)
     about = train(recipe, out, minutes=minutes)
     print(json.dumps(about["held_out"], indent=1))
     print(f"CPU hours: {json.dumps(about['cpu_hours'])}")
-    print(f"next: python -m vap_core train policy --suite simpler-bridge --vlm {out}")
+    print(f"next: {command('train', 'policy', '--suite', 'simpler-bridge', '--vlm', out)}")
 
 
 @app.command()
@@ -218,6 +219,7 @@ def policy(
     """
     from dataclasses import replace
 
+    from vap_core.base.commands import command
     from vap_core.base.errors import one_of
     from vap_core.training.recipe import RECIPES
 
@@ -256,7 +258,5 @@ def policy(
     )
     print(json.dumps(about["held_out"], indent=1))
     print(f"CPU hours: {json.dumps(about['cpu_hours'])}")
-    print(
-        f"next: python -m vap_core eval --suite {suite} --policy {folder} "
-        f"--methods generic,vap --episodes 4 --out {folder}-eval"
-    )
+    words = ("eval", "--suite", suite, "--policy", folder, "--methods", "generic,vap")
+    print(f"next: {command(*words, '--episodes', '4', '--out', f'{folder}-eval')}")

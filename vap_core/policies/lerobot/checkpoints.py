@@ -68,6 +68,18 @@ def config_field(checkpoint: str | Path, name: str) -> str:
         ) from error
 
 
+def trained_for(checkpoint: str | Path) -> str:
+    """The suite whose recipe trained a checkpoint; "" where its folder does not say.
+
+    Raises: BadPolicy when a file of the checkpoint is missing.
+    """
+    try:
+        card = parse_json((locate(checkpoint) / TRAINING_CARD).read_text())
+        return str(card["recipe"]["suite"])
+    except (OSError, ValueError, LookupError, TypeError):
+        return ""
+
+
 def base_models(folder: Path) -> list[str]:
     """Models of the hub that a checkpoint builds on.
 
