@@ -1,6 +1,7 @@
 """Episodes that are run again for their attention maps: the command, its tables, and which episodes and calls are named."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,6 +33,30 @@ def test_tables_are_published_beside_those_of_other_suites(tmp_path: Path) -> No
     metadata = pq.read_schema(tmp_path / "kept" / "attention_calls.parquet").metadata
     about = json.loads(metadata[tables.ABOUT])
     assert [each["runs"][0]["digest"] for each in about] == ["a", "b", "c"]
+
+
+def test_publishing_leaves_no_row_of_an_older_replay_of_the_suite_and_method(
+    tmp_path: Path,
+) -> None:
+    """A replay without causal measures takes those of the policy before it away."""
+
+    def publish(policy: str, suite: str, tables_with_rows: Sequence[str]) -> None:
+        line = {"suite": suite, "method": "soft", "policy": policy, "number": 1}
+        rows = {name: [dict(line)] if name in tables_with_rows else [] for name in tables.TABLES}
+        tables.write(tmp_path, rows, [{"digest": policy}])
+        tables.publish(tmp_path, tmp_path / "kept")
+
+    kept = tmp_path / "kept"
+    publish("first", "one", ["episodes", "calls", "layers"])
+    assert tables.read(kept)["causal"].empty, "a folder without causal rows can be read"
+    publish("old", "one", tables.TABLES)
+    publish("other", "another", tables.TABLES)
+    publish("new", "one", ["episodes", "calls"])
+    found = tables.read(kept)
+    policies = {name: list(table.policy) for name, table in found.items()}
+    assert policies["episodes"] == policies["calls"] == ["other", "new"]
+    assert policies["layers"] == policies["causal"] == ["other"]
+    assert {str(table.number.dtype) for table in found.values()} == {"int32"}
 
 
 def test_a_folder_that_is_no_run_gets_no_folder_of_attention(tmp_path: Path) -> None:
