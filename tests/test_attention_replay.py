@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -124,6 +125,42 @@ def test_an_episode_is_run_again_and_measured(tmp_path: Path) -> None:
     assert len(tables["layers"]) == 2 * 4 * 8
     with pytest.raises(BadStudy, match="was run with another"):
         replayed(study, "pick-shaver", tmp_path, "another")
+
+
+def test_a_replay_without_any_observed_call_names_the_errors(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The policy raises at its first call."""
+    study = Study((("simpler-bridge", "pick-shaver"),), ("generic",), episodes=1, policy="mini-pi0")
+    whole = make_trial(study, study.rows("simpler-bridge", "pick-shaver"), "generic", tmp_path)
+    broken = copy(whole.policy)
+
+    def plan(*_: Any) -> None:
+        raise RuntimeError("no memory left")
+
+    broken.plan = plan
+    job = replay.Job(
+        name="one",
+        study=study,
+        method="generic",
+        rows=tuple(study.rows("simpler-bridge", "pick-shaver")),
+        known=(("failure", 5),),
+        policy=broken.label,
+        memory=tmp_path,
+        explained=(True,),
+    )
+    monkeypatch.setattr(replay, "make_trial", lambda *_: replace(whole, policy=broken))
+    monkeypatch.setattr(replay, "plan", lambda *_: [job])
+    monkeypatch.setattr(replay, "prepare", lambda _: None)
+    monkeypatch.setattr(
+        replay, "results", lambda work, jobs, **_: ((job, work(job)) for job in jobs)
+    )
+    says = (
+        r"no call of the policy was observed in 1 episodes; 1 ended in an error, the first is "
+        r"simpler-bridge/pick-shaver/generic/0: RuntimeError: no memory left\. Mend it, delete .*parts and run"
+    )
+    with pytest.raises(BadStudy, match=says):
+        replay.run_replay(tmp_path, tmp_path / "out", replay.Wanted(), progress=False)
 
 
 def test_a_policy_without_attention_is_refused(tmp_path: Path) -> None:
