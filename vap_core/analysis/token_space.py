@@ -7,7 +7,7 @@ from jaxtyping import Float32, Float64
 
 from vap_core.analysis.embedding_search import nearest_tokens, paired_cosines
 from vap_core.base.files import parse_json
-from vap_core.evaluation.perception.estimates import Estimate
+from vap_core.evaluation.perception.estimates import NONE, Estimate
 from vap_core.evaluation.statistics import bootstrap_interval
 from vap_core.policies.embedding_table import open_table
 from vap_core.policies.mini_pi0.token_alignment import (
@@ -73,6 +73,8 @@ def rotation_cosines(model: Path, policy: Path) -> dict[str, Float64[np.ndarray,
 
 
 def mean_cosine(cosines: Float64[np.ndarray, " w"]) -> Estimate:
-    """The mean over words, with its bootstrap interval over words."""
+    """The mean over words, with its bootstrap interval over words; NONE without words."""
+    if not len(cosines):
+        return NONE
     low, high = bootstrap_interval(cosines, np.ones(len(cosines)))
     return Estimate(value=float(cosines.mean()), low=low, high=high, n=len(cosines))
