@@ -20,7 +20,7 @@ from vap_core.cli import app
 from vap_core.evaluation.tokens import study
 from vap_core.policies.embedding_table import open_table
 from vap_core.policies.mini_pi0 import teach_token, token_alignment
-from vap_core.policies.token_groups import token_groups
+from vap_core.policies.token_groups import token_groups, vocabulary_of
 from vap_core.simulation import suites
 from vap_core.training.words import vocabulary
 
@@ -112,3 +112,27 @@ def test_words_that_no_film_says_are_left_out_of_the_rotation(grown: tuple[Path,
     assert cosine * np.linalg.norm(word) ** 2 == pytest.approx(float(word @ moved), rel=1e-3)
     words = nearest_words(open_table(far).block(15, 16)[0], far, 3)
     assert words[0] == (vocabulary()[15], pytest.approx(1))
+
+
+def test_a_space_that_does_not_fit_is_refused_in_one_line(
+    grown: tuple[Path, Path],  # noqa: F811
+    tmp_path: Path,
+) -> None:
+    """An embedding of another width, models of two widths, folders without a model or words."""
+    home, far = grown
+    word = open_table(home).block(15, 16)[0]
+    with pytest.raises(BadPolicy, match="features and the embedding has 5; take a model"):
+        nearest_words(word[:5], home)
+    with pytest.raises(BadPolicy, match="features and the embedding has 5; take a model"):
+        rotation_deg(word[:5], home, far)
+    with pytest.raises(BadPolicy, match="holds no table of word embeddings"):
+        nearest_words(word, tmp_path / "none")
+    real = tiny_lerobot.pi0(tmp_path / "pi0")
+    with pytest.raises(BadPolicy, match=f"{real} has 32 features and {home} has {len(word)}"):
+        rotation_cosines(home, real)
+    row = open_table(real).block(3, 4)[0]
+    words = {token: word for word, token in vocabulary_of(real)[0].items()}
+    assert nearest_words(row, real, 1) == [(words[3], pytest.approx(1))]
+    (real / "tokenizer" / "tokenizer.json").unlink()
+    with pytest.raises(BadPolicy, match="does not say what its tokens are; put .*tokenizer.json"):
+        nearest_words(row, real)

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 ERRORS = "errors"
-"""Beside the tables in a part: the episodes that ended in an error, and the last line of its traceback."""
+"""Beside the tables in a part: the episodes that ended in an error, and its last line."""
 Known = tuple[str, int]
 """Outcome and number of steps that an episode has in the run."""
 
