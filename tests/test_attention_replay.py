@@ -240,5 +240,7 @@ def test_an_episode_is_named_and_found_in_its_run(
         examples.record(table, "put-camera/22", tmp_path, tmp_path)
     with pytest.raises(BadStudy, match="give SUITE/TASK/METHOD/EPISODE"):
         examples.record(table, "simpler-bridge/put-camera/soft/last", tmp_path, tmp_path)
+    with pytest.raises(BadStudy, match="give SUITE/TASK/METHOD/EPISODE"):
+        examples.record(table, "simpler-bridge/put-camera/soft/²", tmp_path, tmp_path)
     with pytest.raises(BadStudy, match="holds no episode"):
         examples.record(table, "simpler-bridge/put-camera/soft/2200", tmp_path, tmp_path)
