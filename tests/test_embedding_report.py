@@ -80,12 +80,30 @@ def test_real_checkpoints_are_compared_with_their_words(tmp_path: Path) -> None:
     embedding_report.keep(table, tmp_path / "new" / "rows.csv")
     assert len(pd.read_csv(tmp_path / "new" / "rows.csv")) == 4
     with pytest.raises(BadOutput, match="neither"):
-        embedding_report.keep(table, tmp_path / "rows.txt")
+        embedding_report.keep(table, tmp_path / "other" / "rows.txt")
+    assert not (tmp_path / "other").exists()
     with pytest.raises(BadPolicy, match="no suite 'nowhere'"):
         embedding_report.spaces(one, [other], "nowhere")
     (one / "tokenizer" / "tokenizer.json").write_text("{}")
     with pytest.raises(BadPolicy, match="is no tokenizer"):
         token_groups([one], ["put"])
+
+
+def test_a_name_that_is_no_tables_is_refused_before_the_work(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    opened: list[Path] = []
+    monkeypatch.setattr(embedding_report, "open_table", opened.append)
+    out = tmp_path / "new" / "rows.txt"
+    found = CliRunner().invoke(app, ["embeddings", "--out", str(out)])
+    assert isinstance(found.exception, BadOutput)
+    assert "ends with neither .parquet nor .csv" in str(found.exception)
+    blocked = tmp_path / "file"
+    blocked.touch()
+    found = CliRunner().invoke(app, ["embeddings", "--out", str(blocked / "rows.csv")])
+    assert isinstance(found.exception, BadOutput)
+    assert opened == []
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_words_that_no_film_says_are_left_out_of_the_rotation(grown: tuple[Path, Path]) -> None:  # noqa: F811
