@@ -148,10 +148,7 @@ def pattern_counts(table: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def layer_table(layers: "pd.DataFrame") -> "pd.DataFrame":
-    """Density on the target and on the look-alikes by layer, mean over heads and episodes.
-
-    `best_head` is the mean over episodes of the densest head on the target.
-    """
+    """Density on the target and on the look-alikes by layer, mean over heads and episodes."""
     import pandas as pd
 
     rows = []
@@ -162,8 +159,6 @@ def layer_table(layers: "pd.DataFrame") -> "pd.DataFrame":
         row["n"] = len(seen[KEY].drop_duplicates())
         row["lift"] = seen["share_target"].sum() / seen["chance_target"].sum()
         row["lift_lookalikes"] = seen["share_lookalikes"].sum() / seen["chance_lookalikes"].sum()
-        by_head = seen.groupby("head", observed=True)[["share_target", "chance_target"]].sum()
-        row["best_head"] = (by_head["share_target"] / by_head["chance_target"]).max()
         rows.append(row)
     return pd.DataFrame(rows)
 
