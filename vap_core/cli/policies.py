@@ -163,7 +163,7 @@ def embeddings(
     Example: python -m vap_core embeddings
     Example: python -m vap_core embeddings models/paligemma-3b-pt-224 models/pi0 models/pi05
     """
-    from vap_core.analysis.embedding_report import keep, report, spaces
+    from vap_core.analysis.embedding_report import check_output, keep, report, spaces
     from vap_core.base.errors import BadPolicy
     from vap_core.evaluation.policy_names import shipped
     from vap_core.simulation.suites import BENCHMARKS
@@ -173,6 +173,8 @@ def embeddings(
         folders = [shipped(name) for name in BENCHMARKS if shipped(name).is_dir()]
     if not folders:
         raise BadPolicy("embeddings: name the folder of a policy after the model's.")
+    if out is not None:
+        check_output(out)
     table = spaces(vlm, folders, suite, with_bar)
     print(report(table))
     if out is not None:
