@@ -13,13 +13,13 @@ from tests.toys import MeanColour, SameColour, detector, personal, scene, segmen
 from vap_core.base.errors import BadPhotoSet
 from vap_core.base.files import DATA
 from vap_core.evaluation.metrics import rate
+from vap_core.evaluation.perception.estimates import clustered_share
 from vap_core.evaluation.photos import run
 from vap_core.evaluation.photos.apart import single_rows
 from vap_core.evaluation.photos.folder import read_photo_set
 from vap_core.evaluation.photos.pictures import fit_line, labelled
 from vap_core.evaluation.photos.report import (
     clustered_mean,
-    clustered_share,
     object_rows,
     scene_rows,
     single_report,

@@ -20,9 +20,8 @@ from jaxtyping import Float32
 
 from vap_core.base.types import Mask, Rgb, value
 from vap_core.evaluation.engine import spread_evenly
-from vap_core.evaluation.perception.estimates import Estimate
+from vap_core.evaluation.perception.estimates import Estimate, clustered_share
 from vap_core.evaluation.perception.first_frames import opening_views
-from vap_core.evaluation.photos.report import clustered_share
 from vap_core.evaluation.statistics import bootstrap_interval, holm, sign_flip
 from vap_core.perception.boxes import mask_box
 from vap_core.policies.mini_pi0.learned_token import answers
@@ -155,8 +154,8 @@ def beside_policy(
 
     `table` has the rows of `scores` of one reading, of SCENE and of PHOTO; `episodes` are those of
     a published table, whose methods are columns. A row per suite and, if there are several, one for
-    ALL_SUITES; shares are `Estimate`s with intervals over objects. The last two columns are soft's first touches where the
-    model's choice in the scene was right, and where it was not.
+    ALL_SUITES; shares are `Estimate`s with intervals over objects. The last two columns are soft's
+    first touches where the model's choice in the scene was right, and where it was not.
     """
     import pandas as pd
 
