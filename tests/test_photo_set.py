@@ -15,6 +15,7 @@ from vap_core.attend import Attender
 from vap_core.base.errors import BadPhotoSet
 from vap_core.base.files import DATA
 from vap_core.evaluation.metrics import rate
+from vap_core.evaluation.perception.estimates import clustered_share
 from vap_core.evaluation.photos import run
 from vap_core.evaluation.photos.apart import mask_rows, single_rows
 from vap_core.evaluation.photos.clips import follow_scene
@@ -23,7 +24,6 @@ from vap_core.evaluation.photos.measure import measure_scene
 from vap_core.evaluation.photos.pictures import fit_line, labelled
 from vap_core.evaluation.photos.report import (
     clustered_mean,
-    clustered_share,
     object_rows,
     scene_rows,
     single_report,
