@@ -12,8 +12,15 @@ from rerun.chunk import Chunk, RrdReader
 
 from vap_core.base.errors import BadOutput, BadRecording
 from vap_core.recording.file import temporary_path
-from vap_core.recording.reading import PROPERTIES, UNREADABLE, open_whole, property_group
-from vap_core.recording.stream import finish_stream, open_stream
+from vap_core.recording.reading import (
+    KINDS,
+    PROPERTIES,
+    UNREADABLE,
+    open_whole,
+    property_group,
+    read_checked_properties,
+)
+from vap_core.recording.stream import finish_stream, log_properties, open_stream
 
 CURVES = {
     "margin": "/vap/vote_margin/",
@@ -26,15 +33,17 @@ STEPS = "/steps"
 """The entity of an index that holds the columns."""
 STATE = "/observation.state"
 """What every recording has at every step."""
+GROUPS = ("rollout", "outcome")
+"""The property groups of an index: of each what `KINDS` names, always as the same types."""
 INDEXED_ENTITIES = [
-    f"{PROPERTIES}/**",
+    *(f"{PROPERTIES}/{group}" for group in GROUPS),
     STATE,
     "/vap/vote_margin/**",
     "/vap/track_score/**",
     "/vap/hand/**",
 ]
-FOLDER = ".index-1"
-"""Beside recordings; the number grows when the columns of an index change."""
+FOLDER = ".index-2"
+"""Beside recordings; the number grows when what an index holds changes."""
 
 type Samples = list[tuple[np.ndarray, np.ndarray]]
 """Steps and values, once per chunk."""
@@ -70,28 +79,32 @@ def _write_index(recording: Path, path: Path) -> None:
     reader = open_whole(recording)
     recording_id = reader.recordings()[0].recording_id
     properties, state, curves = _read_indexed(reader)
-    groups = [property_group(chunk) for chunk in properties]
-    if "rollout" not in groups or not state:
+    if "rollout" not in properties or not state:
         raise ValueError("no recording of an episode")
     steps = np.unique(np.concatenate([frame_indices for frame_indices, _ in state]))
     columns: dict[str, Any] = {
         name: _least_per_step(steps, samples) for name, samples in curves.items()
     }
     rec = open_stream(path, recording_id)
-    rec.send_chunks(properties)
+    for group, values in properties.items():
+        if values:
+            log_properties(rec, group, rr.AnyValues(**values))
     index = [rr.TimeColumn("frame_index", sequence=steps)]
     rec.send_columns(STEPS, index, rr.AnyValues.columns(**columns))
     finish_stream(rec, path)
 
 
-def _read_indexed(reader: RrdReader) -> tuple[list[Chunk], Samples, dict[str, Samples]]:
-    """The chunks of properties, the state's samples, and those of every curve."""
-    properties: list[Chunk] = []
+def _read_indexed(
+    reader: RrdReader,
+) -> tuple[dict[str, dict[str, Any]], Samples, dict[str, Samples]]:
+    """The properties by group, the state's samples, and those of every curve."""
+    properties: dict[str, dict[str, Any]] = {}
     state: Samples = []
     curves: dict[str, Samples] = {name: [] for name in CURVES}
     for chunk in reader.store().stream().filter(content=INDEXED_ENTITIES):
-        if chunk.entity_path.startswith(PROPERTIES):
-            properties.append(chunk)
+        group = property_group(chunk)
+        if group in GROUPS:
+            properties.setdefault(group, {}).update(_typed_properties(chunk))
         elif chunk.is_static:
             continue
         elif chunk.entity_path.startswith(STATE):
@@ -101,6 +114,20 @@ def _read_indexed(reader: RrdReader) -> tuple[list[Chunk], Samples, dict[str, Sa
                 if chunk.entity_path.startswith(prefix):
                     curves[name].append(_samples(chunk))
     return properties, state, curves
+
+
+def _typed_properties(chunk: Chunk) -> dict[str, Any]:
+    """What KINDS names, every number that may be a float as one.
+
+    One catalog holds all indexes of a run, and a column of it has one type.
+
+    Raises: ValueError, as `read_checked_properties`.
+    """
+    values = {}
+    for name, value in read_checked_properties(chunk).items():
+        if name in KINDS:
+            values[name] = float(value) if KINDS[name] == (int, float) else value
+    return values
 
 
 def _samples(chunk: Chunk) -> tuple[np.ndarray, np.ndarray]:
