@@ -5,19 +5,23 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pytest
 import rerun as rr
 
-from tests.drawn import ROW, opening, record
+from tests.drawn import ROW, SUCCESS, frame, opening, record
 from tests.test_why import fail
-from vap_core.recording import isolated, load_steps
+from vap_core.base.errors import BadRecording
+from vap_core.recording import Recorder, isolated, load_steps, read_summary, write_film
 from vap_core.recording.catalog import PROPERTY_COLUMNS
 from vap_core.recording.query import run_query
 from vap_core.recording.reading import KINDS, property_group, read_chunks, read_properties
-from vap_core.recording.stream import finish_stream, log_row, open_stream
+from vap_core.recording.stored_pictures import SAMPLE, prompted_entities
+from vap_core.recording.stream import finish_stream, log_row, open_stream, time_columns
 
-GROUP_OF = {name: group for group, names in PROPERTY_COLUMNS.items() for name in names}
+QUERIED = {name: group for group, names in PROPERTY_COLUMNS.items() for name in names}
+GROUP_OF = {**QUERIED, "hz": "rollout"}
 ODD: dict[Any, Any] = {
     str: pa.array([7]),
     int: pa.array([3.5]),
@@ -93,9 +97,11 @@ def test_recordings_with_a_property_of_another_type_are_named(whole: Path, tmp_p
     """One of each property; first by name, so that a catalog would take their types for all."""
     link_all(whole, tmp_path)
     odd = {}
-    for name in GROUP_OF:
+    for name in QUERIED:
         odd[tmp_path / f"a-{name}.rrd"] = name
-        rewrite(whole / "fine.rrd", tmp_path / f"a-{name}.rrd", {name: ODD[KINDS.get(name, bool)]}, name)
+        rewrite(
+            whole / "fine.rrd", tmp_path / f"a-{name}.rrd", {name: ODD[KINDS.get(name, bool)]}, name
+        )
     big = tmp_path / "a-big.rrd"
     odd[big] = "seed"
     rewrite(whole / "fine.rrd", big, {"seed": pa.array([2**63 + 5], pa.uint64())}, "big")
@@ -125,3 +131,61 @@ def test_properties_of_other_widths_are_read(whole: Path, tmp_path: Path) -> Non
     for file, (name, value) in values.items():
         mine = held.table[held.table["file"] == str(tmp_path / f"{file}.rrd")]
         assert set(mine[name]) == set(value.to_pylist())
+
+
+def test_a_rate_that_no_film_can_have_is_refused(whole: Path, tmp_path: Path) -> None:
+    for number, hz in enumerate((1e7, 1001.0, -1.0, np.nan)):
+        path = tmp_path / f"{number}.rrd"
+        rewrite(whole / "fine.rrd", path, {"hz": pa.array([hz])})
+        with pytest.raises(BadRecording, match="its property hz is"):
+            read_summary(path)
+    rewrite(whole / "fine.rrd", tmp_path / "fast.rrd", {"hz": pa.array([1000.0])})
+    assert read_summary(tmp_path / "fast.rrd")["hz"] == 1000
+
+
+def test_a_film_of_a_damaged_video_is_one_line(tmp_path: Path) -> None:
+    """Packets of noise, and one that holds no picture."""
+    start = opening(1)
+    whole = tmp_path / "whole.rrd"
+    with Recorder(whole, start, video=True) as recorder:
+        for step in range(6):
+            recorder.frame(frame(step, start))
+        recorder.close(SUCCESS)
+    (entity,) = prompted_entities(whole).values()
+    packets = samples(whole, entity)
+    none = b"\x12\x00"
+    for name, damaged, words in (
+        ("noise", [none + b"junkjunk"] * 6, "a video that cannot be decoded"),
+        ("short", [*packets[:5], none], "a video of 6 steps that decodes to 5 pictures"),
+    ):
+        path = tmp_path / f"{name}.rrd"
+        with_samples(whole, path, entity, damaged)
+        with pytest.raises(BadRecording, match=words) as caught:
+            write_film(path, tmp_path / "film.mp4")
+        assert "\n" not in str(caught.value)
+    with_samples(whole, tmp_path / "same.rrd", entity, packets)
+    assert write_film(tmp_path / "same.rrd", tmp_path / "film.mp4") > 6
+
+
+def samples(recording: Path, entity: str) -> list[bytes]:
+    """The packets of a video, in the order of the file."""
+    found = []
+    for chunk in read_chunks(recording):
+        batch = chunk.to_record_batch()
+        if chunk.entity_path == entity and SAMPLE in batch.schema.names:
+            for cell in batch[SAMPLE]:
+                found.append(bytes(cell.values.flatten().to_numpy().astype(np.uint8)))
+    return found
+
+
+def with_samples(recording: Path, out: Path, entity: str, packets: list[bytes]) -> None:
+    """A copy of a recording with other packets."""
+    rec = open_stream(out, out.stem)
+    for chunk in read_chunks(recording):
+        group = property_group(chunk)
+        is_video = chunk.entity_path == entity and SAMPLE in chunk.to_record_batch().schema.names
+        if not is_video and (group in PROPERTY_COLUMNS or not chunk.entity_path.startswith("/__")):
+            rec.send_chunks(chunk)
+    times = time_columns([(step, step / 10) for step in range(len(packets))])
+    rec.send_columns(entity, times, rr.VideoStream.columns(sample=packets))
+    finish_stream(rec, out)

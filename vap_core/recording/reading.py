@@ -1,6 +1,5 @@
 """Reading recordings back: their chunks and their properties."""
 
-import math
 import warnings
 from pathlib import Path
 from shlex import quote
@@ -26,6 +25,8 @@ KINDS: dict[str, type | tuple[type, ...]] = {
     **dict.fromkeys(("wrong_object", "first_object_correct"), bool),
 }
 """What properties of a recording must be where they are there."""
+MOST_HZ = 1000
+"""Control steps a second. A film repeats its last picture for seconds, which has to end."""
 UNREADABLE = (RuntimeError, ValueError, OSError, Warning)
 """What rerun and the checks here raise at a file that is no whole recording."""
 
@@ -113,7 +114,7 @@ def read_checked_properties(chunk: Chunk) -> dict[str, Any]:
                 raise ValueError(f"its property {name} is {str(value)[:40]!r}")
             if kind is int and not -(2**63) <= value < 2**63:
                 raise ValueError(f"its property {name} is {value}")
-            if name == "hz" and not 0 <= float(value) < math.inf:
+            if name == "hz" and not 0 <= value <= MOST_HZ:
                 raise ValueError(f"its property hz is {value}")
         checked[name] = value
     return checked
