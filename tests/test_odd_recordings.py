@@ -1,5 +1,6 @@
 """A recording with odd properties or damaged bytes is one line, and its neighbours are read."""
 
+import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +14,16 @@ import rerun as rr
 from tests.drawn import ROW, SUCCESS, frame, opening, record
 from tests.test_why import fail
 from vap_core.base.errors import BadRecording
-from vap_core.recording import Recorder, isolated, load_steps, read_summary, write_film
+from vap_core.recording import (
+    Recorder,
+    ensure_index,
+    isolated,
+    load_steps,
+    read_summary,
+    write_film,
+)
 from vap_core.recording.catalog import PROPERTY_COLUMNS
+from vap_core.recording.index import FOLDER
 from vap_core.recording.query import run_query
 from vap_core.recording.reading import KINDS, property_group, read_chunks, read_properties
 from vap_core.recording.stored_pictures import SAMPLE, prompted_entities
@@ -189,3 +198,38 @@ def with_samples(recording: Path, out: Path, entity: str, packets: list[bytes]) 
     times = time_columns([(step, step / 10) for step in range(len(packets))])
     rec.send_columns(entity, times, rr.VideoStream.columns(sample=packets))
     finish_stream(rec, out)
+
+
+def test_a_damaged_index_is_made_again(whole: Path, tmp_path: Path) -> None:
+    """Also where the damage can be read, and only changes a number."""
+    link_all(whole, tmp_path)
+    table = load_steps(tmp_path).table
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        for path in tmp_path.glob("*.rrd"):
+            index = ensure_index(path)
+            flipped = np.fromfile(index, np.uint8)
+            at = rng.integers(len(flipped), size=rng.choice([1, 2, 8]))
+            flipped[at] ^= (1 << rng.integers(8, size=len(at))).astype(np.uint8)
+            index.write_bytes(flipped.tobytes())
+        held = load_steps(tmp_path)
+        assert held.unreadable == {}
+        assert held.table.equals(table)
+    assert len(list((tmp_path / FOLDER).iterdir())) == 2, "the damaged ones are gone"
+
+
+def test_a_copy_is_named_with_the_recording_that_it_repeats(whole: Path, tmp_path: Path) -> None:
+    link_all(whole, tmp_path)
+    copy = tmp_path / "copy.rrd"
+    shutil.copy(tmp_path / "fine.rrd", copy)
+    for _ in range(2):
+        held = load_steps(tmp_path)
+        assert held.unreadable == {
+            tmp_path / "fine.rrd": "it holds the same episode as copy.rrd; move one of them away"
+        }
+        assert {Path(file).name for file in held.table["file"]} == {"copy.rrd", "wrong.rrd"}
+        indexes = {path: path.stat().st_mtime_ns for path in (tmp_path / FOLDER).iterdir()}
+        assert len(indexes) == 3
+        assert load_steps(tmp_path).table.equals(held.table)
+        kept = {path: path.stat().st_mtime_ns for path in (tmp_path / FOLDER).iterdir()}
+        assert kept == indexes

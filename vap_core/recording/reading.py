@@ -49,6 +49,11 @@ def open_whole(path: Path) -> RrdReader:
         return RrdReader(path)
 
 
+def recording_id(path: Path) -> str:
+    """The id of a recording; its index and its correction have the same."""
+    return str(RrdReader(path).recordings()[0].recording_id)
+
+
 def property_group(chunk: Chunk) -> str | None:
     """The property group that a chunk holds, None for any other chunk."""
     parent, _, group = chunk.entity_path.rpartition("/")
