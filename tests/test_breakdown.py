@@ -5,6 +5,7 @@ from typing import Any
 
 import pandas as pd
 
+from tests.test_why import fail
 from vap_core.base import figures
 from vap_core.base.tables import align
 from vap_core.evaluation.diagnosis import STAGES
@@ -16,6 +17,7 @@ from vap_core.evaluation.report.failures import (
 )
 from vap_core.evaluation.report.funnel import funnel_figure
 from vap_core.evaluation.report.page import report_page
+from vap_core.recording import recording_file_name
 from vap_core.rollout.failure import CASES
 
 STAGE_COLUMNS = [f"stage_{stage}" for stage in STAGES]
@@ -138,3 +140,18 @@ def test_a_report_of_methods_that_highlight_nothing_has_their_failures(tmp_path:
     page = report_page(table, {}, figures.empty_figure(1.0, 1.0), [], tmp_path)
     assert "Where episodes are lost" in page
     assert "Failures (2)" in page
+
+
+def test_a_recorded_failure_that_is_older_than_the_diagnosis_is_left_out(tmp_path: Path) -> None:
+    """Beside a run that was diagnosed its cells are empty."""
+    about = fail(tmp_path / "recordings" / "one.rrd", "owl_b")
+    names = ("suite", "task", "episode", "seed", "method", "policy")
+    old = {**{name: about[name] for name in names}, "outcome": "failure", "success": False}
+    name = recording_file_name(*(old[name] for name in names[:5]))
+    (tmp_path / "recordings" / "one.rrd").rename(tmp_path / "recordings" / name)
+    mine = TABLE[TABLE.method == "vap"].tail(2)
+    new = mine.assign(task="select-cup", episode=[0, 1], seed=0, policy="p")
+    table = pd.concat([new, pd.DataFrame([old])], ignore_index=True)
+    page = report_page(table, {}, figures.empty_figure(1.0, 1.0), [tmp_path], tmp_path)
+    assert "Failures (1)" in page
+    assert "<article>" not in page

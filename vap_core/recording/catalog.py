@@ -9,7 +9,6 @@ A file that cannot be read is named in `steps.unreadable`; the rest of the query
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,9 +18,10 @@ import rerun as rr
 
 from vap_core.base.errors import BadRecording, first_line
 from vap_core.recording.corrections import CORRECTIONS, corrections_folder
-from vap_core.recording.index import CURVES, FOLDER, STEPS, index_path
+from vap_core.recording.index import CURVES, FOLDER, STEPS, find_indexes
 from vap_core.recording.isolated import index_isolated
 from vap_core.recording.legacy_names import former_name
+from vap_core.recording.reading import recording_id
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -76,19 +76,17 @@ def load_steps(folder: Path) -> StepTable:
         )
     unreadable: dict[Path, str] = {}
     with tempfile.TemporaryDirectory() as scratch, rr.server.Server(host="127.0.0.1") as server:
-        index_folder = None if _can_index(Path(folder)) else Path(scratch)
-        indexes = _ensure_indexes(files, index_folder, unreadable)
+        indexes = ensure_indexes(files, Path(scratch), unreadable)
         if not indexes:
             raise BadRecording(
                 f"query: none of {len(files)} files in {folder} can be read; "
                 f"the first: {next(iter(unreadable.values()))}."
             )
         dataset = server.client().create_dataset("recordings")
-        _register_indexes(dataset, indexes, index_folder, unreadable)
+        register_recordings(dataset, indexes, indexes, unreadable)
         layers = sorted(corrections_folder(Path(folder)).glob("*.rrd"))
         register_files(dataset, {path: path for path in layers}, unreadable, layer=CORRECTIONS)
-        recordings = {index.resolve(): file for file, index in indexes.items()}
-        return StepTable(_join_steps(dataset, recordings), unreadable)
+        return StepTable(_join_steps(dataset, _by_file(indexes)), unreadable)
 
 
 def _can_index(folder: Path) -> bool:
@@ -97,13 +95,19 @@ def _can_index(folder: Path) -> bool:
     return os.access(indexes if indexes.exists() else folder, os.W_OK)
 
 
-def _ensure_indexes(
-    files: Sequence[Path], folder: Path | None, unreadable: dict[Path, str]
+def ensure_indexes(
+    files: Sequence[Path], scratch: Path, unreadable: dict[Path, str]
 ) -> dict[Path, Path]:
-    """The index of every recording that has one, or can get one."""
+    """The index of every recording of one folder that has one, or can get one.
+
+    New ones are in `scratch` where none can be written beside the recordings. Recordings are read
+    in a process of their own.
+    """
     from tqdm import tqdm
 
-    missing = [path for path in files if not _has_index(path, folder)]
+    folder = None if _can_index(files[0].parent) else scratch
+    indexes = find_indexes(files, folder)
+    missing = [path for path in files if path not in indexes]
     for path, reason in tqdm(
         index_isolated(missing, folder),
         "index",
@@ -115,29 +119,44 @@ def _ensure_indexes(
     ):
         if reason is not None:
             unreadable[path] = reason
-    return {path: index_path(path, folder) for path in files if path not in unreadable}
+    indexes |= find_indexes([path for path in missing if path not in unreadable], folder)
+    for path in missing:
+        if path not in indexes:
+            unreadable.setdefault(path, "its index was removed while it was read")
+    return {path: indexes[path] for path in files if path in indexes}
 
 
-def _has_index(path: Path, folder: Path | None) -> bool:
-    try:
-        return index_path(path, folder).exists()
-    except OSError:
-        return False
-
-
-def _register_indexes(
+def register_recordings(
     dataset: "DatasetEntry",
+    files: Mapping[Path, Path],
     indexes: Mapping[Path, Path],
-    folder: Path | None,
     unreadable: dict[Path, str],
 ) -> None:
-    """Register every index; one that cannot be, as it is damaged, is made again once."""
+    """Register what to read for each recording; of those that hold one episode the first alone."""
     refused: dict[Path, str] = {}
-    register_files(dataset, indexes, refused)
-    for path in refused:
-        with suppress(OSError):
-            indexes[path].unlink()
-    register_files(dataset, _ensure_indexes(list(refused), folder, unreadable), unreadable)
+    register_files(dataset, files, refused)
+    first = _files_by_segment(dataset, _by_file(files)) if refused else {}
+    for path, reason in refused.items():
+        original = first.get(recording_id(indexes[path]))
+        if original is not None:
+            reason = f"it holds the same episode as {Path(original).name}; move one of them away"
+        unreadable[path] = reason
+
+
+def _by_file(files: Mapping[Path, Path]) -> dict[Path, Path]:
+    """The recording by what is read for it."""
+    return {read.resolve(): recording for recording, read in files.items()}
+
+
+def _files_by_segment(
+    dataset: "DatasetEntry", recordings: Mapping[Path, Path]
+) -> dict[str, str | None]:
+    """The recording of every segment; None where its index is not among its files."""
+    import pyarrow as pa
+
+    segments = pa.Table.from_batches(dataset.segment_table().collect())
+    files = [_recording_of(urls, recordings) for urls in segments["rerun_storage_urls"].to_pylist()]
+    return dict(zip(segments["rerun_segment_id"].to_pylist(), files, strict=True))
 
 
 def register_files(

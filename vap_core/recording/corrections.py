@@ -8,10 +8,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import rerun as rr
-from rerun.chunk import RrdReader
 
 from vap_core.base.errors import BadRecording, BadStudy, one_of
-from vap_core.recording.reading import property_group, read_chunks, read_properties, read_summary
+from vap_core.recording.reading import (
+    property_group,
+    read_chunks,
+    read_properties,
+    read_summary,
+    recording_id,
+)
 from vap_core.recording.stream import finish_stream, log_properties, log_row, open_stream
 from vap_core.rollout.failure import CASES
 
@@ -68,7 +73,7 @@ def write_correction(recording: Path, correction: Correction, frame_index: int) 
     path = layer_path(recording)
     unfinished = path.with_name(f".{path.name}.new")
     unfinished.unlink(missing_ok=True)
-    rec = open_stream(unfinished, _recording_id(recording))
+    rec = open_stream(unfinished, recording_id(recording))
     values = rr.AnyValues(
         case=correction.case,
         sub_case=correction.sub_case,
@@ -107,7 +112,3 @@ def read_correction(path: Path) -> Correction:
         raise BadRecording(
             f"corrections: {path} is damaged ({error}); delete it and correct that failure again."
         ) from error
-
-
-def _recording_id(recording: Path) -> str:
-    return RrdReader(recording).recordings()[0].recording_id

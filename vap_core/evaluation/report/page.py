@@ -18,7 +18,7 @@ from urllib.parse import quote
 from vap_core.base.errors import BadRecording
 from vap_core.base.palette import METHODS, method_marks
 from vap_core.base.tables import Rows
-from vap_core.evaluation.report.failures import DIAGNOSIS_COLUMNS, funnel_table
+from vap_core.evaluation.report.failures import DIAGNOSIS_COLUMNS, diagnosed, funnel_table
 from vap_core.evaluation.report.funnel import funnel_figure
 
 if TYPE_CHECKING:
@@ -90,8 +90,9 @@ def _funnel(table: "pd.DataFrame") -> "Figure":
 
 
 def _failures(table: "pd.DataFrame", sources: Sequence[Path], out: Path) -> list[str]:
-    """A card per failure: its verdict, what the policy saw at the deciding frame, a link."""
-    failed = table[table["outcome"].eq("failure")]
+    """A card per diagnosed failure: its verdict, what the policy saw when it failed, a link."""
+    episodes = diagnosed(table)
+    failed = episodes[episodes["outcome"].eq("failure")]
     order = ["suite", "case", "sub_case", "method", "task", "episode"]
     failed = failed.sort_values(order, kind="stable")
     rows = failed.to_dict("records")
