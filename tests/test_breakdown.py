@@ -1,11 +1,12 @@
 """How failures divide into cases, and at which stages episodes are lost: tables and pictures."""
 
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import pytest
 
-from tests.test_why import fail
 from vap_core.base import figures
 from vap_core.base.tables import align
 from vap_core.evaluation.diagnosis import STAGES
@@ -142,16 +143,27 @@ def test_a_report_of_methods_that_highlight_nothing_has_their_failures(tmp_path:
     assert "Failures (2)" in page
 
 
-def test_a_recorded_failure_that_is_older_than_the_diagnosis_is_left_out(tmp_path: Path) -> None:
-    """Beside a run that was diagnosed its cells are empty."""
-    about = fail(tmp_path / "recordings" / "one.rrd", "owl_b")
-    names = ("suite", "task", "episode", "seed", "method", "policy")
-    old = {**{name: about[name] for name in names}, "outcome": "failure", "success": False}
-    name = recording_file_name(*(old[name] for name in names[:5]))
-    (tmp_path / "recordings" / "one.rrd").rename(tmp_path / "recordings" / name)
-    mine = TABLE[TABLE.method == "vap"].tail(2)
-    new = mine.assign(task="select-cup", episode=[0, 1], seed=0, policy="p")
-    table = pd.concat([new, pd.DataFrame([old])], ignore_index=True)
-    page = report_page(table, {}, figures.empty_figure(1.0, 1.0), [tmp_path], tmp_path)
+def test_a_page_leaves_out_recorded_failures_of_runs_older_than_the_diagnosis(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their case, sub-case and deciding frame are not numbers and texts, but nothing."""
+
+    def summaries(paths: list[Path]) -> Generator[tuple[Path, dict[str, str], str]]:
+        for path in paths:
+            yield path, {"policy": "p"}, ""
+
+    monkeypatch.setattr("vap_core.recording.isolated.read_summaries", summaries)
+    about = {"task": "select-cup", "seed": 0, "policy": "p", "case_sentence": "because"}
+    new = {**row("generic", "unprompted", "wrong object"), **about, "episode": 0}
+    old = {name: new[name] for name in ("suite", "method", "outcome", "success", *about)}
+    rows = [new, {**old, "episode": 1}, {**old, "episode": 2}]
+    (tmp_path / "recordings").mkdir()
+    for each in rows:
+        name = recording_file_name("vlabench", "select-cup", each["episode"], 0, "generic")
+        (tmp_path / "recordings" / name).write_bytes(b"")
+    forest = figures.empty_figure(1.0, 1.0)
+    page = report_page(pd.DataFrame(rows), {}, forest, [tmp_path], tmp_path)
     assert "Failures (1)" in page
-    assert "<article>" not in page
+    assert page.count("<article>") == 1
+    assert "episode 0 · generic" in page
+    assert "2 more of runs older than the diagnosis are left out" in page

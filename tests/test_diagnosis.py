@@ -383,3 +383,18 @@ def test_the_other_method_is_of_the_same_episode_policy_and_scene(
         BadStudy, match="'soft' did not run this episode here; there is generic, vap[.]$"
     ):
         recordings.side_by_side_recording(failures, last, "soft")
+
+
+def test_a_failure_is_not_laid_beside_itself(run: Path, tmp_path: Path) -> None:
+    """Before anything is run or written; the message names the methods that there are."""
+    failures = list_failures(run)
+    with pytest.raises(BadStudy, match="'generic' is that failure's own method; there is no other"):
+        recordings.side_by_side_recording(failures, 0, "generic")
+    everything = failures.all_episodes
+    both = pd.concat([everything, everything.assign(method="vap")], ignore_index=True)
+    with pytest.raises(BadStudy, match="own method; there is vap[.]$"):
+        recordings.side_by_side_recording(replace(failures, all_episodes=both), 0, "generic")
+    picture = tmp_path / "same.png"
+    words = ("diagnose", run, "--open", 0, "--against", "generic", "--png", picture)
+    assert "is that failure's own method" in refused(*words)
+    assert not picture.exists()

@@ -9,13 +9,15 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
-from lerobot.envs.configs import EnvConfig
+from lerobot.envs.configs import EnvConfig, HubEnvConfig
 from lerobot.envs.utils import _call_make_env, _import_hub_module, _normalize_hub_result
 from lerobot.processor import ProcessorStepRegistry
 
@@ -29,6 +31,7 @@ from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.memory import save
 from vap_core.policies.lerobot.adapter import IMAGE, _resize, load_policy
 from vap_core.policies.lerobot.checkpoints import trained_for
+from vap_core.policies.lerobot.step import VapEnvConfig
 from vap_core.policies.protocol import PolicyInput
 from vap_core.rollout.loop import rollout
 from vap_core.simulation import suites
@@ -61,6 +64,50 @@ def test_the_hubs_file_makes_the_same_environments() -> None:
     assert seen["pixels"]["front"].shape == (2, 224, 224, 3)
     assert seen["vap_step"].tolist() == [[0.0], [0.0]]
     env.close()
+
+
+@dataclass
+class MyHubEnv(HubEnvConfig):
+    """A user's configuration of an environment from the hub."""
+
+    task: str | None = "widowx-pick/pick-straw-cup"
+    image_size: int = 96
+    robots: str = "menagerie"
+    max_steps: int | None = 7
+
+
+def hub_environments(config: EnvConfig) -> Any:
+    module = _import_hub_module(str(ROOT / "plugins" / "envhub" / "env.py"), "you/vap-core")
+    return _call_make_env(module, n_envs=1, use_async_envs=False, cfg=config)
+
+
+def test_the_hubs_file_heeds_the_size_and_the_length_of_a_configuration() -> None:
+    env = hub_environments(MyHubEnv(robots="plain"))["widowx-pick"][0]
+    seen, _ = env.reset(seed=0)
+    assert {picture.shape for picture in seen["pixels"].values()} == {(1, 96, 96, 3)}
+    assert env.call("_max_episode_steps") == (7,)
+    env.close()
+
+
+def test_the_hubs_file_heeds_every_option_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without building a scene: Menagerie's meshes are not on every machine."""
+    options = set(VapEnvConfig().gym_kwargs)
+    asked: list[dict[str, Any]] = []
+
+    class Asked:
+        def __init__(self, **settings: Any) -> None:
+            asked.append(settings)
+
+        def create_envs(self, *_: Any) -> dict[str, Any]:
+            return {}
+
+    monkeypatch.setattr("vap_core.policies.lerobot.step.VapEnvConfig", Asked)
+    hub_environments(MyHubEnv())
+    task = "widowx-pick/pick-straw-cup"
+    assert asked == [{"task": task, "image_size": 96, "robots": "menagerie", "max_steps": 7}]
+    assert set(asked[0]) == {"task", *options}
+    hub_environments(HubEnvConfig(task=task))
+    assert asked[1:] == [{"task": task}]
 
 
 def test_a_mini_pi0_scales_its_images_as_our_loop_does() -> None:

@@ -41,7 +41,8 @@ def recording_of(failures: Failures, number: int) -> Path:
 def side_by_side_recording(failures: Failures, number: int, method: str) -> Path:
     """One recording of a listed failure and of another method on the same episode.
 
-    Raises: as `recording_of`; BadStudy for a method that did not run the episode.
+    Raises: as `recording_of`; BadStudy for a method that did not run the episode, or that is the
+        failure's own.
     """
     from vap_core.recording import combine_recordings
 
@@ -49,6 +50,12 @@ def side_by_side_recording(failures: Failures, number: int, method: str) -> Path
     same = _in_scene_of(row, failures)
     for name in (*ROW_KEY, "policy"):
         same = same[same[name] == row[name]]
+    if method == row["method"]:
+        others = sorted(set(same["method"]) - {method})
+        raise BadStudy(
+            f"diagnose: {method!r} is that failure's own method; "
+            f"there is {', '.join(others) or 'no other'}."
+        )
     other = same[same["method"] == method]
     if other.empty:
         raise BadStudy(

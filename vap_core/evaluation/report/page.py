@@ -90,13 +90,19 @@ def _funnel(table: "pd.DataFrame") -> "Figure":
 
 
 def _failures(table: "pd.DataFrame", sources: Sequence[Path], out: Path) -> list[str]:
-    """A card per diagnosed failure: its verdict, what the policy saw when it failed, a link."""
-    episodes = diagnosed(table)
-    failed = episodes[episodes["outcome"].eq("failure")]
+    """A card per failure: its verdict, what the policy saw at the deciding frame, a link.
+
+    Failures that were not diagnosed have none and are counted.
+    """
+    known = diagnosed(table)
+    failed = known[known["outcome"].eq("failure")]
     order = ["suite", "case", "sub_case", "method", "task", "episode"]
     failed = failed.sort_values(order, kind="stable")
     rows = failed.to_dict("records")
     parts = [f"<h2>Failures ({len(rows)})</h2>"]
+    older = int(table["outcome"].eq("failure").sum()) - len(rows)
+    if older:
+        parts.append(f"<p>{older} more of runs older than the diagnosis are left out.</p>")
     pictured: list[str] = []
     with closing(_recorded(rows, sources)) as recorded:
         for row, recording in islice(recorded, MOST_FAILURES):
