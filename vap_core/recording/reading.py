@@ -110,7 +110,8 @@ def read_checked_properties(chunk: Chunk) -> dict[str, Any]:
     Raises: ValueError, for a property of another kind than a recorder writes.
     """
     checked = {}
-    for name, value in read_properties(chunk).items():
+    found: dict[str, Any] = read_properties(chunk)
+    for name, value in found.items():
         kind = KINDS.get(name)
         if kind is not None:
             if value is None:
