@@ -116,7 +116,8 @@ def read_checked_properties(chunk: Chunk) -> dict[str, Any]:
         if kind is not None:
             if value is None:
                 continue
-            if (type(value) is bool) != (kind is bool) or not isinstance(value, kind):
+            of_kind = isinstance(value, kind) and (type(value) is bool) == (kind is bool)
+            if not of_kind:
                 raise ValueError(f"its property {name} is {str(value)[:40]!r}")
             if kind is int and not -(2**63) <= value < 2**63:
                 raise ValueError(f"its property {name} is {value}")
