@@ -282,6 +282,35 @@ def test_episodes_without_a_call_before_the_first_touch_are_reported_without_mea
     assert said.startswith("2 episodes run again, 2 of them end as in the run\n\nno call came")
 
 
+def test_noise_reaches_the_area_that_is_stated_for_chance() -> None:
+    """Scored on layouts left out, a predictor without knowledge lies under .5 in the mean."""
+    rng = np.random.default_rng(6)
+    failed = np.arange(96) % 6 == 0
+    table = pd.DataFrame({"success": ~failed, "layout": [str(i) for i in range(96)]})
+    table["suite"] = np.repeat(["one", "other"], 48)
+    of_noise = []
+    for _ in range(200):
+        noise = table.assign(**{name: rng.normal(size=96) for name in ("margin", "lift", "peaks")})
+        suites, layouts = list(noise.suite), list(noise.layout)
+        ranks = noise.groupby("suite")[["lift", "peaks"]].rank(pct=True).to_numpy()
+        scores = prediction.left_out_scores(ranks, failed, layouts)
+        of_noise.append(prediction.auc(scores, failed, suites))
+    chance = prediction.warnings_by_chance(noise, ["lift", "peaks"], draws=200)
+    error = np.std(of_noise) * np.sqrt(2 / 200)
+    assert chance["attention"].value == pytest.approx(np.mean(of_noise), abs=3 * error)
+    assert chance["attention"].value < 0.5 - error
+    assert chance["attention"].low < np.mean(of_noise) < chance["attention"].high
+    assert chance["low vote margin, unfitted"].value == pytest.approx(0.5, abs=0.03)
+    gain = chance["both, beyond the margin"]
+    assert gain.value == pytest.approx(chance["both"].value - chance["vote margin"].value)
+    assert gain.low < 0 < gain.high
+    sure = table.assign(margin=table.success.astype(float), lift=noise.lift, peaks=noise.peaks)
+    known = prediction.warnings(sure, ["lift", "peaks"])["vote margin"]
+    assert known.value > chance["vote margin"].high
+    few = noise.assign(success=np.arange(96) > 3)
+    assert prediction.warnings_by_chance(few, ["lift"]) == {}
+
+
 def test_the_first_calls_are_those_of_each_episodes_first_step() -> None:
     about = {"suite": "s", "task": "t", "method": "vap", "seed": 0}
     calls = pd.DataFrame([

@@ -13,6 +13,7 @@ from scipy.stats import ortho_group
 from typer.testing import CliRunner
 
 from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadStudy, UnknownName
+from vap_core.base.files import DATA
 from vap_core.base.types import Rgb
 from vap_core.cli import app
 from vap_core.evaluation import engine, trials
@@ -363,3 +364,22 @@ def test_the_loss_of_a_suite_is_corrected_for_the_others() -> None:
     assert [each.value for each in found.loss] == pytest.approx([1, 0.5, 7 / 8])
     assert list(found.p) == pytest.approx([2**-5, 1, 2**-6])
     assert list(found.p_holm) == pytest.approx([2**-4, 1, 2**-6])
+
+
+def test_the_differences_of_forms_of_the_token_are_by_token() -> None:
+    """Those of the published table: four tokens, whose mean says little of a fifth."""
+    loop = pd.read_parquet(DATA / "results" / "token_closed_loop.parquet")
+    own = report.success_by_token(loop, "soft-own")
+    assert {task: round(100 * gain) for (_, task), gain in own.items()} == {
+        "pick-shaver": -50,
+        "put-camera": -4,
+        "put-owl-figurine": -17,
+        "put-straw-cup": -42,
+    }
+    found = report.mean_of_tokens(list(own), least=-1.0)
+    reference = stats.ttest_1samp(own, 0).confidence_interval()
+    assert found.n == 4
+    assert (found.low, found.high) == pytest.approx((reference.low, reference.high))
+    assert found.low < 0 < found.high
+    certain = report.mean_of_tokens([-1.0, -0.9], least=-1.0)
+    assert certain.low == -1, "no success is lost twice"
