@@ -17,10 +17,10 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from vap_core.base.condition import rows_matching
-from vap_core.base.errors import BadOutput, BadRecording, VapError, first_line
+from vap_core.base.errors import BadOutput, BadRecording, first_line
 from vap_core.recording.blueprint import full_window
-from vap_core.recording.catalog import register_files
-from vap_core.recording.corrections import CORRECTIONS, layer_path, read_correction
+from vap_core.recording.catalog import read_corrections_of, register_files
+from vap_core.recording.corrections import CORRECTIONS, layer_path
 from vap_core.recording.isolated import read_summaries
 from vap_core.recording.stored_pictures import by_camera
 from vap_core.recording.viewer import free_port
@@ -122,22 +122,13 @@ def serve_run(run: Path, where: str | None = None, port: int | None = None) -> I
 
 def _correct(summaries: dict[Path, dict[str, Any]], unreadable: dict[Path, str]) -> list[Path]:
     """Put corrected cases in place of the recorded ones; returns the layers that hold them."""
-    layers = []
-    for path, summary in summaries.items():
-        layer = layer_path(path)
-        if not layer.exists():
-            continue
-        try:
-            correction = read_correction(layer)
-        except VapError as error:
-            unreadable[layer] = str(error)
-            continue
-        if correction.policy not in ("", summary.get("policy")):
-            continue  # of a recording that has been made again with another policy
+    policies = {path: summary.get("policy") for path, summary in summaries.items()}
+    corrections = read_corrections_of(policies, unreadable)
+    for path, correction in corrections.items():
+        summary = summaries[path]
         summary["case"], summary["sub_case"] = correction.case, correction.sub_case
         summary["case_sentence"] = correction.note
-        layers.append(layer)
-    return layers
+    return [layer_path(path) for path in corrections]
 
 
 @contextmanager
