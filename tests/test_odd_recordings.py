@@ -289,3 +289,41 @@ def test_a_layer_that_ends_its_reader_is_named(
         assert unreadable[layer].startswith(words)
     with pytest.raises(BadRecording, match="is damaged .*; delete it"):
         read_corrections(tmp_path)
+
+
+def test_a_browser_reads_indexes_and_no_recording_whole(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link_all(whole, tmp_path)
+    shutil.copy(tmp_path / "wrong.rrd", tmp_path / "z-copy.rrd")
+    for path in tmp_path.glob("*.rrd"):
+        ensure_index(path)
+    expected = {path.name: read_summary(path) for path in whole.glob("*.rrd")}
+    monkeypatch.setattr(isolated, "START", "raise SystemExit('a recording was read')")
+    with serve_run(tmp_path) as browser:
+        assert browser.unreadable == {
+            tmp_path / "z-copy.rrd": "it holds the same episode as wrong.rrd; move one of them away"
+        }
+        assert {row["file"] for row in browser.rows} == set(expected)
+        for row in browser.rows:
+            for name in ("outcome", "case", "sub_case", "task", "steps", "deciding_frame"):
+                assert row[name] == expected[row["file"]][name]
+
+
+def test_flipped_bits_in_indexed_recordings_leave_a_browser_the_others(
+    whole: Path, tmp_path: Path
+) -> None:
+    """The bytes of a recording change after it was indexed."""
+    link_all(whole, tmp_path)
+    for seed in range(20):
+        path = tmp_path / f"flip-{seed}.rrd"
+        rewrite(whole / "fine.rrd", path, {}, path.stem)
+        data = np.fromfile(path, np.uint8)
+        ensure_index(path)
+        rng = np.random.default_rng(seed)
+        tail = len(data) // 2 if seed % 2 else 0
+        data[rng.integers(tail, len(data), size=8)] ^= 1 << 3
+        path.write_bytes(data.tobytes())
+    with serve_run(tmp_path) as browser:
+        assert {"fine.rrd", "wrong.rrd"} <= {row["file"] for row in browser.rows}
+        assert all("\n" not in reason for reason in browser.unreadable.values())
