@@ -15,11 +15,15 @@ from tests.drawn import ROW, SUCCESS, frame, opening, record
 from tests.test_why import fail
 from vap_core.base.errors import BadRecording
 from vap_core.recording import (
+    Correction,
     Recorder,
     ensure_index,
     isolated,
     load_steps,
+    read_corrections,
     read_summary,
+    serve_run,
+    write_correction,
     write_film,
 )
 from vap_core.recording.catalog import PROPERTY_COLUMNS
@@ -233,3 +237,93 @@ def test_a_copy_is_named_with_the_recording_that_it_repeats(whole: Path, tmp_pat
         assert load_steps(tmp_path).table.equals(held.table)
         kept = {path: path.stat().st_mtime_ns for path in (tmp_path / FOLDER).iterdir()}
         assert kept == indexes
+
+
+def test_a_damaged_layer_is_one_line(whole: Path, tmp_path: Path) -> None:
+    """Flipped bits end neither `diagnose` nor a query; some end the process that reads them."""
+    recordings = tmp_path / "recordings"
+    link_all(whole, recordings)
+    layer = write_correction(recordings / "wrong.rrd", Correction("case 3", "slip"), 3)
+    good = np.frombuffer(layer.read_bytes(), np.uint8)
+    for case in range(60):
+        rng = np.random.default_rng(case)
+        at = rng.integers(len(good), size=rng.choice([1, 2, 8]))
+        flipped = good.copy()
+        flipped[at] ^= (1 << rng.integers(8, size=len(at))).astype(np.uint8)
+        (layer.parent / f"{case}.rrd").write_bytes(flipped.tobytes())
+    refused = []
+    for path, correction, reason in isolated.read_layers(sorted(layer.parent.glob("*.rrd"))):
+        assert "\n" not in reason
+        if correction is None:
+            assert f"corrections: {path} is damaged" in reason
+            refused.append(path)
+    assert len(refused) > 30
+    assert layer not in refused
+
+
+ENDS_AT_LAYERS = """
+import os
+import vap_core.recording.isolated as isolated
+isolated.read_correction = lambda path: os.abort()
+isolated.main()
+"""
+
+
+def test_a_layer_that_ends_its_reader_is_named(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recordings = tmp_path / "recordings"
+    link_all(whole, recordings)
+    for path in recordings.glob("*.rrd"):
+        ensure_index(path)
+    layer = write_correction(recordings / "wrong.rrd", Correction("case 3", "slip"), 3)
+    monkeypatch.setattr(isolated, "START", ENDS_AT_LAYERS)
+    result = run_query(tmp_path, "frame_index = 0")
+    assert set(result.matches["case"]) == {"case 1", ""}
+    with serve_run(tmp_path) as browser:
+        assert {row["case"] for row in browser.rows} == {"case 1", ""}
+        named = browser.unreadable
+    words = f"corrections: {layer} is damaged ({isolated.ENDED_READER}); delete it"
+    for unreadable in (result.unreadable, named):
+        assert list(unreadable) == [layer]
+        assert unreadable[layer].startswith(words)
+    with pytest.raises(BadRecording, match="is damaged .*; delete it"):
+        read_corrections(tmp_path)
+
+
+def test_a_browser_reads_indexes_and_no_recording_whole(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link_all(whole, tmp_path)
+    shutil.copy(tmp_path / "wrong.rrd", tmp_path / "z-copy.rrd")
+    for path in tmp_path.glob("*.rrd"):
+        ensure_index(path)
+    expected = {path.name: read_summary(path) for path in whole.glob("*.rrd")}
+    monkeypatch.setattr(isolated, "START", "raise SystemExit('a recording was read')")
+    with serve_run(tmp_path) as browser:
+        assert browser.unreadable == {
+            tmp_path / "z-copy.rrd": "it holds the same episode as wrong.rrd; move one of them away"
+        }
+        assert {row["file"] for row in browser.rows} == set(expected)
+        for row in browser.rows:
+            for name in ("outcome", "case", "sub_case", "task", "steps", "deciding_frame"):
+                assert row[name] == expected[row["file"]][name]
+
+
+def test_flipped_bits_in_indexed_recordings_leave_a_browser_the_others(
+    whole: Path, tmp_path: Path
+) -> None:
+    """The bytes of a recording change after it was indexed."""
+    link_all(whole, tmp_path)
+    for seed in range(20):
+        path = tmp_path / f"flip-{seed}.rrd"
+        rewrite(whole / "fine.rrd", path, {}, path.stem)
+        data = np.fromfile(path, np.uint8)
+        ensure_index(path)
+        rng = np.random.default_rng(seed)
+        tail = len(data) // 2 if seed % 2 else 0
+        data[rng.integers(tail, len(data), size=8)] ^= 1 << 3
+        path.write_bytes(data.tobytes())
+    with serve_run(tmp_path) as browser:
+        assert {"fine.rrd", "wrong.rrd"} <= {row["file"] for row in browser.rows}
+        assert all("\n" not in reason for reason in browser.unreadable.values())

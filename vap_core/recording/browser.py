@@ -7,7 +7,7 @@ The catalog server is on 127.0.0.1 alone and holds nothing but the run's own fil
 """
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,11 +17,16 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from vap_core.base.condition import rows_matching
-from vap_core.base.errors import BadOutput, BadRecording, VapError, first_line
+from vap_core.base.errors import BadOutput, BadRecording, first_line
 from vap_core.recording.blueprint import full_window
-from vap_core.recording.catalog import register_files
-from vap_core.recording.corrections import CORRECTIONS, layer_path, read_correction
-from vap_core.recording.isolated import read_summaries
+from vap_core.recording.catalog import (
+    ensure_indexes,
+    read_corrections_of,
+    register_files,
+    register_recordings,
+)
+from vap_core.recording.corrections import CORRECTIONS, layer_path
+from vap_core.recording.reading import read_summary, recording_id
 from vap_core.recording.stored_pictures import by_camera
 from vap_core.recording.viewer import free_port
 from vap_core.recording.views import (
@@ -90,19 +95,15 @@ def serve_run(run: Path, where: str | None = None, port: int | None = None) -> I
             f"query: there is no recording in {folder}; run eval with --record all, or failures."
         )
     unreadable: dict[Path, str] = {}
-    summaries: dict[Path, dict[str, Any]] = {}
-    for path, summary, reason in read_summaries(files):
-        if summary is None:
-            unreadable[path] = reason
-        else:
-            summaries[path] = summary
-    layers = _correct(summaries, unreadable)
     with tempfile.TemporaryDirectory() as scratch, _server(port or free_port()) as server:
+        indexes = ensure_indexes(files, Path(scratch), unreadable)
+        summaries = {path: read_summary(index) for path, index in indexes.items()}
+        layers = _correct(summaries, unreadable)
         client = server.client()
         dataset = client.create_dataset("recordings")
-        register_files(dataset, {path: path for path in summaries}, unreadable)
+        register_recordings(dataset, {path: path for path in indexes}, indexes, unreadable)
         register_files(dataset, {path: path for path in layers}, unreadable, layer=CORRECTIONS)
-        rows = _rows(dataset, summaries, unreadable)
+        rows = _rows(dataset, summaries, indexes, unreadable)
         if not rows:
             raise BadRecording(
                 f"query: none of {len(files)} files in {folder} can be read; "
@@ -122,22 +123,13 @@ def serve_run(run: Path, where: str | None = None, port: int | None = None) -> I
 
 def _correct(summaries: dict[Path, dict[str, Any]], unreadable: dict[Path, str]) -> list[Path]:
     """Put corrected cases in place of the recorded ones; returns the layers that hold them."""
-    layers = []
-    for path, summary in summaries.items():
-        layer = layer_path(path)
-        if not layer.exists():
-            continue
-        try:
-            correction = read_correction(layer)
-        except VapError as error:
-            unreadable[layer] = str(error)
-            continue
-        if correction.policy not in ("", summary.get("policy")):
-            continue  # of a recording that has been made again with another policy
+    policies = {path: summary.get("policy") for path, summary in summaries.items()}
+    corrections = read_corrections_of(policies, unreadable)
+    for path, correction in corrections.items():
+        summary = summaries[path]
         summary["case"], summary["sub_case"] = correction.case, correction.sub_case
         summary["case_sentence"] = correction.note
-        layers.append(layer)
-    return layers
+    return [layer_path(path) for path in corrections]
 
 
 @contextmanager
@@ -162,16 +154,17 @@ def _schema() -> "pa.Schema":
 
 
 def _rows(
-    dataset: "DatasetEntry", summaries: dict[Path, dict[str, Any]], unreadable: dict[Path, str]
+    dataset: "DatasetEntry",
+    summaries: Mapping[Path, dict[str, Any]],
+    indexes: Mapping[Path, Path],
+    unreadable: Mapping[Path, str],
 ) -> list[dict[str, Any]]:
     """One row per recording: failures first, then by case and sub-case."""
-    from rerun.chunk import RrdReader
-
     rows = []
     for path, summary in summaries.items():
         if path in unreadable:
             continue
-        segment = RrdReader(path).recordings()[0].recording_id
+        segment = recording_id(indexes[path])
         frame = max(0, int(summary.get("deciding_frame", 0)))
         row: dict[str, Any] = {}
         for name in COLUMNS:

@@ -17,10 +17,10 @@ from urllib.parse import unquote, urlparse
 import rerun as rr
 
 from vap_core.base.errors import BadRecording, first_line
-from vap_core.recording.corrections import CORRECTIONS, corrections_folder
+from vap_core.recording.corrections import layer_path
 from vap_core.recording.index import CURVES, FOLDER, STEPS, find_indexes
-from vap_core.recording.isolated import index_isolated
-from vap_core.recording.legacy_names import former_name
+from vap_core.recording.isolated import index_isolated, read_layers
+from vap_core.recording.layers import Correction
 from vap_core.recording.reading import recording_id
 
 if TYPE_CHECKING:
@@ -49,8 +49,6 @@ PROPERTY_COLUMNS = {
     ),
 }
 """Columns that every step of a recording shares, by property group; as in results tables."""
-CORRECTED_COLUMNS = ("case", "sub_case", "case_sentence")
-"""Columns that a correction replaces."""
 
 
 @dataclass(frozen=True)
@@ -84,9 +82,11 @@ def load_steps(folder: Path) -> StepTable:
             )
         dataset = server.client().create_dataset("recordings")
         register_recordings(dataset, indexes, indexes, unreadable)
-        layers = sorted(corrections_folder(Path(folder)).glob("*.rrd"))
-        register_files(dataset, {path: path for path in layers}, unreadable, layer=CORRECTIONS)
-        return StepTable(_join_steps(dataset, _by_file(indexes)), unreadable)
+        properties = _property_table(dataset, _by_file(indexes))
+        policies = dict(zip(map(Path, properties["file"]), properties["policy"], strict=True))
+        corrections = read_corrections_of(policies, unreadable)
+        table = _join_steps(_corrected(properties, corrections), _curve_table(dataset))
+        return StepTable(table, unreadable)
 
 
 def _can_index(folder: Path) -> bool:
@@ -189,17 +189,52 @@ def register_files(
             unreadable[of_url[result.uri]] = str(result.error).strip().splitlines()[-1][:160]
 
 
-def _join_steps(dataset: "DatasetEntry", recordings: Mapping[Path, Path]) -> "pd.DataFrame":
-    """Every step beside the properties of its recording; `recordings` has the file by index."""
-    joined = _property_table(dataset, recordings).merge(
-        _curve_table(dataset), on="segment", how="inner"
-    )
-    joined = joined.drop(columns="segment")
+def read_corrections_of(
+    policies: Mapping[Path, str | None], unreadable: dict[Path, str]
+) -> dict[Path, Correction]:
+    """The correction of every recording that has one, given what policy each is of.
+
+    A layer of a recording that has been made again with another policy does not count. Layers are
+    read in a process of their own; one that is damaged is named in `unreadable`.
+    """
+    recordings = {layer_path(path): path for path in policies}
+    layers = [layer for layer in recordings if layer.exists()]
+    corrections = {}
+    for layer, correction, reason in read_layers(layers):
+        recording = recordings[layer]
+        if correction is None:
+            unreadable[layer] = reason
+        elif correction.policy in ("", policies[recording]):
+            corrections[recording] = correction
+    return corrections
+
+
+def _corrected(
+    properties: "pd.DataFrame", corrections: Mapping[Path, Correction]
+) -> "pd.DataFrame":
+    """Corrections in place of what they correct, marked in the column `corrected`."""
+    table = properties.assign(corrected=False)
+    for index, file in table["file"].items():
+        correction = corrections.get(Path(file))
+        if correction is not None:
+            cells = {
+                "case": correction.case,
+                "sub_case": correction.sub_case,
+                "case_sentence": correction.note,
+                "corrected": True,
+            }
+            table.loc[index, list(cells)] = list(cells.values())
+    return table
+
+
+def _join_steps(properties: "pd.DataFrame", curves: "pd.DataFrame") -> "pd.DataFrame":
+    """Every step beside the properties of its recording."""
+    joined = properties.merge(curves, on="segment", how="inner").drop(columns="segment")
     return joined.sort_values(["file", "frame_index"], ignore_index=True)
 
 
 def _property_table(dataset: "DatasetEntry", recordings: Mapping[Path, Path]) -> "pd.DataFrame":
-    """One row per recording; a correction replaces what it corrects."""
+    """One row per recording; `recordings` has the file by index."""
     import pandas as pd
     import pyarrow as pa
 
@@ -210,13 +245,8 @@ def _property_table(dataset: "DatasetEntry", recordings: Mapping[Path, Path]) ->
     ]
     for group, names in PROPERTY_COLUMNS.items():
         for name in names:
-            table[name] = _property(segments, group, name)
-    table["corrected"] = _property(segments, "correction", "case").notna()
-    for name in CORRECTED_COLUMNS:
-        correction = _property(segments, "correction", name)
-        table[name] = correction.where(table["corrected"], table[name])
-    # A correction of a recording that is gone, or was made again with another policy, is alone.
-    return table[table["file"].notna()]
+            table[name] = _first_elements(segments, f"property:{group}:{name}")
+    return table
 
 
 def _recording_of(urls: Sequence[str], recordings: Mapping[Path, Path]) -> str | None:
@@ -243,19 +273,6 @@ def _curve_table(dataset: "DatasetEntry") -> "pd.DataFrame":
     for name in CURVES:
         table[name] = _first_elements(rows, f"{STEPS}:{name}").astype(float)
     return table
-
-
-def _property(segments: "pa.Table", group: str, name: str) -> "pd.Series[Any]":
-    """A property of every recording, whether written under its current or its former name."""
-    column = f"property:{group}:{name}"
-    former_column = f"property:{group}:{former_name(group, name)}"
-    if former_column not in segments.column_names:
-        return _first_elements(segments, column)
-    former_values = _first_elements(segments, former_column)
-    if column not in segments.column_names:
-        return former_values
-    values = _first_elements(segments, column)
-    return values.where(values.notna(), former_values)
 
 
 def _first_elements(table: "pa.Table", name: str) -> "pd.Series[Any]":
