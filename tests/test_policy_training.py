@@ -295,3 +295,27 @@ def test_a_folder_that_cannot_be_written_is_said_before_the_work(
     line = refused("train", *words, *out, option, tmp_path / "file" / "in-it")
     assert f"{tmp_path}/file/in-it cannot be written (Not a directory)" in line
     assert f"choose another folder with {option}" in line
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--vlm", "nowhere"), "nowhere holds no mini-paligemma"),
+        (("--start", "nowhere"), "nowhere is no mini-pi0 to go on from"),
+        (
+            (
+                *("--start", SHIPPED / "mini-pi0-simpler-bridge-wide"),
+                *("--vlm", SHIPPED / "mini-paligemma"),
+            ),
+            "did not grow from this mini-paligemma",
+        ),
+    ],
+    ids=["vlm", "start", "other-vlm"],
+)
+def test_what_a_training_grows_from_is_read_before_the_films(
+    words: tuple[str | Path, ...], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(policy, "load_films", lambda *asked: pytest.fail("films were asked for"))
+    folders = ("--out", tmp_path / "out", "--cache", tmp_path / "cache")
+    line = refused("train", "policy", "--suite", SUITE, *folders, *words)
+    assert told in line.lower()

@@ -1,13 +1,16 @@
 """The policy that a training goes on from, instead of beginning with nothing.
 
-    learner, scales = go_on_from(start_folder("mini-pi0-tabletop"), config, teacher)
+    start = read_start(start_folder("mini-pi0-tabletop"), teacher, seed=0)
+    require_alike(start, config)
 
 It has to look and act as the recipe says, and to have grown from the same mini-PaliGemma.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
+import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -21,22 +24,29 @@ SCALES = "policy_preprocessor_step_4_normalizer_processor.safetensors"
 """The file in which lerobot keeps a policy's statistics."""
 
 
+@dataclass(frozen=True)
+class Start:
+    """The policy in a folder, and how its processors scale states and actions."""
+
+    folder: Path
+    learner: Learner
+    stats: dict[str, dict[str, Tensor]]
+
+
 def start_folder(start: str) -> Path:
     """The folder of the shipped policy with this name, or the folder that it names."""
     shipped = SHIPPED / start
     return shipped if shipped.is_dir() else Path(start)
 
 
-def go_on_from(
-    folder: Path, wanted: MiniPI0Config, teacher: MiniVlm | None
-) -> tuple[Learner, dict[str, dict[str, Tensor]]]:
-    """A learner with a policy's weights, and how its processors scale states and actions.
+def read_start(folder: Path, teacher: MiniVlm | None, seed: int) -> Start:
+    """The policy of a folder; the questions beside it begin with weights of the seed.
 
-    Raises: BadPolicy when it can't be read, does not look and act as in `wanted`, or did not grow
-        from the `teacher`.
+    Raises: BadPolicy when it can't be read, or did not grow from the `teacher`.
     """
     from lerobot.configs import PreTrainedConfig
 
+    torch.manual_seed(seed)
     try:
         config = cast(MiniPI0Config, PreTrainedConfig.from_pretrained(folder))
         learner = Learner(config)
@@ -51,15 +61,20 @@ def go_on_from(
             f"{first_line(error):.120}); name a checkpoint's folder, or get the repository's "
             "data/policies again: git checkout data/policies"
         ) from error
-    for name in ("input_features", "output_features", "chunk_size", "width"):
-        if getattr(config, name) != getattr(wanted, name):
-            raise BadPolicy(
-                f"train policy: {folder} differs from the recipe in {name}; go on from a policy "
-                "of the same suite, or leave out --start."
-            )
     if teacher is not None and config.vlm != teacher.sha256():
         raise BadPolicy(
             f"train policy: {folder} did not grow from this mini-PaliGemma; name the one that it "
             "grew from with --vlm, or leave it out to teach no learned word."
         )
-    return learner, stats
+    return Start(folder, learner, stats)
+
+
+def require_alike(start: Start, wanted: MiniPI0Config) -> None:
+    """Raises: BadPolicy when the policy does not look and act as in `wanted`."""
+    config = start.learner.policy.config
+    for name in ("input_features", "output_features", "chunk_size", "width"):
+        if getattr(config, name) != getattr(wanted, name):
+            raise BadPolicy(
+                f"train policy: {start.folder} differs from the recipe in {name}; go on from a "
+                "policy of the same suite, or leave out --start."
+            )

@@ -40,7 +40,7 @@ from vap_core.training.policy.ahead import Ahead
 from vap_core.training.policy.batches import Frames, statistics
 from vap_core.training.policy.commands import Known, nameable
 from vap_core.training.policy.losses import Learner, embedding_cosine, losses
-from vap_core.training.policy.start import go_on_from, start_folder
+from vap_core.training.policy.start import read_start, require_alike, start_folder
 from vap_core.training.policy.taught import learn_words
 from vap_core.training.recipe import Recipe, filmed_tasks
 from vap_core.training.step import Figures, Schedule, average_of, train_steps
@@ -161,6 +161,11 @@ def train(
         if demonstrations is None:
             make_folder(cache, "train policy", "choose another folder with --cache")
         jobs = jobs or os.cpu_count() or 1
+        # Before the films, which take longest.
+        teacher = None if vlm is None else load_vlm(vlm)
+        start = None
+        if recipe.start:
+            start = read_start(start_folder(recipe.start), teacher, recipe.seed)
         films = load_films(recipe, cache, demonstrations, jobs)
         if not films.train:
             raise BadOutput(
@@ -168,25 +173,25 @@ def train(
                 "make more stages."
             )
         _require_trainable(recipe, films.all)
-        teacher = None if vlm is None else load_vlm(vlm)
         made_of: dict[str, Any] = {
             "recipe": recipe.as_json(),
             "data_sha256": data_sha256(films.all),
         }
-        # Of initial weights only; every other draw comes from the step's stream.
-        torch.manual_seed(recipe.seed)
         first = films.train[0]
         config = configuration(recipe, first.state.shape[1], first.action.shape[1])
-        if recipe.start:
-            start = start_folder(recipe.start)
-            learner, stats = go_on_from(start, config, teacher)
+        if start is not None:
+            require_alike(start, config)
+            learner = start.learner
+            stats = start.stats
             config = learner.policy.config
             made_of["start"] = {
                 "name": recipe.start,
-                "sha256": sha256_of(start / "model.safetensors"),
+                "sha256": sha256_of(start.folder / "model.safetensors"),
             }
         else:
             stats = statistics(films.train, recipe.angle_noise_rad)
+            # Of initial weights only; every other draw comes from the step's stream.
+            torch.manual_seed(recipe.seed)
             learner = Learner(config)
             if teacher is not None:
                 config.vlm = teacher.sha256()
