@@ -182,6 +182,33 @@ def test_a_training_goes_on_from_another_policys_weights(
         train("third", "grown-from", start=str(tmp_path / "grown-from"))
 
 
+@pytest.mark.parametrize("name", ["tabletop", "shared-pair", SUITE, f"{SUITE}-wide"])
+def test_words_are_taught_where_they_mean_the_same(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Policies of before the recipe moved their words; shared-pair's recipe teaches none."""
+
+    def load_films(*asked: object) -> policy.Films:
+        return policy.Films([], [])
+
+    monkeypatch.setattr(policy, "load_films", load_films)
+    start = SHIPPED / f"mini-pi0-{name}"
+    model = SHIPPED / ("mini-paligemma-tint-free" if name.endswith("wide") else "mini-paligemma")
+
+    def train(**changes: object) -> None:
+        recipe = replace(RECIPES[SUITE], start=str(start), **changes)
+        policy.train(recipe, tmp_path / str(changes), vlm=model, cache=tmp_path / "cache", jobs=1)
+
+    if name.endswith("wide"):
+        with pytest.raises(BadOutput, match="holds no film"):
+            train()
+    else:
+        with pytest.raises(BadPolicy, match=r"mean cosine 0\.7\d, .* leave out --vlm"):
+            train()
+        with pytest.raises(BadOutput, match="holds no film"):
+            train(taught=0)
+
+
 def test_a_training_that_is_ended_again_and_again_ends_like_one_that_was_not(
     stage: tuple[Path, list[Film]],
     tmp_path: Path,

@@ -3,7 +3,8 @@
     start = read_start(start_folder("mini-pi0-tabletop"), teacher, seed=0)
     require_alike(start, config)
 
-It has to look and act as the recipe says, and to have grown from the same mini-PaliGemma.
+It has to look and act as the recipe says, and to have grown from the same mini-PaliGemma. Where
+learned words are taught, its words' embeddings have to be that model's still.
 """
 
 from dataclasses import dataclass
@@ -18,10 +19,15 @@ from vap_core.base.errors import BadPolicy, first_line
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.vlm import MiniVlm
 from vap_core.policies.names import SHIPPED
-from vap_core.training.policy.losses import Learner
+from vap_core.training.policy.losses import Learner, embedding_cosine
 
 SCALES = "policy_preprocessor_step_4_normalizer_processor.safetensors"
 """The file in which lerobot keeps a policy's statistics."""
+ALIKE = 0.99
+"""Mean cosine of embeddings above which a word means the same to two models.
+
+A policy that moved its words has 0.78 to 0.89, one that kept them 1.000.
+"""
 
 
 @dataclass(frozen=True)
@@ -67,6 +73,19 @@ def read_start(folder: Path, teacher: MiniVlm | None, seed: int) -> Start:
             "grew from with --vlm, or leave it out to teach no learned word."
         )
     return Start(folder, learner, stats)
+
+
+def require_shared_words(start: Start, teacher: MiniVlm) -> None:
+    """Raises: BadPolicy when a word learned in the `teacher` would mean something else to the
+    policy, whose own training moved the embeddings of words.
+    """
+    mean = embedding_cosine(start.learner.policy, teacher)["mean"]
+    if mean < ALIKE:
+        raise BadPolicy(
+            f"train policy: the words of {start.folder} are no longer those of the mini-PaliGemma "
+            f"that it grew from (mean cosine {mean:.2f}, least allowed {ALIKE}), so that a word "
+            "learned there means nothing to it; leave out --vlm to teach no learned word."
+        )
 
 
 def require_alike(start: Start, wanted: MiniPI0Config) -> None:

@@ -40,7 +40,12 @@ from vap_core.training.policy.ahead import Ahead
 from vap_core.training.policy.batches import Frames, statistics
 from vap_core.training.policy.commands import Known, nameable
 from vap_core.training.policy.losses import Learner, embedding_cosine, losses
-from vap_core.training.policy.start import read_start, require_alike, start_folder
+from vap_core.training.policy.start import (
+    read_start,
+    require_alike,
+    require_shared_words,
+    start_folder,
+)
 from vap_core.training.policy.taught import learn_words
 from vap_core.training.recipe import Recipe, filmed_tasks
 from vap_core.training.step import Figures, Schedule, average_of, train_steps
@@ -154,7 +159,7 @@ def train(
     Raises: BadOutput when `out` holds another training or a model without what it would go on from,
         another process trains there, or it or `cache` cannot be written or is damaged; BadPolicy
         for a start that is no mini-pi0, or one of other cameras or sizes, or of another
-        mini-PaliGemma; UnknownName: no such device.
+        mini-PaliGemma, or whose words are no longer that one's; UnknownName: no such device.
     """
     place = torch.device(device_name(device))
     with training_folder(out, "train policy", recipe.as_json()):
@@ -166,6 +171,8 @@ def train(
         start = None
         if recipe.start:
             start = read_start(start_folder(recipe.start), teacher, recipe.seed)
+            if teacher is not None and recipe.taught:
+                require_shared_words(start, teacher)
         films = load_films(recipe, cache, demonstrations, jobs)
         if not films.train:
             raise BadOutput(
