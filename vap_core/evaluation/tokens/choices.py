@@ -206,7 +206,7 @@ def losses(table: "pd.DataFrame", episodes: "pd.DataFrame") -> "pd.DataFrame":
     rows = []
     steps = {TO_SCENE: _gains_of_photos(table), TO_POLICY: _gains_of_scene(table, episodes)}
     for step, gains in steps.items():
-        of_step = []
+        of_step: list[dict[str, Any]] = []
         for suite, part in _parts(gains):
             by_object = _by_object(part)
             line = {"step": step, "suite": suite, "objects": len(by_object)}
