@@ -187,9 +187,10 @@ def warnings_by_chance(
         for name, area in drawn.items():
             areas.setdefault(name, []).append(area)
     found = {}
-    for name, values in areas.items():
-        low, high = percentiles(np.array(values))
-        found[name] = Auc(value=float(np.mean(values)), low=low, high=high, n=len(known.failed))
+    for name, drawn_areas in areas.items():
+        low, high = percentiles(np.array(drawn_areas))
+        mean = float(np.mean(drawn_areas))
+        found[name] = Auc(value=mean, low=low, high=high, n=len(known.failed))
     return found
 
 
