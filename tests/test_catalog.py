@@ -119,8 +119,6 @@ def test_a_recording_that_ends_its_reader_is_named_and_the_others_are_read(
 POISONED_SUMMARY = POISON.replace("isolated.ensure_index", "isolated.read_summary").replace(
     "path, folder", "path"
 )
-POISONED = POISONED_SUMMARY.replace("isolated.main()", "").replace("index", "summary") + POISON
-"""Neither the summary of such a recording can be read, nor what its index would hold."""
 
 
 def test_a_recording_that_ends_its_reader_is_no_part_of_a_browser_and_cannot_be_opened(
@@ -128,7 +126,7 @@ def test_a_recording_that_ends_its_reader_is_no_part_of_a_browser_and_cannot_be_
 ) -> None:
     for name in ("a", "b"):
         shutil.copy(run / "recordings" / "fine.rrd", tmp_path / f"{name}.rrd")
-    monkeypatch.setattr(isolated, "START", POISONED)
+    monkeypatch.setattr(isolated, "START", POISONED_SUMMARY)
     with serve_run(tmp_path) as browser:
         assert [row["file"] for row in browser.rows] == ["a.rrd"]
         assert browser.unreadable == {tmp_path / "b.rrd": isolated.ENDED_READER}

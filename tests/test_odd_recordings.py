@@ -1,7 +1,7 @@
 """A recording with odd properties or damaged bytes is one line, and its neighbours are read."""
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from vap_core.recording import (
     Correction,
     Recorder,
     ensure_index,
+    film,
     isolated,
     load_steps,
     read_corrections,
@@ -156,6 +157,18 @@ def test_a_rate_that_no_film_can_have_is_refused(whole: Path, tmp_path: Path) ->
     assert read_summary(tmp_path / "fast.rrd")["hz"] == 1000
 
 
+def test_a_timeline_that_no_film_can_have_is_refused(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A recording that says no rate has that of its timeline."""
+    recording = whole / "fine.rrd"
+    without = {name: value for name, value in read_summary(recording).items() if name != "hz"}
+    monkeypatch.setattr(film, "read_summary", lambda path: without)
+    monkeypatch.setattr(film, "_frame_rate", lambda *_: 1e9)
+    with pytest.raises(BadRecording, match="steps a second by its timeline; 1000 are the most"):
+        write_film(recording, tmp_path / "film.mp4")
+
+
 def test_a_film_of_a_damaged_video_is_one_line(tmp_path: Path) -> None:
     """Packets of noise, and one that holds no picture."""
     start = opening(1)
@@ -291,23 +304,24 @@ def test_a_layer_that_ends_its_reader_is_named(
         read_corrections(tmp_path)
 
 
-def test_a_browser_reads_indexes_and_no_recording_whole(
+def test_a_browser_shows_how_many_recordings_it_has_read(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     link_all(whole, tmp_path)
     shutil.copy(tmp_path / "wrong.rrd", tmp_path / "z-copy.rrd")
-    for path in tmp_path.glob("*.rrd"):
-        ensure_index(path)
-    expected = {path.name: read_summary(path) for path in whole.glob("*.rrd")}
-    monkeypatch.setattr(isolated, "START", "raise SystemExit('a recording was read')")
+    bars = []
+
+    def bar(answers: Iterable[Any], doing: str, total: int, **_: Any) -> Iterable[Any]:
+        bars.append((doing, total))
+        return answers
+
+    monkeypatch.setattr("tqdm.tqdm", bar)
     with serve_run(tmp_path) as browser:
         assert browser.unreadable == {
             tmp_path / "z-copy.rrd": "it holds the same episode as wrong.rrd; move one of them away"
         }
-        assert {row["file"] for row in browser.rows} == set(expected)
-        for row in browser.rows:
-            for name in ("outcome", "case", "sub_case", "task", "steps", "deciding_frame"):
-                assert row[name] == expected[row["file"]][name]
+        assert {row["file"] for row in browser.rows} == {"fine.rrd", "wrong.rrd"}
+    assert bars == [("read", 3)]
 
 
 def test_flipped_bits_in_indexed_recordings_leave_a_browser_the_others(

@@ -7,7 +7,7 @@ The catalog server is on 127.0.0.1 alone and holds nothing but the run's own fil
 """
 
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,13 +20,14 @@ from vap_core.base.condition import rows_matching
 from vap_core.base.errors import BadOutput, BadRecording, first_line
 from vap_core.recording.blueprint import full_window
 from vap_core.recording.catalog import (
-    ensure_indexes,
     read_corrections_of,
     register_files,
     register_recordings,
+    show_progress,
 )
 from vap_core.recording.corrections import CORRECTIONS, layer_path
-from vap_core.recording.reading import read_summary, recording_id
+from vap_core.recording.isolated import read_summaries
+from vap_core.recording.reading import recording_id
 from vap_core.recording.stored_pictures import by_camera
 from vap_core.recording.viewer import free_port
 from vap_core.recording.views import (
@@ -95,15 +96,19 @@ def serve_run(run: Path, where: str | None = None, port: int | None = None) -> I
             f"query: there is no recording in {folder}; run eval with --record all, or failures."
         )
     unreadable: dict[Path, str] = {}
+    summaries: dict[Path, dict[str, Any]] = {}
+    for path, summary, reason in show_progress(read_summaries(files), "read", len(files)):
+        if summary is None:
+            unreadable[path] = reason
+        else:
+            summaries[path] = summary
+    layers = _correct(summaries, unreadable)
     with tempfile.TemporaryDirectory() as scratch, _server(port or free_port()) as server:
-        indexes = ensure_indexes(files, Path(scratch), unreadable)
-        summaries = {path: read_summary(index) for path, index in indexes.items()}
-        layers = _correct(summaries, unreadable)
         client = server.client()
         dataset = client.create_dataset("recordings")
-        register_recordings(dataset, {path: path for path in indexes}, indexes, unreadable)
+        register_recordings(dataset, {path: path for path in summaries}, unreadable)
         register_files(dataset, {path: path for path in layers}, unreadable, layer=CORRECTIONS)
-        rows = _rows(dataset, summaries, indexes, unreadable)
+        rows = _rows(dataset, summaries, unreadable)
         if not rows:
             raise BadRecording(
                 f"query: none of {len(files)} files in {folder} can be read; "
@@ -154,17 +159,14 @@ def _schema() -> "pa.Schema":
 
 
 def _rows(
-    dataset: "DatasetEntry",
-    summaries: Mapping[Path, dict[str, Any]],
-    indexes: Mapping[Path, Path],
-    unreadable: Mapping[Path, str],
+    dataset: "DatasetEntry", summaries: dict[Path, dict[str, Any]], unreadable: dict[Path, str]
 ) -> list[dict[str, Any]]:
     """One row per recording: failures first, then by case and sub-case."""
     rows = []
     for path, summary in summaries.items():
         if path in unreadable:
             continue
-        segment = recording_id(indexes[path])
+        segment = recording_id(path)
         frame = max(0, int(summary.get("deciding_frame", 0)))
         row: dict[str, Any] = {}
         for name in COLUMNS:

@@ -8,7 +8,7 @@ A file that cannot be read is named in `steps.unreadable`; the rest of the query
 
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -74,14 +74,14 @@ def load_steps(folder: Path) -> StepTable:
         )
     unreadable: dict[Path, str] = {}
     with tempfile.TemporaryDirectory() as scratch, rr.server.Server(host="127.0.0.1") as server:
-        indexes = ensure_indexes(files, Path(scratch), unreadable)
+        indexes = _ensure_indexes(files, Path(scratch), unreadable)
         if not indexes:
             raise BadRecording(
                 f"query: none of {len(files)} files in {folder} can be read; "
                 f"the first: {next(iter(unreadable.values()))}."
             )
         dataset = server.client().create_dataset("recordings")
-        register_recordings(dataset, indexes, indexes, unreadable)
+        register_recordings(dataset, indexes, unreadable)
         properties = _property_table(dataset, _by_file(indexes))
         policies = dict(zip(map(Path, properties["file"]), properties["policy"], strict=True))
         corrections = read_corrections_of(policies, unreadable)
@@ -95,7 +95,7 @@ def _can_index(folder: Path) -> bool:
     return os.access(indexes if indexes.exists() else folder, os.W_OK)
 
 
-def ensure_indexes(
+def _ensure_indexes(
     files: Sequence[Path], scratch: Path, unreadable: dict[Path, str]
 ) -> dict[Path, Path]:
     """The index of every recording of one folder that has one, or can get one.
@@ -103,20 +103,11 @@ def ensure_indexes(
     New ones are in `scratch` where none can be written beside the recordings. Recordings are read
     in a process of their own.
     """
-    from tqdm import tqdm
-
     folder = None if _can_index(files[0].parent) else scratch
     indexes = find_indexes(files, folder)
     missing = [path for path in files if path not in indexes]
-    for path, reason in tqdm(
-        index_isolated(missing, folder),
-        "index",
-        total=len(missing),
-        unit="recording",
-        leave=False,
-        delay=3,
-        mininterval=1,
-    ):
+    answers = index_isolated(missing, folder)
+    for path, reason in show_progress(answers, "index", len(missing)):
         if reason is not None:
             unreadable[path] = reason
     indexes |= find_indexes([path for path in missing if path not in unreadable], folder)
@@ -126,10 +117,24 @@ def ensure_indexes(
     return {path: indexes[path] for path in files if path in indexes}
 
 
+def show_progress[T](answers: Iterable[T], doing: str, total: int) -> Iterable[T]:
+    """The same, with a bar that counts recordings where they take longer than 3 seconds."""
+    from tqdm import tqdm
+
+    return tqdm(
+        answers,
+        doing,
+        total=total,
+        unit="recording",
+        leave=False,
+        delay=3,
+        mininterval=1,
+    )
+
+
 def register_recordings(
     dataset: "DatasetEntry",
     files: Mapping[Path, Path],
-    indexes: Mapping[Path, Path],
     unreadable: dict[Path, str],
 ) -> None:
     """Register what to read for each recording; of those that hold one episode the first alone."""
@@ -137,7 +142,7 @@ def register_recordings(
     register_files(dataset, files, refused)
     first = _files_by_segment(dataset, _by_file(files)) if refused else {}
     for path, reason in refused.items():
-        original = first.get(recording_id(indexes[path]))
+        original = first.get(recording_id(files[path]))
         if original is not None:
             reason = f"it holds the same episode as {Path(original).name}; move one of them away"
         unreadable[path] = reason
