@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.command import refused
 from vap_core.base.errors import BadOutput, BadStudy, UnknownName
+from vap_core.cli import benches
 from vap_core.cli.bench import (
     embeddings,
     engine,
@@ -413,3 +415,53 @@ def test_scale_runs() -> None:
     assert [done for done, _ in found.values["memory"]] == [0, 5, 10]
     assert len(scale_report.tables(found)) == 3
     assert asdict(found)
+
+
+@pytest.mark.parametrize(
+    ("words", "match"),
+    [
+        ("style --json bs.json", "bench: style reads no option; leave --json out."),
+        ("--json x.json loop --steps 5", "bench: loop reads --steps; leave --json out."),
+        ("loop --quick", "leave --quick out"),
+        ("policy --device cpu", "leave --device out"),
+        ("profile --stack embedded", "profile reads --quick, --json; leave --stack out."),
+        ("engine --episodes 200", "leave --episodes out"),  # as the default says, too
+        ("query --steps 9 --repeats 3", "leave --steps and --repeats out"),
+        ("measured --random-weights", "leave --random-weights out"),
+        ("nothing --json x", "bench: 'nothing' is unknown; known: embeddings, engine"),
+    ],
+)
+def test_an_option_that_a_bench_does_not_read_is_refused(words: str, match: str) -> None:
+    assert match in refused("bench", *words.split())
+
+
+def test_each_bench_reads_the_options_that_the_table_says() -> None:
+    source = ast.parse(Path(benches.__file__).read_text())
+    (choice,) = (node for node in ast.walk(source) if isinstance(node, ast.Match))
+    derived = {"parts": benches.STACK_PARTS, "part": ("json",)}
+    options = {*derived, *(name for read in benches.BENCHES.values() for name in read)}
+    reads = {}
+    for case in choice.cases:
+        assert isinstance(case.pattern, ast.MatchValue)
+        names = set()
+        for node in ast.walk(ast.Module(case.body, [])):
+            if isinstance(node, ast.Name) and node.id in options:
+                names |= set(derived.get(node.id, (node.id,)))
+        reads[ast.literal_eval(case.pattern.value)] = names
+    assert reads == {what: set(read) for what, read in benches.BENCHES.items()}
+
+
+def test_a_file_that_cannot_be_written_is_refused_before_the_measurement(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def measure(*_: object, **__: object) -> Measurement:
+        raise AssertionError("measured")
+
+    monkeypatch.setattr(profile, "measure", measure)
+    (tmp_path / "file").write_bytes(b"")
+    below = refused("bench", "profile", "--json", tmp_path / "file" / "x.json")
+    assert "cannot be written" in below
+    assert "give --json another name" in below
+    assert "is a folder; give --json another name" in refused(
+        "bench", "profile", "--json", tmp_path
+    )

@@ -114,6 +114,27 @@ def test_a_query_wants_a_condition_or_a_server(run: Path) -> None:
     assert "or add --serve" in done.stderr
 
 
+def test_without_a_display_the_server_says_how_to_reach_it_from_elsewhere(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`python -m rerun` opens a window, which cannot be opened here."""
+
+    class Interrupted:
+        def wait(self) -> bool:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("vap_core.cli.recordings.threading", SimpleNamespace(Event=Interrupted))
+    monkeypatch.setattr("vap_core.recording.viewer.has_display", lambda: False)
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    done = vap("query", run, "--serve", "--port", port)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    tunnel = lines.index(f"  ssh -N -L {port}:127.0.0.1:{port} HOST")
+    assert "no display here; on a machine that has one" in lines[tunnel - 1]
+    assert lines[tunnel + 1].startswith(f"  python -m rerun rerun+http://127.0.0.1:{port}/entry/")
+
+
 def test_a_film_shows_the_policys_input_and_holds_where_it_was_decided(
     run: Path, tmp_path: Path
 ) -> None:

@@ -330,6 +330,7 @@ def test_a_correction_changes_the_table_and_nothing_else(run: Path) -> None:
         ("query R steps>1 --port 9", "--port is of --serve; leave --port out"),
         ("query R --serve --open 0 --png a", "in a browser; leave --open and --png out"),
         ("query R --serve --limit 20", "in a browser; leave --limit out"),
+        ("view R --mp4 a.mp4 --frame 0", "--mp4 films every step; leave --frame out"),
     ],
 )
 def test_an_option_that_would_do_nothing_is_refused(words: str, match: str) -> None:

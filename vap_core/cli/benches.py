@@ -5,13 +5,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer.core import TyperCommand
 
 from vap_core.cli.options import (
     DetectorName,
     EncoderName,
     StackName,
     TrackerName,
-    Workers,
+    refuse_dropped,
     stack_of,
 )
 
@@ -19,24 +20,33 @@ if TYPE_CHECKING:
     from vap_core.cli.bench.measurement import Measurement, Table
 
 app = typer.Typer()
-BENCHES = (
-    "loop",
-    "suites",
-    "stack",
-    "policy",
-    "eval",
-    "profile",
-    "scale",
-    "engine",
-    "embeddings",
-    "query",
-    "style",
-    "measured",
-)
+STACK_PARTS = ("stack", "detector", "encoder", "tracker")
+BENCHES = {
+    "loop": ("steps",),
+    "suites": ("workers",),
+    "stack": (*STACK_PARTS, "random_weights", "device"),
+    "policy": ("quick",),
+    "eval": ("workers", "quick", "repeats", "lerobot_from", "json"),
+    "profile": ("quick", "json"),
+    "scale": ("episodes", "quick", "json"),
+    "engine": ("workers", "quick"),
+    "embeddings": ("quick", "json"),
+    "query": ("quick",),
+    "style": (),
+    "measured": (),
+}
+"""The options that each bench reads, by parameter."""
 
 
-@app.command()
+class BenchCommand(TyperCommand):
+    """A command whose context is of the type that its parameter is annotated with."""
+
+    context_class = typer.Context
+
+
+@app.command(cls=BenchCommand)
 def bench(
+    context: typer.Context,
     what: Annotated[
         str,
         typer.Argument(
@@ -52,7 +62,7 @@ def bench(
         ),
     ] = "loop",
     steps: Annotated[int, typer.Option(min=5, help="loop: control steps to time.")] = 60,
-    workers: Workers = 2,
+    workers: Annotated[int, typer.Option(min=1, help="suites, eval, engine: processes.")] = 2,
     stack: StackName = "foundation",
     detector: DetectorName = "",
     encoder: EncoderName = "",
@@ -104,6 +114,11 @@ def bench(
     """
     from vap_core.base.errors import one_of
 
+    if what not in BENCHES:
+        raise one_of("bench:", what, BENCHES)
+    _refuse_unread(what, context)
+    if json is not None:
+        _check_writable(json)
     parts = stack_of(stack, detector, encoder, tracker)
     part = None if json is None else json.with_suffix(".part.json")
     # Each case imports its own benchmark alone: most are large, and some need an extra.
@@ -160,9 +175,34 @@ def bench(
             from vap_core.cli.bench import measured
 
             text = measured.run()
-        case _:
-            raise one_of("bench:", what, BENCHES)
     print(text)
+
+
+def _refuse_unread(what: str, context: typer.Context) -> None:
+    """Refuse options that the chosen bench does not read. Raises: BadStudy."""
+    read = BENCHES[what]
+    given = {}
+    for name in context.params:
+        source = context.get_parameter_source(name)
+        if name != "what" and name not in read and source and source.name == "COMMANDLINE":
+            given[_option(name)] = context.params[name]
+    listed = ", ".join(map(_option, read)) or "no option"
+    refuse_dropped(f"bench: {what} reads {listed}", given)
+
+
+def _option(parameter: str) -> str:
+    return "--" + parameter.replace("_", "-")
+
+
+def _check_writable(json: Path) -> None:
+    """Check, before the measurement, that its file can be written. Raises: BadOutput."""
+    from vap_core.base.errors import BadOutput
+    from vap_core.base.files import make_folder
+
+    mend = "give --json another name"
+    if json.is_dir():
+        raise BadOutput(f"bench: {json} is a folder; {mend}.")
+    make_folder(json.parent, "bench", mend)
 
 
 def _kept(

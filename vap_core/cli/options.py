@@ -1,6 +1,6 @@
 """Options that several commands share."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -56,3 +56,15 @@ def with_bar(starts: Iterable[int], label: str) -> Iterable[int]:
     from tqdm import tqdm
 
     return tqdm(starts, desc=label, unit="block", disable=None, leave=False)
+
+
+def refuse_dropped(why: str, given: Mapping[str, object]) -> None:
+    """Refuse options that would do nothing: those that are not None.
+
+    Raises: BadStudy, which names them.
+    """
+    from vap_core.base.errors import BadStudy
+
+    named = [name for name, setting in given.items() if setting is not None]
+    if named:
+        raise BadStudy(f"{why}; leave {' and '.join(named)} out.")

@@ -1,11 +1,12 @@
 """Commands that find and open recordings: diagnose, query, view, show."""
 
 import threading
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from vap_core.cli.options import refuse_dropped
 
 app = typer.Typer()
 
@@ -96,10 +97,10 @@ def diagnose(
             "diagnose: --mp4 films one recording, --against lays two side by side; leave one out."
         )
     if correct is None:
-        _refuse_dropped("diagnose: --note is of a correction", {"--note": note or None})
+        refuse_dropped("diagnose: --note is of a correction", {"--note": note or None})
     else:
         shown = {"--png": png, "--mp4": mp4, "--against": against}
-        _refuse_dropped("diagnose: --correct shows nothing", shown)
+        refuse_dropped("diagnose: --correct shows nothing", shown)
     if show is None and (correct is not None or (against is not None and png is None)):
         option = "--against" if correct is None else "--correct"
         raise BadStudy(f"diagnose: {option} is of one failure; name it by --open and its number.")
@@ -170,12 +171,12 @@ def query(
 
     if serve:
         shown = {"--open": show, "--png": png, "--limit": limit}
-        _refuse_dropped("query: --serve shows every recording in a browser", shown)
+        refuse_dropped("query: --serve shows every recording in a browser", shown)
         _serve(run, where, port)
         return
     if where is None:
         raise BadStudy('query: name a condition, such as "margin < 0.05", or add --serve.')
-    _refuse_dropped("query: --port is of --serve", {"--port": port})
+    refuse_dropped("query: --port is of --serve", {"--port": port})
     result = run_query(run, where)
     if show is None and png is None:
         print(format_result(result, limit or 20))
@@ -188,7 +189,9 @@ def query(
 @app.command()
 def view(
     recording: Annotated[Path, typer.Argument(help="A recording (.rrd) of eval, rollout or demo.")],
-    frame: Annotated[int, typer.Option(min=0, help="The step to show first.")] = 0,
+    frame: Annotated[
+        int | None, typer.Option(min=0, help="The step to show first. Default 0.")
+    ] = None,
     png: Annotated[
         Path | None, typer.Option(help="Save a picture of that step instead, without a display.")
     ] = None,
@@ -203,7 +206,9 @@ def view(
     Example: python -m vap_core view data/runs/demo/recordings/*franka*000*vap.rrd
     Example: python -m vap_core view data/runs/demo/recordings/*franka*000*vap.rrd --mp4 talk.mp4
     """
-    _show_frame(recording, frame, png, mp4)
+    if mp4 is not None and png is None:
+        refuse_dropped("view: --mp4 films every step", {"--frame": frame})
+    _show_frame(recording, frame or 0, png, mp4)
 
 
 @app.command()
@@ -231,15 +236,6 @@ def show(
     else:
         screenshot(recording, png, frame_index=frame)
     print(f"wrote {png}")
-
-
-def _refuse_dropped(why: str, given: Mapping[str, object]) -> None:
-    """Refuse options that would do nothing. Raises: BadStudy, which names them."""
-    from vap_core.base.errors import BadStudy
-
-    named = [name for name, setting in given.items() if setting is not None]
-    if named:
-        raise BadStudy(f"{why}; leave {' and '.join(named)} out.")
 
 
 def _serve(run: Path, where: str | None, port: int | None) -> None:
