@@ -283,11 +283,9 @@ def test_pictures_of_two_suites_have_a_part_and_the_papers_robot_each() -> None:
     left, right = rates_of_arms_figure(arms).axes
     names = [tick.get_text() for tick in left.get_yticklabels()]
     assert names == ["references-3", "references-1", "vap"], "the first arm stands at the top"
-    places_right = {
-        (float(line.get_xdata()[0]), float(line.get_ydata()[0]))
-        for line in right.lines if line.get_marker() == "o"
-    }  # fmt: skip
-    assert places_right == {(pytest.approx(70), 2.0), (pytest.approx(20), 1.0)}, "none for 3"
+    circles = [line for line in right.lines if line.get_marker() == "o"]
+    at = sorted((round(float(line.get_xdata()[0])), line.get_ydata()[0]) for line in circles)
+    assert at == [(20, 1), (70, 2)], "none for three photos"
 
 
 def test_an_ablation_of_two_suites_has_a_heading_each() -> None:
@@ -347,6 +345,7 @@ def test_another_policys_effects_stand_beside_each_arm() -> None:
     (-0.1, 0.1, 0.7, -0.2, "not here: as much is excluded"),
     (-0.1, 0.1, 0.7, 0.05, "cannot tell"),
     (-0.1, -0.02, 0.06, -0.05, "cannot tell"),
+    (-0.1, -0.02, 0.06, -0.01, "cannot tell"),
 ])  # fmt: skip
 def test_what_a_difference_says_about_the_papers_finding(
     low: float, high: float, p: float, theirs: float, said: str

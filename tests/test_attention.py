@@ -17,7 +17,8 @@ from tests import tiny_lerobot as tiny
 from tests.command import vap
 from tests.drawn import SUCCESS, columns, entities, frame, opening, rerun
 from tests.test_why import tabs
-from vap_core.base.errors import UnknownName
+from vap_core.analysis.attention import layer_effects
+from vap_core.base.errors import BadPolicy, UnknownName
 from vap_core.evaluation.policy_names import shipped
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import make_trial, register_personal
@@ -238,6 +239,17 @@ def test_a_policy_without_patches_reports_nothing_and_nothing_is_kept_outside(
         report_attention(0, "front", one)
         report_attention(0, "front", {ACTION: np.ones((1, 1, 2, 2), np.float32)})
     assert not first[0]["front"][ACTION].any(), "what is reported first stands"
+
+
+def test_layers_are_known_of_a_pi0_alone(tmp_path: Path) -> None:
+    pi05 = tmp_path / "pi05"
+    toy_pi0.save_toy(pi05, ("front",), tiny.STATE, tiny.ACTION, TOY, "pi05")
+    with toy_sizes(TOY):
+        effects = layer_effects(pi05)
+    assert list(effects.index) == ["vision-language model", "action expert"]
+    for folder in (tiny.smolvla(tmp_path / "smolvla"), tiny.act(tmp_path / "act")):
+        with pytest.raises(BadPolicy, match="is no pi0, .*; give the folder of a pi0, pi0.5 or"):
+            layer_effects(folder)
 
 
 def test_pictures_that_are_padded_are_not_read(toys: dict[str, LeRobot]) -> None:

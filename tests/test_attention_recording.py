@@ -1,5 +1,6 @@
 """The real command records an episode of a published run with its maps: heat maps, numbers, masks and outcome are in the file, of the same steps, and agree with each other."""
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -144,7 +145,7 @@ def test_the_command_names_the_step_of_a_words_highest_peak(recorded: tuple[Path
     highest = max(tensors, key=lambda step: heat_map(tensors[step], "token").max())
     (line,) = (line for line in said.splitlines() if line.startswith("next: "))
     picture = ["show", str(path), f"{path.stem}.png", "--attention", "--frame", str(highest)]
-    assert line.split() == ["next:", "python", "-m", "vap_core", *picture]
+    assert shlex.split(line) == ["next:", "python", "-m", "vap_core", *picture]
 
 
 @pytest.mark.slow

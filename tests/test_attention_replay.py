@@ -1,6 +1,8 @@
 """Episodes that are run again for their attention maps: the command, its tables, and which episodes and calls are named."""
 
 import json
+from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,6 +34,30 @@ def test_tables_are_published_beside_those_of_other_suites(tmp_path: Path) -> No
     metadata = pq.read_schema(tmp_path / "kept" / "attention_calls.parquet").metadata
     about = json.loads(metadata[tables.ABOUT])
     assert [each["runs"][0]["digest"] for each in about] == ["a", "b", "c"]
+
+
+def test_publishing_leaves_no_row_of_an_older_replay_of_the_suite_and_method(
+    tmp_path: Path,
+) -> None:
+    """A replay without causal measures takes those of the policy before it away."""
+
+    def publish(policy: str, suite: str, tables_with_rows: Sequence[str]) -> None:
+        line = {"suite": suite, "method": "soft", "policy": policy, "number": 1}
+        rows = {name: [dict(line)] if name in tables_with_rows else [] for name in tables.TABLES}
+        tables.write(tmp_path, rows, [{"digest": policy}])
+        tables.publish(tmp_path, tmp_path / "kept")
+
+    kept = tmp_path / "kept"
+    publish("first", "one", ["episodes", "calls", "layers"])
+    assert tables.read(kept)["causal"].empty, "a folder without causal rows can be read"
+    publish("old", "one", tables.TABLES)
+    publish("other", "another", tables.TABLES)
+    publish("new", "one", ["episodes", "calls"])
+    found = tables.read(kept)
+    policies = {name: list(table.policy) for name, table in found.items()}
+    assert policies["episodes"] == policies["calls"] == ["other", "new"]
+    assert policies["layers"] == policies["causal"] == ["other"]
+    assert {str(table.number.dtype) for table in found.values()} == {"int32"}
 
 
 def test_a_folder_that_is_no_run_gets_no_folder_of_attention(tmp_path: Path) -> None:
@@ -99,6 +125,42 @@ def test_an_episode_is_run_again_and_measured(tmp_path: Path) -> None:
     assert len(tables["layers"]) == 2 * 4 * 8
     with pytest.raises(BadStudy, match="was run with another"):
         replayed(study, "pick-shaver", tmp_path, "another")
+
+
+def test_a_replay_without_any_observed_call_names_the_errors(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The policy raises at its first call."""
+    study = Study((("simpler-bridge", "pick-shaver"),), ("generic",), episodes=1, policy="mini-pi0")
+    whole = make_trial(study, study.rows("simpler-bridge", "pick-shaver"), "generic", tmp_path)
+    broken = copy(whole.policy)
+
+    def plan(*_: Any) -> None:
+        raise RuntimeError("no memory left")
+
+    broken.plan = plan
+    job = replay.Job(
+        name="one",
+        study=study,
+        method="generic",
+        rows=tuple(study.rows("simpler-bridge", "pick-shaver")),
+        known=(("failure", 5),),
+        policy=broken.label,
+        memory=tmp_path,
+        explained=(True,),
+    )
+    monkeypatch.setattr(replay, "make_trial", lambda *_: replace(whole, policy=broken))
+    monkeypatch.setattr(replay, "plan", lambda *_: [job])
+    monkeypatch.setattr(replay, "prepare", lambda _: None)
+    monkeypatch.setattr(
+        replay, "results", lambda work, jobs, **_: ((job, work(job)) for job in jobs)
+    )
+    says = (
+        r"no call of the policy was observed in 1 episodes; 1 ended in an error, the first is "
+        r"simpler-bridge/pick-shaver/generic/0: RuntimeError: no memory left\. Mend it, delete .*parts and run"
+    )
+    with pytest.raises(BadStudy, match=says):
+        replay.run_replay(tmp_path, tmp_path / "out", replay.Wanted(), progress=False)
 
 
 def test_a_policy_without_attention_is_refused(tmp_path: Path) -> None:
@@ -178,5 +240,7 @@ def test_an_episode_is_named_and_found_in_its_run(
         examples.record(table, "put-camera/22", tmp_path, tmp_path)
     with pytest.raises(BadStudy, match="give SUITE/TASK/METHOD/EPISODE"):
         examples.record(table, "simpler-bridge/put-camera/soft/last", tmp_path, tmp_path)
+    with pytest.raises(BadStudy, match="give SUITE/TASK/METHOD/EPISODE"):
+        examples.record(table, "simpler-bridge/put-camera/soft/²", tmp_path, tmp_path)
     with pytest.raises(BadStudy, match="holds no episode"):
         examples.record(table, "simpler-bridge/put-camera/soft/2200", tmp_path, tmp_path)

@@ -8,6 +8,8 @@ from PIL import Image
 
 from tests.command import refused, vap
 from tests.scanned import EPS
+from vap_core.base.errors import BadPhoto
+from vap_core.base.photos import photos_in
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +65,13 @@ def test_a_damaged_neighbour_is_named_before_anything_is_saved(
     line = refused("register", "new", folder / "good-0.png", *words)
     assert "old.object.safetensors" in line
     assert [path.name for path in tmp_path.iterdir()] == ["old.object.safetensors"]
+
+
+@pytest.mark.parametrize("name", ["none", "file.png"])
+def test_what_is_no_folder_of_photos_is_one_line(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file.png").touch()
+    with pytest.raises(BadPhoto, match=f"{name} cannot be read as a folder .*; name a folder of"):
+        photos_in(tmp_path / name)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 3), (2000, 4)])

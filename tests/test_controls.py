@@ -93,6 +93,8 @@ def test_the_least_lead_says_what_is_answered_and_rightly() -> None:
     control.suite.value = "tabletop"
     control.threshold.value = 0.0
     assert ": 75 [30, 95] 4 views are answered" in control.answer.value
+    with pytest.raises(UnknownName, match="number of photos '2' is unknown; known: 1, 5"):
+        controls.Abstention(table, k=2)
 
 
 @pytest.fixture

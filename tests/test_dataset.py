@@ -351,6 +351,10 @@ def put(path: Path, **new: object) -> None:
         (lambda f: (f / "data/chunk-000/file-000.parquet").unlink(), "is damaged"),
         (lambda f: (f / ABOUT).write_text("{"), "absent or damaged .JSONDecodeError"),
         (lambda f: (f / "meta/info.json").unlink(), "absent or damaged .FileNotFoundError"),
+        (lambda f: put(f / ABOUT, suite=None), "absent or damaged .TypeError"),
+        (lambda f: put(f / ABOUT, episodes=None), "absent or damaged .TypeError"),
+        (lambda f: put(f / ABOUT, stages="2"), "absent or damaged .TypeError"),
+        (lambda f: (f / ABOUT).write_text('{"version": 1}'), "absent or damaged .KeyError"),
         (lambda f: put(f / ABOUT, version=2), "version 2 of a LeRobotDataset v3.0, not 1 of v3.0"),
         (
             lambda f: put(f / "meta/info.json", codebase_version="v2.1"),

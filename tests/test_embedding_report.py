@@ -20,7 +20,7 @@ from vap_core.cli import app
 from vap_core.evaluation.tokens import study
 from vap_core.policies.embedding_table import open_table
 from vap_core.policies.mini_pi0 import teach_token, token_alignment
-from vap_core.policies.token_groups import token_groups
+from vap_core.policies.token_groups import token_groups, vocabulary_of
 from vap_core.simulation import suites
 from vap_core.training.words import vocabulary
 
@@ -80,7 +80,8 @@ def test_real_checkpoints_are_compared_with_their_words(tmp_path: Path) -> None:
     embedding_report.keep(table, tmp_path / "new" / "rows.csv")
     assert len(pd.read_csv(tmp_path / "new" / "rows.csv")) == 4
     with pytest.raises(BadOutput, match="neither"):
-        embedding_report.keep(table, tmp_path / "rows.txt")
+        embedding_report.keep(table, tmp_path / "other" / "rows.txt")
+    assert not (tmp_path / "other").exists()
     with pytest.raises(BadPolicy, match="no suite 'nowhere'"):
         embedding_report.spaces(one, [other], "nowhere")
     (one / "tokenizer" / "tokenizer.json").write_text("{}")
@@ -88,9 +89,28 @@ def test_real_checkpoints_are_compared_with_their_words(tmp_path: Path) -> None:
         token_groups([one], ["put"])
 
 
+def test_a_name_that_is_no_tables_is_refused_before_the_work(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    opened: list[Path] = []
+    monkeypatch.setattr(embedding_report, "open_table", opened.append)
+    out = tmp_path / "new" / "rows.txt"
+    found = CliRunner().invoke(app, ["embeddings", "--out", str(out)])
+    assert isinstance(found.exception, BadOutput)
+    assert "ends with neither .parquet nor .csv" in str(found.exception)
+    blocked = tmp_path / "file"
+    blocked.touch()
+    found = CliRunner().invoke(app, ["embeddings", "--out", str(blocked / "rows.csv")])
+    assert isinstance(found.exception, BadOutput)
+    assert opened == []
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
 def test_words_that_no_film_says_are_left_out_of_the_rotation(grown: tuple[Path, Path]) -> None:  # noqa: F811
     home, far = grown
-    assert len(rotation_cosines(home, home)["copied"]) == 0
+    unmoved = rotation_cosines(home, home)
+    assert [len(each) for each in unmoved.values()] == [0, 0, 0]
+    assert [mean_cosine(each).text() for each in unmoved.values()] == ["-", "-", "-"]
     shipped = teach_token.MODEL.parent
     found = rotation_cosines(teach_token.MODEL, shipped / f"mini-pi0-{SUITE}")
     assert len(found["copied"]) == 56
@@ -110,3 +130,27 @@ def test_words_that_no_film_says_are_left_out_of_the_rotation(grown: tuple[Path,
     assert cosine * np.linalg.norm(word) ** 2 == pytest.approx(float(word @ moved), rel=1e-3)
     words = nearest_words(open_table(far).block(15, 16)[0], far, 3)
     assert words[0] == (vocabulary()[15], pytest.approx(1))
+
+
+def test_a_space_that_does_not_fit_is_refused_in_one_line(
+    grown: tuple[Path, Path],  # noqa: F811
+    tmp_path: Path,
+) -> None:
+    """An embedding of another width, models of two widths, folders without a model or words."""
+    home, far = grown
+    word = open_table(home).block(15, 16)[0]
+    with pytest.raises(BadPolicy, match="features and the embedding has 5; take a model"):
+        nearest_words(word[:5], home)
+    with pytest.raises(BadPolicy, match="features and the embedding has 5; take a model"):
+        rotation_deg(word[:5], home, far)
+    with pytest.raises(BadPolicy, match="holds no table of word embeddings"):
+        nearest_words(word, tmp_path / "none")
+    real = tiny_lerobot.pi0(tmp_path / "pi0")
+    with pytest.raises(BadPolicy, match=f"{real} has 32 features and {home} has {len(word)}"):
+        rotation_cosines(home, real)
+    row = open_table(real).block(3, 4)[0]
+    words = {token: word for word, token in vocabulary_of(real)[0].items()}
+    assert nearest_words(row, real, 1) == [(words[3], pytest.approx(1))]
+    (real / "tokenizer" / "tokenizer.json").unlink()
+    with pytest.raises(BadPolicy, match="does not say what its tokens are; put .*tokenizer.json"):
+        nearest_words(row, real)

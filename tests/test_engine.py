@@ -246,7 +246,7 @@ def test_a_run_that_goes_on_begins_with_short_jobs(
 def test_leftovers_of_killed_writes_are_removed_but_no_recording(tmp_path: Path) -> None:
     out = open_run(tmp_path / "run", STUDY.configuration())
     kept = out / "recordings" / ".a.rrd.tmp"
-    gone = [out / "parts" / ".b.1.tmp", out / "recordings" / ".index-1" / ".c.9.rrd.tmp"]
+    gone = [out / "parts" / ".b.1.tmp", out / "recordings" / ".index-2" / ".c.9.rrd.tmp"]
     for path in (kept, *gone):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(b"half")

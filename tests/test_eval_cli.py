@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from tests.command import process, vap
+from tests.command import process, refused, vap
 from vap_core.base.errors import BadOutput, VapError
 from vap_core.cli.options import names
 from vap_core.evaluation.rescore import rescore
@@ -45,6 +45,18 @@ def files(out: Path) -> dict[str, bytes]:
         for path in sorted(out.rglob("*"))
         if path.is_file()
     }
+
+
+@pytest.mark.parametrize("given", ["", ",", " , "])
+@pytest.mark.parametrize("command", [("eval",), ("rollout", "--task", TASKS[0])])
+def test_methods_that_name_none_are_refused(
+    tmp_path: Path, command: tuple[str, ...], given: str
+) -> None:
+    """An unset variable of the shell ran generic and vap over the whole list."""
+    shared = ("--suite", SUITE, "--policy", "expert", "--episodes", "1", "--out", tmp_path / "run")
+    said = refused(*command, *shared, "--methods", given)
+    assert f"--methods: {given!r} names no method; name one, or leave the option out" in said
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.slow

@@ -43,6 +43,18 @@ def frames(folder: Path, squares) -> Path:
     return folder
 
 
+def test_stretches_without_the_object_that_are_not_named_are_counted():
+    def said(n: int) -> str:
+        lost = tuple((2 * i, 2 * i) for i in range(1, n + 1))
+        summary = ground_clip.ClipSummary(
+            frames=40, grounded=0, tracked=40 - n, lost=lost, text="bring it", object="mug"
+        )
+        return str(summary).splitlines()[1]
+
+    six = "not visible in frames 2-2, 4-4, 6-6, 8-8, 10-10, 12-12"
+    assert [said(6), said(7), said(10)] == [six, f"{six} and 1 more", f"{six} and 4 more"]
+
+
 def test_a_folder_of_frames_is_tracked_through(bank, tmp_path):
     """Found in frame 5, the second try; gone in frame 7."""
     squares = [[]] * 5 + [

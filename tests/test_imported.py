@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.command import vap
+from tests.command import refused, vap
 from tests.scanned import mug, put
 from vap_core.base.errors import BadObject, BadOutput, UnknownName
 from vap_core.simulation.assets import objects
@@ -15,7 +15,7 @@ from vap_core.simulation.assets.scans import convex_parts, storage
 from vap_core.simulation.assets.scans.import_scan import default_name, import_scan
 from vap_core.simulation.gl import ensure_gl
 from vap_core.simulation.scenes import build
-from vap_core.simulation.studio import reference_views
+from vap_core.simulation.studio import reference_views, write_views
 
 ensure_gl()
 import mujoco  # noqa: E402
@@ -46,7 +46,7 @@ def shelf(tmp_path_factory):
         with Image.open(folder / "objects" / "my-mug.preview.png") as preview:
             assert preview.size == (1280, 320)
         assert "my-mug: a cup, 7.0 x 7.0 x 9.0 cm" in done.stdout
-        assert "next: python -m vap_core eval --suite SUITE --object 'my-mug'" in done.stdout
+        assert "next: python -m vap_core eval --suite SUITE --object my-mug " in done.stdout
         yield folder
 
 
@@ -125,6 +125,8 @@ def test_a_name_that_is_taken_needs_replace(shelf):
         import_scan(file, "../mug", "cup")
     with pytest.raises(BadObject, match="cannot be a category"):
         import_scan(file, "mug", "cup!")
+    with pytest.raises(BadObject, match="'my cup' cannot be a category; .* --category cup"):
+        import_scan(file, "mug", "my cup")
 
 
 @pytest.mark.parametrize("name", storage.FILES)
@@ -181,3 +183,17 @@ def test_photograph_writes_the_reference_views(shelf):
     for i in range(2):
         with Image.open(shelf / "photos" / f"my-mug-{i}.png") as photo:
             assert photo.size == (320, 320)
+
+
+def test_photographing_replaces_no_picture_of_anothers(shelf, tmp_path):
+    """The same views again are no error: nothing is lost."""
+    (tmp_path / "my-mug-1.png").write_bytes(b"a photo of mine")
+    line = refused("objects", "photograph", "my-mug", "--out", tmp_path, "--views", "2")
+    assert "my-mug-1.png exists with other contents; choose another folder with --out" in line
+    assert [path.name for path in tmp_path.iterdir()] == ["my-mug-1.png"]
+    assert (tmp_path / "my-mug-1.png").read_bytes() == b"a photo of mine"
+    model = objects.get_object("my-mug")
+    assert write_views(model, tmp_path / "new", 2) == write_views(model, tmp_path / "new", 2)
+    write_views(model, tmp_path, 2, replace=True)
+    with Image.open(tmp_path / "my-mug-1.png") as photo:
+        assert photo.size == (320, 320)

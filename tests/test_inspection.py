@@ -72,6 +72,9 @@ def test_an_episode_is_found_by_its_number() -> None:
         UnknownName, match="no episode 50 of vlabench/select-cup; its list has 0 to 49"
     ):
         episode("vlabench", "select-cup", 50)
+    for suite, task in (("vlabench", "select-cup"), ("widowx-pick", "pick-straw-cup")):
+        with pytest.raises(UnknownName, match=f"no episode -1 of {suite}/{task}; the first is 0"):
+            episode(suite, task, -1)
 
 
 def test_a_track_is_told_by_what_lies_under_it() -> None:

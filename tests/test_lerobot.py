@@ -422,7 +422,7 @@ def test_a_fingerprint_tells_checkpoints_apart(folders, tmp_path):
     folder = copy_of(folders["act"], tmp_path)
     assert fingerprint(folder) == fingerprint(folders["act"]) != fingerprint(folders["ensemble"])
     (folder / "words").mkdir()
-    for left in ("training.json", "captions.json", "words/mug.token.safetensors"):
+    for left in ("training.json", "recipe.json", "captions.json", "words/mug.token.safetensors"):
         (folder / left).write_text("{}")
     assert fingerprint(folder) == fingerprint(folders["act"]), "what a training leaves beside it"
     (folder / "config.json").write_text((folder / "config.json").read_text() + " ")

@@ -3,6 +3,8 @@
 import importlib.util
 import json
 import os
+import re
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -20,10 +22,15 @@ from lerobot.envs.utils import _call_make_env, _import_hub_module, _normalize_hu
 from lerobot.processor import ProcessorStepRegistry
 
 from tests.command import refused, vap
+from tests.toys import personal
+from vap_core.base.files import SHIPPED
+from vap_core.cli.lerobot import _task_to_try
 from vap_core.evaluation.policy_names import shipped
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import make_trial, register_personal
+from vap_core.memory import save
 from vap_core.policies.lerobot.adapter import IMAGE, _resize, load_policy
+from vap_core.policies.lerobot.checkpoints import trained_for
 from vap_core.policies.lerobot.step import VapEnvConfig
 from vap_core.policies.protocol import PolicyInput
 from vap_core.rollout.loop import rollout
@@ -196,8 +203,42 @@ def test_lerobots_own_command_gives_the_successes_of_our_engine(
     assert different == 0
 
 
+@pytest.mark.parametrize(
+    ("checkpoint", "task"),
+    [
+        (shipped("tabletop"), "tabletop/select-cup"),
+        (shipped("vlabench"), "vlabench/select-cup"),
+        (SHIPPED / "mini-pi0-shared-pair", "shared-pair/put-pouch-near-vase"),
+    ],
+)
+def test_the_command_after_attach_is_of_the_checkpoints_suite(
+    tmp_path: Path, checkpoint: Path, task: str
+) -> None:
+    """It named a task of another robot for all but one, and broke at a folder with a space."""
+    out = tmp_path / "a b'c"
+    study = Study((("tabletop", "select-cup"),), ("vap",), policy="mini-pi0")
+    register_personal(study, tmp_path / "memory")
+    done = vap("attach", checkpoint, out, "--memory", tmp_path / "memory")
+    (line,) = re.findall(r"^next: (.*)$", done.stdout, re.MULTILINE)
+    words = shlex.split(line)
+    assert words[:3] == ["lerobot-eval", f"--policy.path={out}", "--env.type=vap"]
+    assert f"--env.task={task}" in words
+
+
+def test_the_command_after_attach_leaves_the_suite_open_where_nothing_says_it(
+    tmp_path: Path,
+) -> None:
+    for file in shipped(SUITE).iterdir():
+        if file.name != "training.json":
+            (tmp_path / file.name).symlink_to(file.resolve())
+    assert trained_for(shipped(SUITE)) == SUITE
+    assert trained_for(tmp_path) == ""
+    assert _task_to_try(str(shipped(SUITE)), tmp_path) == f"{SUITE}/pick-shaver"
+    assert _task_to_try(str(tmp_path), tmp_path) == "SUITE/TASK"
+
+
 def test_attach_says_what_it_wrote_and_refuses_a_second_time(tmp_path: Path) -> None:
-    (tmp_path / "memory").mkdir()
+    save(tmp_path / "memory", personal("mug", "cup", (40, 120, 110)))
     words = ("attach", shipped(SUITE), tmp_path / "out", "--memory", tmp_path / "memory")
     done = vap(*words)
     assert done.returncode == 0, done.stderr
@@ -207,6 +248,10 @@ def test_attach_says_what_it_wrote_and_refuses_a_second_time(tmp_path: Path) -> 
     again = vap(*words)
     assert again.returncode == 2
     assert "exists; choose another folder" in again.stderr
+    (tmp_path / "empty").mkdir()
+    words_of_empty = (*words[:2], tmp_path / "late", "--memory", tmp_path / "empty")
+    assert f"{tmp_path / 'empty'} holds no object" in refused(*words_of_empty)
+    assert not (tmp_path / "late").exists()
     (tmp_path / "file").write_text("")
     inside = refused("attach", shipped(SUITE), tmp_path / "file" / "out", "--memory", words[4])
     assert "cannot be written" in inside

@@ -19,6 +19,7 @@ from tests.toys import TOYS, MeanColour, personal, scene
 from vap_core.base.errors import BadMemory, BadOutput, BadPhoto
 from vap_core.base.types import Description, Rgb
 from vap_core.memory import (
+    kind_instead,
     load,
     load_bank,
     load_photo,
@@ -70,6 +71,10 @@ def test_register_uses_the_whole_photo_where_nothing_is_found() -> None:
     [
         ("../escape", "cup", 1, "cannot name an object"),
         ("mug", " ", 1, "cannot be a category"),
+        ("mug", "my cup", 1, "'my cup' cannot be a category; .* alone, .* --category cup\\."),
+        ("mug", "The  Coffee cup", 1, "alone, .* --category 'coffee cup'"),
+        ("mug", "the my cup", 1, "alone, .* --category cup\\."),
+        ("mug", "an apple", 1, "alone, .* --category apple"),
         ("mug", "cup", 0, "has no photos; give at least one"),
     ],
 )
@@ -79,6 +84,11 @@ def test_register_says_what_is_missing(name: str, category: str, photos: int, er
         register(name, category, pictures, TOYS.detector, TOYS.encoder)
     with pytest.raises((BadMemory, BadPhoto), match=error):
         remember(name, category, pictures, TOYS.encoder)
+
+
+@pytest.mark.parametrize("category", ["a", "anorak", "a-frame", "theatre mask", "mylar bag"])
+def test_what_only_begins_like_an_article_is_a_category(category: str) -> None:
+    assert kind_instead(category) == ""
 
 
 def test_an_object_is_never_overwritten_unasked(tmp_path: Path) -> None:

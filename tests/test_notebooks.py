@@ -231,3 +231,22 @@ def test_pages_have_an_index_and_the_viewer_beside_them(tmp_path: Path) -> None:
     assert (out / "viewer" / "re_viewer_bg.wasm").stat().st_size > 1_000_000
     with pytest.raises(BadOutput, match="choose another folder"):
         notebook_pages.write_pages(path.parent, path)
+
+
+def test_the_papers_accuracy_of_implicit_instructions_stands_beside_ours_of_that_kind() -> None:
+    notebook = READ[NOTEBOOKS / "09_shared_scenes.ipynb"]
+    answer = "".join(notebook["cells"][0]["source"])
+    assert "in 96 % of the 105 implicit ones (the paper's language model: 94.7 to 99.6 %" in answer
+    assert "implicit ones in 96 % [91, 99] of 105 (the paper 94.7 to 99.6 %" in printed(notebook)
+
+
+def test_forms_of_the_token_are_compared_over_tokens_and_the_copy_is_not_acquitted() -> None:
+    """Four tokens, whose mean over tokens has an interval that holds none."""
+    notebook = READ[NOTEBOOKS / "05_learned_token.ipynb"]
+    output = printed(notebook)
+    assert "pick-shaver -50, put-camera -4, put-owl-figurine -17, put-straw-cup -42" in output
+    assert "over tokens -28 [-62, 6]" in output
+    answer = "".join(notebook["cells"][0]["source"])
+    for text in (answer, output):
+        assert "what the copy costs is not measured" in text
+        assert "copy is not what costs" not in text

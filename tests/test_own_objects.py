@@ -1,6 +1,7 @@
 """eval-objects: made-up designs, the folder form, what is wrong with bad folders, the figures, and resuming."""
 
 import os
+import shlex
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,15 +12,16 @@ from tqdm import tqdm
 
 from tests.command import refused, vap
 from tests.scanned import box, put
-from vap_core.base.errors import BadObject, BadStudy
+from vap_core.base.errors import BadObject, BadOutput, BadStudy
 from vap_core.evaluation.own_objects import run as own
-from vap_core.evaluation.own_objects.folder import VARIABLE, Source, objects_in, read_source
+from vap_core.evaluation.own_objects.folder import Source, objects_in, read_source
 from vap_core.evaluation.own_objects.report import Tables, group_rows, object_rows, text_report
 from vap_core.simulation.assets.scans.closed_parts import blob, hollow, lathe, ring, tube
 from vap_core.simulation.assets.scans.design_paint import LOUD, QUIET, SIDE, draw_colours
 from vap_core.simulation.assets.scans.designs import FORMS, HANDLED, draw_design, write_designs
 from vap_core.simulation.assets.scans.mesh_file import _weld
 from vap_core.simulation.assets.scans.mesh_repair import count_edge_flaws
+from vap_core.simulation.assets.scans.storage import VARIABLE
 from vap_core.simulation.assets.triangles import area_vectors
 from vap_core.simulation.suites import suite
 
@@ -98,6 +100,22 @@ def test_the_folder_of_designs_is_read_and_depends_on_all_of_it(tmp_path):
     assert source.sha256 != read_source(tmp_path).sha256
 
 
+def test_designs_replace_no_file_of_anothers(tmp_path):
+    """The same designs again are no error: nothing is lost."""
+    (tmp_path / "objects.csv").write_text("file,category\nmug.glb,cup\n")
+    line = refused("objects", "designs", tmp_path, "--count", "2")
+    assert "objects.csv exists with other contents; choose another folder" in line
+    assert [path.name for path in tmp_path.iterdir()] == ["objects.csv"]
+    assert (tmp_path / "objects.csv").read_text() == "file,category\nmug.glb,cup\n"
+    (tmp_path / "objects.csv").unlink()
+    paths = write_designs(tmp_path, 2, 0)
+    assert write_designs(tmp_path, 2, 0) == paths
+    paths[0].write_bytes(b"mine")
+    with pytest.raises(BadOutput, match="exists with other contents"):
+        write_designs(tmp_path, 2, 0)
+    assert paths[0].read_bytes() == b"mine"
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -107,6 +125,7 @@ def test_the_folder_of_designs_is_read_and_depends_on_all_of_it(tmp_path):
         ("file,category\nmug.glb,cup\nmug.glb,cup\n", "line 3 names a second 'mug'"),
         ("file,category,height_cm\nmug.glb,cup,tall\n", "the height 'tall'"),
         ("file,category\n", "names no file"),
+        ("file,category\nmug.glb,my cup\n", "line 2 has the category 'my cup'; .* example cup"),
     ],
 )
 def test_what_is_wrong_with_a_folder_is_one_line(tmp_path, text, message):
@@ -115,6 +134,30 @@ def test_what_is_wrong_with_a_folder_is_one_line(tmp_path, text, message):
         (tmp_path / "objects.csv").write_text(text)
     with pytest.raises(BadObject, match=message):
         read_source(tmp_path)
+
+
+def test_where_every_object_is_left_out_the_remedy_is_one_that_there_is(tmp_path):
+    """The option that mends an open surface is that of `objects import`."""
+    folder, out = tmp_path / "a b's", tmp_path / "out"
+    folder.mkdir()
+    open_box = box(rgb=(200, 60, 30))
+    open_box.update_faces(np.arange(10))
+    for name in ("open.ply", "other.ply"):
+        put(folder, name, open_box)
+    table = "file,category,height_cm\nopen.ply,coffee cup,6\nother.ply,cup,\n"
+    (folder / "objects.csv").write_text(table)
+    line = refused("eval-objects", folder, "--views-only", "--out", out)
+    assert "eval-objects: every object was left out. open: " in line
+    assert "is not watertight" in line
+    assert f"Of 1 more {out / 'report.txt'} says why." in line
+    command, _, then = line.partition("python -m vap_core ")[2].partition("; ")
+    assert shlex.split(command) == [
+        "objects", "import", str(folder / "open.ply"), "--category", "coffee cup",
+        "--height-cm", "6", "--repair", "--out", "DIR",
+    ]  # fmt: skip
+    assert then.startswith("then measure with eval-objects DIR.")
+    report = (out / "report.txt").read_text()
+    assert [words.split(":")[1] for words in report.splitlines()] == [" open", " other"]
 
 
 def test_where_objects_are_looked_up_is_as_before_afterwards(tmp_path, monkeypatch):

@@ -1,20 +1,24 @@
 """A robot of one's own: what its MJCF lacks, and a camera that cannot look, are one line; it changes no other run's digest."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.command import refused
 from tests.test_own_suite import DOCUMENTED
-from vap_core.base.errors import BadRobot, BadSuite, UnknownName
+from vap_core.base.errors import BadOutput, BadRobot, BadSuite, UnknownName
+from vap_core.evaluation.store import open_run
 from vap_core.evaluation.study import DEMO, Study
+from vap_core.policies.scripted.scripted import MOTIONS, Motion
 from vap_core.simulation import suites
 from vap_core.simulation.cameras import RIGS, Rig
 from vap_core.simulation.control import Arm
-from vap_core.simulation.robots import ROBOTS
+from vap_core.simulation.robots import ROBOTS, mjcf
 from vap_core.simulation.scenes import build
 from vap_core.simulation.suites import own
 
@@ -47,12 +51,12 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setattr(own, "OPENED", {})
     suites._seeded.cache_clear()
     suites.benchmark.cache_clear()
-    rigs, robots = dict(RIGS), dict(ROBOTS)
+    rigs, robots, motions = dict(RIGS), dict(ROBOTS), dict(MOTIONS)
     (tmp_path / "mine.xml").write_text(MJCF)
     path = tmp_path / "desk.py"
     path.write_text(ENTERS + DOCUMENTED.replace('"wx250s"', '"mine"'))
     yield path
-    for registry, before in ((RIGS, rigs), (ROBOTS, robots)):
+    for registry, before in ((RIGS, rigs), (ROBOTS, robots), (MOTIONS, motions)):
         registry.clear()
         registry.update(before)
 
@@ -202,3 +206,70 @@ def test_the_cameras_of_an_own_robot_are_in_its_runs_digest(file: Path) -> None:
     assert study.configuration()["world"] == before
     RIGS["mine"] = tuple(replace(rig, fovy_rad=0.9) for rig in RIGS["mine"])
     assert study.configuration()["world"] != before
+
+
+LOADS = """<mujoco>
+  <compiler meshdir="shapes" texturedir="shapes"/>
+  <include file="part.xml"/>
+  <asset>
+    <mesh name="hull" file="hull.obj"/>
+    <hfield name="hill" file="hill.png" size="1 1 1 1"/>
+    <texture name="paint" type="2d" file="paint.png"/>
+  </asset>
+"""
+HULL = "v 0 0 0\nv .01 0 0\nv 0 .01 0\nv 0 0 .01\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+@pytest.fixture
+def loading(file: Path) -> Path:
+    """The folder of a robot whose MJCF includes a file, and loads three more from another folder."""
+    folder = file.parent
+    (head,) = re.findall(r"^<mujoco.*$", MJCF, re.MULTILINE)
+    (folder / "mine.xml").write_text(MJCF.replace(head, LOADS))
+    (folder / "part.xml").write_text('<mujoco><default><geom density="900"/></default></mujoco>')
+    (folder / "shapes").mkdir()
+    (folder / "shapes" / "hull.obj").write_text(HULL)
+    for name in ("hill", "paint"):
+        Image.new("RGB", (8, 8)).save(folder / "shapes" / f"{name}.png")
+    return folder
+
+
+def test_a_file_that_an_own_robot_loads_is_in_its_runs_digest(loading: Path) -> None:
+    """A run went on with another robot where a file that its MJCF includes was edited."""
+    study = Study((TASK,), ("generic",), policy="random", suite_files=(str(loading / "desk.py"),))
+    assert list(mjcf.other_files(ROBOTS["mine"])) == [
+        "part.xml",
+        "shapes/hill.png",
+        "shapes/hull.obj",
+        "shapes/paint.png",
+    ]
+    run = open_run(loading / "run", study.configuration())
+    assert open_run(run, study.configuration()) == run
+    for file in mjcf.other_files(ROBOTS["mine"]).values():
+        before = file.read_bytes()
+        file.write_bytes(before + b"\n")
+        with pytest.raises(BadOutput, match=r"holds another run \(world \w+ there, \w+ now\)"):
+            open_run(run, study.configuration())
+        file.write_bytes(before)
+    assert open_run(run, study.configuration()) == run
+
+
+def test_a_file_that_the_mjcf_loads_and_that_is_gone_is_named(loading: Path) -> None:
+    suites.open_file(loading / "desk.py")
+    (loading / "shapes" / "hull.obj").unlink()
+    with pytest.raises(BadRobot, match=r"loads .*hull\.obj, which is no file; put it there"):
+        mjcf.other_files(ROBOTS["mine"])
+
+
+def test_the_motion_of_an_own_robot_is_in_the_scripted_policys_runs(file: Path) -> None:
+    """A run went on with another motion."""
+    suites.open_file(file)
+    MOTIONS["mine"] = Motion()
+    scripted, other = (Study((TASK,), ("generic",), policy=name) for name in ("scripted", "random"))
+    run = open_run(file.parent / "scripted", scripted.configuration())
+    run_of_other = open_run(file.parent / "other", other.configuration())
+    MOTIONS["mine"] = Motion(close_s=0.0)
+    with pytest.raises(BadOutput, match=r"holds another run \(other motions\)"):
+        open_run(run, scripted.configuration())
+    assert open_run(run_of_other, other.configuration()) == run_of_other
+    assert "motions" not in DEMO.configuration()

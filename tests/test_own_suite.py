@@ -13,6 +13,8 @@ import pytest
 from tests.command import process, refused, vap
 from vap_core.base.errors import BadSuite, UnknownName
 from vap_core.evaluation.feasibility import feasible
+from vap_core.evaluation.report.provenance import command_line, provenance
+from vap_core.evaluation.report.runs import load_runs
 from vap_core.evaluation.rescore import rescore
 from vap_core.evaluation.store import read, read_manifest
 from vap_core.evaluation.study import Study
@@ -71,7 +73,11 @@ def test_a_run_of_a_suite_that_is_not_open_names_the_remedy(file: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_commands_told_at_the_end_find_the_suite_and_are_quoted(tmp_path: Path) -> None:
+def test_the_commands_told_at_the_end_find_the_suite_and_are_quoted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(own, "OPENED", {})
+    suites.benchmark.cache_clear()
     (tmp_path / "my desk").mkdir()
     file = tmp_path / "my desk" / "desk.py"
     file.write_text(DOCUMENTED)
@@ -85,15 +91,46 @@ def test_the_commands_told_at_the_end_find_the_suite_and_are_quoted(tmp_path: Pa
         f"VAP_SUITES={file}",
         ["python", "-m", "vap_core", "report", str(out)],
     )
-    told = subprocess.run(
+    told = run_as_told(command, tmp_path)
+    assert told.returncode == 0, told.stderr
+    monkeypatch.setenv("VAP_SUITES", str(file))
+    (line,) = provenance(load_runs([out])).command
+    assert line.startswith(f"VAP_SUITES={shlex.quote(str(file))} python -m vap_core eval --suite ")
+    again = run_as_told(f"{line} --record none --workers 1 --out again", tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert read_manifest(tmp_path / "again")["digest"] == read_manifest(out)["digest"]
+
+
+def run_as_told(command: str, folder: Path) -> "subprocess.CompletedProcess[str]":
+    """A printed command, run by a shell in a folder."""
+    return subprocess.run(
         command.replace(" python ", f" {shlex.quote(sys.executable)} "),
         shell=True,
-        cwd=tmp_path,
+        cwd=folder,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
     )
-    assert told.returncode == 0, told.stderr
+
+
+def test_the_reports_command_finds_the_suite(file: Path) -> None:
+    """It could not be run: a run keeps no file of its suites."""
+    suites.open_file(file)
+    study = {
+        "tasks": [["my-desk", "pick-bottle"]],
+        "methods": ["vap"],
+        "policy": "expert",
+        "episodes": None,
+        "seed": 0,
+    }
+    assert shlex.split(command_line(study))[:6] == [
+        f"VAP_SUITES={file}",
+        *("python", "-m", "vap_core", "eval", "--suite"),
+    ]
+    several = {**study, "tasks": [*study["tasks"], ["simpler-bridge", "pick-shaver"]]}
+    assert f"suite_files=({str(file)!r},)" in command_line(several), "told in code"
+    other = {**study, "tasks": [["simpler-bridge", "pick-shaver"]], "episodes": 2}
+    assert command_line(other).startswith("python -m vap_core rollout")
 
 
 @pytest.mark.parametrize("name", ["simpler-bridge", "my-absent"])
@@ -122,6 +159,23 @@ def test_the_environment_takes_no_name_that_is_another_suites(
         (('"my-desk"', '"../desk"'), "the name '../desk' will not do"),
         (("bottle-lookalike-1", "bottle-lookalike-99"), "bottle-lookalike-99"),
         (("PICK, episode,", "PICK, 0,"), "is there twice"),
+        (('("front",)', "()"), r"desk\.py: cameras is empty; wx250s has front\.$"),
+        (
+            ('category="bottle"', 'category="botle"'),
+            r"task pick-bottle: the instruction 'pick up my bottle' asks for my bottle, and the "
+            r"category is 'botle'; write \"my botle\" in it once, or correct the category\.$",
+        ),
+        (("up my bottle", "up the bottle"), "task pick-bottle: .* names no personal object; write"),
+        (("up my bottle", "up my cup"), "asks for my cup, and the category is 'bottle'; write"),
+        (
+            ("up my bottle", "up my bottle and my cup"),
+            "asks for my bottle and my cup, and the category is 'bottle'; write",
+        ),
+        (
+            ('"bottle-personal", "bottle-lookalike-1"', '"cup-personal", "bottle-lookalike-1"'),
+            r"row my-desk\.pick-bottle\.000: its first object, the target, is cup-personal, a cup, "
+            "and the task's category is 'bottle'; place the target first, or correct",
+        ),
         (
             ("tuple(places))", "tuple(places), seed=3)"),
             r"row my-desk\.pick-bottle\.000 has seed=3; leave it 0: seeds come from --seed\.",

@@ -1,6 +1,7 @@
 """eval-photos: the folder form, what is wrong with bad folders, the figures, and resuming."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,16 +11,19 @@ from PIL import Image
 
 from tests.command import refused, vap
 from tests.toys import MeanColour, SameColour, detector, personal, scene, segmenter
+from vap_core.attend import Attender
 from vap_core.base.errors import BadPhotoSet
 from vap_core.base.files import DATA
 from vap_core.evaluation.metrics import rate
+from vap_core.evaluation.perception.estimates import clustered_share
 from vap_core.evaluation.photos import run
-from vap_core.evaluation.photos.apart import single_rows
+from vap_core.evaluation.photos.apart import mask_rows, single_rows
+from vap_core.evaluation.photos.clips import follow_scene
 from vap_core.evaluation.photos.folder import read_photo_set
+from vap_core.evaluation.photos.measure import measure_scene
 from vap_core.evaluation.photos.pictures import fit_line, labelled
 from vap_core.evaluation.photos.report import (
     clustered_mean,
-    clustered_share,
     object_rows,
     scene_rows,
     single_report,
@@ -30,6 +34,7 @@ from vap_core.perception.protocols import Stack
 
 RED, GREEN, BLUE, DARK = (250, 0, 0), (0, 250, 0), (0, 0, 250), (120, 10, 0)
 HEADER = "scene,object,x0,y0,x1,y1\n"
+TOY = Stack("toy", detector, MeanColour(), segmenter, SameColour())
 
 
 @pytest.fixture
@@ -54,8 +59,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def toy(monkeypatch: pytest.MonkeyPatch) -> None:
-    stack = Stack("toy", detector, MeanColour(), segmenter, SameColour())
-    monkeypatch.setattr(run, "load_stack", lambda name: stack)
+    monkeypatch.setattr(run, "load_stack", lambda name: TOY)
 
 
 def test_the_form_is_read(folder):
@@ -90,6 +94,8 @@ def test_kinds_are_told_apart_as_they_are_remembered(folder):
         ("scenes.csv", HEADER + "c.png,mug,1,2,3,4\n", "line 2 names the scene 'c.png'"),
         ("scenes.csv", HEADER + "a.png,mug,1,2,3\n", "line 2 has the box"),
         ("scenes.csv", HEADER + "a.png,mug,9,2,3,4\n", "without area"),
+        ("scenes.csv", HEADER + "a.png,mug,0.1,0.1,0.9,0.9\n", "line 2 .* pixels, not fractions"),
+        ("scenes.csv", HEADER + "a.png,mug,4,4,4.5,16\n", "line 2 .* pixels, not fractions"),
         ("scenes.csv", HEADER + "a.png,ghost,,,,\n", "no references of 'ghost'"),
         ("scenes.csv", HEADER + "a.png,mug,1,2,3,4\n", "no line for b.png"),
         (
@@ -99,7 +105,14 @@ def test_kinds_are_told_apart_as_they_are_remembered(folder):
         ),
         ("objects.csv", "object,category\nmgu,cup\n", "line 2 names 'mgu'"),
         ("objects.csv", "object,category\nmug,3!\n", "'3!' cannot be a category"),
+        ("objects.csv", "object,category\nmug,my cup\n", "'my cup' cannot be a category"),
         ("references/boxes.csv", "photo,x0,y0,x1,y1\nmug/7.png,1,2,3,4\n", "names 'mug/7.png'"),
+        (
+            "references/boxes.csv",
+            "photo,x0,y0,x1,y1\nmug/0.png,0.1,0.1,0.9,0.9\n",
+            "boxes.csv line 2 .* pixels, not fractions",
+        ),
+        ("references/boxes.csv", "photo,x0,y0,x1,y1\nmug/0.png,0,0,1,1\n", "not fractions"),
         ("scenes.csv", "\xff\xfe", "lacks the column|cannot be read"),
     ],
 )
@@ -145,6 +158,7 @@ def test_the_command_measures_writes_and_resumes(folder, toy, tmp_path):
     assert (absent.present, absent.tinted, absent.iou) == (False, True, 0.0)
     assert "object in view" in done.stdout
     assert "vote among" in done.stdout
+    assert "note: scenes.csv names ball without references: taken as rivals" in done.stderr
     assert (out / "sheet-01.png").stat().st_size > 1000
     assert (out / "memory" / "mug.references.png").exists()
     assert len(pd.read_csv(out / "questions.csv")) == 6
@@ -159,11 +173,53 @@ def test_the_command_measures_writes_and_resumes(folder, toy, tmp_path):
     assert "holds another run" in refused("eval-photos", folder, "--stack", "toy", "--out", out)
 
 
+def test_a_name_that_is_misspelt_in_one_line_is_told(folder, toy, tmp_path):
+    """Its object is asked for once less, and the table does not show that."""
+    text = (folder / "scenes.csv").read_text()
+    (folder / "scenes.csv").write_text(text.replace("a.png,mug", "a.png,mugg"))
+    done = vap("eval-photos", folder, "--stack", "toy", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    lines = [line for line in done.stderr.splitlines() if line.startswith("note:")]
+    assert lines == [
+        "note: scenes.csv names ball, mugg without references: taken as rivals, not asked for; "
+        "where one is misspelt, mend it and measure anew"
+    ]
+    assert read_photo_set(DATA / "photo-set").rivals == ("book", "rice")
+
+
 def test_a_box_outside_its_photo_is_named(folder, toy, tmp_path):
     (folder / "scenes.csv").write_text(HEADER + "a.png,mug,70,4,90,16\nb.png,mug,,,,\n")
     line = refused("eval-photos", folder, "--stack", "toy", "--out", tmp_path / "out")
     assert "lies outside" in line
     assert "64x64" in line
+
+
+def test_a_box_that_reaches_far_beyond_its_photo_is_named(folder, toy, tmp_path):
+    """Of a digit too many the overlap would be near 0, whatever is found."""
+    (folder / "scenes.csv").write_text(HEADER + "a.png,mug,4,4,160,16\nb.png,mug,,,,\n")
+    line = refused("eval-photos", folder, "--stack", "toy", "--out", tmp_path / "out")
+    assert "'mug' reaches beyond" in line
+    assert "64x64" in line
+    photo_set = read_photo_set(folder)
+    far = replace(photo_set.scenes[0], masks={"mug": folder / "scenes" / "a.png"})
+    with pytest.raises(BadPhotoSet, match="reaches beyond"):
+        mask_rows(far, TOY)
+    with pytest.raises(BadPhotoSet, match="reaches beyond"):
+        follow_scene(far, photo_set, TOY)
+
+
+def test_a_box_that_reaches_a_pixel_beyond_its_photo_is_clipped(folder, toy):
+    at_the_edge = np.array([[52, 4, 64, 16]], np.float32)
+    Image.fromarray(scene([(52, 4, RED)])).save(folder / "scenes" / "a.png")
+    memory = {"mug": personal("mug", "cup", RED)}
+    photo_set = read_photo_set(folder)
+    ious = []
+    for beyond in (0, 1):
+        boxes = {"mug": at_the_edge + np.array([0, 0, beyond, 0], np.float32)}
+        first = replace(photo_set.scenes[0], boxes=boxes)
+        (answer,) = measure_scene(first, photo_set, memory, Attender(TOY, memory))
+        ious.append(answer["iou"])
+    assert ious == [1.0, 1.0]
 
 
 def row(**changed: object) -> dict[str, object]:

@@ -2,22 +2,23 @@
 
 import json
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
-from shutil import rmtree
+from shutil import copy, rmtree
 
 import pytest
 import torch
 from safetensors.torch import load_file
 
-from tests.command import refused
+from tests.command import refused, vap
 from tests.deaths import die_before_each_rename
 from tests.random_kills import kill_in, serving
 from vap_core.base.errors import BadOutput, BadPolicy
-from vap_core.base.files import SHIPPED, sha256_of
+from vap_core.base.files import DATA, SHIPPED, sha256_of
 from vap_core.base.types import Description
 from vap_core.policies.lerobot.adapter import load_policy
+from vap_core.policies.lerobot.checkpoints import fingerprint
 from vap_core.policies.mini_pi0.learned_token import TokenTraining
 from vap_core.policies.mini_pi0.vlm import MiniVlm, load_from_policy, load_vlm
 from vap_core.training.films import demonstrations
@@ -182,6 +183,33 @@ def test_a_training_goes_on_from_another_policys_weights(
         train("third", "grown-from", start=str(tmp_path / "grown-from"))
 
 
+@pytest.mark.parametrize("name", ["tabletop", "shared-pair", SUITE, f"{SUITE}-wide"])
+def test_words_are_taught_where_they_mean_the_same(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Policies of before the recipe moved their words; shared-pair's recipe teaches none."""
+
+    def load_films(*asked: object) -> policy.Films:
+        return policy.Films([], [])
+
+    monkeypatch.setattr(policy, "load_films", load_films)
+    start = SHIPPED / f"mini-pi0-{name}"
+    model = SHIPPED / ("mini-paligemma-tint-free" if name.endswith("wide") else "mini-paligemma")
+
+    def train(**changes: object) -> None:
+        recipe = replace(RECIPES[SUITE], start=str(start), **changes)
+        policy.train(recipe, tmp_path / str(changes), vlm=model, cache=tmp_path / "cache", jobs=1)
+
+    if name.endswith("wide"):
+        with pytest.raises(BadOutput, match="holds no film"):
+            train()
+    else:
+        with pytest.raises(BadPolicy, match=r"mean cosine 0\.7\d, .* leave out --vlm"):
+            train()
+        with pytest.raises(BadOutput, match="holds no film"):
+            train(taught=0)
+
+
 def test_a_training_that_is_ended_again_and_again_ends_like_one_that_was_not(
     stage: tuple[Path, list[Film]],
     tmp_path: Path,
@@ -253,6 +281,58 @@ def assert_same(torn: Path, whole: Path) -> None:
         assert all(torch.equal(one[part], other[part]) for part in one)
 
 
+def test_the_card_says_which_demonstrations_were_learned_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a dataset the cost is not known; of two stages none is held out."""
+
+    def captions(names: Iterable[str], *where: object) -> tuple[dict[str, Description], float]:
+        return {name: Description("white", "a tall thing, mostly white") for name in names}, 0.0
+
+    monkeypatch.setattr(policy, "captions", captions)
+    shown = DATA / "demonstrations" / SUITE
+    recipe = replace(TINY, steps=1, batch=2, draws=1, seed=3)
+    card = policy.train(recipe, tmp_path / "out", demonstrations=shown, jobs=1)
+    assert card["demonstrations"] == {"suite": SUITE, "seed": 7, "stages": 2}
+    assert (card["recipe"]["stages"], card["recipe"]["seed"]) == (2, 3)
+    kept = json.loads((tmp_path / "out" / "training.json").read_text())
+    assert kept == json.loads(json.dumps(card))
+    assert set(card["cpu_hours"]) == {"vlm", "captions", "steps", "total"}
+    assert card["held_out"] == {}
+    with pytest.raises(BadOutput, match=f"shows {SUITE}, not vlabench"):
+        policy.train(RECIPES["vlabench"], tmp_path / "other", demonstrations=shown)
+    # What ships, as `locate` wants it, and nothing else that a training leaves.
+    ships = {file.name for file in (SHIPPED / "mini-pi0-simpler-bridge").iterdir()}
+    (tmp_path / "copy").mkdir()
+    for name in ships:
+        copy(tmp_path / "out" / name, tmp_path / "copy" / name)
+    assert {file.name for file in (tmp_path / "out").iterdir()} > ships | {"recipe.json"}
+    assert fingerprint(tmp_path / "copy") == fingerprint(tmp_path / "out")
+
+
+def test_the_cost_of_a_model_whose_card_says_none_is_left_out() -> None:
+    assert policy._vlm_cost_s(None) == 0.0
+    assert policy._vlm_cost_s(SHIPPED / "mini-paligemma") is None
+    known_s = policy._vlm_cost_s(SHIPPED / "mini-paligemma-tint-free")
+    assert known_s == pytest.approx(0.46 * 3600, rel=0.02)
+
+
+def test_stages_are_refused_beside_demonstrations(tmp_path: Path) -> None:
+    shown = ("--demonstrations", DATA / "demonstrations" / SUITE)
+    line = refused("train", "policy", "--suite", SUITE, *shown, "--stages", "2", "--out", tmp_path)
+    assert "--stages films scenes, --demonstrations takes all stages" in line
+    assert not list(tmp_path.iterdir())
+
+
+def test_that_no_film_was_held_out_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    card = {"held_out": {}, "cpu_hours": {"total": 0.1}}
+    monkeypatch.setattr(policy, "train", lambda *asked, **how: card)
+    words = ("train", "policy", "--suite", SUITE, "--vlm", SHIPPED / "mini-paligemma-tint-free")
+    assert vap(*words).stdout.startswith("no film was held out (every 19th stage is)")
+    card["held_out"] = {"flow": 0.5}
+    assert vap(*words).stdout.startswith('{\n "flow": 0.5\n}')
+
+
 def test_films_of_what_is_held_out_are_refused(stage: tuple[Path, list[Film]]) -> None:
     _, films = stage
     policy._require_trainable(TINY, films)
@@ -295,3 +375,27 @@ def test_a_folder_that_cannot_be_written_is_said_before_the_work(
     line = refused("train", *words, *out, option, tmp_path / "file" / "in-it")
     assert f"{tmp_path}/file/in-it cannot be written (Not a directory)" in line
     assert f"choose another folder with {option}" in line
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--vlm", "nowhere"), "nowhere holds no mini-paligemma"),
+        (("--start", "nowhere"), "nowhere is no mini-pi0 to go on from"),
+        (
+            (
+                *("--start", SHIPPED / "mini-pi0-simpler-bridge-wide"),
+                *("--vlm", SHIPPED / "mini-paligemma"),
+            ),
+            "did not grow from this mini-paligemma",
+        ),
+    ],
+    ids=["vlm", "start", "other-vlm"],
+)
+def test_what_a_training_grows_from_is_read_before_the_films(
+    words: tuple[str | Path, ...], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(policy, "load_films", lambda *asked: pytest.fail("films were asked for"))
+    folders = ("--out", tmp_path / "out", "--cache", tmp_path / "cache")
+    line = refused("train", "policy", "--suite", SUITE, *folders, *words)
+    assert told in line.lower()

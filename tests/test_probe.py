@@ -19,6 +19,7 @@ from vap_core.training.films.demonstrations import draw_objects, row
 from vap_core.training.policy import probe
 from vap_core.training.policy.probe import WAYS, ProbePrompter, conclude, keep, of_shipped
 
+from .command import refused
 from .test_soft_prompt import SUITE, grown  # noqa: F401
 from .toys import observation
 
@@ -115,6 +116,23 @@ def test_another_way_to_ask_is_kept_beside_those_of_before(tmp_path: Path) -> No
     ]
 
 
+def test_a_table_that_cannot_be_added_to_is_said_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(probe, "_scene", lambda *asked: pytest.fail("an episode was played"))
+    monkeypatch.setattr(probe, "results", lambda **asked: pytest.fail("scenes were begun"))
+    damaged, foreign, file = tmp_path / "bad.parquet", tmp_path / "other.parquet", tmp_path / "file"
+    damaged.write_bytes(b"PAR1")
+    pd.DataFrame({"suite": ["one"]}).to_parquet(foreign)
+    file.touch()
+    for out in (damaged, foreign, file / "probe.parquet"):
+        before = out.read_bytes() if out.exists() else None
+        told = refused("eval-policy", "--suite", SUITE, "--out", out)
+        assert told.startswith("error: probe: ")
+        assert "--out" in told
+        assert (out.read_bytes() if out.exists() else None) == before
+
+
 def test_episodes_of_the_policy_that_ships_go_before_those_of_others() -> None:
     ships, other = label_of(shipped_checkpoint(SUITE)), "mini_pi0:mini-pi0-older@00c47015"
     table = pd.DataFrame({"suite": [SUITE, SUITE, "vlabench"], "policy": [other, ships, other]})
@@ -130,6 +148,8 @@ def test_what_cannot_be_asked_for_is_told_in_a_line(grown: tuple[Path, Path]) ->
         probe.probe(str(grown[1]), SUITE, ways=("shouted",))
     with pytest.raises(UnknownName, match="suite 'simpler-bridge-dev' is unknown"):
         probe.probe(str(grown[1]), "simpler-bridge-dev")
+    with pytest.raises(BadStudy, match="shared-pair name two personal objects.*with eval"):
+        probe.probe(str(grown[1]), "shared-pair")
     with pytest.raises(BadStudy, match="name one by --ways"):
         probe.probe(str(grown[1]), SUITE, ways=())
     with pytest.raises(BadPolicy, match="decides on 4 actions at a time; ask for 1 to 4"):

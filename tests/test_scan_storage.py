@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from tests.command import vap
 from vap_core.base.errors import BadObject, BadOutput
 from vap_core.simulation.assets.scans import storage
 from vap_core.simulation.assets.scans.storage import Scan, ScanMetadata
@@ -44,6 +45,23 @@ def shelf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("VAP_OBJECTS", str(tmp_path))
     storage.save_scan(tmp_path, METADATA, cube())
     return tmp_path
+
+
+@pytest.mark.parametrize("kind", ["nothing", "a file"])
+def test_a_variable_that_names_no_folder_is_told(tmp_path: Path, kind: str) -> None:
+    """Else an object in the folder that was meant would be unknown, or not be listed."""
+    place = tmp_path / "objects"
+    if kind == "a file":
+        place.write_bytes(b"no folder")
+    for words in (("list",), ("photograph", "my-mug", "--out", tmp_path / "photos")):
+        done = vap("objects", *words, env={"VAP_OBJECTS": str(place)})
+        assert (done.returncode, done.stdout) == (2, "")
+        assert done.stderr.strip().startswith(f"error: objects: VAP_OBJECTS={place} is no folder; ")
+
+
+def test_an_empty_variable_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VAP_OBJECTS", "")
+    assert storage.scans_folder() == Path("data/objects")
 
 
 def test_a_replacement_killed_between_its_renames_loses_nothing(shelf: Path) -> None:

@@ -5,6 +5,7 @@ import pytest
 
 from tests.pages import ROOT
 from vap_core.analysis import shared_films, shared_scenes
+from vap_core.base.errors import BadOutput
 from vap_core.base.files import DATA, SHIPPED
 from vap_core.evaluation.paper import ledger
 from vap_core.evaluation.parsers import report
@@ -166,6 +167,34 @@ def test_a_policy_that_was_taught_pairs_is_named_apart_from_the_benchmarks_own()
         "expert",
     ]
     assert [shared_scenes._policy_name(name) for name in names] == list(shared_scenes.POLICY_ORDER)
+
+
+def test_a_policy_of_ones_own_comes_last_under_its_label(monkeypatch, tmp_path):
+    """Two of its checkpoints, and the shipped one with another sampling noise, are not pooled."""
+    labels = [
+        "pi0:second@0000aaaa",
+        "expert",
+        "mini_pi0:mini-pi0-tabletop@f212e7e5",
+        "mini_pi0:mini-pi0-tabletop@f212e7e5, temperature 0.5",
+        "pi0:first@0000bbbb",
+        "mini_pi0:mini-pi0-tabletop-wide@0000cccc",
+    ]
+    tables = []
+    for label in labels:
+        tables.append(({}, sequence(ENDS).assign(policy=label)))
+    monkeypatch.setattr(shared_scenes, "read_runs", lambda _: tables)
+    found = shared_scenes.shared_episodes(tmp_path / "mine.parquet")
+    own = [labels[i] for i in (5, 3, 4, 0)]
+    assert list(dict.fromkeys(found["policy"])) == ["mini-pi0", "expert", *own]
+    table = shared_scenes.sequence_table(found)
+    assert set(table["n"]) == {len(ENDS)}
+    shared_scenes.shared_figure(found)
+
+
+def test_a_table_of_other_suites_is_refused():
+    said = "mini_pi0.parquet holds episodes of .*tabletop.*; publish .* --suite shared-pair"
+    with pytest.raises(BadOutput, match=said):
+        shared_scenes.shared_episodes(DATA / "results" / "mini_pi0.parquet")
 
 
 def test_the_page_names_the_frozen_policy_of_the_published_rows():

@@ -22,6 +22,7 @@ from vap_core.evaluation.perception.estimates import (
     mean,
     precision,
     share,
+    share_by,
 )
 from vap_core.evaluation.perception.report import ALL, Measure
 from vap_core.evaluation.perception.run import Survey, plan, publish, read
@@ -85,6 +86,25 @@ def test_share_ignores_what_is_not_known_and_has_wilsons_interval() -> None:
 
 def frame(episodes: list[int], values: list[float | None]) -> pd.DataFrame:
     return pd.DataFrame({"suite": "s", "task": "t", "episode": episodes, "x": values})
+
+
+EPISODE_COLUMNS = ["suite", "task", "episode"]
+
+
+def test_rows_that_repeat_their_episode_do_not_narrow_its_share() -> None:
+    """A track at six lengths of hiding is of one episode."""
+    once = frame(list(range(8)), [1, 1, 1, 1, 1, 1, 0, 0])
+    six_times = pd.concat([once] * 6)
+    alone = share_by(once, "x", EPISODE_COLUMNS)
+    repeated = share_by(six_times, "x", EPISODE_COLUMNS)
+    wilson = rate(6, 8)
+    assert (alone.value, alone.n, repeated.n) == (0.75, 8, 48)
+    assert (alone.low, alone.high) == pytest.approx((wilson.low, wilson.high))
+    assert (repeated.low, repeated.high) == pytest.approx((alone.low, alone.high))
+    assert share(six_times.x).low > alone.low + 0.15, "as if each row were an episode"
+    unknown = frame([0, 1, 1], [1, None, None])
+    assert share_by(unknown, "x", EPISODE_COLUMNS).n == 1
+    assert share_by(unknown[1:], "x", EPISODE_COLUMNS).text() == "-"
 
 
 def test_mean_is_bootstrapped_by_episode_not_by_view() -> None:

@@ -13,9 +13,11 @@ from scipy.stats import ortho_group
 from typer.testing import CliRunner
 
 from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadStudy, UnknownName
+from vap_core.base.files import DATA
 from vap_core.base.types import Rgb
 from vap_core.cli import app
 from vap_core.evaluation import engine, trials
+from vap_core.evaluation.metrics import rate
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.tokens import choices, report, study
 from vap_core.evaluation.tokens.choices import Scene
@@ -311,3 +313,73 @@ def test_the_highest_score_is_the_choice() -> None:
     cost = choices.cost_of_policy(both, pd.DataFrame(rows, columns=columns))
     assert (cost.value, cost.n) == (0, 3), "one of three in the scene, and one of three touched"
     assert cost.low <= 0 <= cost.high
+
+
+def chosen_in_both(right: dict[str, tuple[bool, bool]], episodes: int) -> pd.DataFrame:
+    """Rows of `choices.scores`: per object, whether it is chosen in photos and in the scene."""
+    lines = []
+    for target, by_view in right.items():
+        for seen_in, is_right in zip((choices.PHOTO, choices.SCENE), by_view, strict=True):
+            for episode in range(episodes):
+                about = {"suite": "s", "task": target, "object": target, "episode": episode}
+                for shown, score in ((target, float(is_right)), ("look-alike", 0.5)):
+                    lines.append({**about, "seen_in": seen_in, "shown": shown, "score": score})
+    return pd.DataFrame(lines)
+
+
+def touches(right: dict[str, bool], episodes: int) -> pd.DataFrame:
+    """Episodes of soft: per object, whether it is touched first."""
+    lines = []
+    for target, is_right in right.items():
+        for episode in range(episodes):
+            line = {"suite": "s", "task": target, "episode": episode, "method": "soft"}
+            lines.append({**line, "first_object_correct": is_right})
+    return pd.DataFrame(lines)
+
+
+@pytest.mark.parametrize("episodes", [6, 24])
+def test_objects_are_the_units_whatever_the_number_of_their_episodes(episodes: int) -> None:
+    """Each object has one learned token: more episodes with it say nothing of other tokens."""
+    table = chosen_in_both({"cup": (True, False), "owl": (True, True)}, episodes)
+    cost = choices.cost_of_scene(table)
+    assert (cost.value, cost.low, cost.high, cost.n) == (0.5, 0, 1, 2 * episodes)
+    touched = touches({"cup": False, "owl": False}, episodes)
+    cost = choices.cost_of_policy(table, touched)
+    assert (cost.value, cost.low, cost.high) == (0.5, 0, 1)
+    in_scene = choices.beside_policy(table, touched, ["soft"]).loc["s", choices.IN_SCENE]
+    wilson = rate(1, 2)
+    assert (in_scene.value, in_scene.n) == (0.5, 2 * episodes)
+    assert (in_scene.low, in_scene.high) == pytest.approx((wilson.low, wilson.high))
+
+
+def test_the_loss_of_a_suite_is_corrected_for_the_others() -> None:
+    right = {f"object-{i}": (True, False) for i in range(6)}
+    one = chosen_in_both(right, 2)
+    other = chosen_in_both({"cup": (True, False), "owl": (True, True)}, 2).assign(suite="other")
+    touched = touches(dict.fromkeys([*right], False), 2)
+    touched = pd.concat([touched, touches({"cup": False, "owl": True}, 2).assign(suite="other")])
+    found = choices.losses(pd.concat([one, other]), touched).loc[choices.TO_SCENE]
+    assert list(found.index) == ["s", "other", choices.ALL_SUITES]
+    assert list(found.objects) == [6, 2, 8]
+    assert [each.value for each in found.loss] == pytest.approx([1, 0.5, 7 / 8])
+    assert list(found.p) == pytest.approx([2**-5, 1, 2**-6])
+    assert list(found.p_holm) == pytest.approx([2**-4, 1, 2**-6])
+
+
+def test_the_differences_of_forms_of_the_token_are_by_token() -> None:
+    """Those of the published table: four tokens, whose mean says little of a fifth."""
+    loop = pd.read_parquet(DATA / "results" / "token_closed_loop.parquet")
+    own = report.success_by_token(loop, "soft-own")
+    assert {task: round(100 * gain) for (_, task), gain in own.items()} == {
+        "pick-shaver": -50,
+        "put-camera": -4,
+        "put-owl-figurine": -17,
+        "put-straw-cup": -42,
+    }
+    found = report.mean_of_tokens(list(own), least=-1.0)
+    reference = stats.ttest_1samp(own, 0).confidence_interval()
+    assert found.n == 4
+    assert (found.low, found.high) == pytest.approx((reference.low, reference.high))
+    assert found.low < 0 < found.high
+    certain = report.mean_of_tokens([-1.0, -0.9], least=-1.0)
+    assert certain.low == -1, "no success is lost twice"

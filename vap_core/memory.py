@@ -5,6 +5,7 @@ References are crops of photos, and their embeddings Z_o.
 
 import json
 import re
+import shlex
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -31,6 +32,8 @@ REFERENCE_THRESHOLD = 0.05
 """A photo of the object shows one of its category, so a reference's box needs a lower score than a
 proposal does."""
 CATEGORY = re.compile(r"[^\W\d_][\w -]*")
+OWNED = re.compile(r"(?:(?:my|our|his|her|their|the|an?) )+(?=.)")
+"""What stands before a category in an instruction, and is no part of it."""
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,63}")
 AGAIN = "register the object again with --replace, or delete the file"
 
@@ -107,6 +110,15 @@ def plain_category(category: str) -> str:
     return " ".join(normalize("NFC", category).lower().split())
 
 
+def kind_instead(category: str) -> str:
+    """A word to write instead of a category that will not do; "" where it will."""
+    plain = plain_category(category)
+    if not CATEGORY.fullmatch(plain):
+        return "cup"
+    before = OWNED.match(plain)
+    return plain[before.end() :] if before else ""
+
+
 def check_names(name: str, category: str) -> None:
     """Raises: BadMemory: no usable name or category of an object."""
     if not NAME.fullmatch(name):
@@ -114,10 +126,11 @@ def check_names(name: str, category: str) -> None:
             f"remember: {name!r} cannot name an object; use letters, digits, space, dot, dash or "
             "underscore."
         )
-    if not CATEGORY.fullmatch(plain_category(category)):
+    kind = kind_instead(category)
+    if kind:
         raise BadMemory(
-            f"remember: {category!r} cannot be a category; name the kind of thing in words, for "
-            "example --category cup."
+            f"remember: {category!r} cannot be a category; name the kind of thing alone, in words, "
+            f"for example --category {shlex.quote(kind)}."
         )
 
 

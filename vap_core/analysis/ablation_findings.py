@@ -73,7 +73,8 @@ def verdict(found: Comparison, theirs: float) -> str:
     """
     within = found.low <= theirs <= found.high
     if not is_shown(found):
-        return "cannot tell" if within else "not here: as much is excluded"
+        beyond = theirs < found.low if theirs < 0 else theirs > found.high
+        return "not here: as much is excluded" if beyond else "cannot tell"
     if within:
         return "holds"
     if theirs * found.difference < 0:

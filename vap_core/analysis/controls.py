@@ -129,7 +129,8 @@ class Abstention(Control):
 
     `choices` is the survey's table of that name.
 
-    Raises: MissingPart: the extra `notebooks` is not installed.
+    Raises: UnknownName for a `k` that it does not have; MissingPart: the extra `notebooks` is not
+        installed.
     """
 
     def __init__(self, choices: "pd.DataFrame", k: int = 5, threshold: float = 0.6) -> None:
@@ -138,6 +139,8 @@ class Abstention(Control):
 
         self._choices = choices
         numbers = sorted({int(number) for number in choices.k})
+        if k not in numbers:
+            raise one_of("Abstention: number of photos", str(k), numbers)
         suites = [ALL, *dict.fromkeys(choices.suite)]
         self.suite = ipywidgets.Dropdown(options=suites, value=ALL, description="suite")
         self.k = ipywidgets.SelectionSlider(options=numbers, value=k, description="photos K")

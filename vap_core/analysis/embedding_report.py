@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from vap_core.analysis.embedding_search import Watch
 from vap_core.analysis.embedding_space import compare, compare_tokens
 from vap_core.base.errors import BadOutput, BadPolicy
-from vap_core.base.files import write_atomic, writing
+from vap_core.base.files import make_folder, write_atomic, writing
 from vap_core.base.tables import align
 from vap_core.evaluation.paper import ledger
 from vap_core.policies.embedding_table import open_table
@@ -101,16 +101,27 @@ def report(table: "pd.DataFrame") -> str:
     return f"{align(rows)}\n\n{note}"
 
 
+def check_output(path: Path) -> None:
+    """Make the folder of a file that `keep` will write, before the work.
+
+    Raises: BadOutput when the name ends otherwise than .parquet or .csv, or the folder cannot be
+        written.
+    """
+    if path.suffix not in (".parquet", ".csv"):
+        raise BadOutput(
+            f"embeddings: {path} ends with neither .parquet nor .csv; choose another --out."
+        )
+    make_folder(path.parent, "embeddings", "choose another --out")
+
+
 def keep(table: "pd.DataFrame", path: Path) -> None:
     """Write the rows as Parquet or CSV, by the name's ending. Raises: BadOutput."""
+    check_output(path)
+    if path.suffix == ".csv":
+        data = table.to_csv(index=False).encode()
+    else:
+        data = table.to_parquet(index=False, compression="zstd")
     with writing(path, "embeddings", "choose another --out"):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.suffix == ".csv":
-            data = table.to_csv(index=False).encode()
-        elif path.suffix == ".parquet":
-            data = table.to_parquet(index=False, compression="zstd")
-        else:
-            raise BadOutput(f"embeddings: {path} ends with neither .parquet nor .csv.")
         write_atomic(path, data)
 
 

@@ -23,6 +23,9 @@ FOLDER_HZ = 10.0
 RETRY = 5
 """While the object is not in view, every so many frames are grounded."""
 
+SPANS = 6
+"""A summary names as many stretches without the object; of others it gives the number."""
+
 
 @value
 class ClipSummary:
@@ -42,8 +45,10 @@ class ClipSummary:
             f"grounded in frame {self.grounded} of {self.frames}; tracked in {self.tracked} frames"
         ]
         if self.lost:
-            spans = ", ".join(f"{first}-{last}" for first, last in self.lost[:6])
-            lines.append(f"not visible in frames {spans}")
+            spans = ", ".join(f"{first}-{last}" for first, last in self.lost[:SPANS])
+            more = len(self.lost) - SPANS
+            also = f" and {more} more" if more > 0 else ""
+            lines.append(f"not visible in frames {spans}{also}")
         lines.append(f"instruction: {self.text}")
         return "\n".join(lines)
 

@@ -47,6 +47,10 @@ Ways = Mapping[str, Mapping[str, Grounding]]
 
 def episode(suite: str, task: str, number: int) -> EpisodeRow:
     """Episode `number` of a task's list. Raises: UnknownName."""
+    if number < 0:
+        raise UnknownName(
+            f"inspection.episode: no episode {number} of {suite}/{task}; the first is 0."
+        )
     n = number + 1 if suite in suites.WARM_UPS else None
     rows = suites.rows(suite, task, n=n)
     for row in rows:
@@ -290,7 +294,7 @@ def write_photo(folder: Path, row: EpisodeRow, camera: str, size: int = 448) -> 
     references = folder / "references"
     photo = folder / "photo.png"
     with writing(folder, "inspection.write_photo", "choose another folder"):
-        write_views(get_object(row.target), references)
+        write_views(get_object(row.target), references, replace=True)
         images = camera_images(row, size=size)
         Image.fromarray(images[camera]).save(photo)
     return photo, references

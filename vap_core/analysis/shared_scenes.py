@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vap_core.base.errors import BadOutput
 from vap_core.base.figures import empty_figure
 from vap_core.base.palette import FRAME, GRID, METHODS, TEXT
 from vap_core.evaluation import paper
@@ -19,7 +20,7 @@ from vap_core.evaluation.metrics import Rate, rate
 from vap_core.evaluation.parsers.paraphrases import KINDS
 from vap_core.evaluation.publish import read_runs
 from vap_core.evaluation.statistics import bootstrap_interval
-from vap_core.policies.names import MINI, checkpoint_of
+from vap_core.policies.names import MINI, TEMPERATURE, checkpoint_of
 from vap_core.simulation import suites
 from vap_core.simulation.suites import shared
 from vap_core.training.recipe import FILMED
@@ -48,18 +49,27 @@ POLICY_ORDER = (MINI, TAUGHT, "scripted", "expert")
 
 
 def shared_episodes(path: Path) -> "pd.DataFrame":
-    """Every episode of a published table in the lists' order, its policy by a short name.
+    """Every episode of a published table in the lists' order.
 
-    Raises: BadOutput.
+    A policy of POLICY_ORDER has its short name. Others come after them, under their labels.
+
+    Raises: BadOutput, also for a table with episodes of other suites.
     """
     import pandas as pd
 
     episodes = pd.concat([episodes for _, episodes in read_runs(path)], ignore_index=True)
+    others = sorted(set(episodes["suite"]) - set(SUITE_ORDER))
+    if others:
+        raise BadOutput(
+            f"shared_episodes: {path} holds episodes of {', '.join(others)}; publish those of "
+            f"shared scenes alone: --suite {' --suite '.join(SUITE_ORDER)}."
+        )
     episodes = episodes.assign(policy=episodes["policy"].map(_policy_name))
+    own = sorted(set(episodes["policy"]) - set(POLICY_ORDER))
     order = pd.DataFrame(
         {
             "suite": episodes["suite"].map(SUITE_ORDER.index),
-            "policy": episodes["policy"].map(POLICY_ORDER.index),
+            "policy": episodes["policy"].map([*POLICY_ORDER, *own].index),
             "method": episodes["method"],
             "task": episodes["task"].map(_task_order()),
             "episode": episodes["episode"],
@@ -245,15 +255,15 @@ def shared_figure(episodes: "pd.DataFrame", title: str = "") -> "Figure":
 
     Raises: BadOutput, as `paper.ledger`.
     """
-    sequences = sequence_table(episodes)
-    sequences = sequences[sequences["task"] == ALL]
-    pairs = pair_table(episodes)
-    pairs = pairs[pairs["task"] == ALL]
     names = [name for name in SUITE_ORDER if name in set(episodes["suite"])]
     tables = {}
     for name in names:
-        table = pairs.rename(columns={"SR": "both"}) if name == PAIR else sequences
-        tables[name] = table[table["suite"] == name]
+        of_suite = episodes[episodes["suite"] == name]
+        if name == PAIR:
+            table = pair_table(of_suite).rename(columns={"SR": "both"})
+        else:
+            table = sequence_table(of_suite)
+        tables[name] = table[table["task"] == ALL]
     n_lines = max(len(table) for table in tables.values())
     figure = empty_figure(3.3 * len(names), 0.34 * n_lines + 1.5)
     for axes, (name, table) in zip(
@@ -327,7 +337,9 @@ def _task_order() -> dict[str, int]:
 
 
 def _policy_name(policy: str) -> str:
-    name = policy.partition(":")[0].replace("_", "-")
-    if checkpoint_of(policy).startswith(f"{MINI}-{PAIR}"):
-        return TAUGHT
-    return MINI if name.startswith(MINI) else name
+    """The short name of a policy that was published here; any other's label."""
+    if TEMPERATURE in policy:
+        return policy
+    names = {f"{MINI}-{benchmark}": MINI for benchmark in suites.BENCHMARKS}
+    names[f"{MINI}-{PAIR}"] = TAUGHT
+    return names.get(checkpoint_of(policy), policy)

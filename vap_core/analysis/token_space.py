@@ -6,16 +6,17 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from vap_core.analysis.embedding_search import nearest_tokens, paired_cosines
-from vap_core.base.files import parse_json
-from vap_core.evaluation.perception.estimates import Estimate
+from vap_core.base.errors import BadPolicy
+from vap_core.evaluation.perception.estimates import NONE, Estimate
 from vap_core.evaluation.statistics import bootstrap_interval
-from vap_core.policies.embedding_table import open_table
+from vap_core.policies.embedding_table import check_width, open_table
 from vap_core.policies.mini_pi0.token_alignment import (
     align,
     held_out_cosines,
     orthogonal_map,
     shared_tables,
 )
+from vap_core.policies.token_groups import vocabulary_of
 
 READ = 0.9999
 """A word whose cosine is above it has been left alone: the policy's films never say it."""
@@ -24,13 +25,25 @@ READ = 0.9999
 def nearest_words(
     embedding: Float32[np.ndarray, " d"], model: Path, k: int = 6
 ) -> list[tuple[str, float]]:
-    """The words of a small model that are nearest to an embedding, and their cosines.
+    """The words of a model that are nearest to an embedding, and their cosines.
 
-    Raises: BadPolicy, as `open_table`.
+    The words are those of a small model's config.json or of a tokenizer.json in the folder. A row
+    that is no word's is "token N".
+
+    Raises: BadPolicy, as `open_table`; for an embedding of another width; for a folder without
+        words.
     """
-    words = parse_json((model / "config.json").read_text())["words"]
-    found = nearest_tokens(embedding, open_table(model), k)
-    return [(words[token], cosine) for token, cosine in found]
+    table = open_table(model)
+    check_width(table, len(embedding), "the embedding")
+    found = vocabulary_of(model)
+    if found is None:
+        raise BadPolicy(
+            f"nearest_words: {model} does not say what its tokens are; put the model's "
+            "tokenizer.json there."
+        )
+    words = {token: word for word, token in found[0].items()}
+    nearest = nearest_tokens(embedding, table, k)
+    return [(words.get(token, f"token {token}"), cosine) for token, cosine in nearest]
 
 
 def longest_word(model: Path) -> float:
@@ -73,6 +86,8 @@ def rotation_cosines(model: Path, policy: Path) -> dict[str, Float64[np.ndarray,
 
 
 def mean_cosine(cosines: Float64[np.ndarray, " w"]) -> Estimate:
-    """The mean over words, with its bootstrap interval over words."""
+    """The mean over words, with its bootstrap interval over words; NONE without words."""
+    if not len(cosines):
+        return NONE
     low, high = bootstrap_interval(cosines, np.ones(len(cosines)))
     return Estimate(value=float(cosines.mean()), low=low, high=high, n=len(cosines))

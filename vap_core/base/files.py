@@ -117,6 +117,29 @@ def write_atomic(path: Path, data: bytes, *, replace: bool = True) -> None:
         scratch.write_bytes(data)
 
 
+def write_files(
+    files: Mapping[Path, bytes], caller: str, mend: str, *, replace: bool = False
+) -> None:
+    """Write files; those that hold just these bytes already are left as they are.
+
+    Raises: BadOutput for an OSError; without `replace`, before anything is written, for a file
+        that holds other bytes.
+    """
+    missing: dict[Path, bytes] = {}
+    for path, data in files.items():
+        with writing(path, caller, mend):
+            if path.is_file() and path.read_bytes() == data:
+                continue
+            taken = os.path.lexists(path)
+        if taken and not replace:
+            raise BadOutput(f"{caller}: {path} exists with other contents; {mend}.")
+        missing[path] = data
+    for path, data in missing.items():
+        with writing(path, caller, mend):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomic(path, data, replace=replace)
+
+
 def remove_scratch(folder: Path, pattern: str = ".*.tmp") -> None:
     """Remove what killed processes left in a folder: scratch as old as ABANDONED_S, if it can be.
 

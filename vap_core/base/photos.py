@@ -104,9 +104,18 @@ def photos_in(folder: Path) -> list[Path]:
     """The picture files of a folder by their suffixes, in the order of their names.
 
     Hidden ones, such as the `._NAME` that macOS writes beside its files, are left out.
+
+    Raises: BadPhoto: there is no such folder, or it cannot be read.
     """
+    try:
+        paths = list(folder.iterdir())
+    except OSError as error:
+        raise BadPhoto(
+            f"photos_in: {folder} cannot be read as a folder ({error.strerror or error}); name a "
+            "folder of photos."
+        ) from error
     found = []
-    for path in folder.iterdir():
+    for path in paths:
         if path.suffix.lower() in PICTURE_SUFFIXES and not path.name.startswith("."):
             found.append(path)
     return sorted(found)

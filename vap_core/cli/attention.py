@@ -77,14 +77,15 @@ def attention(
     """
     from vap_core.analysis.attention import examples, replay, report
     from vap_core.analysis.attention.tables import publish as publish_tables
+    from vap_core.base.commands import command
 
     if out is None:
         table = run.suffix == ".parquet"
         out = Path("data/runs") / f"attention-{run.stem}" if table else run / "attention"
     if record:
         path, step = examples.record(run, record, out / "recordings", out / "memory", policy)
-        picture = f"{path} {path.stem}.png --attention --frame {step}"
-        print(f"wrote {path}\nnext: python -m vap_core show {picture}")
+        words = ("show", path, f"{path.stem}.png", "--attention", "--frame", str(step))
+        print(f"wrote {path}\nnext: {command(*words)}")
         return
     wanted = replay.Wanted(
         suites=tuple(names(suite)),

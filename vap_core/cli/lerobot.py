@@ -1,5 +1,6 @@
 """Commands for lerobot's own: attach VAP to a checkpoint, look into a dataset."""
 
+import shlex
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -66,10 +67,27 @@ def attach_command(
         episodes=episodes,
     )
     print(f"wrote {out}: the checkpoint, and VAP before it in its preprocessor")
-    print(
-        f"next: lerobot-eval --policy.path={out} --env.type=vap "
-        "--env.task=simpler-bridge/put-camera --eval.n_episodes=24 --seed=0"
-    )
+    words = ["lerobot-eval", f"--policy.path={out}", "--env.type=vap"]
+    words += [f"--env.task={_task_to_try(checkpoint, memory)}", "--eval.n_episodes=20", "--seed=0"]
+    print(f"next: {shlex.join(words)}")
+
+
+def _task_to_try(checkpoint: str, memory: Path) -> str:
+    """A task of the suite that a checkpoint was trained for, of an object in the memory if any.
+
+    SUITE/TASK where the checkpoint does not say its suite.
+    """
+    from vap_core.memory import load_bank
+    from vap_core.policies.lerobot.checkpoints import trained_for
+    from vap_core.simulation import suites
+
+    name = trained_for(checkpoint)
+    if name not in suites.SUITES:
+        return "SUITE/TASK"
+    tasks = suites.suite(name).tasks
+    known = {remembered.category for remembered in load_bank(memory).values()}
+    task = next((task for task in tasks if task.category in known), tasks[0])
+    return f"{name}/{task.name}"
 
 
 @app.command("inspect-dataset")
@@ -116,6 +134,7 @@ def inspect_dataset_command(
 
     require("policy", "inspect-dataset")
     from vap_core.analysis.dataset_inspection import TABLE, inspect_dataset, report_table
+    from vap_core.base.commands import command
     from vap_core.base.errors import BadDataset
 
     if masks and copy is None:
@@ -136,4 +155,4 @@ def inspect_dataset_command(
     first = out / "episode_000000.rrd"
     copied = f" and the dataset {copy}" if copy is not None else ""
     print(f"wrote {out / TABLE}, {len({r.episode for r in reports})} recordings{copied}")
-    print(f"look: python -m vap_core view {first}")
+    print(f"look: {command('view', first)}")

@@ -58,6 +58,7 @@ def import_object(
 
     Example: python -m vap_core objects import mug.glb --category cup --height-cm 9
     """
+    from vap_core.base.commands import command
     from vap_core.simulation.assets import objects
     from vap_core.simulation.assets.scans import import_scan, storage
     from vap_core.simulation.grasps import too_wide_for
@@ -89,8 +90,7 @@ def import_object(
     preview = folder / f"{metadata.name}.preview.png"
     write_preview(model, preview)
     print(f"look: {preview}")
-    setting = ""
-    use = f"eval --suite SUITE --object '{metadata.name}' --out data/runs/{metadata.name}"
+    environment = {}
     if folder == storage.scans_folder():
         too_wide = too_wide_for(metadata.name)
         if too_wide:
@@ -100,8 +100,10 @@ def import_object(
                 file=sys.stderr,
             )
     else:
-        setting = f"VAP_OBJECTS={folder} "
-    print(f"next: {setting}python -m vap_core {use}  # of a suite that asks for a {category}")
+        environment["VAP_OBJECTS"] = str(folder)
+    words = ("eval", "--suite", "SUITE", "--object", metadata.name)
+    line = command(*words, "--out", f"data/runs/{metadata.name}", environment=environment)
+    print(f"next: {line}  # of a suite that asks for a {category}")
 
 
 @app.command("designs")
@@ -117,11 +119,12 @@ def designs(
 
     Example: python -m vap_core objects designs data/designs --seed 1
     """
+    from vap_core.base.commands import command
     from vap_core.simulation.assets.scans.designs import TABLE, write_designs
 
     paths = write_designs(out, count, seed)
     print(f"wrote {len(paths)} designs to {out}, and their kinds to {out / TABLE}")
-    print(f"next: python -m vap_core eval-objects {out}")
+    print(f"next: {command('eval-objects', out)}")
 
 
 @app.command("list")
@@ -145,11 +148,11 @@ def photograph(
 
     Example: python -m vap_core objects photograph camera-personal --out data/photos/camera
     """
+    from vap_core.base.commands import command
     from vap_core.simulation.assets.objects import get_object
     from vap_core.simulation.studio import write_views
 
     model = get_object(name)
     paths = write_views(model, out, views)
     print(f"wrote {views} pictures to {out}")
-    photos = " ".join(f"'{path}'" for path in paths)
-    print(f"next: python -m vap_core register '{name}' --category '{model.category}' {photos}")
+    print(f"next: {command('register', name, '--category', model.category, *paths)}")

@@ -150,13 +150,14 @@ def paste_photos(
     Example: python -m vap_core paste-photos my-things my-small-set --scenes my-desk
         --size 1920x1080 --share 4,13 --objects 12
     """
+    from vap_core.base.commands import command
     from vap_core.evaluation.photos.paste import parse_pasting
     from vap_core.evaluation.photos.paste import paste_photos as paste
     from vap_core.perception.stacks import load_stack
 
     asked = parse_pasting(size, share, pictures=pictures, objects=objects, seed=seed)
     print(paste(photos, scenes, out, asked, load_stack(stack)))
-    print(f"look: {out / 'cuts.png'}\nnext: python -m vap_core eval-photos {out}")
+    print(f"look: {out / 'cuts.png'}\nnext: {command('eval-photos', out)}")
 
 
 @app.command("eval-objects")

@@ -1,7 +1,6 @@
 """Commands about photos of your own objects: register remembers them, ground finds them."""
 
 import json
-import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -103,6 +102,7 @@ def register(
     """
     import dataclasses
 
+    from vap_core.base.commands import command
     from vap_core.evaluation.photos import register as registering
     from vap_core.evaluation.photos.trust import leave_one_out, warnings
     from vap_core.instruction.owners import check_owner
@@ -136,8 +136,8 @@ def register(
     print(f"{obj.name}: a {obj.category} with {len(obj.crops)} references, saved to {path}")
     print(f"look at the crops: {sheet}")
     print(trust)
-    bank = shlex.quote(str(memory))
-    print(f'next: python -m vap_core ground IMAGE "bring my {obj.category}" --memory {bank}')
+    words = ("ground", "IMAGE", f"bring my {obj.category}", "--memory", memory)
+    print(f"next: {command(*words)}")
 
 
 @app.command()
@@ -213,6 +213,7 @@ def ground(
         write_evidence,
     )
     from vap_core.analysis.ground_clip import ground_clip, is_clip
+    from vap_core.base.commands import command
     from vap_core.base.errors import BadInstruction
     from vap_core.base.photos import load_photo, shrink
     from vap_core.instruction.parsers import Parsing
@@ -242,7 +243,7 @@ def ground(
         if note and not always_tint:
             print(f"note: {note}", file=sys.stderr)
         print(summary)
-        print(f"wrote {mp4} and {rrd}; look: python -m vap_core view {shlex.quote(str(rrd))}")
+        print(f"wrote {mp4} and {rrd}; look: {command('view', rrd)}")
         return
     rgb = load_photo(image, long_side=None)
     if tiles is None:  # by the file's own size
@@ -282,7 +283,7 @@ def ground(
         return
     print(found)
     paths = " and ".join(map(str, written))
-    print(f"wrote {paths}; look: python -m vap_core view {shlex.quote(str(written[1]))}")
+    print(f"wrote {paths}; look: {command('view', written[1])}")
 
 
 def note_uses(memory: Path, objects: Sequence[str], speaker: str) -> None:

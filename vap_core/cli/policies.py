@@ -55,7 +55,7 @@ def eval_policy(
     from vap_core.base.errors import BadStudy
     from vap_core.evaluation.study import Study
     from vap_core.simulation import suites
-    from vap_core.training.policy.probe import conclude, keep, probe
+    from vap_core.training.policy.probe import conclude, keep, kept, probe
 
     tasks = tuple((suite, task.name) for task in suites.suite(suite).tasks)
     study = Study(tasks, ("generic",), policy=policy)
@@ -65,6 +65,8 @@ def eval_policy(
             f"eval-policy: {policy!r} has no weights; "
             "take mini-pi0, or a lerobot checkpoint's folder or hub id."
         )
+    if out is not None:
+        kept(out)  # said before the work
     table = probe(
         checkpoint,
         suite,
@@ -161,7 +163,7 @@ def embeddings(
     Example: python -m vap_core embeddings
     Example: python -m vap_core embeddings models/paligemma-3b-pt-224 models/pi0 models/pi05
     """
-    from vap_core.analysis.embedding_report import keep, report, spaces
+    from vap_core.analysis.embedding_report import check_output, keep, report, spaces
     from vap_core.base.errors import BadPolicy
     from vap_core.evaluation.policy_names import shipped
     from vap_core.simulation.suites import BENCHMARKS
@@ -171,6 +173,8 @@ def embeddings(
         folders = [shipped(name) for name in BENCHMARKS if shipped(name).is_dir()]
     if not folders:
         raise BadPolicy("embeddings: name the folder of a policy after the model's.")
+    if out is not None:
+        check_output(out)
     table = spaces(vlm, folders, suite, with_bar)
     print(report(table))
     if out is not None:

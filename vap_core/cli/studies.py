@@ -185,16 +185,22 @@ def study_of(
 ) -> "Study":
     """The study of some tasks.
 
-    Without `methods`, they are generic, and vap unless the policy reads the simulator.
+    Where `methods` is None they are generic, and vap unless the policy reads the simulator.
 
-    Raises: as `Study`.
+    Raises: BadStudy where `methods` are given and name none; else as `Study`.
     """
+    from vap_core.base.errors import BadStudy
     from vap_core.evaluation.policy_names import PRIVILEGED
     from vap_core.evaluation.study import Study
 
-    chosen = tuple(dict.fromkeys(names(",".join(methods or ()))))
+    if methods is None:
+        methods = ["generic"] if policy in PRIVILEGED else ["generic", "vap"]
+    chosen = tuple(dict.fromkeys(names(",".join(methods))))
     if not chosen:
-        chosen = ("generic",) if policy in PRIVILEGED else ("generic", "vap")
+        raise BadStudy(
+            f"--methods: {','.join(methods)!r} names no method; name one, or leave the option out "
+            "for the default, generic,vap."
+        )
     return Study(tasks, chosen, policy=policy, **options)
 
 

@@ -111,13 +111,14 @@ def vlm(
 
     Example: python -m vap_core train vlm --stages 20 --steps 100 --out data/runs/small-vlm
     """
+    from vap_core.base.commands import command
     from vap_core.training.vlm.train import Recipe, train
 
     recipe = Recipe(stages=stages, steps=steps, seed=seed)
     about = train(recipe, out, minutes=minutes)
     print(json.dumps(about["held_out"], indent=1))
     print(f"CPU hours: {json.dumps(about['cpu_hours'])}")
-    print(f"next: python -m vap_core train policy --suite simpler-bridge --vlm {out}")
+    print(f"next: {command('train', 'policy', '--suite', 'simpler-bridge', '--vlm', out)}")
 
 
 @app.command()
@@ -183,7 +184,8 @@ def policy(
         Path | None,
         typer.Option(
             "--demonstrations",
-            help="A dataset of train demonstrations to learn from, instead of filming.",
+            help="A dataset of train demonstrations to learn from, with all of its stages, instead "
+            "of filming; not beside --stages.",
         ),
     ] = None,
     cache: Annotated[
@@ -218,13 +220,19 @@ def policy(
     """
     from dataclasses import replace
 
-    from vap_core.base.errors import one_of
+    from vap_core.base.commands import command
+    from vap_core.base.errors import BadStudy, one_of
     from vap_core.training.recipe import RECIPES
 
     if suite not in RECIPES:
         raise one_of("train policy: suite", suite, RECIPES)
+    if demonstrations is not None and stages is not None:
+        raise BadStudy(
+            "train policy: --stages films scenes, --demonstrations takes all stages of a dataset "
+            "that is there; leave one out."
+        )
     from vap_core.training.films.scenes import CACHE
-    from vap_core.training.policy.train import train
+    from vap_core.training.policy.train import HELD_OUT, train
     from vap_core.training.vlm.train import make
 
     folder = out or Path(f"data/runs/trained/mini-pi0-{suite}")
@@ -254,9 +262,10 @@ def policy(
         jobs=jobs,
         device=device,
     )
-    print(json.dumps(about["held_out"], indent=1))
+    if about["held_out"]:
+        print(json.dumps(about["held_out"], indent=1))
+    else:
+        print(f"no film was held out (every {HELD_OUT}th stage is), so nothing was measured.")
     print(f"CPU hours: {json.dumps(about['cpu_hours'])}")
-    print(
-        f"next: python -m vap_core eval --suite {suite} --policy {folder} "
-        f"--methods generic,vap --episodes 4 --out {folder}-eval"
-    )
+    words = ("eval", "--suite", suite, "--policy", folder, "--methods", "generic,vap")
+    print(f"next: {command(*words, '--episodes', '4', '--out', f'{folder}-eval')}")

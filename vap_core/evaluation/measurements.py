@@ -55,11 +55,18 @@ def encode_table(table: "pa.Table") -> bytes:
     return sink.getvalue().to_pybytes()
 
 
-def add_rows(path: Path, table: "pd.DataFrame", key: list[str], about: dict[bytes, Any]) -> bytes:
+def add_rows(
+    path: Path,
+    table: "pd.DataFrame",
+    key: list[str],
+    about: dict[bytes, Any],
+    replaced: "pd.DataFrame | None" = None,
+) -> bytes:
     """The rows of a kept table and of a new one as a Parquet file.
 
-    Kept rows that are equal to a new one in `key` are left out. The metadata hold, under the name
-    in `about`, a list: what they held, and its value unless that is there.
+    Kept rows that are equal in `key` to a row of `replaced` (default: of the new table) are left
+    out. The metadata hold, under the name in `about`, a list: what they held, and its value unless
+    that is there.
 
     Raises: BadOutput for a damaged table.
     """
@@ -73,8 +80,11 @@ def add_rows(path: Path, table: "pd.DataFrame", key: list[str], about: dict[byte
         kept = read_arrow(path, "publish", "restore it, or delete it and publish again")
         held = parse_json((kept.schema.metadata or {}).get(name, b"[]"))
         old = kept.to_pandas()
-        replaced = pd.MultiIndex.from_frame(old[key]).isin(pd.MultiIndex.from_frame(table[key]))
-        whole = pd.concat([old[~replaced], table], ignore_index=True)
+        if len(old):  # one without rows may have no columns
+            gone = pd.MultiIndex.from_frame((table if replaced is None else replaced)[key])
+            old = old[~pd.MultiIndex.from_frame(old[key]).isin(gone)]
+        if len(old):
+            whole = pd.concat([old, table], ignore_index=True) if len(table) else old
     if new not in held:
         held.append(new)
     arrow = pa.Table.from_pandas(whole, preserve_index=False)

@@ -29,6 +29,7 @@ NOT_DRAWN = {
     "film",
     "index",
     "isolated",
+    "layers",
     "legacy_names",
     "query",
     "reading",

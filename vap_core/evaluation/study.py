@@ -1,19 +1,15 @@
 """A study: which tasks, methods and policy, and how many episodes."""
 
-import hashlib
-import json
-import os
-import shlex
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from vap_core import __version__
+from vap_core.base.commands import command
 from vap_core.base.errors import BadStudy, one_of
 from vap_core.base.extras import require
+from vap_core.evaluation import world
 from vap_core.evaluation.methods import (
     METHODS,
     PUBLISHED,
@@ -30,12 +26,9 @@ from vap_core.perception.stacks import check_stack, checksums
 from vap_core.policies.lerobot import checkpoints
 from vap_core.policies.names import check_policy_name, label_of
 from vap_core.rollout.loop import Follow
-from vap_core.simulation import robots, suites
-from vap_core.simulation.assets.objects import get_object
-from vap_core.simulation.cameras import RIGS, SHIPPED_RIGS
+from vap_core.simulation import suites
 from vap_core.simulation.scenes import Meshes
 from vap_core.simulation.suites import starts
-from vap_core.simulation.suites.variants import VARIANTS
 from vap_core.simulation.types import EpisodeRow
 
 MESHES = ("plain", "menagerie")
@@ -115,17 +108,15 @@ class Study:
 
     def next_command(self, *words: str | Path) -> str:
         """A command to print, to be run next; it finds the study's own suites."""
-        line = shlex.join(["python", "-m", "vap_core", *map(str, words)])
-        if not self.suite_files:
-            return line
-        return f"{suites.own.VARIABLE}={shlex.quote(os.pathsep.join(self.suite_files))} {line}"
+        return command(*words, environment=suites.own.environment(self.suite_files))
 
     def configuration(self) -> dict[str, Any]:
         """What the results depend on, as JSON.
 
         Weights, episode lists, and the world (robots, objects, styles, sensors) enter by checksum,
-        methods by name, and those that are not published by what they change, too. Of a stack whose
-        parts are not all embedded so do its models' files and the thresholds kept on this machine.
+        methods by name, and those that are not published by what they change, too. With the
+        scripted policy the motions that do not ship enter as well; of a stack whose parts are not
+        all embedded, its models' files and the thresholds kept on this machine.
 
         Raises: BadPolicy for a checkpoint that is not on this machine; MissingWeights when the
             backbone's package is not installed or the stack's models are not here; BadSuite for a
@@ -158,7 +149,13 @@ class Study:
         about |= checksums(self.stack if self.uses_stack() else "embedded")
         if digests and self.seed + self.seeds > 1:
             about["starts"] = starts.settings()
-        return {**about, "world": _world_digest(self)}
+        own_motions = {}
+        if self.policy == "scripted":
+            own_motions = world.own_motions(suite for suite, _ in self.tasks)
+        if own_motions:
+            about["motions"] = own_motions
+        listed = [(suite, self.rows(suite, task)) for suite, task in self.tasks]
+        return {**about, "world": world.digest(listed)}
 
 
 def _check_names(study: Study) -> None:
@@ -235,48 +232,6 @@ def _check_policy(study: Study) -> None:
             f"Study: policy {policy!r} has no words that could be learned; leave soft out, or take "
             f"--policy {MINI}."
         )
-
-
-def _world_digest(study: Study) -> str:
-    """Over the cameras that ship and those of the study's robots, styles, suites, robots, objects.
-
-    What an own suite's file enters for its own robot changes no other suite's digest.
-    """
-    rigs = dict(SHIPPED_RIGS)
-    for suite, _ in study.tasks:
-        robot_name = suites.suite(suite).robot
-        rigs[robot_name] = RIGS[robot_name]
-    found = hashlib.sha256(_canonical((rigs, VARIANTS)))
-    for suite, task in study.tasks:
-        known = suites.suite(suite)
-        robot = robots.get(known.robot)
-        placed = set()
-        for row in study.rows(suite, task):
-            for place in row.placements:
-                placed.add(place.model)
-        models = [get_object(name) for name in sorted(placed)]
-        found.update(_canonical((known, robot, models)) + robot.xml.read_bytes())
-    return found.hexdigest()[:16]
-
-
-def _canonical(value: Any) -> bytes:
-    """Every number in a value, whatever NumPy's print options are; of files their names."""
-
-    def plain(part: Any) -> Any:
-        if is_dataclass(part) and not isinstance(part, type):
-            parts = {"kind": type(part).__name__}
-            for field in fields(part):
-                parts[field.name] = getattr(part, field.name)
-            return parts
-        if isinstance(part, np.ndarray | np.generic):
-            return part.tolist()
-        if isinstance(part, Path):
-            return part.name
-        raise TypeError(
-            f"Study: {type(part).__name__} cannot be hashed; give it fields, or add its kind here."
-        )
-
-    return json.dumps(value, default=plain, sort_keys=True).encode()
 
 
 DEMO = Study(

@@ -60,6 +60,15 @@ class EmbeddingTable:
         return np.array(mapped, np.float32)
 
 
+def check_width(table: EmbeddingTable, width: int, of: str) -> None:
+    """Raises: BadPolicy when a table does not have the `width` features that `of` has."""
+    if table.shape[1] != width:
+        raise BadPolicy(
+            f"embeddings: {table.file.parent} has {table.shape[1]} features and {of} has {width}; "
+            "take a model with a token that was learned in it, or a policy that grew from it."
+        )
+
+
 def open_table(folder: Path) -> EmbeddingTable:
     """The table of word embeddings of the model in a folder, whatever number of files it has.
 

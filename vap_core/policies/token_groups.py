@@ -27,7 +27,7 @@ def token_groups(
     Raises: BadPolicy for a damaged file.
     """
     for folder in folders:
-        found = _vocabulary(folder)
+        found = vocabulary_of(folder)
         if found is None:
             continue
         vocabulary, encode = found
@@ -40,8 +40,11 @@ def token_groups(
     return {}
 
 
-def _vocabulary(folder: Path) -> tuple[dict[str, int], Encode] | None:
-    """The token of every word, and what encodes a text; None where the folder does not say."""
+def vocabulary_of(folder: Path) -> tuple[dict[str, int], Encode] | None:
+    """The token of every word, and what encodes a text; None where the folder does not say.
+
+    Raises: BadPolicy for a damaged file.
+    """
     config = folder / "config.json"
     try:
         words = parse_json(config.read_text()).get("words") if config.is_file() else None

@@ -17,11 +17,17 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from vap_core.base.condition import rows_matching
-from vap_core.base.errors import BadOutput, BadRecording, VapError, first_line
+from vap_core.base.errors import BadOutput, BadRecording, first_line
 from vap_core.recording.blueprint import full_window
-from vap_core.recording.catalog import register_files
-from vap_core.recording.corrections import CORRECTIONS, layer_path, read_correction
+from vap_core.recording.catalog import (
+    read_corrections_of,
+    register_files,
+    register_recordings,
+    show_progress,
+)
+from vap_core.recording.corrections import CORRECTIONS, layer_path
 from vap_core.recording.isolated import read_summaries
+from vap_core.recording.reading import recording_id
 from vap_core.recording.stored_pictures import by_camera
 from vap_core.recording.viewer import free_port
 from vap_core.recording.views import (
@@ -91,7 +97,7 @@ def serve_run(run: Path, where: str | None = None, port: int | None = None) -> I
         )
     unreadable: dict[Path, str] = {}
     summaries: dict[Path, dict[str, Any]] = {}
-    for path, summary, reason in read_summaries(files):
+    for path, summary, reason in show_progress(read_summaries(files), "read", len(files)):
         if summary is None:
             unreadable[path] = reason
         else:
@@ -100,7 +106,7 @@ def serve_run(run: Path, where: str | None = None, port: int | None = None) -> I
     with tempfile.TemporaryDirectory() as scratch, _server(port or free_port()) as server:
         client = server.client()
         dataset = client.create_dataset("recordings")
-        register_files(dataset, {path: path for path in summaries}, unreadable)
+        register_recordings(dataset, {path: path for path in summaries}, unreadable)
         register_files(dataset, {path: path for path in layers}, unreadable, layer=CORRECTIONS)
         rows = _rows(dataset, summaries, unreadable)
         if not rows:
@@ -122,22 +128,13 @@ def serve_run(run: Path, where: str | None = None, port: int | None = None) -> I
 
 def _correct(summaries: dict[Path, dict[str, Any]], unreadable: dict[Path, str]) -> list[Path]:
     """Put corrected cases in place of the recorded ones; returns the layers that hold them."""
-    layers = []
-    for path, summary in summaries.items():
-        layer = layer_path(path)
-        if not layer.exists():
-            continue
-        try:
-            correction = read_correction(layer)
-        except VapError as error:
-            unreadable[layer] = str(error)
-            continue
-        if correction.policy not in ("", summary.get("policy")):
-            continue  # of a recording that has been made again with another policy
+    policies = {path: summary.get("policy") for path, summary in summaries.items()}
+    corrections = read_corrections_of(policies, unreadable)
+    for path, correction in corrections.items():
+        summary = summaries[path]
         summary["case"], summary["sub_case"] = correction.case, correction.sub_case
         summary["case_sentence"] = correction.note
-        layers.append(layer)
-    return layers
+    return [layer_path(path) for path in corrections]
 
 
 @contextmanager
@@ -165,13 +162,11 @@ def _rows(
     dataset: "DatasetEntry", summaries: dict[Path, dict[str, Any]], unreadable: dict[Path, str]
 ) -> list[dict[str, Any]]:
     """One row per recording: failures first, then by case and sub-case."""
-    from rerun.chunk import RrdReader
-
     rows = []
     for path, summary in summaries.items():
         if path in unreadable:
             continue
-        segment = RrdReader(path).recordings()[0].recording_id
+        segment = recording_id(path)
         frame = max(0, int(summary.get("deciding_frame", 0)))
         row: dict[str, Any] = {}
         for name in COLUMNS:

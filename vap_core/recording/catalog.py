@@ -8,8 +8,7 @@ A file that cannot be read is named in `steps.unreadable`; the rest of the query
 
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,10 +17,11 @@ from urllib.parse import unquote, urlparse
 import rerun as rr
 
 from vap_core.base.errors import BadRecording, first_line
-from vap_core.recording.corrections import CORRECTIONS, corrections_folder
-from vap_core.recording.index import CURVES, FOLDER, STEPS, index_path
-from vap_core.recording.isolated import index_isolated
-from vap_core.recording.legacy_names import former_name
+from vap_core.recording.corrections import layer_path
+from vap_core.recording.index import CURVES, FOLDER, STEPS, find_indexes
+from vap_core.recording.isolated import index_isolated, read_layers
+from vap_core.recording.layers import Correction
+from vap_core.recording.reading import recording_id
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -49,8 +49,6 @@ PROPERTY_COLUMNS = {
     ),
 }
 """Columns that every step of a recording shares, by property group; as in results tables."""
-CORRECTED_COLUMNS = ("case", "sub_case", "case_sentence")
-"""Columns that a correction replaces."""
 
 
 @dataclass(frozen=True)
@@ -76,19 +74,19 @@ def load_steps(folder: Path) -> StepTable:
         )
     unreadable: dict[Path, str] = {}
     with tempfile.TemporaryDirectory() as scratch, rr.server.Server(host="127.0.0.1") as server:
-        index_folder = None if _can_index(Path(folder)) else Path(scratch)
-        indexes = _ensure_indexes(files, index_folder, unreadable)
+        indexes = _ensure_indexes(files, Path(scratch), unreadable)
         if not indexes:
             raise BadRecording(
                 f"query: none of {len(files)} files in {folder} can be read; "
                 f"the first: {next(iter(unreadable.values()))}."
             )
         dataset = server.client().create_dataset("recordings")
-        _register_indexes(dataset, indexes, index_folder, unreadable)
-        layers = sorted(corrections_folder(Path(folder)).glob("*.rrd"))
-        register_files(dataset, {path: path for path in layers}, unreadable, layer=CORRECTIONS)
-        recordings = {index.resolve(): file for file, index in indexes.items()}
-        return StepTable(_join_steps(dataset, recordings), unreadable)
+        register_recordings(dataset, indexes, unreadable)
+        properties = _property_table(dataset, _by_file(indexes))
+        policies = dict(zip(map(Path, properties["file"]), properties["policy"], strict=True))
+        corrections = read_corrections_of(policies, unreadable)
+        table = _join_steps(_corrected(properties, corrections), _curve_table(dataset))
+        return StepTable(table, unreadable)
 
 
 def _can_index(folder: Path) -> bool:
@@ -98,46 +96,72 @@ def _can_index(folder: Path) -> bool:
 
 
 def _ensure_indexes(
-    files: Sequence[Path], folder: Path | None, unreadable: dict[Path, str]
+    files: Sequence[Path], scratch: Path, unreadable: dict[Path, str]
 ) -> dict[Path, Path]:
-    """The index of every recording that has one, or can get one."""
+    """The index of every recording of one folder that has one, or can get one.
+
+    New ones are in `scratch` where none can be written beside the recordings. Recordings are read
+    in a process of their own.
+    """
+    folder = None if _can_index(files[0].parent) else scratch
+    indexes = find_indexes(files, folder)
+    missing = [path for path in files if path not in indexes]
+    answers = index_isolated(missing, folder)
+    for path, reason in show_progress(answers, "index", len(missing)):
+        if reason is not None:
+            unreadable[path] = reason
+    indexes |= find_indexes([path for path in missing if path not in unreadable], folder)
+    for path in missing:
+        if path not in indexes:
+            unreadable.setdefault(path, "its index was removed while it was read")
+    return {path: indexes[path] for path in files if path in indexes}
+
+
+def show_progress[T](answers: Iterable[T], doing: str, total: int) -> Iterable[T]:
+    """The same, with a bar that counts recordings where they take longer than 3 seconds."""
     from tqdm import tqdm
 
-    missing = [path for path in files if not _has_index(path, folder)]
-    for path, reason in tqdm(
-        index_isolated(missing, folder),
-        "index",
-        total=len(missing),
+    return tqdm(
+        answers,
+        doing,
+        total=total,
         unit="recording",
         leave=False,
         delay=3,
         mininterval=1,
-    ):
-        if reason is not None:
-            unreadable[path] = reason
-    return {path: index_path(path, folder) for path in files if path not in unreadable}
+    )
 
 
-def _has_index(path: Path, folder: Path | None) -> bool:
-    try:
-        return index_path(path, folder).exists()
-    except OSError:
-        return False
-
-
-def _register_indexes(
+def register_recordings(
     dataset: "DatasetEntry",
-    indexes: Mapping[Path, Path],
-    folder: Path | None,
+    files: Mapping[Path, Path],
     unreadable: dict[Path, str],
 ) -> None:
-    """Register every index; one that cannot be, as it is damaged, is made again once."""
+    """Register what to read for each recording; of those that hold one episode the first alone."""
     refused: dict[Path, str] = {}
-    register_files(dataset, indexes, refused)
-    for path in refused:
-        with suppress(OSError):
-            indexes[path].unlink()
-    register_files(dataset, _ensure_indexes(list(refused), folder, unreadable), unreadable)
+    register_files(dataset, files, refused)
+    first = _files_by_segment(dataset, _by_file(files)) if refused else {}
+    for path, reason in refused.items():
+        original = first.get(recording_id(files[path]))
+        if original is not None:
+            reason = f"it holds the same episode as {Path(original).name}; move one of them away"
+        unreadable[path] = reason
+
+
+def _by_file(files: Mapping[Path, Path]) -> dict[Path, Path]:
+    """The recording by what is read for it."""
+    return {read.resolve(): recording for recording, read in files.items()}
+
+
+def _files_by_segment(
+    dataset: "DatasetEntry", recordings: Mapping[Path, Path]
+) -> dict[str, str | None]:
+    """The recording of every segment; None where its index is not among its files."""
+    import pyarrow as pa
+
+    segments = pa.Table.from_batches(dataset.segment_table().collect())
+    files = [_recording_of(urls, recordings) for urls in segments["rerun_storage_urls"].to_pylist()]
+    return dict(zip(segments["rerun_segment_id"].to_pylist(), files, strict=True))
 
 
 def register_files(
@@ -170,17 +194,52 @@ def register_files(
             unreadable[of_url[result.uri]] = str(result.error).strip().splitlines()[-1][:160]
 
 
-def _join_steps(dataset: "DatasetEntry", recordings: Mapping[Path, Path]) -> "pd.DataFrame":
-    """Every step beside the properties of its recording; `recordings` has the file by index."""
-    joined = _property_table(dataset, recordings).merge(
-        _curve_table(dataset), on="segment", how="inner"
-    )
-    joined = joined.drop(columns="segment")
+def read_corrections_of(
+    policies: Mapping[Path, str | None], unreadable: dict[Path, str]
+) -> dict[Path, Correction]:
+    """The correction of every recording that has one, given what policy each is of.
+
+    A layer of a recording that has been made again with another policy does not count. Layers are
+    read in a process of their own; one that is damaged is named in `unreadable`.
+    """
+    recordings = {layer_path(path): path for path in policies}
+    layers = [layer for layer in recordings if layer.exists()]
+    corrections = {}
+    for layer, correction, reason in read_layers(layers):
+        recording = recordings[layer]
+        if correction is None:
+            unreadable[layer] = reason
+        elif correction.policy in ("", policies[recording]):
+            corrections[recording] = correction
+    return corrections
+
+
+def _corrected(
+    properties: "pd.DataFrame", corrections: Mapping[Path, Correction]
+) -> "pd.DataFrame":
+    """Corrections in place of what they correct, marked in the column `corrected`."""
+    table = properties.assign(corrected=False)
+    for index, file in table["file"].items():
+        correction = corrections.get(Path(file))
+        if correction is not None:
+            cells = {
+                "case": correction.case,
+                "sub_case": correction.sub_case,
+                "case_sentence": correction.note,
+                "corrected": True,
+            }
+            table.loc[index, list(cells)] = list(cells.values())
+    return table
+
+
+def _join_steps(properties: "pd.DataFrame", curves: "pd.DataFrame") -> "pd.DataFrame":
+    """Every step beside the properties of its recording."""
+    joined = properties.merge(curves, on="segment", how="inner").drop(columns="segment")
     return joined.sort_values(["file", "frame_index"], ignore_index=True)
 
 
 def _property_table(dataset: "DatasetEntry", recordings: Mapping[Path, Path]) -> "pd.DataFrame":
-    """One row per recording; a correction replaces what it corrects."""
+    """One row per recording; `recordings` has the file by index."""
     import pandas as pd
     import pyarrow as pa
 
@@ -191,13 +250,8 @@ def _property_table(dataset: "DatasetEntry", recordings: Mapping[Path, Path]) ->
     ]
     for group, names in PROPERTY_COLUMNS.items():
         for name in names:
-            table[name] = _property(segments, group, name)
-    table["corrected"] = _property(segments, "correction", "case").notna()
-    for name in CORRECTED_COLUMNS:
-        correction = _property(segments, "correction", name)
-        table[name] = correction.where(table["corrected"], table[name])
-    # A correction of a recording that is gone, or was made again with another policy, is alone.
-    return table[table["file"].notna()]
+            table[name] = _first_elements(segments, f"property:{group}:{name}")
+    return table
 
 
 def _recording_of(urls: Sequence[str], recordings: Mapping[Path, Path]) -> str | None:
@@ -224,19 +278,6 @@ def _curve_table(dataset: "DatasetEntry") -> "pd.DataFrame":
     for name in CURVES:
         table[name] = _first_elements(rows, f"{STEPS}:{name}").astype(float)
     return table
-
-
-def _property(segments: "pa.Table", group: str, name: str) -> "pd.Series[Any]":
-    """A property of every recording, whether written under its current or its former name."""
-    column = f"property:{group}:{name}"
-    former_column = f"property:{group}:{former_name(group, name)}"
-    if former_column not in segments.column_names:
-        return _first_elements(segments, column)
-    former_values = _first_elements(segments, former_column)
-    if column not in segments.column_names:
-        return former_values
-    values = _first_elements(segments, column)
-    return values.where(values.notna(), former_values)
 
 
 def _first_elements(table: "pa.Table", name: str) -> "pd.Series[Any]":

@@ -4,42 +4,19 @@ The recording itself is never rewritten.
 """
 
 import os
-from dataclasses import dataclass, field
+from contextlib import closing
 from pathlib import Path
 
 import rerun as rr
-from rerun.chunk import RrdReader
 
-from vap_core.base.errors import BadRecording, BadStudy, one_of
-from vap_core.recording.reading import property_group, read_chunks, read_properties, read_summary
+from vap_core.base.errors import BadRecording, BadStudy
+from vap_core.recording.isolated import read_layers
+from vap_core.recording.layers import Correction as Correction
+from vap_core.recording.reading import read_summary, recording_id
 from vap_core.recording.stream import finish_stream, log_properties, log_row, open_stream
-from vap_core.rollout.failure import CASES
 
 CORRECTIONS = "corrections"
 """The layer's name, and the folder beside `recordings` that holds its files."""
-
-
-@dataclass(frozen=True)
-class Correction:
-    """What a researcher concluded: the case and sub-case of a failure, and a note why.
-
-    `policy` is the label of the one that was recorded, "" where a layer does not say.
-    """
-
-    case: str
-    sub_case: str
-    note: str = ""
-    policy: str = field(default="", compare=False)
-
-    def __post_init__(self) -> None:
-        if self.case not in CASES:
-            raise one_of("correct: case", self.case, CASES)
-        if self.sub_case not in CASES[self.case]:
-            raise one_of(f"correct: sub-case of {self.case}", self.sub_case, CASES[self.case])
-
-    def __str__(self) -> str:
-        text = f"corrected to {self.case}, {self.sub_case}"
-        return f"{text}: {self.note}" if self.note else text
 
 
 def layer_path(recording: Path) -> Path:
@@ -55,7 +32,7 @@ def corrections_folder(recordings: Path) -> Path:
 def write_correction(recording: Path, correction: Correction, frame_index: int) -> Path:
     """Write a correction of one recording, in place of an earlier one; returns the layer's path.
 
-    The viewer and the catalog merge it with the recording, because both have the same id.
+    The viewer merges it with the recording, because both have the same id.
 
     Raises: BadRecording when the recording cannot be read; BadStudy when it is of no failure.
     """
@@ -68,7 +45,7 @@ def write_correction(recording: Path, correction: Correction, frame_index: int) 
     path = layer_path(recording)
     unfinished = path.with_name(f".{path.name}.new")
     unfinished.unlink(missing_ok=True)
-    rec = open_stream(unfinished, _recording_id(recording))
+    rec = open_stream(unfinished, recording_id(recording))
     values = rr.AnyValues(
         case=correction.case,
         sub_case=correction.sub_case,
@@ -90,24 +67,11 @@ def read_corrections(folder: Path) -> dict[str, Correction]:
 
     Raises: BadRecording for one that is damaged.
     """
-    paths = sorted((folder / CORRECTIONS).glob("*.rrd"))
-    return {path.name: read_correction(path) for path in paths}
-
-
-def read_correction(path: Path) -> Correction:
-    """The correction of one layer. Raises: BadRecording, when it is damaged."""
-    values = {}
-    try:
-        for chunk in read_chunks(path):
-            if property_group(chunk) == "correction":
-                values = read_properties(chunk)
-        note, policy = values["case_sentence"], str(values.get("policy", ""))
-        return Correction(values["case"], values["sub_case"], note, policy)
-    except (RuntimeError, ValueError, OSError, KeyError) as error:
-        raise BadRecording(
-            f"corrections: {path} is damaged ({error}); delete it and correct that failure again."
-        ) from error
-
-
-def _recording_id(recording: Path) -> str:
-    return RrdReader(recording).recordings()[0].recording_id
+    corrections = {}
+    layers = sorted((folder / CORRECTIONS).glob("*.rrd"))
+    with closing(read_layers(layers)) as read:
+        for path, correction, reason in read:
+            if correction is None:
+                raise BadRecording(reason)
+            corrections[path.name] = correction
+    return corrections

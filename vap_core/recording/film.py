@@ -10,7 +10,7 @@ from vap_core.base.errors import BadRecording
 from vap_core.base.palette import RIGHT_MARK, WRONG_MARK
 from vap_core.base.types import Rgb
 from vap_core.base.video import Mp4
-from vap_core.recording.reading import read_chunks, read_summary
+from vap_core.recording.reading import MOST_HZ, read_chunks, read_summary
 from vap_core.recording.stored_pictures import prompted_entities, read_pictures
 
 if TYPE_CHECKING:
@@ -42,6 +42,11 @@ def write_film(recording: Path, mp4: Path) -> int:
     if not steps:
         raise BadRecording(f"film: {recording} holds no pictures; record the episode again.")
     hz = float(summary.get("hz") or _frame_rate(recording, set(entities.values())))
+    if not hz <= MOST_HZ:
+        raise BadRecording(
+            f"film: {recording} has {hz:.0f} steps a second by its timeline; "
+            f"{MOST_HZ} are the most."
+        )
     verdict = read_verdict(recording)
     if not verdict and "suite" in summary:
         verdict = str(summary.get("outcome", "unfinished")).upper()

@@ -1,4 +1,4 @@
-"""Reads and indexes recordings in a process of its own: a damaged one can end the process.
+"""Reads recordings and corrections, and indexes, in another process: a damaged file can end it.
 
 Rerun's reader stops the whole process where some bytes are wrong, and no exception can be caught.
 """
@@ -8,11 +8,13 @@ import os
 import subprocess
 import sys
 from collections.abc import Generator, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from vap_core.base.errors import BadRecording, VapError
 from vap_core.recording.index import ensure_index
+from vap_core.recording.layers import Correction, damaged_layer, read_correction
 from vap_core.recording.reading import read_summary, unreadable
 
 ENDED_READER = "its damaged bytes ended the process that read it"
@@ -48,6 +50,17 @@ def check_recording(recording: Path) -> None:
             raise BadRecording(reason)
 
 
+def read_layers(layers: Sequence[Path]) -> Generator[tuple[Path, Correction | None, str]]:
+    """Every layer with its correction, None where a reason says why it has none."""
+    for path, answer in _answers(layers, {"correction": True}):
+        if "correction" in answer:
+            yield path, Correction(**answer["correction"]), ""
+        elif answer["reason"] == ENDED_READER:
+            yield path, None, str(damaged_layer(path, ENDED_READER))
+        else:
+            yield path, None, answer["reason"]
+
+
 def main() -> None:
     """The other process: a line of JSON in with the paths, a line out for each of them."""
     asked = json.loads(sys.stdin.readline())
@@ -57,6 +70,8 @@ def main() -> None:
         try:
             if asked.get("summary"):
                 answer["summary"] = read_summary(Path(path))
+            elif asked.get("correction"):
+                answer["correction"] = asdict(read_correction(Path(path)))
             else:
                 ensure_index(Path(path), folder)
         except VapError as error:  # also a disk that is full

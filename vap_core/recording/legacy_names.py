@@ -19,11 +19,6 @@ FORMER_NAMES = {
 """By property group: the name that a property has now, and the name that it had before."""
 
 
-def former_name(group: str, name: str) -> str | None:
-    """The name that a property had before, None where it was never renamed."""
-    return FORMER_NAMES.get(group, {}).get(name)
-
-
 def with_current_names(group: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """The properties of one group by their current names, whenever they were written."""
     current = {former: name for name, former in FORMER_NAMES.get(group, {}).items()}

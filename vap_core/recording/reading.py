@@ -1,6 +1,5 @@
 """Reading recordings back: their chunks and their properties."""
 
-import math
 import warnings
 from pathlib import Path
 from shlex import quote
@@ -22,8 +21,12 @@ KINDS: dict[str, type | tuple[type, ...]] = {
     **dict.fromkeys(("detail", "case", "sub_case", "deciding_camera", "case_sentence"), str),
     **dict.fromkeys(("episode", "seed", "steps", "held_steps", "deciding_frame"), int),
     **dict.fromkeys(("hz", "case_confidence"), (int, float)),
+    **dict.fromkeys(("success", "success_once", "cmr"), bool),
+    **dict.fromkeys(("wrong_object", "first_object_correct"), bool),
 }
 """What properties of a recording must be where they are there."""
+MOST_HZ = 1000
+"""Control steps a second. A film repeats its last picture for seconds, which has to end."""
 UNREADABLE = (RuntimeError, ValueError, OSError, Warning)
 """What rerun and the checks here raise at a file that is no whole recording."""
 
@@ -44,6 +47,11 @@ def open_whole(path: Path) -> RrdReader:
         # Without a footer rerun only warns, and can read no single entity.
         warnings.simplefilter("error")
         return RrdReader(path)
+
+
+def recording_id(path: Path) -> str:
+    """The id of a recording; its index and its correction have the same."""
+    return str(RrdReader(path).recordings()[0].recording_id)
 
 
 def property_group(chunk: Chunk) -> str | None:
@@ -86,7 +94,7 @@ def read_summary(path: Path) -> dict[str, Any]:
             warnings.simplefilter("error")
             for chunk in read_chunks(path):
                 if property_group(chunk) in ("rollout", "outcome"):
-                    summary |= _checked(read_properties(chunk))
+                    summary |= read_checked_properties(chunk)
                     continue
                 batch = chunk.to_record_batch()
                 if "frame_index" in batch.schema.names:
@@ -96,20 +104,24 @@ def read_summary(path: Path) -> dict[str, Any]:
     return {**summary, "frames": len(steps)}
 
 
-def _checked(values: dict[str, Any]) -> dict[str, Any]:
-    """Properties without those that hold nothing where something is expected.
+def read_checked_properties(chunk: Chunk) -> dict[str, Any]:
+    """`read_properties` without those that hold nothing where something is expected.
 
     Raises: ValueError, for a property of another kind than a recorder writes.
     """
     checked = {}
-    for name, value in values.items():
+    found: dict[str, Any] = read_properties(chunk)
+    for name, value in found.items():
         kind = KINDS.get(name)
         if kind is not None:
             if value is None:
                 continue
-            if type(value) is bool or not isinstance(value, kind):
+            of_kind = isinstance(value, kind) and (type(value) is bool) == (kind is bool)
+            if not of_kind:
                 raise ValueError(f"its property {name} is {str(value)[:40]!r}")
-            if name == "hz" and not 0 <= float(values[name]) < math.inf:
+            if kind is int and not -(2**63) <= value < 2**63:
+                raise ValueError(f"its property {name} is {value}")
+            if name == "hz" and not 0 <= value <= MOST_HZ:
                 raise ValueError(f"its property hz is {value}")
         checked[name] = value
     return checked

@@ -1,6 +1,6 @@
 """The pictures of a recording, read back: JPEG or AV1, as they were kept."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ def by_camera(entities: Iterable[str]) -> dict[str, str]:
 def read_pictures(path: Path, entities: set[str]) -> dict[str, dict[int, Rgb]]:
     """The pictures of some entities, by entity and control step.
 
-    Raises: BadRecording, for a JPEG that cannot be decoded.
+    Raises: BadRecording, for a JPEG or a video that cannot be decoded whole.
     """
     jpegs: dict[str, dict[int, Any]] = {entity: {} for entity in entities}
     packets: dict[str, dict[int, Any]] = {entity: {} for entity in entities}
@@ -54,8 +54,8 @@ def read_pictures(path: Path, entities: set[str]) -> dict[str, dict[int, Rgb]]:
         pictures[entity] = {step: _decode_jpeg(blob) for step, blob in jpegs[entity].items()}
         if packets[entity]:
             in_order = dict(sorted(packets[entity].items()))
-            decoded = _decode_video(in_order.values())
-            pictures[entity] = dict(zip(in_order, decoded, strict=False))
+            decoded = _decode_video(list(in_order.values()))
+            pictures[entity] = dict(zip(in_order, decoded, strict=True))
     return pictures
 
 
@@ -68,13 +68,28 @@ def _decode_jpeg(blob: np.ndarray) -> Rgb:
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(np.uint8)
 
 
-def _decode_video(packets: Any) -> Iterator[Rgb]:
-    """The pictures of an AV1 stream, in the order of its packets."""
+def _decode_video(packets: Sequence[np.ndarray]) -> list[Rgb]:
+    """The pictures of an AV1 stream, one of each packet.
+
+    Raises: BadRecording, when a packet cannot be decoded, or holds none or several pictures.
+    """
     import av
 
     codec: Any = av.CodecContext.create("libdav1d", "r")
-    for packet in packets:
-        for frame in codec.decode(av.Packet(packet.tobytes())):
-            yield frame.to_ndarray(format="rgb24")
-    for frame in codec.decode(None):
-        yield frame.to_ndarray(format="rgb24")
+    pictures = []
+    try:
+        for data in [*packets, None]:
+            packet = None if data is None else av.Packet(data.tobytes())
+            for frame in codec.decode(packet):
+                pictures.append(frame.to_ndarray(format="rgb24"))
+    except (av.FFmpegError, ValueError) as error:
+        raise BadRecording(
+            f"pictures: the recording holds a video that cannot be decoded ({error}); "
+            "record the episode again."
+        ) from error
+    if len(pictures) != len(packets):
+        raise BadRecording(
+            f"pictures: the recording holds a video of {len(packets)} steps that decodes to "
+            f"{len(pictures)} pictures; record the episode again."
+        )
+    return pictures

@@ -1,5 +1,6 @@
 """Photographs of single objects on a plain table, such as a personal object's reference views."""
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -8,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 from PIL import Image
 
-from vap_core.base.files import writing
+from vap_core.base.files import write_files, writing
 from vap_core.base.types import Mask, Rgb, value
 from vap_core.simulation.assets.mujoco_object import VISUAL_GROUP, add_object
 from vap_core.simulation.assets.objects import ObjectModel, extent_m
@@ -146,14 +147,22 @@ def reference_shots(model: ObjectModel, n: int, seed: int) -> list[Shot]:
     return shots
 
 
-def write_views(model: ObjectModel, folder: Path, n: int = 5) -> list[Path]:
-    """Reference photos as `<name>-<i>.png`. Raises: BadOutput."""
-    paths = [folder / f"{model.name}-{i}.png" for i in range(n)]
-    with writing(folder, "photograph", "choose another folder with --out"):
-        folder.mkdir(parents=True, exist_ok=True)
-        for path, rgb in zip(paths, reference_views(model, n), strict=True):
-            Image.fromarray(rgb).save(path)
-    return paths
+def write_views(
+    model: ObjectModel, folder: Path, n: int = 5, *, replace: bool = False
+) -> list[Path]:
+    """Reference photos as `<name>-<i>.png`.
+
+    Raises: BadOutput when the folder cannot be written, or, without `replace`, holds other files
+        of these names.
+    """
+    files = {}
+    for i, rgb in enumerate(reference_views(model, n)):
+        picture = io.BytesIO()
+        Image.fromarray(rgb).save(picture, "PNG")
+        files[folder / f"{model.name}-{i}.png"] = picture.getvalue()
+    mend = "choose another folder with --out"
+    write_files(files, "photograph", mend, replace=replace)
+    return list(files)
 
 
 def write_preview(model: ObjectModel, path: Path, size: int = 320) -> None:

@@ -13,9 +13,8 @@ import torch
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import make_folder, parse_json, replacing, write_atomic, writing
 from vap_core.evaluation.store import LOCK, differences, locked
+from vap_core.policies.lerobot.checkpoints import RECIPE
 
-RECIPE = "recipe.json"
-"""The file of a training's folder that holds its recipe, from its beginning."""
 STATE = "training.pt"
 """The file that a training goes on from."""
 WEIGHTS = ("model.safetensors", "vlm.safetensors")

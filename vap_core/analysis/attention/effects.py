@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vap_core.base.errors import BadPolicy
 from vap_core.policies.hooks import observe_attention
 from vap_core.policies.lerobot.adapter import IMAGE, STATE, LeRobot, load_policy
 from vap_core.policies.protocol import Chunk, PolicyInput
@@ -18,17 +19,23 @@ SIDE = 112
 
 
 def layer_effects(folder: Path) -> "pd.DataFrame":
-    """Largest change of an action of the pi0 in a folder when a layer attends evenly.
+    """Largest change of an action of the policy in a folder when a layer attends evenly.
 
-    Two rows: the vision-language model, whose queries are patches and words, and the action expert.
-    The input is noise under a real instruction.
+    It is a pi0, pi0.5 or mini-pi0. Two rows: the vision-language model, whose queries are patches
+    and words, and the action expert. The input is noise under a real instruction.
 
-    Raises: BadPolicy, as `load_policy`.
+    Raises: BadPolicy, as `load_policy`, or for another kind of policy.
     """
     import pandas as pd
 
     policy = load_policy(folder)
-    towers = policy.policy.model.paligemma_with_expert
+    model: Any = getattr(policy.policy, "model", None)
+    towers = getattr(model, "paligemma_with_expert", None)
+    if towers is None:
+        raise BadPolicy(
+            f"layer_effects: {policy.label} is no pi0, whose layers are known here; give the "
+            "folder of a pi0, pi0.5 or mini-pi0."
+        )
     look = _noise(policy)
     plain = _chunk(policy, look)
     rows: dict[str, dict[int, float]] = {}

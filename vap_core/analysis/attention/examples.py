@@ -74,7 +74,7 @@ def example_tiles(source: Path, line: Mapping[str, Any], memory: Path) -> list[T
 def _find(source: Path, name: str, policy: str = "") -> tuple[Mapping[str, Any], Mapping[str, Any]]:
     """The manifest of the run that holds an episode, and its row there."""
     parts = name.split("/")
-    if len(parts) not in (len(PARTS), len(PARTS) + 1) or not all(map(str.isdigit, parts[3:])):
+    if len(parts) not in (len(PARTS), len(PARTS) + 1) or not all(map(str.isdecimal, parts[3:])):
         raise BadStudy(
             f"attention: --record {name}: give SUITE/TASK/METHOD/EPISODE, such as "
             "simpler-bridge/put-camera/soft/22."

@@ -49,19 +49,3 @@ def mean(values: Values, clusters: Sequence[str], strata: Sequence[str] = ()) ->
     times = resamples(clusters, strata)
     low, high = percentiles(times @ values / times.sum(axis=1))
     return Estimate(value=float(values.mean()), low=low, high=high, n=len(values))
-
-
-def difference(
-    one: Values, other: Values, clusters: Sequence[str], other_clusters: Sequence[str]
-) -> Estimate:
-    """The mean of `one` minus that of `other`; layouts that both have are drawn for both."""
-    both = resamples([*clusters, *other_clusters])
-    first, second = both[:, : len(one)], both[:, len(one) :]
-    gaps = _means(first, one) - _means(second, other)
-    low, high = percentiles(gaps)
-    return Estimate(value=float(one.mean() - other.mean()), low=low, high=high, n=len(one))
-
-
-def _means(times: Times, values: Values) -> Float[np.ndarray, " resamples"]:
-    total = times.sum(axis=1)
-    return np.divide(times @ values, total, out=np.full(len(times), np.nan), where=total > 0)

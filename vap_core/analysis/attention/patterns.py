@@ -19,6 +19,12 @@ if TYPE_CHECKING:
 
 WORDS = (TOKEN, COLOUR, CATEGORY)
 """The queries that are words, in the order in which one of them means the target."""
+MEASURES = (
+    *("calls", "share", "chance", "lift", "lift_lookalikes"),
+    *("on_target", "chance_hit", "on_rival", "on_background"),
+    *("drift", "switches", "entropy"),
+)
+"""What `per_episode` measures."""
 STABLE = "stable"
 DRIFTING = "drifting"
 CONFUSED = "confused"
@@ -102,11 +108,15 @@ def per_episode(
     `lift` is the density of attention on the target, 1 where it is that of the whole view, and
     `lift_lookalikes` that on the look-alikes. `on_target` and `on_rival` are the shares of peaks
     there. `drift` is the mean way of the peak between successive calls, in sides of a view;
-    `switches` is how often its region changes.
+    `switches` is how often its region changes. Without such calls it has its columns and no row.
     """
     import numpy as np
     import pandas as pd
 
+    nothing = episodes[KEY].head(0).assign(query=pd.Series(dtype=str))
+    nothing = nothing.reindex(columns=[*KEY, "query", *MEASURES]).merge(episodes, on=KEY)
+    if calls.empty:
+        return nothing
     merged = over_views(calls).merge(episodes, on=KEY)
     touch = merged["first_touch"].fillna(np.inf)
     before = merged if whole else merged[merged["step"] < touch]
@@ -135,7 +145,7 @@ def per_episode(
                 "entropy": ordered["entropy"].mean(),
             }
         )
-    return pd.DataFrame(rows).merge(episodes, on=KEY)
+    return pd.DataFrame(rows).merge(episodes, on=KEY) if rows else nothing
 
 
 def localisation(row: "pd.Series", thresholds: Thresholds = THRESHOLDS) -> str:

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LEAST_FAILURES = 10
+DRAWS = 200
+"""How often failures are dealt out at random for `warnings_by_chance`."""
+BEYOND = "both, beyond the margin"
 Scores = Float[np.ndarray, " n"]
 Labels = Bool[np.ndarray, " n"]
 
@@ -132,7 +135,10 @@ def _logistic(
         chance = 1 / (1 + np.exp(-(design @ weights)))
         gradient = design.T @ (labels - chance) - penalty @ weights
         hessian = (design.T * (chance * (1 - chance))) @ design + penalty
-        weights = weights + np.linalg.solve(hessian, gradient)
+        step = np.linalg.solve(hessian, gradient)
+        weights = weights + step
+        if np.abs(step).max() < 1e-12:
+            break
     return weights
 
 
@@ -141,29 +147,95 @@ def warnings(table: "pd.DataFrame", measures: Sequence[str]) -> dict[str, Auc]:
 
     Logistic regressions, scored on layouts that they were not fitted on; predictors are ranks
     within their suite. The margin stands there unfitted, too: a low one foretells a failure.
-    `table` are episodes of one method that votes. Empty with fewer than LEAST_FAILURES.
+    What a fitted area is compared with is not .5, but that of `warnings_by_chance`. Intervals
+    resample the scored layouts; the fits are not repeated, so that they are too narrow. `table` are
+    episodes of one method that votes. Empty with fewer than LEAST_FAILURES.
     """
-    voted = table[table["margin"].notna()]
-    failed = ~voted["success"].to_numpy(bool)
-    if failed.sum() < LEAST_FAILURES:
+    known = _Voted.of(table, measures)
+    if known.failed.sum() < LEAST_FAILURES:
         return {}
-    layouts = [f"{one} {other}" for one, other in zip(voted["suite"], voted["layout"], strict=True)]
-    suites = list(voted["suite"].astype(str))
-    ranks = voted.groupby("suite", observed=True)[["margin", *measures]].rank(pct=True)
-    scores = {}
-    for name, columns in (
-        ("vote margin", ["margin"]),
-        ("attention", list(measures)),
-        ("both", ["margin", *measures]),
-    ):
-        scores[name] = left_out_scores(ranks[columns].to_numpy(float), failed, layouts)
+    scores = known.scores(known.failed)
     found = {}
-    low_margin = -ranks["margin"].to_numpy(float)
-    for name, values in {"low vote margin, unfitted": low_margin, **scores}.items():
-        found[name] = auc_interval(values, failed, layouts, suites)
+    for name, values in scores.items():
+        found[name] = auc_interval(values, known.failed, known.layouts, known.suites)
     pair = (scores["vote margin"], scores["both"])
-    found["both, beyond the margin"] = auc_gain(pair, failed, layouts, suites)
+    found[BEYOND] = auc_gain(pair, known.failed, known.layouts, known.suites)
     return found
+
+
+def warnings_by_chance(
+    table: "pd.DataFrame", measures: Sequence[str], draws: int = DRAWS
+) -> dict[str, Auc]:
+    """The areas of `warnings` when failures are dealt out at random within their suite.
+
+    The mean and the middle 95 % of the draws: what predictors reach that know nothing. Fitted ones
+    lie under .5 in the mean: the failures that a fold holds are missing from its fit, which leans
+    away from them. An area inside the range is not shown to be better or worse than chance.
+    Failures are dealt out to single episodes, as if those of one layout were independent.
+    """
+    known = _Voted.of(table, measures)
+    if known.failed.sum() < LEAST_FAILURES:
+        return {}
+    rng = np.random.default_rng(SEED)
+    areas: dict[str, list[float]] = {}
+    for _ in range(draws):
+        failed = _shuffled(known.failed, known.suites, rng)
+        drawn = {}
+        for name, values in known.scores(failed).items():
+            drawn[name] = auc(values, failed, known.suites)
+        drawn[BEYOND] = drawn["both"] - drawn["vote margin"]
+        for name, area in drawn.items():
+            areas.setdefault(name, []).append(area)
+    found = {}
+    for name, drawn_areas in areas.items():
+        low, high = percentiles(np.array(drawn_areas))
+        mean = float(np.mean(drawn_areas))
+        found[name] = Auc(value=mean, low=low, high=high, n=len(known.failed))
+    return found
+
+
+def _shuffled(labels: Labels, strata: Sequence[str], rng: np.random.Generator) -> Labels:
+    """The labels in another order within each stratum."""
+    names = np.asarray(strata, dtype=str)
+    shuffled = labels.copy()
+    for name in np.unique(names):
+        shuffled[names == name] = rng.permutation(labels[names == name])
+    return shuffled
+
+
+@dataclass(frozen=True)
+class _Voted:
+    """Episodes that voted, with the ranks of their margins and measures within their suite."""
+
+    failed: Labels
+    layouts: list[str]
+    suites: list[str]
+    margin: Float[np.ndarray, "n 1"]
+    measured: Float[np.ndarray, "n d"]
+
+    @classmethod
+    def of(cls, table: "pd.DataFrame", measures: Sequence[str]) -> "_Voted":
+        voted = table[table["margin"].notna()]
+        names = zip(voted["suite"], voted["layout"], strict=True)
+        ranks = voted.groupby("suite", observed=True)[["margin", *measures]].rank(pct=True)
+        return cls(
+            failed=~voted["success"].to_numpy(bool),
+            layouts=[f"{suite} {layout}" for suite, layout in names],
+            suites=list(voted["suite"].astype(str)),
+            margin=ranks[["margin"]].to_numpy(float),
+            measured=ranks[[*measures]].to_numpy(float),
+        )
+
+    def scores(self, failed: Labels) -> dict[str, Scores]:
+        """How likely each episode is to fail, by every predictor; `failed` are to be foretold."""
+        found = {"low vote margin, unfitted": -self.margin[:, 0]}
+        for name, predictors in (
+            ("vote margin", self.margin),
+            ("attention", self.measured),
+            ("both", np.column_stack([self.margin, self.measured])),
+        ):
+            found[name] = left_out_scores(predictors, failed, self.layouts)
+        return found
 
 
 def predict_success(table: "pd.DataFrame", measures: Sequence[str]) -> "dict[str, Auc]":

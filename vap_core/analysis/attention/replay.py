@@ -32,6 +32,8 @@ from vap_core.simulation.types import EpisodeRow
 if TYPE_CHECKING:
     import pandas as pd
 
+ERRORS = "errors"
+"""Beside the tables in a part: the episodes that ended in an error, and its last line."""
 Known = tuple[str, int]
 """Outcome and number of steps that an episode has in the run."""
 
@@ -75,8 +77,8 @@ def run_replay(
 
     `source` is a run's folder or a published table.
 
-    Raises: BadOutput, BadStudy when nothing is left of what is asked for, or it was run with
-        weights that are not here.
+    Raises: BadOutput, BadStudy when nothing is left of what is asked for, when it was run with
+        weights that are not here, or when no call of the policy was observed.
     """
     from tqdm import tqdm
 
@@ -205,7 +207,7 @@ def run_job(job: Job) -> dict[str, Rows]:
         return observer
 
     trial = replace(trial, attention=QUERIES)
-    found: dict[str, Rows] = {name: [] for name in tables.TABLES}
+    found: dict[str, Rows] = {name: [] for name in (*tables.TABLES, ERRORS)}
     episodes = list(rollout(trial, job.rows, observe, batch=BATCH))
     for row, episode, known in zip(job.rows, episodes, job.known, strict=True):
         observer = observers.get((row.key, row.seed))
@@ -215,6 +217,9 @@ def run_job(job: Job) -> dict[str, Rows]:
         found["episodes"].append({**about, **_ending(observer, episode, known)})
         for name, rows in observer.tables.items():
             found[name] += [{**about, **row} for row in rows]
+        if episode.outcome.status == "error":
+            error = episode.outcome.detail.strip().rpartition("\n")[2]
+            found[ERRORS].append({**about, "error": error})
     return found
 
 
@@ -262,11 +267,17 @@ def _ending(observer: Observer, episode: Episode, known: Known) -> dict[str, Any
 
 
 def _write_tables(source: Path, folder: Path, parts: Sequence[Path]) -> "dict[str, pd.DataFrame]":
-    """All parts as one table of each kind, with the runs and the code in the metadata."""
-    rows: dict[str, Rows] = {name: [] for name in tables.TABLES}
+    """All parts as one table of each kind, with the runs and the code in the metadata.
+
+    Raises: BadStudy when they hold no call.
+    """
+    rows: dict[str, Rows] = {name: [] for name in (*tables.TABLES, ERRORS)}
     for path in parts:
         for name, part in measurements.read_json_part(path, caller="attention").items():
             rows[name] += part
+    errors = rows.pop(ERRORS)
+    if not rows["calls"]:
+        raise _without_calls(folder, len(rows["episodes"]), errors)
     measured = {row["suite"] for row in rows["episodes"]}
     runs = []
     for manifest, episodes in read_runs(source):
@@ -274,3 +285,15 @@ def _write_tables(source: Path, folder: Path, parts: Sequence[Path]) -> "dict[st
             runs.append(manifest)
     tables.write(folder, rows, runs)
     return tables.read(folder)
+
+
+def _without_calls(folder: Path, episodes: int, errors: Rows) -> BadStudy:
+    reason = f"{len(errors)} ended in an error"
+    if errors:
+        first = errors[0]
+        name = "/".join(str(first[part]) for part in ("suite", "task", "method", "episode"))
+        reason += f", the first is {name}: {first['error']:.200}"
+    return BadStudy(
+        f"attention: no call of the policy was observed in {episodes} episodes; {reason}. Mend "
+        f"it, delete {folder / 'parts'} and run the same command again."
+    )

@@ -12,6 +12,7 @@ from vap_core.analysis.attention.patterns import (
     with_localisation,
 )
 from vap_core.analysis.attention.prediction import predict_success
+from vap_core.base.errors import BadStudy
 from vap_core.base.tables import align
 from vap_core.evaluation.perception.estimates import share
 from vap_core.evaluation.store import KEY
@@ -27,22 +28,29 @@ INTERVALS = ("lift", "lift_lookalikes", "on_target", "on_rival")
 
 
 def text(tables: "dict[str, pd.DataFrame]") -> str:
-    """Where every query looks, the patterns, and how well the measures tell successes."""
+    """Where every query looks, the patterns, and how well the measures tell successes.
+
+    Where no call came before the first touch, it says so.
+    """
     episodes = tables["episodes"]
     table = per_episode(tables["calls"], episodes)
     whole = per_episode(tables["calls"], episodes, whole=True)
     again = int(episodes["reproduced"].sum())
-    parts = [
-        f"{len(episodes)} episodes run again, {again} of them end as in the run; before the first "
-        "touch:",
-        align(_rows(where_text(where_queries_look(table)))),
-        "the word that means the target, over whole episodes:",
-        align(_rows(pattern_counts(with_localisation(whole)))),
-    ]
-    parts.append(
-        "area under the ROC curve for success, before the first touch [95 %, layouts resampled]:"
-    )
-    parts.append(align(_rows(auc_table(with_localisation(table)).reset_index())))
+    parts = [f"{len(episodes)} episodes run again, {again} of them end as in the run"]
+    if len(table):
+        parts[0] += "; before the first touch:"
+        parts.append(align(_rows(where_text(where_queries_look(table)))))
+    if len(whole):
+        parts.append("the word that means the target, over whole episodes:")
+        parts.append(align(_rows(pattern_counts(with_localisation(whole)))))
+    if len(table):
+        parts.append(
+            "area under the ROC curve for success, before the first touch "
+            "[95 %, layouts resampled]:"
+        )
+        parts.append(align(_rows(auc_table(with_localisation(table)).reset_index())))
+    else:
+        parts.append("no call came before the first touch")
     return "\n\n".join(parts)
 
 
@@ -140,10 +148,7 @@ def pattern_counts(table: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def layer_table(layers: "pd.DataFrame") -> "pd.DataFrame":
-    """Density on the target and on the look-alikes by layer, mean over heads and episodes.
-
-    `best_head` is the mean over episodes of the densest head on the target.
-    """
+    """Density on the target and on the look-alikes by layer, mean over heads and episodes."""
     import pandas as pd
 
     rows = []
@@ -154,8 +159,6 @@ def layer_table(layers: "pd.DataFrame") -> "pd.DataFrame":
         row["n"] = len(seen[KEY].drop_duplicates())
         row["lift"] = seen["share_target"].sum() / seen["chance_target"].sum()
         row["lift_lookalikes"] = seen["share_lookalikes"].sum() / seen["chance_lookalikes"].sum()
-        by_head = seen.groupby("head", observed=True)[["share_target", "chance_target"]].sum()
-        row["best_head"] = (by_head["share_target"] / by_head["chance_target"]).max()
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -203,7 +206,14 @@ def causal_table(causal: "pd.DataFrame") -> "pd.DataFrame":
     Columns with a region's name are the density inside it, 1 where it is that of the whole view;
     `rank_gradient` and `rank_masking` are the mean rank correlations over patches with the two
     causal measures; n is calls.
+
+    Raises: BadStudy when no call has causal measures.
     """
+    if causal.empty:
+        raise BadStudy(
+            "attention: no call of these tables has causal measures; replay with --explain 2 and "
+            "another --out."
+        )
     groups = causal.groupby(["suite", "method", "measure"], observed=True, sort=False)
     table = groups[["hit", "chance_hit", "rank_gradient", "rank_masking"]].mean()
     for region in reversed(REGIONS):

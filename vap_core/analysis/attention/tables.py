@@ -57,18 +57,18 @@ def read(folder: Path) -> "dict[str, pd.DataFrame]":
 def publish(folder: Path, to: Path) -> list[Path]:
     """Keep the tables of a finished replay in another folder.
 
-    What that holds of other suites and methods stays. Raises: BadOutput.
+    What that holds of the suites and methods of these episodes goes, also from a table to which
+    the replay adds nothing; what it holds of others stays. Raises: BadOutput.
     """
     import pyarrow.parquet as pq
 
+    found = read(folder)
     files = {}
-    for name, table in read(folder).items():
-        if table.empty:
-            continue  # nothing was explained, or asked
+    for name, table in found.items():
         metadata = pq.read_schema(folder / file_name(name)).metadata or {}
         (about,) = parse_json(metadata[ABOUT])
         files[file_name(name)] = measurements.add_rows(
-            to / file_name(name), table, REPLACED, {ABOUT: about}
+            to / file_name(name), table, REPLACED, {ABOUT: about}, replaced=found["episodes"]
         )
     return measurements.publish_tables(files, to, caller="attention")
 

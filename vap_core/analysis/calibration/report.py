@@ -10,7 +10,7 @@ import numpy as np
 
 from vap_core.base.tables import Rows, align
 from vap_core.base.types import value
-from vap_core.evaluation.photos.report import clustered_share
+from vap_core.evaluation.perception.estimates import clustered_share
 from vap_core.perception.protocols import FamiliarityJudge, Stack, Thresholds
 
 if TYPE_CHECKING:

@@ -10,6 +10,7 @@ objects, as `objects import --out` writes them.
 
 import hashlib
 import os
+import shlex
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,11 +18,11 @@ from pathlib import Path
 from vap_core.base.csv_rows import read_rows
 from vap_core.base.errors import BadObject
 from vap_core.base.types import value
+from vap_core.memory import kind_instead
 from vap_core.simulation.assets.scans import import_scan, storage
 
 TABLE = "objects.csv"
 COLUMNS = ("file", "category", "height_cm", "groups")
-VARIABLE = "VAP_OBJECTS"
 
 
 @value
@@ -55,6 +56,7 @@ def read_source(folder: Path) -> Source:
         name = import_scan.default_name(path)
         if name in groups:
             raise BadObject(f"eval-objects: {where} names a second {name!r}; rename the file.")
+        _check_category(row["category"], where)
         _check_height(row["height_cm"], where)
         groups[name] = tuple(word for word in map(str.strip, row["groups"].split(";")) if word)
         files[name] = row
@@ -88,24 +90,39 @@ def import_missing(
                 report=lambda line: None,
             )
         except BadObject as error:
-            refused[name] = str(error)
+            refused[name] = f"{error}{_by_itself(folder, row, str(error))}"
             continue
         storage.save_scan(target, metadata, scan, replace=True)
     return refused
 
 
+def _by_itself(folder: Path, row: Mapping[str, str], error: str) -> str:
+    """How to import a file with the option that an error names; "" where it names none."""
+    if " --" not in error:
+        return ""
+    words = ["objects", "import", str(folder / row["file"]), "--category", row["category"]]
+    if row["height_cm"]:
+        words += ["--height-cm", row["height_cm"]]
+    if "pass --repair" in error:
+        words.append("--repair")
+    return (
+        f" It is an option of python -m vap_core {shlex.join(words)} --out DIR; then measure with "
+        "eval-objects DIR."
+    )
+
+
 @contextmanager
 def objects_in(folder: Path) -> Iterator[None]:
     """Look own objects up in `folder`, in this process and in those that it starts."""
-    before = os.environ.get(VARIABLE)
-    os.environ[VARIABLE] = str(folder.resolve())
+    before = os.environ.get(storage.VARIABLE)
+    os.environ[storage.VARIABLE] = str(folder.resolve())
     try:
         yield
     finally:
         if before is None:
-            del os.environ[VARIABLE]
+            del os.environ[storage.VARIABLE]
         else:
-            os.environ[VARIABLE] = before
+            os.environ[storage.VARIABLE] = before
 
 
 def _imported(folder: Path) -> Source:
@@ -121,6 +138,15 @@ def _imported(folder: Path) -> Source:
             f"{','.join(COLUMNS)} for every 3-D file into {folder / TABLE}."
         )
     return Source(groups=groups, files={}, sha256=digest.hexdigest())
+
+
+def _check_category(text: str, where: str) -> None:
+    kind = kind_instead(text)
+    if kind:
+        raise BadObject(
+            f"eval-objects: {where} has the category {text!r}; name the kind of thing alone, in "
+            f"words, for example {kind}."
+        )
 
 
 def _check_height(text: str, where: str) -> None:

@@ -9,8 +9,8 @@ import numpy as np
 from vap_core.base.photos import load_photo
 from vap_core.base.tables import Rows, align
 from vap_core.base.types import value
+from vap_core.evaluation.perception.estimates import clustered_share
 from vap_core.evaluation.photos.pictures import join_tiles, write_picture
-from vap_core.evaluation.photos.report import clustered_share
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -46,7 +46,9 @@ def text_report(tables: Tables) -> str:
     if tables.refused:
         lines = [f"left out: {name}: {why}" for name, why in tables.refused.items()]
         parts.append("\n".join(lines))
-    return "\n\n".join([*parts, NOTE])
+    if len(tables.views):
+        parts.append(NOTE)
+    return "\n\n".join(parts)
 
 
 def object_rows(tables: Tables) -> Rows:

@@ -1,6 +1,6 @@
 """Measures the objects of a folder one by one; what an interrupted run had finished is kept."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -65,7 +65,8 @@ class ObjectSurvey:
 def measure_objects(folder: Path, out: Path, asked: ObjectSurvey) -> str:
     """Do what `out` lacks of the measurement, write tables and sheets, and return the report.
 
-    Raises: BadObject; UnknownName; MissingWeights; BadOutput when `out` holds another run.
+    Raises: BadObject, also where every object was left out; UnknownName; MissingWeights; BadOutput
+        when `out` holds another run.
     """
     from tqdm import tqdm
 
@@ -81,8 +82,19 @@ def measure_objects(folder: Path, out: Path, asked: ObjectSurvey) -> str:
         written = _write(tables, out)
         report = text_report(tables)
         write_atomic(out / "report.txt", f"{report}\n".encode())
+        if not len(views):
+            raise _nothing_measured(refused, out)
     names = ", ".join(map(str, [*written, *write_sheets(out)]))
     return f"{report}\n\nwrote {names}"
+
+
+def _nothing_measured(refused: Mapping[str, str], out: Path) -> BadObject:
+    """Why the first object was left out, and where the report has the others."""
+    name, why = next(iter(refused.items()))
+    others = ""
+    if len(refused) > 1:
+        others = f" Of {len(refused) - 1} more {out / 'report.txt'} says why."
+    return BadObject(f"eval-objects: every object was left out. {name}: {why}{others}")
 
 
 def _configuration(source: Source, asked: ObjectSurvey) -> dict[str, Any]:

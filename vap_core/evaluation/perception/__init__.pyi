@@ -6,6 +6,7 @@ from .curves import lookalike_pairs as lookalike_pairs
 from .curves import references_figure as references_figure
 from .curves import time_figure as time_figure
 from .estimates import share as share
+from .estimates import share_by as share_by
 from .first_frames import opening_views as opening_views
 from .first_frames import registered_object as registered_object
 from .report import measures as measures

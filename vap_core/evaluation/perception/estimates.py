@@ -1,10 +1,12 @@
 """Shares, means and average precisions with their 95 % intervals.
 
 Views of one episode show the same objects, so means and average precisions are bootstrapped by
-episode (percentiles, seeded); shares carry Wilson's interval over views, objects or tracks.
+episode (percentiles, seeded). `share` carries Wilson's interval over views, objects or tracks, as
+if each were independent of the others: too narrow where they are of few episodes or objects.
+`clustered_share` and `share_by` take those for the units.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -58,6 +60,44 @@ def share(hits: Iterable[Any]) -> Estimate:
             n_right += bool(hit)
     found = rate(n_right, n_known)
     return Estimate(value=found.value, low=found.low, high=found.high, n=found.n)
+
+
+def clustered_share(hits: Float64[np.ndarray, " n"], clusters: Iterable[object]) -> Estimate:
+    """The mean of hits (0 to 1) and its 95 % interval when whole clusters are independent.
+
+    Wilson's interval for n / d cases, where the design effect d is the mean's cluster-robust
+    variance over the variance that n independent cases would have. n / d is at least the number of
+    clusters, which it also is where all hits are alike, and at most n.
+    """
+    from statsmodels.stats.proportion import proportion_confint
+
+    n = len(hits)
+    if not n:
+        return NONE
+    share = float(hits.mean())
+    _, number = np.unique([str(name) for name in clusters], return_inverse=True)
+    count = int(number.max()) + 1
+    independent = share * (1 - share) / n
+    worth = float(count)
+    if count > 1 and independent > 0:
+        sums = np.bincount(number, hits - share)
+        clustered = float((sums**2).sum()) / n**2 * count / (count - 1)
+        if clustered > 0:
+            worth = float(np.clip(n * independent / clustered, count, n))
+        else:
+            worth = float(n)
+    low, high = proportion_confint(share * worth, worth, alpha=0.05, method="wilson")
+    return Estimate(value=share, low=float(low), high=float(high), n=n)
+
+
+def share_by(table: "pd.DataFrame", column: str, units: Sequence[str]) -> Estimate:
+    """The share of a column's known values that hold; rows alike in the columns `units` are one.
+
+    The interval is `clustered_share`'s: rows that repeat others of their unit do not narrow it.
+    """
+    known = table.dropna(subset=[column])
+    names = known[[*units]].itertuples(index=False, name=None)
+    return clustered_share(known[column].to_numpy(float), names)
 
 
 def mean(table: "pd.DataFrame", column: str) -> Estimate:

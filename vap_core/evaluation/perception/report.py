@@ -29,7 +29,8 @@ CASES = ("right", "case 1", "case 2", "nothing")
 TIERS = ("standard", "hard")
 NOTE = (
     f"value [95 % interval] n; K = {USUAL_K}, vote, unless said otherwise. Shares: Wilson over "
-    "views (objects for recall, tracks for identity); IoU and AP50: bootstrap by episode.\n"
+    "views (objects for recall, tracks for identity), too narrow where views are of one object or "
+    "tracks of one episode; IoU and AP50: bootstrap by episode.\n"
     "Views that show less of the target than 100 px of 224 x 224 do not count. 'hard': a "
     "look-alike of the target's own base and ink colours is in view."
 )

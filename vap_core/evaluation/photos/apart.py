@@ -10,7 +10,7 @@ from vap_core.base.errors import BadPhotoSet
 from vap_core.base.photos import load_mask, load_photo
 from vap_core.base.types import Boxes, PersonalObject
 from vap_core.evaluation.photos.folder import Scene
-from vap_core.evaluation.photos.measure import judge
+from vap_core.evaluation.photos.measure import clip_boxes, judge
 from vap_core.memory import reference_rows
 from vap_core.perception.boxes import mask_iou
 from vap_core.perception.protocols import Stack
@@ -26,13 +26,15 @@ Row = dict[str, Any]
 def mask_rows(scene: Scene, stack: Stack) -> list[Row]:
     """The IoU of the stack's mask from the true box with the true mask, a row per given mask.
 
-    Raises: BadPhoto, BadPhotoSet: a mask cannot be read, or is not as large as its scene.
+    Raises: BadPhoto, BadPhotoSet: a mask cannot be read, or is not as large as its scene; or as
+        `clip_boxes`.
     """
     if not scene.masks:
         return []
     rgb = load_photo(scene.path, long_side=None)
     names = sorted(scene.masks)
-    xyxy = np.concatenate([scene.boxes[name] for name in names])
+    true_boxes = clip_boxes(scene, rgb).boxes
+    xyxy = np.concatenate([true_boxes[name] for name in names])
     boxes = Boxes(xyxy, np.ones(len(xyxy), np.float32), "true boxes")
     found = stack.segmenter(rgb, judge(rgb, boxes, stack))
     rows: list[Row] = []

@@ -16,7 +16,7 @@ from jaxtyping import Float64
 from vap_core.base.photos import load_photo
 from vap_core.base.types import Boxes, Mask, Rgb, value
 from vap_core.evaluation.photos.folder import PhotoSet, Scene
-from vap_core.evaluation.photos.measure import judge
+from vap_core.evaluation.photos.measure import clip_boxes, judge
 from vap_core.perception.protocols import Stack, TargetTracker
 
 FRAMES = 48
@@ -70,9 +70,10 @@ def follow_scene(scene: Scene, photo_set: PhotoSet, stack: Stack) -> list[Row]:
     `end` is what the mask lies on when the window is back: object, twin, other, or "" for no mask.
     `on_object` counts frames, of the `in_view` ones, `on_twin` of all `frames`.
 
-    Raises: BadPhoto when the scene's photo cannot be read.
+    Raises: BadPhoto when the scene's photo cannot be read; BadPhotoSet, as `clip_boxes`.
     """
     rgb = load_photo(scene.path, long_side=None)
+    scene = clip_boxes(scene, rgb)
     pan = pan_over(rgb)
     subjects = {subject.name for subject in photo_set.subjects}
     rows = []

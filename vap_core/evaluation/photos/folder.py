@@ -25,7 +25,7 @@ from vap_core.base.csv_rows import read_rows
 from vap_core.base.errors import BadPhotoSet
 from vap_core.base.photos import photos_in
 from vap_core.base.types import value
-from vap_core.memory import CATEGORY, plain_category
+from vap_core.memory import kind_instead, plain_category
 
 BOX = ("x0", "y0", "x1", "y1")
 MASKS = "masks"
@@ -74,6 +74,12 @@ class PhotoSet:
     scenes: tuple[Scene, ...]
     categories: Mapping[str, str]
     sha256: str
+
+    @property
+    def rivals(self) -> tuple[str, ...]:
+        """The objects of scenes without references, which are never asked for."""
+        asked = {subject.name for subject in self.subjects}
+        return tuple(sorted(set(self.categories) - asked))
 
 
 def read_photo_set(folder: Path) -> PhotoSet:
@@ -246,7 +252,7 @@ def read_categories(
             categories[row["object"]] = row["category"]
     for name, category in categories.items():
         categories[name] = plain_category(category)
-        if not CATEGORY.fullmatch(categories[name]):
+        if kind_instead(category):
             raise BadPhotoSet(
                 f"{caller}: {category!r} cannot be a category; write {name},KIND into {table} "
                 "with the kind in words, for example mug-1,cup."
@@ -275,6 +281,11 @@ def _parse_box(row: Mapping[str, str], where: str) -> Box | None:
         raise BadPhotoSet(
             f"eval-photos: {where} has the box {','.join(cells)!r} without area; x to the right, "
             "y down, far corner last."
+        )
+    if (box[2:] - box[:2] < 1).any() or box.max() <= 1:
+        raise BadPhotoSet(
+            f"eval-photos: {where} has the box {','.join(cells)!r} with a side of a pixel or less; "
+            "give pixels, not fractions of the picture."
         )
     return box
 

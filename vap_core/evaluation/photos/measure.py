@@ -23,6 +23,8 @@ from vap_core.perception.proof import prove
 from vap_core.perception.protocols import FamiliarityJudge, Stack
 
 CAMERA = "photo"
+BEYOND_PX = 4
+"""How far a box that is drawn by hand may reach beyond its photo; it is clipped."""
 Row = dict[str, Any]
 Memory = Mapping[str, PersonalObject]
 
@@ -32,10 +34,11 @@ def measure_scene(
 ) -> list[Row]:
     """One row for every remembered object that the scene's lines name.
 
-    Raises: BadPhoto, BadPhotoSet: the photo cannot be read, or a box lies outside of it.
+    Raises: BadPhoto when the photo cannot be read; BadPhotoSet, as `clip_boxes`.
     """
     rgb = load_photo(scene.path, long_side=None)
-    true_boxes, owners = _true_boxes(scene, rgb)
+    scene = clip_boxes(scene, rgb)
+    true_boxes, owners = _true_boxes(scene)
     candidates = _candidates(rgb, true_boxes, attender.stack)
     rows = []
     for name, boxes in scene.boxes.items():
@@ -61,22 +64,37 @@ def measure_scene(
     return rows
 
 
-def _true_boxes(scene: Scene, rgb: Rgb) -> tuple[Boxes, list[str]]:
-    """Every box of the scene, clipped to the photo, and whose it is."""
+def clip_boxes(scene: Scene, rgb: Rgb) -> Scene:
+    """The scene with its boxes clipped to its photo.
+
+    Raises: BadPhotoSet: a box lies outside the photo, or reaches more than BEYOND_PX beyond it.
+    """
     height, width = rgb.shape[:2]
-    clipped = [np.zeros((0, 4), np.float32)]
+    clipped = {}
+    for name, boxes in scene.boxes.items():
+        clipped[name] = np.clip(boxes, 0, (width, height, width, height)).astype(np.float32)
+        for box, inside in zip(boxes, clipped[name], strict=True):
+            flaw = ""
+            if abs(box - inside).max() > BEYOND_PX:
+                flaw = "reaches beyond"
+            if (inside[2:] - inside[:2] < 1).any():
+                flaw = "lies outside"
+            if flaw:
+                raise BadPhotoSet(
+                    f"eval-photos: the box {box.tolist()} of {name!r} {flaw} {scene.path}, which "
+                    f"has {width}x{height} pixels when upright; mend scenes.csv."
+                )
+    return replace(scene, boxes=clipped)
+
+
+def _true_boxes(scene: Scene) -> tuple[Boxes, list[str]]:
+    """Every box of the scene, and whose it is."""
+    every = [np.zeros((0, 4), np.float32)]
     owners = []
     for name, boxes in scene.boxes.items():
-        for box in boxes:
-            inside = np.clip(box, 0, (width, height, width, height)).astype(np.float32)
-            if not (inside[2:] - inside[:2] >= 1).all():
-                raise BadPhotoSet(
-                    f"eval-photos: the box {box.tolist()} of {name!r} lies outside {scene.path}, "
-                    f"which has {width}x{height} pixels when upright; mend scenes.csv."
-                )
-            clipped.append(inside[None])
-            owners.append(name)
-    xyxy = np.concatenate(clipped)
+        every.append(boxes)
+        owners += [name] * len(boxes)
+    xyxy = np.concatenate(every)
     return Boxes(xyxy, np.ones(len(xyxy), np.float32), "true boxes"), owners
 
 

@@ -7,7 +7,11 @@ import numpy as np
 from jaxtyping import Float64
 
 from vap_core.base.tables import Rows, align
-from vap_core.evaluation.perception.estimates import NONE, RESAMPLES, Estimate
+from vap_core.evaluation.perception.estimates import (
+    RESAMPLES,
+    Estimate,
+    clustered_share,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -141,34 +145,6 @@ def vote_rows(table: "pd.DataFrame") -> Rows:
             cells.append(_share(known[column], known))
         rows.append(cells)
     return rows
-
-
-def clustered_share(hits: Float64[np.ndarray, " n"], clusters: Iterable[object]) -> Estimate:
-    """The mean of hits (0 to 1) and its 95 % interval when whole clusters are independent.
-
-    Wilson's interval for n / d cases, where the design effect d is the mean's cluster-robust
-    variance over the variance that n independent cases would have. n / d is at least the number of
-    clusters, which it also is where all hits are alike, and at most n.
-    """
-    from statsmodels.stats.proportion import proportion_confint
-
-    n = len(hits)
-    if not n:
-        return NONE
-    share = float(hits.mean())
-    _, number = np.unique([str(name) for name in clusters], return_inverse=True)
-    count = int(number.max()) + 1
-    independent = share * (1 - share) / n
-    worth = float(count)
-    if count > 1 and independent > 0:
-        sums = np.bincount(number, hits - share)
-        clustered = float((sums**2).sum()) / n**2 * count / (count - 1)
-        if clustered > 0:
-            worth = float(np.clip(n * independent / clustered, count, n))
-        else:
-            worth = float(n)
-    low, high = proportion_confint(share * worth, worth, alpha=0.05, method="wilson")
-    return Estimate(value=share, low=float(low), high=float(high), n=n)
 
 
 def _share(hits: "pd.Series", part: "pd.DataFrame") -> str:

@@ -1,5 +1,6 @@
 """Measures a photo set scene by scene; what an interrupted run had finished is kept."""
 
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,7 @@ from vap_core.evaluation import store
 from vap_core.evaluation.measurements import read_json_part, write_json_part, write_table
 from vap_core.evaluation.photos.apart import mask_rows, single_rows
 from vap_core.evaluation.photos.clips import follow_scene
-from vap_core.evaluation.photos.folder import PhotoSet, Scene, read_photo_set
+from vap_core.evaluation.photos.folder import SCENES_CSV, PhotoSet, Scene, read_photo_set
 from vap_core.evaluation.photos.measure import Row, measure_scene
 from vap_core.evaluation.photos.register import remember_subjects
 from vap_core.evaluation.photos.report import (
@@ -42,13 +43,16 @@ def measure_photos(
     """Do what `out` lacks of the measurement, write tables and sheets, and return the report.
 
     With `clips` objects are followed through clips made of the scenes, too (clips.py). Where not
-    `kept`, thresholds that were kept on this machine do not count: the best candidate wins.
+    `kept`, thresholds that were kept on this machine do not count: the best candidate wins. With
+    `progress` stderr has bars, and a note of the objects that have no references.
 
     Raises: BadPhotoSet, BadPhoto; MissingWeights; BadOutput when `out` holds another run.
     """
     import pandas as pd
 
     photo_set = read_photo_set(folder)
+    if progress and photo_set.subjects and photo_set.rivals:
+        print(_rivals_note(photo_set), file=sys.stderr)
     store.open_run(out, _configuration(photo_set, stack_name, kept))
     parts: list[str] = []
     written: list[Path] = []
@@ -88,6 +92,14 @@ def measure_photos(
         write_atomic(out / "report.txt", f"{report}\n".encode())
     names = ", ".join(map(str, written))
     return f"{report}\n\nwrote {names}"
+
+
+def _rivals_note(photo_set: PhotoSet) -> str:
+    """A misspelt object is a rival, too, and no question then asks for it."""
+    return (
+        f"note: {SCENES_CSV} names {', '.join(photo_set.rivals)} without references: taken as "
+        "rivals, not asked for; where one is misspelt, mend it and measure anew"
+    )
 
 
 def _configuration(photo_set: PhotoSet, stack_name: str, kept: bool) -> dict[str, object]:

@@ -1,10 +1,10 @@
 """Where the numbers of a report come from: digests, versions, and the commands of the runs."""
 
-import shlex
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vap_core.base.commands import command
 from vap_core.base.errors import VapError
 from vap_core.evaluation.policy_names import policy_today
 from vap_core.evaluation.report.runs import Runs
@@ -58,14 +58,19 @@ def _policy(runs: Runs, name: Path) -> str:
 
 
 def command_line(study: dict[str, Any]) -> str:
-    """The command line that runs a configuration, without --out; in code where no command does."""
+    """The command line that runs a configuration, without --out; in code where no command does.
+
+    It finds the user's own suites, where they are known here.
+    """
+    files = suites.own_files(suite for suite, _ in study["tasks"])
+    study = {**study, "suite_files": files}
     tasks_by_suite: dict[str, list[str]] = {}
     for suite, task in study["tasks"]:
         tasks_by_suite.setdefault(suite, []).append(task)
     changed = _changed(study)
     whole = _are_whole_suites(changed["tasks"], study.get("object", ""))
     if _is_demo(study, changed):
-        return f"python -m vap_core demo --episodes {study['episodes']} --seed {study['seed']}"
+        return command("demo", "--episodes", str(study["episodes"]), "--seed", str(study["seed"]))
     if not whole and not _suits_rollout(study, changed):
         return f"Study({', '.join(f'{name}={setting!r}' for name, setting in changed.items())})"
     words = ["eval" if whole else "rollout"]
@@ -81,7 +86,7 @@ def command_line(study: dict[str, Any]) -> str:
             words += [f"--{name}", str(setting)]
     if study.get("audit"):
         words.append("--audit")
-    return "python -m vap_core " + shlex.join(words)
+    return command(*words, environment=suites.own.environment(files))
 
 
 def _is_demo(study: dict[str, Any], changed: dict[str, Any]) -> bool:

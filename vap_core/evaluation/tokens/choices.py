@@ -5,6 +5,9 @@ model is asked about each alone. The one with the highest answer, the mean over 
 it, is the model's choice. That is its recognition at its best: a policy sees all of them at once,
 small, and has to move there as well. The same choice among unseen photos of the same objects says
 what the change from photo to scene costs.
+
+Every object has one learned token, so its episodes are not independent of each other: all intervals
+and p values here take objects, not episodes, as the independent units.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,9 +20,9 @@ from jaxtyping import Float32
 
 from vap_core.base.types import Mask, Rgb, value
 from vap_core.evaluation.engine import spread_evenly
-from vap_core.evaluation.perception.estimates import Estimate, share
+from vap_core.evaluation.perception.estimates import Estimate, clustered_share
 from vap_core.evaluation.perception.first_frames import opening_views
-from vap_core.evaluation.statistics import bootstrap_interval
+from vap_core.evaluation.statistics import bootstrap_interval, holm, sign_flip
 from vap_core.perception.boxes import mask_box
 from vap_core.policies.mini_pi0.learned_token import answers
 from vap_core.simulation import suites
@@ -45,6 +48,8 @@ AFTER_RIGHT = "soft, where the model is right"
 AFTER_WRONG = "soft, where it is wrong"
 """Columns of `beside_policy` beside the methods."""
 ALL_SUITES = "all suites"
+TO_SCENE, TO_POLICY = "photo to scene", "scene to policy"
+"""Steps at which an object is lost, the rows of `losses`."""
 
 
 @value
@@ -149,8 +154,8 @@ def beside_policy(
 
     `table` has the rows of `scores` of one reading, of SCENE and of PHOTO; `episodes` are those of
     a published table, whose methods are columns. A row per suite and, if there are several, one for
-    ALL_SUITES; shares are `Estimate`s. The last two columns are soft's first touches where the
-    model's choice in the scene was right, and where it was not.
+    ALL_SUITES; shares are `Estimate`s with intervals over objects. The last two columns are soft's
+    first touches where the model's choice in the scene was right, and where it was not.
     """
     import pandas as pd
 
@@ -160,18 +165,15 @@ def beside_policy(
         index=KEY, columns="method", values="first_object_correct", aggfunc="first", observed=True
     )
     joined = joined.merge(first.reset_index(), on=KEY)
-    parts = [(str(name), part) for name, part in joined.groupby("suite", sort=False)]
-    if len(parts) > 1:
-        parts.append((ALL_SUITES, joined))
     lines = {}
-    for name, part in parts:
+    for name, part in _parts(joined):
         line: dict[str, Estimate | float] = {"chance": float(part["chance"].mean())}
-        line[IN_PHOTOS] = share(part["right_photo"])
-        line[IN_SCENE] = share(part["right"])
+        line[IN_PHOTOS] = _share(part, "right_photo")
+        line[IN_SCENE] = _share(part, "right")
         for method in methods:
-            line[method] = share(part[method])
-        line[AFTER_RIGHT] = share(part.loc[part["right"], "soft"])
-        line[AFTER_WRONG] = share(part.loc[~part["right"], "soft"])
+            line[method] = _share(part, method)
+        line[AFTER_RIGHT] = _share(part[part["right"]], "soft")
+        line[AFTER_WRONG] = _share(part[~part["right"]], "soft")
         lines[name] = line
     return pd.DataFrame(lines).T
 
@@ -179,11 +181,9 @@ def beside_policy(
 def cost_of_scene(table: "pd.DataFrame") -> Estimate:
     """The share of right choices in photos minus that in the scene, over the same episodes.
 
-    `table` is `beside_policy`'s. The interval is bootstrapped over episodes.
+    `table` is `beside_policy`'s. The interval is bootstrapped over objects, n are episodes.
     """
-    photo = chosen(table[table["seen_in"] == PHOTO])[[*KEY, "right"]]
-    both = chosen(table[table["seen_in"] == SCENE]).merge(photo, on=KEY, suffixes=("", "_photo"))
-    return _mean_gain(both["right_photo"], both["right"])
+    return _mean_gain(_gains_of_photos(table))
 
 
 def cost_of_policy(table: "pd.DataFrame", episodes: "pd.DataFrame") -> Estimate:
@@ -191,13 +191,72 @@ def cost_of_policy(table: "pd.DataFrame", episodes: "pd.DataFrame") -> Estimate:
 
     `table` and `episodes` are `beside_policy`'s.
     """
+    return _mean_gain(_gains_of_scene(table, episodes))
+
+
+def losses(table: "pd.DataFrame", episodes: "pd.DataFrame") -> "pd.DataFrame":
+    """What is lost at TO_SCENE and at TO_POLICY, by suite; `table` and `episodes` likewise.
+
+    A row per step and suite, and one for ALL_SUITES if there are several: `loss` is an `Estimate`
+    over `objects`, `p` the exact test that an object is as likely to win as to lose (`sign_flip`),
+    `p_holm` is `p` corrected for the suites of a step; that of ALL_SUITES is `p`.
+    """
+    import pandas as pd
+
+    rows = []
+    steps = {TO_SCENE: _gains_of_photos(table), TO_POLICY: _gains_of_scene(table, episodes)}
+    for step, gains in steps.items():
+        of_step: list[dict[str, Any]] = []
+        for suite, part in _parts(gains):
+            by_object = _by_object(part)
+            line = {"step": step, "suite": suite, "objects": len(by_object)}
+            p = sign_flip(by_object["sum"].to_numpy(float))
+            of_step.append({**line, "loss": _mean_gain(part), "p": p, "p_holm": p})
+        single = [line for line in of_step if line["suite"] != ALL_SUITES]
+        for line, p_holm in zip(single, holm([line["p"] for line in single]), strict=True):
+            line["p_holm"] = p_holm
+        rows += of_step
+    return pd.DataFrame(rows).set_index(["step", "suite"])
+
+
+def _parts(joined: "pd.DataFrame") -> "list[tuple[str, pd.DataFrame]]":
+    """The episodes of each suite; all of them at the end where there are several suites."""
+    parts = [(str(name), part) for name, part in joined.groupby("suite", sort=False)]
+    if len(parts) > 1:
+        parts.append((ALL_SUITES, joined))
+    return parts
+
+
+def _share(part: "pd.DataFrame", column: str) -> Estimate:
+    """The share of the known values of a column that hold; the interval is over objects."""
+    known = part.dropna(subset=[column])
+    return clustered_share(known[column].to_numpy(float), known["object"])
+
+
+def _gains_of_photos(table: "pd.DataFrame") -> "pd.DataFrame":
+    """By how much an episode is right in photos more than in the scene: -1, 0 or 1."""
+    photo = chosen(table[table["seen_in"] == PHOTO])[[*KEY, "right"]]
+    both = chosen(table[table["seen_in"] == SCENE]).merge(photo, on=KEY, suffixes=("", "_photo"))
+    return both.assign(gain=both["right_photo"].astype(float) - both["right"].astype(float))
+
+
+def _gains_of_scene(table: "pd.DataFrame", episodes: "pd.DataFrame") -> "pd.DataFrame":
+    """By how much an episode is right in the scene more than in soft's first touch, likewise."""
     soft = episodes[episodes["method"] == "soft"][[*KEY, "first_object_correct"]]
     both = chosen(table[table["seen_in"] == SCENE]).merge(soft, on=KEY)
-    return _mean_gain(both["right"], both["first_object_correct"])
+    touched = both["first_object_correct"].astype(float)
+    return both.assign(gain=both["right"].astype(float) - touched)
 
 
-def _mean_gain(more: "pd.Series", less: "pd.Series") -> Estimate:
-    """The mean difference of pairs, with its bootstrap interval."""
-    gain = more.to_numpy(float) - less.to_numpy(float)
-    low, high = bootstrap_interval(gain, np.ones(len(gain)))
-    return Estimate(value=float(gain.mean()), low=low, high=high, n=len(gain))
+def _by_object(gains: "pd.DataFrame") -> "pd.DataFrame":
+    """The sum of an object's gains, and the number of its episodes."""
+    return gains.groupby(["suite", "object"], sort=True, observed=True)["gain"].agg(["sum", "size"])
+
+
+def _mean_gain(gains: "pd.DataFrame") -> Estimate:
+    """The mean gain of episodes; its interval resamples objects with all their episodes."""
+    by_object = _by_object(gains)
+    low, high = bootstrap_interval(
+        by_object["sum"].to_numpy(float), by_object["size"].to_numpy(float)
+    )
+    return Estimate(value=float(gains["gain"].mean()), low=low, high=high, n=len(gains))

@@ -23,7 +23,8 @@ NOTE = (
     "yes, % of photos that no training saw [95 % Wilson interval] n; right: as many photos of the "
     "object as of others, each kind with half of the weight (no interval: it is of two rates). The "
     "paper asks for more than 95 % right. Photos of one object are not independent of each other: "
-    "intervals over objects would be wider."
+    "intervals over objects would be wider. What the model chooses has its interval over objects, "
+    "of which each has one token."
 )
 
 
@@ -105,7 +106,7 @@ def pooled(answers: "pd.DataFrame", k: int = USUAL_K) -> "pd.DataFrame":
             continue
         kinds = kind_of(part)
         of_objects = [right(rows) for _, rows in part.groupby("object", sort=False)]
-        line = {"reading": name, "right": _mean_of_objects(of_objects)}
+        line = {"reading": name, "right": mean_of_tokens(of_objects)}
         for kind in KINDS:
             found = said_yes(part[kinds == kind])
             line[kind] = Estimate(value=found.value, low=found.low, high=found.high, n=found.n)
@@ -124,6 +125,33 @@ def confusions(answers: "pd.DataFrame", k: int = USUAL_K) -> "pd.DataFrame":
         lines.append((row.suite, row.object, row.shown, *_numbers(rate(row.yes, row.n))))
     columns = ["suite", "object", "look-alike", "n", "yes", "low", "high"]
     return pd.DataFrame(lines, columns=columns)
+
+
+def success_by_token(episodes: "pd.DataFrame", other: str, one: str = "soft") -> "pd.Series":
+    """By task, how much more often `other` succeeds than `one` in the episodes that both ran.
+
+    A task has one target, and so one learned token of each form: tasks are the independent units.
+    """
+    key = ["suite", "task", "episode"]
+    wide = episodes.pivot(index=key, columns="method", values="success")[[one, other]].dropna()
+    gain = wide[other].astype(float) - wide[one].astype(float)
+    return gain.groupby(["suite", "task"], sort=False).mean()
+
+
+def mean_of_tokens(values: Sequence[float], least: float = 0.0) -> Estimate:
+    """The mean of one value per token with Student's 95 % interval, inside `least` to 1.
+
+    A single token has no interval. `least` is -1 for differences.
+    """
+    import numpy as np
+    from scipy import stats
+
+    n = len(values)
+    middle = float(np.mean(values))
+    if n < 2:
+        return Estimate(value=middle, low=float("nan"), high=float("nan"), n=n)
+    half = float(stats.t.ppf(0.975, n - 1) * np.std(values, ddof=1) / np.sqrt(n))
+    return Estimate(value=middle, low=max(least, middle - half), high=min(1.0, middle + half), n=n)
 
 
 def report(tables: Mapping[str, "pd.DataFrame"]) -> str:
@@ -151,7 +179,7 @@ def report(tables: Mapping[str, "pd.DataFrame"]) -> str:
 
 def _choice_rows(table: "pd.DataFrame") -> list[list[str]]:
     """By suite: whether the model chooses the target among the objects of listed episodes."""
-    from vap_core.evaluation.perception.estimates import share
+    from vap_core.evaluation.perception.estimates import clustered_share
     from vap_core.evaluation.tokens.choices import chosen
 
     rows = [["objects of first views", "seen in", "chance", "the model chooses the target"]]
@@ -160,26 +188,14 @@ def _choice_rows(table: "pd.DataFrame") -> list[list[str]]:
     for (suite, seen_in), part in usual.groupby(["suite", "seen_in"], sort=False):
         found = chosen(part)
         chance = f"{100 * found.chance.mean():.1f}"
-        rows.append([str(suite), str(seen_in), chance, share(found.right).text()])
+        of_objects = clustered_share(found.right.to_numpy(float), found.object)
+        rows.append([str(suite), str(seen_in), chance, of_objects.text()])
     return rows
 
 
 def text(found: Rate) -> str:
     """A rate with its interval and n: "97.2 [94.0, 98.7] 180"."""
     return _text(found.value, found.low, found.high, found.n)
-
-
-def _mean_of_objects(values: Sequence[float]) -> Estimate:
-    """Their mean with Student's 95 % interval, inside 0..1; one object has none."""
-    import numpy as np
-    from scipy import stats
-
-    n = len(values)
-    middle = float(np.mean(values))
-    if n < 2:
-        return Estimate(value=middle, low=float("nan"), high=float("nan"), n=n)
-    half = float(stats.t.ppf(0.975, n - 1) * np.std(values, ddof=1) / np.sqrt(n))
-    return Estimate(value=middle, low=max(0.0, middle - half), high=min(1.0, middle + half), n=n)
 
 
 def _numbers(found: Rate) -> tuple[int, float, float, float]:

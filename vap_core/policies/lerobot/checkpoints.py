@@ -19,7 +19,8 @@ STEP_CLASS = "vap_core.policies.lerobot.step.VapPrompt"
 """Its class."""
 ANY_STEP_CLASS = re.compile(r"vap_core\.(\w+\.)*VapPrompt")
 """Its class in this version or an earlier one."""
-TRAINING_CARD, CAPTIONS, WORDS = "training.json", "captions.json", "words"
+TRAINING_CARD, RECIPE = "training.json", "recipe.json"
+CAPTIONS, WORDS = "captions.json", "words"
 """How a checkpoint was trained, and what a training leaves beside it: none decides what it does."""
 WANTED_FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
 
@@ -65,6 +66,18 @@ def config_field(checkpoint: str | Path, name: str) -> str:
             f"load: {file} is no configuration ({type(error).__name__}); save the checkpoint again "
             "with lerobot 0.6."
         ) from error
+
+
+def trained_for(checkpoint: str | Path) -> str:
+    """The suite whose recipe trained a checkpoint; "" where its folder does not say.
+
+    Raises: BadPolicy when a file of the checkpoint is missing.
+    """
+    try:
+        card = parse_json((locate(checkpoint) / TRAINING_CARD).read_text())
+        return str(card["recipe"]["suite"])
+    except (OSError, ValueError, LookupError, TypeError):
+        return ""
 
 
 def base_models(folder: Path) -> list[str]:
@@ -148,7 +161,7 @@ def _downloaded(name: str) -> Path:
 
 def _decides(name: Path) -> bool:
     """Whether a file of a checkpoint, by its name in the folder, decides what it does."""
-    if name.name == TRAINING_CARD or name.parts[0] in (CAPTIONS, WORDS):
+    if name.name in (TRAINING_CARD, RECIPE) or name.parts[0] in (CAPTIONS, WORDS):
         return False
     return any(name.match(pattern) for pattern in WANTED_FILES)
 

@@ -263,11 +263,16 @@ def attach(checkpoint: str | Path, out: Path, memory: Path, **options: Any) -> P
     observations. `options` are VapPrompt's other fields.
 
     Raises: BadOutput when `out` exists; BadPolicy, BadMemory, UnknownName when the parts do not
-        fit.
+        fit; BadMemory also where `memory` holds no object, or a damaged one.
     """
     source = locate(checkpoint).resolve()
     memory = Path(memory).resolve()
     step = VapPrompt(str(memory), **options)
+    if not load_bank(memory):
+        raise BadMemory(
+            f"attach: {memory} holds no object; register one there, or name another folder with "
+            "--memory."
+        )
     if out.exists():
         raise BadOutput(f"attach: {out} exists; choose another folder.")
     file = source / PIPELINES[0]

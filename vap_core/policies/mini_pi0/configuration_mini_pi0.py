@@ -35,8 +35,9 @@ class MiniPI0Config(PI0Config):
     """Scale of the sampling noise: below 1 the actions keep closer to what was demonstrated most, 0
     draws none."""
     vlm: str = ""
-    """SHA-256 of the mini-PaliGemma that it was initialised from; learned words mean the same in
-    both."""
+    """SHA-256 of the mini-PaliGemma that it was initialised from. Learned words mean the same in
+    both, unless the policy's training moved the embeddings of words, as those of before the recipe
+    did."""
     words: tuple[str, ...] = ()
     """The vocabulary: token i is word i; see processor_mini_pi0."""
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from vap_core.policies.embedding_table import open_table
+from vap_core.policies.embedding_table import check_width, open_table
 
 PRIOR = 1e-3
 """Weight of the identity, in squared lengths of a mean row.
@@ -40,6 +40,7 @@ def align(
 
     Raises: BadPolicy.
     """
+    check_width(open_table(model), len(embedding), "the embedding")
     source, target = shared_tables(model, policy)
     return (embedding @ orthogonal_map(source, target)).astype(np.float32)
 
@@ -49,6 +50,7 @@ def shared_tables(
 ) -> tuple[Float32[np.ndarray, "v d"], Float32[np.ndarray, "v d"]]:
     """The two tables over the tokens that both have. Raises: BadPolicy."""
     tables = open_table(model), open_table(policy)
+    check_width(tables[1], tables[0].shape[1], str(model))
     n = min(table.shape[0] for table in tables)
     return tables[0].block(0, n), tables[1].block(0, n)
 

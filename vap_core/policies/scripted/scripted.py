@@ -5,8 +5,9 @@ takes any object of the category; then it picks, puts down or touches through th
 actions as a learned policy, in either control. It never sees simulator state.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -64,6 +65,8 @@ MOTIONS = {
     "google": Motion(thick_m=0.035, hover_m=0.20, close_s=1.4, arrived_m=0.02),
     "so101": Motion(thick_m=0.028, hover_m=0.13, lift_m=0.09, close_s=0.6, beside_m=0.04),
 }
+SHIPPED_MOTIONS: Mapping[str, Motion] = MappingProxyType(dict(MOTIONS))
+"""The motions of the robots that ship, whatever the file of an own suite enters in MOTIONS."""
 
 
 @value

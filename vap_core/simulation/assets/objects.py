@@ -172,7 +172,7 @@ def get_object(name: str) -> ObjectModel:
     of these in red, `<name>-red`, or one of the user's own scans.
 
     Raises:
-        UnknownName: there is no such object.
+        UnknownName: there is no such object, or VAP_OBJECTS names no folder.
         BadObject: it is a scan that is damaged.
     """
     if name in OBJECTS:

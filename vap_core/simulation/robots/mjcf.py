@@ -1,6 +1,8 @@
 """A robot's MJCF file, checked: it holds every part that its `Robot` names."""
 
+import os
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -41,6 +43,29 @@ def load(robot: Robot) -> mujoco.MjSpec:
             )
     _check_order(spec, robot, where)
     return spec
+
+
+def other_files(robot: Robot) -> dict[str, Path]:
+    """The files that a robot's MJCF includes or loads, by their paths from its folder, in order.
+
+    Raises: BadRobot, as `load`, and for a file that is not there.
+    """
+    spec = load(robot)
+    xml = Path(os.path.abspath(robot.xml))
+    fields = {}
+    for field in spec.hfields:  # MuJoCo lists them without the folder that the compiler names
+        fields[str(xml.parent / field.file)] = Path(spec.meshdir, field.file)
+    files = {}
+    for path in mujoco.mju_getXMLDependencies(str(xml)):
+        file = Path(os.path.normpath(xml.parent / fields.get(path, path)))
+        if not file.is_file():
+            raise BadRobot(
+                f"robot {robot.name!r}: {robot.xml} loads {file}, which is no file; put it there, "
+                "or correct the MJCF."
+            )
+        if file != xml:
+            files[os.path.relpath(file, xml.parent)] = file
+    return dict(sorted(files.items()))
 
 
 def _kinds(spec: mujoco.MjSpec, robot: Robot) -> Iterator[Kind]:

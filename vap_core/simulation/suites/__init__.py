@@ -93,6 +93,16 @@ def _find_own(name: str) -> own.OwnSuite | None:
     return own.find(name, taken=SUITES, endings=ENDINGS)
 
 
+def own_files(names: Iterable[str]) -> tuple[str, ...]:
+    """The files of the user's own suites among some, each once. Raises: BadSuite."""
+    files = []
+    for name in names:
+        own_suite = _find_own(name)
+        if own_suite is not None:
+            files.append(str(own_suite.file))
+    return tuple(dict.fromkeys(files))
+
+
 def has_list(name: str) -> bool:
     """Whether a suite's rows are a list, the same for every seed: all but the warm-up suites'."""
     return is_listed(name) or _find_own(name) is not None

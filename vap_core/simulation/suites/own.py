@@ -8,7 +8,7 @@ import hashlib
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
@@ -21,7 +21,7 @@ from vap_core.simulation import robots
 from vap_core.simulation.assets import objects
 from vap_core.simulation.cameras import add_rigs
 from vap_core.simulation.robots import mjcf
-from vap_core.simulation.suites import lists
+from vap_core.simulation.suites import lists, wording
 from vap_core.simulation.suites.suite import Suite
 from vap_core.simulation.types import AS_LISTED, EpisodeRow
 
@@ -50,6 +50,11 @@ class OwnSuite:
 
 OPENED: dict[str, OwnSuite] = {}
 """The suites of one's own that are open in this process."""
+
+
+def environment(files: Sequence[str]) -> dict[str, str]:
+    """The variables by which another process finds the suites of some files."""
+    return {VARIABLE: os.pathsep.join(files)} if files else {}
 
 
 def find(name: str, taken: Iterable[str], endings: tuple[str, ...]) -> OwnSuite | None:
@@ -168,16 +173,25 @@ def _checked_rows(
         spec = mjcf.load(robot)
         rigs = add_rigs(spec, robot.name)
         spec.compile()
+        if not suite.cameras:
+            raise BadSuite(f"cameras is empty; {robot.name} has {', '.join(sorted(rigs))}")
         for camera in suite.cameras:
             if camera not in rigs:
                 raise one_of(f"suite {suite.name}: camera", camera, sorted(rigs))
+        for task in suite.tasks:
+            wording.check(task)
         rows = tuple(make_rows())
         lists.check(rows, suite)
         keys = set()
         for row in rows:
             suite.task(row.task)
-            for place in row.placements:
-                objects.get_object(place.model)
+            models = [objects.get_object(place.model) for place in row.placements]
+            if models[0].category != row.category:
+                raise BadSuite(
+                    f"row {row.key}: its first object, the target, is {models[0].name}, a "
+                    f"{models[0].category}, and the task's category is {row.category!r}; place the "
+                    "target first, or correct the category"
+                )
             if row.suite != suite.name or row.key in keys:
                 raise BadSuite(
                     f"row {row.key} is there twice, or of another suite; make rows by "

@@ -50,6 +50,8 @@ PLACES = "vap.places"
 ABOUT = "meta/demonstrations.json"
 VERSION = 1
 """Of meta/demonstrations.json."""
+CARD = {"suite": str, "seed": int, "stages": int, "episodes": list}
+"""What meta/demonstrations.json holds beside its version, and of which type."""
 LEROBOT = "v3.0"
 """The version of the LeRobotDataset format."""
 PART = 10
@@ -210,6 +212,9 @@ def about(folder: Path) -> dict[str, Any]:
         info = parse_json(read_file(folder / "meta" / "info.json"))
         lerobot = info["codebase_version"]
         version = card["version"]
+        for name, kind in CARD.items():
+            if not isinstance(card[name], kind):
+                raise TypeError(f"{name} of {ABOUT} is no {kind.__name__}")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise BadOutput(
             f"read: meta/ of {folder} is absent or damaged ({_line(error)}); {AGAIN}."

@@ -101,8 +101,9 @@ class Questions(nn.Module):
 class Learner(nn.Module):
     """What is trained: the policy, and the questions beside it.
 
-    The embeddings of words are not: a word means the same to the policy and to the model that it
-    was initialised from, in which a soft prompt learns its word.
+    The embeddings of words are not: a word means the same to a policy that begins with a
+    mini-PaliGemma and to that model, in which a soft prompt learns its word. Trainings of before
+    the recipe moved them (docs/policy.md); what goes on from such a policy keeps them as they are.
     """
 
     def __init__(self, config: MiniPI0Config) -> None:

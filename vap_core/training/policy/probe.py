@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from vap_core.base.errors import BadOutput, BadStudy, one_of
-from vap_core.base.files import write_atomic
+from vap_core.base.files import make_folder, write_atomic
 from vap_core.base.parquet import read_parquet
 from vap_core.base.tables import align
 from vap_core.base.types import Attended, Colour, Description, Rgb, value
@@ -47,6 +47,9 @@ if TYPE_CHECKING:
 WAYS = ("tinted", "painted", "described", "plain")
 EACH = 4
 """Episodes of one scene, each run in every way."""
+ASKED = ["suite", "policy", "method"]
+"""What tells the episodes of a kept table apart, whose place others take."""
+OTHER_TABLE = "name another table with --out"
 COAT = 0.85
 """Opacity of paint."""
 ProbeState = tuple[Colour, str]
@@ -170,6 +173,11 @@ def probe(
 
     if suite_name not in FILMED:
         raise one_of("eval-policy: suite", suite_name, FILMED)
+    if FILMED[suite_name].pairs:
+        raise BadStudy(
+            f"eval-policy: the commands of {suite_name} name two personal objects, and these ways "
+            "ask for one; run its episodes with eval."
+        )
     if not ways:
         raise BadStudy("eval-policy: there is no way to ask; name one by --ways.")
     for way in ways:
@@ -206,6 +214,20 @@ def conclude(table: "pd.DataFrame") -> str:
     return align(lines)
 
 
+def kept(path: Path) -> "pd.DataFrame | None":
+    """The episodes of a table that others are to be added to; None where there is no table yet.
+
+    Raises: BadOutput for a file to which nothing can be added.
+    """
+    make_folder(path.parent, "probe", OTHER_TABLE)
+    if not path.exists():
+        return None
+    found = read_parquet(path, "probe", OTHER_TABLE)
+    if not set(ASKED) <= set(found):
+        raise BadOutput(f"probe: {path} holds no episodes of eval-policy; {OTHER_TABLE}.")
+    return found
+
+
 def keep(table: "pd.DataFrame", path: Path) -> None:
     """Add the episodes to a table; those of the same suite, policy and way are replaced.
 
@@ -214,24 +236,21 @@ def keep(table: "pd.DataFrame", path: Path) -> None:
     import pandas as pd
 
     columns = [name for name in table if name != "detail" and not name.startswith("seconds_")]
-    asked = ["suite", "policy", "method"]
-    keys = list(table[asked].drop_duplicates().itertuples(index=False, name=None))
-    old = table[:0]
-    if path.exists():
-        old = read_parquet(path, "probe", "name another table with --out")
+    keys = list(table[ASKED].drop_duplicates().itertuples(index=False, name=None))
+    old = kept(path)
+    if old is None:
+        old = table[:0]
     try:
-        old_keys = pd.MultiIndex.from_frame(old[asked])
+        old_keys = pd.MultiIndex.from_frame(old[ASKED])
         parts = []
         for part in (old[~old_keys.isin(keys)], table[columns]):
             if len(part):
                 parts.append(part)
         whole = pd.concat(parts, ignore_index=True)
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, whole.to_parquet(compression="zstd", index=False))
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError) as error:
         raise BadOutput(
-            f"probe: {path} cannot be added to ({type(error).__name__}); "
-            "name another table with --out."
+            f"probe: {path} cannot be added to ({type(error).__name__}); {OTHER_TABLE}."
         ) from error
 
 

@@ -10,7 +10,7 @@ on where it was interrupted, at whatever moment.
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -40,7 +40,12 @@ from vap_core.training.policy.ahead import Ahead
 from vap_core.training.policy.batches import Frames, statistics
 from vap_core.training.policy.commands import Known, nameable
 from vap_core.training.policy.losses import Learner, embedding_cosine, losses
-from vap_core.training.policy.start import go_on_from, start_folder
+from vap_core.training.policy.start import (
+    read_start,
+    require_alike,
+    require_shared_words,
+    start_folder,
+)
 from vap_core.training.policy.taught import learn_words
 from vap_core.training.recipe import Recipe, filmed_tasks
 from vap_core.training.step import Figures, Schedule, average_of, train_steps
@@ -62,12 +67,12 @@ Without any, three in five generic objects are grasped where with all of it two 
 class Films:
     """Films to train on, films held out, and the CPU seconds that filming them took.
 
-    The cost of a dataset is not known.
+    The cost of a dataset is not known: None.
     """
 
     train: list[Film]
     held_out: list[Film]
-    cpu_s: float = 0.0
+    cpu_s: float | None = None
 
     @property
     def all(self) -> list[Film]:
@@ -98,6 +103,20 @@ def configuration(recipe: Recipe, state_size: int, action_size: int) -> MiniPI0C
     )
 
 
+def origin(demonstrations: Path, suite_name: str) -> dict[str, Any]:
+    """Suite, seed and number of stages of a dataset's films.
+
+    Raises: BadOutput for one that is damaged or of another suite.
+    """
+    card = about(demonstrations)
+    if card["suite"] != suite_name:
+        raise BadOutput(
+            f"train policy: {demonstrations} shows {card['suite']}, not {suite_name}; "
+            "name its suite, or another dataset."
+        )
+    return {name: card[name] for name in ("suite", "seed", "stages")}
+
+
 def load_films(
     recipe: Recipe,
     cache: Path = CACHE,
@@ -106,16 +125,10 @@ def load_films(
 ) -> Films:
     """The films of a dataset, or of the cache, shot where they are missing there.
 
-    Raises: BadOutput for a dataset that is damaged, of another suite, or of tasks that the recipe
-        holds out.
+    Raises: BadOutput for a dataset that is damaged or of another suite.
     """
     if demonstrations is not None:
-        shown = about(demonstrations)["suite"]
-        if shown != recipe.suite:
-            raise BadOutput(
-                f"train policy: {demonstrations} shows {shown}, not {recipe.suite}; "
-                "name its suite, or another dataset."
-            )
+        origin(demonstrations, recipe.suite)
         kept = read(demonstrations, lambda stage: not _is_held_out(stage))
         return Films(kept, read(demonstrations, _is_held_out))
     folder = cache / FILMS
@@ -147,20 +160,32 @@ def train(
     Returns training.json: the recipe, what was measured on the films held out, and the cost. The
     policy goes on from the recipe's `start`; without one it grows from the mini-PaliGemma in `vlm`,
     or, None, begins with nothing. Learned words are taught in `vlm`, from which the start must have
-    grown; None: none are. `demonstrations` is a dataset of train demonstrations; None: the cache.
+    grown; None: none are. `demonstrations` is a dataset of train demonstrations, whose number of
+    stages takes the place of the recipe's; None: the cache.
     The steps run on `device` (`base.device`); `jobs` processes, None: one a core, film, photograph,
     teach the words and draw the batches.
 
     Raises: BadOutput when `out` holds another training or a model without what it would go on from,
         another process trains there, or it or `cache` cannot be written or is damaged; BadPolicy
         for a start that is no mini-pi0, or one of other cameras or sizes, or of another
-        mini-PaliGemma; UnknownName: no such device.
+        mini-PaliGemma, or whose words are no longer that one's; UnknownName: no such device.
     """
     place = torch.device(device_name(device))
+    made_of: dict[str, Any] = {}
+    if demonstrations is not None:
+        made_of["demonstrations"] = origin(demonstrations, recipe.suite)
+        recipe = replace(recipe, stages=made_of["demonstrations"]["stages"])
     with training_folder(out, "train policy", recipe.as_json()):
         if demonstrations is None:
             make_folder(cache, "train policy", "choose another folder with --cache")
         jobs = jobs or os.cpu_count() or 1
+        # Before the films, which take longest.
+        teacher = None if vlm is None else load_vlm(vlm)
+        start = None
+        if recipe.start:
+            start = read_start(start_folder(recipe.start), teacher, recipe.seed)
+            if teacher is not None and recipe.taught:
+                require_shared_words(start, teacher)
         films = load_films(recipe, cache, demonstrations, jobs)
         if not films.train:
             raise BadOutput(
@@ -168,31 +193,32 @@ def train(
                 "make more stages."
             )
         _require_trainable(recipe, films.all)
-        teacher = None if vlm is None else load_vlm(vlm)
-        made_of: dict[str, Any] = {
-            "recipe": recipe.as_json(),
-            "data_sha256": data_sha256(films.all),
-        }
-        # Of initial weights only; every other draw comes from the step's stream.
-        torch.manual_seed(recipe.seed)
+        made_of["recipe"] = recipe.as_json()
+        made_of["data_sha256"] = data_sha256(films.all)
         first = films.train[0]
         config = configuration(recipe, first.state.shape[1], first.action.shape[1])
-        if recipe.start:
-            start = start_folder(recipe.start)
-            learner, stats = go_on_from(start, config, teacher)
+        if start is not None:
+            require_alike(start, config)
+            learner = start.learner
+            stats = start.stats
             config = learner.policy.config
             made_of["start"] = {
                 "name": recipe.start,
-                "sha256": sha256_of(start / "model.safetensors"),
+                "sha256": sha256_of(start.folder / "model.safetensors"),
             }
         else:
             stats = statistics(films.train, recipe.angle_noise_rad)
+            # Of initial weights only; every other draw comes from the step's stream.
+            torch.manual_seed(recipe.seed)
             learner = Learner(config)
             if teacher is not None:
                 config.vlm = teacher.sha256()
                 initialise_policy(teacher, learner.policy)
         made_of["vlm"] = config.vlm
-        cost_cpu_s = {"films": films.cpu_s, "vlm": _vlm_cost_s(vlm)}
+        cost_cpu_s: dict[str, float] = {}
+        for part, spent_s in (("films", films.cpu_s), ("vlm", _vlm_cost_s(vlm))):
+            if spent_s is not None:
+                cost_cpu_s[part] = spent_s
         # After the start was checked: words take minutes.
         known, taught = _prepare_words(recipe, films, vlm, out, cost_cpu_s, jobs)
         frames = Frames(recipe=recipe, films=films.train, stats=stats, config=config, known=known)
@@ -308,7 +334,7 @@ def _prepare_words(
 
 
 def _hours(cost_cpu_s: dict[str, float]) -> dict[str, float]:
-    """CPU hours by part, and in all."""
+    """CPU hours by part whose cost is known, and in all of these."""
     hours = {}
     for part, seconds in cost_cpu_s.items():
         hours[part] = round(seconds / 3600, 3)
@@ -316,12 +342,15 @@ def _hours(cost_cpu_s: dict[str, float]) -> dict[str, float]:
     return hours
 
 
-def _vlm_cost_s(folder: Path | None) -> float:
-    """CPU seconds that the mini-PaliGemma in a folder took; 0 where its training.json says none."""
-    if folder is None or not (folder / TRAINING_CARD).is_file():
+def _vlm_cost_s(folder: Path | None) -> float | None:
+    """CPU seconds that the mini-PaliGemma in a folder took, 0 without one; None: not known."""
+    if folder is None:
         return 0.0
+    if not (folder / TRAINING_CARD).is_file():
+        return None
     card = parse_json((folder / TRAINING_CARD).read_bytes())
-    return 3600.0 * float(card.get("cpu_hours", {}).get("total", 0.0))
+    hours = card.get("cpu_hours", {}).get("total")
+    return None if hours is None else 3600.0 * float(hours)
 
 
 def _is_held_out(stage: int) -> bool:

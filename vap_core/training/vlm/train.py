@@ -270,10 +270,19 @@ def make(out: Path, *, cache: Path = CACHE, jobs: int | None = None) -> Path:
     if file.is_file():
         with reading_kept(file, "train vlm"):
             about = dict(parse_json(file.read_bytes()))
-        if about.get("recipe") == vars(recipe) and about.get("trained_steps") == recipe.steps:
+            trained_steps = _trained_steps(about)
+        if about.get("recipe") == vars(recipe) and trained_steps == recipe.steps:
             return out
     train(recipe, out, cache=cache, jobs=jobs or os.cpu_count() or 1)
     return out
+
+
+def _trained_steps(about: Mapping[str, Any]) -> int:
+    """The steps that the model of a training.json took."""
+    if "trained_steps" in about:
+        return int(about["trained_steps"])
+    # The card of mini-paligemma, which ships, is older than the field.
+    return int(about["log"][-1]["step"])
 
 
 def data_sha256(pool: Sequence[View], looks: Mapping[str, Description]) -> str:

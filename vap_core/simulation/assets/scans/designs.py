@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from vap_core.base.files import writing
+from vap_core.base.files import write_files
 from vap_core.base.types import Rgb, value
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.scans.closed_parts import (
@@ -49,20 +49,20 @@ class Design:
 def write_designs(folder: Path, count: int, seed: int) -> list[Path]:
     """Write `count` designs as GLB, and objects.csv with their categories; returns the files.
 
-    Kinds take turns, of each kind the forms, and every other round is loud. Raises: BadOutput.
+    Kinds take turns, of each kind the forms, and every other round is loud.
+
+    Raises: BadOutput when the folder cannot be written, or holds other contents under these names.
     """
     lines = ["file,category,height_cm,groups"]
-    paths = []
-    with writing(folder, "designs", "choose another folder"):
-        folder.mkdir(parents=True, exist_ok=True)
-        for i in range(count):
-            design = draw_design(i, seed)
-            path = folder / f"{design.name}.glb"
-            path.write_bytes(design.glb)
-            paths.append(path)
-            lines.append(f"{path.name},{design.category},,{';'.join(design.groups)}")
-        (folder / TABLE).write_text("\n".join(lines) + "\n")
-    return paths
+    files = {}
+    for i in range(count):
+        design = draw_design(i, seed)
+        path = folder / f"{design.name}.glb"
+        files[path] = design.glb
+        lines.append(f"{path.name},{design.category},,{';'.join(design.groups)}")
+    table = "\n".join(lines) + "\n"
+    write_files({**files, folder / TABLE: table.encode()}, "designs", "choose another folder")
+    return list(files)
 
 
 def draw_design(number: int, seed: int) -> Design:

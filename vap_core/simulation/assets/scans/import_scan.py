@@ -6,6 +6,7 @@ decomposition.
 """
 
 import re
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -18,7 +19,7 @@ import numpy as np
 from vap_core import __version__
 from vap_core.base.errors import BadObject
 from vap_core.base.limits import bounded
-from vap_core.memory import CATEGORY, NAME
+from vap_core.memory import NAME, kind_instead, plain_category
 from vap_core.simulation import robots
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.scans.bake import (
@@ -102,7 +103,7 @@ def import_scan(
         mass_kg = float(np.clip(DENSITY_KG_M3 * volume_m3, *MASS_KG))
     metadata = ScanMetadata(
         name=name,
-        category=" ".join(category.lower().split()),
+        category=plain_category(category),
         mass_kg=round(mass_kg, 4),
         source=path.name,
         source_sha256=sha256(path.read_bytes()).hexdigest(),
@@ -156,10 +157,11 @@ def _check_arguments(name: str, category: str, mass_kg: float | None) -> None:
             f"objects: a name that ends in {objects.RED} is of an object that was made red; choose "
             "another --name."
         )
-    if not CATEGORY.fullmatch(category.strip()):
+    kind = kind_instead(category)
+    if kind:
         raise BadObject(
-            f"objects: {category!r} cannot be a category; name the kind of thing in words, for "
-            "example --category cup."
+            f"objects: {category!r} cannot be a category; name the kind of thing alone, in words, "
+            f"for example --category {shlex.quote(kind)}."
         )
     if mass_kg is not None and not 0 < mass_kg <= HEAVIEST_KG:
         raise BadObject(

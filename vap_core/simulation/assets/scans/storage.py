@@ -19,12 +19,13 @@ from tempfile import mkdtemp
 import numpy as np
 from PIL import Image
 
-from vap_core.base.errors import BadObject, BadOutput
+from vap_core.base.errors import BadObject, BadOutput, UnknownName
 from vap_core.base.files import parse_json, remove_scratch
 from vap_core.base.types import Rgb, value
 from vap_core.simulation.assets.shapes import Hull, Mesh
 
 FORMAT, VERSION = "vap-object", 1
+VARIABLE = "VAP_OBJECTS"
 MESH_FILE, HULLS_FILE, TEXTURE_FILE = FILES = ("mesh.npz", "hulls.npz", "texture.png")
 METADATA_FILE = "object.json"
 FORMER, STAGE = ".old", ".stage-"
@@ -68,18 +69,26 @@ class ScanMetadata:
 
 def scans_folder() -> Path:
     """The folder that holds the scans."""
-    return Path(os.environ.get("VAP_OBJECTS", "data/objects"))
+    return Path(os.environ.get(VARIABLE) or "data/objects")
 
 
 def scan_folders() -> dict[str, Path]:
     """The folder of every scan by its name.
 
     Where a replacement was killed half way, that is the place of the former scan.
+
+    Raises: UnknownName when VAP_OBJECTS names no folder.
     """
+    folder = scans_folder()
+    if os.environ.get(VARIABLE) and not folder.is_dir():
+        raise UnknownName(
+            f"objects: {VARIABLE}={folder} is no folder; name the one that holds your objects, or "
+            "unset the variable."
+        )
     folders = {}
-    for path in sorted(scans_folder().glob(f"[!.]*/{METADATA_FILE}")):
+    for path in sorted(folder.glob(f"[!.]*/{METADATA_FILE}")):
         folders[path.parent.name] = path.parent
-    for path in sorted(scans_folder().glob(f".*{FORMER}/{METADATA_FILE}")):
+    for path in sorted(folder.glob(f".*{FORMER}/{METADATA_FILE}")):
         folders.setdefault(_name_of(path.parent), path.parent)
     return dict(sorted(folders.items()))
 

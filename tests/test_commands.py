@@ -1,0 +1,63 @@
+"""The commands that are printed, to be run next: a shell reads back what was meant."""
+
+import re
+import shlex
+from pathlib import Path
+
+import trimesh
+
+from tests.command import vap
+from tests.scanned import put
+from vap_core import cli
+from vap_core.base.commands import command
+
+ODD = "a b'c $x"
+"""A folder's name that a shell takes apart, unless it is quoted."""
+
+
+def next_words(said: str) -> list[str]:
+    """What a shell makes of the command that was printed."""
+    (line,) = re.findall(r"^next: (.*)$", said, re.MULTILINE)
+    return shlex.split(line, comments=True)
+
+
+def test_every_word_and_variable_is_read_back() -> None:
+    line = command("view", Path(ODD), "it's", environment={"VAP_SUITES": f"{ODD}/desk.py"})
+    words = [f"VAP_SUITES={ODD}/desk.py", "python", "-m", "vap_core", "view", ODD, "it's"]
+    assert shlex.split(line) == words
+    assert line.startswith("VAP_SUITES='"), "a quoted name would not be a variable"
+    assert command("eval", "--episodes", "4") == "python -m vap_core eval --episodes 4"
+
+
+def test_the_command_after_designs_is_read_back(tmp_path: Path) -> None:
+    done = vap("objects", "designs", tmp_path / ODD, "--count", "1")
+    words = ["python", "-m", "vap_core", "eval-objects", str(tmp_path / ODD)]
+    assert next_words(done.stdout) == words
+
+
+def test_the_command_after_photographs_is_read_back(tmp_path: Path) -> None:
+    out = tmp_path / ODD
+    done = vap("objects", "photograph", "cup-personal", "--out", out, "--views", "2")
+    photos = [str(path) for path in sorted(out.glob("*.png"))]
+    assert next_words(done.stdout) == [
+        *("python", "-m", "vap_core", "register"),
+        *("cup-personal", "--category", "cup", *photos),
+    ]
+
+
+def test_the_command_after_an_import_is_read_back(tmp_path: Path) -> None:
+    file = put(tmp_path, "mug.stl", trimesh.creation.box((0.05, 0.05, 0.09)))
+    words = ("--category", "cup", "--colour", "#aa3322", "--out", tmp_path / ODD)
+    done = vap("objects", "import", file, *words)
+    assert next_words(done.stdout) == [
+        f"VAP_OBJECTS={tmp_path / ODD}",
+        *("python", "-m", "vap_core", "eval", "--suite", "SUITE"),
+        *("--object", "mug", "--out", "data/runs/mug"),
+    ]
+
+
+def test_no_command_is_printed_with_a_value_that_is_not_quoted() -> None:
+    """`command` writes them; a line of a module's own making left its values unquoted."""
+    for path in sorted(Path(cli.__file__).parent.rglob("*.py")):
+        found = re.findall(r"""f["'].*python -m vap_core [^"]*\{.*""", path.read_text())
+        assert not found, path.name

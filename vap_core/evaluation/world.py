@@ -1,0 +1,75 @@
+"""The world of a study as one digest: cameras, styles, suites, robots and objects."""
+
+import hashlib
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vap_core.policies.scripted.scripted import MOTIONS, SHIPPED_MOTIONS
+from vap_core.simulation import robots, suites
+from vap_core.simulation.assets.objects import get_object
+from vap_core.simulation.cameras import RIGS, SHIPPED_RIGS
+from vap_core.simulation.robots import mjcf
+from vap_core.simulation.suites.variants import VARIANTS
+from vap_core.simulation.types import EpisodeRow
+
+
+def digest(listed: Sequence[tuple[str, Sequence[EpisodeRow]]]) -> str:
+    """Over the cameras that ship and those of the robots used, styles, suites, robots, objects.
+
+    `listed` has, task by task, its suite and its rows. A robot enters with every file that its MJCF
+    includes or loads. What an own suite's file enters for its own robot changes no other suite's
+    digest.
+    """
+    rigs = dict(SHIPPED_RIGS)
+    for suite, _ in listed:
+        robot_name = suites.suite(suite).robot
+        rigs[robot_name] = RIGS[robot_name]
+    found = hashlib.sha256(_canonical((rigs, VARIANTS)))
+    for suite, rows in listed:
+        known = suites.suite(suite)
+        robot = robots.get(known.robot)
+        placed = set()
+        for row in rows:
+            for place in row.placements:
+                placed.add(place.model)
+        models = [get_object(name) for name in sorted(placed)]
+        found.update(_canonical((known, robot, models)) + robot.xml.read_bytes())
+        for name, file in mjcf.other_files(robot).items():
+            found.update(_canonical((name, hashlib.sha256(file.read_bytes()).hexdigest())))
+    return found.hexdigest()[:16]
+
+
+def own_motions(of: Iterable[str]) -> dict[str, dict[str, float]]:
+    """The scripted motions that do not ship, by robot, among those of the robots of some suites."""
+    own = {}
+    for suite in of:
+        robot = suites.suite(suite).robot
+        motion = MOTIONS.get(robot)
+        if motion is not None and motion != SHIPPED_MOTIONS.get(robot):
+            own[robot] = asdict(motion)
+    return own
+
+
+def _canonical(value: Any) -> bytes:
+    """Every number in a value, whatever NumPy's print options are; of files their names."""
+
+    def plain(part: Any) -> Any:
+        if is_dataclass(part) and not isinstance(part, type):
+            parts = {"kind": type(part).__name__}
+            for field in fields(part):
+                parts[field.name] = getattr(part, field.name)
+            return parts
+        if isinstance(part, np.ndarray | np.generic):
+            return part.tolist()
+        if isinstance(part, Path):
+            return part.name
+        raise TypeError(
+            f"Study: {type(part).__name__} cannot be hashed; give it fields, or add its kind here."
+        )
+
+    return json.dumps(value, default=plain, sort_keys=True).encode()
