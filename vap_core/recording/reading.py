@@ -119,9 +119,10 @@ def read_checked_properties(chunk: Chunk) -> dict[str, Any]:
             of_kind = isinstance(value, kind) and (type(value) is bool) == (kind is bool)
             if not of_kind:
                 raise ValueError(f"its property {name} is {str(value)[:40]!r}")
-            if kind is int and not -(2**63) <= value < 2**63:
+            number: Any = value
+            if kind is int and not -(2**63) <= number < 2**63:
                 raise ValueError(f"its property {name} is {value}")
-            if name == "hz" and not 0 <= value <= MOST_HZ:
+            if name == "hz" and not 0 <= number <= MOST_HZ:
                 raise ValueError(f"its property hz is {value}")
         checked[name] = value
     return checked
