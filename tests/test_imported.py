@@ -179,7 +179,7 @@ def test_what_was_saved_is_what_is_loaded(shelf, tmp_path):
 def test_photograph_writes_the_reference_views(shelf):
     done = vap("objects", "photograph", "my-mug", "--out", shelf / "photos", "--views", "2")
     assert done.returncode == 0, done.stderr
-    assert "register 'my-mug' --category 'cup'" in done.stdout
+    assert "register my-mug --category cup" in done.stdout
     for i in range(2):
         with Image.open(shelf / "photos" / f"my-mug-{i}.png") as photo:
             assert photo.size == (320, 320)

@@ -105,10 +105,7 @@ def _by_itself(folder: Path, row: Mapping[str, str], error: str) -> str:
         words += ["--height-cm", row["height_cm"]]
     if "pass --repair" in error:
         words.append("--repair")
-    return (
-        f" It is an option of python -m vap_core {shlex.join(words)} --out DIR; then measure with "
-        "eval-objects DIR."
-    )
+    return f" Run: python -m vap_core {shlex.join(words)} --out DIR; then eval-objects DIR."
 
 
 @contextmanager

@@ -93,7 +93,7 @@ def _nothing_measured(refused: Mapping[str, str], out: Path) -> BadObject:
     name, why = next(iter(refused.items()))
     others = ""
     if len(refused) > 1:
-        others = f" Of {len(refused) - 1} more {out / 'report.txt'} says why."
+        others = f" report.txt in {out.name} says why of {len(refused) - 1} more."
     return BadObject(f"eval-objects: every object was left out. {name}: {why}{others}")
 
 
