@@ -1,6 +1,5 @@
 """Commands that find and open recordings: diagnose, query, view, show."""
 
-import shlex
 import threading
 from pathlib import Path
 from typing import Annotated
@@ -290,18 +289,19 @@ def _tunnel_text(url: str) -> str:
 
 def _check(recording: Path) -> None:
     """Check that a recording can be read. Raises: BadRecording; of a leftover it names the mend."""
+    from vap_core.base.commands import command
     from vap_core.base.errors import BadRecording
-    from vap_core.recording import check_recording, is_leftover
+    from vap_core.recording import check_recording
+    from vap_core.recording.file import LEFTOVER
 
     try:
         check_recording(recording)
     except BadRecording as error:
-        if not is_leftover(recording):
+        if not (LEFTOVER.fullmatch(recording.name) and recording.is_file()):
             raise
         raise BadRecording(
             f"{recording} is a recording that was not finished; once the process that makes it has "
-            f"ended, `python -m vap_core view {shlex.quote(str(recording))} --recover` saves its "
-            "steps."
+            f"ended, `{command('view', recording, '--recover')}` saves its steps."
         ) from error
 
 

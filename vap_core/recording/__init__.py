@@ -19,7 +19,6 @@ from vap_core.recording.corrections import write_correction as write_correction
 from vap_core.recording.dataset import DatasetRecorder as DatasetRecorder
 from vap_core.recording.deferred import DeferredRecorder as DeferredRecorder
 from vap_core.recording.deferred import is_failure_or_sampled as is_failure_or_sampled
-from vap_core.recording.file import is_leftover as is_leftover
 from vap_core.recording.file import recording_file_name as recording_file_name
 from vap_core.recording.file import recording_name as recording_name
 from vap_core.recording.file import recover as recover

@@ -35,11 +35,6 @@ def temporary_path(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}.tmp")
 
 
-def is_leftover(path: Path) -> bool:
-    """Whether a file has the name of what a process leaves that ends while it records."""
-    return LEFTOVER.fullmatch(path.name) is not None and path.is_file()
-
-
 def rerun_command(*arguments: str | Path) -> list[str]:
     """A command line of the rerun that this environment has."""
     return [sys.executable, "-m", "rerun", *map(str, arguments)]
@@ -69,7 +64,7 @@ def recover(leftover: Path) -> Path:
     """
     leftover = Path(leftover)
     named = LEFTOVER.fullmatch(leftover.name)
-    if named is None or not is_leftover(leftover):
+    if named is None or not leftover.is_file():
         raise BadRecording(
             f"recover: {leftover} is no leftover of a recording; "
             f"expected an existing file named like {temporary_path(Path('NAME.rrd')).name}."
