@@ -100,7 +100,7 @@ def import_object(
                 file=sys.stderr,
             )
     else:
-        environment["VAP_OBJECTS"] = str(folder)
+        environment[storage.VARIABLE] = str(folder)
     words = ("eval", "--suite", "SUITE", "--object", metadata.name)
     line = command(*words, "--out", f"data/runs/{metadata.name}", environment=environment)
     print(f"next: {line}  # of a suite that asks for a {category}")

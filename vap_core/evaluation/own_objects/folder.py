@@ -10,11 +10,11 @@ objects, as `objects import --out` writes them.
 
 import hashlib
 import os
-import shlex
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
+from vap_core.base.commands import command
 from vap_core.base.csv_rows import read_rows
 from vap_core.base.errors import BadObject
 from vap_core.base.types import value
@@ -105,7 +105,7 @@ def _by_itself(folder: Path, row: Mapping[str, str], error: str) -> str:
         words += ["--height-cm", row["height_cm"]]
     if "pass --repair" in error:
         words.append("--repair")
-    return f" Run: python -m vap_core {shlex.join(words)} --out DIR; then eval-objects DIR."
+    return f" Run: {command(*words, '--out', 'DIR')}; then eval-objects DIR."
 
 
 @contextmanager

@@ -5,7 +5,6 @@ Pictures are inside the page; links to recordings are relative to its folder.
 
 import base64
 import os
-import shlex
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing
 from html import escape
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
+from vap_core.base.commands import command
 from vap_core.base.errors import BadRecording
 from vap_core.base.palette import METHODS, method_marks
 from vap_core.base.tables import Rows
@@ -153,11 +153,11 @@ def _card(row: Mapping[str, Any], recording: Path, out: Path) -> str:
     images = []
     for camera, rgb in _views(recording, frame).items():
         images.append(f"<img alt='{escape(camera)}' title='{escape(camera)}' src='{_jpeg(rgb)}'>")
-    command = f"python -m vap_core view {shlex.quote(str(recording))} --frame {frame}"
+    look = command("view", recording, "--frame", str(frame))
     return (
         f"<article><h3>✗ {escape(words)}</h3><div>{escape(about)}</div>"
         f"<div>{''.join(images)}</div><p>{escape(str(row['case_sentence']))}</p>"
-        f"<a href='{link}'>recording</a>, frame {frame}: <code>{escape(command)}</code></article>"
+        f"<a href='{link}'>recording</a>, frame {frame}: <code>{escape(look)}</code></article>"
     )
 
 

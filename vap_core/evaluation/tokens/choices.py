@@ -20,7 +20,7 @@ from jaxtyping import Float32
 
 from vap_core.base.types import Mask, Rgb, value
 from vap_core.evaluation.engine import spread_evenly
-from vap_core.evaluation.perception.estimates import Estimate, clustered_share
+from vap_core.evaluation.perception.estimates import Estimate, share_by
 from vap_core.evaluation.perception.first_frames import opening_views
 from vap_core.evaluation.statistics import bootstrap_interval, holm, sign_flip
 from vap_core.perception.boxes import mask_box
@@ -48,6 +48,8 @@ AFTER_RIGHT = "soft, where the model is right"
 AFTER_WRONG = "soft, where it is wrong"
 """Columns of `beside_policy` beside the methods."""
 ALL_SUITES = "all suites"
+OBJECTS = ("object",)
+"""What tells independent units apart."""
 TO_SCENE, TO_POLICY = "photo to scene", "scene to policy"
 """Steps at which an object is lost, the rows of `losses`."""
 
@@ -168,12 +170,12 @@ def beside_policy(
     lines = {}
     for name, part in _parts(joined):
         line: dict[str, Estimate | float] = {"chance": float(part["chance"].mean())}
-        line[IN_PHOTOS] = _share(part, "right_photo")
-        line[IN_SCENE] = _share(part, "right")
+        line[IN_PHOTOS] = share_by(part, "right_photo", OBJECTS)
+        line[IN_SCENE] = share_by(part, "right", OBJECTS)
         for method in methods:
-            line[method] = _share(part, method)
-        line[AFTER_RIGHT] = _share(part[part["right"]], "soft")
-        line[AFTER_WRONG] = _share(part[~part["right"]], "soft")
+            line[method] = share_by(part, method, OBJECTS)
+        line[AFTER_RIGHT] = share_by(part[part["right"]], "soft", OBJECTS)
+        line[AFTER_WRONG] = share_by(part[~part["right"]], "soft", OBJECTS)
         lines[name] = line
     return pd.DataFrame(lines).T
 
@@ -225,12 +227,6 @@ def _parts(joined: "pd.DataFrame") -> "list[tuple[str, pd.DataFrame]]":
     if len(parts) > 1:
         parts.append((ALL_SUITES, joined))
     return parts
-
-
-def _share(part: "pd.DataFrame", column: str) -> Estimate:
-    """The share of the known values of a column that hold; the interval is over objects."""
-    known = part.dropna(subset=[column])
-    return clustered_share(known[column].to_numpy(float), known["object"])
 
 
 def _gains_of_photos(table: "pd.DataFrame") -> "pd.DataFrame":

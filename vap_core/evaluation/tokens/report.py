@@ -179,8 +179,8 @@ def report(tables: Mapping[str, "pd.DataFrame"]) -> str:
 
 def _choice_rows(table: "pd.DataFrame") -> list[list[str]]:
     """By suite: whether the model chooses the target among the objects of listed episodes."""
-    from vap_core.evaluation.perception.estimates import clustered_share
-    from vap_core.evaluation.tokens.choices import chosen
+    from vap_core.evaluation.perception.estimates import share_by
+    from vap_core.evaluation.tokens.choices import OBJECTS, chosen
 
     rows = [["objects of first views", "seen in", "chance", "the model chooses the target"]]
     usual = reading(table, "as learned")
@@ -188,8 +188,7 @@ def _choice_rows(table: "pd.DataFrame") -> list[list[str]]:
     for (suite, seen_in), part in usual.groupby(["suite", "seen_in"], sort=False):
         found = chosen(part)
         chance = f"{100 * found.chance.mean():.1f}"
-        of_objects = clustered_share(found.right.to_numpy(float), found.object)
-        rows.append([str(suite), str(seen_in), chance, of_objects.text()])
+        rows.append([str(suite), str(seen_in), chance, share_by(found, "right", OBJECTS).text()])
     return rows
 
 
