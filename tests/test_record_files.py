@@ -199,6 +199,35 @@ def test_on_a_full_disk_nothing_is_left_of_a_recording(tmp_path: Path, n_bytes: 
     assert not list(tmp_path.iterdir())
 
 
+def test_the_next_recording_of_a_process_is_whole_after_a_full_disk(tmp_path: Path) -> None:
+    first, second = tmp_path / "first.rrd", tmp_path / "second.rrd"
+    program = (
+        f"import sys, pathlib, resource, signal; sys.path.insert(0, {str(Path(__file__).parents[1])!r})\n"
+        "from tests import drawn as t\n"
+        "from vap_core.base.errors import BadOutput\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]\n"
+        "kept = []\n"
+        "def record(path):\n"
+        "    start = t.opening(1)\n"
+        "    kept.append(recorder := t.Recorder(pathlib.Path(path), start, flush_every=500))\n"
+        "    for step in range(30): recorder.frame(t.frame(step, start))\n"
+        "    recorder.close(t.SUCCESS)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, hard))\n"
+        "try:\n"
+        f"    record({str(first)!r})\n"
+        "except BadOutput as error: print(error)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))\n"
+        f"record({str(second)!r})\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert "first.rrd cannot be written" in done.stdout
+    assert read_summary(second)["frames"] == 30
+    assert list(tmp_path.iterdir()) == [second]
+
+
 def test_a_folder_that_cannot_be_written_says_so(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(BadOutput, match="choose a folder you may write to"):

@@ -1,6 +1,7 @@
 """Writing to a recording: the stream into its file, one row, and time columns."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import timedelta
 from glob import escape
 from pathlib import Path
@@ -40,8 +41,9 @@ def open_stream(path: Path, recording_id: str) -> rr.RecordingStream:
             f"record: cannot write in {path.parent} ({err.strerror}); "
             "choose a folder you may write to."
         ) from err
-    # Otherwise every finished recording keeps its threads and some megabytes.
-    rerun_bindings.flush_and_cleanup_orphaned_recordings()
+    with suppress(RuntimeError):  # another recording's: its own flush raises it
+        # Otherwise every finished recording keeps its threads and some megabytes.
+        rerun_bindings.flush_and_cleanup_orphaned_recordings()
     config = rr.ChunkBatcherConfig(
         flush_tick=timedelta(days=365),
         flush_num_bytes=2**40,
