@@ -179,7 +179,8 @@ def rates_of_arms_figure(results: Sequence[ArmResult]) -> "Figure":
     for axes, (suite, arms) in zip(parts, suites.items(), strict=True):
         _draw_rates(axes, arms, names)
         axes.set_title(_heading(suite, arms), fontsize=9)
-    figure.supxlabel("success rate, % (95 % interval; diamonds: the paper)", fontsize=8)
+    diamonds = "; diamonds: the paper" if any(one.paper == one.paper for one in results) else ""
+    figure.supxlabel(f"success rate, % (95 % interval{diamonds})", fontsize=8)
     return figure
 
 
@@ -201,7 +202,7 @@ def cases_figure(results: Sequence[ArmResult]) -> "Figure":
             axes.bar_label(bars, counts, label_type="center", color="white", fontsize=7)
         axes.set_yticks(ys, [f"{one.arm}, n {one.sr.n}" for one in arms], fontsize=8)
         axes.set_title(suite, fontsize=9)
-        axes.set_xlabel("% of episodes", fontsize=8)
+        axes.set_xlabel("% of episodes (in the bars: how many)", fontsize=8)
         axes.spines[["top", "right"]].set_visible(False)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2,
                   frameon=False, fontsize=8)  # fmt: skip

@@ -1,5 +1,6 @@
 """Writing to a recording: the stream into its file, one row, and time columns."""
 
+import shutil
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import timedelta
@@ -17,6 +18,9 @@ from vap_core.recording.file import temporary_path
 from vap_core.recording.reading import UNREADABLE, open_whole
 from vap_core.rollout.types import Frame
 
+ROOM_BYTES = 32 * 2**20
+"""More than one flush writes. Rerun's writer of a file can wait forever when a write fails."""
+
 type Moment = tuple[int, float]
 """Control step and seconds since the episode's start."""
 
@@ -26,7 +30,7 @@ def open_stream(path: Path, recording_id: str) -> rr.RecordingStream:
 
     It flushes only on request, so that equal runs give equal chunks.
 
-    Raises: BadOutput, when `path` exists or its folder cannot be written.
+    Raises: BadOutput, when `path` exists, its folder cannot be written, or its disk is full.
     """
     if path.exists():
         raise BadOutput(
@@ -35,6 +39,7 @@ def open_stream(path: Path, recording_id: str) -> rr.RecordingStream:
         )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        _require_room(path)
         temporary_path(path).write_bytes(b"")
     except OSError as err:
         raise BadOutput(
@@ -85,10 +90,17 @@ def flush_stream(rec: rr.RecordingStream, path: Path) -> None:
 
     Raises: BadOutput, when it cannot be written; nothing is left of the recording then.
     """
+    _require_room(path)
     try:
         rec.flush()
     except RuntimeError as error:
         raise _unwritten(path) from error
+
+
+def _require_room(path: Path) -> None:
+    """Raises: BadOutput, where the disk has less than ROOM_BYTES left."""
+    if shutil.disk_usage(path.parent).free < ROOM_BYTES:
+        raise _unwritten(path)
 
 
 def _unwritten(path: Path) -> BadOutput:
