@@ -344,6 +344,8 @@ def test_another_policys_effects_stand_beside_each_arm() -> None:
     (0.1, 0.3, 0.001, -0.2, "the other way round"),
     (-0.1, 0.1, 0.7, -0.2, "not here: as much is excluded"),
     (-0.1, 0.1, 0.7, 0.05, "cannot tell"),
+    (-0.052, -0.004, 0.41, 0.001, "none is shown in either"),
+    (-0.052, -0.004, 0.01, -0.001, "there is none, here is one"),
     (-0.1, -0.02, 0.06, -0.05, "cannot tell"),
     (-0.1, -0.02, 0.06, -0.01, "cannot tell"),
 ])  # fmt: skip

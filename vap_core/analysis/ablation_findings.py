@@ -13,6 +13,9 @@ from vap_core.evaluation.statistics import Comparison
 if TYPE_CHECKING:
     import pandas as pd
 
+NO_POINT = 0.005
+"""Differences of success below it round to no point."""
+
 
 def findings_table(results: Mapping[str, Sequence[ArmResult]]) -> "pd.DataFrame":
     """One row for every arm that the paper has, too; differences in points of success."""
@@ -69,8 +72,11 @@ def two_policies_table(
 def verdict(found: Comparison, theirs: float) -> str:
     """What a difference that was found says about another's difference, `theirs`.
 
-    The other's own error is not known, and not counted.
+    The other's own error is not known, and not counted. A difference of the other's that rounds to
+    no point is none.
     """
+    if abs(theirs) < NO_POINT:
+        return "there is none, here is one" if is_shown(found) else "none is shown in either"
     within = found.low <= theirs <= found.high
     if not is_shown(found):
         beyond = theirs < found.low if theirs < 0 else theirs > found.high

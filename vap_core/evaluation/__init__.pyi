@@ -1,5 +1,6 @@
 from . import engine as engine
 from . import paper as paper
+from .ablations.picture import is_shown as is_shown
 from .diagnosis import explain as explain
 from .diagnosis.failures import list_failures as list_failures
 from .diagnosis.recordings import save_screenshot as save_screenshot
