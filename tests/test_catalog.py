@@ -27,9 +27,11 @@ from vap_core.recording import (
     write_correction,
 )
 from vap_core.recording.browser import serve_run
-from vap_core.recording.catalog import register_files
+from vap_core.recording.catalog import PROPERTY_COLUMNS, register_files
 from vap_core.recording.index import FOLDER
 from vap_core.recording.query import first_match, format_result, run_query
+from vap_core.rollout.failure import NO_DIAGNOSIS
+from vap_core.rollout.types import Episode
 
 
 @pytest.fixture(scope="module")
@@ -376,3 +378,11 @@ def test_two_methods_share_a_time_line(run: Path, tmp_path: Path) -> None:
         )
     with pytest.raises(BadOutput, match="never overwritten"):
         combine_recordings({"mine": folder / "wrong.rrd"}, tmp_path / "both.rrd")
+
+
+def test_a_query_has_the_columns_of_a_results_table() -> None:
+    header = opening(1)
+    episode = Episode(header, (frame(0, header),), SUCCESS, {})
+    columns = {*episode.summary(), *NO_DIAGNOSIS}
+    for names in PROPERTY_COLUMNS.values():
+        assert set(names) <= columns

@@ -22,6 +22,7 @@ from vap_core.perception.chat import (
     answer_in_time,
     data_url,
     endpoint_from_environment,
+    question_message,
     request_answer,
 )
 from vap_core.perception.colours import COLOURS, colour_indices
@@ -232,7 +233,10 @@ def test_a_picture_as_an_address_is_the_picture() -> None:
             r"refuses \(401: bad key second line\); check OPENAI_BASE_URL, OPENAI_MODEL and",
         ),
         ((500, b"<html>oops"), r"refuses \(500: <html>oops\)"),
-        ((302, b"", ("Location", "http://127.0.0.1:9/elsewhere")), r"refuses \(302: Found\)"),
+        (
+            (302, b"", ("Location", "http://127.0.0.1:9/elsewhere")),
+            r"refuses \(302: it redirects to http://127.0.0.1:9/elsewhere, which is not",
+        ),
         ((200, b"not json"), "does not answer as a chat endpoint does"),
         ((200, b"[" * 100_000), "does not answer as a chat endpoint does"),
         ((200, {"choices": []}), "does not answer as a chat endpoint does"),
@@ -249,21 +253,24 @@ def test_what_goes_wrong_is_one_line(answer: Any, said: str) -> None:
     assert "secret" not in str(caught.value)
 
 
+def ask(endpoint: ChatEndpoint) -> str:
+    return request_answer(
+        endpoint, [question_message("what?")], doing="ask", instead="another server"
+    )
+
+
 def test_no_server_and_a_silent_one_are_said() -> None:
     with serving() as server:
         url = server.url
     with pytest.raises(BadEndpoint, match=r"gives no answer \(.*refused\); is the server up"):
-        request_answer(ChatEndpoint(url, "seer-1"), "what?")
+        ask(ChatEndpoint(url, "seer-1"))
     import socket
 
     with (
         socket.create_server(("127.0.0.1", 0)) as mute,
         pytest.raises(BadEndpoint, match=r"gives no answer \(timed out\)"),
     ):
-        request_answer(
-            ChatEndpoint(f"http://127.0.0.1:{mute.getsockname()[1]}/v1", "seer-1", timeout_s=0.2),
-            "what?",
-        )
+        ask(ChatEndpoint(f"http://127.0.0.1:{mute.getsockname()[1]}/v1", "seer-1", timeout_s=0.2))
 
 
 @pytest.mark.parametrize("url", ["http://api..example.com/v1", "http://127.0.0.1:1/vü1"])
@@ -323,7 +330,7 @@ def test_an_answer_without_end_is_given_up(
     with endless(head, drip, pause_s) as url:
         endpoint = ChatEndpoint(url, "seer-1", "secret", total_s=0.3 if pause_s else 20.0)
         with pytest.raises(BadEndpoint, match=said) as caught:
-            request_answer(endpoint, "what?")
+            ask(endpoint)
     assert time.monotonic() - start < 10
     assert "secret" not in str(caught.value)
 

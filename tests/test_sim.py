@@ -49,7 +49,7 @@ def test_a_known_slab_covers_the_computable_number_of_pixels():
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     with cameras.Renderer(model, ("slab",)) as renderer:
-        seen = renderer.masks(data, "down", 224)["slab"]
+        seen = renderer.masks_and_hand(data, "down", 224)[0]["slab"]
     focal = cameras.intrinsics(model, "down", (224, 224))[0, 0]
     assert focal == pytest.approx(112 / np.tan(np.pi / 8))
     assert seen.sum() == pytest.approx(focal**2 * 0.3 * 0.2 / 0.5**2, rel=0.01)
@@ -63,8 +63,8 @@ def test_a_view_need_not_be_square():
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     with cameras.Renderer(model, ("slab",)) as renderer:
-        square = renderer.masks(data, "down", 448)["slab"]
-        seen = renderer.masks(data, "down", (224, 300))["slab"]
+        square = renderer.masks_and_hand(data, "down", 448)[0]["slab"]
+        seen = renderer.masks_and_hand(data, "down", (224, 300))[0]["slab"]
         assert renderer.rgb(data, "down", (224, 300)).shape == (224, 300, 3)
     assert seen.shape == (224, 300)
     assert seen.sum() == pytest.approx(square.sum() / 4, rel=0.02)
@@ -88,7 +88,9 @@ def test_masks_of_one_sample_a_pixel_are_those_of_several(scene, row):
     assert all((views[camera] == again[camera]).all() for camera in views)
     with SeveralSamples(scene.model, scene.renderer.objects, scene.renderer.shadows) as several:
         for camera, of_view in masks.items():
-            wanted = several.masks(env._data, camera, env.image_hw, hidden=env._hidden())
+            wanted = several.masks_and_hand(env._data, camera, env.image_hw, hidden=env._hidden())[
+                0
+            ]
             assert of_view.keys() == wanted.keys()
             assert all((of_view[name] == wanted[name]).all() for name in wanted)
 

@@ -168,7 +168,7 @@ def test_lookalike_pairs_match_a_look_alike_with_the_target_beside_it() -> None:
 @pytest.mark.parametrize(
     ("draw", "table", "axes"),
     [(curves.abstention_figure, "choices", 1), (curves.hardness_figure, "objects", 2), (curves.references_figure, "choices", 3),
-     (curves.time_figure, "tracks", 1), (curves.hidden_figure, "tracks", 1), (curves.size_figure, "objects", 1)],
+     (curves.time_figure, "tracks", 1), (curves.hidden_figure, "tracks", 1)],
 )  # fmt: skip
 def test_figures_draw(draw, table: str, axes: int, tmp_path: Path) -> None:
     figure = draw(tables()[table])

@@ -307,10 +307,11 @@ def test_the_highest_score_is_the_choice() -> None:
     after = (line[choices.AFTER_RIGHT], line[choices.AFTER_WRONG])
     assert [(each.value, each.n) for each in after] == [(1, 1), (0, 2)]
     assert list(beside.index) == ["s"]
-    cost = choices.cost_of_scene(both)
+    losses = choices.losses(both, pd.DataFrame(rows, columns=columns)).loss
+    cost = losses[choices.TO_SCENE, "s"]
     assert (cost.value, cost.n) == (pytest.approx(-1 / 3), 3)
     assert cost.low <= cost.value <= cost.high
-    cost = choices.cost_of_policy(both, pd.DataFrame(rows, columns=columns))
+    cost = losses[choices.TO_POLICY, "s"]
     assert (cost.value, cost.n) == (0, 3), "one of three in the scene, and one of three touched"
     assert cost.low <= 0 <= cost.high
 
@@ -341,10 +342,11 @@ def touches(right: dict[str, bool], episodes: int) -> pd.DataFrame:
 def test_objects_are_the_units_whatever_the_number_of_their_episodes(episodes: int) -> None:
     """Each object has one learned token: more episodes with it say nothing of other tokens."""
     table = chosen_in_both({"cup": (True, False), "owl": (True, True)}, episodes)
-    cost = choices.cost_of_scene(table)
-    assert (cost.value, cost.low, cost.high, cost.n) == (0.5, 0, 1, 2 * episodes)
     touched = touches({"cup": False, "owl": False}, episodes)
-    cost = choices.cost_of_policy(table, touched)
+    losses = choices.losses(table, touched).loss
+    cost = losses[choices.TO_SCENE, "s"]
+    assert (cost.value, cost.low, cost.high, cost.n) == (0.5, 0, 1, 2 * episodes)
+    cost = losses[choices.TO_POLICY, "s"]
     assert (cost.value, cost.low, cost.high) == (0.5, 0, 1)
     in_scene = choices.beside_policy(table, touched, ["soft"]).loc["s", choices.IN_SCENE]
     wilson = rate(1, 2)

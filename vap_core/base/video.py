@@ -5,7 +5,6 @@ from contextlib import ExitStack, contextmanager
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -95,14 +94,9 @@ class Mp4:
     def __enter__(self) -> "Mp4":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: Any) -> None:
         with self._told():
-            self._files.__exit__(kind, error, trace)
+            self._files.__exit__(*error)
 
     @contextmanager
     def _told(self) -> Iterator[None]:

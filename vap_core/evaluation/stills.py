@@ -30,7 +30,6 @@ NOT_DRAWN = {
     "index",
     "isolated",
     "layers",
-    "legacy_names",
     "query",
     "reading",
     "stored_pictures",

@@ -73,27 +73,50 @@ def endpoint_from_environment(url: str = "") -> ChatEndpoint:
     )
 
 
-def request_answer(endpoint: ChatEndpoint, question: str, images: Sequence[Rgb] = ()) -> str:
-    """The model's answer to one question about some images.
+def request_answer(
+    endpoint: ChatEndpoint,
+    messages: Sequence[dict[str, Any]],
+    *,
+    doing: str,
+    instead: str,
+    **fields: Any,
+) -> str:
+    """The model's answer to some messages; `fields` are further ones of the request.
+
+    Errors name what was being done, and what to take instead.
 
     Raises: BadEndpoint: the server cannot be reached, takes too long, refuses, or answers something
         other than the protocol says.
     """
-    body = _question_body(endpoint.model, question, images)
+    body = {"model": endpoint.model, "messages": list(messages), **fields}
     data = answer_in_time(
-        endpoint, lambda: _fetch(endpoint, body), doing="chat", instead="another server"
+        endpoint, lambda: _fetch(endpoint, body, doing), doing=doing, instead=instead
     )
     try:
-        text = parse_json(data)["choices"][0]["message"]["content"]
-        if not isinstance(text, str) or not text.strip():
+        message = parse_json(data)["choices"][0]["message"]
+        refusal = message.get("refusal")
+        text = message.get("content")
+        if not refusal and not (isinstance(text, str) and text.strip()):
             raise ValueError("no text")
-    except (ValueError, KeyError, IndexError, TypeError) as error:
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
         raise BadEndpoint(
-            f"chat: {endpoint.url} does not answer as a chat endpoint does "
-            f"({type(error).__name__}); give the address that ends in /v1, and a model "
-            f"that sees pictures in {MODEL}."
+            f"{doing}: {endpoint.url} does not answer as a chat endpoint does "
+            f"({type(error).__name__}); give the address that ends in /v1, or take {instead}."
         ) from error
-    return text
+    if refusal:
+        raise BadEndpoint(
+            f"{doing}: {endpoint.model} at {endpoint.url} refuses: {_line(str(refusal))!r}; ask "
+            f"otherwise, or take {instead}."
+        )
+    return str(text)
+
+
+def question_message(question: str, images: Sequence[Rgb] = ()) -> dict[str, Any]:
+    """One user message: the question, then the images."""
+    content: list[dict[str, Any]] = [{"type": "text", "text": question}]
+    for rgb in images:
+        content.append({"type": "image_url", "image_url": {"url": data_url(rgb)}})
+    return {"role": "user", "content": content}
 
 
 def answer_in_time[T](
@@ -143,15 +166,7 @@ def _is_web_address(url: str) -> bool:
         return False
 
 
-def _question_body(model: str, question: str, images: Sequence[Rgb]) -> dict[str, Any]:
-    """One user message: the question, then the images."""
-    content: list[dict[str, Any]] = [{"type": "text", "text": question}]
-    for rgb in images:
-        content.append({"type": "image_url", "image_url": {"url": data_url(rgb)}})
-    return {"model": model, "messages": [{"role": "user", "content": content}]}
-
-
-def _fetch(endpoint: ChatEndpoint, body: dict[str, Any]) -> bytes:
+def _fetch(endpoint: ChatEndpoint, body: dict[str, Any], doing: str) -> bytes:
     """The server's response, of MAX_ANSWER_BYTES at most. Raises: BadEndpoint."""
     headers = {"Content-Type": "application/json"}
     if endpoint.key:
@@ -169,13 +184,13 @@ def _fetch(endpoint: ChatEndpoint, body: dict[str, Any]) -> bytes:
         if len(data) <= MAX_ANSWER_BYTES:
             return data
         raise BadEndpoint(
-            f"chat: {endpoint.url} answers with over {MAX_ANSWER_BYTES / 1e6:.0f} MB; "
+            f"{doing}: {endpoint.url} answers with over {MAX_ANSWER_BYTES / 1e6:.0f} MB; "
             f"is it a chat endpoint, and {URL} right?"
         )
     except HTTPError as error:
         with error:
             raise BadEndpoint(
-                f"chat: {endpoint.url} refuses ({error.code}: {_refusal_reason(error)}); "
+                f"{doing}: {endpoint.url} refuses ({error.code}: {_refusal_reason(error)}); "
                 f"check {URL}, {MODEL} and {KEY}."
             ) from error
     except (URLError, HTTPException, OSError, ValueError) as error:  # ValueError: of an address
@@ -183,18 +198,24 @@ def _fetch(endpoint: ChatEndpoint, body: dict[str, Any]) -> bytes:
         if isinstance(error, URLError):
             cause = error.reason
         raise BadEndpoint(
-            f"chat: {endpoint.url} gives no answer ({str(cause) or type(cause).__name__}); "
+            f"{doing}: {endpoint.url} gives no answer ({str(cause) or type(cause).__name__}); "
             f"is the server up, and {URL} right?"
         ) from error
 
 
 def _refusal_reason(error: HTTPError) -> str:
-    """What the server says, as one line, whether it follows the protocol or sends plain text."""
+    """What the server says, as one line: a redirect, the protocol's error, or plain text."""
+    if 300 <= error.code < 400 and "Location" in error.headers:
+        return f"it redirects to {_line(error.headers['Location'])}, which is not followed"
     text = ""
     with suppress(OSError, HTTPException, ValueError, KeyError, TypeError):
         text = error.read(2000).decode(errors="replace")
         text = str(parse_json(text)["error"]["message"])
-    return " ".join(text.split())[:200] or error.reason
+    return _line(text) or error.reason
+
+
+def _line(text: str) -> str:
+    return " ".join(text.split())[:200]
 
 
 class _NoRedirects(request.HTTPRedirectHandler):

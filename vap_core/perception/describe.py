@@ -15,7 +15,12 @@ import numpy as np
 from vap_core.base.errors import BadEndpoint
 from vap_core.base.types import Description, PersonalObject, Rgb
 from vap_core.perception.attributes import PATTERNS, SHAPES, CropAttributes, measure_crop
-from vap_core.perception.chat import ChatEndpoint, endpoint_from_environment, request_answer
+from vap_core.perception.chat import (
+    ChatEndpoint,
+    endpoint_from_environment,
+    question_message,
+    request_answer,
+)
 from vap_core.perception.colours import COLOURS, SHADES, add_shade
 from vap_core.perception.protocols import Segmenter
 
@@ -106,7 +111,12 @@ class ChatCaptioner:
 
     def _request_phrase(self, question: str, crops: Sequence[Rgb]) -> str:
         """The model's answer as one line, without quotes or a full stop."""
-        answer = request_answer(self.endpoint, question, crops)
+        answer = request_answer(
+            self.endpoint,
+            [question_message(question, crops)],
+            doing="describe",
+            instead="another server whose model sees pictures",
+        )
         phrase = " ".join(answer.split()).strip(" \"'`.“”")
         if not phrase or len(phrase) > MAX_CHARACTERS or not phrase.isprintable():
             raise BadEndpoint(

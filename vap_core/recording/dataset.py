@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -51,13 +50,8 @@ class DatasetRecorder:
     def __enter__(self) -> "DatasetRecorder":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if error is None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
             finish_stream(self._rec, self.path)
         else:
             self._rec.disconnect()

@@ -1,7 +1,6 @@
 """Recordings for `vap_core ground`: of one picture, and of a clip."""
 
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 import rerun as rr
@@ -67,13 +66,8 @@ class ClipRecorder:
     def __enter__(self) -> "ClipRecorder":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if error is None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
             finish_stream(self._rec, self.path)
         else:
             self._rec.disconnect()

@@ -9,7 +9,6 @@ from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 
 from vap_core.base.errors import BadRecording
 from vap_core.base.files import check_regular
-from vap_core.recording.legacy_names import with_current_names
 
 PROPERTIES = "/__properties"
 """Rerun's reserved entity; below it is one entity per property group."""
@@ -61,8 +60,7 @@ def property_group(chunk: Chunk) -> str | None:
 
 
 def read_properties(chunk: Chunk) -> dict[str, Any]:
-    """The properties in a chunk of one property group, by their current names."""
-    group = chunk.entity_path.removeprefix(f"{PROPERTIES}/")
+    """The properties in a chunk of one property group."""
     batch = chunk.to_record_batch()
     values = {}
     for name in batch.schema.names:
@@ -70,7 +68,7 @@ def read_properties(chunk: Chunk) -> dict[str, Any]:
             continue
         cells = batch[name][0].as_py()
         values[name] = cells[0] if cells else None
-    return with_current_names(group, values)
+    return values
 
 
 def read_summary(path: Path) -> dict[str, Any]:

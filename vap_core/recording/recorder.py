@@ -20,7 +20,6 @@ Pictures are JPEG or AV1, at the steps that have them; everything that changes t
 
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 from typing import Literal
 
 import rerun as rr
@@ -136,12 +135,7 @@ class Recorder:
     def __enter__(self) -> "Recorder":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        err: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._rec is not None:
             try:
                 self._flush()

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from types import MappingProxyType, TracebackType
+from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float64
@@ -181,12 +181,7 @@ class Renderer:
     def __enter__(self) -> "Renderer":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -212,17 +207,6 @@ class Renderer:
         dim(renderer.scene, light)
         return np.ascontiguousarray(renderer.render())
 
-    def masks(
-        self,
-        data: mujoco.MjData,
-        name: str,
-        size: int | tuple[int, int],
-        hidden: frozenset[str] = frozenset(),
-        before: Sequence[Screen] = (),
-    ) -> Mapping[str, Mask]:
-        """Visible pixels of every object that is not hidden; `before` is in front of the camera."""
-        return self.masks_and_hand(data, name, size, hidden=hidden, before=before)[0]
-
     def masks_and_hand(
         self,
         data: mujoco.MjData,
@@ -231,7 +215,10 @@ class Renderer:
         hidden: frozenset[str] = frozenset(),
         before: Sequence[Screen] = (),
     ) -> tuple[Mapping[str, Mask], Mask]:
-        """`masks`, and the visible pixels of the gripper."""
+        """Visible pixels of every object that is not hidden, and those of the gripper.
+
+        `before` is in front of the camera.
+        """
         renderer = self._renderer(size, masks=True)
         self._update(renderer, data, name, hidden=hidden, before=before)
         drawn = renderer.render()

@@ -6,7 +6,6 @@ Compiled once, and shared by every episode that uses it. The world frame stands 
 
 from collections.abc import Mapping, Sequence
 from itertools import product
-from types import TracebackType
 from typing import Literal
 
 import numpy as np
@@ -47,12 +46,7 @@ class Scene:
     def __enter__(self) -> "Scene":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

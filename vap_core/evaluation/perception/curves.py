@@ -29,11 +29,6 @@ TIME_TARGET = 0.8
 """The IoU that a track is to keep."""
 RULE_COLOURS = {"vote": WINNER, "average": OTHER}
 OCCLUDERS = {"plate": "a plate hides it fully", "arm": "an arm moves in front"}
-RECALLS = {
-    "recalled": ("among the 10 best boxes", WINNER),
-    "proposed": ("above the detector's own threshold", OTHER),
-}
-"""Columns of the table of objects, each with its label and colour in `size_figure`."""
 
 
 def abstention(choices: "pd.DataFrame", margin: str = "margin", k: int = USUAL_K) -> "pd.DataFrame":
@@ -204,27 +199,6 @@ def hidden_figure(tracks: "pd.DataFrame") -> "Figure":
     return figure
 
 
-def size_figure(objects: "pd.DataFrame", bins: int = 7) -> "Figure":
-    """Recall of the detector against the visible size of an object, in bins of equally many.
-
-    Bars are 95 % Wilson intervals.
-    """
-    figure, axes = _make_panel(6.4, 3.8)
-    parts = _split_by_size(objects, bins)
-    middles = np.empty(len(parts))
-    for i, part in enumerate(parts):
-        middles[i] = part.px.median()
-    for column, (label, colour) in RECALLS.items():
-        shares = [share(part[column]) for part in parts]
-        _draw_line(axes, middles, shares, colour=colour, label=label)
-    axes.set(xlabel=f"visible pixels ({len(objects)} objects in view, {len(parts)} bins)")
-    axes.set(ylabel="% found (IoU 0.5)", xscale="log", ylim=(0, 103))
-    axes.xaxis.set_major_formatter("{x:.0f}")
-    axes.xaxis.set_minor_formatter("{x:.0f}")
-    axes.legend(frameon=False, loc="best")
-    return figure
-
-
 def _suite_colours(table: "pd.DataFrame") -> dict[str, str]:
     """The suites of a table in their usual order, each with its colour."""
     colours = {}
@@ -243,15 +217,6 @@ def _mean_iou_over_time(tracks: "pd.DataFrame") -> list[Estimate]:
         at_point = tracks.assign(x=point)
         means.append(mean(at_point, "x"))
     return means
-
-
-def _split_by_size(objects: "pd.DataFrame", bins: int) -> "list[pd.DataFrame]":
-    """Objects in bins of equally many, by their visible pixels; fewer bins where sizes repeat."""
-    quantiles = np.linspace(0, 1, bins + 1)
-    edges = np.unique(np.quantile(objects.px, quantiles))
-    above = np.searchsorted(edges, objects.px, side="right")
-    bin_of = np.clip(above - 1, 0, len(edges) - 2)
-    return [objects[bin_of == i] for i in range(len(edges) - 1)]
 
 
 def _bounds(

@@ -180,28 +180,13 @@ def beside_policy(
     return pd.DataFrame(lines).T
 
 
-def cost_of_scene(table: "pd.DataFrame") -> Estimate:
-    """The share of right choices in photos minus that in the scene, over the same episodes.
-
-    `table` is `beside_policy`'s. The interval is bootstrapped over objects, n are episodes.
-    """
-    return _mean_gain(_gains_of_photos(table))
-
-
-def cost_of_policy(table: "pd.DataFrame", episodes: "pd.DataFrame") -> Estimate:
-    """The share of right choices in the scene minus that of soft's first touches, likewise.
-
-    `table` and `episodes` are `beside_policy`'s.
-    """
-    return _mean_gain(_gains_of_scene(table, episodes))
-
-
 def losses(table: "pd.DataFrame", episodes: "pd.DataFrame") -> "pd.DataFrame":
-    """What is lost at TO_SCENE and at TO_POLICY, by suite; `table` and `episodes` likewise.
+    """What is lost at TO_SCENE and at TO_POLICY, by suite.
 
-    A row per step and suite, and one for ALL_SUITES if there are several: `loss` is an `Estimate`
-    over `objects`, `p` the exact test that an object is as likely to win as to lose (`sign_flip`),
-    `p_holm` is `p` corrected for the suites of a step; that of ALL_SUITES is `p`.
+    `table` and `episodes` are `beside_policy`'s. A row per step and suite, and one for ALL_SUITES
+    if there are several: `loss` is an `Estimate` over `objects`, `p` the exact test that an object
+    is as likely to win as to lose (`sign_flip`), `p_holm` is `p` corrected for the suites of a
+    step; that of ALL_SUITES is `p`.
     """
     import pandas as pd
 

@@ -59,7 +59,7 @@ class Texture:
     ink: Srgb
     accent: Srgb
     motif: str
-    layout: MotifLayout
+    layout: MotifLayout = "full"
     repeats: int = 4
     word: str = ""
     seed: int = 0

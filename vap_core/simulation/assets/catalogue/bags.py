@@ -4,22 +4,6 @@ import numpy as np
 
 from vap_core.simulation.assets.bodies.leather_bag import LeatherBag
 from vap_core.simulation.assets.bodies.pouch import Pouch
-from vap_core.simulation.assets.catalogue.colours import (
-    CAMEL,
-    DEEP,
-    ESPRESSO,
-    FERN,
-    IVORY,
-    LAGOON,
-    LINEN,
-    MARINE,
-    ONYX,
-    PARCHMENT,
-    RASPBERRY,
-    STONE,
-    TAN,
-    WALNUT,
-)
 from vap_core.simulation.assets.catalogue.family import Family
 from vap_core.simulation.assets.catalogue.sampling import (
     ColourScheme,
@@ -27,7 +11,22 @@ from vap_core.simulation.assets.catalogue.sampling import (
     recolour_with,
     uniform_outside,
 )
-from vap_core.simulation.assets.textures import Texture
+from vap_core.simulation.assets.textures import Srgb, Texture
+
+CAMEL: Srgb = (168, 138, 98)
+DEEP: Srgb = (44, 66, 88)
+ESPRESSO: Srgb = (66, 43, 31)
+FERN: Srgb = (146, 154, 112)
+IVORY: Srgb = (240, 230, 212)
+LAGOON: Srgb = (86, 142, 146)
+LINEN: Srgb = (222, 204, 172)
+MARINE: Srgb = (52, 64, 92)
+ONYX: Srgb = (46, 44, 46)
+PARCHMENT: Srgb = (230, 214, 186)
+RASPBERRY: Srgb = (172, 92, 104)
+STONE: Srgb = (150, 150, 148)
+TAN: Srgb = (172, 124, 78)
+WALNUT: Srgb = (84, 55, 39)
 
 LEATHERS: tuple[ColourScheme, ...] = (
     ((102, 70, 50), (190, 146, 96), (82, 54, 40)),
@@ -80,7 +79,7 @@ LEATHER_BAG = Family(
     instances=(
         (
             LeatherBag(),
-            Texture(base=ESPRESSO, ink=TAN, accent=WALNUT, motif="hide", layout="full", repeats=5),
+            Texture(base=ESPRESSO, ink=TAN, accent=WALNUT, motif="hide", repeats=5),
         ),
         (
             LeatherBag(
@@ -93,7 +92,7 @@ LEATHER_BAG = Family(
                 handle="arch",
                 hardware="gold",
             ),
-            Texture(base=ESPRESSO, ink=TAN, accent=WALNUT, motif="sleek", layout="full", repeats=4),
+            Texture(base=ESPRESSO, ink=TAN, accent=WALNUT, motif="sleek", repeats=4),
         ),
         (
             LeatherBag(
@@ -105,9 +104,7 @@ LEATHER_BAG = Family(
                 clasp="button",
                 handle="flat",
             ),
-            Texture(
-                base=ESPRESSO, ink=TAN, accent=WALNUT, motif="checks", layout="full", repeats=6
-            ),
+            Texture(base=ESPRESSO, ink=TAN, accent=WALNUT, motif="checks", repeats=6),
         ),
         (
             LeatherBag(
@@ -134,7 +131,7 @@ LEATHER_BAG = Family(
                 handle="twin",
                 hardware="gold",
             ),
-            Texture(base=MARINE, ink=TAN, accent=WALNUT, motif="chevron", layout="full", repeats=5),
+            Texture(base=MARINE, ink=TAN, accent=WALNUT, motif="chevron", repeats=5),
         ),
         (
             LeatherBag(
@@ -146,7 +143,7 @@ LEATHER_BAG = Family(
                 clasp="none",
                 handle="twin",
             ),
-            Texture(base=STONE, ink=ONYX, accent=WALNUT, motif="plaid", layout="full", repeats=5),
+            Texture(base=STONE, ink=ONYX, accent=WALNUT, motif="plaid", repeats=5),
         ),
     ),
     recolour=recolour_with(LEATHERS),
@@ -158,7 +155,7 @@ POUCH = Family(
     instances=(
         (
             Pouch(),
-            Texture(base=LINEN, ink=CAMEL, accent=IVORY, motif="ribs", layout="full", repeats=5),
+            Texture(base=LINEN, ink=CAMEL, accent=IVORY, motif="ribs", repeats=5),
         ),
         (
             Pouch(
@@ -170,11 +167,11 @@ POUCH = Family(
                 strap="loop",
                 badge="button",
             ),
-            Texture(base=LINEN, ink=CAMEL, accent=IVORY, motif="quilt", layout="full", repeats=6),
+            Texture(base=LINEN, ink=CAMEL, accent=IVORY, motif="quilt", repeats=6),
         ),
         (
             Pouch(radius=0.0318, thick=0.041, rim=0.012, zip="front", pull="drop", strap="handle"),
-            Texture(base=LINEN, ink=CAMEL, accent=IVORY, motif="dots", layout="full", repeats=7),
+            Texture(base=LINEN, ink=CAMEL, accent=IVORY, motif="dots", repeats=7),
         ),
         (
             Pouch(
@@ -186,13 +183,11 @@ POUCH = Family(
                 strap="none",
                 badge="bar",
             ),
-            Texture(
-                base=LINEN, ink=RASPBERRY, accent=IVORY, motif="hoops", layout="full", repeats=7
-            ),
+            Texture(base=LINEN, ink=RASPBERRY, accent=IVORY, motif="hoops", repeats=7),
         ),
         (
             Pouch(radius=0.0316, thick=0.041, rim=0.01, zip="front", pull="tab", strap="loop"),
-            Texture(base=FERN, ink=CAMEL, accent=IVORY, motif="cord", layout="full", repeats=5),
+            Texture(base=FERN, ink=CAMEL, accent=IVORY, motif="cord", repeats=5),
         ),
         (
             Pouch(
@@ -204,7 +199,7 @@ POUCH = Family(
                 strap="handle",
                 badge="button",
             ),
-            Texture(base=LAGOON, ink=DEEP, accent=IVORY, motif="stripes", layout="full", repeats=7),
+            Texture(base=LAGOON, ink=DEEP, accent=IVORY, motif="stripes", repeats=7),
         ),
     ),
     recolour=recolour_with(POUCH_COLOURS),

@@ -7,23 +7,24 @@ import numpy as np
 from vap_core.simulation.assets.bodies.cups import Cup
 from vap_core.simulation.assets.bodies.disposable_cups import PaperCup, StrawCup
 from vap_core.simulation.assets.catalogue.colours import (
-    COFFEE,
     CREAM,
-    FOREST,
-    INDIGO,
-    KRAFT,
     MUSTARD,
     NAVY,
-    PAPER_WHITE,
     PLUM,
     ROSE,
     RUST,
     TEAL,
-    TOMATO,
 )
 from vap_core.simulation.assets.catalogue.family import Family
 from vap_core.simulation.assets.catalogue.sampling import choose
 from vap_core.simulation.assets.textures import Srgb, Texture
+
+COFFEE: Srgb = (74, 48, 36)
+FOREST: Srgb = (54, 98, 80)
+INDIGO: Srgb = (66, 74, 124)
+KRAFT: Srgb = (192, 150, 104)
+PAPER_WHITE: Srgb = (236, 230, 220)
+TOMATO: Srgb = (196, 70, 52)
 
 PAPER_COLOURS: tuple[Srgb, ...] = (
     (228, 224, 216),
@@ -82,7 +83,7 @@ CUP = Family(
         (Cup(), Texture(base=CREAM, ink=RUST, accent=TEAL, motif="heart", layout="row", repeats=4)),
         (
             Cup(low=0.0205, high=0.0205, height=0.07, grip="square", reach=0.016),
-            Texture(base=CREAM, ink=TEAL, accent=RUST, motif="hoops", layout="full", repeats=8),
+            Texture(base=CREAM, ink=TEAL, accent=RUST, motif="hoops", repeats=8),
         ),
         (
             Cup(low=0.0185, high=0.0215, height=0.074, grip="ear", reach=0.018, rim="accent"),
@@ -98,7 +99,7 @@ CUP = Family(
         ),
         (
             Cup(low=0.02, high=0.021, height=0.068, grip="round", reach=0.015, rim="ink"),
-            Texture(base=CREAM, ink=RUST, accent=TEAL, motif="dots", layout="full", repeats=7),
+            Texture(base=CREAM, ink=RUST, accent=TEAL, motif="dots", repeats=7),
         ),
         (
             Cup(low=0.0195, high=0.0215, height=0.076, grip="ear", reach=0.016),
@@ -106,7 +107,7 @@ CUP = Family(
         ),
         (
             Cup(low=0.019, high=0.021, height=0.073, grip="round", reach=0.016),
-            Texture(base=CREAM, ink=NAVY, accent=TEAL, motif="stripes", layout="full", repeats=8),
+            Texture(base=CREAM, ink=NAVY, accent=TEAL, motif="stripes", repeats=8),
         ),
         (
             Cup(low=0.02, high=0.0215, height=0.069, grip="round", reach=0.018),
@@ -125,7 +126,7 @@ STRAW_CUP = Family(
         ),
         (
             StrawCup(low=0.017, high=0.0215, height=0.078, lid="dome", bend=False),
-            Texture(base=ROSE, ink=PLUM, accent=CREAM, motif="plaid", layout="full", repeats=5),
+            Texture(base=ROSE, ink=PLUM, accent=CREAM, motif="plaid", repeats=5),
         ),
         (
             StrawCup(low=0.0175, high=0.021, height=0.082, lid="step", bend=True),
@@ -143,11 +144,11 @@ STRAW_CUP = Family(
         ),
         (
             StrawCup(low=0.0168, high=0.0212, height=0.079, lid="step", bend=False),
-            Texture(base=CREAM, ink=PLUM, accent=ROSE, motif="stripes", layout="full", repeats=9),
+            Texture(base=CREAM, ink=PLUM, accent=ROSE, motif="stripes", repeats=9),
         ),
         (
             StrawCup(low=0.0172, high=0.0215, height=0.077, lid="dome", bend=False),
-            Texture(base=TEAL, ink=MUSTARD, accent=CREAM, motif="dots", layout="full", repeats=8),
+            Texture(base=TEAL, ink=MUSTARD, accent=CREAM, motif="dots", repeats=8),
         ),
     ),
 )
@@ -158,9 +159,7 @@ PAPER_CUP = Family(
     instances=(
         (
             PaperCup(),
-            Texture(
-                base=COFFEE, ink=KRAFT, accent=PAPER_WHITE, motif="hoops", layout="full", repeats=8
-            ),
+            Texture(base=COFFEE, ink=KRAFT, accent=PAPER_WHITE, motif="hoops", repeats=8),
         ),
         (
             PaperCup(low=0.0182, high=0.0215, height=0.078, sleeve=(0.2, 0.72), rim="ink"),
@@ -169,7 +168,6 @@ PAPER_CUP = Family(
                 ink=KRAFT,
                 accent=PAPER_WHITE,
                 motif="chevron",
-                layout="full",
                 repeats=9,
             ),
         ),
@@ -192,15 +190,12 @@ PAPER_CUP = Family(
                 ink=FOREST,
                 accent=PAPER_WHITE,
                 motif="stripes",
-                layout="full",
                 repeats=12,
             ),
         ),
         (
             PaperCup(low=0.0176, high=0.0214, height=0.077, sleeve=(0.12, 0.86), rim="accent"),
-            Texture(
-                base=PAPER_WHITE, ink=KRAFT, accent=COFFEE, motif="dots", layout="full", repeats=8
-            ),
+            Texture(base=PAPER_WHITE, ink=KRAFT, accent=COFFEE, motif="dots", repeats=8),
         ),
         (
             PaperCup(

@@ -5,20 +5,13 @@ import numpy as np
 from vap_core.simulation.assets.bodies.cat import Cat
 from vap_core.simulation.assets.bodies.owl import Owl
 from vap_core.simulation.assets.catalogue.colours import (
-    AMBER,
-    ASH,
     BONE,
     COCOA,
     CREAM,
-    FLAX,
-    GINGER,
-    JADE,
     MOSS,
     MUSTARD,
     SAGE,
     SAND,
-    SNOW,
-    SOOT,
     TEAL,
 )
 from vap_core.simulation.assets.catalogue.family import Family
@@ -28,7 +21,15 @@ from vap_core.simulation.assets.catalogue.sampling import (
     recolour_with,
     uniform_outside,
 )
-from vap_core.simulation.assets.textures import Texture
+from vap_core.simulation.assets.textures import Srgb, Texture
+
+AMBER: Srgb = (214, 160, 60)
+ASH: Srgb = (152, 142, 148)
+FLAX: Srgb = (240, 220, 186)
+GINGER: Srgb = (206, 128, 62)
+JADE: Srgb = (126, 168, 92)
+SNOW: Srgb = (236, 232, 224)
+SOOT: Srgb = (43, 42, 46)
 
 CAT_COATS: tuple[ColourScheme, ...] = (
     ((58, 56, 60), (176, 166, 160), (192, 170, 66)),
@@ -72,15 +73,15 @@ OWL = Family(
         ),
         (
             Owl(height=0.076, belly=0.0215, ears="wide", eye=0.008),
-            Texture(base=SAND, ink=COCOA, accent=CREAM, motif="hoops", layout="full", repeats=8),
+            Texture(base=SAND, ink=COCOA, accent=CREAM, motif="hoops", repeats=8),
         ),
         (
             Owl(height=0.074, belly=0.021, ears="none", eye=0.0068),
-            Texture(base=SAND, ink=COCOA, accent=CREAM, motif="dots", layout="full", repeats=9),
+            Texture(base=SAND, ink=COCOA, accent=CREAM, motif="dots", repeats=9),
         ),
         (
             Owl(height=0.08, belly=0.021, ears="tuft", eye=0.0062, wings="spread"),
-            Texture(base=SAND, ink=MOSS, accent=CREAM, motif="chevron", layout="full", repeats=8),
+            Texture(base=SAND, ink=MOSS, accent=CREAM, motif="chevron", repeats=8),
         ),
         (
             Owl(height=0.078, belly=0.0215, ears="wide", eye=0.007, wings="spread"),
@@ -88,7 +89,7 @@ OWL = Family(
         ),
         (
             Owl(height=0.077, belly=0.021, ears="tuft", eye=0.0076),
-            Texture(base=SAGE, ink=COCOA, accent=CREAM, motif="stripes", layout="full", repeats=10),
+            Texture(base=SAGE, ink=COCOA, accent=CREAM, motif="stripes", repeats=10),
         ),
         (
             Owl(height=0.073, belly=0.0215, ears="none", eye=0.0082, wings="spread"),
@@ -101,10 +102,10 @@ CAT = Family(
     mass_kg=0.10,
     draw=_draw_cat,
     instances=(
-        (Cat(), Texture(base=SOOT, ink=ASH, accent=AMBER, motif="sleek", layout="full", repeats=4)),
+        (Cat(), Texture(base=SOOT, ink=ASH, accent=AMBER, motif="sleek", repeats=4)),
         (
             Cat(height=0.074, girth=0.019, ears="pointed", tail="up", face="muzzle"),
-            Texture(base=SOOT, ink=ASH, accent=AMBER, motif="tabby", layout="full", repeats=6),
+            Texture(base=SOOT, ink=ASH, accent=AMBER, motif="tabby", repeats=6),
         ),
         (
             Cat(height=0.078, girth=0.018, ears="folded", tail="curl", face="plain", collar=True),
@@ -112,17 +113,15 @@ CAT = Family(
         ),
         (
             Cat(height=0.075, girth=0.019, ears="pointed", tail="wrap", face="mask"),
-            Texture(
-                base=SOOT, ink=SNOW, accent=AMBER, motif="patches", layout="full", repeats=4, seed=3
-            ),
+            Texture(base=SOOT, ink=SNOW, accent=AMBER, motif="patches", repeats=4, seed=3),
         ),
         (
             Cat(height=0.08, girth=0.0185, ears="round", tail="up", face="muzzle", collar=True),
-            Texture(base=SNOW, ink=ASH, accent=AMBER, motif="dots", layout="full", repeats=6),
+            Texture(base=SNOW, ink=ASH, accent=AMBER, motif="dots", repeats=6),
         ),
         (
             Cat(height=0.073, girth=0.0195, ears="pointed", tail="curl", face="mask"),
-            Texture(base=GINGER, ink=FLAX, accent=AMBER, motif="stripes", layout="full", repeats=6),
+            Texture(base=GINGER, ink=FLAX, accent=AMBER, motif="stripes", repeats=6),
         ),
     ),
     recolour=recolour_with(CAT_COATS),

@@ -4,22 +4,6 @@ import numpy as np
 
 from vap_core.simulation.assets.bodies.shoe import Shoe
 from vap_core.simulation.assets.bodies.slipper import Slipper
-from vap_core.simulation.assets.catalogue.colours import (
-    BRICK,
-    CHALK,
-    CHESTNUT,
-    CORAL,
-    DUSK,
-    HONEY,
-    INKY,
-    IRON,
-    MIDNIGHT,
-    MIST,
-    OLIVE,
-    PETAL,
-    WINE,
-    WOOL,
-)
 from vap_core.simulation.assets.catalogue.family import Family
 from vap_core.simulation.assets.catalogue.sampling import (
     ColourScheme,
@@ -27,7 +11,22 @@ from vap_core.simulation.assets.catalogue.sampling import (
     recolour_with,
     uniform_outside,
 )
-from vap_core.simulation.assets.textures import Texture
+from vap_core.simulation.assets.textures import Srgb, Texture
+
+BRICK: Srgb = (158, 78, 58)
+CHALK: Srgb = (224, 224, 220)
+CHESTNUT: Srgb = (120, 82, 54)
+CORAL: Srgb = (196, 100, 78)
+DUSK: Srgb = (92, 112, 138)
+HONEY: Srgb = (222, 200, 166)
+INKY: Srgb = (38, 38, 42)
+IRON: Srgb = (74, 76, 84)
+MIDNIGHT: Srgb = (58, 66, 96)
+MIST: Srgb = (134, 154, 172)
+OLIVE: Srgb = (122, 130, 86)
+PETAL: Srgb = (208, 152, 152)
+WINE: Srgb = (112, 46, 58)
+WOOL: Srgb = (240, 228, 206)
 
 SHOE_COLOURS: tuple[ColourScheme, ...] = (
     ((110, 120, 130), (52, 52, 56), (236, 234, 230)),
@@ -78,7 +77,7 @@ SHOE = Family(
     instances=(
         (
             Shoe(),
-            Texture(base=DUSK, ink=INKY, accent=CHALK, motif="sleek", layout="full", repeats=4),
+            Texture(base=DUSK, ink=INKY, accent=CHALK, motif="sleek", repeats=4),
         ),
         (
             Shoe(
@@ -90,7 +89,7 @@ SHOE = Family(
                 side="bars",
                 toe="cap",
             ),
-            Texture(base=DUSK, ink=INKY, accent=CHALK, motif="cord", layout="full", repeats=4),
+            Texture(base=DUSK, ink=INKY, accent=CHALK, motif="cord", repeats=4),
         ),
         (
             Shoe(
@@ -102,7 +101,7 @@ SHOE = Family(
                 side="patch",
                 toe="plain",
             ),
-            Texture(base=DUSK, ink=INKY, accent=CHALK, motif="checks", layout="full", repeats=7),
+            Texture(base=DUSK, ink=INKY, accent=CHALK, motif="checks", repeats=7),
         ),
         (
             Shoe(
@@ -114,7 +113,7 @@ SHOE = Family(
                 side="patch",
                 toe="bumper",
             ),
-            Texture(base=DUSK, ink=BRICK, accent=CHALK, motif="dots", layout="full", repeats=7),
+            Texture(base=DUSK, ink=BRICK, accent=CHALK, motif="dots", repeats=7),
         ),
         (
             Shoe(
@@ -126,7 +125,7 @@ SHOE = Family(
                 side="bars",
                 toe="bumper",
             ),
-            Texture(base=CORAL, ink=INKY, accent=CHALK, motif="chevron", layout="full", repeats=5),
+            Texture(base=CORAL, ink=INKY, accent=CHALK, motif="chevron", repeats=5),
         ),
         (
             Shoe(
@@ -138,7 +137,7 @@ SHOE = Family(
                 side="none",
                 toe="cap",
             ),
-            Texture(base=OLIVE, ink=WINE, accent=CHALK, motif="plaid", layout="full", repeats=5),
+            Texture(base=OLIVE, ink=WINE, accent=CHALK, motif="plaid", repeats=5),
         ),
     ),
     recolour=recolour_with(SHOE_COLOURS),
@@ -150,7 +149,7 @@ SLIPPER = Family(
     instances=(
         (
             Slipper(),
-            Texture(base=HONEY, ink=CHESTNUT, accent=WOOL, motif="quilt", layout="full", repeats=6),
+            Texture(base=HONEY, ink=CHESTNUT, accent=WOOL, motif="quilt", repeats=6),
         ),
         (
             Slipper(
@@ -162,7 +161,7 @@ SLIPPER = Family(
                 charm="band",
                 lining="accent",
             ),
-            Texture(base=HONEY, ink=CHESTNUT, accent=WOOL, motif="cord", layout="full", repeats=4),
+            Texture(base=HONEY, ink=CHESTNUT, accent=WOOL, motif="cord", repeats=4),
         ),
         (
             Slipper(
@@ -174,7 +173,7 @@ SLIPPER = Family(
                 charm="bow",
                 lining="accent",
             ),
-            Texture(base=HONEY, ink=CHESTNUT, accent=WOOL, motif="dots", layout="full", repeats=6),
+            Texture(base=HONEY, ink=CHESTNUT, accent=WOOL, motif="dots", repeats=6),
         ),
         (
             Slipper(
@@ -186,7 +185,7 @@ SLIPPER = Family(
                 charm="pompom",
                 lining="light",
             ),
-            Texture(base=HONEY, ink=MIDNIGHT, accent=WOOL, motif="hoops", layout="full", repeats=9),
+            Texture(base=HONEY, ink=MIDNIGHT, accent=WOOL, motif="hoops", repeats=9),
         ),
         (
             Slipper(
@@ -198,7 +197,7 @@ SLIPPER = Family(
                 charm="none",
                 lining="ink",
             ),
-            Texture(base=PETAL, ink=CHESTNUT, accent=WOOL, motif="plaid", layout="full", repeats=5),
+            Texture(base=PETAL, ink=CHESTNUT, accent=WOOL, motif="plaid", repeats=5),
         ),
         (
             Slipper(
@@ -210,7 +209,7 @@ SLIPPER = Family(
                 charm="ears",
                 lining="light",
             ),
-            Texture(base=MIST, ink=IRON, accent=WOOL, motif="sleek", layout="full", repeats=4),
+            Texture(base=MIST, ink=IRON, accent=WOOL, motif="sleek", repeats=4),
         ),
     ),
     recolour=recolour_with(SLIPPER_COLOURS),

@@ -3,18 +3,12 @@
 import numpy as np
 
 from vap_core.simulation.assets.bodies.gadgets import CameraBody, Can, Shaver
-from vap_core.simulation.assets.catalogue.colours import (
-    BONE,
-    COAL,
-    CREAM,
-    MUSTARD,
-    RUST,
-    SAND,
-    TEAL,
-)
+from vap_core.simulation.assets.catalogue.colours import BONE, CREAM, MUSTARD, RUST, SAND, TEAL
 from vap_core.simulation.assets.catalogue.family import Family
 from vap_core.simulation.assets.catalogue.sampling import choose
-from vap_core.simulation.assets.textures import Texture
+from vap_core.simulation.assets.textures import Srgb, Texture
+
+COAL: Srgb = (57, 57, 61)
 
 COLA_CAN = Texture(
     base=(168, 38, 42),
@@ -70,11 +64,11 @@ CAMERA = Family(
     instances=(
         (
             CameraBody(),
-            Texture(base=COAL, ink=SAND, accent=BONE, motif="dots", layout="full", repeats=6),
+            Texture(base=COAL, ink=SAND, accent=BONE, motif="dots", repeats=6),
         ),
         (
             CameraBody(width=0.072, height=0.052, lens=0.015, bump="finder"),
-            Texture(base=COAL, ink=SAND, accent=BONE, motif="stripes", layout="full", repeats=5),
+            Texture(base=COAL, ink=SAND, accent=BONE, motif="stripes", repeats=5),
         ),
         (
             CameraBody(width=0.064, height=0.056, lens=0.0175, bump="flash"),
@@ -82,7 +76,7 @@ CAMERA = Family(
         ),
         (
             CameraBody(width=0.07, height=0.054, lens=0.014, bump="none", strap=True),
-            Texture(base=COAL, ink=SAND, accent=BONE, motif="checks", layout="full", repeats=5),
+            Texture(base=COAL, ink=SAND, accent=BONE, motif="checks", repeats=5),
         ),
         (
             CameraBody(width=0.066, height=0.053, lens=0.0165, bump="prism", strap=True),
@@ -90,7 +84,7 @@ CAMERA = Family(
         ),
         (
             CameraBody(width=0.067, height=0.055, lens=0.0155, bump="flash", strap=True),
-            Texture(base=COAL, ink=RUST, accent=BONE, motif="hoops", layout="full", repeats=7),
+            Texture(base=COAL, ink=RUST, accent=BONE, motif="hoops", repeats=7),
         ),
         (
             CameraBody(width=0.073, height=0.056, lens=0.014, bump="none"),
@@ -113,11 +107,11 @@ SHAVER = Family(
         ),
         (
             Shaver(radius=0.018, height=0.116, head="wide", waist=0.001),
-            Texture(base=TEAL, ink=CREAM, accent=COAL, motif="stripes", layout="full", repeats=6),
+            Texture(base=TEAL, ink=CREAM, accent=COAL, motif="stripes", repeats=6),
         ),
         (
             Shaver(radius=0.019, height=0.108, head="foil", waist=0.002, switch="bar"),
-            Texture(base=TEAL, ink=CREAM, accent=COAL, motif="checks", layout="full", repeats=5),
+            Texture(base=TEAL, ink=CREAM, accent=COAL, motif="checks", repeats=5),
         ),
         (
             Shaver(radius=0.0185, height=0.114, head="rotary", waist=0.0015),
@@ -133,11 +127,11 @@ SHAVER = Family(
         ),
         (
             Shaver(radius=0.018, height=0.112, head="wide", waist=0.0025, switch="bar"),
-            Texture(base=RUST, ink=CREAM, accent=COAL, motif="dots", layout="full", repeats=8),
+            Texture(base=RUST, ink=CREAM, accent=COAL, motif="dots", repeats=8),
         ),
         (
             Shaver(radius=0.019, height=0.11, head="rotary", waist=0.001, switch="bar"),
-            Texture(base=MUSTARD, ink=RUST, accent=COAL, motif="chevron", layout="full", repeats=6),
+            Texture(base=MUSTARD, ink=RUST, accent=COAL, motif="chevron", repeats=6),
         ),
     ),
 )

@@ -7,19 +7,17 @@ import numpy as np
 from vap_core.simulation.assets.bodies.bus import Bus
 from vap_core.simulation.assets.bodies.house import House
 from vap_core.simulation.assets.bodies.painting import Painting
-from vap_core.simulation.assets.catalogue.colours import (
-    BLUE,
-    EGGSHELL,
-    FIRE_BRICK,
-    GOLD,
-    LAWN,
-    PORCELAIN,
-    UMBER,
-    VIVID_COLOURS,
-)
+from vap_core.simulation.assets.catalogue.colours import PORCELAIN, VIVID_COLOURS
 from vap_core.simulation.assets.catalogue.family import Family
 from vap_core.simulation.assets.catalogue.sampling import choose
 from vap_core.simulation.assets.textures import Srgb, Texture
+
+BLUE: Srgb = (48, 100, 178)
+EGGSHELL: Srgb = (238, 230, 212)
+FIRE_BRICK: Srgb = (190, 50, 46)
+GOLD: Srgb = (226, 176, 64)
+LAWN: Srgb = (86, 146, 72)
+UMBER: Srgb = (92, 64, 46)
 
 SKY_COLOURS: tuple[Srgb, ...] = (
     (150, 196, 226),
@@ -116,9 +114,7 @@ HOUSE = Family(
     instances=(
         (
             House(),
-            Texture(
-                base=FIRE_BRICK, ink=BLUE, accent=LAWN, motif="planks", layout="full", repeats=30
-            ),
+            Texture(base=FIRE_BRICK, ink=BLUE, accent=LAWN, motif="planks", repeats=30),
         ),
         (
             House(
@@ -132,9 +128,7 @@ HOUSE = Family(
                 storeys=1,
                 chimney=False,
             ),
-            Texture(
-                base=FIRE_BRICK, ink=BLUE, accent=LAWN, motif="dots", layout="full", repeats=16
-            ),
+            Texture(base=FIRE_BRICK, ink=BLUE, accent=LAWN, motif="dots", repeats=16),
         ),
         (
             House(
@@ -146,9 +140,7 @@ HOUSE = Family(
                 roof_paint="ink",
                 windows=3,
             ),
-            Texture(
-                base=FIRE_BRICK, ink=BLUE, accent=GOLD, motif="stripes", layout="full", repeats=14
-            ),
+            Texture(base=FIRE_BRICK, ink=BLUE, accent=GOLD, motif="stripes", repeats=14),
         ),
         (
             House(
@@ -166,7 +158,6 @@ HOUSE = Family(
                 ink=EGGSHELL,
                 accent=LAWN,
                 motif="checks",
-                layout="full",
                 repeats=12,
             ),
         ),
@@ -203,7 +194,7 @@ HOUSE = Family(
                 storeys=2,
                 chimney=False,
             ),
-            Texture(base=GOLD, ink=UMBER, accent=LAWN, motif="hoops", layout="full", repeats=12),
+            Texture(base=GOLD, ink=UMBER, accent=LAWN, motif="hoops", repeats=12),
         ),
         (
             House(
@@ -215,9 +206,7 @@ HOUSE = Family(
                 roof_paint="warm",
                 windows=3,
             ),
-            Texture(
-                base=LAWN, ink=PORCELAIN, accent=UMBER, motif="chevron", layout="full", repeats=14
-            ),
+            Texture(base=LAWN, ink=PORCELAIN, accent=UMBER, motif="chevron", repeats=14),
         ),
     ),
 )

@@ -6,24 +6,22 @@ import numpy as np
 
 from vap_core.simulation.assets.bodies.plants import Plant
 from vap_core.simulation.assets.bodies.scrubber import Scrubber
-from vap_core.simulation.assets.catalogue.colours import (
-    AVOCADO,
-    BERRY,
-    CLAY,
-    EUCALYPTUS,
-    LEMON,
-    MULBERRY,
-    PORCELAIN,
-    SALMON,
-    SEED,
-    SKY,
-    STALK,
-    VIOLET,
-    VIVID_COLOURS,
-)
+from vap_core.simulation.assets.catalogue.colours import PORCELAIN, VIVID_COLOURS
 from vap_core.simulation.assets.catalogue.family import Family
 from vap_core.simulation.assets.catalogue.sampling import choose
 from vap_core.simulation.assets.textures import Srgb, Texture
+
+AVOCADO: Srgb = (128, 132, 62)
+BERRY: Srgb = (200, 40, 48)
+CLAY: Srgb = (190, 108, 76)
+EUCALYPTUS: Srgb = (104, 158, 108)
+LEMON: Srgb = (236, 204, 70)
+MULBERRY: Srgb = (112, 70, 104)
+SALMON: Srgb = (214, 122, 118)
+SEED: Srgb = (246, 218, 150)
+SKY: Srgb = (98, 160, 200)
+STALK: Srgb = (66, 126, 58)
+VIOLET: Srgb = (112, 84, 164)
 
 LEAF_COLOURS: tuple[Srgb, ...] = (
     (72, 128, 64),
@@ -113,9 +111,7 @@ PLANT = Family(
     instances=(
         (
             Plant(),
-            Texture(
-                base=CLAY, ink=EUCALYPTUS, accent=SALMON, motif="hoops", layout="full", repeats=4
-            ),
+            Texture(base=CLAY, ink=EUCALYPTUS, accent=SALMON, motif="hoops", repeats=4),
         ),
         (
             Plant(
@@ -149,7 +145,6 @@ PLANT = Family(
                 ink=EUCALYPTUS,
                 accent=PORCELAIN,
                 motif="chevron",
-                layout="full",
                 repeats=7,
             ),
         ),
@@ -164,9 +159,7 @@ PLANT = Family(
                 blunt=0.85,
                 tips="ink",
             ),
-            Texture(
-                base=CLAY, ink=MULBERRY, accent=PORCELAIN, motif="dots", layout="full", repeats=8
-            ),
+            Texture(base=CLAY, ink=MULBERRY, accent=PORCELAIN, motif="dots", repeats=8),
         ),
         (
             Plant(
@@ -185,7 +178,6 @@ PLANT = Family(
                 ink=EUCALYPTUS,
                 accent=CLAY,
                 motif="stripes",
-                layout="full",
                 repeats=10,
             ),
         ),
@@ -219,13 +211,13 @@ SCRUBBER = Family(
     instances=(
         (
             Scrubber(),
-            Texture(base=BERRY, ink=SEED, accent=STALK, motif="seeds", layout="full", repeats=9),
+            Texture(base=BERRY, ink=SEED, accent=STALK, motif="seeds", repeats=9),
         ),
         (
             Scrubber(
                 outline="apple", radius=0.022, body=0.046, rows=6, bump=0.03, leaves=4, leaf=0.016
             ),
-            Texture(base=BERRY, ink=SEED, accent=STALK, motif="dots", layout="full", repeats=12),
+            Texture(base=BERRY, ink=SEED, accent=STALK, motif="dots", repeats=12),
         ),
         (
             Scrubber(
@@ -237,7 +229,7 @@ SCRUBBER = Family(
                 leaves=8,
                 leaf=0.016,
             ),
-            Texture(base=BERRY, ink=SEED, accent=STALK, motif="knit", layout="full", repeats=10),
+            Texture(base=BERRY, ink=SEED, accent=STALK, motif="knit", repeats=10),
         ),
         (
             Scrubber(
@@ -249,13 +241,13 @@ SCRUBBER = Family(
                 leaves=5,
                 leaf=0.02,
             ),
-            Texture(base=BERRY, ink=VIOLET, accent=STALK, motif="hoops", layout="full", repeats=11),
+            Texture(base=BERRY, ink=VIOLET, accent=STALK, motif="hoops", repeats=11),
         ),
         (
             Scrubber(
                 outline="acorn", radius=0.0215, body=0.048, rows=7, bump=0.025, leaves=6, leaf=0.018
             ),
-            Texture(base=LEMON, ink=SEED, accent=STALK, motif="chevron", layout="full", repeats=8),
+            Texture(base=LEMON, ink=SEED, accent=STALK, motif="chevron", repeats=8),
         ),
         (
             Scrubber(
@@ -267,9 +259,7 @@ SCRUBBER = Family(
                 leaves=6,
                 leaf=0.018,
             ),
-            Texture(
-                base=SKY, ink=PORCELAIN, accent=BERRY, motif="stripes", layout="full", repeats=8
-            ),
+            Texture(base=SKY, ink=PORCELAIN, accent=BERRY, motif="stripes", repeats=8),
         ),
         (
             Scrubber(

@@ -3,17 +3,16 @@
 import numpy as np
 
 from vap_core.simulation.assets.bodies.dishes import Basket, Dish
-from vap_core.simulation.assets.catalogue.colours import (
-    CHINA,
-    COBALT,
-    PETROL,
-    STRAW,
-    TEAK,
-    TURQUOISE,
-)
 from vap_core.simulation.assets.catalogue.family import Family
 from vap_core.simulation.assets.catalogue.sampling import choose
 from vap_core.simulation.assets.textures import Srgb, Texture
+
+CHINA: Srgb = (238, 236, 230)
+COBALT: Srgb = (48, 78, 146)
+PETROL: Srgb = (36, 122, 132)
+STRAW: Srgb = (205, 164, 103)
+TEAK: Srgb = (104, 68, 36)
+TURQUOISE: Srgb = (56, 164, 170)
 
 CANE_COLOURS: tuple[Srgb, ...] = (
     (188, 142, 88),
@@ -103,9 +102,7 @@ PLATE = Family(
     prop=(
         (
             Dish(),
-            Texture(
-                base=CHINA, ink=COBALT, accent=COBALT, motif="chevron", layout="full", repeats=28
-            ),
+            Texture(base=CHINA, ink=COBALT, accent=COBALT, motif="chevron", repeats=28),
         ),
     ),
 )
@@ -116,7 +113,7 @@ BASKET = Family(
     prop=(
         (
             Basket(),
-            Texture(base=STRAW, ink=TEAK, accent=TEAK, motif="wicker", layout="full", repeats=22),
+            Texture(base=STRAW, ink=TEAK, accent=TEAK, motif="wicker", repeats=22),
         ),
     ),
     recolour=_recolour_basket,
@@ -130,9 +127,7 @@ PLASTIC_BOWL = Family(
             Dish(
                 radius=0.07, height=0.045, floor=0.04, thick=0.0035, belly=0.006, painted="outside"
             ),
-            Texture(
-                base=TURQUOISE, ink=PETROL, accent=CHINA, motif="stripes", layout="full", repeats=24
-            ),
+            Texture(base=TURQUOISE, ink=PETROL, accent=CHINA, motif="stripes", repeats=24),
         ),
     ),
     recolour=_recolour_bowl,

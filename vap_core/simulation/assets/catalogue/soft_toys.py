@@ -4,21 +4,6 @@ import numpy as np
 
 from vap_core.simulation.assets.bodies.plushie import Plushie
 from vap_core.simulation.assets.bodies.stuffed_toy import StuffedToy
-from vap_core.simulation.assets.catalogue.colours import (
-    BARK,
-    BISCUIT,
-    BLUSH,
-    CHERRY,
-    DENIM,
-    LILAC,
-    MILK,
-    MINT,
-    NUT,
-    OAT,
-    PEBBLE,
-    PINE,
-    STORM,
-)
 from vap_core.simulation.assets.catalogue.family import Family
 from vap_core.simulation.assets.catalogue.sampling import (
     ColourScheme,
@@ -26,7 +11,21 @@ from vap_core.simulation.assets.catalogue.sampling import (
     recolour_with,
     uniform_outside,
 )
-from vap_core.simulation.assets.textures import Texture
+from vap_core.simulation.assets.textures import Srgb, Texture
+
+BARK: Srgb = (122, 88, 66)
+BISCUIT: Srgb = (226, 206, 172)
+BLUSH: Srgb = (214, 160, 150)
+CHERRY: Srgb = (196, 58, 54)
+DENIM: Srgb = (62, 84, 124)
+LILAC: Srgb = (180, 162, 194)
+MILK: Srgb = (238, 226, 202)
+MINT: Srgb = (172, 188, 162)
+NUT: Srgb = (112, 78, 56)
+OAT: Srgb = (226, 196, 168)
+PEBBLE: Srgb = (150, 146, 148)
+PINE: Srgb = (58, 112, 108)
+STORM: Srgb = (108, 136, 158)
 
 PLUSHIE_COATS: tuple[ColourScheme, ...] = (
     ((138, 104, 76), (226, 200, 168), (236, 214, 190)),
@@ -75,29 +74,29 @@ PLUSHIE = Family(
     instances=(
         (
             Plushie(),
-            Texture(base=BARK, ink=BLUSH, accent=OAT, motif="fuzz", layout="full", repeats=4),
+            Texture(base=BARK, ink=BLUSH, accent=OAT, motif="fuzz", repeats=4),
         ),
         (
             Plushie(
                 length=0.076, width=0.064, height=0.06, coat="tufts", ears="round", snout=0.016
             ),
-            Texture(base=BARK, ink=BLUSH, accent=OAT, motif="patches", layout="full", repeats=6),
+            Texture(base=BARK, ink=BLUSH, accent=OAT, motif="patches", repeats=6),
         ),
         (
             Plushie(length=0.08, width=0.06, height=0.06, coat="mane", ears="none", snout=0.02),
-            Texture(base=BARK, ink=BLUSH, accent=OAT, motif="hoops", layout="full", repeats=8),
+            Texture(base=BARK, ink=BLUSH, accent=OAT, motif="hoops", repeats=8),
         ),
         (
             Plushie(
                 length=0.075, width=0.062, height=0.062, coat="smooth", ears="round", snout=0.015
             ),
-            Texture(base=BARK, ink=MILK, accent=OAT, motif="cord", layout="full", repeats=4),
+            Texture(base=BARK, ink=MILK, accent=OAT, motif="cord", repeats=4),
         ),
         (
             Plushie(
                 length=0.082, width=0.06, height=0.058, coat="spines", ears="long", snout=0.018
             ),
-            Texture(base=PEBBLE, ink=BLUSH, accent=OAT, motif="dots", layout="full", repeats=7),
+            Texture(base=PEBBLE, ink=BLUSH, accent=OAT, motif="dots", repeats=7),
         ),
         (
             Plushie(
@@ -115,23 +114,23 @@ STUFFED_TOY = Family(
     instances=(
         (
             StuffedToy(),
-            Texture(base=BISCUIT, ink=NUT, accent=CHERRY, motif="sleek", layout="full", repeats=4),
+            Texture(base=BISCUIT, ink=NUT, accent=CHERRY, motif="sleek", repeats=4),
         ),
         (
             StuffedToy(radius=0.022, height=0.068, hat="beanie", eyes="dots", nose="wide"),
-            Texture(base=BISCUIT, ink=NUT, accent=CHERRY, motif="dots", layout="full", repeats=7),
+            Texture(base=BISCUIT, ink=NUT, accent=CHERRY, motif="dots", repeats=7),
         ),
         (
             StuffedToy(
                 radius=0.0215, height=0.065, hat="cap", eyes="crosses", nose="bar", limbs="feet"
             ),
-            Texture(base=BISCUIT, ink=NUT, accent=CHERRY, motif="hoops", layout="full", repeats=9),
+            Texture(base=BISCUIT, ink=NUT, accent=CHERRY, motif="hoops", repeats=9),
         ),
         (
             StuffedToy(
                 radius=0.022, height=0.067, hat="brim", eyes="dots", nose="wide", limbs="feet"
             ),
-            Texture(base=BISCUIT, ink=DENIM, accent=CHERRY, motif="cord", layout="full", repeats=4),
+            Texture(base=BISCUIT, ink=DENIM, accent=CHERRY, motif="cord", repeats=4),
         ),
         (
             StuffedToy(

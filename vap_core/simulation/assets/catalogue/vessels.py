@@ -16,11 +16,12 @@ from vap_core.simulation.assets.catalogue.colours import (
     RUST,
     SAGE,
     SAND,
-    SLATE,
 )
 from vap_core.simulation.assets.catalogue.family import Family
 from vap_core.simulation.assets.catalogue.sampling import choose
-from vap_core.simulation.assets.textures import Texture
+from vap_core.simulation.assets.textures import Srgb, Texture
+
+SLATE: Srgb = (98, 112, 127)
 
 URN = ((0.0165, 0.0), (0.0185, 0.2), (0.0212, 0.55), (0.0195, 0.72), (0.011, 0.9), (0.0145, 1.0))
 """Outlines of vases: (radius, share of the height), base to lip."""
@@ -95,9 +96,7 @@ BOTTLE = Family(
         ),
         (
             Bottle(radius=0.0205, height=0.112, shoulder=0.72, neck=0.01, cap="sport"),
-            Texture(
-                base=SLATE, ink=CREAM, accent=MUSTARD, motif="stripes", layout="full", repeats=7
-            ),
+            Texture(base=SLATE, ink=CREAM, accent=MUSTARD, motif="stripes", repeats=7),
         ),
         (
             Bottle(radius=0.0195, height=0.118, shoulder=0.66, neck=0.0085, cap="ball"),
@@ -123,7 +122,7 @@ BOTTLE = Family(
         ),
         (
             Bottle(radius=0.0195, height=0.113, shoulder=0.7, neck=0.0095, cap="screw"),
-            Texture(base=RUST, ink=CREAM, accent=SLATE, motif="dots", layout="full", repeats=8),
+            Texture(base=RUST, ink=CREAM, accent=SLATE, motif="dots", repeats=8),
         ),
         (
             Bottle(radius=0.0205, height=0.117, shoulder=0.68, neck=0.0105, cap="ball"),
@@ -142,7 +141,7 @@ VASE = Family(
         ),
         (
             Vase(height=0.112, knots=URN),
-            Texture(base=BONE, ink=NAVY, accent=SLATE, motif="chevron", layout="full", repeats=6),
+            Texture(base=BONE, ink=NAVY, accent=SLATE, motif="chevron", repeats=6),
         ),
         (
             Vase(height=0.108, knots=GOURD),
@@ -150,7 +149,7 @@ VASE = Family(
         ),
         (
             Vase(height=0.114, knots=AMPHORA, handles=True),
-            Texture(base=BONE, ink=NAVY, accent=SLATE, motif="hoops", layout="full", repeats=10),
+            Texture(base=BONE, ink=NAVY, accent=SLATE, motif="hoops", repeats=10),
         ),
         (
             Vase(height=0.106, knots=FLUTE),
@@ -158,11 +157,11 @@ VASE = Family(
         ),
         (
             Vase(height=0.11, knots=CARAFE),
-            Texture(base=ROSE, ink=NAVY, accent=SLATE, motif="dots", layout="full", repeats=8),
+            Texture(base=ROSE, ink=NAVY, accent=SLATE, motif="dots", repeats=8),
         ),
         (
             Vase(height=0.112, knots=URN, handles=True),
-            Texture(base=MOSS, ink=MUSTARD, accent=BONE, motif="stripes", layout="full", repeats=9),
+            Texture(base=MOSS, ink=MUSTARD, accent=BONE, motif="stripes", repeats=9),
         ),
     ),
 )
@@ -177,7 +176,7 @@ PEN_HOLDER = Family(
         ),
         (
             PenHolder(radius=0.0205, height=0.082, sides=6, pens=3, rim="ink"),
-            Texture(base=SAGE, ink=COCOA, accent=CREAM, motif="checks", layout="full", repeats=6),
+            Texture(base=SAGE, ink=COCOA, accent=CREAM, motif="checks", repeats=6),
         ),
         (
             PenHolder(radius=0.02, height=0.078, sides=4, pens=4, rim="base"),
@@ -193,11 +192,11 @@ PEN_HOLDER = Family(
         ),
         (
             PenHolder(radius=0.0205, height=0.081, sides=6, pens=4, rim="accent"),
-            Texture(base=MUSTARD, ink=COCOA, accent=CREAM, motif="dots", layout="full", repeats=8),
+            Texture(base=MUSTARD, ink=COCOA, accent=CREAM, motif="dots", repeats=8),
         ),
         (
             PenHolder(radius=0.02, height=0.079, sides=24, pens=5, rim="base"),
-            Texture(base=RUST, ink=NAVY, accent=CREAM, motif="chevron", layout="full", repeats=6),
+            Texture(base=RUST, ink=NAVY, accent=CREAM, motif="chevron", repeats=6),
         ),
     ),
 )
