@@ -198,6 +198,15 @@ def meant_by(kind: str, bank: dict[str, PersonalObject], text: str, speaker: str
 
 
 @pytest.mark.parametrize("kind", ["rule", "embedding"])
+@pytest.mark.parametrize("speaker", ["carl", "anna", "ben", "dan", ""])
+def test_annas_brother_is_not_somebody_elses(kind: str, speaker: str) -> None:
+    """Whoever is known as exactly that; the last word alone is another person's."""
+    assert meant_by(kind, BROTHERS, "bring Anna's brother's cup", speaker) == "d"
+    text = "put Anna's cup next to Anna's brother's cup"
+    assert meant_by(kind, BROTHERS, text, speaker) == "a d"
+
+
+@pytest.mark.parametrize("kind", ["rule", "embedding"])
 def test_annas_brother_needs_no_second_name(kind: str) -> None:
     bank = {"a": cup("a", "anna"), "b": cup("b", "ben", "anna's brother")}
     for speaker in ("carl", "anna", ""):
