@@ -103,7 +103,7 @@ class BadViews(VapError):
 
 
 class BadEncoder(VapError):
-    """An encoder whose numbers are not finite."""
+    """An encoder whose rows are not finite, not of length 1, or of another width."""
 
 
 class BadStudy(VapError):
