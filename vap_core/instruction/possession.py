@@ -23,13 +23,13 @@ class Possession:
         person = person_pattern(self.context)
         categories = {obj.category for obj in self.context.objects.values()}
         # "it's Ben's" and "the cup's Ben's", but not the two of "Anna's brother's"
-        shortened = "|".join(("it", "that", "this", "which", "who", "one", *map(spaced, categories)))
+        subjects = ["it", "that", "this", "which", "who", "one", *map(spaced, categories)]
         for pattern in (
             rf"\bof (mine|his|hers|theirs|ours|(?:{person})|[\w-]+['’]s)(?:['’]s)?(?:\W|$)",
             rf"\b(?:belong\w*|owned) (?:to|by) (my [\w-]+|{person}|us|him|her|them|[\w-]+)\b",
             rf"\b({person}|my [\w-]+|he|she|they|we|[A-Z][\w-]+) (?:owns?\b|has\W*$)",
             r"(?:\bis|\bare|['’]s) (mine|his|hers|theirs|ours|my [\w-]+['’]s)(?:\W|$)",
-            rf"(?:\bis|\bare|\b(?:{shortened})['’]s) ([\w-]+['’]s)(?:\W|$)",
+            rf"(?:\bis|\bare|\b(?:{'|'.join(subjects)})['’]s) ([\w-]+['’]s)(?:\W|$)",
         ):
             match = re.search(pattern, said, re.IGNORECASE)
             if match:
