@@ -5,7 +5,7 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float32
 
-from vap_core.base.errors import BadEncoder, one_of
+from vap_core.base.errors import BadCrop, BadEncoder, one_of
 from vap_core.base.types import (
     SAME,
     Ballot,
@@ -44,33 +44,31 @@ def compare(
     """cos(e_i, z_k) of every crop of a view, by the encoder of that view.
 
     Raises: BadEncoder when its rows are not finite, not of length 1 (within 1e-3), or of another
-        width than the references': no vote would mean anything.
+        width than the references': no vote would mean anything. BadCrop, which is one, where it
+        embeds the references of the object as it should.
     """
     encoder = stack.encoder_of(proposals.boxes)
     references = reference_rows(obj, encoder)
-    _check_rows(encoder.name, proposals.embeddings, references)
+    fault = _fault(proposals.embeddings, references) or _fault(references, references)
+    if fault:
+        again = encoder(list(obj.crops))
+        kind = BadEncoder if _fault(again, references) else BadCrop
+        raise kind(
+            f"vote: encoder {encoder.name!r} gave {fault}; test it with "
+            "pytest --pyargs vap_core.contracts --encoder MODULE:NAME."
+        )
     return similarity(proposals.embeddings, references)
 
 
-def _check_rows(
-    encoder: str, rows: Float32[np.ndarray, "n _d"], references: Float32[np.ndarray, "k _e"]
-) -> None:
-    """Raises: BadEncoder, as `compare` does."""
-    wrong = ""
+def _fault(rows: Float32[np.ndarray, "n _d"], references: Float32[np.ndarray, "k _e"]) -> str:
+    """What is wrong with the rows of crops, "" where nothing is."""
     if rows.shape[1] != references.shape[1]:
-        wrong = f"{rows.shape[1]} numbers a crop, and {references.shape[1]} for the references"
-    for given in (rows, references):
-        if not np.isfinite(given).all():
-            wrong = wrong or "numbers that are not finite"
-        length = np.linalg.norm(given, axis=1)
-        far = np.abs(length - 1) > LENGTH_TOLERANCE
-        if far.any():
-            wrong = wrong or f"a row of length {length[far][0]:.3g}, not of length 1"
-    if wrong:
-        raise BadEncoder(
-            f"vote: encoder {encoder!r} gave {wrong}; test it with "
-            "pytest --pyargs vap_core.contracts --encoder MODULE:NAME."
-        )
+        return f"{rows.shape[1]} numbers a crop, and {references.shape[1]} for the references"
+    if not np.isfinite(rows).all():
+        return "numbers that are not finite"
+    length = np.linalg.norm(rows, axis=1)
+    far = np.abs(length - 1) > LENGTH_TOLERANCE
+    return f"a row of length {length[far][0]:.3g}, not of length 1" if far.any() else ""
 
 
 def nominate(rgb: Rgb, obj: PersonalObject, offered: Proposals, stack: Stack) -> Proposals:

@@ -106,6 +106,10 @@ class BadEncoder(VapError):
     """An encoder whose rows are not finite, not of length 1, or of another width."""
 
 
+class BadCrop(BadEncoder):
+    """A crop that an encoder cannot embed, although it can embed the references."""
+
+
 class BadStudy(VapError):
     """Tasks, methods and a policy that do not fit together."""
 
