@@ -182,6 +182,45 @@ def test_what_is_nobodys_is_one_line(
     assert len(str(caught.value)) <= 300
 
 
+BROTHERS = {
+    obj.name: obj
+    for obj in (cup("a", "anna"), cup("b", "ben", "brother"), cup("d", "dan", "anna's brother"))
+}
+
+
+def meant_by(kind: str, bank: dict[str, PersonalObject], text: str, speaker: str) -> str:
+    """The objects' names that a parser, "rule" or "embedding", finds."""
+    parser = rule_parser(bank)
+    if kind == "embedding":
+        parser = EmbeddingParser(Context(bank, speaker), embed_text)
+    targets = parser(text, {obj.category for obj in bank.values()}).targets
+    return " ".join(recall(bank, target, speaker=speaker).name for target in targets)
+
+
+@pytest.mark.parametrize("kind", ["rule", "embedding"])
+@pytest.mark.parametrize("speaker", ["carl", "anna", "ben", "dan", ""])
+def test_annas_brother_is_not_somebody_elses(kind: str, speaker: str) -> None:
+    """Whoever is known as exactly that; the last word alone is another person's."""
+    assert meant_by(kind, BROTHERS, "bring Anna's brother's cup", speaker) == "d"
+    text = "put Anna's cup next to Anna's brother's cup"
+    assert meant_by(kind, BROTHERS, text, speaker) == "a d"
+
+
+@pytest.mark.parametrize("kind", ["rule", "embedding"])
+def test_annas_brother_needs_no_second_name(kind: str) -> None:
+    bank = {"a": cup("a", "anna"), "b": cup("b", "ben", "anna's brother")}
+    for speaker in ("carl", "anna", ""):
+        assert meant_by(kind, bank, "bring Anna's brother's cup", speaker) == "b"
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["bring the cup that's Ben's", "bring the cup, it's Ben's", "the cup's Ben's, bring it"],
+)
+def test_a_shortened_is_names_the_owner(text: str) -> None:
+    assert meant_by("embedding", BROTHERS, text, "carl") == "b"
+
+
 def test_two_brothers_are_ambiguous() -> None:
     objects = {obj.name: obj for obj in (cup("b", "ben", "brother"), cup("c", "carl", "brother"))}
     (target,) = parse("bring my brother's cup").targets

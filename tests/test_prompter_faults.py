@@ -4,13 +4,18 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from vap_core.base.types import Attended, Rgb
+from tests.toys import TOYS, MeanColour, personal
+from vap_core.attend import Attender
+from vap_core.base.errors import BadCrop, BadEncoder
+from vap_core.base.types import Attended, Boxes, Rgb
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import make_trial
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters.protocol import PromptContext, checked_steps, unchanged
+from vap_core.rollout.prompters.tint import TintPrompter
 from vap_core.simulation.types import Observation
 
 STUDY = Study((("simpler-bridge", "pick-shaver"),), ("generic",), policy="random", episodes=3)
@@ -44,6 +49,31 @@ class Faulty:
         for state, observation, context in zip(states, observations, contexts, strict=True):
             results.append((state, unchanged(observation.images, context.instruction)))
         return self.change(results, states.index(2)) if 2 in states else results
+
+
+class Fails(MeanColour):
+    """Gives numbers that are not finite from one call to another."""
+
+    def __init__(self, first: int, last: int) -> None:
+        self.calls = range(first, last + 1)
+        self.count = 0
+
+    def __call__(self, crops: Sequence[Rgb]) -> np.ndarray:
+        self.count += 1
+        rows = super().__call__(crops)
+        return rows * np.float32(np.nan) if self.count in self.calls else rows
+
+
+def middle(images: Sequence[Rgb], phrase: str, threshold: float | None = None) -> list[Boxes]:
+    xyxy = np.array([[60, 60, 120, 120]], np.float32)
+    return [Boxes(xyxy, np.ones(1, np.float32), phrase) for _ in images]
+
+
+def with_encoder(trial: Trial, encoder: Fails) -> Trial:
+    """The trial by the method, with one box in every view."""
+    stack = TOYS.with_parts("mine", detector=middle, encoder=encoder)
+    mug = personal("mug", "shaver", (200, 30, 30))
+    return replace(trial, prompter=TintPrompter(Attender(stack, {"mug": mug})))
 
 
 @pytest.fixture(scope="module")
@@ -85,3 +115,19 @@ def test_the_number_of_episodes_is_in_the_message() -> None:
     line = "prompter Faulty: steps returned 0 results for 2 episodes; return one for each"
     with pytest.raises(ValueError, match=line):
         checked_steps([], Faulty(lambda results, i: results), 2)
+
+
+def test_a_crop_that_cannot_be_embedded_is_the_error_of_its_episode(trial: Trial) -> None:
+    """The encoder still embeds the references; in a batch or alone."""
+    for batch in (1, 3):
+        one, bad, other = rollout(with_encoder(trial, Fails(2, 2)), ROWS, batch=batch)
+        statuses = [each.outcome.status for each in (one, bad, other)]
+        assert statuses == ["failure", "error", "failure"]
+        assert "gave numbers that are not finite; test it with pytest" in bad.outcome.detail
+
+
+def test_an_encoder_that_fails_for_everything_ends_the_run_in_one_line(trial: Trial) -> None:
+    with pytest.raises(BadEncoder, match="gave numbers that are not finite; test") as caught:
+        list(rollout(with_encoder(trial, Fails(1, 99)), ROWS, batch=1))
+    assert not isinstance(caught.value, BadCrop)
+    assert "\n" not in str(caught.value)

@@ -1,6 +1,7 @@
 """The vote against a slow readable reference, exact cases and properties."""
 
 import inspect
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -8,9 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from tests.toys import TOYS, personal
+from tests.toys import TOYS, personal, scene
+from vap_core.attend import Attender
 from vap_core.base.errors import BadEncoder, UnknownName
-from vap_core.base.types import Boxes
+from vap_core.base.types import Boxes, Rgb
 from vap_core.perception.candidates import Proposals
 from vap_core.vote import compare, similarity, vote
 
@@ -133,3 +135,36 @@ def test_numbers_that_are_not_finite_elect_nothing() -> None:
     broken[1, 0] = np.nan
     with pytest.raises(BadEncoder, match="not finite; test it with pytest"):
         compare(mine, Proposals(boxes, broken), TOYS)
+
+
+class Raw:
+    """The mean colour, without the division by its length."""
+
+    name = "raw"
+
+    def __call__(self, crops: Sequence[Rgb]) -> np.ndarray:
+        rows = [crop.reshape(-1, 3).mean(axis=0) for crop in crops]
+        return np.array(rows, np.float32).reshape(-1, 3)
+
+
+def test_rows_that_are_not_of_length_1_elect_nothing() -> None:
+    """Every cosine would be cut to 1, and the first candidate would win."""
+    views = {"front": scene([(4, 4, (200, 30, 30)), (30, 30, (30, 30, 200))])}
+    memory = {"mug": personal("mug", "cup", (30, 30, 200), (32, 32, 190))}
+    stack = TOYS.with_parts("mine", encoder=Raw())
+    with pytest.raises(
+        BadEncoder, match=r"'raw' gave a row of length \S+, not of length 1; test it"
+    ):
+        Attender(stack, memory).start(views, "bring my cup")
+    mine = memory["mug"]
+    boxes = Boxes(np.array([[0, 0, 9, 9]], np.float32), np.ones(1, np.float32), "cup")
+    nearly = Proposals(boxes, mine.embeddings[:1] * np.float32(1.0005))
+    assert compare(mine, nearly, TOYS).max() == pytest.approx(1.0)
+
+
+def test_rows_of_another_width_are_one_line() -> None:
+    """A memory of an encoder that has kept its name."""
+    boxes = Boxes(np.array([[0, 0, 9, 9]], np.float32), np.ones(1, np.float32), "cup")
+    wide = Proposals(boxes, np.full((1, 4), 0.5, np.float32))
+    with pytest.raises(BadEncoder, match="gave 4 numbers a crop, and 3 for the references; test"):
+        compare(personal("mine", "cup", (90, 90, 90)), wide, TOYS)

@@ -202,7 +202,7 @@ class Attender:
             BadInstruction, UnknownName: the instruction does not match the memory.
             BadViews: a view is no RGB picture, there are boxes of a camera that gives none or
                 outside its view, or the views cannot be associated.
-            BadEncoder: an encoder gives numbers that are not finite.
+            BadEncoder: an encoder gives rows that are not finite or not of length 1.
         """
         check_views(views)
         if boxes is not None:
@@ -263,7 +263,7 @@ class Attender:
     def ground(self, camera: str, obj: PersonalObject, candidates: Candidates) -> Grounding:
         """The vote of one view for one object.
 
-        Raises: BadEncoder when the encoder gives numbers that are not finite.
+        Raises: BadEncoder, as `vote.compare` does.
         """
         boxes = candidates.boxes
         cosine = compare(obj, candidates, self.stack)

@@ -5,7 +5,7 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float32
 
-from vap_core.base.errors import BadEncoder, one_of
+from vap_core.base.errors import BadCrop, BadEncoder, one_of
 from vap_core.base.types import (
     SAME,
     Ballot,
@@ -27,6 +27,8 @@ SAME_PLACE = 0.5
 """Of two boxes of which the smaller is covered by more than this share, one is a candidate."""
 MOST_CANDIDATES = 4
 """Candidates of one object among proposals of any object. Each of them is segmented and tracked."""
+LENGTH_TOLERANCE = 1e-3
+"""How far from 1 an embedding's length may be."""
 
 
 def similarity(
@@ -41,16 +43,32 @@ def compare(
 ) -> Float32[np.ndarray, "n k"]:
     """cos(e_i, z_k) of every crop of a view, by the encoder of that view.
 
-    Raises: BadEncoder when it gives numbers that are not finite: no vote would mean anything.
+    Raises: BadEncoder when its rows are not finite, not of length 1 (within 1e-3), or of another
+        width than the references': no vote would mean anything. BadCrop, which is one, where it
+        embeds the references of the object as it should.
     """
     encoder = stack.encoder_of(proposals.boxes)
-    cosine = similarity(proposals.embeddings, reference_rows(obj, encoder))
-    if not np.isfinite(cosine).all():
-        raise BadEncoder(
-            f"vote: encoder {encoder.name!r} gave numbers that are not finite; test it with "
+    references = reference_rows(obj, encoder)
+    fault = _fault(proposals.embeddings, references) or _fault(references, references)
+    if fault:
+        again = encoder(list(obj.crops))
+        kind = BadEncoder if _fault(again, references) else BadCrop
+        raise kind(
+            f"vote: encoder {encoder.name!r} gave {fault}; test it with "
             "pytest --pyargs vap_core.contracts --encoder MODULE:NAME."
         )
-    return cosine
+    return similarity(proposals.embeddings, references)
+
+
+def _fault(rows: Float32[np.ndarray, "n _d"], references: Float32[np.ndarray, "k _e"]) -> str:
+    """What is wrong with the rows of crops, "" where nothing is."""
+    if rows.shape[1] != references.shape[1]:
+        return f"{rows.shape[1]} numbers a crop, and {references.shape[1]} for the references"
+    if not np.isfinite(rows).all():
+        return "numbers that are not finite"
+    length = np.linalg.norm(rows, axis=1)
+    far = np.abs(length - 1) > LENGTH_TOLERANCE
+    return f"a row of length {length[far][0]:.3g}, not of length 1" if far.any() else ""
 
 
 def nominate(rgb: Rgb, obj: PersonalObject, offered: Proposals, stack: Stack) -> Proposals:
@@ -58,7 +76,7 @@ def nominate(rgb: Rgb, obj: PersonalObject, offered: Proposals, stack: Stack) ->
 
     Where the stack has a verifier, crops of unfamiliar views are compared point by point first.
 
-    Raises: BadEncoder when the encoder gives numbers that are not finite.
+    Raises: BadEncoder, as `compare` does.
     """
     cosine = compare(obj, offered, stack)
     if stack.verifier is None or offered.boxes.familiar:

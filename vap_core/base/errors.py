@@ -103,7 +103,11 @@ class BadViews(VapError):
 
 
 class BadEncoder(VapError):
-    """An encoder whose numbers are not finite."""
+    """An encoder whose rows are not finite, not of length 1, or of another width."""
+
+
+class BadCrop(BadEncoder):
+    """A crop that an encoder cannot embed, although it can embed the references."""
 
 
 class BadStudy(VapError):

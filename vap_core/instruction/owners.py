@@ -9,7 +9,8 @@ in particular. The rule, in this order:
 3. "our cup" is a cup without an owner.
 4. "Anna's cup" is a cup of the owner called anna, upper and lower case alike.
 5. "my brother's cup" is a cup of the owner who is known as "brother" or, when Anna speaks, as
-   "Anna's brother" (`register --owner ben --known-as "anna's brother"`).
+   "Anna's brother" (`register --owner ben --known-as "anna's brother"`). "Anna's brother's cup" is
+   one of whoever is known as "Anna's brother"; where nobody is, as "brother".
 6. "his", "her" and "their cup" are a cup of the only other person who has one.
 
 An owner that nobody has, and words that fit several people, are errors.
@@ -85,6 +86,9 @@ def belonging(
 def find_owner(person: str, speaker: str, owners: dict[str, tuple[str, ...]]) -> str:
     """The owner that "anna", "my brother" or "anna's brother" means.
 
+    The speaker's own relation comes first, then all the words, then the relation alone. Only
+    "anna's brother", all of it, can be the speaker.
+
     Raises: UnknownName, BadInstruction.
     """
     person = fold(person)
@@ -97,10 +101,11 @@ def find_owner(person: str, speaker: str, owners: dict[str, tuple[str, ...]]) ->
         mine = [f"{speaker}'s {word}" for word in words]
     else:
         mine = []
-    for wanted in (mine, words):
+    for wanted in (mine, [person], words):
         found = []
         for name, known_as in owners.items():
-            if name != speaker and ({name, *known_as} & set(wanted)):
+            other = name != speaker or (wanted == [person] and "'s " in person)
+            if other and ({name, *known_as} & set(wanted)):
                 found.append(name)
         if len(found) == 1:
             return found[0]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from vap_core.instruction.context import Context
 from vap_core.instruction.expressions import Expression, find_category, person_pattern
 from vap_core.instruction.owners import MINE, OTHERS, fold
-from vap_core.instruction.rule import possessive
+from vap_core.instruction.rule import possessive, spaced
 
 
 @dataclass(frozen=True)
@@ -21,11 +21,15 @@ class Possession:
     def owner(self, expression: Expression, said: str) -> str | None:
         """The owner that an expression names; `said` is it without what it excludes."""
         person = person_pattern(self.context)
+        categories = {obj.category for obj in self.context.objects.values()}
+        # "it's Ben's" and "the cup's Ben's", but not the two of "Anna's brother's"
+        subjects = ["it", "that", "this", "which", "who", "one", *map(spaced, categories)]
         for pattern in (
             rf"\bof (mine|his|hers|theirs|ours|(?:{person})|[\w-]+['’]s)(?:['’]s)?(?:\W|$)",
             rf"\b(?:belong\w*|owned) (?:to|by) (my [\w-]+|{person}|us|him|her|them|[\w-]+)\b",
             rf"\b({person}|my [\w-]+|he|she|they|we|[A-Z][\w-]+) (?:owns?\b|has\W*$)",
-            r"(?:\bis|\bare|['’]s) (mine|his|hers|theirs|ours|(?:my )?[\w-]+['’]s)(?:\W|$)",
+            r"(?:\bis|\bare|['’]s) (mine|his|hers|theirs|ours|my [\w-]+['’]s)(?:\W|$)",
+            rf"(?:\bis|\bare|\b(?:{'|'.join(subjects)})['’]s) ([\w-]+['’]s)(?:\W|$)",
         ):
             match = re.search(pattern, said, re.IGNORECASE)
             if match:
@@ -35,7 +39,6 @@ class Possession:
         if expression.kind in ("owner", "alone"):
             beginning = self._beginning(said)
             return beginning and self.antecedent(expression, beginning)
-        categories = {obj.category for obj in self.context.objects.values()}
         if find_category(said, categories) is not None:
             for other in self.expressions:
                 if other.kind == "alone" and other is not expression:

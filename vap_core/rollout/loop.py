@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vap_core.base.errors import BadAction, OutOfReach, VapError
+from vap_core.base.errors import BadAction, BadCrop, OutOfReach, VapError
 from vap_core.base.types import Attended, Views
 from vap_core.policies.hooks import AttentionMaps, observe_attention
 from vap_core.policies.protocol import Policy, PolicyInput, PrivilegedPolicy
@@ -107,12 +107,13 @@ def rollout(
 
     Episodes do not depend on each other. Only the rounding of a policy that is called for several
     episodes at once depends on `batch`: `batch` 1 and 5 can differ in the last bits of an action.
-    An exception inside an episode, a call of sys.exit, or what a prompter returns against its
-    protocol ends that episode with status "error" and its traceback in `detail`; the others go on.
+    An exception inside an episode, a call of sys.exit, a crop that an encoder cannot embed, or what
+    a prompter returns against its protocol ends that episode with status "error" and its traceback
+    in `detail`; the others go on.
     Frames keep their images only with `keep_images`; a sink always gets them.
 
-    Raises: VapError: the user has to act: weights are absent, or the policy returns arrays of
-        another shape or type than its protocol's.
+    Raises: VapError: the user has to act: weights are absent, the policy returns arrays of another
+        shape or type than its protocol's, or an encoder cannot embed the references either.
     """
     keeps_images = sink is not None or keep_images
     for first in range(0, len(rows), batch):
@@ -530,9 +531,10 @@ def _fail(episode: RunningEpisode) -> None:
 def _ends_the_run(error: BaseException) -> bool:
     """Whether the user has to act (a full disk, an absent weight).
 
-    A bad action fails its own episode only.
+    A bad action, and a crop that cannot be embedded, fail their own episode only.
     """
-    return isinstance(error, VapError) and not isinstance(error, OutOfReach | BadAction)
+    of_episode = isinstance(error, OutOfReach | BadAction | BadCrop)
+    return isinstance(error, VapError) and not of_episode
 
 
 @contextmanager

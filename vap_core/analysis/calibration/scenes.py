@@ -82,7 +82,7 @@ def measure_scene(number: int, stack: Stack) -> list[Row]:
     `likeness` is None where there are no candidates; cameras that do not show the target are not
     asked for it.
 
-    Raises: BadEncoder when the encoder gives numbers that are not finite.
+    Raises: BadEncoder, as `vote.compare` does.
     """
     start = scene(number)
     (views,) = list(opening_views([start]))
