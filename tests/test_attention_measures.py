@@ -379,3 +379,38 @@ def test_a_figure_has_the_suites_in_the_order_of_the_benchmarks() -> None:
     (axes,) = figures.where_figure(pd.DataFrame(lines)).axes
     from_the_top = [label.get_text().split(" ")[0] for label in axes.get_yticklabels()][::-1]
     assert from_the_top == [*suites.BENCHMARKS, "all"]
+
+
+def test_tables_have_a_suites_methods_together_in_the_order_of_the_benchmarks() -> None:
+    published = [("tabletop", "vap"), ("own", "vap"), ("vlabench", "soft"), ("tabletop", "soft")]
+    wanted = [("vlabench", "soft"), ("tabletop", "soft"), ("tabletop", "vap"), ("own", "vap")]
+    lines = []
+    for suite, method in published:
+        for success in (False, True):
+            line: dict[str, Any] = {"suite": suite, "method": method, "success": success}
+            line |= {"measure": "masking", "hit": True, "chance_hit": 0.1, "layout": "a"}
+            line |= {"rank_gradient": 0.5, "rank_masking": 1.0, "localisation": "stable"}
+            for name in REGIONS:
+                line |= {f"share_{name}": np.float32(0.1), f"chance_{name}": np.float32(0.3)}
+            lines.append(line)
+    table = pd.DataFrame(lines)
+    for found in (report.pattern_counts(table), report.causal_table(table)):
+        assert list(zip(found.suite, found.method, strict=True)) == wanted
+    areas = report.auc_table(table, ["rank_masking"])
+    of_all = ["all suites, soft", "all suites, vap"]
+    assert list(areas.index) == [*(", ".join(each) for each in wanted), *of_all]
+    assert report.in_order(pd.DataFrame()).empty
+    assert "0.330000" not in report.causal_table(table).to_string()  # as a float32 has it
+    assert report.causal_table(table)["target"].dtype == np.float64
+
+
+def test_the_figure_over_time_says_how_many_episodes_touch_something_beside_its_curves() -> None:
+    calls = [call(episode, step, "target") for episode in range(6) for step in (0, 4)]
+    endings = [ending(i, i % 2 == 0, touch=None if i == 1 else 8.0) for i in range(6)]
+    figure = figures.time_figure(pd.DataFrame(calls), pd.DataFrame(endings))
+    (axes,) = figure.axes
+    legend = axes.get_legend()
+    labels = [text.get_text() for text in legend.get_texts()]
+    assert labels == ["success (3 of 3)", "failure (2 of 3)", "chance"]
+    figure.canvas.draw()
+    assert legend.get_window_extent().y1 < axes.get_window_extent().y0

@@ -114,6 +114,11 @@ def test_parsers_are_as_the_command_prints_them():
     assert figure.get_suptitle() == "finding"
     (axes,) = figure.axes
     assert "95 % interval" in axes.get_xlabel()
+    (theirs,) = axes.patches  # of implicit instructions, beside ours of that kind alone
+    assert (theirs.get_x(), theirs.get_x() + theirs.get_width()) == (94.7, 99.6)
+    names = [label.get_text().split(",")[0] for label in axes.get_yticklabels()]
+    assert names[round(theirs.get_y() + theirs.get_height() / 2)] == "implicit"
+    assert theirs.get_height() < 1
 
 
 def test_first_steps_divide_by_where_the_films_had_objects():

@@ -19,6 +19,7 @@ from .report import auc_by_layer as auc_by_layer
 from .report import auc_table as auc_table
 from .report import causal_table as causal_table
 from .report import first_look as first_look
+from .report import in_order as in_order
 from .report import layer_table as layer_table
 from .report import pattern_counts as pattern_counts
 from .report import where_queries_look as where_queries_look

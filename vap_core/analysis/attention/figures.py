@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vap_core.analysis.attention.patterns import LOCALISATIONS, over_views
+from vap_core.analysis.attention.report import in_order
 from vap_core.base.figures import OTHER, WINNER, empty_figure
 from vap_core.base.palette import FRAME, TEXT
 from vap_core.evaluation.store import KEY
-from vap_core.simulation.suites import BENCHMARKS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,7 +34,7 @@ def where_figure(table: "pd.DataFrame") -> "Figure":
     `table` is `report.where_queries_look`'s; 1 is what an even attention would have, bars of error
     are 95 % intervals over layouts.
     """
-    lines = _in_order(table).iloc[::-1].reset_index(drop=True)
+    lines = in_order(table).iloc[::-1].reset_index(drop=True)
     figure = empty_figure(7.2, 0.3 * len(lines) + 1.1)
     axes = figure.subplots()
     places = np.arange(len(lines))
@@ -122,18 +122,11 @@ def patterns_figure(counts: "pd.DataFrame") -> "Figure":
     return figure
 
 
-def _in_order(table: "pd.DataFrame") -> "pd.DataFrame":
-    """The rows in the order of the benchmarks; those of all suites are last."""
-    places = {name: i for i, name in enumerate(BENCHMARKS)}
-    order = table["suite"].astype(str).map(places).fillna(len(places))
-    return table.loc[order.sort_values(kind="stable").index]
-
-
 def _grid(
     table: "pd.DataFrame", *, width: float, height: float
 ) -> "tuple[Figure, dict[tuple[str, str], Axes]]":
     """A panel for every suite and method of a table, suites from left to right."""
-    suites = list(dict.fromkeys(_in_order(table)["suite"].astype(str)))
+    suites = list(dict.fromkeys(in_order(table)["suite"].astype(str)))
     methods = list(dict.fromkeys(table["method"].astype(str)))
     figure = empty_figure(max(4.0, width * len(suites) + 0.4), height * len(methods) + 0.5)
     panels = figure.subplots(len(methods), len(suites), squeeze=False, sharey=True)
@@ -153,7 +146,8 @@ def _grid(
 def time_figure(calls: "pd.DataFrame", episodes: "pd.DataFrame") -> "Figure":
     """Share of peaks on the target by the number of calls left to the first touch of anything.
 
-    Episodes that succeed and that fail apart; `calls` are of one query a method.
+    Episodes that succeed and that fail apart, without those that touch nothing; `calls` are of one
+    query a method.
     """
     merged = over_views(calls).merge(episodes, on=KEY)
     touched = merged[merged["first_touch"].notna() & (merged["step"] < merged["first_touch"])]
@@ -161,7 +155,7 @@ def time_figure(calls: "pd.DataFrame", episodes: "pd.DataFrame") -> "Figure":
     left = touched.groupby(keys, observed=True)["step"].rank(ascending=False) - 1
     shown = touched.assign(left=left)[left <= CALLS_BEFORE]
     methods = list(dict.fromkeys(shown["method"].astype(str)))
-    figure = empty_figure(3.4 * len(methods), 2.7)
+    figure = empty_figure(3.6 * len(methods), 3.1)
     row = figure.subplots(1, len(methods), squeeze=False, sharey=True)[0]
     for axes, method in zip(row, methods, strict=True):
         of_method = shown[shown["method"].astype(str) == method]
@@ -170,13 +164,14 @@ def time_figure(calls: "pd.DataFrame", episodes: "pd.DataFrame") -> "Figure":
             rates = 100 * group["hit"].mean()[group.size() >= LEAST_EPISODES]
             name = "success" if success else "failure"
             n = len(of_method[of_method["success"] == success][KEY].drop_duplicates())
+            ended = episodes[(episodes["method"] == method) & (episodes["success"] == success)]
             axes.plot(
                 -rates.index,
                 rates,
                 line,
                 markersize=4,
                 color=colour,
-                label=f"{name} (n = {n})",
+                label=f"{name} ({n} of {len(ended)})",
             )
         axes.axhline(
             100 * of_method["chance_hit"].mean(),
@@ -188,6 +183,7 @@ def time_figure(calls: "pd.DataFrame", episodes: "pd.DataFrame") -> "Figure":
         axes.set_title(method, fontsize=9)
         axes.set_xlabel("calls before the first touch")
         axes.spines[["top", "right"]].set_visible(False)
-        axes.legend(fontsize=7)
+        below = (0.5, -0.24)
+        axes.legend(loc="upper center", bbox_to_anchor=below, ncols=2, frameon=False, fontsize=7)
     row[0].set_ylabel("peak on the target, %")
     return figure

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from vap_core.analysis.attention.intervals import Times, percentiles, resamples
+from vap_core.evaluation.perception.estimates import Estimate
 from vap_core.evaluation.statistics import SEED
 
 if TYPE_CHECKING:
@@ -25,22 +26,6 @@ Scores = Float[np.ndarray, " n"]
 Labels = Bool[np.ndarray, " n"]
 
 
-@dataclass(frozen=True)
-class Auc:
-    """Chance that a positive has a higher score than a negative, of `n` episodes, and its 95 %
-    interval."""
-
-    value: float
-    low: float
-    high: float
-    n: int
-
-    def __str__(self) -> str:
-        if np.isnan(self.value):
-            return f"- (n = {self.n})"
-        return f"{self.value:.2f} [{self.low:.2f}, {self.high:.2f}] (n = {self.n})"
-
-
 def auc(scores: Scores, labels: Labels, strata: Sequence[str] = ()) -> float:
     """The share of pairs in order, ties count half; nan without both kinds."""
     once = np.ones((1, len(labels)))
@@ -49,16 +34,11 @@ def auc(scores: Scores, labels: Labels, strata: Sequence[str] = ()) -> float:
 
 def auc_interval(
     scores: Scores, labels: Labels, clusters: Sequence[str], strata: Sequence[str] = ()
-) -> Auc:
-    """The area, and its interval by resampling clusters (percentiles)."""
+) -> Estimate:
+    """The area of n episodes, and its interval by resampling clusters (percentiles)."""
     times = resamples(clusters, strata)
     low, high = percentiles(_resampled(scores, labels, strata, times=times))
-    return Auc(
-        value=auc(scores, labels, strata),
-        low=low,
-        high=high,
-        n=len(labels),
-    )
+    return Estimate(value=auc(scores, labels, strata), low=low, high=high, n=len(labels))
 
 
 def auc_gain(
@@ -66,19 +46,15 @@ def auc_gain(
     labels: Labels,
     clusters: Sequence[str],
     strata: Sequence[str] = (),
-) -> Auc:
+) -> Estimate:
     """By how much the second of two scores of the same episodes tells them better."""
     first, second = scores
     times = resamples(clusters, strata)
     gains = _resampled(second, labels, strata, times=times)
     gains = gains - _resampled(first, labels, strata, times=times)
     low, high = percentiles(gains)
-    return Auc(
-        value=auc(second, labels, strata) - auc(first, labels, strata),
-        low=low,
-        high=high,
-        n=len(labels),
-    )
+    gain = auc(second, labels, strata) - auc(first, labels, strata)
+    return Estimate(value=gain, low=low, high=high, n=len(labels))
 
 
 def _resampled(
@@ -142,7 +118,7 @@ def _logistic(
     return weights
 
 
-def warnings(table: "pd.DataFrame", measures: Sequence[str]) -> dict[str, Auc]:
+def warnings(table: "pd.DataFrame", measures: Sequence[str]) -> dict[str, Estimate]:
     """Failures foretold by the vote margin, by the attention, by both, and what that gains.
 
     Logistic regressions, scored on layouts that they were not fitted on; predictors are ranks
@@ -165,7 +141,7 @@ def warnings(table: "pd.DataFrame", measures: Sequence[str]) -> dict[str, Auc]:
 
 def warnings_by_chance(
     table: "pd.DataFrame", measures: Sequence[str], draws: int = DRAWS
-) -> dict[str, Auc]:
+) -> dict[str, Estimate]:
     """The areas of `warnings` when failures are dealt out at random within their suite.
 
     The mean and the middle 95 % of the draws: what predictors reach that know nothing. Fitted ones
@@ -190,7 +166,7 @@ def warnings_by_chance(
     for name, drawn_areas in areas.items():
         low, high = percentiles(np.array(drawn_areas))
         mean = float(np.mean(drawn_areas))
-        found[name] = Auc(value=mean, low=low, high=high, n=len(known.failed))
+        found[name] = Estimate(value=mean, low=low, high=high, n=len(known.failed))
     return found
 
 
@@ -238,7 +214,7 @@ class _Voted:
         return found
 
 
-def predict_success(table: "pd.DataFrame", measures: Sequence[str]) -> "dict[str, Auc]":
+def predict_success(table: "pd.DataFrame", measures: Sequence[str]) -> dict[str, Estimate]:
     """For every measure of `patterns.per_episode`, how well it tells successes from failures."""
     suites = list(table["suite"].astype(str))
     found = {}

@@ -3,6 +3,8 @@
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from vap_core.analysis.attention import intervals
 from vap_core.analysis.attention.measures import LOOKALIKES, REGIONS, TARGET
 from vap_core.analysis.attention.patterns import (
@@ -16,6 +18,7 @@ from vap_core.base.errors import BadStudy
 from vap_core.base.tables import align
 from vap_core.evaluation.perception.estimates import share
 from vap_core.evaluation.store import KEY
+from vap_core.simulation.suites import BENCHMARKS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -54,6 +57,19 @@ def text(tables: "dict[str, pd.DataFrame]") -> str:
     return "\n\n".join(parts)
 
 
+def in_order(table: "pd.DataFrame") -> "pd.DataFrame":
+    """The rows by suite, then by the name of the method.
+
+    The benchmarks come first, in their order, then others as they stand, and ALL_SUITES last.
+    """
+    if table.empty:
+        return table
+    suites = table["suite"].astype(str)
+    places = list(dict.fromkeys([*BENCHMARKS, *suites[suites != ALL_SUITES], ALL_SUITES]))
+    order = np.lexsort((table["method"].astype(str), suites.map(places.index)))
+    return table.iloc[order].reset_index(drop=True)
+
+
 def auc_table(table: "pd.DataFrame", measures: Sequence[str] = MEASURES) -> "pd.DataFrame":
     """How well each measure tells successes from failures, a row per suite and method.
 
@@ -62,7 +78,7 @@ def auc_table(table: "pd.DataFrame", measures: Sequence[str] = MEASURES) -> "pd.
     import pandas as pd
 
     rows = {}
-    for (suite, method), group in _groups(table, ["method"]):
+    for (suite, method), group in _groups(in_order(table), ["method"]):
         row = {"n": str(len(group)), "successes": str(int(group["success"].sum()))}
         for measure, area in predict_success(group, measures).items():
             row[measure] = f"{area.value:.2f} [{area.low:.2f}, {area.high:.2f}]"
@@ -89,7 +105,7 @@ def where_queries_look(table: "pd.DataFrame") -> "pd.DataFrame":
             )
             row |= {name: found.value, f"{name}_low": found.low, f"{name}_high": found.high}
         rows.append(row)
-    return pd.DataFrame(rows)
+    return in_order(pd.DataFrame(rows))
 
 
 def where_text(table: "pd.DataFrame") -> "pd.DataFrame":
@@ -129,7 +145,7 @@ def first_look(calls: "pd.DataFrame", episodes: "pd.DataFrame") -> "pd.DataFrame
         row["then_touches"] = share(group.loc[group["looks"], "touches"])
         row["else_touches"] = share(group.loc[~group["looks"], "touches"])
         rows.append(row)
-    return pd.DataFrame(rows)
+    return in_order(pd.DataFrame(rows))
 
 
 def pattern_counts(table: "pd.DataFrame") -> "pd.DataFrame":
@@ -144,7 +160,7 @@ def pattern_counts(table: "pd.DataFrame") -> "pd.DataFrame":
             row[name] = len(found)
             row[f"{name}, success"] = int(found["success"].sum())
         rows.append(row)
-    return pd.DataFrame(rows)
+    return in_order(pd.DataFrame(rows))
 
 
 def layer_table(layers: "pd.DataFrame") -> "pd.DataFrame":
@@ -160,7 +176,7 @@ def layer_table(layers: "pd.DataFrame") -> "pd.DataFrame":
         row["lift"] = seen["share_target"].sum() / seen["chance_target"].sum()
         row["lift_lookalikes"] = seen["share_lookalikes"].sum() / seen["chance_lookalikes"].sum()
         rows.append(row)
-    return pd.DataFrame(rows)
+    return in_order(pd.DataFrame(rows))
 
 
 def _groups(
@@ -189,7 +205,7 @@ def auc_by_layer(layers: "pd.DataFrame", episodes: "pd.DataFrame") -> "pd.DataFr
     seen["lift"] = seen["share_target"] / seen["chance_target"]
     keys = [*KEY, "query", "layer"]
     lifts = seen.groupby(keys, observed=True, sort=False)["lift"].mean().reset_index()
-    merged = lifts.merge(episodes, on=KEY)
+    merged = in_order(lifts.merge(episodes, on=KEY))
     rows: dict[str, dict[int, str]] = {}
     for (suite, method, query, layer), group in merged.groupby(
         ["suite", "method", "query", "layer"], observed=True, sort=False
@@ -219,5 +235,6 @@ def causal_table(causal: "pd.DataFrame") -> "pd.DataFrame":
     for region in reversed(REGIONS):
         shares = groups[[f"share_{region}", f"chance_{region}"]].sum()
         table.insert(0, region, shares[f"share_{region}"] / shares[f"chance_{region}"])
-    table.insert(0, "n", groups.size())
-    return table.round(2).reset_index()
+    rounded = table.astype(float).round(2)  # two digits of a float32 are shown as six
+    rounded.insert(0, "n", groups.size())
+    return in_order(rounded.reset_index())

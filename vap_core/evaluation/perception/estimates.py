@@ -41,10 +41,19 @@ class Estimate:
         """Value, interval and n: "97.2 [94.0, 98.7] 180"."""
         if not self.n:
             return "-"
-        middle = _format_number(scale * self.value, digits)
-        low = _format_number(scale * self.low, digits)
-        high = _format_number(scale * self.high, digits)
+        middle, low, high = self._numbers(scale, digits)
         return f"{middle} [{low}, {high}] {self.n}"
+
+    def share_text(self) -> str:
+        """A share as a sentence has it: "97 % [94, 99] of 180"."""
+        if not self.n:
+            return "-"
+        middle, low, high = self._numbers(100.0, 0)
+        return f"{middle} % [{low}, {high}] of {self.n}"
+
+    def _numbers(self, scale: float, digits: int) -> tuple[str, ...]:
+        numbers = (self.value, self.low, self.high)
+        return tuple(_format_number(scale * number, digits) for number in numbers)
 
 
 NONE = Estimate(value=float("nan"), low=float("nan"), high=float("nan"), n=0)
