@@ -82,6 +82,8 @@ def test_share_ignores_what_is_not_known_and_has_wilsons_interval() -> None:
     assert (found.low, found.high) == (rate(2, 3).low, rate(2, 3).high)
     assert share([]).text() == NONE.text() == "-"
     assert Estimate(0.5, float("nan"), float("nan"), 1).text() == "50.0 [?, ?] 1"
+    assert Estimate(0.972, 0.94, 0.987, 180).sentence() == "97 % [94, 99] of 180"
+    assert Estimate(float("nan"), float("nan"), float("nan"), 0).sentence() == "-"
 
 
 def frame(episodes: list[int], values: list[float | None]) -> pd.DataFrame:

@@ -46,6 +46,10 @@ class Estimate:
         high = _format_number(scale * self.high, digits)
         return f"{middle} [{low}, {high}] {self.n}"
 
+    def sentence(self) -> str:
+        """A share within a sentence: "97 % [94, 99] of 180"."""
+        return self.text(digits=0).replace(" [", " % [").replace("] ", "] of ")
+
 
 NONE = Estimate(value=float("nan"), low=float("nan"), high=float("nan"), n=0)
 
