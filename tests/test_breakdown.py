@@ -14,6 +14,7 @@ from vap_core.evaluation.report.failures import (
     breakdown,
     breakdown_rows,
     funnel_table,
+    sub_cases_table,
     sub_cases_text,
 )
 from vap_core.evaluation.report.funnel import funnel_figure
@@ -91,6 +92,15 @@ def test_as_text_every_share_has_its_interval() -> None:
         sub_cases_text(breakdown(TABLE)).splitlines()[0]
         == "vlabench vap: 3 x case 2: views disagree, 1 x case 3: timeout"
     )
+
+
+def test_the_sub_cases_as_a_table() -> None:
+    table = sub_cases_table(breakdown(TABLE))
+    assert table.index.names == ["case", "sub-case"]
+    of_vap = table["vlabench", "vap"]
+    assert (of_vap["case 2", "views disagree"], of_vap["case 3", "timeout"]) == (3, 1)
+    assert of_vap.sum() == 4, "only what occurred, and all of it"
+    assert (table.sum(axis=1) > 0).all()
 
 
 def test_what_several_policies_did_is_not_added_up() -> None:

@@ -81,10 +81,10 @@ def choices() -> pd.DataFrame:
 
 def test_the_least_lead_says_what_is_answered_and_rightly() -> None:
     table = choices()
-    assert "0.60: 50 [24, 76] 10 views are answered, 80 [38, 96] 5 of them" in (
-        controls.answered_text(table, 5, 0.6)
-    )
-    assert ": 90 [60, 98] 10 views are answered" in controls.answered_text(table, 5, 0.0)
+    said = controls.answered_text(table, 5, 0.6)
+    assert "0.60: 50 % [24, 76] of 10 views are answered" in said
+    assert ", 80 % [38, 96] of 5 of these rightly." in said
+    assert ": 90 % [60, 98] of 10 views are answered" in controls.answered_text(table, 5, 0.0)
     control = controls.Abstention(table)
     before = control.answer.value
     control.k.value = 1
@@ -92,7 +92,7 @@ def test_the_least_lead_says_what_is_answered_and_rightly() -> None:
     assert control.answer.value != before
     control.suite.value = "tabletop"
     control.threshold.value = 0.0
-    assert ": 75 [30, 95] 4 views are answered" in control.answer.value
+    assert ": 75 % [30, 95] of 4 views are answered" in control.answer.value
     with pytest.raises(UnknownName, match="number of photos '2' is unknown; known: 1, 5"):
         controls.Abstention(table, k=2)
 

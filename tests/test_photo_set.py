@@ -21,7 +21,7 @@ from vap_core.evaluation.photos.apart import mask_rows, single_rows
 from vap_core.evaluation.photos.clips import follow_scene
 from vap_core.evaluation.photos.folder import read_photo_set
 from vap_core.evaluation.photos.measure import measure_scene
-from vap_core.evaluation.photos.pictures import fit_line, labelled
+from vap_core.evaluation.photos.pictures import fit_line, join_tiles, labelled
 from vap_core.evaluation.photos.report import (
     clustered_mean,
     object_rows,
@@ -357,6 +357,16 @@ def test_a_label_says_why_a_box_is_not_tinted():
     assert evidence(refused_one) == ", IoU 0.76, likeness 0.44"
     assert evidence(row(present=False, likeness=0.3)) == ", likeness 0.30"
     assert evidence(row(likeness=None)) == evidence(row(likeness=float("nan"))) == ""
+
+
+def test_the_pictures_of_a_sheet_do_not_touch() -> None:
+    tile = np.zeros((4, 6, 3), np.uint8)
+    sheet = join_tiles([tile] * 3, columns=2, gap_px=2)
+    assert sheet.shape == (10, 14, 3)
+    assert (sheet[:, 6:8] == 255).all()
+    assert (sheet[4:6] == 255).all()
+    assert (sheet[:4, 8:] == 0).all()
+    assert join_tiles([tile] * 3, columns=2).shape == (8, 12, 3)
 
 
 @pytest.mark.parametrize("line", ["mug", "what was found is unlike the other photos (cosine 0.43)"])

@@ -18,6 +18,7 @@ from vap_core.analysis.plots import (
 )
 from vap_core.attend import Attender
 from vap_core.base.figures import write_png
+from vap_core.base.palette import METHODS, SUITES, THIN_LINES
 from vap_core.evaluation.metrics import rate, score
 from vap_core.evaluation.report.failures import breakdown, funnel_table
 from vap_core.evaluation.report.funnel import cases_figure, funnel_figure
@@ -46,6 +47,10 @@ def test_grounding_table_names_what_is_under_each_candidate() -> None:
     assert table["is"].tolist() == ["other", "mug"]
     assert table.winner.tolist() == [False, True]
     assert table.iou.tolist() == [1.0, 1.0]
+    nowhere = {"mug": np.eye(*LINE.shape[:2], dtype=bool)}
+    table = grounding_table(attended.groundings["front"][0], nowhere)
+    assert table["is"].tolist() == ["-", "-"]
+    assert (table.iou < 0.1).all()
 
 
 def test_grounding_figure_has_a_row_per_target_and_survives_no_candidate(tmp_path) -> None:
@@ -103,6 +108,11 @@ def test_what_a_sheet_says_is_dark_and_beside_its_picture() -> None:
     boxes = [text.get_window_extent() for text in said]
     assert boxes[0].y1 == pytest.approx(boxes[1].y1, abs=2), "captions begin at one height"
     assert min(box.y0 for box in boxes) >= 0, "nothing is cut"
+    large = sheet({"cup": tiles}, side_in=1.0, label_in=0.5, title_pt=11.0)
+    FigureCanvasAgg(large).draw()
+    said = [text for text in large.axes[0].texts if text.get_text() != "cup"]
+    assert {text.get_fontsize() for text in said} == {11}
+    assert min(text.get_window_extent().y0 for text in said) >= 0, "nothing is cut"
 
 
 def test_scores_and_film_draw() -> None:
@@ -192,6 +202,7 @@ def test_results_show_every_rate_and_put_bounds_last() -> None:
     ]
     assert [text.get_text() for text in panel.texts] == ["25", "75", "90"]
     matrix = tasks_figure(lines).axes[0]
+    assert matrix.get_title().startswith("% of episodes that succeed")
     areas = [dots.get_sizes()[0] for dots in matrix.collections]
     assert areas[1] == pytest.approx(3 * areas[0]), "the area of a dot is the rate"
     bold = [text.get_text() for text in matrix.texts if text.get_fontweight() == "bold"]
@@ -213,6 +224,17 @@ def test_learning_has_a_panel_per_figure_and_a_line_per_training_that_logged_it(
     flow, hit = learning_figure(logs, {"flow": "Flow", "hit": "Hit"}, shares=["hit"]).axes
     assert 1 < hit.get_ylim()[1] < 1.1, "a share is read against the whole"
     assert flow.get_ylim()[1] > 2
+
+
+def test_a_line_of_a_suite_has_its_colour_whatever_stands_behind_it() -> None:
+    log = [{"step": 1, "flow": 2.0}, {"step": 2, "flow": 1.0}]
+    named = {"vlabench": log, "vlabench (last training)": log, "tabletop (last training)": log}
+    lines = learning_figure(named, {"flow": "Flow"}).axes[0].lines
+    assert [line.get_color() for line in lines] == [
+        SUITES["vlabench"][0],
+        SUITES["vlabench"][0],
+        THIN_LINES["tabletop"],
+    ]
 
 
 def test_rates_are_bars_as_high_as_they_are_with_their_intervals() -> None:
@@ -247,6 +269,18 @@ def test_many_panels_of_rates_are_in_several_rows(n: int, rows: int, columns: in
     assert len(named) == 1
     assert named[0].get_subplotspec().is_last_row()
     assert figure.get_figwidth() < 13
+
+
+def test_bars_of_methods_have_the_methods_colours() -> None:
+    from matplotlib.colors import to_hex
+
+    some = rate(1, 2)
+    for names in (["generic", "VAP"], ["VAP", "soft"]):
+        figure = rates_figure({"suite": {"cup": dict.fromkeys(names, some)}}, "%")
+        drawn = [to_hex(patch.get_facecolor()) for patch in figure.axes[0].patches]
+        assert drawn == [METHODS[name.lower()][0] for name in names]
+    mixed = rates_figure({"suite": {"cup": {"succeeds": some, "vap": some}}}, "%").axes[0]
+    assert to_hex(mixed.patches[1].get_facecolor()) != METHODS["vap"][0]
 
 
 def test_groups_and_colours_have_one_order_in_every_panel() -> None:

@@ -187,3 +187,8 @@ def test_time_and_hidden_figures_show_the_numbers() -> None:
     assert np.isnan(lines[0].get_ydata()[0])
     lost = curves.hidden_figure(tables()["tracks"]).axes[0].containers[0].lines[0]
     assert lost.get_ydata().tolist() == [50.0, 50.0]
+    tracks = tables()["tracks"]
+    arm = tracks[tracks.hidden > 0].assign(kind="arm").iloc[:3]
+    n = int(arm.target.sum())
+    axes = curves.hidden_figure(pd.concat([tracks, arm], ignore_index=True)).axes[0]
+    assert axes.get_legend_handles_labels()[1][1] == f"an arm moves in front (n = {n})"

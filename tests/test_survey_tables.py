@@ -84,6 +84,8 @@ def test_share_ignores_what_is_not_known_and_has_wilsons_interval() -> None:
     assert Estimate(0.5, float("nan"), float("nan"), 1).text() == "50.0 [?, ?] 1"
     assert Estimate(0.728, 0.63, 0.812, 96).share_text() == "73 % [63, 81] of 96"
     assert NONE.share_text() == "-"
+    assert Estimate(0.972, 0.94, 0.987, 180).share_text() == "97 % [94, 99] of 180"
+    assert Estimate(float("nan"), float("nan"), float("nan"), 0).share_text() == "-"
 
 
 def frame(episodes: list[int], values: list[float | None]) -> pd.DataFrame:

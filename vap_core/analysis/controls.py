@@ -164,13 +164,13 @@ class Abstention(Control):
 
 
 def answered_text(choices: "pd.DataFrame", k: int, threshold: float) -> str:
-    """How many views are answered from a lead on, and how many of these rightly, in %."""
+    """How many views are answered from a lead on, and how many of these rightly."""
     usual = choices[(choices.k == k) & (choices.rule == "vote")]
     answered = usual[(usual.elected != "") & (usual.margin >= threshold)]
     covered = share(usual.index.isin(answered.index))
     return (
-        f"K = {k}, a lead of at least {threshold:.2f}: {covered.text(digits=0)} views are "
-        f"answered, {share(answered.right).text(digits=0)} of them rightly (%, 95 % interval, n)."
+        f"K = {k}, a lead of at least {threshold:.2f}: {covered.share_text()} views are answered "
+        f"(95 % interval), {share(answered.right).share_text()} of these rightly."
     )
 
 

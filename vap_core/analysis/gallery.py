@@ -293,7 +293,7 @@ def bounds_table(scores: Sequence[Score]) -> "pd.DataFrame":
             if policy == "expert":
                 word, task = ("least", ordered[0])
             cells[f"{policy}, {word} in"] = task.task
-            cells[f"there, {word}, SR %"] = f"{task.sr} of {task.n}"
+            cells[f"{policy}, SR % in that task"] = f"{task.sr} of {task.n}"
         lines.append(cells)
     return pd.DataFrame(lines).set_index("suite")
 

@@ -41,6 +41,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+NAMED_IOU = 0.1
+"""A candidate whose mask overlaps every object by less is none of them."""
+
 Ways = Mapping[str, Mapping[str, Grounding]]
 """The first target's grounding in every view, by way to associate: OFF, or a name of PAIRINGS."""
 
@@ -67,7 +70,8 @@ def grounding_table(
 ) -> "pd.DataFrame":
     """One line per candidate: score, votes, whether it shared the most votes, and mean cosine.
 
-    With ground truth also the object that the candidate's mask covers best, and its IoU.
+    With ground truth also the object that the candidate's mask covers best, and its IoU; "-" below
+    NAMED_IOU.
     """
     import pandas as pd
 
@@ -87,7 +91,7 @@ def grounding_table(
         }
         if truth:
             name, iou = _best_overlap(mask, truth)
-            line["is"] = name
+            line["is"] = name if iou >= NAMED_IOU else "-"
             line["iou"] = iou
         lines.append(line)
     return pd.DataFrame(lines, columns=columns)

@@ -11,7 +11,17 @@ import numpy as np
 
 from vap_core.base.figures import BAR_COLOURS, LINE_COLOURS, TIER_COLOURS, empty_figure
 from vap_core.base.files import write_atomic
-from vap_core.base.palette import ELECTED, ELECTED_CASING, FRAME, GRID, ROLES, SUITES, TEXT
+from vap_core.base.palette import (
+    ELECTED,
+    ELECTED_CASING,
+    FRAME,
+    GRID,
+    METHODS,
+    ROLES,
+    SUITES,
+    TEXT,
+    THIN_LINES,
+)
 from vap_core.base.types import Attended, Grounding, PersonalObject, Rgb, value
 from vap_core.base.vote_picture import vote_picture
 from vap_core.evaluation.metrics import Rate
@@ -120,15 +130,17 @@ def sheet(
     side_in: float = 1.0,
     label_in: float = 0.85,
     columns: int = 1,
+    title_pt: float = 7.0,
 ) -> "Figure":
     """A contact sheet: one labelled row of square tiles per key.
 
-    The rows are distributed over `columns` side by side. Sizes are in inches.
+    The rows are distributed over `columns` side by side. Sizes are in inches, that of the tiles'
+    titles in points.
     """
     from matplotlib.figure import Figure
 
     most = max(map(len, rows.values()))
-    caption = _caption_height_in(rows)
+    caption = _caption_height_in(rows, title_pt)
     gap = 0.06
     rows_per_column = -(-len(rows) // columns)
     width = label_in + side_in * most
@@ -144,7 +156,7 @@ def sheet(
         )
         for j, tile in enumerate(tiles):
             x = left + label_in + j * side_in
-            _draw_tile(axes, tile, x=x, y=top, side_in=side_in)
+            _draw_tile(axes, tile, x=x, y=top, side_in=side_in, title_pt=title_pt)
     axes.set(xlim=(0, columns * width), ylim=(rows_per_column * height, 0))
     return figure
 
@@ -226,7 +238,8 @@ def learning_figure(
     """What trainings logged, over their optimiser steps.
 
     A panel per quantity of the log, of which `panels` holds the name in the log and the title; a
-    line per training that logs it. The axes of `shares` end at 1.
+    line per training that logs it, in the colour of the suite that its label begins with; what
+    stands in brackets behind the suite says more of the training. The axes of `shares` end at 1.
     """
     figure = empty_figure(3.1 * len(panels) + 0.4, 3.0 + 0.3 * (len(logs) > 1))
     drawn: dict[str, Line2D] = {}
@@ -240,8 +253,9 @@ def learning_figure(
                     steps.append(entry["step"])
                     values.append(entry[name])
                 colour = LINE_COLOURS[i % len(LINE_COLOURS)]
-                if label in SUITES:
-                    colour, _ = SUITES[label]
+                suite = label.partition(" (")[0]
+                if suite in SUITES:
+                    colour = THIN_LINES.get(suite, SUITES[suite][0])
                 (drawn[label],) = axes.plot(steps, values, color=colour, linewidth=1.6)
         axes.set(title=title, xlabel="optimiser steps")
         axes.set_ylim(bottom=0, top=SHARE_TOP if name in shares else None)
@@ -261,7 +275,8 @@ def rates_figure(
 
     A row has PANELS_IN_A_ROW panels at most; the rows of more are as even as they can be. Rates are
     drawn in percent with their intervals. Groups and colours keep one order over all panels, that
-    in which they first appear. `groups_label` says what the groups are.
+    in which they first appear; methods, in any case, have the colours that they have everywhere.
+    `groups_label` says what the groups are.
     """
     groups: dict[str, None] = {}
     names: dict[str, None] = {}
@@ -275,6 +290,7 @@ def rates_figure(
     grid = figure.subplots(n_rows, n_columns, squeeze=False, sharey=True)
     for axes in grid.flat[len(panels) :]:
         axes.set_axis_off()
+    colours = _bar_colours(list(names))
     drawn: dict[str, BarContainer] = {}
     for axes, (title, panel) in zip(grid.flat[: len(panels)], panels.items(), strict=True):
         own = [group for group in groups if group in panel]
@@ -290,7 +306,7 @@ def rates_figure(
                 axes=axes,
                 x=np.array(at) + offset,
                 rates=rates_of_name,
-                colour=i,
+                colour=colours[i],
                 width=0.76 / len(names),
             )
             if at:
@@ -403,13 +419,25 @@ def _percentages(rates: Sequence[Rate]) -> _Percentages:
     return _Percentages(100 * np.array(values), 100 * np.array(lows), 100 * np.array(highs))
 
 
+def _bar_colours(names: Sequence[str]) -> list[str]:
+    """The colours of the bars of a group: of methods their own, of anything else by place."""
+    colours = []
+    are_methods = all(name.lower() in METHODS for name in names)
+    for i, name in enumerate(names):
+        if are_methods:
+            colour, _ = METHODS[name.lower()]
+        else:
+            colour = BAR_COLOURS[i % len(BAR_COLOURS)]
+        colours.append(colour)
+    return colours
+
+
 def _draw_rates(
-    axes: "Axes", x: np.ndarray, rates: Sequence[Rate], colour: int, width: float
+    axes: "Axes", x: np.ndarray, rates: Sequence[Rate], colour: str, width: float
 ) -> "BarContainer":
     """Bars of rates with their intervals, in percent."""
     percent = _percentages(rates)
-    shade = BAR_COLOURS[colour % len(BAR_COLOURS)]
-    bars = axes.bar(x, percent.value, width, color=shade)
+    bars = axes.bar(x, percent.value, width, color=colour)
     axes.errorbar(
         x,
         percent.value,
@@ -422,17 +450,19 @@ def _draw_rates(
     return bars
 
 
-def _caption_height_in(rows: Mapping[str, Sequence[Tile]]) -> float:
+def _caption_height_in(rows: Mapping[str, Sequence[Tile]], title_pt: float) -> float:
     """The height of the longest title of a sheet, in inches."""
     height = 0.0
     for tile in chain.from_iterable(rows.values()):
         if tile.title:
             n_lines = len(tile.title.splitlines())
-            height = max(height, 0.05 + 0.12 * n_lines)
+            height = max(height, 0.05 + 0.12 * n_lines * title_pt / 7)
     return height
 
 
-def _draw_tile(axes: "Axes", tile: Tile, *, x: float, y: float, side_in: float) -> None:
+def _draw_tile(
+    axes: "Axes", tile: Tile, *, x: float, y: float, side_in: float, title_pt: float
+) -> None:
     """One tile of a sheet with its top left corner at (x, y)."""
     from matplotlib.patches import Rectangle
 
@@ -461,7 +491,7 @@ def _draw_tile(axes: "Axes", tile: Tile, *, x: float, y: float, side_in: float) 
         tile.title,
         ha="center",
         va="top",
-        fontsize=7,
+        fontsize=title_pt,
         color=TEXT,
     )
 

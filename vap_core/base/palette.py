@@ -64,6 +64,8 @@ SUITES = {
     "tabletop": ("#9fd0e0", "D"),
 }
 """Colour and marker of the four benchmarks."""
+THIN_LINES = {"tabletop": "#3f8db0"}
+"""A darker shade of a suite's colour, for a thin line on white."""
 CASES = {
     "case 1": "#4a2a6b",
     "case 2": "#9b6bb5",

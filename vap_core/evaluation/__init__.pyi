@@ -9,7 +9,7 @@ from .perception.estimates import share as share
 from .report.cells import percent_interval as percent_interval
 from .report.failures import breakdown as breakdown
 from .report.failures import funnel_table as funnel_table
-from .report.failures import sub_cases_text as sub_cases_text
+from .report.failures import sub_cases_table as sub_cases_table
 from .report.funnel import cases_figure as cases_figure
 from .report.funnel import funnel_figure as funnel_figure
 from .report.pictures import differences_figure as differences_figure

@@ -182,10 +182,14 @@ def hidden_figure(tracks: "pd.DataFrame") -> "Figure":
             continue
         part = targets[(targets.hidden == 0) | (targets.kind == kind)]
         hidden = sorted(part.hidden.unique())
+        estimates = [share(~part[part.hidden == n].kept.astype(bool)) for n in hidden]
+        if n_lines > 0:  # the numbers below the axis are of the first occluder
+            ns = [str(e.n) for n, e in zip(hidden, estimates, strict=True) if n > 0]
+            label += f" (n = {', '.join(ns)})"
         _draw_line(
             axes,
             x=np.array(hidden) + 0.12 * (n_lines - 0.5),
-            estimates=[share(~part[part.hidden == n].kept.astype(bool)) for n in hidden],
+            estimates=estimates,
             colour=(WINNER, OTHER)[n_lines],
             label=label,
             counts=n_lines == 0,

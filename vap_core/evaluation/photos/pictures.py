@@ -15,19 +15,23 @@ if TYPE_CHECKING:
     from PIL.ImageFont import FreeTypeFont
 
 LABEL_PX, COLUMNS = 34, 4
+GAP_PX = 10
+"""Between the tiles of a sheet of scenes, whose pictures would touch."""
 LARGEST_PX, SMALLEST_PX = 13, 10
 """Sizes of a label's text, from that of a short one to that of a long one."""
 TRUTH, RIGHT, WRONG, SILENT = (255, 255, 255), (60, 200, 90), (235, 60, 50), (160, 160, 160)
 DOUBTFUL = (250, 180, 40)
 
 
-def join_tiles(tiles: Sequence[Rgb], columns: int = COLUMNS) -> Rgb:
-    """Tiles of one size in rows."""
+def join_tiles(tiles: Sequence[Rgb], columns: int = COLUMNS, gap_px: int = 0) -> Rgb:
+    """Tiles of one size in rows, on white; `gap_px` lie between two."""
     height, width = tiles[0].shape[:2]
+    down, across = height + gap_px, width + gap_px
     rows = -(-len(tiles) // columns)
-    out = np.full((rows * height, min(columns, len(tiles)) * width, 3), 255, np.uint8)
+    shape = (rows * down - gap_px, min(columns, len(tiles)) * across - gap_px, 3)
+    out = np.full(shape, 255, np.uint8)
     for i, tile in enumerate(tiles):
-        y, x = i // columns * height, i % columns * width
+        y, x = i // columns * down, i % columns * across
         out[y : y + height, x : x + width] = tile
     return out
 

@@ -10,6 +10,7 @@ from vap_core.base.photos import load_photo
 from vap_core.base.types import Rgb
 from vap_core.evaluation.photos.folder import PhotoSet, Scene
 from vap_core.evaluation.photos.pictures import (
+    GAP_PX,
     RIGHT,
     SILENT,
     TRUTH,
@@ -44,7 +45,7 @@ def write_sheets(photo_set: PhotoSet, table: "pd.DataFrame", folder: Path) -> li
     paths = []
     for first in range(0, len(tiles), TILES):
         path = folder / f"sheet-{1 + first // TILES:02}.png"
-        write_picture(path, join_tiles(tiles[first : first + TILES]))
+        write_picture(path, join_tiles(tiles[first : first + TILES], gap_px=GAP_PX))
         paths.append(path)
     return paths
 

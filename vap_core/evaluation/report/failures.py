@@ -114,16 +114,31 @@ def breakdown_rows(counts: "pd.DataFrame") -> list[list[str]]:
     return rows
 
 
+def _sub_case_columns() -> list[str]:
+    """The columns of a breakdown that count sub-cases."""
+    columns = []
+    for case, sub_cases in CASES.items():
+        for sub_case in sub_cases:
+            columns.append(f"{case}: {sub_case}")
+    return columns
+
+
+def sub_cases_table(counts: "pd.DataFrame") -> "pd.DataFrame":
+    """One row per sub-case that occurred, by case; a column of counts per suite and method."""
+    flat = counts.set_index(BY)[_sub_case_columns()].T
+    table = flat[flat.sum(axis=1) > 0]
+    table.index = table.index.str.split(": ", n=1, expand=True).set_names(["case", "sub-case"])
+    return table
+
+
 def sub_cases_text(counts: "pd.DataFrame") -> str:
     """How often each sub-case occurred, most frequent first, one line per suite and method."""
     lines = []
     for line in counts.to_dict("records"):
         occurred = []
-        for case, sub_cases in CASES.items():
-            for sub_case in sub_cases:
-                name = f"{case}: {sub_case}"
-                if line[name]:
-                    occurred.append((int(line[name]), name))
+        for name in _sub_case_columns():
+            if line[name]:
+                occurred.append((int(line[name]), name))
         occurred.sort(reverse=True)
         text = ", ".join(f"{n} x {name}" for n, name in occurred)
         lines.append(f"{line['suite']} {line['method']}: {text or 'no failure'}")

@@ -98,6 +98,7 @@ def tasks_figure(results: "pd.DataFrame", title: str = "") -> "Figure":
     axes.set_yticks(list(places.values()), [line[2] for line in lines], fontsize=9)
     axes.set_xticks(range(len(methods)), _labels(methods, bounds, "\n(bound)"), fontsize=9)
     axes.xaxis.tick_top()
+    axes.set_title("% of episodes that succeed; so is the area of a dot", fontsize=9)
     _set_ours_bold(axes.get_xticklabels(), methods)
     axes.set(xlim=(-0.7, len(methods) - 0.3), ylim=(bottom + 0.6, -1.1))
     axes.tick_params(length=0)
