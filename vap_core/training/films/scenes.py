@@ -137,7 +137,6 @@ def stage(
     *,
     held_out: bool = False,
     views: int = VIEWS,
-    size: int = SIZE,
     look: Look = draw_style,
 ) -> Shots:
     """Render one stage, in a room that `look` draws."""
@@ -146,7 +145,7 @@ def stage(
     robot = sorted(robots.ROBOTS)[int(rng.integers(len(robots.ROBOTS)))]
     with (
         scenes.build(robot, models, style=look(rng)) as scene,
-        mujoco.Renderer(scene.model, size, size) as renderer,
+        mujoco.Renderer(scene.model, SIZE, SIZE) as renderer,
     ):
         data = mujoco.MjData(scene.model)
         rgb: list[np.ndarray] = []
