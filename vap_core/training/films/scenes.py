@@ -254,16 +254,6 @@ def stage_file(folder: Path, seed: int, number: int, held_out: bool) -> Path:
     return folder / f"{kind}-{seed}-{number:05d}.npz"
 
 
-def cost_s(folder: Path, seed: int, number: int, held_out: bool) -> float:
-    """CPU seconds that a stage in `folder` took to render.
-
-    Raises: BadOutput when its file is absent or damaged.
-    """
-    path = stage_file(folder, seed, number, held_out)
-    with kept_arrays(path, "train") as file:
-        return float(file["cpu_s"])
-
-
 def boxes_of(
     ids: UInt8[np.ndarray, "_h _w"], n: int, least_px: int = 40
 ) -> Iterator[tuple[int, tuple[int, int, int, int]]]:
