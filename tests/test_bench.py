@@ -420,7 +420,7 @@ def test_scale_runs() -> None:
 @pytest.mark.parametrize(
     ("words", "match"),
     [
-        ("style --json bs.json", "bench: style reads no option; leave --json out."),
+        ("measured --json bs.json", "bench: measured reads no option; leave --json out."),
         ("--json x.json loop --steps 5", "bench: loop reads --steps; leave --json out."),
         ("loop --quick", "leave --quick out"),
         ("policy --device cpu", "leave --device out"),

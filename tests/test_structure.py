@@ -12,7 +12,7 @@ from types import CodeType
 import pytest
 
 import vap_core
-from vap_core.cli.bench.style import measure
+from tests.source_style import measure
 
 ROOT = Path(vap_core.__file__).parent
 METHOD = ("memory", "instruction", "vote", "associate", "prompt", "attend")

@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from vap_core.training.policy.colouring import (
     natural_colours,
     tints,
 )
-from vap_core.training.policy.commands import FORMS, Command, Known, command
+from vap_core.training.policy.commands import Command, Form, Known, command
 from vap_core.training.recipe import RECIPES, filmed_task
 from vap_core.training.words import PAINTS, similar_colours, vocabulary
 
@@ -81,7 +82,7 @@ def test_an_object_is_as_often_tinted_or_painted_whether_it_is_the_target_or_not
 ) -> None:
     """For every form, the target's share less the rivals' is 0 within 3.5 standard errors of at most 2 points."""
     for name in ("tinted", "painted"):
-        for form in FORMS:
+        for form in get_args(Form):
             differences, own = [], []
             for made in commands:
                 if made.form == form:
@@ -200,7 +201,7 @@ def test_forms_have_their_shares_and_the_captioners_grammar(
     phrases = {
         text for caption in known.captions.values() for text in (caption.short, caption.long)
     }
-    shares = {form: np.mean([made.form == form for made in commands]) for form in FORMS}
+    shares = {form: np.mean([made.form == form for made in commands]) for form in get_args(Form)}
     assert shares["described"] > 0.3
     assert shares["plain"] > 0.1
     assert shares["coloured"] > 0.3

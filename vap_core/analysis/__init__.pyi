@@ -1,6 +1,5 @@
 from .ablation_findings import findings_table as findings_table
 from .ablation_findings import two_policies_table as two_policies_table
-from .ablation_findings import verdict as verdict
 from .ablations import ablation_episodes as ablation_episodes
 from .ablations import ablation_results as ablation_results
 from .ablations import across_policies as across_policies

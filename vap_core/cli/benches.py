@@ -32,7 +32,6 @@ BENCHES = {
     "engine": ("workers", "quick"),
     "embeddings": ("quick", "json"),
     "query": ("quick",),
-    "style": (),
     "measured": (),
 }
 """The options that each bench reads, by parameter."""
@@ -57,7 +56,7 @@ def bench(
             "scale: cost against cameras, image size, candidates, batch and workers, and memory; "
             "engine: a Ray cluster on this machine against local processes; "
             "query: a question to a thousand recordings; "
-            "embeddings: tables of PaliGemma's size, compared; style: how the source reads; "
+            "embeddings: tables of PaliGemma's size, compared; "
             "measured: write docs/measured.md from what ships."
         ),
     ] = "loop",
@@ -167,10 +166,6 @@ def bench(
             from vap_core.cli.bench import query
 
             text = query.run(quick=quick)
-        case "style":
-            from vap_core.cli.bench import style
-
-            text = style.run()
         case "measured":
             from vap_core.cli.bench import measured
 

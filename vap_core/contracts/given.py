@@ -87,10 +87,10 @@ def noise(seed: int, h: int = 96, w: int = 128) -> Rgb:
     return np.random.default_rng(seed).integers(0, 255, (h, w, 3), dtype=np.uint8)
 
 
-def short_rows(where: str, steps: int, n: int = 2) -> list[EpisodeRow]:
-    """The first steps of the first episodes of SUITE/TASK."""
+def short_rows(where: str, steps: int) -> list[EpisodeRow]:
+    """The first steps of the first two episodes of SUITE/TASK."""
     suite, _, task = where.partition("/")
-    return [replace(row, max_steps=steps) for row in suites.rows(suite, task, n)]
+    return [replace(row, max_steps=steps) for row in suites.rows(suite, task, 2)]
 
 
 def trial_of(policy: Any, rows: Sequence[EpisodeRow]) -> Trial:

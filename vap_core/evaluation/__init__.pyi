@@ -13,7 +13,6 @@ from .report.failures import sub_cases_table as sub_cases_table
 from .report.funnel import cases_figure as cases_figure
 from .report.funnel import funnel_figure as funnel_figure
 from .report.pictures import differences_figure as differences_figure
-from .report.pictures import forest_figure as forest_figure
 from .report.result_figures import suites_figure as suites_figure
 from .report.result_figures import tasks_figure as tasks_figure
 from .report.runs import load_runs as load_runs

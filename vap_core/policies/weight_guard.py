@@ -3,12 +3,16 @@
 The checksum of all its parameters is in every result.
 """
 
+import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 from weakref import WeakKeyDictionary
 
 from vap_core.base.errors import BadPolicy
+
+if TYPE_CHECKING:
+    from torch import nn
 
 
 @runtime_checkable
@@ -31,6 +35,18 @@ def checksum(policy: object) -> str:
     if not isinstance(policy, Weighted):
         return ""
     return policy.sha256()[:16]
+
+
+def state_sha256(module: "nn.Module") -> str:
+    """Checksum of a module's parameters and buffers as they stand, in the order of their names."""
+    import torch
+
+    digest = hashlib.sha256()
+    for name, tensor in sorted(module.state_dict().items()):
+        flat = tensor.detach().cpu().contiguous().reshape(-1)
+        digest.update(name.encode())
+        digest.update(flat.view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
 
 
 @contextmanager

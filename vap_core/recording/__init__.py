@@ -9,7 +9,6 @@ import os
 os.environ.setdefault("RUST_LOG", "error")
 
 from vap_core.recording.browser import serve_run as serve_run
-from vap_core.recording.catalog import StepTable as StepTable
 from vap_core.recording.catalog import load_steps as load_steps
 from vap_core.recording.clicks import Votes as Votes
 from vap_core.recording.clicks import inspect_votes as inspect_votes

@@ -10,7 +10,6 @@ from vap_core.base.palette import Rgb8, rgb8
 
 TARGET = rgb8(palette.TARGET)
 ELECTED = rgb8(palette.ELECTED)
-GOAL = rgb8(palette.GOAL)
 LOOKALIKES = tuple(rgb8(colour) for colour in palette.LOOKALIKES)
 CAMERAS = tuple(rgb8(colour) for colour in palette.CAMERAS)
 MUTED = rgb8(palette.FRAME)

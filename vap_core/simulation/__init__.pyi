@@ -1,6 +1,5 @@
 from . import robots as robots
 from .assets.objects import CLUTTER as CLUTTER
-from .assets.objects import TIERS as TIERS
 from .assets.objects import personal_instance as personal_instance
 from .occluder import Occlusion as Occlusion
 from .studio import Stage as Stage

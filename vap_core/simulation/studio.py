@@ -159,12 +159,12 @@ def write_views(
     return list(files)
 
 
-def write_preview(model: ObjectModel, path: Path, size: int = 320) -> None:
+def write_preview(model: ObjectModel, path: Path) -> None:
     """The object from its front, its side, its back and above, side by side. Raises: BadOutput."""
     shots = []
     for azimuth, elevation in ((0.0, 0.3), (np.pi / 2, 0.3), (np.pi, 0.3), (0.4, 1.2)):
         shots.append(Shot(float(azimuth), elevation, fill=0.75))
-    picture = np.concatenate(photograph(model, shots, size), axis=1)
+    picture = np.concatenate(photograph(model, shots), axis=1)
     with writing(path, "preview", "choose another folder with --out"):
         Image.fromarray(picture).save(path)
 

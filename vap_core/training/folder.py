@@ -54,6 +54,15 @@ def kept_arrays(path: Path, caller: str) -> Iterator[Mapping[str, np.ndarray]]:
         yield arrays
 
 
+def cost_s(stage: Path) -> float:
+    """CPU seconds that a stage's films or scenes took to make.
+
+    Raises: BadOutput when its file is absent or damaged.
+    """
+    with kept_arrays(stage, "train") as arrays:
+        return float(arrays["cpu_s"])
+
+
 def checkpoint(path: Path, resume: bool) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
     """What an interrupted run left at `path`, and a function that replaces it atomically.
 

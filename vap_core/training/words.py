@@ -1,7 +1,7 @@
 """The words of the small models: of instructions, questions and answers, and of appearance."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import cache
 
 from vap_core.base.types import Colour
@@ -95,8 +95,8 @@ def similar_colours(word: str) -> frozenset[str]:
     return frozenset(similar)
 
 
-def distinct_colours(taken: Iterable[str], colours: Sequence[Colour] = PALETTE) -> list[Colour]:
-    """The colours that nobody takes for one of these words; all of them when none is left."""
+def distinct_colours(taken: Iterable[str]) -> list[Colour]:
+    """The palette's colours that nobody takes for one of these words; all when none is left."""
     words = set(taken)
-    distinct = [colour for colour in colours if not similar_colours(colour.name) & words]
-    return distinct or list(colours)
+    distinct = [colour for colour in PALETTE if not similar_colours(colour.name) & words]
+    return distinct or list(PALETTE)

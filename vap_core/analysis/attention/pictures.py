@@ -23,7 +23,7 @@ from vap_core.analysis.attention.replay import check_policy
 from vap_core.analysis.plots import Tile, sheet
 from vap_core.base.palette import RIGHT_MARK, WRONG_MARK
 from vap_core.base.types import Mask, Rgb
-from vap_core.evaluation.diagnosis.recordings import listed_row, study_of
+from vap_core.evaluation.diagnosis.recordings import listed_row, note_changed, study_of
 from vap_core.evaluation.engine import spread_evenly
 from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.policies.hooks import heat_map
@@ -95,12 +95,7 @@ def run_again(
         return sinks[-1]
 
     (episode,) = rollout(replace(trial, attention=QUERIES), [row], observe, batch=1)
-    outcome = episode.outcome
-    if (outcome.status, outcome.steps) != (line["outcome"], line["steps"]):
-        print(
-            f"note: run again, it is a {outcome.status} after {outcome.steps} steps "
-            f"(was {line['outcome']} after {line['steps']})."
-        )
+    note_changed(episode.outcome, line)
     return episode, sinks[0].frames
 
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 LEAST_FAILURES = 10
 DRAWS = 200
 """How often failures are dealt out at random for `warnings_by_chance`."""
+FOLDS = 10
+RIDGE = 0.1
 BEYOND = "both, beyond the margin"
 Scores = Float[np.ndarray, " n"]
 Labels = Bool[np.ndarray, " n"]
@@ -79,19 +81,19 @@ def _resampled(
 
 
 def left_out_scores(
-    predictors: Float[np.ndarray, "n d"], labels: Labels, clusters: Sequence[str], folds: int = 10
+    predictors: Float[np.ndarray, "n d"], labels: Labels, clusters: Sequence[str]
 ) -> Scores:
     """What a logistic regression says of layouts that it was not fitted on.
 
-    Clusters are dealt out to `folds` folds. The intercept is left out: that of a fold without
+    Clusters are dealt out to FOLDS folds. The intercept is left out: that of a fold without
     positives is higher, which would rank the folds against the truth. A small ridge keeps the fit
     finite where a predictor separates the episodes.
     """
     names, of_cluster = np.unique(np.asarray(clusters, dtype=str), return_inverse=True)
-    fold_of = np.random.default_rng(SEED).permutation(len(names)) % folds
+    fold_of = np.random.default_rng(SEED).permutation(len(names)) % FOLDS
     folds_of = fold_of[of_cluster]
     scores = np.zeros(len(labels))
-    for fold in range(folds):
+    for fold in range(FOLDS):
         held = folds_of == fold
         mean = predictors[~held].mean(0)
         scale = predictors[~held].std(0) + 1e-9
@@ -101,12 +103,10 @@ def left_out_scores(
     return scores
 
 
-def _logistic(
-    design: Float[np.ndarray, "n k"], labels: Labels, ridge: float = 0.1
-) -> Float[np.ndarray, " k"]:
+def _logistic(design: Float[np.ndarray, "n k"], labels: Labels) -> Float[np.ndarray, " k"]:
     """Newton's method."""
     weights = np.zeros(design.shape[1])
-    penalty = ridge * np.eye(len(weights))
+    penalty = RIDGE * np.eye(len(weights))
     for _ in range(50):
         chance = 1 / (1 + np.exp(-(design @ weights)))
         gradient = design.T @ (labels - chance) - penalty @ weights

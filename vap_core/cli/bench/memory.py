@@ -8,6 +8,7 @@ from dataclasses import replace
 from itertools import cycle
 from pathlib import Path
 
+from vap_core.cli.bench.jobs import jobs_of
 from vap_core.evaluation import processes
 from vap_core.evaluation.jobs import BATCH, Job, run_job
 from vap_core.evaluation.policy_names import MINI
@@ -55,22 +56,11 @@ def _run(plan: tuple[int, int, Path]) -> Series:
 def _jobs(study: Study, folder: Path) -> Sequence[Job]:
     """A job of each task in turn, over all episodes that fill one."""
     rows = [study.rows(*task) for task in study.tasks]
-    jobs = []
+    jobs: list[Job] = []
     for first in range(0, min(map(len, rows)) - BATCH + 1, BATCH):
         for of_task in rows:
-            batch = tuple(replace(row, max_steps=STEPS) for row in of_task[first : first + BATCH])
-            keys = tuple(f"{row.task}-{row.episode}" for row in batch)
-            jobs.append(
-                Job(
-                    study=study,
-                    method="vap",
-                    rows=batch,
-                    keys=keys,
-                    attempt=1,
-                    folder=folder,
-                    record="failures",
-                )
-            )
+            batch = [replace(row, max_steps=STEPS) for row in of_task[first : first + BATCH]]
+            jobs += jobs_of(study, "vap", batch, folder)
     return jobs
 
 

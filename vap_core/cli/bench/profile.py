@@ -13,10 +13,11 @@ from typing import Any
 
 from tqdm import tqdm
 
+from vap_core.cli.bench.jobs import jobs_of
 from vap_core.cli.bench.measurement import Measurement, Table, provenance
 from vap_core.cli.bench.profile_parts import profiled
 from vap_core.evaluation.engine import spread_evenly
-from vap_core.evaluation.jobs import BATCH, Job, run_job
+from vap_core.evaluation.jobs import Job, run_job
 from vap_core.evaluation.policy_names import MINI
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import register_personal
@@ -104,7 +105,7 @@ def _measure_column(
         rows = _rows(study.rows(suite, task), column.variant, n)
         if quick:
             rows = [replace(row, max_steps=QUICK_STEPS) for row in rows]
-        jobs += _jobs(study, method, rows, folder)
+        jobs += jobs_of(study, method, rows, folder)
     run_job(_warm_up(jobs[0]))
     summaries: list[dict[str, Any]] = []
     with profiled() as parts:
@@ -127,25 +128,6 @@ def _measure_column(
 def _rows(listed: Sequence[EpisodeRow], variant: str, n: int) -> list[EpisodeRow]:
     """`n` episodes of a list in one variant, spread evenly."""
     return spread_evenly([row for row in listed if row.variant == variant], n)
-
-
-def _jobs(study: Study, method: str, rows: Sequence[EpisodeRow], folder: Path) -> list[Job]:
-    jobs = []
-    for first in range(0, len(rows), BATCH):
-        batch = tuple(rows[first : first + BATCH])
-        keys = tuple(f"{row.task}-{row.episode}" for row in batch)
-        jobs.append(
-            Job(
-                study=study,
-                method=method,
-                rows=batch,
-                keys=keys,
-                attempt=1,
-                folder=folder,
-                record="failures",
-            )
-        )
-    return jobs
 
 
 def _warm_up(job: Job) -> Job:

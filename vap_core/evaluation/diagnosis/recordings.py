@@ -23,7 +23,7 @@ from vap_core.evaluation.stills import write_provenance
 from vap_core.evaluation.store import ROW_KEY
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import make_trial, register_personal
-from vap_core.simulation.types import EpisodeRow
+from vap_core.simulation.types import EpisodeRow, Outcome
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -170,13 +170,17 @@ def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
         lambda header: Recorder(path, header, explain=explain),
         batch=1,
     )
-    outcome = episode.outcome
+    note_changed(episode.outcome, row)
+    return path
+
+
+def note_changed(outcome: Outcome, row: Mapping[str, Any]) -> None:
+    """Print a line where an episode that was run again ended otherwise than its `row` says."""
     if (outcome.status, outcome.steps) != (row["outcome"], row["steps"]):
         print(
             f"note: run again, it is a {outcome.status} after {outcome.steps} steps "
             f"(was {row['outcome']} after {row['steps']})."
         )
-    return path
 
 
 def _recorded_policy(recording: Path) -> str | None:

@@ -143,7 +143,7 @@ def track_episode(job: Job, stack: Stack) -> list[TableRow]:
     return track_film(film, job, stack)
 
 
-def record_film(job: Job, scene: Scene, size: int = 224) -> Film:
+def record_film(job: Job, scene: Scene) -> Film:
     """The expert's episode, to its end, in pictures and masks.
 
     The target is hidden from a moment that the episode's number decides.
@@ -153,7 +153,7 @@ def record_film(job: Job, scene: Scene, size: int = 224) -> Film:
     """
     row = job.row
     expert = Expert()
-    env = make_env(scene, row.suite, image_size=size, cameras=cameras_of(row))
+    env = make_env(scene, row.suite, cameras=cameras_of(row))
     env.reset(row)
     state = expert.start(np.random.default_rng([row.seed, row.episode]))
     frames = []
@@ -165,9 +165,7 @@ def record_film(job: Job, scene: Scene, size: int = 224) -> Film:
     fraction = float(np.random.default_rng([13, row.episode]).uniform(0.2, 0.45))
     start = round(len(frames) * fraction)
     occlusion = Occlusion(0, row.max_steps + 1, job.kind)
-    screened = make_env(
-        scene, row.suite, image_size=size, cameras=cameras_of(row), occlusion=occlusion
-    )
+    screened = make_env(scene, row.suite, cameras=cameras_of(row), occlusion=occlusion)
     covered = []
     for moment in moments[start : start + max(job.hidden, default=0)]:
         screened.restore(moment)

@@ -10,7 +10,6 @@ has an effect on a chunk.
 """
 
 import copy
-import hashlib
 import inspect
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -39,6 +38,7 @@ from vap_core.policies.lerobot.token_positions import positions
 from vap_core.policies.lerobot.traced import ChunkPredictor
 from vap_core.policies.names import label_of
 from vap_core.policies.protocol import Chunk, PolicyInput
+from vap_core.policies.weight_guard import state_sha256
 from vap_core.simulation.env import Env
 from vap_core.simulation.scenes import Scene
 from vap_core.simulation.suites import Suite
@@ -217,12 +217,7 @@ class LeRobot:
 
     def sha256(self) -> str:
         """Checksum of all parameters and buffers as they stand."""
-        digest = hashlib.sha256()
-        for name, tensor in sorted(self.policy.state_dict().items()):
-            flat = tensor.detach().cpu().contiguous().reshape(-1)
-            digest.update(name.encode())
-            digest.update(flat.view(torch.uint8).numpy().tobytes())
-        return digest.hexdigest()
+        return state_sha256(self.policy)
 
     def _plan_batch(
         self, states: Sequence[LeRobotState], inputs: Sequence[PolicyInput]

@@ -3,7 +3,6 @@
 A mini-pi0 is initialised from it; a token is learned in it (SPEC section 4).
 """
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -19,6 +18,7 @@ from vap_core.base.files import write_atomic
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniTowers
 from vap_core.policies.mini_pi0.processor_mini_pi0 import END, encode, vocabulary
+from vap_core.policies.weight_guard import state_sha256
 
 ANSWER = 3
 """Words of the longest answer, END included."""
@@ -115,11 +115,7 @@ class MiniVlm(nn.Module):
 
     def sha256(self) -> str:
         """Checksum of all weights as they stand."""
-        digest = hashlib.sha256()
-        for name, tensor in sorted(self.towers.state_dict().items()):
-            digest.update(name.encode())
-            digest.update(tensor.detach().contiguous().numpy().tobytes())
-        return digest.hexdigest()
+        return state_sha256(self.towers)
 
     def save(self, folder: Path) -> None:
         """Write `folder`: sizes and words as config.json, weights as safetensors in bfloat16."""

@@ -14,12 +14,13 @@ import numpy as np
 from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import simpler, tabletop, vlabench
 from vap_core.simulation.suites.layout import (
-    Area,
     Spot,
+    nearest_m,
     place,
     place_at_random_yaws,
     radius_m,
     scatter,
+    scattered,
 )
 from vap_core.simulation.suites.suite import Suite, Task
 from vap_core.simulation.types import EpisodeRow, Placement
@@ -86,7 +87,7 @@ def _desk(
         grid.append(simpler.DESK.at((i + 0.5) / steps, (j + 0.5) / steps))
     taken = [grid[episode % len(grid)]]
     for i in rng.permutation(len(grid)).tolist():
-        if len(taken) < 3 and _nearest_m(grid[i], taken) > simpler.BESIDE_M:
+        if len(taken) < 3 and nearest_m(grid[i], taken) > simpler.BESIDE_M:
             taken.append(grid[i])
     return tuple(place_at_random_yaws(rng, names, taken))
 
@@ -98,25 +99,20 @@ def _around_the_goal(
     wide = max(map(radius_m, names))
     while True:
         goal, *spots = scatter(rng, simpler.DESK, [0.06, wide, wide, wide], gap_m=0.065)
-        spots.sort(key=lambda spot: _nearest_m(spot, [goal]))
+        spots.sort(key=lambda spot: nearest_m(spot, [goal]))
         edge_m = min(goal[0] - simpler.DESK.x0, simpler.DESK.x1 - goal[0])
-        if _nearest_m(spots[0], [goal]) > simpler.APART_M and edge_m > 0.03:
+        if nearest_m(spots[0], [goal]) > simpler.APART_M and edge_m > 0.03:
             break
     first = spots.pop(episode % 3)
     target, *rivals = place_at_random_yaws(rng, names, [first, *spots])
     return (target, place(task.goal, goal, 0.0), *rivals)
 
 
-def _nearest_m(spot: Spot, spots: list[Spot]) -> float:
-    """The distance to the nearest of `spots`."""
-    return min(float(np.hypot(spot[0] - x, spot[1] - y)) for x, y in spots)
-
-
 def _table(
     rng: np.random.Generator, task: Task, episode: int, names: list[str]
 ) -> tuple[Placement, ...]:
     """Anywhere on vlabench's table."""
-    return _scattered(rng, vlabench.TABLE, names, gap_m=0.05)
+    return scattered(rng, vlabench.TABLE, names, gap_m=0.05)
 
 
 def _tabletop(
@@ -124,24 +120,11 @@ def _tabletop(
 ) -> tuple[Placement, ...]:
     """Anywhere on the desk of the SO-101, or within its reach beside the bowl."""
     if not task.goal:
-        return _scattered(rng, tabletop.TABLE, names, gap_m=0.035)
+        return scattered(rng, tabletop.TABLE, names, gap_m=0.035)
     bowl = tabletop.BOWLS[episode % 2]
     fixed = [(bowl, radius_m(task.goal) / np.sqrt(2))]
-    target, *rivals = _scattered(rng, tabletop.REACH, names, gap_m=0.03, fixed=fixed)
+    target, *rivals = scattered(rng, tabletop.REACH, names, gap_m=0.03, fixed=fixed)
     return (target, place(task.goal, bowl, 0.0), *rivals)
-
-
-def _scattered(
-    rng: np.random.Generator,
-    area: Area,
-    names: list[str],
-    gap_m: float,
-    fixed: list[tuple[Spot, float]] | None = None,
-) -> tuple[Placement, ...]:
-    """The objects anywhere in an area, so far apart, and as far from what is fixed."""
-    radii = list(map(radius_m, names))
-    spots = scatter(rng, area, radii, fixed=fixed or [], gap_m=gap_m)
-    return tuple(place_at_random_yaws(rng, names, spots))
 
 
 LAYOUTS: Mapping[str, tuple[Layout, int]] = {

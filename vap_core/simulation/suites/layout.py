@@ -85,6 +85,25 @@ def place_at_random_yaws(
     return placements
 
 
+def scattered(
+    rng: np.random.Generator,
+    area: Area,
+    models: Sequence[str],
+    *,
+    gap_m: float,
+    fixed: Sequence[tuple[Spot, float]] = (),
+) -> tuple[Placement, ...]:
+    """Each model anywhere in an area at a random yaw; distances as in `scatter`."""
+    radii = list(map(radius_m, models))
+    spots = scatter(rng, area, radii, fixed=fixed, gap_m=gap_m)
+    return tuple(place_at_random_yaws(rng, models, spots))
+
+
+def nearest_m(spot: Spot, spots: Sequence[Spot]) -> float:
+    """The distance to the nearest of `spots`."""
+    return min(float(np.hypot(spot[0] - x, spot[1] - y)) for x, y in spots)
+
+
 def draw_lookalikes(rng: np.random.Generator, stem: str, n: int = 2) -> list[str]:
     """The names of `n` of the personal object's look-alikes, drawn without repeats."""
     names = [model.name for model in objects.lookalikes(stem)]

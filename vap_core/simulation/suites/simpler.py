@@ -15,8 +15,8 @@ import numpy as np
 from vap_core.simulation.assets import objects
 from vap_core.simulation.suites.layout import (
     Area,
-    Spot,
     draw_lookalikes,
+    nearest_m,
     place,
     place_at_random_yaws,
     radius_m,
@@ -160,16 +160,10 @@ def _pick(task: Task, turn: int, cell: int) -> tuple[Placement, ...]:
         grid.append(DESK.at(i / (GRID - 1), j / (GRID - 1)))
     taken = [grid[cell]]
     for i in rng.permutation(len(grid)).tolist():
-        if len(taken) < 3 and _nearest_m(grid[i], taken) > BESIDE_M:
+        if len(taken) < 3 and nearest_m(grid[i], taken) > BESIDE_M:
             taken.append(grid[i])
     target = place(task.personal, grid[cell], yaw)
     return (target, *place_at_random_yaws(rng, draw_lookalikes(rng, task.stem), taken[1:]))
-
-
-def _nearest_m(spot: Spot, spots: Sequence[Spot]) -> float:
-    """The distance to the nearest of `spots`."""
-    distances = np.array(spots) - spot
-    return float(np.hypot(distances[:, 0], distances[:, 1]).min())
 
 
 def _near(task: Task, layout: int) -> tuple[Placement, ...]:

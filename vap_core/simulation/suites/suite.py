@@ -3,6 +3,7 @@
 This module loads no simulator.
 """
 
+from collections.abc import Callable
 from typing import Literal
 
 from vap_core.base.errors import one_of
@@ -85,3 +86,13 @@ class Suite:
             variant=variant,
             cameras=self.cameras,
         )
+
+    def rows_of(
+        self, episodes: int, placements: Callable[[Task, int], tuple[Placement, ...]]
+    ) -> tuple[EpisodeRow, ...]:
+        """So many episodes of every task; `placements` are those of a task's i-th episode."""
+        rows = []
+        for task in self.tasks:
+            for i in range(episodes):
+                rows.append(self.row(task, i, placements(task, i)))
+        return tuple(rows)

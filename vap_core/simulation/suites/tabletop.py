@@ -12,9 +12,8 @@ from vap_core.simulation.suites.layout import (
     Spot,
     draw_lookalikes,
     place,
-    place_at_random_yaws,
     radius_m,
-    scatter,
+    scattered,
 )
 from vap_core.simulation.suites.suite import Suite, Task
 from vap_core.simulation.types import EpisodeRow, Placement
@@ -68,11 +67,7 @@ EPISODES = 20
 
 def rows() -> tuple[EpisodeRow, ...]:
     """All 8 x 20 episodes."""
-    episodes = []
-    for task in TABLETOP.tasks:
-        for i in range(EPISODES):
-            episodes.append(TABLETOP.row(task, i, _placements(task, i)))
-    return tuple(episodes)
+    return TABLETOP.rows_of(EPISODES, _placements)
 
 
 def _placements(task: Task, episode: int) -> tuple[Placement, ...]:
@@ -88,7 +83,5 @@ def _placements(task: Task, episode: int) -> tuple[Placement, ...]:
         gap_m = 0.03
         fixed = [(bowl, radius_m(BOWL) / np.sqrt(2))]
         goal = [place(BOWL, bowl, 0.0)]
-    radii = list(map(radius_m, names))
-    spots = scatter(rng, area, radii, fixed=fixed, gap_m=gap_m)
-    target, *lookalikes = place_at_random_yaws(rng, names, spots)
+    target, *lookalikes = scattered(rng, area, names, gap_m=gap_m, fixed=fixed)
     return (target, *goal, *lookalikes)

@@ -5,13 +5,7 @@ The personal object is selected by touching it; three cameras, joint control.
 
 import numpy as np
 
-from vap_core.simulation.suites.layout import (
-    Area,
-    draw_lookalikes,
-    place_at_random_yaws,
-    radius_m,
-    scatter,
-)
+from vap_core.simulation.suites.layout import Area, draw_lookalikes, scattered
 from vap_core.simulation.suites.suite import Suite, Task
 from vap_core.simulation.types import EpisodeRow, Placement
 
@@ -47,16 +41,10 @@ EPISODES = 50
 
 def rows() -> tuple[EpisodeRow, ...]:
     """All 5 x 50 episodes."""
-    episodes = []
-    for task in VLABENCH.tasks:
-        for i in range(EPISODES):
-            episodes.append(VLABENCH.row(task, i, _placements(task, i)))
-    return tuple(episodes)
+    return VLABENCH.rows_of(EPISODES, _placements)
 
 
 def _placements(task: Task, episode: int) -> tuple[Placement, ...]:
     rng = np.random.default_rng([51, *task.name.encode(), episode])
     names = [task.personal, *draw_lookalikes(rng, task.stem)]
-    radii = list(map(radius_m, names))
-    spots = scatter(rng, TABLE, radii, gap_m=0.05)
-    return tuple(place_at_random_yaws(rng, names, spots))
+    return scattered(rng, TABLE, names, gap_m=0.05)

@@ -288,16 +288,6 @@ def stage_file(folder: Path, suite_name: str, seed: int, number: int) -> Path:
     return folder / f"{suite_name}-{seed}-{number:05d}.npz"
 
 
-def cost_s(folder: Path, suite_name: str, seed: int, number: int) -> float:
-    """CPU seconds that a stage in `folder` took to film.
-
-    Raises: BadOutput when its file is absent or damaged.
-    """
-    path = stage_file(folder, suite_name, seed, number)
-    with kept_arrays(path, "train") as arrays:
-        return float(arrays["cpu_s"])
-
-
 def _spots(
     rng: np.random.Generator, area: Area, loose: Sequence[str], fixed: Mapping[str, Spot]
 ) -> list[Spot]:

@@ -137,7 +137,6 @@ def stage(
     *,
     held_out: bool = False,
     views: int = VIEWS,
-    size: int = SIZE,
     look: Look = draw_style,
 ) -> Shots:
     """Render one stage, in a room that `look` draws."""
@@ -146,7 +145,7 @@ def stage(
     robot = sorted(robots.ROBOTS)[int(rng.integers(len(robots.ROBOTS)))]
     with (
         scenes.build(robot, models, style=look(rng)) as scene,
-        mujoco.Renderer(scene.model, size, size) as renderer,
+        mujoco.Renderer(scene.model, SIZE, SIZE) as renderer,
     ):
         data = mujoco.MjData(scene.model)
         rgb: list[np.ndarray] = []
@@ -253,16 +252,6 @@ def stage_file(folder: Path, seed: int, number: int, held_out: bool) -> Path:
     """The file of a stage."""
     kind = "held" if held_out else "train"
     return folder / f"{kind}-{seed}-{number:05d}.npz"
-
-
-def cost_s(folder: Path, seed: int, number: int, held_out: bool) -> float:
-    """CPU seconds that a stage in `folder` took to render.
-
-    Raises: BadOutput when its file is absent or damaged.
-    """
-    path = stage_file(folder, seed, number, held_out)
-    with kept_arrays(path, "train") as file:
-        return float(file["cpu_s"])
 
 
 def boxes_of(

@@ -26,6 +26,7 @@ from vap_core.training.films.scenes import POSES, Shots, boxes_of
 from vap_core.training.perception.fitting import Run, fit, half_precision
 
 BATCH = 16
+N_NEGATIVES = 16
 Objects = list[tuple[str, np.ndarray]]
 """Category and box, `x0 y0 x1 y1` in cells, of every object in a view."""
 
@@ -182,20 +183,20 @@ def giou_loss(
 
 
 def sample_phrases(
-    rng: np.random.Generator, categories: Sequence[str], negatives: int = 16
+    rng: np.random.Generator, categories: Sequence[str]
 ) -> tuple[list[str | None], Float32[np.ndarray, "p 384"]]:
-    """One phrase per category and some that name nothing: what each names, and its embedding.
+    """One phrase per category and N_NEGATIVES that name nothing.
 
-    The embeddings carry a little noise.
+    What each names, and its embedding, which carries a little noise.
 
     Raises: MissingWeights, as `embed_text`.
     """
     asked: list[str | None] = [*categories]
-    asked += [None] * negatives
+    asked += [None] * N_NEGATIVES
     phrases = []
     for category in categories:
         phrases.append(str(rng.choice(training_phrases(category))))
-    for phrase in rng.choice(NEGATIVES, negatives, replace=False):
+    for phrase in rng.choice(NEGATIVES, N_NEGATIVES, replace=False):
         phrases.append(str(phrase))
     noise = rng.normal(0, 0.01, (len(phrases), 384)).astype(np.float32)
     rows = embed_text(phrases) + noise

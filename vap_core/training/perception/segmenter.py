@@ -27,15 +27,16 @@ from vap_core.training.perception.detector import augment
 from vap_core.training.perception.fitting import Run, fit, half_precision
 
 BATCH = 16
+LEAST_PX = 80
 GRID = 28
 """Cells of the tracker's grid along the longer side."""
 
 
-def crops_of(shots: Shots, least_px: int = 80) -> list[tuple[int, int]]:
-    """View and object of everything with enough visible pixels to be worth a mask."""
+def crops_of(shots: Shots) -> list[tuple[int, int]]:
+    """View and object of everything with at least LEAST_PX visible pixels."""
     crops = []
     for v, ids in enumerate(shots.ids):
-        for i, _ in boxes_of(ids, len(shots.names), least_px):
+        for i, _ in boxes_of(ids, len(shots.names), LEAST_PX):
             crops.append((v, i))
     return crops
 

@@ -41,7 +41,6 @@ AFTERWARDS = 0.15
 NEAR_M = 0.02
 """A hand that is nearer to its target than to any rival by this much gives its choice away."""
 Form = Literal["coloured", "described", "learned", "plain"]
-FORMS: tuple[Form, ...] = ("coloured", "described", "learned", "plain")
 Embedding = Float32[np.ndarray, " d"]
 
 

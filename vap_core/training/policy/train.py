@@ -32,9 +32,9 @@ from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import suite
 from vap_core.training.films.captions import captions
 from vap_core.training.films.dataset import about, data_sha256, read, shoot_stages
-from vap_core.training.films.demonstrations import SIDE, Film, cached, cost_s
+from vap_core.training.films.demonstrations import SIDE, Film, cached, stage_file
 from vap_core.training.films.scenes import CACHE, only_generic
-from vap_core.training.folder import training_folder
+from vap_core.training.folder import cost_s, training_folder
 from vap_core.training.patches import model_options
 from vap_core.training.policy.ahead import Ahead
 from vap_core.training.policy.batches import Frames, statistics
@@ -139,7 +139,7 @@ def load_films(
     for stage in range(recipe.stages):
         part = held_out if _is_held_out(stage) else films
         part += cached(folder, recipe.suite, recipe.seed, stage)
-        spent_s += cost_s(folder, recipe.suite, recipe.seed, stage)
+        spent_s += cost_s(stage_file(folder, recipe.suite, recipe.seed, stage))
     return Films(films, held_out, spent_s)
 
 

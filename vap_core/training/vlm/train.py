@@ -34,8 +34,8 @@ from vap_core.simulation.assets.objects import get_object
 from vap_core.training.films.captions import captions
 from vap_core.training.films.demonstrations import SIDE, small
 from vap_core.training.films.looks import draw_look
-from vap_core.training.films.scenes import CACHE, Shots, cached, cost_s, only_generic, stage_file
-from vap_core.training.folder import reading_kept, training_folder
+from vap_core.training.films.scenes import CACHE, Shots, cached, only_generic, stage_file
+from vap_core.training.folder import cost_s, reading_kept, training_folder
 from vap_core.training.patches import PatchScores, model_options, patch_loss, patch_shares
 from vap_core.training.recipe import Sizes
 from vap_core.training.step import Figures, Schedule, average_of, train_steps
@@ -126,7 +126,7 @@ def views(
     for number in range(stages):
         shots = cached(folder, seed, number, held_out=held_out, look=draw_look)
         only_generic([get_object(name) for name in shots.names])
-        spent_s += cost_s(folder, seed, number, held_out)
+        spent_s += cost_s(stage_file(folder, seed, number, held_out))
         pictures = zip(shots.rgb, shots.ids, strict=True)
         portraits = zip(shots.portraits[::2], shots.portrait_ids[::2], strict=True)
         for rgb, ids in chain(pictures, portraits):

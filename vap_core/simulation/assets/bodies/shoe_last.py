@@ -67,8 +67,9 @@ class Last:
         """One point of the hull."""
         return self.surface(np.array([s]), np.array([lift]), raised)[0]
 
-    def hull_mesh(self, swatch: int, columns: int = 13, rows: int = 6) -> Mesh:
+    def hull_mesh(self, swatch: int, rows: int = 6) -> Mesh:
         """The whole hull; decorated, either side shows the whole decoration."""
+        columns = 13
         s = (1 - np.cos(np.linspace(0.0, np.pi, columns))) / 2
         down = np.broadcast_to(np.linspace(1, 0, rows)[:, None], (rows, columns))
         near = self.surface(s[None], np.linspace(-1, 0, rows)[:, None])

@@ -17,12 +17,12 @@ SIDE = 256
 Paint = Callable[[np.random.Generator, list[Srgb]], Rgb]
 
 
-def draw_colours(rng: np.random.Generator, count: int = 4) -> list[Srgb]:
-    """Saturated colours, well apart in hue."""
+def draw_colours(rng: np.random.Generator) -> list[Srgb]:
+    """Four saturated colours, well apart in hue."""
     start = rng.uniform()
     colours = []
-    for i in range(count):
-        hue = (start + i / count + rng.uniform(-0.04, 0.04)) % 1
+    for i in range(4):
+        hue = (start + i / 4 + rng.uniform(-0.04, 0.04)) % 1
         rgb = colorsys.hsv_to_rgb(hue, rng.uniform(0.55, 0.9), rng.uniform(0.45, 0.95))
         red, green, blue = (round(255 * channel) for channel in rgb)
         colours.append((red, green, blue))

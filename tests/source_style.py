@@ -1,13 +1,10 @@
-"""Line lengths, comprehensions and file sizes of the source, beside those of other packages."""
+"""Line lengths, comprehensions and file sizes of source files, and those of other packages."""
 
 import ast
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
-import vap_core
-from vap_core.base.tables import align
 
 ANCHORS = {
     "mink": (82, 0.2, 0.3),
@@ -58,31 +55,3 @@ def measure(paths: list[Path]) -> Style:
         ternaries=ternaries,
         longest_file=longest,
     )
-
-
-def run() -> str:
-    """A row per folder of the package, one for all of it, and one per anchor."""
-    root = Path(vap_core.__file__).parent
-    header = ["", "files", "lines", "p95 of line length", "comprehensions", "ternaries", "longest"]
-    rows = [header]
-    for folder in sorted(root.iterdir()):
-        if folder.is_dir() and folder.name != "__pycache__":
-            rows.append(_row(f"{folder.name}/", sorted(folder.rglob("*.py"))))
-    rows.append(_row("the method", sorted(root.glob("*.py"))))
-    rows.append(_row("vap_core", sorted(root.rglob("*.py"))))
-    for name, (length, comprehensions, ternaries) in ANCHORS.items():
-        rows.append([name, "", "", str(length), f"{comprehensions:.1f}", f"{ternaries:.1f}", ""])
-    return f"{align(rows)}\n\nComprehensions and ternaries are counts per 100 lines."
-
-
-def _row(name: str, paths: list[Path]) -> list[str]:
-    style = measure(paths)
-    return [
-        name,
-        str(len(paths)),
-        str(style.lines),
-        f"{style.line_length_p95:.0f}",
-        f"{style.per_100_lines(style.comprehensions):.1f}",
-        f"{style.per_100_lines(style.ternaries):.1f}",
-        str(style.longest_file),
-    ]
