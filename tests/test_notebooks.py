@@ -24,6 +24,10 @@ INTERVAL = re.compile(r"(-?\d*\.?\d+)(?: %)?(?: points?)? \[(-?\d*\.?\d+), (-?\d
 """A value with its interval: 54 % [44, 64], 7 points [-6, 22], .74 [.52, .94]."""
 ANSWERED_FROM_TABLES = ("05_learned_token.ipynb", "06_attention_maps.ipynb")
 """The notebooks whose first cell quotes what their cells print."""
+WITHOUT_CONSOLE_TEXT = (*ANSWERED_FROM_TABLES, "09_shared_scenes.ipynb")
+"""The notebooks whose conclusions are Markdown, and whose long outputs are tables."""
+STREAM_LIMIT = 112
+"""A page of 1,100 pixels has so many characters in a line of code."""
 
 
 def markdown(path: Path) -> dict[str, str]:
@@ -97,6 +101,7 @@ def printed(notebook: dict[str, Any]) -> str:
         for output in cell.get("outputs", []):
             parts += output.get("text", [])
             parts += output.get("data", {}).get("text/plain", [])
+            parts += output.get("data", {}).get("text/markdown", [])
     return "".join(parts)
 
 
@@ -127,6 +132,15 @@ def test_the_first_screen_quotes_what_the_cells_print(name: str) -> None:
     answer = "".join(notebook["cells"][0]["source"])
     assert len(intervals(answer)) > 5
     assert unprinted(answer, printed(notebook)) == []
+
+
+@pytest.mark.parametrize("name", WITHOUT_CONSOLE_TEXT)
+def test_no_printed_line_is_broken_on_a_page(name: str) -> None:
+    for cell in READ[NOTEBOOKS / name]["cells"]:
+        for output in cell.get("outputs", []):
+            if output["output_type"] == "stream":
+                for line in "".join(output["text"]).splitlines():
+                    assert len(line) <= STREAM_LIMIT, (cell["id"], line)
 
 
 def test_links_are_written_once_and_follow_a_new_notebook(tmp_path: Path) -> None:
