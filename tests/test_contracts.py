@@ -108,6 +108,23 @@ class Paints:
     def steps(self, *_: Any) -> Any: ...
 
 
+class PaintsLater:
+    """Writes into what it is given from the second step on."""
+
+    needs_truth = "never"
+    highlights = False
+    references: dict = {}  # noqa: RUF012
+
+    def start(self, observation: Any, context: PromptContext) -> Any:
+        return None, unchanged(observation.images, context.instruction)
+
+    def steps(self, states: Any, observations: Any, contexts: Any) -> Any:
+        for observation in observations:
+            for image in observation.images.values():
+                image[:20, :20] = 255, 0, 0
+        return [self.start(*seen) for seen in zip(observations, contexts, strict=True)]
+
+
 class Wild(Random):
     """Other actions in every episode that it ever runs."""
 
@@ -123,9 +140,10 @@ def test_boxes_outside_the_image_are_found(scene: RenderedScene) -> None:
         test_detector.test_every_image_has_its_boxes_inside_it_best_first(Outside(), scene)
 
 
-def test_a_prompter_that_paints_in_place_is_found() -> None:
+@pytest.mark.parametrize("make", [Paints, PaintsLater])
+def test_a_prompter_that_paints_in_place_is_found(make: Callable[[], Prompter[Any]]) -> None:
     with pytest.raises(AssertionError):
-        test_prompter.test_what_it_is_given_stays_as_it_was(Paints(), WHERE)
+        test_prompter.test_what_it_is_given_stays_as_it_was(make(), WHERE)
 
 
 def test_randomness_of_its_own_is_found() -> None:

@@ -111,6 +111,33 @@ def test_a_prompter_that_errs_in_batches_alone_is_asked_one_by_one(trial: Trial)
     assert [episode.outcome.status for episode in episodes] == ["failure"] * 3
 
 
+def paint(results: list[Result], i: int) -> list[Result]:
+    for image in results[i][1].images.values():
+        image[:] = 0
+    return results
+
+
+def painted(results: list[Result], i: int) -> list[Result]:
+    """On copies."""
+    state, attended = results[i]
+    images = {name: np.zeros_like(image) for name, image in attended.images.items()}
+    return [*results[:i], (state, replace(attended, images=images)), *results[i + 1 :]]
+
+
+def test_a_prompter_cannot_write_into_what_it_is_given(trial: Trial) -> None:
+    """The recording shows what the cameras saw. It may paint copies."""
+    one, bad, other = rollout(replace(trial, prompter=Faulty(paint)), ROWS, batch=3)
+    statuses = [each.outcome.status for each in (one, bad, other)]
+    assert statuses == ["failure", "error", "failure"]
+    assert "read-only" in bad.outcome.detail.strip().splitlines()[-1]
+    good = replace(trial, prompter=Faulty(painted))
+    _, episode, _ = rollout(good, ROWS, batch=3, keep_images=True)
+    assert episode.outcome.status == "failure"
+    last = episode.frames[-1]
+    assert all(image.any() for image in last.images.values())
+    assert not any(image.any() for image in last.prompted.values())
+
+
 def test_the_number_of_episodes_is_in_the_message() -> None:
     line = "prompter Faulty: steps returned 0 results for 2 episodes; return one for each"
     with pytest.raises(ValueError, match=line):

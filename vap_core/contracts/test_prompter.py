@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from vap_core.base.types import Attended
+from vap_core.base.types import Attended, Views
 from vap_core.contracts.given import short_rows
 from vap_core.rollout.prompters.protocol import PromptContext, Prompter, SceneTruth
 from vap_core.simulation.env import Env
@@ -49,6 +49,10 @@ def check_same(one: Attended, other: Attended) -> None:
         assert np.array_equal(image, other.images[name])
 
 
+def copies(images: Views) -> Views:
+    return {name: image.copy() for name, image in images.items()}
+
+
 def test_it_says_what_it_reads_and_whether_it_highlights(prompter: Prompter[Any]) -> None:
     assert prompter.needs_truth in ("never", "start", "always")
     assert isinstance(prompter.highlights, bool)
@@ -64,11 +68,14 @@ def test_every_step_has_a_text_and_images_that_fit(prompter: Prompter[Any], wher
 
 
 def test_what_it_is_given_stays_as_it_was(prompter: Prompter[Any], where: str) -> None:
-    (observation, context), _ = two_steps(prompter, where)[0]
-    before = {name: image.copy() for name, image in observation.images.items()}
-    prompter.start(observation, context)
-    for name, image in observation.images.items():
-        assert np.array_equal(image, before[name])
+    """At the first step and at the next."""
+    first, second = two_steps(prompter, where)[0]
+    before = [copies(seen.images) for seen, _ in (first, second)]
+    state, _ = prompter.start(*first)
+    prompter.steps([state], [second[0]], [second[1]])
+    for (seen, _), images in zip((first, second), before, strict=True):
+        for name, image in seen.images.items():
+            assert np.array_equal(image, images[name])
 
 
 def test_a_batch_equals_one_by_one(prompter: Prompter[Any], where: str) -> None:

@@ -235,7 +235,7 @@ def _start_prompting(trial: Trial, episode: RunningEpisode, observation: Observa
         return unchanged(observation.images, episode.goal.instruction)
     context = _context(trial, episode)
     with _timed(episode.seconds, "attend"):
-        state, attended = trial.prompter.start(observation, context)
+        state, attended = trial.prompter.start(_shown(observation), context)
     episode.prompter_state = state
     episode.prompting = True
     return attended
@@ -281,10 +281,15 @@ def _call_prompter(
     contexts = []
     for episode in following:
         states.append(episode.prompter_state)
-        images.append(observations[id(episode)])
+        images.append(_shown(observations[id(episode)]))
         contexts.append(_context(trial, episode))
     returned = trial.prompter.steps(states, images, contexts)
     return checked_steps(returned, trial.prompter, len(following))
+
+
+def _shown(observation: Observation) -> Observation:
+    """What the prompter sees. It cannot write: the recording shows what the cameras saw."""
+    return Observation(_locked(observation.images), _read_only(observation.state))
 
 
 def _context(trial: Trial, episode: RunningEpisode) -> PromptContext:
@@ -419,8 +424,12 @@ def _call_policy(
 
 def _policy_input(images: Views, text: str, state: np.ndarray) -> PolicyInput:
     """What the policy reads. It cannot write: the recording shows what the prompter made."""
-    views = {name: _read_only(rgb) for name, rgb in images.items()}
-    return PolicyInput(views, text, _read_only(state))
+    return PolicyInput(_locked(images), text, _read_only(state))
+
+
+def _locked(images: Views) -> Views:
+    """The images, read-only."""
+    return {name: _read_only(rgb) for name, rgb in images.items()}
 
 
 def _read_only(array: np.ndarray) -> np.ndarray:
