@@ -11,6 +11,7 @@ import pytest
 import typer
 
 from tests.pages import FENCE, PAGES, ROOT, blocks, commands, spans
+from tests.test_notebooks import anchors as headings
 from tests.test_stills import COMMITTED
 from vap_core.cli import app
 from vap_core.contracts import plugin
@@ -46,6 +47,22 @@ def test_readme_is_short() -> None:
     assert len(PAGES["README.md"].split()) <= WORDS
 
 
+def test_readme_leads_to_the_notebooks_that_its_steps_open() -> None:
+    linked = set(LINK.findall(PAGES["README.md"]))
+    assert {
+        "notebooks/00_tour.ipynb",
+        "notebooks/02_grounding_inspection.ipynb",
+        "notebooks/00_tour.ipynb#All-notebooks",
+    } <= linked
+    assert "`notebooks/" not in PAGES["README.md"], "a name that is no link"
+
+
+def test_the_methods_of_the_first_figure_are_named_below_it() -> None:
+    result = PAGES["README.md"].split("## Result")[1].split("## Start")[0]
+    for method in ("generic", "hard-short", "hard-long", "soft", "oracle-mask", "wrong-mask"):
+        assert method in result, method
+
+
 def test_readme_names_every_page() -> None:
     linked = set(LINK.findall(PAGES["README.md"]))
     for page in PAGES:
@@ -61,7 +78,9 @@ def test_links_lead_somewhere(page: str) -> None:
         path, _, anchor = link.partition("#")
         target = (ROOT / page).parent / path if path else ROOT / page
         assert target.exists(), link
-        if anchor:
+        if anchor and target.suffix == ".ipynb":
+            assert anchor in headings(target), link
+        elif anchor:
             assert anchor in anchors(target.read_text()), link
 
 

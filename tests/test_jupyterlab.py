@@ -14,12 +14,9 @@ import pytest
 from PIL import Image
 
 from tests import browser
-from vap_core.analysis.plots import small_jpeg
 from vap_core.recording.viewer import free_port
 
 ROOT = Path(__file__).resolve().parents[1]
-STILL = ROOT / "figures" / "00_tour_jupyterlab.jpg"
-"""The last page of the test; delete it to have it taken again."""
 pytestmark = [
     pytest.mark.sweep,
     pytest.mark.skipif(not browser.available(), reason=browser.MISSING),
@@ -159,5 +156,3 @@ def test_the_tour_runs_its_viewer_draws_and_a_control_answers(lab: str, tmp_path
         shot = page.screenshot()
     picture = Image.open(BytesIO(shot)).convert("RGB")
     assert picture.size == browser.SIZE
-    if not STILL.exists():
-        STILL.write_bytes(small_jpeg(picture, 200_000))

@@ -69,6 +69,14 @@ def test_the_map_holds_every_notebook() -> None:
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_the_first_cell_answers_its_question(path: Path) -> None:
+    """The map quotes the question, where "below the next cell" has no meaning."""
+    first = "".join(READ[path]["cells"][0]["source"])
+    assert "**Answer.**" in first
+    assert "below the next cell" not in first
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
 def test_a_notebook_leads_to_its_neighbours(path: Path) -> None:
     cells = markdown(path)
     line = notebook_links.links_text(path, TITLES)

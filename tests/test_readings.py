@@ -199,7 +199,7 @@ def test_the_docs_count_the_published_readings() -> None:
     assert counted == expected
     assert (
         "simpler-bridge read its list in 7 runs (83 readings of 52 methods and arms), and in one with "
-        "a red look-alike (3 of 3), that of vlabench in 3 runs (13 of 13), that of simpler-fractal in "
+        "a red look-alike (3 of 3). That of vlabench did in 3 runs (13 of 13), that of simpler-fractal in "
         "13 runs (60 of 51;"
     ) in text
     wide = fingerprint(SHIPPED / "mini-pi0-simpler-bridge-wide")
