@@ -125,6 +125,25 @@ class PaintsLater:
         return [self.start(*seen) for seen in zip(observations, contexts, strict=True)]
 
 
+class ReadsLater:
+    """Says that it reads the simulator at the start, and reads it at every step."""
+
+    needs_truth = "start"
+    highlights = False
+    references: dict = {}  # noqa: RUF012
+
+    def start(self, observation: Any, context: PromptContext) -> Any:
+        assert context.truth is not None
+        return None, unchanged(observation.images, context.truth.row.instruction)
+
+    def steps(self, states: Any, observations: Any, contexts: Any) -> Any:
+        return [self.start(*seen) for seen in zip(observations, contexts, strict=True)]
+
+
+class ReadsAlways(ReadsLater):
+    needs_truth = "always"
+
+
 class Wild(Random):
     """Other actions in every episode that it ever runs."""
 
@@ -144,6 +163,18 @@ def test_boxes_outside_the_image_are_found(scene: RenderedScene) -> None:
 def test_a_prompter_that_paints_in_place_is_found(make: Callable[[], Prompter[Any]]) -> None:
     with pytest.raises(AssertionError):
         test_prompter.test_what_it_is_given_stays_as_it_was(make(), WHERE)
+
+
+def test_a_prompter_that_reads_more_than_it_says_is_found() -> None:
+    with pytest.raises(AssertionError):
+        test_prompter.test_every_step_has_a_text_and_images_that_fit(ReadsLater(), WHERE)
+    kept(test_prompter, prompter=ReadsAlways(), where=WHERE)
+
+
+def test_the_truth_of_a_step_has_its_number() -> None:
+    for first, second in test_prompter.two_steps(ReadsAlways(), WHERE):
+        truths = [context.truth for _, context in (first, second)]
+        assert [truth and truth.step for truth in truths] == [0, 1]
 
 
 def test_randomness_of_its_own_is_found() -> None:

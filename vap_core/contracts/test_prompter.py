@@ -14,12 +14,13 @@ from vap_core.simulation.types import Observation
 Step = tuple[Observation, PromptContext]
 
 
-def step_of(prompter: Prompter[Any], env: Env) -> Step:
-    """What a prompter is given at this moment."""
+def step_of(prompter: Prompter[Any], env: Env, number: int) -> Step:
+    """What a rollout gives a prompter at this control step: of the truth only what it declares."""
     cameras = {camera.name: camera for camera in env.cameras()}
     truth = None
-    if prompter.needs_truth != "never":
-        truth = SceneTruth(env.row, env.truth(masks=True).masks)
+    needs = prompter.needs_truth
+    if needs == "always" or (needs == "start" and number == 0):
+        truth = SceneTruth(env.row, env.truth(masks=True).masks, step=number)
     return env.observe(), PromptContext(env.row.instruction, cameras, truth)
 
 
@@ -28,9 +29,9 @@ def two_steps(prompter: Prompter[Any], where: str) -> list[tuple[Step, Step]]:
     found = []
     for row in short_rows(where, steps=2):
         with open_row(row) as env:
-            first = step_of(prompter, env)
+            first = step_of(prompter, env, 0)
             env.step(np.zeros(env.action_size, np.float32))
-            found.append((first, step_of(prompter, env)))
+            found.append((first, step_of(prompter, env, 1)))
     return found
 
 
