@@ -159,6 +159,35 @@ def test_boxes_outside_the_image_are_found(scene: RenderedScene) -> None:
         test_detector.test_every_image_has_its_boxes_inside_it_best_first(Outside(), scene)
 
 
+class RandomScores:
+    """Another score with every call."""
+
+    def __call__(self, images: list, phrase: str, threshold: float | None = None) -> list[Boxes]:
+        found = []
+        for _ in images:
+            score = np.random.rand(1).astype(np.float32)  # noqa: NPY002
+            found.append(Boxes(np.array([[9, 9, 30, 30]], np.float32), score, phrase))
+        return found
+
+
+class NothingAlone:
+    """Finds a box in a batch, none in a single picture."""
+
+    def __call__(self, images: list, phrase: str, threshold: float | None = None) -> list[Boxes]:
+        if len(images) == 1:
+            return [Boxes.empty(phrase)]
+        one = Boxes(np.array([[9, 9, 30, 30]], np.float32), np.ones(1, np.float32), phrase)
+        return [one for _ in images]
+
+
+@pytest.mark.parametrize("make", [RandomScores, NothingAlone])
+def test_boxes_that_depend_on_the_call_are_found(
+    make: Callable[[], Any], scene: RenderedScene
+) -> None:
+    with pytest.raises(AssertionError):
+        test_detector.test_a_batch_equals_one_by_one_and_repeats_its_bits(make(), scene)
+
+
 @pytest.mark.parametrize("make", [Paints, PaintsLater])
 def test_a_prompter_that_paints_in_place_is_found(make: Callable[[], Prompter[Any]]) -> None:
     with pytest.raises(AssertionError):
