@@ -16,7 +16,7 @@ import pytest
 from tests.contract import kept
 from vap_core.attend import Attender
 from vap_core.base.errors import UnknownName
-from vap_core.base.types import Boxes
+from vap_core.base.types import Boxes, Track
 from vap_core.contracts import (  # fmt: skip
     given,
     test_detector,
@@ -204,6 +204,45 @@ def test_the_truth_of_a_step_has_its_number() -> None:
     for first, second in test_prompter.two_steps(ReadsAlways(), WHERE):
         truths = [context.truth for _, context in (first, second)]
         assert [truth and truth.step for truth in truths] == [0, 1]
+
+
+class Stacks:
+    """Takes all views as one array."""
+
+    def start(self, images: list, masks: list) -> list:
+        np.stack(images)
+        return [tuple(Track(mask, 1.0) for mask in of_view) for of_view in masks]
+
+    def step(self, states: list, images: list) -> tuple[list, list]:
+        np.stack(images)
+        return list(states), list(states)
+
+
+class Drops:
+    """Leaves out the identities that it is not asked for."""
+
+    def start(self, images: list, masks: list) -> list:
+        return [tuple(Track(mask, 1.0) for mask in of_view) for of_view in masks]
+
+    def start_targets(self, images: list, masks: list, targets: list) -> list:
+        asked = [of_view[list(wanted)] for of_view, wanted in zip(masks, targets, strict=True)]
+        return self.start(images, asked)
+
+    def step(self, states: list, images: list) -> tuple[list, list]:
+        return list(states), list(states)
+
+
+def test_a_tracker_that_wants_views_of_one_size_is_found(scene: RenderedScene) -> None:
+    with pytest.raises(ValueError, match="need at least one array"):
+        test_tracker.test_no_view_has_no_tracks(Stacks())
+    with pytest.raises(ValueError, match="must have the same shape"):
+        test_tracker.test_views_may_differ_in_size(Stacks(), scene)
+
+
+def test_a_tracker_that_moves_the_identities_is_found(scene: RenderedScene) -> None:
+    with pytest.raises(AssertionError):
+        test_tracker.test_the_targets_of_a_view_keep_their_places(Drops(), scene)
+    test_tracker.test_the_targets_of_a_view_keep_their_places(Stacks(), scene)
 
 
 def test_randomness_of_its_own_is_found() -> None:
