@@ -16,7 +16,7 @@ import pytest
 from tests.contract import kept
 from vap_core.attend import Attender
 from vap_core.base.errors import UnknownName
-from vap_core.base.types import Boxes
+from vap_core.base.types import Boxes, Track
 from vap_core.contracts import (  # fmt: skip
     given,
     test_detector,
@@ -159,6 +159,35 @@ def test_boxes_outside_the_image_are_found(scene: RenderedScene) -> None:
         test_detector.test_every_image_has_its_boxes_inside_it_best_first(Outside(), scene)
 
 
+class RandomScores:
+    """Another score with every call."""
+
+    def __call__(self, images: list, phrase: str, threshold: float | None = None) -> list[Boxes]:
+        found = []
+        for _ in images:
+            score = np.random.rand(1).astype(np.float32)  # noqa: NPY002
+            found.append(Boxes(np.array([[9, 9, 30, 30]], np.float32), score, phrase))
+        return found
+
+
+class NothingAlone:
+    """Finds a box in a batch, none in a single picture."""
+
+    def __call__(self, images: list, phrase: str, threshold: float | None = None) -> list[Boxes]:
+        if len(images) == 1:
+            return [Boxes.empty(phrase)]
+        one = Boxes(np.array([[9, 9, 30, 30]], np.float32), np.ones(1, np.float32), phrase)
+        return [one for _ in images]
+
+
+@pytest.mark.parametrize("make", [RandomScores, NothingAlone])
+def test_boxes_that_depend_on_the_call_are_found(
+    make: Callable[[], Any], scene: RenderedScene
+) -> None:
+    with pytest.raises(AssertionError):
+        test_detector.test_a_batch_equals_one_by_one_and_repeats_its_bits(make(), scene)
+
+
 @pytest.mark.parametrize("make", [Paints, PaintsLater])
 def test_a_prompter_that_paints_in_place_is_found(make: Callable[[], Prompter[Any]]) -> None:
     with pytest.raises(AssertionError):
@@ -175,6 +204,45 @@ def test_the_truth_of_a_step_has_its_number() -> None:
     for first, second in test_prompter.two_steps(ReadsAlways(), WHERE):
         truths = [context.truth for _, context in (first, second)]
         assert [truth and truth.step for truth in truths] == [0, 1]
+
+
+class Stacks:
+    """Takes all views as one array."""
+
+    def start(self, images: list, masks: list) -> list:
+        np.stack(images)
+        return [tuple(Track(mask, 1.0) for mask in of_view) for of_view in masks]
+
+    def step(self, states: list, images: list) -> tuple[list, list]:
+        np.stack(images)
+        return list(states), list(states)
+
+
+class Drops:
+    """Leaves out the identities that it is not asked for."""
+
+    def start(self, images: list, masks: list) -> list:
+        return [tuple(Track(mask, 1.0) for mask in of_view) for of_view in masks]
+
+    def start_targets(self, images: list, masks: list, targets: list) -> list:
+        asked = [of_view[list(wanted)] for of_view, wanted in zip(masks, targets, strict=True)]
+        return self.start(images, asked)
+
+    def step(self, states: list, images: list) -> tuple[list, list]:
+        return list(states), list(states)
+
+
+def test_a_tracker_that_wants_views_of_one_size_is_found(scene: RenderedScene) -> None:
+    with pytest.raises(ValueError, match="need at least one array"):
+        test_tracker.test_no_view_has_no_tracks(Stacks())
+    with pytest.raises(ValueError, match="must have the same shape"):
+        test_tracker.test_views_may_differ_in_size(Stacks(), scene)
+
+
+def test_a_tracker_that_moves_the_identities_is_found(scene: RenderedScene) -> None:
+    with pytest.raises(AssertionError):
+        test_tracker.test_the_targets_of_a_view_keep_their_places(Drops(), scene)
+    test_tracker.test_the_targets_of_a_view_keep_their_places(Stacks(), scene)
 
 
 def test_randomness_of_its_own_is_found() -> None:

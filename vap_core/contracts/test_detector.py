@@ -10,6 +10,12 @@ from vap_core.perception.protocols import Detector
 PHRASES = ("cup", "owl statue", "something nobody has named")
 
 
+def assert_same(boxes: Boxes, others: Boxes) -> None:
+    """The same corners and scores, bit for bit."""
+    assert np.array_equal(boxes.xyxy, others.xyxy)
+    assert np.array_equal(boxes.score, others.score)
+
+
 def test_every_image_has_its_boxes_inside_it_best_first(
     detector: Detector, scene: RenderedScene
 ) -> None:
@@ -36,8 +42,13 @@ def test_a_batch_equals_one_by_one_and_repeats_its_bits(
     together = detector(images, "bottle")
     np.random.seed(5)  # noqa: NPY002  (global seeding must change nothing)
     for image, boxes in zip(images, together, strict=True):
-        assert np.allclose(boxes.xyxy, detector([image], "bottle")[0].xyxy, atol=1e-2)
-    assert np.array_equal(together[0].xyxy, together[2].xyxy)
+        (alone,) = detector([image], "bottle")
+        assert len(boxes) == len(alone)
+        assert np.allclose(boxes.xyxy, alone.xyxy, atol=1e-2)
+        assert np.allclose(boxes.score, alone.score, atol=1e-4)
+    assert_same(together[0], together[2])
+    for boxes, again in zip(together, detector(images, "bottle"), strict=True):
+        assert_same(boxes, again)
 
 
 def test_a_higher_threshold_gives_no_more_boxes(detector: Detector, scene: RenderedScene) -> None:

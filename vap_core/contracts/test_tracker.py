@@ -7,7 +7,7 @@ import numpy as np
 from vap_core.base.types import Rgb, Track
 from vap_core.contracts.given import RenderedScene
 from vap_core.perception.boxes import mask_iou
-from vap_core.perception.protocols import Tracker
+from vap_core.perception.protocols import TargetTracker, Tracker
 
 
 def follow(
@@ -40,6 +40,39 @@ def test_every_identity_has_a_track_in_order(tracker: Tracker, scene: RenderedSc
 
 def test_a_view_without_identities_has_no_tracks(tracker: Tracker, scene: RenderedScene) -> None:
     assert follow(tracker, [scene.rgb], [scene.masks[:0]]) == [()]
+
+
+def test_no_view_has_no_tracks(tracker: Tracker) -> None:
+    """Where no view shows a target, nothing is followed."""
+    assert tracker.start([], []) == []
+    states, tracks = tracker.step([], [])
+    assert (list(states), list(tracks)) == ([], [])
+    if isinstance(tracker, TargetTracker):
+        assert tracker.start_targets([], [], []) == []
+
+
+def test_views_may_differ_in_size(tracker: Tracker, scene: RenderedScene) -> None:
+    """In one call; a wrist camera need not be as large as the others."""
+    h, w = scene.rgb.shape[:2]
+    smaller = np.ascontiguousarray(scene.rgb[: h - 16, : w - 32])
+    masks = np.ascontiguousarray(scene.masks[:2, : h - 16, : w - 32])
+    first, second = follow(tracker, [scene.rgb, smaller], [scene.masks[:2], masks])
+    assert_same(first, follow(tracker, [scene.rgb], [scene.masks[:2]])[0])
+    assert_same(second, follow(tracker, [smaller], [masks])[0])
+
+
+def test_the_targets_of_a_view_keep_their_places(tracker: Tracker, scene: RenderedScene) -> None:
+    """Of `start_targets`, where the tracker has it: what is not asked for has no mask."""
+    if not isinstance(tracker, TargetTracker):
+        return
+    n = len(scene.masks)
+    moved = [np.roll(scene.rgb, 2, axis=0)]
+    (tracks,) = tracker.step(tracker.start_targets([scene.rgb], [scene.masks], [[1]]), moved)[1]
+    assert len(tracks) == n
+    assert all(track.mask is None for i, track in enumerate(tracks) if i != 1)
+    states = tracker.start_targets([scene.rgb], [scene.masks], [range(n)])
+    (every,) = tracker.step(states, moved)[1]
+    assert_same(every, follow(tracker, [scene.rgb], [scene.masks])[0])
 
 
 def test_views_are_independent_and_repeat_their_bits(
