@@ -11,7 +11,7 @@ import pytest
 from tests.toys import TOYS, personal, scene
 from vap_core.attend import Attender
 from vap_core.base.errors import BadInstruction, BadMemory, BadOutput, UnknownName
-from vap_core.base.types import PersonalObject
+from vap_core.base.types import Instruction, PersonalObject
 from vap_core.instruction import parse, rewrite
 from vap_core.instruction.context import Context
 from vap_core.instruction.embedding import EmbeddingParser
@@ -190,11 +190,20 @@ BROTHERS = {
 
 def meant_by(kind: str, bank: dict[str, PersonalObject], text: str, speaker: str) -> str:
     """The objects' names that a parser, "rule" or "embedding", finds."""
+    targets = parsed_by(kind, bank, text, speaker).targets
+    return " ".join(recall(bank, target, speaker=speaker).name for target in targets)
+
+
+def rewritten_by(kind: str, bank: dict[str, PersonalObject], text: str, speaker: str) -> str:
+    parsed = parsed_by(kind, bank, text, speaker)
+    return rewrite(parsed, PALETTE[: len(parsed.targets)])
+
+
+def parsed_by(kind: str, bank: dict[str, PersonalObject], text: str, speaker: str) -> Instruction:
     parser = rule_parser(bank)
     if kind == "embedding":
         parser = EmbeddingParser(Context(bank, speaker), embed_text)
-    targets = parser(text, {obj.category for obj in bank.values()}).targets
-    return " ".join(recall(bank, target, speaker=speaker).name for target in targets)
+    return parser(text, {obj.category for obj in bank.values()})
 
 
 @pytest.mark.parametrize("kind", ["rule", "embedding"])
@@ -219,6 +228,36 @@ def test_annas_brother_needs_no_second_name(kind: str) -> None:
 )
 def test_a_shortened_is_names_the_owner(text: str) -> None:
     assert meant_by("embedding", BROTHERS, text, "carl") == "b"
+
+
+HERS = {
+    obj.name: obj
+    for obj in (
+        cup("a", "anna"),
+        cup("b", "ben", "anna's brother"),
+        cup("n", "nils", "neighbour"),
+        cup("pot", category="pot"),
+    )
+}
+
+
+@pytest.mark.parametrize("kind", ["rule", "embedding"])
+@pytest.mark.parametrize(
+    ("text", "name", "rewritten"),
+    [
+        ("give her Ben's cup", "b", "give her the red cup"),
+        ("give her my brother's cup", "b", "give her the red cup"),
+        ("bring her the neighbour's cup", "n", "bring her the red cup"),
+        ("give her my cup", "a", "give her the red cup"),
+        ("give her our pot", "pot", "give her the red pot"),
+        ("bring her neighbour's cup", "n", "bring the red cup"),
+    ],
+)
+def test_her_before_another_owner_is_who_gets_it(
+    kind: str, text: str, name: str, rewritten: str
+) -> None:
+    assert meant_by(kind, HERS, text, "anna") == name
+    assert rewritten_by(kind, HERS, text, "anna") == rewritten
 
 
 def test_two_brothers_are_ambiguous() -> None:

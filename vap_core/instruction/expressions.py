@@ -10,7 +10,7 @@ from functools import cache
 from vap_core.base.types import value
 from vap_core.instruction.context import Context
 from vap_core.instruction.owners import MINE
-from vap_core.instruction.rule import ARTICLE, category_pattern, possessive, spaced
+from vap_core.instruction.rule import ARTICLE, category_pattern, possessive, pronoun, spaced
 
 PLACING = "put|place|set|lay|move|drop|push|stack|store|leave|slide|stand|stow"
 ACTION = (
@@ -205,7 +205,7 @@ def _beginning(people: str) -> re.Pattern[str]:
     owned = rf"(?:{possessive(people)}|{_OWNED})"
     return re.compile(
         r"\b(?:(?P<several>(?:one|some|any) of (?:my|his|her|their|our))"
-        rf"|(?P<owner>(?:my|his|her|their|our)\b(?:\s+(?:[\w-]+\s+)?{_OWNED})?"
+        rf"|(?P<owner>{pronoun(people)}\b(?:\s+(?:[\w-]+\s+)?{_OWNED})?"
         rf"|{owned}(?:\s+[\w-]+['’]s)?)"
         r"|(?P<alone>mine|hers|theirs|ours)"
         r"|(?P<definite>(?:the|that|this|those|these)\b(?!['’])"

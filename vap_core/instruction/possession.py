@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from vap_core.instruction.context import Context
 from vap_core.instruction.expressions import Expression, find_category, person_pattern
 from vap_core.instruction.owners import MINE, OTHERS, fold
-from vap_core.instruction.rule import possessive, spaced
+from vap_core.instruction.rule import possessive, pronoun, spaced
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,10 @@ class Possession:
 
     def _beginning(self, said: str) -> str | None:
         """The owner that an expression begins with: "my", "Anna's", "James'"."""
-        known = possessive(person_pattern(self.context))
+        people = person_pattern(self.context)
+        known = possessive(people)
         pattern = (
-            r"(?:my|his|her|their|our)(?:\s+(?:[\w-]+\s+)?[\w-]+['’]s)?(?=\W|$)"
+            rf"{pronoun(people)}(?:\s+(?:[\w-]+\s+)?[\w-]+['’]s)?(?=\W|$)"
             rf"|mine|hers|theirs|ours|(?:{known}|[\w-]+['’]s)(?:\s+[\w-]+['’]s)?"
         )
         match = re.match(pattern, said, re.IGNORECASE)

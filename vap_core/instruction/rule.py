@@ -20,6 +20,10 @@ OWNER = re.compile(rf"\b(?P<owner>my\s+{_PERSON})", re.IGNORECASE)
 """A possessive trigger: "my cup", or with an owner beside the speaker, "my brother's cup"."""
 ARTICLE = r"(?:the|an?)\s+"
 """What may stand before a person: "the neighbour's cup" is rewritten with its article."""
+DETERMINER = (
+    "my|his|her|their|our|mine|hers|theirs|ours|the|an?|this|that|these|those|some|any|one of"
+)
+"""What an expression begins with that "her" does not belong to."""
 
 
 @runtime_checkable
@@ -112,6 +116,14 @@ def possessive(people: str) -> str:
     return rf"(?:{people})(?:['’]s|(?<=s)['’])"
 
 
+def pronoun(people: str) -> str:
+    """A regular expression for "my" and "her", which begin an object, of one for people.
+
+    In "give her my cup" and "give her Ben's cup" her is who gets it.
+    """
+    return rf"(?:my|his|their|our|her(?!\s+(?:(?:{DETERMINER})\b|{possessive(people)})))"
+
+
 @cache
 def _any_owner(owners: tuple[str, ...]) -> re.Pattern[str]:
     """As OWNER, and "his cup", "Anna's cup", "Anna's brother's cup"; for one of `owners` also
@@ -120,7 +132,7 @@ def _any_owner(owners: tuple[str, ...]) -> re.Pattern[str]:
     longest_first = sorted(owners, key=len, reverse=True)
     names = "|".join(spaced(name).replace("'", "['’]") for name in longest_first)
     return re.compile(
-        rf"\b(?:{ARTICLE})??(?P<owner>(?:my|his|her|their|our|{possessive(names)}"
+        rf"\b(?:{ARTICLE})??(?P<owner>(?:{pronoun(names)}|{possessive(names)}"
         r"|(?!(?:it|that|what|who|where|here|there|let|how)['’])[\w-]+(?:['’][\w-]+)*['’]s)\s+"
         rf"{_PERSON})",
         re.IGNORECASE,
