@@ -140,6 +140,7 @@ def test_a_damaged_log_is_named(logs: tuple[Path, Path]) -> None:
         "first_policy",
         "ten_seeds",
         "second_machine",
+        "another_seed",
         "tint_free",
         "scripted",
         "bounds",

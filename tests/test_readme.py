@@ -301,6 +301,18 @@ def test_what_a_policy_reaches_that_was_made_again() -> None:
     assert f"{_of_way(again, 'vap')} % with VAP and {_of_way(again, 'generic')} without" in PROSE
 
 
+def test_what_another_seed_of_vlabench_reaches() -> None:
+    other, ships = _played("another_seed"), _played("mini_pi0")
+    ships = ships[ships.suite == "vlabench"]
+    ways = ("generic", "hard-short", "hard-long", "soft", "vap")
+    assert other.groupby("method").size().to_dict() == dict.fromkeys(ways, 250)
+    assert set(other.policy).isdisjoint(set(ships.policy))
+    page = PAGES["docs/policy.md"]
+    for name, rows in (("seed 0, the default", ships), ("seed 1", other)):
+        assert f"| {name} | {' | '.join(_of_way(rows, way) for way in ways)} |" in page
+    assert f"{_of_way(other, 'vap')} % with VAP and {_of_way(other, 'generic')} without" in PROSE
+
+
 def _played(name: str) -> pd.DataFrame:
     """The episodes of a published table, none of which ended in an error."""
     played = pd.concat([episodes for _, episodes in read_runs(RESULTS / f"{name}.parquet")])
