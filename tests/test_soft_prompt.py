@@ -10,8 +10,10 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import make_pre_post_processors
 
 from vap_core.base.errors import BadMemory, BadStudy
+from vap_core.contracts import test_suite
 from vap_core.evaluation import engine, trials
 from vap_core.evaluation.jobs import run_job
+from vap_core.evaluation.methods import make_prompter
 from vap_core.evaluation.study import Study
 from vap_core.policies.lerobot.checkpoints import config_field
 from vap_core.policies.mini_pi0 import learned_token, teach_token
@@ -24,6 +26,9 @@ from vap_core.policies.names import SHIPPED
 from vap_core.rollout.prompters.text import TextPrompter, soft_prompt
 from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
+from vap_core.simulation.suites import Suite, wording
+from vap_core.simulation.suites.open_row import build_scene
+from vap_core.simulation.suites.suite import Task
 from vap_core.training.words import vocabulary
 
 SUITE, TASK, STATE, ACTION = "simpler-bridge", "put-camera", 13, 7
@@ -68,6 +73,29 @@ def test_my_cup_becomes_a_word() -> None:
     say = soft_prompt(WORD).rewrite
     assert say("put my camera on the plate") == "put <my_0> on the plate"
     assert say("pick up my straw cup") == "pick up <my_0>"
+
+
+@pytest.mark.parametrize(
+    ("category", "instruction", "read"),
+    [
+        ("cup", "put my cup gently on the plate", "put <my_0> gently on the plate"),
+        ("work of art", "pick up my work of art", "pick up <my_0>"),
+    ],
+)
+def test_the_words_beside_the_object_stay(category: str, instruction: str, read: str) -> None:
+    """The methods of one table read the same command of an own suite."""
+    task = Task(name="own", category=category, instruction=instruction, max_steps=9)
+    wording.check(task)
+    (row,) = suites.rows("widowx-pick", "pick-straw-cup", 1)
+    own = replace(row, category=category, instruction=instruction)
+    scene = build_scene(row.suite, [place.model for place in row.placements])
+    prompter = make_prompter("soft", own, Path("nowhere"), scene, None)
+    scene.close()
+    assert isinstance(prompter, TextPrompter)
+    assert prompter.rewrite(instruction) == read
+    suite = Suite(name="own", robot="wx250s", hz=5.0, cameras=("front",), tasks=(task,))
+    of_category = test_suite.test_every_instruction_has_one_personal_object_of_the_tasks_category
+    of_category(suite)
 
 
 def test_photos_show_the_target_its_look_alikes_and_others() -> None:

@@ -26,7 +26,7 @@ def test_every_instruction_has_one_personal_object_of_the_tasks_category(suite: 
     for task in suite.tasks:
         if suite.name not in shared.SUITES:
             wording.check(task)
-        target, *others = parse(task.instruction).targets
+        target, *others = parse(task.instruction, [task.category]).targets
         assert target.category == task.category, task.name
         assert not others or suite.name in shared.SUITES, task.name
 

@@ -179,7 +179,7 @@ def make_prompter(
         case HardPrompt() as how:
             return hard_prompt(load_bank(bank)[row.target], how)
         case SoftPrompt():
-            return soft_prompt(WORD)
+            return soft_prompt(WORD, _categories(row))
         case OtherCommand(command="blank"):
             return say("")
         case OtherCommand():
@@ -202,8 +202,13 @@ def make_prompter(
 
 def _alike(scene: Scene, row: EpisodeRow) -> frozenset[str]:
     """The scene's objects of the target's category, or of every sub-goal's."""
-    categories = {row.category, *(subgoal.category for subgoal in row.subgoals)}
+    categories = _categories(row)
     return frozenset(name for name in scene.objects if get_object(name).category in categories)
+
+
+def _categories(row: EpisodeRow) -> set[str]:
+    """The target's category, or those of every sub-goal."""
+    return {row.category, *(subgoal.category for subgoal in row.subgoals)}
 
 
 def _next_command(row: EpisodeRow) -> str:

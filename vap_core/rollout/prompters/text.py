@@ -1,6 +1,6 @@
 """Prompters that change words only: the images pass unchanged (P 5.2; SPEC section 4)."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
@@ -101,11 +101,15 @@ def hard_prompt(obj: PersonalObject, how: HardPrompt) -> TextPrompter:
     return TextPrompter(append)
 
 
-def soft_prompt(word: str) -> TextPrompter:
-    """The personal span is replaced: "pick up my cup" -> "pick up <my_0>" for `word` "<my_0>"."""
+def soft_prompt(word: str, categories: Collection[str] = ()) -> TextPrompter:
+    """The personal span is replaced: "pick up my cup" -> "pick up <my_0>" for `word` "<my_0>".
+
+    With the objects' `categories` it is the span that the method replaces; without, it is all words
+    up to the first stop word.
+    """
 
     def replace_span(instruction: str) -> str:
-        target = parse(instruction).targets[0]
+        target = parse(instruction, categories).targets[0]
         return instruction[: target.start] + word + instruction[target.stop :]
 
     return TextPrompter(replace_span)

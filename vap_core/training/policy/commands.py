@@ -112,7 +112,7 @@ def command(film: Film, t: int, recipe: Recipe, known: Known, rng: np.random.Gen
     elif form == "described":
         text = describe_instruction(task, getattr(looks[0], length))
     elif form == "learned":
-        text = soft_prompt(WORD).rewrite(task.instruction)
+        text = soft_prompt(WORD, [task.category]).rewrite(task.instruction)
         embedding = known.learned[names[0]]
     else:
         text = phrase_instruction(task, "", rng)
