@@ -301,6 +301,21 @@ def test_what_a_policy_reaches_that_was_made_again() -> None:
     assert f"{_of_way(again, 'vap')} % with VAP and {_of_way(again, 'generic')} without" in PROSE
 
 
+def test_what_a_policy_that_never_saw_a_tint_does_with_either_half() -> None:
+    halves, whole = _played("tint_free_halves"), _played("tint_free")
+    assert set(halves.policy) < set(whole.policy)
+    assert halves.groupby("method").size().to_dict() == {"mask-only": 250, "rewrite-only": 250}
+    tint, words = (_of_way(halves, way) for way in ("mask-only", "rewrite-only"))
+    assert f"the tint alone has {tint} %, the words alone {words} (" in PROSE
+    generic = whole[(whole.suite == "vlabench") & (whole.method == "generic")]
+    generic = generic.set_index(["task", "episode"]).success.astype(bool)
+    for way, won, lost in (("mask-only", 11, 3), ("rewrite-only", 37, 34)):
+        one = halves[halves.method == way].set_index(["task", "episode"]).success.astype(bool)
+        one, other = one.align(generic, join="inner")
+        assert ((one & ~other).sum(), (~one & other).sum()) == (won, lost)
+    assert "(11 won and 3 lost, 37 and 34; exact p .06 and .81, uncorrected)" in PROSE
+
+
 def test_what_another_seed_of_vlabench_reaches() -> None:
     other, ships = _played("another_seed"), _played("mini_pi0")
     ships = ships[ships.suite == "vlabench"]
