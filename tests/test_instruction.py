@@ -49,6 +49,7 @@ def test_a_compound_of_a_known_category_is_another_category() -> None:
 def test_owner_is_kept() -> None:
     assert parse("bring my brother's cup").targets[0].owner == "my brother's"
     assert parse("bring my old brother's cup").targets[0].category == "cup"
+    assert parse("bring my friend's brother's cup").targets[0].category == "cup"
     assert rewrite(parse("bring my friends' cup"), [RED]) == "bring the red cup"
 
 

@@ -260,6 +260,36 @@ def test_her_before_another_owner_is_who_gets_it(
     assert rewritten_by(kind, HERS, text, "anna") == rewritten
 
 
+@pytest.mark.parametrize("kind", ["rule", "embedding"])
+def test_my_friends_brother_has_a_cup(kind: str) -> None:
+    """He is known as exactly that; another's brother is somebody else."""
+    known = (cup("l", "lea", "friend's brother"), cup("b", "ben", "brother", "carl's brother"))
+    bank = {obj.name: obj for obj in (*known, cup("x"))}
+    for speaker in ("carl", "anna", ""):
+        assert meant_by(kind, bank, "bring my friend's brother's cup", speaker) == "l"
+        text = "put my friend's brother's cup on my brother's cup"
+        assert meant_by(kind, bank, text, speaker) == "l b"
+    assert rewritten_by(kind, bank, "bring my friend’s brother’s cup", "") == "bring the red cup"
+    del bank["l"]
+    with pytest.raises(UnknownName, match='nobody is "my friend\'s brother"; the memory knows ben'):
+        meant_by(kind, bank, "bring my friend's brother's cup", "carl")
+
+
+def test_the_speakers_friends_brother_can_have_her_name() -> None:
+    bank = {obj.name: obj for obj in (cup("l", "lea", "anna's friend's brother"), cup("x"))}
+    assert meant_by("rule", bank, "bring my friend's brother's cup", "anna") == "l"
+    with pytest.raises(UnknownName, match="nobody is"):
+        meant_by("rule", bank, "bring my friend's brother's cup", "carl")
+
+
+@pytest.mark.parametrize("kind", ["rule", "embedding"])
+@pytest.mark.parametrize("whose", ["my", "my brother's", "Ben's"])
+def test_a_part_of_an_object_is_no_further_owner(kind: str, whose: str) -> None:
+    bank = {"b": cup("b", "ben", "brother")}
+    speaker = "ben" if whose == "my" else "anna"
+    assert meant_by(kind, bank, f"bring {whose} cup's lid", speaker) == "b"
+
+
 def test_two_brothers_are_ambiguous() -> None:
     objects = {obj.name: obj for obj in (cup("b", "ben", "brother"), cup("c", "carl", "brother"))}
     (target,) = parse("bring my brother's cup").targets

@@ -205,8 +205,8 @@ def _beginning(people: str) -> re.Pattern[str]:
     owned = rf"(?:{possessive(people)}|{_OWNED})"
     return re.compile(
         r"\b(?:(?P<several>(?:one|some|any) of (?:my|his|her|their|our))"
-        rf"|(?P<owner>{pronoun(people)}\b(?:\s+(?:[\w-]+\s+)?{_OWNED})?"
-        rf"|{owned}(?:\s+[\w-]+['’]s)?)"
+        rf"|(?P<owner>{pronoun(people)}\b(?:\s+(?:[\w-]+\s+)?{_OWNED}(?:\s+{_OWNED})?)?"
+        rf"|{owned}(?:\s+[\w-]+['’]s){{0,2}})"
         r"|(?P<alone>mine|hers|theirs|ours)"
         r"|(?P<definite>(?:the|that|this|those|these)\b(?!['’])"
         r"(?!\s+(?:time|way|you|I|we|he|she|they)\b))"

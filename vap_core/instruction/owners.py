@@ -10,7 +10,9 @@ in particular. The rule, in this order:
 4. "Anna's cup" is a cup of the owner called anna, upper and lower case alike.
 5. "my brother's cup" is a cup of the owner who is known as "brother" or, when Anna speaks, as
    "Anna's brother" (`register --owner ben --known-as "anna's brother"`). "Anna's brother's cup" is
-   one of whoever is known as "Anna's brother"; where nobody is, as "brother".
+   one of whoever is known as "Anna's brother"; where nobody is, as "brother". "my friend's
+   brother's cup" needs somebody who is known as "friend's brother" or, when Anna speaks, as "Anna's
+   friend's brother".
 6. "his", "her" and "their cup" are a cup of the only other person who has one.
 
 An owner that nobody has, and words that fit several people, are errors.
@@ -86,8 +88,8 @@ def belonging(
 def find_owner(person: str, speaker: str, owners: dict[str, tuple[str, ...]]) -> str:
     """The owner that "anna", "my brother" or "anna's brother" means.
 
-    The speaker's own relation comes first, then all the words, then the relation alone. Only
-    "anna's brother", all of it, can be the speaker.
+    The speaker's own relation comes first, then all the words, then the last one. Only "anna's
+    brother", all of it, can be the speaker. Of "my friend's brother" the last word alone is nobody.
 
     Raises: UnknownName, BadInstruction.
     """
@@ -96,7 +98,9 @@ def find_owner(person: str, speaker: str, owners: dict[str, tuple[str, ...]]) ->
         return person
     relation = person.removeprefix("my ")
     speaker = fold(speaker)
-    words = [relation, relation.split()[-1]]
+    words = [relation]
+    if _relations(person) < 2:
+        words.append(relation.split()[-1])
     if person.startswith("my ") and speaker:
         mine = [f"{speaker}'s {word}" for word in words]
     else:
@@ -135,6 +139,12 @@ def fold(person: str) -> str:
     """
     words = " ".join(normalize("NFC", person).lower().replace("’", "'").split())
     return re.sub(r"('s|(?<=s)')$", "", words)
+
+
+def _relations(person: str) -> int:
+    """How many people a person is named by: 2 for "my friend's brother", 0 for "anna"."""
+    first = person.split()[0] in (*MINE, *OURS, *OTHERS)
+    return first + len(re.findall(r"(?:'s|s') ", person))
 
 
 def _owned_by(objects: Sequence[PersonalObject], owner: str) -> list[PersonalObject]:

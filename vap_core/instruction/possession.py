@@ -59,9 +59,11 @@ class Possession:
         """The owner that an expression begins with: "my", "Anna's", "James'"."""
         people = person_pattern(self.context)
         known = possessive(people)
+        things = "|".join({spaced(obj.category) for obj in self.context.objects.values()})
+        one = rf"(?!(?:{things})['’])[\w-]+['’]s"  # no person: "my brother's cup's lid"
         pattern = (
-            rf"{pronoun(people)}(?:\s+(?:[\w-]+\s+)?[\w-]+['’]s)?(?=\W|$)"
-            rf"|mine|hers|theirs|ours|(?:{known}|[\w-]+['’]s)(?:\s+[\w-]+['’]s)?"
+            rf"{pronoun(people)}(?:\s+(?:[\w-]+\s+)?{one}(?:\s+{one})?)?(?=\W|$)"
+            rf"|mine|hers|theirs|ours|(?:{known}|[\w-]+['’]s)(?:\s+{one}){{0,2}}"
         )
         match = re.match(pattern, said, re.IGNORECASE)
         return match and match.group()

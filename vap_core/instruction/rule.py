@@ -15,9 +15,11 @@ STOP_WORDS = frozenset(
 )
 """Words that end a category phrase when no known category matches, and that name no person."""
 _WORD = rf"(?!(?:{'|'.join(sorted(STOP_WORDS))})\b)[\w-]+"
-_PERSON = rf"(?:(?:{_WORD}\s+){{0,2}}?{_WORD}(?:['’]s|s['’])\s+)?"
+_OWNING = rf"{_WORD}(?:['’]s|s['’])\s+"
+_PERSON = rf"(?:(?:{_WORD}\s+){{0,2}}?{_OWNING}(?:{_OWNING})?)?"
 OWNER = re.compile(rf"\b(?P<owner>my\s+{_PERSON})", re.IGNORECASE)
-"""A possessive trigger: "my cup", or with an owner beside the speaker, "my brother's cup"."""
+"""A possessive trigger: "my cup", or with an owner beside the speaker, "my brother's cup" and "my
+friend's brother's cup"."""
 ARTICLE = r"(?:the|an?)\s+"
 """What may stand before a person: "the neighbour's cup" is rewritten with its article."""
 DETERMINER = (
@@ -51,9 +53,7 @@ def parse(text: str, categories: Collection[str] = (), owners: Collection[str] =
     while trigger is not None:
         start, stop = trigger.span()
         begin = trigger.start("owner")
-        first = re.match(r"[\w'’-]+\s+", text[begin:])
-        if first and leading_category(text[begin + first.end() :], categories)[0] in categories:
-            stop = begin + first.end()  # "my cup near Anna's" is about my cup
+        stop = begin + _before_category(text[begin:stop], text[begin:], categories)
         category, length = leading_category(text[stop:], categories)
         owner = text[begin:stop].strip()
         if category and (category in categories or owner.lower().startswith("my")):
@@ -66,6 +66,17 @@ def parse(text: str, categories: Collection[str] = (), owners: Collection[str] =
             'for example "bring my cup".'
         )
     return Instruction(text, tuple(targets))
+
+
+def _before_category(owner: str, rest: str, categories: Collection[str]) -> int:
+    """The length of the owner that `rest` begins with; a category that is named ends it.
+
+    "my cup near Anna's" is about my cup, and so is "my cup's lid".
+    """
+    for step in re.finditer(r"^[\w'’-]+\s+|['’]s?\s+", owner):
+        if leading_category(rest[step.end() :], categories)[0] in categories:
+            return step.end()
+    return len(owner)
 
 
 def rewrite(instruction: Instruction, colours: Sequence[Colour | None]) -> str:
