@@ -12,7 +12,8 @@ from tests.toys import TOYS, SameColour, personal, scene
 from vap_core.associate import PAIRINGS, compare_views
 from vap_core.attend import Attender, Prompting
 from vap_core.base.errors import BadInstruction, BadStudy, BadViews, UnknownName
-from vap_core.base.types import Attended, Boxes, Camera, Grounding
+from vap_core.base.events import is_lost
+from vap_core.base.types import Attended, Boxes, Camera, Grounding, Rgb
 from vap_core.evaluation.ablations.forms import NumberedMarker
 from vap_core.perception.protocols import Thresholds
 from vap_core.perception.stacks import load_stack
@@ -580,3 +581,37 @@ def test_a_calibrated_view_may_be_oblong():
     cameras = {name: replace(overhead(name, 0.0), width=96) for name in ("a", "b")}
     attender = Attender(TOYS, MEMORY, Prompting(associate=PAIRINGS["geometry"]))
     attender.start(dict.fromkeys(cameras, wide), "bring my cup", cameras=cameras)
+
+
+def test_a_view_that_shows_another_target_is_not_called_unmodified() -> None:
+    """The first step and the next; a view without any target still passes unmodified."""
+    both = scene([(4, 4, (200, 30, 30)), (30, 30, (30, 30, 200))])
+    one = scene([(4, 4, (200, 30, 30))])
+    none = np.zeros_like(one)
+    memory = {
+        "mug": personal("mug", "cup", (30, 30, 200)),
+        "bag": personal("bag", "bag", (200, 30, 30)),
+    }
+    attender = Attender(TOYS, memory)
+    state, _ = attender.start({"front": both}, "put my cup near my bag")
+    state, attended = attender.step(state, {"front": one})
+    assert (attended.images["front"] != one).any()
+    (event,) = attended.events
+    assert event.text == "front: target 0 not visible, it is not marked in this view"
+    assert is_lost(event)
+    _, attended = attender.step(state, {"front": none})
+    (event,) = attended.events
+    assert event.text == "front: target 1 not visible, the view passes unmodified"
+    assert is_lost(event)
+
+    def found(images: Sequence[Rgb], phrase: str, threshold: float | None = None) -> list[Boxes]:
+        """Bags alone."""
+        if phrase == "cup":
+            return [Boxes.empty(phrase) for _ in images]
+        return TOYS.detector(images, phrase, threshold)
+
+    attender = Attender(replace(TOYS, detector=found), memory)
+    _, attended = attender.start({"front": both}, "put my cup near my bag")
+    assert attended.events[0].text == "front: no cup found, it is not marked in this view"
+    _, attended = attender.start({"front": none}, "put my cup near my bag")
+    assert attended.events[0].text == "front: no cup found, the view passes unmodified"

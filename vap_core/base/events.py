@@ -8,6 +8,10 @@ from vap_core.base.types import Association, Ballot, Event, Grounding
 Visible = frozenset[tuple[str, int]]
 """Camera and target index of every target that is visible in that view."""
 UNMODIFIED = "the view passes unmodified"
+UNMARKED = "it is not marked in this view"
+"""What is said instead where the view shows another target, which is marked."""
+LOST = "not visible, "
+"""What the event of a lost target says before either."""
 
 
 def grounding_events(
@@ -17,7 +21,11 @@ def grounding_events(
     chosen_by: str,
 ) -> tuple[Event, ...]:
     """Events of t = 0. `chosen_by` names what overruled a vote, where something did."""
-    events = [_elected(g, chosen_by) for per_view in groundings.values() for g in per_view]
+    events = []
+    for per_view in groundings.values():
+        shown = any(grounding.mask is not None for grounding in per_view)
+        without = UNMARKED if shown else UNMODIFIED
+        events += [_elected(grounding, chosen_by, without) for grounding in per_view]
     for j, association in enumerate(associations):
         if association is not None:
             events.append(_associated(groundings, j, association))
@@ -32,8 +40,10 @@ def grounding_events(
 def visibility_events(frame_index: int, before: Visible, after: Visible) -> tuple[Event, ...]:
     """Targets that one step lost, and targets that it found again."""
     events = []
+    shown = {camera for camera, _ in after}
     for camera, j in sorted(before - after):
-        text = f"{camera}: target {j} not visible, {UNMODIFIED}"
+        without = UNMARKED if camera in shown else UNMODIFIED
+        text = f"{camera}: target {j} {LOST}{without}"
         events.append(Event(frame_index, "WARN", text))
     for camera, j in sorted(after - before):
         events.append(Event(frame_index, "INFO", f"{camera}: target {j} re-acquired"))
@@ -42,7 +52,7 @@ def visibility_events(frame_index: int, before: Visible, after: Visible) -> tupl
 
 def is_lost(event: Event) -> bool:
     """Whether the event says that a target was lost."""
-    return event.text.endswith(f"not visible, {UNMODIFIED}")
+    return event.text.endswith((LOST + UNMODIFIED, LOST + UNMARKED))
 
 
 def describe_ballot(grounding: Grounding) -> str:
@@ -79,17 +89,18 @@ def describe_lead(ballot: Ballot) -> str:
     return lead
 
 
-def _elected(grounding: Grounding, chosen_by: str) -> Event:
+def _elected(grounding: Grounding, chosen_by: str, without: str) -> Event:
+    """The event of one vote; `without` says what becomes of a view without the target."""
     ballot, camera, name = grounding.ballot, grounding.camera, grounding.object
     n, k = grounding.similarity.shape
     if ballot.winner is None:
         phrase = grounding.candidates.phrase
-        return Event(0, "WARN", f"{camera}: no {phrase} found, {UNMODIFIED}")
+        return Event(0, "WARN", f"{camera}: no {phrase} found, {without}")
     if grounding.rejected is not None:
-        text = f"{camera}: {name} {describe_rejection(grounding)}, {UNMODIFIED}"
+        text = f"{camera}: {name} {describe_rejection(grounding)}, {without}"
         return Event(0, "WARN", text)
     if grounding.winner is None:
-        text = f"{camera}: {name} is none of {n} candidates by {chosen_by}, {UNMODIFIED}"
+        text = f"{camera}: {name} is none of {n} candidates by {chosen_by}, {without}"
         return Event(0, "WARN", text)
     # Whether the candidate is the named object is not known here, so the text does not say it.
     verb = "elects"
