@@ -330,6 +330,18 @@ def test_the_method_grounds_the_speakers_object() -> None:
         assert attended.groundings["front"][0].object == name
 
 
+def test_an_owner_who_is_remembered_later_can_be_named() -> None:
+    """By an Attender that was made before; the memory is read at every start."""
+    memory = {"a": personal("a", "cup", TEAL)}
+    views = {"front": scene([(4, 8, TEAL), (30, 30, RUST)])}
+    attender = Attender(TOYS, memory)
+    memory["b"] = replace(personal("b", "cup", RUST), owner="ben")
+    _, attended = attender.start(views, "bring Ben's cup")
+    assert attended.groundings["front"][0].object == "b"
+    own = rule_parser({})
+    assert Attender(TOYS, memory, parser=own).parser is own
+
+
 def test_owner_and_note_are_kept(tmp_path: Path) -> None:
     obj = replace(cup("mug", "Anna", "ben's sister", "Mama"), note="for the morning ☕ coffee")
     back = load(save(tmp_path, obj))

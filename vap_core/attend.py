@@ -160,7 +160,8 @@ class Attender:
     """Grounds personal objects at t = 0, tracks them afterwards, and prompts every image.
 
     It holds models and the memory, and no state of an episode. `speaker` is whom "my" means
-    (instruction.owners); without a `parser` the rule parses.
+    (instruction.owners); without a `parser` the rule parses. What is added to `memory` later counts
+    from the next start on; a `parser` that is given decides itself.
     """
 
     def __init__(
@@ -174,8 +175,13 @@ class Attender:
         self.stack = stack
         self.memory = memory
         self.prompting = prompting or Prompting()
-        self.parser = parser or rule_parser(memory)
+        self._parser = parser
         self.speaker = speaker
+
+    @property
+    def parser(self) -> Parser:
+        """The parser that was given; else the rule, for the owners that the memory has now."""
+        return self._parser or rule_parser(self.memory)
 
     @property
     def references(self) -> Mapping[str, tuple[Rgb, ...]]:
