@@ -13,7 +13,7 @@ from vap_core.associate import PAIRINGS, compare_views
 from vap_core.attend import Attender, Prompting
 from vap_core.base.errors import BadInstruction, BadStudy, BadViews, UnknownName
 from vap_core.base.events import is_lost
-from vap_core.base.types import Attended, Boxes, Camera, Grounding, Rgb
+from vap_core.base.types import Attended, Boxes, Camera, Colour, Grounding, Rgb
 from vap_core.evaluation.ablations.forms import NumberedMarker
 from vap_core.perception.protocols import Thresholds
 from vap_core.perception.stacks import load_stack
@@ -561,6 +561,20 @@ def test_episodes_that_are_stepped_together_are_as_if_alone():
 def test_the_palette_gives_the_colour():
     attender = Attender(TOYS, MEMORY, Prompting(palette=PALETTE[2:3]))
     assert attender.start({"front": LINE}, "bring my cup")[1].text == "bring the green cup"
+
+
+@pytest.mark.parametrize(
+    ("name", "rgb"), [("white", (255, 255, 255)), ("black", (0, 0, 0)), ("pale", (255, 200, 200))]
+)
+def test_a_colour_without_a_hue_is_refused(name: str, rgb: tuple[int, int, int]) -> None:
+    """Every grey has the hue of red: a white object would be measured as not white."""
+    with pytest.raises(BadStudy, match=f"palette's '{name}' .* take a vivid one"):
+        Prompting(palette=(*PALETTE, Colour(name, rgb)))
+
+
+def test_a_colour_that_is_named_twice_is_refused() -> None:
+    with pytest.raises(BadStudy, match="the palette has 'red' twice"):
+        Prompting(palette=(*PALETTE, Colour("red", (200, 40, 40))))
 
 
 @pytest.mark.parametrize("cameras", [("front", "side"), ("side", "front")])

@@ -55,7 +55,7 @@ from vap_core.perception.candidates import (
     segment,
 )
 from vap_core.perception.protocols import FamiliarityJudge, Stack, TargetTracker
-from vap_core.prompt import PALETTE, PromptForm, Tint, choose_colours
+from vap_core.prompt import PALETTE, PromptForm, Tint, choose_colours, has_colour
 from vap_core.vote import VoteRule, check_rule, compare, nominate, vote
 
 PerTarget = tuple[Grounding, ...]
@@ -72,7 +72,8 @@ class Prompting:
     candidate is below the stack's threshold is not in view. `references` is how many of an object's
     references are used, the first ones; None uses all.
 
-    Raises: UnknownName, BadStudy, when it is built from what is no rule, pairing or count.
+    Raises: UnknownName, BadStudy, when it is built from what is no rule, pairing or count, or from
+        a palette with a name twice or a colour without a hue.
     """
 
     form: PromptForm = field(default_factory=Tint)
@@ -86,6 +87,7 @@ class Prompting:
 
     def __post_init__(self) -> None:
         check_rule(self.rule, "Prompting")
+        _check_palette(self.palette)
         if not isinstance(self.associate, Pairing | None):
             raise BadStudy(
                 f"Prompting: associate is {self.associate!r}; give a Pairing, for example "
@@ -94,6 +96,21 @@ class Prompting:
         if self.references is not None and self.references < 1:
             raise BadStudy(
                 f"Prompting: references is {self.references}; give 1 or more, or None for all."
+            )
+
+
+def _check_palette(palette: Sequence[Colour]) -> None:
+    """Raises: BadStudy: a colour that no pixel is found to have, or a name twice."""
+    names = [colour.name for colour in palette]
+    for colour in palette:
+        if not has_colour(np.array([colour.rgb], np.uint8), colour).all():
+            raise BadStudy(
+                f"Prompting: the palette's {colour.name!r} {colour.rgb} is grey, pale or dark: "
+                "colours are told apart by their hue; take a vivid one, as in prompt.PALETTE."
+            )
+        if names.count(colour.name) > 1:
+            raise BadStudy(
+                f"Prompting: the palette has {colour.name!r} twice; give every colour its own name."
             )
 
 
