@@ -9,10 +9,11 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies import get_policy_class, make_pre_post_processors
 from lerobot.policies.pi0.modeling_pi0 import PI0Policy
+from transformers.modeling_utils import ALL_ATTENTION_FUNCTIONS
 
 from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
-from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
+from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy, fused_attention
 from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
 from vap_core.policies.names import checkpoint_of
 from vap_core.policies.protocol import PolicyInput
@@ -176,3 +177,18 @@ def test_a_step_of_training_reaches_every_part(checkpoint: Path) -> None:
     for part in ("vision_tower", "multi_modal_projector", "language_model.layers.0.self_attn.q_proj", "layers.1.self_attn.k_proj", "embed_tokens",
                  "gemma_expert.model.layers.1", "action_out_proj", "state_proj"):  # fmt: skip
         assert any(part in name for name in felt), part
+
+
+def test_an_oblong_resolution_is_refused() -> None:
+    with pytest.raises(ValueError, match="image_resolution is 112x100; the tower reads squares"):
+        MiniPI0Config(words=vocabulary(), image_resolution=(112, 100))
+
+
+def test_the_fused_attention_can_be_entered_again() -> None:
+    before = ALL_ATTENTION_FUNCTIONS.get("eager")
+    with fused_attention():
+        fused = ALL_ATTENTION_FUNCTIONS["eager"]
+        with fused_attention():
+            pass
+        assert ALL_ATTENTION_FUNCTIONS["eager"] is fused
+    assert ALL_ATTENTION_FUNCTIONS.get("eager") is before

@@ -306,3 +306,18 @@ def test_the_limit_reaches_the_policy_of_a_run(
     )
     assert table.outcome.tolist() == ["failure", "error", "failure"]
     assert "did not answer within 0.2 s" in table.detail[1]
+
+
+@pytest.mark.parametrize("limit_s", [0.0, -1.0, float("nan")])
+def test_a_limit_of_no_time_is_refused(trial: Trial, limit_s: float) -> None:
+    """A timer of 0 s would never end a call."""
+    with pytest.raises(BadStudy, match="policy_timeout_s is .*; give seconds above 0, or None"):
+        replace(trial, policy_timeout_s=limit_s)
+    with pytest.raises(BadStudy, match="give seconds above 0"), policy_call(limit_s, ["a"]):
+        pass
+
+
+@pytest.mark.parametrize("batch", [0, -1])
+def test_a_batch_of_no_episode_is_refused(trial: Trial, batch: int) -> None:
+    with pytest.raises(BadStudy, match=f"batch is {batch}; give how many episodes"):
+        list(rollout(trial, ROWS, batch=batch))

@@ -128,6 +128,16 @@ def test_framing_keeps_size_and_type() -> None:
     assert not np.array_equal(out, photo)
 
 
+@pytest.mark.parametrize("h_w", [(100, 200), (200, 100)])
+def test_an_oblong_photo_keeps_both_halves(h_w: tuple[int, int]) -> None:
+    photo = np.zeros((*h_w, 3), np.uint8)
+    photo[-70:-30, -70:-30] = 255
+    for seed in range(5):
+        out = augment(photo, np.random.default_rng(seed))
+        assert out.shape == photo.shape
+        assert (out > 0).mean() > 0.01
+
+
 def test_a_token_comes_back_from_disk_for_its_own_model_only(tmp_path: Path) -> None:
     token = Token("red-mug", np.arange(4, dtype=np.float32), 0.96875, "f" * 64)
     path = token_file.save(tmp_path, token)

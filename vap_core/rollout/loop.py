@@ -14,14 +14,20 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vap_core.base.errors import BadAction, BadCrop, OutOfReach, VapError
+from vap_core.base.errors import BadAction, BadCrop, BadStudy, OutOfReach, VapError
 from vap_core.base.types import Attended, Views
 from vap_core.policies.hooks import AttentionMaps, observe_attention
 from vap_core.policies.protocol import Policy, PolicyInput, PrivilegedPolicy
 from vap_core.rollout import audit
 from vap_core.rollout.coverage import mask_coverage
 from vap_core.rollout.late_masks import LateMasks
-from vap_core.rollout.policy_call import check_chunks, check_policy, checked_plan, policy_call
+from vap_core.rollout.policy_call import (
+    check_chunks,
+    check_limit,
+    check_policy,
+    checked_plan,
+    policy_call,
+)
 from vap_core.rollout.prompters.protocol import (
     PromptContext,
     Prompter,
@@ -65,7 +71,8 @@ class Trial:
     `image_size` is simulation.Env's.
     A call of the policy that takes longer than `policy_timeout_s` fails (rollout.policy_call).
 
-    Raises: BadPolicy: the policy lacks what the loop needs.
+    Raises: BadPolicy: the policy lacks what the loop needs; BadStudy: `policy_timeout_s` is not
+        above 0.
     """
 
     method: str
@@ -84,6 +91,7 @@ class Trial:
 
     def __post_init__(self) -> None:
         check_policy(self.policy)
+        check_limit(self.policy_timeout_s)
 
     @property
     def bound(self) -> bool:
@@ -113,8 +121,11 @@ def rollout(
     Frames keep their images only with `keep_images`; a sink always gets them.
 
     Raises: VapError: the user has to act: weights are absent, the policy returns arrays of another
-        shape or type than its protocol's, or an encoder cannot embed the references either.
+        shape or type than its protocol's, an encoder cannot embed the references either, or `batch`
+        is below 1.
     """
+    if batch < 1:
+        raise BadStudy(f"rollout: batch is {batch}; give how many episodes run at once, from 1 on.")
     keeps_images = sink is not None or keep_images
     for first in range(0, len(rows), batch):
         running = []

@@ -29,9 +29,10 @@ def policy_call(limit_s: float | None, episodes: Sequence[str]) -> Iterator[None
     returns late or never, such as one long kernel of torch: that one ends first. A policy whose own
     code catches BaseException can go on.
 
-    Raises: TimeoutError; RuntimeError when the policy calls sys.exit; BadStudy for a limit outside
-        the main thread, where no handler runs.
+    Raises: TimeoutError; RuntimeError when the policy calls sys.exit; BadStudy for a limit that is
+        not above 0, or outside the main thread, where no handler runs.
     """
+    check_limit(limit_s)
     note = threading.Timer(NOTE_AFTER_S, _note_waiting, [episodes])
     note.daemon = True
     note.start()
@@ -48,6 +49,14 @@ def policy_call(limit_s: float | None, episodes: Sequence[str]) -> Iterator[None
         ) from None
     finally:
         note.cancel()
+
+
+def check_limit(limit_s: float | None) -> None:
+    """Raises: BadStudy for a limit that is not above 0: a timer of 0 s never ends a call."""
+    if limit_s is not None and not limit_s > 0:
+        raise BadStudy(
+            f"rollout: policy_timeout_s is {limit_s:g}; give seconds above 0, or None for no limit."
+        )
 
 
 def check_policy(policy: Any) -> None:

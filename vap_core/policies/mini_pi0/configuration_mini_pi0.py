@@ -44,7 +44,12 @@ class MiniPI0Config(PI0Config):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.words = tuple(self.words)
-        if self.image_resolution[0] % self.patch or self.vision_width % HEADS:
+        height, width = self.image_resolution
+        if height != width:
+            raise ValueError(
+                f"MiniPI0Config: image_resolution is {height}x{width}; the tower reads squares."
+            )
+        if height % self.patch or self.vision_width % HEADS:
             raise ValueError(
                 f"MiniPI0Config: {self.image_resolution} pixels do not part into patches of "
                 f"{self.patch}, or {self.vision_width} features by {HEADS}"

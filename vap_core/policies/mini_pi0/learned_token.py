@@ -129,12 +129,12 @@ def augment(photo: Rgb, rng: np.random.Generator) -> Rgb:
     """
     import cv2
 
-    size = photo.shape[0]
+    size = np.array(photo.shape[1::-1])
     zoom = float(rng.uniform(0.6, 1.3))
     angle_deg = float(rng.uniform(-12, 12))
-    turn = cv2.getRotationMatrix2D((size / 2, size / 2), angle_deg, zoom)
+    turn = cv2.getRotationMatrix2D((size / 2).tolist(), angle_deg, zoom)
     turn[:, 2] = turn[:, 2] + rng.uniform(-0.15, 0.15, 2) * size
-    moved = cv2.warpAffine(photo, turn, (size, size), borderMode=cv2.BORDER_REPLICATE)
+    moved = cv2.warpAffine(photo, turn, size.tolist(), borderMode=cv2.BORDER_REPLICATE)
     lit = moved * rng.uniform(0.8, 1.2) * rng.uniform(0.95, 1.05, 3)
     return np.clip(lit, 0, 255).astype(np.uint8)
 

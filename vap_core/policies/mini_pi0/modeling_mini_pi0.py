@@ -144,13 +144,17 @@ def frozen(module: nn.Module) -> Iterator[None]:
 def fused_attention() -> Iterator[None]:
     """Inside, the eager attention that lerobot's PI0 asks for is PyTorch's fused one.
 
-    The numbers are the same, and a step takes a third less time.
+    The numbers are the same, and a step takes a third less time. It can be entered again inside.
     """
+    before = ALL_ATTENTION_FUNCTIONS.get("eager")
     ALL_ATTENTION_FUNCTIONS["eager"] = sdpa_attention_forward
     try:
         yield
     finally:
-        del ALL_ATTENTION_FUNCTIONS["eager"]
+        if before is None:
+            del ALL_ATTENTION_FUNCTIONS["eager"]
+        else:
+            ALL_ATTENTION_FUNCTIONS["eager"] = before
 
 
 def vlm_config(config: MiniPI0Config) -> Any:
