@@ -185,6 +185,20 @@ def test_the_likest_reference_alone_can_stand_for_all() -> None:
     assert nothing.tolist() == [0.0]
 
 
+def test_a_view_that_is_less_like_the_references_counts_less() -> None:
+    """Distances .1 and .2 in the one view, .2 and .4 in the other: the ratio is the same."""
+    near, far = (np.array([[1 - d], [1 - 2 * d]], np.float32) for d in (0.1, 0.2))
+    views = [
+        Sighting(cosine, np.zeros((2, 4), np.float32), np.zeros((2, 4), np.float32))
+        for cosine in (near, far)
+    ]
+    for reliance, part in ((0.0, 1.0), (1.0, 0.5), (3.0, 0.125)):
+        of_near, of_far = references(views, Pairing((), reliance=reliance))
+        assert of_near[0] - of_near[1] == pytest.approx(3.7 * np.log(2), abs=1e-4)
+        assert of_far[0] - of_far[1] == pytest.approx(part * 3.7 * np.log(2), abs=1e-4)
+        assert of_far[2] == of_near[2] == 0.0
+
+
 def test_geometry_recovers_true_correspondences() -> None:
     """Two overhead cameras 0.5 m apart; every distance can be reckoned by hand."""
     left, right = overhead("left", 0.0), overhead("right", 0.5)

@@ -70,6 +70,10 @@ class Pairing:
     likest: bool = False
     """Whether a candidate's distance to the references is that to the likest one alone, instead of
     the mean; the numbers above were fitted with the mean."""
+    reliance: float = 0.0
+    """How much less the references tell its candidates apart in a view that is less like them: by
+    the least distance in all views over that in this one, to this power. (A wrist camera looks from
+    above, as few references do.) 0: every view counts the same."""
     decisive: float = 0.0
     """The best choice for all views is taken where it leads every other by this; elsewhere each
     view keeps its own."""
@@ -190,9 +194,9 @@ def total_scores(
 def references(views: Sequence[Sighting], pairing: Pairing) -> list[ViewScores]:
     """The references' evidence for the candidates of every view.
 
-    It is `evidence` (log(d_v / d_i) + max(log(d / d_v) + `absent`, 0)), and 0 for none. d_i is 1 -
-    the mean cosine of candidate i with the references (the greatest where `likest`), d_v the least
-    in its view, d the least in all views.
+    It is `evidence` ((d / d_v) ** `reliance` log(d_v / d_i) + max(log(d / d_v) + `absent`, 0)), and
+    0 for none. d_i is 1 - the mean cosine of candidate i with the references (the greatest where
+    `likest`), d_v the least in its view, d the least in all views.
     """
     distances = []
     for view in views:
@@ -206,7 +210,9 @@ def references(views: Sequence[Sighting], pairing: Pairing) -> list[ViewScores]:
         if len(d):
             lead = float(np.log(least / d.min()))
             visible = max(lead + pairing.absent, 0.0)
-        of_view = pairing.evidence * (np.log(d.min(initial=np.inf) / d) + visible)
+        nearest = d.min(initial=np.inf)
+        trust = (least / nearest) ** pairing.reliance
+        of_view = pairing.evidence * (trust * np.log(nearest / d) + visible)
         scores.append(np.append(of_view, 0.0))
     return scores
 

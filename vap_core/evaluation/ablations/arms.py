@@ -77,6 +77,11 @@ UNTRAINED = (Colour("orange", (255, 128, 0)), Colour("purple", (128, 0, 255)))
 
 In its films things are painted in them (training.words.PAINTS), and commands name them.
 """
+RELIANT = Pairing(("geometry",), evidence=6.0, reliance=3.0, decisive=1.25)
+"""Chosen on first frames of development layouts alone (vlabench 240, tabletop 224; generic objects
+that nothing was trained on): of the rules tried, the least common errors where contradictions are
+halved. Every view for itself: 3 and 3 errors, 119 and 94 contradictions; so 8 and 8, 56 and 42;
+`associated-decisive` 10 and 11, 66 and 44."""
 
 
 def _tints() -> dict[str, Arm]:
@@ -197,6 +202,7 @@ ABLATIONS: dict[str, Ablation] = {
             "associated-both": Prompting(associate=Pairing(("embedding", "geometry"))),
             "associated-decisive": Prompting(associate=Pairing(("geometry",), decisive=1.0)),
             "associated-likest": Prompting(associate=Pairing(("geometry",), likest=True)),
+            "associated-reliant": Prompting(associate=RELIANT),
         },
         methods=(DEFAULT, "vap-associated"),
         suites=("vlabench", "tabletop"),
