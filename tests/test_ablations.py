@@ -244,6 +244,9 @@ def test_figures_of_published_ablations() -> None:
     assert cases_text(results["rewrite"]).splitlines()[0].split() == (
         "vap SR 90 % [60, 98], Case 1 1 of 10, Case 2 0 of 10".split()
     )
+    (one, *_) = results["rewrite"]
+    two_suites = cases_text([one, replace(one, suite="tabletop")]).splitlines()
+    assert [line.split()[0] for line in two_suites] == [one.suite, "tabletop"]
 
 
 def test_arms_of_another_suite_are_read_by_its_name() -> None:

@@ -5,7 +5,7 @@ all_effects_figure(results)
 sweep_figure(results["opacity"], {"opacity-0.1": 0.1, "vap": 0.5, "opaque": 1.0}, "opacity")
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -80,7 +80,7 @@ def all_effects_figure(
         _draw_blocks(axes, part)
         axes.set_ylim(-most + 0.4, 0.6)
         axes.set_xlim(-103, 45)
-        axes.set_xlabel("points of success against the first arm (95 % interval)", fontsize=8)
+        axes.set_xlabel("points of success against the first arm [95 %]", fontsize=8)
     figure.legend(
         handles=legend_handles(whose), loc="outside lower center", ncols=4, frameon=False,
         fontsize=8,
@@ -209,12 +209,16 @@ def cases_figure(results: Sequence[ArmResult]) -> "Figure":
     return figure
 
 
-def cases_text(results: Iterable[ArmResult]) -> str:
-    """One line an arm: how many episodes failed by Case 1 and by Case 2."""
+def cases_text(results: Sequence[ArmResult]) -> str:
+    """One line an arm, after its suite where there are several: how many episodes failed by Case 1
+    and by Case 2.
+    """
+    several = len(_by_suite(results)) > 1
     lines = []
     for one in results:
+        where = f"{one.suite:16}" if several else ""
         lines.append(
-            f"{one.arm:22} SR {one.sr}, Case 1 {one.case_1.k} of {one.case_1.n}, "
+            f"{where}{one.arm:22} SR {one.sr}, Case 1 {one.case_1.k} of {one.case_1.n}, "
             f"Case 2 {one.case_2.k} of {one.case_2.n}"
         )
     return "\n".join(lines)
