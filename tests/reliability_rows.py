@@ -54,6 +54,20 @@ TRIED = (
         ),
     ),
     Row(
+        "corrections: damaged, absent, of a recording that is gone, of another policy",
+        "`query` and its server name a damaged one, `diagnose` ends in one line that says to "
+        "delete it; without one the recorded case holds; one without its recording, or of another "
+        "policy, does not count",
+        (
+            "test_odd_recordings::test_a_damaged_layer_is_one_line",
+            "test_odd_recordings::test_a_layer_that_ends_its_reader_is_named",
+            "test_browse::test_the_browser_shows_corrected_cases_and_leaves_a_damaged_layer_out",
+            "test_catalog::test_a_damaged_layer_is_one_line",
+            "test_catalog::test_a_correction_without_its_recording_is_left_out",
+            "test_diagnosis::test_a_correction_is_of_the_policy_that_was_recorded",
+        ),
+    ),
+    Row(
         "a picture with EPS content, as a photo and as a texture",
         "no program starts",
         (
@@ -577,6 +591,11 @@ ATTACKS = (
 )
 
 LEFT = (
+    (
+        "a correction that is copied to the name of another recording",
+        "corrections are found by their file's name and their policy; of the same policy it counts "
+        "for that recording",
+    ),
     (
         "a run of a trained policy that is interrupted and goes on",
         "its policy is asked in batches of other sizes, so the last bits of an action differ, and "

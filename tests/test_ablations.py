@@ -1,7 +1,7 @@
 """Ablations: arms by name, the table by hand, and the command."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ from vap_core.analysis.ablations import (
 from vap_core.analysis.agreements import gate_figure, gated_cases
 from vap_core.attend import Prompting
 from vap_core.base.errors import BadOutput
+from vap_core.base.tables import signed
 from vap_core.base.types import Colour, Mask, Rgb
 from vap_core.evaluation import hiding, methods, paper
 from vap_core.evaluation.ablations.arms import ABLATIONS, ARMS, TINT_SHARES, Ablation, Hidden
@@ -29,12 +30,15 @@ from vap_core.evaluation.ablations.arrow import Arrow
 from vap_core.evaluation.ablations.picture import effects_figure, policies_figure
 from vap_core.evaluation.ablations.run import arm_folder
 from vap_core.evaluation.ablations.table import (
+    ArmResult,
     across_policies,
     arm_results,
     arm_rows,
     policy_results,
 )
 from vap_core.evaluation.methods import METHODS, PUBLISHED, find, known_methods, references_needed
+from vap_core.evaluation.metrics import rate
+from vap_core.evaluation.report.cells import comparison_rows
 from vap_core.evaluation.statistics import Comparison
 from vap_core.evaluation.study import Study
 from vap_core.prompt import PALETTE, PromptForm, Tint, tint
@@ -375,6 +379,24 @@ def test_the_table_of_findings_holds_the_papers_arms_only() -> None:
     )  # fmt: skip
     assert row["here, points [95 %]"].startswith("-90 [")
     assert row["the paper's finding"] == "holds"
+
+
+def test_a_difference_that_rounds_to_no_point_has_one_sign_in_every_table() -> None:
+    found = Comparison(
+        suite="s", task="t", split="", policy="p", one="vap", other="opaque", pairs=96, layouts=96,
+        both=0, only_one=0, only_other=0, neither=0, difference=-0.0004, low=-0.0003,
+        high=0.0004, p_mcnemar=1.0, p=1.0, p_holm=1.0,
+    )  # fmt: skip
+    first = ArmResult("s", "vap", rate(9, 10), rate(9, 10), rate(0, 10), rate(0, 10), None, 0.5)
+    arm = replace(first, arm="opaque", against=found, paper=0.499)
+    (row,) = findings_table({"opacity": [first, arm]}).to_dict("records")
+    assert (row["here, points [95 %]"], row["paper"]) == ("+0 [+0, +0]", "+0")
+    assert effect_text([first, arm], "opaque") == "+0 [+0, +0]"
+    assert arm_rows([first, arm])[2][7] == "+0.0 [+0.0, +0.0]"
+    rows = comparison_rows(pd.DataFrame([asdict(found)]))
+    assert rows[1][9] == "+0.0 [+0.0, +0.0]"
+    assert signed(-0.4) == signed(0.4) == "+0"
+    assert (signed(-0.6), signed(2.26, 1)) == ("-1", "+2.3")
 
 
 def test_policies_stand_side_by_side_and_each_is_compared_with_itself() -> None:

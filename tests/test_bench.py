@@ -379,6 +379,10 @@ def test_the_pictures_bars_are_the_tables() -> None:
     tops = [bar.get_y() + bar.get_height() for bar in figure.axes[0].containers[-1]]
     quoted = [float(row[2]) for row in scale_report.tables(found)[0].rows[1:4]]
     assert tops == quoted == [2.0, 2.5, 3.0]
+    dots = figure.axes[0].lines
+    assert [list(line.get_ydata()) for line in dots] == [[2.0], [2.5], [3.0]], "one a repeat"
+    assert {line.get_color() for line in dots} == {"black"}
+    assert "every black dot is one repeat" in measured.page()
 
 
 @pytest.mark.sweep

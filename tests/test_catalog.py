@@ -91,6 +91,11 @@ def test_a_correction_without_its_recording_is_left_out(run: Path, tmp_path: Pat
     held = load_steps(folder)
     assert set(held.table["file"]) == {str(folder / "wrong.rrd")}
     assert set(held.table["case"]) == {"case 3"}
+    (tmp_path / "corrections" / "apart.rrd").write_bytes(b"noise")
+    assert not load_steps(folder).unreadable
+    shutil.rmtree(tmp_path / "corrections")
+    assert set(load_steps(folder).table["case"]) == {"case 1"}
+    assert read_corrections(tmp_path) == {}
 
 
 POISON = """

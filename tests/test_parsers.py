@@ -22,6 +22,7 @@ from vap_core.instruction.expressions import find_exclusions, find_expressions
 from vap_core.instruction.history import Use, add_uses
 from vap_core.instruction.looks import fit
 from vap_core.instruction.parsers import Parsing, load_parser, rule_parser
+from vap_core.instruction.rule import MAX_CHARACTERS
 from vap_core.perception.chat import ChatEndpoint
 from vap_core.perception.text_encoder import embed_text
 from vap_core.prompt import PALETTE
@@ -148,6 +149,25 @@ def test_what_cannot_be_resolved_is_one_line(text: str, error: type[VapError], s
         EmbeddingParser(CONTEXT, embed_text)(text)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) <= 300
+
+
+def test_every_parser_refuses_an_instruction_that_is_too_long() -> None:
+    said = []
+    chat = ChatEndpoint("http://127.0.0.1:9/v1", "nobody")
+    text = "bring my camera ".ljust(MAX_CHARACTERS, "!")
+    for parser in (
+        rule_parser(CONTEXT.objects),
+        EmbeddingParser(CONTEXT, embed_text),
+        ChatParser(CONTEXT, chat),
+    ):
+        with pytest.raises(BadInstruction, match="are 501 characters; an instruction") as caught:
+            parser(f"{text}!")
+        said.append(str(caught.value))
+    assert len(set(said)) == 1
+    assert "\n" not in said[0]
+    assert len(said[0]) <= 200
+    assert len(parse(text).targets) == 1
+    assert found(EmbeddingParser(CONTEXT, embed_text)(text)) == ["camera"]
 
 
 def test_who_speaks_decides_whose_it_is() -> None:

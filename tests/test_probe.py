@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 
 from vap_core.base.errors import BadPolicy, BadStudy, UnknownName
+from vap_core.cli.policies import eval_policy
 from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.names import label_of, shipped_checkpoint
 from vap_core.policies.protocol import PolicyInput
@@ -114,6 +115,24 @@ def test_another_way_to_ask_is_kept_beside_those_of_before(tmp_path: Path) -> No
         ("mini_pi0:other", "tinted", 7),
         ("mini_pi0:one", "tinted", 8),
     ]
+
+
+def test_what_another_run_adds_meanwhile_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So the table is read before the work, to refuse it early, and again after it."""
+    path = tmp_path / "probe.parquet"
+    said = {"policy": "mini_pi0:one", "method": "plain", "task": "t", "success": True}
+    said |= {"wrong_object": False, "touched": True}
+    keep(pd.DataFrame([said | {"suite": "one"}]), path)
+
+    def work(*args: object, **asked: object) -> pd.DataFrame:
+        keep(pd.DataFrame([said | {"suite": "two"}]), path)
+        return pd.DataFrame([said | {"suite": SUITE}])
+
+    monkeypatch.setattr(probe, "probe", work)
+    eval_policy(SUITE, out=path)
+    assert pd.read_parquet(path)["suite"].tolist() == ["one", "two", SUITE]
 
 
 def test_a_table_that_cannot_be_added_to_is_said_before_the_work(

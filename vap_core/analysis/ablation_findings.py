@@ -6,6 +6,7 @@ findings_table(ablation_results(episodes))
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from vap_core.base.tables import signed, signed_interval
 from vap_core.evaluation.ablations.picture import is_shown
 from vap_core.evaluation.ablations.table import ArmResult
 from vap_core.evaluation.statistics import Comparison
@@ -29,13 +30,13 @@ def findings_table(results: Mapping[str, Sequence[ArmResult]]) -> "pd.DataFrame"
                 continue
             found = one.against
             assert found is not None
-            low, here, high = (round(100 * x) for x in (found.low, found.difference, found.high))
+            here, low, high = (100 * x for x in (found.difference, found.low, found.high))
             row = {
                 "ablation": name,
                 "arm": one.arm,
                 "n": one.sr.n,
-                "here, points [95 %]": f"{here:+d} [{low:+d}, {high:+d}]",
-                "paper": f"{round(100 * theirs):+d}",
+                "here, points [95 %]": signed_interval(here, low, high),
+                "paper": signed(100 * theirs),
                 "the paper's finding": verdict(found, theirs),
             }
             rows.append(row)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from vap_core.base.figures import empty_figure
 from vap_core.base.palette import CASES
+from vap_core.base.tables import signed_interval
 from vap_core.evaluation.ablations.arms import ABLATIONS
 from vap_core.evaluation.ablations.picture import (
     CLEAR,
@@ -232,8 +233,8 @@ def effect_text(results: Sequence[ArmResult], arm: str, suite: str = "") -> str:
     (one,) = [each for each in results if each.arm == arm and suite in ("", each.suite)]
     if one.against is None:
         return f"{100 * one.sr.value:.0f} % of {one.sr.n}"
-    low, mid, high = (100 * x for x in (one.against.low, one.against.difference, one.against.high))
-    return f"{mid:+.0f} [{low:+.0f}, {high:+.0f}]"
+    found = one.against
+    return signed_interval(100 * found.difference, 100 * found.low, 100 * found.high)
 
 
 def _by_suite(results: Sequence[ArmResult]) -> dict[str, list[ArmResult]]:

@@ -3,6 +3,7 @@ were lost and found."""
 
 from collections.abc import Mapping
 
+from vap_core.base.tables import signed
 from vap_core.base.types import Association, Ballot, Event, Grounding
 
 Visible = frozenset[tuple[str, int]]
@@ -83,7 +84,7 @@ def describe_lead(ballot: Ballot) -> str:
     """How far the elected candidate is ahead of every other, by `Ballot.cosine_margin`."""
     if len(ballot.votes) == 1:
         return "the only candidate"
-    lead = f"lead {ballot.cosine_margin:+.2f}"
+    lead = f"lead {signed(ballot.cosine_margin, 2)}"
     if int(ballot.tied.sum()) > 1:
         return f"tie, {lead}"
     return lead

@@ -43,6 +43,16 @@ def escape(cell: str) -> str:
     return cell.translate(_LATEX)
 
 
+def signed(value: float, digits: int = 0) -> str:
+    """A rounded number with its sign: "+3", "-0.4"; "+0" for all that rounds to zero."""
+    return f"{value:+z.{digits}f}"
+
+
+def signed_interval(middle: float, low: float, high: float, digits: int = 0) -> str:
+    """A signed number and its interval: "+3 [-1, +7]"."""
+    return f"{signed(middle, digits)} [{signed(low, digits)}, {signed(high, digits)}]"
+
+
 def _render(rows: Rows, style: str) -> str:
     from tabulate import tabulate
 

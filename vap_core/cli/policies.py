@@ -66,7 +66,7 @@ def eval_policy(
             "take mini-pi0, or a lerobot checkpoint's folder or hub id."
         )
     if out is not None:
-        kept(out)  # said before the work
+        kept(out)  # refused before the work; read again by keep: others may add to it meanwhile
     table = probe(
         checkpoint,
         suite,

@@ -16,6 +16,7 @@ from vap_core.base.errors import BadEndpoint, BadInstruction
 from vap_core.base.files import parse_json
 from vap_core.base.types import Instruction, Target
 from vap_core.instruction.context import Context
+from vap_core.instruction.rule import check_length
 from vap_core.perception.chat import MODEL, ChatEndpoint, request_answer
 
 TASK = (
@@ -45,8 +46,9 @@ class ChatParser:
         """Parse one instruction; every target names its object.
 
         Raises: BadEndpoint: the server cannot be reached, takes too long, refuses, or its answer is
-            malformed; BadInstruction: the model finds no personal object.
+            malformed; BadInstruction: the model finds no personal object, or the text is too long.
         """
+        check_length(text)
         answer = request_answer(
             self.endpoint,
             self._messages(text),

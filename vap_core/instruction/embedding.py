@@ -19,6 +19,7 @@ from vap_core.instruction.expressions import (
 )
 from vap_core.instruction.meaning import EmbedText
 from vap_core.instruction.reading import Reading
+from vap_core.instruction.rule import check_length
 
 
 @dataclass(frozen=True)
@@ -31,9 +32,10 @@ class EmbeddingParser:
     def __call__(self, text: str, categories: Collection[str] = ()) -> Instruction:
         """Parse one instruction; every target names its object.
 
-        Raises: BadInstruction: no personal object, or several fit; UnknownName: none is remembered;
-            MissingWeights: `embed` has no weights here.
+        Raises: BadInstruction: no personal object, or several fit, or the text is too long;
+            UnknownName: none is remembered; MissingWeights: `embed` has no weights here.
         """
+        check_length(text)
         exclusions = find_exclusions(text)
         found: list[tuple[Expression, PersonalObject]] = []
         problem: VapError | None = None

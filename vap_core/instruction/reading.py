@@ -260,12 +260,14 @@ class Reading:
         "put my cup on the plate; the striped one stays" names the other cup.
         """
         best: tuple[float, int] | None = None
+        categories = self._categories()
+        known = self._known_words(category)
         for other in self.expressions:
             if other is self.expression or other.destination:
                 continue
-            if find_category(other.said, self._categories()) not in (None, category):
+            if find_category(other.said, categories) not in (None, category):
                 continue
-            words = content(other.said, self._known_words(category))
+            words = content(other.said, known)
             if words:
                 order, lead = self._ranked(words, candidates)
                 if best is None or lead > best[0]:

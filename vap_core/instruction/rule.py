@@ -28,6 +28,10 @@ DETERMINER = (
 """What an expression begins with that "her" does not belong to."""
 
 
+MAX_CHARACTERS = 500
+"""The longest instruction that a parser reads: the time of one grows with the square of it."""
+
+
 @runtime_checkable
 class Parser(Protocol):
     """Finds the personalised spans of an instruction."""
@@ -45,8 +49,9 @@ def parse(text: str, categories: Collection[str] = (), owners: Collection[str] =
     the article of "the neighbour's <category>" is part of the span.
 
     Raises:
-        BadInstruction: the text holds no possessive span.
+        BadInstruction: the text holds no possessive span, or is too long.
     """
+    check_length(text)
     targets: list[Target] = []
     pattern = _any_owner(tuple(owners)) if owners else OWNER
     trigger = pattern.search(text)
@@ -66,6 +71,15 @@ def parse(text: str, categories: Collection[str] = (), owners: Collection[str] =
             'for example "bring my cup".'
         )
     return Instruction(text, tuple(targets))
+
+
+def check_length(text: str) -> None:
+    """Refuse what no parser reads. Raises: BadInstruction: over `MAX_CHARACTERS`."""
+    if len(text) > MAX_CHARACTERS:
+        raise BadInstruction(
+            f"parse: {text[:40]!r} and what follows are {len(text):,} characters; an instruction "
+            f"has at most {MAX_CHARACTERS}. Give it in several."
+        )
 
 
 def _before_category(owner: str, rest: str, categories: Collection[str]) -> int:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vap_core.base.errors import BadCluster, BadStudy
-from vap_core.base.tables import align
+from vap_core.base.tables import align, signed
 from vap_core.cli.bench.timing import seconds_of
 from vap_core.evaluation import cluster, engine
 from vap_core.evaluation.jobs import Job, Rows
@@ -148,4 +148,4 @@ def _overhead_text(runs: dict[str, list[EngineRun]]) -> str:
 
 def _percent(slow: Sequence[float], fast: Sequence[float]) -> str:
     middle, low, high = (100 * (each - 1) for each in ratio(slow, fast))
-    return f"{middle:+.1f} % [{low:+.1f}, {high:+.1f}]"
+    return f"{signed(middle, 1)} % [{signed(low, 1)}, {signed(high, 1)}]"

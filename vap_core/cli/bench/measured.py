@@ -24,6 +24,10 @@ write these by `--json FILE`, and what has not been measured is left out. Times 
 that is named; compare ratios."""
 
 
+CAPTION = "A bar stacks the medians of the parts; every black dot is one repeat as a whole."
+"""Of the picture of `bench scale`."""
+
+
 def shipped(bench: str) -> Path:
     """Where the measurement of a benchmark ships."""
     return DATA / "results" / f"bench_{bench}.json"
@@ -39,6 +43,7 @@ def page() -> str:
         parts += [f"## {heading}", as_markdown(measurement, tables(measurement))]
         if bench == "scale":
             parts.append(f"![How the cost grows](../figures/{PICTURE.name})")
+            parts.append(CAPTION)
     return "\n\n".join(parts) + "\n"
 
 

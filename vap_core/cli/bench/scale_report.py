@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vap_core.base.figures import OURS, empty_figure
+from vap_core.base.tables import signed
 from vap_core.cli.bench.measurement import Measurement, Table
 
 if TYPE_CHECKING:
@@ -83,7 +84,7 @@ def _workers(measurement: Measurement) -> Table:
     note = "Ray is not installed and was not measured."
     if overhead is not None:
         note = (
-            f"Ray over processes: {overhead:+.0f} % beyond start-up, in one run each; "
+            f"Ray over processes: {signed(overhead)} % beyond start-up, in one run each; "
             "`bench engine` repeats it."
         )
     return Table("Wall time by workers", rows, note)

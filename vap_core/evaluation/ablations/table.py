@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vap_core.base.errors import BadOutput
+from vap_core.base.tables import signed_interval
 from vap_core.base.types import value
 from vap_core.evaluation import paper
 from vap_core.evaluation.ablations.arms import Ablation
@@ -130,7 +131,7 @@ def arm_rows(results: list[ArmResult]) -> list[list[str]]:
         difference = p = "-"
         if one.against is not None:
             of = one.against
-            difference = f"{100 * of.difference:+.1f} [{100 * of.low:+.1f}, {100 * of.high:+.1f}]"
+            difference = signed_interval(100 * of.difference, 100 * of.low, 100 * of.high, digits=1)
             p = f"{of.p_holm:.3g}"
         published = "-" if one.paper != one.paper else f"{100 * one.paper:.1f}"
         cells = [one.suite, one.arm, str(one.sr.n), str(one.sr), str(one.cmr)]

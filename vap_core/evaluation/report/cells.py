@@ -2,6 +2,8 @@
 
 from typing import TYPE_CHECKING, Any
 
+from vap_core.base.tables import signed_interval
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -78,7 +80,7 @@ def comparison_rows(compared: "pd.DataFrame") -> list[Row]:
             [
                 *(track, line.task, line.other, line.one, line.policy),
                 *map(str, counts),
-                percent_interval(line.difference, line.low, line.high, sign="+"),
+                _difference(line),
                 *(_p_value(line.p_mcnemar), _p_value(line.p), _p_value(line.p_holm)),
             ]
         )
@@ -99,11 +101,11 @@ def percent(fraction: float) -> str:
     return f"{100 * fraction:.1f}"
 
 
-def percent_interval(middle: float, low: float, high: float, sign: str = "") -> str:
+def percent_interval(middle: float, low: float, high: float) -> str:
     """A fraction and its interval as percent without the sign, "-" where it is not defined."""
     if low != low:
         return "-"
-    return f"{100 * middle:{sign}.1f} {_interval(low, high, sign)}"
+    return f"{100 * middle:.1f} {_interval(low, high)}"
 
 
 def _result_head(with_layouts: bool, with_paper: bool) -> Row:
@@ -136,10 +138,17 @@ def _result_cells(line: Any, with_layouts: bool, with_paper: bool) -> Row:
     return cells
 
 
-def _interval(low: float, high: float, sign: str = "") -> str:
+def _interval(low: float, high: float) -> str:
     if low != low:
         return "-"
-    return f"[{100 * low:{sign}.1f}, {100 * high:{sign}.1f}]"
+    return f"[{100 * low:.1f}, {100 * high:.1f}]"
+
+
+def _difference(line: Any) -> str:
+    """The points between two methods, "-" where they are not defined."""
+    if line.low != line.low:
+        return "-"
+    return signed_interval(100 * line.difference, 100 * line.low, 100 * line.high, digits=1)
 
 
 def _attempts(count: float) -> str:
