@@ -142,6 +142,7 @@ def test_a_damaged_log_is_named(logs: tuple[Path, Path]) -> None:
         "second_machine",
         "another_seed",
         "tint_free_halves",
+        "tint_free_fractal",
         "tint_free",
         "scripted",
         "bounds",

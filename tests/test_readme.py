@@ -16,11 +16,12 @@ from vap_core.evaluation.publish import read_runs
 from vap_core.evaluation.report.failures import breakdown
 from vap_core.evaluation.report.results import results
 from vap_core.evaluation.report.runs import load_runs
-from vap_core.evaluation.statistics import ALL_TASKS, rate_over_layouts
+from vap_core.evaluation.statistics import ALL_TASKS, compare, rate_over_layouts
 from vap_core.policies.lerobot.checkpoints import fingerprint
 from vap_core.policies.names import checkpoint_of
 
 RESULTS = ROOT / "data" / "results"
+BOUNDS = ("oracle-mask", "oracle-track", "wrong-mask")
 SHARES = {
     label.removeprefix("share-"): Path(checkpoint).name for label, checkpoint in TINT_SHARES.items()
 }
@@ -186,7 +187,7 @@ def test_the_policy_of_more_scenes_came_out_the_same_again() -> None:
 
 def test_what_simpler_fractals_policies_of_todays_recipe_reach() -> None:
     by_recipe = ("mini-pi0-simpler-fractal-wide", "mini-pi0-simpler-fractal-tint-free")
-    names = ("mini_pi0", "oracle_track", "fractal_today")
+    names = ("mini_pi0", "oracle_track", "fractal_today", "tint_free_fractal")
     published = pd.concat([_played(name) for name in names])
     published = published[published.policy.map(checkpoint_of).isin(by_recipe)]
     played = published[published.split == "visual matching"].copy()
@@ -314,6 +315,41 @@ def test_what_a_policy_that_never_saw_a_tint_does_with_either_half() -> None:
         one, other = one.align(generic, join="inner")
         assert ((one & ~other).sum(), (~one & other).sum()) == (won, lost)
     assert "(11 won and 3 lost, 37 and 34; exact p .06 and .81, uncorrected)" in PROSE
+
+
+def test_what_the_policy_of_the_other_robot_that_never_saw_a_tint_does() -> None:
+    told = _played("tint_free_fractal")
+    before = _played("fractal_today")
+    before = before[before.policy.isin(set(told.policy))]
+    assert told.groupby("method").size().to_dict() == dict.fromkeys(
+        ("hard-short", "hard-long", "soft", "mask-only", "rewrite-only", *BOUNDS), 460
+    )
+    both = pd.concat([before, told])
+    points, ps = {}, {}
+    for one, sign in (("generic", 1), ("vap", 1), ("below", -1)):
+        for other in set(told.method):
+            (whole,) = compare(both, [one.replace("below", "generic"), other], by_task=False)
+            low, high = sorted((sign * whole.low, sign * whole.high))
+            middle, low, high = (f"{100 * x:.0f}" for x in (sign * whole.difference, low, high))
+            points[one, other] = f"{middle} [{low}, {high}]"
+            ps[one, other] = f"{whole.p:.2f}".lstrip("0")
+    tint, words = ("below", "mask-only"), ("below", "rewrite-only")
+    assert (
+        f"the tint alone and the words alone are {points[tint]} and {points[words]} points below "
+        f"generic (p {ps[tint]} and {ps[words]})"
+    ) in PROSE
+    short, long, soft = (("generic", way) for way in ("hard-short", "hard-long", "soft"))
+    assert (
+        f"are {points[short]}, {points[long]} and {points[soft]} points above generic "
+        f"(p {ps[short]}, {ps[long]} and {ps[soft]}, uncorrected)"
+    ) in PROSE
+    start, always = (("vap", way) for way in BOUNDS[:2])
+    assert (
+        f"changes VAP by {points[start]} and {points[always]} points "
+        f"(p {ps[start]} and {ps[always]})"
+    ) in PROSE
+    wrong = told[told.method == "wrong-mask"].wrong_object.mean()
+    assert f"given a look-alike's it moves a wrong object in {100 * wrong:.0f} %" in PROSE
 
 
 def test_what_another_seed_of_vlabench_reaches() -> None:
