@@ -16,7 +16,7 @@ from vap_core.evaluation.publish import read_runs
 from vap_core.evaluation.report.failures import breakdown
 from vap_core.evaluation.report.results import results
 from vap_core.evaluation.report.runs import load_runs
-from vap_core.evaluation.statistics import ALL_TASKS, compare, rate_over_layouts
+from vap_core.evaluation.statistics import ALL_TASKS, compare, mcnemar, rate_over_layouts
 from vap_core.policies.lerobot.checkpoints import fingerprint
 from vap_core.policies.names import checkpoint_of
 
@@ -350,6 +350,26 @@ def test_what_the_policy_of_the_other_robot_that_never_saw_a_tint_does() -> None
     ) in PROSE
     wrong = told[told.method == "wrong-mask"].wrong_object.mean()
     assert f"given a look-alike's it moves a wrong object in {100 * wrong:.0f} %" in PROSE
+
+
+def test_what_tabletop_reaches_with_todays_engine() -> None:
+    one, other = (
+        rows[(rows.suite == "tabletop") & (rows.method == "vap")].set_index(["task", "episode"])
+        for rows in (_played("mini_pi0"), _played("ablations"))
+    )
+    other = other.reindex(one.index)
+    won = (~one.success.astype(bool) & other.success.astype(bool)).sum()
+    lost = (one.success.astype(bool) & ~other.success.astype(bool)).sum()
+    assert (won, lost, len(one)) == (6, 1, 160)
+    assert mcnemar(1, 6) == pytest.approx(0.125)
+    same = 100 * (one.steps == other.steps).mean()
+    assert f"{same:.0f} % of its 160 episodes end after as many steps, and seven end" in PROSE
+    rates = [_of_way(rows.reset_index(), "vap") for rows in (other, one)]
+    assert f"it has {rates[0].replace(' [', ' % [')} there and {rates[1]} in the main" in PROSE
+    for rows, selects, places in ((one, 74, 50), (other, 74, 56)):
+        task = rows.index.get_level_values("task")
+        for verb, percent in (("select", selects), ("put", places)):
+            assert round(100 * rows.success[task.str.startswith(verb)].mean()) == percent
 
 
 def test_what_another_seed_of_vlabench_reaches() -> None:
