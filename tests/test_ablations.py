@@ -103,6 +103,18 @@ def test_the_table_by_hand() -> None:
     assert labels == ["rewrite-only, n 10", "mask-only, n 10"]
 
 
+def test_seeds_of_the_same_layouts_do_not_narrow_an_arms_interval() -> None:
+    won = [True] * 9 + [False]
+    one_seed = pd.concat([outcomes("vap", won), outcomes("mask-only", won)], ignore_index=True)
+    ten_seeds = pd.concat([one_seed.assign(seed=seed) for seed in range(10)], ignore_index=True)
+    (few, _), (many, _) = (
+        arm_results(ABLATIONS["rewrite"], rows) for rows in (one_seed, ten_seeds)
+    )
+    assert (few.sr.n, many.sr.n) == (10, 100)
+    assert many.sr.high - many.sr.low > 0.3 > rate(90, 100).high - rate(90, 100).low
+    assert str(few.sr) == str(rate(9, 10)), "Wilson's where no layout returns"
+
+
 def test_several_policies_of_a_suite_are_refused() -> None:
     """Their episodes would be pooled, and compared by the last policy alone."""
     ablation = ABLATIONS["rewrite"]

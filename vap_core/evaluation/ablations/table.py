@@ -11,7 +11,7 @@ from vap_core.base.types import value
 from vap_core.evaluation import paper
 from vap_core.evaluation.ablations.arms import Ablation
 from vap_core.evaluation.metrics import Rate, rate
-from vap_core.evaluation.statistics import Comparison, compare, holm
+from vap_core.evaluation.statistics import Comparison, compare, holm, rate_over_layouts
 from vap_core.policies.names import TEMPERATURE, checkpoint_of
 
 if TYPE_CHECKING:
@@ -167,10 +167,11 @@ def _refuse_policies(suite: str, of_arms: "pd.DataFrame") -> None:
 
 
 def _share(rows: "pd.DataFrame", column: str) -> Rate:
-    """The share of episodes in which it holds, of those that can say, as `metrics.count` does."""
+    """The share of episodes in which it holds, of those that can say, as `metrics.count` does; its
+    interval is over layouts where one returns.
+    """
     measured = rows[rows[column].notna()]
-    won = measured[column].eq(True) & measured["outcome"].ne("error")
-    return rate(int(won.sum()), len(measured))
+    return rate_over_layouts(measured.assign(success=measured[column]))
 
 
 def _paper_sr(ablation: Ablation, suite: str, arm: str) -> float:
