@@ -6,10 +6,10 @@ findings_table(ablation_results(episodes))
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from vap_core.base.tables import signed, signed_interval
+from vap_core.base.tables import signed
 from vap_core.evaluation.ablations.picture import is_shown
 from vap_core.evaluation.ablations.table import ArmResult
-from vap_core.evaluation.statistics import Comparison
+from vap_core.evaluation.statistics import Comparison, points_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,12 +30,11 @@ def findings_table(results: Mapping[str, Sequence[ArmResult]]) -> "pd.DataFrame"
                 continue
             found = one.against
             assert found is not None
-            here, low, high = (100 * x for x in (found.difference, found.low, found.high))
             row = {
                 "ablation": name,
                 "arm": one.arm,
                 "n": one.sr.n,
-                "here, points [95 %]": signed_interval(here, low, high),
+                "here, points [95 %]": points_text(found),
                 "paper": signed(100 * theirs),
                 "the paper's finding": verdict(found, theirs),
             }

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 from vap_core.base.figures import empty_figure
 from vap_core.base.palette import CASES
-from vap_core.base.tables import signed_interval
 from vap_core.evaluation.ablations.arms import ABLATIONS
 from vap_core.evaluation.ablations.picture import (
     CLEAR,
@@ -25,6 +24,7 @@ from vap_core.evaluation.ablations.table import PAPER_SUITES, ArmResult, arm_res
 from vap_core.evaluation.ablations.table import across_policies as across_policies
 from vap_core.evaluation.ablations.table import policy_results as policy_results
 from vap_core.evaluation.publish import read_runs
+from vap_core.evaluation.statistics import points_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -233,8 +233,7 @@ def effect_text(results: Sequence[ArmResult], arm: str, suite: str = "") -> str:
     (one,) = [each for each in results if each.arm == arm and suite in ("", each.suite)]
     if one.against is None:
         return f"{100 * one.sr.value:.0f} % of {one.sr.n}"
-    found = one.against
-    return signed_interval(100 * found.difference, 100 * found.low, 100 * found.high)
+    return points_text(one.against)
 
 
 def _by_suite(results: Sequence[ArmResult]) -> dict[str, list[ArmResult]]:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float64
 
+from vap_core.base.tables import signed_interval
 from vap_core.base.types import value
 from vap_core.evaluation.layouts import layout_names
 from vap_core.evaluation.metrics import Rate, rate
@@ -92,6 +93,11 @@ def compare(
                 }
                 comparisons.append(_compare_pairs(pairs, names))
     return _holm_corrected(comparisons)
+
+
+def points_text(found: Comparison, digits: int = 0) -> str:
+    """A difference of success in points, with its interval: "+3 [-1, +7]"."""
+    return signed_interval(100 * found.difference, 100 * found.low, 100 * found.high, digits)
 
 
 def mcnemar(only_one: int, only_other: int) -> float:

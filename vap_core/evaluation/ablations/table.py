@@ -6,12 +6,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.tables import signed_interval
 from vap_core.base.types import value
 from vap_core.evaluation import paper
 from vap_core.evaluation.ablations.arms import Ablation
+from vap_core.evaluation.layouts import layout_names
 from vap_core.evaluation.metrics import Rate, rate
-from vap_core.evaluation.statistics import Comparison, compare, holm, rate_over_layouts
+from vap_core.evaluation.statistics import (
+    Comparison,
+    compare,
+    holm,
+    points_text,
+    rate_over_layouts,
+)
 from vap_core.policies.names import TEMPERATURE, checkpoint_of
 
 if TYPE_CHECKING:
@@ -50,6 +56,7 @@ def arm_results(ablation: Ablation, episodes: "pd.DataFrame") -> list[ArmResult]
     results = []
     for suite in dict.fromkeys(episodes["suite"]):
         of_suite = episodes[episodes["suite"] == suite].assign(split="")
+        of_suite["layout"] = layout_names(of_suite)
         ran = set(of_suite["method"])
         arms = [arm for arm in ablation.names if arm in ran]
         if ablation.names[0] not in ran or len(arms) < 2:
@@ -130,9 +137,8 @@ def arm_rows(results: list[ArmResult]) -> list[list[str]]:
     for one in results:
         difference = p = "-"
         if one.against is not None:
-            of = one.against
-            difference = signed_interval(100 * of.difference, 100 * of.low, 100 * of.high, digits=1)
-            p = f"{of.p_holm:.3g}"
+            difference = points_text(one.against, digits=1)
+            p = f"{one.against.p_holm:.3g}"
         published = "-" if one.paper != one.paper else f"{100 * one.paper:.1f}"
         cells = [one.suite, one.arm, str(one.sr.n), str(one.sr), str(one.cmr)]
         cases = [str(one.case_1.k), str(one.case_2.k)]
