@@ -111,9 +111,9 @@ def test_every_holm_p_of_the_main_table_is_what_report_prints() -> None:
     led = found[[("vap" in names) and not names & bounds for names in found.methods]]
     single = led[led.task != ALL_TASKS]
     assert led[led.task == ALL_TASKS].p_holm.max() < 0.001
-    assert (len(single), (single.p_holm < 0.05).sum()) == (84, 40)
+    assert (len(single), (single.p_holm < 0.05).sum()) == (84, 46)
     assert quoted("What the shipped policies reach") == ["< .001", "< 0.05"]
-    assert "84 comparisons of 84; 40 of them" in section("What the shipped policies reach")
+    assert "84 comparisons of 84; 46 of them" in section("What the shipped policies reach")
 
 
 def test_every_holm_p_of_the_dose_of_tints_is_what_ablate_prints() -> None:
@@ -140,7 +140,7 @@ def test_no_p_is_corrected_over_a_family_that_no_command_prints() -> None:
     of_fractal = of_fractal[of_fractal.split == "variant aggregation"]
     of_fractal = of_fractal[of_fractal.task == ALL_TASKS].set_index("methods").p_holm
     for words in ("hard-short", "hard-long", "soft"):
-        assert of_fractal[frozenset(("generic", words))] == 1
+        assert of_fractal[frozenset(("generic", words))] > 0.5
 
 
 def test_the_held_out_tints_are_called_unseen_as_tints_alone() -> None:

@@ -16,7 +16,13 @@ from vap_core.evaluation.publish import read_runs
 from vap_core.evaluation.report.failures import breakdown
 from vap_core.evaluation.report.results import results
 from vap_core.evaluation.report.runs import load_runs
-from vap_core.evaluation.statistics import ALL_TASKS, compare, mcnemar, rate_over_layouts
+from vap_core.evaluation.statistics import (
+    ALL_TASKS,
+    Comparison,
+    compare,
+    mcnemar,
+    rate_over_layouts,
+)
 from vap_core.policies.lerobot.checkpoints import fingerprint
 from vap_core.policies.names import checkpoint_of
 
@@ -380,6 +386,46 @@ def test_what_tabletop_reaches_with_either_engine() -> None:
     again = today.loc["vap"]
     for column in ("outcome", "steps"):
         assert (arm[column].reindex(again.index) == again[column]).all()
+
+
+def test_other_starts_are_beside_the_same_episodes_as_listed() -> None:
+    key = ["suite", "task", "episode"]
+    moved, listed = _played("starts"), _played("mini_pi0")
+    moved = moved[(moved.suite == "tabletop") & (moved.method == "vap")].set_index(key)
+    listed = listed[listed.method == "vap"].set_index(key)
+    same = listed.reindex(moved.index)
+    assert set(same.policy) == set(moved.policy)
+    won, before = moved.success.sum(), same.success.sum()
+    assert f"tabletop {won} of {len(moved)} ({before})" in PROSE
+
+
+def test_the_scripted_policys_intervals_over_layouts() -> None:
+    played = _played("scripted")
+    of_vap = played[(played.suite == "simpler-fractal") & (played.method == "vap")]
+    looks = [of_vap[of_vap.split == split] for split in ("visual matching", "variant aggregation")]
+    over = [rate_over_layouts(rows) for rows in looks]
+    quoted = " and ".join(f"[{100 * one.low:.0f}, {100 * one.high:.0f}]" for one in over)
+    assert f"drawn again the interval of VAP is {quoted}" in PROSE
+
+
+def test_what_the_true_mask_gains_on_several_views() -> None:
+    played = pd.concat([_played("mini_pi0"), _played("oracle_track")])
+    played = played[played.suite.isin(["vlabench", "tabletop"])]
+    found = {
+        (c.suite, c.one, c.other): c
+        for c in compare(played, ["vap", "oracle-mask", "oracle-track"], by_task=False)
+    }
+
+    def points(c: Comparison) -> str:
+        return f"{100 * c.difference:.0f} points [{100 * c.low:.0f}, {100 * c.high:.0f}]"
+
+    start = [found[suite, "vap", "oracle-mask"] for suite in ("vlabench", "tabletop")]
+    texts = [points(c) for c in start]
+    assert f"perception: {texts[0]} on vlabench" in PROSE
+    assert f"on tabletop {texts[1].replace(' points', '')}, not beyond chance" in PROSE
+    assert start[0].p < 0.001 < 0.05 < start[1].p
+    always = found["tabletop", "oracle-mask", "oracle-track"]
+    assert f"it adds {points(always)} on tabletop (p {always.p:.3f}".replace("0.", ".") in PROSE
 
 
 def test_what_another_seed_of_vlabench_reaches() -> None:

@@ -271,6 +271,17 @@ def test_holm_takes_single_tasks_and_all_of_them_apart() -> None:
     assert whole[0].pairs == 20
 
 
+def test_holm_does_not_depend_on_what_else_a_table_holds() -> None:
+    methods = {**WON, "mask-only": [0] * 10}
+    alone = episodes(methods)
+    others = [episodes(methods, suite="vlabench"), episodes(methods).assign(policy="another")]
+    by_itself, *beside = (
+        [c.p_holm for c in compare(pd.concat([alone, one]))[:3]] for one in (None, *others)
+    )
+    assert min(by_itself) > min(c.p for c in compare(alone))
+    assert all(one == by_itself for one in beside)
+
+
 def test_a_layout_of_simpler_returns_under_every_look() -> None:
     fractal = suites.lists.read("simpler-fractal")
     known = pd.DataFrame(

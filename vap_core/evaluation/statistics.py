@@ -4,6 +4,7 @@ A pair is one episode (PAIR_KEY) under two methods; an error counts as no succes
 unit is the starting layout (`layouts`).
 """
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
@@ -34,8 +35,8 @@ class Comparison:
 
     `difference` is SR of `other` minus SR of `one`; `low` and `high` are its 95 % cluster
     bootstrap. `p_mcnemar` is exact and takes every pair for independent. `p` takes only layouts for
-    independent (the same number where no layout returns). `p_holm` is `p` corrected for all
-    comparisons of its kind (single tasks, or all tasks together) in one table.
+    independent (the same number where no layout returns). `p_holm` is `p` corrected for the
+    suite's comparisons with one policy of its kind (single tasks, or all tasks together).
     """
 
     suite: str
@@ -259,13 +260,16 @@ def _compare_pairs(pairs: "pd.DataFrame", names: dict[str, str]) -> Comparison:
 
 
 def _holm_corrected(comparisons: Sequence[Comparison]) -> list[Comparison]:
-    """With `p_holm` corrected within single tasks, and within ALL_TASKS."""
+    """With `p_holm` corrected within the comparisons of a suite with one policy: of its single
+    tasks, and apart from them of ALL_TASKS.
+
+    So it does not depend on what else a table holds.
+    """
     corrected = list(comparisons)
-    for whole in (True, False):
-        family = []
-        for i, comparison in enumerate(comparisons):
-            if (comparison.task == ALL_TASKS) == whole:
-                family.append(i)
+    families = defaultdict(list)
+    for i, one in enumerate(comparisons):
+        families[one.suite, one.policy, one.task == ALL_TASKS].append(i)
+    for family in families.values():
         p_holm = holm([comparisons[i].p for i in family])
         for i, p in zip(family, p_holm, strict=True):
             corrected[i] = replace(comparisons[i], p_holm=p)

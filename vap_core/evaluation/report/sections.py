@@ -44,8 +44,8 @@ COMPARISONS_NOTE = (
     "go by p.\n"
     "- p McNemar: exact, every pair on its own. p layouts: the same where no layout returns; else "
     "exact, too, with whole layouts changing sign.\n"
-    "- p Holm: p layouts, corrected for all comparisons of single tasks, and apart from them for "
-    "those of all tasks together."
+    "- p Holm: p layouts, corrected for a suite's comparisons with one policy: those of its single "
+    "tasks, and apart from them those of all tasks together."
 )
 FAILURES_NOTE = (
     "Case 1: all views are prompted alike, and wrong. Case 2: views are prompted with different "
