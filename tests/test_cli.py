@@ -199,7 +199,7 @@ def test_register_stops_at_a_doubtful_photo_and_goes_on_with_its_box(tmp_path: P
     line = refused(*words, tmp_path / "wall.png")
     assert "wall.png: no cup was found in it" in line
     assert "--box wall.png=x0,y0,x1,y1" in line
-    assert [path.name for path in (tmp_path / "bank").iterdir()] == ["x.references.png"]
+    assert [path.name for path in (tmp_path / "bank").iterdir()] == ["x.doubtful.png"]
     done = vap(*words, tmp_path / "wall.png", "--box", "wall.png=20,30,70,90")
     assert done.returncode == 0, done.stderr
     assert "only 53x63 pixels" in done.stderr or "only 54x64 pixels" in done.stderr

@@ -1,8 +1,11 @@
 """Photos in, objects out and back; every damaged input is one clear line and loses nothing."""
 
+import errno
 import json
 import os
 import struct
+import warnings
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +19,7 @@ from PIL import Image
 
 from tests.scanned import EPS, fake_ghostscript
 from tests.toys import TOYS, MeanColour, personal, scene
-from vap_core.base.errors import BadMemory, BadOutput, BadPhoto
+from vap_core.base.errors import BadEncoder, BadMemory, BadOutput, BadPhoto
 from vap_core.base.types import Description, Rgb
 from vap_core.memory import (
     kind_instead,
@@ -84,6 +87,28 @@ def test_register_says_what_is_missing(name: str, category: str, photos: int, er
         register(name, category, pictures, TOYS.detector, TOYS.encoder)
     with pytest.raises((BadMemory, BadPhoto), match=error):
         remember(name, category, pictures, TOYS.encoder)
+
+
+@pytest.mark.parametrize(
+    ("rows", "fault"),
+    [
+        ([[np.nan, 0.0]], "numbers that are not finite"),
+        ([[3.0, 4.0]], "a row of length 5, not of length 1"),
+        ([[1.0, 0.0], [1.0, 0.0]], "2 rows for 1 crops"),
+    ],
+)
+def test_bad_rows_are_not_remembered(rows: list[list[float]], fault: str) -> None:
+    class Odd:
+        name = "odd"
+
+        def __call__(self, crops: Sequence[Rgb]) -> np.ndarray:
+            return np.array(rows, np.float32)
+
+    with pytest.raises(
+        BadEncoder, match=f"remember: encoder 'odd' gave {fault}; test it"
+    ) as caught:
+        remember("mug", "cup", [scene([(4, 8, TEAL)])], Odd())
+    assert "pytest --pyargs vap_core.contracts --encoder MODULE:NAME" in str(caught.value)
 
 
 @pytest.mark.parametrize("category", ["a", "anorak", "a-frame", "theatre mask", "mylar bag"])
@@ -252,9 +277,25 @@ def test_another_encoder_is_said(tmp_path: Path) -> None:
         load(path, "dinov2")
 
 
+@pytest.mark.parametrize("call", ["read_bytes", "iterdir"])
+def test_a_memory_that_cannot_be_read_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
+) -> None:
+    save(tmp_path, personal("mug", "cup", TEAL))
+
+    def refuse(path: Path) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, call, refuse)
+    with pytest.raises(BadMemory, match="cannot be read .Permission denied.; check its perm"):
+        load_bank(tmp_path)
+
+
 def write(path: Path, kind: str) -> Path:
     if kind == "missing":
         return path
+    if kind == "long":
+        return path.with_name("x" * 300)
     if kind == "huge":
         Image.new("1", (9000, 9000)).save(path)
     else:
@@ -267,6 +308,7 @@ def write(path: Path, kind: str) -> Path:
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
+        ("long", "cannot be read .File name too long.; check the path"),
         ("missing", "is not a file"),
         ("empty", "is empty"),
         ("text", "cannot be read as an image"),
@@ -277,6 +319,20 @@ def write(path: Path, kind: str) -> Path:
 def test_bad_photos(tmp_path: Path, kind: str, message: str) -> None:
     with pytest.raises(BadPhoto, match=message):
         load_photo(write(tmp_path / "photo.png", kind))
+
+
+@pytest.mark.parametrize("side", [9750, 30_000])
+def test_a_photo_that_is_far_too_large_is_one_line(tmp_path: Path, side: int) -> None:
+    """Pillow warns above 89 megapixels, and refuses above 178; the file is a header alone."""
+    chunk = b"IHDR" + struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
+    header = struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    data = struct.pack(">I", 9) + b"IDAT" + b"x" * 13
+    (tmp_path / "photo.png").write_bytes(b"\x89PNG\r\n\x1a\n" + header + data)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        with pytest.raises(BadPhoto, match="over 50 million.*; scale it down"):
+            load_photo(tmp_path / "photo.png")
+    assert not caught
 
 
 def test_a_photo_starts_no_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ References are crops of photos, and their embeddings Z_o.
 """
 
 import json
+import os.path
 import re
 import shlex
 import struct
@@ -17,13 +18,27 @@ from unicodedata import normalize
 import numpy as np
 from jaxtyping import Float32
 
-from vap_core.base.errors import BadMemory, BadOutput, BadPhoto, UnknownName, one_of
-from vap_core.base.files import encode_tensors, parse_json, remove_scratch, write_atomic
+from vap_core.base.errors import (
+    BadEncoder,
+    BadMemory,
+    BadOutput,
+    BadPhoto,
+    UnknownName,
+    one_of,
+)
+from vap_core.base.files import (
+    encode_tensors,
+    parse_json,
+    read_file,
+    remove_scratch,
+    write_atomic,
+)
 from vap_core.base.photos import load_photo as load_photo
 from vap_core.base.types import Description, PersonalObject, Rgb, Target
 from vap_core.instruction.owners import belonging, check_owner, owners_of
 from vap_core.perception.boxes import crop
 from vap_core.perception.protocols import Detector, Encoder, ReferenceCropper
+from vap_core.perception.rows import describe_fault, row_fault
 
 FORMAT = "vap-personal-object"
 VERSION = 1
@@ -91,15 +106,22 @@ def remember(name: str, category: str, crops: Sequence[Rgb], encoder: Encoder) -
     """Embed reference crops that are cut out already.
 
     Raises:
-        BadMemory: no usable name or category; BadPhoto: no crops.
+        BadMemory: no usable name or category; BadPhoto: no crops; BadEncoder: its rows are not
+            one a crop, not finite, or not of length 1 (within 1e-3).
     """
     check_names(name, category)
     if not crops:
         raise BadPhoto(f"remember: {name!r} has no photos; give at least one, five are best.")
+    rows = encoder(crops)
+    fault = row_fault(rows, rows)
+    if len(rows) != len(crops):
+        fault = f"{len(rows)} rows for {len(crops)} crops"
+    if fault:
+        raise BadEncoder(describe_fault("remember", encoder, fault))
     return PersonalObject(
         name=name,
         category=plain_category(category),
-        embeddings=encoder(crops),
+        embeddings=rows,
         crops=tuple(crops),
         encoder=encoder.name,
     )
@@ -227,7 +249,7 @@ def save(bank: Path | str, obj: PersonalObject, *, replace: bool = False) -> Pat
         remove_scratch(bank)
         write_atomic(path, encode_tensors(tensors, header), replace=replace)
     except OSError as error:
-        if path.exists() and not replace:
+        if os.path.lexists(path) and not replace:
             raise taken(path) from error
         raise BadOutput(
             f"save: {bank} cannot be written ({error.strerror}); choose another folder with "
@@ -241,6 +263,29 @@ def object_path(bank: Path, name: str) -> Path:
     return bank / f"{name}{SUFFIX}"
 
 
+def object_files(bank: Path) -> list[Path]:
+    """The files of a bank's objects, in the order of their names.
+
+    Hidden files, such as the `._NAME` that macOS writes beside its files, are left out.
+
+    Raises: BadMemory: the folder cannot be read.
+    """
+    try:
+        paths = sorted(bank.iterdir())
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    except OSError as error:
+        raise BadMemory(
+            f"load_bank: {bank} cannot be read ({error.strerror or error}); check its permissions, "
+            "or choose another folder with --memory."
+        ) from error
+    found = []
+    for path in paths:
+        if path.name.endswith(SUFFIX) and not path.name.startswith("."):
+            found.append(path)
+    return found
+
+
 def taken(path: Path) -> BadOutput:
     """The error for an object whose name a bank holds already."""
     return BadOutput(f"save: {path} exists; choose another name or pass --replace.")
@@ -250,7 +295,7 @@ def load(path: Path | str, encoder: str | None = None) -> PersonalObject:
     """Read one object; the file is parsed, never executed.
 
     Raises:
-        BadMemory: missing, damaged, of another version, or embedded by another encoder.
+        BadMemory: missing, unreadable, damaged, of another version, or embedded by another encoder.
     """
     path = Path(path)
     header, tensors = _read(path)
@@ -303,12 +348,10 @@ def load(path: Path | str, encoder: str | None = None) -> PersonalObject:
 def load_bank(bank: Path | str, encoder: str | None = None) -> dict[str, PersonalObject]:
     """Every object of a bank by name; a bank that does not exist yet is empty.
 
-    Hidden files, such as the `._NAME` that macOS writes beside its files, are left out.
+    Raises: BadMemory, as `load` and `object_files`.
     """
     objects = {}
-    for path in sorted(Path(bank).glob(f"*{SUFFIX}")):
-        if path.name.startswith("."):
-            continue
+    for path in object_files(Path(bank)):
         obj = load(path, encoder)
         objects[obj.name] = obj
     return objects
@@ -337,9 +380,13 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     from safetensors import SafetensorError
     from safetensors.numpy import load as decode
 
-    if not path.is_file():
-        raise BadMemory(f"load: {path} is not a file; {AGAIN}.")
-    data = path.read_bytes()
+    try:
+        data = read_file(path)
+    except OSError as error:
+        raise BadMemory(
+            f"load: {path} cannot be read ({error.strerror or error}); check its permissions, or "
+            f"{AGAIN}."
+        ) from error
     damaged = (
         SafetensorError,
         struct.error,

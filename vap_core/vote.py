@@ -19,6 +19,7 @@ from vap_core.perception.boxes import box_cover
 from vap_core.perception.candidates import Candidates, Proposals
 from vap_core.perception.proof import MOST_COMPARED, prove
 from vap_core.perception.protocols import Stack
+from vap_core.perception.rows import describe_fault, row_fault
 
 VoteRule = Literal["vote", "average", "best"]
 RULES: tuple[str, ...] = get_args(VoteRule)
@@ -27,8 +28,6 @@ SAME_PLACE = 0.5
 """Of two boxes of which the smaller is covered by more than this share, one is a candidate."""
 MOST_CANDIDATES = 4
 """Candidates of one object among proposals of any object. Each of them is segmented and tracked."""
-LENGTH_TOLERANCE = 1e-3
-"""How far from 1 an embedding's length may be."""
 
 
 def similarity(
@@ -49,26 +48,12 @@ def compare(
     """
     encoder = stack.encoder_of(proposals.boxes)
     references = reference_rows(obj, encoder)
-    fault = _fault(proposals.embeddings, references) or _fault(references, references)
+    fault = row_fault(proposals.embeddings, references) or row_fault(references, references)
     if fault:
         again = encoder(list(obj.crops))
-        kind = BadEncoder if _fault(again, references) else BadCrop
-        raise kind(
-            f"vote: encoder {encoder.name!r} gave {fault}; test it with "
-            "pytest --pyargs vap_core.contracts --encoder MODULE:NAME."
-        )
+        kind = BadEncoder if row_fault(again, references) else BadCrop
+        raise kind(describe_fault("vote", encoder, fault))
     return similarity(proposals.embeddings, references)
-
-
-def _fault(rows: Float32[np.ndarray, "n _d"], references: Float32[np.ndarray, "k _e"]) -> str:
-    """What is wrong with the rows of crops, "" where nothing is."""
-    if rows.shape[1] != references.shape[1]:
-        return f"{rows.shape[1]} numbers a crop, and {references.shape[1]} for the references"
-    if not np.isfinite(rows).all():
-        return "numbers that are not finite"
-    length = np.linalg.norm(rows, axis=1)
-    far = np.abs(length - 1) > LENGTH_TOLERANCE
-    return f"a row of length {length[far][0]:.3g}, not of length 1" if far.any() else ""
 
 
 def nominate(rgb: Rgb, obj: PersonalObject, offered: Proposals, stack: Stack) -> Proposals:

@@ -1,5 +1,6 @@
 """Ground a clip, track through it, and write it as a recording and as a video."""
 
+import os.path
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from itertools import chain
@@ -9,6 +10,7 @@ from vap_core.analysis.ground import claimed_paths
 from vap_core.attend import Attender, AttendState, Prompting
 from vap_core.base import video
 from vap_core.base.errors import BadPhoto
+from vap_core.base.files import file_fault
 from vap_core.base.photos import load_photo, photos_in
 from vap_core.base.types import Attended, PersonalObject, Rgb, Track, value
 from vap_core.instruction.parsers import Parsing
@@ -54,8 +56,11 @@ class ClipSummary:
 
 
 def is_clip(path: Path) -> bool:
-    """Whether `ground` is asked to follow a clip: a video, or a folder of frames."""
-    return path.is_dir() or video.is_video(path)
+    """Whether `ground` is asked to follow a clip: a video, or a folder of frames.
+
+    What cannot be looked at is no folder.
+    """
+    return os.path.isdir(path) or video.is_video(path)
 
 
 def ground_clip(
@@ -148,8 +153,8 @@ def _follow(
 
 def _open(path: Path) -> tuple[Iterator[Rgb], float]:
     """The frames of a video or of a folder, and how many there are a second. Raises: BadPhoto."""
-    if not path.is_dir():
-        hz = video.frame_rate(path) if path.is_file() else 1.0
+    if not os.path.isdir(path):
+        hz = 1.0 if file_fault(path) else video.frame_rate(path)
         return video.frames(path, SIDE), hz
     photos = photos_in(path)
     if not photos:

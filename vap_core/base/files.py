@@ -167,6 +167,20 @@ def read_file(path: Path) -> bytes:
     return path.read_bytes()
 
 
+def file_fault(path: Path) -> str:
+    """Why no file can be read at a path, as the rest of a sentence about it; "" where one can be.
+
+    `Path.is_file` raises for a folder without rights, and for a name that is too long.
+    """
+    try:
+        if not path.is_file():
+            return "is not a file"
+        with path.open("rb"):
+            return ""
+    except OSError as error:
+        return f"cannot be read ({error.strerror or error})"
+
+
 def encode_tensors(tensors: "Mapping[str, np.ndarray]", metadata: Mapping[str, str]) -> bytes:
     """A safetensors file with its header sorted: equal contents are equal bytes."""
     from safetensors.numpy import save

@@ -1,11 +1,13 @@
 """Reading a user's photos: upright RGB, bounded in size, and one line of error for whatever cannot
 be read."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
 
 from vap_core.base.errors import BadPhoto
+from vap_core.base.files import file_fault
 from vap_core.base.types import Mask, Rgb
 
 PICTURE_FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "GIF", "TIFF", "AVIF")
@@ -35,7 +37,7 @@ def load_photo(path: Path | str, long_side: int | None = LONG_SIDE) -> Rgb:
     size). Grey stands where it is transparent.
 
     Raises:
-        BadPhoto: missing, empty, not an image, truncated, or more than 50 megapixels.
+        BadPhoto: missing, unreadable, empty, not an image, truncated, or more than 50 megapixels.
     """
     rgb = _decode(path, "RGB")
     return rgb if long_side is None else shrink(rgb, long_side)
@@ -69,7 +71,11 @@ def _decode(path: Path | str, mode: str) -> np.ndarray:
     _check_file(path)
     register_heif_opener(thumbnails=False)
     try:
-        with path.open("rb") as file, Image.open(file, formats=PHOTO_FORMATS) as image:
+        with (
+            warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning),
+            path.open("rb") as file,
+            Image.open(file, formats=PHOTO_FORMATS) as image,
+        ):
             if image.width * image.height > MAX_PIXELS:
                 raise BadPhoto(
                     f"load_photo: {path} has {image.width}x{image.height} pixels, over "
@@ -92,6 +98,10 @@ def _decode(path: Path | str, mode: str) -> np.ndarray:
         raise BadPhoto(
             f"load_photo: {path} cannot be read as an image, it is none of "
             f"{', '.join(PHOTO_FORMATS)}; export it as JPEG or PNG."
+        ) from error
+    except Image.DecompressionBombError as error:
+        raise BadPhoto(
+            f"load_photo: {path} has over {MAX_PIXELS / 1e6:.0f} million pixels; scale it down."
         ) from error
     except Exception as error:  # a damaged file makes the decoders raise anything
         raise BadPhoto(
@@ -122,8 +132,9 @@ def photos_in(folder: Path) -> list[Path]:
 
 
 def _check_file(path: Path) -> None:
-    if not path.is_file():
-        raise BadPhoto(f"load_photo: {path} is not a file; check the path.")
+    fault = file_fault(path)
+    if fault:
+        raise BadPhoto(f"load_photo: {path} {fault}; check the path and its permissions.")
     size = path.stat().st_size
     if not size:
         raise BadPhoto(f"load_photo: {path} is empty; export the photo again.")

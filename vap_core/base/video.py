@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from vap_core.base.errors import BadOutput, BadPhoto
-from vap_core.base.files import check_regular, replacing
+from vap_core.base.files import check_regular, file_fault, replacing
 from vap_core.base.types import Rgb
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
@@ -31,12 +31,13 @@ def is_video(path: Path) -> bool:
 def frames(path: Path, long_side: int | None = None) -> Iterator[Rgb]:
     """The frames of a video, upright, shrunk to `long_side` pixels where longer.
 
-    Raises: BadPhoto: the file is missing, or holds no video that can be decoded.
+    Raises: BadPhoto: the file is missing or unreadable, or holds no video that can be decoded.
     """
     import av
 
-    if not path.is_file():
-        raise BadPhoto(f"video: {path} is not a file; check the path.")
+    fault = file_fault(path)
+    if fault:
+        raise BadPhoto(f"video: {path} {fault}; check the path and its permissions.")
     try:
         with av.open(str(path)) as container:
             if not container.streams.video:

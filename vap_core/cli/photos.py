@@ -101,43 +101,50 @@ def register(
         --note "for the morning coffee"
     """
     import dataclasses
+    import os.path
+    from contextlib import suppress
 
     from vap_core.base.commands import command
     from vap_core.evaluation.photos import register as registering
     from vap_core.evaluation.photos.trust import leave_one_out, warnings
     from vap_core.instruction.owners import check_owner
-    from vap_core.memory import check_names, load_bank, object_path, save, taken
+    from vap_core.memory import check_names, object_path, save, taken
     from vap_core.perception.describe import load_captioner, with_description
     from vap_core.perception.stacks import load_stack
 
     stack = stack_of(stack, detector, encoder, tracker)
     check_names(name, category)
     check_owner(owner, known_as or [], note)
-    if object_path(memory, name).exists() and not replace:
+    if os.path.lexists(object_path(memory, name)) and not replace:
         raise taken(object_path(memory, name))
-    known = load_bank(memory)
+    known, damaged = registering.load_others(memory, name)
+    for error in damaged:
+        if not replace:
+            raise error
+        print(f"note: {error}", file=sys.stderr)
     paths = registering.gather_photos(photos or [])
     if video is not None:
         paths += registering.film_photos(video, memory / f"{name}.frames", frames)
     given = registering.parse_given(box or [], mask or [], paths)
     models = load_stack(stack)
     references = registering.choose(paths, category, models, given, whole=whole)
-    sheet = memory / f"{name}.references.png"
-    registering.write_sheet(sheet, references, paths)
+    doubtful = memory / f"{name}.doubtful.png"
     if not accept:
-        registering.refuse_doubtful(references, paths, sheet)
+        registering.refuse_doubtful(references, paths, doubtful)
     obj = registering.remember_references(name, category, references, models)
     for line in warnings(obj, references, [path.name for path in paths]):
         print(f"note: {line}", file=sys.stderr)
     obj = with_description(obj, load_captioner(models.segmenter, describe))
     obj = dataclasses.replace(obj, owner=owner, known_as=tuple(known_as or []), note=note)
     path = save(memory, obj, replace=replace)
-    trust = leave_one_out(obj, references, {**known, name: obj}, models.encoder)
     print(f"{obj.name}: a {obj.category} with {len(obj.crops)} references, saved to {path}")
+    sheet = memory / f"{name}.references.png"
+    registering.write_sheet(sheet, references, paths)
+    with suppress(OSError):
+        doubtful.unlink(missing_ok=True)
     print(f"look at the crops: {sheet}")
-    print(trust)
-    words = ("ground", "IMAGE", f"bring my {obj.category}", "--memory", memory)
-    print(f"next: {command(*words)}")
+    print(leave_one_out(obj, references, {**known, name: obj}, models.encoder))
+    print(f"next: {command(*registering.next_words(obj, memory, stack, known))}")
 
 
 @app.command()

@@ -3,13 +3,14 @@
 A box is chosen in every photo, all are shown on a contact sheet, and a doubtful one stops it.
 """
 
+import os.path
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from vap_core.base.errors import BadPhoto, BadPhotoSet
+from vap_core.base.errors import BadMemory, BadPhoto, BadPhotoSet
 from vap_core.base.photos import load_mask, load_photo, photos_in
 from vap_core.base.types import PersonalObject, Rgb
 from vap_core.base.video import is_video, sharp_frames
@@ -23,7 +24,8 @@ from vap_core.evaluation.photos.pictures import (
     labelled,
     write_picture,
 )
-from vap_core.memory import load_bank, remember, save
+from vap_core.instruction.owners import fold
+from vap_core.memory import load, load_bank, object_files, object_path, remember, save
 from vap_core.perception.boxes import mask_box
 from vap_core.perception.protocols import Stack
 from vap_core.perception.references import Box, Reference, choose_references, whole_photos
@@ -40,16 +42,16 @@ def gather_photos(paths: Sequence[Path]) -> list[Path]:
     """
     found: list[Path] = []
     for path in paths:
-        if not path.is_dir():
+        if not os.path.isdir(path):
             found.append(path)
             continue
         inside = photos_in(path)
         if not inside:
             raise BadPhoto(f"register: {path} holds no picture; name a folder of photos.")
         found.extend(inside)
-    once: dict[Path, Path] = {}
+    once: dict[str, Path] = {}
     for path in found:
-        once.setdefault(path.resolve(), path)
+        once.setdefault(os.path.realpath(path), path)
     return list(once.values())
 
 
@@ -109,10 +111,14 @@ def choose(
 
 
 def refuse_doubtful(references: Sequence[Reference], photos: Sequence[Path], sheet: Path) -> None:
-    """Raises: BadPhoto, which names the first photo whose crop may be wrong."""
+    """Stop at crops that may be wrong, after writing their sheet.
+
+    Raises: BadPhoto, which names the sheet and the first photo whose crop may be wrong; BadOutput.
+    """
     doubtful = [i for i, reference in enumerate(references) if reference.doubt]
     if not doubtful:
         return
+    write_sheet(sheet, references, photos)
     first = doubtful[0]
     name = _shortest_name(photos[first], photos)
     more = ""
@@ -127,7 +133,7 @@ def refuse_doubtful(references: Sequence[Reference], photos: Sequence[Path], she
 def remember_references(
     name: str, category: str, references: Sequence[Reference], stack: Stack
 ) -> PersonalObject:
-    """The object with the chosen crops. Raises: BadMemory."""
+    """The object with the chosen crops. Raises: BadMemory, BadEncoder."""
     crops = [fit_crop(reference.crop) for reference in references]
     return remember(name, category, crops, stack.encoder)
 
@@ -165,6 +171,42 @@ def describe_choice(reference: Reference) -> str:
     if np.isnan(reference.agreement):
         return "box proposed; the only photo"
     return f"box proposed; cosine {reference.agreement:.2f} to the other photos"
+
+
+def load_others(memory: Path, name: str) -> tuple[dict[str, PersonalObject], tuple[BadMemory, ...]]:
+    """The objects of a memory besides `name`, and an error for each that cannot be loaded.
+
+    The file of `name` itself is not read: it may be damaged, and is to be replaced.
+
+    Raises: BadMemory: the folder cannot be read.
+    """
+    known = {}
+    errors = []
+    for path in object_files(memory):
+        if path == object_path(memory, name):
+            continue
+        try:
+            obj = load(path)
+        except BadMemory as error:
+            errors.append(error)
+        else:
+            known[obj.name] = obj
+    return known, tuple(errors)
+
+
+def next_words(
+    obj: PersonalObject, memory: Path, stack: str, others: Mapping[str, PersonalObject]
+) -> list[str]:
+    """The command that grounds an object which was just registered beside `others`."""
+    words = ["ground", "IMAGE", f"bring my {obj.category}", "--memory", str(memory)]
+    if stack != "embedded":
+        words += ["--stack", stack]
+    if obj.owner:
+        words += ["--speaker", obj.owner]
+    for other in others.values():
+        if other.category == obj.category and fold(other.owner) == fold(obj.owner):
+            return [*words, "--object", obj.name]
+    return words
 
 
 def remember_subjects(
