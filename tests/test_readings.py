@@ -188,7 +188,7 @@ def test_the_docs_count_the_published_readings() -> None:
         f"{vlabench[0]} of vlabench with {vlabench[1]}." in text
     )
     expected = {
-        "simpler-bridge": (10, 96, 52),
+        "simpler-bridge": (11, 104, 52),
         "simpler-bridge-red": (1, 3, 3),
         "simpler-fractal": (13, 60, 51),
         "vlabench": (4, 14, 14),
