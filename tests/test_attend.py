@@ -7,13 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from tests.toys import TOYS, SameColour, personal, scene
 from vap_core.associate import PAIRINGS, compare_views
 from vap_core.attend import Attender, Prompting
 from vap_core.base.errors import BadInstruction, BadStudy, BadViews, UnknownName
 from vap_core.base.events import is_lost
-from vap_core.base.types import Attended, Boxes, Camera, Colour, Grounding, Rgb
+from vap_core.base.types import Attended, Boxes, Camera, Colour, Grounding, Rgb, Views
 from vap_core.evaluation.ablations.forms import NumberedMarker
 from vap_core.perception.protocols import Thresholds
 from vap_core.perception.stacks import load_stack
@@ -162,6 +164,148 @@ def test_two_targets_on_one_object_is_a_warning_and_tints_once() -> None:
         e.level == "WARN" and "two targets share one object" in e.text for e in attended.events
     )
     assert (attended.images["front"] == tint(LINE, where(LINE, TEAL), attended.colours[0])).all()
+
+
+def unseen_colours(attended: Attended, views: Views) -> set[str]:
+    """The colours of the text that no view was tinted in."""
+    unseen = set()
+    for colour in PALETTE:
+        if colour.name not in attended.text.split():
+            continue
+        tinted = 0
+        for camera, rgb in views.items():
+            shown = attended.images[camera]
+            everywhere = tint(rgb, np.ones(rgb.shape[:2], bool), colour)
+            changed = (shown != rgb).any(axis=2)
+            tinted += ((shown == everywhere).all(axis=2) & changed).sum()
+        if not tinted:
+            unseen.add(colour.name)
+    return unseen
+
+
+TWICE = "pick up my vase, then put my vase on the shelf"
+TWO = "put my cup near my vase"
+ALIKE = {"mug": CUP, "ming": personal("ming", "vase", TEAL)}
+"""Both elect the teal square."""
+
+
+def test_an_object_that_is_named_twice_is_one_target() -> None:
+    attender = Attender(TOYS, MEMORY)
+    state, attended = attender.start({"front": LINE}, TWICE)
+    assert attended.text == "pick up the red vase, then put the red vase on the shelf"
+    assert attended.colours == (RED,)
+    assert [g.object for g in attended.groundings["front"]] == ["ming"]
+    assert len(attended.tracks["front"]) == 1
+    assert [e.text for e in attended.events] == [
+        "front: elects candidate 2 for ming with 1/1 votes"
+    ]
+    assert (attended.images["front"] == tint(LINE, where(LINE, SAND), RED)).all()
+    moved = scene([(24, 40, SAND)])
+    _, attended = attender.step(state, {"front": moved})
+    assert (attended.images["front"] == tint(moved, where(moved, SAND), RED)).all()
+    assert attended.text == state.text
+
+
+def test_mentions_of_two_objects_in_turn_keep_their_colours() -> None:
+    text = "put my cup near my vase, then my vase near my cup"
+    _, attended = Attender(TOYS, MEMORY).start({"front": LINE}, text)
+    assert attended.text == (
+        "put the red cup near the blue vase, then the blue vase near the red cup"
+    )
+    assert attended.colours == (RED, BLUE)
+
+
+def test_an_object_that_is_named_more_often_than_there_are_colours() -> None:
+    text = ", ".join(["my vase"] * (len(PALETTE) + 1))
+    _, attended = Attender(TOYS, MEMORY).start({"front": LINE}, text)
+    assert attended.text == text.replace("my", "the red")
+
+
+def test_an_object_given_by_hand_for_two_mentions_is_one_target() -> None:
+    attender = Attender(TOYS, {**MEMORY, "other": personal("other", "cup", GREY)})
+    text = "put my cup near my cup"
+    _, one = attender.start({"front": LINE}, text, objects=["other", "other"])
+    assert (one.text, len(one.colours)) == ("put the red cup near the red cup", 1)
+    _, two = attender.start({"front": LINE}, text, objects=["other", "mug"])
+    assert (two.text, len(two.colours)) == ("put the red cup near the blue cup", 2)
+
+
+def test_a_second_object_in_the_box_of_the_first_keeps_its_words() -> None:
+    """At most one of the two is right, and no pixel has the second one's colour."""
+    state, attended = Attender(TOYS, ALIKE).start({"front": LINE}, TWO)
+    assert attended.text == state.text == "put the red cup near my vase"
+    assert (attended.images["front"] == tint(LINE, where(LINE, TEAL), RED)).all()
+    assert any("front: two targets share one object" in e.text for e in attended.events)
+
+
+def test_a_second_object_that_another_view_shows_has_its_colour() -> None:
+    """In the side view the vase is SAND, nearer to its references than GREY is."""
+    memory = {"mug": CUP, "ming": personal("ming", "vase", SAND)}
+    views = {"front": scene([(24, 20, TEAL)]), "side": scene([(4, 20, TEAL), (44, 20, SAND)])}
+    _, attended = Attender(TOYS, memory).start(views, TWO)
+    assert attended.text == "put the red cup near the blue vase"
+    assert not unseen_colours(attended, views)
+
+
+def test_a_box_that_is_wider_for_the_second_object_is_the_same_object() -> None:
+    """Its tracker follows one identity, so that what its mask has more is not tinted either."""
+
+    def wider(images: Sequence[Rgb], phrase: str, threshold: float | None = None) -> list[Boxes]:
+        x1 = 34 if phrase == "cup" else 36
+        return [given_by_hand((24, 20, x1, 32))["front"] for _ in images]
+
+    attender = Attender(replace(TOYS, detector=wider), ALIKE)
+    state, attended = attender.start({"front": LINE}, TWO)
+    assert state.ids == {"front": (0, 0)}
+    assert attended.text == "put the red cup near my vase"
+    first = where(LINE, TEAL) & (np.arange(64) < 34)
+    assert (attended.images["front"] == tint(LINE, first, RED)).all()
+    assert attended.tracks["front"][0] is attended.tracks["front"][1]
+    _, attended = attender.step(state, {"front": LINE})
+    assert (attended.images["front"] == tint(LINE, where(LINE, TEAL), RED)).all()
+
+
+def test_a_second_object_inside_the_first_keeps_its_words() -> None:
+    """Its box is one of its own, and every pixel of it is the first one's already."""
+    boxes = given_by_hand((24, 20, 36, 32), (26, 22, 32, 28))
+
+    def parted(image: Rgb, of_view: Boxes) -> np.ndarray:
+        masks = np.zeros((len(of_view), *image.shape[:2]), bool)
+        for mask, (x0, y0, x1, y1) in zip(masks, of_view.xyxy.astype(int), strict=True):
+            mask[y0:y1, x0:x1] = True
+        return masks
+
+    view = LINE.copy()
+    view[22:28, 26:32] = SAND
+    memory = {"mug": personal("mug", "cup", (68, 122, 105)), "ming": MEMORY["ming"]}
+    attender = Attender(replace(TOYS, segmenter=parted), memory)
+    state, attended = attender.start({"front": view}, TWO, boxes=boxes)
+    assert state.ids == {"front": (0, 1)}
+    assert attended.text == "put the red cup near my vase"
+    assert not unseen_colours(attended, {"front": view})
+    warned = [e.text for e in attended.events if e.level == "WARN"]
+    assert warned == ["front: ming is inside another target, it is not marked in this view"]
+
+
+squares = st.lists(st.sampled_from([GREY, TEAL, SAND, (200, 40, 40)]), max_size=3)
+
+
+@given(
+    shown=st.lists(squares, min_size=1, max_size=2),
+    alike=st.booleans(),
+    text=st.sampled_from(["bring my cup", TWICE, TWO, f"{TWO}, then my vase near my cup"]),
+    unlike=st.booleans(),
+)
+def test_every_colour_that_is_named_is_visible(
+    shown: list[list[tuple[int, int, int]]], alike: bool, text: str, unlike: bool
+) -> None:
+    views = {}
+    for number, colours in enumerate(shown):
+        placed = [(4 + 20 * i, 20, colour) for i, colour in enumerate(colours)]
+        views[f"view {number}"] = scene(placed)
+    stack = TOYS if unlike else replace(TOYS, thresholds=Thresholds(0.999, 0.999))
+    _, attended = Attender(stack, ALIKE if alike else MEMORY).start(views, text)
+    assert not unseen_colours(attended, views)
 
 
 def test_mirrored_views_mirror_the_answer() -> None:

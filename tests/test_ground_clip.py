@@ -121,6 +121,27 @@ def test_while_the_first_target_is_not_in_view_no_other_is_tinted(bank, tmp_path
         assert changed.mean() < 0.02
 
 
+@pytest.mark.parametrize("form", [(), ("--json",), ("clip",)])
+def test_two_objects_in_one_box_are_said(bank, tmp_path, monkeypatch, form):
+    """The second keeps its words, and is not noted as used; another command says no such thing."""
+    save(bank, remember("dish", "bowl", [scene([(26, 26, RED)])], MeanColour()))
+    seen = frames(tmp_path / "clip", [[(4, 4, GREEN), (40, 10, RED)]])
+    if "clip" not in form:
+        seen = seen / "000.png"
+    options = [word for word in form if word != "clip"]
+    where = ("--stack", "toy", "--memory", bank, "--out", tmp_path / "out", *options)
+    done = vap("ground", seen, "put my cup near my bowl", *where)
+    assert done.returncode == 0, done.stderr
+    assert "put the blue cup near my bowl" in done.stdout
+    assert done.stderr.count("two targets share one object, at most one is right") == 1
+    used = (bank / "history.jsonl").read_text()
+    assert ("mug" in used, "dish" in used) == (True, False)
+    done = vap("ground", seen, "put my bowl near a plate, then my bowl in a bin", *where)
+    assert "put the blue bowl near a plate, then the blue bowl in a bin" in done.stdout
+    assert "share" not in done.stderr
+    assert (bank / "history.jsonl").read_text().count("dish") == 1
+
+
 def test_always_tint_reaches_a_clip(bank, tmp_path, monkeypatch):
     asked = []
 

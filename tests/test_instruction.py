@@ -5,7 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vap_core.base.errors import BadInstruction
-from vap_core.instruction import parse, rewrite
+from vap_core.instruction import parse, rewrite, unite
+from vap_core.instruction.rule import is_name
 from vap_core.prompt import PALETTE
 
 RED, BLUE = PALETTE[0], PALETTE[1]
@@ -127,3 +128,40 @@ def test_the_rest_of_the_text_is_untouched(before: str, noun: str) -> None:
 def test_a_rewritten_instruction_has_nothing_left_to_rewrite(noun: str) -> None:
     with pytest.raises(BadInstruction):
         parse(rewrite(parse(f"bring my {noun}"), [RED]))
+
+
+def test_targets_of_one_object_are_united() -> None:
+    text = "My vase and my cup: put my vase near my cups, my vase first"
+    parsed = parse(text, ["vase", "cup"])
+    assert rewrite(unite(parsed, ["a", "b", "c", "d", "e"]), [*[None] * 4, RED]) == (
+        "My vase and my cup: put my vase near my cups, the red vase first"
+    )
+    one = unite(parsed, ["ming", "mug", "ming", "mug", "ming"])
+    assert [(target.category, len(target.again)) for target in one.targets] == [
+        ("vase", 2),
+        ("cup", 1),
+    ]
+    assert rewrite(one, [RED, BLUE]) == (
+        "The red vase and the blue cup: put the red vase near the blue cup, the red vase first"
+    )
+    assert rewrite(one, [None, BLUE]) == (
+        "My vase and the blue cup: put my vase near the blue cup, my vase first"
+    )
+
+
+@pytest.mark.parametrize(
+    ("said", "named"),
+    [
+        ("my cup", True),
+        ("his cups", True),
+        ("Anna's blue cup", True),
+        ("the neighbour's cup", True),
+        ("James’ cup", True),
+        ("the cup", False),
+        ("my favourite one", False),
+        ("my cup-holder", False),
+        ("it", False),
+    ],
+)
+def test_a_name_is_a_possessive_and_a_category(said: str, named: bool) -> None:
+    assert is_name(said, "cup") == named

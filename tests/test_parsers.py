@@ -123,6 +123,27 @@ def test_a_list_of_objects_is_every_one_of_them(
     assert rewrite(parsed, PALETTE[: len(names)]) == rewritten
 
 
+@pytest.mark.parametrize(
+    ("text", "rewritten"),
+    [
+        (
+            "pick up my bag, then put my bag on the shelf",
+            "pick up the red bag, then put the red bag on the shelf",
+        ),
+        ("My bag is dirty. Bring my bag.", "The red bag is dirty. Bring the red bag."),
+        ("take James' cup, then lift his cup", "take the red cup, then lift the red cup"),
+        ("take my bag, then lift the bag", "take the red bag, then lift the bag"),
+        ("bring my bag, my favourite one", "bring the red bag, my favourite one"),
+        ("bring my bag and use it", "bring the red bag and use it"),
+    ],
+)
+def test_an_object_that_is_named_twice_is_one_target(text: str, rewritten: str) -> None:
+    """Both its names are rewritten; other words for it stay."""
+    parsed = EmbeddingParser(Context({obj.name: obj for obj in THINGS}), embed_text)(text)
+    assert len(parsed.targets) == 1
+    assert rewrite(parsed, [RED]) == rewritten
+
+
 def test_one_of_a_list_that_nobody_remembers_is_named() -> None:
     parser = EmbeddingParser(Context({obj.name: obj for obj in THINGS}), embed_text)
     with pytest.raises(UnknownName, match="'my hat' is remembered"):
@@ -289,9 +310,30 @@ def test_an_expression_is_whole_words_and_an_object_is_one_target() -> None:
     )
 
 
+def test_what_a_chat_model_names_twice_is_one_target_in_one_colour() -> None:
+    text = "take my camera, then put my camera near Ben's cup"
+    said = answer(("my camera", "camera"), ("Ben's cup", "cup-ben"), ("my camera", "camera"))
+    with serving(said) as server:
+        parsed = ChatParser(CONTEXT, ChatEndpoint(server.url, "reader-1"))(text)
+    assert found(parsed) == ["camera", "cup-ben"]
+    assert rewrite(parsed, PALETTE[:2]) == (
+        "take the red camera, then put the red camera near the blue cup"
+    )
+
+
+def test_one_expression_may_be_two_objects_in_turn() -> None:
+    text = "put my cup near my cup"
+    said = answer(("my cup", "cup-spots"), ("my cup", "cup-bands"))
+    with serving(said) as server:
+        parsed = ChatParser(CONTEXT, ChatEndpoint(server.url, "reader-1"))(text)
+    assert found(parsed) == ["cup-spots", "cup-bands"]
+    assert rewrite(parsed, PALETTE[:2]) == "put the red cup near the blue cup"
+
+
 @pytest.mark.parametrize(
     ("said", "error"),
     [
+        (answer(("my camera", "camera"), ("my camera", "camera")), "no part of the instruction"),
         ((401, {"error": {"message": "bad key\nsecond line"}}), r"refuses \(401: .*bad key"),
         ((500, b"<html>oops"), r"refuses \(500: <html>oops\)"),
         ((429, b""), r"refuses \(429: Too Many Requests\)"),

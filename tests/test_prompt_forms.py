@@ -5,19 +5,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.toys import TOYS, observation, personal, scene
 from vap_core.analysis.prompt_forms import (
     forms_figure,
     marked_frames,
     tinted_frames,
     tints_figure,
 )
-from vap_core.attend import Prompting
+from vap_core.attend import Attender, Prompting
 from vap_core.base.types import Camera
 from vap_core.evaluation.ablations.arms import ABLATIONS
-from vap_core.evaluation.ablations.arrow import hand_pixel
+from vap_core.evaluation.ablations.arrow import ArrowPrompter, hand_pixel
 from vap_core.evaluation.ablations.forms import draw_arrow
 from vap_core.prompt import PALETTE, Tint, has_colour, tint
 from vap_core.rollout.prompters.oracle import spoil
+from vap_core.rollout.prompters.protocol import PromptContext
 from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import get_object, texture_image
 
@@ -116,6 +118,20 @@ def test_the_arrow_begins_at_the_hand_and_ends_on_the_target() -> None:
     assert changed[10, 70]
     assert changed[70, 30]
     assert not changed[:, 80:].any()
+
+
+def test_two_targets_at_one_place_have_one_arrow_in_the_colour_that_is_named() -> None:
+    square = (40, 120, 110)
+    memory = {name: personal(name, name, square) for name in ("cup", "vase")}
+    attender = Attender(TOYS, memory, Prompting(highlight=False))
+    prompter = ArrowPrompter(attender, np.array([0.0, 0, 0, 1, 0, 0, 0]))
+    seen = observation({"top": scene([(60, 20, square)], size=100)})
+    context = PromptContext("put my cup near my vase", {"top": camera()})
+    _, attended = prompter.start(seen, context)
+    assert attended.text == "put the red cup near my vase"
+    red, blue = (has_colour(attended.images["top"].reshape(-1, 3), one) for one in PALETTE[:2])
+    assert red.any()
+    assert not blue.any()
 
 
 def test_every_look_alike_can_be_red_by_nature() -> None:

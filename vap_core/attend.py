@@ -43,7 +43,7 @@ from vap_core.base.types import (
     election_scores,
     value,
 )
-from vap_core.instruction import Parser, rewrite
+from vap_core.instruction import Parser, rewrite, unite
 from vap_core.instruction.parsers import rule_parser
 from vap_core.memory import recall
 from vap_core.perception.candidates import (
@@ -216,8 +216,8 @@ class Attender:
     ) -> tuple[AttendState, Attended]:
         """Ground every target of `instruction` in every view (t = 0).
 
-        `objects` names the remembered object of each target in turn, where its category alone does
-        not decide. `boxes` replaces the detector by candidates given by hand, clipped to their
+        `objects` names the remembered object of each "my cup" in turn, where its category alone
+        does not decide. `boxes` replaces the detector by candidates given by hand, clipped to their
         view; a camera that it leaves out has none. `cameras` are the calibrated cameras at this
         moment, which association by geometry needs.
 
@@ -264,7 +264,8 @@ class Attender:
     ) -> tuple[Instruction, list[PersonalObject]]:
         """Parse an instruction, and recall the object of each of its targets.
 
-        A letter that is written as two characters, such as an umlaut, is made one (NFC).
+        An object that is named several times is one target. A letter that is written as two
+        characters, such as an umlaut, is made one (NFC).
 
         Raises: BadInstruction, UnknownName.
         """
@@ -279,9 +280,10 @@ class Attender:
         wanted = []
         for j, target in enumerate(parsed.targets):
             name = None if objects is None else objects[j]
-            obj = recall(self.memory, target, name, self.speaker)
-            wanted.append(obj.first(self.prompting.references))
-        return parsed, wanted
+            wanted.append(recall(self.memory, target, name, self.speaker))
+        parsed = unite(parsed, [obj.name for obj in wanted])
+        once = {obj.name: obj.first(self.prompting.references) for obj in wanted}
+        return parsed, list(once.values())
 
     def ground(self, camera: str, obj: PersonalObject, candidates: Candidates) -> Grounding:
         """The vote of one view for one object.
@@ -337,7 +339,7 @@ class Attender:
         for camera in views:
             ids[camera] = _winner_ids(candidates[camera], groundings[camera])
             masks[camera] = masks_by_id(candidates[camera])
-            tracks[camera] = tuple(map(_first_track, groundings[camera]))
+            tracks[camera] = _first_tracks(groundings[camera], ids[camera])
 
         scenes = []
         for camera, rgb in views.items():
@@ -345,7 +347,7 @@ class Attender:
         colours = choose_colours(len(parsed.targets), scenes, self.prompting.palette)
         text = parsed.text
         if self.prompting.rewrite:
-            text = rewrite(parsed, _colours_in_view(colours, ids))
+            text = rewrite(parsed, _colours_in_view(colours, tracks))
         state = AttendState(
             frame_index=0,
             instruction=parsed,
@@ -357,7 +359,8 @@ class Attender:
             trackers=self._start_trackers(views, masks, ids),
             visible=_visible(tracks),
         )
-        events = grounding_events(groundings, associations, ids, chosen_by)
+        covered = {camera: _covered(per_target) for camera, per_target in tracks.items()}
+        events = grounding_events(groundings, associations, ids, covered, chosen_by)
         others: dict[str, list[Mask]] = {}
         if self._marks_others:
             for camera in views:
@@ -532,12 +535,27 @@ class Attender:
         others: Sequence[Mask],
     ) -> Rgb:
         """One view with every tracked target in its colour; no pixel belongs to two of them."""
-        free = np.ones(rgb.shape[:2], bool)
-        for track, colour in zip(tracks, colours, strict=True):
-            if track.mask is not None:
-                rgb = self.prompting.form(rgb, track.mask & free, colour, others)
-                free &= ~track.mask
+        for mask, colour in zip(own_masks(tracks), colours, strict=True):
+            if mask is not None:
+                rgb = self.prompting.form(rgb, mask, colour, others)
         return rgb
+
+
+def own_masks(tracks: Sequence[Track]) -> list[Mask | None]:
+    """The pixels of every target of a view that are no earlier target's; None without a mask."""
+    own: list[Mask | None] = []
+    taken: Mask | None = None
+    for track in tracks:
+        mask = track.mask
+        if mask is None:
+            own.append(None)
+        elif taken is None:
+            own.append(mask)
+            taken = mask
+        else:
+            own.append(mask & ~taken)
+            taken = taken | mask
+    return own
 
 
 def _winner_ids(candidates: Sequence[Candidates], per_target: PerTarget) -> tuple[int | None, ...]:
@@ -559,19 +577,39 @@ def _other_masks(followed: Sequence[Mask | None], ids: Sequence[int | None]) -> 
 
 
 def _colours_in_view(
-    colours: Sequence[Colour], ids: Mapping[str, tuple[int | None, ...]]
+    colours: Sequence[Colour], tracks: Mapping[str, tuple[Track, ...]]
 ) -> list[Colour | None]:
-    """The colour of every target that some view shows; None for the others, not rewritten."""
-    named: list[Colour | None] = []
-    for j, colour in enumerate(colours):
-        shown = any(per_target[j] is not None for per_target in ids.values())
-        named.append(colour if shown else None)
+    """The colour of every target that some view shows; None for the others, not rewritten.
+
+    A target of which every pixel is an earlier one's shows nowhere.
+    """
+    named: list[Colour | None] = [None] * len(colours)
+    for per_target in tracks.values():
+        for j, mask in enumerate(own_masks(per_target)):
+            if mask is not None and mask.any():
+                named[j] = colours[j]
     return named
 
 
-def _first_track(grounding: Grounding) -> Track:
-    """The track at t = 0: the mask of the chosen candidate."""
-    return Track(grounding.mask, 0.0 if grounding.mask is None else 1.0)
+def _covered(tracks: Sequence[Track]) -> tuple[bool, ...]:
+    """Which targets of a view have a mask, every pixel of which is an earlier one's."""
+    covered = []
+    for track, own in zip(tracks, own_masks(tracks), strict=True):
+        has_mask = track.mask is not None and track.mask.any()
+        covered.append(bool(has_mask and own is not None and not own.any()))
+    return tuple(covered)
+
+
+def _first_tracks(per_target: PerTarget, ids: Sequence[int | None]) -> tuple[Track, ...]:
+    """The tracks of a view at t = 0: the masks of the chosen candidates, one per identity."""
+    tracks: list[Track] = []
+    for grounding, identity in zip(per_target, ids, strict=True):
+        j = ids.index(identity)
+        if identity is not None and j < len(tracks):
+            tracks.append(tracks[j])
+        else:
+            tracks.append(Track(grounding.mask, 0.0 if grounding.mask is None else 1.0))
+    return tuple(tracks)
 
 
 def _tracks_of_targets(

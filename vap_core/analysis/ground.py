@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from vap_core.attend import Attender, Prompting, own_masks
 from vap_core.base.errors import BadInstruction
-from vap_core.base.events import describe_rejection
+from vap_core.base.events import describe_rejection, is_shared
 from vap_core.base.files import writing
 from vap_core.base.types import Attended, Boxes, Grounding, PersonalObject, Rgb, value
 from vap_core.instruction.parsers import Parsing
@@ -37,8 +38,17 @@ class Found:
     @property
     def used(self) -> tuple[str, ...]:
         """Names of the objects that are highlighted."""
-        groundings = self.attended.groundings[CAMERA]
-        return tuple(one.object for one in groundings if one.winner is not None)
+        names = []
+        shown = own_masks(self.attended.tracks[CAMERA])
+        for grounding, mask in zip(self.attended.groundings[CAMERA], shown, strict=True):
+            if mask is not None and mask.any():
+                names.append(grounding.object)
+        return tuple(names)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is said of two targets that are one object, or one in the other."""
+        return shared_targets(self.attended)
 
     def __str__(self) -> str:
         lines = []
@@ -46,6 +56,11 @@ class Found:
             lines.extend(_format_grounding(grounding))
         lines.append(f"instruction: {self.attended.text}")
         return "\n".join(lines)
+
+
+def shared_targets(attended: Attended) -> tuple[str, ...]:
+    """The warnings about two targets that are one object, or one in the other."""
+    return tuple(event.text for event in attended.events if is_shared(event))
 
 
 def parse_boxes(boxes: Sequence[str], rgb: Rgb) -> Boxes:
@@ -79,7 +94,6 @@ def ground_image(
     Raises: as `load_own`, `Parsing.load` and `Attender.start`; BadMemory for a memory that is
         damaged or of another encoder.
     """
-    from vap_core.attend import Attender, Prompting
     from vap_core.memory import load_bank
     from vap_core.perception.stacks import load_own
     from vap_core.perception.tiles import TiledDetector

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from itertools import chain
 from pathlib import Path
 
-from vap_core.analysis.ground import claimed_paths
+from vap_core.analysis.ground import claimed_paths, shared_targets
 from vap_core.attend import Attender, AttendState, Prompting
 from vap_core.base import video
 from vap_core.base.errors import BadPhoto
@@ -31,7 +31,10 @@ SPANS = 6
 
 @value
 class ClipSummary:
-    """What was found in a clip: the frame it was grounded in, and those in which it was tracked."""
+    """What was found in a clip: the frame it was grounded in, and those in which it was tracked.
+
+    `notes` are the warnings of that frame about two targets that are one object.
+    """
 
     frames: int
     grounded: int | None
@@ -39,6 +42,7 @@ class ClipSummary:
     lost: tuple[tuple[int, int], ...]
     text: str
     object: str
+    notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         if self.grounded is None:
@@ -120,6 +124,7 @@ def _follow(
     from vap_core.recording import ClipRecorder, ClipStep
 
     grounded, visible, text = None, [], instruction
+    notes: tuple[str, ...] = ()
     with ExitStack() as files:
         recorder = files.enter_context(ClipRecorder(rrd, CAMERA, obj.name, hz))
         film = files.enter_context(video.Mp4(mp4, hz))
@@ -138,6 +143,7 @@ def _follow(
                     recorder.ground(number, at, rgb, grounding, obj, instruction, attended.text)
                 if is_first:
                     grounded, text = number, attended.text
+                    notes = shared_targets(attended)
             visible.append(track.mask is not None)
             recorder.add(ClipStep(number, at, rgb, prompted, track))
             film.add(prompted)
@@ -148,6 +154,7 @@ def _follow(
         lost=_spans(visible, grounded),
         text=text,
         object=obj.name,
+        notes=notes,
     )
 
 

@@ -11,6 +11,8 @@ Visible = frozenset[tuple[str, int]]
 UNMODIFIED = "the view passes unmodified"
 UNMARKED = "it is not marked in this view"
 """What is said instead where the view shows another target, which is marked."""
+SHARED = "two targets share one object, at most one is right"
+INSIDE = "is inside another target"
 LOST = "not visible, "
 """What the event of a lost target says before either."""
 
@@ -19,9 +21,13 @@ def grounding_events(
     groundings: Mapping[str, tuple[Grounding, ...]],
     associations: tuple[Association | None, ...],
     ids: Mapping[str, tuple[int | None, ...]],
+    covered: Mapping[str, tuple[bool, ...]],
     chosen_by: str,
 ) -> tuple[Event, ...]:
-    """Events of t = 0. `chosen_by` names what overruled a vote, where something did."""
+    """Events of t = 0. `chosen_by` names what overruled a vote, where something did.
+
+    `covered[camera][j]` says whether every pixel of target j is an earlier target's.
+    """
     events = []
     for per_view in groundings.values():
         shown = any(grounding.mask is not None for grounding in per_view)
@@ -33,8 +39,11 @@ def grounding_events(
     for camera, per_target in ids.items():
         found = [identity for identity in per_target if identity is not None]
         if len(set(found)) < len(found):
-            text = f"{camera}: two targets share one object, at most one is right"
-            events.append(Event(0, "WARN", text))
+            events.append(Event(0, "WARN", f"{camera}: {SHARED}"))
+        for j, identity in enumerate(per_target):
+            if covered[camera][j] and identity not in per_target[:j]:
+                name = groundings[camera][j].object
+                events.append(Event(0, "WARN", f"{camera}: {name} {INSIDE}, {UNMARKED}"))
     return tuple(events)
 
 
@@ -54,6 +63,11 @@ def visibility_events(frame_index: int, before: Visible, after: Visible) -> tupl
 def is_lost(event: Event) -> bool:
     """Whether the event says that a target was lost."""
     return event.text.endswith((LOST + UNMODIFIED, LOST + UNMARKED))
+
+
+def is_shared(event: Event) -> bool:
+    """Whether the event says that two targets of a view are one object, or one is in the other."""
+    return event.text.endswith((SHARED, f"{INSIDE}, {UNMARKED}"))
 
 
 def describe_ballot(grounding: Grounding) -> str:

@@ -124,11 +124,11 @@ class PersonalObject:
 
 @value
 class Target:
-    """One personalised span of an instruction.
+    """One object that an instruction names, and where.
 
     `text[start:stop]` is "my cup" for owner "my" and category "cup". `object` is the name of the
     remembered object that a parser of implicit references found; None where category and owner
-    decide.
+    decide. `again` are the other spans that name the same object.
     """
 
     start: int
@@ -136,11 +136,14 @@ class Target:
     owner: str
     category: str
     object: str | None = None
+    again: tuple["Target", ...] = ()
 
 
 @value
 class Instruction:
-    """A parsed instruction: its text and its personalised spans, left to right and disjoint."""
+    """A parsed instruction: its text and its targets, left to right; all spans are disjoint.
+
+    A parser may give several targets of one object; `instruction.unite` makes them one."""
 
     text: str
     targets: tuple[Target, ...]

@@ -249,6 +249,8 @@ def ground(
         note = missing_threshold(stack)
         if note and not always_tint:
             print(f"note: {note}", file=sys.stderr)
+        for warning in summary.notes:
+            print(f"note: {warning}", file=sys.stderr)
         print(summary)
         print(f"wrote {mp4} and {rrd}; look: {command('view', rrd)}")
         return
@@ -284,6 +286,8 @@ def ground(
     note = missing_threshold(stack)
     if note and not always_tint:
         print(f"note: {note}", file=sys.stderr)
+    for warning in found.notes:
+        print(f"note: {warning}", file=sys.stderr)
     written = write_evidence(out, image.stem, found)
     if as_json:
         print(json.dumps(to_json(found)))

@@ -9,3 +9,4 @@ from vap_core.instruction.rule import Parser as Parser
 from vap_core.instruction.rule import leading_category as leading_category
 from vap_core.instruction.rule import parse as parse
 from vap_core.instruction.rule import rewrite as rewrite
+from vap_core.instruction.rule import unite as unite

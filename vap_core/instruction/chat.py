@@ -7,8 +7,8 @@ executed.
 
 import json
 import re
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -16,7 +16,7 @@ from vap_core.base.errors import BadEndpoint, BadInstruction
 from vap_core.base.files import parse_json
 from vap_core.base.types import Instruction, Target
 from vap_core.instruction.context import Context
-from vap_core.instruction.rule import check_length
+from vap_core.instruction.rule import check_length, is_name
 from vap_core.perception.chat import MODEL, ChatEndpoint, request_answer
 
 TASK = (
@@ -108,13 +108,20 @@ class ChatParser:
         }
 
     def _targets(self, text: str, answer: str) -> tuple[Target, ...]:
-        """The checked targets, left to right, the first of each object. Raises: BadEndpoint."""
+        """The checked targets, left to right, one of each object. Raises: BadEndpoint.
+
+        An expression that comes again is the next place where the instruction has it.
+        """
         targets: list[Target] = []
+        places: dict[str, Iterator[re.Match[str]]] = {}
         try:
             for row in parse_json(answer)["targets"]:
                 obj = self.context.objects[row["object"]]
                 said = row["expression"]
-                place = re.search(rf"(?<!\w){re.escape(said)}(?!\w)", text, re.IGNORECASE)
+                if said not in places:
+                    whole = rf"(?<!\w){re.escape(said)}(?!\w)"
+                    places[said] = re.finditer(whole, text, re.IGNORECASE)
+                place = next(places[said], None)
                 if place is None or not said.strip():
                     raise ValueError("no part of the instruction")
                 targets.append(
@@ -136,10 +143,13 @@ class ChatParser:
                 f"that was asked for ({type(error).__name__}: {str(error)[:60]!r}); try "
                 f"another model in {MODEL}, or --parser rule."
             ) from error
-        first: dict[str | None, Target] = {}
+        kept: dict[str | None, Target] = {}
         for target in targets:
-            first.setdefault(target.object, target)
-        return tuple(first.values())
+            first = kept.setdefault(target.object, target)
+            said = text[target.start : target.stop]
+            if target is not first and is_name(said, target.category):
+                kept[target.object] = replace(first, again=(*first.again, target))
+        return tuple(kept.values())
 
 
 def _in_words(context: Context, name: str) -> dict[str, Any]:

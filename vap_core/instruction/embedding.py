@@ -5,7 +5,7 @@ and `meaning` compares words by their sentence embeddings.
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from vap_core.base.errors import BadInstruction, VapError
 from vap_core.base.types import Instruction, PersonalObject, Target
@@ -19,7 +19,7 @@ from vap_core.instruction.expressions import (
 )
 from vap_core.instruction.meaning import EmbedText
 from vap_core.instruction.reading import Reading
-from vap_core.instruction.rule import check_length
+from vap_core.instruction.rule import check_length, is_name
 
 
 @dataclass(frozen=True)
@@ -81,19 +81,29 @@ class EmbeddingParser:
 
 
 def _targets(found: Sequence[tuple[Expression, PersonalObject]]) -> tuple[Target, ...]:
-    """One target per object: where a verb of action or a place is, only those that stand there."""
+    """One target per object: where a verb of action or a place is, only those that stand there.
+
+    Wherever else the object is named again, as "my cup", that is a span of its target, too.
+    """
     governed = [pair for pair in found if pair[0].governed]
-    targets: list[Target] = []
+    targets: dict[str, Target] = {}
     for expression, obj in governed or found:
-        if obj.name in {target.object for target in targets}:
+        targets.setdefault(obj.name, _target(expression, obj))
+    for expression, obj in found:
+        target = targets.get(obj.name)
+        if target is None or target.start == expression.start:
             continue
-        targets.append(
-            Target(
-                start=expression.start,
-                stop=expression.stop,
-                owner=obj.owner,
-                category=obj.category,
-                object=obj.name,
-            )
-        )
-    return tuple(targets)
+        if is_name(expression.said, obj.category):
+            again = (*target.again, _target(expression, obj))
+            targets[obj.name] = replace(target, again=again)
+    return tuple(targets.values())
+
+
+def _target(expression: Expression, obj: PersonalObject) -> Target:
+    return Target(
+        start=expression.start,
+        stop=expression.stop,
+        owner=obj.owner,
+        category=obj.category,
+        object=obj.name,
+    )

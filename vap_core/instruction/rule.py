@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from functools import cache
 from typing import Protocol, runtime_checkable
 
@@ -94,9 +95,9 @@ def _before_category(owner: str, rest: str, categories: Collection[str]) -> int:
 
 
 def rewrite(instruction: Instruction, colours: Sequence[Colour | None]) -> str:
-    """Replace each target's span by "the <colour> <category>".
+    """Replace each target's spans by "the <colour> <category>".
 
-    There is one colour per target; None leaves its span as it is. The rest of the text is
+    There is one colour per target; None leaves its spans as they are. The rest of the text is
     unchanged, character for character.
 
     Raises: BadInstruction when there are more or fewer colours than targets.
@@ -106,15 +107,41 @@ def rewrite(instruction: Instruction, colours: Sequence[Colour | None]) -> str:
         raise BadInstruction(
             f"rewrite: {len(colours)} colours for {n} targets in {instruction.text!r}; one each."
         )
+    spans: dict[int, tuple[Target, Colour]] = {}
+    for target, colour in zip(instruction.targets, colours, strict=True):
+        if colour is not None:
+            spans |= {span.start: (span, colour) for span in (target, *target.again)}
     text = instruction.text
-    pairs = zip(instruction.targets, colours, strict=True)
-    for target, colour in reversed(list(pairs)):
-        if colour is None:
-            continue
-        article = "The" if _has_capital(instruction.text, target) else "the"
-        phrase = f"{article} {colour.name} {target.category}"
-        text = text[: target.start] + phrase + text[target.stop :]
+    for start in sorted(spans, reverse=True):
+        span, colour = spans[start]
+        article = "The" if _has_capital(instruction.text, span) else "the"
+        text = text[:start] + f"{article} {colour.name} {span.category}" + text[span.stop :]
     return text
+
+
+def unite(instruction: Instruction, names: Sequence[str]) -> Instruction:
+    """The instruction with one target per object; `names` has the object of every target.
+
+    The first span of an object is its target, and the later ones are `again` of it.
+    """
+    targets: dict[str, Target] = {}
+    for target, name in zip(instruction.targets, names, strict=True):
+        first = targets.get(name)
+        if first is None:
+            targets[name] = target
+        else:
+            targets[name] = replace(first, again=(*first.again, target, *target.again))
+    return Instruction(instruction.text, tuple(targets.values()))
+
+
+def is_name(said: str, category: str) -> bool:
+    """Whether words name an object of a category as the rule has it: "my cup", "Anna's red cup".
+
+    Other words for an object that is named already are not rewritten.
+    """
+    owner = rf"(?:my|his|her|their|our)\s|(?:{ARTICLE})?(?:[\w-]+\s+){{0,2}}[\w-]+['’]"
+    named = re.match(rf"(?:{owner}).*?\b{category_pattern(category)}", said, re.IGNORECASE)
+    return named is not None
 
 
 def _has_capital(text: str, target: Target) -> bool:
