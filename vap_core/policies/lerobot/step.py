@@ -103,7 +103,7 @@ class VapPrompt(ProcessorStep):
         check_stack(self.stack, "VapPrompt")
         if self.episodes not in ("auto", "vap_step", "reset"):
             raise one_of("VapPrompt: episodes", self.episodes, ("auto", "vap_step", "reset"))
-        if not Path(self.memory).is_dir():
+        if not os.path.isdir(self.memory):
             raise BadMemory(
                 f"VapPrompt: {self.memory} is no folder of remembered objects; register one, or "
                 "attach again."
