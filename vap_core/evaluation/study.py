@@ -120,7 +120,8 @@ class Study:
 
         Raises: BadPolicy for a checkpoint that is not on this machine; MissingWeights when the
             backbone's package is not installed or the stack's models are not here; BadSuite for a
-            list without a checksum; BadObject for a damaged scan.
+            list without a checksum; BadObject for a damaged scan; BadStudy for an arm that
+            `describe` refuses.
         """
         digests = {}
         for suite, _ in self.tasks:
