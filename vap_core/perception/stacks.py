@@ -10,6 +10,7 @@ from vap_core.base.errors import one_of
 from vap_core.base.files import sha256_of
 from vap_core.perception.foundation.sources import EMBEDDED, KINDS, parts_of
 from vap_core.perception.foundation.sources import mixed as mixed
+from vap_core.perception.own_parts import describe_parts
 from vap_core.perception.protocols import Stack, Thresholds
 
 EMBEDDED_THRESHOLDS = Thresholds(familiar=0.53, unfamiliar=0.54)
@@ -101,9 +102,11 @@ def checksums(name: str, kept: bool = True) -> dict[str, Any]:
     `weights` has every file that the embedded stack reads; of a stack whose parts are not all
     embedded also the files of its other models, as their lock.json says. `thresholds` is that of
     the file that `calibrate --keep` wrote; it is left out where there is none, of a stack that
-    `ships_thresholds`, and where not `kept`.
+    `ships_thresholds`, and where not `kept`. `parts` are those of a stack of the caller's own
+    (`describe_parts`), which is made for that.
 
-    Raises: UnknownName; MissingWeights: a model's files are not here.
+    Raises: UnknownName; MissingWeights: a model's files are not here; what the caller's stack
+        raises.
     """
     from vap_core.perception.embedded.weights import weights_sha256
     from vap_core.perception.foundation.store import locked_sha256, store_folder
@@ -112,6 +115,8 @@ def checksums(name: str, kept: bool = True) -> dict[str, Any]:
     found: dict[str, Any] = {"weights": weights_sha256()}
     if ":" in name or name in KINDS:
         found["weights"] = {**found["weights"], **locked_sha256(name)}
+    elif name != EMBEDDED and name in STACKS:
+        found["parts"] = describe_parts(STACKS[name])
     file = thresholds_file(store_folder(), name)
     if kept and not ships_thresholds(name) and file.is_file():
         found["thresholds"] = sha256_of(file)
