@@ -69,8 +69,9 @@ STACKS: dict[str, Callable[[], Stack]] = {
 def load_own(name: str) -> Stack:
     """The stack as `load_stack` gives it, for pictures of a user's own.
 
-    Where calibrate --photos --keep has measured a threshold on such pictures, it is used. Runs on
-    the benchmarks never depend on it.
+    Where calibrate --photos --keep has measured a threshold on such pictures, it is used. A stack
+    without thresholds has those that calibrate --keep has measured. Runs on the benchmarks never
+    depend on what is added here.
 
     Raises: as load_stack; BadOutput: the file of thresholds is damaged.
     """
@@ -79,9 +80,16 @@ def load_own(name: str) -> Stack:
 
     stack = load_stack(name)
     kept = read_thresholds(store_folder(), name, stack.encoder.name)
-    if kept is None or stack.thresholds is None:
+    if kept is None:
         return stack
+    if stack.thresholds is None:
+        return replace(stack, thresholds=kept)
     return replace(stack, thresholds=replace(stack.thresholds, unfamiliar=kept.unfamiliar))
+
+
+def is_own(name: str) -> bool:
+    """Whether a stack of that name would be the caller's own."""
+    return ":" not in name and name not in (EMBEDDED, *KINDS)
 
 
 def ships_thresholds(name: str) -> bool:
@@ -90,7 +98,7 @@ def ships_thresholds(name: str) -> bool:
     They belong to a detector and an encoder together: those of the embedded stack ship. A stack of
     another name than those of `sources` is the caller's, with its own. Raises: UnknownName.
     """
-    if ":" not in name and name not in KINDS:
+    if is_own(name):
         return True
     parts = parts_of(name)
     return parts["detector"] == parts["encoder"] == EMBEDDED
@@ -115,7 +123,7 @@ def checksums(name: str, kept: bool = True) -> dict[str, Any]:
     found: dict[str, Any] = {"weights": weights_sha256()}
     if ":" in name or name in KINDS:
         found["weights"] = {**found["weights"], **locked_sha256(name)}
-    elif name != EMBEDDED and name in STACKS:
+    elif is_own(name) and name in STACKS:
         found["parts"] = describe_parts(STACKS[name])
     file = thresholds_file(store_folder(), name)
     if kept and not ships_thresholds(name) and file.is_file():
