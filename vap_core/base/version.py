@@ -55,7 +55,7 @@ def source_digest(form: Any) -> str:
     nothing has any.
     """
     if inspect.isroutine(form) or inspect.isclass(form):
-        parts = (form,)
+        parts: tuple[Any, ...] = (form,)
     else:
         parts = type(form).__mro__
     source = ""

@@ -15,8 +15,8 @@ def describe_parts(make: Callable[[], Stack]) -> dict[str, Any]:
     """The stack that `make` returns, as JSON.
 
     Of each part it has the class, the class's source, and the attributes that are numbers, words,
-    arrays, lists of these, dataclasses or further parts. Others, such as a network's weights or
-    what a closure holds, are left out.
+    arrays, lists of these, dataclasses or further parts. Others are left out: dictionaries, a
+    network's weights, what a closure or a partial holds.
     """
     stack = make()
     about: dict[str, Any] = {"made by": source_digest(make), "encoder name": stack.encoder.name}
