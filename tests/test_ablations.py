@@ -1,8 +1,12 @@
 """Ablations: arms by name, the table by hand, and the command."""
 
+import sys
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -21,7 +25,7 @@ from vap_core.analysis.ablations import (
 )
 from vap_core.analysis.agreements import gate_figure, gated_cases
 from vap_core.attend import Prompting
-from vap_core.base.errors import BadOutput
+from vap_core.base.errors import BadOutput, BadStudy
 from vap_core.base.tables import signed
 from vap_core.base.types import Colour, Mask, Rgb
 from vap_core.evaluation import hiding, methods, paper
@@ -236,6 +240,115 @@ def _all_red(rgb: Rgb, mask: Mask, colour: Colour, others: Sequence[Mask]) -> Rg
 
 def _red_box(rgb: Rgb, mask: Mask, colour: Colour, others: Sequence[Mask]) -> Rgb:
     return tint(rgb, mask, colour)
+
+
+def _mixed(rgb: Rgb, mask: Mask, colour: Colour, others: Sequence[Mask], alpha: float = 0.5) -> Rgb:
+    return tint(rgb, mask, colour, alpha)
+
+
+def _closure(alpha: float) -> PromptForm:
+    def form(rgb: Rgb, mask: Mask, colour: Colour, others: Sequence[Mask]) -> Rgb:
+        return tint(rgb, mask, colour, alpha)
+
+    return form
+
+
+def _local_class(alpha: float) -> PromptForm:
+    @dataclass(frozen=True)
+    class Form:
+        def __call__(self, rgb: Rgb, mask: Mask, colour: Colour, others: Sequence[Mask]) -> Rgb:
+            return tint(rgb, mask, colour, alpha)
+
+    return Form()
+
+
+class Slotted:
+    """A form whose number is in no field of a dataclass."""
+
+    __slots__ = ("alpha",)
+
+    def __init__(self, alpha: float) -> None:
+        self.alpha = alpha
+
+    def __call__(self, rgb: Rgb, mask: Mask, colour: Colour, others: Sequence[Mask]) -> Rgb:
+        return tint(rgb, mask, colour, self.alpha)
+
+    def mark(self, rgb: Rgb, mask: Mask, colour: Colour, others: Sequence[Mask]) -> Rgb:
+        return self(rgb, mask, colour, others)
+
+
+class Named(NamedTuple):
+    """A form that is a tuple."""
+
+    alpha: float
+
+    def __call__(self, rgb: Rgb, mask: Mask, colour: Colour, others: Sequence[Mask]) -> Rgb:
+        return tint(rgb, mask, colour, self.alpha)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A form with an array, whose text leaves most numbers out."""
+
+    weights: np.ndarray
+
+    def __call__(self, rgb: Rgb, mask: Mask, colour: Colour, others: Sequence[Mask]) -> Rgb:
+        return rgb
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        _closure(0.3),
+        _local_class(0.3),
+        partial(_mixed, alpha=0.3),
+        Slotted(0.3),
+        Slotted(0.3).mark,
+        Named(0.3),
+        Table(np.zeros(2000)),
+        lambda rgb, mask, colour, others, alpha=0.3: tint(rgb, mask, colour, alpha),
+    ],
+    ids=["closure", "local", "partial", "slots", "method", "tuple", "array", "lambda"],
+)
+def test_a_form_that_cannot_be_told_from_another_is_refused(
+    form: PromptForm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else the numbers of alpha .3 are returned for alpha .7: nothing that is read differs."""
+    monkeypatch.setitem(methods._ALL, "mine", Prompting(form=form))
+    study = Study((("widowx-pick", "pick-bottle"),), ("mine",), episodes=1)
+    with pytest.raises(BadStudy, match="take a dataclass or a function of a module") as refusal:
+        study.configuration()
+    assert "\n" not in str(refusal.value)
+
+
+OWN_FORM = """
+from dataclasses import dataclass
+
+class Base:
+    def __call__(self, rgb, mask, colour, others):
+        return rgb + {level}
+
+@dataclass(frozen=True)
+class Form(Base):
+    alpha: float = 0.5
+"""
+
+
+def test_what_a_form_inherits_is_its_code_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = []
+    for level in (1, 1, 2):
+        file = tmp_path / f"mine_{len(found)}.py"
+        file.write_text(OWN_FORM.format(level=level))
+        spec = spec_from_file_location(file.stem, file)
+        assert spec is not None
+        assert spec.loader is not None
+        module = module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, file.stem, module)
+        spec.loader.exec_module(module)
+        found.append(methods.describe(module.Form()))
+    assert found[0] == found[1] != found[2]
 
 
 def test_figures_of_published_ablations() -> None:

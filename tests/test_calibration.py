@@ -242,6 +242,20 @@ def test_a_threshold_for_own_photos_is_kept_and_runs_do_not_depend_on_it(tmp_pat
         run.keep_choice("toy", report.Choice(0.9, None))
 
 
+def test_an_own_stack_without_thresholds_uses_what_was_kept(tmp_path, monkeypatch):
+    monkeypatch.setitem(stacks.STACKS, "toy", lambda: TOY)
+    monkeypatch.setenv(store.VARIABLE, str(tmp_path))
+    assert "calibrate --stack toy --keep" in ground.missing_threshold("toy")
+    run.refuse_keep("toy")
+    run.keep_choice("toy", report.Choice(0.9, None))
+    assert stacks.load_own("toy").thresholds == Thresholds(0.9, 0.9)
+    assert ground.missing_threshold("toy") == ""
+    assert stacks.load_stack("toy").thresholds is None
+    monkeypatch.setitem(stacks.STACKS, "toy", lambda: replace(TOY, detector=Judge()))
+    with pytest.raises(BadOutput, match="calibrate --stack toy --photos SET --keep"):
+        run.refuse_keep("toy")
+
+
 def test_photos_are_measured_without_scenes(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "load_stack", lambda name: TOY)
     with pytest.raises(BadOutput, match="no scenes and no photos"):

@@ -1,28 +1,32 @@
 """A run's folder belongs to the weights and thresholds of its stack, those that do not ship too."""
 
 import json
-from collections.abc import Callable
+import runpy
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from vap_core.analysis.calibration import run as calibration
 from vap_core.base.errors import BadOutput, MissingWeights
+from vap_core.base.types import Boxes, Rgb
 from vap_core.evaluation.own_objects import run as own_objects
 from vap_core.evaluation.own_objects.folder import Source
 from vap_core.evaluation.perception.run import Survey
 from vap_core.evaluation.photos import run as photos
 from vap_core.evaluation.photos.folder import PhotoSet
-from vap_core.evaluation.store import open_run
+from vap_core.evaluation.store import digest, open_run
 from vap_core.evaluation.study import Study
 from vap_core.perception.embedded.weights import weights_sha256
 from vap_core.perception.foundation.sources import MODELS, TENSORS
 from vap_core.perception.foundation.store import LOCK, VARIABLE
 from vap_core.perception.kept_thresholds import keep_thresholds
-from vap_core.perception.protocols import Stack, Thresholds
-from vap_core.perception.stacks import checksums
+from vap_core.perception.protocols import Encoder, Stack, Thresholds, Tracker
+from vap_core.perception.stacks import STACKS, checksums
 
 from .test_photo_set import folder  # noqa: F401
 from .toys import MeanColour, SameColour, detector, segmenter
@@ -132,3 +136,96 @@ def test_calibration_measures_photos_without_the_thresholds_that_it_kept(
     assert answers["tinted"].all()
     photos.measure_photos(folder, tmp_path / "photos", MIXED, progress=False)
     assert not pd.read_parquet(tmp_path / "photos" / "questions.parquet")["tinted"].any()
+
+
+class Shifted(MeanColour):
+    """An encoder with a number of its own."""
+
+    def __init__(self, offset: float) -> None:
+        self.offset = offset
+
+
+class Weighted(MeanColour):
+    """An encoder with weights of its own."""
+
+    def __init__(self, last: float) -> None:
+        self.weights = np.zeros(2000, np.float32)
+        self.weights[-1] = last
+
+
+class Wrapped(SameColour):
+    """A tracker that holds another, and a number in a slot."""
+
+    __slots__ = ("inner", "least")
+
+    def __init__(self, inner: Tracker, least: float) -> None:
+        self.inner = inner
+        self.least = least
+
+
+class Renamed(MeanColour):
+    """An encoder whose name is computed."""
+
+    def __init__(self, name: str) -> None:
+        self._words = {"name": name}
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return self._words["name"]
+
+
+class Nested:
+    """A detector that calls another, and refers to itself."""
+
+    def __init__(self, encoder: Encoder) -> None:
+        self.encoder = encoder
+        self.again = self
+
+    def __call__(
+        self, images: Sequence[Rgb], phrase: str, threshold: float | None = None
+    ) -> list[Boxes]:
+        return detector(images, phrase, threshold)
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        lambda n: {"encoder": Shifted(n)},
+        lambda n: {"encoder": Weighted(n)},
+        lambda n: {"detector": Nested(Shifted(n))},
+        lambda n: {"tracker": Wrapped(Wrapped(SameColour(), 0.0), n)},
+        lambda n: {"tracker": Wrapped(Wrapped(SameColour(), n), 0.0)},
+        lambda n: {"encoder": Renamed(f"colour-{n}")},
+        lambda n: {"segmenter": segmenter, "encoder": Shifted(1.0) if n == 1.0 else MeanColour()},
+    ],
+    ids=["number", "array", "nested", "slots", "tracker", "name", "class"],
+)
+def test_another_own_stack_of_the_same_name_is_another_run(
+    parts: Callable[[float], dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same function makes them: only the parts differ."""
+    toy = Stack("mine", detector, MeanColour(), segmenter, SameColour())
+    digests = []
+    for number in (1.0, 1.0, 100.0):
+
+        def make(number: float = number) -> Stack:
+            return replace(toy, **parts(number))
+
+        monkeypatch.setitem(STACKS, "mine", make)
+        digests.append(digest(of_study("mine")))
+    assert digests[0] == digests[1] != digests[2]
+    assert "parts" not in of_study("embedded"), "digests are those of versions without it"
+
+
+def test_another_code_of_an_own_part_is_another_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    toy = Stack("mine", detector, MeanColour(), segmenter, SameColour())
+    digests = []
+    for answer in ("[]", "[]", "None"):
+        file = tmp_path / f"mine_{len(digests)}.py"
+        file.write_text(f"def detect(images, phrase, threshold=None):\n    return {answer}\n")
+        own = replace(toy, detector=runpy.run_path(str(file))["detect"])
+        monkeypatch.setitem(STACKS, "mine", lambda own=own: own)
+        digests.append(digest(of_study("mine")))
+    assert digests[0] == digests[1] != digests[2]

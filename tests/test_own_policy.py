@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from tests.toys import MeanColour
+from vap_core.base.errors import BadPolicy
 from vap_core.base.files import DATA
 from vap_core.base.photos import load_photo, photos_in
 from vap_core.base.types import Rgb
 from vap_core.evaluation.diagnosis import diagnose, explain
 from vap_core.evaluation.study import Study
-from vap_core.evaluation.trials import make_trial, register_personal
+from vap_core.evaluation.trials import HIDDEN_FROM, make_trial, register_personal
 from vap_core.memory import remember, save
 from vap_core.perception.stacks import load_stack
 from vap_core.recording import Recorder
@@ -78,6 +79,25 @@ def test_the_documented_policy_runs_when_pasted(
     printed = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in printed] == list(names["methods"])
     assert all(line.endswith("of 1") for line in printed)
+
+
+def test_the_documented_way_hides_the_target_for_calls_of_that_policy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not for those of the study's own, which does two actions a call."""
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(compile(documented("def plan(").replace('"vap"', '"hidden-2"'), "pasted", "exec"), names)
+    still = names["Still"]
+    occlusion = names["trial"].occlusion
+    assert isinstance(names["trial"].policy, still)
+    assert occlusion.frames == 2 * still.execute == 2
+    assert occlusion.start == HIDDEN_FROM * still.execute
+    own = make_trial(names["study"], names["rows"], "hidden-2", names["memory"])
+    assert own.occlusion.frames == 2 * own.policy.execute == 4
+    still.execute = None
+    with pytest.raises(BadPolicy, match="Still.execute is None; it must be a whole number"):
+        make_trial(names["study"], names["rows"], "hidden-2", names["memory"], still())
 
 
 @pytest.mark.parametrize("method", ["generic", "vap"])

@@ -144,6 +144,7 @@ def test_the_command_prints_and_publishes(tmp_path: Path) -> None:
     about = json.loads((table.schema.metadata or {})[b"about"])
     assert about["paraphrases"] == paraphrase_digest()
     assert "suite 'lab' is unknown; known: " in refused("eval-parsers", "--suite", "lab")
+    assert "',' names no parser" in refused("eval-parsers", "--parser", ",")
     assert "part 'all' is unknown; known: check-1" in refused("eval-parsers", "--part", "all")
     assert "'magic' is unknown; known: rule" in refused("eval-parsers", *some, "--parser", "magic")
 

@@ -19,7 +19,7 @@ from vap_core.instruction.chat import ChatParser
 from vap_core.instruction.context import Context
 from vap_core.instruction.embedding import EmbeddingParser
 from vap_core.instruction.expressions import find_exclusions, find_expressions
-from vap_core.instruction.history import Use, add_uses
+from vap_core.instruction.history import MAX_USES, Use, add_uses
 from vap_core.instruction.looks import fit
 from vap_core.instruction.parsers import Parsing, load_parser, rule_parser
 from vap_core.instruction.rule import MAX_CHARACTERS
@@ -269,6 +269,22 @@ def test_a_chat_model_gets_the_memory_in_words_and_answers_by_schema() -> None:
         "looks": "white with blue spots",
     }  # fmt: skip
     assert about["earlier uses, last one last"][-1]["object"] == "cup-ben"
+
+
+def test_the_page_says_how_many_uses_each_parser_reads() -> None:
+    uses = tuple(Use(object="cup-ben", by="ben", at=f"{2000 + i}-01-01") for i in range(30))
+    with serving(answer(("my camera", "camera"))) as server:
+        parser = ChatParser(replace(CONTEXT, uses=uses), ChatEndpoint(server.url, "reader-1"))
+        parser("bring my camera")
+    about = json.loads(server.asked[0][2]["messages"][1]["content"])
+    sent = about["earlier uses, last one last"]
+    assert [use["at"] for use in sent] == [use.at for use in uses[-len(sent) :]]
+    page = Path(__file__).resolve().parents[1] / "docs" / "parsers.md"
+    words = " ".join(page.read_text().split())
+    assert (
+        f"`embedding` reads the last {MAX_USES} uses, and `chat` sends the last {len(sent)}"
+        in words
+    )
 
 
 def test_without_a_key_no_stored_token_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,11 +2,13 @@
 
 import ast
 import hashlib
+import inspect
 import subprocess
 from collections.abc import Collection
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 
 @cache
@@ -44,6 +46,25 @@ def code_digest(folder: Path, without: Collection[str] = ()) -> str:
         found.update(path.relative_to(folder).as_posix().encode())
         found.update(ast.dump(_without_docstrings(ast.parse(path.read_text()))).encode())
     return found.hexdigest()[:16]
+
+
+def source_digest(form: Any) -> str:
+    """A digest of the source of a function, or of the class of a callable and of its bases.
+
+    What has no source, because it is built in or typed into a console, is left out; "" where
+    nothing has any.
+    """
+    if inspect.isroutine(form) or inspect.isclass(form):
+        parts: tuple[Any, ...] = (form,)
+    else:
+        parts = type(form).__mro__
+    source = ""
+    for part in parts:
+        try:
+            source += inspect.getsource(part)
+        except (OSError, TypeError):
+            continue
+    return hashlib.sha256(source.encode()).hexdigest()[:16] if source else ""
 
 
 def _installed_version() -> str:

@@ -43,12 +43,18 @@ def eval_parsers(
     Example: python -m vap_core eval-parsers
     Example: python -m vap_core eval-parsers --parser chat --part test --limit 20
     """
-    from vap_core.base.errors import one_of
+    from vap_core.base.errors import BadStudy, one_of
     from vap_core.evaluation.parsers import report
     from vap_core.evaluation.parsers.measure import answer_table, measure
     from vap_core.evaluation.parsers.paraphrases import PARTS, suite_names
     from vap_core.instruction.parsers import load_parser
 
+    parsers = names(parser)
+    if not parsers:
+        raise BadStudy(
+            f"eval-parsers: --parser {parser!r} names no parser; name one, or leave the option out "
+            "for the default, rule,embedding."
+        )
     suites = names(suite) or list(suite_names())
     parts = names(part) or list(PARTS)
     for what, given, known in (("suite", suites, suite_names()), ("part", parts, PARTS)):
@@ -56,7 +62,7 @@ def eval_parsers(
             if name not in known:
                 raise one_of(f"eval-parsers: {what}", name, known)
     answers = []
-    for name in names(parser):
+    for name in parsers:
         answers += measure(name, partial(load_parser, name), suites, parts, limit)
     table = answer_table(answers)
     if wrong:

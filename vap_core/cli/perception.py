@@ -232,8 +232,9 @@ def calibrate(
             "--keep",
             help="Write the chosen thresholds beside the weights of a foundation stack, which then "
             "uses them. Of the embedded stack it is the threshold for photos, which ground and "
-            "inspect-dataset then use, and eval-photos and attached checkpoints do not. A stack "
-            "with an embedded part needs --photos.",
+            "inspect-dataset then use, and eval-photos and attached checkpoints do not; of a stack "
+            "of your own without thresholds it is both. A stack with an embedded part needs "
+            "--photos.",
         ),
     ] = False,
     out: Annotated[

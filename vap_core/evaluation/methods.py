@@ -1,8 +1,6 @@
 """The methods that the paper compares, by name, and the prompter of each (P 5.2)."""
 
-import hashlib
 import inspect
-import re
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
@@ -11,6 +9,7 @@ from typing import Any
 from vap_core.associate import PAIRINGS
 from vap_core.attend import Attender, Prompting
 from vap_core.base.errors import BadStudy
+from vap_core.base.version import source_digest
 from vap_core.evaluation.ablations.arms import ARMS, Hidden
 from vap_core.evaluation.ablations.arrow import Arrow, ArrowPrompter
 from vap_core.memory import load_bank
@@ -96,33 +95,38 @@ def describe(how: Any) -> Any:
     """What a method changes, as JSON: kinds and numbers, and a digest of the code of its form.
 
     Where a function has no source, its name stands for it.
+
+    Raises: BadStudy for what has numbers that are found neither in fields nor in the source of a
+        module: a closure, a partial, a bound method, an array, an object of another class.
     """
     if how is None or isinstance(how, str | int | float):
         return how
-    if isinstance(how, list | tuple):
+    if type(how) in (list, tuple):
         return [describe(part) for part in how]
     if isinstance(how, Mapping):
         return {str(key): describe(part) for key, part in how.items()}
-    if is_dataclass(how) and not isinstance(how, type):
-        about: dict[str, Any] = {"kind": type(how).__qualname__}
+    about: dict[str, Any] = {"kind": type(how).__qualname__}
+    if is_dataclass(how) and not isinstance(how, type) and _is_of_a_module(type(how)):
         for field in fields(how):
             about[field.name] = describe(getattr(how, field.name))
+    elif inspect.isfunction(how) and _is_of_a_module(how) and how.__closure__ is None:
+        about = {"kind": f"<function {how.__qualname__}>"}
+        about |= describe(how.__dict__)
     else:
-        about = {"kind": re.sub(r" at 0x[0-9a-fA-F]+", "", repr(how))}
-        about |= describe(getattr(how, "__dict__", {}))
+        name = getattr(how, "__qualname__", type(how).__qualname__)
+        raise BadStudy(
+            f"Study: an arm uses {name}, and another one with other numbers would look the same; "
+            "take a dataclass or a function of a module, with its numbers in fields or in its own "
+            "source."
+        )
     if callable(how):
-        about["code"] = _code_digest(how)
+        about["code"] = source_digest(how)
     return about
 
 
-def _code_digest(form: Any) -> str:
-    """A digest of the source of a function, or of the class of a callable; "" where it has none."""
-    code = form if inspect.isroutine(form) or inspect.isclass(form) else type(form)
-    try:
-        source = inspect.getsource(code)
-    except (OSError, TypeError):  # of a console, or built in
-        return ""
-    return hashlib.sha256(source.encode()).hexdigest()[:16]
+def _is_of_a_module(code: Any) -> bool:
+    """Whether a function or class is defined at the top of a module, under a name."""
+    return "<" not in code.__qualname__
 
 
 def hidden_calls(method: str) -> int:

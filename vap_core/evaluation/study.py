@@ -116,11 +116,13 @@ class Study:
         Weights, episode lists, and the world (robots, objects, styles, sensors) enter by checksum,
         methods by name, and those that are not published by what they change, too. With the
         scripted policy the motions that do not ship enter as well; of a stack whose parts are not
-        all embedded, its models' files and the thresholds kept on this machine.
+        all embedded, its models' files and the thresholds kept on this machine; of a caller's own
+        stack what its parts are.
 
         Raises: BadPolicy for a checkpoint that is not on this machine; MissingWeights when the
             backbone's package is not installed or the stack's models are not here; BadSuite for a
-            list without a checksum; BadObject for a damaged scan.
+            list without a checksum; BadObject for a damaged scan; BadStudy for an arm that
+            `describe` refuses.
         """
         digests = {}
         for suite, _ in self.tasks:

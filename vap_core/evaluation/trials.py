@@ -33,6 +33,7 @@ from vap_core.policies.mini_pi0.learned_token import WORD
 from vap_core.policies.mini_pi0.teach_token import file_suffix, model_of, teach, teach_own
 from vap_core.policies.protocol import Policy, PrivilegedPolicy
 from vap_core.rollout.loop import Trial
+from vap_core.rollout.policy_call import check_policy
 from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import ObjectModel, get_object
 from vap_core.simulation.occluder import Occlusion
@@ -108,20 +109,31 @@ def _remembered(study: Study) -> list[tuple[str, str, str]]:
     return found
 
 
-def make_trial(study: Study, rows: Sequence[EpisodeRow], method: str, bank: Path) -> Trial:
+def make_trial(
+    study: Study,
+    rows: Sequence[EpisodeRow],
+    method: str,
+    bank: Path,
+    policy: Policy[Any] | PrivilegedPolicy[Any] | None = None,
+) -> Trial:
     """The scene, models and policy of some rows of one task and variant, built or cached.
 
-    The scene holds only what the rows place. It is closed when the next one is built.
+    The scene holds only what the rows place. It is closed when the next one is built. `policy`
+    takes the place of the study's; an arm of `ablate` then hides the target for that one's calls.
 
     Raises: UnknownName for a suite that no registry holds; BadPolicy when the checkpoint is not on
-        this machine or does not fit the suite; BadMemory when a description or a token that the
-        method needs is not in `bank`; MissingMeshes for a robot whose meshes are not here.
+        this machine or does not fit the suite, or `policy` lacks what the loop needs; BadMemory
+        when a description or a token that the method needs is not in `bank`; MissingMeshes for a
+        robot whose meshes are not here.
     """
     first = rows[0]
     suite = suites.suite(first.suite)
     scene = _scene(study, rows)
-    stack = _stack(study.stack) if needs_stack(method) or study.policy == "scripted" else None
-    policy = _policy(study=study, method=method, row=first, bank=bank, scene=scene, stack=stack)
+    scripted = policy is None and study.policy == "scripted"
+    stack = _stack(study.stack) if needs_stack(method) or scripted else None
+    if policy is None:
+        policy = _policy(study=study, method=method, row=first, bank=bank, scene=scene, stack=stack)
+    check_policy(policy)
     return Trial(
         method=method,
         scene=scene,

@@ -10,6 +10,7 @@ from vap_core.base.errors import one_of
 from vap_core.base.files import sha256_of
 from vap_core.perception.foundation.sources import EMBEDDED, KINDS, parts_of
 from vap_core.perception.foundation.sources import mixed as mixed
+from vap_core.perception.own_parts import describe_parts
 from vap_core.perception.protocols import Stack, Thresholds
 
 EMBEDDED_THRESHOLDS = Thresholds(familiar=0.53, unfamiliar=0.54)
@@ -68,8 +69,9 @@ STACKS: dict[str, Callable[[], Stack]] = {
 def load_own(name: str) -> Stack:
     """The stack as `load_stack` gives it, for pictures of a user's own.
 
-    Where calibrate --photos --keep has measured a threshold on such pictures, it is used. Runs on
-    the benchmarks never depend on it.
+    Where calibrate --photos --keep has measured a threshold on such pictures, it is used. A stack
+    without thresholds has those that calibrate --keep has measured. Runs on the benchmarks never
+    depend on what is added here.
 
     Raises: as load_stack; BadOutput: the file of thresholds is damaged.
     """
@@ -78,9 +80,16 @@ def load_own(name: str) -> Stack:
 
     stack = load_stack(name)
     kept = read_thresholds(store_folder(), name, stack.encoder.name)
-    if kept is None or stack.thresholds is None:
+    if kept is None:
         return stack
+    if stack.thresholds is None:
+        return replace(stack, thresholds=kept)
     return replace(stack, thresholds=replace(stack.thresholds, unfamiliar=kept.unfamiliar))
+
+
+def is_own(name: str) -> bool:
+    """Whether a stack of that name would be the caller's own."""
+    return ":" not in name and name not in (EMBEDDED, *KINDS)
 
 
 def ships_thresholds(name: str) -> bool:
@@ -89,7 +98,7 @@ def ships_thresholds(name: str) -> bool:
     They belong to a detector and an encoder together: those of the embedded stack ship. A stack of
     another name than those of `sources` is the caller's, with its own. Raises: UnknownName.
     """
-    if ":" not in name and name not in KINDS:
+    if is_own(name):
         return True
     parts = parts_of(name)
     return parts["detector"] == parts["encoder"] == EMBEDDED
@@ -101,9 +110,11 @@ def checksums(name: str, kept: bool = True) -> dict[str, Any]:
     `weights` has every file that the embedded stack reads; of a stack whose parts are not all
     embedded also the files of its other models, as their lock.json says. `thresholds` is that of
     the file that `calibrate --keep` wrote; it is left out where there is none, of a stack that
-    `ships_thresholds`, and where not `kept`.
+    `ships_thresholds`, and where not `kept`. `parts` are those of a stack of the caller's own
+    (`describe_parts`), which is made for that.
 
-    Raises: UnknownName; MissingWeights: a model's files are not here.
+    Raises: UnknownName; MissingWeights: a model's files are not here; what the caller's stack
+        raises.
     """
     from vap_core.perception.embedded.weights import weights_sha256
     from vap_core.perception.foundation.store import locked_sha256, store_folder
@@ -112,6 +123,8 @@ def checksums(name: str, kept: bool = True) -> dict[str, Any]:
     found: dict[str, Any] = {"weights": weights_sha256()}
     if ":" in name or name in KINDS:
         found["weights"] = {**found["weights"], **locked_sha256(name)}
+    elif is_own(name) and name in STACKS:
+        found["parts"] = describe_parts(STACKS[name])
     file = thresholds_file(store_folder(), name)
     if kept and not ships_thresholds(name) and file.is_file():
         found["thresholds"] = sha256_of(file)

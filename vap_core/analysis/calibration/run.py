@@ -17,8 +17,8 @@ from vap_core.evaluation.photos.run import TABLE, measure_photos
 from vap_core.perception.foundation.sources import needs_photos
 from vap_core.perception.foundation.store import store_folder
 from vap_core.perception.kept_thresholds import keep_command, keep_thresholds
-from vap_core.perception.protocols import Stack
-from vap_core.perception.stacks import checksums, load_stack, ships_thresholds
+from vap_core.perception.protocols import FamiliarityJudge, Stack
+from vap_core.perception.stacks import checksums, is_own, load_stack, ships_thresholds
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -58,16 +58,23 @@ def calibrate(
 
 
 def refuse_keep(stack_name: str, photos: Sequence[Path] = ()) -> None:
-    """Raises: BadOutput without own photos, for a stack that ships thresholds or needs photos."""
+    """Raises: BadOutput without own photos, for a stack that has thresholds or needs photos; for a
+    stack of the caller's own, which is loaded to see, as `load_stack`.
+    """
     if photos:
         return
-    if ships_thresholds(stack_name):
+    has_thresholds, photos_needed = ships_thresholds(stack_name), needs_photos(stack_name)
+    if is_own(stack_name):
+        stack = load_stack(stack_name)
+        has_thresholds = stack.thresholds is not None
+        photos_needed = isinstance(stack.detector, FamiliarityJudge)
+    if has_thresholds:
         raise BadOutput(
             f"calibrate: the stack {stack_name} ships its thresholds, so that results stay "
             "comparable; name photos of your own with --photos to keep a threshold for photos, or "
             "leave --keep out."
         )
-    if needs_photos(stack_name):
+    if photos_needed:
         raise BadOutput(
             f"calibrate: the stack {stack_name} has a threshold of its own for photos, and "
             f"rendered scenes are no photos; run {keep_command(stack_name, photos=True)}."
@@ -77,7 +84,8 @@ def refuse_keep(stack_name: str, photos: Sequence[Path] = ()) -> None:
 def keep_choice(stack_name: str, chosen: Choice) -> Path:
     """Write the chosen thresholds beside the stack's weights.
 
-    Of a stack that ships thresholds it is that of unfamiliar views, which `load_own` reads.
+    Of a stack that ships thresholds it is that of unfamiliar views. `load_own` reads it, and those
+    of a stack of the caller's own.
 
     Raises: BadOutput.
     """
