@@ -28,7 +28,8 @@ from vap_core.attend import Prompting
 from vap_core.base.errors import BadOutput, BadStudy
 from vap_core.base.tables import signed
 from vap_core.base.types import Colour, Mask, Rgb
-from vap_core.evaluation import hiding, methods, paper
+from vap_core.evaluation import hiding, methods, paper, switching
+from vap_core.evaluation.ablations import run as ablation_run
 from vap_core.evaluation.ablations.arms import ABLATIONS, ARMS, TINT_SHARES, Ablation, Hidden
 from vap_core.evaluation.ablations.arrow import Arrow
 from vap_core.evaluation.ablations.picture import effects_figure, policies_figure
@@ -43,7 +44,7 @@ from vap_core.evaluation.ablations.table import (
 from vap_core.evaluation.methods import METHODS, PUBLISHED, find, known_methods, references_needed
 from vap_core.evaluation.metrics import rate
 from vap_core.evaluation.report.cells import comparison_rows
-from vap_core.evaluation.statistics import Comparison
+from vap_core.evaluation.statistics import Comparison, rate_over_layouts
 from vap_core.evaluation.study import Study
 from vap_core.prompt import PALETTE, PromptForm, Tint, tint
 from vap_core.rollout.types import MaskCoverage
@@ -131,6 +132,17 @@ def test_several_policies_of_a_suite_are_refused() -> None:
     assert [one.arm for one in arm_results(ablation, beside)] == ["vap", "mask-only"]
 
 
+def test_an_arm_that_shares_no_episode_with_the_first_is_refused() -> None:
+    """It has no difference, and would be taken for the first arm itself."""
+    both = outcomes("mask-only", [False] * 10)
+    other_seed = outcomes("rewrite-only", [True] * 10).assign(seed=1)
+    table = pd.concat([outcomes("vap", [True] * 10), both, other_seed], ignore_index=True)
+    with pytest.raises(BadOutput, match=r"rewrite-only shares no episode with vap on simpler-br"):
+        arm_results(ABLATIONS["rewrite"], table)
+    results = arm_results(ABLATIONS["rewrite"], table[table["method"] != "rewrite-only"])
+    assert [one.arm for one in results if one.against is None] == ["vap"]
+
+
 def test_an_error_is_a_failure_and_has_no_cmr_where_none_is_defined() -> None:
     table = pd.concat([outcomes("vap", [True] * 9 + [False]), outcomes("mask-only", [True] * 10)])
     table = table.reset_index(drop=True).assign(cmr=None)
@@ -138,6 +150,21 @@ def test_an_error_is_a_failure_and_has_no_cmr_where_none_is_defined() -> None:
     vap_arm, *_ = arm_results(ABLATIONS["rewrite"], table)
     assert (vap_arm.sr.k, vap_arm.sr.n, vap_arm.cmr.n) == (9, 10, 0)
     assert "-" in arm_rows([vap_arm])[1][4]
+
+
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_the_note_below_the_table_says_whose_the_intervals_are(
+    seeds: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    won = [True] * 9 + [False]
+    once = pd.concat([outcomes("vap", won), outcomes("mask-only", won)], ignore_index=True)
+    table = pd.concat([once.assign(seed=seed) for seed in range(seeds)], ignore_index=True)
+    monkeypatch.setattr(ablation_run, "run_arms", lambda *_, **__: table)
+    study = Study((("simpler-bridge", "pick-shaver"),), ("vap",), episodes=10, seeds=seeds)
+    text = ablation_run.ablate_text("rewrite", study, tmp_path)
+    assert "Intervals of rates: over layouts where they return, else Wilson's" in text
+    wilson = str(rate(9 * seeds, 10 * seeds))
+    assert (wilson in text) == (seeds == 1)
 
 
 def test_an_arm_takes_one_line() -> None:
@@ -200,12 +227,23 @@ def test_the_track_is_kept_that_is_on_the_target_soon_after_it_is_seen_again() -
     assert hiding.is_track_kept([seen(None), [], seen("mine")], "mine") is True
     assert hiding.is_track_kept([seen(None), seen("other"), seen("mine")], "mine") is False
     assert hiding.is_track_kept([seen("mine", pixels=20), []], "mine") is None
-    rows = []
-    for kept in (True, True, False, None):
-        rows.append({"suite": "s", "method": "hidden-2", "hidden_s": 1.6, "track_kept": kept})
-    (line,) = hiding.hiding_lines(pd.DataFrame(rows))
-    assert line.startswith("s hidden-2: hidden for 1.6 s, track kept in 67 %")
+    rows = outcomes("hidden-2", [True] * 4).assign(hidden_s=1.6)
+    rows["track_kept"] = [True, True, False, None]
+    (line,) = hiding.hiding_lines(rows)
+    assert line == (f"simpler-bridge hidden-2: hidden for 1.6 s, track kept in {rate(2, 3)}")
     assert hiding.hiding_lines(outcomes("vap", [True])) == []
+
+
+def test_layouts_that_return_do_not_narrow_what_is_said_of_tracks_and_switches() -> None:
+    held = [True] * 9 + [False]
+    once = outcomes("arm", held).assign(hidden_s=1.6, track_kept=held, switched_s=1.0)
+    once = once.assign(turned_s=None, obeyed=held)
+    again = pd.concat([once.assign(seed=seed) for seed in range(10)], ignore_index=True)
+    for lines in (hiding.hiding_lines, switching.switching_lines):
+        (few,), (many,) = lines(once), lines(again)
+        assert f"in {rate(9, 10)}" in few, "Wilson's where no layout returns"
+        assert f"in {rate_over_layouts(again)}" in many
+        assert str(rate(90, 100)) not in many
 
 
 def test_an_arm_runs_once_for_all_ablations(tmp_path: Path) -> None:

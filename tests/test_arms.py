@@ -120,14 +120,11 @@ def test_reaction_and_obedience_are_read_from_an_episode() -> None:
     there = replace(played, frames=(switched, played.frames[2], played.frames[5]))
     assert columns(there)["turned_s"] is None, "it was nearer to the rival before the switch"
     stored_before = {**columns(there), "turned_s": 0.0}
-    table = pd.DataFrame(
-        [
-            {"suite": TASK[0], "method": "switched-early", **columns(played)},
-            {"suite": TASK[0], "method": "switched-early", **columns(stays)},
-            {"suite": TASK[0], "method": "switched-early", **stored_before},
-            {"suite": TASK[0], "method": "oracle-track"},
-        ]
-    )
+    rows = [columns(played), columns(stays), stored_before, {}]
+    table = pd.DataFrame(rows).assign(
+        suite=TASK[0], task=TASK[1], episode=range(4), seed=0, outcome="failure",
+        method=["switched-early"] * 3 + ["oracle-track"],
+    )  # fmt: skip
     (line,) = switching_lines(table)
     assert "switched in 3 episodes, obeyed in 33 % [6, 79]; the hand turned in 1" in line
     assert line.endswith("median 0.6 s after the switch")

@@ -4,6 +4,7 @@ import ast
 import importlib
 import re
 import shlex
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -107,6 +108,14 @@ def check_names(values: dict[str, object]) -> None:
             for name in text.split(","):
                 stands_for_any = name.isupper() or name.endswith(".py")
                 assert stands_for_any or name in names, (option, name)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.startswith("docs/")])
+def test_a_colon_is_followed_by_what_it_announces(page: str) -> None:
+    paragraphs = re.split(r"\n\s*\n", FENCE.sub("```", PAGES[page]))
+    for one, following in pairwise(paragraphs):
+        if one.rstrip().endswith(":"):
+            assert re.match(r"```|\||[-*>] |\d+\.|!\[", following.strip()), one[-80:]
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if commands(page) and page != RECORD])

@@ -62,6 +62,13 @@ def test_every_method_and_suite_has_a_marker_of_its_own() -> None:
     assert palette.suite_colour("my-suite") == palette.FRAME
 
 
+def test_every_policy_of_a_method_has_a_marker_of_its_own() -> None:
+    own = {marker for _, marker in palette.METHODS.values()}
+    further = palette.FURTHER_POLICY_MARKERS
+    assert len(set(further) | own) == len(further) + len(own), "they stand beside a method's own"
+    assert len(set(palette.POLICY_MARKERS)) == len(palette.POLICY_MARKERS)
+
+
 def test_only_the_target_is_orange_and_only_the_goal_rose() -> None:
     names = ["cup", "mine", "tray", "pot"]
     colours = palette.object_colours(names, target="mine", goal="tray")

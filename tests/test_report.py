@@ -22,7 +22,8 @@ from vap_core.base.tables import escape, latex, markdown
 from vap_core.evaluation.metrics import rate
 from vap_core.evaluation.publish import publish
 from vap_core.evaluation.report import conclude, report
-from vap_core.evaluation.report.results import errors, results
+from vap_core.evaluation.report.latex import ABOVE_PAPER, main_tables
+from vap_core.evaluation.report.results import errors, paper_results, results
 from vap_core.evaluation.report.runs import load_runs
 from vap_core.evaluation.statistics import ALL_TASKS, compare, rate_over_layouts
 from vap_core.evaluation.store import append, open_run
@@ -220,6 +221,31 @@ def test_what_reads_the_simulator_is_marked(tmp_path: Path) -> None:
     marked = results(runs).groupby("method")["bound"].agg(["all", "any"])
     assert marked.loc["vap"].all()
     assert not marked.loc["generic"].any()
+
+
+def test_the_latex_table_marks_bounds_and_takes_layouts_for_units(tmp_path: Path) -> None:
+    runs = load_runs([run(tmp_path / str(seed), BRIDGE[:1], seed=seed) for seed in range(3)])
+    runs.table["bound"] = runs.table["method"].eq("vap")
+    lines = results(runs)
+    rows = {}
+    for row in main_tables(lines, paper_results(runs)).split(ABOVE_PAPER)[0].splitlines():
+        rows[row.split(" & ")[0]] = row
+    assert "vap (bound)" in rows
+    assert "generic" in rows
+    line = lines[lines["method"] == "vap"].iloc[0]
+    over_layouts = f"[{100 * line.sr_layout_low:.1f}, {100 * line.sr_layout_high:.1f}]"
+    assert rows["vap (bound)"].count(over_layouts) == 1, "of SR"
+    assert f"[{100 * line.cmr_low:.1f}, {100 * line.cmr_high:.1f}]" in rows["vap (bound)"]
+    alone = results(load_runs([tmp_path / "0"])).iloc[:1]
+    once = main_tables(alone, alone.iloc[:0])
+    assert f"[{100 * alone.sr_low.item():.1f}, {100 * alone.sr_high.item():.1f}]" in once
+
+
+def test_every_bound_method_of_a_published_table_is_marked_in_latex() -> None:
+    runs = load_runs([DATA / "results" / "mini_pi0.parquet"])
+    lines = results(runs)
+    marked = set(re.findall(r"^(\S+) \(bound\) &", main_tables(lines, lines.iloc[:0]), re.M))
+    assert marked == set(lines.loc[lines["bound"], "method"]) >= {"oracle-mask", "wrong-mask"}
 
 
 def test_a_policy_that_reads_the_simulator_is_marked_in_runs_that_do_not_say_so() -> None:

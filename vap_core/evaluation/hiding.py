@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from vap_core.evaluation.diagnosis.thresholds import THRESHOLDS
-from vap_core.evaluation.metrics import rate
+from vap_core.evaluation.statistics import rate_over_layouts
 from vap_core.rollout.types import Episode, MaskCoverage
 from vap_core.simulation.occluder import Occlusion
 
@@ -49,13 +49,16 @@ def is_track_kept(later: Sequence[Sequence[MaskCoverage]], target: str) -> bool 
 
 
 def hiding_lines(episodes: "pd.DataFrame") -> list[str]:
-    """How often the track was kept, by suite and method; none where nothing was hidden."""
+    """How often the track was kept, by suite and method; none where nothing was hidden.
+
+    Its interval is over layouts where one returns, else Wilson's.
+    """
     if "track_kept" not in episodes:
         return []
     lines = []
     hidden = episodes[episodes["track_kept"].notna()]
     for (suite, method), part in hidden.groupby(["suite", "method"], sort=False):
-        kept = rate(int(part["track_kept"].eq(True).sum()), len(part))
+        kept = rate_over_layouts(part, "track_kept")
         seconds = float(part["hidden_s"].iloc[0])
         lines.append(f"{suite} {method}: hidden for {seconds:.1f} s, track kept in {kept}")
     return lines

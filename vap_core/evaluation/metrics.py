@@ -152,12 +152,17 @@ def count(
         for measure in MEASURES:
             columns += [measure, f"{measure}_n"]
         return pd.DataFrame(columns=columns)
-    error = table["outcome"].eq("error")
-    flat = table[names].assign(n=1, errors=error.astype(int), steps=table["steps"].astype(int))
+    flat = table[names].assign(n=1, errors=table["outcome"].eq("error").astype(int))
+    flat["steps"] = table["steps"].astype(int)
     for measure in MEASURES:
-        flat[measure] = (table[measure].eq(True) & ~error).astype(int)
+        flat[measure] = holds(table, measure).astype(int)
         flat[f"{measure}_n"] = table[measure].notna().astype(int)
     return flat.groupby(names, sort=False, dropna=False).sum().reset_index()
+
+
+def holds(episodes: "pd.DataFrame", measure: str) -> "pd.Series":
+    """In which episodes a measure holds: it is known and true, and the episode is no error."""
+    return episodes[measure].eq(True) & episodes["outcome"].ne("error")
 
 
 def step_times(episodes: "Iterable[Mapping[str, Any]] | pd.DataFrame") -> dict[str, float]:

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vap_core.evaluation.metrics import rate
+from vap_core.evaluation.statistics import rate_over_layouts
 from vap_core.rollout.prompters.switch import SWITCHED
 from vap_core.rollout.types import Episode, Frame
 from vap_core.simulation import robots
@@ -42,8 +42,9 @@ def columns(episode: Episode) -> dict[str, Any]:
 def switching_lines(episodes: "pd.DataFrame") -> list[str]:
     """What the robot did, by suite and method; of a table without such episodes nothing.
 
-    Tables of earlier versions have `turned_s` 0 where the gripper was nearer to the other object
-    already at the switch; that hand did not turn.
+    The interval of `obeyed` is over layouts where one returns, else Wilson's. Tables of earlier
+    versions have `turned_s` 0 where the gripper was nearer to the other object already at the
+    switch; that hand did not turn.
     """
     if "switched_s" not in episodes:
         return []
@@ -52,7 +53,7 @@ def switching_lines(episodes: "pd.DataFrame") -> list[str]:
     for (name, method), part in switched.groupby(["suite", "method"], sort=False):
         turned = part["turned_s"].dropna().astype(float)
         turned = turned[turned > 0]
-        obeyed = rate(int(part["obeyed"].eq(True).sum()), len(part))
+        obeyed = rate_over_layouts(part, "obeyed")
         line = f"{name} {method}: switched in {len(part)} episodes, obeyed in {obeyed}"
         if len(turned):
             line += f"; the hand turned in {len(turned)}, "

@@ -33,7 +33,7 @@ def ablate_text(
 ) -> str:
     """Run what `root` lacks, draw `NAME.png` there, and return the table.
 
-    Raises: what `engine.run` raises.
+    Raises: what `engine.run` and `arm_results` raise.
     """
     ablation = ABLATIONS[name]
     episodes = run_arms(name, study, root, workers=workers, record=record)
@@ -55,8 +55,9 @@ def ablate_text(
         *switching_lines(episodes),
         *hiding_lines(episodes),
         f"n episodes a suite, {study.seeds} seed(s) from {study.seed}; policy {policy}; "
-        f"{errors} errors. Intervals: Wilson's for rates, cluster bootstrap over layouts for "
-        "differences; p exact, Holm's correction over the arms of a suite.",
+        f"{errors} errors. Intervals of rates: over layouts where they return, else Wilson's; of "
+        "differences: cluster bootstrap over layouts. p exact, Holm's correction over the arms of "
+        "a suite.",
         f"picture: {picture}",
         f"every arm is a run of its own: {study.next_command('diagnose', first)}",
     ]

@@ -50,8 +50,8 @@ def arm_results(ablation: Ablation, episodes: "pd.DataFrame") -> list[ArmResult]
     """The arms of every suite in `episodes` (rows of a results table) that ran the first arm and
     another.
 
-    Raises: BadOutput when they are of several policies in a suite, and as `paper.ledger`;
-        BadSuite, as `statistics.compare`.
+    Raises: BadOutput when they are of several policies in a suite, when an arm shares no episode
+        with the first, and as `paper.ledger`; BadSuite, as `statistics.compare`.
     """
     results = []
     for suite in dict.fromkeys(episodes["suite"]):
@@ -147,13 +147,23 @@ def arm_rows(results: list[ArmResult]) -> list[list[str]]:
 
 
 def _against_default(arms: Sequence[str], of_suite: "pd.DataFrame") -> dict[str, Comparison]:
-    """Each arm against the first, over all tasks of the suite."""
+    """Each arm against the first, over all tasks of the suite.
+
+    Raises: BadOutput for one that shares no episode with the first.
+    """
     default, *others = arms
     found = {}
     for arm in others:
         part = of_suite[of_suite["method"].isin([default, arm])]
-        for comparison in compare(part, [default, arm], by_task=False):
-            found[arm] = comparison
+        comparisons = compare(part, [default, arm], by_task=False)
+        if not comparisons:
+            suite = part["suite"].iloc[0]
+            raise BadOutput(
+                f"arm_results: {arm} shares no episode with {default} on {suite}, so they cannot "
+                f"be compared; run it on {default}'s episodes (the same seeds), or leave its rows "
+                "out."
+            )
+        (found[arm],) = comparisons
     p_holm = holm([comparison.p for comparison in found.values()])
     corrected = {}
     for (arm, comparison), p in zip(found.items(), p_holm, strict=True):
@@ -176,8 +186,7 @@ def _share(rows: "pd.DataFrame", column: str) -> Rate:
     """The share of episodes in which it holds, of those that can say, as `metrics.count` does; its
     interval is over layouts where one returns.
     """
-    measured = rows[rows[column].notna()]
-    return rate_over_layouts(measured.assign(success=measured[column]))
+    return rate_over_layouts(rows[rows[column].notna()], column)
 
 
 def _paper_sr(ablation: Ablation, suite: str, arm: str) -> float:

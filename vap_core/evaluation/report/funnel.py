@@ -8,7 +8,7 @@ import numpy as np
 
 from vap_core.base.figures import empty_figure
 from vap_core.base.palette import CASES as CASE_COLOURS
-from vap_core.base.palette import METHODS, rgb8
+from vap_core.base.palette import METHODS, POLICY_MARKERS, rgb8
 from vap_core.evaluation.diagnosis import STAGES
 from vap_core.evaluation.report.failures import APART, FunnelRow
 from vap_core.rollout.failure import CASES
@@ -32,8 +32,6 @@ PERCENT_A_LETTER = 0.95
 FUNNEL_COLOURS = {name: METHODS[name][0] for name in ("generic", "soft", "vap", "oracle-mask")}
 """The methods of a funnel."""
 SUCCESS_MARK = "D"
-POLICY_MARKERS = ("o", "^", "s", "v", "X")
-"""Markers of the lines of one method with several policies, in the order of appearance."""
 LABEL_APART = 6.0
 """Percent between two numbers at the ends of lines, so that both can be read."""
 

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
 
 Measures = Mapping[str, tuple[str, ...]]
 """The rates that a task has a column for, by task: CMR where it is defined, and SR."""
+PREAMBLE = """% needs \\usepackage{booktabs}
+% 95 % intervals: of SR over layouts where they return, else Wilson's; of CMR Wilson's
+% (bound): it reads the simulator
+"""
 ABOVE_PAPER = r"\textit{The paper's own numbers: another world}"
 HEADS = {"cmr": "CMR (\\%)", "sr": "SR (\\%)"}
 
@@ -24,9 +28,12 @@ HEADS = {"cmr": "CMR (\\%)", "sr": "SR (\\%)"}
 def main_tables(lines: "pd.DataFrame", published: "pd.DataFrame") -> str:
     """A tabular per suite and track: methods as rows, n, CMR and SR of every task as columns.
 
+    A method or policy that reads the simulator is marked "(bound)". The interval of SR is over
+    layouts where one returns, else Wilson's; that of CMR is Wilson's.
+
     `lines` are of `results.results`, `published` of `results.paper_results`.
     """
-    tables = ["% needs \\usepackage{booktabs}; intervals: Wilson, 95 %\n"]
+    tables = [PREAMBLE]
     for (suite, split), part in lines.groupby(TRACK, sort=False):
         of_track = (published["suite"] == suite) & (published["split"] == split)
         tables.append(_table(part, published[of_track], track_title(suite, split)))
@@ -85,6 +92,8 @@ def _our_rows(lines: "pd.DataFrame", measures: Measures) -> list[str]:
         name = str(method)
         if several:
             name = f"{method} ({policy})"
+        if part["bound"].any():
+            name += " (bound)"
         cells = [escape(name)]
         for task, of_task in measures.items():
             line = by_task.get(task)
@@ -124,8 +133,9 @@ def _row(cells: list[str]) -> str:
 
 
 def _rate_with_interval(line: Any, name: str) -> str:
-    low = getattr(line, f"{name}_low")
-    high = getattr(line, f"{name}_high")
+    low, high = getattr(line, f"{name}_low"), getattr(line, f"{name}_high")
+    if name == "sr" and line.sr_layout_low == line.sr_layout_low:
+        low, high = line.sr_layout_low, line.sr_layout_high
     if low != low:
         return "--"
     return rf"{100 * getattr(line, name):.1f} {{\scriptsize [{100 * low:.1f}, {100 * high:.1f}]}}"

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vap_core.base.figures import empty_figure
-from vap_core.base.palette import GRID, TEXT, method_marks
+from vap_core.base.palette import FURTHER_POLICY_MARKERS, GRID, TEXT, method_marks
 from vap_core.evaluation.metrics import Score
 from vap_core.evaluation.statistics import Comparison
 
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
 Line = tuple[str, ...]
 """What a line of a forest plot is about: the words of its heading, then the task."""
-POLICY_MARKERS = ("d", "*", "8")
-"""Markers of a method's third policy and all further ones, each filled and then hollow."""
 
 
 def forest_figure(results: "pd.DataFrame") -> "Figure":
@@ -156,8 +154,8 @@ def _forest_axes(
 
 
 def _policy_style(colour: str, marker: str, i: int) -> dict[str, Any]:
-    """The mark of the i-th policy: the method's own, filled and hollow, then POLICY_MARKERS."""
-    markers = (marker, *POLICY_MARKERS)
+    """The mark of the i-th policy: the method's own, filled and hollow, then further ones."""
+    markers = (marker, *FURTHER_POLICY_MARKERS)
     return _mark_style(colour, markers[i // 2 % len(markers)], filled=i % 2 == 0)
 
 

@@ -13,7 +13,12 @@ from vap_core.evaluation import paper
 from vap_core.evaluation.metrics import MEASURES, RATES, SCORE_KEY, TRACK, count, intervals
 from vap_core.evaluation.policy_names import PRIVILEGED
 from vap_core.evaluation.report.runs import Runs
-from vap_core.evaluation.statistics import ALL_TASKS, Comparison, layout_interval
+from vap_core.evaluation.statistics import (
+    ALL_TASKS,
+    Comparison,
+    layout_clusters,
+    layout_interval,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -154,9 +159,7 @@ def _layout_intervals(table: "pd.DataFrame") -> "pd.DataFrame":
     import pandas as pd
 
     key = list(SCORE_KEY)
-    won = table["success"].eq(True) & table["outcome"].ne("error")
-    episodes = table[[*key, "layout"]].assign(won=won.astype(float), n=1.0)
-    clusters = episodes.groupby([*key, "layout"], sort=True)[["won", "n"]].sum().reset_index()
+    clusters = layout_clusters(table, by=key).reset_index()
     lines = []
     for names, part in clusters.groupby(key, sort=False):
         low, high = layout_interval(part["won"].to_numpy(), part["n"].to_numpy())
