@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.colour_vision import VISIONS, delta_e, least_difference, lightness
-from vap_core.base import palette
+from vap_core.base import figures, palette
 
 ROLES = [palette.TARGET, palette.ELECTED, palette.GOAL, *palette.LOOKALIKES]
 METHODS = [colour for colour, _ in palette.METHODS.values()]
@@ -64,9 +64,9 @@ def test_every_method_and_suite_has_a_marker_of_its_own() -> None:
 
 def test_every_policy_of_a_method_has_a_marker_of_its_own() -> None:
     own = {marker for _, marker in palette.METHODS.values()}
-    further = palette.FURTHER_POLICY_MARKERS
+    further = figures.FURTHER_POLICY_MARKERS
     assert len(set(further) | own) == len(further) + len(own), "they stand beside a method's own"
-    assert len(set(palette.POLICY_MARKERS)) == len(palette.POLICY_MARKERS)
+    assert len(set(figures.POLICY_MARKERS)) == len(figures.POLICY_MARKERS)
 
 
 def test_only_the_target_is_orange_and_only_the_goal_rose() -> None:

@@ -17,6 +17,12 @@ LINE_COLOURS = tuple(SUITES[name][0] for name in ("simpler-fractal", "vlabench",
 """The curves of what is no suite."""
 BAR_COLOURS = (*LINE_COLOURS[:2], ROLES["other objects"], LINE_COLOURS[2])
 """The bars of a group, in their order; told apart in grey, too."""
+POLICY_MARKERS = ("o", "^", "s", "v", "X")
+"""Markers of a method's policies where its colour alone says the method, in the order of
+appearance."""
+FURTHER_POLICY_MARKERS = ("d", "*", "8")
+"""Markers of a method's third policy and all further ones where the first two have the method's
+own, filled and then hollow, as these are."""
 
 
 def empty_figure(width: float, height: float) -> "Figure":

@@ -57,12 +57,6 @@ FURTHER_METHODS = (
     ("#b7c27a", ">"),
 )
 """Colours and markers of any other method, in the order of appearance; they repeat."""
-POLICY_MARKERS = ("o", "^", "s", "v", "X")
-"""Markers of a method's policies where its colour alone says the method, in the order of
-appearance."""
-FURTHER_POLICY_MARKERS = ("d", "*", "8")
-"""Markers of a method's third policy and all further ones where the first two have the method's
-own, filled and then hollow, as these are."""
 SUITES = {
     "simpler-fractal": ("#232f7e", "o"),
     "simpler-bridge": ("#157a6b", "s"),

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vap_core.base.figures import empty_figure
+from vap_core.base.figures import POLICY_MARKERS, empty_figure
 from vap_core.base.palette import CASES as CASE_COLOURS
-from vap_core.base.palette import METHODS, POLICY_MARKERS, rgb8
+from vap_core.base.palette import METHODS, rgb8
 from vap_core.evaluation.diagnosis import STAGES
 from vap_core.evaluation.report.failures import APART, FunnelRow
 from vap_core.rollout.failure import CASES

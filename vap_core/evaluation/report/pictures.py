@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vap_core.base.figures import empty_figure
-from vap_core.base.palette import FURTHER_POLICY_MARKERS, GRID, TEXT, method_marks
+from vap_core.base.figures import FURTHER_POLICY_MARKERS, empty_figure
+from vap_core.base.palette import GRID, TEXT, method_marks
 from vap_core.evaluation.metrics import Score
 from vap_core.evaluation.statistics import Comparison
 
