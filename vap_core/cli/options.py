@@ -47,8 +47,8 @@ def stack_of(stack: str, detector: str, encoder: str, tracker: str) -> str:
 
 
 def names(text: str) -> list[str]:
-    """The names in "a, b,c"; empty ones are left out."""
-    return [name.strip() for name in text.split(",") if name.strip()]
+    """The names in "a, b,c", each once; empty ones are left out."""
+    return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
 
 
 def with_bar(starts: Iterable[int], label: str) -> Iterable[int]:

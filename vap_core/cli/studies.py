@@ -195,7 +195,7 @@ def study_of(
 
     if methods is None:
         methods = ["generic"] if policy in PRIVILEGED else ["generic", "vap"]
-    chosen = tuple(dict.fromkeys(names(",".join(methods))))
+    chosen = tuple(names(",".join(methods)))
     if not chosen:
         raise BadStudy(
             f"--methods: {','.join(methods)!r} names no method; name one, or leave the option out "
