@@ -42,6 +42,22 @@ REPORTED: dict[tuple[str, str, str], tuple[tuple[Told, ...], ...]] = {
         ((ALL_TASKS, "generic", "soft"),),
         ((ALL_TASKS, "generic", "hard-short"), (ALL_TASKS, "generic", "hard-long")),
     ),
+    (
+        "The defaults of simpler-bridge and vlabench",
+        "tabletop_by_recipe",
+        "mini-pi0-tabletop-wide",
+    ): (
+        (
+            (ALL_TASKS, "generic", "vap"),
+            (ALL_TASKS, "hard-short", "vap"),
+            (ALL_TASKS, "soft", "vap"),
+        ),
+        (
+            (ALL_TASKS, "generic", "hard-short"),
+            (ALL_TASKS, "generic", "hard-long"),
+            (ALL_TASKS, "generic", "soft"),
+        ),
+    ),
     ("vlabench without a tint", "tint_free", f"{VLABENCH}-tint-free"): (
         ((ALL_TASKS, "generic", "vap"), (ALL_TASKS, "vap", "soft")),
         ((ALL_TASKS, "generic", "hard-short"), (ALL_TASKS, "generic", "hard-long")),

@@ -144,6 +144,7 @@ def test_a_damaged_log_is_named(logs: tuple[Path, Path]) -> None:
         "tint_free_halves",
         "tint_free_fractal",
         "tabletop_older_engine",
+        "tabletop_by_recipe",
         "ablations",
         "ablations_ten_seeds",
         "tint_free",

@@ -428,6 +428,20 @@ def test_what_the_true_mask_gains_on_several_views() -> None:
     assert f"it adds {points(always)} on tabletop (p {always.p:.3f}".replace("0.", ".") in PROSE
 
 
+def test_what_tabletops_policy_of_the_recipe_reaches() -> None:
+    (head, *body), played = (
+        table("| method | SR | selects, of 80 |"),
+        _played("tabletop_by_recipe"),
+    )
+    assert played.groupby("method").size().eq(160).all() and played.method.nunique() == len(body)
+    for name, *cells in body:
+        rows = played[played.method == _method(name)]
+        placing = rows.task.str.startswith("put")
+        parts = [rows.success, rows.success[~placing], rows.success[placing], rows.wrong_object]
+        held = [_percent(rate(int(part.sum()), len(part))) for part in parts]
+        assert [cell.strip("*") for cell in cells] == held, (head, name)
+
+
 def test_what_another_seed_of_vlabench_reaches() -> None:
     other, ships = _played("another_seed"), _played("mini_pi0")
     ships = ships[ships.suite == "vlabench"]
