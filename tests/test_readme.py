@@ -433,7 +433,8 @@ def test_what_tabletops_policy_of_the_recipe_reaches() -> None:
         table("| method | SR | selects, of 80 |"),
         _played("tabletop_by_recipe"),
     )
-    assert played.groupby("method").size().eq(160).all() and played.method.nunique() == len(body)
+    assert played.groupby("method").size().eq(160).all()
+    assert played.method.nunique() == len(body)
     for name, *cells in body:
         rows = played[played.method == _method(name)]
         placing = rows.task.str.startswith("put")
