@@ -3,10 +3,12 @@
 Drawing a batch takes a core longer than a GPU takes to learn from it.
 """
 
+import signal
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -31,6 +33,7 @@ class Ahead:
         self._steps = _Steps(frames)
         self._jobs = min(jobs, MOST)
         self._drawn: Iterator[tuple[Batch, float]] | None = None
+        self._handler: Any = None
 
     def take(self, step: int) -> Batch:
         """The batch of a step: of the first that is asked for, and then of the next, in turn.
@@ -48,12 +51,14 @@ class Ahead:
                 worker_init_fn=_begin_worker,
             )
             self._drawn = cast(Iterator[tuple[Batch, float]], iter(loader))
+            self._ignore_deaths()
         try:
             batch, cpu_s = next(self._drawn)
         except RuntimeError as error:
             # An error of `draw` itself says "in DataLoader worker process".
             if "DataLoader worker (pid" not in str(error):
                 raise
+            self.close()
             raise WorkerDied(
                 "a process that draws batches died, perhaps for lack of memory; run the same "
                 "command again, with fewer jobs."
@@ -65,6 +70,17 @@ class Ahead:
     def close(self) -> None:
         """End the processes."""
         self._drawn = None
+        if self._handler is not None:
+            signal.signal(signal.SIGCHLD, self._handler)
+            self._handler = None
+
+    def _ignore_deaths(self) -> None:
+        """Let `take` alone find that a process died, within seconds.
+
+        torch's handler of SIGCHLD raises wherever the main thread is at that moment.
+        """
+        if self._jobs > 1 and threading.current_thread() is threading.main_thread():
+            self._handler = signal.signal(signal.SIGCHLD, signal.SIG_DFL)
 
 
 @dataclass
