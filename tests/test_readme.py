@@ -441,6 +441,10 @@ def test_what_tabletops_policy_of_the_recipe_reaches() -> None:
         parts = [rows.success, rows.success[~placing], rows.success[placing], rows.wrong_object]
         held = [_percent(rate(int(part.sum()), len(part))) for part in parts]
         assert [cell.strip("*") for cell in cells] == held, (head, name)
+    failed = played[(played.method == "vap") & ~played.success.astype(bool)]
+    counts = [len(failed), *(failed.case.eq(f"case {i}").sum() for i in (3, 2))]
+    text = "of VAP's {} failures {} are Case 3, {} are views that contradict each other"
+    assert text.format(*counts) in PROSE
 
 
 def test_what_another_seed_of_vlabench_reaches() -> None:
