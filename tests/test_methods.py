@@ -193,11 +193,20 @@ def test_a_batch_of_oracles_is_each_by_itself() -> None:
 
 
 def test_the_truth_is_about_one_target() -> None:
-    two = replace(ROW, instruction="put my cup near my cup")
+    two = replace(ROW, instruction="put my cup near my bowl")
+    memory = {"mug": MUG, "dish": personal("dish", "bowl", GREY, GREY)}
+    arm = OraclePrompter(Attender(TOYS, memory), Oracle("box"), ALIKE)
     with pytest.raises(
-        BadInstruction, match="2 targets in 'put my cup near my cup', but the truth is about one"
+        BadInstruction, match="2 targets in 'put my cup near my bowl', but the truth is about one"
     ):
-        begin(Oracle("box"), LINE, two)
+        arm.start(*looking({"front": LINE}, two))
+
+
+def test_an_object_named_twice_is_one_target_of_the_truth() -> None:
+    twice = replace(ROW, instruction="bring my cup, my cup")
+    (_, attended), (_, once) = begin(Oracle("box"), LINE, twice), begin(Oracle("box"), LINE)
+    assert attended.text == "bring the red cup, the red cup"
+    assert (attended.images["front"] == once.images["front"]).all()
 
 
 @pytest.mark.parametrize(
