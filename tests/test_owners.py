@@ -414,6 +414,19 @@ def test_a_damaged_history_is_one_line(tmp_path: Path, line: str) -> None:
     assert Parsing("rule").load(tmp_path, {})("bring my cup").targets
 
 
+def test_a_history_that_cannot_be_read_is_not_to_be_deleted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add_uses(tmp_path, ["mug"], "anna", NOON)
+
+    def refuse(path: Path) -> bytes:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    with pytest.raises(BadMemory, match=r"cannot be read \(Permission denied\); check its perm"):
+        read_uses(tmp_path)
+
+
 def test_a_bank_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(BadOutput, match="choose another folder with --memory"):

@@ -6,7 +6,7 @@ from datetime import datetime
 from pathlib import Path
 
 from vap_core.base.errors import BadMemory
-from vap_core.base.files import check_regular, parse_json, writing
+from vap_core.base.files import parse_json, read_file, writing
 from vap_core.base.types import value
 
 FILE = "history.jsonl"
@@ -29,19 +29,23 @@ class Use:
 def read_uses(bank: Path) -> tuple[Use, ...]:
     """The uses that a memory keeps, oldest first; none where there is no history yet.
 
-    Raises: BadMemory: a damaged line.
+    Raises: BadMemory: it cannot be read, or a line is damaged.
     """
     path = bank / FILE
-    if not path.exists():
-        return ()
     uses = []
     try:
-        check_regular(path)
-        lines = path.read_text("utf-8").splitlines()
+        lines = read_file(path).decode("utf-8").splitlines()
         for line in lines[-MAX_USES:]:
             row = parse_json(line)
             uses.append(Use(object=row["object"], by=row["by"], at=row["at"]))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (FileNotFoundError, NotADirectoryError):
+        return ()
+    except OSError as error:
+        raise BadMemory(
+            f"history: {path} cannot be read ({error.strerror or error}); check its permissions, "
+            "or choose another folder with --memory."
+        ) from error
+    except (ValueError, KeyError, TypeError) as error:
         raise BadMemory(
             f"history: {path} is damaged ({type(error).__name__}); delete it to start a new one."
         ) from error
