@@ -345,9 +345,10 @@ class Attender:
         for camera, rgb in views.items():
             scenes.append((rgb, list(masks[camera])))
         colours = choose_colours(len(parsed.targets), scenes, self.prompting.palette)
+        shown = {camera: are_shown(per_target) for camera, per_target in tracks.items()}
         text = parsed.text
         if self.prompting.rewrite:
-            text = rewrite(parsed, _colours_in_view(colours, tracks))
+            text = rewrite(parsed, _colours_in_view(colours, shown))
         state = AttendState(
             frame_index=0,
             instruction=parsed,
@@ -359,8 +360,7 @@ class Attender:
             trackers=self._start_trackers(views, masks, ids),
             visible=_visible(tracks),
         )
-        covered = {camera: _covered(per_target) for camera, per_target in tracks.items()}
-        events = grounding_events(groundings, associations, ids, covered, chosen_by)
+        events = grounding_events(groundings, associations, ids, shown, chosen_by)
         others: dict[str, list[Mask]] = {}
         if self._marks_others:
             for camera in views:
@@ -558,6 +558,11 @@ def own_masks(tracks: Sequence[Track]) -> list[Mask | None]:
     return own
 
 
+def are_shown(tracks: Sequence[Track]) -> tuple[bool, ...]:
+    """Which targets of a view have a pixel that is no earlier target's."""
+    return tuple(mask is not None and bool(mask.any()) for mask in own_masks(tracks))
+
+
 def _winner_ids(candidates: Sequence[Candidates], per_target: PerTarget) -> tuple[int | None, ...]:
     """The tracker's identity of every target in one view."""
     ids: list[int | None] = []
@@ -577,27 +582,14 @@ def _other_masks(followed: Sequence[Mask | None], ids: Sequence[int | None]) -> 
 
 
 def _colours_in_view(
-    colours: Sequence[Colour], tracks: Mapping[str, tuple[Track, ...]]
+    colours: Sequence[Colour], shown: Mapping[str, tuple[bool, ...]]
 ) -> list[Colour | None]:
-    """The colour of every target that some view shows; None for the others, not rewritten.
-
-    A target of which every pixel is an earlier one's shows nowhere.
-    """
-    named: list[Colour | None] = [None] * len(colours)
-    for per_target in tracks.values():
-        for j, mask in enumerate(own_masks(per_target)):
-            if mask is not None and mask.any():
-                named[j] = colours[j]
+    """The colour of every target that some view shows; None for the others, not rewritten."""
+    named: list[Colour | None] = []
+    for j, colour in enumerate(colours):
+        somewhere = any(per_target[j] for per_target in shown.values())
+        named.append(colour if somewhere else None)
     return named
-
-
-def _covered(tracks: Sequence[Track]) -> tuple[bool, ...]:
-    """Which targets of a view have a mask, every pixel of which is an earlier one's."""
-    covered = []
-    for track, own in zip(tracks, own_masks(tracks), strict=True):
-        has_mask = track.mask is not None and track.mask.any()
-        covered.append(bool(has_mask and own is not None and not own.any()))
-    return tuple(covered)
 
 
 def _first_tracks(per_target: PerTarget, ids: Sequence[int | None]) -> tuple[Track, ...]:

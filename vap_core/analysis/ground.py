@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vap_core.attend import Attender, Prompting, own_masks
+from vap_core.attend import Attender, Prompting, are_shown
 from vap_core.base.errors import BadInstruction
 from vap_core.base.events import describe_rejection, is_shared
 from vap_core.base.files import writing
@@ -38,12 +38,9 @@ class Found:
     @property
     def used(self) -> tuple[str, ...]:
         """Names of the objects that are highlighted."""
-        names = []
-        shown = own_masks(self.attended.tracks[CAMERA])
-        for grounding, mask in zip(self.attended.groundings[CAMERA], shown, strict=True):
-            if mask is not None and mask.any():
-                names.append(grounding.object)
-        return tuple(names)
+        shown = are_shown(self.attended.tracks[CAMERA])
+        found = zip(self.attended.groundings[CAMERA], shown, strict=True)
+        return tuple(grounding.object for grounding, is_shown in found if is_shown)
 
     @property
     def notes(self) -> tuple[str, ...]:

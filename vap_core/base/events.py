@@ -21,17 +21,17 @@ def grounding_events(
     groundings: Mapping[str, tuple[Grounding, ...]],
     associations: tuple[Association | None, ...],
     ids: Mapping[str, tuple[int | None, ...]],
-    covered: Mapping[str, tuple[bool, ...]],
+    shown: Mapping[str, tuple[bool, ...]],
     chosen_by: str,
 ) -> tuple[Event, ...]:
     """Events of t = 0. `chosen_by` names what overruled a vote, where something did.
 
-    `covered[camera][j]` says whether every pixel of target j is an earlier target's.
+    `shown[camera][j]` says whether target j has a pixel that is no earlier target's.
     """
     events = []
     for per_view in groundings.values():
-        shown = any(grounding.mask is not None for grounding in per_view)
-        without = UNMARKED if shown else UNMODIFIED
+        marked = any(grounding.mask is not None for grounding in per_view)
+        without = UNMARKED if marked else UNMODIFIED
         events += [_elected(grounding, chosen_by, without) for grounding in per_view]
     for j, association in enumerate(associations):
         if association is not None:
@@ -40,10 +40,11 @@ def grounding_events(
         found = [identity for identity in per_target if identity is not None]
         if len(set(found)) < len(found):
             events.append(Event(0, "WARN", f"{camera}: {SHARED}"))
-        for j, identity in enumerate(per_target):
-            if covered[camera][j] and identity not in per_target[:j]:
-                name = groundings[camera][j].object
-                events.append(Event(0, "WARN", f"{camera}: {name} {INSIDE}, {UNMARKED}"))
+        for j, grounding in enumerate(groundings[camera]):
+            has_mask = grounding.mask is not None and grounding.mask.any()
+            if has_mask and not shown[camera][j] and per_target[j] not in per_target[:j]:
+                text = f"{camera}: {grounding.object} {INSIDE}, {UNMARKED}"
+                events.append(Event(0, "WARN", text))
     return tuple(events)
 
 

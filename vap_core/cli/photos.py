@@ -214,7 +214,6 @@ def ground(
     from vap_core.analysis.ground import (
         GROUND_SIDE,
         ground_image,
-        missing_threshold,
         parse_boxes,
         to_json,
         write_evidence,
@@ -246,11 +245,7 @@ def ground(
         )
         if summary.grounded is not None:
             note_uses(memory, [summary.object], speaker)
-        note = missing_threshold(stack)
-        if note and not always_tint:
-            print(f"note: {note}", file=sys.stderr)
-        for warning in summary.notes:
-            print(f"note: {warning}", file=sys.stderr)
+        _print_notes(stack, summary.notes, always_tint)
         print(summary)
         print(f"wrote {mp4} and {rrd}; look: {command('view', rrd)}")
         return
@@ -283,11 +278,7 @@ def ground(
         parsing=parsing,
     )
     note_uses(memory, found.used, speaker)
-    note = missing_threshold(stack)
-    if note and not always_tint:
-        print(f"note: {note}", file=sys.stderr)
-    for warning in found.notes:
-        print(f"note: {warning}", file=sys.stderr)
+    _print_notes(stack, found.notes, always_tint)
     written = write_evidence(out, image.stem, found)
     if as_json:
         print(json.dumps(to_json(found)))
@@ -308,3 +299,12 @@ def note_uses(memory: Path, objects: Sequence[str], speaker: str) -> None:
         add_uses(memory, objects, speaker, datetime.now().astimezone())
     except BadOutput as error:
         print(f"note: {error}", file=sys.stderr)
+
+
+def _print_notes(stack: str, warnings: Sequence[str], always_tint: bool) -> None:
+    """What `ground` says beside its answer."""
+    from vap_core.analysis.ground import missing_threshold
+
+    missing = "" if always_tint else missing_threshold(stack)
+    for line in filter(None, (missing, *warnings)):
+        print(f"note: {line}", file=sys.stderr)

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64
 
-from vap_core.attend import Attender, AttendState, own_masks
+from vap_core.attend import Attender, AttendState, are_shown
 from vap_core.base.types import Attended, Camera, Rgb
 from vap_core.evaluation.ablations.forms import draw_arrow
 from vap_core.rollout.prompters.protocol import PromptContext
@@ -74,11 +74,10 @@ class ArrowPrompter:
         hand_world = self.world_from_base.apply(observation.state[:3].astype(np.float64))
         for camera, tracks in attended.tracks.items():
             start = hand_pixel(context.cameras[camera], hand_world)
-            owned = own_masks(tracks)
-            for track, own, colour in zip(tracks, owned, attended.colours, strict=True):
-                if track.mask is None or own is None or start is None or not own.any():
-                    continue
-                images[camera] = draw_arrow(images[camera], track.mask, colour, start)
+            shown = are_shown(tracks)
+            for track, is_shown, colour in zip(tracks, shown, attended.colours, strict=True):
+                if is_shown and track.mask is not None and start is not None:
+                    images[camera] = draw_arrow(images[camera], track.mask, colour, start)
         return replace(attended, images=images)
 
 
