@@ -34,6 +34,7 @@ from vap_core.policies.lerobot.attention_hooks import can_watch, reporting_atten
 from vap_core.policies.lerobot.checkpoints import PIPELINES, locate
 from vap_core.policies.lerobot.loading import build
 from vap_core.policies.lerobot.module_hooks import overriding_tokens
+from vap_core.policies.lerobot.normalisation import EMPTY
 from vap_core.policies.lerobot.token_positions import positions
 from vap_core.policies.lerobot.traced import ChunkPredictor
 from vap_core.policies.names import label_of
@@ -48,10 +49,9 @@ if TYPE_CHECKING:
 
 STATE = "observation.state"
 IMAGE = "observation.images."
-EMPTY = "observation.images.empty_camera"
 TOKENS = "observation.language.tokens"
 TOKEN_MASK = "observation.language.attention_mask"
-"""lerobot's feature keys; a checkpoint fills its empty cameras itself."""
+"""lerobot's feature keys."""
 DRAWS_NOTHING = ("act",)
 """Policies whose chunk is a function of the observation alone."""
 OF_MODULES = frozenset(vars(torch.nn.Module()))
@@ -307,8 +307,9 @@ def load_policy(
     `checkpoint` is a folder, or the `owner/name` of a model that was downloaded before.
     `temperature` scales a mini-pi0's sampling noise, instead of the checkpoint's own.
 
-    Raises: BadPolicy when it is not there, would execute code, cannot be built, does not end with
-        exactly the file's weights, or has no temperature to set.
+    Raises: BadPolicy when it is not there, would execute code, cannot be built, lacks statistics
+        that it scales by, does not end with exactly the file's weights, or has no temperature to
+        set.
     """
     folder = locate(checkpoint)
     policy, preprocessor, postprocessor = build(folder, device)
