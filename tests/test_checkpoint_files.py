@@ -1,6 +1,7 @@
 """What a checkpoint's files hold decides what it does: statistics that are absent, runs and scratch beside them, weights that were replaced."""
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +12,12 @@ from safetensors.torch import load_file, save_file
 
 from tests import tiny_lerobot as tiny
 from vap_core.base.errors import BadPolicy
-from vap_core.policies.lerobot.adapter import load_policy
+from vap_core.evaluation.store import open_run
+from vap_core.policies.lerobot.adapter import load_for_suite, load_policy
+from vap_core.policies.lerobot.checkpoints import RUN, fingerprint
+from vap_core.policies.names import label_of
+from vap_core.simulation import suites
+from vap_core.simulation.scenes import build
 
 BEFORE = "policy_preprocessor_step_3_normalizer_processor.safetensors"
 AFTER = "policy_postprocessor_step_0_unnormalizer_processor.safetensors"
@@ -113,3 +119,38 @@ def test_statistics_follow_the_checkpoints_rename_map(copy: Path) -> None:
 
     change(copy / BEFORE, to_old)
     load_policy(copy)
+
+
+def test_a_run_or_scratch_in_its_folder_is_no_part_of_a_checkpoint(copy: Path) -> None:
+    before = fingerprint(copy), label_of(copy)
+    run = open_run(copy / "eval", {"suite": "simpler-bridge"})
+    assert (run / RUN).is_file()
+    (run / "memory" / "mug").mkdir(parents=True)
+    scratch = copy / ".saving-abc"
+    scratch.mkdir()
+    for file in (run / "memory" / "mug" / "object.json", run / "left.safetensors"):
+        file.write_text("{}")
+    shutil.copy(copy / "model.safetensors", scratch)
+    assert (fingerprint(copy), label_of(copy)) == before
+    (copy / "tokenizer").mkdir()
+    (copy / "tokenizer" / "tokenizer.json").write_text("{}")
+    assert fingerprint(copy) != before[0], "what it reads its commands by"
+
+
+def test_a_checkpoint_that_was_trained_on_is_loaded_again(copy: Path) -> None:
+    """As in a notebook, whose process goes on; a run's table names the weights that acted."""
+    known = suites.suite("simpler-bridge")
+    (row,) = suites.rows("simpler-bridge", "put-camera", 1)
+    with build(known.robot, [place.model for place in row.placements]) as scene:
+        first = load_for_suite(str(copy), scene, known)
+        (copy / "training.json").write_text("{}")
+        assert load_for_suite(str(copy), scene, known) is first
+        again = copy / "again.safetensors"
+        shutil.copy(copy / "model.safetensors", again)
+        change(
+            again, lambda key, tensor: (key, tensor + 1 if tensor.is_floating_point() else tensor)
+        )
+        os.replace(again, copy / "model.safetensors")
+        second = load_for_suite(str(copy), scene, known)
+    assert second.label == label_of(copy) != first.label
+    assert second.sha256() != first.sha256()
