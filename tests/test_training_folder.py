@@ -30,6 +30,7 @@ from vap_core.training.policy import taught
 from vap_core.training.policy import train as policy
 from vap_core.training.policy.ahead import Ahead
 from vap_core.training.recipe import FILMED, RECIPES, filmed_tasks
+from vap_core.training.step import Schedule, train_steps
 from vap_core.training.vlm import train as vlm
 
 
@@ -171,6 +172,62 @@ def test_a_model_does_not_go_on_with_other_views(
         vlm.train(recipe, tmp_path)
     looks = known(stage[1]).captions
     assert vlm.data_sha256(pool, looks) != vlm.data_sha256(pool[::-1], looks)
+
+
+@pytest.mark.parametrize("fault", ["loss", "gradient"])
+def test_a_training_that_diverges_is_said_and_not_kept(fault: str, tmp_path: Path) -> None:
+    """A finite loss of which a gradient is not, before the last step, is found as it is saved."""
+
+    def losses(model: nn.Linear, step: int) -> tuple[Tensor, dict[str, float]]:
+        loss = model(torch.ones(1, 2)).square().sum()
+        if step == 4:
+            loss = loss * torch.nan if fault == "loss" else (loss * 0).sqrt()
+        return loss, {"flow": float(loss.detach())}
+
+    def run(steps: int) -> Schedule:
+        return Schedule(name="x", steps=steps, rate=0.1, every=2, slower="lower --rate")
+
+    told = {"loss": "the loss is", "gradient": "the weights are"}[fault]
+    message = f"{told} not finite at step 5; lower --rate, with another --out"
+    with pytest.raises(BadOutput, match=message):
+        train_steps(nn.Linear(2, 1), losses, run(5), tmp_path)
+    kept = torch.load(tmp_path / "training.pt", weights_only=True)
+    assert kept["step"] == 4
+    for part in ("model", "mean"):
+        assert all(weight.isfinite().all() for weight in kept[part].values())
+    with pytest.raises(BadOutput, match="loss is not finite at step [56]; lower --rate"):
+        train_steps(nn.Linear(2, 1), losses, run(6), tmp_path)
+
+
+@pytest.mark.parametrize("fault", ["loss", "gradient"])
+def test_a_head_that_diverges_is_said_and_not_kept(fault: str, tmp_path: Path) -> None:
+    epochs = []
+
+    def losses(rng: np.random.Generator) -> Iterator[Tensor]:
+        epochs.append(rng)
+        loss = head(torch.ones(1, 2)).square().sum()
+        if len(epochs) == 2:
+            loss = loss * torch.nan if fault == "loss" else (loss * 0).sqrt()
+        yield loss
+
+    head = nn.Linear(2, 1)
+    run = Run(
+        name="looks",
+        seed=0,
+        epochs=3,
+        rate=0.1,
+        decay=0.0,
+        file=tmp_path / "looks.pt",
+        resume=True,
+        expired=lambda: False,
+    )
+    told = {"loss": "loss is not finite at batch 1 of", "gradient": "weights are not finite after"}
+    message = f"looks head's {told[fault]} epoch 2; run it again with another --seed"
+    with pytest.raises(BadOutput, match=message):
+        fit(head, losses, 1, run)
+    kept = torch.load(tmp_path / "looks.pt", weights_only=True)
+    assert kept["epoch"] == 1
+    assert all(weight.isfinite().all() for weight in kept["head"].values())
 
 
 def test_a_head_that_was_trained_otherwise_is_not_taken(tmp_path: Path) -> None:

@@ -35,6 +35,8 @@ class Schedule:
     every: int = 250
     made_of: Any = None
     """Recipe and data, as JSON: a training of something else is not gone on with."""
+    slower: str = "lower the recipe's rate"
+    """What to do about a training that diverges."""
 
 
 def train_steps[M: nn.Module](
@@ -51,7 +53,8 @@ def train_steps[M: nn.Module](
     `losses` gives the loss of one step, drawn from streams of its number, and figures to log;
     `helpers_cpu_s`, the CPU seconds of other processes since this call began.
 
-    Raises: BadOutput when `out` holds another training or cannot be written.
+    Raises: BadOutput when `out` holds another training or cannot be written, or when the training
+        diverges: what is kept stays as it was.
     """
     from tqdm import tqdm
 
@@ -77,6 +80,8 @@ def train_steps[M: nn.Module](
     for step in tqdm(numbers, desc=run.name, total=run.steps, initial=first_step, mininterval=10):
         _set_rate(optimiser, run, step)
         loss, figures = losses(model, step)
+        # `figures` are numbers already, so that this waits for nothing more on a GPU.
+        _require_finite(loss, run, step, "loss is", out)
         optimiser.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(model.parameters(), 1.0)
@@ -91,6 +96,9 @@ def train_steps[M: nn.Module](
             saved: dict[str, Any] = {"step": step + 1, "log": log, "made_of": made_of}
             for name, part in parts.items():
                 saved[name] = part.state_dict()
+            # A finite loss can have a gradient that is not.
+            for weight in model.parameters():
+                _require_finite(weight, run, step, "weights are", out)
             with writing(out, "train"):
                 save(saved)
         if last:
@@ -119,6 +127,15 @@ def _require_same_training(state: dict[str, Any], made_of: str, out: Path) -> No
         raise BadOutput(
             f"train: {out} holds a training with another recipe or other data; "
             "go on with those, or choose another --out."
+        )
+
+
+def _require_finite(numbers: Tensor, run: Schedule, step: int, what: str, out: Path) -> None:
+    """Raises: BadOutput when one of the numbers is not finite; `what` names them."""
+    if not bool(torch.isfinite(numbers.detach()).all()):
+        raise BadOutput(
+            f"train: {out}: the {what} not finite at step {step + 1}; {run.slower}, with another "
+            "--out."
         )
 
 

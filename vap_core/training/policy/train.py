@@ -243,6 +243,7 @@ def train(
             minutes=minutes,
             every=every,
             made_of=made_of,
+            slower="lower --rate",
         )
         mean, log = train_steps(learner.to(place), step, run, out, lambda: ahead.cpu_s)
         ahead.close()
