@@ -15,7 +15,7 @@ import pytest
 
 from tests.command import refused, vap
 from tests.test_breakdown import TABLE
-from vap_core.base.errors import BadOutput, BadStudy, UnknownName
+from vap_core.base.errors import BadOutput, BadRecording, BadStudy, UnknownName
 from vap_core.base.files import DATA
 from vap_core.evaluation import engine
 from vap_core.evaluation.diagnosis import recordings
@@ -31,8 +31,9 @@ from vap_core.evaluation.report.failures import (
     breakdown,
 )
 from vap_core.evaluation.study import Study
-from vap_core.recording import Recorder, read_summary
+from vap_core.recording import Recorder, read_summary, recover
 from vap_core.recording.index import FOLDER
+from vap_core.simulation.types import Outcome
 
 STUDY = Study((("widowx-pick", "pick-straw-cup"),), ("generic",), episodes=3, policy="random")
 
@@ -127,6 +128,116 @@ def test_a_damaged_recording_is_made_again_where_that_can_be_written(
 
 def read_only(path: Path, missing_ok: bool = False) -> None:
     raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+
+def opened(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Failures:
+    """The failures of the run as a published table, whose recordings lie below `tmp_path`."""
+    publish([run], tmp_path / "mine.parquet")
+    monkeypatch.chdir(tmp_path)
+    return list_failures(tmp_path / "mine.parquet")
+
+
+def kept_beside(path: Path) -> list[str]:
+    return sorted(each.name for each in path.parent.glob(f"{path.name}.*"))
+
+
+def test_a_recording_of_another_episode_is_neither_shown_nor_lost(
+    run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    failures = opened(run, tmp_path, monkeypatch)
+    first, second = failures.table.episode[:2]
+    path = recording_of(failures, 1)
+    capsys.readouterr()
+    for number in (1, 2):
+        recording_of(failures, 0).replace(path)
+        foreign = path.read_bytes()
+        assert read_summary(recording_of(failures, 1))["episode"] == second
+        kept = path.with_name(f"{path.name}.replaced-{number}")
+        assert kept.read_bytes() == foreign
+        said = capsys.readouterr().out
+        assert said == (
+            f"note: {path} is of episode {first}, not {second}; it is kept as {kept.name}, "
+            "and the episode is run again.\n"
+        )
+    assert len(kept_beside(path)) == 2
+    assert [each.name for each in path.parent.glob("*.rrd")] == [path.name]
+
+
+def test_what_a_killed_process_recorded_is_not_the_whole_episode(
+    run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    class Killed(Recorder):
+        def close(self, outcome: Outcome) -> None:
+            raise KeyboardInterrupt
+
+    failures = opened(run, tmp_path, monkeypatch)
+    with monkeypatch.context() as patch:
+        patch.setattr("vap_core.recording.Recorder", Killed)
+        with pytest.raises(KeyboardInterrupt):
+            recording_of(failures, 0)
+    (leftover,) = tmp_path.glob("data/runs/mine-diagnosed/**/.*.tmp")
+    recovered = recover(leftover)
+    assert "outcome" not in read_summary(recovered)
+    layer = correct_failure(failures, 0, "unprompted: slip")
+    assert "is unfinished; it is kept as" in capsys.readouterr().out
+    assert read_summary(recovered)["outcome"] == "failure"
+    assert layer.name == recovered.name
+    assert len(kept_beside(recovered)) == 1
+
+
+@pytest.mark.parametrize("name", ["suite", "task", "episode", "seed", "method", "policy"])
+def test_a_recording_is_that_of_a_row_in_all_that_names_it(name: str) -> None:
+    row = {"suite": "s", "task": "t", "episode": 1, "seed": 0, "method": "vap", "policy": "p"}
+    recorded = {**row, "outcome": "failure", "steps": 9}
+    assert recordings._why_other(recorded, row) == ""
+    assert f"is of {name} 7, not {row[name]}" == recordings._why_other({**recorded, name: 7}, row)
+    del recorded[name]
+    assert recordings._why_other(recorded, row)
+
+
+def test_a_recording_that_ended_otherwise_than_its_row_says_so(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    failures = list_failures(run)
+    path = recording_of(failures, 1)
+    steps = failures.table.steps[1]
+    failures.table.loc[1, "steps"] = steps - 1
+    assert recording_of(failures, 1) == path
+    assert capsys.readouterr().out == (
+        f"note: recorded, it is a failure after {steps} steps (was failure after {steps - 1}).\n"
+    )
+
+
+def test_a_recording_without_rights_stays_and_a_damaged_one_is_kept(
+    run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    failures = opened(run, tmp_path, monkeypatch)
+    path = recording_of(failures, 0)
+    damaged = path.read_bytes()[:5000]
+    path.write_bytes(damaged)
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "open", no_rights)
+        with pytest.raises(BadRecording, match="give yourself the right to read it") as caught:
+            recording_of(failures, 0)
+    assert str(caught.value).startswith(f"diagnose: {path} cannot be read (Permission denied);")
+    assert kept_beside(path) == []
+    recording_of(failures, 0)
+    assert f"note: {path} is damaged; it is kept as" in capsys.readouterr().out
+    assert path.with_name(f"{path.name}.replaced-1").read_bytes() == damaged
+    assert read_summary(path)["outcome"] == "failure"
+
+
+def no_rights(path: Path, mode: str) -> None:
+    raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
 
 def test_a_misspelt_correction_is_said_before_the_episode_is_run_again(
