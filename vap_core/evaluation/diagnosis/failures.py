@@ -236,7 +236,7 @@ def _notes_of_old_corrections(sources: Sequence[Path]) -> list[str]:
         if old:
             notes.append(
                 f"not counted: corrections of an earlier version in {base} ({len(old)}), which do "
-                "not name their run; correct again, or move each to RUN/POLICY/corrections there."
+                "not name their run; correct again, or move each to DIGEST/POLICY/corrections."
             )
     return notes
 
