@@ -160,7 +160,7 @@ def test_a_page_leaves_out_recorded_failures_of_runs_older_than_the_diagnosis(
 
     def summaries(paths: list[Path]) -> Generator[tuple[Path, dict[str, str], str]]:
         for path in paths:
-            yield path, {"policy": "p"}, ""
+            yield path, {**new, "steps": 9}, ""
 
     monkeypatch.setattr("vap_core.recording.isolated.read_summaries", summaries)
     about = {"task": "select-cup", "seed": 0, "policy": "p", "case_sentence": "because"}

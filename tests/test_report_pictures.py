@@ -31,12 +31,6 @@ def test_a_failure_is_pictured_by_the_recording_of_its_own_policy(
         (source / "recordings").mkdir(parents=True)
         (source / "recordings" / name).write_bytes(b"")
 
-    def summaries(paths: list[Path]) -> Generator[tuple[Path, dict[str, str] | None, str]]:
-        for path in paths:
-            damaged = "damaged" in path.parts
-            yield path, None if damaged else {"policy": path.parts[-3]}, "damaged"
-
-    monkeypatch.setattr("vap_core.recording.isolated.read_summaries", summaries)
     row = {
         "suite": "simpler-bridge",
         "task": "put-camera",
@@ -44,9 +38,22 @@ def test_a_failure_is_pictured_by_the_recording_of_its_own_policy(
         "seed": 0,
         "method": "vap",
     }
-    for policy, found in (("b", [sources[1] / "recordings" / name]), ("c", [])):
-        recorded = list(page._recorded([{**row, "policy": policy}], sources))
-        assert [path for _, path in recorded] == found
+    whole = {**row, "outcome": "failure", "steps": 60}
+    said = whole
+
+    def summaries(paths: list[Path]) -> Generator[tuple[Path, dict[str, object] | None, str]]:
+        for path in paths:
+            damaged = "damaged" in path.parts
+            yield path, None if damaged else {**said, "policy": path.parts[-3]}, "damaged"
+
+    monkeypatch.setattr("vap_core.recording.isolated.read_summaries", summaries)
+    of_b = {**row, "policy": "b"}
+    path = sources[1] / "recordings" / name
+    assert list(page._recorded([of_b], sources)) == [(of_b, path)]
+    assert not list(page._recorded([{**row, "policy": "c"}], sources))
+    for other in ({**whole, "episode": 4}, {**whole, "method": "generic"}, row):
+        said = other
+        assert not list(page._recorded([of_b], sources))
 
 
 def test_a_card_gives_a_command_for_a_shell(tmp_path: Path) -> None:

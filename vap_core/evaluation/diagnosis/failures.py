@@ -18,6 +18,7 @@ from vap_core.base.errors import BadOutput, BadStudy
 from vap_core.base.tables import align
 from vap_core.evaluation.publish import read_runs, scene_of
 from vap_core.evaluation.report.failures import (
+    PLAYED,
     SUBGOAL,
     breakdown,
     breakdown_rows,
@@ -46,8 +47,6 @@ COLUMNS = {
     "case_sentence": "why",
 }
 """The columns that `failures_text` shows, and their titles; the sub-goal where there are any."""
-PLAYED = ["suite", "task", "episode", "seed", "method"]
-"""The columns that name a recording."""
 UNSAFE = r"[^\w.@-]|^\.+"
 """What is replaced in the name of a folder: characters of a policy's label, and dots before it."""
 ARTIFACTS = Path("data/runs")

@@ -15,13 +15,13 @@ from vap_core.base.errors import BadRecording, BadStudy
 from vap_core.base.files import take_name, writing
 from vap_core.evaluation.diagnosis import explain
 from vap_core.evaluation.diagnosis.failures import (
-    PLAYED,
     Failures,
     deciding_frame,
     failure_row,
 )
 from vap_core.evaluation.policy_names import policy_today
 from vap_core.evaluation.publish import scene_of
+from vap_core.evaluation.report.failures import why_other
 from vap_core.evaluation.run_schema import EXECUTED
 from vap_core.evaluation.stills import write_provenance
 from vap_core.evaluation.store import ROW_KEY
@@ -161,7 +161,7 @@ def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
     other = ""
     if os.path.lexists(path):
         summary = _summary(path)
-        other = _why_other(summary, row)
+        other = why_other(summary, row)
         if not other:
             _note_otherwise("recorded", summary["outcome"], summary["steps"], row)
             return path
@@ -216,18 +216,6 @@ def _summary(recording: Path) -> dict[str, Any]:
         ) from error
     ((_, summary, _),) = read_summaries([recording])
     return summary or {}
-
-
-def _why_other(summary: Mapping[str, Any], row: Mapping[str, Any]) -> str:
-    """Why a recording is not the whole one of a row, as the rest of a sentence; "" where it is."""
-    if not summary:
-        return "is damaged"
-    for name in (*PLAYED, "policy"):
-        if summary.get(name) != row[name]:
-            return f"is of {name} {summary.get(name)}, not {row[name]}"
-    if "outcome" not in summary or "steps" not in summary:
-        return "is unfinished"
-    return ""
 
 
 def _keep_beside(path: Path) -> Path:

@@ -1,6 +1,7 @@
 """How failures divide into cases (P tab:error_case_breakdown), and the funnel of stages."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadOutput
 from vap_core.base.types import value
@@ -19,6 +20,9 @@ APART = ", "
 SUBGOAL = "subgoal"
 """The column of the sub-goal that was diagnosed, counted from 1, where there are several."""
 DIAGNOSIS_COLUMNS = ("case", "sub_case", "deciding_frame")
+
+PLAYED = ["suite", "task", "episode", "seed", "method"]
+"""The columns that name a recording."""
 
 
 def check_diagnosed(table: "pd.DataFrame") -> None:
@@ -47,6 +51,22 @@ def undiagnosed(table: "pd.DataFrame") -> "pd.DataFrame":
 def older_text(n_more: int) -> str:
     """How many episodes are not shown, because no failure of their runs was diagnosed."""
     return f"{n_more} more of runs older than the diagnosis are left out"
+
+
+def why_other(summary: Mapping[str, Any], row: Mapping[str, Any]) -> str:
+    """Why a recording is not the whole one of an episode, as the rest of a sentence; "" where it
+    is.
+
+    `summary` is what the recording says of itself, nothing where it is damaged.
+    """
+    if not summary:
+        return "is damaged"
+    for name in (*PLAYED, "policy"):
+        if summary.get(name) != row[name]:
+            return f"is of {name} {summary.get(name)}, not {row[name]}"
+    if "outcome" not in summary or "steps" not in summary:
+        return "is unfinished"
+    return ""
 
 
 def breakdown(table: "pd.DataFrame") -> "pd.DataFrame":

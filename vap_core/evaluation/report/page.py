@@ -23,6 +23,7 @@ from vap_core.evaluation.report.failures import (
     diagnosed,
     funnel_table,
     older_text,
+    why_other,
 )
 from vap_core.evaluation.report.funnel import funnel_figure
 
@@ -126,9 +127,10 @@ def _failures(table: "pd.DataFrame", sources: Sequence[Path], out: Path) -> list
 def _recorded(
     rows: Sequence[Mapping[str, Any]], sources: Sequence[Path]
 ) -> Generator[tuple[Mapping[str, Any], Path]]:
-    """Each episode that has a recording, and the first such; a damaged one is none.
+    """Each episode that has a recording, and the first such.
 
-    Files of runs of other policies have the same name.
+    Files of runs of other policies have the same name; one that is damaged, unfinished or of
+    another episode is none.
     """
     from vap_core.recording import isolated, recording_file_name
 
@@ -145,7 +147,7 @@ def _recorded(
     summaries = isolated.read_summaries([path for _, path in candidates])
     with closing(summaries):
         for (number, _), (path, summary, _) in zip(candidates, summaries, strict=True):
-            if summary and number != found and summary.get("policy") == rows[number]["policy"]:
+            if number != found and not why_other(summary or {}, rows[number]):
                 found = number
                 yield rows[number], path
 
