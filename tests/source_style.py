@@ -6,14 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-ANCHORS = {
-    "mink": (82, 0.2, 0.3),
-    "optimistix": (86, 0.0, 0.0),
-    "supervision": (82, 0.7, 0.4),
-    "Gymnasium": (113, 0.9, 0.2),
-    "lerobot": (94, 0.8, 0.7),
-}
-"""95th percentile of line lengths, and comprehensions and ternaries per 100 lines, of packages."""
 COMPREHENSIONS = ast.ListComp | ast.SetComp | ast.DictComp | ast.GeneratorExp
 
 

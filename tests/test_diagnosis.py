@@ -15,7 +15,7 @@ import pytest
 
 from tests.command import refused, vap
 from tests.test_breakdown import TABLE
-from vap_core.base.errors import BadOutput, BadStudy, UnknownName
+from vap_core.base.errors import BadOutput, BadRecording, BadStudy, UnknownName
 from vap_core.base.files import DATA
 from vap_core.evaluation import engine
 from vap_core.evaluation.diagnosis import recordings
@@ -30,9 +30,11 @@ from vap_core.evaluation.publish import publish, read_published
 from vap_core.evaluation.report.failures import (
     breakdown,
 )
+from vap_core.evaluation.store import read_manifest
 from vap_core.evaluation.study import Study
-from vap_core.recording import Recorder, read_summary
+from vap_core.recording import Recorder, read_summary, recover
 from vap_core.recording.index import FOLDER
+from vap_core.simulation.types import Outcome
 
 STUDY = Study((("widowx-pick", "pick-straw-cup"),), ("generic",), episodes=3, policy="random")
 
@@ -56,6 +58,41 @@ def test_a_run_lists_its_failures_with_their_reasons(run: Path) -> None:
     assert "and 1 more; --limit shows them" in told
     assert set(failures.table["case"]) == {"unprompted"}
     assert failures.table["deciding_frame"].between(0, 60).all()
+
+
+@pytest.mark.parametrize(
+    ("asked", "n", "n_failures"),
+    [({}, 2191, 2), ({"suite": "simpler-bridge"}, 96, 0)],
+)
+def test_what_is_older_than_the_diagnosis_is_counted(
+    asked: dict[str, str], n: int, n_failures: int
+) -> None:
+    failures = list_failures(DATA / "results" / "bounds.parquet", **asked)
+    kept = len(failures.episodes)
+    whole = pd.concat(part for _, part in read_published(DATA / "results" / "bounds.parquet"))
+    for column, wanted in asked.items():
+        whole = whole[whole[column] == wanted]
+    assert (kept + n, breakdown(failures.episodes)["n"].sum()) == (len(whole), kept)
+    said = f"{n} more of runs older than the diagnosis are left out; {n_failures} of them failed."
+    assert said in failures_text(failures)
+
+
+def test_an_older_episode_that_another_source_has_diagnosed_is_not_left_out(
+    run: Path, tmp_path: Path
+) -> None:
+    """The older run comes first, and with other episodes of its own."""
+    shutil.copytree(run, tmp_path / "older")
+    for part in (tmp_path / "older" / "parts").iterdir():
+        table = pd.read_parquet(part)
+        texts = dict.fromkeys(("case", "sub_case", "case_sentence"))
+        table.assign(**texts, deciding_frame=float("nan")).to_parquet(part)
+    alone = list_failures(tmp_path / "older")
+    assert "3 more of runs older than the diagnosis" in failures_text(alone)
+    both = list_failures(tmp_path / "older", run)
+    assert len(both.table) == 3
+    assert "older than the diagnosis" not in failures_text(both)
+    mixed = list_failures(DATA / "results" / "bounds.parquet", run)
+    assert mixed.all_episodes["deciding_frame"].dtype == int
 
 
 def test_several_places_are_one_list_of_every_episode_once(run: Path, tmp_path: Path) -> None:
@@ -129,6 +166,116 @@ def read_only(path: Path, missing_ok: bool = False) -> None:
     raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
 
+def opened(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Failures:
+    """The failures of the run as a published table, whose recordings lie below `tmp_path`."""
+    publish([run], tmp_path / "mine.parquet")
+    monkeypatch.chdir(tmp_path)
+    return list_failures(tmp_path / "mine.parquet")
+
+
+def kept_beside(path: Path) -> list[str]:
+    return sorted(each.name for each in path.parent.glob(f"{path.name}.*"))
+
+
+def test_a_recording_of_another_episode_is_neither_shown_nor_lost(
+    run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    failures = opened(run, tmp_path, monkeypatch)
+    first, second = failures.table.episode[:2]
+    path = recording_of(failures, 1)
+    capsys.readouterr()
+    for number in (1, 2):
+        recording_of(failures, 0).replace(path)
+        foreign = path.read_bytes()
+        assert read_summary(recording_of(failures, 1))["episode"] == second
+        kept = path.with_name(f"{path.name}.replaced-{number}")
+        assert kept.read_bytes() == foreign
+        said = capsys.readouterr().out
+        assert said == (
+            f"note: {path} is of episode {first}, not {second}; it is kept as {kept.name}, "
+            "and the episode is run again.\n"
+        )
+    assert len(kept_beside(path)) == 2
+    assert [each.name for each in path.parent.glob("*.rrd")] == [path.name]
+
+
+def test_what_a_killed_process_recorded_is_not_the_whole_episode(
+    run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    class Killed(Recorder):
+        def close(self, outcome: Outcome) -> None:
+            raise KeyboardInterrupt
+
+    failures = opened(run, tmp_path, monkeypatch)
+    with monkeypatch.context() as patch:
+        patch.setattr("vap_core.recording.Recorder", Killed)
+        with pytest.raises(KeyboardInterrupt):
+            recording_of(failures, 0)
+    (leftover,) = tmp_path.glob("data/runs/mine-diagnosed/**/.*.tmp")
+    recovered = recover(leftover)
+    assert "outcome" not in read_summary(recovered)
+    layer = correct_failure(failures, 0, "unprompted: slip")
+    assert "is unfinished; it is kept as" in capsys.readouterr().out
+    assert read_summary(recovered)["outcome"] == "failure"
+    assert layer.name == recovered.name
+    assert len(kept_beside(recovered)) == 1
+
+
+@pytest.mark.parametrize("name", ["suite", "task", "episode", "seed", "method", "policy"])
+def test_a_recording_is_that_of_a_row_in_all_that_names_it(name: str) -> None:
+    row = {"suite": "s", "task": "t", "episode": 1, "seed": 0, "method": "vap", "policy": "p"}
+    recorded = {**row, "outcome": "failure", "steps": 9}
+    assert recordings._why_other(recorded, row) == ""
+    assert f"is of {name} 7, not {row[name]}" == recordings._why_other({**recorded, name: 7}, row)
+    del recorded[name]
+    assert recordings._why_other(recorded, row)
+
+
+def test_a_recording_that_ended_otherwise_than_its_row_says_so(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    failures = list_failures(run)
+    path = recording_of(failures, 1)
+    steps = failures.table.steps[1]
+    failures.table.loc[1, "steps"] = steps - 1
+    assert recording_of(failures, 1) == path
+    assert capsys.readouterr().out == (
+        f"note: recorded, it is a failure after {steps} steps (was failure after {steps - 1}).\n"
+    )
+
+
+def test_a_recording_without_rights_stays_and_a_damaged_one_is_kept(
+    run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    failures = opened(run, tmp_path, monkeypatch)
+    path = recording_of(failures, 0)
+    damaged = path.read_bytes()[:5000]
+    path.write_bytes(damaged)
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "open", no_rights)
+        with pytest.raises(BadRecording, match="give yourself the right to read it") as caught:
+            recording_of(failures, 0)
+    assert str(caught.value).startswith(f"diagnose: {path} cannot be read (Permission denied);")
+    assert kept_beside(path) == []
+    recording_of(failures, 0)
+    assert f"note: {path} is damaged; it is kept as" in capsys.readouterr().out
+    assert path.with_name(f"{path.name}.replaced-1").read_bytes() == damaged
+    assert read_summary(path)["outcome"] == "failure"
+
+
+def no_rights(path: Path, mode: str) -> None:
+    raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+
 def test_a_misspelt_correction_is_said_before_the_episode_is_run_again(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -147,7 +294,8 @@ def test_a_published_table_opens_too(
     failures = list_failures(tmp_path / "mine.parquet", suite="widowx-pick", case="unprompted")
     monkeypatch.chdir(tmp_path)
     path = recording_of(failures, 0)
-    assert path.parent == Path("data/runs/mine-diagnosed/recordings")
+    digest = read_manifest(run)["digest"]
+    assert path.parent == Path("data/runs/mine-diagnosed", digest, "random/recordings")
     assert path.exists()
 
 
@@ -164,7 +312,8 @@ def test_a_correction_is_of_the_policy_that_was_recorded(
     monkeypatch.chdir(tmp_path)
     listed = partial(list_failures, tmp_path / "mine.parquet", where="policy = 'random'")
     layer = correct_failure(listed(), 0, "unprompted: slip")
-    assert layer.parent == Path("data/runs/mine-diagnosed/random/corrections")
+    digest = read_manifest(runs[0])["digest"]
+    assert layer.parent == Path("data/runs/mine-diagnosed", digest, "random/corrections")
     assert listed().table.corrected.tolist() == [True, False]
     everything = list_failures(tmp_path / "mine.parquet").all_episodes
     assert everything.corrected.sum() == 1
@@ -174,6 +323,44 @@ def test_a_correction_is_of_the_policy_that_was_recorded(
         of_random = found.policy.eq("random")
         assert found.corrected[of_random].sum() == of_random.any(), "found where it was written"
         assert not found.corrected[~of_random].any(), "it is of the other policy"
+
+
+def test_tables_of_one_name_share_what_is_of_one_run(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(run, other, ignore=shutil.ignore_patterns("recordings"))
+    manifest = read_manifest(run)
+    manifest["configuration"]["follow"] = "call"
+    (other / "run.json").write_text(json.dumps({**manifest, "digest": "of-call"}))
+    tables = {}
+    for name, source in (("a", run), ("b", other), ("copy", run)):
+        tables[name] = tmp_path / name / "t.parquet"
+        publish([source], tables[name])
+    monkeypatch.chdir(tmp_path)
+    layer = correct_failure(list_failures(tables["a"]), 0, "unprompted: slip")
+    corrected = {name: list_failures(table).table.corrected.sum() for name, table in tables.items()}
+    assert corrected == {"a": 1, "b": 0, "copy": 1}
+    folders = {name: set(list_failures(table).table.folder) for name, table in tables.items()}
+    assert folders["a"] == folders["copy"] == {str(layer.parent.parent)}
+    assert folders["b"] == {"data/runs/t-diagnosed/of-call/random"}
+    old = tmp_path / "data/runs/t-diagnosed/random/corrections"
+    old.mkdir(parents=True)
+    layer.replace(old / layer.name)
+    failures = list_failures(tables["a"])
+    assert not failures.table.corrected.any()
+    said = "not counted: corrections of an earlier version in data/runs/t-diagnosed (1)"
+    assert said in failures_text(failures)
+
+
+def test_the_digest_of_a_published_table_leads_out_of_no_folder(run: Path, tmp_path: Path) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    changed = {**read_manifest(run), "digest": "../.."}
+    (tmp_path / "run" / "run.json").write_text(json.dumps(changed))
+    publish([tmp_path / "run"], tmp_path / "t.parquet")
+    (folder,) = set(list_failures(tmp_path / "t.parquet").table.folder)
+    assert ".." not in Path(folder).parts
+    assert len(Path(folder).parts) == 5
 
 
 def test_a_recording_of_older_weights_is_made_anew(

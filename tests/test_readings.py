@@ -141,6 +141,7 @@ def test_a_damaged_log_is_named(logs: tuple[Path, Path]) -> None:
         "ten_seeds",
         "second_machine",
         "another_seed",
+        "tint_share_again",
         "tint_free_halves",
         "tint_free_fractal",
         "tabletop_older_engine",

@@ -127,6 +127,32 @@ def test_what_policies_of_other_tint_shares_reach() -> None:
         assert cells == [_of_way(of_share, way) for way in ways]
 
 
+def test_what_a_second_training_of_a_tint_share_reaches() -> None:
+    shares = ABLATIONS["tint-share"]
+    again, listed = _played("tint_share_again"), _played("tint_share").query("seed == 0")
+    head, *body = table("| tint share, seed 2 | generic")
+    assert [cell.strip("*").lower() for cell in head[1:]] == list(shares.names)
+    for share, *cells in body:
+        of_share = again[
+            again.policy.map(checkpoint_of).str.endswith(f"-seed-2-tint-share-{share}")
+        ]
+        assert set(of_share.groupby("method").size()) == {96}
+        assert [cell.strip("*") for cell in cells] == [
+            _of_way(of_share, way) for way in shares.names
+        ]
+    assert len(body) == again.policy.nunique()
+    prompted = again[(again.method == "vap") & again.policy.str.contains("tint-share-0@")]
+    first = listed[(listed.method == "vap") & (listed.policy.map(checkpoint_of) == SHARES["0"])]
+    pairs = first.merge(prompted, on=["task", "episode"])
+    won = (~pairs.success_x.astype(bool) & pairs.success_y.astype(bool)).sum()
+    lost = (pairs.success_x.astype(bool) & ~pairs.success_y.astype(bool)).sum()
+    assert f"VAP ({won} won, {lost} lost; exact p .31)" in PROSE
+    assert (
+        f"{prompted.sub_case.eq('missed grasp').sum()} of the {(~prompted.success.astype(bool)).sum()} failures are missed grasps. Neither"
+        in PROSE
+    )
+
+
 def test_what_more_steps_on_the_same_scenes_reach() -> None:
     (vap, elsewhere), (generic, generic_elsewhere) = _starts("more_steps", listed=4 * 96, others=2)
     assert f"reaches {vap} % with VAP on simpler-bridge" in PROSE

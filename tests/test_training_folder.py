@@ -5,20 +5,26 @@ import json
 import subprocess
 import sys
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from shutil import copytree
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
 
+from tests.command import refused
 from tests.test_policy_ahead import frames_of
 from tests.test_policy_training import SUITE, TINY, known, vlm_inputs
 from vap_core.base.errors import BadOutput, VapError
-from vap_core.base.files import SHIPPED, sha256_of
+from vap_core.base.files import DATA, SHIPPED, sha256_of
+from vap_core.base.types import Description
+from vap_core.policies.mini_pi0 import token_file
+from vap_core.policies.mini_pi0.token_file import Token
+from vap_core.policies.mini_pi0.vlm import MiniVlm, load_vlm
 from vap_core.simulation.suites import suite
 from vap_core.training.films import demonstrations, scenes
 from vap_core.training.films.captions import captions
@@ -30,6 +36,7 @@ from vap_core.training.policy import taught
 from vap_core.training.policy import train as policy
 from vap_core.training.policy.ahead import Ahead
 from vap_core.training.recipe import FILMED, RECIPES, filmed_tasks
+from vap_core.training.step import Schedule, train_steps
 from vap_core.training.vlm import train as vlm
 
 
@@ -171,6 +178,210 @@ def test_a_model_does_not_go_on_with_other_views(
         vlm.train(recipe, tmp_path)
     looks = known(stage[1]).captions
     assert vlm.data_sha256(pool, looks) != vlm.data_sha256(pool[::-1], looks)
+
+
+Trained = Callable[..., dict[str, Any]]
+"""Begins or goes on with a tiny training in tmp_path / out for one step, `--vlm` by its name."""
+
+
+@pytest.fixture
+def train_one(
+    stage: tuple[Path, list[Film]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Trained:
+    short = replace(TINY, stages=1, steps=9, batch=2, draws=1)
+    first = stage[1][0]
+    config = policy.configuration(short, first.state.shape[1], first.action.shape[1])
+    for name in ("one", "another"):
+        MiniVlm(config).save(tmp_path / name)
+
+    def captions(names: Iterable[str], *where: object) -> tuple[dict[str, Description], float]:
+        return {name: Description("white", "a tall thing, mostly white") for name in names}, 0.0
+
+    def learn(vlm: Path, folder: Path, *how: object) -> tuple[float, float]:
+        embedding = np.zeros(short.width, np.float32)
+        token_file.save(folder, Token(how[-1][0], embedding, 0.5, load_vlm(vlm).sha256()))
+        return 0.5, 0.0
+
+    monkeypatch.setattr(demonstrations, "EPISODES", 2)
+    monkeypatch.setattr(policy, "captions", captions)
+    monkeypatch.setattr(taught, "_learn", learn)
+
+    def train(out: str, vlm: str = "", **changes: object) -> dict[str, Any]:
+        return policy.train(
+            replace(short, **changes),
+            tmp_path / out,
+            vlm=tmp_path / vlm if vlm else None,
+            cache=stage[0].parent,
+            minutes=0.0,
+            jobs=1,
+        )
+
+    return train
+
+
+OTHER = "holds a training with another mini-PaliGemma, or with none; go on with the same --vlm"
+
+
+@pytest.mark.parametrize(("first", "then"), [("one", ""), ("", "one")])
+def test_a_training_goes_on_with_the_words_that_it_began_with(
+    first: str, then: str, train_one: Trained, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The start's own model is the same either way, and its films are, too."""
+    train_one("start", "one")
+    start = str(tmp_path / "start")
+    begun = train_one("out", first, start=start)
+    assert begun["taught_in"] == (load_vlm(tmp_path / "one").sha256() if first else "")
+    assert train_one("out", first, start=start)["trained_steps"] == 2
+    with monkeypatch.context() as stopped:
+        stopped.setattr(policy, "load_films", lambda *asked: pytest.fail("films were asked for"))
+        with pytest.raises(BadOutput, match=OTHER):
+            train_one("out", then, start=start)
+    # As earlier code left it.
+    state = torch.load(tmp_path / "out" / "training.pt", weights_only=True)
+    made_of = json.loads(state["made_of"])
+    del made_of["taught_in"]
+    torch.save({**state, "made_of": json.dumps(made_of)}, tmp_path / "out" / "training.pt")
+    assert train_one("out", first, start=start)["trained_steps"] == 3
+    with pytest.raises(BadOutput, match=OTHER):
+        train_one("out", then, start=start)
+
+
+def test_words_of_another_model_are_found_before_the_work(
+    train_one: Trained, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = tmp_path / "out" / "words" / "words.json"
+    with monkeypatch.context() as stopped:
+        stopped.setattr(policy, "train_steps", lambda *asked: pytest.fail("killed after words"))
+        with pytest.raises(pytest.fail.Exception):
+            train_one("out", "one")
+    kept = json.loads(words.read_text())
+    assert kept["model"] == load_vlm(tmp_path / "one").sha256()
+    before = {path.name: path.read_bytes() for path in words.parent.iterdir()}
+    with monkeypatch.context() as stopped:
+        stopped.setattr(policy, "load_films", lambda *asked: pytest.fail("films were asked for"))
+        with pytest.raises(BadOutput, match="words were learned in another mini-PaliGemma"):
+            train_one("out", "another")
+    assert {path.name: path.read_bytes() for path in words.parent.iterdir()} == before
+    words.write_text(json.dumps({name: kept[name] for name in ("cpu_s", "accuracy")}))
+    assert train_one("out", "one")["taught"]["objects"] == len(kept["accuracy"])
+    with pytest.raises(BadOutput, match=OTHER):
+        train_one("out", "another")
+
+
+def test_the_remedy_for_a_damaged_checkpoint_works(train_one: Trained, tmp_path: Path) -> None:
+    """Beside the model that the training has written, too, and beside what a killed save left."""
+    train_one("out")
+    state = tmp_path / "out" / "training.pt"
+    model = tmp_path / "out" / "model.safetensors"
+    (tmp_path / "out" / ".saving-abc").mkdir()
+    (tmp_path / "out" / ".saving-abc" / model.name).write_bytes(b"half")
+    state.write_bytes(_half(state.read_bytes()))
+    remedy = r"training\.pt is damaged .*; delete it, with model\.safetensors beside it, and run"
+    with pytest.raises(BadOutput, match=remedy):
+        train_one("out")
+    state.unlink()
+    model.unlink()
+    assert train_one("out")["trained_steps"] == 1
+    assert model.exists()
+    assert not list(state.parent.glob(".saving-*"))
+
+
+def test_what_is_refused_is_told_before_a_model_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`train policy` without --vlm trains the mini-PaliGemma first, for half an hour of CPU."""
+    monkeypatch.setattr(vlm, "make", lambda *asked, **how: pytest.fail("a model was made"))
+    (tmp_path / "file").write_text("no folder")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "recipe.json").write_text("{}")
+    (tmp_path / "other" / "captions.json").write_text("{}")
+    shown = DATA / "demonstrations" / SUITE
+    for words, told in (
+        (("--suite", SUITE, "--device", "tpu"), "tpu"),
+        (("--suite", "vlabench", "--demonstrations", shown), f"shows {SUITE}, not vlabench"),
+        (("--suite", SUITE, "--demonstrations", tmp_path), "holds no demonstrations"),
+        (("--suite", SUITE, "--out", tmp_path / "file" / "in"), "choose another folder with --out"),
+        (("--suite", SUITE, "--cache", tmp_path / "file" / "in"), "another folder with --cache"),
+        (("--suite", SUITE, "--out", tmp_path / "other"), "holds a training with another recipe"),
+    ):
+        folder = () if "--out" in words else ("--out", tmp_path / "out")
+        assert told in refused("train", "policy", *words, *folder)
+
+
+def test_films_of_another_rate_are_not_taken(
+    stage: tuple[Path, list[Film]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their pictures would stand beside states of other moments."""
+    monkeypatch.setattr(demonstrations, "every", lambda suite_name: 2)
+    message = (
+        r"films of another recipe \(\d+ pictures of \d+ steps, one is wanted every 2\); choose"
+    )
+    with pytest.raises(BadOutput, match=message):
+        demonstrations.cached(stage[0], SUITE, 0, 0)
+
+
+@pytest.mark.parametrize(
+    "content", ["", "{", "[]", '{"cpu_hours": []}', '{"cpu_hours": {"total": "long"}}']
+)
+def test_a_damaged_card_of_a_model_leaves_its_cost_unknown(content: str, tmp_path: Path) -> None:
+    (tmp_path / "training.json").write_text(content)
+    assert policy._vlm_cost_s(tmp_path) is None
+
+
+@pytest.mark.parametrize("fault", ["loss", "gradient"])
+def test_a_training_that_diverges_is_said_and_not_kept(fault: str, tmp_path: Path) -> None:
+    """A finite loss of which a gradient is not, before the last step, is found as it is saved."""
+
+    def losses(model: nn.Linear, step: int) -> tuple[Tensor, dict[str, float]]:
+        loss = model(torch.ones(1, 2)).square().sum()
+        if step == 4:
+            loss = loss * torch.nan if fault == "loss" else (loss * 0).sqrt()
+        return loss, {"flow": float(loss.detach())}
+
+    def run(steps: int) -> Schedule:
+        return Schedule(name="x", steps=steps, rate=0.1, every=2, slower="lower --rate")
+
+    told = {"loss": "the loss is", "gradient": "the weights are"}[fault]
+    message = f"{told} not finite at step 5; lower --rate, with another --out"
+    with pytest.raises(BadOutput, match=message):
+        train_steps(nn.Linear(2, 1), losses, run(5), tmp_path)
+    kept = torch.load(tmp_path / "training.pt", weights_only=True)
+    assert kept["step"] == 4
+    for part in ("model", "mean"):
+        assert all(weight.isfinite().all() for weight in kept[part].values())
+    with pytest.raises(BadOutput, match="loss is not finite at step [56]; lower --rate"):
+        train_steps(nn.Linear(2, 1), losses, run(6), tmp_path)
+
+
+@pytest.mark.parametrize("fault", ["loss", "gradient"])
+def test_a_head_that_diverges_is_said_and_not_kept(fault: str, tmp_path: Path) -> None:
+    epochs = []
+
+    def losses(rng: np.random.Generator) -> Iterator[Tensor]:
+        epochs.append(rng)
+        loss = head(torch.ones(1, 2)).square().sum()
+        if len(epochs) == 2:
+            loss = loss * torch.nan if fault == "loss" else (loss * 0).sqrt()
+        yield loss
+
+    head = nn.Linear(2, 1)
+    run = Run(
+        name="looks",
+        seed=0,
+        epochs=3,
+        rate=0.1,
+        decay=0.0,
+        file=tmp_path / "looks.pt",
+        resume=True,
+        expired=lambda: False,
+    )
+    told = {"loss": "loss is not finite at batch 1 of", "gradient": "weights are not finite after"}
+    message = f"looks head's {told[fault]} epoch 2; run it again with another --seed"
+    with pytest.raises(BadOutput, match=message):
+        fit(head, losses, 1, run)
+    kept = torch.load(tmp_path / "looks.pt", weights_only=True)
+    assert kept["epoch"] == 1
+    assert all(weight.isfinite().all() for weight in kept["head"].values())
 
 
 def test_a_head_that_was_trained_otherwise_is_not_taken(tmp_path: Path) -> None:

@@ -232,7 +232,7 @@ def policy(
             "that is there; leave one out."
         )
     from vap_core.training.films.scenes import CACHE
-    from vap_core.training.policy.train import HELD_OUT, train
+    from vap_core.training.policy.train import HELD_OUT, require_startable, train
     from vap_core.training.vlm.train import make
 
     folder = out or Path(f"data/runs/trained/mini-pi0-{suite}")
@@ -251,6 +251,9 @@ def policy(
     rendered = cache or CACHE
     grows_from = vlm
     if vlm is None and not recipe.start:
+        require_startable(
+            recipe, folder, demonstrations=demonstrations, cache=rendered, device=device
+        )
         grows_from = make(folder.parent / "mini-paligemma", cache=rendered, jobs=jobs)
     about = train(
         recipe,

@@ -2,6 +2,7 @@
 
 import fcntl
 import json
+import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,8 @@ from vap_core.policies.lerobot.checkpoints import RECIPE
 
 STATE = "training.pt"
 """The file that a training goes on from."""
+SAVING = ".saving-"
+"""What the scratch folder of a model that is being saved is called."""
 WEIGHTS = ("model.safetensors", "vlm.safetensors")
 
 
@@ -24,25 +27,33 @@ WEIGHTS = ("model.safetensors", "vlm.safetensors")
 def training_folder(out: Path, caller: str, recipe: Mapping[str, Any]) -> Iterator[None]:
     """Inside, this process alone trains in `out`, by this recipe.
 
+    What a save that was killed left there is removed.
+
     Raises: BadOutput when `out` cannot be written, another process trains there, or it holds the
         training of another recipe, or a model without what its training would go on from.
     """
     make_folder(out, caller)
     # The processes that draw batches are forked, and outlive a training that is killed.
     with locked(out, fcntl.lockf):
+        # Of a save that was killed; nobody else saves here.
+        for scratch in out.glob(f"{SAVING}*"):
+            shutil.rmtree(scratch, ignore_errors=True)
         _begin(out, caller, recipe)
         yield
 
 
 @contextmanager
-def reading_kept(path: Path, caller: str) -> Iterator[None]:
-    """Inside, a file is read that an earlier call wrote. Raises: BadOutput when it is damaged."""
+def reading_kept(path: Path, caller: str, also: str = "") -> Iterator[None]:
+    """Inside, a file is read that an earlier call wrote.
+
+    Raises: BadOutput when it is damaged; with `also`, which names what has to be deleted besides.
+    """
     try:
         yield
     except Exception as error:  # numpy and torch raise anything for a damaged file
         raise BadOutput(
-            f"{caller}: {path} is damaged ({type(error).__name__}); delete it and run the same "
-            "command again."
+            f"{caller}: {path} is damaged ({type(error).__name__}); delete it{also} and run the "
+            "same command again."
         ) from error
 
 
@@ -77,8 +88,11 @@ def checkpoint(path: Path, resume: bool) -> tuple[dict[str, Any], Callable[[dict
 
     state: dict[str, Any] = {}
     if resume and path.exists():
+        # A model without what its training goes on from is refused.
+        models = [name for name in WEIGHTS if (path.parent / name).exists()]
+        also = f", with {models[0]} beside it," if models else ""
         # Begun on a GPU, a training goes on where there is none.
-        with reading_kept(path, "train"):
+        with reading_kept(path, "train", also):
             state = torch.load(path, map_location="cpu", weights_only=True)
     return state, save
 

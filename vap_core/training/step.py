@@ -3,7 +3,7 @@
 import copy
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,13 +13,15 @@ import torch
 from torch import Tensor, nn
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import writing
+from vap_core.base.files import parse_json, writing
 from vap_core.training.folder import STATE, checkpoint
 
 KEEP = 0.999
 """Of the moving average of the weights, a step; the average is what is saved."""
 WARM = 300
 """Steps until the full rate."""
+LATER = ("taught_in",)
+"""Parts of `made_of` that earlier code did not keep; a checkpoint without them goes with any."""
 Figures = dict[str, float]
 """Figures to log, by name."""
 
@@ -35,6 +37,8 @@ class Schedule:
     every: int = 250
     made_of: Any = None
     """Recipe and data, as JSON: a training of something else is not gone on with."""
+    slower: str = "lower the recipe's rate"
+    """What to do about a training that diverges."""
 
 
 def train_steps[M: nn.Module](
@@ -51,7 +55,8 @@ def train_steps[M: nn.Module](
     `losses` gives the loss of one step, drawn from streams of its number, and figures to log;
     `helpers_cpu_s`, the CPU seconds of other processes since this call began.
 
-    Raises: BadOutput when `out` holds another training or cannot be written.
+    Raises: BadOutput when `out` holds another training or cannot be written, or when the training
+        diverges: what is kept stays as it was.
     """
     from tqdm import tqdm
 
@@ -64,7 +69,7 @@ def train_steps[M: nn.Module](
     state, save = checkpoint(out / STATE, resume=True)
     made_of = json.dumps(run.made_of, sort_keys=True)
     if state:
-        _require_same_training(state, made_of, out)
+        _require_same_training(_made_of(state), parse_json(made_of), out)
         for name, part in parts.items():
             part.load_state_dict(state[name])
     first_step = state.get("step", 0)
@@ -77,6 +82,8 @@ def train_steps[M: nn.Module](
     for step in tqdm(numbers, desc=run.name, total=run.steps, initial=first_step, mininterval=10):
         _set_rate(optimiser, run, step)
         loss, figures = losses(model, step)
+        # `figures` are numbers already, so that this waits for nothing more on a GPU.
+        _require_finite(loss, run, step, "loss is", out)
         optimiser.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(model.parameters(), 1.0)
@@ -91,11 +98,23 @@ def train_steps[M: nn.Module](
             saved: dict[str, Any] = {"step": step + 1, "log": log, "made_of": made_of}
             for name, part in parts.items():
                 saved[name] = part.state_dict()
+            # A finite loss can have a gradient that is not.
+            for weight in model.parameters():
+                _require_finite(weight, run, step, "weights are", out)
             with writing(out, "train"):
                 save(saved)
         if last:
             break
     return mean, log
+
+
+def begun_with(out: Path) -> dict[str, Any]:
+    """Recipe and data of the training that `out` holds; nothing where it holds none.
+
+    Raises: BadOutput when its checkpoint is damaged.
+    """
+    state, _ = checkpoint(out / STATE, resume=True)
+    return dict(_made_of(state) or {})
 
 
 def average_of(batches: list[Figures]) -> Figures:
@@ -113,12 +132,30 @@ def average_of(batches: list[Figures]) -> Figures:
     return means
 
 
-def _require_same_training(state: dict[str, Any], made_of: str, out: Path) -> None:
+def _made_of(state: Mapping[str, Any]) -> Any:
+    """Recipe and data of the training that a checkpoint is of, as JSON gives them back."""
+    return parse_json(state.get("made_of", "null"))
+
+
+def _require_same_training(kept: Any, made_of: Any, out: Path) -> None:
     """Raises: BadOutput when a checkpoint is of another recipe or other data."""
-    if state.get("made_of") != made_of:
+    wanted = made_of
+    if isinstance(kept, dict) and isinstance(made_of, dict):
+        unknown = set(LATER) - set(kept)
+        wanted = {name: part for name, part in made_of.items() if name not in unknown}
+    if kept != wanted:
         raise BadOutput(
             f"train: {out} holds a training with another recipe or other data; "
             "go on with those, or choose another --out."
+        )
+
+
+def _require_finite(numbers: Tensor, run: Schedule, step: int, what: str, out: Path) -> None:
+    """Raises: BadOutput when one of the numbers is not finite; `what` names them."""
+    if not bool(torch.isfinite(numbers.detach()).all()):
+        raise BadOutput(
+            f"train: {out}: the {what} not finite at step {step + 1}; {run.slower}, with another "
+            "--out."
         )
 
 

@@ -36,7 +36,7 @@ def layer_effects(folder: Path) -> "pd.DataFrame":
             f"layer_effects: {policy.label} is no pi0, whose layers are known here; give the "
             "folder of a pi0, pi0.5 or mini-pi0."
         )
-    look = _noise(policy)
+    look = noise_input(policy, np.random.default_rng(0), SIDE)
     plain = _chunk(policy, look)
     rows: dict[str, dict[int, float]] = {}
     for name, decoder in (
@@ -69,12 +69,12 @@ def _chunk(policy: LeRobot, look: PolicyInput) -> Chunk:
         return policy.plan([policy.start(np.random.default_rng(0))], [look])[1][0]
 
 
-def _noise(policy: LeRobot) -> PolicyInput:
-    rng = np.random.default_rng(0)
+def noise_input(policy: LeRobot, rng: np.random.Generator, side: int) -> PolicyInput:
+    """Noise as pictures (`side` px) and state, under a real instruction."""
     images = {}
     for key in policy.wanted:
         if key != STATE:
-            rgb = rng.integers(0, 256, (SIDE, SIDE, 3), dtype=np.uint8)
+            rgb = rng.integers(0, 256, (side, side, 3), dtype=np.uint8)
             images[key.removeprefix(IMAGE)] = rgb
     state = rng.normal(size=policy.wanted[STATE]).astype(np.float32)
     return PolicyInput(images, "pick up the red cup", state)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vap_core.analysis.attention.effects import noise_input
 from vap_core.base.errors import BadStudy
 from vap_core.base.tables import align
 from vap_core.cli.bench.timing import seconds_of
@@ -16,9 +17,8 @@ from vap_core.evaluation.policy_names import MINI, shipped
 from vap_core.evaluation.statistics import ratio
 from vap_core.perception.embedded.backbone import features
 from vap_core.policies.hooks import observe_attention, observe_inputs
-from vap_core.policies.lerobot.adapter import IMAGE, STATE, LeRobot, load_policy
+from vap_core.policies.lerobot.adapter import LeRobot, load_policy
 from vap_core.policies.lerobot.traced import CALLS_BEFORE_TRACE
-from vap_core.policies.protocol import PolicyInput
 from vap_core.simulation.suites import BENCHMARKS
 
 SIDE = 224
@@ -103,7 +103,7 @@ def _call_seconds(policy: LeRobot, rng: np.random.Generator, repeat: int) -> dic
     inputs = []
     states = []
     for i in range(max(BATCHES)):
-        inputs.append(_draw_input(policy, rng))
+        inputs.append(noise_input(policy, rng, SIDE))
         states.append(policy.start(np.random.default_rng(i)))
     seconds: dict[int, list[float]] = {batch: [] for batch in BATCHES}
     # The trace is made in one round; in the next one every other batch size is compared with it.
@@ -124,7 +124,7 @@ def _observed_seconds(
 
     An observed call is never a traced one; the queries are two words and the expert's tokens.
     """
-    one = _draw_input(policy, rng)
+    one = noise_input(policy, rng, SIDE)
     states = [policy.start(rng)]
     call = partial(policy.plan, states, [one])
 
@@ -147,14 +147,3 @@ def _observed_seconds(
             eager.append(times[0])
             observed.append(times[1])
     return float(np.median(eager)), float(np.median(observed))
-
-
-def _draw_input(policy: LeRobot, rng: np.random.Generator) -> PolicyInput:
-    """Noise as pictures and state."""
-    images = {}
-    for key in policy.wanted:
-        if key != STATE:
-            name = key.removeprefix(IMAGE)
-            images[name] = rng.integers(0, 256, (SIDE, SIDE, 3), dtype=np.uint8)
-    state = rng.normal(size=policy.wanted[STATE]).astype(np.float32)
-    return PolicyInput(images, "pick up the red cup", state)

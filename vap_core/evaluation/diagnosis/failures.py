@@ -21,8 +21,11 @@ from vap_core.evaluation.report.failures import (
     SUBGOAL,
     breakdown,
     breakdown_rows,
+    check_diagnosed,
     diagnosed,
+    older_text,
     sub_cases_text,
+    undiagnosed,
 )
 from vap_core.evaluation.store import KEY
 
@@ -45,8 +48,10 @@ COLUMNS = {
 """The columns that `failures_text` shows, and their titles; the sub-goal where there are any."""
 PLAYED = ["suite", "task", "episode", "seed", "method"]
 """The columns that name a recording."""
-UNSAFE = r"[^\w.@-]"
-"""Characters of a policy's label that are replaced in the name of a folder."""
+UNSAFE = r"[^\w.@-]|^\.+"
+"""What is replaced in the name of a folder: characters of a policy's label, and dots before it."""
+ARTIFACTS = Path("data/runs")
+"""Below it are the recordings and corrections of published tables."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +61,15 @@ class Failures:
     `manifests` are the runs' run.json by digest. `all_episodes` are all episodes of the runs,
     failed or not; `episodes` those of the suite, task and method asked for; `table` the failures
     among them that are left. Each table has the run's digest as `configuration`, its `source`, and
-    as `folder` where the recordings and corrections of the row are.
+    as `folder` where the recordings and corrections of the row are. `notes` are sentences on what
+    none of them has.
     """
 
     manifests: Mapping[str, dict[str, Any]]
     all_episodes: "pd.DataFrame"
     episodes: "pd.DataFrame"
     table: "pd.DataFrame"
+    notes: tuple[str, ...] = ()
 
 
 def list_failures(
@@ -76,32 +83,22 @@ def list_failures(
 ) -> Failures:
     """The failures in run folders or published tables, narrowed down.
 
-    An episode that several sources hold is of the first of them.
+    An episode that several sources hold is of the first of them that was diagnosed.
 
     `where` is a SQL condition on the table's columns.
 
     Raises: BadOutput when there is no such run, or it was never diagnosed; BadStudy for a name or a
         condition that fits nothing in it.
     """
-    import pandas as pd
-
-    manifests = {}
-    tables = []
-    for source in dict.fromkeys(sources):
-        for manifest, episodes in read_runs(source):
-            manifests[manifest["digest"]] = manifest
-            if not episodes.empty:
-                named = episodes.assign(configuration=manifest["digest"], source=str(source))
-                tables.append(diagnosed(named))
-    if not tables:
-        raise BadOutput(
-            f"diagnose: {' and '.join(map(str, sources))} hold no finished episode; run eval first."
-        )
-    once = _without_repeated(pd.concat(tables, ignore_index=True), manifests)
-    all_episodes = _with_corrections(_with_folders(once))
+    manifests, once = _read_once(sources)
+    older = undiagnosed(once)
+    known = diagnosed(once).reset_index(drop=True)
+    all_episodes = _with_corrections(_with_folders(known))
     selected = all_episodes
     for column, wanted in (("suite", suite), ("task", task), ("method", method)):
         selected = _select(selected, column, wanted)
+        if wanted is not None:
+            older = older[older[column] == wanted]
     table = selected[selected["outcome"].eq("failure")]
     table = _select(table, "case", f"case {case}" if str(case).isdigit() else case)
     table = _select(table, "sub_case", sub_case)
@@ -112,13 +109,14 @@ def list_failures(
         all_episodes=all_episodes,
         episodes=selected,
         table=table.reset_index(drop=True),
+        notes=(*_notes_of_older(older), *_notes_of_old_corrections(sources)),
     )
 
 
 def failures_text(failures: Failures, limit: int = 20) -> str:
     """How the failures divide, and the first of them, numbered as `recording_of` takes them."""
     counts = breakdown(failures.episodes)
-    parts = [align(breakdown_rows(counts)), sub_cases_text(counts)]
+    parts = [align(breakdown_rows(counts)), sub_cases_text(counts), *failures.notes]
     if failures.table.empty:
         return "\n\n".join([*parts, "no failure is left of what was asked for."])
     shown = failures.table.head(limit)
@@ -150,6 +148,31 @@ def deciding_frame(failures: Failures, number: int) -> int:
     return max(0, int(failure_row(failures, number)["deciding_frame"]))
 
 
+def _read_once(sources: Sequence[Path]) -> "tuple[dict[str, dict[str, Any]], pd.DataFrame]":
+    """The manifests of all runs, by digest, and every episode once; a diagnosed one goes first.
+
+    Raises: BadOutput.
+    """
+    import pandas as pd
+
+    manifests = {}
+    tables = []
+    for source in dict.fromkeys(sources):
+        for manifest, episodes in read_runs(source):
+            manifests[manifest["digest"]] = manifest
+            if not episodes.empty:
+                check_diagnosed(episodes)
+                named = episodes.assign(configuration=manifest["digest"], source=str(source))
+                tables.append(named)
+    if not tables:
+        raise BadOutput(
+            f"diagnose: {' and '.join(map(str, sources))} hold no finished episode; run eval first."
+        )
+    whole = pd.concat(tables, ignore_index=True)
+    ordered = whole.sort_values("case", key=pd.isna, kind="stable")
+    return manifests, _without_repeated(ordered, manifests)
+
+
 def _without_repeated(
     table: "pd.DataFrame", manifests: Mapping[str, dict[str, Any]]
 ) -> "pd.DataFrame":
@@ -163,66 +186,78 @@ def _without_repeated(
     return table[~keys.duplicated()].reset_index(drop=True)
 
 
+def _notes_of_older(older: "pd.DataFrame") -> list[str]:
+    """A sentence on the episodes of runs that are older than the diagnosis."""
+    if older.empty:
+        return []
+    n_failures = int(older["outcome"].eq("failure").sum())
+    return [f"{older_text(len(older))}; {n_failures} of them failed."]
+
+
 def _with_folders(table: "pd.DataFrame") -> "pd.DataFrame":
     """With the folder of each row's recordings and corrections.
 
-    That is the run's; a published table has one of its own, and in it one a policy where several
-    played the same rows.
+    That is the run's; a published table has one for each of its runs and policies.
     """
-    folders = table["source"].map(_artifacts_folder)
-    if "policy" in table:
-        several = table.groupby(["source", *PLAYED])["policy"].transform("nunique") > 1
-        folders = folders.mask(several, folders + "/" + table["policy"].map(_folder_name))
+    named = table if "policy" in table else table.assign(policy="unnamed")
+    folders = []
+    for row in named[["source", "configuration", "policy"]].itertuples(index=False):
+        folders.append(_artifacts_folder(*row))
     return table.assign(folder=folders)
 
 
-def _places(source: str, table: "pd.DataFrame") -> list[str]:
-    """The folders that hold, or once held, the corrections of a source."""
-    base = _artifacts_folder(source)
-    places = [base]
-    if base != source and "policy" in table:
-        for policy in table["policy"].unique():
-            places.append(f"{base}/{_folder_name(policy)}")
-    return places
+def _artifacts_folder(source: str, digest: str, policy: str) -> str:
+    if not _is_published(source):
+        return source
+    return str(_table_folder(source) / _folder_name(digest) / _folder_name(policy))
 
 
-def _folder_name(policy: object) -> str:
-    return re.sub(UNSAFE, "-", str(policy))
+def _is_published(source: str) -> bool:
+    return Path(source).suffix == ".parquet"
 
 
-def _artifacts_folder(source: str) -> str:
-    path = Path(source)
-    if path.suffix == ".parquet":
-        return str(Path("data/runs") / f"{path.stem}-diagnosed")
-    return source
+def _table_folder(source: str) -> Path:
+    """What the folders of a published table lie in; tables of one file name share it."""
+    return ARTIFACTS / f"{Path(source).stem}-diagnosed"
+
+
+def _folder_name(label: object) -> str:
+    return re.sub(UNSAFE, "-", str(label))
+
+
+def _notes_of_old_corrections(sources: Sequence[Path]) -> list[str]:
+    """A sentence on the corrections of each published table that earlier versions wrote.
+
+    They do not name their run: another table of that file name can have written them.
+    """
+    notes = []
+    for base in dict.fromkeys(_table_folder(str(s)) for s in sources if _is_published(str(s))):
+        old = [*base.glob("corrections/*.rrd"), *base.glob("*/corrections/*.rrd")]
+        if old:
+            notes.append(
+                f"not counted: corrections of an earlier version in {base} ({len(old)}), which do "
+                "not name their run; correct again, or move each to DIGEST/POLICY/corrections."
+            )
+    return notes
 
 
 def _with_corrections(table: "pd.DataFrame") -> "pd.DataFrame":
     """With the corrections of researchers, marked in the column `corrected`.
 
-    A correction holds for a failure of the policy that was recorded. It is looked for wherever one
-    of the table may have been written: the table may have had other policies then.
+    A correction holds for a failure of the policy that was recorded, in the folder where it lies.
     """
     from vap_core.recording import read_corrections, recording_file_name
 
     table = table.assign(corrected=False)
     failed = table[table["outcome"].eq("failure")]
-    for source, part in failed.groupby("source", sort=False):
-        written = []
-        for folder in _places(str(source), part):
-            written.append((folder, read_corrections(Path(folder))))
-        if not any(corrections for _, corrections in written):
+    for folder, part in failed.groupby("folder", sort=False):
+        corrections = read_corrections(Path(str(folder)))
+        if not corrections:
             continue
         for index, row in part.iterrows():
-            correction = None
-            name = recording_file_name(*row[PLAYED])
-            for folder, corrections in written:
-                found = corrections.get(name)
-                # A layer that does not name its policy holds where it lies.
-                here = "" if folder == row["folder"] else None
-                if found is not None and found.policy in (here, row.get("policy")):
-                    correction = found
-            if correction is None:
+            correction = corrections.get(recording_file_name(*row[PLAYED]))
+            # A layer that does not name its policy holds where it lies.
+            if correction is None or correction.policy not in ("", row.get("policy")):
                 continue
             cells = {
                 "case": correction.case,

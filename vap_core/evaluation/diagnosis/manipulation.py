@@ -56,8 +56,7 @@ def _wrong_object(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | No
     reached = trace.rule != "selected" and (trace.gap_m <= thresholds.near_m).any()
     if strayed is not None and touched is None and not reached:
         name = trace.others[strayed][0]
-        closest_cm = 100 * trace.gap_m.min()
-        sentence = f"touches {name} and comes no closer to {target} than {closest_cm:.0f} cm"
+        sentence = f"touches {name} and {_closest_words(trace, digits=0)}"
         return _diagnosis(trace, "wrong object", strayed, sentence, object=name)
     return None
 
@@ -115,10 +114,17 @@ def _distance_words(trace: EpisodeTrace, at: int) -> str:
     return f" ({gap_mm} mm from its bounding box)"
 
 
+def _closest_words(trace: EpisodeTrace, digits: int) -> str:
+    """How close the tcp comes to the bounding box of the target, which the hand never touches."""
+    closest_cm = f"{100 * trace.gap_m.min():.{digits}f}"
+    if float(closest_cm) == 0:
+        return f"reaches {trace.target} and does not touch it"
+    return f"comes no closer to {trace.target} than {closest_cm} cm"
+
+
 def _timeout(trace: EpisodeTrace) -> Diagnosis:
     closest = int(np.argmin(trace.gap_m))
-    closest_cm = 100 * trace.gap_m[closest]
-    sentence = f"comes no closer to {trace.target} than {closest_cm:.1f} cm"
+    sentence = _closest_words(trace, digits=1)
     if any(trace.touches):
         sentence = f"does not complete the task after it touches {trace.target}"
     return _diagnosis(trace, "timeout", closest, sentence)

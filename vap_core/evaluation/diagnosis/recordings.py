@@ -3,15 +3,19 @@
 A failure that was not recorded is run again: the same row, weights and seed give the same episode.
 """
 
+import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import fields, replace
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vap_core.base.errors import BadStudy
-from vap_core.base.files import writing
+from vap_core.base.errors import BadRecording, BadStudy
+from vap_core.base.files import take_name, writing
 from vap_core.evaluation.diagnosis import explain
 from vap_core.evaluation.diagnosis.failures import (
+    PLAYED,
     Failures,
     deciding_frame,
     failure_row,
@@ -32,8 +36,10 @@ if TYPE_CHECKING:
 def recording_of(failures: Failures, number: int) -> Path:
     """The recording of a listed failure; made by running the episode again where there is none.
 
+    What has its name and is not that recording is renamed, and a line says so.
+
     Raises: BadStudy for a number that is not listed, or for an episode list or policy that has
-        changed since.
+        changed since; BadRecording for a recording without the right to read it; BadOutput.
     """
     return _recording_of_row(failures, failure_row(failures, number))
 
@@ -152,8 +158,13 @@ def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
     episode_row = listed_row(study, row)
     folder = Path(row["folder"])
     path = folder / "recordings" / recording_name(episode_row, row["method"])
-    if path.exists() and _recorded_policy(path) == row["policy"]:
-        return path
+    other = ""
+    if os.path.lexists(path):
+        summary = _summary(path)
+        other = _why_other(summary, row)
+        if not other:
+            _note_otherwise("recorded", summary["outcome"], summary["steps"], row)
+            return path
     memory = folder / "memory"
     register_personal(study, memory)
     trial = make_trial(study, [episode_row], row["method"], memory)
@@ -162,8 +173,9 @@ def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
             f"diagnose: this was run with {row['policy']}, and {trial.policy.label} is here now; "
             "run eval again."
         )
-    # Damaged, or made with the weights that a table was published with before.
-    _unlink(path)
+    if other:
+        kept = _keep_beside(path)
+        print(f"note: {path} {other}; it is kept as {kept.name}, and the episode is run again.")
     (episode,) = rollout(
         trial,
         [episode_row],
@@ -176,19 +188,57 @@ def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
 
 def note_changed(outcome: Outcome, row: Mapping[str, Any]) -> None:
     """Print a line where an episode that was run again ended otherwise than its `row` says."""
-    if (outcome.status, outcome.steps) != (row["outcome"], row["steps"]):
+    _note_otherwise("run again", outcome.status, outcome.steps, row)
+
+
+def _note_otherwise(how: str, status: str, steps: int, row: Mapping[str, Any]) -> None:
+    if (status, steps) != (row["outcome"], row["steps"]):
         print(
-            f"note: run again, it is a {outcome.status} after {outcome.steps} steps "
+            f"note: {how}, it is a {status} after {steps} steps "
             f"(was {row['outcome']} after {row['steps']})."
         )
 
 
-def _recorded_policy(recording: Path) -> str | None:
-    """The policy of a recording; None where it cannot be read."""
+def _summary(recording: Path) -> dict[str, Any]:
+    """What a recording is of; nothing where it is damaged.
+
+    Raises: BadRecording, where the rights to read it are missing.
+    """
     from vap_core.recording.isolated import read_summaries
 
+    try:
+        if recording.is_file():
+            recording.open("rb").close()
+    except OSError as error:
+        raise BadRecording(
+            f"diagnose: {recording} cannot be read ({error.strerror}); give yourself the right to "
+            "read it, or move it away."
+        ) from error
     ((_, summary, _),) = read_summaries([recording])
-    return None if summary is None else summary.get("policy")
+    return summary or {}
+
+
+def _why_other(summary: Mapping[str, Any], row: Mapping[str, Any]) -> str:
+    """Why a recording is not the whole one of a row, as the rest of a sentence; "" where it is."""
+    if not summary:
+        return "is damaged"
+    for name in (*PLAYED, "policy"):
+        if summary.get(name) != row[name]:
+            return f"is of {name} {summary.get(name)}, not {row[name]}"
+    if "outcome" not in summary or "steps" not in summary:
+        return "is unfinished"
+    return ""
+
+
+def _keep_beside(path: Path) -> Path:
+    """Give what has a recording's name a free one, which no command reads. Raises: BadOutput."""
+    numbers = count(1)
+    with writing(path.parent, "diagnose", "copy the run to where you may write"):
+        while True:
+            kept = path.with_name(f"{path.name}.replaced-{next(numbers)}")
+            with suppress(FileExistsError):
+                take_name(path, kept)
+                return kept
 
 
 def _unlink(path: Path) -> None:

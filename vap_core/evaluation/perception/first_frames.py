@@ -16,7 +16,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float, Float32, Float64
 
 from vap_core.base.types import (
     Ballot,
@@ -214,14 +214,15 @@ def object_under_box(view: View, box: Box) -> str:
 
 
 def match(
-    found: Float32[np.ndarray, "n 4"],
-    wanted: Float32[np.ndarray, "m 4"],
-    ignored: Float32[np.ndarray, "i 4"],
+    found: Float[np.ndarray, "n 4"],
+    wanted: Float[np.ndarray, "m 4"],
+    ignored: Float[np.ndarray, "i 4"],
     at: float = SAME_BOX,
 ) -> list[bool | None]:
     """Whether each box, best first, takes a wanted box that is still free.
 
-    As in average precision. None for a box that overlaps an ignored one: it counts neither way.
+    It takes one that it overlaps by `at`, as in average precision. None for any other that is the
+    same box as an ignored one: it counts neither way.
     """
     with_wanted = _box_ious(found, wanted)
     with_ignored = _box_ious(found, ignored)
@@ -234,7 +235,7 @@ def match(
         if chosen >= 0 and free[chosen] and overlap[chosen] >= at:
             free[chosen] = False
             hits.append(True)
-        elif ignored_overlap.max(initial=0.0) >= at:
+        elif ignored_overlap.max(initial=0.0) >= SAME_BOX:
             hits.append(None)
         else:
             hits.append(False)
@@ -486,7 +487,7 @@ def _is_found(found: Float32[np.ndarray, "n 4"], box: Box) -> bool:
 
 
 def _box_ious(
-    a: Float32[np.ndarray, "n 4"], b: Float32[np.ndarray, "m 4"]
+    a: Float[np.ndarray, "n 4"], b: Float[np.ndarray, "m 4"]
 ) -> Float64[np.ndarray, "n m"]:
     return box_iou(a.astype(np.float64), b.astype(np.float64))
 

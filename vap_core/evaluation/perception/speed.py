@@ -33,13 +33,11 @@ POLICY = "scripted policy's plan"
 LIMITS_MS = {START: 300.0, STEP: 45.0}
 
 
-def measure(
-    stack: Stack, repeat: int = 25, against: Mapping[str, Work] | None = None
-) -> list[TableRow]:
+def measure(stack: Stack, repeat: int = 25) -> list[TableRow]:
     """A row per piece of work: its median, its quartiles, and how many rounds.
 
-    `against` names more work to compare with, such as another policy's step; a step of the scripted
-    policy (a 224 px view of its own) and a pass of the backbone are always there.
+    A step of the scripted policy (a 224 px view of its own) and a pass of the backbone are there to
+    compare with.
     """
     import torch
 
@@ -49,8 +47,7 @@ def measure(
     torch.set_num_threads(1)
     try:
         with build_scene(SUITE, models) as scene:
-            works = {**_works(stack, scene), **(against or {})}
-            times_ms = _time_in_turn(works, repeat)
+            times_ms = _time_in_turn(_works(stack, scene), repeat)
     finally:
         torch.set_num_threads(threads)
     rows = []

@@ -21,17 +21,32 @@ SUBGOAL = "subgoal"
 DIAGNOSIS_COLUMNS = ("case", "sub_case", "deciding_frame")
 
 
-def diagnosed(table: "pd.DataFrame") -> "pd.DataFrame":
-    """The episodes whose failures were diagnosed.
-
-    Raises: BadOutput when the table is older than the diagnosis.
-    """
+def check_diagnosed(table: "pd.DataFrame") -> None:
+    """Raises: BadOutput when the whole table is older than the diagnosis."""
     if not set(DIAGNOSIS_COLUMNS) <= set(table.columns):
         raise BadOutput(
             "diagnose: this run was made before failures were diagnosed; run the same eval again "
             "in another folder."
         )
+
+
+def diagnosed(table: "pd.DataFrame") -> "pd.DataFrame":
+    """The episodes whose failures were diagnosed.
+
+    Raises: as `check_diagnosed`.
+    """
+    check_diagnosed(table)
     return table[table["case"].notna()].astype({"deciding_frame": int})
+
+
+def undiagnosed(table: "pd.DataFrame") -> "pd.DataFrame":
+    """The episodes of runs that are older than the diagnosis, in a table that has others, too."""
+    return table[table["case"].isna()]
+
+
+def older_text(n_more: int) -> str:
+    """How many episodes are not shown, because no failure of their runs was diagnosed."""
+    return f"{n_more} more of runs older than the diagnosis are left out"
 
 
 def breakdown(table: "pd.DataFrame") -> "pd.DataFrame":

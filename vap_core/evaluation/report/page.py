@@ -18,7 +18,12 @@ from vap_core.base.commands import command
 from vap_core.base.errors import BadRecording
 from vap_core.base.palette import METHODS, method_marks
 from vap_core.base.tables import Rows
-from vap_core.evaluation.report.failures import DIAGNOSIS_COLUMNS, diagnosed, funnel_table
+from vap_core.evaluation.report.failures import (
+    DIAGNOSIS_COLUMNS,
+    diagnosed,
+    funnel_table,
+    older_text,
+)
 from vap_core.evaluation.report.funnel import funnel_figure
 
 if TYPE_CHECKING:
@@ -102,7 +107,7 @@ def _failures(table: "pd.DataFrame", sources: Sequence[Path], out: Path) -> list
     parts = [f"<h2>Failures ({len(rows)})</h2>"]
     older = int(table["outcome"].eq("failure").sum()) - len(rows)
     if older:
-        parts.append(f"<p>{older} more of runs older than the diagnosis are left out.</p>")
+        parts.append(f"<p>{older_text(older)}.</p>")
     pictured: list[str] = []
     with closing(_recorded(rows, sources)) as recorded:
         for row, recording in islice(recorded, MOST_FAILURES):

@@ -13,7 +13,6 @@ import copy
 import inspect
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,9 +30,10 @@ from vap_core.policies.hooks import (
     report_input,
 )
 from vap_core.policies.lerobot.attention_hooks import can_watch, reporting_attention
-from vap_core.policies.lerobot.checkpoints import PIPELINES, locate
+from vap_core.policies.lerobot.checkpoints import PIPELINES, locate, stamp
 from vap_core.policies.lerobot.loading import build
 from vap_core.policies.lerobot.module_hooks import overriding_tokens
+from vap_core.policies.lerobot.normalisation import EMPTY
 from vap_core.policies.lerobot.token_positions import positions
 from vap_core.policies.lerobot.traced import ChunkPredictor
 from vap_core.policies.names import label_of
@@ -48,10 +48,9 @@ if TYPE_CHECKING:
 
 STATE = "observation.state"
 IMAGE = "observation.images."
-EMPTY = "observation.images.empty_camera"
 TOKENS = "observation.language.tokens"
 TOKEN_MASK = "observation.language.attention_mask"
-"""lerobot's feature keys; a checkpoint fills its empty cameras itself."""
+"""lerobot's feature keys."""
 DRAWS_NOTHING = ("act",)
 """Policies whose chunk is a function of the observation alone."""
 OF_MODULES = frozenset(vars(torch.nn.Module()))
@@ -307,8 +306,9 @@ def load_policy(
     `checkpoint` is a folder, or the `owner/name` of a model that was downloaded before.
     `temperature` scales a mini-pi0's sampling noise, instead of the checkpoint's own.
 
-    Raises: BadPolicy when it is not there, would execute code, cannot be built, does not end with
-        exactly the file's weights, or has no temperature to set.
+    Raises: BadPolicy when it is not there, would execute code, cannot be built, lacks statistics
+        that it scales by, does not end with exactly the file's weights, or has no temperature to
+        set.
     """
     folder = locate(checkpoint)
     policy, preprocessor, postprocessor = build(folder, device)
@@ -328,7 +328,8 @@ def load_policy(
     )
 
 
-_load_cached = cache(load_policy)
+_loaded: dict[tuple[str, float | None], tuple[object, LeRobot]] = {}
+"""The policies of this process by checkpoint and temperature, with the `stamp` of their files."""
 
 
 def load_for_suite(
@@ -336,13 +337,27 @@ def load_for_suite(
 ) -> LeRobot:
     """The checkpoint, loaded once in this process, for the inputs and actions of a suite.
 
-    Raises: BadPolicy when it does not fit them.
+    It is loaded again where its files have changed since.
+
+    Raises: BadPolicy, as `load_policy`, and when it does not fit them.
     """
-    policy = _load_cached(checkpoint, temperature=temperature)
+    policy = _load_once(checkpoint, temperature)
     env = Env(scene, control=suite.control)
     state_size = len(env.state())
     policy.check(suite.cameras, state_size, env.action_size)
     return policy
+
+
+def _load_once(checkpoint: str, temperature: float | None) -> LeRobot:
+    """The checkpoint as its files are now. Raises: BadPolicy, as `load_policy`."""
+    key = (checkpoint, temperature)
+    now = stamp(checkpoint)
+    if key in _loaded and _loaded[key][0] != now:
+        # Two sets of weights may not fit into memory.
+        del _loaded[key]
+    if key not in _loaded:
+        _loaded[key] = (now, load_policy(checkpoint, temperature=temperature))
+    return _loaded[key][1]
 
 
 def _takes_noise(policy: "PreTrainedPolicy") -> bool:

@@ -22,6 +22,8 @@ ANY_STEP_CLASS = re.compile(r"vap_core\.(\w+\.)*VapPrompt")
 TRAINING_CARD, RECIPE = "training.json", "recipe.json"
 CAPTIONS, WORDS = "captions.json", "words"
 """How a checkpoint was trained, and what a training leaves beside it: none decides what it does."""
+RUN = "run.json"
+"""The manifest of a run, whose folder may be in a checkpoint's (evaluation.store)."""
 WANTED_FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
 
 
@@ -106,14 +108,24 @@ def fingerprint(checkpoint: str | Path) -> str:
     """
     folder = locate(checkpoint)
     digest = hashlib.sha256()
-    for file in sorted(folder.rglob("*")):
-        name = file.relative_to(folder)
-        if not file.is_file() or not _decides(name):
-            continue
+    for name in _deciding_files(folder):
         digest.update(name.as_posix().encode())
-        with file.open("rb") as stream:
+        with (folder / name).open("rb") as stream:
             digest.update(hashlib.file_digest(stream, "sha256").digest())
     return digest.hexdigest()
+
+
+def stamp(checkpoint: str | Path) -> tuple[object, ...]:
+    """What differs once a file that `fingerprint` reads was replaced or written, without reading.
+
+    Raises: BadPolicy when a file is missing.
+    """
+    folder = locate(checkpoint)
+    found: list[object] = [folder.resolve()]
+    for name in _deciding_files(folder):
+        about = (folder / name).stat()
+        found.append((name, about.st_ino, about.st_size, about.st_mtime_ns))
+    return tuple(found)
 
 
 def is_vap_step(step: Mapping[str, Any]) -> bool:
@@ -157,6 +169,24 @@ def _downloaded(name: str) -> Path:
             f"`hf download {name}`, or give a folder."
         ) from error
     return Path(folder)
+
+
+def _deciding_files(folder: Path) -> list[Path]:
+    """The files of a checkpoint that decide what it does, by their names in its folder."""
+    found = []
+    for file in sorted(folder.rglob("*")):
+        name = file.relative_to(folder)
+        if file.is_file() and _decides(name) and not _is_beside(folder, name):
+            found.append(name)
+    return found
+
+
+def _is_beside(folder: Path, name: Path) -> bool:
+    """Whether a file is in a hidden folder, as what a killed save leaves, or in a run's."""
+    for inner in list(name.parents)[:-1]:
+        if inner.name.startswith(".") or (folder / inner / RUN).is_file():
+            return True
+    return False
 
 
 def _decides(name: Path) -> bool:

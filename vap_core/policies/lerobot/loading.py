@@ -17,6 +17,7 @@ import torch
 from vap_core.base.device import device_name
 from vap_core.base.errors import BadPolicy, first_line
 from vap_core.policies.lerobot.checkpoints import WEIGHTS, base_models, refuse_code
+from vap_core.policies.lerobot.normalisation import require_statistics
 
 if TYPE_CHECKING:
     from lerobot.policies.pretrained import PreTrainedPolicy
@@ -25,8 +26,9 @@ if TYPE_CHECKING:
 def build(folder: Path, device: str | None) -> tuple["PreTrainedPolicy", Any, Any]:
     """The policy of a checkpoint, its preprocessor and its postprocessor.
 
-    Raises: BadPolicy when it would execute code, cannot be built, or does not end with exactly the
-        file's weights. UnknownName when the device is not on this machine.
+    Raises: BadPolicy when it would execute code, cannot be built, lacks statistics that it scales
+        by, or does not end with exactly the file's weights. UnknownName when the device is not on
+        this machine.
     """
     # registers our own type of policy and its step
     import_module("vap_core.policies.mini_pi0.processor_mini_pi0")
@@ -40,6 +42,7 @@ def build(folder: Path, device: str | None) -> tuple["PreTrainedPolicy", Any, An
             f"load: {folder} cannot become a policy "
             f"({type(error).__name__}: {first_line(error):.200}); {remedy}."
         ) from error
+    require_statistics(folder, policy.config, preprocessor, postprocessor)
     with _silence():
         compare(policy, folder / WEIGHTS)
     return policy, preprocessor, postprocessor

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
-from vap_core.base.errors import OutOfReach
+from vap_core.base.errors import BadOutput, OutOfReach
 from vap_core.base.files import write_atomic, writing
 from vap_core.base.types import Mask, Rgb, value
 from vap_core.policies.scripted.expert import Expert, ExpertState
@@ -269,18 +269,20 @@ def small(rgb: Rgb) -> UInt8[np.ndarray, "s s 3"]:
 def cached(folder: Path, suite_name: str, seed: int, number: int) -> list[Film]:
     """The stage's films from `folder`, shot first if they are not there.
 
-    Raises: BadOutput when their file is damaged or cannot be written.
+    Raises: BadOutput when their file is damaged, was filmed by another recipe or cannot be written.
     """
     path = stage_file(folder, suite_name, seed, number)
     if not path.exists():
         started = time.process_time()
         made = films(suite_name, seed, number)
         _write_stage(path, made, time.process_time() - started)
+    found = []
     with kept_arrays(path, "train") as arrays:
-        found = []
         for i in range(int(arrays["n"])):
             found.append(_read_film(arrays, i))
-        return found
+    for film in found:
+        _require_pictures(film, every(suite_name), path)
+    return found
 
 
 def stage_file(folder: Path, suite_name: str, seed: int, number: int) -> Path:
@@ -402,6 +404,17 @@ def _write_stage(path: Path, made: Sequence[Film], cpu_s: float) -> None:
     with writing(path, "train"):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, buffer.getvalue())
+
+
+def _require_pictures(film: Film, interval: int, path: Path) -> None:
+    """Raises: BadOutput when there is not a picture every `interval` steps."""
+    steps = len(film.action)
+    if len(film.images) != -(-steps // interval):
+        raise BadOutput(
+            f"train: {path} holds films of another recipe ({len(film.images)} pictures of {steps} "
+            f"steps, one is wanted every {interval}); choose another --cache, or delete it and run "
+            "the same command again."
+        )
 
 
 def _read_film(arrays: Mapping[str, np.ndarray], i: int) -> Film:

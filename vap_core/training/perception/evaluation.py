@@ -12,7 +12,7 @@ from tqdm import tqdm
 from vap_core.base.types import value
 from vap_core.evaluation.metrics import rate
 from vap_core.evaluation.perception.estimates import average_precision
-from vap_core.evaluation.perception.first_frames import FLOOR, VISIBLE_PX
+from vap_core.evaluation.perception.first_frames import FLOOR, VISIBLE_PX, match
 from vap_core.perception.boxes import box_iou, crop, mask_iou
 from vap_core.perception.embedded.detect_network import DetectHead, DetectNetwork
 from vap_core.perception.embedded.detector import (
@@ -170,18 +170,10 @@ def precision_of_views(
     hits: list[bool] = []
     for (boxes, scores), wanted, ignored in per_view:
         total += len(wanted)
-        free = np.ones(len(wanted), bool)
-        for box, score in zip(boxes, scores, strict=True):
-            overlap: np.ndarray = np.zeros(1)
-            if len(wanted):
-                overlap = np.where(free, box_iou(box[None], wanted)[0], 0)
-            if overlap.max() >= mask_iou:
-                free[overlap.argmax()] = False
+        for hit, score in zip(match(boxes, wanted, ignored, at=mask_iou), scores, strict=True):
+            if hit is not None:
                 marked_scores.append(float(score))
-                hits.append(True)
-            elif not len(ignored) or box_iou(box[None], ignored).max() < 0.5:
-                marked_scores.append(float(score))
-                hits.append(False)
+                hits.append(hit)
     if total == 0:
         return None
     precision = average_precision(

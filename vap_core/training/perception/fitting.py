@@ -53,7 +53,8 @@ def fit(
     `losses` yields the loss of each of an epoch's `per_epoch` batches, drawn from the stream it is
     given.
 
-    Raises: BadOutput when the file is damaged, or of a head that was trained otherwise.
+    Raises: BadOutput when the file is damaged, or of a head that was trained otherwise, or when the
+        training diverges: the file stays as it was.
     """
     optimiser = torch.optim.AdamW(head.parameters(), run.rate, weight_decay=run.decay)
     state, save = checkpoint(run.file, run.resume)
@@ -83,12 +84,15 @@ def fit(
         for batch, loss in enumerate(bar, start=1):
             done = (epoch * per_epoch + batch) / (run.epochs * per_epoch)
             _set_rate(optimiser, run.rate, done)
+            _require_finite(loss, run, f"loss is not finite at batch {batch} of epoch {epoch + 1}")
             optimiser.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(head.parameters(), 5.0)
             optimiser.step()
             total += loss.item()
             bar.set_postfix(loss=f"{total / batch:.3f}", refresh=False)
+        for weight in head.parameters():
+            _require_finite(weight, run, f"weights are not finite after epoch {epoch + 1}")
         saved = {
             "made_of": made_of,
             "head": head.state_dict(),
@@ -98,6 +102,14 @@ def fit(
         }
         with writing(run.file, "train perception"):
             save(saved)
+
+
+def _require_finite(numbers: Tensor, run: Run, fault: str) -> None:
+    """Raises: BadOutput, which tells the fault, when one of the numbers is not finite."""
+    if not bool(torch.isfinite(numbers.detach()).all()):
+        raise BadOutput(
+            f"train perception: the {run.name} head's {fault}; run it again with another --seed."
+        )
 
 
 def _set_rate(optimiser: torch.optim.Optimizer, rate: float, done: float) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from vap_core.base.errors import BadOutput
 from vap_core.base.files import parse_json, write_atomic, writing
 from vap_core.base.types import Rgb
 from vap_core.evaluation.processes import results_here
@@ -32,6 +33,8 @@ OTHERS = 6
 """Photos of objects of other categories."""
 SIZE = 224
 """Pixels of a photo, square."""
+FILE = "words.json"
+"""The words of a folder: what learning them cost, how accurate each is, and in which model."""
 TRAINING = TokenTraining(epochs=8)
 LEAST_ACCURACY = 0.75
 """A word that tells its object from others in fewer unseen photos is not used."""
@@ -54,6 +57,20 @@ def crews(films: Sequence[Film], count: int) -> list[tuple[str, ...]]:
     return list(found)
 
 
+def require_words_of(model: str, folder: Path) -> None:
+    """Check that the words of a folder were learned in the model with this SHA-256.
+
+    Those that earlier code learned do not say in which, and are accepted.
+
+    Raises: BadOutput when they were learned in another, or words.json is damaged.
+    """
+    if _read_kept(folder / FILE).get("model", model) != model:
+        raise BadOutput(
+            f"train policy: the words in {folder} were learned in another mini-PaliGemma; name "
+            "that with --vlm, or choose another --out."
+        )
+
+
 def learn_words(
     vlm: Path, films: Sequence[Film], count: int, folder: Path, jobs: int = 1
 ) -> tuple[dict[str, Embedding], dict[str, Any]]:
@@ -62,16 +79,15 @@ def learn_words(
     They are learned in `jobs` processes, in the mini-PaliGemma of the folder `vlm`. `folder` keeps
     them; an earlier call goes on.
 
-    Raises: BadOutput when words.json is damaged or cannot be written.
+    Raises: BadOutput when words.json is damaged, of another model or cannot be written.
     """
     from tqdm import tqdm
 
-    file = folder / "words.json"
-    kept: dict[str, Any] = {"cpu_s": 0.0, "accuracy": {}}
-    if file.exists():
-        with reading_kept(file, "train"):
-            found = parse_json(file.read_bytes())
-            kept = {"cpu_s": float(found["cpu_s"]), "accuracy": dict(found["accuracy"])}
+    file = folder / FILE
+    kept = _read_kept(file)
+    model = load_vlm(vlm).sha256()
+    require_words_of(model, folder)
+    kept["model"] = model
     crew_of: dict[str, tuple[str, ...]] = {}
     for crew in crews(films, count):
         for name in crew:
@@ -89,12 +105,23 @@ def learn_words(
             write_atomic(file, json.dumps(kept, indent=1).encode())
     # In the films' order, whichever was learned first.
     kept["accuracy"] = {name: kept["accuracy"][name] for name in crew_of}
-    model = load_vlm(vlm).sha256()
     words = {}
     for name, accuracy in kept["accuracy"].items():
         if accuracy >= LEAST_ACCURACY:
             words[name] = token_file.load(folder, name, model).embedding
     return words, kept
+
+
+def _read_kept(file: Path) -> dict[str, Any]:
+    """What words.json says of the words learned so far. Raises: BadOutput when it is damaged."""
+    kept: dict[str, Any] = {"cpu_s": 0.0, "accuracy": {}}
+    if file.exists():
+        with reading_kept(file, "train"):
+            found = parse_json(file.read_bytes())
+            kept = {"cpu_s": float(found["cpu_s"]), "accuracy": dict(found["accuracy"])}
+            if "model" in found:
+                kept["model"] = str(found["model"])
+    return kept
 
 
 def _learn(

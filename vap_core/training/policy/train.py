@@ -27,14 +27,19 @@ from vap_core.base.version import code_version
 from vap_core.policies.lerobot.checkpoints import CAPTIONS, TRAINING_CARD, WORDS
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
-from vap_core.policies.mini_pi0.vlm import initialise_policy, load_vlm, store_in_bfloat16
+from vap_core.policies.mini_pi0.vlm import (
+    MiniVlm,
+    initialise_policy,
+    load_vlm,
+    store_in_bfloat16,
+)
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import suite
 from vap_core.training.films.captions import captions
 from vap_core.training.films.dataset import about, data_sha256, read, shoot_stages
 from vap_core.training.films.demonstrations import SIDE, Film, cached, stage_file
 from vap_core.training.films.scenes import CACHE, only_generic
-from vap_core.training.folder import cost_s, training_folder
+from vap_core.training.folder import SAVING, cost_s, training_folder
 from vap_core.training.patches import model_options
 from vap_core.training.policy.ahead import Ahead
 from vap_core.training.policy.batches import Frames, statistics
@@ -46,9 +51,9 @@ from vap_core.training.policy.start import (
     require_shared_words,
     start_folder,
 )
-from vap_core.training.policy.taught import learn_words
+from vap_core.training.policy.taught import learn_words, require_words_of
 from vap_core.training.recipe import Recipe, filmed_tasks
-from vap_core.training.step import Figures, Schedule, average_of, train_steps
+from vap_core.training.step import Figures, Schedule, average_of, begun_with, train_steps
 
 FILMS = "films"
 HELD_OUT = 19
@@ -143,6 +148,25 @@ def load_films(
     return Films(films, held_out, spent_s)
 
 
+def require_startable(
+    recipe: Recipe,
+    out: Path,
+    *,
+    demonstrations: Path | None = None,
+    cache: Path = CACHE,
+    device: str | None = None,
+) -> None:
+    """Check what `train` is given before the mini-PaliGemma is, which takes long to make.
+
+    Raises: as `train`, for the device, the dataset's origin, `out` and `cache`.
+    """
+    device_name(device)
+    recipe = _with_stages_of(demonstrations, recipe)
+    with training_folder(out, "train policy", recipe.as_json()):
+        if demonstrations is None:
+            _make_cache(cache)
+
+
 def train(
     recipe: Recipe,
     out: Path,
@@ -174,10 +198,10 @@ def train(
     made_of: dict[str, Any] = {}
     if demonstrations is not None:
         made_of["demonstrations"] = origin(demonstrations, recipe.suite)
-        recipe = replace(recipe, stages=made_of["demonstrations"]["stages"])
+    recipe = _with_stages_of(demonstrations, recipe)
     with training_folder(out, "train policy", recipe.as_json()):
         if demonstrations is None:
-            make_folder(cache, "train policy", "choose another folder with --cache")
+            _make_cache(cache)
         jobs = jobs or os.cpu_count() or 1
         # Before the films, which take longest.
         teacher = None if vlm is None else load_vlm(vlm)
@@ -186,6 +210,7 @@ def train(
             start = read_start(start_folder(recipe.start), teacher, recipe.seed)
             if teacher is not None and recipe.taught:
                 require_shared_words(start, teacher)
+        made_of["taught_in"] = _require_same_teacher(recipe, teacher, out)
         films = load_films(recipe, cache, demonstrations, jobs)
         if not films.train:
             raise BadOutput(
@@ -243,6 +268,7 @@ def train(
             minutes=minutes,
             every=every,
             made_of=made_of,
+            slower="lower --rate",
         )
         mean, log = train_steps(learner.to(place), step, run, out, lambda: ahead.cpu_s)
         ahead.close()
@@ -275,7 +301,7 @@ def save(
 
     policy = learner.policy
     # Killed at any moment, every file that has its name is whole.
-    with writing(out, "train policy"), TemporaryDirectory(prefix=".saving-", dir=out) as name:
+    with writing(out, "train policy"), TemporaryDirectory(prefix=SAVING, dir=out) as name:
         part = Path(name)
         policy.save_pretrained(part)
         store_in_bfloat16(part / "model.safetensors")
@@ -304,6 +330,44 @@ def save(
     with writing(out, "train policy"):
         write_atomic(out / TRAINING_CARD, json.dumps(card, indent=1).encode())
     return card
+
+
+def _with_stages_of(demonstrations: Path | None, recipe: Recipe) -> Recipe:
+    """The recipe with as many stages as a dataset has; without one, as it is.
+
+    Raises: BadOutput, as `origin`.
+    """
+    if demonstrations is None:
+        return recipe
+    return replace(recipe, stages=origin(demonstrations, recipe.suite)["stages"])
+
+
+def _make_cache(cache: Path) -> None:
+    """Raises: BadOutput when the folder of films cannot be written."""
+    make_folder(cache, "train policy", "choose another folder with --cache")
+
+
+def _require_same_teacher(recipe: Recipe, teacher: MiniVlm | None, out: Path) -> str:
+    """The SHA-256 of the model that words are taught in, "" where none are.
+
+    Raises: BadOutput when the training in `out` grew from another model, or its words were taught
+        in another.
+    """
+    sha256 = "" if teacher is None else teacher.sha256()
+    taught_in = sha256 if recipe.taught else ""
+    known = {"taught_in": taught_in}
+    if not recipe.start:
+        known["vlm"] = sha256
+    begun = begun_with(out)
+    for name, given in known.items():
+        if begun.get(name, given) != given:
+            raise BadOutput(
+                f"train policy: {out} holds a training with another mini-PaliGemma, or with none; "
+                "go on with the same --vlm, or choose another --out."
+            )
+    if taught_in:
+        require_words_of(taught_in, out / WORDS)
+    return taught_in
 
 
 def _prepare_words(
@@ -343,14 +407,21 @@ def _hours(cost_cpu_s: dict[str, float]) -> dict[str, float]:
 
 
 def _vlm_cost_s(folder: Path | None) -> float | None:
-    """CPU seconds that the mini-PaliGemma in a folder took, 0 without one; None: not known."""
+    """CPU seconds that the mini-PaliGemma in a folder took, 0 without one.
+
+    None: not known, as where its card does not say so, or is absent or damaged.
+    """
     if folder is None:
         return 0.0
     if not (folder / TRAINING_CARD).is_file():
         return None
-    card = parse_json((folder / TRAINING_CARD).read_bytes())
-    hours = card.get("cpu_hours", {}).get("total")
-    return None if hours is None else 3600.0 * float(hours)
+    try:
+        card = parse_json((folder / TRAINING_CARD).read_bytes())
+        hours = card.get("cpu_hours", {}).get("total")
+        return None if hours is None else 3600.0 * float(hours)
+    except (OSError, ValueError, TypeError, AttributeError):
+        # The card is not what the policy grows from.
+        return None
 
 
 def _is_held_out(stage: int) -> bool:

@@ -1,0 +1,156 @@
+"""What a checkpoint's files hold decides what it does: statistics that are absent, runs and scratch beside them, weights that were replaced."""
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from tests import tiny_lerobot as tiny
+from vap_core.base.errors import BadPolicy
+from vap_core.evaluation.store import open_run
+from vap_core.policies.lerobot.adapter import load_for_suite, load_policy
+from vap_core.policies.lerobot.checkpoints import RUN, fingerprint
+from vap_core.policies.names import label_of
+from vap_core.simulation import suites
+from vap_core.simulation.scenes import build
+
+BEFORE = "policy_preprocessor_step_3_normalizer_processor.safetensors"
+AFTER = "policy_postprocessor_step_0_unnormalizer_processor.safetensors"
+STATE = "observation.state"
+Tensors = dict[str, torch.Tensor]
+
+
+@pytest.fixture(scope="module")
+def act(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tiny.act(tmp_path_factory.mktemp("checkpoints") / "act")
+
+
+@pytest.fixture
+def copy(act: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(act, tmp_path / "copy")
+
+
+def change(file: Path, changed: Callable[[str, torch.Tensor], tuple[str, torch.Tensor]]) -> None:
+    kept = load_file(file)
+    save_file(dict(changed(key, tensor) for key, tensor in kept.items()), file)
+
+
+def renamed(key: str, tensor: torch.Tensor) -> tuple[str, torch.Tensor]:
+    return key.replace(STATE, "observation.joints").replace("action.", "actions."), tensor
+
+
+def short(key: str, tensor: torch.Tensor) -> tuple[str, torch.Tensor]:
+    return key, tensor[:-1].contiguous() if key.startswith((STATE, "action")) else tensor
+
+
+@pytest.mark.parametrize(
+    ("file", "of"), [(BEFORE, STATE), (AFTER, "action")], ids=["state", "action"]
+)
+def test_a_checkpoint_without_its_statistics_is_refused(copy: Path, file: str, of: str) -> None:
+    """lerobot's normaliser would hand on what it was given, unscaled."""
+    assert any(key.startswith(of) for key in load_file(copy / file))
+    whole = (copy / file).read_bytes()
+    numbers = {STATE: tiny.STATE, "action": tiny.ACTION}[of]
+    for changed, fault in (
+        (renamed, f"has no statistics of {of}"),
+        (short, f"has statistics of {of} for {numbers - 1} numbers, where it has {numbers}"),
+    ):
+        change(copy / file, changed)
+        with pytest.raises(BadPolicy, match=f"{fault}; save it with the dataset's statistics"):
+            load_policy(copy)
+        (copy / file).write_bytes(whole)
+    load_policy(copy)
+    name = file.partition("_step")[0] + ".json"
+    pipeline = json.loads((copy / name).read_text())
+    for step in pipeline["steps"]:
+        step.pop("state_file", None)
+    (copy / name).write_text(json.dumps(pipeline))
+    with pytest.raises(
+        BadPolicy, match=r"has no statistics of (observation\.images\.front|action)"
+    ):
+        load_policy(copy)
+
+
+@pytest.mark.parametrize("kind", ["STATE", "VISUAL"])
+def test_what_is_not_scaled_needs_no_statistics(copy: Path, kind: str) -> None:
+    """Where the checkpoint says IDENTITY; statistics of the others are needed still."""
+    file = copy / "policy_preprocessor.json"
+    pipeline = json.loads(file.read_text())
+    (step,) = [step for step in pipeline["steps"] if "norm_map" in step["config"]]
+    step["config"]["norm_map"][kind] = "IDENTITY"
+    file.write_text(json.dumps(pipeline))
+    of = {"STATE": STATE, "VISUAL": "observation.images"}[kind]
+    kept = {key: t for key, t in load_file(copy / BEFORE).items() if not key.startswith(of)}
+    save_file(kept, copy / BEFORE)
+    load_policy(copy)
+    save_file({"nothing.mean": torch.zeros(1)}, copy / BEFORE)
+    with pytest.raises(BadPolicy, match="has no statistics of"):
+        load_policy(copy)
+
+
+def test_statistics_follow_the_checkpoints_rename_map(copy: Path) -> None:
+    """They are of the name that the renaming gives, as the normaliser comes after it."""
+    file = copy / "policy_preprocessor.json"
+    pipeline = json.loads(file.read_text())
+    steps = pipeline["steps"]
+    rename = {"observation.images.head": "observation.images.front", "observation.qpos": STATE}
+    steps[0]["config"]["rename_map"] = rename
+    file.write_text(json.dumps(pipeline))
+    assert set(load_policy(copy).wanted) == set(rename)
+    (scale,) = [step for step in steps if "norm_map" in step["config"]]
+    # Behind the normaliser, which then meets the old names.
+    steps.append(steps.pop(0))
+    file.write_text(json.dumps(pipeline))
+    with pytest.raises(BadPolicy, match=r"no statistics of observation\.(images\.head|qpos)"):
+        load_policy(copy)
+    old_of = {new: old for old, new in rename.items()}
+    features = scale["config"]["features"]
+    scale["config"]["features"] = {old_of.get(key, key): value for key, value in features.items()}
+    file.write_text(json.dumps(pipeline))
+
+    def to_old(key: str, tensor: torch.Tensor) -> tuple[str, torch.Tensor]:
+        name, _, part = key.rpartition(".")
+        return f"{old_of.get(name, name)}.{part}", tensor
+
+    change(copy / BEFORE, to_old)
+    load_policy(copy)
+
+
+def test_a_run_or_scratch_in_its_folder_is_no_part_of_a_checkpoint(copy: Path) -> None:
+    before = fingerprint(copy), label_of(copy)
+    run = open_run(copy / "eval", {"suite": "simpler-bridge"})
+    assert (run / RUN).is_file()
+    (run / "memory" / "mug").mkdir(parents=True)
+    scratch = copy / ".saving-abc"
+    scratch.mkdir()
+    for file in (run / "memory" / "mug" / "object.json", run / "left.safetensors"):
+        file.write_text("{}")
+    shutil.copy(copy / "model.safetensors", scratch)
+    assert (fingerprint(copy), label_of(copy)) == before
+    (copy / "tokenizer").mkdir()
+    (copy / "tokenizer" / "tokenizer.json").write_text("{}")
+    assert fingerprint(copy) != before[0], "what it reads its commands by"
+
+
+def test_a_checkpoint_that_was_trained_on_is_loaded_again(copy: Path) -> None:
+    """As in a notebook, whose process goes on; a run's table names the weights that acted."""
+    known = suites.suite("simpler-bridge")
+    (row,) = suites.rows("simpler-bridge", "put-camera", 1)
+    with build(known.robot, [place.model for place in row.placements]) as scene:
+        first = load_for_suite(str(copy), scene, known)
+        (copy / "training.json").write_text("{}")
+        assert load_for_suite(str(copy), scene, known) is first
+        again = copy / "again.safetensors"
+        shutil.copy(copy / "model.safetensors", again)
+        change(
+            again, lambda key, tensor: (key, tensor + 1 if tensor.is_floating_point() else tensor)
+        )
+        os.replace(again, copy / "model.safetensors")
+        second = load_for_suite(str(copy), scene, known)
+    assert second.label == label_of(copy) != first.label
+    assert second.sha256() != first.sha256()
