@@ -592,11 +592,6 @@ ATTACKS = (
 
 LEFT = (
     (
-        "a correction that is copied to the name of another recording",
-        "corrections are found by their file's name and their policy; of the same policy it counts "
-        "for that recording",
-    ),
-    (
         "a run of a trained policy that is interrupted and goes on",
         "its policy is asked in batches of other sizes, so the last bits of an action differ, and "
         "an episode at the edge can end otherwise; with scripted and random policies rows are equal",

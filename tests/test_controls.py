@@ -162,6 +162,40 @@ def test_labels_are_kept_and_the_last_one_counts(picker: failure_picker.FailureP
     assert len(picker.labels.read_text().splitlines()) == 4
 
 
+@pytest.mark.parametrize("ending", [0, 1, 2])
+def test_a_label_begins_its_own_line(picker: failure_picker.FailurePicker, ending: int) -> None:
+    """Also below a last line without its end, which an editor may leave."""
+    picker.keep.click()
+    data = picker.labels.read_bytes()
+    assert data.endswith(b"\r\n")
+    picker.labels.write_bytes(data[: len(data) - ending])
+    picker.failure.value = 1
+    picker.keep.click()
+    found = failure_picker.read_labels(picker.labels)
+    assert found["episode"].tolist() == [0, 1]
+    assert found["sub_case"].tolist() == ["distractor vote", "views disagree"]
+
+
+def test_an_empty_file_of_labels_holds_none(
+    picker: failure_picker.FailurePicker, tmp_path: Path
+) -> None:
+    picker.labels.parent.mkdir()
+    picker.labels.touch()
+    assert failure_picker.read_labels(picker.labels).empty
+    picker.keep.click()
+    assert "1 labelled in labels.csv, 1 as diagnosed" in picker.said.value
+
+
+def test_a_label_is_as_diagnosed_with_its_case_alone(picker: failure_picker.FailurePicker) -> None:
+    """`unprompted` has the sub-cases of case 3."""
+    picker.failures.table.loc[2, "case"] = "unprompted"
+    picker.suite.value = "tabletop"
+    assert picker.label.value == "unprompted: slip"
+    picker.label.value = "case 3: slip"
+    picker.keep.click()
+    assert "1 labelled in labels.csv, 0 as diagnosed" in picker.said.value
+
+
 def test_words_of_a_table_are_no_html(picker: failure_picker.FailurePicker) -> None:
     picker.failures.table.loc[2, "case_sentence"] = "<img src=x onerror=alert(1)>"
     picker.suite.value = "tabletop"

@@ -20,6 +20,7 @@ from vap_core.base.files import DATA
 from vap_core.evaluation import engine
 from vap_core.evaluation.diagnosis import recordings
 from vap_core.evaluation.diagnosis.failures import (
+    PLAYED,
     Failures,
     deciding_frame,
     failures_text,
@@ -32,7 +33,7 @@ from vap_core.evaluation.report.failures import (
 )
 from vap_core.evaluation.store import read_manifest
 from vap_core.evaluation.study import Study
-from vap_core.recording import Recorder, read_summary, recover
+from vap_core.recording import Recorder, read_summary, recording_file_name, recover
 from vap_core.recording.index import FOLDER
 from vap_core.simulation.types import Outcome
 
@@ -486,6 +487,17 @@ def test_so_many_recordings_are_spread_over_a_task(tmp_path: Path) -> None:
         "each with its index"
     )
     assert list_failures(tmp_path / "run").table.shape[0] == 4
+
+
+def test_a_correction_under_another_recordings_name_is_not_of_it(run: Path) -> None:
+    failures = list_failures(run)
+    layer = correct_failure(failures, 1, "unprompted: slip")
+    other = failures.table.to_dict("records")[0]
+    copy = layer.with_name(recording_file_name(*map(other.get, PLAYED)))
+    shutil.copy(layer, copy)
+    assert list_failures(run).table.corrected.tolist() == [False, True, False]
+    layer.unlink()
+    copy.unlink()
 
 
 def test_a_correction_changes_the_table_and_nothing_else(run: Path) -> None:

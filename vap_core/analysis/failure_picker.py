@@ -33,7 +33,7 @@ def read_labels(path: Path) -> "pd.DataFrame":
     """Every label of a file, the last of each episode. Raises: BadOutput where it is damaged."""
     import pandas as pd
 
-    if not path.exists():
+    if not path.exists() or path.stat().st_size == 0:
         return pd.DataFrame(columns=list(LABELS))
     try:
         found = pd.read_csv(path, keep_default_na=False)
@@ -63,11 +63,13 @@ def write_label(path: Path, row: dict[str, Any], label: str, note: str = "") -> 
     text = StringIO()
     writer = csv.DictWriter(text, LABELS)
     with writing(path, "write_label", "make room, or name another file"):
-        if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            writer.writeheader()
-        writer.writerow(line)
+        path.parent.mkdir(parents=True, exist_ok=True)
         before = path.read_bytes() if path.exists() else b""
+        if not before:
+            writer.writeheader()
+        elif not before.endswith(b"\n"):  # a program or a person left the last line open
+            before += b"\n"
+        writer.writerow(line)
         write_atomic(path, before + text.getvalue().encode())
 
 
@@ -171,7 +173,8 @@ class FailurePicker(Control):
     def _keep(self) -> None:
         write_label(self.labels, self.row, self.label.value, self.note.value)
         found = read_labels(self.labels)
-        same = found["sub_case"].eq(found["diagnosed_sub_case"]).sum()
+        is_same = found["case"].eq(found["diagnosed_case"])
+        same = (is_same & found["sub_case"].eq(found["diagnosed_sub_case"])).sum()
         file = escape(self.labels.name)
         self.said.value = f"{len(found)} labelled in {file}, {same} as diagnosed"
 

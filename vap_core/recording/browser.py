@@ -20,14 +20,14 @@ from vap_core.base.condition import rows_matching
 from vap_core.base.errors import BadOutput, BadRecording, first_line
 from vap_core.recording.blueprint import full_window
 from vap_core.recording.catalog import (
-    read_corrections_of,
     register_files,
     register_recordings,
     show_progress,
 )
-from vap_core.recording.corrections import CORRECTIONS, layer_path
+from vap_core.recording.corrections import CORRECTIONS, layer_path, read_corrections_of
 from vap_core.recording.isolated import read_summaries
-from vap_core.recording.reading import recording_id
+from vap_core.recording.query import UNFINISHED
+from vap_core.recording.reading import list_recordings, recording_id, recordings_folder
 from vap_core.recording.stored_pictures import by_camera
 from vap_core.recording.viewer import free_port
 from vap_core.recording.views import (
@@ -89,12 +89,8 @@ def serve_run(run: Path, where: str | None = None, port: int | None = None) -> I
     import pandas as pd
     import pyarrow as pa
 
-    folder = run / "recordings" if (run / "recordings").is_dir() else run
-    files = sorted(folder.glob("*.rrd"))
-    if not files:
-        raise BadRecording(
-            f"query: there is no recording in {folder}; run eval with --record all, or failures."
-        )
+    folder = recordings_folder(run)
+    files = list_recordings(folder)
     unreadable: dict[Path, str] = {}
     summaries: dict[Path, dict[str, Any]] = {}
     for path, summary, reason in show_progress(read_summaries(files), "read", len(files)):
@@ -102,11 +98,11 @@ def serve_run(run: Path, where: str | None = None, port: int | None = None) -> I
             unreadable[path] = reason
         else:
             summaries[path] = summary
-    layers = _correct(summaries, unreadable)
     with tempfile.TemporaryDirectory() as scratch, _server(port or free_port()) as server:
         client = server.client()
         dataset = client.create_dataset("recordings")
         register_recordings(dataset, {path: path for path in summaries}, unreadable)
+        layers = _correct(summaries, unreadable)
         register_files(dataset, {path: path for path in layers}, unreadable, layer=CORRECTIONS)
         rows = _rows(dataset, summaries, unreadable)
         if not rows:
@@ -128,8 +124,11 @@ def serve_run(run: Path, where: str | None = None, port: int | None = None) -> I
 
 def _correct(summaries: dict[Path, dict[str, Any]], unreadable: dict[Path, str]) -> list[Path]:
     """Put corrected cases in place of the recorded ones; returns the layers that hold them."""
-    policies = {path: summary.get("policy") for path, summary in summaries.items()}
-    corrections = read_corrections_of(policies, unreadable)
+    failures = {}
+    for path, summary in summaries.items():
+        if path not in unreadable and summary.get("outcome") == "failure":
+            failures[path] = path
+    corrections = read_corrections_of(failures, unreadable)
     for path, correction in corrections.items():
         summary = summaries[path]
         summary["case"], summary["sub_case"] = correction.case, correction.sub_case
@@ -173,7 +172,7 @@ def _rows(
             row[name] = summary.get(name, 0 if name in NUMBERS else "")
         row["link"] = dataset.segment_url(segment, "frame_index", frame)
         row["file"] = path.name
-        row["outcome"] = row["outcome"] or "unfinished"
+        row["outcome"] = row["outcome"] or UNFINISHED
         rows.append(row)
     rows.sort(key=lambda row: (row["outcome"] == "success", row["case"], row["sub_case"]))
     return rows

@@ -17,11 +17,12 @@ from urllib.parse import unquote, urlparse
 import rerun as rr
 
 from vap_core.base.errors import BadRecording, first_line
-from vap_core.recording.corrections import layer_path
+from vap_core.recording.corrections import layer_path, read_corrections_of
+from vap_core.recording.file import recording_file_name
 from vap_core.recording.index import CURVES, FOLDER, STEPS, find_indexes
-from vap_core.recording.isolated import index_isolated, read_layers
+from vap_core.recording.isolated import index_isolated
 from vap_core.recording.layers import Correction
-from vap_core.recording.reading import recording_id
+from vap_core.recording.reading import list_recordings, recording_id
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -49,6 +50,8 @@ PROPERTY_COLUMNS = {
     ),
 }
 """Columns that every step of a recording shares, by property group; as in results tables."""
+NAMING = ("suite", "task", "episode", "seed", "method")
+"""The properties that a recorder names its file by."""
 
 
 @dataclass(frozen=True)
@@ -65,13 +68,10 @@ class StepTable:
 def load_steps(folder: Path) -> StepTable:
     """Read every recording of a folder, through its index.
 
-    Raises: BadRecording when there is none, or none that can be read.
+    Raises: BadRecording when there is none, or none that can be read, and for corrections without
+        rights.
     """
-    files = sorted(Path(folder).glob("*.rrd"))
-    if not files:
-        raise BadRecording(
-            f"query: there is no recording in {folder}; run eval with --record all, or failures."
-        )
+    files = list_recordings(Path(folder))
     unreadable: dict[Path, str] = {}
     with tempfile.TemporaryDirectory() as scratch, rr.server.Server(host="127.0.0.1") as server:
         indexes = _ensure_indexes(files, Path(scratch), unreadable)
@@ -83,8 +83,8 @@ def load_steps(folder: Path) -> StepTable:
         dataset = server.client().create_dataset("recordings")
         register_recordings(dataset, indexes, unreadable)
         properties = _property_table(dataset, _by_file(indexes))
-        policies = dict(zip(map(Path, properties["file"]), properties["policy"], strict=True))
-        corrections = read_corrections_of(policies, unreadable)
+        failed = map(Path, properties["file"][properties["outcome"] == "failure"])
+        corrections = read_corrections_of({path: indexes[path] for path in failed}, unreadable)
         table = _join_steps(_corrected(properties, corrections), _curve_table(dataset))
         return StepTable(table, unreadable)
 
@@ -92,7 +92,7 @@ def load_steps(folder: Path) -> StepTable:
 def _can_index(folder: Path) -> bool:
     """Whether indexes can be written beside the recordings of a folder."""
     indexes = folder / FOLDER
-    return os.access(indexes if indexes.exists() else folder, os.W_OK)
+    return os.access(indexes if os.path.exists(indexes) else folder, os.W_OK)
 
 
 def _ensure_indexes(
@@ -103,9 +103,9 @@ def _ensure_indexes(
     New ones are in `scratch` where none can be written beside the recordings. Recordings are read
     in a process of their own.
     """
-    folder = None if _can_index(files[0].parent) else scratch
-    indexes = find_indexes(files, folder)
+    indexes = find_indexes(files)
     missing = [path for path in files if path not in indexes]
+    folder = None if _can_index(files[0].parent) else scratch
     answers = index_isolated(missing, folder)
     for path, reason in show_progress(answers, "index", len(missing)):
         if reason is not None:
@@ -137,31 +137,69 @@ def register_recordings(
     files: Mapping[Path, Path],
     unreadable: dict[Path, str],
 ) -> None:
-    """Register what to read for each recording; of those that hold one episode the first alone."""
-    refused: dict[Path, str] = {}
-    register_files(dataset, files, refused)
-    first = _files_by_segment(dataset, _by_file(files)) if refused else {}
-    for path, reason in refused.items():
-        original = first.get(recording_id(files[path]))
-        if original is not None:
-            reason = f"it holds the same episode as {Path(original).name}; move one of them away"
-        unreadable[path] = reason
+    """Register what to read for each recording; of those that hold one episode one alone.
+
+    That is one that has a correction, or else the name that a recorder gives it, or else the first.
+    """
+    left_out: dict[Path, str] = {}
+    register_files(dataset, files, left_out)
+    registered = _registered(dataset, _by_file(files)) if left_out else {}
+    copies: dict[str, list[Path]] = {}
+    for path, reason in left_out.items():
+        segment = recording_id(files[path])
+        if segment in registered:
+            copies.setdefault(segment, []).append(path)
+        else:
+            unreadable[path] = reason
+    for segment, others in copies.items():
+        first, name = registered[segment]
+        same = [first, *others]
+        kept = min(same, key=lambda path: (not os.path.exists(layer_path(path)), path.name != name))
+        if kept != first and not _replace(dataset, files[kept]):
+            kept = first
+        for path in same:
+            if path != kept:
+                unreadable[path] = (
+                    f"it holds the same episode as {kept.name}; move one of them away"
+                )
+
+
+def _replace(dataset: "DatasetEntry", read: Path) -> bool:
+    """Register a file in place of the one that has its segment; whether it could be."""
+    from rerun.catalog import OnDuplicateSegmentLayer
+
+    url = read.resolve().as_uri()
+    try:
+        done = dataset.register([url], on_duplicate=OnDuplicateSegmentLayer.REPLACE)
+        return not any(result.error for result in done.iter_results())
+    except ValueError:
+        return False
+
+
+def _registered(
+    dataset: "DatasetEntry", recordings: Mapping[Path, Path]
+) -> dict[str, tuple[Path, str]]:
+    """The recording of every segment, if it is among `recordings`, and what `_own_name` says."""
+    found = {}
+    table = _property_table(dataset, recordings).dropna(subset=["file"])
+    for row in table.to_dict("records"):
+        found[row["segment"]] = (Path(row["file"]), _own_name(row))
+    return found
+
+
+def _own_name(row: Mapping[str, Any]) -> str:
+    """The name that a recorder gives a recording, "" where its properties do not say it."""
+    import pandas as pd
+
+    suite, task, episode, seed, method = (row[name] for name in NAMING)
+    if any(pd.isna(row[name]) for name in NAMING):
+        return ""
+    return recording_file_name(suite, task, int(episode), int(seed), method)
 
 
 def _by_file(files: Mapping[Path, Path]) -> dict[Path, Path]:
     """The recording by what is read for it."""
     return {read.resolve(): recording for recording, read in files.items()}
-
-
-def _files_by_segment(
-    dataset: "DatasetEntry", recordings: Mapping[Path, Path]
-) -> dict[str, str | None]:
-    """The recording of every segment; None where its index is not among its files."""
-    import pyarrow as pa
-
-    segments = pa.Table.from_batches(dataset.segment_table().collect())
-    files = [_recording_of(urls, recordings) for urls in segments["rerun_storage_urls"].to_pylist()]
-    return dict(zip(segments["rerun_segment_id"].to_pylist(), files, strict=True))
 
 
 def register_files(
@@ -192,26 +230,6 @@ def register_files(
     for result in results:  # in the order in which they were finished
         if result.error:
             unreadable[of_url[result.uri]] = str(result.error).strip().splitlines()[-1][:160]
-
-
-def read_corrections_of(
-    policies: Mapping[Path, str | None], unreadable: dict[Path, str]
-) -> dict[Path, Correction]:
-    """The correction of every recording that has one, given what policy each is of.
-
-    A layer of a recording that has been made again with another policy does not count. Layers are
-    read in a process of their own; one that is damaged is named in `unreadable`.
-    """
-    recordings = {layer_path(path): path for path in policies}
-    layers = [layer for layer in recordings if layer.exists()]
-    corrections = {}
-    for layer, correction, reason in read_layers(layers):
-        recording = recordings[layer]
-        if correction is None:
-            unreadable[layer] = reason
-        elif correction.policy in ("", policies[recording]):
-            corrections[recording] = correction
-    return corrections
 
 
 def _corrected(

@@ -4,6 +4,7 @@ The recording itself is never rewritten.
 """
 
 import os
+from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import rerun as rr
 from vap_core.base.errors import BadRecording, BadStudy
 from vap_core.recording.isolated import read_layers
 from vap_core.recording.layers import Correction as Correction
-from vap_core.recording.reading import read_summary, recording_id
+from vap_core.recording.reading import list_files, read_summary, recording_id
 from vap_core.recording.stream import finish_stream, log_properties, log_row, open_stream
 
 CORRECTIONS = "corrections"
@@ -65,13 +66,38 @@ def write_correction(recording: Path, correction: Correction, frame_index: int) 
 def read_corrections(folder: Path) -> dict[str, Correction]:
     """Every correction in a run's folder, by the name of its recording.
 
-    Raises: BadRecording for one that is damaged.
+    Raises: BadRecording for one that is damaged, and for what may not be read.
     """
     corrections = {}
-    layers = sorted((folder / CORRECTIONS).glob("*.rrd"))
+    layers = list_files(folder / CORRECTIONS)
     with closing(read_layers(layers)) as read:
         for path, correction, reason in read:
             if correction is None:
                 raise BadRecording(reason)
             corrections[path.name] = correction
+    return corrections
+
+
+def read_corrections_of(
+    failures: Mapping[Path, Path], unreadable: dict[Path, str]
+) -> dict[Path, Correction]:
+    """The correction of every recorded failure that has one; each has what to read its id from.
+
+    A layer of another id does not count: of a recording that has been made again with another
+    policy, or copied from another recording's. Layers are read in a process of their own; one that
+    is damaged is named in `unreadable`.
+
+    Raises: BadRecording for a folder of corrections without rights.
+    """
+    there: set[Path] = set()
+    for folder in {path.parent for path in failures}:
+        there.update(list_files(corrections_folder(folder)))
+    recordings = {layer_path(path): path for path in failures if layer_path(path) in there}
+    corrections = {}
+    for layer, correction, reason in read_layers(list(recordings)):
+        recording = recordings[layer]
+        if correction is None:
+            unreadable[layer] = reason
+        elif correction.recording == recording_id(failures[recording]):
+            corrections[recording] = correction
     return corrections

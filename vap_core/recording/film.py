@@ -10,7 +10,7 @@ from vap_core.base.errors import BadRecording
 from vap_core.base.palette import RIGHT_MARK, WRONG_MARK
 from vap_core.base.types import Rgb
 from vap_core.base.video import Mp4
-from vap_core.recording.reading import MOST_HZ, read_chunks, read_summary
+from vap_core.recording.reading import MOST_HZ, read_chunks, read_summary, recording_id
 from vap_core.recording.stored_pictures import prompted_entities, read_pictures
 
 if TYPE_CHECKING:
@@ -39,6 +39,11 @@ def write_film(recording: Path, mp4: Path) -> int:
     pictures = read_pictures(recording, set(entities.values()))
     views = {camera: pictures[entity] for camera, entity in entities.items()}
     steps = sorted({step for of_camera in views.values() for step in of_camera})
+    if not steps and recording_id(recording).startswith("together."):
+        raise BadRecording(
+            f"film: {recording} lays several recordings side by side, and a film is of one; name "
+            "one of them."
+        )
     if not steps:
         raise BadRecording(f"film: {recording} holds no pictures; record the episode again.")
     hz = float(summary.get("hz") or _frame_rate(recording, set(entities.values())))

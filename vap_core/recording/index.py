@@ -105,10 +105,11 @@ def _kept_name(name: str, index: Path) -> str:
 
 
 def _list_indexes(place: Path) -> dict[str, list[Path]]:
-    """The indexes of a folder, by how their names begin."""
+    """The indexes of a folder, by how their names begin; none where it may not be entered."""
     by_name: dict[str, list[Path]] = {}
-    for path in sorted(place.glob(f"*.{'?' * DIGITS}{SUFFIX}")):
-        by_name.setdefault(path.name[: -DIGITS - len(SUFFIX) - 1], []).append(path)
+    with suppress(OSError):
+        for path in sorted(place.glob(f"*.{'?' * DIGITS}{SUFFIX}")):
+            by_name.setdefault(path.name[: -DIGITS - len(SUFFIX) - 1], []).append(path)
     return by_name
 
 

@@ -5,7 +5,14 @@ from pathlib import Path
 from typing import Any
 
 from vap_core.base.errors import BadRecording, UnknownName, one_of
-from vap_core.recording.reading import UNREADABLE, property_group, read_chunks, read_properties
+from vap_core.recording.reading import (
+    UNREADABLE,
+    property_group,
+    read_chunks,
+    read_properties,
+    recording_id,
+    refused,
+)
 from vap_core.rollout.failure import CASES
 
 
@@ -13,13 +20,15 @@ from vap_core.rollout.failure import CASES
 class Correction:
     """What a researcher concluded: the case and sub-case of a failure, and a note why.
 
-    `policy` is the label of the one that was recorded, "" where a layer does not say.
+    `policy` is the label of the one that was recorded, "" where a layer does not say; `recording`
+    is the id of the recording that a layer is of, "" where this is of none.
     """
 
     case: str
     sub_case: str
     note: str = ""
     policy: str = field(default="", compare=False)
+    recording: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
         if self.case not in CASES:
@@ -35,7 +44,7 @@ class Correction:
 def read_correction(path: Path) -> Correction:
     """The correction of one layer, read in this process: damaged bytes can end it.
 
-    Raises: BadRecording, when it is damaged.
+    Raises: BadRecording, when it is damaged, or may not be read.
     """
     values: dict[str, Any] = {}
     try:
@@ -51,8 +60,11 @@ def read_correction(path: Path) -> Correction:
             sub_case=values["sub_case"],
             note=values["case_sentence"],
             policy=values["policy"],
+            recording=recording_id(path),
         )
-    except (*UNREADABLE, KeyError, UnknownName) as error:
+    except PermissionError as error:
+        raise refused(path, error) from error
+    except (*UNREADABLE, LookupError, UnknownName) as error:
         raise damaged_layer(path, error) from error
 
 

@@ -8,6 +8,7 @@ from vap_core.base.errors import BadStudy
 from vap_core.base.tables import align
 from vap_core.base.types import value
 from vap_core.recording.catalog import load_steps
+from vap_core.recording.reading import recordings_folder
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
 COLUMNS = ("suite", "task", "method", "episode", "outcome", "case", "sub_case")
 MATCH_COLUMNS = ("matching_steps", "first_step", "last_step")
 """How many steps of a recording match, and which are the first and the last of them."""
+UNFINISHED = "unfinished"
+"""The outcome of a recording that has none; a condition may name it."""
 
 
 @value
@@ -34,9 +37,9 @@ def run_query(run: Path, where: str) -> QueryResult:
 
     Raises: BadRecording without readable recordings; BadStudy for a condition that fits no table.
     """
-    folder = run / "recordings" if (run / "recordings").is_dir() else run
-    steps = load_steps(folder)
-    rows = rows_matching(steps.table, where).fillna({"case": "", "sub_case": ""})
+    steps = load_steps(recordings_folder(run))
+    table = steps.table.fillna({"outcome": UNFINISHED})
+    rows = rows_matching(table, where).fillna({"case": "", "sub_case": ""})
     grouped = rows.groupby(["file", *COLUMNS], sort=False, dropna=False)["frame_index"]
     matches = grouped.agg(matching_steps="size", first_step="min", last_step="max")
     n_recordings = int(steps.table["file"].nunique())

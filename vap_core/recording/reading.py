@@ -1,5 +1,6 @@
 """Reading recordings back: their chunks and their properties."""
 
+import os
 import warnings
 from pathlib import Path
 from shlex import quote
@@ -30,9 +31,51 @@ UNREADABLE = (RuntimeError, ValueError, OSError, Warning)
 """What rerun and the checks here raise at a file that is no whole recording."""
 
 
+def list_files(folder: Path) -> list[Path]:
+    """The .rrd files of a folder, by name; none where there is no such folder.
+
+    Raises: BadRecording for a folder that cannot be read.
+    """
+    try:
+        with os.scandir(folder) as entries:
+            names = [entry.name for entry in entries if entry.name.endswith(".rrd")]
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    except OSError as error:
+        raise refused(folder, error) from error
+    return [folder / name for name in sorted(names)]
+
+
+def recordings_folder(run: Path) -> Path:
+    """The folder of a run's recordings; `run` itself where it has none of its own.
+
+    Raises: BadRecording for a run that cannot be read.
+    """
+    folder = run / "recordings"
+    try:
+        return folder if folder.is_dir() else run
+    except OSError as error:
+        raise refused(run, error) from error
+
+
+def list_recordings(folder: Path) -> list[Path]:
+    """Every recording of a folder. Raises: BadRecording without one, or without rights."""
+    files = list_files(folder)
+    if not files:
+        raise BadRecording(
+            f"query: there is no recording in {folder}; run eval with --record all, or failures."
+        )
+    return files
+
+
 def read_chunks(path: Path) -> LazyChunkStream:
-    """The chunks of a recording, in the order of the file."""
+    """The chunks of a recording, in the order of the file.
+
+    Raises: one of UNREADABLE; PermissionError for a file without rights.
+    """
     check_regular(path)
+    with path.open("rb"):  # Rerun's own error does not say which kind it is
+        pass
     return RrdReader(path).stream()
 
 
@@ -76,10 +119,14 @@ def read_summary(path: Path) -> dict[str, Any]:
 
     `frames` counts the recorded steps. An unfinished recording has no `outcome`.
 
-    Raises: BadRecording, when the file is missing, damaged, or no recording.
+    Raises: BadRecording, when the file is missing, damaged, no recording, or may not be read.
     """
     path = Path(path)
-    if not path.is_file():
+    try:
+        is_there = path.is_file()
+    except OSError as err:
+        raise refused(path, err) from err
+    if not is_there:
         raise BadRecording(
             f"read_summary: there is no recording at {path}; check the path, or make one: eval or "
             "rollout with --record all."
@@ -97,6 +144,8 @@ def read_summary(path: Path) -> dict[str, Any]:
                 batch = chunk.to_record_batch()
                 if "frame_index" in batch.schema.names:
                     steps.update(batch["frame_index"].to_pylist())
+    except PermissionError as err:
+        raise refused(path, err) from err
     except UNREADABLE as err:
         raise unreadable(path, err) from err
     return {**summary, "frames": len(steps)}
@@ -132,4 +181,11 @@ def unreadable(path: Path, reason: object) -> BadRecording:
     return BadRecording(
         f"{path} cannot be read as a recording ({line}); "
         f"`rerun rrd optimize {quote(str(path))} -o mended.rrd` saves what can be saved."
+    )
+
+
+def refused(path: Path, error: OSError) -> BadRecording:
+    """The error of a file or a folder that the system does not let this process read."""
+    return BadRecording(
+        f"{path} cannot be read ({error.strerror or error}); check its path and its permissions."
     )

@@ -243,7 +243,8 @@ def _notes_of_old_corrections(sources: Sequence[Path]) -> list[str]:
 def _with_corrections(table: "pd.DataFrame") -> "pd.DataFrame":
     """With the corrections of researchers, marked in the column `corrected`.
 
-    A correction holds for a failure of the policy that was recorded, in the folder where it lies.
+    A correction holds for the episode, method and policy that were recorded, in the folder where it
+    lies.
     """
     from vap_core.recording import read_corrections, recording_file_name
 
@@ -258,6 +259,9 @@ def _with_corrections(table: "pd.DataFrame") -> "pd.DataFrame":
             # A layer that does not name its policy holds where it lies.
             if correction is None or correction.policy not in ("", row.get("policy")):
                 continue
+            episode = f"{row['suite']}.{row['task']}.{row['episode']:03d}.s{row['seed']}"
+            if not correction.recording.startswith(f"{episode}.{row['method']}."):
+                continue  # copied from another recording's
             cells = {
                 "case": correction.case,
                 "sub_case": correction.sub_case,
