@@ -30,6 +30,7 @@ from vap_core.evaluation.diagnosis.recordings import correct_failure, recording_
 from vap_core.evaluation.publish import publish, read_published
 from vap_core.evaluation.report.failures import (
     breakdown,
+    why_other,
 )
 from vap_core.evaluation.store import read_manifest
 from vap_core.evaluation.study import Study
@@ -232,10 +233,10 @@ def test_what_a_killed_process_recorded_is_not_the_whole_episode(
 def test_a_recording_is_that_of_a_row_in_all_that_names_it(name: str) -> None:
     row = {"suite": "s", "task": "t", "episode": 1, "seed": 0, "method": "vap", "policy": "p"}
     recorded = {**row, "outcome": "failure", "steps": 9}
-    assert recordings._why_other(recorded, row) == ""
-    assert f"is of {name} 7, not {row[name]}" == recordings._why_other({**recorded, name: 7}, row)
+    assert why_other(recorded, row) == ""
+    assert f"is of {name} 7, not {row[name]}" == why_other({**recorded, name: 7}, row)
     del recorded[name]
-    assert recordings._why_other(recorded, row)
+    assert why_other(recorded, row)
 
 
 def test_a_recording_that_ended_otherwise_than_its_row_says_so(
