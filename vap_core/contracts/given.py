@@ -15,7 +15,7 @@ from vap_core.base.types import Boxes, Rgb, value
 from vap_core.rollout.loop import Trial
 from vap_core.rollout.prompters.text import generic
 from vap_core.simulation import suites
-from vap_core.simulation.suites.open_row import build_scene
+from vap_core.simulation.suites.open_row import build_scene, models_of
 from vap_core.simulation.types import EpisodeRow
 from vap_core.training.films.scenes import boxes_of, stage
 
@@ -96,10 +96,9 @@ def short_rows(where: str, steps: int) -> list[EpisodeRow]:
 def trial_of(policy: Any, rows: Sequence[EpisodeRow]) -> Trial:
     """A trial of a policy that sees raw images and reads the raw instruction."""
     suite = suites.suite(rows[0].suite)
-    models = {place.model: None for row in rows for place in row.placements}
     return Trial(
         method="generic",
-        scene=build_scene(suite.name, list(models)),
+        scene=build_scene(suite.name, models_of(rows)),
         policy=policy,
         prompter=generic(),
         control=suite.control,

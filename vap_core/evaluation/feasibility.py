@@ -12,7 +12,7 @@ from vap_core.policies.scripted.expert import Expert
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters.text import generic
 from vap_core.simulation import suites
-from vap_core.simulation.suites.open_row import build_scene
+from vap_core.simulation.suites.open_row import build_scene, models_of
 from vap_core.simulation.types import EpisodeRow
 
 
@@ -49,11 +49,7 @@ def feasible(rows: Sequence[EpisodeRow]) -> tuple[bool, ...]:
 def _try_rows(rows: Sequence[EpisodeRow]) -> list[bool]:
     """`feasible` for rows of one suite and variant."""
     suite = suites.suite(rows[0].suite)
-    models: dict[str, None] = {}
-    for row in rows:
-        for place in row.placements:
-            models[place.model] = None
-    with build_scene(suite.name, list(models), rows[0].variant) as scene:
+    with build_scene(suite.name, models_of(rows), rows[0].variant) as scene:
         trial = Trial(
             method="generic",
             scene=scene,

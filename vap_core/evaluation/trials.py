@@ -39,7 +39,7 @@ from vap_core.simulation.assets.objects import ObjectModel, get_object
 from vap_core.simulation.occluder import Occlusion
 from vap_core.simulation.scenes import Meshes, Scene
 from vap_core.simulation.studio import reference_views
-from vap_core.simulation.suites.open_row import build_scene
+from vap_core.simulation.suites.open_row import build_scene, models_of
 from vap_core.simulation.types import EpisodeRow
 
 HIDDEN_FROM = 2
@@ -207,8 +207,8 @@ def _scene(study: Study, rows: Sequence[EpisodeRow]) -> Scene:
     for row in study.rows(first.suite, first.task):
         if row.variant == first.variant:
             listed.append(row)
-    placed = _models(rows)
-    names = [name for name in _models([*listed, *rows]) if name in placed]
+    placed = models_of(rows)
+    names = [name for name in models_of([*listed, *rows]) if name in placed]
     key = (first.suite, tuple(names), first.variant, study.robots)
     if key not in _last_scene:
         for scene in _last_scene.values():
@@ -216,12 +216,3 @@ def _scene(study: Study, rows: Sequence[EpisodeRow]) -> Scene:
         _last_scene.clear()
         _last_scene[key] = build_scene(*key)
     return _last_scene[key]
-
-
-def _models(rows: Sequence[EpisodeRow]) -> dict[str, None]:
-    """The objects that rows place, in order of first appearance."""
-    names: dict[str, None] = {}
-    for row in rows:
-        for place in row.placements:
-            names[place.model] = None
-    return names

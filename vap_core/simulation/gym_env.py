@@ -21,7 +21,7 @@ from vap_core.simulation import suites
 from vap_core.simulation.scenes import Meshes, Scene
 from vap_core.simulation.suites import Judge
 from vap_core.simulation.suites.lists import check
-from vap_core.simulation.suites.open_row import build_scene, make_env
+from vap_core.simulation.suites.open_row import build_scene, make_env, models_of
 from vap_core.simulation.types import EpisodeRow
 
 LONGEST_M = 0.25
@@ -161,19 +161,14 @@ class VapEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
 
     def _scene(self, row: EpisodeRow) -> Scene:
         """A scene with the objects of `row` and of all listed rows of its variant."""
-        models: dict[str, None] = {}
-        for known in (*self.rows, row):
-            if known.variant == row.variant:
-                for place in known.placements:
-                    models[place.model] = None
-        key = (row.variant, tuple(models))
+        of_variant = [known for known in (*self.rows, row) if known.variant == row.variant]
+        models = tuple(models_of(of_variant))
+        key = (row.variant, models)
         if key not in self._scenes:
             if len(self._scenes) >= MOST_SCENES:
                 oldest = next(iter(self._scenes))
                 self._scenes.pop(oldest).close()
-            self._scenes[key] = build_scene(
-                self.suite.name, tuple(models), row.variant, self.robots
-            )
+            self._scenes[key] = build_scene(self.suite.name, models, row.variant, self.robots)
         return self._scenes[key]
 
     def _observe(self) -> dict[str, Any]:

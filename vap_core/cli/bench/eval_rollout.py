@@ -98,19 +98,16 @@ def _build(plan: Plan, folder: Path) -> None:
     from vap_core.policies.lerobot.adapter import load_policy
     from vap_core.rollout.loop import Trial
     from vap_core.rollout.prompters.tint import TintPrompter
-    from vap_core.simulation.suites.open_row import build_scene
+    from vap_core.simulation.suites.open_row import build_scene, models_of
 
-    models: dict[str, None] = {}
-    for row in suites.rows(SUITE, TASK):
-        for placement in row.placements:
-            models[placement.model] = None
+    models = models_of(suites.rows(SUITE, TASK))
     suite = suites.suite(SUITE)
     with toy_sizes(plan.toy):
         policy = load_policy(folder / "pi0", "cpu")
     attender = Attender(load_stack("embedded"), load_bank(folder / "memory"))
     _trial = Trial(
         method="vap",
-        scene=build_scene(SUITE, tuple(models)),
+        scene=build_scene(SUITE, models),
         policy=policy,
         prompter=TintPrompter(attender),
         control=suite.control,

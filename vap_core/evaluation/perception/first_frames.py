@@ -37,7 +37,7 @@ from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.phrases import AMBIGUOUS, UNSEEN
 from vap_core.simulation.env import Env
 from vap_core.simulation.studio import reference_views
-from vap_core.simulation.suites.open_row import build_scene, make_env
+from vap_core.simulation.suites.open_row import build_scene, make_env, models_of
 from vap_core.simulation.types import EpisodeRow
 from vap_core.vote import VoteRule, compare, nominate, similarity, vote
 
@@ -115,7 +115,7 @@ def opening_views(rows: Sequence[EpisodeRow], size: int = 224) -> Iterator[list[
     for row in rows:
         groups.setdefault((row.suite, row.variant), []).append(row)
     for (suite, variant), group in groups.items():
-        with build_scene(suite, _models(group), variant) as scene:
+        with build_scene(suite, models_of(group), variant) as scene:
             env = make_env(scene, suite, image_size=size)
             for row in group:
                 env.reset(row)
@@ -240,16 +240,6 @@ def match(
         else:
             hits.append(False)
     return hits
-
-
-def _models(rows: Sequence[EpisodeRow]) -> list[str]:
-    """The objects that the rows place, in the order of their first places."""
-    models: list[str] = []
-    for row in rows:
-        for place in row.placements:
-            if place.model not in models:
-                models.append(place.model)
-    return models
 
 
 def _opening_views(env: Env, row: EpisodeRow) -> list[View]:

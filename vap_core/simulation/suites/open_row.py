@@ -1,6 +1,6 @@
 """From an episode row to a scene and an environment: with its suite, variant and objects."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 from vap_core.simulation.assets.objects import ObjectModel
@@ -24,6 +24,15 @@ def build_scene(
     """
     robot = suite_called(suite).robot
     return build(robot, models, style=VARIANTS[variant].style, meshes=meshes)
+
+
+def models_of(rows: Iterable[EpisodeRow]) -> list[str]:
+    """The objects that rows place, in the order of their first places."""
+    models: dict[str, None] = {}
+    for row in rows:
+        for place in row.placements:
+            models[place.model] = None
+    return list(models)
 
 
 def make_env(
