@@ -14,6 +14,7 @@ from vap_core.simulation import robots, suites
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.cameras import RIGS, SHIPPED_RIGS
 from vap_core.simulation.robots import mjcf
+from vap_core.simulation.suites.open_row import models_of
 from vap_core.simulation.suites.variants import VARIANTS
 from vap_core.simulation.types import EpisodeRow
 
@@ -33,11 +34,7 @@ def digest(listed: Sequence[tuple[str, Sequence[EpisodeRow]]]) -> str:
     for suite, rows in listed:
         known = suites.suite(suite)
         robot = robots.get(known.robot)
-        placed = set()
-        for row in rows:
-            for place in row.placements:
-                placed.add(place.model)
-        models = [get_object(name) for name in sorted(placed)]
+        models = [get_object(name) for name in sorted(models_of(rows))]
         found.update(_canonical((known, robot, models)) + robot.xml.read_bytes())
         for name, file in mjcf.other_files(robot).items():
             found.update(_canonical((name, hashlib.sha256(file.read_bytes()).hexdigest())))

@@ -3,7 +3,7 @@
 import copy
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -83,7 +83,8 @@ def train_steps[M: nn.Module](
         _set_rate(optimiser, run, step)
         loss, figures = losses(model, step)
         # `figures` are numbers already, so that this waits for nothing more on a GPU.
-        _require_finite(loss, run, step, "loss is", out)
+        remedy = f"not finite at step {step + 1}; {run.slower}, with another --out."
+        require_finite([loss], f"train: {out}: the loss is {remedy}")
         optimiser.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(model.parameters(), 1.0)
@@ -99,8 +100,7 @@ def train_steps[M: nn.Module](
             for name, part in parts.items():
                 saved[name] = part.state_dict()
             # A finite loss can have a gradient that is not.
-            for weight in model.parameters():
-                _require_finite(weight, run, step, "weights are", out)
+            require_finite(model.parameters(), f"train: {out}: the weights are {remedy}")
             with writing(out, "train"):
                 save(saved)
         if last:
@@ -115,6 +115,13 @@ def begun_with(out: Path) -> dict[str, Any]:
     """
     state, _ = checkpoint(out / STATE, resume=True)
     return dict(_made_of(state) or {})
+
+
+def require_finite(tensors: Iterable[Tensor], line: str) -> None:
+    """Raises: BadOutput, which says this line, when one of the numbers is not finite."""
+    for numbers in tensors:
+        if not bool(torch.isfinite(numbers.detach()).all()):
+            raise BadOutput(line)
 
 
 def average_of(batches: list[Figures]) -> Figures:
@@ -147,15 +154,6 @@ def _require_same_training(kept: Any, made_of: Any, out: Path) -> None:
         raise BadOutput(
             f"train: {out} holds a training with another recipe or other data; "
             "go on with those, or choose another --out."
-        )
-
-
-def _require_finite(numbers: Tensor, run: Schedule, step: int, what: str, out: Path) -> None:
-    """Raises: BadOutput when one of the numbers is not finite; `what` names them."""
-    if not bool(torch.isfinite(numbers.detach()).all()):
-        raise BadOutput(
-            f"train: {out}: the {what} not finite at step {step + 1}; {run.slower}, with another "
-            "--out."
         )
 
 

@@ -19,6 +19,7 @@ from vap_core.policies.mini_pi0.learned_token import Photos
 from vap_core.policies.mini_pi0.token_file import Token
 from vap_core.simulation.assets import objects
 from vap_core.simulation.studio import reference_views
+from vap_core.simulation.suites.open_row import models_of
 from vap_core.simulation.types import EpisodeRow
 
 if TYPE_CHECKING:
@@ -175,10 +176,4 @@ def _teach(teacher: "MiniVlm", rows: Sequence[EpisodeRow], folder: Path, suffix:
 
 def _placed(rows: Sequence[EpisodeRow]) -> set[str]:
     """The objects that the rows place, without the goals."""
-    placed = set()
-    goals = set()
-    for row in rows:
-        goals.add(row.goal)
-        for place in row.placements:
-            placed.add(place.model)
-    return placed - goals
+    return set(models_of(rows)) - {row.goal for row in rows}

@@ -15,6 +15,7 @@ from tqdm import tqdm
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import writing
 from vap_core.training.folder import checkpoint
+from vap_core.training.step import require_finite
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,8 @@ def fit(
             )
         head.load_state_dict(state["head"])
         optimiser.load_state_dict(state["optimiser"])
+    head_name = f"train perception: the {run.name} head's"
+    remedy = "run it again with another --seed."
     for epoch in range(state.get("epoch", 0), run.epochs):
         if run.expired():
             return
@@ -84,15 +87,16 @@ def fit(
         for batch, loss in enumerate(bar, start=1):
             done = (epoch * per_epoch + batch) / (run.epochs * per_epoch)
             _set_rate(optimiser, run.rate, done)
-            _require_finite(loss, run, f"loss is not finite at batch {batch} of epoch {epoch + 1}")
+            at = f"not finite at batch {batch} of epoch {epoch + 1}"
+            require_finite([loss], f"{head_name} loss is {at}; {remedy}")
             optimiser.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(head.parameters(), 5.0)
             optimiser.step()
             total += loss.item()
             bar.set_postfix(loss=f"{total / batch:.3f}", refresh=False)
-        for weight in head.parameters():
-            _require_finite(weight, run, f"weights are not finite after epoch {epoch + 1}")
+        at = f"not finite after epoch {epoch + 1}"
+        require_finite(head.parameters(), f"{head_name} weights are {at}; {remedy}")
         saved = {
             "made_of": made_of,
             "head": head.state_dict(),
@@ -102,14 +106,6 @@ def fit(
         }
         with writing(run.file, "train perception"):
             save(saved)
-
-
-def _require_finite(numbers: Tensor, run: Run, fault: str) -> None:
-    """Raises: BadOutput, which tells the fault, when one of the numbers is not finite."""
-    if not bool(torch.isfinite(numbers.detach()).all()):
-        raise BadOutput(
-            f"train perception: the {run.name} head's {fault}; run it again with another --seed."
-        )
 
 
 def _set_rate(optimiser: torch.optim.Optimizer, rate: float, done: float) -> None:
