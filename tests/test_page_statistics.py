@@ -10,9 +10,10 @@ from tests.pages import PAGES, ROOT, table
 from vap_core.evaluation.ablations.arms import ABLATIONS
 from vap_core.evaluation.ablations.table import policy_results
 from vap_core.evaluation.metrics import rate
-from vap_core.evaluation.publish import read_runs
+from vap_core.evaluation.publish import read_published, read_runs
+from vap_core.evaluation.readings import read_log
 from vap_core.evaluation.report.runs import load_runs
-from vap_core.evaluation.statistics import ALL_TASKS, compare
+from vap_core.evaluation.statistics import ALL_TASKS, compare, rate_over_layouts
 from vap_core.training.recipe import RECIPES
 from vap_core.training.words import PAINTS
 
@@ -185,12 +186,54 @@ def test_the_held_out_tints_are_called_unseen_as_tints_alone() -> None:
             assert "tints" in around, f"{page}: {around}"
 
 
-def test_the_bounds_have_the_intervals_of_their_counts() -> None:
+def test_the_bounds_are_those_of_their_table() -> None:
     _, *body = table("| suite | expert (reads the simulator), SR [95 %]")
-    for _, *cells in body:
-        for cell in cells:
-            k, n, text = re.fullmatch(r"(\d+) of (\d+), (.+)", cell).groups()
-            assert text == str(rate(int(k), int(n)))
+    played = pd.concat([rows for _, rows in read_runs(RESULTS / "bounds.parquet")])
+    assert {suite for suite, *_ in body} == set(played.suite)
+    for suite, *cells in body:
+        for policy, cell in zip(("expert", "random"), cells, strict=True):
+            rows = played[(played.suite == suite) & (played.policy == policy)]
+            k, n, errors = rows.success.sum(), len(rows), rows.outcome.eq("error").sum()
+            told = f" ({errors} error)" if errors else ""
+            assert cell == f"{k} of {n}{told}, {rate(int(k), n)}"
+
+
+def test_a_rate_over_several_seeds_has_its_interval_over_layouts() -> None:
+    prose = " ".join(BENCHMARKS.split())
+    ten = pd.concat([rows for _, rows in read_runs(RESULTS / "ten_seeds.parquet")])
+    elsewhere = ten[(ten.method == "vap") & (ten.seed > 0)]
+    assert f"CMR is {rate_over_layouts(elsewhere, 'cmr')};" in prose
+    starts = pd.concat([rows for _, rows in read_runs(RESULTS / "starts.parquet")])
+    first = starts[starts.policy.str.endswith("00c47015") & (starts.method == "vap")]
+    wrong = rate_over_layouts(first[first.seed > 0], "wrong_object")
+    assert f"is moved in {wrong} of VAP's {len(first)} episodes" in prose
+
+
+def test_a_column_of_selections_says_that_a_touch_counts() -> None:
+    heads = [line for line in BENCHMARKS.splitlines() if "| wrong object moved" in line]
+    assert [head.split("|")[1].strip() for head in heads if "moved or touched" not in head] == [
+        "method"
+    ]
+    assert len(heads) == 3
+
+
+def test_the_runs_of_a_policy_are_counted_as_its_table_holds_them() -> None:
+    prose = " ".join(BENCHMARKS.split())
+    counts = set()
+    for name in ("mini_pi0", "by_recipe"):
+        runs: dict[str, set[str]] = {}
+        for manifest, rows in read_published(RESULTS / f"{name}.parquet"):
+            for label in set(rows.policy[rows.suite.isin(("simpler-bridge", "vlabench"))]):
+                runs.setdefault(label, set()).add(manifest["digest"])
+        counts |= {len(digests) for digests in runs.values()}
+    assert counts == {2, 3}
+    assert "It was run, in two or three runs a policy, by" in prose
+    log = read_log(RESULTS / "readings.csv")
+    wide = [line for line in log if line.weights == "9a311f4c1857" and line.rows == 460]
+    listed = [line for line in wide if not line.what_for.startswith("other starts")]
+    arms = [line for line in listed if line.what_for.startswith("arms of ablate")]
+    assert "wide in eleven, seven of them of `ablate`'s arms, and in one from other starts" in prose
+    assert (len(wide) - len(listed), len(listed), len(arms)) == (1, 11, 7)
 
 
 def test_no_zero_of_the_shared_scenes_hides_a_success() -> None:

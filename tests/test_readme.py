@@ -196,11 +196,18 @@ def test_what_policies_reach_from_other_starts() -> None:
         "any-start: never saw a tint, angles with noise": "c657f21c",
         "any-start": "c657f21c",
     }
+    at_home = {"tint-free": "a9ca87ac"}  # the same parameters, in the folder of their training
     played = pd.concat([_played(name) for name in ("starts", "ten_seeds", "more_scenes")])
-    elsewhere = played[(played.suite == "simpler-bridge") & (played.seed > 0)]
+    played = played[played.suite == "simpler-bridge"]
+    elsewhere = played[played.seed > 0]
+    home = pd.concat([played, _played("first_policy"), _played("tint_free")])
+    home = home[(home.suite == "simpler-bridge") & (home.seed == 0)]
     _, *body = table("| policy | method | as listed (seed 0)")
     assert {row[0] for row in body} == set(digests)
-    for name, method, _, cell in body:
+    for name, method, as_listed, cell in body:
+        of_row = home[home.policy.str.endswith(at_home.get(name, digests[name]))]
+        of_row = of_row.drop_duplicates(["policy", "method", "task", "episode"])
+        assert as_listed == f"{_of_way(of_row, _method(method))} of 96", name
         rows = elsewhere[elsewhere.policy.str.endswith(digests[name])]
         quoted, n = re.fullmatch(r"(.+) of (\d+) \(.*", cell.replace("*", "")).groups()
         assert quoted == _over_layouts(rows, _method(method)), name

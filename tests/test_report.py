@@ -178,6 +178,15 @@ def test_the_golden_numbers_by_hand(tmp_path: Path) -> None:
     ] == [12, 12, 6, 4, 2, 2, 2]
 
 
+def test_all_tasks_are_the_same_for_every_method(tmp_path: Path) -> None:
+    """A method that was run on one task of two stands beside the others as half a list."""
+    one = run(tmp_path / "one", methods=["oracle-mask"], tasks=BRIDGE[:1])
+    lines = results(load_runs([run(tmp_path / "both"), one]))
+    together = lines[lines.task == ALL_TASKS].set_index("method")
+    assert together.n.to_dict() == {"generic": 12, "vap": 12, "oracle-mask": 6}
+    assert set(together.listed) == {48}
+
+
 def test_every_latex_table_is_a_whole_one(tmp_path: Path) -> None:
     report([run(tmp_path / "run")], tmp_path)
     for name, tables in (("results.tex", 1), ("comparisons.tex", 1), ("outcomes.tex", 1)):

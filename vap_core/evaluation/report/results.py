@@ -29,8 +29,9 @@ OUTCOMES = ("success", "failure", "error")
 def results(runs: Runs) -> "pd.DataFrame":
     """One row per suite, task, split, method and policy, in the order of the runs.
 
-    After the tasks of each track that has several, rows of ALL_TASKS follow. `n` of `listed`
-    episodes were run, `asked` were asked for. `sr_k` of `sr_n` episodes succeed; `sr_low` and
+    After the tasks of each track that has several, rows of ALL_TASKS follow; their `listed` counts
+    the tasks that any method of the track was asked for. `n` of `listed` episodes were run, `asked`
+    were asked for. `sr_k` of `sr_n` episodes succeed; `sr_low` and
     `sr_high` are Wilson's, `sr_cp_*` Clopper and Pearson's. `sr_layout_*` is the cluster bootstrap
     over starting layouts where a layout was run more than once, else nan. `bound` marks a method or
     policy that reads the simulator. `paper_*` are the paper's numbers.
@@ -48,6 +49,8 @@ def results(runs: Runs) -> "pd.DataFrame":
         .reset_index()
         .merge(counts, on=key, how="left")
     )
+    total = lines["task"] == ALL_TASKS
+    lines.loc[total, "listed"] = lines["seeds"] * _listed_together(runs, lines)
     counted = counts.columns.drop(key)
     lines[counted] = lines[counted].fillna(0).astype(int)
     for name in RATES:
@@ -152,6 +155,16 @@ def _with_totals(runs: Runs) -> "tuple[pd.DataFrame, pd.DataFrame]":
     wanted = with_total(runs.wanted)
     order = wanted.groupby(TRACK, sort=False).ngroup().sort_values(kind="stable").index
     return with_total(runs.table), wanted.loc[order].reset_index(drop=True)
+
+
+def _listed_together(runs: Runs, lines: "pd.DataFrame") -> "pd.Series[int]":
+    """For each line the episodes that one seed lists in all tasks that its track was run on."""
+    import pandas as pd
+
+    by_task = runs.wanted.groupby([*TRACK, "task"], sort=False)["listed"].max()
+    together = by_task.groupby(TRACK, sort=False).sum()
+    of_line = together.loc[pd.MultiIndex.from_frame(lines[TRACK])]
+    return of_line.set_axis(lines.index)
 
 
 def _layout_intervals(table: "pd.DataFrame") -> "pd.DataFrame":
