@@ -20,6 +20,7 @@ from vap_core.evaluation.statistics import (
     ALL_TASKS,
     Comparison,
     compare,
+    holm,
     mcnemar,
     rate_over_layouts,
 )
@@ -142,7 +143,7 @@ def test_what_a_second_training_of_a_tint_share_reaches() -> None:
         ]
     assert len(body) == again.policy.nunique()
     counts, missed = [], []
-    for share in ("0", "0.5"):
+    for share in ("0", "0.2", "0.5"):
         first, second = (
             rows[(rows.method == "vap") & rows.policy.map(checkpoint_of).str.endswith(name)]
             for rows, name in ((listed, SHARES[share]), (again, f"-seed-2-tint-share-{share}"))
@@ -154,7 +155,44 @@ def test_what_a_second_training_of_a_tint_share_reaches() -> None:
         failed = second[~second.success.astype(bool)]
         missed.append(f"{failed.sub_case.eq('missed grasp').sum()} of {len(failed)}")
     assert all(count in PROSE for count in counts)
-    assert f"{' and '.join(missed)} failures are missed grasps." in PROSE
+    assert f"{', '.join(missed[:2])} and {missed[2]} failures are missed grasps." in PROSE
+
+
+def test_an_effect_of_tints_that_the_tables_show_is_told() -> None:
+    """Of every share and arm against the share 0, in both seeds, one is beyond chance."""
+    tables = {1: _played("tint_share").query("seed == 0"), 2: _played("tint_share_again")}
+    found = {}
+    for seed, rows in tables.items():
+        share = rows.policy.map(checkpoint_of).str.extract(r"tint-share-([\d.]+)$")[0].fillna("0")
+        for name in sorted(set(share) - {"0"}):
+            for arm in ABLATIONS["tint-share"].names:
+                none, some = (rows[(rows.method == arm) & (share == of)] for of in ("0", name))
+                pairs = none.merge(some, on=["task", "episode"])
+                assert len(pairs) == 96
+                before, after = pairs.success_x.astype(bool), pairs.success_y.astype(bool)
+                found[seed, name, arm] = (
+                    int((after & ~before).sum()),
+                    int((before & ~after).sum()),
+                )
+    exact = {key: mcnemar(*counts) for key, counts in found.items()}
+    corrected = dict(zip(exact, holm(list(exact.values())), strict=True))
+    key = 2, "0.5", "mask-only"
+    assert [name for name, p in corrected.items() if p < 0.05] == [key]
+    (won, lost), (others_won, others_lost) = found[key], found[2, "0.2", "mask-only"]
+    assert (
+        f"({won} won, {lost} lost; exact p {exact[key]:.3f}, {corrected[key]:.3f} corrected for the "
+        f"{len(found)} comparisons with the share 0 of both seeds)".replace("0.", ".")
+    ) in PROSE
+    assert f"({others_won} won, {others_lost} lost; p .035, not beyond chance" in PROSE
+    for page in ("README.md", "docs/benchmarks.md"):
+        assert re.search(r"(?i)no effect (of the tints )?(on|is)", PAGES[page])[2] == "on"
+
+
+def test_readmes_least_and_greatest_rate_over_tint_shares() -> None:
+    rows = pd.concat([_played("tint_share").query("seed == 0"), _played("tint_share_again")])
+    rates = rows[rows.method == "vap"].groupby("policy").success.mean()
+    assert len(rates) == 4 + 3
+    assert f"[{100 * rates.min():.0f} to {100 * rates.max():.0f} %]" in PAGES["README.md"]
 
 
 def test_what_more_steps_on_the_same_scenes_reach() -> None:
