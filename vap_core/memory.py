@@ -38,7 +38,7 @@ from vap_core.base.types import Description, PersonalObject, Rgb, Target
 from vap_core.instruction.owners import belonging, check_owner, owners_of
 from vap_core.perception.boxes import crop
 from vap_core.perception.protocols import Detector, Encoder, ReferenceCropper
-from vap_core.perception.rows import describe_fault, row_fault
+from vap_core.perception.rows import describe_fault, embed_crops, row_fault
 
 FORMAT = "vap-personal-object"
 VERSION = 1
@@ -106,16 +106,14 @@ def remember(name: str, category: str, crops: Sequence[Rgb], encoder: Encoder) -
     """Embed reference crops that are cut out already.
 
     Raises:
-        BadMemory: no usable name or category; BadPhoto: no crops; BadEncoder: its rows are not
-            one a crop, not finite, or not of length 1 (within 1e-3).
+        BadMemory: no usable name or category; BadPhoto: no crops; BadEncoder: its rows are no
+            float32 array with one a crop, not finite, or not of length 1 (within 1e-3).
     """
     check_names(name, category)
     if not crops:
         raise BadPhoto(f"remember: {name!r} has no photos; give at least one, five are best.")
-    rows = encoder(crops)
+    rows = embed_crops("remember", encoder, crops)
     fault = row_fault(rows, rows)
-    if len(rows) != len(crops):
-        fault = f"{len(rows)} rows for {len(crops)} crops"
     if fault:
         raise BadEncoder(describe_fault("remember", encoder, fault))
     return PersonalObject(
@@ -157,7 +155,10 @@ def check_names(name: str, category: str) -> None:
 
 
 def reference_rows(obj: PersonalObject, encoder: Encoder) -> Float32[np.ndarray, "k d"]:
-    """Z_o by this encoder: the remembered rows if they are its own, else from the kept crops."""
+    """Z_o by this encoder: the remembered rows if they are its own, else from the kept crops.
+
+    Raises: BadEncoder, as `embed_crops` does.
+    """
     if encoder.name == obj.encoder:
         return obj.embeddings
     return _embed_crops(obj, _ByIdentity(encoder))
@@ -372,7 +373,7 @@ class _ByIdentity:
 
 @lru_cache(maxsize=256)
 def _embed_crops(obj: PersonalObject, by: _ByIdentity) -> Float32[np.ndarray, "k d"]:
-    return by.encoder(obj.crops)
+    return embed_crops("remember", by.encoder, obj.crops)
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

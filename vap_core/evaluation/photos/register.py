@@ -92,7 +92,7 @@ def parse_given(
 def choose(
     photos: Sequence[Path], category: str, stack: Stack, given: Mapping[int, Box], *, whole: bool
 ) -> tuple[Reference, ...]:
-    """Read the photos and choose the box of each. Raises: BadPhoto."""
+    """Read the photos and choose the box of each. Raises: BadPhoto, BadEncoder."""
     if not photos:
         raise BadPhoto("register: no photos; name picture files, a folder of them, or --video.")
     pictures = [load_photo(photo, long_side=None) for photo in photos]
@@ -216,7 +216,7 @@ def remember_subjects(
 
     Doubtful crops are used as they are, so that nothing is tuned by hand; a sheet shows each.
 
-    Raises: BadPhoto, BadPhotoSet.
+    Raises: BadPhoto, BadPhotoSet, BadEncoder.
     """
     known = load_bank(folder, stack.encoder.name)
     memory = {}
