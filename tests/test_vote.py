@@ -197,8 +197,14 @@ def attending(encoder: Encoder) -> None:
 @pytest.mark.parametrize(
     ("change", "fault"),
     [
-        (lambda rows: rows.astype(np.float64), r"an array of shape \(\d, 3\) and type float64, not"),
-        (lambda rows: rows.astype(np.float16), r"an array of shape \(\d, 3\) and type float16, not"),
+        (
+            lambda rows: rows.astype(np.float64),
+            r"an array of shape \(\d, 3\) and type float64, not",
+        ),
+        (
+            lambda rows: rows.astype(np.float16),
+            r"an array of shape \(\d, 3\) and type float16, not",
+        ),
         (lambda rows: rows.tolist(), "list, not a NumPy array"),
         (lambda rows: memoryview(rows), "memoryview, not a NumPy array"),
         (lambda rows: None, "NoneType, not a NumPy array"),

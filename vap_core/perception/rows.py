@@ -13,9 +13,7 @@ LENGTH_TOLERANCE = 1e-3
 """How far from 1 an embedding's length may be."""
 
 
-def embed_crops(
-    what: str, encoder: Encoder, crops: Sequence[Rgb]
-) -> Float32[np.ndarray, "n d"]:
+def embed_crops(what: str, encoder: Encoder, crops: Sequence[Rgb]) -> Float32[np.ndarray, "n d"]:
     """The rows of an encoder, as the protocol has them; their numbers may be any.
 
     Raises: BadEncoder: they are no NumPy array of type float32 with one row a crop; the message
