@@ -49,7 +49,11 @@ proposal does."""
 CATEGORY = re.compile(r"[^\W\d_][\w -]*")
 OWNED = re.compile(r"(?:(?:my|our|his|her|their|the|an?) )+(?=.)")
 """What stands before a category in an instruction, and is no part of it."""
+OWNER_WORDS = ("my", "our", "his", "her", "their", "the", "an")
+"""No kind of thing by themselves; "a" may be one, as the letter."""
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,63}")
+NAME_RULE = "letters a to z, digits, space, dot, dash or underscore, at most 64 characters"
+"""`NAME` in words."""
 AGAIN = "register the object again with --replace, or delete the file"
 
 
@@ -133,19 +137,17 @@ def plain_category(category: str) -> str:
 def kind_instead(category: str) -> str:
     """A word to write instead of a category that will not do; "" where it will."""
     plain = plain_category(category)
-    if not CATEGORY.fullmatch(plain):
-        return "cup"
     before = OWNED.match(plain)
-    return plain[before.end() :] if before else ""
+    kind = plain[before.end() :] if before else plain
+    if not CATEGORY.fullmatch(plain) or kind in OWNER_WORDS:
+        return "cup"
+    return kind if before else ""
 
 
 def check_names(name: str, category: str) -> None:
     """Raises: BadMemory: no usable name or category of an object."""
     if not NAME.fullmatch(name):
-        raise BadMemory(
-            f"remember: {name!r} cannot name an object; use letters, digits, space, dot, dash or "
-            "underscore."
-        )
+        raise BadMemory(f"remember: {name!r} cannot name an object; use {NAME_RULE}.")
     kind = kind_instead(category)
     if kind:
         raise BadMemory(
