@@ -25,6 +25,7 @@ from vap_core.perception.embedded.weights import weights_sha256
 from vap_core.perception.foundation.sources import MODELS, TENSORS
 from vap_core.perception.foundation.store import LOCK, VARIABLE
 from vap_core.perception.kept_thresholds import keep_thresholds
+from vap_core.perception.own_parts import describe_parts
 from vap_core.perception.protocols import Encoder, Stack, Thresholds, Tracker
 from vap_core.perception.stacks import STACKS, checksums
 
@@ -141,7 +142,7 @@ def test_calibration_measures_photos_without_the_thresholds_that_it_kept(
 class Shifted(MeanColour):
     """An encoder with a number of its own."""
 
-    def __init__(self, offset: float) -> None:
+    def __init__(self, offset: Any) -> None:
         self.offset = offset
 
 
@@ -192,13 +193,31 @@ class Nested:
     [
         lambda n: {"encoder": Shifted(n)},
         lambda n: {"encoder": Weighted(n)},
+        lambda n: {"encoder": Shifted(np.float32(n))},
+        lambda n: {"encoder": Shifted(np.int64(n))},
+        lambda n: {"encoder": Shifted(np.bool_(n == 1.0))},
+        lambda n: {"encoder": Shifted(np.longdouble(n))},
+        lambda n: {"encoder": Shifted([np.float16(n)])},
         lambda n: {"detector": Nested(Shifted(n))},
         lambda n: {"tracker": Wrapped(Wrapped(SameColour(), 0.0), n)},
         lambda n: {"tracker": Wrapped(Wrapped(SameColour(), n), 0.0)},
         lambda n: {"encoder": Renamed(f"colour-{n}")},
         lambda n: {"segmenter": segmenter, "encoder": Shifted(1.0) if n == 1.0 else MeanColour()},
     ],
-    ids=["number", "array", "nested", "slots", "tracker", "name", "class"],
+    ids=[
+        "number",
+        "array",
+        "float32",
+        "int64",
+        "bool",
+        "longdouble",
+        "list",
+        "nested",
+        "slots",
+        "tracker",
+        "name",
+        "class",
+    ],
 )
 def test_another_own_stack_of_the_same_name_is_another_run(
     parts: Callable[[float], dict[str, Any]], monkeypatch: pytest.MonkeyPatch
@@ -215,6 +234,15 @@ def test_another_own_stack_of_the_same_name_is_another_run(
         digests.append(digest(of_study("mine")))
     assert digests[0] == digests[1] != digests[2]
     assert "parts" not in of_study("embedded"), "digests are those of versions without it"
+
+
+def test_a_number_of_numpy_is_described_as_that_number() -> None:
+    described = []
+    for offset in (2.5, np.float32(2.5)):
+        own = Stack("mine", detector, Shifted(offset), segmenter, SameColour())
+        described.append(json.dumps(describe_parts(lambda own=own: own)))
+    assert described[0] == described[1]
+    assert "2.5" in described[0]
 
 
 def test_another_code_of_an_own_part_is_another_run(

@@ -271,6 +271,40 @@ def test_states_that_are_changed_in_place_are_found() -> None:
         test_policy.test_the_states_it_is_given_stay_as_they_were(Counts(), WHERE)
 
 
+class Pushes(Random):
+    """Moves the simulated robot itself where it plans for one episode alone."""
+
+    def plan_from_simulation(self, states: Any, envs: Any) -> Any:
+        if len(envs) == 1:
+            envs[0].step(np.full(envs[0].action_size, 0.02, np.float32))
+        return super().plan_from_simulation(states, envs)
+
+
+class Reuses(Random):
+    """Writes every chunk into one array."""
+
+    def __init__(self) -> None:
+        self.out = np.zeros((2, 1, 7), np.float32)
+
+    def plan_from_simulation(self, states: Any, envs: Any) -> Any:
+        states, chunks = super().plan_from_simulation(states, envs)
+        self.out[: len(chunks)] = chunks
+        return states, list(self.out[: len(chunks)])
+
+
+def test_states_that_differ_under_the_same_actions_are_found() -> None:
+    runs = [test_policy.episodes(Pushes(), WHERE, batch) for batch in (1, 2)]
+    assert np.array_equal(*[test_policy.actions(run) for run in runs])
+    with pytest.raises(AssertionError):
+        test_policy.test_a_batch_equals_one_by_one(Pushes(), WHERE)
+
+
+def test_a_policy_that_reuses_its_array_keeps_the_contract() -> None:
+    kept(test_policy, policy=Reuses(), where=WHERE)
+    ours = test_policy.actions(test_policy.episodes(Random(), WHERE, batch=2))
+    assert np.array_equal(ours, test_policy.actions(test_policy.episodes(Reuses(), WHERE, 2)))
+
+
 # --- The page ------------------------------------------------------------------------------------
 
 PAGE = (ROOT / "docs" / "contracts.md").read_text()

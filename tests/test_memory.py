@@ -20,6 +20,7 @@ from PIL import Image
 from tests.scanned import EPS, fake_ghostscript
 from tests.toys import TOYS, MeanColour, personal, scene
 from vap_core.base.errors import BadEncoder, BadMemory, BadOutput, BadPhoto
+from vap_core.base.photos import photos_in
 from vap_core.base.types import Description, Rgb
 from vap_core.memory import (
     kind_instead,
@@ -78,6 +79,12 @@ def test_register_uses_the_whole_photo_where_nothing_is_found() -> None:
         ("mug", "The  Coffee cup", 1, "alone, .* --category 'coffee cup'"),
         ("mug", "the my cup", 1, "alone, .* --category cup\\."),
         ("mug", "an apple", 1, "alone, .* --category apple"),
+        ("mug", "my", 1, "'my' cannot be a category; .* alone, .* --category cup\\."),
+        ("mug", "Their", 1, "'Their' cannot be a category; .* --category cup\\."),
+        ("mug", "the my", 1, "'the my' cannot be a category; .* --category cup\\."),
+        ("mug", "a my", 1, "'a my' cannot be a category; .* --category cup\\."),
+        ("grün", "cup", 1, "use letters a to z, digits, .* at most 64 characters\\."),
+        ("m" * 65, "cup", 1, "use letters a to z, digits, .* at most 64 characters\\."),
         ("mug", "cup", 0, "has no photos; give at least one"),
     ],
 )
@@ -361,6 +368,20 @@ def test_whatever_a_decoder_raises_is_one_line(
 def test_ordinary_formats_are_read(tmp_path: Path, kind: str) -> None:
     Image.new("RGB", (8, 6)).save(tmp_path / "a.photo", kind)
     assert load_photo(tmp_path / "a.photo").shape == (6, 8, 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), [("a.jfif", "JPEG"), ("a.JPE", "JPEG"), ("a.mpo", "MPO"), ("a.jpg", "MPO")]
+)
+def test_a_jpeg_of_another_suffix_is_a_photo(tmp_path: Path, name: str, kind: str) -> None:
+    """Windows saves .jfif, and two-lens cameras .mpo, whose first picture is read."""
+    second = Image.new("RGB", (8, 6), (0, 0, 250))
+    more = {"save_all": True, "append_images": [second]} if kind == "MPO" else {}
+    Image.new("RGB", (8, 6), (250, 0, 0)).save(tmp_path / name, kind, **more)
+    (path,) = photos_in(tmp_path)
+    rgb = load_photo(path)
+    assert rgb.shape == (6, 8, 3)
+    assert rgb[..., 0].min() > 240
 
 
 def test_photos_are_turned_upright_and_shrunk(tmp_path: Path) -> None:

@@ -126,6 +126,26 @@ def test_fingers_that_the_mjcf_lacks_are_named(file: Path) -> None:
         build("mine", [])
 
 
+@pytest.mark.parametrize(
+    ("field", "words"),
+    [
+        ("fingers_open=(0.037,)", "2 fingers, 1 open, 2 closed; one each, and at least one finger"),
+        (
+            "fingers_closed=(0.1, 0.1, 0.1)",
+            "2 fingers, 2 open, 3 closed; one each, and at least one finger",
+        ),
+        (
+            "fingers=(), fingers_open=(), fingers_closed=()",
+            "0 fingers, 0 open, 0 closed; one each, and at least one finger",
+        ),
+        ("links=()", "links is empty; name the bodies from the base to the fingers"),
+    ],
+)
+def test_fingers_and_links_are_counted(file: Path, field: str, words: str) -> None:
+    edit(file, 'name="mine", xml', f'name="mine", {field}, xml')
+    assert f"Robot 'mine': {words}" in refusal_of(file)
+
+
 def test_a_file_that_is_not_there_is_named(file: Path, tmp_path: Path) -> None:
     (tmp_path / "mine.xml").unlink()
     words = "mine.xml is no file; give Robot.xml the path of its MJCF."

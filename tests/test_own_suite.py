@@ -193,6 +193,40 @@ def test_what_is_wrong_is_one_line_that_names_the_file(
     assert "\n" not in str(refusal.value)
 
 
+RETURNS = "return episodes made by SUITE.row(task, episode, placements)."
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ("import sys; sys.exit(0)", "let the file end by itself, with SUITE and rows()."),
+        ("import sys; yield sys.exit()", "let the file end by itself, with SUITE and rows()."),
+        ("return None", f"rows() returned NoneType; {RETURNS}"),
+        ("return [1, 2]", f"rows() returned int as an episode; {RETURNS}"),
+        ("pass", f"rows() returned NoneType; {RETURNS}"),
+        ("return 'ab'", f"rows() returned str as an episode; {RETURNS}"),
+    ],
+)
+def test_rows_that_are_no_episodes_are_one_line(file: Path, body: str, words: str) -> None:
+    file.write_text(f"{DOCUMENTED}\n\ndef rows():\n    {body}\n")
+    with pytest.raises(BadSuite) as refusal:
+        suites.open_file(file)
+    said = str(refusal.value)
+    assert said.endswith(words)
+    assert "\n" not in said
+    if "exit" in body:
+        line = len(file.read_text().splitlines())
+        assert f"desk.py, line {line}: sys.exit(" in said
+
+
+def test_a_task_of_a_name_that_is_there_is_refused(file: Path) -> None:
+    """Each episode of it would be run twice."""
+    file.write_text(DOCUMENTED.replace("(PICK,)", "(PICK, PICK)"))
+    with pytest.raises(BadSuite, match="two tasks are called pick-bottle; rename one") as refusal:
+        suites.open_file(file)
+    assert "desk.py" in str(refusal.value)
+
+
 @pytest.mark.parametrize(
     ("edit", "words"),
     [

@@ -87,6 +87,29 @@ def test_given_boxes_and_masks_are_taken(things):
     assert "is not as large as its photo" in line
 
 
+def test_a_comma_or_a_quote_in_a_photos_name_is_no_end_of_a_cell(things):
+    name = 'left, "near".png'
+    (things / "things" / "mug" / "0.png").rename(things / "things" / "mug" / name)
+    quoted = name.replace('"', '""')
+    (things / "things" / "boxes.csv").write_text(f'photo,x0,y0,x1,y1\n"mug/{quoted}",20,20,44,44\n')
+    for i in (1, 2):
+        (things / "things" / "mug" / f"{i}.png").rename(things / "things" / "mug" / f"z{i}.png")
+    assert "4 objects" in paste(things, "set")
+    photo_set = read_photo_set(things / "set")
+    (mug,) = (subject for subject in photo_set.subjects if subject.name == "mug")
+    assert mug.photos[0].path.name == name
+    assert mug.photos[0].box is not None
+    assert mug.photos[0].box.tolist() == [20, 20, 44, 44]
+
+
+def test_a_folder_that_cannot_name_an_object_is_named_before_anything_is_cut(things):
+    (things / "things" / "plant").rename(things / "things" / "grün")
+    words = ("paste-photos", things / "things", things / "set", "--scenes", things / "place")
+    line = refused(*words, "--stack", "toy")
+    assert f"paste-photos: {things / 'things' / 'grün'} cannot name an object" in line
+    assert not (things / "set").exists()
+
+
 @pytest.mark.parametrize(
     ("file", "said"),
     [

@@ -126,6 +126,15 @@ def test_what_is_wrong_with_a_folder_is_one_line(folder, file, text, message):
     assert len(str(error.value).replace(str(folder), "")) <= 300
 
 
+@pytest.mark.parametrize("name", ["grün", "mug!", "m" * 65])
+def test_a_folder_that_cannot_name_an_object_is_named(folder, name):
+    """Before anything is embedded."""
+    (folder / "references" / "mug").rename(folder / "references" / name)
+    with pytest.raises(BadPhotoSet, match="cannot name an object; call it by letters a") as error:
+        read_photo_set(folder)
+    assert str(folder / "references" / name) in str(error.value)
+
+
 def test_the_set_that_ships_is_in_this_form():
     photo_set = read_photo_set(DATA / "photo-set")
     assert [subject.name for subject in photo_set.subjects] == ["cookies"]

@@ -18,11 +18,13 @@ from vap_core.evaluation import engine, trials
 from vap_core.evaluation.processes import results
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import make_trial
+from vap_core.policies.hooks import TEXT, report_input
 from vap_core.policies.protocol import PolicyInput
 from vap_core.policies.scripted.random import Random
 from vap_core.rollout import policy_call as calls
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.policy_call import check_policy, checked_plan, policy_call
+from vap_core.rollout.types import Episode
 from vap_core.simulation.types import EpisodeRow
 
 STUDY = Study((("simpler-bridge", "pick-shaver"),), ("generic",), policy="random", episodes=3)
@@ -256,6 +258,53 @@ def test_a_policy_cannot_write_into_what_it_is_shown(trial: Trial) -> None:
     assert episode.outcome.status == "failure", episode.outcome.detail
     assert shown
     assert max(int(rgb.max()) for rgb in episode.frames[0].images.values()) > 0
+
+
+class Reuses:
+    """Writes every chunk into one array, and plans for one episode at a time."""
+
+    label = "reuses"
+
+    def __init__(self, execute: int) -> None:
+        self.execute = execute
+        self.out = np.zeros((execute, 7), np.float32)
+        self.sent: list[np.ndarray] = []
+
+    def start(self, rng: np.random.Generator) -> None: ...
+
+    def plan(self, states: Sequence[Any], inputs: Sequence[PolicyInput]) -> object:
+        if len(inputs) > 1:
+            raise ValueError("one at a time")
+        report_input(0, TEXT, inputs[0].text)
+        self.out += np.float32(1e-3)
+        self.sent.append(self.out.copy())
+        return states, [self.out]
+
+
+def actions_of(episode: Episode) -> np.ndarray:
+    return np.array([frame.action for frame in episode.frames if frame.action is not None])
+
+
+def test_a_frame_keeps_the_action_that_was_executed(trial: Trial) -> None:
+    """Whatever the policy writes into its array later."""
+    policy = Reuses(execute=1)
+    (episode,) = rollout(replace(trial, policy=policy), ROWS[:1])
+    assert np.array_equal(actions_of(episode), np.concatenate(policy.sent))
+
+
+def test_an_episode_executes_its_own_chunk_to_the_end(trial: Trial) -> None:
+    policy = Reuses(execute=3)
+    episodes = rollout(replace(trial, policy=policy), ROWS[:2], batch=2)
+    for episode, sent in zip(episodes, policy.sent, strict=True):
+        assert np.array_equal(actions_of(episode), sent)
+
+
+def test_an_audit_leaves_the_chunk_as_it_was(trial: Trial) -> None:
+    """Its second call writes into the array that the first one returned."""
+    policy = Reuses(execute=3)
+    (episode,) = rollout(replace(trial, policy=policy, audit=True), ROWS[:1])
+    assert episode.outcome.status == "failure", episode.outcome.detail
+    assert np.array_equal(actions_of(episode), policy.sent[0])
 
 
 @pytest.mark.parametrize(("size", "noted"), [(1e30, True), (100.0, True), (0.01, False)])

@@ -116,6 +116,23 @@ def test_boxes_and_masks_are_read_by_the_photos_name(tmp_path):
         registering.choose(photos, "cup", STACK, {0: given[0]}, whole=True)
 
 
+def test_a_path_of_a_mask_or_photo_may_hold_an_equals_sign(tmp_path):
+    folder = tmp_path / "day=1"
+    folder.mkdir()
+    photos = [*save(folder, [scene([(6, 6, RED)])]), folder / "mug-0.png=b.png"]
+    Image.fromarray(scene([(6, 6, RED)])).save(photos[1], "PNG")
+    mask = np.zeros((64, 64), np.uint8)
+    mask[9:21, 9:21] = 255
+    Image.fromarray(mask).save(folder / "mask.png")
+    for number, photo in enumerate(photos):
+        for name in (photo.name, str(photo)):
+            given = registering.parse_given([], [f"{name}={folder / 'mask.png'}"], photos)
+            assert list(given) == [number]
+            assert given[number].tolist() == [9, 9, 21, 21]
+    with pytest.raises(BadPhoto, match="names no single photo; write --mask PHOTO=MASK.png with"):
+        registering.parse_given([], [str(folder / "mask.png")], photos[:1])
+
+
 def test_a_mask_is_as_large_as_its_photo_and_ends_where_it_is_transparent(tmp_path):
     photos = save(tmp_path, [scene([(6, 6, RED)])])
     small = tmp_path / "small.png"

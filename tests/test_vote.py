@@ -1,7 +1,8 @@
 """The vote against a slow readable reference, exact cases and properties."""
 
 import inspect
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,11 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from tests.toys import TOYS, personal, scene
+from tests.toys import TOYS, MeanColour, personal, scene
 from vap_core.attend import Attender
 from vap_core.base.errors import BadEncoder, UnknownName
 from vap_core.base.types import Boxes, Rgb
+from vap_core.memory import remember
 from vap_core.perception.candidates import Proposals
+from vap_core.perception.protocols import Encoder
+from vap_core.perception.references import choose_references
 from vap_core.vote import compare, similarity, vote
 
 cosines = st.integers(0, 2**31).flatmap(
@@ -160,6 +164,62 @@ def test_rows_that_are_not_of_length_1_elect_nothing() -> None:
     boxes = Boxes(np.array([[0, 0, 9, 9]], np.float32), np.ones(1, np.float32), "cup")
     nearly = Proposals(boxes, mine.embeddings[:1] * np.float32(1.0005))
     assert compare(mine, nearly, TOYS).max() == pytest.approx(1.0)
+
+
+class Returns(MeanColour):
+    """Its rows in another form."""
+
+    def __init__(self, change: Callable[[np.ndarray], object]) -> None:
+        self.change = change
+
+    def __call__(self, crops: Sequence[Rgb]) -> Any:
+        return self.change(super().__call__(crops))
+
+
+PHOTOS = [scene([(4, 4, (200, 30, 30))]), scene([(30, 30, (200, 30, 30))])]
+
+
+def remembering(encoder: Encoder) -> None:
+    remember("mug", "cup", PHOTOS, encoder)
+
+
+def choosing(encoder: Encoder) -> None:
+    choose_references(PHOTOS, "cup", TOYS.detector, encoder)
+
+
+def attending(encoder: Encoder) -> None:
+    memory = {"mug": personal("mug", "cup", (200, 30, 30))}
+    stack = TOYS.with_parts("mine", encoder=encoder)
+    Attender(stack, memory).start({"front": PHOTOS[0]}, "bring my cup")
+
+
+@pytest.mark.parametrize("ask", [remembering, choosing, attending])
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        (
+            lambda rows: rows.astype(np.float64),
+            r"an array of shape \(\d, 3\) and type float64, not",
+        ),
+        (
+            lambda rows: rows.astype(np.float16),
+            r"an array of shape \(\d, 3\) and type float16, not",
+        ),
+        (lambda rows: rows.tolist(), "list, not a NumPy array"),
+        (lambda rows: memoryview(rows), "memoryview, not a NumPy array"),
+        (lambda rows: None, "NoneType, not a NumPy array"),
+        (lambda rows: rows.ravel(), r"an array of shape \(\d,\) and type float32, not"),
+        (lambda rows: rows[:-1], r"\d rows for \d crops"),
+        (lambda rows: 0 * rows, "a row of length 0, not of length 1"),
+    ],
+)
+def test_rows_of_another_form_are_one_line(
+    ask: Callable[[Encoder], None], change: Callable[[np.ndarray], object], fault: str
+) -> None:
+    with pytest.raises(BadEncoder, match=f"'mean-colour' gave {fault}") as caught:
+        ask(Returns(change))
+    assert "\n" not in str(caught.value)
+    assert "--encoder MODULE:NAME" in str(caught.value)
 
 
 def test_rows_of_another_width_are_one_line() -> None:

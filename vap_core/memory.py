@@ -38,7 +38,7 @@ from vap_core.base.types import Description, PersonalObject, Rgb, Target
 from vap_core.instruction.owners import belonging, check_owner, owners_of
 from vap_core.perception.boxes import crop
 from vap_core.perception.protocols import Detector, Encoder, ReferenceCropper
-from vap_core.perception.rows import describe_fault, row_fault
+from vap_core.perception.rows import describe_fault, embed_crops, row_fault
 
 FORMAT = "vap-personal-object"
 VERSION = 1
@@ -49,7 +49,11 @@ proposal does."""
 CATEGORY = re.compile(r"[^\W\d_][\w -]*")
 OWNED = re.compile(r"(?:(?:my|our|his|her|their|the|an?) )+(?=.)")
 """What stands before a category in an instruction, and is no part of it."""
+OWNER_WORDS = ("my", "our", "his", "her", "their", "the", "an")
+"""No kind of thing by themselves; "a" may be one, as the letter."""
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,63}")
+NAME_RULE = "letters a to z, digits, space, dot, dash or underscore, at most 64 characters"
+"""`NAME` in words."""
 AGAIN = "register the object again with --replace, or delete the file"
 
 
@@ -106,16 +110,14 @@ def remember(name: str, category: str, crops: Sequence[Rgb], encoder: Encoder) -
     """Embed reference crops that are cut out already.
 
     Raises:
-        BadMemory: no usable name or category; BadPhoto: no crops; BadEncoder: its rows are not
-            one a crop, not finite, or not of length 1 (within 1e-3).
+        BadMemory: no usable name or category; BadPhoto: no crops; BadEncoder: its rows are no
+            float32 array with one a crop, not finite, or not of length 1 (within 1e-3).
     """
     check_names(name, category)
     if not crops:
         raise BadPhoto(f"remember: {name!r} has no photos; give at least one, five are best.")
-    rows = encoder(crops)
+    rows = embed_crops("remember", encoder, crops)
     fault = row_fault(rows, rows)
-    if len(rows) != len(crops):
-        fault = f"{len(rows)} rows for {len(crops)} crops"
     if fault:
         raise BadEncoder(describe_fault("remember", encoder, fault))
     return PersonalObject(
@@ -135,19 +137,17 @@ def plain_category(category: str) -> str:
 def kind_instead(category: str) -> str:
     """A word to write instead of a category that will not do; "" where it will."""
     plain = plain_category(category)
-    if not CATEGORY.fullmatch(plain):
-        return "cup"
     before = OWNED.match(plain)
-    return plain[before.end() :] if before else ""
+    kind = plain[before.end() :] if before else plain
+    if not CATEGORY.fullmatch(plain) or kind in OWNER_WORDS:
+        return "cup"
+    return kind if before else ""
 
 
 def check_names(name: str, category: str) -> None:
     """Raises: BadMemory: no usable name or category of an object."""
     if not NAME.fullmatch(name):
-        raise BadMemory(
-            f"remember: {name!r} cannot name an object; use letters, digits, space, dot, dash or "
-            "underscore."
-        )
+        raise BadMemory(f"remember: {name!r} cannot name an object; use {NAME_RULE}.")
     kind = kind_instead(category)
     if kind:
         raise BadMemory(
@@ -157,7 +157,10 @@ def check_names(name: str, category: str) -> None:
 
 
 def reference_rows(obj: PersonalObject, encoder: Encoder) -> Float32[np.ndarray, "k d"]:
-    """Z_o by this encoder: the remembered rows if they are its own, else from the kept crops."""
+    """Z_o by this encoder: the remembered rows if they are its own, else from the kept crops.
+
+    Raises: BadEncoder, as `embed_crops` does.
+    """
     if encoder.name == obj.encoder:
         return obj.embeddings
     return _embed_crops(obj, _ByIdentity(encoder))
@@ -372,7 +375,7 @@ class _ByIdentity:
 
 @lru_cache(maxsize=256)
 def _embed_crops(obj: PersonalObject, by: _ByIdentity) -> Float32[np.ndarray, "k d"]:
-    return by.encoder(obj.crops)
+    return embed_crops("remember", by.encoder, obj.crops)
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

@@ -19,7 +19,7 @@ from vap_core.perception.boxes import box_cover
 from vap_core.perception.candidates import Candidates, Proposals
 from vap_core.perception.proof import MOST_COMPARED, prove
 from vap_core.perception.protocols import Stack
-from vap_core.perception.rows import describe_fault, row_fault
+from vap_core.perception.rows import describe_fault, embed_crops, row_fault
 
 VoteRule = Literal["vote", "average", "best"]
 RULES: tuple[str, ...] = get_args(VoteRule)
@@ -50,7 +50,7 @@ def compare(
     references = reference_rows(obj, encoder)
     fault = row_fault(proposals.embeddings, references) or row_fault(references, references)
     if fault:
-        again = encoder(list(obj.crops))
+        again = embed_crops("vote", encoder, obj.crops)
         kind = BadEncoder if row_fault(again, references) else BadCrop
         raise kind(describe_fault("vote", encoder, fault))
     return similarity(proposals.embeddings, references)

@@ -1,11 +1,22 @@
 """Tables that people write: CSV files of named columns, read with the number of each line."""
 
 import csv
-from collections.abc import Sequence
+import io
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from vap_core.base.errors import VapError
-from vap_core.base.files import check_regular
+from vap_core.base.files import check_regular, write_atomic
+
+
+def write_rows(path: Path, rows: Iterable[Sequence[object]]) -> None:
+    """Write rows, the columns' names first; a cell with a comma or a quote is quoted.
+
+    Raises: OSError.
+    """
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    write_atomic(path, text.getvalue().encode())
 
 
 def read_rows(

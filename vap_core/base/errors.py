@@ -103,7 +103,7 @@ class BadViews(VapError):
 
 
 class BadEncoder(VapError):
-    """An encoder whose rows are not finite, not of length 1, or of another width."""
+    """An encoder whose rows have another form than asked for, are not finite or not of length 1."""
 
 
 class BadCrop(BadEncoder):

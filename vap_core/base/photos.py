@@ -19,7 +19,7 @@ Ghostscript on the file, whatever the file's suffix.
 PHOTO_FORMATS = (*PICTURE_FORMATS, "HEIF")
 """Of a user's photos; HEIF, which phones write, needs a plugin."""
 PICTURE_SUFFIXES = (
-    *(".jpg", ".jpeg", ".png", ".webp", ".bmp", ".gif"),
+    *(".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".webp", ".bmp", ".gif"),
     *(".tif", ".tiff", ".avif", ".heic", ".heif"),
 )
 MAX_PIXELS = 50_000_000

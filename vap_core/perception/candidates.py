@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float32, Int64
 from vap_core.base.types import Boxes, Rgb, Views, value
 from vap_core.perception.boxes import box_iou, crop
 from vap_core.perception.protocols import Stack
+from vap_core.perception.rows import embed_crops
 
 SAME_BOX_IOU = 0.7
 """Boxes of two phrases that overlap by more than this IoU are the same object."""
@@ -59,9 +60,9 @@ def embed_views(views: Views, boxes: Mapping[str, Boxes], stack: Stack) -> dict[
 
 
 def embed(rgb: Rgb, boxes: Boxes, stack: Stack) -> Proposals:
-    """The embeddings of every box of one view."""
-    encoder = stack.encoder_of(boxes)
-    return Proposals(boxes, encoder([crop(rgb, box) for box in boxes.xyxy]))
+    """The embeddings of every box of one view. Raises: BadEncoder, as `embed_crops` does."""
+    crops = [crop(rgb, box) for box in boxes.xyxy]
+    return Proposals(boxes, embed_crops("embed", stack.encoder_of(boxes), crops))
 
 
 def segment(

@@ -14,9 +14,9 @@ from vap_core.perception.protocols import Stack, Tracker
 def describe_parts(make: Callable[[], Stack]) -> dict[str, Any]:
     """The stack that `make` returns, as JSON.
 
-    Of each part it has the class, the class's source, and the attributes that are numbers, words,
-    arrays, lists of these, dataclasses or further parts. Others are left out: dictionaries, a
-    network's weights, what a closure or a partial holds.
+    Of each part it has the class, the class's source, and the attributes that are numbers (NumPy's,
+    too), words, arrays, lists of these, dataclasses or further parts. Others are left out:
+    dictionaries, a network's weights, what a closure or a partial holds.
     """
     stack = make()
     about: dict[str, Any] = {"made by": source_digest(make), "encoder name": stack.encoder.name}
@@ -29,6 +29,9 @@ def _describe(part: Any, within: tuple[int, ...]) -> Any:
     """A part as JSON; `within` are the ids of the parts that hold it."""
     if part is None or isinstance(part, str | int | float):
         return part
+    if isinstance(part, np.generic):
+        number = part.item()
+        return number if isinstance(number, str | int | float) else repr(number)
     if isinstance(part, np.ndarray):
         return hashlib.sha256(str((part.dtype, part.shape)).encode() + part.tobytes()).hexdigest()
     if id(part) in within:
@@ -48,7 +51,7 @@ def _describe(part: Any, within: tuple[int, ...]) -> Any:
 
 def _counts(value: Any) -> bool:
     """Whether a value is one that `describe_parts` describes."""
-    if isinstance(value, str | int | float | np.ndarray | list | tuple):
+    if isinstance(value, str | int | float | np.generic | np.ndarray | list | tuple):
         return True
     return callable(value) or isinstance(value, Tracker) or is_dataclass(value)
 

@@ -10,9 +10,11 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 
+from vap_core.base.errors import BadEncoder
 from vap_core.base.types import Boxes, Rgb, value
 from vap_core.perception.boxes import box_iou, crop
 from vap_core.perception.protocols import Detector, Encoder, ReferenceCropper
+from vap_core.perception.rows import describe_fault, embed_crops, row_fault
 
 THRESHOLD = 0.05
 """Photos of the object show one of its kind, so a box needs a lower score than a proposal does."""
@@ -73,6 +75,9 @@ def choose_references(
     """The box of every photo: the given one (by the photo's number), else the one that is chosen.
 
     A box None is none. A photo in which nothing is proposed is used whole, and its doubt says so.
+
+    Raises: BadEncoder: its rows are no float32 array with one a crop, not finite, or not of length
+        1 (within 1e-3): no box would resemble another.
     """
     boxes_given = {i: box for i, box in (given or {}).items() if box is not None}
     proposals = []
@@ -80,7 +85,11 @@ def choose_references(
     for i, photo in enumerate(photos):
         boxes = _boxes_of(photo, category, detector, boxes_given.get(i))
         proposals.append(boxes)
-        rows.append(encoder([crop(photo, box) for box in boxes.xyxy]))
+        crops = [crop(photo, box) for box in boxes.xyxy]
+        rows.append(embed_crops("remember", encoder, crops))
+        fault = row_fault(rows[i], rows[0])
+        if fault:
+            raise BadEncoder(describe_fault("remember", encoder, fault))
     references = []
     for i, photo in enumerate(photos):
         others = rows[:i] + rows[i + 1 :]

@@ -33,6 +33,7 @@ def plan(
     with observe_inputs() as of_prompted:
         returned = policy.plan(states, prompted)
         after, chunks = checked_plan(returned, policy.label, len(states))
+    chunks = copy.deepcopy(chunks)  # the second call may write into the same arrays
     with observe_inputs() as of_raw:
         policy.plan(spare, raw)
     if len(of_prompted) != len(prompted):

@@ -390,7 +390,8 @@ def _plan(trial: Trial, live: Sequence[RunningEpisode], steps: dict[int, Step]) 
     share = (time.perf_counter() - start) / len(calling)
     for episode, state, chunk in zip(calling, states, chunks, strict=True):
         episode.policy_state = state
-        episode.queue.extend(chunk[: trial.policy.execute])
+        # A copy: the policy may write its next chunk into the same array.
+        episode.queue.extend(np.array(chunk[: trial.policy.execute]))
         episode.seconds["policy"] += share
 
 

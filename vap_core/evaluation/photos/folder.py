@@ -25,7 +25,7 @@ from vap_core.base.csv_rows import read_rows
 from vap_core.base.errors import BadPhotoSet
 from vap_core.base.photos import photos_in
 from vap_core.base.types import value
-from vap_core.memory import kind_instead, plain_category
+from vap_core.memory import NAME, NAME_RULE, kind_instead, plain_category
 
 BOX = ("x0", "y0", "x1", "y1")
 MASKS = "masks"
@@ -135,6 +135,7 @@ def _read_references(folder: Path) -> dict[str, tuple[ReferencePhoto, ...]]:
     boxes = read_boxes(folder / BOXES_CSV)
     objects = {}
     for path in folders:
+        check_object_folder(path)
         photos = []
         for photo in photos_in(path):
             photos.append(ReferencePhoto(photo, boxes.pop(f"{path.name}/{photo.name}", None)))
@@ -150,6 +151,12 @@ def _read_references(folder: Path) -> dict[str, tuple[ReferencePhoto, ...]]:
             "name photos as OBJECT/FILE."
         )
     return objects
+
+
+def check_object_folder(path: Path, caller: str = "eval-photos") -> None:
+    """Raises: BadPhotoSet: the object of a folder of photos cannot be called as the folder is."""
+    if not NAME.fullmatch(path.name):
+        raise BadPhotoSet(f"{caller}: {path} cannot name an object; call it by {NAME_RULE}.")
 
 
 def read_boxes(path: Path) -> dict[str, Box]:

@@ -19,8 +19,9 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from vap_core.base.csv_rows import write_rows
 from vap_core.base.errors import BadOutput, BadPhoto, BadPhotoSet
-from vap_core.base.files import write_atomic, writing
+from vap_core.base.files import writing
 from vap_core.base.photos import load_mask, load_photo, photos_in
 from vap_core.base.types import Boxes, Mask, Rgb, value
 from vap_core.evaluation.photos.folder import (
@@ -30,6 +31,7 @@ from vap_core.evaluation.photos.folder import (
     OBJECTS_CSV,
     SCENES_CSV,
     Box,
+    check_object_folder,
     read_boxes,
     read_categories,
 )
@@ -99,7 +101,7 @@ def paste_photos(photos: Path, scenes: Path, out: Path, asked: Pasting, stack: S
     cuts: dict[str, list[Cut]] = {}
     kept: dict[str, list[Path]] = {}
     left_out = []
-    known = [",".join(("photo", *BOX))]
+    known: list[tuple[str, ...]] = [("photo", *BOX)]
     for name, paths in sources.items():
         references, rest = split(paths)
         given = [boxes.get(f"{name}/{path.name}") for path in paths]
@@ -112,14 +114,14 @@ def paste_photos(photos: Path, scenes: Path, out: Path, asked: Pasting, stack: S
         kept[name] = references
         for path, box in zip(references, given, strict=False):
             if box is not None:
-                known.append(f"{name}/{path.name},{','.join(f'{x:g}' for x in box)}")
+                known.append((f"{name}/{path.name}", *(f"{x:g}" for x in box)))
     if len(cuts) < 2:
         raise BadPhotoSet(f"paste-photos: {photos} gives fewer than two objects to paste.")
     try:
         for name, references in kept.items():
             _copy(references, out / "references" / name)
         if len(known) > 1:
-            write_atomic(out / BOXES_CSV, ("\n".join(known) + "\n").encode())
+            write_rows(out / BOXES_CSV, known)
         _write_cuts(out / "cuts.png", cuts)
         questions = _write_pictures(out, backgrounds, cuts, categories, asked)
     except BaseException:  # an interruption, too
@@ -137,7 +139,7 @@ def _write_pictures(
     asked: Pasting,
 ) -> int:
     """The scenes and their tables; returns how many questions they ask. Raises: BadPhoto."""
-    rows = ["scene,object,x0,y0,x1,y1"]
+    rows: list[tuple[object, ...]] = [("scene", "object", *BOX)]
     for number in range(asked.pictures):
         rng = np.random.default_rng([asked.seed, number])
         ground = _cover(load_photo(backgrounds[number % len(backgrounds)], None), asked)
@@ -145,12 +147,12 @@ def _write_pictures(
         scene = f"{number:03}.png"
         write_picture(out / "scenes" / scene, picture)
         for name, corners in placed.items():
-            rows.append(f"{scene},{name},{','.join(map(str, corners))}")
+            rows.append((scene, name, *corners))
         for name in absent(list(placed), list(cuts), categories, rng):
-            rows.append(f"{scene},{name},,,,")
-    kinds = [f"{name},{categories[name]}" for name in cuts]
-    write_atomic(out / SCENES_CSV, ("\n".join(rows) + "\n").encode())
-    write_atomic(out / OBJECTS_CSV, ("\n".join(["object,category", *kinds]) + "\n").encode())
+            rows.append((scene, name, "", "", "", ""))
+    kinds = [(name, categories[name]) for name in cuts]
+    write_rows(out / SCENES_CSV, rows)
+    write_rows(out / OBJECTS_CSV, [("object", "category"), *kinds])
     return len(rows) - 1
 
 
@@ -257,6 +259,8 @@ def _sources(photos: Path) -> dict[str, list[Path]]:
     folders = [path for path in photos.iterdir() if path.is_dir() and path.name != MASKS]
     for folder in sorted(folders):
         found = photos_in(folder)
+        if found:
+            check_object_folder(folder, "paste-photos")
         if len(found) == 1:
             raise BadPhotoSet(
                 f"paste-photos: {folder} holds one photo; two are needed, one of them to cut out."

@@ -6,17 +6,17 @@ objects are taken whose results its authors report, as references the split `tra
 `test_dense`, whose masks are drawn. A scene has one object with a mask; the others in it have none.
 """
 
-import csv
 import io
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from vap_core.base.csv_rows import write_rows
 from vap_core.base.errors import BadPhotoSet
 from vap_core.base.files import kept_folder, parse_json, read_file, sha256_of, write_atomic
 from vap_core.base.photos import PICTURE_FORMATS, load_photo
@@ -109,9 +109,9 @@ def _write(origin: Path, folder: Path) -> None:
         target = folder / MASKS / photo.name / f"{name}.png"
         target.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(target, cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes())
-    _write_csv(folder / BOXES_CSV, reference_boxes)
-    _write_csv(folder / OBJECTS_CSV, [("object", "category"), *kinds.items()])
-    _write_csv(folder / SCENES_CSV, scene_boxes)
+    write_rows(folder / BOXES_CSV, reference_boxes)
+    write_rows(folder / OBJECTS_CSV, [("object", "category"), *kinds.items()])
+    write_rows(folder / SCENES_CSV, scene_boxes)
 
 
 def _reported_objects(origin: Path) -> dict[str, str]:
@@ -211,9 +211,3 @@ def _box(mask: Mask, photo: Path) -> tuple[str, ...]:
     if box is None:
         raise BadPhotoSet(f"eval-photos: the mask of {photo} is empty; report it to {REPO}.")
     return tuple(f"{value:g}" for value in box)
-
-
-def _write_csv(path: Path, rows: Sequence[tuple[str, ...]]) -> None:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    write_atomic(path, text.getvalue().encode())

@@ -92,7 +92,7 @@ def parse_given(
 def choose(
     photos: Sequence[Path], category: str, stack: Stack, given: Mapping[int, Box], *, whole: bool
 ) -> tuple[Reference, ...]:
-    """Read the photos and choose the box of each. Raises: BadPhoto."""
+    """Read the photos and choose the box of each. Raises: BadPhoto, BadEncoder."""
     if not photos:
         raise BadPhoto("register: no photos; name picture files, a folder of them, or --video.")
     pictures = [load_photo(photo, long_side=None) for photo in photos]
@@ -216,7 +216,7 @@ def remember_subjects(
 
     Doubtful crops are used as they are, so that nothing is tuned by hand; a sheet shows each.
 
-    Raises: BadPhoto, BadPhotoSet.
+    Raises: BadPhoto, BadPhotoSet, BadEncoder.
     """
     known = load_bank(folder, stack.encoder.name)
     memory = {}
@@ -240,13 +240,18 @@ def remember_subjects(
 
 
 def _split(text: str, photos: Sequence[Path], option: str, form: str) -> tuple[int, str]:
-    """The photo's number and the rest of "PHOTO=REST"."""
-    photo, _, words = text.rpartition("=")
+    """The photo's number and the rest of "PHOTO=REST"; both may hold "=", too."""
+    photo = ""
+    for path in photos:
+        for known in (str(path), path.name):
+            if text.startswith(f"{known}=") and len(known) > len(photo):
+                photo = known
     fitting = []
     for i, path in enumerate(photos):
         if photo in (str(path), path.name):
             fitting.append(i)
-    if not photo and len(photos) == 1:
+    words = text[len(photo) :].removeprefix("=")
+    if not photo and "=" not in words and len(photos) == 1:
         fitting = [0]
     if len(fitting) != 1:
         names = [shlex.quote(_shortest_name(path, photos)) for path in photos[:6]]

@@ -7,6 +7,7 @@ import numpy as np
 from vap_core.base.types import PersonalObject, Rgb, value
 from vap_core.perception.protocols import Encoder
 from vap_core.perception.references import LEAST_COSINE, SMALL_PX, Reference
+from vap_core.perception.rows import embed_crops
 from vap_core.vote import similarity, vote
 
 FEWEST = 3
@@ -56,7 +57,7 @@ def leave_one_out(
     background: list[Rgb] = []
     for reference in references:
         background.extend(reference.others)
-    rows = [encoder(background)]
+    rows = [embed_crops("remember", encoder, background)]
     names = [""] * len(background)
     for other in bank.values():
         if other.name != obj.name and other.encoder == obj.encoder:

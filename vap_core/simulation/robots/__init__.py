@@ -34,7 +34,8 @@ class Robot:
     lean before a pose counts as out of reach.
     `table_m` is the table top's (x0, y0, x1, y1) and `floor_z_m` the floor below it, metres in the
     world frame.
-    Raises: ValueError when joints, home angles and speeds differ in number.
+    Raises: ValueError when joints, home angles and speeds differ in number, or fingers and their
+        two lists of travel; when there is no finger or no link.
     """
 
     name: str
@@ -63,6 +64,16 @@ class Robot:
             raise ValueError(
                 f"Robot {self.name!r}: {len(self.joints)} joints, {len(self.home)} home angles, "
                 f"{len(self.speed_rad_s)} speeds; one each"
+            )
+        n = len(self.fingers)
+        if not n == len(self.fingers_open) == len(self.fingers_closed) or n == 0:
+            raise ValueError(
+                f"Robot {self.name!r}: {n} fingers, {len(self.fingers_open)} open, "
+                f"{len(self.fingers_closed)} closed; one each, and at least one finger"
+            )
+        if not self.links:
+            raise ValueError(
+                f"Robot {self.name!r}: links is empty; name the bodies from the base to the fingers"
             )
 
 

@@ -136,6 +136,9 @@ def _said(error: BaseException) -> str:
         wrong = WRONG_TYPE.search(str(error))
         if wrong is not None:
             return _wrong_type(**wrong.groupdict())
+    if isinstance(error, SystemExit):
+        called = f"sys.exit({error.code!r}) was called"
+        return f"{called}; let the file end by itself, with SUITE and rows()."
     words = " ".join(str(error).split()).removesuffix(".")
     return f"{words}." if isinstance(error, VapError) else f"{type(error).__name__}: {words}."
 
@@ -162,8 +165,32 @@ def _short(text: str) -> str:
     return line if len(line) <= LONGEST_VALUE else f"{line[:LONGEST_VALUE]}..."
 
 
+def _check_tasks(suite: Suite) -> None:
+    """Raises: BadSuite: a task's words do not fit, or two tasks have one name."""
+    names = set()
+    for task in suite.tasks:
+        wording.check(task)
+        if task.name in names:
+            raise BadSuite(f"two tasks are called {task.name}; rename one")
+        names.add(task.name)
+
+
+def _made_rows(make_rows: Callable[[], object]) -> tuple[EpisodeRow, ...]:
+    """What `rows()` returns. Raises: BadSuite: it is no list of episodes."""
+    mend = "return episodes made by SUITE.row(task, episode, placements)"
+    made = make_rows()
+    if not isinstance(made, Iterable):
+        raise BadSuite(f"rows() returned {type(made).__name__}; {mend}")
+    rows = []
+    for row in made:
+        if not isinstance(row, EpisodeRow):
+            raise BadSuite(f"rows() returned {type(row).__name__} as an episode; {mend}")
+        rows.append(row)
+    return tuple(rows)
+
+
 def _checked_rows(
-    suite: Suite, make_rows: Callable[[], Iterable[EpisodeRow]], path: Path
+    suite: Suite, make_rows: Callable[[], object], path: Path
 ) -> tuple[EpisodeRow, ...]:
     """The suite's list, once it names only what exists. Raises: BadSuite."""
     try:
@@ -178,9 +205,8 @@ def _checked_rows(
         for camera in suite.cameras:
             if camera not in rigs:
                 raise one_of(f"suite {suite.name}: camera", camera, sorted(rigs))
-        for task in suite.tasks:
-            wording.check(task)
-        rows = tuple(make_rows())
+        _check_tasks(suite)
+        rows = _made_rows(make_rows)
         lists.check(rows, suite)
         keys = set()
         for row in rows:
@@ -205,7 +231,7 @@ def _checked_rows(
         for task in suite.tasks:
             if not any(row.task == task.name for row in rows):
                 raise BadSuite(f"task {task.name} has no row")
-    except Exception as error:  # rows() is the user's: anything may come of it
+    except (Exception, SystemExit) as error:  # rows() is the user's: anything may come of it
         raise BadSuite(f"suites: {_place(path, path.resolve(), error)}: {_said(error)}") from error
     return rows
 

@@ -19,7 +19,7 @@ import numpy as np
 from vap_core import __version__
 from vap_core.base.errors import BadObject
 from vap_core.base.limits import bounded
-from vap_core.memory import NAME, kind_instead, plain_category
+from vap_core.memory import NAME, NAME_RULE, kind_instead, plain_category
 from vap_core.simulation import robots
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.scans.bake import (
@@ -139,8 +139,7 @@ def _flat_below(surface: ScannedSurface, up: UpAxis) -> float:
 def _check_arguments(name: str, category: str, mass_kg: float | None) -> None:
     if not NAME.fullmatch(name):
         raise BadObject(
-            f"objects: {name!r} cannot name an object; use letters, digits, space, dot, dash or "
-            "underscore, for example --name my-mug."
+            f"objects: {name!r} cannot name an object; use {NAME_RULE}, for example --name my-mug."
         )
     if name in objects.OBJECTS or "-generic-" in name:
         raise BadObject(
