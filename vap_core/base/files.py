@@ -15,7 +15,7 @@ from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
-from vap_core.base.errors import BadOutput
+from vap_core.base.errors import BadOutput, first_line
 
 if TYPE_CHECKING:
     import numpy as np
@@ -192,6 +192,17 @@ def encode_tensors(tensors: "Mapping[str, np.ndarray]", metadata: Mapping[str, s
     ).encode()
     header += b" " * (-len(header) % 8)
     return struct.pack("<Q", len(header)) + header + data[8 + size :]
+
+
+@contextmanager
+def saving_tensors() -> Iterator[None]:
+    """Inside, safetensors writes a file. Raises: OSError where it cannot."""
+    from safetensors import SafetensorError
+
+    try:
+        yield
+    except SafetensorError as error:
+        raise OSError(first_line(error)) from error
 
 
 def parse_json(text: str | bytes) -> Any:

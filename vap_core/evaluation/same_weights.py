@@ -23,7 +23,7 @@ class SameWeights:
         """The first checksum that this process received, by suite and policy."""
 
     def check(self, folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Raises: BadPolicy when the rows are of other weights than those of the run in `folder`."""
+        """Raises: BadPolicy when the rows are of other weights than the run in `folder`."""
         self._check_files(folder)
         for row in rows:
             checksum = row.get("policy_sha256")
