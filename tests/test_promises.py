@@ -11,8 +11,12 @@ from pathlib import Path
 import pytest
 
 import vap_core
+from vap_core import memory
 from vap_core.base import files, parquet
-from vap_core.base.errors import LONGEST, BadObject, BadOutput, BadSuite, one_of
+from vap_core.base.errors import LONGEST, BadMemory, BadObject, BadOutput, BadSuite, one_of
+from vap_core.evaluation import readings, store
+from vap_core.instruction import history
+from vap_core.policies.mini_pi0 import token_file
 from vap_core.recording import viewer
 from vap_core.simulation.suites import lists
 
@@ -197,6 +201,37 @@ def test_a_table_that_cannot_be_opened_is_not_to_be_deleted(
     with pytest.raises(BadOutput, match=reason) as told:
         parquet.read_parquet(damaged(tmp_path / "a.parquet"), "x", "delete it")
     assert "delete" not in str(told.value)
+
+
+READS_WHOLE_FILES = {
+    "memory": (memory.load, "mug.safetensors", BadMemory),
+    "token": (lambda path: token_file.load(path.parent, "mug", "model"), "mug.token.safetensors", BadMemory),
+    "history": (lambda path: history.read_uses(path.parent), history.FILE, BadMemory),
+    "run": (lambda path: store.read_manifest(path.parent), store.MANIFEST, BadOutput),
+    "log": (readings.read_log, "readings.csv", BadOutput),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", READS_WHOLE_FILES)
+def test_a_file_larger_than_any_memory_is_one_line(tmp_path: Path, kind: str) -> None:
+    read, name, error = READS_WHOLE_FILES[kind]
+    (tmp_path / name).touch()
+    os.truncate(tmp_path / name, 1 << 42)
+    with pytest.raises(error) as caught:
+        read(tmp_path / name)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_file_for_which_the_memory_does_not_suffice_is_an_error_of_reading(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def exhausted(path: Path) -> bytes:
+        raise MemoryError
+
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(Path, "read_bytes", exhausted)
+    with pytest.raises(OSError, match="Cannot allocate memory"):
+        files.read_file(tmp_path / "file")
 
 
 def test_arrays_of_objects_are_refused_wherever_arrays_are_read(tmp_path: Path) -> None:
