@@ -7,7 +7,10 @@ from contextlib import contextmanager
 
 @contextmanager
 def full_disk(n_bytes: int = 0) -> Iterator[None]:
-    """Inside, this process can write no file beyond so many bytes; Python ignores the signal."""
+    """Inside, this process can write no file beyond so many bytes; Python ignores the signal.
+
+    pytest captures output in a file, too: a test of what prints takes `capsys`.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, hard))
     try:
