@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from tests.command import refused, vap
+from tests.full_disk import full_disk
 from tests.toys import TOYS, personal, scene
 from vap_core import memory
 from vap_core.analysis import dataset_inspection
@@ -148,6 +150,35 @@ def test_answers_of_another_threshold_owner_or_version_are_not_taken_for_these(
     inspect_dataset(recorded, TOLD, bank, "toys", out, episodes=1)
     monkeypatch.setattr(dataset_inspection, "__version__", "later")
     refuses("version")
+
+
+@pytest.mark.parametrize("part", ["meta/info.json", "meta/episodes", "data"])
+def test_answers_of_a_dataset_that_was_replaced_are_not_taken_for_these(
+    recorded: Path, bank: Path, tmp_path: Path, part: str
+) -> None:
+    dataset, out = tmp_path / "desk", tmp_path / "out"
+    shutil.copytree(recorded, dataset)
+    inspect_dataset(dataset, TOLD, bank, "toys", out, episodes=1)
+    inspect_dataset(dataset, TOLD, bank, "toys", out, episodes=1)
+    path = dataset / part
+    if path.is_file():
+        path.write_text(path.read_text().replace('"toy"', '"arm"'))
+    else:
+        (path,) = path.rglob("*.parquet")
+        pq.write_table(pq.read_table(path), path, compression="gzip")
+    with pytest.raises(BadOutput, match=r"another inspection \(dataset differ\); choose another"):
+        inspect_dataset(dataset, TOLD, bank, "toys", out, episodes=1)
+
+
+def test_a_disk_that_is_full_at_the_table_is_one_line(
+    recorded: Path, bank: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    inspect_dataset(recorded, TOLD, bank, "toys", out, episodes=1)
+    (out / "views.csv").unlink()
+    message = r"^inspect-dataset: .* cannot be written \(File too large\); make room"
+    with pytest.raises(BadOutput, match=message), full_disk():
+        inspect_dataset(recorded, TOLD, bank, "toys", out, episodes=1)
 
 
 @pytest.mark.parametrize("whose", [{"owner": "ben"}, {"known_as": ("brother",)}])

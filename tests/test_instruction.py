@@ -67,6 +67,20 @@ def test_an_owner_ends_before_the_next_phrase(text: str, category: str) -> None:
     assert (target.owner, target.category) == ("my", category)
 
 
+@pytest.mark.parametrize("categories", [[], ["cup"], ["lamp"]])
+@pytest.mark.parametrize("text", ["give my brother my cup", "Hand my old friend my cup, please"])
+def test_who_gets_an_object_is_no_part_of_it(text: str, categories: list[str]) -> None:
+    (target,) = parse(text, categories).targets
+    assert (target.owner, target.category) == ("my", "cup")
+
+
+def test_a_determiner_ends_a_category() -> None:
+    (target,) = parse("show my camera the plate").targets
+    assert target.category == "camera"
+    assert parse("bring my cup my friend", ["cup"]).targets[0].category == "cup"
+    assert parse("bring my the-one cup").targets[0].category == "the-one cup"
+
+
 @pytest.mark.parametrize(("word", "category"), [("glasses", "glass"), ("boxes", "box")])
 def test_every_plural_counts(word: str, category: str) -> None:
     assert parse(f"bring my {word}", [category]).targets[0].category == category

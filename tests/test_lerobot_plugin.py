@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +23,17 @@ from lerobot.processor import ProcessorStepRegistry
 
 from tests.command import refused, vap
 from tests.toys import personal
+from vap_core.base.errors import BadMemory, UnknownName
 from vap_core.base.files import SHIPPED
 from vap_core.cli.lerobot import _task_to_try
 from vap_core.evaluation.policy_names import shipped
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.memory import save
+from vap_core.perception.stacks import load_stack
 from vap_core.policies.lerobot.adapter import IMAGE, _resize, load_policy
 from vap_core.policies.lerobot.checkpoints import trained_for
-from vap_core.policies.lerobot.step import VapEnvConfig
+from vap_core.policies.lerobot.step import VapEnvConfig, attach
 from vap_core.policies.protocol import PolicyInput
 from vap_core.rollout.loop import rollout
 from vap_core.simulation import suites
@@ -238,7 +240,8 @@ def test_the_command_after_attach_leaves_the_suite_open_where_nothing_says_it(
 
 
 def test_attach_says_what_it_wrote_and_refuses_a_second_time(tmp_path: Path) -> None:
-    save(tmp_path / "memory", personal("mug", "cup", (40, 120, 110)))
+    mug = personal("mug", "cup", (40, 120, 110))
+    save(tmp_path / "memory", replace(mug, encoder=load_stack("embedded").encoder.name))
     words = ("attach", shipped(SUITE), tmp_path / "out", "--memory", tmp_path / "memory")
     done = vap(*words)
     assert done.returncode == 0, done.stderr
@@ -255,3 +258,14 @@ def test_attach_says_what_it_wrote_and_refuses_a_second_time(tmp_path: Path) -> 
     (tmp_path / "file").write_text("")
     inside = refused("attach", shipped(SUITE), tmp_path / "file" / "out", "--memory", words[4])
     assert "cannot be written" in inside
+
+
+def test_attach_refuses_what_would_fail_at_the_first_picture(tmp_path: Path) -> None:
+    bank, out = tmp_path / "memory", tmp_path / "out"
+    mug = personal("mug", "cup", (40, 120, 110))
+    save(bank, mug)
+    with pytest.raises(BadMemory, match=f"mug.* was embedded by '{mug.encoder}', this stack uses"):
+        attach(shipped(SUITE), out, bank)
+    with pytest.raises(UnknownName, match="^attach: object 'cup' is unknown; known: mug"):
+        attach(shipped(SUITE), out, bank, objects=["cup"])
+    assert not out.exists()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.full_disk import full_disk
 from tests.toys import TOYS, personal, scene
 from vap_core.attend import Attender
 from vap_core.base.errors import BadInstruction, BadMemory, BadOutput, UnknownName
@@ -15,7 +16,7 @@ from vap_core.base.types import Instruction, PersonalObject
 from vap_core.instruction import parse, rewrite
 from vap_core.instruction.context import Context
 from vap_core.instruction.embedding import EmbeddingParser
-from vap_core.instruction.history import FILE, add_uses, read_uses
+from vap_core.instruction.history import FILE, MAX_USES, add_uses, read_uses
 from vap_core.instruction.owners import owners_of
 from vap_core.instruction.parsers import Parsing, rule_parser
 from vap_core.memory import load, load_bank, recall, save
@@ -412,6 +413,28 @@ def test_a_damaged_history_is_one_line(tmp_path: Path, line: str) -> None:
     with pytest.raises(BadMemory, match="is damaged"):
         Parsing("embedding").load(tmp_path, {"mug": cup("mug")})
     assert Parsing("rule").load(tmp_path, {})("bring my cup").targets
+
+
+def test_a_write_of_the_history_that_fails_leaves_the_earlier_uses(tmp_path: Path) -> None:
+    add_uses(tmp_path, ["mug"], "anna", NOON)
+    with pytest.raises(BadOutput, match="history: .* cannot be written"), full_disk(90):
+        add_uses(tmp_path, ["mug", "lamp", "dish"], "ben", NOON)
+    assert [use.object for use in read_uses(tmp_path)] == ["mug"]
+    with (tmp_path / FILE).open("a") as file:  # as versions that appended left it
+        file.write('\n{"object": "la')
+    assert [use.object for use in read_uses(tmp_path)] == ["mug"]
+    add_uses(tmp_path, ["dish"], "ben\u2028jr.", NOON)
+    assert [(use.object, use.by) for use in read_uses(tmp_path)] == [
+        ("mug", "anna"),
+        ("dish", "ben\u2028jr."),
+    ]
+
+
+def test_a_history_keeps_the_last_uses(tmp_path: Path) -> None:
+    add_uses(tmp_path, ["mug", *["lamp"] * MAX_USES], "", NOON)
+    add_uses(tmp_path, ["dish"], "", NOON)
+    assert [use.object for use in read_uses(tmp_path)] == [*["lamp"] * (MAX_USES - 1), "dish"]
+    assert len((tmp_path / FILE).read_text().splitlines()) == MAX_USES
 
 
 def test_a_history_that_cannot_be_read_is_not_to_be_deleted(

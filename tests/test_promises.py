@@ -11,8 +11,12 @@ from pathlib import Path
 import pytest
 
 import vap_core
+from vap_core import memory
 from vap_core.base import files, parquet
-from vap_core.base.errors import LONGEST, BadObject, BadOutput, BadSuite, one_of
+from vap_core.base.errors import LONGEST, BadMemory, BadObject, BadOutput, BadSuite, one_of
+from vap_core.evaluation import readings, store
+from vap_core.instruction import history
+from vap_core.policies.mini_pi0 import token_file
 from vap_core.recording import viewer
 from vap_core.simulation.suites import lists
 
@@ -197,6 +201,99 @@ def test_a_table_that_cannot_be_opened_is_not_to_be_deleted(
     with pytest.raises(BadOutput, match=reason) as told:
         parquet.read_parquet(damaged(tmp_path / "a.parquet"), "x", "delete it")
     assert "delete" not in str(told.value)
+
+
+UNGUARDED = {
+    # Inside the `writing` or `try` of their callers.
+    ("base/files.py", "write_atomic"),
+    ("evaluation/store.py", "_begin_run"),
+    ("perception/embedded/weights.py", "write_entry"),
+    ("policies/mini_pi0/token_file.py", "save"),
+    ("simulation/assets/scans/storage.py", "_write_folder"),
+    ("policies/mini_pi0/vlm.py", "_write_bfloat16"),
+    ("training/films/dataset.py", "_write_card"),
+    ("training/folder.py", "save"),
+    ("analysis/notebook_pages.py", "_write_viewer"),
+    # What notebooks and the authors run, where a traceback helps more.
+    ("analysis/controls.py", "chosen"),
+    ("analysis/kept.py", "kept_table"),
+    ("analysis/notebook_links.py", "write_links"),
+    ("analysis/plots.py", "_keep_svg"),
+    ("analysis/plots.py", "keep_png"),
+    ("policies/lerobot/toy_pi0.py", "save_toy"),
+    ("simulation/suites/lists.py", "write"),
+    # In a temporary folder that is gone afterwards.
+    ("cli/bench/eval_lerobot.py", "__init__"),
+    # Begun anew after a full disk, which is still a traceback.
+    ("evaluation/photos/paste.py", "_write_pictures"),
+    ("evaluation/photos/paste.py", "paste_photos"),
+    ("perception/foundation/store.py", "write_lock"),
+}
+"""Functions that write a file outside `writing`, and outside a `try` that catches OSError."""
+WRITES = ("write_atomic", "write_text", "write_bytes")
+
+
+def is_guard(node: ast.AST) -> bool:
+    """Whether a full disk inside is told in one line."""
+    if isinstance(node, ast.With):
+        return any(ast.unparse(item.context_expr).startswith("writing(") for item in node.items)
+    if isinstance(node, ast.Try):
+        caught = [each.type for each in node.handlers if each.type is not None]
+        return any("OSError" in ast.unparse(kind) for kind in caught)
+    return False
+
+
+def unguarded(node: ast.AST, function: str = "") -> set[str]:
+    """The functions that write a file where nothing tells of a full disk."""
+    if isinstance(node, ast.FunctionDef):
+        function = node.name
+    found = set()
+    if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in WRITES:
+        found.add(function)
+    guarded = node.body if is_guard(node) else []  # type: ignore[attr-defined]
+    for child in ast.iter_child_nodes(node):
+        if child not in guarded:
+            found |= unguarded(child, function)
+    return found
+
+
+def test_a_full_disk_is_told_wherever_a_file_is_written() -> None:
+    found = set()
+    for path in SOURCES:
+        for function in unguarded(ast.parse(path.read_text())):
+            found.add((path.relative_to(ROOT).as_posix(), function))
+    assert found == UNGUARDED
+
+
+READS_WHOLE_FILES = {
+    "memory": (memory.load, "mug.safetensors", BadMemory),
+    "token": (lambda path: token_file.load(path.parent, "mug", "model"), "mug.token.safetensors", BadMemory),
+    "history": (lambda path: history.read_uses(path.parent), history.FILE, BadMemory),
+    "run": (lambda path: store.read_manifest(path.parent), store.MANIFEST, BadOutput),
+    "log": (readings.read_log, "readings.csv", BadOutput),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", READS_WHOLE_FILES)
+def test_a_file_larger_than_any_memory_is_one_line(tmp_path: Path, kind: str) -> None:
+    read, name, error = READS_WHOLE_FILES[kind]
+    (tmp_path / name).touch()
+    os.truncate(tmp_path / name, 1 << 42)
+    with pytest.raises(error) as caught:
+        read(tmp_path / name)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_file_for_which_the_memory_does_not_suffice_is_an_error_of_reading(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def exhausted(path: Path) -> bytes:
+        raise MemoryError
+
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(Path, "read_bytes", exhausted)
+    with pytest.raises(OSError, match="Cannot allocate memory"):
+        files.read_file(tmp_path / "file")
 
 
 def test_arrays_of_objects_are_refused_wherever_arrays_are_read(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from scipy import stats
 from scipy.stats import ortho_group
 from typer.testing import CliRunner
 
+from tests.full_disk import full_disk
 from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadStudy, UnknownName
 from vap_core.base.files import DATA
 from vap_core.base.types import Rgb
@@ -215,6 +216,35 @@ def test_the_study_measures_every_token_and_goes_on(
         study.run(Tokens((SUITE,), (5,), epochs=1), tmp_path / "run", progress=False)
     assert "learned in the policy" in report.report(tables)
     assert "the model chooses the target" in report.report(tables)
+
+
+def test_a_job_whose_parts_are_not_named_is_not_done(tmp_path: Path) -> None:
+    """A disk that was full left an empty file."""
+    (job, *_) = plan(Tokens((SUITE,), (5,), epochs=2))
+    done = tmp_path / "done" / job.name
+    done.parent.mkdir()
+    done.write_text("")
+    assert not study._is_done(tmp_path, job)
+    (tmp_path / "part").touch()
+    done.write_text("part\n")
+    assert study._is_done(tmp_path, job)
+
+
+def test_a_disk_that_is_full_ends_the_study_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    jobs = plan(Tokens((SUITE,), (5,), epochs=2))[:1]
+    monkeypatch.setattr(study, "plan", lambda asked: jobs)
+    monkeypatch.setattr(Tokens, "configuration", lambda asked: {"survey": "tokens"})
+    study.store.open_run(tmp_path / "run", {"survey": "tokens"})
+    (tmp_path / "run" / "done").mkdir()
+    monkeypatch.setattr(study, "results", lambda *_, **__: [(jobs[0], {"answers": [{"n": 1}]})])
+    monkeypatch.setattr(
+        study.store, "write_part", lambda folder, *_, **__: folder / "answers" / "part"
+    )
+    with pytest.raises(BadOutput, match="^eval-tokens: .* cannot be written"), full_disk():
+        study.run(Tokens((SUITE,), (5,), epochs=2), tmp_path / "run", progress=False)
+    assert not list((tmp_path / "run" / "done").iterdir())
 
 
 def test_the_usual_number_of_photos_comes_first_and_once_in_the_policy() -> None:

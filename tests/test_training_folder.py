@@ -17,11 +17,13 @@ import torch
 from torch import Tensor, nn
 
 from tests.command import refused
+from tests.full_disk import full_disk
 from tests.test_policy_ahead import frames_of
 from tests.test_policy_training import SUITE, TINY, known, vlm_inputs
 from vap_core.base.errors import BadOutput, VapError
-from vap_core.base.files import DATA, SHIPPED, sha256_of
+from vap_core.base.files import DATA, SHIPPED, sha256_of, writing
 from vap_core.base.types import Description
+from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.mini_pi0 import token_file
 from vap_core.policies.mini_pi0.token_file import Token
 from vap_core.policies.mini_pi0.vlm import MiniVlm, load_vlm
@@ -31,10 +33,13 @@ from vap_core.training.films.captions import captions
 from vap_core.training.films.demonstrations import Film, draw_objects, row
 from vap_core.training.films.looks import draw_look
 from vap_core.training.folder import checkpoint
+from vap_core.training.perception.detector import save_array
 from vap_core.training.perception.fitting import Run, fit
 from vap_core.training.policy import taught
 from vap_core.training.policy import train as policy
 from vap_core.training.policy.ahead import Ahead
+from vap_core.training.policy.batches import Frames
+from vap_core.training.policy.losses import Learner
 from vap_core.training.recipe import FILMED, RECIPES, filmed_tasks
 from vap_core.training.step import Schedule, train_steps
 from vap_core.training.vlm import train as vlm
@@ -166,6 +171,29 @@ def test_a_full_disk_is_one_line(
         return
     with pytest.raises(BadOutput, match="cannot be written .No space left on device"):
         policy.train(recipe, tmp_path / "out", cache=stage[0].parent, jobs=1)
+
+
+def test_a_disk_that_is_full_while_weights_are_written_is_one_line(tmp_path: Path) -> None:
+    """Of a real limit of the file system: torch and safetensors raise errors of their own."""
+    _, save = checkpoint(tmp_path / "training.pt", resume=False)
+    save({"step": 1})
+    message = "cannot be written .File too large"
+    with pytest.raises(BadOutput, match=message), full_disk(30_000), writing(tmp_path, "train"):
+        save({"step": 2, "model": torch.zeros(100_000)})
+    assert checkpoint(tmp_path / "training.pt", resume=True)[0] == {"step": 1}
+
+    config: Any = load_policy(SHIPPED / "mini-pi0-simpler-bridge").policy.config
+    learner, held = Learner(config), object.__new__(Frames)
+    out = tmp_path / "out"
+    out.mkdir()
+    message = r"^train policy: .*out cannot be written .*; make room"
+    with pytest.raises(BadOutput, match=message), full_disk(30_000):
+        policy.save(learner=learner, stats=None, held=held, card={}, out=out)
+    assert not list(out.iterdir())
+
+    with pytest.raises(BadOutput, match="cannot be written"), full_disk(30_000):
+        save_array(tmp_path / "detector.npy", np.zeros(100_000))
+    assert [path.name for path in tmp_path.glob("*.npy")] == []
 
 
 def test_a_model_does_not_go_on_with_other_views(

@@ -18,13 +18,14 @@ from vap_core import __version__
 from vap_core.associate import MOST_VIEWS, PAIRINGS
 from vap_core.attend import Attender, AttendState, Prompting
 from vap_core.base.errors import BadDataset, BadOutput
-from vap_core.base.files import parse_json, write_atomic
+from vap_core.base.files import parse_json, write_atomic, writing
 from vap_core.base.tables import Rows, align
 from vap_core.base.types import Attended, PersonalObject, Views, value
 from vap_core.memory import load_bank
 from vap_core.perception.stacks import load_own
 from vap_core.policies.lerobot.datasets import Copy, Recorded, open_dataset
 
+CALLER = "inspect-dataset"
 TABLE = "views.csv"
 
 
@@ -80,7 +81,7 @@ def inspect_dataset(
     bank = load_bank(memory, models.encoder.name)
     attender = Attender(models, bank, speaker=speaker)
     about = {
-        "dataset": str(path.resolve()),
+        "dataset": [str(path.resolve()), recorded.digest()],
         "instruction": instruction,
         "objects": None if objects is None else list(objects),
         "stack": [models.name, models.encoder.name],
@@ -102,9 +103,11 @@ def inspect_dataset(
                     recorded, episode, attender, instruction, objects, out, writer
                 )
                 text = json.dumps([asdict(report) for report in found])
-                write_atomic(done, text.encode())
+                with writing(out, CALLER):
+                    write_atomic(done, text.encode())
             reports += found
-    write_atomic(out / TABLE, _csv(reports).encode())
+    with writing(out, CALLER):
+        write_atomic(out / TABLE, _csv(reports).encode())
     return reports
 
 

@@ -1,6 +1,7 @@
 """Files that are complete or absent, and where the files that ship with the package are."""
 
 import errno
+import fcntl
 import hashlib
 import json
 import os
@@ -15,7 +16,7 @@ from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
-from vap_core.base.errors import BadOutput
+from vap_core.base.errors import BadOutput, first_line
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,6 +32,9 @@ NO_LINKS = (errno.EPERM, errno.ENOSYS, errno.EOPNOTSUPP, errno.EMLINK)
 """What a file system without hard links says of one."""
 ABANDONED_S = 3600.0
 """A scratch file that was last written so long ago belongs to no process that runs."""
+
+LARGEST_BYTES = 2_000_000_000
+"""The largest file that is read into memory at once."""
 
 
 def kept_folder(name: str) -> Path:
@@ -140,6 +144,17 @@ def write_files(
             write_atomic(path, data, replace=replace)
 
 
+@contextmanager
+def folder_locked(folder: Path) -> Iterator[None]:
+    """Inside, other processes that lock the folder wait. Raises: OSError."""
+    held = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(held)
+
+
 def remove_scratch(folder: Path, pattern: str = ".*.tmp") -> None:
     """Remove what killed processes left in a folder: scratch as old as ABANDONED_S, if it can be.
 
@@ -162,9 +177,17 @@ def check_regular(path: Path) -> None:
 
 
 def read_file(path: Path) -> bytes:
-    """A regular file's contents. Raises: OSError."""
+    """A regular file's contents.
+
+    Raises: OSError, also for one above LARGEST_BYTES, and where the memory does not suffice.
+    """
     check_regular(path)
-    return path.read_bytes()
+    if path.stat().st_size > LARGEST_BYTES:
+        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
+    try:
+        return path.read_bytes()
+    except MemoryError as error:
+        raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM), str(path)) from error
 
 
 def file_fault(path: Path) -> str:
@@ -192,6 +215,17 @@ def encode_tensors(tensors: "Mapping[str, np.ndarray]", metadata: Mapping[str, s
     ).encode()
     header += b" " * (-len(header) % 8)
     return struct.pack("<Q", len(header)) + header + data[8 + size :]
+
+
+@contextmanager
+def saving_tensors() -> Iterator[None]:
+    """Inside, safetensors writes a file. Raises: OSError where it cannot."""
+    from safetensors import SafetensorError
+
+    try:
+        yield
+    except SafetensorError as error:
+        raise OSError(first_line(error)) from error
 
 
 def parse_json(text: str | bytes) -> Any:

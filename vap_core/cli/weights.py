@@ -95,7 +95,10 @@ def export_weights(
 
     Example: python -m vap_core weights export --folder data/runs/weights
     """
+    from vap_core.base.files import writing
     from vap_core.perception.embedded.export import export_graphs
 
-    for path in export_graphs(folder):
+    with writing(folder, "weights export"):
+        paths = export_graphs(folder)
+    for path in paths:
         print(f"{path}  {path.stat().st_size:,} bytes")

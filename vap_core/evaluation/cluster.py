@@ -125,7 +125,7 @@ def _run_remotely(
     """Run one job on another machine, in a folder of its own.
 
     Raises: BadCluster when that machine has other weights, lists or code; BadSuite when the file of
-        an own suite is not at the same path there.
+        an own suite is not at the same path there; BadOutput when its disk is full.
     """
     job.study.open_suites()
     configuration = job.study.configuration()
@@ -138,8 +138,9 @@ def _run_remotely(
         folder = Path(scratch)
         for name, data in memory.items():
             path = folder / MEMORY / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
+            with writing(path, "cluster"):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(data)
         rows = work(replace(job, folder=folder))
         written: Files = {}
         for name, data in _read_files(folder).items():

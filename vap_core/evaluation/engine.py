@@ -18,6 +18,7 @@ from vap_core.base.errors import WorkerDied
 from vap_core.evaluation import readings, store
 from vap_core.evaluation.jobs import BATCH, Job, Record, Rows, row_of_dead_worker, run_job
 from vap_core.evaluation.processes import prepare, results
+from vap_core.evaluation.same_weights import SameWeights
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import register_personal
 from vap_core.evaluation.worker_server import worker_modules
@@ -53,8 +54,9 @@ def run(
 
     A run that begins is entered in the log of readings (`readings.LOCAL`), with `what_for`.
 
-    Raises: BadOutput when the folder holds another run, is in use or cannot be written; WorkerDied
-        when LONE_DEATHS workers died in a row, each with one episode.
+    Raises: BadOutput when the folder holds another run, is in use or cannot be written; BadPolicy
+        when the weights change while it runs; WorkerDied when LONE_DEATHS workers died in a row,
+        each with one episode.
     """
     from tqdm import tqdm
 
@@ -71,6 +73,7 @@ def run(
             )
         return complete
 
+    weights = SameWeights(study)
     _open_run(study, folder, what_for)
     with store.locked(folder):
         store.sweep(folder)
@@ -97,6 +100,7 @@ def run(
                     finished = executor(run_job, jobs, workers, "--workers")
                 try:
                     for job, rows in finished:
+                        weights.check(folder, rows)
                         store.append(folder, rows)
                         deaths = 0
                         _show_progress(bar, counts, counted, job.method, rows)

@@ -9,18 +9,15 @@ for that, and not logged. A run is entered once, when it begins, with what it wi
 """
 
 import csv
-import fcntl
 import io
-import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import DATA, read_file, write_atomic, writing
+from vap_core.base.files import DATA, folder_locked, read_file, write_atomic, writing
 from vap_core.simulation import suites
 
 FILE = "readings.csv"
@@ -126,21 +123,10 @@ def append(readings: Sequence[Reading], path: Path) -> None:
         path, "readings", "make room, or run the command in a folder where data/runs can be written"
     ):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with _locked(path.parent):
+        with folder_locked(path.parent):
             for reading in (*read_log(path), *readings):
                 writer.writerow(astuple(reading))
             write_atomic(path, table.getvalue().encode())
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Keep other processes that add to a log out of its folder."""
-    held = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(held, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(held)
 
 
 def publish_readings(manifests: Iterable[Mapping[str, Any]], target: Path) -> None:

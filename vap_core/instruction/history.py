@@ -6,7 +6,7 @@ from datetime import datetime
 from pathlib import Path
 
 from vap_core.base.errors import BadMemory
-from vap_core.base.files import parse_json, read_file, writing
+from vap_core.base.files import folder_locked, parse_json, read_file, write_atomic, writing
 from vap_core.base.types import value
 
 FILE = "history.jsonl"
@@ -34,9 +34,8 @@ def read_uses(bank: Path) -> tuple[Use, ...]:
     path = bank / FILE
     uses = []
     try:
-        lines = read_file(path).decode("utf-8").splitlines()
-        for line in lines[-MAX_USES:]:
-            row = parse_json(line)
+        for line in _lines(path)[-MAX_USES:]:
+            row = parse_json(line.decode("utf-8"))
             uses.append(Use(object=row["object"], by=row["by"], at=row["at"]))
     except (FileNotFoundError, NotADirectoryError):
         return ()
@@ -53,14 +52,26 @@ def read_uses(bank: Path) -> tuple[Use, ...]:
 
 
 def add_uses(bank: Path, objects: Sequence[str], by: str, at: datetime) -> None:
-    """Append one use per object. Raises: BadOutput."""
+    """Add one use per object; the last MAX_USES uses are kept. Raises: BadOutput."""
     if not objects:
         return
-    lines = ""
+    added = []
     for name in objects:
         row = {"object": name, "by": by, "at": at.isoformat(timespec="seconds")}
-        lines += json.dumps(row, ensure_ascii=False) + "\n"
+        added.append(json.dumps(row, ensure_ascii=False).encode("utf-8"))
+    path = bank / FILE
     with writing(bank, "history", "choose another folder with --memory"):
         bank.mkdir(parents=True, exist_ok=True)
-        with (bank / FILE).open("a", encoding="utf-8") as file:
-            file.write(lines)
+        with folder_locked(bank):
+            lines = _lines(path) if path.exists() else []
+            whole = [*lines, *added][-MAX_USES:]
+            write_atomic(path, b"".join(line + b"\n" for line in whole))
+
+
+def _lines(path: Path) -> list[bytes]:
+    """The lines of a history; not one without an end, of which the writing failed.
+
+    Raises: OSError.
+    """
+    *lines, _ = read_file(path).split(b"\n")
+    return [line for line in lines if line.strip()]

@@ -27,7 +27,12 @@ DETERMINER = (
     "my|his|her|their|our|mine|hers|theirs|ours|the|an?|this|that|these|those|some|any|one of"
 )
 """What an expression begins with that "her" does not belong to."""
+NEXT_PHRASE = frozenset("my the a an this these those".split())
+"""Determiners that end a category phrase: "show my camera the plate".
 
+Those of other people do not: the published study of parsers is of a rule without them.
+"""
+_AGAIN = re.compile(r"\s+my(?![\w-])", re.IGNORECASE)
 
 MAX_CHARACTERS = 500
 """The longest instruction that a parser reads: the time of one grows with the square of it."""
@@ -45,9 +50,10 @@ def parse(text: str, categories: Collection[str] = (), owners: Collection[str] =
 
     Every "my <category>" or "my <person>'s <category>" becomes a target. The longest of
     `categories` (a plural allowed) that follows the trigger wins; otherwise the words up to
-    punctuation or the first stop word are the category, so unseen nouns work too. Where objects
-    have `owners`, "Anna's <category>" and "his <category>" of a known category are targets as well;
-    the article of "the neighbour's <category>" is part of the span.
+    punctuation, the first stop word or the next determiner are the category, so unseen nouns work
+    too; but "my brother" in "give my brother my cup" is who gets it. Where objects have `owners`,
+    "Anna's <category>" and "his <category>" of a known category are targets as well; the article
+    of "the neighbour's <category>" is part of the span.
 
     Raises:
         BadInstruction: the text holds no possessive span, or is too long.
@@ -62,7 +68,9 @@ def parse(text: str, categories: Collection[str] = (), owners: Collection[str] =
         stop = begin + _before_category(text[begin:stop], text[begin:], categories)
         category, length = leading_category(text[stop:], categories)
         owner = text[begin:stop].strip()
-        if category and (category in categories or owner.lower().startswith("my")):
+        receives = category not in categories and _AGAIN.match(text, stop + length)
+        is_named = category in categories or owner.lower().startswith("my")
+        if category and is_named and not receives:
             stop += length
             targets.append(Target(start=start, stop=stop, owner=owner, category=category))
         trigger = pattern.search(text, stop)
@@ -201,7 +209,7 @@ def leading_category(rest: str, categories: Collection[str] = ()) -> tuple[str, 
     length = 0
     for word in re.finditer(r"[\w-]+", rest):
         between = rest[length : word.start()].strip()
-        if between or word.group().lower() in STOP_WORDS:
+        if between or word.group().lower() in STOP_WORDS | NEXT_PHRASE:
             break
         words.append(word.group().lower())
         length = word.end()

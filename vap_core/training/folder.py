@@ -1,6 +1,7 @@
 """The folder of a training, and the files that an earlier call left for this one."""
 
 import fcntl
+import io
 import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping
@@ -12,7 +13,7 @@ import numpy as np
 import torch
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import make_folder, parse_json, replacing, write_atomic, writing
+from vap_core.base.files import make_folder, parse_json, write_atomic, writing
 from vap_core.evaluation.store import LOCK, differences, locked
 from vap_core.policies.lerobot.checkpoints import RECIPE
 
@@ -77,14 +78,16 @@ def cost_s(stage: Path) -> float:
 def checkpoint(path: Path, resume: bool) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
     """What an interrupted run left at `path`, and a function that replaces it atomically.
 
-    The first is empty where there is nothing, or without `resume`.
+    The first is empty where there is nothing, or without `resume`. The second raises OSError.
 
     Raises: BadOutput when what is there is damaged.
     """
 
     def save(state: dict[str, Any]) -> None:
-        with replacing(path) as part:
-            torch.save(state, part)
+        # Into a file torch raises RuntimeError where the disk is full.
+        whole = io.BytesIO()
+        torch.save(state, whole)
+        write_atomic(path, whole.getvalue())
 
     state: dict[str, Any] = {}
     if resume and path.exists():

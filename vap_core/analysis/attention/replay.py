@@ -87,7 +87,8 @@ def run_replay(
         folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):
         parts = folder / "parts"
-        parts.mkdir(exist_ok=True)
+        with writing(folder, "attention"):
+            parts.mkdir(exist_ok=True)
         missing = []
         for job in jobs:
             if not (parts / f"{job.name}.json").exists():

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import parse_json, write_atomic
+from vap_core.base.files import parse_json, write_atomic, writing
 from vap_core.base.parquet import read_parquet
 from vap_core.base.version import code_version
 from vap_core.evaluation import measurements
@@ -29,7 +29,7 @@ def file_name(name: str) -> str:
 def write(
     folder: Path, rows: Mapping[str, Sequence[Mapping[str, Any]]], runs: Sequence[Any]
 ) -> None:
-    """Write the four tables of a replay of some runs."""
+    """Write the four tables of a replay of some runs. Raises: BadOutput."""
     import pandas as pd
     import pyarrow as pa
 
@@ -37,7 +37,8 @@ def write(
     for name in TABLES:
         table = pa.Table.from_pandas(_compact(pd.DataFrame(rows[name])), preserve_index=False)
         data = measurements.encode_table(table.replace_schema_metadata({ABOUT: about}))
-        write_atomic(folder / file_name(name), data)
+        with writing(folder, "attention"):
+            write_atomic(folder / file_name(name), data)
 
 
 def read(folder: Path) -> "dict[str, pd.DataFrame]":

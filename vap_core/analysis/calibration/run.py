@@ -9,7 +9,7 @@ from vap_core import __version__
 from vap_core.analysis.calibration.report import PRICE, Choice, choose, text_report
 from vap_core.analysis.calibration.scenes import SEED, Row, measure_scene
 from vap_core.base.errors import BadOutput, BadPhotoSet
-from vap_core.base.files import write_atomic
+from vap_core.base.files import write_atomic, writing
 from vap_core.base.parquet import read_parquet
 from vap_core.evaluation import store
 from vap_core.evaluation.measurements import read_json_part, write_json_part
@@ -52,8 +52,9 @@ def calibrate(
         table = _measure(stack, out, scenes, photos, progress)
         chosen = choose(table, price)
         report = text_report(table, chosen, stack)
-        write_atomic(out / "report.txt", f"{report}\n".encode())
-        write_atomic(out / "answers.csv", table.round(4).to_csv(index=False).encode())
+        with writing(out, "calibrate"):
+            write_atomic(out / "report.txt", f"{report}\n".encode())
+            write_atomic(out / "answers.csv", table.round(4).to_csv(index=False).encode())
     return f"{report}\n\nwrote {out / 'report.txt'} and {out / 'answers.csv'}", chosen
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from vap_core.base.files import DATA, write_atomic
+from vap_core.base.files import DATA, write_atomic, writing
 from vap_core.cli.bench import embeddings, eval_report, profile, scale_report
 from vap_core.cli.bench.measurement import Measurement, Table, as_markdown, read
 
@@ -51,8 +51,9 @@ def run() -> str:
     """Write the page and the picture. Raises: BadOutput."""
     from vap_core.base.figures import write_png
 
-    PAGE.parent.mkdir(exist_ok=True)
-    write_atomic(PAGE, page().encode())
+    with writing(PAGE, "bench"):
+        PAGE.parent.mkdir(exist_ok=True)
+        write_atomic(PAGE, page().encode())
     if not shipped("scale").exists():
         return f"wrote {PAGE}"
     write_png(scale_report.figure(read(shipped("scale"))), PICTURE)

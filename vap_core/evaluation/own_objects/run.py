@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from vap_core import __version__
 from vap_core.base.errors import BadObject, BadStudy
-from vap_core.base.files import write_atomic
+from vap_core.base.files import write_atomic, writing
 from vap_core.base.types import value
 from vap_core.evaluation import engine, measurements, store
 from vap_core.evaluation.feasibility import feasible
@@ -81,7 +81,8 @@ def measure_objects(folder: Path, out: Path, asked: ObjectSurvey) -> str:
         tables = Tables(views=views, episodes=episodes, groups=source.groups, refused=refused)
         written = _write(tables, out)
         report = text_report(tables)
-        write_atomic(out / "report.txt", f"{report}\n".encode())
+        with writing(out, CALLER):
+            write_atomic(out / "report.txt", f"{report}\n".encode())
         if not len(views):
             raise _nothing_measured(refused, out)
     names = ", ".join(map(str, [*written, *write_sheets(out)]))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vap_core.base.files import write_atomic
+from vap_core.base.files import write_atomic, writing
 from vap_core.base.tables import align
 from vap_core.base.types import value
 from vap_core.evaluation.perception.estimates import NONE, Estimate, mean, precision, share
@@ -132,11 +132,15 @@ def summary(found: Iterable[Measure]) -> list[dict[str, object]]:
 
 
 def conclude(tables: Survey, stack: str, folder: Path) -> str:
-    """Write `summary.json` into the run's folder, and return the text to print."""
+    """Write `summary.json` into the run's folder, and return the text to print.
+
+    Raises: BadOutput.
+    """
     path = folder / "summary.json"
     rows = summary(measures(tables))
     content = json.dumps(rows, indent=1)
-    write_atomic(path, content.encode())
+    with writing(folder, "survey"):
+        write_atomic(path, content.encode())
     return f"{report(tables, stack)}\n\nwrote {path} and the tables beside it"
 
 

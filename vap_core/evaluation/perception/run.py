@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadOutput, one_of
 from vap_core.base.extras import require
-from vap_core.base.files import write_atomic
+from vap_core.base.files import write_atomic, writing
 from vap_core.base.parquet import read_parquet
 from vap_core.evaluation import measurements, store
 from vap_core.evaluation.perception import tracking
@@ -179,7 +179,8 @@ def run_survey(
     with store.locked(folder):
         planned = plan(asked)
         parts = folder / "parts"
-        parts.mkdir(exist_ok=True)
+        with writing(folder, "survey"):
+            parts.mkdir(exist_ok=True)
         missing = []
         paths = []
         for job in planned:
@@ -308,7 +309,7 @@ def _to_number(scalar: Any) -> Any:
 def _write_tables(folder: Path, parts: Sequence[Path]) -> "dict[str, pd.DataFrame]":
     """All parts as one table of each kind, with the run's configuration in every file's metadata.
 
-    Raises: BadOutput for a damaged part.
+    Raises: BadOutput for a damaged part, or when the disk is full.
     """
     tables: Tables = {name: [] for name in TABLES}
     for path in parts:
@@ -318,7 +319,9 @@ def _write_tables(folder: Path, parts: Sequence[Path]) -> "dict[str, pd.DataFram
     manifest = json.dumps(store.read_manifest(folder), sort_keys=True)
     for name, rows in tables.items():
         table = _arrow_table(rows).replace_schema_metadata({b"run": manifest.encode()})
-        write_atomic(_table_path(folder, name), measurements.encode_table(table))
+        data = measurements.encode_table(table)
+        with writing(folder, "survey"):
+            write_atomic(_table_path(folder, name), data)
     return _read_tables(folder)
 
 

@@ -18,7 +18,14 @@ import numpy as np
 
 from vap_core.base.csv_rows import write_rows
 from vap_core.base.errors import BadPhotoSet
-from vap_core.base.files import kept_folder, parse_json, read_file, sha256_of, write_atomic
+from vap_core.base.files import (
+    kept_folder,
+    parse_json,
+    read_file,
+    sha256_of,
+    write_atomic,
+    writing,
+)
 from vap_core.base.photos import PICTURE_FORMATS, load_photo
 from vap_core.base.types import Mask
 from vap_core.evaluation.photos.folder import BOXES_CSV, MASKS, OBJECTS_CSV, SCENES_CSV
@@ -45,7 +52,8 @@ def pods(
 
     It is downloaded (170 MB) unless `origin` is a copy, as `hf download` leaves it.
 
-    Raises: BadPhotoSet: it cannot be had, or is not what it should be; names the remedy.
+    Raises: BadPhotoSet: it cannot be had, or is not what it should be; names the remedy. BadOutput:
+        `folder` cannot be written.
     """
     folder = folder or FOLDER
     if (folder / SCENES_CSV).is_file():
@@ -107,11 +115,18 @@ def _write(origin: Path, folder: Path) -> None:
     for name, photo, mask in _photos(origin, SCENES, kinds, folder / "scenes"):
         scene_boxes.append((photo.name, name, *_box(mask, photo)))
         target = folder / MASKS / photo.name / f"{name}.png"
+<<<<<<< HEAD
         target.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(target, cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes())
     write_rows(folder / BOXES_CSV, reference_boxes)
     write_rows(folder / OBJECTS_CSV, [("object", "category"), *kinds.items()])
     write_rows(folder / SCENES_CSV, scene_boxes)
+=======
+        _write_file(target, cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes())
+    _write_csv(folder / BOXES_CSV, reference_boxes)
+    _write_csv(folder / OBJECTS_CSV, [("object", "category"), *kinds.items()])
+    _write_csv(folder / SCENES_CSV, scene_boxes)
+>>>>>>> runs
 
 
 def _reported_objects(origin: Path) -> dict[str, str]:
@@ -150,7 +165,6 @@ def _photos(
         count[name] = count.get(name, -1) + 1
         stem = f"{name}-{count[name]:02d}" if beginning == SCENES else f"{count[name]}"
         place = folder if beginning == SCENES else folder / name
-        place.mkdir(parents=True, exist_ok=True)
         photo = _keep(row["image"]["bytes"], place, stem)
         yield name, photo, _mask(row["mask"]["bytes"], photo)
     if set(count) != set(kinds):
@@ -188,7 +202,7 @@ def _keep(data: bytes, folder: Path, stem: str) -> Path:
             f"eval-photos: the photo {stem} of {REPO} is no image ({error!s:.100}); fetch it again."
         ) from error
     path = folder / f"{stem}.{suffix}"
-    write_atomic(path, data)
+    _write_file(path, data)
     return path
 
 
@@ -211,3 +225,19 @@ def _box(mask: Mask, photo: Path) -> tuple[str, ...]:
     if box is None:
         raise BadPhotoSet(f"eval-photos: the mask of {photo} is empty; report it to {REPO}.")
     return tuple(f"{value:g}" for value in box)
+<<<<<<< HEAD
+=======
+
+
+def _write_csv(path: Path, rows: Sequence[tuple[str, ...]]) -> None:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    _write_file(path, text.getvalue().encode())
+
+
+def _write_file(path: Path, data: bytes) -> None:
+    """Raises: BadOutput."""
+    with writing(path, "eval-photos"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, data)
+>>>>>>> runs

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from vap_core import __version__
 from vap_core.attend import Attender
-from vap_core.base.files import write_atomic
+from vap_core.base.files import write_atomic, writing
 from vap_core.evaluation import store
 from vap_core.evaluation.measurements import read_json_part, write_json_part, write_table
 from vap_core.evaluation.photos.apart import mask_rows, single_rows
@@ -89,7 +89,8 @@ def measure_photos(
             written += write_table(followed, out, CLIPS)
             parts.append(clip_report(followed))
         report = "\n\n".join(part for part in parts if part)
-        write_atomic(out / "report.txt", f"{report}\n".encode())
+        with writing(out, "eval-photos"):
+            write_atomic(out / "report.txt", f"{report}\n".encode())
     names = ", ".join(map(str, written))
     return f"{report}\n\nwrote {names}"
 

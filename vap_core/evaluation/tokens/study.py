@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from vap_core.base.errors import BadOutput, BadStudy, one_of
+from vap_core.base.files import write_atomic, writing
 from vap_core.base.parquet import read_parquet
 from vap_core.base.types import Rgb
 from vap_core.evaluation import measurements, store
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 
     from vap_core.policies.mini_pi0.vlm import MiniVlm
 
+CALLER = "eval-tokens"
 KS = (1, 3, 5, 7)
 """Numbers of photos to learn from."""
 USUAL_K = teach_token.K
@@ -175,8 +177,8 @@ def run(
 ) -> "dict[str, pd.DataFrame]":
     """Do what `folder` lacks, and return the tables.
 
-    Raises: BadOutput when the folder holds another run, or is in use; BadStudy when nothing is
-        asked for; WorkerDied.
+    Raises: BadOutput when the folder holds another run, is in use or cannot be written; BadStudy
+        when nothing is asked for; WorkerDied.
     """
     from tqdm import tqdm
 
@@ -189,7 +191,8 @@ def run(
     store.open_run(folder, asked.configuration())
     with store.locked(folder):
         done = folder / "done"
-        done.mkdir(exist_ok=True)
+        with writing(folder, CALLER):
+            done.mkdir(exist_ok=True)
         missing = [job for job in jobs if not _is_done(folder, job)]
         with tqdm(
             total=len(jobs),
@@ -200,20 +203,24 @@ def run(
             for job, tables in results(run_job, missing, workers=workers, remedy="--workers"):
                 parts = []
                 for name, rows in tables.items():
-                    part = store.write_part(folder, name, rows, caller="eval-tokens")
+                    part = store.write_part(folder, name, rows, caller=CALLER)
                     parts.append(f"{part.relative_to(folder)}\n")
-                (done / job.name).write_text("".join(parts))
+                with writing(folder, CALLER):
+                    write_atomic(done / job.name, "".join(parts).encode())
                 bar.update()
     return read(folder)
 
 
 def _is_done(folder: Path, job: Job) -> bool:
-    """Whether a training has ended and every part that it wrote is still there."""
+    """Whether a training has ended and every part that it wrote is still there.
+
+    It wrote some: a file that names none was not written to its end.
+    """
     try:
         parts = (folder / "done" / job.name).read_text().splitlines()
     except OSError:
         return False
-    return all((folder / part).exists() for part in parts)
+    return bool(parts) and all((folder / part).exists() for part in parts)
 
 
 def read(folder: Path) -> "dict[str, pd.DataFrame]":

@@ -3,6 +3,7 @@
 Datasets come from outside: they are parsed, never executed, and nothing is looked up on a network.
 """
 
+import hashlib
 import io
 import logging
 import shutil
@@ -16,6 +17,7 @@ from unittest.mock import patch
 import numpy as np
 
 from vap_core.base.errors import BadDataset
+from vap_core.base.files import sha256_of
 from vap_core.base.types import Mask, Rgb, Views, value
 
 if TYPE_CHECKING:
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
 
 PREFIXES = ("observation.images.", "observation.")
 INFO = Path("meta", "info.json")
+PARTS = ("meta", "data", "images", "videos")
+"""The folders of a dataset."""
 MASK = "vap.mask."
 """Begins the name of a feature that has a target's mask."""
 
@@ -51,6 +55,25 @@ class Recorded:
     def length(self, episode: int) -> int:
         """Frames of an episode."""
         return int(self.dataset.meta.episodes[episode]["length"])
+
+    def digest(self) -> str:
+        """A digest of the contents of meta/, and of the name, size and time of every other file.
+
+        Raises: BadDataset.
+        """
+        found = hashlib.sha256()
+        try:
+            for part in PARTS:
+                for path in sorted((self.folder / part).rglob("*")):
+                    name = path.relative_to(self.folder).as_posix()
+                    if part == "meta" and path.is_file():
+                        found.update(f"{name} {sha256_of(path)}\n".encode())
+                    elif path.is_file():
+                        about = path.stat()
+                        found.update(f"{name} {about.st_size} {about.st_mtime_ns}\n".encode())
+        except OSError as error:
+            raise _damaged(self.folder, error) from error
+        return found.hexdigest()[:16]
 
     def tasks(self, episodes: int) -> tuple[str, ...]:
         """The tasks of the first `episodes` episodes, each once, in their order."""

@@ -260,19 +260,24 @@ def attach(checkpoint: str | Path, out: Path, memory: Path, **options: Any) -> P
     """Write a checkpoint with VAP beside the frozen one; returns its folder.
 
     Every file is linked, and one step is added to the preprocessor, right after the renaming of
-    observations. `options` are VapPrompt's other fields.
+    observations. `options` are VapPrompt's other fields. The stack is loaded once, to see that it
+    can be, and that its encoder made the memory.
 
     Raises: BadOutput when `out` exists; BadPolicy, BadMemory, UnknownName when the parts do not
-        fit; BadMemory also where `memory` holds no object, or a damaged one.
+        fit; BadMemory also where `memory` holds no object, or a damaged one; as `load_stack`.
     """
     source = locate(checkpoint).resolve()
     memory = Path(memory).resolve()
     step = VapPrompt(str(memory), **options)
-    if not load_bank(memory):
+    bank = load_bank(memory)
+    if not bank:
         raise BadMemory(
             f"attach: {memory} holds no object; register one there, or name another folder with "
             "--memory."
         )
+    for name in step.objects or ():
+        if name not in bank:
+            raise one_of("attach: object", name, bank)
     if out.exists():
         raise BadOutput(f"attach: {out} exists; choose another folder.")
     file = source / PIPELINES[0]
@@ -287,6 +292,7 @@ def attach(checkpoint: str | Path, out: Path, memory: Path, **options: Any) -> P
         ) from error
     if attached:
         raise BadPolicy(f"attach: {source} has VAP attached; give the checkpoint without it.")
+    step._load()  # what would fail at the first picture fails here
     entry = {"class": STEP_CLASS, "config": step.get_config()}
     pipeline["steps"].insert(place, entry)
     made = False

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vap_core.base.errors import BadStudy
-from vap_core.base.files import DATA
+from vap_core.base.files import DATA, writing
 from vap_core.base.types import Rgb
 from vap_core.policies.lerobot.checkpoints import config_field
 from vap_core.policies.mini_pi0 import learned_token, token_file
@@ -127,7 +127,8 @@ def teach(
     SHA-256 of the model that the policy was initialised from; `model` is its folder, by default the
     shipped one's. A token that is not learned well is noted on stderr.
 
-    Raises: BadPolicy without the model; BadStudy when the policy was initialised from another one.
+    Raises: BadPolicy without the model; BadStudy when the policy was initialised from another one;
+        BadOutput when the folder cannot be written.
     """
     from vap_core.policies.mini_pi0 import vlm
 
@@ -145,7 +146,8 @@ def teach(
 def teach_own(rows: Iterable[EpisodeRow], folder: Path, policy: Path) -> Token:
     """The same in the weights of the policy whose checkpoint is given, not in those it came from.
 
-    Raises: BadPolicy when the checkpoint is no mini-pi0.
+    Raises: BadPolicy when the checkpoint is no mini-pi0; BadOutput when the folder cannot be
+        written.
     """
     from vap_core.policies.mini_pi0 import vlm
 
@@ -170,7 +172,8 @@ def _teach(teacher: "MiniVlm", rows: Sequence[EpisodeRow], folder: Path, suffix:
             f"photos, less than {100 * LEAST_ACCURACY:.0f} %.",
             file=sys.stderr,
         )
-    token_file.save(folder, token, suffix)
+    with writing(folder, "tokens"):
+        token_file.save(folder, token, suffix)
     return token
 
 

@@ -31,7 +31,7 @@ class Token:
 
 
 def save(folder: Path, token: Token, suffix: str = SUFFIX) -> Path:
-    """Write the object's name and `suffix`."""
+    """Write the object's name and `suffix`. Raises: OSError."""
     header = {"object": token.object, "accuracy": repr(token.accuracy), "model": token.model}
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{token.object}{suffix}"

@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, UInt8, UInt16
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
-from vap_core.base.files import replacing
+from vap_core.base.files import replacing, writing
 from vap_core.base.types import Rgb
 from vap_core.perception.embedded.backbone import features
 from vap_core.perception.embedded.detect_network import DetectHead
@@ -75,8 +75,8 @@ def featurise(
 
 
 def save_array(path: Path, array: np.ndarray) -> None:
-    """Write an array so that an interrupted run never leaves half of it."""
-    with replacing(path) as part, part.open("wb") as file:
+    """Write an array so that an interrupted run never leaves half of it. Raises: BadOutput."""
+    with writing(path, "train perception"), replacing(path) as part, part.open("wb") as file:
         np.save(file, array)
 
 

@@ -19,7 +19,7 @@ import torch
 from torch import nn
 from tqdm import tqdm
 
-from vap_core.base.files import kept_folder, make_folder
+from vap_core.base.files import kept_folder, make_folder, writing
 from vap_core.evaluation.processes import results
 from vap_core.perception.embedded.export import export_graphs, require_onnx
 from vap_core.perception.embedded.weights import PERCEPTION, save_weights
@@ -93,8 +93,9 @@ def train(
     about = _describe_training(scenes, seed, stages)
     about["measured"] = evaluate(detect, segment, look, unseen)
     tensors = _name_tensors({"detect": detect, "look": look, "segment": segment})
-    save_weights(PERCEPTION, tensors, about, out)
-    export_graphs(out)
+    with writing(out, "train perception"):
+        save_weights(PERCEPTION, tensors, about, out)
+        export_graphs(out)
     return about
 
 

@@ -22,7 +22,14 @@ from torch import Tensor
 
 from vap_core.base.device import device_name
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import make_folder, parse_json, sha256_of, write_atomic, writing
+from vap_core.base.files import (
+    make_folder,
+    parse_json,
+    saving_tensors,
+    sha256_of,
+    write_atomic,
+    writing,
+)
 from vap_core.base.version import code_version
 from vap_core.policies.lerobot.checkpoints import CAPTIONS, TRAINING_CARD, WORDS
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
@@ -303,10 +310,11 @@ def save(
     # Killed at any moment, every file that has its name is whole.
     with writing(out, "train policy"), TemporaryDirectory(prefix=SAVING, dir=out) as name:
         part = Path(name)
-        policy.save_pretrained(part)
-        store_in_bfloat16(part / "model.safetensors")
-        for pipeline in make_pre_post_processors(policy.config, dataset_stats=stats):
-            pipeline.save_pretrained(part)
+        with saving_tensors():
+            policy.save_pretrained(part)
+            store_in_bfloat16(part / "model.safetensors")
+            for pipeline in make_pre_post_processors(policy.config, dataset_stats=stats):
+                pipeline.save_pretrained(part)
         for file in part.iterdir():
             os.replace(file, out / file.name)
     # What is measured is what was saved.
