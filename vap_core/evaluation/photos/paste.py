@@ -118,12 +118,13 @@ def paste_photos(photos: Path, scenes: Path, out: Path, asked: Pasting, stack: S
     if len(cuts) < 2:
         raise BadPhotoSet(f"paste-photos: {photos} gives fewer than two objects to paste.")
     try:
-        for name, references in kept.items():
-            _copy(references, out / "references" / name)
-        if len(known) > 1:
-            write_rows(out / BOXES_CSV, known)
-        _write_cuts(out / "cuts.png", cuts)
-        questions = _write_pictures(out, backgrounds, cuts, categories, asked)
+        with writing(out, "paste-photos"):
+            for name, references in kept.items():
+                _copy(references, out / "references" / name)
+            if len(known) > 1:
+                write_rows(out / BOXES_CSV, known)
+            _write_cuts(out / "cuts.png", cuts)
+            questions = _write_pictures(out, backgrounds, cuts, categories, asked)
     except BaseException:  # an interruption, too
         shutil.rmtree(out, ignore_errors=True)
         raise

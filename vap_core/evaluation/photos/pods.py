@@ -115,18 +115,11 @@ def _write(origin: Path, folder: Path) -> None:
     for name, photo, mask in _photos(origin, SCENES, kinds, folder / "scenes"):
         scene_boxes.append((photo.name, name, *_box(mask, photo)))
         target = folder / MASKS / photo.name / f"{name}.png"
-<<<<<<< HEAD
-        target.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(target, cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes())
-    write_rows(folder / BOXES_CSV, reference_boxes)
-    write_rows(folder / OBJECTS_CSV, [("object", "category"), *kinds.items()])
-    write_rows(folder / SCENES_CSV, scene_boxes)
-=======
         _write_file(target, cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes())
-    _write_csv(folder / BOXES_CSV, reference_boxes)
-    _write_csv(folder / OBJECTS_CSV, [("object", "category"), *kinds.items()])
-    _write_csv(folder / SCENES_CSV, scene_boxes)
->>>>>>> runs
+    with writing(folder, "eval-photos"):
+        write_rows(folder / BOXES_CSV, reference_boxes)
+        write_rows(folder / OBJECTS_CSV, [("object", "category"), *kinds.items()])
+        write_rows(folder / SCENES_CSV, scene_boxes)
 
 
 def _reported_objects(origin: Path) -> dict[str, str]:
@@ -225,14 +218,6 @@ def _box(mask: Mask, photo: Path) -> tuple[str, ...]:
     if box is None:
         raise BadPhotoSet(f"eval-photos: the mask of {photo} is empty; report it to {REPO}.")
     return tuple(f"{value:g}" for value in box)
-<<<<<<< HEAD
-=======
-
-
-def _write_csv(path: Path, rows: Sequence[tuple[str, ...]]) -> None:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    _write_file(path, text.getvalue().encode())
 
 
 def _write_file(path: Path, data: bytes) -> None:
@@ -240,4 +225,3 @@ def _write_file(path: Path, data: bytes) -> None:
     with writing(path, "eval-photos"):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, data)
->>>>>>> runs
