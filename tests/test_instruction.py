@@ -74,6 +74,19 @@ def test_who_gets_an_object_is_no_part_of_it(text: str, categories: list[str]) -
     assert (target.owner, target.category) == ("my", "cup")
 
 
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("show my camera my plate", ["camera", "plate"]),
+        ("bring my cup my plate and my bowl", ["cup", "plate", "bowl"]),
+        ("bring my mug my sister gave me", ["mug", "sister gave me"]),
+    ],
+)
+def test_an_object_that_nobody_registered_is_not_passed_over(text: str, found: list[str]) -> None:
+    """It is a target, so that it is refused, and not the rest done without it."""
+    assert [target.category for target in parse(text, ["plate", "bowl"]).targets] == found
+
+
 def test_a_determiner_ends_a_category() -> None:
     (target,) = parse("show my camera the plate").targets
     assert target.category == "camera"

@@ -83,8 +83,8 @@ def test_register_uses_the_whole_photo_where_nothing_is_found() -> None:
         ("mug", "Their", 1, "'Their' cannot be a category; .* --category cup\\."),
         ("mug", "the my", 1, "'the my' cannot be a category; .* --category cup\\."),
         ("mug", "a my", 1, "'a my' cannot be a category; .* --category cup\\."),
-        ("grün", "cup", 1, "use letters a to z, digits, .* at most 64 characters\\."),
-        ("m" * 65, "cup", 1, "use letters a to z, digits, .* at most 64 characters\\."),
+        ("grün", "cup", 1, "use a letter a to z or a digit, .* at most 64 characters\\."),
+        ("m" * 65, "cup", 1, "use a letter a to z or a digit, .* at most 64 characters\\."),
         ("mug", "cup", 0, "has no photos; give at least one"),
     ],
 )

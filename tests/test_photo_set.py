@@ -130,7 +130,9 @@ def test_what_is_wrong_with_a_folder_is_one_line(folder, file, text, message):
 def test_a_folder_that_cannot_name_an_object_is_named(folder, name):
     """Before anything is embedded."""
     (folder / "references" / "mug").rename(folder / "references" / name)
-    with pytest.raises(BadPhotoSet, match="cannot name an object; call it by letters a") as error:
+    with pytest.raises(
+        BadPhotoSet, match="cannot name an object; call it by a letter a to z"
+    ) as error:
         read_photo_set(folder)
     assert str(folder / "references" / name) in str(error.value)
 

@@ -228,7 +228,10 @@ UNGUARDED = {
     # In a temporary folder that is gone afterwards.
     ("cli/bench/eval_lerobot.py", "__init__"),
 }
-"""Functions that write a file outside `writing`, and outside a `try` that catches OSError."""
+"""Functions that call one of WRITES outside `writing`, and outside a `try` that catches OSError.
+
+Other ways to write (torch, numpy, safetensors, a copy, a folder) are not looked for.
+"""
 WRITES = ("write_atomic", "write_rows", "write_text", "write_bytes")
 
 

@@ -23,7 +23,7 @@ from vap_core.evaluation.metrics import rate
 from vap_core.evaluation.publish import publish
 from vap_core.evaluation.report import conclude, report
 from vap_core.evaluation.report.latex import ABOVE_PAPER, main_tables
-from vap_core.evaluation.report.results import errors, paper_results, results
+from vap_core.evaluation.report.results import errors, outcomes, paper_results, results
 from vap_core.evaluation.report.runs import load_runs
 from vap_core.evaluation.statistics import ALL_TASKS, compare, rate_over_layouts
 from vap_core.evaluation.store import append, open_run
@@ -185,6 +185,17 @@ def test_all_tasks_are_the_same_for_every_method(tmp_path: Path) -> None:
     together = lines[lines.task == ALL_TASKS].set_index("method")
     assert together.n.to_dict() == {"generic": 12, "vap": 12, "oracle-mask": 6}
     assert set(together.listed) == {48}
+    ended = outcomes(load_runs([tmp_path / "both", one])).set_index("method")
+    assert ended.listed.to_dict() == dict.fromkeys(together.index, 48)
+    assert ended.asked.to_dict() == together.n.to_dict()
+
+
+def test_a_suite_without_a_list_has_what_each_method_was_asked_for(tmp_path: Path) -> None:
+    tasks = tuple(("widowx-pick", task.name) for task in suites.suite("widowx-pick").tasks[:2])
+    some = run(tmp_path / "some", tasks=tasks, episodes=2, methods=["vap"])
+    lines = results(load_runs([run(tmp_path / "more", tasks=tasks, methods=["generic"]), some]))
+    together = lines[lines.task == ALL_TASKS].set_index("method")
+    assert together.listed.to_dict() == together.n.to_dict() == {"generic": 12, "vap": 4}
 
 
 def test_every_latex_table_is_a_whole_one(tmp_path: Path) -> None:

@@ -49,10 +49,13 @@ proposal does."""
 CATEGORY = re.compile(r"[^\W\d_][\w -]*")
 OWNED = re.compile(r"(?:(?:my|our|his|her|their|the|an?) )+(?=.)")
 """What stands before a category in an instruction, and is no part of it."""
-OWNER_WORDS = ("my", "our", "his", "her", "their", "the", "an")
+OWNER_WORDS = ("my", "our", "his", "her", "their", "the", "an", "this", "that", "these", "those")
 """No kind of thing by themselves; "a" may be one, as the letter."""
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,63}")
-NAME_RULE = "letters a to z, digits, space, dot, dash or underscore, at most 64 characters"
+NAME_RULE = (
+    "a letter a to z or a digit, then letters, digits, space, dot, dash or underscore, at most 64 "
+    "characters"
+)
 """`NAME` in words."""
 AGAIN = "register the object again with --replace, or delete the file"
 

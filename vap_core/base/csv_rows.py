@@ -1,4 +1,4 @@
-"""Tables that people write: CSV files of named columns, read with the number of each line."""
+"""CSV files of named columns: those that people write are read with the number of each line."""
 
 import csv
 import io

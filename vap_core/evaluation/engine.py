@@ -18,7 +18,6 @@ from vap_core.base.errors import WorkerDied
 from vap_core.evaluation import readings, store
 from vap_core.evaluation.jobs import BATCH, Job, Record, Rows, row_of_dead_worker, run_job
 from vap_core.evaluation.processes import prepare, results
-from vap_core.evaluation.same_weights import SameWeights
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import register_personal
 from vap_core.evaluation.worker_server import worker_modules
@@ -73,7 +72,6 @@ def run(
             )
         return complete
 
-    weights = SameWeights(study)
     _open_run(study, folder, what_for)
     with store.locked(folder):
         store.sweep(folder)
@@ -100,7 +98,6 @@ def run(
                     finished = executor(run_job, jobs, workers, "--workers")
                 try:
                     for job, rows in finished:
-                        weights.check(folder, rows)
                         store.append(folder, rows)
                         deaths = 0
                         _show_progress(bar, counts, counted, job.method, rows)

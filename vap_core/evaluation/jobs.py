@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from vap_core.base.errors import BadRecording, BadStudy
 from vap_core.base.files import writing
 from vap_core.evaluation import diagnosis, hiding, input_audit, state_log, switching
+from vap_core.evaluation.same_weights import require_same_weights
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import make_trial
 from vap_core.policies.weight_guard import unchanged_weights
@@ -61,12 +62,14 @@ def run_job(job: Job) -> Rows:
     checksum of the policy's parameters. `bound` marks a method or policy that reads the simulator:
     its rows are no results.
 
-    Raises: BadPolicy when the parameters changed; BadStudy; BadOutput.
+    Raises: BadPolicy when the parameters changed, or the checkpoint since the run began; BadStudy;
+        BadOutput.
     """
     from vap_core.rollout.loop import rollout
 
     job.study.open_suites()
     trial = make_trial(job.study, job.rows, job.method, job.folder / "memory")
+    require_same_weights(job.study, job.rows[0].suite, job.folder)
     begin = None
     if _records(job):
         begin = _recorders(job)

@@ -65,7 +65,7 @@ def readings_of(configuration: Mapping[str, Any], run: str, what_for: str = "") 
     Raises: UnknownName for a task that its suite does not have; BadSuite for a damaged list.
     """
     found = []
-    weights = _weights_by_suite(configuration)
+    weights = weights_by_suite(configuration)
     split = configuration.get("split", "")
     tasks_by_suite: dict[str, list[str]] = {}
     for suite, task in configuration["tasks"]:
@@ -181,7 +181,7 @@ def readings_of_lists(digests: Iterable[str]) -> list[Reading]:
     return [reading for reading in all_readings() if reading.list in wanted]
 
 
-def _weights_by_suite(configuration: Mapping[str, Any]) -> dict[str, str]:
+def weights_by_suite(configuration: Mapping[str, Any]) -> dict[str, str]:
     """The beginning of the weights' digest of every suite of a run's configuration."""
     names = {suite for suite, _ in configuration["tasks"]}
     if "checkpoint" in configuration:

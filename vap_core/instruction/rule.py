@@ -32,6 +32,7 @@ NEXT_PHRASE = frozenset("my the a an this these those".split())
 
 Those of other people do not: the published study of parsers is of a rule without them.
 """
+_GIVING = re.compile(r"\b(?:give|hand|pass|offer|lend)\s+$", re.IGNORECASE)
 _AGAIN = re.compile(r"\s+my(?![\w-])", re.IGNORECASE)
 
 MAX_CHARACTERS = 500
@@ -51,9 +52,9 @@ def parse(text: str, categories: Collection[str] = (), owners: Collection[str] =
     Every "my <category>" or "my <person>'s <category>" becomes a target. The longest of
     `categories` (a plural allowed) that follows the trigger wins; otherwise the words up to
     punctuation, the first stop word or the next determiner are the category, so unseen nouns work
-    too; but "my brother" in "give my brother my cup" is who gets it. Where objects have `owners`,
-    "Anna's <category>" and "his <category>" of a known category are targets as well; the article
-    of "the neighbour's <category>" is part of the span.
+    too. In "give my brother my cup" my brother is who gets it, no target. Where objects have
+    `owners`, "Anna's <category>" and "his <category>" of a known category are targets as well; the
+    article of "the neighbour's <category>" is part of the span.
 
     Raises:
         BadInstruction: the text holds no possessive span, or is too long.
@@ -68,7 +69,11 @@ def parse(text: str, categories: Collection[str] = (), owners: Collection[str] =
         stop = begin + _before_category(text[begin:stop], text[begin:], categories)
         category, length = leading_category(text[stop:], categories)
         owner = text[begin:stop].strip()
-        receives = category not in categories and _AGAIN.match(text, stop + length)
+        receives = (
+            category not in categories
+            and _GIVING.search(text[:start])
+            and _AGAIN.match(text, stop + length)
+        )
         is_named = category in categories or owner.lower().startswith("my")
         if category and is_named and not receives:
             stop += length

@@ -19,6 +19,7 @@ from vap_core.evaluation.statistics import (
     layout_clusters,
     layout_interval,
 )
+from vap_core.simulation import suites
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -50,7 +51,7 @@ def results(runs: Runs) -> "pd.DataFrame":
         .merge(counts, on=key, how="left")
     )
     total = lines["task"] == ALL_TASKS
-    lines.loc[total, "listed"] = lines["seeds"] * _listed_together(runs, lines)
+    lines.loc[total, "listed"] = _listed_together(runs, lines[total], TRACK)
     counted = counts.columns.drop(key)
     lines[counted] = lines[counted].fillna(0).astype(int)
     for name in RATES:
@@ -96,7 +97,11 @@ def outcomes(runs: Runs) -> "pd.DataFrame":
     ended = groups[["run", *OUTCOMES]].sum()
     ended["retried"] = groups["retried"].sum(min_count=1)
     ended["most_attempts"] = groups["attempts"].max()
-    lines = runs.wanted.groupby(by, sort=False)[["listed", "asked"]].sum().join(ended).reset_index()
+    wanted = runs.wanted.groupby(by, sort=False)
+    lines = wanted[["listed", "asked"]].sum().join(wanted["seed"].nunique().rename("seeds"))
+    lines = lines.join(ended).reset_index()
+    lines["listed"] = _listed_together(runs, lines, ["suite"])
+    lines = lines.drop(columns="seeds")
     lines[["run", *OUTCOMES]] = lines[["run", *OUTCOMES]].fillna(0).astype(int)
     return lines
 
@@ -157,14 +162,16 @@ def _with_totals(runs: Runs) -> "tuple[pd.DataFrame, pd.DataFrame]":
     return with_total(runs.table), wanted.loc[order].reset_index(drop=True)
 
 
-def _listed_together(runs: Runs, lines: "pd.DataFrame") -> "pd.Series[int]":
-    """For each line the episodes that one seed lists in all tasks that its track was run on."""
-    import pandas as pd
+def _listed_together(runs: Runs, lines: "pd.DataFrame", where: Sequence[str]) -> "pd.Series[int]":
+    """`listed` of lines over all tasks that any method was asked for `where` a line is.
 
-    by_task = runs.wanted.groupby([*TRACK, "task"], sort=False)["listed"].max()
-    together = by_task.groupby(TRACK, sort=False).sum()
-    of_line = together.loc[pd.MultiIndex.from_frame(lines[TRACK])]
-    return of_line.set_axis(lines.index)
+    A suite without a list has no more than a method was asked for.
+    """
+    by_task = runs.wanted.groupby([*TRACK, "task"], sort=False)["listed"].max().reset_index()
+    together = by_task.groupby(list(where), sort=False)["listed"].sum().rename("together")
+    found = lines.join(together, on=list(where))
+    whole = found["seeds"] * found["together"]
+    return whole.where(found["suite"].map(suites.has_list), found["listed"])
 
 
 def _layout_intervals(table: "pd.DataFrame") -> "pd.DataFrame":

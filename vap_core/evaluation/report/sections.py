@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 RESULTS_NOTE = (
-    "- n: episodes that were run, of those in the suite's whole list; all tasks: those that any "
-    "method here was asked for, together.\n"
+    "- n: episodes that were run, of those in the suite's whole list; all tasks: of the whole "
+    "lists of every task that any method here was asked for.\n"
     "  An error is no success and stays in n; an episode that was not run is not in n.\n"
     "- SR, CMR, wrong object: % of n with Wilson's 95 % interval (results.csv has Clopper and "
     "Pearson's, too). CMR is not defined for selections, where a touch counts as a wrong object, "

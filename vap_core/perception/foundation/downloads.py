@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from vap_core.base.errors import MissingWeights
-from vap_core.base.files import sha256_of, writing
+from vap_core.base.files import sha256_of
 from vap_core.perception.foundation.sources import MODELS, TENSORS, Source
 from vap_core.perception.foundation.store import (
     LOCK,
@@ -232,5 +232,4 @@ def _check_and_lock(source: Source, folder: Path, unpinned: bool) -> None:
             f"{source.sha256[:12]}.. is pinned; it was removed, pull it again, "
             "or pass --unpinned to use other weights on purpose."
         )
-    with writing(folder, "weights pull"):
-        write_lock(folder, source, digests)
+    write_lock(folder, source, digests)
