@@ -121,7 +121,9 @@ def test_a_name_that_is_taken_needs_replace(shelf):
     with pytest.raises(BadObject, match="ends in -red"):
         import_scan(file, "cup-personal-red", "cup")
     assert default_name(Path("杯子.glb")) == "my-object"
-    with pytest.raises(BadObject, match="cannot name an object; use a letter a to z or a digit, .* 64 char"):
+    with pytest.raises(
+        BadObject, match="cannot name an object; use a letter a to z or a digit, .* 64 char"
+    ):
         import_scan(file, "../mug", "cup")
     with pytest.raises(BadObject, match="cannot be a category"):
         import_scan(file, "mug", "cup!")
