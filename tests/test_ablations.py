@@ -584,7 +584,9 @@ def test_policies_stand_side_by_side_and_each_is_compared_with_itself() -> None:
     across = across_policies(shares, episodes)
     assert [(one.arm, one.sr.k) for one in across] == [("share-0", 9), ("share-0.5", 2)]
     assert effect_text(across, "share-0.5").startswith("-70 [")
+    (twice,) = policies_figure(found, "share", list(found.values())).axes
     (axes,) = policies_figure(found, "share").axes
+    assert len(twice.containers) == 2 * len(axes.containers)
     assert [label.get_text() for label in axes.get_xticklabels()] == ["share-0", "share-0.5"]
     assert [len(bars.lines[0].get_xdata()) for bars in axes.containers] == [2, 2]
 

@@ -1,7 +1,7 @@
 """The effect of every arm as a forest plot: points of SR against the ablation's first arm."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from vap_core.base.palette import method_marks
 from vap_core.evaluation.ablations.table import ArmResult
@@ -72,9 +72,13 @@ def _points(found: Comparison) -> tuple[float, float, float]:
     return 100 * found.low, 100 * found.difference, 100 * found.high
 
 
-def policies_figure(of_policies: Mapping[str, Sequence[ArmResult]], label: str) -> "Figure":
+def policies_figure(
+    of_policies: Mapping[str, Sequence[ArmResult]],
+    label: str,
+    again: Sequence[Sequence[ArmResult]] = (),
+) -> "Figure":
     """The success rate of every method (95 %), with the policies side by side; `label` says what
-    tells them apart.
+    tells them apart. `again` has another training of each, drawn hollow.
     """
     from matplotlib.figure import Figure as NewFigure
 
@@ -83,24 +87,41 @@ def policies_figure(of_policies: Mapping[str, Sequence[ArmResult]], label: str) 
     methods = dict.fromkeys(one.arm for results in of_policies.values() for one in results)
     for i, (method, (colour, marker)) in enumerate(method_marks(list(methods)).items()):
         offset = 0.08 * (i - (len(methods) - 1) / 2)
-        xs, rates = [], []
-        for x, results in enumerate(of_policies.values()):
-            for one in results:
-                if one.arm == method:
-                    xs.append(x + offset)
-                    rates.append(one.sr)
-        bounds = [
-            [100 * (one.value - one.low) for one in rates],
-            [100 * (one.high - one.value) for one in rates],
-        ]
-        ours = [100 * one.value for one in rates]
-        axes.errorbar(xs, ours, bounds, color=colour, marker=marker, capsize=2, label=method)
+        look = {"color": colour, "marker": marker}
+        _draw_rates(axes, list(of_policies.values()), method, offset, label=method, **look)
+        if again:
+            hollow = {**look, "markerfacecolor": "white", "linestyle": ":"}
+            _draw_rates(axes, again, method, offset + 0.04, **hollow)
     n = ", ".join(dict.fromkeys(str(one.sr.n) for part in of_policies.values() for one in part))
     axes.set_xticks(range(len(of_policies)), list(of_policies))
     axes.set(xlabel=label, ylabel=f"success rate, % (95 %, n {n})", ylim=(-3, 103))
     axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(loc="outside right center", frameon=False, fontsize=8)
+    title = "hollow: trained\na second time" if again else None
+    figure.legend(
+        loc="outside right center", frameon=False, fontsize=8, title=title, title_fontsize=8
+    )
     return figure
+
+
+def _draw_rates(
+    axes: "Axes",
+    of_policies: Sequence[Sequence[ArmResult]],
+    method: str,
+    offset: float,
+    **look: Any,
+) -> None:
+    """One method's success rate at each policy's place."""
+    xs, rates = [], []
+    for x, results in enumerate(of_policies):
+        for one in results:
+            if one.arm == method:
+                xs.append(x + offset)
+                rates.append(one.sr)
+    bounds = [
+        [100 * (one.value - one.low) for one in rates],
+        [100 * (one.high - one.value) for one in rates],
+    ]
+    axes.errorbar(xs, [100 * one.value for one in rates], bounds, capsize=2, **look)
 
 
 def is_shown(found: Comparison) -> bool:
