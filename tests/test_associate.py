@@ -26,7 +26,10 @@ from vap_core.base.types import Camera
 from vap_core.vote import vote
 
 NAMES = ("front", "side", "wrist", "top")
-TERMS = sorted(PAIRINGS)
+OF_OBJECTS = Pairing(("geometry",), evidence=6.0, reliance=3.0, likest=0.5, hidden=0.5)
+"""An object that fewer views show has no disadvantage."""
+RULES = {**PAIRINGS, "objects": OF_OBJECTS}
+TERMS = sorted(RULES)
 
 
 def overhead(name: str, x: float, y: float = 0.0) -> Camera:
@@ -82,18 +85,27 @@ SCORE = {"embedding": embedding, "hungarian": hungarian, "geometry": geometry}
 def slow(views: dict[str, Sighting], pairing: Pairing) -> dict[tuple[int | None, ...], float]:
     """The score of every combination, written out."""
     sights = list(views.values())
-    away = [
-        [max(1 - float(np.float64(row).mean()), 1e-3) for row in view.cosine] for view in sights
-    ]
+
+    def distance(row: np.ndarray) -> float:
+        to_all, to_likest = 1 - float(np.float64(row).mean()), 1 - float(np.float64(row).max())
+        share = pairing.likest
+        return max(to_all, 1e-3) ** (1 - share) * max(to_likest, 1e-3) ** share
+
+    away = [[distance(row) for row in view.cosine] for view in sights]
     least = min(min(of_view) for of_view in away if of_view)
 
     def single(v: int, i: int | None) -> float:
+        if pairing.hidden is not None and i is None:
+            of_view = [single(v, j) for j in range(len(away[v]))]
+            return pairing.hidden * float(np.mean(of_view)) - 0.1 if of_view else 0.0
         if i is None:
             return 0.0
         best = min(away[v])
-        return pairing.evidence * (
-            np.log(best / away[v][i]) + max(np.log(least / best) + pairing.absent, 0)
-        )
+        trust = (least / best) ** pairing.reliance
+        visible = 0.0
+        if pairing.hidden is None:
+            visible = max(np.log(least / best) + pairing.absent, 0)
+        return pairing.evidence * (trust * np.log(best / away[v][i]) + visible)
 
     def pair(a: Sighting, i: int | None, b: Sighting, j: int | None) -> float:
         if i is None or j is None:
@@ -114,13 +126,20 @@ def slow(views: dict[str, Sighting], pairing: Pairing) -> dict[tuple[int | None,
 @settings(max_examples=25)
 @given(views=scenes.filter(two_sighted))
 def test_equals_brute_force(name: str, views: dict[str, Sighting]) -> None:
-    every = slow(views, PAIRINGS[name])
+    every = slow(views, RULES[name])
     best = max(every, key=lambda choice: every[choice])
-    found = associate(views, PAIRINGS[name])
+    found = associate(views, RULES[name])
     assert tuple(found.chosen.values()) == best
     assert found.total == pytest.approx(every[best], abs=1e-9)
+    rivals = [choice for choice in every if choice != best]
+    if RULES[name].hidden is not None:  # other objects: no candidate of the best choice
+        rivals = [
+            choice
+            for choice in every
+            if all(i != j or i is None for i, j in zip(choice, best, strict=True))
+        ]
     assert found.margin == pytest.approx(
-        every[best] - max(score for choice, score in every.items() if choice != best), abs=1e-9
+        every[best] - max(every[choice] for choice in rivals), abs=1e-9
     )
     assert sum(found.terms.values()) == pytest.approx(found.total, abs=1e-9)
     for v, (camera, view) in enumerate(views.items()):
@@ -144,8 +163,8 @@ def test_the_order_of_candidates_and_of_views_does_not_matter(
         for c, o in orders.items()
     }
     before, after = (
-        associate(views, PAIRINGS[name]),
-        associate({c: mixed[c] for c in rng.permutation(list(mixed)).tolist()}, PAIRINGS[name]),
+        associate(views, RULES[name]),
+        associate({c: mixed[c] for c in rng.permutation(list(mixed)).tolist()}, RULES[name]),
     )
     assert {
         c: None if i is None else int(orders[c][i]) for c, i in after.chosen.items()
@@ -179,10 +198,33 @@ def test_the_likest_reference_alone_can_stand_for_all() -> None:
         Sighting(empty, np.zeros((0, 4), np.float32), np.zeros((0, 4), np.float32)),
     ]
     by_mean, nothing = references(views, Pairing(()))
-    by_likest, _ = references(views, Pairing((), likest=True))
+    by_likest, _ = references(views, Pairing((), likest=1.0))
     assert by_mean[1] > by_mean[0]
     assert by_likest[0] - by_likest[1] == pytest.approx(3.7 * np.log(0.5 / 0.1), abs=1e-4)
     assert nothing.tolist() == [0.0]
+
+
+def test_the_likest_reference_can_weigh_as_much_as_all() -> None:
+    """Distances .1 and .9 to two references: .5 on average; the geometric mean of .1 and .5."""
+    cosine = np.array([[0.9, 0.1], [0.5, 0.5]], np.float32)
+    views = [Sighting(cosine, np.zeros((2, 4), np.float32), np.zeros((2, 4), np.float32))]
+    (scores,) = references(views, Pairing((), likest=0.5))
+    expected = 3.7 * np.log(0.5 / np.sqrt(0.1 * 0.5))
+    assert scores[0] - scores[1] == pytest.approx(expected, abs=1e-4)
+
+
+def test_an_object_that_one_view_hides_does_not_lose_to_one_that_all_show() -> None:
+    """Two of three cameras show the target, a little likelier there; all show a look-alike."""
+    both = np.array([[0.8], [0.7]], np.float32)
+    views = {
+        "front": replace(view(FRONT, 0.0, mine=MINE, other=OTHER), cosine=both),
+        "side": replace(view(SIDE, 0.0, mine=MINE, other=OTHER), cosine=both),
+        "wrist": replace(view(WRIST, 0.0, other=OTHER, third=THIRD), cosine=both - 0.1),
+    }
+    pairs_gain = Pairing(("geometry",))
+    assert associate(views, pairs_gain).chosen == {"front": 1, "side": 1, "wrist": 0}
+    even = replace(pairs_gain, hidden=0.5)
+    assert associate(views, even).chosen == {"front": 0, "side": 0, "wrist": None}
 
 
 def test_a_view_that_is_less_like_the_references_counts_less() -> None:
@@ -330,7 +372,7 @@ def test_views_that_contradict_each_other_agree_when_asked_together(name: str) -
     }
     alone = {camera: vote(one.cosine).winner for camera, one in worse.items()}
     assert alone == {**RIGHT, "wrist": 2}
-    assert associate(worse, PAIRINGS[name]).chosen == RIGHT
+    assert associate(worse, RULES[name]).chosen == RIGHT
 
 
 @pytest.mark.parametrize("name", TERMS)
@@ -338,7 +380,7 @@ def test_a_view_that_does_not_show_the_target_chooses_none(name: str) -> None:
     """The wrist sees the look-alikes only, and would have to choose one of them by itself."""
     absent = {**CASE_2, "wrist": view(WRIST, 0.6, third=THIRD, other=OTHER)}
     assert vote(absent["wrist"].cosine).winner is not None
-    assert associate(absent, PAIRINGS[name]).chosen == {**RIGHT, "wrist": None}
+    assert associate(absent, RULES[name]).chosen == {**RIGHT, "wrist": None}
 
 
 @pytest.mark.parametrize("name", TERMS)
@@ -362,7 +404,7 @@ def test_a_distractor_proposed_twice_in_every_view_changes_nothing(name: str) ->
             third_again=THIRD,
         ),
     }
-    assert associate(twice, PAIRINGS[name]).chosen == RIGHT
+    assert associate(twice, RULES[name]).chosen == RIGHT
 
 
 @settings(max_examples=30)
@@ -404,6 +446,21 @@ def test_views_keep_their_own_choices_where_none_is_decisive() -> None:
     assert again is not None
     assert again.chosen == found.chosen
     assert associate(CASE_2, replace(below, decisive=found.margin + 0.01)) is None
+
+
+def test_the_margin_over_other_objects_ignores_what_one_view_shows() -> None:
+    """A second box of the chosen object in one view takes the lead over any choice, not this one."""
+    doubled = {
+        **CASE_2,
+        "front": view(FRONT, 0.0, other=OTHER, mine=MINE, third=THIRD, mine_again=MINE),
+    }
+    by_any = [associate(views, PAIRINGS["geometry"]).margin for views in (CASE_2, doubled)]
+    by_object = [
+        associate(views, replace(OF_OBJECTS, reliance=0.0)).margin for views in (CASE_2, doubled)
+    ]
+    assert by_any[0] > 1.0
+    assert by_any[1] == pytest.approx(0.0, abs=1e-9)
+    assert by_object[1] > 1.0
 
 
 def test_what_cannot_be_associated_is_said() -> None:

@@ -35,6 +35,8 @@ MOST_COMBINATIONS = 10_000_000
 """Limits of the enumeration: views, and combinations of their candidates."""
 NEAREST = 1e-3
 """Cosine distances below this count as equal to it, so that their logarithm stays finite."""
+SLACK = 0.1
+"""Natural logarithms: a candidate whose pairs cost less than this is no worse than none."""
 HEIGHTS_M = (0.0, 0.08)
 """The centres of objects that stand on the table (z = 0 in the world) lie between these heights."""
 
@@ -67,16 +69,21 @@ class Pairing:
     `spread_m` as objects stand that close on a table."""
     astray: float = 0.015
     """The share of boxes so cut or so wrong that their centres carry no evidence."""
-    likest: bool = False
-    """Whether a candidate's distance to the references is that to the likest one alone, instead of
-    the mean; the numbers above were fitted with the mean."""
+    likest: float = 0.0
+    """A candidate's distance to the references is the geometric mean of that to the likest one, of
+    this weight, and of the mean distance; the numbers above were fitted with the mean alone."""
     reliance: float = 0.0
     """How much less the references tell its candidates apart in a view that is less like them: by
     the least distance in all views over that in this one, to this power. (A wrist camera looks from
     above, as few references do.) 0: every view counts the same."""
     decisive: float = 0.0
-    """The best choice for all views is taken where it leads every other by this; elsewhere each
-    view keeps its own."""
+    """The best choice for all views is taken where its margin is at least this; elsewhere each view
+    keeps its own."""
+    hidden: float | None = None
+    """None of a view scores this share of its candidates' mean, less `SLACK`, and geometry only
+    speaks against pairs: an object that fewer views show has no disadvantage. The margin is the
+    lead over other objects, so over every choice that has no candidate of the best one. By default
+    `absent` scores a view, pairs that match gain, and the margin is the lead over any choice."""
 
 
 @value
@@ -152,16 +159,16 @@ def associate(views: Mapping[str, Sighting], pairing: Pairing) -> Association | 
 
     chosen: dict[str, int | None] = {}
     support: dict[str, ViewScores] = {}
-    rival = -np.inf
     for v, (name, view) in enumerate(views.items()):
         choice = best[v]
         chosen[name] = None if choice == len(view.xyxy) else choice
         of_view = np.moveaxis(totals, v, 0).reshape(totals.shape[v], -1)
         support[name] = of_view.max(axis=1)
-        others = np.delete(support[name], choice)
-        best_other = float(others.max(initial=-np.inf))
-        rival = max(rival, best_other)
     total = float(totals[best])
+    if pairing.hidden is None:
+        rival = _best_other(support, chosen)
+    else:
+        rival = _best_other_object(totals, best)
     if total - rival < pairing.decisive:
         return None
     return Association(
@@ -171,6 +178,26 @@ def associate(views: Mapping[str, Sighting], pairing: Pairing) -> Association | 
         terms=_scores_of_choice(singles, pairs, best),
         support=support,
     )
+
+
+def _best_other(support: Mapping[str, ViewScores], chosen: Mapping[str, int | None]) -> float:
+    """The best total of a combination that differs from the chosen one in any view."""
+    rival = -np.inf
+    for name, scores in support.items():
+        choice = chosen[name]
+        others = np.delete(scores, len(scores) - 1 if choice is None else choice)
+        rival = max(rival, float(others.max(initial=-np.inf)))
+    return rival
+
+
+def _best_other_object(totals: Float64[np.ndarray, "..."], best: Sequence[int]) -> float:
+    """The best total of a combination that shares no candidate with the `best` one."""
+    others = totals
+    for v, choice in enumerate(best):
+        is_candidate = choice < totals.shape[v] - 1
+        if is_candidate:
+            others = np.delete(others, choice, axis=v)
+    return float(others.max())
 
 
 def total_scores(
@@ -192,28 +219,33 @@ def total_scores(
 
 
 def references(views: Sequence[Sighting], pairing: Pairing) -> list[ViewScores]:
-    """The references' evidence for the candidates of every view.
+    """The references' evidence for the candidates of every view, and the score of none.
 
     It is `evidence` ((d / d_v) ** `reliance` log(d_v / d_i) + max(log(d / d_v) + `absent`, 0)), and
-    0 for none. d_i is 1 - the mean cosine of candidate i with the references (the greatest where
-    `likest`), d_v the least in its view, d the least in all views.
+    0 for none. d_i is 1 - the mean cosine of candidate i with the references (by `likest` the
+    greatest), d_v the least in its view, d the least in all views. Where `hidden` is given, the
+    second part is left out, and none scores as it says.
     """
     distances = []
     for view in views:
         cosine = view.cosine.astype(np.float64)
-        of_each = cosine.max(axis=1) if pairing.likest else cosine.mean(axis=1)
-        distances.append(np.maximum(1.0 - of_each, NEAREST))
+        to_all = np.maximum(1.0 - cosine.mean(axis=1), NEAREST)
+        to_likest = np.maximum(1.0 - cosine.max(axis=1), NEAREST)
+        distances.append(to_all ** (1 - pairing.likest) * to_likest**pairing.likest)
     least = min(float(d.min()) for d in distances if len(d))
     scores = []
     for d in distances:
-        visible = 0.0
-        if len(d):
-            lead = float(np.log(least / d.min()))
-            visible = max(lead + pairing.absent, 0.0)
         nearest = d.min(initial=np.inf)
         trust = (least / nearest) ** pairing.reliance
+        visible = 0.0
+        if len(d) and pairing.hidden is None:
+            lead = float(np.log(least / nearest))
+            visible = max(lead + pairing.absent, 0.0)
         of_view = pairing.evidence * (trust * np.log(nearest / d) + visible)
-        scores.append(np.append(of_view, 0.0))
+        none = 0.0
+        if len(d) and pairing.hidden is not None:
+            none = pairing.hidden * float(of_view.mean()) - SLACK
+        scores.append(np.append(of_view, none))
     return scores
 
 
@@ -244,7 +276,8 @@ def hungarian(a: Sighting, b: Sighting, pairing: Pairing) -> Scores:
 def geometry(a: Sighting, b: Sighting, pairing: Pairing) -> Scores:
     """Log ratio of two densities of `ray_distance_m`.
 
-    For one object a Gaussian of `sigma_m`, but for a share `astray`; for two, `spread_m` wide.
+    For one object a Gaussian of `sigma_m`, but for a share `astray`; for two, `spread_m` wide. Where
+    `hidden` is given, less its greatest value.
 
     Raises: BadViews, without calibrated cameras.
     """
@@ -254,8 +287,11 @@ def geometry(a: Sighting, b: Sighting, pairing: Pairing) -> Scores:
             "pair by 'embedding' or 'hungarian'."
         )
     gaussian = np.exp(-0.5 * (ray_distance_m(a, b) / pairing.sigma_m) ** 2)
-    near = (pairing.spread_m / pairing.sigma_m) ** 2 * gaussian
-    return np.log(pairing.astray + (1 - pairing.astray) * near)
+    densest = (pairing.spread_m / pairing.sigma_m) ** 2
+    scores = np.log(pairing.astray + (1 - pairing.astray) * densest * gaussian)
+    if pairing.hidden is not None:
+        scores -= np.log(pairing.astray + (1 - pairing.astray) * densest)
+    return scores
 
 
 def ray_distance_m(a: Sighting, b: Sighting) -> Scores:
