@@ -276,8 +276,8 @@ def hungarian(a: Sighting, b: Sighting, pairing: Pairing) -> Scores:
 def geometry(a: Sighting, b: Sighting, pairing: Pairing) -> Scores:
     """Log ratio of two densities of `ray_distance_m`.
 
-    For one object a Gaussian of `sigma_m`, but for a share `astray`; for two, `spread_m` wide. Where
-    `hidden` is given, less its greatest value.
+    For one object a Gaussian of `sigma_m`, but for a share `astray`; for two, `spread_m` wide. With
+    `hidden` less its greatest value.
 
     Raises: BadViews, without calibrated cameras.
     """

@@ -279,8 +279,9 @@ class Association:
 
     Scores are natural logarithms. `chosen[camera]` is a candidate, or None: not visible there.
     `total` is the chosen combination's score, `terms` its parts by name, and `margin` its lead over
-    the best combination that differs in any view (associate.Pairing.hidden: in every view). `support[camera]` holds the best total of any
-    combination with each candidate of that view, and last with none."""
+    the best combination that differs in any view (associate.Pairing.hidden: in every view).
+    `support[camera]` holds the best total of any combination with each candidate of that view, and
+    last with none."""
 
     chosen: Mapping[str, int | None]
     total: float
