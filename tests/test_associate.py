@@ -21,7 +21,7 @@ from vap_core.associate import (
     ray_distance_m,
     references,
 )
-from vap_core.base.errors import BadViews
+from vap_core.base.errors import BadStudy, BadViews, UnknownName
 from vap_core.base.types import Camera
 from vap_core.vote import vote
 
@@ -461,6 +461,25 @@ def test_the_margin_over_other_objects_ignores_what_one_view_shows() -> None:
     assert by_any[0] > 1.0
     assert by_any[1] == pytest.approx(0.0, abs=1e-9)
     assert by_object[1] > 1.0
+
+
+@pytest.mark.parametrize(
+    ("field", "wrong", "error", "said"),
+    [
+        ("terms", ("geometri",), UnknownName, "term 'geometri' is unknown; known: embedding, geom"),
+        ("terms", "geometry", BadStudy, "terms is 'geometry'; give a tuple of names"),
+        ("sigma_m", 0.0, BadStudy, "sigma_m is 0.0; give more than 0"),
+        ("spread_m", float("nan"), BadStudy, "spread_m is nan; give more than 0"),
+    ],
+)
+def test_what_is_no_pairing_is_refused(
+    field: str, wrong: object, error: type[Exception], said: str
+) -> None:
+    """Set past the check of signatures, which users do not have."""
+    pairing = Pairing(("geometry",))
+    object.__setattr__(pairing, field, wrong)
+    with pytest.raises(error, match=said):
+        pairing.__post_init__()
 
 
 def test_what_cannot_be_associated_is_said() -> None:

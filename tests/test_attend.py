@@ -590,11 +590,41 @@ def test_views_that_cannot_be_associated_are_said() -> None:
         BadViews, match="geometry needs calibrated cameras; give Attender.start cameras="
     ):
         attender.start(CONTRADICTING, "bring my cup")
+    misnamed = {name.upper(): camera for name, camera in CAMERAS.items()}
+    with pytest.raises(BadViews, match=r"for front, side, wrist \(given: FRONT, SIDE, WRIST\)"):
+        attender.start(CONTRADICTING, "bring my cup", cameras=misnamed)
     small = {**CAMERAS, "side": replace(CAMERAS["side"], width=32)}
     with pytest.raises(
         BadViews, match="camera 'side' is calibrated for 32x64 pixels, but its view has 64x64"
     ):
         attender.start(CONTRADICTING, "bring my cup", cameras=small)
+
+
+def in_millimetres(pose: np.ndarray) -> np.ndarray:
+    return np.block([[pose[:3, :3], 1000 * pose[:3, 3:]], [pose[3:]]])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"pose_world": in_millimetres}, "stands 1000 m above the table"),
+        (
+            {"pose_world": lambda pose: pose @ np.diag([1.0, -1, -1, 1])},
+            "looks away from the table",
+        ),
+        ({"pose_world": lambda pose: pose * np.nan}, "has numbers that are not finite"),
+        ({"pose_world": lambda pose: 2.0 * pose}, "has a pose_world without a rotation"),
+        ({"pose_world": lambda pose: pose @ np.diag([-1.0, 1, 1, 1])}, "has a pose_world without"),
+        ({"k": np.zeros_like}, "has a k that cannot be inverted"),
+    ],
+)
+def test_a_camera_that_cannot_see_the_table_is_refused(change: Any, said: str) -> None:
+    """Its rays meet the objects of no other view: every other one would lose its tint."""
+    attender = Attender(TOYS, MEMORY, Prompting(associate=PAIRINGS["geometry"]))
+    ((field, how),) = change.items()
+    side = replace(CAMERAS["side"], **{field: how(getattr(CAMERAS["side"], field))})
+    with pytest.raises(BadViews, match=f"camera 'side' {said}.*with the table at z = 0"):
+        attender.start(CONTRADICTING, "bring my cup", cameras={**CAMERAS, "side": side})
 
 
 def test_on_a_rendered_desk_with_three_cameras_no_view_contradicts_another() -> None:

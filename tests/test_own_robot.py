@@ -27,6 +27,8 @@ ENTERS = """
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from vap_core.simulation.cameras import RIGS, Rig
 from vap_core.simulation.robots import ROBOTS
 
@@ -139,11 +141,29 @@ def test_fingers_that_the_mjcf_lacks_are_named(file: Path) -> None:
             "0 fingers, 0 open, 0 closed; one each, and at least one finger",
         ),
         ("links=()", "links is empty; name the bodies from the base to the fingers"),
+        ("hz=0.0", "hz is 0; give more than 0"),
+        (
+            "speed_rad_s=np.full(6, 180.0)",
+            "speed_rad_s is [180.0, 180.0, 180.0, 180.0, 180.0, 180.0]; give radians a second, "
+            "above 0 and at most 30",
+        ),
+        (
+            "fingers_open=(0.037, -0.015)",
+            "finger 'right_finger' is at -0.015 both open and closed",
+        ),
     ],
 )
 def test_fingers_and_links_are_counted(file: Path, field: str, words: str) -> None:
     edit(file, 'name="mine", xml', f'name="mine", {field}, xml')
     assert f"Robot 'mine': {words}" in refusal_of(file)
+
+
+def test_a_home_in_degrees_is_refused(file: Path) -> None:
+    edit(file, 'name="mine", xml', 'name="mine", home=np.rad2deg(ROBOTS["wx250s"].home), xml')
+    words = "home has -18.6108 for joint shoulder, outside its range -1.8"
+    said = refusal_of(file)
+    assert words in said
+    assert said.endswith("; give radians.")
 
 
 def test_a_file_that_is_not_there_is_named(file: Path, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from vap_core.base.errors import BadViews
+from vap_core.base.errors import BadStudy, BadViews, one_of
 from vap_core.base.types import Association, Camera, Grounding, election_scores, value
 from vap_core.perception.candidates import Candidates
 
@@ -35,6 +35,8 @@ MOST_COMBINATIONS = 10_000_000
 """Limits of the enumeration: views, and combinations of their candidates."""
 NEAREST = 1e-3
 """Cosine distances below this count as equal to it, so that their logarithm stays finite."""
+HIGHEST_M = 20.0
+"""A camera higher above the table than this has a pose in other units."""
 SLACK = 0.1
 """Natural logarithms: a candidate whose pairs cost less than this is no worse than none."""
 HEIGHTS_M = (0.0, 0.08)
@@ -50,6 +52,8 @@ class Pairing:
     three-camera scenes of generic objects with two twins each (342 views, every tenth box withheld;
     true boxes, embedded encoder). They do not depend on an encoder's scale: `evidence` and `absent`
     compare ratios of cosine distances, `likeness` cosines of centred embeddings.
+
+    Raises: UnknownName for a term that does not exist; BadStudy for a width that is not above 0.
     """
 
     terms: tuple[Term, ...]
@@ -85,6 +89,16 @@ class Pairing:
     lead over other objects, so over every choice that has no candidate of the best one. By default
     `absent` scores a view, pairs that match gain, and the margin is the lead over any choice."""
 
+    def __post_init__(self) -> None:
+        if isinstance(self.terms, str):
+            raise BadStudy(f"Pairing: terms is {self.terms!r}; give a tuple of names.")
+        for term in self.terms:
+            if term not in TERMS:
+                raise one_of("Pairing: term", term, TERMS)
+        for name in ("sigma_m", "spread_m", "astray"):
+            if not getattr(self, name) > 0:
+                raise BadStudy(f"Pairing: {name} is {getattr(self, name)}; give more than 0.")
+
 
 @value
 class Sighting:
@@ -109,8 +123,11 @@ def associate_targets(
 
     `groundings[camera][j]` and `candidates[camera][j]` are of target j.
 
-    Raises: as `associate`; BadViews, when a camera is calibrated for another image size.
+    Raises: as `associate`; BadViews, when a view has no camera although geometry needs one, or one
+        that is calibrated for another image size or cannot see the table.
     """
+    if "geometry" in pairing.terms:
+        _check_poses(groundings, cameras)
     chosen: dict[str, tuple[Grounding, ...]] = dict.fromkeys(groundings, ())
     associations: list[Association | None] = []
     n_targets = len(next(iter(groundings.values())))
@@ -388,6 +405,55 @@ def _check_calibration(camera: str, grounding: Grounding, cameras: Mapping[str, 
             f"Attender.start: camera {camera!r} is calibrated for {known.width}x{known.height} "
             f"pixels, but its view has {width}x{height}; scale its k, or the view."
         )
+
+
+def _check_poses(
+    groundings: Mapping[str, Sequence[Grounding]], cameras: Mapping[str, Camera]
+) -> None:
+    """Raises: BadViews: of two views or more that have candidates, one has no camera, or one whose
+    rays cannot meet the table.
+    """
+    views = []
+    for view, per_target in groundings.items():
+        if any(len(grounding.candidates) for grounding in per_target):
+            views.append(view)
+    if len(views) < 2:
+        return
+    missing = [view for view in views if view not in cameras]
+    if missing:
+        raise BadViews(
+            f"associate: geometry needs calibrated cameras; give Attender.start cameras=... for "
+            f"{', '.join(missing)} (given: {', '.join(cameras) or 'none'}), or pair by 'embedding' "
+            "or 'hungarian'."
+        )
+    for view in views:
+        fault = _pose_fault(cameras[view])
+        if fault:
+            raise BadViews(
+                f"Attender.start: camera {view!r} {fault}; pose_world maps the camera (OpenCV "
+                "axes: x right, y down, z ahead) to the world, in metres, with the table at z = 0."
+            )
+
+
+def _pose_fault(camera: Camera) -> str:
+    """What keeps a camera's rays from meeting the table, "" where nothing does."""
+    pose = camera.pose_world
+    if not (np.isfinite(pose).all() and np.isfinite(camera.k).all()):
+        return "has numbers that are not finite"
+    if np.linalg.matrix_rank(camera.k) < 3:
+        return "has a k that cannot be inverted"
+    rotation = pose[:3, :3]
+    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+    if not is_rotation or np.linalg.det(rotation) < 0:
+        return "has a pose_world without a rotation"
+    height_m = float(pose[2, 3])
+    if not 0 < height_m < HIGHEST_M:
+        return f"stands {height_m:g} m above the table"
+    corners = np.array([[x, y, 1.0] for x in (0, camera.width) for y in (0, camera.height)])
+    rays = corners @ np.linalg.inv(camera.k).T @ rotation.T
+    if (rays[:, 2] >= 0).all():
+        return "looks away from the table"
+    return ""
 
 
 def _check_size(sightings: Sequence[Sighting]) -> None:

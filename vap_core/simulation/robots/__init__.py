@@ -10,6 +10,8 @@ from vap_core.base.types import value
 from vap_core.simulation.types import Pose
 
 HERE = Path(__file__).parent
+FASTEST_RAD_S = 30.0
+"""A joint that is faster has its speed in degrees."""
 ORIGIN = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
 
@@ -35,7 +37,8 @@ class Robot:
     `table_m` is the table top's (x0, y0, x1, y1) and `floor_z_m` the floor below it, metres in the
     world frame.
     Raises: ValueError when joints, home angles and speeds differ in number, or fingers and their
-        two lists of travel; when there is no finger or no link.
+        two lists of travel; when there is no finger or no link; for an `hz` or a speed that is not
+        above 0 or too fast for radians, or a finger whose two travels are equal.
     """
 
     name: str
@@ -71,6 +74,20 @@ class Robot:
                 f"Robot {self.name!r}: {n} fingers, {len(self.fingers_open)} open, "
                 f"{len(self.fingers_closed)} closed; one each, and at least one finger"
             )
+        if not self.hz > 0:
+            raise ValueError(f"Robot {self.name!r}: hz is {self.hz:g}; give more than 0")
+        if not ((self.speed_rad_s > 0) & (self.speed_rad_s <= FASTEST_RAD_S)).all():
+            raise ValueError(
+                f"Robot {self.name!r}: speed_rad_s is {self.speed_rad_s.tolist()}; give radians a "
+                f"second, above 0 and at most {FASTEST_RAD_S:g}"
+            )
+        for finger, opened, closed in zip(
+            self.fingers, self.fingers_open, self.fingers_closed, strict=True
+        ):
+            if opened == closed:
+                raise ValueError(
+                    f"Robot {self.name!r}: finger {finger!r} is at {opened:g} both open and closed"
+                )
         if not self.links:
             raise ValueError(
                 f"Robot {self.name!r}: links is empty; name the bodies from the base to the fingers"

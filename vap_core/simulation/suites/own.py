@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from jaxtyping import TypeCheckError
 
@@ -20,7 +21,7 @@ from vap_core.base.types import value
 from vap_core.simulation import robots
 from vap_core.simulation.assets import objects
 from vap_core.simulation.cameras import add_rigs
-from vap_core.simulation.robots import mjcf
+from vap_core.simulation.robots import Robot, mjcf
 from vap_core.simulation.suites import lists, wording
 from vap_core.simulation.suites.suite import Suite
 from vap_core.simulation.types import AS_LISTED, EpisodeRow
@@ -189,6 +190,18 @@ def _made_rows(make_rows: Callable[[], object]) -> tuple[EpisodeRow, ...]:
     return tuple(rows)
 
 
+def _check_home(robot: Robot, model: Any) -> None:
+    """Raises: BadSuite: a joint begins outside its range."""
+    for name, angle in zip(robot.joints, robot.home.tolist(), strict=True):
+        joint = model.joint(name)
+        low, high = joint.range.tolist()
+        if joint.limited[0] and not low - 1e-6 <= angle <= high + 1e-6:
+            raise BadSuite(
+                f"{robot.name}'s home has {angle:g} for joint {name}, outside its range "
+                f"{low:g} to {high:g}; give radians"
+            )
+
+
 def _checked_rows(
     suite: Suite, make_rows: Callable[[], object], path: Path
 ) -> tuple[EpisodeRow, ...]:
@@ -199,7 +212,7 @@ def _checked_rows(
             raise BadSuite(f"{robot.name} is controlled at hz={robot.hz:g}, and not {suite.hz:g}")
         spec = mjcf.load(robot)
         rigs = add_rigs(spec, robot.name)
-        spec.compile()
+        _check_home(robot, spec.compile())
         if not suite.cameras:
             raise BadSuite(f"cameras is empty; {robot.name} has {', '.join(sorted(rigs))}")
         for camera in suite.cameras:
