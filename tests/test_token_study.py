@@ -384,6 +384,14 @@ def test_objects_are_the_units_whatever_the_number_of_their_episodes(episodes: i
     assert (in_scene.low, in_scene.high) == pytest.approx((wilson.low, wilson.high))
 
 
+def test_rows_of_several_trainings_of_one_word_are_refused() -> None:
+    """The highest score would be over both: the same rows twice would halve chance."""
+    table = chosen_in_both({"cup": (True, False)}, 6)
+    again = pd.concat([table, table], ignore_index=True)
+    with pytest.raises(BadStudy, match="of several trainings of one word; choose one by k, epochs"):
+        choices.losses(again, touches({"cup": False}, 6))
+
+
 def test_the_loss_of_a_suite_is_corrected_for_the_others() -> None:
     right = {f"object-{i}": (True, False) for i in range(6)}
     one = chosen_in_both(right, 2)

@@ -1,6 +1,8 @@
 """A learned word: only its embedding is trained, it tells what the model can see, and it is spoken to a policy whose weights stay."""
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -151,6 +153,16 @@ def test_a_token_comes_back_from_disk_for_its_own_model_only(tmp_path: Path) -> 
     path.write_bytes(path.read_bytes()[:20])
     with pytest.raises(BadMemory, match="no learned word"):
         token_file.load(tmp_path, "red-mug", "f" * 64)
+    wrong: list[tuple[dict[str, Any], str]] = [
+        ({"object": "blue-mug"}, "is the word of 'blue-mug', not of 'red-mug'"),
+        ({"embedding": np.array([1.0, np.nan], np.float32)}, "has numbers that are not finite"),
+        ({"accuracy": 7.0}, "has an accuracy of 7, not from 0 to 1"),
+        ({"accuracy": float("nan")}, "has an accuracy of nan, not from 0 to 1"),
+    ]
+    for change, said in wrong:
+        token_file.save(tmp_path, replace(token, **change)).rename(path)
+        with pytest.raises(BadMemory, match=said):
+            token_file.load(tmp_path, "red-mug", "f" * 64)
     assert path.name == f"red-mug{SUFFIX}"
     saved = {token_file.save(tmp_path, token).read_bytes() for _ in range(6)}
     assert len(saved) == 1
@@ -182,6 +194,9 @@ def test_a_policy_hears_the_word_and_its_weights_stay(checkpoint: Path) -> None:
     assert policy.sha256() == before
     with pytest.raises(BadPolicy, match="no word <mine>"):
         policy.with_tokens({"<mine>": np.zeros(32, np.float32)})
+    for width in (1, 7):
+        with pytest.raises(BadPolicy, match=f"has {width} numbers, and those of .* have "):
+            policy.with_tokens({WORD: np.zeros(width, np.float32)})
 
 
 def test_the_model_answers_after_a_round_trip_and_a_policy_grows_from_it(

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
+from vap_core.base.errors import BadStudy
 from vap_core.base.types import Mask, Rgb, value
 from vap_core.evaluation.engine import spread_evenly
 from vap_core.evaluation.perception.estimates import Estimate, share_by
@@ -133,11 +134,18 @@ def scores(
 def chosen(table: "pd.DataFrame") -> "pd.DataFrame":
     """One row per episode: whether the highest score is the target's alone, and chance.
 
-    `table` has the rows of `scores` of one reading. Episodes whose target no view shows count as
-    wrong.
+    `table` has the rows of `scores` of one reading and one training of each object's word. Episodes
+    whose target no view shows count as wrong.
+
+    Raises: BadStudy for rows of several trainings.
     """
     import pandas as pd
 
+    if table.duplicated([*KEY, "object", "shown"]).any():
+        raise BadStudy(
+            "tokens: the rows are of several trainings of one word; choose one by k, epochs and "
+            "the reading."
+        )
     rows = []
     for key, group in table.groupby([*KEY, "object"], observed=True, sort=False):
         is_target = group["shown"] == group["object"]

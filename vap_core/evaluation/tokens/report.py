@@ -185,10 +185,12 @@ def _choice_rows(table: "pd.DataFrame") -> list[list[str]]:
     rows = [["objects of first views", "seen in", "chance", "the model chooses the target"]]
     usual = reading(table, "as learned")
     usual = usual[usual.k == USUAL_K]
-    for (suite, seen_in), part in usual.groupby(["suite", "seen_in"], sort=False):
+    several = usual["epochs"].nunique() > 1
+    for (suite, epochs, seen_in), part in usual.groupby(["suite", "epochs", "seen_in"], sort=False):
         found = chosen(part)
+        name = f"{suite}, {epochs} epochs" if several else str(suite)
         chance = f"{100 * found.chance.mean():.1f}"
-        rows.append([str(suite), str(seen_in), chance, share_by(found, "right", OBJECTS).text()])
+        rows.append([name, str(seen_in), chance, share_by(found, "right", OBJECTS).text()])
     return rows
 
 

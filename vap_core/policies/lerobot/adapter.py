@@ -32,7 +32,7 @@ from vap_core.policies.hooks import (
 from vap_core.policies.lerobot.attention_hooks import can_watch, reporting_attention
 from vap_core.policies.lerobot.checkpoints import PIPELINES, locate, stamp
 from vap_core.policies.lerobot.loading import build
-from vap_core.policies.lerobot.module_hooks import overriding_tokens
+from vap_core.policies.lerobot.module_hooks import overriding_tokens, word_width
 from vap_core.policies.lerobot.normalisation import EMPTY
 from vap_core.policies.lerobot.token_positions import positions
 from vap_core.policies.lerobot.traced import ChunkPredictor
@@ -121,7 +121,8 @@ class LeRobot:
 
         Its own table of embeddings stays as it is.
 
-        Raises: BadPolicy for a word that the vocabulary does not have.
+        Raises: BadPolicy for a word that the vocabulary does not have, or an embedding of another
+            width than its words'.
         """
         tokens = {word: i for i, word in enumerate(getattr(self.policy.config, "words", ()))}
         learned = {}
@@ -130,6 +131,12 @@ class LeRobot:
                 raise BadPolicy(
                     f"LeRobot: {self.label} has no word {word}; learned words need a mini-pi0, "
                     "which reserves some for them."
+                )
+            width = word_width(self.policy)
+            if len(embedding) != width:
+                raise BadPolicy(
+                    f"LeRobot: the embedding of {word} has {len(embedding)} numbers, and those of "
+                    f"{self.label} have {width}; learn the word in the model that it grew from."
                 )
             learned[tokens[word]] = torch.from_numpy(embedding)
         policy = copy.copy(self)

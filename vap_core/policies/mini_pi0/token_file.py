@@ -42,7 +42,8 @@ def save(folder: Path, token: Token, suffix: str = SUFFIX) -> Path:
 def load(folder: Path, name: str, model: str, suffix: str = SUFFIX) -> Token:
     """The word of that object.
 
-    Raises: BadMemory when it is absent, damaged, or was learned in another model.
+    Raises: BadMemory when it is absent, damaged, of another object, or was learned in another
+        model.
     """
     from safetensors import SafetensorError
 
@@ -53,12 +54,26 @@ def load(folder: Path, name: str, model: str, suffix: str = SUFFIX) -> Token:
         raise BadMemory(
             f"tokens.load: {path} holds no learned word ({type(error).__name__}); learn it again."
         ) from error
+    fault = _fault(token, name)
+    if fault:
+        raise BadMemory(f"tokens.load: {path} {fault}; learn it again.")
     if token.model != model:
         raise BadMemory(
             f"tokens.load: {path} was learned in model {token.model[:8]}, this is {model[:8]}; "
             "learn it again."
         )
     return token
+
+
+def _fault(token: Token, name: str) -> str:
+    """What is wrong with the word of object `name`, "" where nothing is."""
+    if token.object != name:
+        return f"is the word of {token.object!r}, not of {name!r}"
+    if not np.isfinite(token.embedding).all():
+        return "has numbers that are not finite"
+    if not 0 <= token.accuracy <= 1:
+        return f"has an accuracy of {token.accuracy:g}, not from 0 to 1"
+    return ""
 
 
 def _read(path: Path) -> Token:
