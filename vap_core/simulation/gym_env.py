@@ -15,10 +15,10 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs import registration
 
-from vap_core.base.errors import BadSuite
+from vap_core.base.errors import BadSuite, one_of
 from vap_core.base.types import Rgb
 from vap_core.simulation import suites
-from vap_core.simulation.scenes import Meshes, Scene
+from vap_core.simulation.scenes import Scene, meshes_called
 from vap_core.simulation.suites import Judge
 from vap_core.simulation.suites.lists import check
 from vap_core.simulation.suites.open_row import build_scene, make_env, models_of
@@ -46,6 +46,9 @@ class VapEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
 
     `reset(options={"episode": i})` starts episode i of its list, else one is drawn by the seed.
     `reset(options={"row": row})` starts any EpisodeRow of the same robot, for suites of your own.
+
+    Raises: UnknownName for a suite, a task, `robots` or a `render_mode` that there is not; BadSuite
+        for a damaged list, or `episodes` below 1; BadViews for an `image_size` below 1.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012
@@ -55,16 +58,20 @@ class VapEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         suite: str,
         task: str,
         image_size: int = 224,
-        robots: Meshes = "plain",
+        robots: str = "plain",
         render_mode: str | None = None,
         episodes: int = 20,
     ) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise one_of("VapEnv: render_mode", render_mode, self.metadata["render_modes"])
+        if episodes < 1:
+            raise BadSuite(f"VapEnv: episodes is {episodes}; give 1 or more.")
         self.suite = suites.suite(suite)
         self.rows = suites.rows(suite, task, episodes if suite in suites.WARM_UPS else None)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.suite.hz}
         self.image_size = image_size
-        self.robots = robots
+        self.robots = meshes_called(robots)
         self._scenes: dict[tuple[str, tuple[str, ...]], Scene] = {}
         self._judge: Judge | None = None
         self._start(self.rows[0])
