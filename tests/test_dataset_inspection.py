@@ -316,7 +316,7 @@ def test_two_features_of_one_camera_are_refused(tmp_path: Path) -> None:
     dataset.add_frame(dict.fromkeys(keys, picture(0, "top", 0)) | {"task": "bring the mug"})
     dataset.save_episode()
     dataset.finalize()
-    said = r"twice has pictures .*images\.front and observation\.front, .*'front' here; rename or"
+    said = r"twice has pictures .*images\.front and observation\.front, .*'front' here; remove one"
     with pytest.raises(BadDataset, match=said):
         open_dataset(tmp_path / "twice")
 

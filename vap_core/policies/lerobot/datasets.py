@@ -250,7 +250,7 @@ def _cameras(dataset: "LeRobotDataset", folder: Path) -> dict[str, str]:
             if camera in keys:
                 raise BadDataset(
                     f"dataset: {folder} has pictures {keys[camera]} and {key}, which are both of a "
-                    f"camera {camera!r} here; rename or remove one of them (lerobot-edit-dataset)."
+                    f"camera {camera!r} here; remove one (lerobot-edit-dataset), or rename it."
                 )
             keys[camera] = key
     return keys

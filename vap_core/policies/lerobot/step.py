@@ -74,7 +74,7 @@ class VapPrompt(ProcessorStep):
     """Tints the remembered object in every `observation.images.*`, and rewrites `task`.
 
     Pictures are lerobot's: floats in 0..1, 3 x H x W or B x 3 x H x W. Those of one channel whose
-    key says depth pass as they are.
+    key says depth pass as they are; a colour picture of another name is refused.
 
     Views in which it is not seen pass bit for bit. `memory` is the folder of remembered objects,
     `objects` names those meant where the category alone does not decide, `speaker` is whom "my"
