@@ -13,7 +13,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from tests.command import refused, vap
 from tests.full_disk import full_disk
-from tests.toys import TOYS, personal, scene
+from tests.toys import TOYS, SameColour, personal, scene
 from vap_core import memory
 from vap_core.analysis import dataset_inspection
 from vap_core.analysis.dataset_inspection import (
@@ -24,6 +24,7 @@ from vap_core.analysis.dataset_inspection import (
 )
 from vap_core.attend import Attender
 from vap_core.base.errors import BadDataset, BadOutput
+from vap_core.perception.embedded import weights
 from vap_core.perception.kept_thresholds import keep_thresholds, thresholds_file
 from vap_core.perception.protocols import Thresholds
 from vap_core.perception.stacks import STACKS
@@ -33,6 +34,10 @@ from vap_core.recording import read_summary
 BLUE, GREEN = (0, 0, 255), (0, 255, 0)
 CAMERAS = ("top", "wrist")
 TOLD = "bring my mug"
+
+
+class Elsewhere(SameColour):
+    """A tracker of another class."""
 
 
 def picture(t: int, camera: str, episode: int) -> np.ndarray:
@@ -150,6 +155,22 @@ def test_answers_of_another_threshold_owner_or_version_are_not_taken_for_these(
     inspect_dataset(recorded, TOLD, bank, "toys", out, episodes=1)
     monkeypatch.setattr(dataset_inspection, "__version__", "later")
     refuses("version")
+
+
+def test_answers_of_other_parts_or_weights_are_not_taken_for_these(
+    recorded: Path, bank: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The stack's name and its encoder's are as they were."""
+    ask = (recorded, TOLD, bank, "toys", tmp_path / "out")
+    inspect_dataset(*ask, episodes=1)
+    other = replace(TOYS, tracker=Elsewhere())
+    with monkeypatch.context() as patch:
+        patch.setitem(STACKS, "toys", lambda: other)
+        with pytest.raises(BadOutput, match=r"another inspection \(parts differ\); choose another"):
+            inspect_dataset(*ask, episodes=1)
+    monkeypatch.setattr(weights, "weights_sha256", lambda: {"tracker.npz": "0" * 64})
+    with pytest.raises(BadOutput, match=r"another inspection \(weights differ\); choose another"):
+        inspect_dataset(*ask, episodes=1)
 
 
 @pytest.mark.parametrize("part", ["meta/info.json", "meta/episodes", "data"])
@@ -282,6 +303,22 @@ def test_what_is_no_dataset_is_one_line(recorded: Path, tmp_path: Path, flaw: st
         open_dataset(folder)
     assert "\n" not in str(refusal.value)
     assert str(folder) in str(refusal.value)
+
+
+def test_two_features_of_one_camera_are_refused(tmp_path: Path) -> None:
+    """The second took the first's place, and the first was copied without a prompt."""
+    h, w = scene([]).shape[:2]
+    feature = {"dtype": "image", "shape": (h, w, 3), "names": ["height", "width", "channels"]}
+    keys = ("observation.images.front", "observation.front")
+    dataset = LeRobotDataset.create(
+        "me/twice", fps=5, features=dict.fromkeys(keys, feature), root=tmp_path / "twice", use_videos=False
+    )  # fmt: skip
+    dataset.add_frame(dict.fromkeys(keys, picture(0, "top", 0)) | {"task": "bring the mug"})
+    dataset.save_episode()
+    dataset.finalize()
+    said = r"twice has pictures .*images\.front and observation\.front, .*'front' here; remove one"
+    with pytest.raises(BadDataset, match=said):
+        open_dataset(tmp_path / "twice")
 
 
 def test_stretches_and_views_that_disagree() -> None:

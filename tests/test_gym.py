@@ -8,9 +8,9 @@ import pytest
 from gymnasium.envs.registration import parse_env_id
 from gymnasium.utils.env_checker import check_env
 
-from vap_core.base.errors import BadSuite
+from vap_core.base.errors import BadSuite, BadViews, UnknownName
 from vap_core.simulation import suites
-from vap_core.simulation.gym_env import env_id
+from vap_core.simulation.gym_env import VapEnv, env_id
 from vap_core.simulation.types import Placement
 
 FIRST = [(name, suite.tasks[-1].name) for name, suite in suites.BENCHMARKS.items()]
@@ -29,6 +29,23 @@ def test_an_episode_with_sub_goals_is_refused():
     """Its reward was that of the first sub-goal."""
     with pytest.raises(BadSuite, match="shared-sequence have sub-goals.*vap_core eval"):
         gym.make(env_id("shared-sequence", suites.suite("shared-sequence").tasks[0].name))
+
+
+@pytest.mark.parametrize(
+    ("asked", "error", "said"),
+    [
+        ({"robots": "bogus"}, UnknownName, "robots 'bogus' is unknown; known: menagerie, plain"),
+        ({"image_size": 0}, BadViews, "pictures of 0 x 0 pixels; give 1 or more"),
+        ({"image_size": -4}, BadViews, "pictures of -4 x -4 pixels; give 1 or more"),
+        ({"render_mode": "human"}, UnknownName, "render_mode 'human' is unknown; known: rgb_array"),
+        ({"episodes": 0}, BadSuite, "episodes is 0; give 1 or more"),
+        ({"episodes": -1}, BadSuite, "episodes is -1; give 1 or more"),
+    ],
+)
+def test_an_environment_that_cannot_be_made_is_one_line(asked, error, said):
+    with pytest.raises(error, match=said) as refusal:
+        VapEnv("widowx-pick", "pick-straw-cup", **asked)
+    assert "\n" not in str(refusal.value)
 
 
 def test_the_name_in_the_manual_works_and_other_names_read_as_before():

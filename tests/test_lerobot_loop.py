@@ -17,7 +17,7 @@ from tests import tiny_lerobot as tiny
 from tests.toys import TOYS, personal, scene
 from vap_core import memory
 from vap_core.attend import Attender
-from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadViews, UnknownName
+from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadSuite, BadViews, UnknownName
 from vap_core.perception.stacks import STACKS, load_stack
 from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.lerobot.step import LeRobotEnv, VapEnvConfig, VapPrompt, attach
@@ -243,6 +243,64 @@ def test_a_picture_that_is_not_lerobots_is_refused(bank, change, said):
         pipeline(bank)(shown)
 
 
+@pytest.mark.parametrize("key", ["observation.image", "observation.image2", "observation.wrist"])
+def test_a_colour_picture_that_would_stay_without_a_tint_is_refused(bank, key):
+    """The task names the tint, and the policy reads the picture without it."""
+    shown = batch([at(4)], [0])
+    said = rf"{key} is a colour picture, and observation.images.\* alone .* by rename_map in the"
+    with pytest.raises(BadViews, match=said):
+        pipeline(bank)({**shown, key: torch.zeros(1, 3, 64, 64)})
+    with pytest.raises(BadViews, match=said):
+        pipeline(bank)(
+            {
+                "observation.images.top": shown["observation.images.top"][0],
+                "observation.vap_step": shown["observation.vap_step"],
+                key: torch.zeros(3, 64, 64),
+                "task": "bring my mug",
+            }
+        )
+    with pytest.raises(BadViews, match=said):
+        pipeline(bank)({key: torch.zeros(1, 3, 64, 64), "task": ["bring my mug"]})
+
+
+def test_what_is_no_colour_picture_passes_under_any_name(bank):
+    shown = batch([at(4)] * 3, [0, 0, 0])
+    others = {
+        "observation.history": torch.zeros(3, 5, 2),
+        "observation.image_tokens": torch.zeros(3, 8, 2),
+        "observation.depth": torch.zeros(3, 1, 64, 64),
+        "observation.image_is_pad": torch.zeros(3, 2, dtype=torch.bool),
+        "observation.points": torch.zeros(3, 2, 9, 3),
+    }
+    out = pipeline(bank)({**shown, **others})
+    for key, tensor in others.items():
+        assert torch.equal(out[key], tensor)
+
+
+@pytest.mark.parametrize("step", [float("nan"), float("inf"), 1.5, -1.0])
+def test_a_step_that_is_no_whole_number_is_refused(bank, step):
+    ongoing = pipeline(bank)
+    ongoing(batch([at(4)], [0]))
+    with pytest.raises(BadViews, match=rf"vap_step is {step:g}; give the whole number of steps"):
+        ongoing(batch([at(6)], [step]))
+
+
+@pytest.mark.parametrize("step", [0.0, 1.0])
+def test_a_repeated_step_and_the_next_have_the_cameras_of_the_start(bank, step):
+    """An episode that is over stands still with all of them."""
+    ongoing = pipeline(bank)
+    ongoing(batch([at(4)], [0]))
+    ongoing(batch([at(4)], [1]))
+    shown = batch([at(4)], [1 + step])
+    side = {"observation.images.side": shown["observation.images.top"]}
+    said = r"views of \[.*'side'.*\], but the episode started with \['top'\]; give the same cameras"
+    with pytest.raises(BadViews, match=said):
+        ongoing({**shown, **side})
+    del shown["observation.images.top"]
+    with pytest.raises(BadViews, match=said):
+        ongoing({**shown, **side})
+
+
 def test_two_environments_need_a_task_each(bank):
     shown = {**batch([at(4), at(6)], [0, 0]), "task": "bring my mug"}
     with pytest.raises(BadViews, match="of 2 environments, but there are 1 tasks and 2 steps"):
@@ -292,6 +350,16 @@ def test_the_environment_numbers_its_steps_and_ends_like_ours():
     assert config.fps == 5
     with pytest.raises(UnknownName, match="task 'nonesuch' is unknown; known: pick-shaver"):
         VapEnvConfig(task=f"{SUITE}/nonesuch")
+
+
+@pytest.mark.parametrize("max_steps", [0, -1])
+def test_a_limit_of_no_steps_is_refused(max_steps):
+    """It was the whole limit of the suite."""
+    said = f"max_steps is {max_steps}; give 1 or more, or leave it out"
+    with pytest.raises(BadSuite, match=said):
+        VapEnvConfig(task=f"{SUITE}/{TASK}", max_steps=max_steps)
+    with pytest.raises(BadSuite, match=said):
+        LeRobotEnv(SUITE, TASK, image_size=64, max_steps=max_steps)
 
 
 @pytest.fixture(scope="module")

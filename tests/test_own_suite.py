@@ -8,7 +8,9 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium
 import pytest
+from gymnasium.envs import registration
 
 from tests.command import process, refused, vap
 from vap_core.base.errors import BadSuite, UnknownName
@@ -20,7 +22,7 @@ from vap_core.evaluation.store import read, read_manifest
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import make_trial
 from vap_core.rollout.loop import rollout
-from vap_core.simulation import robots, suites
+from vap_core.simulation import gym_env, robots, suites
 from vap_core.simulation.suites import own
 from vap_core.simulation.suites.open_row import open_row
 from vap_core.simulation.types import EpisodeRow
@@ -65,6 +67,34 @@ def test_other_commands_find_it_by_the_environment(
         suites.suite("my-desk")
     monkeypatch.setenv("VAP_SUITES", str(file))
     assert suites.suite("my-desk").robot == "wx250s"
+
+
+def test_gymnasium_finds_it_by_the_environment(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its instruction has a letter that is not English, which ended the workers."""
+    told = "hebe die Tüte auf, pick up my bottle"
+    file.write_text(DOCUMENTED.replace("pick up my bottle", told))
+    monkeypatch.setenv("VAP_SUITES", str(file))
+    monkeypatch.setattr(registration, "registry", dict(registration.registry))
+    name = gym_env.env_id("my-desk", "pick-bottle")
+    assert name not in registration.registry
+    gym_env.register()
+    makers = [lambda: gymnasium.make(name, image_size=32)] * 2
+    for shared in (True, False):
+        both = gymnasium.vector.AsyncVectorEnv(makers, shared_memory=shared)
+        seen, _ = both.reset(seed=0)
+        assert seen["images"]["front"].any()
+        assert shared or seen["instruction"] == (told, told)
+        assert seen in both.observation_space
+        both.close()
+
+
+def test_a_damaged_suite_of_the_environment_is_said_at_registration(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file.write_text("SUITE = 3\n")
+    monkeypatch.setenv("VAP_SUITES", str(file))
+    with pytest.raises(BadSuite, match=r"desk\.py must define SUITE"):
+        gym_env.register()
 
 
 def test_a_run_of_a_suite_that_is_not_open_names_the_remedy(file: Path) -> None:

@@ -22,7 +22,7 @@ from vap_core.base.files import parse_json, write_atomic, writing
 from vap_core.base.tables import Rows, align
 from vap_core.base.types import Attended, PersonalObject, Views, value
 from vap_core.memory import load_bank
-from vap_core.perception.stacks import load_own
+from vap_core.perception.stacks import checksums, load_own
 from vap_core.policies.lerobot.datasets import Copy, Recorded, open_dataset
 
 CALLER = "inspect-dataset"
@@ -88,6 +88,7 @@ def inspect_dataset(
         "thresholds": None if models.thresholds is None else asdict(models.thresholds),
         "memory": _memory_digest(bank),
         "version": __version__,
+        **checksums(stack, kept=False),  # the thresholds themselves are above
     }
     if speaker:
         about["speaker"] = speaker

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from vap_core.base.errors import BadAction, UnknownName, one_of
+from vap_core.base.errors import BadAction, BadViews, UnknownName, one_of
 from vap_core.base.types import Camera, Mask, Rgb, value
 from vap_core.simulation import cameras as optics
 from vap_core.simulation.contacts import (
@@ -74,7 +74,8 @@ class Env:
     `image_size` is the side of the views, or their height and width, in pixels.
     `control` says what an action is (types.Action); `sensor` how the cameras change their images;
     `occlusion` what hides the target from them, and when. `seconds` sums wall time by part:
-    "physics", "ik", "render", "truth". Raises: UnknownName for a camera that the scene lacks.
+    "physics", "ik", "render", "truth". Raises: UnknownName for a camera that the scene lacks;
+    BadViews for an `image_size` below 1.
     """
 
     def __init__(
@@ -91,6 +92,11 @@ class Env:
         self.robot = scene.robot
         self.hz = scene.robot.hz
         self.image_hw = (image_size, image_size) if isinstance(image_size, int) else image_size
+        if min(self.image_hw) < 1:
+            height, width = self.image_hw
+            raise BadViews(
+                f"Env: image_size asks for pictures of {height} x {width} pixels; give 1 or more."
+            )
         self.control = control
         self.sensor = sensor
         self.occlusion = occlusion

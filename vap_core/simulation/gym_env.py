@@ -3,7 +3,8 @@
 `import vap_core.simulation.gym_env`, then `gym.make("vap/simpler-bridge/put-camera-v0")`. An
 observation is what a policy may read (policies.protocol.PolicyInput): the suite's camera images,
 the proprioception, and the instruction. An action is one control step in the suite's control
-(types.Action). The reward is 1 in the step in which the rule is met, else 0.
+(types.Action). The reward is 1 in the step in which the rule is met, else 0. An AsyncVectorEnv
+gives the instructions with shared_memory=False alone: gymnasium never reads texts from that memory.
 """
 
 import re
@@ -15,10 +16,10 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs import registration
 
-from vap_core.base.errors import BadSuite
+from vap_core.base.errors import BadSuite, one_of
 from vap_core.base.types import Rgb
 from vap_core.simulation import suites
-from vap_core.simulation.scenes import Meshes, Scene
+from vap_core.simulation.scenes import Scene, meshes_called
 from vap_core.simulation.suites import Judge
 from vap_core.simulation.suites.lists import check
 from vap_core.simulation.suites.open_row import build_scene, make_env, models_of
@@ -39,6 +40,7 @@ OUTCOME_FIELDS = (
 )
 """The fields of Outcome in the info of a step."""
 CHARSET = "".join(map(chr, range(32, 127)))
+"""The characters of the shipped suites' instructions; a user's own may have others."""
 
 
 class VapEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
@@ -46,6 +48,9 @@ class VapEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
 
     `reset(options={"episode": i})` starts episode i of its list, else one is drawn by the seed.
     `reset(options={"row": row})` starts any EpisodeRow of the same robot, for suites of your own.
+
+    Raises: UnknownName for a suite, a task, `robots` or a `render_mode` that there is not; BadSuite
+        for a damaged list, or `episodes` below 1; BadViews for an `image_size` below 1.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012
@@ -55,16 +60,20 @@ class VapEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         suite: str,
         task: str,
         image_size: int = 224,
-        robots: Meshes = "plain",
+        robots: str = "plain",
         render_mode: str | None = None,
         episodes: int = 20,
     ) -> None:
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise one_of("VapEnv: render_mode", render_mode, self.metadata["render_modes"])
+        if episodes < 1:
+            raise BadSuite(f"VapEnv: episodes is {episodes}; give 1 or more.")
         self.suite = suites.suite(suite)
         self.rows = suites.rows(suite, task, episodes if suite in suites.WARM_UPS else None)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.suite.hz}
         self.image_size = image_size
-        self.robots = robots
+        self.robots = meshes_called(robots)
         self._scenes: dict[tuple[str, tuple[str, ...]], Scene] = {}
         self._judge: Judge | None = None
         self._start(self.rows[0])
@@ -121,13 +130,20 @@ class VapEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         state = spaces.Box(
             low=-np.inf, high=np.inf, shape=self._env.state().shape, dtype=np.float32
         )
+        instruction = spaces.Text(max_length=200, charset=self._charset())
         return spaces.Dict(
             {
                 "images": spaces.Dict(dict.fromkeys(self.suite.cameras, picture)),
                 "state": state,
-                "instruction": spaces.Text(max_length=200, charset=CHARSET),
+                "instruction": instruction,
             }
         )
+
+    def _charset(self) -> str:
+        """The characters of every instruction of the suite; the same for all its tasks."""
+        name = self.suite.name
+        rows = suites.benchmark(name) if suites.has_list(name) else self.rows
+        return "".join(sorted(set(CHARSET).union(*(row.instruction for row in rows))))
 
     def _actions(self) -> gymnasium.Space[Any]:
         if self.suite.control == "ee":
@@ -202,15 +218,17 @@ def env_id(suite: str, task: str) -> str:
 
 
 def register() -> None:
-    """Enter every task of every suite that is not entered yet.
+    """Enter every task of every suite that is not entered yet, the user's own among them.
 
-    Gymnasium's grammar of ids knows one slash. It is widened for namespaces under "vap/"; every
-    other id is read as before.
+    Those are the suites that are open, and those of VAP_SUITES. Gymnasium's grammar of ids knows
+    one slash. It is widened for namespaces under "vap/"; every other id is read as before.
+
+    Raises: BadSuite: a file of VAP_SUITES is damaged.
     """
     registration.ENV_ID_RE = re.compile(
         r"^(?:(?P<namespace>vap/[\w-]+|[\w:-]+)\/)?(?:(?P<name>[\w:.-]+?))(?:-v(?P<version>\d+))?$"
     )
-    for suite in suites.SUITES.values():
+    for suite in (*suites.SUITES.values(), *suites.own_suites()):
         for task in suite.tasks:
             name = env_id(suite.name, task.name)
             if name not in registration.registry:

@@ -6,11 +6,12 @@ Compiled once, and shared by every episode that uses it. The world frame stands 
 
 from collections.abc import Mapping, Sequence
 from itertools import product
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import UInt8
 
+from vap_core.base.errors import one_of
 from vap_core.base.types import value
 from vap_core.simulation import robots
 from vap_core.simulation.assets import objects
@@ -65,9 +66,10 @@ def build(
 
     `meshes` "menagerie" draws the robot with MuJoCo Menagerie's meshes; only its look changes.
 
-    Raises: UnknownName for a robot or an object that no registry holds, or a robot without cameras;
-        BadRobot for a robot whose MJCF is absent or lacks a part.
+    Raises: UnknownName for a robot or an object that no registry holds, a robot without cameras, or
+        other `meshes`; BadRobot for a robot whose MJCF is absent or lacks a part.
     """
+    meshes = meshes_called(meshes)
     arm = robots.get(robot)
     spec = mjcf.load(arm)
     physics(spec, arm.hz)
@@ -90,6 +92,14 @@ def build(
     compiled = spec.compile()
     renderer = Renderer(compiled, tuple(sizes_m), style.shadows)
     return Scene(robot=arm, model=compiled, sizes_m=sizes_m, cameras=cameras, renderer=renderer)
+
+
+def meshes_called(name: str) -> Meshes:
+    """The meshes of that name. Raises: UnknownName."""
+    for known in get_args(Meshes):
+        if name == known:
+            return known
+    raise one_of("build: robots", name, get_args(Meshes))
 
 
 def parked(arm: Robot, number: int) -> tuple[float, float, float]:

@@ -122,11 +122,7 @@ def open_dataset(folder: Path) -> Recorded:
             n_episodes = len(dataset.meta.episodes)
     except Exception as error:  # lerobot and pyarrow raise anything for a damaged folder
         raise _damaged(folder, error) from error
-    keys = {}
-    for key, feature in dataset.meta.features.items():
-        is_picture = feature["dtype"] in ("image", "video")
-        if is_picture and key not in dataset.meta.depth_keys and 3 in feature["shape"]:
-            keys[_camera(key)] = key
+    keys = _cameras(dataset, folder)
     if not keys or not n_episodes:
         what = "episode" if keys else "colour picture"
         raise BadDataset(f"dataset: {folder} has no {what}; record one with lerobot-record.")
@@ -242,6 +238,22 @@ def offline() -> Iterator[None]:
             yield
     finally:
         logging.disable(level)
+
+
+def _cameras(dataset: "LeRobotDataset", folder: Path) -> dict[str, str]:
+    """The features of colour pictures, by their camera. Raises: BadDataset: two have one name."""
+    keys: dict[str, str] = {}
+    for key, feature in dataset.meta.features.items():
+        is_picture = feature["dtype"] in ("image", "video")
+        if is_picture and key not in dataset.meta.depth_keys and 3 in feature["shape"]:
+            camera = _camera(key)
+            if camera in keys:
+                raise BadDataset(
+                    f"dataset: {folder} has pictures {keys[camera]} and {key}, which are both of a "
+                    f"camera {camera!r} here; remove one (lerobot-edit-dataset), or rename it."
+                )
+            keys[camera] = key
+    return keys
 
 
 def _camera(key: str) -> str:

@@ -32,7 +32,7 @@ from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 
 from vap_core.attend import Attender, AttendState, Prompting
-from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadViews, one_of
+from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadSuite, BadViews, one_of
 from vap_core.base.files import parse_json
 from vap_core.base.types import Rgb, Views
 from vap_core.memory import load_bank
@@ -74,7 +74,7 @@ class VapPrompt(ProcessorStep):
     """Tints the remembered object in every `observation.images.*`, and rewrites `task`.
 
     Pictures are lerobot's: floats in 0..1, 3 x H x W or B x 3 x H x W. Those of one channel whose
-    key says depth pass as they are.
+    key says depth pass as they are; a colour picture of another name is refused.
 
     Views in which it is not seen pass bit for bit. `memory` is the folder of remembered objects,
     `objects` names those meant where the category alone does not decide, `speaker` is whom "my"
@@ -123,8 +123,9 @@ class VapPrompt(ProcessorStep):
                 "VapPrompt: this batch holds actions, so it is for training, and its frames are "
                 "shuffled; train the plain checkpoint."
             )
-        views = _views(observation)
         task = extra.get("task")
+        _check_names(observation, is_batched=not isinstance(task, str))
+        views = _views(observation)
         if not views or task is None:
             missing = "task" if views else f"{IMAGES}*"
             raise BadViews(
@@ -158,7 +159,7 @@ class VapPrompt(ProcessorStep):
 
     def _steps(self, signal: torch.Tensor | None, n: int) -> list[int]:
         """The step that every environment of the batch is at, 0 for a new episode."""
-        numbered = [] if signal is None else [round(step) for step in signal.reshape(-1).tolist()]
+        numbered = [] if signal is None else _whole_numbers(signal)
         if self.episodes == "vap_step" or (self.episodes == "auto" and numbered):
             if not numbered:
                 raise BadViews(
@@ -233,6 +234,11 @@ class VapPrompt(ProcessorStep):
                 f"VapPrompt: the task of environment {i} is {text!r} at step {step}, and was "
                 f"{episode.given[1]!r}; begin an episode with it, and let one step serve one task "
                 "at a time."
+            )
+        elif images.keys() != episode.given[0].keys():
+            raise BadViews(
+                f"VapPrompt: views of {sorted(images)}, but the episode started with "
+                f"{sorted(episode.given[0])}; give the same cameras."
             )
         elif step == episode.step:
             if any((rgb != episode.given[0][camera]).any() for camera, rgb in images.items()):
@@ -318,7 +324,7 @@ class LeRobotEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
     `vap_step` is the number of steps since the episode began. Seed s starts episode s of the task's
     list, modulo its length, exactly as our own rollout does; `max_steps` shortens it.
 
-    Raises: UnknownName for a suite or a task that no registry holds; BadSuite for a damaged list.
+    Raises: as VapEnv; BadSuite for `max_steps` below 1.
     """
 
     def __init__(
@@ -326,9 +332,10 @@ class LeRobotEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         suite: str,
         task: str,
         image_size: int = 224,
-        robots: Any = "plain",
+        robots: str = "plain",
         max_steps: int | None = None,
     ) -> None:
+        _check_max_steps(max_steps)
         self.inner = VapEnv(suite, task, image_size, robots, render_mode="rgb_array")
         self.render_mode = "rgb_array"
         self.metadata = {**self.inner.metadata, "render_fps": round(self.inner.suite.hz)}
@@ -375,7 +382,10 @@ class LeRobotEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
 @EnvConfig.register_subclass("vap")
 @dataclass
 class VapEnvConfig(EnvConfig):
-    """`--env.type=vap --env.task=SUITE/TASK`, or SUITE alone for all its tasks."""
+    """`--env.type=vap --env.task=SUITE/TASK`, or SUITE alone for all its tasks.
+
+    Raises: as LeRobotEnv.
+    """
 
     task: str | None = "simpler-bridge/put-camera"
     image_size: int = 224
@@ -383,12 +393,13 @@ class VapEnvConfig(EnvConfig):
     max_steps: int | None = None
 
     def __post_init__(self) -> None:
+        _check_max_steps(self.max_steps)
         suite_name, *task_names = (self.task or "").split("/")
         self.suite = suites.suite(suite_name)
         tasks = tuple(map(self.suite.task, task_names)) or self.suite.tasks
         self.tasks = tuple(task.name for task in tasks)
         self.fps = round(self.suite.hz)
-        inner = VapEnv(suite_name, self.tasks[0], self.image_size, self.robots)  # type: ignore[arg-type]
+        inner = VapEnv(suite_name, self.tasks[0], self.image_size, self.robots)
         state_shape = inner.observation_space["state"].shape  # type: ignore[index]
         action_shape = inner.action_space.shape or ()
         image_shape = (self.image_size, self.image_size, 3)
@@ -437,6 +448,41 @@ def _views(observation: Mapping[str, Any]) -> dict[str, torch.Tensor]:
     return views
 
 
+def _whole_numbers(signal: torch.Tensor) -> list[int]:
+    """The steps that environments give. Raises: BadViews: one is no whole number from 0 on."""
+    steps = signal.reshape(-1).tolist()
+    for step in steps:
+        if not (step >= 0 and float(step).is_integer()):
+            raise BadViews(
+                f"VapPrompt: {STEP} is {step:g}; give the whole number of steps since the episode "
+                "began (0 = new)."
+            )
+    return list(map(int, steps))
+
+
+def _check_names(observation: Mapping[str, Any], is_batched: bool) -> None:
+    """Raises: BadViews: a colour picture has a name under which it would not be prompted."""
+    for key, entry in observation.items():
+        if not key.startswith(IMAGES) and _is_picture(key, entry, is_batched):
+            raise BadViews(
+                f"VapPrompt: {key} is a colour picture, and {IMAGES}* alone are prompted; map its "
+                f"name to {IMAGES}... by rename_map in the checkpoint's {PIPELINES[0]}, or leave "
+                "it out."
+            )
+
+
+def _is_picture(key: str, entry: Any, is_batched: bool) -> bool:
+    """Whether an entry has the shape of a colour picture.
+
+    The last states of three environments have three dimensions, too, so that a picture of a batch
+    has four.
+    """
+    shape = tuple(getattr(entry, "shape", ()))
+    if len(shape) != 4 and (is_batched or len(shape) != 3):
+        return False
+    return shape[-3] == 3 or ("image" in key and shape[-1] == 3)
+
+
 def _is_depth(key: str, picture: Any) -> bool:
     return "depth" in key and tuple(np.shape(picture))[-3:-2] == (1,)
 
@@ -474,9 +520,19 @@ def _shorten(rows: Iterable[EpisodeRow], max_steps: int | None) -> list[EpisodeR
     """The rows, with `max_steps` at most where it is given."""
     shortened = []
     for row in rows:
-        limit = min(row.max_steps, max_steps or row.max_steps)
-        shortened.append(replace(row, max_steps=limit))
+        if max_steps is not None:
+            row = replace(row, max_steps=min(row.max_steps, max_steps))
+        shortened.append(row)
     return shortened
+
+
+def _check_max_steps(max_steps: int | None) -> None:
+    """Raises: BadSuite: no episode has so few steps."""
+    if max_steps is not None and max_steps < 1:
+        raise BadSuite(
+            f"VapEnvConfig: max_steps is {max_steps}; give 1 or more, or leave it out for the "
+            "suite's own limit."
+        )
 
 
 def _lerobot_observation(observation: Mapping[str, Any], step: int) -> dict[str, Any]:

@@ -93,6 +93,12 @@ def _find_own(name: str) -> own.OwnSuite | None:
     return own.find(name, taken=SUITES, endings=ENDINGS)
 
 
+def own_suites() -> tuple[Suite, ...]:
+    """The user's own suites: those that are open, and those of VAP_SUITES. Raises: BadSuite."""
+    own.open_listed(taken=SUITES, endings=ENDINGS)
+    return tuple(opened.suite for opened in own.OPENED.values())
+
+
 def own_files(names: Iterable[str]) -> tuple[str, ...]:
     """The files of the user's own suites among some, each once. Raises: BadSuite."""
     files = []

@@ -64,11 +64,16 @@ def find(name: str, taken: Iterable[str], endings: tuple[str, ...]) -> OwnSuite 
     `taken` and `endings` are `open_file`'s. Raises: BadSuite.
     """
     if name not in OPENED:
-        opened = {own.file for own in OPENED.values()}
-        for part in os.environ.get(VARIABLE, "").split(os.pathsep):
-            if part and Path(part).resolve() not in opened:
-                open_file(Path(part), taken, endings)
+        open_listed(taken, endings)
     return OPENED.get(name)
+
+
+def open_listed(taken: Iterable[str], endings: tuple[str, ...]) -> None:
+    """Open every file of VAP_SUITES that is not open. Raises: BadSuite."""
+    opened = {own.file for own in OPENED.values()}
+    for part in os.environ.get(VARIABLE, "").split(os.pathsep):
+        if part and Path(part).resolve() not in opened:
+            open_file(Path(part), taken, endings)
 
 
 def open_file(path: Path, taken: Iterable[str], endings: tuple[str, ...]) -> Suite:
