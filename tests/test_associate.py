@@ -448,6 +448,18 @@ def test_views_keep_their_own_choices_where_none_is_decisive() -> None:
     assert associate(CASE_2, replace(below, decisive=found.margin + 0.01)) is None
 
 
+def test_single_candidates_that_contradict_each_other_are_left_as_they_are() -> None:
+    """The likest of each view scores 0: nothing says which of two objects is meant."""
+    views = {
+        "front": view(FRONT, 0.0, mine=MINE),
+        "wrist": view(WRIST, 0.0, other=OTHER),
+    }
+    found = associate(views, OF_OBJECTS)
+    assert found is not None
+    assert found.margin < 0.5
+    assert associate(views, replace(OF_OBJECTS, decisive=1.25)) is None
+
+
 def test_the_margin_over_other_objects_ignores_what_one_view_shows() -> None:
     """A second box of the chosen object in one view takes the lead over any choice, not this one."""
     doubled = {
@@ -470,6 +482,11 @@ def test_the_margin_over_other_objects_ignores_what_one_view_shows() -> None:
         ("terms", "geometry", BadStudy, "terms is 'geometry'; give a tuple of names"),
         ("sigma_m", 0.0, BadStudy, "sigma_m is 0.0; give more than 0"),
         ("spread_m", float("nan"), BadStudy, "spread_m is nan; give more than 0"),
+        ("astray", 1.5, BadStudy, "astray is 1.5; give a share, 0 to 1"),
+        ("likest", -1.0, BadStudy, "likest is -1.0; give a share, 0 to 1"),
+        ("evidence", -1.0, BadStudy, "evidence is -1.0; give 0 or more"),
+        ("decisive", float("nan"), BadStudy, "decisive is nan; give 0 or more"),
+        ("hidden", -0.5, BadStudy, "hidden is -0.5; give 0 or more"),
     ],
 )
 def test_what_is_no_pairing_is_refused(

@@ -95,6 +95,11 @@ def test_a_damaged_suite_of_the_environment_is_said_at_registration(
     monkeypatch.setenv("VAP_SUITES", str(file))
     with pytest.raises(BadSuite, match=r"desk\.py must define SUITE"):
         gym_env.register()
+    imports = [sys.executable, "-c", "import vap_core.simulation.gym_env"]
+    done = subprocess.run(imports, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "desk.py must define SUITE" in done.stderr
+    assert "Its tasks are no environments." in done.stderr
 
 
 def test_a_run_of_a_suite_that_is_not_open_names_the_remedy(file: Path) -> None:

@@ -35,10 +35,12 @@ MOST_COMBINATIONS = 10_000_000
 """Limits of the enumeration: views, and combinations of their candidates."""
 NEAREST = 1e-3
 """Cosine distances below this count as equal to it, so that their logarithm stays finite."""
+ROUNDED = 5e-3
+"""How far a rotation that was rounded to three decimals may be from one."""
 HIGHEST_M = 20.0
 """A camera higher above the table than this has a pose in other units."""
 SLACK = 0.1
-"""Natural logarithms: a candidate whose pairs cost less than this is no worse than none."""
+"""Natural logarithms: a view's likest candidate whose pairs cost less is no worse than none."""
 HEIGHTS_M = (0.0, 0.08)
 """The centres of objects that stand on the table (z = 0 in the world) lie between these heights."""
 
@@ -53,7 +55,7 @@ class Pairing:
     true boxes, embedded encoder). They do not depend on an encoder's scale: `evidence` and `absent`
     compare ratios of cosine distances, `likeness` cosines of centred embeddings.
 
-    Raises: UnknownName for a term that does not exist; BadStudy for a width that is not above 0.
+    Raises: UnknownName for a term that does not exist; BadStudy for a number outside its range.
     """
 
     terms: tuple[Term, ...]
@@ -85,9 +87,11 @@ class Pairing:
     keeps its own."""
     hidden: float | None = None
     """None of a view scores this share of its candidates' mean, less `SLACK`, and geometry only
-    speaks against pairs: an object that fewer views show has no disadvantage. The margin is the
-    lead over other objects, so over every choice that has no candidate of the best one. By default
-    `absent` scores a view, pairs that match gain, and the margin is the lead over any choice."""
+    speaks against pairs: an object that fewer views show has less of a disadvantage. The margin is
+    the lead over other objects, so over every choice that has no candidate of the best one. Views
+    are not compared: the likest candidate of each scores 0, so that single candidates which
+    contradict each other are undecided, and `decisive` leaves them as they are. By default `absent`
+    compares the views, pairs that match gain, and the margin is the lead over any choice."""
 
     def __post_init__(self) -> None:
         if isinstance(self.terms, str):
@@ -95,9 +99,16 @@ class Pairing:
         for term in self.terms:
             if term not in TERMS:
                 raise one_of("Pairing: term", term, TERMS)
-        for name in ("sigma_m", "spread_m", "astray"):
+        for name in ("sigma_m", "spread_m"):
             if not getattr(self, name) > 0:
                 raise BadStudy(f"Pairing: {name} is {getattr(self, name)}; give more than 0.")
+        for name in ("astray", "likest"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise BadStudy(f"Pairing: {name} is {getattr(self, name)}; give a share, 0 to 1.")
+        for name in ("evidence", "reliance", "decisive", "hidden"):
+            number = getattr(self, name)
+            if number is not None and not 0 <= number < np.inf:
+                raise BadStudy(f"Pairing: {name} is {number}; give 0 or more.")
 
 
 @value
@@ -410,8 +421,8 @@ def _check_calibration(camera: str, grounding: Grounding, cameras: Mapping[str, 
 def _check_poses(
     groundings: Mapping[str, Sequence[Grounding]], cameras: Mapping[str, Camera]
 ) -> None:
-    """Raises: BadViews: of two views or more that have candidates, one has no camera, or one whose
-    rays cannot meet the table.
+    """Raises: BadViews: of two views or more that have candidates, one has no camera, or one of a
+    pose that cannot be; or all look away from the table. (A hand may look up for a while.)
     """
     views = []
     for view, per_target in groundings.items():
@@ -426,8 +437,11 @@ def _check_poses(
             f"{', '.join(missing)} (given: {', '.join(cameras) or 'none'}), or pair by 'embedding' "
             "or 'hungarian'."
         )
+    away = [_looks_away(cameras[view]) for view in views]
     for view in views:
         fault = _pose_fault(cameras[view])
+        if not fault and all(away):
+            fault = "looks away from the table, as all do"
         if fault:
             raise BadViews(
                 f"Attender.start: camera {view!r} {fault}; pose_world maps the camera (OpenCV "
@@ -436,24 +450,29 @@ def _check_poses(
 
 
 def _pose_fault(camera: Camera) -> str:
-    """What keeps a camera's rays from meeting the table, "" where nothing does."""
+    """Why a camera cannot stand as its pose says, "" where it can."""
     pose = camera.pose_world
     if not (np.isfinite(pose).all() and np.isfinite(camera.k).all()):
         return "has numbers that are not finite"
     if np.linalg.matrix_rank(camera.k) < 3:
         return "has a k that cannot be inverted"
     rotation = pose[:3, :3]
-    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=ROUNDED)
     if not is_rotation or np.linalg.det(rotation) < 0:
         return "has a pose_world without a rotation"
     height_m = float(pose[2, 3])
     if not 0 < height_m < HIGHEST_M:
         return f"stands {height_m:g} m above the table"
-    corners = np.array([[x, y, 1.0] for x in (0, camera.width) for y in (0, camera.height)])
-    rays = corners @ np.linalg.inv(camera.k).T @ rotation.T
-    if (rays[:, 2] >= 0).all():
-        return "looks away from the table"
     return ""
+
+
+def _looks_away(camera: Camera) -> bool:
+    """Whether no ray of a camera meets the table; of one that has a fault, too."""
+    if _pose_fault(camera):
+        return True
+    corners = np.array([[x, y, 1.0] for x in (0, camera.width) for y in (0, camera.height)])
+    rays = corners @ np.linalg.inv(camera.k).T @ camera.pose_world[:3, :3].T
+    return bool((rays[:, 2] >= 0).all())
 
 
 def _check_size(sightings: Sequence[Sighting]) -> None:

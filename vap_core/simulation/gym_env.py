@@ -8,6 +8,8 @@ gives the instructions with shared_memory=False alone: gymnasium never reads tex
 """
 
 import re
+import warnings
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -23,6 +25,7 @@ from vap_core.simulation.scenes import Scene, meshes_called
 from vap_core.simulation.suites import Judge
 from vap_core.simulation.suites.lists import check
 from vap_core.simulation.suites.open_row import build_scene, make_env, models_of
+from vap_core.simulation.suites.suite import Suite
 from vap_core.simulation.types import EpisodeRow
 
 LONGEST_M = 0.25
@@ -228,7 +231,12 @@ def register() -> None:
     registration.ENV_ID_RE = re.compile(
         r"^(?:(?P<namespace>vap/[\w-]+|[\w:-]+)\/)?(?:(?P<name>[\w:.-]+?))(?:-v(?P<version>\d+))?$"
     )
-    for suite in (*suites.SUITES.values(), *suites.own_suites()):
+    _register(suites.SUITES.values())
+    _register(suites.own_suites())
+
+
+def _register(known: Iterable[Suite]) -> None:
+    for suite in known:
         for task in suite.tasks:
             name = env_id(suite.name, task.name)
             if name not in registration.registry:
@@ -239,4 +247,7 @@ def register() -> None:
                 )
 
 
-register()
+try:
+    register()
+except BadSuite as broken:  # what needs no suite, as VapPrompt on a robot, goes on
+    warnings.warn(f"{broken} Its tasks are no environments.", stacklevel=2)
