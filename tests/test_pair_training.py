@@ -138,8 +138,9 @@ def test_a_scene_without_room_is_refused() -> None:
 
 
 def test_the_expert_puts_a_generic_object_near_another(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(demonstrations, "EPISODES", 1)
-    (made,) = demonstrations.films(SUITE, 0, 0)
+    """One of four: whether a single one is put depends on how a machine rounds."""
+    monkeypatch.setattr(demonstrations, "EPISODES", 4)
+    made, *_ = demonstrations.films(SUITE, 0, 0)
     target, goal = made.names[:2]
     assert made.goal == 1
     assert made.task == TASKS[0].name
