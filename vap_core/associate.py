@@ -194,7 +194,7 @@ def associate(views: Mapping[str, Sighting], pairing: Pairing) -> Association | 
         support[name] = of_view.max(axis=1)
     total = float(totals[best])
     if pairing.hidden is None:
-        rival = _best_other(support, chosen)
+        rival = _best_other(list(support.values()), best)
     else:
         rival = _best_other_object(totals, best)
     if total - rival < pairing.decisive:
@@ -208,13 +208,11 @@ def associate(views: Mapping[str, Sighting], pairing: Pairing) -> Association | 
     )
 
 
-def _best_other(support: Mapping[str, ViewScores], chosen: Mapping[str, int | None]) -> float:
-    """The best total of a combination that differs from the chosen one in any view."""
+def _best_other(support: Sequence[ViewScores], best: Sequence[int]) -> float:
+    """The best total of a combination that differs from the `best` one in any view."""
     rival = -np.inf
-    for name, scores in support.items():
-        choice = chosen[name]
-        others = np.delete(scores, len(scores) - 1 if choice is None else choice)
-        rival = max(rival, float(others.max(initial=-np.inf)))
+    for scores, choice in zip(support, best, strict=True):
+        rival = max(rival, float(np.delete(scores, choice).max(initial=-np.inf)))
     return rival
 
 
@@ -437,16 +435,19 @@ def _check_poses(
             f"{', '.join(missing)} (given: {', '.join(cameras) or 'none'}), or pair by 'embedding' "
             "or 'hungarian'."
         )
-    away = [_looks_away(cameras[view]) for view in views]
     for view in views:
         fault = _pose_fault(cameras[view])
-        if not fault and all(away):
-            fault = "looks away from the table, as all do"
         if fault:
-            raise BadViews(
-                f"Attender.start: camera {view!r} {fault}; pose_world maps the camera (OpenCV "
-                "axes: x right, y down, z ahead) to the world, in metres, with the table at z = 0."
-            )
+            raise _bad_pose(view, fault)
+    if all(_looks_away(cameras[view]) for view in views):
+        raise _bad_pose(views[0], "looks away from the table, as all do")
+
+
+def _bad_pose(view: str, fault: str) -> BadViews:
+    return BadViews(
+        f"Attender.start: camera {view!r} {fault}; pose_world maps the camera (OpenCV axes: x "
+        "right, y down, z ahead) to the world, in metres, with the table at z = 0."
+    )
 
 
 def _pose_fault(camera: Camera) -> str:
@@ -467,12 +468,9 @@ def _pose_fault(camera: Camera) -> str:
 
 
 def _looks_away(camera: Camera) -> bool:
-    """Whether no ray of a camera meets the table; of one that has a fault, too."""
-    if _pose_fault(camera):
-        return True
-    corners = np.array([[x, y, 1.0] for x in (0, camera.width) for y in (0, camera.height)])
-    rays = corners @ np.linalg.inv(camera.k).T @ camera.pose_world[:3, :3].T
-    return bool((rays[:, 2] >= 0).all())
+    """Whether no ray of a camera above the table meets it."""
+    corners = np.array([[x, y] for x in (0.0, camera.width) for y in (0.0, camera.height)])
+    return bool((_directions(camera, corners)[:, 2] >= 0).all())
 
 
 def _check_size(sightings: Sequence[Sighting]) -> None:
@@ -494,13 +492,17 @@ def _rays(view: Sighting) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarra
     """
     assert view.camera is not None
     centre = 0.5 * (view.xyxy[:, :2] + view.xyxy[:, 2:]).astype(np.float64)
-    ones = np.ones((len(centre), 1))
-    pixels = np.concatenate([centre, ones], axis=1)
-    rays = pixels @ np.linalg.inv(view.camera.k).T @ view.camera.pose_world[:3, :3].T
+    rays = _directions(view.camera, centre)
     eye = view.camera.pose_world[:3, 3]
     down = np.where(rays[:, 2:] * eye[2] < 0, rays[:, 2:], np.nan)
     slope = rays[:, :2] / down
     return eye[:2] - eye[2] * slope, slope
+
+
+def _directions(camera: Camera, pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
+    """The rays through some pixels in the world, of any length."""
+    homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
+    return homogeneous @ np.linalg.inv(camera.k).T @ camera.pose_world[:3, :3].T
 
 
 def _centred(embeddings: Float32[np.ndarray, "n d"]) -> Float64[np.ndarray, "n d"]:
