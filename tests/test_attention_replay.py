@@ -16,6 +16,8 @@ from tests.command import refused, vap
 from vap_core.analysis.attention import examples, replay, tables
 from vap_core.base.errors import BadStudy
 from vap_core.base.files import DATA
+from vap_core.evaluation import measurements
+from vap_core.evaluation.publish import read_published
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import make_trial
 
@@ -161,6 +163,30 @@ def test_a_replay_without_any_observed_call_names_the_errors(
     )
     with pytest.raises(BadStudy, match=says):
         replay.run_replay(tmp_path, tmp_path / "out", replay.Wanted(), progress=False)
+
+
+def test_an_episode_that_ended_in_an_error_is_left_out_and_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = DATA / "results" / "token_closed_loop.parquet"
+    (suite,) = {suite for manifest, _ in read_published(source) for suite, _ in manifest["configuration"]["tasks"]}  # fmt: skip
+    about = [
+        {"suite": suite, "task": "put-camera", "method": "soft", "seed": 0, "episode": i}
+        for i in range(3)
+    ]
+    rows = {name: about for name in tables.TABLES}
+    rows["errors"] = [about[1] | {"error": "RuntimeError: no memory left"}]
+    part = tmp_path / "part.json"
+    measurements.write_json_part(part, rows, caller="attention")
+    found = replay._write_tables(source, tmp_path, [part])
+    assert {name: table.episode.tolist() for name, table in found.items()} == {
+        name: [0, 2] for name in tables.TABLES
+    }
+    said = capsys.readouterr().err
+    assert said.startswith(
+        f"attention: of 3 episodes 1 ended in an error, the first is {suite}/put-camera/soft/1: "
+        "RuntimeError: no memory left; left out. To run them again delete "
+    )
 
 
 def test_a_policy_without_attention_is_refused(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ The same row, weights and seed give the same episode; observing changes no actio
 command had finished is found again in its folder.
 """
 
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -270,6 +271,8 @@ def _ending(observer: Observer, episode: Episode, known: Known) -> dict[str, Any
 def _write_tables(source: Path, folder: Path, parts: Sequence[Path]) -> "dict[str, pd.DataFrame]":
     """All parts as one table of each kind, with the runs and the code in the metadata.
 
+    Episodes that ended in an error are left out, and told: they are no failures of a policy.
+
     Raises: BadStudy when they hold no call.
     """
     rows: dict[str, Rows] = {name: [] for name in (*tables.TABLES, ERRORS)}
@@ -277,8 +280,16 @@ def _write_tables(source: Path, folder: Path, parts: Sequence[Path]) -> "dict[st
         for name, part in measurements.read_json_part(path, caller="attention").items():
             rows[name] += part
     errors = rows.pop(ERRORS)
+    n = len(rows["episodes"])
+    rows = _without_errors(rows, errors)
     if not rows["calls"]:
-        raise _without_calls(folder, len(rows["episodes"]), errors)
+        raise _without_calls(folder, n, errors)
+    if errors:
+        print(
+            f"attention: of {n} episodes {_errors_text(errors)}; left out. To run them again delete "
+            f"{folder / 'parts'}.",
+            file=sys.stderr,
+        )
     measured = {row["suite"] for row in rows["episodes"]}
     runs = []
     for manifest, episodes in read_runs(source):
@@ -289,12 +300,29 @@ def _write_tables(source: Path, folder: Path, parts: Sequence[Path]) -> "dict[st
 
 
 def _without_calls(folder: Path, episodes: int, errors: Rows) -> BadStudy:
-    reason = f"{len(errors)} ended in an error"
+    return BadStudy(
+        f"attention: no call of the policy was observed in {episodes} episodes; "
+        f"{_errors_text(errors)}. Mend "
+        f"it, delete {folder / 'parts'} and run the same command again."
+    )
+
+
+def _errors_text(errors: Rows) -> str:
+    text = f"{len(errors)} ended in an error"
     if errors:
         first = errors[0]
         name = "/".join(str(first[part]) for part in ("suite", "task", "method", "episode"))
-        reason += f", the first is {name}: {first['error']:.200}"
-    return BadStudy(
-        f"attention: no call of the policy was observed in {episodes} episodes; {reason}. Mend "
-        f"it, delete {folder / 'parts'} and run the same command again."
-    )
+        text += f", the first is {name}: {first['error']:.200}"
+    return text
+
+
+def _without_errors(rows: dict[str, Rows], errors: Rows) -> dict[str, Rows]:
+    """The rows of every table without those of episodes that ended in an error."""
+    gone = {_episode_of(row) for row in errors}
+    return {
+        name: [row for row in part if _episode_of(row) not in gone] for name, part in rows.items()
+    }
+
+
+def _episode_of(row: dict[str, Any]) -> tuple[Any, ...]:
+    return tuple(row[name] for name in ("suite", "task", "method", "seed", "episode"))
