@@ -449,6 +449,17 @@ def test_other_refusals(run: Path, tmp_path: Path) -> None:
         recording_of(failures, 0)
 
 
+def test_an_episode_of_a_list_that_has_changed_is_not_run_again() -> None:
+    manifest, rows = read_published(DATA / "results" / "bounds.parquet")[0]
+    row = rows.iloc[0].to_dict()
+    assert study_of(manifest, row).tasks == ((row["suite"], row["task"]),)
+    manifest["configuration"]["lists"][row["suite"]] = "0" * 64
+    with pytest.raises(
+        BadStudy, match=f"the list of {row['suite']} has changed since this was run"
+    ):
+        study_of(manifest, row)
+
+
 def test_the_command_lists_and_refuses(run: Path) -> None:
     done = vap("diagnose", run, "--limit", 1)
     assert done.returncode == 0, done.stderr

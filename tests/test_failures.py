@@ -198,6 +198,21 @@ def test_a_late_drift_onto_what_is_then_touched_is_one():
     )
 
 
+def test_an_earlier_brush_of_another_object_does_not_hide_that_the_hand_was_misled():
+    taken = truth(touched=(OTHER,))
+    brush = still(1, now=truth(touched=(THIRD,)))
+    steps = [
+        *still(4),
+        *brush,
+        *still(5),
+        *still(1, [view(OTHER)]),
+        *still(2, [view(OTHER)], taken),
+    ]
+    assert label(told("picked", steps)) == ("case 1", "drift", 10, "front")
+    steps = [*still(7), *still(2, now=taken), *still(3, [view(OTHER)], taken)]
+    assert told("picked", steps).case == "case 3", "it was touched before any prompt was on it"
+
+
 @pytest.mark.parametrize(("wrong", "frame"), [((3, 2, 6), 7), ((3, 2, 2), 2)])
 def test_the_longest_wrong_run_decides_where_the_prompts_are_wrong_as_a_whole(wrong, frame):
     first, between, last = wrong

@@ -38,6 +38,7 @@ def run(
         "episodes": episodes,
         "seed": seed,
         "seeds": 1,
+        "policy": policy,
         **changes,
     }
     open_run(folder, study)
@@ -118,7 +119,8 @@ def test_methods_that_are_finished_need_not_wait_for_the_others(tmp_path: Path) 
 def test_an_unfinished_run_of_another_suite_is_not_asked_for(tmp_path: Path) -> None:
     whole = run(tmp_path / "one", 0)
     half = tmp_path / "half"
-    open_run(half, {"tasks": [["franka-pick", "pick-cup"]], "methods": ["vap"], "episodes": 5})
+    study = {"tasks": [["franka-pick", "pick-cup"]], "methods": ["vap"], "episodes": 5}
+    open_run(half, {**study, "seed": 0, "policy": "scripted"})
     target = tmp_path / "t.parquet"
     assert publish([whole, half], target, suite_names=["widowx-pick"]) > 0
     assert {episodes.suite.iloc[0] for _, episodes in read_runs(target)} == {"widowx-pick"}
@@ -135,6 +137,13 @@ def test_only_finished_runs_and_each_once(tmp_path: Path) -> None:
         publish([whole, whole], tmp_path / "t.parquet")
     with pytest.raises(BadOutput, match="run.json is absent"):
         publish([tmp_path / "nothing"], tmp_path / "t.parquet")
+
+
+def test_the_folder_of_another_command_is_refused(tmp_path: Path) -> None:
+    other = open_run(tmp_path / "perception", {"suites": ["widowx-pick"]})
+    append(other, [{**ROW, "episode": 0, "seed": 0}])
+    with pytest.raises(BadOutput, match="perception holds no run of eval, rollout or demo; name"):
+        publish([other], tmp_path / "table.parquet")
 
 
 def test_runs_of_other_scenes_make_no_table(tmp_path: Path) -> None:

@@ -14,11 +14,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.test_report import run
-from vap_core.base.errors import VapError
+from vap_core.base.errors import BadOutput, VapError
 from vap_core.evaluation.diagnosis.failures import list_failures
 from vap_core.evaluation.diagnosis.recordings import study_of
 from vap_core.evaluation.publish import publish, read_runs
 from vap_core.evaluation.report import report
+from vap_core.evaluation.run_schema import check_run
 
 JUNK: list[Any] = [None, -1, 10**30, 1.5, True, "", "nowhere", [], [1], {}, {"a": [None]}]
 NOTES = ("tasks", "methods", "episodes", "seed", "seeds", "policy", "lists", "stack")
@@ -92,6 +93,16 @@ def test_any_column_of_a_run_is_read_or_refused(
     table[name] = [value] * len(table)
     table.to_parquet(part)
     read_back(folder, tmp_path / "out")
+
+
+def test_a_date_is_a_seed(whole: Path) -> None:
+    rows = pd.read_parquet(next((whole / "parts").iterdir()))
+    manifest = json.loads((whole / "run.json").read_text())
+    manifest["configuration"]["seed"] = 20261126
+    check_run(whole, manifest, rows)
+    manifest["configuration"]["seed"] = 2**32
+    with pytest.raises(BadOutput, match="the setting seed is"):
+        check_run(whole, manifest, rows)
 
 
 @pytest.mark.parametrize(

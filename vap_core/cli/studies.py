@@ -41,6 +41,7 @@ Seed = Annotated[
     int,
     typer.Option(
         min=0,
+        max=2**32 - 1,
         help="Seed of the policy, the sensors and the starts: 0 starts every episode as it is "
         "listed, another moves arm, objects and light a little. Of a warm-up suite the seed of its "
         "list.",

@@ -113,7 +113,23 @@ def run(
                     )
                 jobs = missing()
         store.compact(folder)
-    return store.read(folder)
+    table = store.read(folder)
+    note = _errors_note(table)
+    if note:
+        print(note, file=sys.stderr)
+    return table
+
+
+def _errors_note(table: "pd.DataFrame") -> str:
+    """How episodes that ended in an error, tried as often as was asked for, are tried again."""
+    errors = table[table["outcome"] == "error"]
+    if errors.empty:
+        return ""
+    episodes = "1 episode is an error" if len(errors) == 1 else f"{len(errors)} episodes are errors"
+    return (
+        f"note: {episodes}; when the cause is mended, the same command with --retries "
+        f"{int(errors['attempt'].max())} tries again."
+    )
 
 
 def run_alone(

@@ -19,15 +19,23 @@ EXECUTED = "suite_files"
 """A study's files of own suites. They are the user's to name: none is taken from a file of results.
 """
 LARGEST = 1_000_000
-"""Seeds and counts are smaller."""
+"""Counts are smaller."""
+LARGEST_SEED = 2**32
+"""Seeds are smaller: a date is one."""
+NEEDED_SETTINGS = {"tasks", "methods", "episodes", "seed", "policy"}
+"""What the configuration of a run of eval, rollout or demo holds."""
 
 
-def _is_whole_number(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < LARGEST
+def _is_whole_number(value: Any, end: int = LARGEST) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < end
 
 
 def _is_count(value: Any) -> bool:
     return _is_whole_number(value) and value > 0
+
+
+def _is_seed(value: Any) -> bool:
+    return _is_whole_number(value, LARGEST_SEED)
 
 
 def _is_count_or_all(value: Any) -> bool:
@@ -62,7 +70,7 @@ SETTINGS: Mapping[str, Callable[[Any], bool]] = {
     "tasks": _are_tasks,
     "methods": _are_texts,
     "episodes": _is_count_or_all,
-    "seed": _is_whole_number,
+    "seed": _is_seed,
     "seeds": _is_count,
     "policy": _is_text,
     "temperature": _is_temperature,

@@ -24,7 +24,7 @@ from vap_core.evaluation.methods import (
 from vap_core.evaluation.policy_names import POLICIES, make_policy
 from vap_core.evaluation.study import Study
 from vap_core.memory import load_bank, register, save
-from vap_core.perception.describe import AttributeCaptioner, Captioner, with_description
+from vap_core.perception.describe import AttributeCaptioner, with_description
 from vap_core.perception.protocols import Stack
 from vap_core.perception.stacks import load_stack
 from vap_core.policies.lerobot import checkpoints
@@ -49,17 +49,16 @@ _last_scene: dict[tuple[str, tuple[str, ...], str, Meshes], Scene] = {}
 """The scene that was built last, by suite, objects, variant and meshes."""
 
 
-def register_personal(study: Study, bank: Path, captioner: Captioner | None = None) -> None:
+def register_personal(study: Study, bank: Path) -> None:
     """Remember the personal object of every task from five rendered reference views, or more where
     a method wants them.
 
     An object that is in memory with enough of them stays. Where a method needs its description, it
-    is described too, by `captioner`, or offline; for the soft prompt its token is learned. A study
+    is described too, offline; for the soft prompt its token is learned. A study
     that prompts nothing needs no memory.
 
     Raises: as `load_stack`; BadMemory for a damaged memory; BadObject for a damaged scan;
-        BadEndpoint when the chat endpoint of the `captioner` fails; BadPolicy, BadStudy, as `teach`
-        and `teach_own`; BadOutput when `bank` cannot be written.
+        BadPolicy, BadStudy, as `teach` and `teach_own`; BadOutput when `bank` cannot be written.
     """
     if not study.any_method(needs_memory):
         return
@@ -75,7 +74,7 @@ def register_personal(study: Study, bank: Path, captioner: Captioner | None = No
             obj, _ = register(target, model.category, photos, stack.detector, stack.encoder)
         if study.any_method(needs_description) and obj.description is None:
             seen = obj.first(FEWEST_REFERENCES)
-            described = with_description(seen, captioner or AttributeCaptioner(stack.segmenter))
+            described = with_description(seen, AttributeCaptioner(stack.segmenter))
             obj = replace(obj, description=described.description)
         spaces = {token_space(method) for method in study.methods}
         if spaces & {"copied", "aligned"}:

@@ -286,8 +286,8 @@ def _write_tables(source: Path, folder: Path, parts: Sequence[Path]) -> "dict[st
         raise _without_calls(folder, n, errors)
     if errors:
         print(
-            f"attention: of {n} episodes {_errors_text(errors)}; left out. To run them again delete "
-            f"{folder / 'parts'}.",
+            f"attention: of {n} episodes {_errors_text(errors)}; left out. To run them again "
+            f"delete {folder / 'parts'}.",
             file=sys.stderr,
         )
     measured = {row["suite"] for row in rows["episodes"]}

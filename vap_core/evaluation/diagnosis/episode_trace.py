@@ -49,7 +49,7 @@ def trace_episode(episode: Episode) -> EpisodeTrace:
         grip.append(np.nan if frame.action is None else float(frame.action[-1]))
         for i, name in enumerate(names):
             lift_m[i, step] = truth.objects_world[name][2] - judge.start_world[name][2]
-            moved_m[i, step] = judge.travel_m(name, truth)
+            moved_m[i, step] = judge.strayed_m(name, truth)
 
     candidates = {}
     rejected = []

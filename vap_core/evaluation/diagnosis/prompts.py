@@ -70,7 +70,7 @@ def _deciding_steps(trace: EpisodeTrace, thresholds: Thresholds) -> tuple[list[J
     Empty where no prompt is to blame.
 
     Those up to the first touch of any object, when they are wrong in enough steps; else those up to
-    the touch of another object that a prompt is on.
+    where the hand comes to touch another object that a prompt is on.
     """
     touched = first_true(trace.touches)
     strayed = first_true(trace.others)
@@ -81,14 +81,18 @@ def _deciding_steps(trace: EpisodeTrace, thresholds: Thresholds) -> tuple[list[J
     judged = verdicts(trace, thresholds, until)
     if judged and float(np.mean(_wrong_flags(judged))) >= thresholds.share:
         return judged, True
-    if strayed is None:
-        return [], False
-    judged = verdicts(trace, thresholds, strayed)
-    if not judged or judged[-1][1] == "right":
-        return [], False
-    last, _ = judged[-1]
-    for view in trace.coverage[last]:
-        if view.object in trace.others[strayed]:
+    every = verdicts(trace, thresholds, until=len(trace.steps))
+    before: set[str] = set()
+    for at, touching in enumerate(trace.others):
+        reached = set(touching) - before
+        before = set(touching)
+        if not reached:
+            continue
+        judged = [each for each in every if each[0] < max(at, 1)]
+        if not judged or judged[-1][1] == "right":
+            continue
+        last, _ = judged[-1]
+        if any(view.object in reached for view in trace.coverage[last]):
             return judged, False
     return [], False
 

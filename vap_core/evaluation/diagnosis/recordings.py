@@ -27,6 +27,7 @@ from vap_core.evaluation.stills import write_provenance
 from vap_core.evaluation.store import ROW_KEY
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import make_trial, register_personal
+from vap_core.simulation import suites
 from vap_core.simulation.types import EpisodeRow, Outcome
 
 if TYPE_CHECKING:
@@ -240,17 +241,25 @@ def study_of(manifest: Mapping[str, Any], row: Mapping[str, Any]) -> Study:
 
     Nothing is executed that the manifest names.
 
-    Raises: as `Study`, when something that the manifest names is not here today.
+    Raises: BadStudy when the suite's episode list has changed since; as `Study`, when something
+        that the manifest names is not here today.
     """
     configuration = manifest["configuration"]
+    suite = row["suite"]
+    listed = configuration.get("lists", {}).get(suite)
+    if listed is not None and suites.digest(suite) != listed:
+        raise BadStudy(
+            f"diagnose: the list of {suite} has changed since this was run; use the version that "
+            "ran it, or run eval again."
+        )
     settings = {}
     for field in fields(Study):
         if field.name in configuration and field.name != EXECUTED:
             settings[field.name] = configuration[field.name]
-    settings["tasks"] = ((row["suite"], row["task"]),)
+    settings["tasks"] = ((suite, row["task"]),)
     settings["methods"] = (row["method"],)
     label = str(row.get("policy", ""))
-    settings["policy"] = policy_today(settings["policy"], label, row["suite"])
+    settings["policy"] = policy_today(settings["policy"], label, suite)
     return replace(Study(**settings), audit=False)
 
 

@@ -14,6 +14,7 @@ from vap_core.base.errors import BadOutput
 from vap_core.evaluation.layouts import layout_names
 from vap_core.evaluation.metrics import MEASURES, SCORE_KEY, TRACK
 from vap_core.evaluation.publish import read_runs, require_same_scenes
+from vap_core.evaluation.run_schema import NEEDED_SETTINGS
 from vap_core.evaluation.statistics import PAIR_KEY
 from vap_core.evaluation.store import ROW_KEY
 from vap_core.simulation import suites
@@ -21,8 +22,6 @@ from vap_core.simulation import suites
 if TYPE_CHECKING:
     import pandas as pd
 
-NEEDED_SETTINGS = {"tasks", "methods", "episodes", "seed", "policy"}
-"""What the configuration of a run of eval, rollout or demo holds."""
 NEEDED_COLUMNS = list(dict.fromkeys((*PAIR_KEY, *SCORE_KEY, "outcome", "steps", *MEASURES)))
 
 

@@ -90,7 +90,7 @@ class Judge:
         target = self.row.target
         moved = set(self.moved)
         for name in self.start_world:
-            if self._strayed_m(name, truth) > MOVED_M:
+            if self.strayed_m(name, truth) > MOVED_M:
                 moved.add(name)
         order = list(self.order)
         for name in (*truth.touched, *sorted(moved)):
@@ -118,7 +118,7 @@ class Judge:
         start = _middle(self.start_world[name], self.sizes_m[name])
         return math.dist(_middle_of(self, truth or self.now, name), start)
 
-    def _strayed_m(self, name: str, truth: Truth) -> float:
+    def strayed_m(self, name: str, truth: Truth) -> float:
         """`travel_m`; of what lies in the goal already, within it: it rides along.
 
         What an earlier sub-goal failed to put there stands still where the goal is moved.
