@@ -163,6 +163,20 @@ def test_casts_are_generic_and_of_one_category() -> None:
                 assert len(set(names)) == len(names)
 
 
+def test_the_category_that_is_held_out_is_no_distractor(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = suite("simpler-fractal")
+    held_out = replace(RECIPES[known.name], held_out_category="straw cup")
+
+    def drawn() -> set[str]:
+        rng = np.random.default_rng(0)
+        names = [draw_objects(known, filmed_tasks(known.name)[0], rng) for _ in range(60)]
+        return {objects.get_object(name).category for name in itertools.chain(*names)}
+
+    assert "straw cup" in drawn()
+    monkeypatch.setitem(RECIPES, known.name, held_out)
+    assert "straw cup" not in drawn()
+
+
 def test_every_stage_finds_room_for_its_objects() -> None:
     """Cameras beside a plate once found none in a third of the stages, and were in a sixth of the films instead of a quarter."""
     for known in BENCHMARKS.values():

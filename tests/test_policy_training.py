@@ -389,8 +389,12 @@ def test_a_folder_that_cannot_be_written_is_said_before_the_work(
             ),
             "did not grow from this mini-paligemma",
         ),
+        (
+            ("--start", SHIPPED / "mini-pi0-vlabench-wide"),
+            "mini-pi0-vlabench-wide differs from the recipe in input_features",
+        ),
     ],
-    ids=["vlm", "start", "other-vlm"],
+    ids=["vlm", "start", "other-vlm", "other-cameras"],
 )
 def test_what_a_training_grows_from_is_read_before_the_films(
     words: tuple[str | Path, ...], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -323,8 +323,13 @@ def test_what_is_refused_is_told_before_a_model_is_made(
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "recipe.json").write_text("{}")
     (tmp_path / "other" / "captions.json").write_text("{}")
+    begun = tmp_path / "begun" / "out"
+    begun.mkdir(parents=True)
+    (begun / "recipe.json").write_text(json.dumps(RECIPES[SUITE].as_json()))
+    torch.save({"made_of": json.dumps({"vlm": "aa"})}, begun / "training.pt")
     shown = DATA / "demonstrations" / SUITE
     for words, told in (
+        (("--suite", SUITE, "--out", begun), OTHER),
         (("--suite", SUITE, "--device", "tpu"), "tpu"),
         (("--suite", "vlabench", "--demonstrations", shown), f"shows {SUITE}, not vlabench"),
         (("--suite", SUITE, "--demonstrations", tmp_path), "holds no demonstrations"),

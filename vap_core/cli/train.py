@@ -142,6 +142,7 @@ def policy(
         float | None,
         typer.Option(
             min=0.0,
+            max=1.0,
             help="Deviation (rad) of the noise with which the arm's angles are read. Default the "
             "recipe's.",
         ),
@@ -163,7 +164,7 @@ def policy(
     ] = None,
     rate: Annotated[
         float | None,
-        typer.Option(min=0.0, help="The highest learning rate. Default the recipe's."),
+        typer.Option(min=1e-8, help="The highest learning rate. Default the recipe's."),
     ] = None,
     vlm: Annotated[
         Path | None,
@@ -251,10 +252,11 @@ def policy(
     rendered = cache or CACHE
     grows_from = vlm
     if vlm is None and not recipe.start:
+        model = folder.parent / "mini-paligemma"
         require_startable(
-            recipe, folder, demonstrations=demonstrations, cache=rendered, device=device
+            recipe, folder, model, demonstrations=demonstrations, cache=rendered, device=device
         )
-        grows_from = make(folder.parent / "mini-paligemma", cache=rendered, jobs=jobs)
+        grows_from = make(model, cache=rendered, jobs=jobs)
     about = train(
         recipe,
         folder,

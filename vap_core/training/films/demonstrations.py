@@ -34,7 +34,7 @@ from vap_core.training.films import pairs
 from vap_core.training.films.looks import draw_look
 from vap_core.training.films.scenes import HELD_OUT, TRAIN_INSTANCES, only_generic
 from vap_core.training.folder import kept_arrays
-from vap_core.training.recipe import FILMED, every, filmed_tasks
+from vap_core.training.recipe import FILMED, RECIPES, every, filmed_tasks
 
 SIDE = 112
 """Pixels of a film: a policy sees views of SEEN pixels scaled down to SIDE."""
@@ -121,7 +121,8 @@ def draw_objects(
         others = [i for i in pool if i != first]
         for i in (first, *rng.choice(others, rivals, replace=False)):
             models.append(objects.generic_instance(task.stem, int(i)))
-    kinds = [kind for kind in DISTRACTORS if kind != task.category]
+    unseen = {task.category, RECIPES[known.name].held_out_category}
+    kinds = [kind for kind in DISTRACTORS if kind not in unseen]
     for kind in rng.permutation(kinds)[:distractors]:
         index = pool[int(rng.integers(len(pool)))]
         models.append(objects.generic_instance(str(kind), index))

@@ -88,10 +88,16 @@ def require_shared_words(start: Start, teacher: MiniVlm) -> None:
         )
 
 
+def sizes_of(start: Start) -> tuple[int, int]:
+    """How many numbers its state and its action have."""
+    config = start.learner.policy.config
+    return config.max_state_dim, config.max_action_dim
+
+
 def require_alike(start: Start, wanted: MiniPI0Config) -> None:
     """Raises: BadPolicy when the policy does not look and act as in `wanted`."""
     config = start.learner.policy.config
-    for name in ("input_features", "output_features", "chunk_size", "width"):
+    for name in ("input_features", "output_features", "chunk_size", "width", "words"):
         if getattr(config, name) != getattr(wanted, name):
             raise BadPolicy(
                 f"train policy: {start.folder} differs from the recipe in {name}; go on from a "

@@ -56,6 +56,7 @@ from vap_core.training.policy.start import (
     read_start,
     require_alike,
     require_shared_words,
+    sizes_of,
     start_folder,
 )
 from vap_core.training.policy.taught import learn_words, require_words_of
@@ -158,20 +159,24 @@ def load_films(
 def require_startable(
     recipe: Recipe,
     out: Path,
+    vlm: Path,
     *,
     demonstrations: Path | None = None,
     cache: Path = CACHE,
     device: str | None = None,
 ) -> None:
-    """Check what `train` is given before the mini-PaliGemma is, which takes long to make.
+    """Check what `train` is given before the mini-PaliGemma is made in `vlm`, which takes long.
 
-    Raises: as `train`, for the device, the dataset's origin, `out` and `cache`.
+    Raises: as `train`, for the device, the dataset's origin, `out` and `cache`, and where `out`
+        holds a training that grew from another mini-PaliGemma than is in `vlm`.
     """
     device_name(device)
     recipe = _with_stages_of(demonstrations, recipe)
     with training_folder(out, "train policy", recipe.as_json()):
         if demonstrations is None:
             _make_cache(cache)
+        if begun_with(out) and not (vlm / "model.safetensors").exists():
+            raise _other_teacher(out)
 
 
 def train(
@@ -215,6 +220,7 @@ def train(
         start = None
         if recipe.start:
             start = read_start(start_folder(recipe.start), teacher, recipe.seed)
+            require_alike(start, configuration(recipe, *sizes_of(start)))
             if teacher is not None and recipe.taught:
                 require_shared_words(start, teacher)
         made_of["taught_in"] = _require_same_teacher(recipe, teacher, out)
@@ -234,6 +240,7 @@ def train(
             learner = start.learner
             stats = start.stats
             config = learner.policy.config
+            config.n_action_steps, config.temperature = recipe.execute, TEMPERATURE
             made_of["start"] = {
                 "name": recipe.start,
                 "sha256": sha256_of(start.folder / "model.safetensors"),
@@ -369,13 +376,17 @@ def _require_same_teacher(recipe: Recipe, teacher: MiniVlm | None, out: Path) ->
     begun = begun_with(out)
     for name, given in known.items():
         if begun.get(name, given) != given:
-            raise BadOutput(
-                f"train policy: {out} holds a training with another mini-PaliGemma, or with none; "
-                "go on with the same --vlm, or choose another --out."
-            )
+            raise _other_teacher(out)
     if taught_in:
         require_words_of(taught_in, out / WORDS)
     return taught_in
+
+
+def _other_teacher(out: Path) -> BadOutput:
+    return BadOutput(
+        f"train policy: {out} holds a training with another mini-PaliGemma, or with none; go on "
+        "with the same --vlm, or choose another --out."
+    )
 
 
 def _prepare_words(
@@ -438,8 +449,9 @@ def _is_held_out(stage: int) -> bool:
 
 def _require_trainable(recipe: Recipe, films: Sequence[Film]) -> None:
     """Raises: ValueError when a film shows an evaluation object other than its goal; BadOutput for
-    a task that the recipe's films do not show.
+    a task that the recipe's films do not show, or an object of the category that is held out.
     """
+    held_out = recipe.held_out_category
     tasks = {task.name for task in filmed_tasks(recipe.suite)}
     models = []
     for film in films:
@@ -449,5 +461,11 @@ def _require_trainable(recipe: Recipe, films: Sequence[Film]) -> None:
                 "out; film them again: python -m vap_core train demonstrations."
             )
         for i in nameable(film, recipe.suite):
-            models.append(get_object(film.names[i]))
+            model = get_object(film.names[i])
+            if model.category == held_out:
+                raise BadOutput(
+                    f"train policy: the films show a {held_out}, which {recipe.suite} holds out; "
+                    "film them again: python -m vap_core train demonstrations."
+                )
+            models.append(model)
     only_generic(models)
