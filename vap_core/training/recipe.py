@@ -3,8 +3,10 @@
     RECIPES["simpler-bridge"]                     # `train policy --suite simpler-bridge`
     FILMED["simpler-bridge"]                      # what its films show
 
-Every number that a training depends on is here, is written into its training.json, and is what
-`train policy` takes when nothing else is asked for.
+What tells one training from another is here, and is what `train policy` takes when nothing else is
+asked for; `Recipe` is written into its training.json. What all share stands beside the code that
+uses it. Films are kept by suite, seed and stage: after a change of what they show name another
+`--cache`.
 """
 
 from dataclasses import asdict, dataclass, replace
