@@ -121,9 +121,11 @@ def draw_objects(
         others = [i for i in pool if i != first]
         for i in (first, *rng.choice(others, rivals, replace=False)):
             models.append(objects.generic_instance(task.stem, int(i)))
-    unseen = {task.category, RECIPES[known.name].held_out_category}
-    kinds = [kind for kind in DISTRACTORS if kind not in unseen]
-    for kind in rng.permutation(kinds)[:distractors]:
+    kinds = [kind for kind in DISTRACTORS if kind != task.category]
+    # Left out after the draw, which every later one hangs on.
+    unseen = RECIPES[known.name].held_out_category
+    seen = [kind for kind in rng.permutation(kinds) if kind != unseen]
+    for kind in seen[:distractors]:
         index = pool[int(rng.integers(len(pool)))]
         models.append(objects.generic_instance(str(kind), index))
     only_generic(models)
