@@ -197,8 +197,8 @@ def test_words_are_taught_where_they_mean_the_same(
     model = SHIPPED / ("mini-paligemma-tint-free" if name.endswith("wide") else "mini-paligemma")
 
     def train(**changes: object) -> None:
-        recipe = replace(RECIPES[name.removesuffix("-wide")], start=str(start), taught=80)
-        recipe = replace(recipe, **changes)
+        settings = {"start": str(start), "taught": 80, **changes}
+        recipe = replace(RECIPES[name.removesuffix("-wide")], **settings)
         policy.train(recipe, tmp_path / str(changes), vlm=model, cache=tmp_path / "cache", jobs=1)
 
     if name.endswith("wide"):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vap_core.cli.options import names
+from vap_core.evaluation.run_schema import LARGEST_SEED
 
 if TYPE_CHECKING:
     from vap_core.evaluation.jobs import Record
@@ -41,7 +42,7 @@ Seed = Annotated[
     int,
     typer.Option(
         min=0,
-        max=2**32 - 1,
+        max=LARGEST_SEED - 1,
         help="Seed of the policy, the sensors and the starts: 0 starts every episode as it is "
         "listed, another moves arm, objects and light a little. Of a warm-up suite the seed of its "
         "list.",

@@ -11,7 +11,7 @@ from vap_core.base.errors import BadOutput
 from vap_core.base.files import check_regular, parse_json, write_atomic
 from vap_core.evaluation.measurements import encode_table
 from vap_core.evaluation.readings import FILE, publish_readings
-from vap_core.evaluation.run_schema import NEEDED_SETTINGS, check_run
+from vap_core.evaluation.run_schema import check_run, require_episodes
 from vap_core.evaluation.store import KEY, read, read_manifest
 from vap_core.simulation import suites
 
@@ -129,11 +129,7 @@ def publish(
     named = []
     for source in sources:
         for manifest, episodes in read_runs(source):
-            if not manifest["configuration"].keys() >= NEEDED_SETTINGS:
-                raise BadOutput(
-                    f"publish: {source} holds no run of eval, rollout or demo; name the folder "
-                    "that one of them wrote."
-                )
+            require_episodes(source, manifest["configuration"], "publish")
             if not suite_names or _is_of(manifest, suite_names):
                 _require_finished(source, manifest, episodes, methods)
                 runs.append((manifest, episodes))

@@ -80,12 +80,11 @@ def _checked_configuration(folder: Path) -> dict[str, Any]:
             f"rescore: {folder} was written by an older version, without the hashes of its "
             "episode lists; run it again."
         )
-    for suite, digest in study["lists"].items():
-        if suites.digest(suite) != digest:
-            raise BadOutput(
-                f"rescore: the list of {suite} has changed since {folder} was run; its states fit "
-                "no row of today. Run it again."
-            )
+    for suite in suites.changed_lists(study["lists"]):
+        raise BadOutput(
+            f"rescore: the list of {suite} has changed since {folder} was run; its states fit no "
+            "row of today. Run it again."
+        )
     return study
 
 

@@ -93,6 +93,15 @@ def check_run(source: Path, manifest: Any, episodes: "pd.DataFrame") -> None:
         )
 
 
+def require_episodes(source: Path, configuration: Mapping[str, Any], command: str) -> None:
+    """Raises: BadOutput for a run of another command than eval, rollout or demo."""
+    if not configuration.keys() >= NEEDED_SETTINGS:
+        raise BadOutput(
+            f"{command}: {source} holds no run of eval, rollout or demo; name the folder that one "
+            "of them wrote."
+        )
+
+
 def _wrong_setting(manifest: Any) -> str:
     if not isinstance(manifest, dict) or not isinstance(manifest.get("configuration"), dict):
         return "its manifest has no configuration"

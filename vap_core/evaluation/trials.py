@@ -54,8 +54,8 @@ def register_personal(study: Study, bank: Path) -> None:
     a method wants them.
 
     An object that is in memory with enough of them stays. Where a method needs its description, it
-    is described too, offline; for the soft prompt its token is learned. A study
-    that prompts nothing needs no memory.
+    is described too, offline; for the soft prompt its token is learned. A study that prompts
+    nothing needs no memory.
 
     Raises: as `load_stack`; BadMemory for a damaged memory; BadObject for a damaged scan;
         BadPolicy, BadStudy, as `teach` and `teach_own`; BadOutput when `bank` cannot be written.

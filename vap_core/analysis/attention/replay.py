@@ -302,8 +302,8 @@ def _write_tables(source: Path, folder: Path, parts: Sequence[Path]) -> "dict[st
 def _without_calls(folder: Path, episodes: int, errors: Rows) -> BadStudy:
     return BadStudy(
         f"attention: no call of the policy was observed in {episodes} episodes; "
-        f"{_errors_text(errors)}. Mend "
-        f"it, delete {folder / 'parts'} and run the same command again."
+        f"{_errors_text(errors)}. Mend it, delete {folder / 'parts'} and run the same command "
+        "again."
     )
 
 

@@ -81,6 +81,8 @@ def _deciding_steps(trace: EpisodeTrace, thresholds: Thresholds) -> tuple[list[J
     judged = verdicts(trace, thresholds, until)
     if judged and float(np.mean(_wrong_flags(judged))) >= thresholds.share:
         return judged, True
+    if strayed is None:
+        return [], False
     every = verdicts(trace, thresholds, until=len(trace.steps))
     before: set[str] = set()
     for at, touching in enumerate(trace.others):

@@ -247,7 +247,7 @@ def study_of(manifest: Mapping[str, Any], row: Mapping[str, Any]) -> Study:
     configuration = manifest["configuration"]
     suite = row["suite"]
     listed = configuration.get("lists", {}).get(suite)
-    if listed is not None and suites.digest(suite) != listed:
+    if listed is not None and suites.changed_lists({suite: listed}):
         raise BadStudy(
             f"diagnose: the list of {suite} has changed since this was run; use the version that "
             "ran it, or run eval again."

@@ -14,7 +14,7 @@ from vap_core.base.errors import BadOutput
 from vap_core.evaluation.layouts import layout_names
 from vap_core.evaluation.metrics import MEASURES, SCORE_KEY, TRACK
 from vap_core.evaluation.publish import read_runs, require_same_scenes
-from vap_core.evaluation.run_schema import NEEDED_SETTINGS
+from vap_core.evaluation.run_schema import require_episodes
 from vap_core.evaluation.statistics import PAIR_KEY
 from vap_core.evaluation.store import ROW_KEY
 from vap_core.simulation import suites
@@ -109,17 +109,12 @@ def _named_runs(sources: Sequence[Path]) -> "Iterator[tuple[Path, dict[str, Any]
 
 def _check_run(name: Path, study: dict[str, Any], table: "pd.DataFrame") -> None:
     """Refuse what is no run, what is empty or too old, and a run of other episode lists."""
-    if not study.keys() >= NEEDED_SETTINGS:
+    require_episodes(name, study, "report")
+    for suite in suites.changed_lists(study.get("lists", {})):
         raise BadOutput(
-            f"report: {name} holds no run of eval, rollout or demo; name the folder that one of "
-            "them wrote."
+            f"report: the list of {suite} has changed since {name} was run; use the version that "
+            "ran it, or run it again."
         )
-    for suite, digest in study.get("lists", {}).items():
-        if suites.digest(suite) != digest:
-            raise BadOutput(
-                f"report: the list of {suite} has changed since {name} was run; use the version "
-                "that ran it, or run it again."
-            )
     if table.empty:
         raise BadOutput(
             f"report: {name} holds no finished episode yet; run the same command again, it goes on "

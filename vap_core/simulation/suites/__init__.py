@@ -7,7 +7,7 @@ look-alike that is red by nature. Where a suite's sensor has noise (tabletop), e
 its own. A user's own suites come from files (own.py).
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -125,6 +125,14 @@ def digest(name: str) -> str:
         return own_suite.sha256
     suite(name)  # refuses a name that no suite has
     return lists.digest(list_name(name))
+
+
+def changed_lists(digests: Mapping[str, str]) -> list[str]:
+    """The suites whose lists are not those of these `digests` any more.
+
+    Raises: as `digest`.
+    """
+    return [name for name, kept in digests.items() if digest(name) != kept]
 
 
 @cache

@@ -168,7 +168,7 @@ def require_startable(
     """Check what `train` is given before the mini-PaliGemma is made in `vlm`, which takes long.
 
     Raises: as `train`, for the device, the dataset's origin, `out` and `cache`, and where `out`
-        holds a training that grew from another mini-PaliGemma than is in `vlm`.
+        holds a training and `vlm` no model that it could have grown from.
     """
     device_name(device)
     recipe = _with_stages_of(demonstrations, recipe)
@@ -220,6 +220,7 @@ def train(
         start = None
         if recipe.start:
             start = read_start(start_folder(recipe.start), teacher, recipe.seed)
+            # But for the sizes of states and actions, which films tell.
             require_alike(start, configuration(recipe, *sizes_of(start)))
             if teacher is not None and recipe.taught:
                 require_shared_words(start, teacher)
@@ -456,16 +457,17 @@ def _require_trainable(recipe: Recipe, films: Sequence[Film]) -> None:
     models = []
     for film in films:
         if film.task not in tasks:
-            raise BadOutput(
-                f"train policy: the films show {film.task}, whose category {recipe.suite} holds "
-                "out; film them again: python -m vap_core train demonstrations."
-            )
+            raise _shows_held_out(f"{film.task}, whose category {recipe.suite} holds out")
         for i in nameable(film, recipe.suite):
             model = get_object(film.names[i])
             if model.category == held_out:
-                raise BadOutput(
-                    f"train policy: the films show a {held_out}, which {recipe.suite} holds out; "
-                    "film them again: python -m vap_core train demonstrations."
-                )
+                raise _shows_held_out(f"a {held_out}, which {recipe.suite} holds out")
             models.append(model)
     only_generic(models)
+
+
+def _shows_held_out(what: str) -> BadOutput:
+    return BadOutput(
+        f"train policy: the films show {what}; film them again: python -m vap_core train "
+        "demonstrations."
+    )
