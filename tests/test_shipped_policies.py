@@ -29,6 +29,7 @@ BY_TODAYS_RECIPE = {
     "simpler-bridge-wide-seed-0": (0.2, 0.02),
     "simpler-fractal-wide": (0.2, 0.02),
     "simpler-fractal-tint-free": (0.0, 0.02),
+    "tabletop-longer": (0.2, 0.02),
     "tabletop-wide": (0.2, 0.04),
     "vlabench-wide": (0.2, 0.01),
     "vlabench-tint-free": (0.0, 0.01),

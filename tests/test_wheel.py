@@ -35,6 +35,7 @@ LEFT_OUT = tuple(
         "simpler-bridge-wide",
         "simpler-fractal",
         "simpler-fractal-tint-free",
+        "tabletop-longer",
         "tabletop-wide",
         "vlabench",
         "vlabench-tint-free",
