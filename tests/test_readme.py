@@ -526,7 +526,7 @@ def test_what_tabletops_policies_of_the_recipe_reach(heading: str, name: str) ->
         assert [cell.strip("*") for cell in cells] == held, (head, method)
     failed = played[(played.method == "vap") & ~played.success.astype(bool)]
     counts = [len(failed), *(failed.case.eq(f"case {i}").sum() for i in (3, 2))]
-    text = "VAP's {} failures {} are Case 3, {} are views that contradict each other"
+    text = "of VAP's {} failures {} are Case 3, {} are views that contradict each other"
     assert text.format(*counts) in PROSE
 
 
