@@ -25,7 +25,7 @@ LEFT_OUT = (
     "policies/mini-pi0-simpler-bridge-wide",
     "policies/mini-pi0-simpler-fractal",
     "policies/mini-pi0-simpler-fractal-tint-free",
-    "policies/mini-pi0-tabletop-longer",
+    "policies/mini-pi0-tabletop",
     "policies/mini-pi0-tabletop-wide",
     "policies/mini-pi0-vlabench",
     "policies/mini-pi0-vlabench-tint-free",

@@ -192,5 +192,5 @@ def test_a_start_that_is_no_policy_is_named(
 ) -> None:
     monkeypatch.setattr(start, "SHIPPED", tmp_path)
     recipe = replace(RECIPE, stages=2, steps=1)
-    with pytest.raises(BadPolicy, match=r"mini-pi0-tabletop is no mini-pi0 to go on from"):
+    with pytest.raises(BadPolicy, match=r"mini-pi0-tabletop-longer is no mini-pi0 to go on from"):
         train.train(recipe, tmp_path / "out", cache=filmed, jobs=1)

@@ -26,6 +26,7 @@ from vap_core.evaluation.statistics import (
 )
 from vap_core.policies.lerobot.checkpoints import fingerprint
 from vap_core.policies.names import checkpoint_of
+from vap_core.simulation.suites import BENCHMARKS
 
 RESULTS = ROOT / "data" / "results"
 BOUNDS = ("oracle-mask", "oracle-track", "wrong-mask")
@@ -60,9 +61,7 @@ def test_success_rates() -> None:
 def test_what_the_first_policies_reach() -> None:
     (_, *tracks), *body = table("| first policy of | simpler-fractal")
     played = _played("first_policy")
-    assert set(played.policy.map(checkpoint_of)) == {
-        f"mini-pi0-{suite}" for suite in ("simpler-bridge", "simpler-fractal", "vlabench")
-    }
+    assert set(played.policy.map(checkpoint_of)) == {f"mini-pi0-{suite}" for suite in BENCHMARKS}
     played["track"] = (played.suite + ", " + played.split.astype(str)).str.removesuffix(", ")
     assert set(played.track) == set(tracks)
     assert {_method(method) for method, *_ in body} == set(played.method)
@@ -92,7 +91,7 @@ def test_no_hand_of_the_published_table_closes_after_the_last_action() -> None:
     """A terminal frame has no action: 65 time-outs were once missed grasps that it decided."""
     rows = pd.read_parquet(RESULTS / "mini_pi0.parquet")
     missed = rows[rows["sub_case"] == "missed grasp"]
-    assert len(missed) == 1312
+    assert len(missed) == 1349
     assert (missed["deciding_frame"] < missed["steps"]).all()
 
 
@@ -438,8 +437,8 @@ def test_what_the_policy_of_the_other_robot_that_never_saw_a_tint_does() -> None
 def test_what_tabletop_reaches_with_either_engine() -> None:
     key = ["method", "task", "episode"]
     before = _played("tabletop_older_engine").set_index(key)
-    main = pd.concat([_played("mini_pi0"), _played("oracle_track")])
-    today = main[main.suite == "tabletop"].set_index(key).reindex(before.index)
+    first = _played("first_policy")
+    today = first[first.suite == "tabletop"].set_index(key).reindex(before.index)
     one, other = before.success.astype(bool), today.success.astype(bool)
     won, lost = ~one & other, one & ~other
     n = won.sum() + lost.sum()
@@ -467,7 +466,7 @@ def test_what_tabletop_reaches_with_either_engine() -> None:
 
 def test_other_starts_are_beside_the_same_episodes_as_listed() -> None:
     key = ["suite", "task", "episode"]
-    moved, listed = _played("starts"), _played("mini_pi0")
+    moved, listed = _played("starts"), _played("first_policy")
     moved = moved[(moved.suite == "tabletop") & (moved.method == "vap")].set_index(key)
     listed = listed[listed.method == "vap"].set_index(key)
     same = listed.reindex(moved.index)
@@ -498,23 +497,24 @@ def test_what_the_true_mask_gains_on_several_views() -> None:
 
     start = [found[suite, "vap", "oracle-mask"] for suite in ("vlabench", "tabletop")]
     texts = [points(c) for c in start]
-    assert f"perception: {texts[0]} on vlabench" in PROSE
-    assert f"on tabletop {texts[1].replace(' points', '')}, not beyond chance" in PROSE
-    assert start[0].p < 0.001 < 0.05 < start[1].p
+    assert f"perception: {texts[0]} on vlabench, {texts[1]} on tabletop (exact p < .001" in PROSE
+    assert max(c.p for c in start) < 0.001
     always = found["tabletop", "oracle-mask", "oracle-track"]
-    assert f"it adds {points(always)} on tabletop (p {always.p:.3f}".replace("0.", ".") in PROSE
+    quoted = f"it adds {points(always)} on tabletop (p {always.p:.3f}), not beyond chance"
+    assert quoted.replace("0.", ".") in PROSE
 
 
 @pytest.mark.parametrize(
-    ("heading", "name"),
+    ("heading", "names"),
     [
-        ("| method | SR | selects, of 80 |", "tabletop_by_recipe"),
-        ("| trained on | SR | selects, of 80 |", "tabletop_trained_on"),
-        ("| longer | SR | selects, of 80 |", "tabletop_longer"),
+        ("| default | SR | selects, of 80 |", ("mini_pi0", "oracle_track")),
+        ("| wide | SR | selects, of 80 |", ("tabletop_by_recipe",)),
     ],
 )
-def test_what_tabletops_policies_of_the_recipe_reach(heading: str, name: str) -> None:
-    (head, *body), played = table(heading), _played(name)
+def test_what_tabletops_policies_of_the_recipe_reach(heading: str, names: tuple[str, ...]) -> None:
+    head, *body = table(heading)
+    played = pd.concat([_played(name) for name in names])
+    played = played[played.suite == "tabletop"]
     assert played.outcome.isin(("success", "failure")).all()
     assert played.groupby("method").size().eq(160).all()
     assert played.method.nunique() == len(body)
@@ -524,10 +524,27 @@ def test_what_tabletops_policies_of_the_recipe_reach(heading: str, name: str) ->
         parts = [rows.success, rows.success[~placing], rows.success[placing], rows.wrong_object]
         held = [_percent(rate(int(part.sum()), len(part))) for part in parts]
         assert [cell.strip("*") for cell in cells] == held, (head, method)
+    assert _failures_by_case(played) in PROSE
+
+
+def test_what_tabletops_policy_with_noisier_angles_reaches() -> None:
+    played = _played("tabletop_trained_on")
+    assert played.groupby("method").size().eq(160).all()
+    of_vap = played[played.method == "vap"]
+    placing = of_vap.task.str.startswith("put")
+    selects, places = (round(100 * of_vap.success[each].mean()) for each in (~placing, placing))
+    assert (
+        f"it has {_of_way(played, 'vap').replace(' [', ' % [')} with VAP, selects {selects} and "
+        f"places {places} (`python -m vap_core report data/results/tabletop_trained_on.parquet`"
+    ) in PROSE
+    assert _failures_by_case(played) in PROSE
+
+
+def _failures_by_case(played: pd.DataFrame) -> str:
     failed = played[(played.method == "vap") & ~played.success.astype(bool)]
     counts = [len(failed), *(failed.case.eq(f"case {i}").sum() for i in (3, 2))]
-    text = "of VAP's {} failures {} are Case 3, {} are views that contradict each other"
-    assert text.format(*counts) in PROSE
+    text = "VAP's {} failures {} are Case 3, {} are views that contradict each other"
+    return text.format(*counts)
 
 
 def test_what_another_seed_of_vlabench_reaches() -> None:

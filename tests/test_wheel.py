@@ -35,7 +35,7 @@ LEFT_OUT = tuple(
         "simpler-bridge-wide",
         "simpler-fractal",
         "simpler-fractal-tint-free",
-        "tabletop-longer",
+        "tabletop",
         "tabletop-wide",
         "vlabench",
         "vlabench-tint-free",

@@ -104,7 +104,7 @@ RECIPES: dict[str, Recipe] = {
     "shared-pair": Recipe(
         suite="shared-pair",
         held_out_category="slipper",
-        start="mini-pi0-tabletop",
+        start="mini-pi0-tabletop-longer",
         stages=20,
         steps=700,
         batch=32,

@@ -1,6 +1,6 @@
 """The policy that a training goes on from, instead of beginning with nothing.
 
-    start = read_start(start_folder("mini-pi0-tabletop"), teacher, seed=0)
+    start = read_start(start_folder("mini-pi0-tabletop-longer"), teacher, seed=0)
     require_alike(start, config)
 
 It has to look and act as the recipe says, and to have grown from the same mini-PaliGemma. Where
