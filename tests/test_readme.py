@@ -543,7 +543,7 @@ def test_what_tabletops_policy_with_noisier_angles_reaches() -> None:
 def _failures_by_case(played: pd.DataFrame) -> str:
     failed = played[(played.method == "vap") & ~played.success.astype(bool)]
     counts = [len(failed), *(failed.case.eq(f"case {i}").sum() for i in (3, 2))]
-    text = "VAP's {} failures {} are Case 3, {} are views that contradict each other"
+    text = "of VAP's {} failures {} are Case 3, {} are views that contradict each other"
     return text.format(*counts)
 
 
