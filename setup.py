@@ -20,6 +20,7 @@ SHIPPED = (
     "weights",
 )
 LEFT_OUT = (
+    "policies/mini-paligemma",
     "policies/mini-pi0-simpler-bridge",
     "policies/mini-pi0-simpler-bridge-tint-free",
     "policies/mini-pi0-simpler-bridge-wide",

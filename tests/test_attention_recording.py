@@ -14,7 +14,7 @@ from tests.drawn import SUCCESS, columns, entities, frame, opening, rerun
 from tests.test_why import tabs
 from vap_core.analysis.attention import examples, pictures
 from vap_core.base.errors import BadStudy
-from vap_core.base.files import DATA
+from vap_core.base.files import DATA, SHIPPED
 from vap_core.policies.hooks import heat_map
 from vap_core.policies.mini_pi0 import teach_token, token_file
 from vap_core.policies.mini_pi0.vlm import load_vlm
@@ -40,7 +40,7 @@ def put_token(memory: Path) -> None:
     kept = table[(table["learned_in"] == "vlm") & (table["k"] == teach_token.K)]
     (row,) = kept[kept["object"] == "shaver-personal"].to_dict("records")
     embedding = np.array(row["embedding"], np.float32)
-    model = load_vlm(teach_token.MODEL).sha256()
+    model = load_vlm(SHIPPED / "mini-paligemma").sha256()
     suffix = teach_token.file_suffix(suites.rows("simpler-bridge", "pick-shaver"), model)
     token_file.save(memory, token_file.Token("shaver-personal", embedding, 1.0, model), suffix)
 

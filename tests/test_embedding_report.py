@@ -20,7 +20,7 @@ from vap_core.base.files import DATA
 from vap_core.cli import app
 from vap_core.evaluation.tokens import study
 from vap_core.policies.embedding_table import open_table
-from vap_core.policies.mini_pi0 import teach_token, token_alignment
+from vap_core.policies.mini_pi0 import token_alignment
 from vap_core.policies.names import SHIPPED, shipped_checkpoint
 from vap_core.policies.token_groups import token_groups, vocabulary_of
 from vap_core.simulation import suites
@@ -28,6 +28,9 @@ from vap_core.training.words import vocabulary
 
 from . import tiny_lerobot
 from .test_soft_prompt import SUITE, grown  # noqa: F401
+
+OLDER = SHIPPED / "mini-paligemma"
+"""The model that the first policies grew from."""
 
 
 def test_the_report_compares_the_shipped_policies_beside_the_paper() -> None:
@@ -40,7 +43,7 @@ def test_the_report_compares_the_shipped_policies_beside_the_paper() -> None:
     assert f"{defaults} with mini-paligemma-tint-free" in found.output
     kept = pd.read_parquet(DATA / "results" / "token_spaces.parquet")
     measured = [str(SHIPPED / name) for name in kept.policy.unique()]
-    named = CliRunner().invoke(app, ["embeddings", str(teach_token.MODEL), *measured])
+    named = CliRunner().invoke(app, ["embeddings", str(OLDER), *measured])
     whole = kept[kept.group == embedding_report.WHOLE]
     assert (whole.tokens == 113).all()
     for row in whole.itertuples():
@@ -52,11 +55,11 @@ def test_the_report_compares_the_shipped_policies_beside_the_paper() -> None:
 def test_a_policy_is_measured_beside_the_model_that_it_grew_from() -> None:
     folders = {study._model_folder(name).name for name in suites.BENCHMARKS}
     assert folders == {"mini-paligemma-tint-free"}
-    successor = teach_token.MODEL.parent / f"mini-pi0-{SUITE}-wide-seed-0"
+    successor = SHIPPED / f"mini-pi0-{SUITE}-wide-seed-0"
     table = embedding_report.spaces(None, [successor])
     assert list(table.group) == [embedding_report.WHOLE, f"words of {SUITE}", "reserved"]
     assert (table.cosine_min > 0.999999).all()
-    beside_another = embedding_report.spaces(teach_token.MODEL, [successor])
+    beside_another = embedding_report.spaces(OLDER, [successor])
     assert beside_another.cosine_mean[0] < 0.9
 
 
@@ -109,8 +112,7 @@ def test_words_that_no_film_says_are_left_out_of_the_rotation(grown: tuple[Path,
     unmoved = rotation_cosines(home, home)
     assert [len(each) for each in unmoved.values()] == [0, 0, 0]
     assert [mean_cosine(each).text() for each in unmoved.values()] == ["-", "-", "-"]
-    shipped = teach_token.MODEL.parent
-    found = rotation_cosines(teach_token.MODEL, shipped / f"mini-pi0-{SUITE}")
+    found = rotation_cosines(OLDER, SHIPPED / f"mini-pi0-{SUITE}")
     assert len(found["copied"]) == 56
     assert (found["copied"] < 0.9999).all()
     whole = mean_cosine(found["copied"])
@@ -121,10 +123,10 @@ def test_words_that_no_film_says_are_left_out_of_the_rotation(grown: tuple[Path,
     rows = table.block(0, table.shape[0])
     assert longest_word(far) == pytest.approx(np.sqrt((rows**2).sum(1)).max())
     assert rotation_deg(rows[15], home, home) < 0.1
-    bridge = shipped / f"mini-pi0-{SUITE}"
-    word = open_table(teach_token.MODEL).block(15, 16)[0]
-    moved = token_alignment.align(word, teach_token.MODEL, bridge)
-    cosine = np.cos(np.radians(rotation_deg(word, teach_token.MODEL, bridge)))
+    bridge = SHIPPED / f"mini-pi0-{SUITE}"
+    word = open_table(OLDER).block(15, 16)[0]
+    moved = token_alignment.align(word, OLDER, bridge)
+    cosine = np.cos(np.radians(rotation_deg(word, OLDER, bridge)))
     assert cosine * np.linalg.norm(word) ** 2 == pytest.approx(float(word @ moved), rel=1e-3)
     words = nearest_words(open_table(far).block(15, 16)[0], far, 3)
     assert words[0] == (vocabulary()[15], pytest.approx(1))

@@ -219,7 +219,7 @@ def test_a_column_of_selections_says_that_a_touch_counts() -> None:
     assert [head.split("|")[1].strip() for head in heads if "moved or touched" not in head] == [
         "method"
     ]
-    assert len(heads) == 5
+    assert len(heads) == 4
 
 
 def test_the_runs_of_a_policy_are_counted_as_its_table_holds_them() -> None:

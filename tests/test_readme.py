@@ -329,6 +329,7 @@ def test_what_the_defaults_by_todays_recipe_reach() -> None:
         ("simpler-fractal", "mini-pi0-simpler-fractal-wide"),
         ("simpler-bridge", "mini-pi0-simpler-bridge-wide-seed-0"),
         ("vlabench", "mini-pi0-vlabench-wide"),
+        ("tabletop", "mini-pi0-tabletop-longer"),
     ],
 )
 def test_what_a_policy_of_todays_recipe_does_with_generic_objects(suite: str, name: str) -> None:

@@ -28,17 +28,18 @@ SHIPPED = (
     "weights",
 )
 LEFT_OUT = tuple(
-    f"data/policies/mini-pi0-{name}/"
+    f"data/policies/mini-{name}/"
     for name in (
-        "simpler-bridge",
-        "simpler-bridge-tint-free",
-        "simpler-bridge-wide",
-        "simpler-fractal",
-        "simpler-fractal-tint-free",
-        "tabletop",
-        "tabletop-wide",
-        "vlabench",
-        "vlabench-tint-free",
+        "paligemma",
+        "pi0-simpler-bridge",
+        "pi0-simpler-bridge-tint-free",
+        "pi0-simpler-bridge-wide",
+        "pi0-simpler-fractal",
+        "pi0-simpler-fractal-tint-free",
+        "pi0-tabletop",
+        "pi0-tabletop-wide",
+        "pi0-vlabench",
+        "pi0-vlabench-tint-free",
     )
 )
 Run = Callable[..., subprocess.CompletedProcess[str]]

@@ -25,10 +25,10 @@ from vap_core.simulation.types import EpisodeRow
 if TYPE_CHECKING:
     from vap_core.policies.mini_pi0.vlm import MiniVlm
 
-MODEL = DATA / "policies" / "mini-paligemma"
+MODEL = DATA / "policies" / "mini-paligemma-tint-free"
 """The shipped vision-language model that the default policies were initialised from.
 
-Those of other policies lie beside it, their names beginning with its name (`model_of`).
+That of the first policies lies beside it in a clone (`model_of`).
 """
 K = 5
 """Photos of the object to learn from."""
@@ -99,7 +99,7 @@ def model_of(initialised_from: str) -> Path:
 
     Raises: BadPolicy when a shipped model is damaged.
     """
-    for folder in sorted(MODEL.parent.glob(f"{MODEL.name}*")):
+    for folder in sorted(MODEL.parent.glob("mini-paligemma*")):
         if _sha256(folder) == initialised_from:
             return folder
     return MODEL
