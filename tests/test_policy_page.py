@@ -60,12 +60,10 @@ def test_how_far_its_words_moved_is_as_told(name: str) -> None:
     source, target = source[1:], target[1:]
     lengths = np.linalg.norm(source, axis=1) * np.linalg.norm(target, axis=1)
     mean = float(((source * target).sum(1) / lengths).mean())
-    if name == f"{MINI}shared-pair":
-        assert f"whose embeddings its training moved (mean cosine {mean:.2f})" in " ".join(
-            listed().split()
-        )
-    elif name in FIRST:
-        assert mean < 0.9
+    if name in FIRST:
+        told = re.search(r"policies moved theirs \(([^)]+)\)", " ".join(listed().split()))
+        assert told is not None
+        assert f"{mean:.2f}" in re.split(r", | and ", told[1])
     else:
         assert "(mean cosine 1.000)" in listed()
         assert f"{mean:.3f}" == "1.000"

@@ -166,8 +166,8 @@ def test_a_film_of_a_sequence_has_a_row_a_step(tmp_path):
 
 def test_a_policy_that_was_taught_pairs_is_named_apart_from_the_benchmarks_own():
     names = [
-        "mini_pi0:mini-pi0-tabletop@f212e7e5",
-        "mini_pi0:mini-pi0-shared-pair@e1a98faf",
+        "mini_pi0:mini-pi0-tabletop-longer@99160be2",
+        "mini_pi0:mini-pi0-shared-pair@c4a8f99e",
         "scripted",
         "expert",
     ]
@@ -179,8 +179,8 @@ def test_a_policy_of_ones_own_comes_last_under_its_label(monkeypatch, tmp_path):
     labels = [
         "pi0:second@0000aaaa",
         "expert",
-        "mini_pi0:mini-pi0-tabletop@f212e7e5",
-        "mini_pi0:mini-pi0-tabletop@f212e7e5, temperature 0.5",
+        "mini_pi0:mini-pi0-tabletop-longer@99160be2",
+        "mini_pi0:mini-pi0-tabletop-longer@99160be2, temperature 0.5",
         "pi0:first@0000bbbb",
         "mini_pi0:mini-pi0-tabletop-wide@0000cccc",
     ]
@@ -189,7 +189,7 @@ def test_a_policy_of_ones_own_comes_last_under_its_label(monkeypatch, tmp_path):
         tables.append(({}, sequence(ENDS).assign(policy=label)))
     monkeypatch.setattr(shared_scenes, "read_runs", lambda _: tables)
     found = shared_scenes.shared_episodes(tmp_path / "mine.parquet")
-    own = [labels[i] for i in (5, 3, 4, 0)]
+    own = [labels[i] for i in (3, 5, 4, 0)]
     assert list(dict.fromkeys(found["policy"])) == ["mini-pi0", "expert", *own]
     table = shared_scenes.sequence_table(found)
     assert set(table["n"]) == {len(ENDS)}

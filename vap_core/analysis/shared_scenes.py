@@ -20,7 +20,7 @@ from vap_core.evaluation.metrics import Rate, rate
 from vap_core.evaluation.parsers.paraphrases import KINDS
 from vap_core.evaluation.publish import read_runs
 from vap_core.evaluation.statistics import bootstrap_interval
-from vap_core.policies.names import MINI, TEMPERATURE, checkpoint_of
+from vap_core.policies.names import MINI, TEMPERATURE, checkpoint_of, shipped_checkpoint
 from vap_core.simulation import suites
 from vap_core.simulation.suites import shared
 from vap_core.training.recipe import FILMED
@@ -350,6 +350,6 @@ def _policy_name(policy: str) -> str:
     """The short name of a policy that was published here; any other's label."""
     if TEMPERATURE in policy:
         return policy
-    names = {f"{MINI}-{benchmark}": MINI for benchmark in suites.BENCHMARKS}
+    names = {shipped_checkpoint(benchmark).name: MINI for benchmark in suites.BENCHMARKS}
     names[f"{MINI}-{PAIR}"] = TAUGHT
     return names.get(checkpoint_of(policy), policy)
