@@ -228,7 +228,7 @@ def test_of_several_policies_one_is_asked_for_and_sub_goals_are_refused(tmp_path
         BadStudy, match=r"by mini_pi0:mini-pi0-shared-pair@.* choose one with --pol"
     ):
         replay.plan(table, tmp_path, pair)
-    for policy in ("mini-pi0-shared-pair@", "mini-pi0-tabletop@"):
+    for policy in ("mini-pi0-shared-pair@", "mini-pi0-tabletop-longer@"):
         jobs = replay.plan(table, tmp_path, replace(pair, policy=policy))
         assert {policy in job.policy for job in jobs} == {True}
         assert sum(len(job.rows) for job in jobs) == 100

@@ -1,5 +1,7 @@
 """Tables and figures of shared scenes: what is counted, and that they agree with what was published."""
 
+import json
+
 import pandas as pd
 import pytest
 
@@ -11,7 +13,7 @@ from vap_core.evaluation.paper import ledger
 from vap_core.evaluation.parsers import report
 from vap_core.evaluation.publish import read_runs
 from vap_core.policies.lerobot.checkpoints import fingerprint
-from vap_core.policies.names import checkpoint_of
+from vap_core.policies.names import checkpoint_of, policy_label, shipped_checkpoint
 from vap_core.prompt import PALETTE
 from vap_core.training.recipe import RECIPES
 
@@ -149,12 +151,18 @@ def test_the_page_tells_what_the_pairs_training_lacked_and_reached():
     tints = len(PALETTE)
     assert (tints, tints - len(recipe.held_out_tints)) == (6, 4)
     page = " ".join((ROOT / "docs" / "shared.md").read_text().split())
-    assert "Its films have no slipper and only four of the six tints; the policy" in page
+    assert "in films slippers and two of the six tints. In generic scenes" in page
     ran = pd.concat([rows for _, rows in read_runs(DATA / "results" / "shared.parquet")])
     desk = ran[(ran.suite == "shared-pair") & ran.policy.str.contains("mini-pi0-tabletop")]
     moved = desk.groupby("method").cmr.sum().to_dict()
-    assert moved == {"generic": 1, "vap": 0}
-    assert "With VAP tabletop's policy never moves the target of a pair." in page
+    assert moved == {"generic": 6, "vap": 2}
+    assert "With VAP tabletop's policy moves the target of 2 pairs of 100." in page
+    card = json.loads((SHIPPED / "mini-pi0-shared-pair" / "training.json").read_text())["held_out"]
+    hits = [f"{100 * card[name]:.0f} %" for name in ("hit", "goal_hit")]
+    assert (
+        f"at the right target in {hits[0]} of patches asked and at the right goal in {hits[1]}."
+        in page
+    )
 
 
 @pytest.mark.sweep
@@ -202,12 +210,34 @@ def test_a_table_of_other_suites_is_refused():
         shared_scenes.shared_episodes(DATA / "results" / "mini_pi0.parquet")
 
 
-def test_the_page_names_the_frozen_policy_of_the_published_rows():
-    """The rows of the WidowX are of simpler-bridge's first policy, whatever is the default now."""
+def test_the_published_rows_are_of_the_policies_that_the_page_names():
+    """The defaults, and the shipped policy that was taught pairs."""
     ran = pd.concat([rows for _, rows in read_runs(DATA / "results" / "shared.parquet")])
-    ran = ran[ran["suite"] == SUITE]
-    (label,) = {label for label in ran["policy"] if checkpoint_of(label)}
-    checkpoint = SHIPPED / checkpoint_of(label)
-    assert label.endswith(f"@{fingerprint(checkpoint)[:8]}")
-    page = (ROOT / "docs" / "shared.md").read_text()
-    assert f"`data/policies/{checkpoint.name}`." in page
+    expected = {"scripted", "expert"}
+    for folder in (
+        shipped_checkpoint("simpler-bridge"),
+        shipped_checkpoint("tabletop"),
+        SHIPPED / "mini-pi0-shared-pair",
+    ):
+        expected.add(policy_label("mini_pi0", folder.name, fingerprint(folder)))
+    assert set(ran["policy"]) == expected
+    page = " ".join((ROOT / "docs" / "shared.md").read_text().split())
+    assert (
+        "tabletop's default policy on `shared-sequence` and `shared-pair`, simpler-bridge's" in page
+    )
+
+
+def test_what_the_first_policies_did_is_as_told():
+    ran = pd.concat(
+        [rows for _, rows in read_runs(DATA / "results" / "first_policy_shared.parquet")]
+    )
+    done = ran[ran.method == "vap"].groupby(["suite", "policy"]).success.sum()
+    by_suite = {}
+    for (name, policy), n in done.items():
+        by_suite[name, checkpoint_of(policy).removeprefix("mini-pi0-")] = n
+    assert by_suite == {
+        ("shared-sequence", "tabletop"): 28,
+        ("shared-sequence-bridge", "simpler-bridge"): 1,
+        ("shared-pair", "tabletop"): 0,
+        ("shared-pair", "shared-pair"): 1,
+    }
