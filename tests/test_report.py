@@ -297,6 +297,22 @@ def test_an_unfinished_run_is_reported_as_it_is(tmp_path: Path) -> None:
     assert "0 of 24" in report([early], tmp_path / "out")
 
 
+def test_runs_that_saw_otherwise_are_told_apart(tmp_path: Path) -> None:
+    """VAP with one stack and another's generic are paired; the report says what that compares."""
+    seen = {"stack": "embedded", "follow": "call"}
+    one = run(tmp_path / "one", **seen)
+    alike = run(tmp_path / "alike", seed=1, **seen)
+    other = run(tmp_path / "other", seed=2, **seen | {"stack": "foundation"})
+    assert "Not alike" not in report([one, alike], tmp_path / "out")
+    assert (
+        "**Not alike**: the runs of simpler-bridge differ in stack (embedded, foundation); a "
+        "comparison over several of them compares that, too."
+        in report([one, other], tmp_path / "out")
+    )
+    elsewhere = run(tmp_path / "elsewhere", label="mine", stack="foundation")
+    assert load_runs([one, elsewhere]).unlike == []
+
+
 def test_seeds_of_a_benchmark_are_one_report_with_layouts_for_units(tmp_path: Path) -> None:
     runs = load_runs([run(tmp_path / str(seed), seed=seed) for seed in range(3)])
     lines = results(runs).set_index(["task", "method"])

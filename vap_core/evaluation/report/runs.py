@@ -22,6 +22,8 @@ from vap_core.simulation import suites
 if TYPE_CHECKING:
     import pandas as pd
 
+SETTINGS = ("stack", "follow")
+"""What a run saw with; two runs that differ in it can be paired all the same."""
 NEEDED_COLUMNS = list(dict.fromkeys((*PAIR_KEY, *SCORE_KEY, "outcome", "steps", *MEASURES)))
 
 
@@ -43,6 +45,25 @@ class Runs:
     @property
     def methods(self) -> list[str]:
         return list(dict.fromkeys(self.wanted["method"]))
+
+    @property
+    def unlike(self) -> list[str]:
+        """A sentence for each of SETTINGS in which runs of one suite and policy differ."""
+        lines = {}
+        for (suite, _), part in self.wanted.groupby(["suite", "policy"], sort=False):
+            for setting in SETTINGS:
+                used: dict[str, None] = {}
+                for name in part["run"]:
+                    study = self.manifests[Path(name)]["configuration"]
+                    if setting in study:
+                        used[str(study[setting])] = None
+                if len(used) > 1:
+                    line = (
+                        f"the runs of {suite} differ in {setting} ({', '.join(used)}); a comparison "
+                        "over several of them compares that, too."
+                    )
+                    lines[line] = None
+        return list(lines)
 
 
 def load_runs(sources: Sequence[Path]) -> Runs:

@@ -70,13 +70,14 @@ READINGS_NOTE = (
 
 
 def opening_section(runs: Runs) -> str:
-    """How many episodes there are, and which runs are unfinished."""
+    """How many episodes there are, which runs are unfinished, and in what they differ."""
     several = "s" if len(runs.manifests) > 1 else ""
     lines = [
         f"{len(runs.table)} of the {runs.wanted['asked'].sum()} episodes that "
         f"{len(runs.manifests)} run{several} asked for."
     ]
     lines += [f"**Unfinished**: {line}" for line in runs.unfinished]
+    lines += [f"**Not alike**: {line}" for line in runs.unlike]
     return "\n".join(lines)
 
 
