@@ -6,6 +6,10 @@ from typing import Annotated
 
 import typer
 
+Jobs = Annotated[int | None, typer.Option(min=1, help="Processes that render. Default one a core.")]
+Rendered = Annotated[
+    Path | None, typer.Option(help="Folder of rendered scenes. Default data/cache.")
+]
 app = typer.Typer(
     no_args_is_help=True,
     help="Train shipped parts again; every training resumes after an interruption.",
@@ -21,17 +25,22 @@ def perception(
     seed: Annotated[int, typer.Option(min=0)] = 0,
     minutes: Annotated[
         float | None,
-        typer.Option(help="Stop after this long, with nothing written; the same command goes on."),
+        typer.Option(
+            min=0.0, help="Stop after this long, with nothing written; the same command goes on."
+        ),
     ] = None,
+    cache: Rendered = None,
+    jobs: Jobs = None,
 ) -> None:
     """Train the heads of detector, segmenter and encoder on rendered generic objects, and evaluate
     them on unseen ones.
 
     Example: python -m vap_core train perception --out data/runs/weights --scenes 400
     """
-    from vap_core.training.perception.train import train
+    from vap_core.training.perception.train import CACHE, train
 
-    entry = train(out, scenes=scenes, seed=seed, minutes=minutes)
+    rendered = CACHE if cache is None else cache / CACHE.name
+    entry = train(out, scenes=scenes, seed=seed, minutes=minutes, cache=rendered, jobs=jobs)
     if entry is None:
         print(
             f"stopped after {minutes:g} minutes; nothing is written yet, the same command goes on."
@@ -103,8 +112,10 @@ def vlm(
     steps: Annotated[int, typer.Option(min=1, help="Optimiser steps.")] = 1600,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     minutes: Annotated[
-        float | None, typer.Option(help="Stop after this long; the same command goes on.")
+        float | None, typer.Option(min=0.0, help="Stop after this long; the same command goes on.")
     ] = None,
+    cache: Rendered = None,
+    jobs: Jobs = None,
 ) -> None:
     """Train the mini-PaliGemma that policies grow from, on questions about generic objects.
     Interrupted, the same command goes on.
@@ -112,10 +123,11 @@ def vlm(
     Example: python -m vap_core train vlm --stages 20 --steps 100 --out data/runs/small-vlm
     """
     from vap_core.base.commands import command
+    from vap_core.training.films.scenes import CACHE
     from vap_core.training.vlm.train import Recipe, train
 
     recipe = Recipe(stages=stages, steps=steps, seed=seed)
-    about = train(recipe, out, minutes=minutes)
+    about = train(recipe, out, minutes=minutes, cache=cache or CACHE, jobs=jobs)
     print(json.dumps(about["held_out"], indent=1))
     print(f"CPU hours: {json.dumps(about['cpu_hours'])}")
     print(f"next: {command('train', 'policy', '--suite', 'simpler-bridge', '--vlm', out)}")
@@ -209,7 +221,9 @@ def policy(
     ] = None,
     minutes: Annotated[
         float | None,
-        typer.Option(help="Stop the policy's steps after this long; the same command goes on."),
+        typer.Option(
+            min=0.0, help="Stop the policy's steps after this long; the same command goes on."
+        ),
     ] = None,
 ) -> None:
     """Train a mini-pi0, the small frozen policy, from nothing, by the recipe of its suite: one to

@@ -52,12 +52,13 @@ def train(
     stages. `jobs` processes (all cores) render.
 
     Raises: MissingWeights: `onnx`, which writes the graphs, is not installed; BadOutput: `out`
-        cannot be written.
+        or `cache` cannot be written.
     """
     from vap_core.training.perception.evaluation import evaluate
 
     require_onnx()
     make_folder(out, "train perception")
+    make_folder(cache, "train perception", "choose another folder with --cache")
     started = time.monotonic()
     halted = False
 

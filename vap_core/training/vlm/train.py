@@ -195,18 +195,24 @@ def losses(learner: Learner, batch: Batch) -> tuple[Tensor, Figures]:
 
 
 def train(
-    recipe: Recipe, out: Path, *, minutes: float | None = None, cache: Path = CACHE, jobs: int = 2
+    recipe: Recipe,
+    out: Path,
+    *,
+    minutes: float | None = None,
+    cache: Path = CACHE,
+    jobs: int | None = None,
 ) -> dict[str, Any]:
     """Train, or go on where an earlier call stopped.
 
     Writes the model to `out`, and what was measured on unseen objects and the cost, which it
-    returns.
+    returns. `jobs` processes (all cores) render and describe.
 
     Raises: BadOutput when `out` holds another training or a model without what it would go on from,
         another process trains there, or it or `cache` cannot be written or is damaged.
     """
     with training_folder(out, "train vlm", vars(recipe)):
         make_folder(cache, "train vlm", "choose another folder with --cache")
+        jobs = jobs or os.cpu_count() or 1
         pool, scenes_s = views(recipe.stages, recipe.seed, cache, jobs=jobs)
         n_held_out = min(HELD_OUT, recipe.stages)
         held_out, more_s = views(n_held_out, recipe.seed, cache, held_out=True, jobs=jobs)
@@ -273,7 +279,7 @@ def make(out: Path, *, cache: Path = CACHE, jobs: int | None = None) -> Path:
             trained_steps = _trained_steps(about)
         if about.get("recipe") == vars(recipe) and trained_steps == recipe.steps:
             return out
-    train(recipe, out, cache=cache, jobs=jobs or os.cpu_count() or 1)
+    train(recipe, out, cache=cache, jobs=jobs)
     return out
 
 
@@ -281,7 +287,7 @@ def _trained_steps(about: Mapping[str, Any]) -> int:
     """The steps that the model of a training.json took."""
     if "trained_steps" in about:
         return int(about["trained_steps"])
-    # The card of mini-paligemma, which ships, is older than the field.
+    # The card of data/policies/mini-paligemma is older than the field.
     return int(about["log"][-1]["step"])
 
 
