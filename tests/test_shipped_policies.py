@@ -20,6 +20,7 @@ from vap_core.training.recipe import RECIPES
 FOLDERS = sorted(SHIPPED.glob(f"{MINI}-*"))
 BRIDGE = shipped("simpler-bridge")
 BY_TODAYS_RECIPE = {
+    "shared-pair": (0.2, 0.04),
     "simpler-bridge-tint-free": (0.0, 0.0),
     "simpler-bridge-any-start": (0.0, 0.04),
     "simpler-bridge-tint-share-0.1": (0.1, 0.04),
@@ -59,14 +60,14 @@ def test_it_is_whole_small_and_grown_from_the_model_that_ships(folder: Path) -> 
     } == set(known.cameras)
     if name in BY_TODAYS_RECIPE:
         assert name.startswith(known.name)
-        model = MODEL.with_name(f"{MODEL.name}-tint-free")
+        model = MODEL
         noise = told["recipe"].get("angle_noise_rad", 0.0)
         assert (told["recipe"]["tint_share"], noise) == BY_TODAYS_RECIPE[name]
         assert told["recipe"]["held_out_category"] == RECIPES[known.name].held_out_category
         assert {"magenta", "yellow"} <= set(told["recipe"]["held_out_tints"])
     else:
         assert name == known.name
-        model = MODEL
+        model = SHIPPED / "mini-paligemma"
     assert policy.config.vlm == load_vlm(model).sha256()
     assert len(told["data_sha256"]) == 64
     assert told["log"][-1]["step"] == STOPPED.get(name, told["recipe"]["steps"])
@@ -75,7 +76,13 @@ def test_it_is_whole_small_and_grown_from_the_model_that_ships(folder: Path) -> 
 
 @pytest.mark.parametrize(
     "made",
-    ["simpler-bridge-wide-seed-0", "simpler-fractal-wide", "tabletop-wide", "vlabench-wide"],
+    [
+        "simpler-bridge-wide-seed-0",
+        "simpler-fractal-wide",
+        "tabletop-wide",
+        "vlabench-wide",
+        "shared-pair",
+    ],
 )
 def test_a_suites_recipe_is_what_made_a_policy_that_ships(made: str) -> None:
     told = json.loads((SHIPPED / f"{MINI}-{made}" / "training.json").read_text())

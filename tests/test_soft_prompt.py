@@ -32,6 +32,7 @@ from vap_core.simulation.suites.suite import Task
 from vap_core.training.words import vocabulary
 
 SUITE, TASK, STATE, ACTION = "simpler-bridge", "put-camera", 13, 7
+MODEL = "mini-paligemma"
 
 
 def config(vlm: str = "") -> MiniPI0Config:
@@ -145,16 +146,16 @@ def test_one_object_has_a_token_for_every_model_and_its_look_alikes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Three tasks ask for one camera: two policies grew from one model, the third from another."""
-    for name, seed in (("tiny", 0), ("tiny-other", 1)):
+    for name, seed in ((MODEL, 0), (f"{MODEL}-other", 1)):
         home, far = tmp_path / name, tmp_path / f"policy-{name}"
         home.mkdir()
         far.mkdir()
         grow(home, far, seed)
-    policies = {SUITE: "tiny", "widowx-pick": "tiny-other", "franka-pick": "tiny"}
+    policies = {SUITE: MODEL, "widowx-pick": f"{MODEL}-other", "franka-pick": MODEL}
     monkeypatch.setattr(
         "vap_core.evaluation.study.shipped", lambda suite: tmp_path / f"policy-{policies[suite]}"
     )
-    monkeypatch.setattr(teach_token, "MODEL", tmp_path / "tiny")
+    monkeypatch.setattr(teach_token, "MODEL", tmp_path / MODEL)
     monkeypatch.setattr(teach_token, "VIEWS", 2)
     monkeypatch.setattr(
         learned_token, "TokenTraining", lambda: TokenTraining(epochs=1, augmentations=1)
