@@ -59,8 +59,8 @@ class Runs:
                         used[str(study[setting])] = None
                 if len(used) > 1:
                     line = (
-                        f"the runs of {suite} differ in {setting} ({', '.join(used)}); a comparison "
-                        "over several of them compares that, too."
+                        f"the runs of {suite} differ in {setting} ({', '.join(used)}); a "
+                        "comparison over several of them compares that, too."
                     )
                     lines[line] = None
         return list(lines)
