@@ -49,7 +49,7 @@ class Runs:
     @property
     def unlike(self) -> list[str]:
         """A sentence for each of SETTINGS in which runs of one suite and policy differ."""
-        lines = {}
+        lines: dict[str, None] = {}
         for (suite, _), part in self.wanted.groupby(["suite", "policy"], sort=False):
             for setting in SETTINGS:
                 used: dict[str, None] = {}
