@@ -1,6 +1,7 @@
 """How failures divide into cases, and at which stages episodes are lost: tables and pictures."""
 
 from collections.abc import Generator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from vap_core.base import figures
 from vap_core.base.tables import align
 from vap_core.evaluation.diagnosis import STAGES
+from vap_core.evaluation.metrics import rate
 from vap_core.evaluation.report.failures import (
     breakdown,
     breakdown_rows,
@@ -135,6 +137,14 @@ def test_a_method_that_has_errors_alone_has_no_line() -> None:
     both = funnel_figure(funnel_table(TABLE), {"vap": "red", "generic": "grey"})
     assert both.axes[0].get_title() == "vlabench (n 2 to 9)"
     assert funnel_figure(lines, {"soft": "grey"}).axes[0].get_title() == "vlabench"
+
+
+def test_a_success_rate_is_rounded_as_the_tables_round_it() -> None:
+    """92 of 160 were 58 in the funnel and 57 in the tables."""
+    vap, _ = funnel_table(TABLE)
+    tied = replace(vap, n=160, left=(92,) * len(STAGES), succeeded=92)
+    (label,) = funnel_figure([tied], {"vap": "red"}).axes[0].texts
+    assert str(rate(92, 160)).split(" %")[0] == label.get_text() == "57"
 
 
 def test_a_method_that_reads_the_simulator_is_dashed() -> None:

@@ -141,7 +141,7 @@ def _draw_funnel(
         for i, left in enumerate(row.left):
             if left is not None:
                 stages.append(i)
-                percent.append(100 * left / row.n)
+                percent.append(100 * (left / row.n))
         if not percent:
             continue
         colour = colours[_plain(row.method)]
@@ -154,7 +154,7 @@ def _draw_funnel(
             color=colour,
             linewidth=1.8,
         )
-        success = 100 * row.succeeded / row.n
+        success = 100 * (row.succeeded / row.n)  # rounds as a Rate does: 92 of 160 are 57
         axes.plot(
             len(STAGES) - 1, success, SUCCESS_MARK, color=colour, fillstyle="none", markersize=7
         )
