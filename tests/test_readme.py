@@ -10,6 +10,7 @@ from tests.published import RESULTS, episodes_of, in_percent, method_of, of_way
 from vap_core.cli.bench import eval_report, measured, measurement
 from vap_core.evaluation.diagnosis.failures import list_failures
 from vap_core.evaluation.metrics import Rate
+from vap_core.evaluation.policy_names import shipped
 from vap_core.evaluation.report.failures import breakdown
 from vap_core.evaluation.report.results import results
 from vap_core.evaluation.report.runs import load_runs
@@ -159,12 +160,39 @@ def test_what_tabletop_reaches_with_either_engine() -> None:
 def test_other_starts_are_beside_the_same_episodes_as_listed() -> None:
     key = ["suite", "task", "episode"]
     moved, listed = episodes_of("starts"), episodes_of("first_policy")
-    moved = moved[(moved.suite == "tabletop") & (moved.method == "vap")].set_index(key)
+    of_first = moved.policy.map(checkpoint_of) == "mini-pi0-tabletop"
+    moved = moved[of_first & (moved.method == "vap")].set_index(key)
     listed = listed[listed.method == "vap"].set_index(key)
     same = listed.reindex(moved.index)
     assert set(same.policy) == set(moved.policy)
     won, before = moved.success.sum(), same.success.sum()
     assert f"tabletop {won} of {len(moved)} ({before})" in PROSE
+
+
+def test_what_the_defaults_reach_from_other_starts() -> None:
+    elsewhere, listed = episodes_of("starts"), episodes_of("mini_pi0")
+    key = ["task", "episode"]
+    for suite, n in (("vlabench", 250), ("tabletop", 160)):
+        moved = elsewhere[elsewhere.policy.map(checkpoint_of) == shipped(suite).name]
+        home = listed[listed.suite == suite]
+        assert moved.groupby("method").size().to_dict() == {"generic": n, "vap": n}
+        assert set(moved.seed) == {1}
+        after, before = (
+            rows[rows.method == "vap"].set_index(key).success.astype(bool) for rows in (moved, home)
+        )
+        before = before.reindex(after.index)
+        won, lost = int((after & ~before).sum()), int((before & ~after).sum())
+        p = f"{mcnemar(won, lost):.3f}".removeprefix("0")
+        rate_before = f"{100 * before.mean():.0f}"
+        assert (
+            f"{suite} {of_way(moved, 'vap')} % of {n} (as listed {rate_before}; {won} won, {lost} lost; "
+            f"exact p {p})"
+        ) in PROSE
+        wrong = moved[moved.method == "vap"].wrong_object.mean()
+        assert wrong < 0.1
+        assert f" {100 * after.mean():.0f} on {suite} ({rate_before})" in " ".join(
+            PAGES["README.md"].split()
+        )
 
 
 def test_the_scripted_policys_intervals_over_layouts() -> None:
