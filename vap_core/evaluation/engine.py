@@ -20,6 +20,7 @@ from vap_core.evaluation.jobs import BATCH, Job, Record, Rows, row_of_dead_worke
 from vap_core.evaluation.processes import prepare, results
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import register_personal
+from vap_core.evaluation.unknown_words import unknown_words_notes
 from vap_core.evaluation.worker_server import worker_modules
 from vap_core.simulation.types import AS_LISTED, EpisodeRow
 
@@ -73,6 +74,8 @@ def run(
         return complete
 
     _open_run(study, folder, what_for)
+    for line in unknown_words_notes(study):
+        print(line, file=sys.stderr)
     with store.locked(folder):
         store.sweep(folder)
         store.compact(folder)
