@@ -37,7 +37,7 @@ def unknown_words_notes(study: Study) -> list[str]:
         if words:
             lines.append(
                 f"note: {folder.name} does not know {', '.join(words)}, which instructions of "
-                f"{suite} say; where that reaches it, it reads <unk>. It was trained on the words of "
-                "the benchmarks."
+                f"{suite} say; where that reaches it, it reads <unk>. It was trained on the words "
+                "of the benchmarks."
             )
     return lines
