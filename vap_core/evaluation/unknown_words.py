@@ -1,23 +1,21 @@
 """The words of a study's instructions that its mini-pi0 does not know, and reads as <unk>."""
 
-import re
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 
-from vap_core.base.files import parse_json
 from vap_core.evaluation.study import Study
-from vap_core.policies.lerobot.checkpoints import CONFIG, config_field, locate
+from vap_core.policies.lerobot.checkpoints import config_field, locate
+from vap_core.policies.token_groups import vocabulary_of, words_of
 
 KIND = "mini_pi0"
-"""The type of policy whose words are few, and in its configuration."""
+"""The type of policy whose words are few."""
 
 
-def unknown_words(known: Iterable[str], instructions: Iterable[str]) -> list[str]:
+def unknown_words(known: Container[str], instructions: Iterable[str]) -> list[str]:
     """The words of some instructions, in lower case, that are none of `known`; each once."""
     words: dict[str, None] = {}
-    for instruction in instructions:
-        words |= dict.fromkeys(re.findall(r"[\w']+", instruction.lower()))
-    kept = set(known)
-    return [word for word in words if word not in kept]
+    for instruction in dict.fromkeys(instructions):
+        words |= dict.fromkeys(words_of(instruction))
+    return [word for word in words if word not in known]
 
 
 def unknown_words_notes(study: Study) -> list[str]:
@@ -28,7 +26,7 @@ def unknown_words_notes(study: Study) -> list[str]:
         if not checkpoint or config_field(checkpoint, "type") != KIND:
             continue
         folder = locate(checkpoint)
-        known = parse_json((folder / CONFIG).read_text()).get("words", ())
+        known, _ = vocabulary_of(folder) or ((), None)
         said = []
         for of_task, task in study.tasks:
             if of_task == suite:

@@ -56,14 +56,18 @@ def vocabulary_of(folder: Path) -> tuple[dict[str, int], Encode] | None:
         vocabulary = {word: token for token, word in enumerate(words)}
 
         def encode_words(text: str) -> list[int]:
-            found = re.findall(r"<\w+>|[\w']+", text.lower())
-            return [vocabulary[word] for word in found if word in vocabulary]
+            return [vocabulary[word] for word in words_of(text) if word in vocabulary]
 
         return vocabulary, encode_words
     for name in TOKENIZERS:
         if (folder / name).is_file():
             return _tokenizer(folder / name)
     return None
+
+
+def words_of(text: str) -> list[str]:
+    """The words of a text as a small model reads them, in lower case."""
+    return re.findall(r"<\w+>|[\w']+", text.lower())
 
 
 def _tokenizer(file: Path) -> tuple[dict[str, int], Encode]:

@@ -10,6 +10,7 @@ from vap_core.base.figures import POLICY_MARKERS, empty_figure
 from vap_core.base.palette import CASES as CASE_COLOURS
 from vap_core.base.palette import METHODS, rgb8
 from vap_core.evaluation.diagnosis import STAGES
+from vap_core.evaluation.metrics import rate
 from vap_core.evaluation.report.failures import APART, FunnelRow
 from vap_core.rollout.failure import CASES
 
@@ -141,7 +142,7 @@ def _draw_funnel(
         for i, left in enumerate(row.left):
             if left is not None:
                 stages.append(i)
-                percent.append(100 * (left / row.n))
+                percent.append(100 * rate(left, row.n).value)
         if not percent:
             continue
         colour = colours[_plain(row.method)]
@@ -154,7 +155,7 @@ def _draw_funnel(
             color=colour,
             linewidth=1.8,
         )
-        success = 100 * (row.succeeded / row.n)  # rounds as a Rate does: 92 of 160 are 57
+        success = 100 * rate(row.succeeded, row.n).value
         axes.plot(
             len(STAGES) - 1, success, SUCCESS_MARK, color=colour, fillstyle="none", markersize=7
         )

@@ -49,21 +49,19 @@ class Runs:
     @property
     def unlike(self) -> list[str]:
         """A sentence for each of SETTINGS in which runs of one suite and policy differ."""
-        lines: dict[str, None] = {}
-        for (suite, _), part in self.wanted.groupby(["suite", "policy"], sort=False):
-            for setting in SETTINGS:
-                used: dict[str, None] = {}
-                for name in part["run"]:
-                    study = self.manifests[Path(name)]["configuration"]
-                    if setting in study:
-                        used[str(study[setting])] = None
-                if len(used) > 1:
-                    line = (
-                        f"the runs of {suite} differ in {setting} ({', '.join(used)}); a "
+        lines = []
+        for setting in SETTINGS:
+            by_run = {
+                str(name): one["configuration"].get(setting) for name, one in self.manifests.items()
+            }
+            told = self.wanted.assign(used=self.wanted["run"].map(by_run)).dropna(subset="used")
+            for (suite, _), used in told.groupby(["suite", "policy"], sort=False)["used"]:
+                if used.nunique() > 1:
+                    lines.append(
+                        f"the runs of {suite} differ in {setting} ({', '.join(used.unique())}); a "
                         "comparison over several of them compares that, too."
                     )
-                    lines[line] = None
-        return list(lines)
+        return list(dict.fromkeys(lines))
 
 
 def load_runs(sources: Sequence[Path]) -> Runs:
