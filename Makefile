@@ -1,4 +1,4 @@
-.PHONY: setup demo lint style types check test suite test-all reliability audit lab html links lock clean
+.PHONY: setup demo lint style types check test suite test-all audit lab html links lock clean
 .DEFAULT_GOAL := help
 
 # An empty PYTHONDONTWRITEBYTECODE lets Python keep what it compiled; uv compiles nothing.
@@ -14,7 +14,6 @@ help:
 	@echo "make check     for every day: lint, types and unit tests; two and a half minutes"
 	@echo "make test      lint, types, all tests but the sweeps, and notebooks; nine to 22 minutes on two cores"
 	@echo "make test-all  make test, and the long sweeps"
-	@echo "make reliability  write docs/reliability.md from what the tests counted"
 	@echo "make audit     known vulnerabilities of the pinned packages; needs the internet"
 	@echo "make lab       open the notebooks in JupyterLab"
 	@echo "make html      every notebook as an HTML page in build/html, with the viewer beside it"
@@ -56,10 +55,7 @@ suite: setup .venv/.compiled
 	$(PYTEST) -m "not sweep" --nbval-lax notebooks tests
 
 test-all: test
-	$(RUN) -m pytest -p tests.counts -m sweep
-
-reliability: setup
-	$(RUN) -m tests.reliability_page
+	$(RUN) -m pytest -m sweep
 
 audit: setup
 	@bash .ci/audit

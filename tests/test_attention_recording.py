@@ -50,7 +50,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The recording of the command, and what it printed."""
     out = tmp_path_factory.mktemp("attention")
     put_token(out / "memory")
-    done = vap("attention", RUN, "--record", NAME, "--out", out)
+    done = vap("measure", "attention", RUN, "--record", NAME, "--out", out)
     assert done.returncode == 0, done.stderr
     path = out / "recordings" / "simpler-bridge.pick-shaver.soft.12.rrd"
     assert path.exists(), done.stdout
@@ -144,7 +144,15 @@ def test_the_command_names_the_step_of_a_words_highest_peak(recorded: tuple[Path
     tensors = numbers(path, "token")
     highest = max(tensors, key=lambda step: heat_map(tensors[step], "token").max())
     (line,) = (line for line in said.splitlines() if line.startswith("next: "))
-    picture = ["show", str(path), f"{path.stem}.png", "--attention", "--frame", str(highest)]
+    picture = [
+        "view",
+        str(path),
+        "--png",
+        f"{path.stem}.png",
+        "--attention",
+        "--frame",
+        str(highest),
+    ]
     assert shlex.split(line) == ["next:", "python", "-m", "vap_core", *picture]
 
 
@@ -152,7 +160,7 @@ def test_the_command_names_the_step_of_a_words_highest_peak(recorded: tuple[Path
 def test_a_picture_has_the_maps_of_all_queries(recorded: tuple[Path, str], tmp_path: Path) -> None:
     path, _ = recorded
     png = tmp_path / "one.png"
-    done = vap("show", path, png, "--attention", "--frame", "0")
+    done = vap("view", path, "--png", png, "--attention", "--frame", "0")
     if "could not draw" in done.stderr:
         pytest.skip("no graphics driver on this machine")
     assert done.returncode == 0, done.stderr
@@ -184,10 +192,10 @@ def test_a_recording_without_attention_has_no_such_picture(tmp_path: Path) -> No
         recorder.frame(frame(0, start))
         recorder.close(SUCCESS)
     assert attended(plain) == {}
-    line = refused("show", plain, tmp_path / "one.png", "--attention")
+    line = refused("view", plain, "--png", tmp_path / "one.png", "--attention")
     assert "plain.rrd holds no attention; record it with --attention all" in line
     broken.write_bytes(plain.read_bytes()[:2000])
-    assert "cannot be read" in refused("show", broken, tmp_path / "one.png", "--attention")
+    assert "cannot be read" in refused("view", broken, "--png", tmp_path / "one.png", "--attention")
 
 
 def test_only_the_policy_of_the_run_is_run_again(

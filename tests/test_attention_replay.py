@@ -63,7 +63,7 @@ def test_publishing_leaves_no_row_of_an_older_replay_of_the_suite_and_method(
 
 
 def test_a_folder_that_is_no_run_gets_no_folder_of_attention(tmp_path: Path) -> None:
-    assert "run.json is absent or damaged" in refused("attention", tmp_path)
+    assert "run.json is absent or damaged" in refused("measure", "attention", tmp_path)
     assert not list(tmp_path.iterdir())
 
 
@@ -73,7 +73,7 @@ def test_the_command_measures_a_run_and_goes_on_where_it_stopped(tmp_path: Path)
     done = vap("rollout", "--suite", "simpler-bridge", "--task", "pick-shaver", "--policy", "mini-pi0", "--methods", "generic", "--episodes", "2",
                "--record", "none", "--workers", "1", "--out", run)  # fmt: skip
     assert done.returncode == 0, done.stderr
-    words = ("attention", run, "--workers", "1", "--explain", "1")
+    words = ("measure", "attention", run, "--workers", "1", "--explain", "1")
     done = vap(*words)
     assert done.returncode == 0, done.stderr
     assert "2 episodes run again, 2 of them end as in the run" in done.stdout
@@ -90,7 +90,7 @@ def test_the_command_measures_a_run_and_goes_on_where_it_stopped(tmp_path: Path)
     assert set(tables["causal"]["measure"]) == {"gradient", "masking", "action", "category"}
     own = tables["causal"][tables["causal"]["measure"] == "masking"]
     assert (own["rank_masking"] == 1).all()
-    done = vap("attention", run, "--method", "vap")
+    done = vap("measure", "attention", run, "--method", "vap")
     assert done.returncode == 2
     assert "holds no episode of what was asked for" in done.stderr
 

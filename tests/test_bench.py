@@ -1,4 +1,4 @@
-"""The benchmarks: what they count is exact on known work, their tables divide as they say, and docs/measured.md is what ships."""
+"""The benchmarks: what they count is exact on known work, their tables divide as they say."""
 
 import ast
 from dataclasses import asdict, replace
@@ -16,7 +16,6 @@ from vap_core.cli.bench import (
     engine,
     eval_report,
     lerobot_process,
-    measured,
     measurement,
     memory,
     profile,
@@ -352,11 +351,6 @@ def test_compared_tables_are_measured_as_the_noise_says() -> None:
     assert len({len(row) for row in table.rows}) == 1
 
 
-def test_the_page_is_what_ships() -> None:
-    """Otherwise: python -m vap_core bench measured."""
-    assert measured.PAGE.read_text() == measured.page()
-
-
 def test_the_pictures_bars_are_the_tables() -> None:
     conditions = []
     for i, condition in enumerate(scale.CONDITIONS):
@@ -382,7 +376,6 @@ def test_the_pictures_bars_are_the_tables() -> None:
     dots = figure.axes[0].lines
     assert [list(line.get_ydata()) for line in dots] == [[2.0], [2.5], [3.0]], "one a repeat"
     assert {line.get_color() for line in dots} == {"black"}
-    assert "every black dot is one repeat" in measured.page()
 
 
 @pytest.mark.sweep
@@ -424,14 +417,12 @@ def test_scale_runs() -> None:
 @pytest.mark.parametrize(
     ("words", "match"),
     [
-        ("measured --json bs.json", "bench: measured reads no option; leave --json out."),
         ("--json x.json loop --steps 5", "bench: loop reads --steps; leave --json out."),
         ("loop --quick", "leave --quick out"),
         ("policy --device cpu", "leave --device out"),
         ("profile --stack embedded", "profile reads --quick, --json; leave --stack out."),
         ("engine --episodes 200", "leave --episodes out"),  # as the default says, too
         ("query --steps 9 --repeats 3", "leave --steps and --repeats out"),
-        ("measured --random-weights", "leave --random-weights out"),
         ("nothing --json x", "bench: 'nothing' is unknown; known: embeddings, engine"),
     ],
 )

@@ -204,7 +204,7 @@ def test_a_stack_with_an_embedded_part_is_calibrated_on_photos(name, tmp_path, m
 
 def test_calibrate_refuses_before_it_measures(tmp_path):
     arguments = ("--stack", "embedded:encoder=dinov2-small", "--keep", "--out", tmp_path / "out")
-    assert "--photos SET --keep" in refused("calibrate", *arguments)
+    assert "--photos SET --keep" in refused("measure", "calibration", *arguments)
     assert not (tmp_path / "out").exists()
 
 

@@ -304,7 +304,7 @@ def test_a_picture_in_the_output_folder_is_never_overwritten(
 
 def test_show_refuses_what_is_no_recording(tmp_path: Path) -> None:
     (tmp_path / "x.rrd").write_bytes(b"RRF2garbage")
-    assert "x.rrd" in refused("show", tmp_path / "x.rrd", tmp_path / "x.png")
+    assert "x.rrd" in refused("view", tmp_path / "x.rrd", "--png", tmp_path / "x.png")
 
 
 def test_doctor_finds_this_machine_able() -> None:

@@ -31,7 +31,7 @@ def test_every_word_and_variable_is_read_back() -> None:
 
 def test_the_command_after_designs_is_read_back(tmp_path: Path) -> None:
     done = vap("objects", "designs", tmp_path / ODD, "--count", "1")
-    words = ["python", "-m", "vap_core", "eval-objects", str(tmp_path / ODD)]
+    words = ["python", "-m", "vap_core", "measure", "objects", str(tmp_path / ODD)]
     assert next_words(done.stdout) == words
 
 

@@ -138,7 +138,7 @@ def test_the_same_call_goes_on_and_another_question_is_refused(
 def test_answers_of_another_threshold_owner_or_version_are_not_taken_for_these(
     recorded: Path, bank: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What `calibrate --keep` writes changes what is grounded, and so does whose an object is."""
+    """What `measure calibration --keep` writes changes what is grounded, and so does whose an object is."""
     out = tmp_path / "out"
 
     def refuses(differs: str) -> None:

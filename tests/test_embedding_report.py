@@ -34,7 +34,7 @@ OLDER = SHIPPED / "mini-paligemma"
 
 
 def test_the_report_compares_the_shipped_policies_beside_the_paper() -> None:
-    found = CliRunner().invoke(app, ["embeddings"])
+    found = CliRunner().invoke(app, ["measure", "embeddings"])
     assert found.exit_code == 0, found.output
     assert "words of simpler-bridge" in found.output
     assert found.output.count("paper: pi0") == 4
@@ -43,7 +43,7 @@ def test_the_report_compares_the_shipped_policies_beside_the_paper() -> None:
     assert f"{defaults} with mini-paligemma-tint-free" in found.output
     kept = pd.read_parquet(DATA / "results" / "token_spaces.parquet")
     measured = [str(SHIPPED / name) for name in kept.policy.unique()]
-    named = CliRunner().invoke(app, ["embeddings", str(OLDER), *measured])
+    named = CliRunner().invoke(app, ["measure", "embeddings", str(OLDER), *measured])
     whole = kept[kept.group == embedding_report.WHOLE]
     assert (whole.tokens == 113).all()
     for row in whole.itertuples():
@@ -96,12 +96,12 @@ def test_a_name_that_is_no_tables_is_refused_before_the_work(
     opened: list[Path] = []
     monkeypatch.setattr(embedding_report, "open_table", opened.append)
     out = tmp_path / "new" / "rows.txt"
-    found = CliRunner().invoke(app, ["embeddings", "--out", str(out)])
+    found = CliRunner().invoke(app, ["measure", "embeddings", "--out", str(out)])
     assert isinstance(found.exception, BadOutput)
     assert "ends with neither .parquet nor .csv" in str(found.exception)
     blocked = tmp_path / "file"
     blocked.touch()
-    found = CliRunner().invoke(app, ["embeddings", "--out", str(blocked / "rows.csv")])
+    found = CliRunner().invoke(app, ["measure", "embeddings", "--out", str(blocked / "rows.csv")])
     assert isinstance(found.exception, BadOutput)
     assert opened == []
     assert [path.name for path in tmp_path.iterdir()] == ["file"]

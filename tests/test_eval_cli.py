@@ -98,7 +98,7 @@ def test_a_second_call_runs_nothing_more(run: tuple[Path, str]) -> None:
 
 @pytest.mark.slow
 def test_judged_again_nothing_changes(run: tuple[Path, str]) -> None:
-    done = vap("rescore", run[0])
+    done = vap("report", "--rescore", run[0])
     assert done.returncode == 0, done.stderr
     assert (
         done.stdout.splitlines()[-1]
@@ -230,7 +230,10 @@ REFUSED = {
         ("rollout", *EXPERT, "--task", "fly"),
         "task 'fly' is unknown; known: pick-shaver",
     ),
-    "no run": (("rescore", "nowhere"), "rescore: nowhere holds no results; name the folder"),
+    "no run": (
+        ("report", "--rescore", "nowhere"),
+        "rescore: nowhere holds no results; name the folder",
+    ),
 }
 
 
@@ -243,7 +246,7 @@ def test_names_in_an_option_may_stand_apart() -> None:
 def test_what_makes_no_sense_is_refused_in_one_line(
     words: tuple[str, ...], said: str, tmp_path: Path
 ) -> None:
-    done = vap(*words, *(() if words[0] == "rescore" else ("--out", tmp_path / "out")))
+    done = vap(*words, *(() if words[0] == "report" else ("--out", tmp_path / "out")))
     assert (done.returncode, done.stdout) == (2, "")
     last = done.stderr.strip().splitlines()[-1]
     assert re.search(f"(?i)^error: .*{said}", last), done.stderr

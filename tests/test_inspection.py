@@ -216,7 +216,7 @@ def test_published_tables_are_all_there_or_named(tmp_path: Path) -> None:
         )
     with pytest.raises(
         BadOutput,
-        match=f"lacks perception_{TABLES[0]}.parquet; make them with eval-perception --publish",
+        match=f"lacks perception_{TABLES[0]}.parquet; make them with measure perception --publish",
     ):
         published(tmp_path)
     pd.DataFrame({"suite": ["vlabench"]}).to_parquet(tmp_path / f"perception_{TABLES[0]}.parquet")

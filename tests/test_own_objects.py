@@ -1,4 +1,4 @@
-"""eval-objects: made-up designs, the folder form, what is wrong with bad folders, the figures, and resuming."""
+"""measure objects: made-up designs, the folder form, what is wrong with bad folders, the figures, and resuming."""
 
 import os
 import shlex
@@ -146,8 +146,8 @@ def test_where_every_object_is_left_out_the_remedy_is_one_that_there_is(tmp_path
         put(folder, name, open_box)
     table = "file,category,height_cm\nopen.ply,coffee cup,6\nother.ply,cup,\n"
     (folder / "objects.csv").write_text(table)
-    line = refused("eval-objects", folder, "--views-only", "--out", out)
-    assert "eval-objects: every object was left out. open: " in line
+    line = refused("measure", "objects", folder, "--views-only", "--out", out)
+    assert "measure objects: every object was left out. open: " in line
     assert "is not watertight" in line
     assert "report.txt in out says why of 1 more." in line
     command, _, then = line.partition("python -m vap_core ")[2].partition("; ")
@@ -155,7 +155,7 @@ def test_where_every_object_is_left_out_the_remedy_is_one_that_there_is(tmp_path
         "objects", "import", str(folder / "open.ply"), "--category", "coffee cup",
         "--height-cm", "6", "--repair", "--out", "DIR",
     ]  # fmt: skip
-    assert then.startswith("then eval-objects DIR.")
+    assert then.startswith("then measure objects DIR.")
     report = (out / "report.txt").read_text()
     assert [words.split(":")[1] for words in report.splitlines()] == [" open", " other"]
 
@@ -180,7 +180,7 @@ def test_the_command_imports_looks_runs_and_resumes(tmp_path):
     (folder / "objects.csv").write_text(
         "file,category,height_cm,groups\ncrate.glb,cup,6,loud\ndesk-lamp.glb,lamp,,\n"
     )
-    words = ("eval-objects", folder, "--episodes", "1", "--policy", "scripted", "--out", out)
+    words = ("measure", "objects", folder, "--episodes", "1", "--policy", "scripted", "--out", out)
     done = vap(*words)
     assert done.returncode == 0, done.stderr
     assert "left out: desk-lamp: no task of tabletop asks for a lamp" in done.stdout
@@ -256,7 +256,9 @@ def test_rows_count_what_they_say():
 
 
 def test_folders_that_are_none_are_one_line(tmp_path: Path):
-    assert "is no folder" in refused("eval-objects", tmp_path / "none", "--out", tmp_path / "out")
+    assert "is no folder" in refused(
+        "measure", "objects", tmp_path / "none", "--out", tmp_path / "out"
+    )
 
 
 def test_an_object_that_is_left_out_at_a_later_task_has_no_rows(tmp_path, monkeypatch):

@@ -136,23 +136,25 @@ def test_a_server_that_fails_is_no_abstention() -> None:
 
 def test_the_command_prints_and_publishes(tmp_path: Path) -> None:
     some = ("--suite", "simpler-fractal", "--part", "tune", "--limit", "9")
-    done = vap("eval-parsers", *some, "--publish", tmp_path)
+    done = vap("measure", "parsers", *some, "--publish", tmp_path)
     assert done.returncode == 0, done.stderr
     assert "embedding  tune    explicit" in done.stdout
     table = pq.read_table(tmp_path / report.TABLE)
     assert table.num_rows == 18
     about = json.loads((table.schema.metadata or {})[b"about"])
     assert about["paraphrases"] == paraphrase_digest()
-    assert "suite 'lab' is unknown; known: " in refused("eval-parsers", "--suite", "lab")
-    assert "',' names no parser" in refused("eval-parsers", "--parser", ",")
-    assert "part 'all' is unknown; known: check-1" in refused("eval-parsers", "--part", "all")
-    assert "'magic' is unknown; known: rule" in refused("eval-parsers", *some, "--parser", "magic")
+    assert "suite 'lab' is unknown; known: " in refused("measure", "parsers", "--suite", "lab")
+    assert "',' names no parser" in refused("measure", "parsers", "--parser", ",")
+    assert "part 'all' is unknown; known: check-1" in refused("measure", "parsers", "--part", "all")
+    assert "'magic' is unknown; known: rule" in refused(
+        "measure", "parsers", *some, "--parser", "magic"
+    )
 
 
 def test_the_published_table_is_of_these_paraphrases(every: dict[str, list[Paraphrase]]) -> None:
     arrow = pq.read_table(PUBLISHED)
     about = json.loads((arrow.schema.metadata or {})[b"about"])
-    assert about["paraphrases"] == paraphrase_digest(), "run eval-parsers --publish data/results"
+    assert about["paraphrases"] == paraphrase_digest(), "run measure parsers --publish data/results"
     table: pd.DataFrame = arrow.to_pandas()
     assert len(table) == 2 * sum(map(len, every.values()))
 

@@ -1,4 +1,4 @@
-"""eval-photos: the folder form, what is wrong with bad folders, the figures, and resuming."""
+"""measure photos: the folder form, what is wrong with bad folders, the figures, and resuming."""
 
 import shutil
 from dataclasses import replace
@@ -145,7 +145,9 @@ def test_the_set_that_ships_is_in_this_form():
 
 
 def test_missing_parts_are_named(tmp_path):
-    assert "is no folder" in refused("eval-photos", tmp_path / "none", "--out", tmp_path / "out")
+    assert "is no folder" in refused(
+        "measure", "photos", tmp_path / "none", "--out", tmp_path / "out"
+    )
     with pytest.raises(BadPhotoSet, match="references holds no folder"):
         read_photo_set(tmp_path)
     (tmp_path / "references" / "mug").mkdir(parents=True)
@@ -155,7 +157,7 @@ def test_missing_parts_are_named(tmp_path):
 
 def test_the_command_measures_writes_and_resumes(folder, toy, tmp_path):
     out = tmp_path / "out"
-    done = vap("eval-photos", folder, "--stack", "toy", "--out", out)
+    done = vap("measure", "photos", folder, "--stack", "toy", "--out", out)
     assert done.returncode == 0, done.stderr
     table = pd.read_parquet(out / "questions.parquet").set_index(["scene", "object"])
     assert len(table) == 6
@@ -176,19 +178,21 @@ def test_the_command_measures_writes_and_resumes(folder, toy, tmp_path):
     assert "photos of one object" not in done.stdout  # two references each
     part = (out / "parts" / "a.png.json").stat().st_mtime_ns
     (out / "parts" / "b.png.json").unlink()
-    again = vap("eval-photos", folder, "--stack", "toy", "--out", out)
+    again = vap("measure", "photos", folder, "--stack", "toy", "--out", out)
     assert again.returncode == 0
     assert (out / "parts" / "a.png.json").stat().st_mtime_ns == part
     assert again.stdout.split("ms a photo")[0] == done.stdout.split("ms a photo")[0]
     (folder / "scenes.csv").write_text(HEADER + "a.png,mug,4,4,16,16\nb.png,mug,,,,\n")
-    assert "holds another run" in refused("eval-photos", folder, "--stack", "toy", "--out", out)
+    assert "holds another run" in refused(
+        "measure", "photos", folder, "--stack", "toy", "--out", out
+    )
 
 
 def test_a_name_that_is_misspelt_in_one_line_is_told(folder, toy, tmp_path):
     """Its object is asked for once less, and the table does not show that."""
     text = (folder / "scenes.csv").read_text()
     (folder / "scenes.csv").write_text(text.replace("a.png,mug", "a.png,mugg"))
-    done = vap("eval-photos", folder, "--stack", "toy", "--out", tmp_path / "out")
+    done = vap("measure", "photos", folder, "--stack", "toy", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     lines = [line for line in done.stderr.splitlines() if line.startswith("note:")]
     assert lines == [
@@ -200,7 +204,7 @@ def test_a_name_that_is_misspelt_in_one_line_is_told(folder, toy, tmp_path):
 
 def test_a_box_outside_its_photo_is_named(folder, toy, tmp_path):
     (folder / "scenes.csv").write_text(HEADER + "a.png,mug,70,4,90,16\nb.png,mug,,,,\n")
-    line = refused("eval-photos", folder, "--stack", "toy", "--out", tmp_path / "out")
+    line = refused("measure", "photos", folder, "--stack", "toy", "--out", tmp_path / "out")
     assert "lies outside" in line
     assert "64x64" in line
 
@@ -208,7 +212,7 @@ def test_a_box_outside_its_photo_is_named(folder, toy, tmp_path):
 def test_a_box_that_reaches_far_beyond_its_photo_is_named(folder, toy, tmp_path):
     """Of a digit too many the overlap would be near 0, whatever is found."""
     (folder / "scenes.csv").write_text(HEADER + "a.png,mug,4,4,160,16\nb.png,mug,,,,\n")
-    line = refused("eval-photos", folder, "--stack", "toy", "--out", tmp_path / "out")
+    line = refused("measure", "photos", folder, "--stack", "toy", "--out", tmp_path / "out")
     assert "'mug' reaches beyond" in line
     assert "64x64" in line
     photo_set = read_photo_set(folder)
@@ -307,7 +311,7 @@ def test_masks_are_measured_from_true_boxes_with_references_and_without(folder, 
     without_masks = read_photo_set(folder).sha256
     masked(folder)
     assert read_photo_set(folder).sha256 != without_masks
-    done = vap("eval-photos", folder, "--stack", "toy", "--out", tmp_path / "out")
+    done = vap("measure", "photos", folder, "--stack", "toy", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     table = pd.read_parquet(tmp_path / "out" / "masks.parquet").set_index("object")
     assert table.mask_iou.to_dict() == {"mug": 1.0, "old_mug": 0.5}
@@ -315,7 +319,7 @@ def test_masks_are_measured_from_true_boxes_with_references_and_without(folder, 
     shutil.rmtree(folder / "references")
     (folder / "scenes.csv").write_text(HEADER + "a.png,mug,4,4,16,16\nb.png,old_mug,4,4,16,16\n")
     (folder / "objects.csv").unlink()
-    alone = vap("eval-photos", folder, "--stack", "toy", "--out", tmp_path / "alone")
+    alone = vap("measure", "photos", folder, "--stack", "toy", "--out", tmp_path / "alone")
     assert alone.returncode == 0, alone.stderr
     assert "mean IoU 0.75" in alone.stdout
     assert "object in view" not in alone.stdout
@@ -324,7 +328,7 @@ def test_masks_are_measured_from_true_boxes_with_references_and_without(folder, 
 def test_masks_that_do_not_fit_are_named(folder, toy, tmp_path):
     masked(folder)
     Image.fromarray(np.zeros((8, 8), np.uint8)).save(folder / "masks" / "a.png" / "mug.png")
-    line = refused("eval-photos", folder, "--stack", "toy", "--out", tmp_path / "out")
+    line = refused("measure", "photos", folder, "--stack", "toy", "--out", tmp_path / "out")
     assert "has 8x8 pixels, its scene 64x64" in line
     (folder / "masks" / "a.png" / "mug.png").rename(folder / "masks" / "a.png" / "plant.png")
     with pytest.raises(BadPhotoSet, match="no single box of 'plant' in a.png"):

@@ -1,4 +1,4 @@
-"""PODS in the form of eval-photos: from a hub on this machine, whose files are laid out as the public ones."""
+"""PODS in the form of measure photos: from a hub on this machine, whose files are laid out as the public ones."""
 
 import hashlib
 import io
@@ -233,11 +233,11 @@ def test_the_command_takes_a_folder_or_a_benchmark(
         (("--benchmark", "coco"), "benchmark 'coco' is unknown; known: pods"),
         (("--benchmark", "pods", "--from", tmp_path), "does not tell objects from kinds"),
     ):
-        assert words in refused("eval-photos", *options)
+        assert words in refused("measure", "photos", *options)
 
 
 @pytest.mark.parametrize(
-    "words", [("eval-perception", "--quick"), ("eval-photos", "--benchmark", "pods")]
+    "words", [("measure", "perception", "--quick"), ("measure", "photos", "--benchmark", "pods")]
 )
 def test_missing_weights_are_named_before_anything_is_fetched_or_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]

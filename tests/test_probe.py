@@ -146,7 +146,7 @@ def test_a_table_that_cannot_be_added_to_is_said_before_the_work(
     file.touch()
     for out in (damaged, foreign, file / "probe.parquet"):
         before = out.read_bytes() if out.exists() else None
-        told = refused("eval-policy", "--suite", SUITE, "--out", out)
+        told = refused("measure", "policy", "--suite", SUITE, "--out", out)
         assert told.startswith("error: probe: ")
         assert "--out" in told
         assert (out.read_bytes() if out.exists() else None) == before

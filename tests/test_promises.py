@@ -207,7 +207,6 @@ UNGUARDED = {
     # Inside the `writing` or `try` of their callers.
     ("base/files.py", "write_atomic"),
     ("base/csv_rows.py", "write_rows"),
-    ("evaluation/photos/paste.py", "_write_pictures"),
     ("perception/foundation/store.py", "write_lock"),
     ("evaluation/store.py", "_begin_run"),
     ("perception/embedded/weights.py", "write_entry"),

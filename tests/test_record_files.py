@@ -75,7 +75,7 @@ def test_view_names_the_mend_of_a_leftover_and_makes_a_recording_of_it(
     (tmp_path / "of a").mkdir()
     leftover = tmp_path / "of a" / ".two.rrd.7.tmp"
     leftover.write_bytes(whole[: len(whole) - 300])
-    for words in (("view", leftover), ("show", leftover, tmp_path / "a.png")):
+    for words in (("view", leftover), ("view", leftover, "--png", tmp_path / "a.png")):
         message = refused(*words)
         assert "is a recording that was not finished" in message
         assert f"vap_core view {shlex.quote(str(leftover))} --recover" in message

@@ -177,7 +177,7 @@ def test_a_folder_that_is_no_finished_survey_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadOutput, match=r"run\.json is absent"):
         read(tmp_path)
     run.store.open_run(tmp_path / "begun", Survey(suites=("simpler-bridge",)).configuration())
-    with pytest.raises(BadOutput, match="lacks views, .* run the same eval-perception again"):
+    with pytest.raises(BadOutput, match="lacks views, .* run the same measure perception again"):
         publish(tmp_path / "begun", tmp_path)
 
 
@@ -185,7 +185,15 @@ def test_a_folder_that_is_no_finished_survey_is_refused(tmp_path: Path) -> None:
 def test_the_command_measures_resumes_and_publishes(tmp_path: Path) -> None:
     out = tmp_path / "run"
     small = ["--quick", "--suite", "simpler-fractal", "--episodes", "1", "--jobs", "1"]
-    words = ["eval-perception", *small, "--out", str(out), "--publish", str(tmp_path / "kept")]
+    words = [
+        "measure",
+        "perception",
+        *small,
+        "--out",
+        str(out),
+        "--publish",
+        str(tmp_path / "kept"),
+    ]
     done = vap(*words)
     assert done.returncode == 0, done.stderr
     for told in (

@@ -242,7 +242,7 @@ def test_a_disk_that_is_full_ends_the_study_in_one_line(
     monkeypatch.setattr(
         study.store, "write_part", lambda folder, *_, **__: folder / "answers" / "part"
     )
-    with pytest.raises(BadOutput, match="^eval-tokens: .* cannot be written"), full_disk():
+    with pytest.raises(BadOutput, match="^measure tokens: .* cannot be written"), full_disk():
         study.run(Tokens((SUITE,), (5,), epochs=2), tmp_path / "run", progress=False)
     assert not list((tmp_path / "run" / "done").iterdir())
 
@@ -254,11 +254,11 @@ def test_the_usual_number_of_photos_comes_first_and_once_in_the_policy() -> None
     assert {job.where for job in plan(Tokens((SUITE,), places=("vlm",)))} == {"vlm"}
     with pytest.raises(BadStudy, match="from 5 photos alone"):
         study.run(Tokens((SUITE,), (3,), places=("policy",)), Path("none"), progress=False)
-    with pytest.raises(UnknownName, match="eval-tokens: --learn-in"):
+    with pytest.raises(UnknownName, match="measure tokens: --learn-in"):
         Tokens((SUITE,), places=("here",))
-    with pytest.raises(UnknownName, match="eval-tokens: suite"):
+    with pytest.raises(UnknownName, match="measure tokens: suite"):
         Tokens(("nowhere",))
-    found = CliRunner().invoke(app, ["eval-tokens", "--k", "1,none"])
+    found = CliRunner().invoke(app, ["measure", "tokens", "--k", "1,none"])
     assert isinstance(found.exception, BadStudy)
 
 

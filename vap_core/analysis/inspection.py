@@ -260,7 +260,7 @@ def published(folder: Path, stack: str = "embedded") -> "dict[str, pd.DataFrame]
     if missing:
         raise BadOutput(
             f"inspection.published: {folder} lacks {', '.join(missing)}; "
-            f"make them with eval-perception --publish {folder}."
+            f"make them with measure perception --publish {folder}."
         )
     tables = {}
     for name, path in paths.items():

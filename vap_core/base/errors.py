@@ -34,7 +34,7 @@ class BadPhoto(VapError):
 
 
 class BadPhotoSet(VapError):
-    """References and scenes for eval-photos that are incomplete, or boxes that do not fit them."""
+    """References and scenes of a photo set that are incomplete, or boxes that do not fit them."""
 
 
 class BadDataset(VapError):

@@ -43,11 +43,16 @@ app = typer.Typer(
     rich_markup_mode=None,
     help=HELP,
 )
-for module in (
-    photos, evaluate, ablate, recordings, results, attention, parsers, lerobot, perception,
-    policies, doctor, benches,
-):  # fmt: skip
+for module in (photos, evaluate, ablate, recordings, results, lerobot, doctor, benches):
     app.add_typer(module.app)
+measure = typer.Typer(
+    no_args_is_help=True,
+    help="Measure one part: perception, photos, objects, parsers, policy, tokens, embeddings, "
+    "attention, calibration.",
+)
+for module in (perception, parsers, policies, attention):
+    measure.add_typer(module.app)
+app.add_typer(measure, name="measure")
 app.add_typer(objects.app, name="objects")
 app.add_typer(train.app, name="train")
 app.add_typer(weights.app, name="weights")

@@ -70,9 +70,9 @@ def attention(
     """Run the episodes of a run again, measure where every query looks, and print the patterns; or
     record one of them with its maps.
 
-    Example: python -m vap_core attention data/results/mini_pi0.parquet --method soft,vap
+    Example: python -m vap_core measure attention data/results/mini_pi0.parquet --method soft,vap
         --suite vlabench
-    Example: python -m vap_core attention data/results/first_policy.parquet
+    Example: python -m vap_core measure attention data/results/first_policy.parquet
         --record simpler-bridge/put-camera/soft/22
     """
     from vap_core.analysis.attention import examples, replay, report
@@ -84,7 +84,7 @@ def attention(
         out = Path("data/runs") / f"attention-{run.stem}" if table else run / "attention"
     if record:
         path, step = examples.record(run, record, out / "recordings", out / "memory", policy)
-        words = ("show", path, f"{path.stem}.png", "--attention", "--frame", str(step))
+        words = ("view", path, "--png", f"{path.stem}.png", "--attention", "--frame", str(step))
         print(f"wrote {path}\nnext: {command(*words)}")
         return
     wanted = replay.Wanted(

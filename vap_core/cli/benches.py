@@ -32,7 +32,6 @@ BENCHES = {
     "engine": ("workers", "quick"),
     "embeddings": ("quick", "json"),
     "query": ("quick",),
-    "measured": (),
 }
 """The options that each bench reads, by parameter."""
 
@@ -56,8 +55,7 @@ def bench(
             "scale: cost against cameras, image size, candidates, batch and workers, and memory; "
             "engine: a Ray cluster on this machine against local processes; "
             "query: a question to a thousand recordings; "
-            "embeddings: tables of PaliGemma's size, compared; "
-            "measured: write docs/measured.md from what ships."
+            "embeddings: tables of PaliGemma's size, compared."
         ),
     ] = "loop",
     steps: Annotated[int, typer.Option(min=5, help="loop: control steps to time.")] = 60,
@@ -166,10 +164,6 @@ def bench(
             from vap_core.cli.bench import query
 
             text = query.run(quick=quick)
-        case "measured":
-            from vap_core.cli.bench import measured
-
-            text = measured.run()
     print(text)
 
 

@@ -124,7 +124,7 @@ def designs(
 
     paths = write_designs(out, count, seed)
     print(f"wrote {len(paths)} designs to {out}, and their kinds to {out / TABLE}")
-    print(f"next: {command('eval-objects', out)}")
+    print(f"next: {command('measure', 'objects', out)}")
 
 
 @app.command("list")

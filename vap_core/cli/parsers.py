@@ -11,7 +11,7 @@ from vap_core.cli.options import names
 app = typer.Typer()
 
 
-@app.command("eval-parsers")
+@app.command("parsers")
 def eval_parsers(
     parser: Annotated[
         str,
@@ -40,8 +40,8 @@ def eval_parsers(
 ) -> None:
     """Parse over 200 paraphrased instructions a suite, and print how often the object is right.
 
-    Example: python -m vap_core eval-parsers
-    Example: python -m vap_core eval-parsers --parser chat --part test --limit 20
+    Example: python -m vap_core measure parsers
+    Example: python -m vap_core measure parsers --parser chat --part test --limit 20
     """
     from vap_core.base.errors import BadStudy, one_of
     from vap_core.evaluation.parsers import report
@@ -52,15 +52,15 @@ def eval_parsers(
     parsers = names(parser)
     if not parsers:
         raise BadStudy(
-            f"eval-parsers: --parser {parser!r} names no parser; name one, or leave the option out "
-            "for the default, rule,embedding."
+            f"measure parsers: --parser {parser!r} names no parser; name one, or leave the option "
+            "out for the default, rule,embedding."
         )
     suites = names(suite) or list(suite_names())
     parts = names(part) or list(PARTS)
     for what, given, known in (("suite", suites, suite_names()), ("part", parts, PARTS)):
         for name in given:
             if name not in known:
-                raise one_of(f"eval-parsers: {what}", name, known)
+                raise one_of(f"measure parsers: {what}", name, known)
     answers = []
     for name in parsers:
         answers += measure(name, partial(load_parser, name), suites, parts, limit)

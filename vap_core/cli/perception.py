@@ -10,7 +10,7 @@ from vap_core.cli.options import StackName, Workers
 app = typer.Typer()
 
 
-@app.command("eval-perception")
+@app.command("perception")
 def eval_perception(
     stack: StackName = "embedded",
     suite: Annotated[
@@ -40,7 +40,7 @@ def eval_perception(
     """Measure perception against the simulator: opening frames, tracks through whole expert
     episodes, and time. Interrupted, it goes on.
 
-    Example: python -m vap_core eval-perception --suite simpler-bridge --quick
+    Example: python -m vap_core measure perception --suite simpler-bridge --quick
     """
     from vap_core.evaluation.perception.report import conclude
     from vap_core.evaluation.perception.run import Survey, run_survey
@@ -60,7 +60,7 @@ def eval_perception(
         print(f"wrote {written}")
 
 
-@app.command("eval-photos")
+@app.command("photos")
 def eval_photos(
     folder: Annotated[
         Path | None,
@@ -99,9 +99,9 @@ def eval_photos(
     """Measure registering, grounding and the vote on photos of your own, against the boxes that you
     give. Interrupted, it goes on.
 
-    Example: python -m vap_core eval-photos my-photos
-    Example: python -m vap_core eval-photos my-photos --clips
-    Example: python -m vap_core eval-photos --benchmark pods --stack foundation
+    Example: python -m vap_core measure photos my-photos
+    Example: python -m vap_core measure photos my-photos --clips
+    Example: python -m vap_core measure photos --benchmark pods --stack foundation
     """
     from vap_core.base.errors import BadPhotoSet, one_of
     from vap_core.evaluation.photos.pods import pods
@@ -111,9 +111,9 @@ def eval_photos(
 
     benchmarks = {"pods": pods}
     if benchmark and benchmark not in benchmarks:
-        raise one_of("eval-photos: benchmark", benchmark, benchmarks)
+        raise one_of("measure photos: benchmark", benchmark, benchmarks)
     if (folder is None) == (not benchmark):
-        raise BadPhotoSet("eval-photos: give a folder or --benchmark pods, one of the two.")
+        raise BadPhotoSet("measure photos: give a folder or --benchmark pods, one of the two.")
     if folder is None:
         check_stack(stack)
         check_present(stack)
@@ -122,45 +122,7 @@ def eval_photos(
     print(measure_photos(folder, folder_of_run, stack, clips=clips))
 
 
-@app.command("paste-photos")
-def paste_photos(
-    photos: Annotated[
-        Path,
-        typer.Argument(
-            help="Holds OBJECT/*.jpg, two photos of each object or more, best with a plain "
-            "background; optional objects.csv with object,category, boxes.csv with "
-            "photo,x0,y0,x1,y1, and masks/OBJECT/FILE.png."
-        ),
-    ],
-    out: Annotated[Path, typer.Argument(help="The set's new folder.")],
-    scenes: Annotated[Path, typer.Option(help="Folder of pictures to paste into.")],
-    size: Annotated[str, typer.Option(help="WIDTHxHEIGHT of the pictures.")] = "640x480",
-    pictures: Annotated[int, typer.Option(min=1, help="How many.")] = 16,
-    objects: Annotated[int, typer.Option(min=2, help="Objects in each, where they fit.")] = 5,
-    share: Annotated[
-        str, typer.Option(help="FROM,TO: an object's longer side in per cent of the width.")
-    ] = "15,35",
-    stack: StackName = "embedded",
-    seed: Annotated[int, typer.Option(min=0)] = 0,
-) -> None:
-    """Make a photo set for eval-photos without drawing boxes: objects are cut out of some of their
-    photos and pasted into pictures of a place; look at cuts.png.
-
-    Example: python -m vap_core paste-photos my-things my-set --scenes my-desk
-    Example: python -m vap_core paste-photos my-things my-small-set --scenes my-desk
-        --size 1920x1080 --share 4,13 --objects 12
-    """
-    from vap_core.base.commands import command
-    from vap_core.evaluation.photos.paste import parse_pasting
-    from vap_core.evaluation.photos.paste import paste_photos as paste
-    from vap_core.perception.stacks import load_stack
-
-    asked = parse_pasting(size, share, pictures=pictures, objects=objects, seed=seed)
-    print(paste(photos, scenes, out, asked, load_stack(stack)))
-    print(f"look: {out / 'cuts.png'}\nnext: {command('eval-photos', out)}")
-
-
-@app.command("eval-objects")
+@app.command("objects")
 def eval_objects(
     folder: Annotated[
         Path,
@@ -194,7 +156,7 @@ def eval_objects(
     look-alikes: found in opening views, and fetched by VAP where the expert can. Interrupted, it
     goes on.
 
-    Example: python -m vap_core eval-objects data/designs
+    Example: python -m vap_core measure objects data/designs
     """
     from vap_core.evaluation.own_objects.run import ObjectSurvey, measure_objects
 
@@ -208,12 +170,12 @@ def eval_objects(
     print(measure_objects(folder, out or Path(f"data/runs/objects-{folder.resolve().name}"), asked))
 
 
-@app.command()
+@app.command("calibration")
 def calibrate(
     stack: StackName = "embedded",
     photos: Annotated[
         list[Path] | None,
-        typer.Option(help="A photo set in the form of eval-photos; repeatable."),
+        typer.Option(help="A photo set in the form of measure photos; repeatable."),
     ] = None,
     scenes: Annotated[
         int, typer.Option(min=0, help="Rendered development scenes; 0: photos alone.")
@@ -232,8 +194,8 @@ def calibrate(
             "--keep",
             help="Write the chosen thresholds beside the weights of a foundation stack, which then "
             "uses them. Of the embedded stack it is the threshold for photos, which ground and "
-            "inspect-dataset then use, and eval-photos and attached checkpoints do not; of a stack "
-            "of your own without thresholds it is both. A stack with an embedded part needs "
+            "inspect-dataset then use, and measure photos and attached checkpoints do not; of a "
+            "stack of your own without thresholds it is both. A stack with an embedded part needs "
             "--photos.",
         ),
     ] = False,
@@ -245,8 +207,8 @@ def calibrate(
     """Measure from which cosine on an object is in view: what each threshold costs and brings, on
     development scenes with and without the object. Interrupted, it goes on.
 
-    Example: python -m vap_core calibrate --scenes 8
-    Example: python -m vap_core calibrate --photos my-photos --scenes 0 --keep
+    Example: python -m vap_core measure calibration --scenes 8
+    Example: python -m vap_core measure calibration --photos my-photos --scenes 0 --keep
     """
     from vap_core.analysis.calibration.run import calibrate, keep_choice, refuse_keep
 

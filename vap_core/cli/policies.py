@@ -1,4 +1,4 @@
-"""Commands that measure policies: eval-policy, eval-tokens, embeddings."""
+"""Commands that measure policies: measure policy, measure tokens, embeddings."""
 
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +10,7 @@ from vap_core.cli.options import Workers, names, with_bar
 app = typer.Typer()
 
 
-@app.command("eval-policy")
+@app.command("policy")
 def eval_policy(
     suite: Annotated[str, typer.Option(help="The benchmark that the policy was trained for.")],
     policy: Annotated[
@@ -48,9 +48,9 @@ def eval_policy(
     """Measure what a policy can do with generic objects that no film has shown, told by a tint, by
     paint, by words, or not at all.
 
-    Example: python -m vap_core eval-policy --suite simpler-bridge --scenes 4
-    Example: python -m vap_core eval-policy --suite tabletop --ways tinted --execute 10
-    Example: python -m vap_core eval-policy --suite simpler-bridge --ways tinted,tinted-magenta
+    Example: python -m vap_core measure policy --suite simpler-bridge --scenes 4
+    Example: python -m vap_core measure policy --suite tabletop --ways tinted --execute 10
+    Example: python -m vap_core measure policy --suite simpler-bridge --ways tinted,tinted-magenta
     """
     from vap_core.base.errors import BadStudy
     from vap_core.evaluation.study import Study
@@ -62,7 +62,7 @@ def eval_policy(
     checkpoint = study.checkpoint(suite)
     if not checkpoint:
         raise BadStudy(
-            f"eval-policy: {policy!r} has no weights; "
+            f"measure policy: {policy!r} has no weights; "
             "take mini-pi0, or a lerobot checkpoint's folder or hub id."
         )
     if out is not None:
@@ -82,7 +82,7 @@ def eval_policy(
         print(f"wrote {out}")
 
 
-@app.command("eval-tokens")
+@app.command("tokens")
 def eval_tokens(
     suite: Annotated[
         list[str] | None, typer.Option(help="A benchmark; repeatable. Default all four.")
@@ -112,7 +112,7 @@ def eval_tokens(
     listed episodes the model chooses by it. Interrupted, it goes on; about a minute and a half a
     token and core.
 
-    Example: python -m vap_core eval-tokens --suite simpler-bridge --k 5 --epochs 2
+    Example: python -m vap_core measure tokens --suite simpler-bridge --k 5 --epochs 2
         --out data/runs/few-tokens
     """
     from vap_core.base.errors import BadStudy
@@ -123,7 +123,7 @@ def eval_tokens(
 
     ks = tuple(int(number) for number in names(k) if number.isdecimal() and int(number))
     if len(ks) != len(names(k)) or not ks:
-        raise BadStudy(f"eval-tokens: --k {k}: give numbers of photos, such as 1,3,5,7.")
+        raise BadStudy(f"measure tokens: --k {k}: give numbers of photos, such as 1,3,5,7.")
     asked = Tokens(tuple(dict.fromkeys(suite or BENCHMARKS)), ks, epochs, tuple(names(learn_in)))
     print(report(run(asked, out, workers=workers)))
     if publish is not None:
@@ -160,8 +160,8 @@ def embeddings(
     """Compare the word embeddings of a vision-language model with those of policies: cosine, CKA,
     kNN@1, with the paper's numbers below.
 
-    Example: python -m vap_core embeddings
-    Example: python -m vap_core embeddings models/paligemma-3b-pt-224 models/pi0 models/pi05
+    Example: python -m vap_core measure embeddings
+    Example: python -m vap_core measure embeddings models/paligemma-3b-pt-224 models/pi0 models/pi05
     """
     from vap_core.analysis.embedding_report import check_output, keep, report, spaces
     from vap_core.base.errors import BadPolicy

@@ -1,4 +1,4 @@
-"""Commands that find and open recordings: diagnose, query, view, show."""
+"""Commands that find and open recordings: diagnose, query, view."""
 
 import threading
 from pathlib import Path
@@ -191,7 +191,8 @@ def query(
 def view(
     recording: Annotated[Path, typer.Argument(help="A recording (.rrd) of eval, rollout or demo.")],
     frame: Annotated[
-        int | None, typer.Option(min=0, help="The step to show first. Default 0.")
+        int | None,
+        typer.Option(min=0, help="The step to show first. Default 0; of a picture the middle one."),
     ] = None,
     png: Annotated[
         Path | None, typer.Option(help="Save a picture of that step instead, without a display.")
@@ -199,6 +200,14 @@ def view(
     mp4: Annotated[
         Path | None,
         typer.Option(help="Write a film of what the policy saw, with the verdict, instead."),
+    ] = None,
+    attention: Annotated[
+        bool,
+        typer.Option("--attention", help="With --png: the attention maps of every view and query."),
+    ] = False,
+    beside: Annotated[
+        Path | None,
+        typer.Option(help="Another recording, to be shown beside it on one time line."),
     ] = None,
     recover: Annotated[
         bool,
@@ -212,43 +221,40 @@ def view(
     or make a picture or a film of it.
 
     Example: python -m vap_core view data/runs/demo/recordings/*franka*000*vap.rrd
+    Example: python -m vap_core view data/runs/demo/recordings/NAME.rrd --png shot.png --frame 20
     Example: python -m vap_core view data/runs/demo/recordings/*franka*000*vap.rrd --mp4 talk.mp4
     """
+    from vap_core.base.errors import BadStudy
+
     if mp4 is not None and png is None:
         refuse_dropped("view: --mp4 films every step", {"--frame": frame})
+    if attention and png is None:
+        raise BadStudy("view: --attention is a picture; name its file by --png.")
     if recover:
         from vap_core.recording import recover as recovered
 
         recording = recovered(recording)
         print(f"wrote {recording}")
-    _show_frame(recording, frame or 0, png, mp4)
+    if beside is not None:
+        recording = _combined(recording, beside)
+    if attention and png is not None:
+        from vap_core.recording.attention_picture import attention_screenshot
 
-
-@app.command()
-def show(
-    recording: Annotated[Path, typer.Argument(help="A .rrd file.")],
-    png: Annotated[Path, typer.Argument(help="Picture to write.")],
-    frame: Annotated[
-        int | None, typer.Option(help="Control step to show; default the middle one.")
-    ] = None,
-    attention: Annotated[
-        bool,
-        typer.Option("--attention", help="The attention maps of every view and query instead."),
-    ] = False,
-) -> None:
-    """Take a picture of a recording as the viewer shows it, without a display.
-
-    Example: python -m vap_core show data/runs/demo/recordings/NAME.rrd shot.png --frame 20
-    """
-    from vap_core.recording import screenshot
-    from vap_core.recording.attention_picture import attention_screenshot
-
-    _check(recording)
-    if attention:
+        _check(recording)
         attention_screenshot(recording, png, frame_index=frame)
+        print(f"wrote {png}")
     else:
-        screenshot(recording, png, frame_index=frame)
-    print(f"wrote {png}")
+        _show_frame(recording, frame, png, mp4)
+
+
+def _combined(one: Path, other: Path) -> Path:
+    """Two recordings in one file, beside the first."""
+    from vap_core.recording import combine_recordings
+
+    out = one.with_name(f"{one.stem}-beside-{other.stem}.rrd")
+    combine_recordings({one.stem: one, other.stem: other}, out)
+    print(f"wrote {out}")
+    return out
 
 
 def _serve(run: Path, where: str | None, port: int | None) -> None:
@@ -305,7 +311,9 @@ def _check(recording: Path) -> None:
         ) from error
 
 
-def _show_frame(recording: Path, frame: int, png: Path | None, mp4: Path | None = None) -> None:
+def _show_frame(
+    recording: Path, frame: int | None, png: Path | None, mp4: Path | None = None
+) -> None:
     """Open a recording in the viewer at one step, or make a picture of it, a film, or both."""
     from vap_core.recording import open_viewer, screenshot, write_film
 
@@ -317,4 +325,4 @@ def _show_frame(recording: Path, frame: int, png: Path | None, mp4: Path | None 
         screenshot(recording, png, frame_index=frame, size=(1920, 1080))
         print(f"wrote {png}")
     if png is None and mp4 is None:
-        open_viewer(recording, frame_index=frame)
+        open_viewer(recording, frame_index=frame or 0)

@@ -1,4 +1,4 @@
-"""Commands about the rows of runs: rescore, report, publish, readings."""
+"""Commands about the rows of runs: report, publish."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,19 +8,6 @@ import typer
 from vap_core.cli.options import names
 
 app = typer.Typer()
-
-
-@app.command()
-def rescore(
-    run: Annotated[Path, typer.Argument(help="Run folder of eval, rollout or demo.")],
-) -> None:
-    """Judge a finished run again from its saved states, without a simulator, and say what changed.
-
-    Example: python -m vap_core rescore data/runs/expert-simpler-bridge
-    """
-    from vap_core.evaluation.rescore import rescore as judge_again
-
-    print(judge_again(run))
 
 
 @app.command()
@@ -39,13 +26,28 @@ def report(
             "a table data/runs/TABLE-report."
         ),
     ] = None,
+    rescore: Annotated[
+        bool,
+        typer.Option(
+            "--rescore",
+            help="Judge finished runs again from their saved states, without a simulator, and say "
+            "what changed.",
+        ),
+    ] = False,
 ) -> None:
     """Print and write what runs found: tables with intervals beside the paper's, paired
     comparisons, errors, provenance, pictures.
 
     Example: python -m vap_core report data/runs/demo
+    Example: python -m vap_core report data/runs/expert-simpler-bridge --rescore
     Example: python -m vap_core report data/results/scripted.parquet --out data/runs/scripted-report
     """
+    if rescore:
+        from vap_core.evaluation.rescore import rescore as judge_again
+
+        for run in runs:
+            print(judge_again(run))
+        return
     from vap_core.evaluation.report import report as conclude
 
     folder = out or _report_folder(runs[0])
@@ -103,19 +105,6 @@ def publish(
         methods=names(methods),
     )
     print(f"wrote {to}: {n_episodes} episodes")
-
-
-@app.command()
-def readings() -> None:
-    """Say how often every shipped episode list was read, with which weights and what for: the log
-    beside the published results, and that of this machine's runs (data/runs/readings.csv).
-
-    Example: python -m vap_core readings
-    """
-    from vap_core.base.tables import align
-    from vap_core.evaluation.readings import all_readings, readings_rows
-
-    print(align(readings_rows(all_readings())))
 
 
 def _report_folder(first_run: Path) -> Path:

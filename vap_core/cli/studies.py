@@ -113,7 +113,7 @@ SplitName = Annotated[
 WhatFor = Annotated[
     str,
     typer.Option(
-        "--what-for", help="Why the list is read, in a few words, for the log: see `readings`."
+        "--what-for", help="Why the list is read, in a few words, for the log of readings."
     ),
 ]
 

@@ -109,8 +109,8 @@ def checksums(name: str, kept: bool = True) -> dict[str, Any]:
 
     `weights` has every file that the embedded stack reads; of a stack whose parts are not all
     embedded also the files of its other models, as their lock.json says. `thresholds` is that of
-    the file that `calibrate --keep` wrote; it is left out where there is none, of a stack that
-    `ships_thresholds`, and where not `kept`. `parts` are those of a stack of the caller's own
+    the file that `measure calibration --keep` wrote; it is left out where there is none, of a stack
+    that `ships_thresholds`, and where not `kept`. `parts` are those of a stack of the caller's own
     (`describe_parts`), which is made for that.
 
     Raises: UnknownName; MissingWeights: a model's files are not here; what the caller's stack
@@ -155,8 +155,8 @@ def check_stack(name: str, what: str = "load_stack") -> None:
 def load_mixed(name: str, device: str | None = None) -> Stack:
     """A stack of parts of several; loads those alone that it has.
 
-    It has thresholds where it `ships_thresholds`, or where `calibrate --keep` has measured this
-    very mixture.
+    It has thresholds where it `ships_thresholds`, or where `measure calibration --keep` has
+    measured this very mixture.
 
     Raises: UnknownName, MissingPart, MissingWeights, BadOutput.
     """

@@ -42,8 +42,8 @@ def attention_screenshot(rrd: Path, png: Path, *, frame_index: int | None = None
     queries = attended(rrd)
     if not queries:
         raise BadRecording(
-            f"show: {rrd.name} holds no attention; record it with --attention all, or by "
-            "python -m vap_core attention RUN --record SUITE/TASK/METHOD/EPISODE."
+            f"view: {rrd.name} holds no attention; record it with --attention all, or by "
+            "python -m vap_core measure attention RUN --record SUITE/TASK/METHOD/EPISODE."
         )
     with tempfile.TemporaryDirectory() as scratch:
         copy = Path(scratch) / rrd.name

@@ -1,6 +1,6 @@
 """What a benchmark measured, as a small JSON file with its provenance, and as tables.
 
-The same tables are printed and, for the measurements that ship, written into docs/measured.md.
+A measurement is kept as JSON, and printed as tables.
 """
 
 import json

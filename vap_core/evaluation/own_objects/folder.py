@@ -1,4 +1,4 @@
-"""The folder that eval-objects reads: imported objects, or 3-D files and a table of their kinds.
+"""The folder that measure objects reads: imported objects, or 3-D files and a table of their kinds.
 
     objects.csv   file,category,height_cm,groups
     *.glb ...     the files
@@ -38,7 +38,8 @@ def read_source(folder: Path) -> Source:
     """Read a folder in either form. Raises: BadObject, which names the line."""
     if not folder.is_dir():
         raise BadObject(
-            f"eval-objects: {folder} is no folder; see python -m vap_core eval-objects --help."
+            f"measure objects: {folder} is no folder; see python -m vap_core measure objects "
+            "--help."
         )
     if not (folder / TABLE).exists():
         return _imported(folder)
@@ -46,23 +47,23 @@ def read_source(folder: Path) -> Source:
     files: dict[str, Mapping[str, str]] = {}
     digest = hashlib.sha256()
     rows = read_rows(
-        folder / TABLE, COLUMNS[:2], optional=COLUMNS[2:], caller="eval-objects", error=BadObject
+        folder / TABLE, COLUMNS[:2], optional=COLUMNS[2:], caller="measure objects", error=BadObject
     )
     for line, row in rows:
         path = folder / row["file"]
         where = f"{folder / TABLE} line {line}"
         if not path.is_file():
-            raise BadObject(f"eval-objects: {where} names {row['file']!r}, which is not there.")
+            raise BadObject(f"measure objects: {where} names {row['file']!r}, which is not there.")
         name = import_scan.default_name(path)
         if name in groups:
-            raise BadObject(f"eval-objects: {where} names a second {name!r}; rename the file.")
+            raise BadObject(f"measure objects: {where} names a second {name!r}; rename the file.")
         _check_category(row["category"], where)
         _check_height(row["height_cm"], where)
         groups[name] = tuple(word for word in map(str.strip, row["groups"].split(";")) if word)
         files[name] = row
         digest.update(f"{name} {row}".encode() + hashlib.sha256(path.read_bytes()).digest())
     if not groups:
-        raise BadObject(f"eval-objects: {folder / TABLE} names no file; give one in each line.")
+        raise BadObject(f"measure objects: {folder / TABLE} names no file; give one in each line.")
     return Source(groups=groups, files=files, sha256=digest.hexdigest())
 
 
@@ -105,7 +106,7 @@ def _by_itself(folder: Path, row: Mapping[str, str], error: str) -> str:
         words += ["--height-cm", row["height_cm"]]
     if "pass --repair" in error:
         words.append("--repair")
-    return f" Run: {command(*words, '--out', 'DIR')}; then eval-objects DIR."
+    return f" Run: {command(*words, '--out', 'DIR')}; then measure objects DIR."
 
 
 @contextmanager
@@ -131,7 +132,7 @@ def _imported(folder: Path) -> Source:
         digest.update(path.parent.name.encode() + path.read_bytes())
     if not groups:
         raise BadObject(
-            f"eval-objects: {folder} holds neither {TABLE} nor imported objects; write a line "
+            f"measure objects: {folder} holds neither {TABLE} nor imported objects; write a line "
             f"{','.join(COLUMNS)} for every 3-D file into {folder / TABLE}."
         )
     return Source(groups=groups, files={}, sha256=digest.hexdigest())
@@ -141,7 +142,7 @@ def _check_category(text: str, where: str) -> None:
     kind = kind_instead(text)
     if kind:
         raise BadObject(
-            f"eval-objects: {where} has the category {text!r}; name the kind of thing alone, in "
+            f"measure objects: {where} has the category {text!r}; name the kind of thing alone, in "
             f"words, for example {kind}."
         )
 
@@ -155,6 +156,6 @@ def _check_height(text: str, where: str) -> None:
         fits = False
     if not fits:
         raise BadObject(
-            f"eval-objects: {where} has the height {text!r}; give centimetres, or nothing where "
+            f"measure objects: {where} has the height {text!r}; give centimetres, or nothing where "
             "the file's units are metres."
         )

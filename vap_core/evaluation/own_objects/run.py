@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from tqdm import tqdm
 
-CALLER = "eval-objects"
+CALLER = "measure objects"
 METHOD = "vap"
 
 
@@ -95,7 +95,7 @@ def _nothing_measured(refused: Mapping[str, str], out: Path) -> BadObject:
     others = ""
     if len(refused) > 1:
         others = f" report.txt in {out.name} says why of {len(refused) - 1} more."
-    return BadObject(f"eval-objects: every object was left out. {name}: {why}{others}")
+    return BadObject(f"measure objects: every object was left out. {name}: {why}{others}")
 
 
 def _configuration(source: Source, asked: ObjectSurvey) -> dict[str, Any]:

@@ -52,7 +52,7 @@ def publish(table: "pd.DataFrame", to: Path) -> list[Path]:
     arrow = pa.Table.from_pandas(table, preserve_index=False)
     metadata = {**(arrow.schema.metadata or {}), b"about": json.dumps(about).encode()}
     data = encode_table(arrow.replace_schema_metadata(metadata))
-    return publish_tables({TABLE: data}, to, "eval-parsers")
+    return publish_tables({TABLE: data}, to, "measure parsers")
 
 
 def _cells(group: "pd.DataFrame") -> list[str]:

@@ -203,8 +203,8 @@ def read(folder: Path) -> "dict[str, pd.DataFrame]":
     missing = [name for name in TABLES if not _table_path(folder, name).exists()]
     if missing:
         raise BadOutput(
-            f"survey: {folder} lacks {', '.join(missing)}; run the same eval-perception again to "
-            "finish it."
+            f"survey: {folder} lacks {', '.join(missing)}; run the same measure perception again "
+            "to finish it."
         )
     return _read_tables(folder)
 
@@ -347,6 +347,6 @@ def _read_tables(folder: Path) -> "dict[str, pd.DataFrame]":
     for name in TABLES:
         path = _table_path(folder, name)
         tables[name] = read_parquet(
-            path, "eval-perception", "delete it and run the same command again"
+            path, "measure perception", "delete it and run the same command again"
         )
     return tables

@@ -42,7 +42,7 @@ def mask_rows(scene: Scene, stack: Stack) -> list[Row]:
         truth = load_mask(scene.masks[name])
         if truth.shape != mask.shape:
             raise BadPhotoSet(
-                f"eval-photos: the mask {scene.masks[name]} has "
+                f"measure photos: the mask {scene.masks[name]} has "
                 f"{truth.shape[1]}x{truth.shape[0]} pixels, its scene "
                 f"{mask.shape[1]}x{mask.shape[0]}; save it as large as the upright photo."
             )

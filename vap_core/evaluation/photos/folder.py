@@ -1,4 +1,4 @@
-"""The folder form that eval-photos reads.
+"""The folder form that measure photos reads.
 
     references/OBJECT/*.jpg   photos of each object
     references/boxes.csv      optional: photo,x0,y0,x1,y1 with the photo as OBJECT/FILE
@@ -30,7 +30,7 @@ from vap_core.memory import NAME, NAME_RULE, kind_instead, plain_category
 BOX = ("x0", "y0", "x1", "y1")
 MASKS = "masks"
 SCENES_CSV, BOXES_CSV, OBJECTS_CSV = "scenes.csv", "references/boxes.csv", "objects.csv"
-FORM = "see python -m vap_core eval-photos --help"
+FORM = "see python -m vap_core measure photos --help"
 Box = Float32[np.ndarray, "4"]
 
 
@@ -88,7 +88,7 @@ def read_photo_set(folder: Path) -> PhotoSet:
     Raises: BadPhotoSet: something is missing, or a line does not fit; the message names it.
     """
     if not folder.is_dir():
-        raise BadPhotoSet(f"eval-photos: {folder} is no folder; {FORM}.")
+        raise BadPhotoSet(f"measure photos: {folder} is no folder; {FORM}.")
     photos = _read_references(folder)
     scenes = _read_scenes(folder, photos)
     _refuse_unasked(folder, photos, scenes)
@@ -114,8 +114,9 @@ def _refuse_unasked(folder: Path, photos: Mapping[str, Any], scenes: Iterable["S
         shown |= set(scene.boxes)
     if photos and shown.isdisjoint(photos):
         raise BadPhotoSet(
-            f"eval-photos: {folder / SCENES_CSV} names {', '.join(sorted(shown)[:4])}, references "
-            f"are there of {', '.join(sorted(photos)[:4])}; name an object alike in both."
+            f"measure photos: {folder / SCENES_CSV} names {', '.join(sorted(shown)[:4])}, "
+            f"references are there of {', '.join(sorted(photos)[:4])}; name an object alike in "
+            "both."
         )
 
 
@@ -129,7 +130,7 @@ def _read_references(folder: Path) -> dict[str, tuple[ReferencePhoto, ...]]:
         return {}
     if not folders:
         raise BadPhotoSet(
-            f"eval-photos: {root} holds no folder of photos; put each object's photos into "
+            f"measure photos: {root} holds no folder of photos; put each object's photos into "
             "references/OBJECT."
         )
     boxes = read_boxes(folder / BOXES_CSV)
@@ -141,19 +142,19 @@ def _read_references(folder: Path) -> dict[str, tuple[ReferencePhoto, ...]]:
             photos.append(ReferencePhoto(photo, boxes.pop(f"{path.name}/{photo.name}", None)))
         if not photos:
             raise BadPhotoSet(
-                f"eval-photos: {path} holds no picture; put photos of the object there, or remove "
-                "the folder."
+                f"measure photos: {path} holds no picture; put photos of the object there, or "
+                "remove the folder."
             )
         objects[path.name] = tuple(photos)
     if boxes:
         raise BadPhotoSet(
-            f"eval-photos: {folder / BOXES_CSV} names {sorted(boxes)[0]!r}, which is not there; "
+            f"measure photos: {folder / BOXES_CSV} names {sorted(boxes)[0]!r}, which is not there; "
             "name photos as OBJECT/FILE."
         )
     return objects
 
 
-def check_object_folder(path: Path, caller: str = "eval-photos") -> None:
+def check_object_folder(path: Path, caller: str = "measure photos") -> None:
     """Raises: BadPhotoSet: the object of a folder of photos cannot be called as the folder is."""
     if not NAME.fullmatch(path.name):
         raise BadPhotoSet(f"{caller}: {path} cannot name an object; call it by {NAME_RULE}.")
@@ -174,11 +175,11 @@ def _read_scenes(folder: Path, known: Mapping[str, Any]) -> tuple[Scene, ...]:
     """Every scene with its rows of scenes.csv."""
     root, table = folder / "scenes", folder / SCENES_CSV
     if not root.is_dir() or not photos_in(root):
-        raise BadPhotoSet(f"eval-photos: {root} holds no picture; put photos of scenes there.")
+        raise BadPhotoSet(f"measure photos: {root} holds no picture; put photos of scenes there.")
     if not table.exists():
         raise BadPhotoSet(
-            f"eval-photos: {table} is not there; write a line scene,object,x0,y0,x1,y1 for every "
-            "object of every scene."
+            f"measure photos: {table} is not there; write a line scene,object,x0,y0,x1,y1 for "
+            "every object of every scene."
         )
     paths = {path.name: path for path in photos_in(root)}
     rows: dict[str, dict[str, list[Box]]] = {}
@@ -186,13 +187,13 @@ def _read_scenes(folder: Path, known: Mapping[str, Any]) -> tuple[Scene, ...]:
         where = f"{table} line {line}"
         if row["scene"] not in paths:
             raise BadPhotoSet(
-                f"eval-photos: {where} names the scene {row['scene']!r}, which is not in {root}; "
-                "give its file name."
+                f"measure photos: {where} names the scene {row['scene']!r}, which is not in "
+                f"{root}; give its file name."
             )
         box = _parse_box(row, where)
         if box is None and row["object"] not in known:
             raise BadPhotoSet(
-                f"eval-photos: {where} has no box and no references of {row['object']!r}; give "
+                f"measure photos: {where} has no box and no references of {row['object']!r}; give "
                 f"one, or put photos into references/{row['object']}."
             )
         boxes = rows.setdefault(row["scene"], {}).setdefault(row["object"], [])
@@ -202,8 +203,8 @@ def _read_scenes(folder: Path, known: Mapping[str, Any]) -> tuple[Scene, ...]:
     for name, path in paths.items():
         if name not in rows:
             raise BadPhotoSet(
-                f"eval-photos: {table} has no line for {name}; name its objects, or remove it from "
-                f"{root}."
+                f"measure photos: {table} has no line for {name}; name its objects, or remove it "
+                f"from {root}."
             )
         of_scene = {}
         for obj, boxes in rows[name].items():
@@ -223,7 +224,7 @@ def _masks_of(
         for path in photos_in(root):
             if path.stem not in boxes or len(boxes[path.stem]) != 1:
                 raise BadPhotoSet(
-                    f"eval-photos: {path} is a mask, but {SCENES_CSV} gives no single box of "
+                    f"measure photos: {path} is a mask, but {SCENES_CSV} gives no single box of "
                     f"{path.stem!r} in {scene}; name masks as {MASKS}/SCENE/OBJECT.png."
                 )
             masks[path.stem] = path
@@ -236,13 +237,13 @@ def _refuse_other_masks(folder: Path, scenes: Mapping[str, Any]) -> None:
     for path in sorted((folder / MASKS).iterdir()):
         if path.is_dir() and path.name not in scenes:
             raise BadPhotoSet(
-                f"eval-photos: {path} holds masks of no scene; name the folder as the scene's "
+                f"measure photos: {path} holds masks of no scene; name the folder as the scene's "
                 "file, for example masks/desk.jpg."
             )
 
 
 def read_categories(
-    folder: Path, named: Iterable[str], caller: str = "eval-photos"
+    folder: Path, named: Iterable[str], caller: str = "measure photos"
 ) -> dict[str, str]:
     """The kind of every object: objects.csv's, else its name. Raises: BadPhotoSet."""
     categories = {}
@@ -269,7 +270,7 @@ def read_categories(
 
 def _read_csv(path: Path, columns: tuple[str, ...]) -> list[tuple[int, dict[str, str]]]:
     """Every row with the number of its line. Raises: BadPhotoSet."""
-    return read_rows(path, columns, caller="eval-photos", error=BadPhotoSet)
+    return read_rows(path, columns, caller="measure photos", error=BadPhotoSet)
 
 
 def _parse_box(row: Mapping[str, str], where: str) -> Box | None:
@@ -281,18 +282,18 @@ def _parse_box(row: Mapping[str, str], where: str) -> Box | None:
         box = np.array([float(cell) for cell in cells], np.float32)
     except ValueError as error:
         raise BadPhotoSet(
-            f"eval-photos: {where} has the box {','.join(cells)!r}; give four numbers x0,y0,x1,y1, "
-            "or none where the object is absent."
+            f"measure photos: {where} has the box {','.join(cells)!r}; give four numbers "
+            "x0,y0,x1,y1, or none where the object is absent."
         ) from error
     if not np.isfinite(box).all() or not (box[2:] > box[:2]).all():
         raise BadPhotoSet(
-            f"eval-photos: {where} has the box {','.join(cells)!r} without area; x to the right, "
-            "y down, far corner last."
+            f"measure photos: {where} has the box {','.join(cells)!r} without area; x to the "
+            "right, y down, far corner last."
         )
     if (box[2:] - box[:2] < 1).any() or box.max() <= 1:
         raise BadPhotoSet(
-            f"eval-photos: {where} has the box {','.join(cells)!r} with a side of a pixel or less; "
-            "give pixels, not fractions of the picture."
+            f"measure photos: {where} has the box {','.join(cells)!r} with a side of a pixel or "
+            "less; give pixels, not fractions of the picture."
         )
     return box
 

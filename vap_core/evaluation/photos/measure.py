@@ -81,8 +81,8 @@ def clip_boxes(scene: Scene, rgb: Rgb) -> Scene:
                 flaw = "lies outside"
             if flaw:
                 raise BadPhotoSet(
-                    f"eval-photos: the box {box.tolist()} of {name!r} {flaw} {scene.path}, which "
-                    f"has {width}x{height} pixels when upright; mend scenes.csv."
+                    f"measure photos: the box {box.tolist()} of {name!r} {flaw} {scene.path}, "
+                    f"which has {width}x{height} pixels when upright; mend scenes.csv."
                 )
     return replace(scene, boxes=clipped)
 

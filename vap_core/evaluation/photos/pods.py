@@ -1,4 +1,4 @@
-"""PODS, as eval-photos reads it: three references and twelve scenes with masks of each object.
+"""PODS, as measure photos reads it: three references and twelve scenes with masks of each object.
 
 Photos of 100 things of five kinds (S. Sundaram et al., Personalized Representation from
 Personalized Generation, arXiv:2412.16156; MIT licence), from the Hugging Face hub. Only the 70
@@ -48,7 +48,7 @@ ROWS = 16
 def pods(
     folder: Path | None = None, origin: Path | None = None, say: Callable[[str], None] = print
 ) -> Path:
-    """The folder with PODS in the form of eval-photos, made on the first call.
+    """The folder with PODS in the form of measure photos, made on the first call.
 
     It is downloaded (170 MB) unless `origin` is a copy, as `hf download` leaves it.
 
@@ -65,7 +65,7 @@ def pods(
         except _failures() as error:
             reason = " ".join(str(error).split()) or type(error).__name__
             raise BadPhotoSet(
-                f"eval-photos: {REPO} cannot be had from {endpoint()} ({reason:.150}); run it "
+                f"measure photos: {REPO} cannot be had from {endpoint()} ({reason:.150}); run it "
                 f"again where there is internet, or there `hf download {REPO} --repo-type dataset "
                 "--local-dir DIR`, and pass --from DIR."
             ) from error
@@ -116,7 +116,7 @@ def _write(origin: Path, folder: Path) -> None:
         scene_boxes.append((photo.name, name, *_box(mask, photo)))
         target = folder / MASKS / photo.name / f"{name}.png"
         _write_file(target, cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes())
-    with writing(folder, "eval-photos"):
+    with writing(folder, "measure photos"):
         write_rows(folder / BOXES_CSV, reference_boxes)
         write_rows(folder / OBJECTS_CSV, [("object", "category"), *kinds.items()])
         write_rows(folder / SCENES_CSV, scene_boxes)
@@ -134,12 +134,12 @@ def _reported_objects(origin: Path) -> dict[str, str]:
         }
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise BadPhotoSet(
-            f"eval-photos: {path} does not tell objects from kinds ({error!s:.100}); fetch all of "
-            f"{REPO} again."
+            f"measure photos: {path} does not tell objects from kinds ({error!s:.100}); fetch all "
+            f"of {REPO} again."
         ) from error
     bad = [name for name in kinds if not NAME.fullmatch(name)]
     if bad or not kinds:
-        raise BadPhotoSet(f"eval-photos: {path} names no objects, or {bad}; fetch it again.")
+        raise BadPhotoSet(f"measure photos: {path} names no objects, or {bad}; fetch it again.")
     return kinds
 
 
@@ -162,7 +162,7 @@ def _photos(
         yield name, photo, _mask(row["mask"]["bytes"], photo)
     if set(count) != set(kinds):
         raise BadPhotoSet(
-            f"eval-photos: {origin}/{beginning}*.parquet has photos of {len(count)} of the "
+            f"measure photos: {origin}/{beginning}*.parquet has photos of {len(count)} of the "
             f"{len(kinds)} objects; fetch all of {REPO} again."
         )
 
@@ -179,7 +179,7 @@ def _rows(origin: Path, beginning: str) -> Iterator[dict[str, Any]]:
                     yield from batch.to_pylist()
         except (pa.ArrowException, KeyError) as error:
             raise BadPhotoSet(
-                f"eval-photos: {path} cannot be read ({error!s:.100}); fetch it again."
+                f"measure photos: {path} cannot be read ({error!s:.100}); fetch it again."
             ) from error
 
 
@@ -192,7 +192,8 @@ def _keep(data: bytes, folder: Path, stem: str) -> Path:
             suffix = str(image.format).lower().replace("jpeg", "jpg")
     except (UnidentifiedImageError, TypeError) as error:
         raise BadPhotoSet(
-            f"eval-photos: the photo {stem} of {REPO} is no image ({error!s:.100}); fetch it again."
+            f"measure photos: the photo {stem} of {REPO} is no image ({error!s:.100}); fetch it "
+            "again."
         ) from error
     path = folder / f"{stem}.{suffix}"
     _write_file(path, data)
@@ -207,7 +208,7 @@ def _mask(data: bytes, photo: Path) -> Mask:
     size = load_photo(photo, long_side=None).shape[:2]
     if picture.shape != size:
         raise BadPhotoSet(
-            f"eval-photos: the mask of {photo} has {picture.shape} pixels, the upright photo "
+            f"measure photos: the mask of {photo} has {picture.shape} pixels, the upright photo "
             f"{size}; report it to {REPO}."
         )
     return picture > picture.max() / 2
@@ -216,12 +217,12 @@ def _mask(data: bytes, photo: Path) -> Mask:
 def _box(mask: Mask, photo: Path) -> tuple[str, ...]:
     box = mask_box(mask)
     if box is None:
-        raise BadPhotoSet(f"eval-photos: the mask of {photo} is empty; report it to {REPO}.")
+        raise BadPhotoSet(f"measure photos: the mask of {photo} is empty; report it to {REPO}.")
     return tuple(f"{value:g}" for value in box)
 
 
 def _write_file(path: Path, data: bytes) -> None:
     """Raises: BadOutput."""
-    with writing(path, "eval-photos"):
+    with writing(path, "measure photos"):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, data)

@@ -231,7 +231,7 @@ def remember_subjects(
             try:
                 references = choose(paths, subject.category, stack, given, whole=False)
             except BadPhoto as error:
-                raise BadPhotoSet(f"eval-photos: {error}") from error
+                raise BadPhotoSet(f"measure photos: {error}") from error
             write_sheet(folder / f"{subject.name}.references.png", references, paths)
             obj = remember_references(subject.name, subject.category, references, stack)
             save(folder, obj)

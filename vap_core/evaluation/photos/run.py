@@ -89,7 +89,7 @@ def measure_photos(
             written += write_table(followed, out, CLIPS)
             parts.append(clip_report(followed))
         report = "\n\n".join(part for part in parts if part)
-        with writing(out, "eval-photos"):
+        with writing(out, "measure photos"):
             write_atomic(out / "report.txt", f"{report}\n".encode())
     names = ", ".join(map(str, written))
     return f"{report}\n\nwrote {names}"
@@ -131,6 +131,6 @@ def _of_scenes(
     for scene in bar:
         path = out / "parts" / f"{scene.name}{suffix}"
         if not path.exists():
-            write_json_part(path, measure(scene), caller="eval-photos")
-        rows.extend(read_json_part(path, caller="eval-photos"))
+            write_json_part(path, measure(scene), caller="measure photos")
+        rows.extend(read_json_part(path, caller="measure photos"))
     return pd.DataFrame(rows)

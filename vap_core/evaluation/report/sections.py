@@ -64,8 +64,7 @@ ABSTENTION_NOTE = (
 
 READINGS_NOTE = (
     "Every reading of these lists, with any weights: a list that was read while something was "
-    "tuned is no test of it any more.\n"
-    "`python -m vap_core readings` has the lists that are not in this report."
+    "tuned is no test of it any more."
 )
 
 

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from vap_core.policies.mini_pi0.vlm import MiniVlm
 
-CALLER = "eval-tokens"
+CALLER = "measure tokens"
 KS = (1, 3, 5, 7)
 """Numbers of photos to learn from."""
 USUAL_K = teach_token.K
@@ -72,13 +72,13 @@ class Tokens:
     def __post_init__(self) -> None:
         for place in self.places:
             if place not in PLACES:
-                raise one_of("eval-tokens: --learn-in", place, PLACES)
+                raise one_of("measure tokens: --learn-in", place, PLACES)
         for name in self.suites:
             if name not in suites.BENCHMARKS:
-                raise one_of("eval-tokens: suite", name, suites.BENCHMARKS)
+                raise one_of("measure tokens: suite", name, suites.BENCHMARKS)
             if not shipped(name).is_dir():
                 raise BadStudy(
-                    f"eval-tokens: no mini-pi0 for {name} ships; run: python -m vap_core train "
+                    f"measure tokens: no mini-pi0 for {name} ships; run: python -m vap_core train "
                     f"policy --suite {name}"
                 )
 
@@ -185,8 +185,8 @@ def run(
     jobs = plan(asked)
     if not jobs:
         raise BadStudy(
-            f"eval-tokens: in the policy a token is learned from {USUAL_K} photos alone; ask for "
-            f"--k {USUAL_K}, or for --learn-in vlm."
+            f"measure tokens: in the policy a token is learned from {USUAL_K} photos alone; ask "
+            f"for --k {USUAL_K}, or for --learn-in vlm."
         )
     store.open_run(folder, asked.configuration())
     with store.locked(folder):
@@ -232,10 +232,11 @@ def read(folder: Path) -> "dict[str, pd.DataFrame]":
         parts = []
         for path in sorted((folder / name).glob("*.parquet")):
             remedy = "delete it and run the same command again"
-            parts.append(read_parquet(path, "eval-tokens", remedy))
+            parts.append(read_parquet(path, "measure tokens", remedy))
         if not parts:
             raise BadOutput(
-                f"eval-tokens: {folder} holds no {name}; run the same command again to finish it."
+                f"measure tokens: {folder} holds no {name}; run the same command again to finish "
+                "it."
             )
         whole = pd.concat(parts, ignore_index=True)
         key = [column for column in whole.columns if column not in NOT_KEY]
@@ -255,7 +256,7 @@ def publish(folder: Path, to: Path) -> list[Path]:
     for name, table in read(folder).items():
         path = to / f"token_{name}.parquet"
         tables[path.name] = measurements.add_rows(path, table, TRAINING, {b"runs": manifest})
-    return measurements.publish_tables(tables, to, caller="eval-tokens")
+    return measurements.publish_tables(tables, to, caller="measure tokens")
 
 
 def _measured_epochs(epochs: int) -> set[int]:

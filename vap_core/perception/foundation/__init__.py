@@ -20,7 +20,7 @@ from vap_core.perception.protocols import Stack, Thresholds
 def load(kind: str, device: str | None = None, store: Path | None = None) -> Stack:
     """A stack of `sources.KINDS`, from verified local weights, which are read once.
 
-    It has thresholds where `calibrate --keep` has written them beside the weights.
+    It has thresholds where `measure calibration --keep` has written them beside the weights.
 
     Raises:
         MissingPart: torch or transformers is not installed.
@@ -63,7 +63,7 @@ def load_parts(name: str, device: str | None = None, store: Path | None = None) 
 
 
 def kept_thresholds(name: str, encoder: str) -> Thresholds | None:
-    """The thresholds of a mixed stack that `calibrate --keep` measured. Raises: BadOutput."""
+    """The thresholds of a mixed stack that were measured and kept. Raises: BadOutput."""
     from vap_core.perception.foundation.store import store_folder
 
     return read_thresholds(store_folder(), name, encoder)

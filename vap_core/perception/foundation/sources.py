@@ -158,7 +158,7 @@ def parts_of(name: str) -> dict[str, str]:
 
 
 def needs_photos(name: str) -> bool:
-    """Whether `calibrate --keep` needs photos of a stack.
+    """Whether `measure calibration --keep` needs photos of a stack.
 
     It does where a part is embedded: rendered scenes give too few views that are not familiar. A
     stack of another name than those here is the caller's, with its own thresholds for other views.

@@ -172,14 +172,14 @@ def probe(
     from tqdm import tqdm
 
     if suite_name not in FILMED:
-        raise one_of("eval-policy: suite", suite_name, FILMED)
+        raise one_of("measure policy: suite", suite_name, FILMED)
     if FILMED[suite_name].pairs:
         raise BadStudy(
-            f"eval-policy: the commands of {suite_name} name two personal objects, and these ways "
-            "ask for one; run its episodes with eval."
+            f"measure policy: the commands of {suite_name} name two personal objects, and these "
+            "ways ask for one; run its episodes with eval."
         )
     if not ways:
-        raise BadStudy("eval-policy: there is no way to ask; name one by --ways.")
+        raise BadStudy("measure policy: there is no way to ask; name one by --ways.")
     for way in ways:
         parse_way(way)
     work = partial(_scene, checkpoint, suite_name, tuple(ways), execute, seed)
@@ -224,7 +224,7 @@ def kept(path: Path) -> "pd.DataFrame | None":
         return None
     found = read_parquet(path, "probe", OTHER_TABLE)
     if not set(ASKED) <= set(found):
-        raise BadOutput(f"probe: {path} holds no episodes of eval-policy; {OTHER_TABLE}.")
+        raise BadOutput(f"probe: {path} holds no episodes of measure policy; {OTHER_TABLE}.")
     return found
 
 

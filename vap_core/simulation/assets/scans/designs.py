@@ -2,7 +2,7 @@
 
 They are built of other forms than the objects of the scenes (prisms, amphorae, rings, animals of
 ellipsoids), with handles and without, plain or loud. They enter as a user's scans do:
-`eval-objects` imports them. Quiet ones take their colours from the look-alikes among which they
+`measure objects` imports them. Quiet ones take their colours from the look-alikes among which they
 will stand, so that paint does not tell them apart. A seed is a set: measure on one that nobody
 tuned on.
 """
