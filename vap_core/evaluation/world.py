@@ -11,12 +11,35 @@ import numpy as np
 
 from vap_core.policies.scripted.scripted import MOTIONS, SHIPPED_MOTIONS
 from vap_core.simulation import robots, suites
-from vap_core.simulation.assets.objects import get_object
-from vap_core.simulation.cameras import RIGS, SHIPPED_RIGS
-from vap_core.simulation.robots import mjcf
+from vap_core.simulation.assets.objects import ObjectModel, get_object
+from vap_core.simulation.cameras import RIGS, SHIPPED_RIGS, Rig
+from vap_core.simulation.robots import Robot, mjcf
+from vap_core.simulation.scene_style import SceneStyle
+from vap_core.simulation.sensor import Sensor
+from vap_core.simulation.suites import Suite, Task
 from vap_core.simulation.suites.open_row import models_of
-from vap_core.simulation.suites.variants import VARIANTS
+from vap_core.simulation.suites.variants import VARIANTS, Variant
 from vap_core.simulation.types import EpisodeRow
+
+
+SPELLINGS: dict[type, str] = {
+    Rig: "Rig name body pos_m aim_m fovy_rad up",
+    Variant: "Variant axis style distractors",
+    SceneStyle: (
+        "SceneStyle planks grain wall floor lamp_pos_m lamp ambient shadows robot camera_shift_m"
+    ),
+    Suite: "Suite name robot hz cameras tasks control sensor",
+    Task: "Task name category instruction max_steps rule goal slug",
+    Sensor: "Sensor jitter_m jitter_rad exposure balance noise",
+    Robot: (
+        "Robot name xml joints fingers home speed_rad_s fingers_open fingers_closed opening_m "
+        "palm_m hz base_world links down_base fixed_jaw_m hand_m table_m floor_z_m turn_cost "
+        "lean_rad"
+    ),
+    ObjectModel: "ObjectModel name category split shape texture mass_kg",
+}
+"""The kind of a value and the names of its parts, as digests of runs spell them: a class or a field
+that is renamed keeps its name here."""
 
 
 def digest(listed: Sequence[tuple[str, Sequence[EpisodeRow]]]) -> str:
@@ -54,19 +77,21 @@ def own_motions(of: Iterable[str]) -> dict[str, dict[str, float]]:
 
 def _canonical(value: Any) -> bytes:
     """Every number in a value, whatever NumPy's print options are; of files their names."""
+    return json.dumps(value, default=_spelled, sort_keys=True).encode()
 
-    def plain(part: Any) -> Any:
-        if is_dataclass(part) and not isinstance(part, type):
-            parts = {"kind": type(part).__name__}
-            for field in fields(part):
-                parts[field.name] = getattr(part, field.name)
-            return parts
-        if isinstance(part, np.ndarray | np.generic):
-            return part.tolist()
-        if isinstance(part, Path):
-            return part.name
-        raise TypeError(
-            f"Study: {type(part).__name__} cannot be hashed; give it fields, or add its kind here."
-        )
 
-    return json.dumps(value, default=plain, sort_keys=True).encode()
+def _spelled(part: Any) -> Any:
+    """A value as the digest spells it."""
+    if isinstance(part, tuple(SPELLINGS)):
+        kind, *names = SPELLINGS[type(part)].split()
+        return {"kind": kind, **{name: getattr(part, name) for name in names}}
+    if is_dataclass(part) and not isinstance(part, type):  # a drawn shape or its texture
+        names = [field.name for field in fields(part)]
+        return {"kind": type(part).__name__, **{name: getattr(part, name) for name in names}}
+    if isinstance(part, np.ndarray | np.generic):
+        return part.tolist()
+    if isinstance(part, Path):
+        return part.name
+    raise TypeError(
+        f"Study: {type(part).__name__} cannot be hashed; give it a spelling, or add its kind here."
+    )
