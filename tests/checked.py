@@ -1,4 +1,4 @@
-"""The check of every signature in vap_core, made when a function is first called, done once a call.
+"""The check of every signature in the packages, made when a function is first called, done once a call.
 
 jaxtyping's own hook makes two checks of each function while its module is imported, and does both
 at each call. A worker of the tests pays seconds for functions that it never calls, and a rollout a
@@ -20,9 +20,9 @@ from jaxtyping._import_hook import Typechecker
 WHOLE = jaxtyping.jaxtyped
 
 
-def check_signatures(package: str) -> None:
-    """From now on the package's modules are imported with their signatures checked."""
-    install_import_hook(package, "beartype.beartype")
+def check_signatures(*packages: str) -> None:
+    """From now on the packages' modules are imported with their signatures checked."""
+    install_import_hook(packages, "beartype.beartype")
     of_the_hook = list(Typechecker.lookup.values())
 
     def jaxtyped(*things: Any, typechecker: Any) -> Any:

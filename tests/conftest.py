@@ -1,4 +1,4 @@
-"""Every test runs with the shapes in vap_core's signatures checked."""
+"""Every test runs with the shapes in the signatures of vap_core and vap_make checked."""
 
 import gc
 import os
@@ -15,9 +15,9 @@ from tests.checked import check_signatures
 
 if TYPE_CHECKING:
     from vap_core.rollout.types import EpisodeHeader, Frame
-    from vap_core.training.films.demonstrations import Film
+    from vap_make.films.demonstrations import Film
 
-check_signatures("vap_core")
+check_signatures("vap_core", "vap_make")
 os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = (
     "0"  # read when ray is first imported: the tests' cluster stays on loopback
 )
@@ -75,7 +75,7 @@ def _one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="session")
 def stage(tmp_path_factory: pytest.TempPathFactory) -> "tuple[Path, list[Film]]":
     """A folder that keeps a stage of two episodes of simpler-bridge, and its films."""
-    from vap_core.training.films import demonstrations
+    from vap_make.films import demonstrations
 
     folder = tmp_path_factory.mktemp("cache") / "films"
     with pytest.MonkeyPatch.context() as patch:

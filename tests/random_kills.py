@@ -53,8 +53,8 @@ def replace_object(folder: Path) -> None:
 
 def train_policy(cache: Path, out: Path) -> None:
     from tests.test_policy_training import TINY
-    from vap_core.training.films import demonstrations
-    from vap_core.training.policy import train as policy
+    from vap_make.films import demonstrations
+    from vap_make.policy import train as policy
 
     demonstrations.EPISODES = 2
     policy.HELD_OUT = 9
@@ -66,8 +66,8 @@ def train_vlm(cache: Path, out: Path) -> None:
     import pytest
 
     from tests.test_policy_training import SUITE, vlm_inputs
-    from vap_core.training.films.demonstrations import cached
-    from vap_core.training.vlm import train as vlm
+    from vap_make.films.demonstrations import cached
+    from vap_make.vlm import train as vlm
 
     films = cache / "films"
     schedule = vlm.Schedule

@@ -11,7 +11,6 @@ import pytest
 from tests.command import refused
 from tests.toys import MeanColour, SameColour, segmenter
 from vap_core.analysis import ground
-from vap_core.analysis.calibration import report, run, scenes
 from vap_core.base.errors import BadOutput
 from vap_core.base.types import Boxes
 from vap_core.cli import doctor
@@ -19,6 +18,7 @@ from vap_core.perception import kept_thresholds, stacks
 from vap_core.perception.foundation import store
 from vap_core.perception.protocols import Stack, Thresholds
 from vap_core.simulation.assets import objects
+from vap_make.calibration import report, run, scenes
 
 
 def quarters(images, phrase, threshold=None):

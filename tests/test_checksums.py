@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vap_core.analysis.calibration import run as calibration
 from vap_core.base.errors import BadOutput, MissingWeights
 from vap_core.base.types import Boxes, Rgb
 from vap_core.evaluation.own_objects import run as own_objects
@@ -28,6 +27,7 @@ from vap_core.perception.kept_thresholds import keep_thresholds
 from vap_core.perception.own_parts import describe_parts
 from vap_core.perception.protocols import Encoder, Stack, Thresholds, Tracker
 from vap_core.perception.stacks import STACKS, checksums
+from vap_make.calibration import run as calibration
 
 from .test_photo_set import folder  # noqa: F401
 from .toys import MeanColour, SameColour, detector, segmenter

@@ -19,8 +19,8 @@ import torch
 from vap_core.base.errors import BadOutput
 from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import Suite, suite
-from vap_core.training.films import dataset
-from vap_core.training.films.dataset import (
+from vap_make.films import dataset
+from vap_make.films.dataset import (
     ABOUT,
     MOST,
     about,
@@ -30,9 +30,9 @@ from vap_core.training.films.dataset import (
     read,
     write,
 )
-from vap_core.training.films.demonstrations import PARTS, Film, after_a_miss, cached
-from vap_core.training.policy.batches import STEADY, statistics
-from vap_core.training.recipe import FILMED, filmed_tasks
+from vap_make.films.demonstrations import PARTS, Film, after_a_miss, cached
+from vap_make.policy.batches import STEADY, statistics
+from vap_make.recipe import FILMED, filmed_tasks
 
 SUITE, SIDE, STAGES = "simpler-bridge", 64, 4
 SHIPPED = Path(__file__).parent.parent / "data" / "demonstrations"
@@ -240,7 +240,7 @@ def test_a_killed_writing_goes_on_and_neither_loses_nor_doubles(
 ) -> None:
     out = tmp_path / "out"
     ask = f"write({SUITE!r}, {STAGES}, Path({str(out)!r}), cache=Path({str(cache)!r}), part=1)"
-    code = f"from pathlib import Path; from vap_core.training.films.dataset import write; {ask}"
+    code = f"from pathlib import Path; from vap_make.films.dataset import write; {ask}"
     process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
     first = out / "parts" / "00000-00001"
     while not first.exists():

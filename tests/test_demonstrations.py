@@ -16,9 +16,9 @@ from vap_core.perception import describe
 from vap_core.prompt import PALETTE, has_colour
 from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import BENCHMARKS, suite
-from vap_core.training.films import demonstrations
-from vap_core.training.films.captions import captions, distinguishes
-from vap_core.training.films.demonstrations import (
+from vap_make.films import demonstrations
+from vap_make.films.captions import captions, distinguishes
+from vap_make.films.demonstrations import (
     PARTS,
     SIDE,
     Film,
@@ -28,13 +28,13 @@ from vap_core.training.films.demonstrations import (
     row,
     stage_file,
 )
-from vap_core.training.policy import train as policy
-from vap_core.training.policy.batches import SPIN_Z, Frames, statistics
-from vap_core.training.policy.colouring import colour_of, painted, roughen_mask, tinted
-from vap_core.training.policy.commands import Known, command, near, phrase_instruction
-from vap_core.training.recipe import FILMED, RECIPES, filmed_tasks
-from vap_core.training.vlm.questions import MIN_ASKED_PX, ask, place
-from vap_core.training.words import PAINTS, pattern_words, vocabulary
+from vap_make.policy import train as policy
+from vap_make.policy.batches import SPIN_Z, Frames, statistics
+from vap_make.policy.colouring import colour_of, painted, roughen_mask, tinted
+from vap_make.policy.commands import Known, command, near, phrase_instruction
+from vap_make.recipe import FILMED, RECIPES, filmed_tasks
+from vap_make.vlm.questions import MIN_ASKED_PX, ask, place
+from vap_make.words import PAINTS, pattern_words, vocabulary
 
 SUITE = "simpler-bridge"
 RECIPE = RECIPES[SUITE]

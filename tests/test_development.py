@@ -20,7 +20,7 @@ from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import BENCHMARKS, development, lists, simpler
 from vap_core.simulation.suites.open_row import build_scene, make_env
 from vap_core.simulation.types import EpisodeRow
-from vap_core.training.films.scenes import HELD_OUT, TRAIN_INSTANCES
+from vap_make.films.scenes import HELD_OUT, TRAIN_INSTANCES
 
 TASK = ("simpler-bridge-absent", "put-camera")
 

@@ -24,7 +24,7 @@ from vap_core.policies.mini_pi0 import token_alignment
 from vap_core.policies.names import SHIPPED, shipped_checkpoint
 from vap_core.policies.token_groups import token_groups, vocabulary_of
 from vap_core.simulation import suites
-from vap_core.training.words import vocabulary
+from vap_make.words import vocabulary
 
 from . import tiny_lerobot
 from .test_soft_prompt import SUITE, grown  # noqa: F401

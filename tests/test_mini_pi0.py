@@ -17,7 +17,7 @@ from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy, fused_at
 from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
 from vap_core.policies.names import checkpoint_of
 from vap_core.policies.protocol import PolicyInput
-from vap_core.training.words import vocabulary
+from vap_make.words import vocabulary
 
 STATE, ACTION = 13, 7
 

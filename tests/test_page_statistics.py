@@ -15,8 +15,8 @@ from vap_core.evaluation.readings import read_log
 from vap_core.evaluation.report.runs import load_runs
 from vap_core.evaluation.statistics import ALL_TASKS, compare, rate_over_layouts
 from vap_core.policies.names import shipped_checkpoint
-from vap_core.training.recipe import RECIPES
-from vap_core.training.words import PAINTS
+from vap_make.recipe import RECIPES
+from vap_make.words import PAINTS
 
 RESULTS = ROOT / "data" / "results"
 BENCHMARKS = PAGES["docs/benchmarks.md"]

@@ -21,11 +21,11 @@ from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import Task, shared, suite
 from vap_core.simulation.suites.layout import radius_m
 from vap_core.simulation.suites.rules import NEAR_M
-from vap_core.training.films import demonstrations, pairs
-from vap_core.training.films.demonstrations import Film
-from vap_core.training.policy import start, train
-from vap_core.training.policy.commands import Command, Known, command, phrase_pair
-from vap_core.training.recipe import RECIPES, every, filmed_tasks
+from vap_make.films import demonstrations, pairs
+from vap_make.films.demonstrations import Film
+from vap_make.policy import start, train
+from vap_make.policy.commands import Command, Known, command, phrase_pair
+from vap_make.recipe import RECIPES, every, filmed_tasks
 
 SUITE = "shared-pair"
 RECIPE = RECIPES[SUITE]

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vap_core.simulation.assets import crafts, fabrics, objects, phrases, textures
-from vap_core.training.films import scenes
-from vap_core.training.perception import detector, evaluation, instance_head, segmenter
-from vap_core.training.perception import train as perception
+from vap_make.films import scenes
+from vap_make.perception import detector, evaluation, instance_head, segmenter
+from vap_make.perception import train as perception
 
 
 @given(st.integers(0, 10**6), st.booleans())

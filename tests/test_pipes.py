@@ -24,7 +24,7 @@ from vap_core.recording.layers import read_correction
 from vap_core.simulation.assets.scans.mesh_file import read_mesh_file
 from vap_core.simulation.assets.scans.storage import load_scan
 from vap_core.simulation.suites import lists
-from vap_core.training.films import dataset
+from vap_make.films import dataset
 
 READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "photo": ("a.jpg", lambda folder: load_photo(folder / "a.jpg")),

@@ -15,11 +15,11 @@ from tests.test_policy_training import TINY, known
 from vap_core.base.errors import UnknownName, WorkerDied
 from vap_core.policies.mini_pi0.learned_token import TokenTraining
 from vap_core.policies.mini_pi0.vlm import MiniVlm
-from vap_core.training.films.demonstrations import Film
-from vap_core.training.policy import taught
-from vap_core.training.policy import train as policy
-from vap_core.training.policy.ahead import Ahead
-from vap_core.training.policy.batches import Frames, statistics
+from vap_make.films.demonstrations import Film
+from vap_make.policy import taught
+from vap_make.policy import train as policy
+from vap_make.policy.ahead import Ahead
+from vap_make.policy.batches import Frames, statistics
 
 
 def frames_of(films: list[Film], steps: int) -> Frames:

@@ -17,10 +17,10 @@ from vap_core.policies.mini_pi0.learned_token import WORD
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy, fused_attention
 from vap_core.simulation.control import arm, rotation_vector
 from vap_core.simulation.suites import suite
-from vap_core.training.films.demonstrations import Film
-from vap_core.training.policy import losses
-from vap_core.training.policy import train as policy
-from vap_core.training.policy.batches import (
+from vap_make.films.demonstrations import Film
+from vap_make.policy import losses
+from vap_make.policy import train as policy
+from vap_make.policy.batches import (
     SPIN_Z,
     Batch,
     Frames,

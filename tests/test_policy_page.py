@@ -10,10 +10,10 @@ from vap_core.policies.mini_pi0.teach_token import model_of_policy
 from vap_core.policies.mini_pi0.token_alignment import shared_tables
 from vap_core.policies.names import SHIPPED
 from vap_core.simulation.suites import suite
-from vap_core.training.films.demonstrations import draw_objects
-from vap_core.training.films.looks import draw_look
-from vap_core.training.policy.train import _is_held_out
-from vap_core.training.recipe import RECIPES, filmed_tasks
+from vap_make.films.demonstrations import draw_objects
+from vap_make.films.looks import draw_look
+from vap_make.policy.train import _is_held_out
+from vap_make.recipe import RECIPES, filmed_tasks
 
 MINI = "mini-pi0-"
 POLICY = PAGES["docs/policy.md"]

@@ -22,14 +22,14 @@ from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.lerobot.checkpoints import fingerprint
 from vap_core.policies.mini_pi0.learned_token import TokenTraining
 from vap_core.policies.mini_pi0.vlm import MiniVlm, load_from_policy, load_vlm
-from vap_core.training.films import demonstrations
-from vap_core.training.films.dataset import data_sha256
-from vap_core.training.films.demonstrations import Film, cached
-from vap_core.training.policy import losses, taught
-from vap_core.training.policy import train as policy
-from vap_core.training.policy.commands import Known
-from vap_core.training.recipe import RECIPES
-from vap_core.training.vlm import train as vlm
+from vap_make.films import demonstrations
+from vap_make.films.dataset import data_sha256
+from vap_make.films.demonstrations import Film, cached
+from vap_make.policy import losses, taught
+from vap_make.policy import train as policy
+from vap_make.policy.commands import Known
+from vap_make.recipe import RECIPES
+from vap_make.vlm import train as vlm
 
 SUITE = "simpler-bridge"
 TINY = replace(

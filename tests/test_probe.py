@@ -16,9 +16,9 @@ from vap_core.prompt import PALETTE
 from vap_core.rollout.prompters.protocol import PromptContext, SceneTruth
 from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
-from vap_core.training.films.demonstrations import draw_objects, row
-from vap_core.training.policy import probe
-from vap_core.training.policy.probe import WAYS, ProbePrompter, conclude, keep, of_shipped
+from vap_make.films.demonstrations import draw_objects, row
+from vap_make.policy import probe
+from vap_make.policy.probe import WAYS, ProbePrompter, conclude, keep, of_shipped
 
 from .command import refused
 from .test_soft_prompt import SUITE, grown  # noqa: F401

@@ -276,7 +276,7 @@ def test_proposals_scale_with_the_picture() -> None:
 
 def test_the_shipped_detector_proposes_every_object_of_a_rendered_table() -> None:
     from vap_core.perception.boxes import box_iou
-    from vap_core.training.films.scenes import boxes_of, stage
+    from vap_make.films.scenes import boxes_of, stage
 
     shots = stage(3, 2, held_out=True, views=1)
     true = np.array([box for _, box in boxes_of(shots.ids[0], len(shots.names), 300)], np.float32)

@@ -87,7 +87,7 @@ def torch_tracker(by_torch: dict[str, runtime.TorchNetwork]) -> tracker.LiteTrac
 @pytest.fixture(scope="module")
 def scene() -> tuple[np.ndarray, np.ndarray, Boxes]:
     """A rendered table: picture, masks and boxes of its objects."""
-    from vap_core.training.films.scenes import boxes_of, stage
+    from vap_make.films.scenes import boxes_of, stage
 
     shots = stage(3, 2, held_out=True, views=1)
     seen = list(boxes_of(shots.ids[0], len(shots.names), 150))

@@ -15,7 +15,7 @@ from vap_core.evaluation.publish import read_runs
 from vap_core.policies.lerobot.checkpoints import fingerprint
 from vap_core.policies.names import checkpoint_of, policy_label, shipped_checkpoint
 from vap_core.prompt import PALETTE
-from vap_core.training.recipe import RECIPES
+from vap_make.recipe import RECIPES
 
 SUITE = "shared-sequence-bridge"
 

@@ -14,8 +14,8 @@ from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.mini_pi0.teach_token import MODEL
 from vap_core.policies.mini_pi0.vlm import load_vlm
 from vap_core.simulation import suites
-from vap_core.training.policy.probe import probe
-from vap_core.training.recipe import RECIPES
+from vap_make.policy.probe import probe
+from vap_make.recipe import RECIPES
 
 FOLDERS = sorted(SHIPPED.glob(f"{MINI}-*"))
 BRIDGE = shipped("simpler-bridge")

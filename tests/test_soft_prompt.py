@@ -29,7 +29,7 @@ from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import Suite, wording
 from vap_core.simulation.suites.open_row import build_scene
 from vap_core.simulation.suites.suite import Task
-from vap_core.training.words import vocabulary
+from vap_make.words import vocabulary
 
 SUITE, TASK, STATE, ACTION = "simpler-bridge", "put-camera", 13, 7
 MODEL = "mini-paligemma"

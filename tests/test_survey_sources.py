@@ -11,7 +11,7 @@ import pytest
 import vap_core
 from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import BENCHMARKS, benchmark, simpler
-from vap_core.training.films import scenes
+from vap_make.films import scenes
 
 PLACED = sorted(
     {place.model for name in BENCHMARKS for row in benchmark(name) for place in row.placements}

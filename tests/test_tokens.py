@@ -23,7 +23,7 @@ from vap_core.policies.mini_pi0.learned_token import (
 from vap_core.policies.mini_pi0.token_file import SUFFIX, Token
 from vap_core.policies.mini_pi0.vlm import MiniVlm, initialise_policy, load_vlm
 from vap_core.policies.protocol import PolicyInput
-from vap_core.training.words import vocabulary
+from vap_make.words import vocabulary
 
 from .test_mini_pi0 import checkpoint, config  # noqa: F401
 

@@ -28,21 +28,21 @@ from vap_core.policies.mini_pi0 import token_file
 from vap_core.policies.mini_pi0.token_file import Token
 from vap_core.policies.mini_pi0.vlm import MiniVlm, load_vlm
 from vap_core.simulation.suites import suite
-from vap_core.training.films import demonstrations, scenes
-from vap_core.training.films.captions import captions
-from vap_core.training.films.demonstrations import Film, draw_objects, row
-from vap_core.training.films.looks import draw_look
-from vap_core.training.folder import checkpoint
-from vap_core.training.perception.detector import save_array
-from vap_core.training.perception.fitting import Run, fit
-from vap_core.training.policy import taught
-from vap_core.training.policy import train as policy
-from vap_core.training.policy.ahead import Ahead
-from vap_core.training.policy.batches import Frames
-from vap_core.training.policy.losses import Learner
-from vap_core.training.recipe import FILMED, RECIPES, filmed_tasks
-from vap_core.training.step import Schedule, train_steps
-from vap_core.training.vlm import train as vlm
+from vap_make.films import demonstrations, scenes
+from vap_make.films.captions import captions
+from vap_make.films.demonstrations import Film, draw_objects, row
+from vap_make.films.looks import draw_look
+from vap_make.folder import checkpoint
+from vap_make.perception.detector import save_array
+from vap_make.perception.fitting import Run, fit
+from vap_make.policy import taught
+from vap_make.policy import train as policy
+from vap_make.policy.ahead import Ahead
+from vap_make.policy.batches import Frames
+from vap_make.policy.losses import Learner
+from vap_make.recipe import FILMED, RECIPES, filmed_tasks
+from vap_make.step import Schedule, train_steps
+from vap_make.vlm import train as vlm
 
 
 def test_a_model_that_ships_is_not_trained_over(tmp_path: Path) -> None:
@@ -160,9 +160,9 @@ def test_a_full_disk_is_one_line(
     monkeypatch.setattr(demonstrations, "EPISODES", 2)
     recipe = replace(TINY, stages=2, steps=1, batch=3, draws=2)
     place = {
-        "films": "vap_core.training.films.demonstrations.write_atomic",
-        "recipe": "vap_core.training.folder.write_atomic",
-        "weights": "vap_core.training.policy.train.store_in_bfloat16",
+        "films": "vap_make.films.demonstrations.write_atomic",
+        "recipe": "vap_make.folder.write_atomic",
+        "weights": "vap_make.policy.train.store_in_bfloat16",
     }[at]
     monkeypatch.setattr(place, full)
     if at == "films":

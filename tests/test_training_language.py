@@ -13,18 +13,18 @@ from vap_core.prompt import PALETTE
 from vap_core.simulation import robots
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import BENCHMARKS, suite
-from vap_core.training.films.demonstrations import Film
-from vap_core.training.policy import colouring
-from vap_core.training.policy.colouring import (
+from vap_make.films.demonstrations import Film
+from vap_make.policy import colouring
+from vap_make.policy.colouring import (
     colour_of,
     draw_colouring,
     is_distinct,
     natural_colours,
     tints,
 )
-from vap_core.training.policy.commands import Command, Form, Known, command
-from vap_core.training.recipe import RECIPES, filmed_task
-from vap_core.training.words import PAINTS, similar_colours, vocabulary
+from vap_make.policy.commands import Command, Form, Known, command
+from vap_make.recipe import RECIPES, filmed_task
+from vap_make.words import PAINTS, similar_colours, vocabulary
 
 SUITE, SIDE, THINGS = "simpler-bridge", 8, 40
 RECIPE = RECIPES[SUITE]

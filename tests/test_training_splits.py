@@ -10,11 +10,11 @@ from vap_core.base.files import DATA
 from vap_core.simulation.scene_style import DEFAULT_STYLE
 from vap_core.simulation.suites import BENCHMARKS, VARIANTS, benchmark, simpler
 from vap_core.simulation.suites.variants import Variant
-from vap_core.training.films import looks
-from vap_core.training.films.demonstrations import DISTRACTORS, draw_objects
-from vap_core.training.films.looks import APART, FIRST_GRAIN, distance, draw_look
-from vap_core.training.films.scenes import TRAIN_INSTANCES, draw_style
-from vap_core.training.recipe import FILMED, RECIPES, filmed_task, filmed_tasks
+from vap_make.films import looks
+from vap_make.films.demonstrations import DISTRACTORS, draw_objects
+from vap_make.films.looks import APART, FIRST_GRAIN, distance, draw_look
+from vap_make.films.scenes import TRAIN_INSTANCES, draw_style
+from vap_make.recipe import FILMED, RECIPES, filmed_task, filmed_tasks
 
 
 def overlaps(style: object) -> list[str]:

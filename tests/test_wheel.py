@@ -50,7 +50,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The wheel, built from a copy of the tracked files."""
     source = tmp_path_factory.mktemp("source")
     listed = subprocess.run(
-        ["git", "ls-files", "-z", "vap_core", "data", "*.toml", "setup.py", "MANIFEST.in", "LICENSE", "README.md"],
+        ["git", "ls-files", "-z", "vap_core", "vap_make", "data", "*.toml", "setup.py", "MANIFEST.in", "LICENSE", "README.md"],
         cwd=ROOT, capture_output=True, text=True, check=True,
     ).stdout  # fmt: skip
     for name in filter(None, listed.split("\0")):
@@ -68,7 +68,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_a_wheel_holds_code_and_the_tracked_files_of_data_that_it_reads(wheel: Path) -> None:
     tracked = subprocess.run(
-        ["git", "ls-files", "vap_core", *(f"data/{name}" for name in SHIPPED)],
+        ["git", "ls-files", "vap_core", "vap_make", *(f"data/{name}" for name in SHIPPED)],
         cwd=ROOT, capture_output=True, text=True, check=True,
     ).stdout.split()  # fmt: skip
     expected = {

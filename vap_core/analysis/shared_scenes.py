@@ -23,7 +23,7 @@ from vap_core.evaluation.statistics import bootstrap_interval
 from vap_core.policies.names import MINI, TEMPERATURE, checkpoint_of, shipped_checkpoint
 from vap_core.simulation import suites
 from vap_core.simulation.suites import shared
-from vap_core.training.recipe import FILMED
+from vap_core.simulation.suites.simpler import FILMED_AREA
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -111,14 +111,14 @@ def sequence_table(episodes: "pd.DataFrame") -> "pd.DataFrame":
 def area_table(episodes: "pd.DataFrame") -> "pd.DataFrame":
     """VAP's first steps on the WidowX, by whether the target stands where films showed objects.
 
-    The list's grid has a column on either side beyond that area (training.recipe.FILMED).
+    The list's grid has a column on either side beyond that area (simpler.FILMED_AREA).
 
     Raises: BadSuite for a damaged list.
     """
     import pandas as pd
 
     name = SEQUENCES[0]
-    area = FILMED[shared.LIKE[name]].area
+    area = FILMED_AREA
     filmed = {}
     for row in suites.benchmark(name):
         target = row.placements[0]

@@ -210,7 +210,7 @@ def calibrate(
     Example: python -m vap_core measure calibration --scenes 8
     Example: python -m vap_core measure calibration --photos my-photos --scenes 0 --keep
     """
-    from vap_core.analysis.calibration.run import calibrate, keep_choice, refuse_keep
+    from vap_make.calibration.run import calibrate, keep_choice, refuse_keep
 
     if keep:
         refuse_keep(stack, photos or ())

@@ -55,7 +55,7 @@ def eval_policy(
     from vap_core.base.errors import BadStudy
     from vap_core.evaluation.study import Study
     from vap_core.simulation import suites
-    from vap_core.training.policy.probe import conclude, keep, kept, probe
+    from vap_make.policy.probe import conclude, keep, kept, probe
 
     tasks = tuple((suite, task.name) for task in suites.suite(suite).tasks)
     study = Study(tasks, ("generic",), policy=policy)

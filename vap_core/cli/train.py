@@ -37,7 +37,7 @@ def perception(
 
     Example: python -m vap_core train perception --out data/runs/weights --scenes 400
     """
-    from vap_core.training.perception.train import CACHE, train
+    from vap_make.perception.train import CACHE, train
 
     rendered = CACHE if cache is None else cache / CACHE.name
     entry = train(out, scenes=scenes, seed=seed, minutes=minutes, cache=rendered, jobs=jobs)
@@ -82,10 +82,10 @@ def demonstrations(
 
     if suite not in BENCHMARKS:
         raise one_of("train demonstrations: suite", suite, BENCHMARKS)
-    from vap_core.training.films.dataset import ABOUT, write
-    from vap_core.training.films.scenes import CACHE
-    from vap_core.training.policy.train import FILMS
-    from vap_core.training.recipe import RECIPES
+    from vap_make.films.dataset import ABOUT, write
+    from vap_make.films.scenes import CACHE
+    from vap_make.policy.train import FILMS
+    from vap_make.recipe import RECIPES
 
     folder = out or Path(f"data/runs/demonstrations-{suite}")
     was_complete = (folder / ABOUT).exists()
@@ -123,8 +123,8 @@ def vlm(
     Example: python -m vap_core train vlm --stages 20 --steps 100 --out data/runs/small-vlm
     """
     from vap_core.base.commands import command
-    from vap_core.training.films.scenes import CACHE
-    from vap_core.training.vlm.train import Recipe, train
+    from vap_make.films.scenes import CACHE
+    from vap_make.vlm.train import Recipe, train
 
     recipe = Recipe(stages=stages, steps=steps, seed=seed)
     about = train(recipe, out, minutes=minutes, cache=cache or CACHE, jobs=jobs)
@@ -237,7 +237,7 @@ def policy(
 
     from vap_core.base.commands import command
     from vap_core.base.errors import BadStudy, one_of
-    from vap_core.training.recipe import RECIPES
+    from vap_make.recipe import RECIPES
 
     if suite not in RECIPES:
         raise one_of("train policy: suite", suite, RECIPES)
@@ -246,9 +246,9 @@ def policy(
             "train policy: --stages films scenes, --demonstrations takes all stages of a dataset "
             "that is there; leave one out."
         )
-    from vap_core.training.films.scenes import CACHE
-    from vap_core.training.policy.train import HELD_OUT, require_startable, train
-    from vap_core.training.vlm.train import make
+    from vap_make.films.scenes import CACHE
+    from vap_make.policy.train import HELD_OUT, require_startable, train
+    from vap_make.vlm.train import make
 
     folder = out or Path(f"data/runs/trained/mini-pi0-{suite}")
     standard = RECIPES[suite]

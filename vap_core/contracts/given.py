@@ -15,9 +15,8 @@ from vap_core.base.types import Boxes, Rgb, value
 from vap_core.rollout.loop import Trial
 from vap_core.rollout.prompters.text import generic
 from vap_core.simulation import suites
-from vap_core.simulation.suites.open_row import build_scene, models_of
+from vap_core.simulation.suites.open_row import build_scene, models_of, open_row
 from vap_core.simulation.types import EpisodeRow
-from vap_core.training.films.scenes import boxes_of, stage
 
 LEAST_PX = 150
 """Visible pixels of an object of the scene."""
@@ -70,16 +69,20 @@ def _needed(function: Any) -> list[str]:
 
 
 def rendered_scene() -> RenderedScene:
-    """The fullest of eight views of a rendered table with generic objects."""
-    shots = stage(3, 2, held_out=True, views=8)
-    seen = []
-    for ids in shots.ids:
-        seen.append(list(boxes_of(ids, len(shots.names), LEAST_PX)))
-    v = int(np.argmax([len(found) for found in seen]))
-    masks = np.stack([shots.ids[v] == i + 1 for i, _ in seen[v]])
-    corners = np.array([box for _, box in seen[v]], np.float32)
-    boxes = Boxes(corners, np.ones(len(corners), np.float32), "object")
-    return RenderedScene(shots.rgb[v], masks, boxes)
+    """The fullest of eight views of development scenes, whose objects no film shows."""
+    scenes = []
+    for row in suites.benchmark("vlabench-dev")[:80:10]:
+        with open_row(row) as env:
+            shown = env.truth(masks=True).masks["front"].values()
+            masks = [mask for mask in shown if mask.sum() >= LEAST_PX]
+            scenes.append((env.observe().images["front"], masks))
+    rgb, masks = max(scenes, key=lambda scene: len(scene[1]))
+    corners = []
+    for mask in masks:
+        y, x = np.nonzero(mask)
+        corners.append((x.min(), y.min(), x.max() + 1, y.max() + 1))
+    boxes = Boxes(np.array(corners, np.float32), np.ones(len(masks), np.float32), "object")
+    return RenderedScene(rgb, np.stack(masks), boxes)
 
 
 def noise(seed: int, h: int = 96, w: int = 128) -> Rgb:

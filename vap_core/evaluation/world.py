@@ -21,7 +21,6 @@ from vap_core.simulation.suites.open_row import models_of
 from vap_core.simulation.suites.variants import VARIANTS, Variant
 from vap_core.simulation.types import EpisodeRow
 
-
 SPELLINGS: dict[type, str] = {
     Rig: "Rig name body pos_m aim_m fovy_rad up",
     Variant: "Variant axis style distractors",

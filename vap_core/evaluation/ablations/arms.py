@@ -75,7 +75,7 @@ training scenes that were tinted."""
 UNTRAINED = (Colour("orange", (255, 128, 0)), Colour("purple", (128, 0, 255)))
 """Colours that no shipped policy was trained with as tints.
 
-In its films things are painted in them (training.words.PAINTS), and commands name them.
+In its films things are painted in them (vap_make.words.PAINTS), and commands name them.
 """
 RELIANT = Pairing(("geometry",), evidence=6.0, reliance=3.0, decisive=1.25)
 """Chosen on first frames of development layouts alone (vlabench 240, tabletop 224; generic objects

@@ -1,0 +1,276 @@
+"""Questions about training views, and their answers in words (P 5.1, SPEC section 4).
+
+A mini-PaliGemma learns to answer them before any policy grows from it.
+
+*Where is the red cup*: top left. *Is there a red cup in this image*, *can you recognize the striped
+cup in this image*: yes or no, equally often; the hard no's name a colour that no cup has. *What
+colour is the cup*: red. *Pick up the red cup*, *pick up my cup. My cup is white with blue spots*:
+no words; only the patches that show it are asked for. Colours are paint, or an object's own, and
+never a tint; an object is named by its colour or pattern where that distinguishes it from others of
+its kind, and by its kind where it is the only one.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from itertools import chain
+
+import numpy as np
+from jaxtyping import UInt8
+
+from vap_core.base.types import Description, value
+from vap_core.prompt import PALETTE
+from vap_core.simulation.assets import objects
+from vap_core.simulation.suites import BENCHMARKS
+from vap_make.policy.colouring import COAT, natural_colours, painted
+from vap_make.words import (
+    DETERMINERS,
+    PAINTS,
+    distinct_colours,
+    pattern_words,
+    similar_colours,
+)
+
+COLOURED = 0.45
+"""How often a view's object is painted."""
+MIN_ASKED_PX = 20
+"""Visible pixels of an object that is asked about."""
+TASKS = tuple(chain.from_iterable(suite.tasks for suite in BENCHMARKS.values()))
+
+
+@value
+class Question:
+    """A question about one view, the answer's words, and the index of the object meant, or -1.
+
+    There is no answer where only patches are asked for.
+    """
+
+    text: str
+    answer: tuple[str, ...]
+    target: int
+
+
+@value
+class QuestionedView:
+    """One view, coloured, and questions about it."""
+
+    image: UInt8[np.ndarray, "s s 3"]
+    questions: tuple[Question, ...]
+
+
+@value
+class VisibleObject:
+    """An object in view.
+
+    `words` may name it; `appearance` is all that it shows (a trace of its pattern is seen through
+    paint); `given` is the colour that it was given, or "".
+    """
+
+    look: Description
+    kind: str
+    words: frozenset[str]
+    appearance: frozenset[str]
+    given: str
+
+
+VisibleObjects = Mapping[int, VisibleObject]
+"""By their index among the view's names."""
+
+
+def ask(
+    image: UInt8[np.ndarray, "s s 3"],
+    ids: UInt8[np.ndarray, "s s"],
+    names: Sequence[str],
+    looks: Sequence[Description],
+    n: int,
+    rng: np.random.Generator,
+) -> QuestionedView:
+    """Paint some objects of a view, where `ids` is i + 1 at names[i], and ask `n` questions.
+
+    `looks` are the captioner's descriptions of the objects.
+
+    Raises: UnknownName, BadObject, as `get_object`.
+    """
+    images = image[None]
+    visible = _visible_objects(ids, names, looks)
+    unused = set(PAINTS)
+    for i in visible:
+        pool = sorted(unused, key=PAINTS.index)
+        if pool and rng.random() < COLOURED:
+            colour = pool[int(rng.integers(len(pool)))]
+            unused.discard(colour)
+            mask = (ids == i + 1)[None]
+            images = painted(images, mask, colour, float(rng.uniform(*COAT)))
+            visible[i] = VisibleObject(
+                look=looks[i],
+                kind=visible[i].kind,
+                words=frozenset({colour.name}),
+                appearance=visible[i].appearance | {colour.name},
+                given=colour.name,
+            )
+    gain = rng.uniform(0.9, 1.1) * rng.uniform(0.96, 1.04, 3)
+    shown = np.clip(images[0] * gain, 0, 255).astype(np.uint8)
+    questions = []
+    for _ in range(n):
+        questions.append(_question(ids, visible, rng))
+    return QuestionedView(shown, tuple(questions))
+
+
+def place(mask: np.ndarray) -> tuple[str, str]:
+    """Which of nine parts of the view holds the middle of a mask: its row, then its column."""
+    ys, xs = np.nonzero(mask)
+    middle = np.array([ys.mean(), xs.mean()])
+    row, column = (3 * middle / mask.shape[0]).astype(int)
+    return ("top", "middle", "bottom")[row], ("left", "middle", "right")[column]
+
+
+def _visible_objects(
+    ids: UInt8[np.ndarray, "s s"], names: Sequence[str], looks: Sequence[Description]
+) -> dict[int, VisibleObject]:
+    """The objects with enough visible pixels, as they are."""
+    visible = {}
+    for i, name in enumerate(names):
+        if (ids == i + 1).sum() >= MIN_ASKED_PX:
+            colours = natural_colours(looks[i])
+            pattern = pattern_words(name)
+            visible[i] = VisibleObject(
+                look=looks[i],
+                kind=objects.get_object(name).category,
+                words=frozenset({colours[0], *pattern}),
+                appearance=frozenset({*colours, *pattern}),
+                given="",
+            )
+    return visible
+
+
+def _question(
+    ids: UInt8[np.ndarray, "s s"], visible: VisibleObjects, rng: np.random.Generator
+) -> Question:
+    """A question of any type about one of the objects that a phrase distinguishes, if any."""
+    named = {}
+    for i in visible:
+        phrase = _phrase(i, visible, rng)
+        if phrase:
+            named[i] = phrase
+    drawn = rng.random()
+    if not named:
+        return _ask_absent(visible, rng)
+    target = int(rng.choice(list(named)))
+    phrase = named[target]
+    kind = visible[target].kind
+    if drawn < 0.28:
+        return Question(f"where is the {phrase}", place(ids == target + 1), target)
+    if drawn < 0.46:
+        return Question(_recognition_text(phrase, rng), ("yes",), target)
+    if drawn < 0.64:
+        if rng.random() < 0.7:
+            return _ask_wrong_colour(kind, visible, rng)
+        return _ask_absent(visible, rng)
+    given = visible[target].given
+    if drawn < 0.74 and given and _is_only(kind, visible):
+        return Question(f"what colour is the {kind}", (given,), target)
+    return _ask_for_patches(target, phrase, visible[target], rng)
+
+
+def _phrase(i: int, visible: VisibleObjects, rng: np.random.Generator) -> str | None:
+    """What distinguishes object i from others of its kind; None when nothing does.
+
+    It is "red cup", or "cup" when there is one only.
+    """
+    kind = visible[i].kind
+    others = 0
+    distinctive = set(visible[i].words)
+    for j, rival in visible.items():
+        if j != i and _is_same_kind(rival.kind, kind):
+            others += 1
+            distinctive = _without_akin(distinctive, rival.appearance)
+    if distinctive and (others or rng.random() < 0.7):
+        return f"{rng.choice(sorted(distinctive))} {kind}"
+    return None if others else kind
+
+
+def _ask_wrong_colour(kind: str, visible: VisibleObjects, rng: np.random.Generator) -> Question:
+    """Is there a kind that is there, in a colour or pattern that none of it has?"""
+    own: set[str] = set()
+    all_words: set[str] = set()
+    for rival in visible.values():
+        all_words |= rival.words
+        if _is_same_kind(rival.kind, kind):
+            own |= rival.appearance
+    pool = sorted(_without_akin(all_words, own))
+    if not pool or rng.random() >= 0.5:
+        pool = [colour.name for colour in distinct_colours(own) if colour.name not in own]
+    if not pool:
+        return _ask_absent(visible, rng)
+    text = _recognition_text(f"{rng.choice(pool)} {kind}", rng)
+    return Question(text, ("no",), -1)
+
+
+def _ask_absent(visible: VisibleObjects, rng: np.random.Generator) -> Question:
+    """Is there a kind that is not there, mostly with a colour or pattern of something?"""
+    words = {colour.name for colour in PALETTE}
+    for seen in visible.values():
+        words |= seen.words
+    phrase = str(rng.choice(_absent_kinds(visible)))
+    if rng.random() < 0.7:
+        phrase = f"{rng.choice(sorted(words))} {phrase}"
+    return Question(_recognition_text(phrase, rng), ("no",), -1)
+
+
+def _ask_for_patches(
+    target: int, phrase: str, meant: VisibleObject, rng: np.random.Generator
+) -> Question:
+    """An instruction about an object; only the patches that show it answer."""
+    kind = meant.kind
+    text = str(rng.choice(_instructions(kind)))
+    if not meant.given and phrase != kind and rng.random() < 0.5:
+        description = rng.choice([meant.look.short, meant.look.long])
+        return Question(f"{text}. My {kind} is {description}.", (), target)
+    determiner = rng.choice(DETERMINERS[1:])
+    return Question(text.replace(f"my {kind}", f"{determiner} {phrase}"), (), target)
+
+
+def _recognition_text(phrase: str, rng: np.random.Generator) -> str:
+    """A question that yes or no answers."""
+    if rng.random() < 0.5:
+        return f"is there a {phrase} in this image"
+    return f"can you recognize the {phrase} in this image"
+
+
+def _instructions(kind: str) -> list[str]:
+    """What the benchmarks' tasks tell a robot to do with a kind, or to pick it up."""
+    instructions = []
+    for task in TASKS:
+        if task.category == kind:
+            instructions.append(task.instruction)
+    return instructions or [f"pick up my {kind}"]
+
+
+def _absent_kinds(visible: VisibleObjects) -> list[str]:
+    """The kinds that nothing in view is of, in alphabetical order."""
+    absent = set(objects.CATEGORIES)
+    for kind in objects.CATEGORIES:
+        for seen in visible.values():
+            if _is_same_kind(kind, seen.kind):
+                absent.discard(kind)
+    return sorted(absent)
+
+
+def _is_same_kind(kind: str, other: str) -> bool:
+    """Whether one kind is the other; a straw cup is a cup."""
+    return kind == other or kind.endswith(f" {other}") or other.endswith(f" {kind}")
+
+
+def _is_only(kind: str, visible: VisibleObjects) -> bool:
+    """Whether exactly one object of this very kind is in view."""
+    count = 0
+    for seen in visible.values():
+        count += seen.kind == kind
+    return count == 1
+
+
+def _without_akin(words: set[str], appearance: Collection[str]) -> set[str]:
+    """The words that cannot be taken for one of an appearance's."""
+    kept = set()
+    for word in words:
+        if similar_colours(word).isdisjoint(appearance):
+            kept.add(word)
+    return kept
