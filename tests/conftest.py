@@ -23,7 +23,7 @@ os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = (
 )
 
 END_TO_END = {
-    "test_attention", "test_benchmarks", "test_catalog", "test_cli", "test_cluster", "test_dataset",
+    "test_attention", "test_benchmarks", "test_cli", "test_cluster", "test_dataset",
     "test_demo", "test_demonstrations", "test_diagnosis", "test_engine", "test_eval_cli",
     "test_foundation", "test_gallery", "test_imported", "test_lerobot", "test_lerobot_loop",
     "test_methods", "test_mini_pi0", "test_perception_training", "test_planted",

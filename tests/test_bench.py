@@ -422,7 +422,6 @@ def test_scale_runs() -> None:
         ("policy --device cpu", "leave --device out"),
         ("profile --stack embedded", "profile reads --quick, --json; leave --stack out."),
         ("engine --episodes 200", "leave --episodes out"),  # as the default says, too
-        ("query --steps 9 --repeats 3", "leave --steps and --repeats out"),
         ("nothing --json x", "bench: 'nothing' is unknown; known: embeddings, engine"),
     ],
 )

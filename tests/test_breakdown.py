@@ -1,6 +1,5 @@
 """How failures divide into cases, and at which stages episodes are lost: tables and pictures."""
 
-from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -168,11 +167,7 @@ def test_a_page_leaves_out_recorded_failures_of_runs_older_than_the_diagnosis(
 ) -> None:
     """Their case, sub-case and deciding frame are not numbers and texts, but nothing."""
 
-    def summaries(paths: list[Path]) -> Generator[tuple[Path, dict[str, str], str]]:
-        for path in paths:
-            yield path, {**new, "steps": 9}, ""
-
-    monkeypatch.setattr("vap_core.recording.isolated.read_summaries", summaries)
+    monkeypatch.setattr("vap_core.recording.read_summary", lambda _: {**new, "steps": 9})
     about = {"task": "select-cup", "seed": 0, "policy": "p", "case_sentence": "because"}
     new = {**row("generic", "unprompted", "wrong object"), **about, "episode": 0}
     old = {name: new[name] for name in ("suite", "method", "outcome", "success", *about)}

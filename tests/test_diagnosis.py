@@ -20,7 +20,6 @@ from vap_core.base.files import DATA
 from vap_core.evaluation import engine
 from vap_core.evaluation.diagnosis import recordings
 from vap_core.evaluation.diagnosis.failures import (
-    PLAYED,
     Failures,
     deciding_frame,
     failures_text,
@@ -34,8 +33,7 @@ from vap_core.evaluation.report.failures import (
 )
 from vap_core.evaluation.store import read_manifest
 from vap_core.evaluation.study import Study
-from vap_core.recording import Recorder, read_summary, recording_file_name, recover
-from vap_core.recording.index import FOLDER
+from vap_core.recording import Recorder, read_summary, recover
 from vap_core.simulation.types import Outcome
 
 STUDY = Study((("widowx-pick", "pick-straw-cup"),), ("generic",), episodes=3, policy="random")
@@ -222,10 +220,9 @@ def test_what_a_killed_process_recorded_is_not_the_whole_episode(
     (leftover,) = tmp_path.glob("data/runs/mine-diagnosed/**/.*.tmp")
     recovered = recover(leftover)
     assert "outcome" not in read_summary(recovered)
-    layer = correct_failure(failures, 0, "unprompted: slip")
+    assert recording_of(failures, 0).name == recovered.name
     assert "is unfinished; it is kept as" in capsys.readouterr().out
     assert read_summary(recovered)["outcome"] == "failure"
-    assert layer.name == recovered.name
     assert len(kept_beside(recovered)) == 1
 
 
@@ -313,9 +310,9 @@ def test_a_correction_is_of_the_policy_that_was_recorded(
     publish(runs, tmp_path / "mine.parquet")
     monkeypatch.chdir(tmp_path)
     listed = partial(list_failures, tmp_path / "mine.parquet", where="policy = 'random'")
-    layer = correct_failure(listed(), 0, "unprompted: slip")
+    table = correct_failure(listed(), 0, "unprompted: slip")
     digest = read_manifest(runs[0])["digest"]
-    assert layer.parent == Path("data/runs/mine-diagnosed", digest, "random/corrections")
+    assert table == Path("data/runs/mine-diagnosed", digest, "random/corrections.csv")
     assert listed().table.corrected.tolist() == [True, False]
     everything = list_failures(tmp_path / "mine.parquet").all_episodes
     assert everything.corrected.sum() == 1
@@ -340,19 +337,12 @@ def test_tables_of_one_name_share_what_is_of_one_run(
         tables[name] = tmp_path / name / "t.parquet"
         publish([source], tables[name])
     monkeypatch.chdir(tmp_path)
-    layer = correct_failure(list_failures(tables["a"]), 0, "unprompted: slip")
+    table = correct_failure(list_failures(tables["a"]), 0, "unprompted: slip")
     corrected = {name: list_failures(table).table.corrected.sum() for name, table in tables.items()}
     assert corrected == {"a": 1, "b": 0, "copy": 1}
     folders = {name: set(list_failures(table).table.folder) for name, table in tables.items()}
-    assert folders["a"] == folders["copy"] == {str(layer.parent.parent)}
+    assert folders["a"] == folders["copy"] == {str(table.parent)}
     assert folders["b"] == {"data/runs/t-diagnosed/of-call/random"}
-    old = tmp_path / "data/runs/t-diagnosed/random/corrections"
-    old.mkdir(parents=True)
-    layer.replace(old / layer.name)
-    failures = list_failures(tables["a"])
-    assert not failures.table.corrected.any()
-    said = "not counted: corrections of an earlier version in data/runs/t-diagnosed (1)"
-    assert said in failures_text(failures)
 
 
 def test_the_digest_of_a_published_table_leads_out_of_no_folder(run: Path, tmp_path: Path) -> None:
@@ -495,26 +485,12 @@ def test_so_many_recordings_are_spread_over_a_task(tmp_path: Path) -> None:
     assert sorted(
         path.name.split(".")[2] for path in (tmp_path / "run" / "recordings").glob("*.rrd")
     ) == ["000", "002"]
-    assert len(list((tmp_path / "run" / "recordings" / FOLDER).glob("*.rrd"))) == 2, (
-        "each with its index"
-    )
     assert list_failures(tmp_path / "run").table.shape[0] == 4
-
-
-def test_a_correction_under_another_recordings_name_is_not_of_it(run: Path) -> None:
-    failures = list_failures(run)
-    layer = correct_failure(failures, 1, "unprompted: slip")
-    other = failures.table.to_dict("records")[0]
-    copy = layer.with_name(recording_file_name(*map(other.get, PLAYED)))
-    shutil.copy(layer, copy)
-    assert list_failures(run).table.corrected.tolist() == [False, True, False]
-    layer.unlink()
-    copy.unlink()
 
 
 def test_a_correction_changes_the_table_and_nothing_else(run: Path) -> None:
     failures = list_failures(run)
-    layer = correct_failure(failures, 1, "unprompted: slip", "it held for a moment")
+    file = correct_failure(failures, 1, "unprompted: slip", "it held for a moment")
     again = list_failures(run)
     assert (
         again.table.sub_case[1],
@@ -526,7 +502,12 @@ def test_a_correction_changes_the_table_and_nothing_else(run: Path) -> None:
         [False, True, False],
     )
     assert "* as corrected by hand" in failures_text(again)
-    layer.unlink()
+    with pytest.raises(UnknownName, match="sub-case of unprompted 'drop' is unknown; known: "):
+        correct_failure(failures, 1, "unprompted: drop")
+    file.write_text("suite,task")
+    with pytest.raises(BadOutput, match="corrections.csv is damaged .*; mend it, or delete it"):
+        list_failures(run)
+    file.unlink()
     assert not list_failures(run).table.corrected.any()
 
 
@@ -538,9 +519,7 @@ def test_a_correction_changes_the_table_and_nothing_else(run: Path) -> None:
         ("diagnose R --open 0 --correct c --png a", "--correct shows nothing; leave --png out"),
         ("diagnose R --open 0 --correct c --mp4 a", "--correct shows nothing; leave --mp4 out"),
         ("diagnose R --open 0 --correct c --against vap", "shows nothing; leave --against out"),
-        ("query R steps>1 --port 9", "--port is of --serve; leave --port out"),
-        ("query R --serve --open 0 --png a", "in a browser; leave --open and --png out"),
-        ("query R --serve --limit 20", "in a browser; leave --limit out"),
+        ("view R --attention", "--attention is a picture; name its file by --png"),
         ("view R --mp4 a.mp4 --frame 0", "--mp4 films every step; leave --frame out"),
     ],
 )
@@ -552,7 +531,7 @@ def test_a_picture_and_a_film_are_both_made(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     made = []
-    monkeypatch.setattr("vap_core.recording.check_recording", lambda _: None)
+    monkeypatch.setattr("vap_core.recording.read_summary", lambda _: None)
     monkeypatch.setattr("vap_core.recording.write_film", lambda _, mp4: made.append(mp4) or 1)
     monkeypatch.setattr("vap_core.recording.screenshot", lambda _, png, **__: made.append(png))
     done = vap("view", "a.rrd", "--png", tmp_path / "a.png", "--mp4", tmp_path / "a.mp4")

@@ -15,7 +15,6 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from tests.drawn import SUCCESS, frame, opening
 from tests.scanned import RED, box, mug
 from tests.test_scan_storage import METADATA, cube
 from tests.toys import personal
@@ -30,8 +29,6 @@ from vap_core.memory import load as load_object
 from vap_core.memory import save as save_object
 from vap_core.policies.lerobot.checkpoints import PIPELINES, refuse_code
 from vap_core.policies.mini_pi0 import token_file
-from vap_core.recording import Recorder
-from vap_core.recording.isolated import ENDED_READER, index_isolated
 from vap_core.simulation.assets.scans import mesh_file, storage
 from vap_core.simulation.assets.scans.mesh_file import read_mesh_file
 from vap_core.simulation.suites import lists
@@ -259,30 +256,3 @@ def test_a_mutated_file_is_read_or_refused_in_one_line(
     assert refused or name in ("instruction", "photo")
     record_property("cases", cases)
     record_property("refused", refused)
-
-
-@pytest.mark.sweep
-@pytest.mark.timeout(3600)
-def test_a_mutated_recording_ends_no_process_of_ours(
-    tmp_path: Path, record_property: Callable[[str, object], None]
-) -> None:
-    seed = tmp_path / "seed.rrd"
-    with Recorder(seed, opening(1)) as recorder:
-        recorder.frame(frame(0, opening(1)))
-        recorder.close(SUCCESS)
-    whole = seed.read_bytes()
-    ended = refused = 0
-    for first in range(0, CASES, 500):
-        paths = []
-        for case in range(first, first + 500):
-            path = tmp_path / f"{case}.rrd"
-            path.write_bytes(mutated(whole, np.random.default_rng([case, 3])))
-            paths.append(path)
-        for path, reason in index_isolated(paths, tmp_path / "index"):
-            assert reason is None or "\n" not in reason
-            ended += reason == ENDED_READER
-            refused += reason is not None
-            path.unlink()
-    record_property("cases", CASES)
-    record_property("refused", refused)
-    record_property("ended_their_reader", ended)

@@ -19,8 +19,7 @@ from vap_core.memory import load as load_object
 from vap_core.perception.foundation.store import read_lock
 from vap_core.policies.lerobot.checkpoints import locate
 from vap_core.policies.mini_pi0.token_file import load as load_token
-from vap_core.recording import ensure_index, read_summary
-from vap_core.recording.layers import read_correction
+from vap_core.recording import read_summary
 from vap_core.simulation.assets.scans.mesh_file import read_mesh_file
 from vap_core.simulation.assets.scans.storage import load_scan
 from vap_core.simulation.suites import lists
@@ -43,8 +42,6 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "own objects": ("objects.csv", read_source),
     "boxes": ("a.csv", lambda folder: _read_csv(folder / "a.csv", ("photo",))),
     "recording": ("a.rrd", lambda folder: read_summary(folder / "a.rrd")),
-    "index": ("a.rrd", lambda folder: ensure_index(folder / "a.rrd")),
-    "correction": ("a.rrd", lambda folder: read_correction(folder / "a.rrd")),
     "checkpoint": ("config.json", locate),
     "demonstrations": (str(dataset.ABOUT), dataset.read),
 }

@@ -96,7 +96,6 @@ OWN_JSON = {
     "stills.py",  # a committed picture's provenance
     "store.py",  # what was just written, once through JSON
     "dataset.py",  # a part that this process has just written
-    "isolated.py",  # our own reading process
     "eval_lerobot.py",
     "measurement.py",
     "lerobot_process.py",

@@ -1,6 +1,5 @@
 """The pictures of a report: every line of its tables, methods told apart, the right recording."""
 
-from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from PIL import Image
 
 from tests.test_report import run
 from vap_core.base import palette
+from vap_core.base.errors import BadRecording
 from vap_core.evaluation.report import page
 from vap_core.evaluation.report.failures import FunnelRow
 from vap_core.evaluation.report.funnel import funnel_figure
@@ -41,12 +41,12 @@ def test_a_failure_is_pictured_by_the_recording_of_its_own_policy(
     whole = {**row, "outcome": "failure", "steps": 60}
     said = whole
 
-    def summaries(paths: list[Path]) -> Generator[tuple[Path, dict[str, object] | None, str]]:
-        for path in paths:
-            damaged = "damaged" in path.parts
-            yield path, None if damaged else {**said, "policy": path.parts[-3]}, "damaged"
+    def summary(path: Path) -> dict[str, object]:
+        if "damaged" in path.parts:
+            raise BadRecording("damaged")
+        return {**said, "policy": path.parts[-3]}
 
-    monkeypatch.setattr("vap_core.recording.isolated.read_summaries", summaries)
+    monkeypatch.setattr("vap_core.recording.read_summary", summary)
     of_b = {**row, "policy": "b"}
     path = sources[1] / "recordings" / name
     assert list(page._recorded([of_b], sources)) == [(of_b, path)]

@@ -1,5 +1,7 @@
-"""A SQL condition on any table."""
+"""SQL on any tables."""
 
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from vap_core.base.errors import BadStudy
@@ -25,27 +27,46 @@ def rows_matching(table: "pd.DataFrame", condition: str) -> "pd.DataFrame":
 
     Raises: BadStudy.
     """
-    import pyarrow as pa
-
-    _check_size(condition)
     flat = table.reset_index(drop=True)
-    arrow = pa.Table.from_pandas(flat.assign(**{LINE: flat.index}), preserve_index=False)
-    lines: list[int] = []
-    try:
-        context = _small_context()
-        # A table without rows has no batch, and datafusion panics at none.
-        batches = arrow.to_batches() or [pa.RecordBatch.from_pylist([], schema=arrow.schema)]
-        context.register_record_batches("episodes", [batches])
+    with _asked({"episodes": flat.assign(**{LINE: flat.index})}, condition) as context:
+        lines: list[int] = []
         for batch in context.table("episodes").filter(condition).select(LINE).collect():
             lines += batch[LINE].to_pylist()
+    return flat.loc[sorted(lines)]
+
+
+def select(tables: "Mapping[str, pd.DataFrame]", sql: str) -> "pd.DataFrame":
+    """What a SQL query over tables finds; it can change nothing. Raises: BadStudy."""
+    from datafusion import SQLOptions
+
+    options = SQLOptions().with_allow_ddl(False).with_allow_dml(False).with_allow_statements(False)
+    with _asked(tables, sql) as context:
+        return context.sql_with_options(sql, options).to_pandas()
+
+
+@contextmanager
+def _asked(tables: "Mapping[str, pd.DataFrame]", sql: str) -> "Iterator[SessionContext]":
+    """A session with some tables; what is wrong with a question to them is one line."""
+    import pyarrow as pa
+
+    _check_size(sql)
+    context = _small_context()
+    for name, table in tables.items():
+        arrow = pa.Table.from_pandas(table, preserve_index=False)
+        # A table without rows has no batch, and datafusion panics at none.
+        batches = arrow.to_batches() or [pa.RecordBatch.from_pylist([], schema=arrow.schema)]
+        context.register_record_batches(name, [batches])
+    try:
+        yield context
     except Exception as error:  # datafusion raises bare exceptions
         reason = " ".join(str(error).split())[:200]
-        columns = ", ".join(map(str, table.columns))
+        columns = "; of ".join(
+            f"{name} its columns are {', '.join(str(c) for c in table.columns if c != LINE)}"
+            for name, table in tables.items()
+        )
         raise BadStudy(
-            f"condition: {condition[:200]!r} is none on this table ({reason}); its columns are "
-            f"{columns}."
+            f"condition: {sql[:200]!r} is none on this table ({reason}); {columns}."
         ) from error
-    return flat.loc[sorted(lines)]
 
 
 def _check_size(condition: str) -> None:

@@ -31,7 +31,6 @@ BENCHES = {
     "scale": ("episodes", "quick", "json"),
     "engine": ("workers", "quick"),
     "embeddings": ("quick", "json"),
-    "query": ("quick",),
 }
 """The options that each bench reads, by parameter."""
 
@@ -54,7 +53,6 @@ def bench(
             "profile: a control step of eval by part; "
             "scale: cost against cameras, image size, candidates, batch and workers, and memory; "
             "engine: a Ray cluster on this machine against local processes; "
-            "query: a question to a thousand recordings; "
             "embeddings: tables of PaliGemma's size, compared."
         ),
     ] = "loop",
@@ -78,7 +76,7 @@ def bench(
         bool,
         typer.Option(
             "--quick",
-            help="policy, eval, profile, scale, engine, query, embeddings: a few steps, to see "
+            help="policy, eval, profile, scale, engine, embeddings: a few steps, to see "
             "that it runs; its numbers mean nothing.",
         ),
     ] = False,
@@ -160,10 +158,6 @@ def bench(
             from vap_core.cli.bench import embeddings
 
             text = _kept(embeddings.measure(quick), embeddings.tables, json)
-        case "query":
-            from vap_core.cli.bench import query
-
-            text = query.run(quick=quick)
     print(text)
 
 

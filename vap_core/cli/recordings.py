@@ -1,9 +1,7 @@
 """Commands that find and open recordings: diagnose, query, view."""
 
-import threading
 from pathlib import Path
 from typing import Annotated
-from urllib.parse import urlsplit
 
 import typer
 
@@ -70,8 +68,8 @@ def diagnose(
     correct: Annotated[
         str | None,
         typer.Option(
-            help='With --open: what it really is, "case 3: slip"; kept as a layer beside the '
-            "recording."
+            help='With --open: what it really is, "case 3: slip"; kept as a table beside the '
+            "recordings."
         ),
     ] = None,
     note: Annotated[str, typer.Option(help="With --correct: why you think so.")] = "",
@@ -110,10 +108,10 @@ def diagnose(
     )
     number = show or 0
     if correct is not None:
-        layer = correct_failure(failures, number, correct, note)
+        table = correct_failure(failures, number, correct, note)
         row = failures.table.iloc[number]
         named = f"{row['suite']} {row['task']} {row['method']} {row['episode']}"
-        print(f"{named}: was {row['case']}, {row['sub_case']}; is {correct}\nwrote {layer}")
+        print(f"{named}: was {row['case']}, {row['sub_case']}; is {correct}\nwrote {table}")
         return
     if show is None and png is None and mp4 is None:
         print(failures_text(failures, limit))
@@ -125,64 +123,48 @@ def diagnose(
 
 @app.command()
 def query(
-    run: Annotated[Path, typer.Argument(help="Run folder with recordings.")],
-    where: Annotated[
+    run: Annotated[Path, typer.Argument(help="Run folder of eval, rollout or demo.")],
+    question: Annotated[
         str | None,
         typer.Argument(
-            help="SQL condition on steps: margin, track_score, gap_cm, lift_cm, frame_index, "
-            "method, outcome, case, steps, ...; with --serve on recordings."
+            help="SQL over the tables steps and episodes; or only a condition on steps, or the "
+            "name of a ready one. Without it the columns and the ready ones are listed."
         ),
     ] = None,
-    limit: Annotated[
-        int | None, typer.Option(min=1, help="Recordings to list. Default 20.")
-    ] = None,
+    limit: Annotated[int, typer.Option(min=1, help="Lines to print.")] = 20,
     show: Annotated[
         int | None,
         typer.Option(
             "--open",
             min=0,
-            help="Open this one of the list in the Rerun viewer, at the first such step.",
+            help="Open the recording of this line in the Rerun viewer, at the first such step.",
         ),
     ] = None,
     png: PictureInstead = None,
-    serve: Annotated[
-        bool,
-        typer.Option(
-            "--serve",
-            help="Browse the recordings: a table to filter in Rerun's viewer, with a link to the "
-            "deciding frame of each; served on 127.0.0.1 until Ctrl-C.",
-        ),
-    ] = False,
-    port: Annotated[
-        int | None,
-        typer.Option(min=1, max=65535, help="With --serve: the port. Default a free one."),
-    ] = None,
 ) -> None:
-    """Ask all recordings of a run at once: in which of them, and at which steps, does a
-    condition hold? Or browse them.
+    """Ask the steps and the episodes of a run: in which of them, and where, does a condition hold?
 
-    Example: python -m vap_core query data/runs/demo "margin < 0.05 and success = false"
+    Example: python -m vap_core query data/runs/demo near-miss
+    Example: python -m vap_core query data/runs/demo "margin < 0.05 and success = false" --open 0
     Example: python -m vap_core query data/runs/demo
-        "gap_cm < 1 and lift_cm < 1 and frame_index > 20" --open 0 --png near.png
-    Example: python -m vap_core query data/runs/demo --serve
-    Example: python -m vap_core query data/runs/demo "outcome = 'failure'" --serve
+        "select method, camera, avg(track_score) from steps group by method, camera"
     """
-    from vap_core.base.errors import BadStudy
-    from vap_core.recording.query import first_match, format_result, run_query
+    from vap_core.base.tables import align
+    from vap_core.evaluation import steps
 
-    if serve:
-        shown = {"--open": show, "--png": png, "--limit": limit}
-        refuse_dropped("query: --serve shows every recording in a browser", shown)
-        _serve(run, where, port)
+    if question is None:
+        joined, episodes = steps.read(run)
+        ready = "\n".join(f"  {name:14} {where}" for name, where in steps.QUESTIONS.items())
+        print(f"steps: {', '.join(joined)}\n\nepisodes: {', '.join(episodes)}\n\n{ready}")
         return
-    if where is None:
-        raise BadStudy('query: name a condition, such as "margin < 0.05", or add --serve.')
-    refuse_dropped("query: --port is of --serve", {"--port": port})
-    result = run_query(run, where)
+    found = steps.query(run, question)
     if show is None and png is None:
-        print(format_result(result, limit or 20))
+        rows = [["#", *found.columns]]
+        rows += [[str(i), *map(str, line)] for i, line in enumerate(found.head(limit).values)]
+        print(f"{len(found)} found")
+        print(align(rows))
         return
-    path, frame = first_match(result, show or 0)
+    path, frame = steps.recording_at(run, found, show or 0)
     print(f"{path}, frame {frame}")
     _show_frame(path, frame, png)
 
@@ -257,51 +239,15 @@ def _combined(one: Path, other: Path) -> Path:
     return out
 
 
-def _serve(run: Path, where: str | None, port: int | None) -> None:
-    """Serve a run's recordings until Ctrl-C, and open the viewer where there is a display."""
-    from vap_core.recording.browser import serve_run
-    from vap_core.recording.viewer import has_display, open_address
-
-    with serve_run(run, where, port) as browser:
-        n_failures = sum(row["outcome"] == "failure" for row in browser.rows)
-        print(f"{len(browser.rows)} recordings, {n_failures} of failures, at {browser.url}")
-        if where is not None:
-            print(f"{browser.n_matching} match: {where}")
-        for path, reason in browser.unreadable.items():
-            print(f"note: {path} was left out: {reason}")
-        if has_display():
-            open_address(browser.url)
-        else:
-            print(_tunnel_text(browser.url))
-        print("Ctrl-C ends it.", flush=True)
-        try:
-            threading.Event().wait()
-        except KeyboardInterrupt:
-            print()
-
-
-def _tunnel_text(url: str) -> str:
-    """How to open an address of this machine, which has no display, from one that has one.
-
-    The links in the table hold the port, so it is the same one at both ends.
-    """
-    port = urlsplit(url).port
-    return (
-        "there is no display here; on a machine that has one, with the name of this one for HOST:\n"
-        f"  ssh -N -L {port}:127.0.0.1:{port} HOST\n"
-        f"  python -m rerun {url}"
-    )
-
-
 def _check(recording: Path) -> None:
     """Check that a recording can be read. Raises: BadRecording; of a leftover it names the mend."""
     from vap_core.base.commands import command
     from vap_core.base.errors import BadRecording
-    from vap_core.recording import check_recording
+    from vap_core.recording import read_summary
     from vap_core.recording.file import LEFTOVER
 
     try:
-        check_recording(recording)
+        read_summary(recording)
     except BadRecording as error:
         if not (LEFTOVER.fullmatch(recording.name) and recording.is_file()):
             raise

@@ -1,15 +1,14 @@
 """What one worker process runs: a batch of episodes of one task and variant under one method."""
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from resource import RUSAGE_SELF, getrusage
 from typing import TYPE_CHECKING, Any, Literal
 
-from vap_core.base.errors import BadRecording, BadStudy
+from vap_core.base.errors import BadStudy
 from vap_core.base.files import writing
-from vap_core.evaluation import diagnosis, hiding, input_audit, state_log, switching
+from vap_core.evaluation import diagnosis, hiding, input_audit, state_log, steps, switching
 from vap_core.evaluation.same_weights import require_same_weights
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import make_trial
@@ -85,8 +84,7 @@ def run_job(job: Job) -> Rows:
     )
     with unchanged_weights(trial.policy) as checksum:
         episodes = list(rollout(trial, job.rows, begin, batch=BATCH))
-    if begin is not None:
-        _index_recordings(job)
+    steps.write(job.folder, episodes)
     state_log.write(job.folder, episodes)
     input_audit.write(job.folder, episodes)
     columns = {
@@ -175,15 +173,3 @@ def _recorders(job: Job) -> Callable[[EpisodeHeader], "Recorder | DeferredRecord
         return DeferredRecorder(path, header, is_wanted, video=job.video, explain=diagnosis.explain)
 
     return begin
-
-
-def _index_recordings(job: Job) -> None:
-    """Index the job's recordings, so that a query need not read them whole."""
-    from vap_core.recording import ensure_index, recording_name
-
-    for row in job.rows:
-        path = job.folder / "recordings" / recording_name(row, job.method)
-        if path.exists():
-            # An episode that ended before its first step has nothing to index.
-            with suppress(BadRecording):
-                ensure_index(path)

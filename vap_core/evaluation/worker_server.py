@@ -17,7 +17,6 @@ def worker_modules(policy: str) -> tuple[str, ...]:
         "vap_core.evaluation.jobs",
         "vap_core.rollout.loop",
         "vap_core.recording.recorder",
-        "vap_core.recording.index",
         "onnxruntime",
         "scipy.special",
     )

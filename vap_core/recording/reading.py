@@ -1,6 +1,5 @@
 """Reading recordings back: their chunks and their properties."""
 
-import os
 import warnings
 from pathlib import Path
 from shlex import quote
@@ -29,43 +28,6 @@ MOST_HZ = 1000
 """Control steps a second. A film repeats its last picture for seconds, which has to end."""
 UNREADABLE = (RuntimeError, ValueError, OSError, Warning)
 """What rerun and the checks here raise at a file that is no whole recording."""
-
-
-def list_files(folder: Path) -> list[Path]:
-    """The .rrd files of a folder, by name; none where there is no such folder.
-
-    Raises: BadRecording for a folder that cannot be read.
-    """
-    try:
-        with os.scandir(folder) as entries:
-            names = [entry.name for entry in entries if entry.name.endswith(".rrd")]
-    except (FileNotFoundError, NotADirectoryError):
-        return []
-    except OSError as error:
-        raise refused(folder, error) from error
-    return [folder / name for name in sorted(names)]
-
-
-def recordings_folder(run: Path) -> Path:
-    """The folder of a run's recordings; `run` itself where it has none of its own.
-
-    Raises: BadRecording for a run that cannot be read.
-    """
-    folder = run / "recordings"
-    try:
-        return folder if folder.is_dir() else run
-    except OSError as error:
-        raise refused(run, error) from error
-
-
-def list_recordings(folder: Path) -> list[Path]:
-    """Every recording of a folder. Raises: BadRecording without one, or without rights."""
-    files = list_files(folder)
-    if not files:
-        raise BadRecording(
-            f"query: there is no recording in {folder}; run eval with --record all, or failures."
-        )
-    return files
 
 
 def read_chunks(path: Path) -> LazyChunkStream:

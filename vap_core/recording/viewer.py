@@ -93,11 +93,6 @@ def has_display() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def open_address(url: str) -> None:
-    """Open what a catalog server shows in Rerun's own window. Raises: MissingGL."""
-    _start_viewer().open(url)
-
-
 def _start_viewer() -> ViewerClient:
     """Rerun's own window; it outlives this process. Raises: MissingGL."""
     port = free_port()

@@ -80,7 +80,11 @@ class Frame:
     def without_images(self) -> "Frame":
         """The same step without pictures, masks and attention, to keep in memory."""
         truth = replace(self.truth, masks={}, hand={})
-        return replace(self, images={}, prompted={}, tracks={}, truth=truth, attention={})
+        tracks = {
+            camera: tuple(replace(track, mask=None) for track in of_view)
+            for camera, of_view in self.tracks.items()
+        }
+        return replace(self, images={}, prompted={}, tracks=tracks, truth=truth, attention={})
 
 
 @value

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 from vap_core.base.condition import rows_matching
 from vap_core.base.errors import BadOutput, BadStudy
 from vap_core.base.tables import align
+from vap_core.evaluation.corrections import with_corrections
 from vap_core.evaluation.publish import read_runs, scene_of
 from vap_core.evaluation.report.failures import (
-    PLAYED,
     SUBGOAL,
     breakdown,
     breakdown_rows,
@@ -92,7 +92,7 @@ def list_failures(
     manifests, once = _read_once(sources)
     older = undiagnosed(once)
     known = diagnosed(once).reset_index(drop=True)
-    all_episodes = _with_corrections(_with_folders(known))
+    all_episodes = with_corrections(_with_folders(known))
     selected = all_episodes
     for column, wanted in (("suite", suite), ("task", task), ("method", method)):
         selected = _select(selected, column, wanted)
@@ -108,7 +108,7 @@ def list_failures(
         all_episodes=all_episodes,
         episodes=selected,
         table=table.reset_index(drop=True),
-        notes=(*_notes_of_older(older), *_notes_of_old_corrections(sources)),
+        notes=tuple(_notes_of_older(older)),
     )
 
 
@@ -222,55 +222,6 @@ def _table_folder(source: str) -> Path:
 
 def _folder_name(label: object) -> str:
     return re.sub(UNSAFE, "-", str(label))
-
-
-def _notes_of_old_corrections(sources: Sequence[Path]) -> list[str]:
-    """A sentence on the corrections of each published table that earlier versions wrote.
-
-    They do not name their run: another table of that file name can have written them.
-    """
-    notes = []
-    for base in dict.fromkeys(_table_folder(str(s)) for s in sources if _is_published(str(s))):
-        old = [*base.glob("corrections/*.rrd"), *base.glob("*/corrections/*.rrd")]
-        if old:
-            notes.append(
-                f"not counted: corrections of an earlier version in {base} ({len(old)}), which do "
-                "not name their run; correct again, or move each to DIGEST/POLICY/corrections."
-            )
-    return notes
-
-
-def _with_corrections(table: "pd.DataFrame") -> "pd.DataFrame":
-    """With the corrections of researchers, marked in the column `corrected`.
-
-    A correction holds for the episode, method and policy that were recorded, in the folder where it
-    lies.
-    """
-    from vap_core.recording import read_corrections, recording_file_name
-
-    table = table.assign(corrected=False)
-    failed = table[table["outcome"].eq("failure")]
-    for folder, part in failed.groupby("folder", sort=False):
-        corrections = read_corrections(Path(str(folder)))
-        if not corrections:
-            continue
-        for index, row in part.iterrows():
-            correction = corrections.get(recording_file_name(*row[PLAYED]))
-            # A layer that does not name its policy holds where it lies.
-            if correction is None or correction.policy not in ("", row.get("policy")):
-                continue
-            episode = f"{row['suite']}.{row['task']}.{row['episode']:03d}.s{row['seed']}"
-            if not correction.recording.startswith(f"{episode}.{row['method']}."):
-                continue  # copied from another recording's
-            cells = {
-                "case": correction.case,
-                "sub_case": correction.sub_case,
-                "case_sentence": correction.note,
-                "case_confidence": 1.0,
-                "corrected": True,
-            }
-            table.loc[index, list(cells)] = list(cells.values())
-    return table
 
 
 def _select(table: "pd.DataFrame", column: str, wanted: Any) -> "pd.DataFrame":

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadRecording, BadStudy
 from vap_core.base.files import take_name, writing
+from vap_core.evaluation.corrections import correct
 from vap_core.evaluation.diagnosis import explain
 from vap_core.evaluation.diagnosis.failures import (
     Failures,
@@ -134,21 +135,12 @@ def _opening_frame(failures: Failures, number: int, recording: Path) -> int:
 
 
 def correct_failure(failures: Failures, number: int, case: str, note: str = "") -> Path:
-    """Correct the case of a listed failure, to "case 3: slip" for example.
+    """Correct the case of a listed failure, to "case 3: slip" for example; returns the table.
 
-    The correction is a layer beside the recording.
-
-    Returns: the layer's path.
-
-    Raises: BadStudy, UnknownName.
+    Raises: BadStudy, UnknownName, BadOutput.
     """
-    from vap_core.recording import Correction, write_correction
-
-    name, _, sub_case = case.partition(":")
-    # A wrong name is said before the episode is run again.
-    correction = Correction(name.strip(), sub_case.strip(), note)
-    path, frame = recording_to_show(failures, number)
-    return write_correction(path, correction, frame)
+    row = failure_row(failures, number)
+    return correct(Path(row["folder"]), row, case, note)
 
 
 def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
@@ -205,7 +197,7 @@ def _summary(recording: Path) -> dict[str, Any]:
 
     Raises: BadRecording, where the rights to read it are missing.
     """
-    from vap_core.recording.isolated import read_summaries
+    from vap_core.recording import read_summary
 
     try:
         if recording.is_file():
@@ -215,8 +207,9 @@ def _summary(recording: Path) -> dict[str, Any]:
             f"diagnose: {recording} cannot be read ({error.strerror}); give yourself the right to "
             "read it, or move it away."
         ) from error
-    ((_, summary, _),) = read_summaries([recording])
-    return summary or {}
+    with suppress(BadRecording):
+        return read_summary(recording)
+    return {}
 
 
 def _keep_beside(path: Path) -> Path:

@@ -6,7 +6,7 @@ Pictures are inside the page; links to recordings are relative to its folder.
 import base64
 import os
 from collections.abc import Generator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from html import escape
 from io import BytesIO
 from itertools import islice
@@ -132,24 +132,18 @@ def _recorded(
     Files of runs of other policies have the same name; one that is damaged, unfinished or of
     another episode is none.
     """
-    from vap_core.recording import isolated, recording_file_name
+    from vap_core.recording import read_summary, recording_file_name
 
-    candidates = []
-    for number, row in enumerate(rows):
+    for row in rows:
         name = recording_file_name(
             row["suite"], row["task"], int(row["episode"]), int(row["seed"]), row["method"]
         )
         for source in sources:
             path = Path(source) / "recordings" / name
-            if path.is_file():
-                candidates.append((number, path))
-    found = -1
-    summaries = isolated.read_summaries([path for _, path in candidates])
-    with closing(summaries):
-        for (number, _), (path, summary, _) in zip(candidates, summaries, strict=True):
-            if number != found and not why_other(summary or {}, rows[number]):
-                found = number
-                yield rows[number], path
+            with suppress(BadRecording):
+                if path.is_file() and not why_other(read_summary(path), row):
+                    yield row, path
+                    break
 
 
 def _card(row: Mapping[str, Any], recording: Path, out: Path) -> str:
