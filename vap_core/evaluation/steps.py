@@ -21,8 +21,6 @@ from vap_core.rollout.types import Episode, SubGoalSpan
 if TYPE_CHECKING:
     import pandas as pd
 
-    from vap_core.evaluation.jobs import Rows
-
 FOLDER = "steps"
 QUESTIONS = {
     "narrow-vote": "margin < 0.05 and outcome = 'failure'",
@@ -41,7 +39,7 @@ order by suite, task, episode, seed, method
 """
 
 
-def step_rows(episode: Episode) -> "Rows":
+def step_rows(episode: Episode) -> list[dict[str, Any]]:
     """A row for each step and camera.
 
     `margin` is that of the present sub-goal's vote, `covers` the object under the prompt, "" for
