@@ -90,13 +90,3 @@ def three(tmp_path_factory: pytest.TempPathFactory) -> "tuple[Path, EpisodeHeade
 
     path, start = tmp_path_factory.mktemp("three") / "three.rrd", opening(3)
     return path, start, record(path, start)
-
-
-@pytest.fixture(autouse=True, scope="session")
-def own_log_of_readings(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Runs of tests are no readings of the lists: they are logged apart, and reports show none."""
-    from vap_core.evaluation import readings
-
-    folder = tmp_path_factory.mktemp("readings")
-    readings.LOCAL = folder / "local.csv"
-    readings.PUBLISHED = folder / "published.csv"

@@ -9,8 +9,9 @@ import pytest
 
 from tests.test_lists import gap_m
 from vap_core.base.errors import BadStudy, UnknownName
-from vap_core.evaluation import layouts, readings
+from vap_core.evaluation import layouts
 from vap_core.evaluation.policy_names import shipped
+from vap_core.evaluation.same_weights import weights_by_suite
 from vap_core.evaluation.study import Study
 from vap_core.policies.scripted.random import Random
 from vap_core.rollout.loop import Trial, rollout
@@ -80,21 +81,18 @@ def test_its_objects_keep_apart(name: str) -> None:
     assert least >= 0.02
 
 
-def test_a_development_list_has_the_policy_of_its_benchmark_and_is_not_logged() -> None:
+def test_a_development_list_has_the_policy_of_its_benchmark() -> None:
     study = Study((("vlabench-dev", "select-shoe"),), ("generic",), policy="random")
     configuration = study.configuration()
     assert configuration["lists"] == {"vlabench-dev": lists.digest("vlabench-dev")}
-    assert readings.readings_of(configuration, "run") == []
     assert shipped("vlabench-dev-absent") == shipped("vlabench")
     absent = Study((("vlabench-absent", "select-shoe"),), ("generic",), policy="random")
-    (line,) = readings.readings_of(absent.configuration(), "run")
-    assert (line.suite, line.rows) == ("vlabench-absent", 50)
-    assert lists.digest("vlabench").startswith(line.list)
+    assert absent.configuration()["lists"] == {"vlabench-absent": lists.digest("vlabench")}
     pair = {
         "tasks": [["vlabench", "select-shoe"], ["vlabench-absent", "select-shoe"]],
         "methods": ["vap"], "episodes": 2, "checkpoints": ["a" * 64],
     }  # fmt: skip
-    assert {each.weights for each in readings.readings_of(pair, "run")} == {"a" * readings.SHORT}
+    assert set(weights_by_suite(pair).values()) == {"a" * 12}
 
 
 def test_names_of_suites() -> None:

@@ -11,7 +11,6 @@ from vap_core.evaluation.ablations.arms import ABLATIONS
 from vap_core.evaluation.ablations.table import policy_results
 from vap_core.evaluation.metrics import rate
 from vap_core.evaluation.publish import read_published, read_runs
-from vap_core.evaluation.readings import read_log
 from vap_core.evaluation.report.runs import load_runs
 from vap_core.evaluation.statistics import ALL_TASKS, compare, rate_over_layouts
 from vap_core.policies.names import shipped_checkpoint
@@ -234,12 +233,6 @@ def test_the_runs_of_a_policy_are_counted_as_its_table_holds_them() -> None:
         counts |= {len(digests) for digests in runs.values()}
     assert counts == {2, 3}
     assert "It was run, in two or three runs a policy, by" in prose
-    log = read_log(RESULTS / "readings.csv")
-    wide = [line for line in log if line.weights == "9a311f4c1857" and line.rows == 460]
-    listed = [line for line in wide if not line.what_for.startswith("other starts")]
-    arms = [line for line in listed if line.what_for.startswith("arms of ablate")]
-    assert "wide in eleven, seven of them of `ablate`'s arms, and in one from other starts" in prose
-    assert (len(wide) - len(listed), len(listed), len(arms)) == (1, 11, 7)
 
 
 def test_no_zero_of_the_shared_scenes_hides_a_success() -> None:

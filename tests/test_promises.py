@@ -14,7 +14,7 @@ import vap_core
 from vap_core import memory
 from vap_core.base import files, parquet
 from vap_core.base.errors import LONGEST, BadMemory, BadObject, BadOutput, BadSuite, one_of
-from vap_core.evaluation import readings, store
+from vap_core.evaluation import store
 from vap_core.instruction import history
 from vap_core.policies.mini_pi0 import token_file
 from vap_core.recording import viewer
@@ -142,7 +142,7 @@ def test_limits_of_time_are_of_a_clock_that_nobody_sets() -> None:
             if name in ("time.time", "datetime.now", "datetime.utcnow", "date.today"):
                 of_the_day.add(path.name)
     assert of_the_day == {
-        "files.py", "readings.py", "photos.py", "measurement.py", "context.py", "failure_picker.py"
+        "files.py", "photos.py", "measurement.py", "context.py", "failure_picker.py"
     }  # fmt: skip
 
 
@@ -270,7 +270,6 @@ READS_WHOLE_FILES = {
     "token": (lambda path: token_file.load(path.parent, "mug", "model"), "mug.token.safetensors", BadMemory),
     "history": (lambda path: history.read_uses(path.parent), history.FILE, BadMemory),
     "run": (lambda path: store.read_manifest(path.parent), store.MANIFEST, BadOutput),
-    "log": (readings.read_log, "readings.csv", BadOutput),
 }  # fmt: skip
 
 

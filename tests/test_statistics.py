@@ -8,11 +8,10 @@ import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import binom, binomtest, norm, permutation_test
+from scipy.stats import norm, permutation_test
 from statsmodels.stats.multitest import multipletests
 
 from vap_core.evaluation.layouts import layout_name, layout_names
-from vap_core.evaluation.metrics import intervals, rate
 from vap_core.evaluation.power import (
     detectable_effect_text,
     minimum_detectable_effect,
@@ -28,29 +27,6 @@ from vap_core.evaluation.statistics import (
     sign_flip,
 )
 from vap_core.simulation import suites
-
-
-@given(st.integers(1, 400).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
-def test_the_conservative_interval_is_scipys_exact_one(kn: tuple[int, int]) -> None:
-    k, n = kn
-    ours, theirs = rate(k, n, conservative=True), binomtest(k, n).proportion_ci(method="exact")
-    assert (ours.low, ours.high) == (
-        pytest.approx(theirs.low, abs=1e-9),
-        pytest.approx(theirs.high, abs=1e-9),
-    )
-
-
-def test_the_conservative_interval_never_covers_less_than_it_says_and_wilsons_does() -> None:
-    n, shares = 20, np.linspace(0.01, 0.99, 99)
-    covered = {}
-    for conservative in (True, False):
-        low, high = intervals(np.arange(n + 1), np.full(n + 1, n), conservative=conservative)
-        inside = (low[:, None] <= shares) & (shares <= high[:, None])
-        covered[conservative] = (binom.pmf(np.arange(n + 1)[:, None], n, shares) * inside).sum(
-            axis=0
-        )
-    assert covered[True].min() >= 0.95
-    assert covered[False].min() < 0.95 < covered[False].mean() + 0.01
 
 
 def test_mcnemar_by_hand() -> None:

@@ -1,23 +1,9 @@
-"""Rows of text cells as aligned text, Markdown and LaTeX (booktabs); the first is the header."""
+"""Rows of text cells as aligned text and Markdown; the first is the header."""
 
 from collections.abc import Sequence
 
 Rows = Sequence[Sequence[str]]
 """The header first; every row has as many cells."""
-_LATEX = str.maketrans(
-    {
-        "%": r"\%",
-        "&": r"\&",
-        "_": r"\_",
-        "#": r"\#",
-        "$": r"\$",
-        "{": r"\{",
-        "}": r"\}",
-        "\\": r"\textbackslash{}",
-        "~": r"\textasciitilde{}",
-        "^": r"\textasciicircum{}",
-    }
-)
 
 
 def align(rows: Rows) -> str:
@@ -31,16 +17,6 @@ def markdown(rows: Rows) -> str:
     for row in rows:
         safe.append([cell.replace("|", "\\|") for cell in row])
     return _render(safe, "github")
-
-
-def latex(rows: Rows) -> str:
-    """A booktabs tabular."""
-    return _render(rows, "latex_booktabs") + "\n"
-
-
-def escape(cell: str) -> str:
-    """Text as LaTeX source that prints it unchanged."""
-    return cell.translate(_LATEX)
 
 
 def signed(value: float, digits: int = 0) -> str:

@@ -28,7 +28,6 @@ from vap_core.cli.studies import (
     Seed,
     SplitName,
     Video,
-    WhatFor,
     all_tasks,
     check_quickly,
     default_folder,
@@ -102,7 +101,6 @@ def rollout(
     encoder: EncoderName = "",
     tracker: TrackerName = "",
     object: OwnObject = "",
-    what_for: WhatFor = "",
 ) -> None:
     """Run tasks of a suite in closed loop, record every episode, and print the table.
 
@@ -135,7 +133,6 @@ def rollout(
         record_option=record,
         retries=retries,
         policy_timeout_s=policy_timeout,
-        what_for=what_for,
         video=video,
         attention=attention,
     )
@@ -226,7 +223,6 @@ def evaluate(
     tracker: TrackerName = "",
     object: OwnObject = "",
     split: SplitName = "",
-    what_for: WhatFor = "",
 ) -> None:
     """Run whole suites, and print the table with 95 % intervals. Interrupted, the same command goes
     on. With --object, the tasks of its category.
@@ -280,7 +276,6 @@ def evaluate(
         retries=retries,
         policy_timeout_s=policy_timeout,
         address=address,
-        what_for=what_for,
         video=video,
         attention=attention,
     )

@@ -63,7 +63,7 @@ def eval_perception(
 @app.command("photos")
 def eval_photos(
     folder: Annotated[
-        Path | None,
+        Path,
         typer.Argument(
             help="Holds references/OBJECT/*.jpg; scenes/*.jpg; scenes.csv with a line "
             "scene,object,x0,y0,x1,y1 for every object of every scene, without box where the "
@@ -71,15 +71,7 @@ def eval_photos(
             "OBJECT/FILE) and objects.csv with object,category (else an object's name is its "
             "kind), masks/SCENE/OBJECT.png. Pixels of the upright photo, far corner exclusive.",
         ),
-    ] = None,
-    benchmark: Annotated[
-        str,
-        typer.Option(help="Instead of a folder: pods, 70 things at home, fetched once (170 MB)."),
-    ] = "",
-    origin: Annotated[
-        Path | None,
-        typer.Option("--from", help="A copy of the benchmark, where there is no internet."),
-    ] = None,
+    ],
     stack: StackName = "embedded",
     clips: Annotated[
         bool,
@@ -101,23 +93,9 @@ def eval_photos(
 
     Example: python -m vap_core measure photos my-photos
     Example: python -m vap_core measure photos my-photos --clips
-    Example: python -m vap_core measure photos --benchmark pods --stack foundation
     """
-    from vap_core.base.errors import BadPhotoSet, one_of
-    from vap_core.evaluation.photos.pods import pods
     from vap_core.evaluation.photos.run import measure_photos
-    from vap_core.perception.foundation.store import check_present
-    from vap_core.perception.stacks import check_stack
 
-    benchmarks = {"pods": pods}
-    if benchmark and benchmark not in benchmarks:
-        raise one_of("measure photos: benchmark", benchmark, benchmarks)
-    if (folder is None) == (not benchmark):
-        raise BadPhotoSet("measure photos: give a folder or --benchmark pods, one of the two.")
-    if folder is None:
-        check_stack(stack)
-        check_present(stack)
-        folder = benchmarks[benchmark](origin=origin)
     folder_of_run = out or Path(f"data/runs/photos-{folder.resolve().name}")
     print(measure_photos(folder, folder_of_run, stack, clips=clips))
 

@@ -110,12 +110,6 @@ SplitName = Annotated[
         "aggregation'. Default all.",
     ),
 ]
-WhatFor = Annotated[
-    str,
-    typer.Option(
-        "--what-for", help="Why the list is read, in a few words, for the log of readings."
-    ),
-]
 
 
 def check_quickly(suite_names: list[str], policy: str | None, record: str | None) -> None:
@@ -227,7 +221,6 @@ def run_study(
     retries: int,
     policy_timeout_s: float | None = None,
     address: str | None = None,
-    what_for: str = "",
     video: bool = False,
     attention: str = "",
 ) -> None:
@@ -272,7 +265,6 @@ def run_study(
         retries=retries,
         policy_timeout_s=policy_timeout_s,
         executor=ray_executor(address) if address else results,
-        what_for=what_for,
         video=video,
         attention=queries,
     )

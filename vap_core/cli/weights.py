@@ -5,8 +5,6 @@ from typing import Annotated
 
 import typer
 
-from vap_core.cli.options import DetectorName, EncoderName, StackName, TrackerName, stack_of
-
 app = typer.Typer(
     no_args_is_help=True,
     help="The foundation stack's weights: what is there, and how to get the rest; the embedded "
@@ -57,30 +55,6 @@ def pull_weights(
     from vap_core.perception.foundation.store import store_folder
 
     pull(models_of(stack), store_folder(), origin=origin, unpinned=unpinned)
-
-
-@app.command("verify")
-def verify_weights(
-    stack: StackName = "foundation",
-    detector: DetectorName = "",
-    encoder: EncoderName = "",
-    tracker: TrackerName = "",
-) -> None:
-    """Run a stack on three known photos with hand-drawn boxes: does it work on this machine?
-
-    Example: python -m vap_core weights verify --stack foundation-small
-    """
-    from vap_core.evaluation.photos.verify import verify_stack
-
-    checks, seconds = verify_stack(stack_of(stack, detector, encoder, tracker))
-    for check in checks:
-        print(check)
-    if all(check.stored is None for check in checks):
-        print("no figures of this stack are stored from elsewhere: the drawn boxes are the measure")
-    failed = sum(not check.holds for check in checks)
-    print(f"{len(checks) - failed} of {len(checks)} hold; {seconds:.1f} s a photo")
-    if failed:
-        raise typer.Exit(1)
 
 
 @app.command("export")

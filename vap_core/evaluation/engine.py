@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import WorkerDied
-from vap_core.evaluation import readings, store
+from vap_core.evaluation import store
 from vap_core.evaluation.jobs import BATCH, Job, Record, Rows, row_of_dead_worker, run_job
 from vap_core.evaluation.processes import prepare, results
 from vap_core.evaluation.study import Study
@@ -48,11 +48,8 @@ def run(
     video: bool = False,
     attention: tuple[str, ...] = (),
     policy_timeout_s: float | None = None,
-    what_for: str = "",
 ) -> "pd.DataFrame":
     """Run the episodes of `study` that `folder` lacks, and return the table of all its episodes.
-
-    A run that begins is entered in the log of readings (`readings.LOCAL`), with `what_for`.
 
     Raises: BadOutput when the folder holds another run, is in use or cannot be written; BadPolicy
         when the weights change while it runs; WorkerDied when LONE_DEATHS workers died in a row,
@@ -73,7 +70,7 @@ def run(
             )
         return complete
 
-    _open_run(study, folder, what_for)
+    store.open_run(folder, study.configuration())
     for line in unknown_words_notes(study):
         print(line, file=sys.stderr)
     with store.locked(folder):
@@ -170,16 +167,6 @@ def _split(job: Job) -> list[Job]:
     for row, key in zip(job.rows, job.keys, strict=True):
         singles.append(replace(job, rows=(row,), keys=(key,)))
     return singles
-
-
-def _open_run(study: Study, folder: Path, what_for: str) -> None:
-    """Begin the run in `folder`, or go on with the one there; log once what it reads."""
-    configuration = study.configuration()
-    store.open_run(folder, configuration)
-    run_digest = store.digest(configuration)
-    reads = readings.readings_of(configuration, run_digest, what_for)
-    if reads and run_digest not in {line.run for line in readings.read_log(readings.LOCAL)}:
-        readings.append(reads, readings.LOCAL)
 
 
 def missing_jobs(

@@ -46,11 +46,10 @@ class Rate:
         return f"{_whole_percent(self.value)} % [{low}, {high}]"
 
 
-def intervals(k: Counts, n: Counts, *, conservative: bool = False) -> tuple[Bounds, Bounds]:
+def intervals(k: Counts, n: Counts) -> tuple[Bounds, Bounds]:
     """95 % intervals of k out of n, nan where n is 0.
 
-    Wilson's score intervals; `conservative`: Clopper and Pearson's, which never cover less than
-    95 %.
+    Wilson's score intervals.
     """
     from statsmodels.stats.proportion import proportion_confint
 
@@ -58,16 +57,15 @@ def intervals(k: Counts, n: Counts, *, conservative: bool = False) -> tuple[Boun
     high = np.full(len(n), np.nan)
     some = n > 0
     if some.any():
-        method = "beta" if conservative else "wilson"
-        low[some], high[some] = proportion_confint(k[some], n[some], alpha=0.05, method=method)
+        low[some], high[some] = proportion_confint(k[some], n[some], alpha=0.05, method="wilson")
     return low, high
 
 
-def rate(k: int, n: int, *, conservative: bool = False) -> Rate:
+def rate(k: int, n: int) -> Rate:
     """k out of n with its interval (see `intervals`)."""
     if n == 0:
         return Rate(0, 0, float("nan"), float("nan"), float("nan"))
-    low, high = intervals(np.array([k]), np.array([n]), conservative=conservative)
+    low, high = intervals(np.array([k]), np.array([n]))
     return Rate(k, n, k / n, float(low[0]), float(high[0]))
 
 

@@ -10,7 +10,6 @@ import numpy as np
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import check_regular, parse_json, write_atomic
 from vap_core.evaluation.measurements import encode_table
-from vap_core.evaluation.readings import FILE, publish_readings
 from vap_core.evaluation.run_schema import check_run, require_episodes
 from vap_core.evaluation.store import KEY, read, read_manifest
 from vap_core.simulation import suites
@@ -106,12 +105,11 @@ def publish(
     """Write every episode of the runs, with their manifests in the file's metadata.
 
     A source is a run's folder, or a table that `publish` wrote, whose runs are taken as they are.
-    Tracebacks, wall times and memory use are left out. What the runs read of shipped lists is
-    entered in the log beside the table (readings.publish_readings). With `supersede`, a method that
-    later sources have read again, for all the same episodes and with the same policy, leaves the
-    earlier source (`superseded` in its manifest). Of the runs only those of `suite_names`, and of
-    each only its `methods` (the others are `left_out` in its manifest, and may be unfinished), are
-    taken, where these are given.
+    Tracebacks, wall times and memory use are left out. With `supersede`, a method
+    that later sources have read again, for all the same episodes and with the same policy, leaves
+    the earlier source (`superseded` in its manifest). Of the runs only those of `suite_names`, and
+    of each only its `methods` (the others are `left_out` in its manifest, and may be unfinished),
+    are taken, where these are given.
 
     Returns: the number of episodes.
 
@@ -157,7 +155,6 @@ def publish(
         b"runs": json.dumps(manifests, sort_keys=True).encode(),
     }
     _write(whole.replace_schema_metadata(metadata), target, replace)
-    publish_readings(manifests, target.with_name(FILE))
     return whole.num_rows
 
 

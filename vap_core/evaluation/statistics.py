@@ -193,7 +193,7 @@ def bootstrap_interval(gain: PerCluster, n: PerCluster, least: float = -1.0) -> 
     means = gain / n
     if np.ptp(means) == 0:
         centre = float(means[0])
-        unseen = rate(0, len(means), conservative=True).high
+        unseen = 1 - 0.025 ** (1 / len(means))
         return centre - unseen * (centre - least), centre + unseen * (1 - centre)
 
     def mean_gain(gains: np.ndarray, counts: np.ndarray, axis: int = -1) -> Any:

@@ -94,8 +94,7 @@ def run_arms(
         for arm in ABLATIONS[name].names:
             of_arm = replace(with_policy, methods=(arm,))
             folder = arm_folder(with_policy, root, arm)
-            what_for = f"ablate {name}"
-            tables.append(run(of_arm, folder, workers=workers, record=record, what_for=what_for))
+            tables.append(run(of_arm, folder, workers=workers, record=record))
     columns = dict.fromkeys(chain.from_iterable(tables))
     kept = [table.dropna(axis="columns", how="all") for table in tables]
     return pd.concat(kept, ignore_index=True).reindex(columns=list(columns))

@@ -177,7 +177,6 @@ def _episodes(study: Study, out: Path) -> Rows:
         record="none",
         progress=False,
         executor=results_here,
-        what_for=CALLER,
     )
     found: Rows = []
     for row in table.to_dict("records"):

@@ -1,4 +1,4 @@
-"""The report over finished runs: Markdown, a page, tables as CSV and LaTeX, pictures."""
+"""The report over finished runs: Markdown, a page, tables as CSV, pictures."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,29 +6,26 @@ from typing import TYPE_CHECKING
 
 from vap_core.base.figures import write_png
 from vap_core.base.files import write_atomic, writing
-from vap_core.base.tables import latex
 from vap_core.evaluation.metrics import RATES
-from vap_core.evaluation.readings import readings_of_lists
 from vap_core.evaluation.report import sections
-from vap_core.evaluation.report.cells import comparison_rows, outcome_rows, result_rows, track_title
-from vap_core.evaluation.report.latex import main_tables
+from vap_core.evaluation.report.cells import outcome_rows, result_rows, track_title
 from vap_core.evaluation.report.page import report_page
 from vap_core.evaluation.report.pictures import differences_figure, forest_figure
 from vap_core.evaluation.report.provenance import provenance
 from vap_core.evaluation.report.results import comparisons, outcomes, paper_results, results
-from vap_core.evaluation.report.runs import Runs, load_runs
+from vap_core.evaluation.report.runs import load_runs
 from vap_core.evaluation.statistics import compare
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-COMPARISON_FILES = ("paired.png", "comparisons.csv", "comparisons.tex")
+COMPARISON_FILES = ("paired.png", "comparisons.csv")
 """What only a report that compares methods has."""
 
 
 def report(sources: Sequence[Path], out: Path) -> str:
-    """Write report.md and report.html, its tables as CSV and LaTeX, forest.png and paired.png.
+    """Write report.md and report.html, its tables as CSV, forest.png and paired.png.
 
     Returns report.md.
 
@@ -53,16 +50,13 @@ def report(sources: Sequence[Path], out: Path) -> str:
         sections.comparisons_section(differences),
         sections.abstention_section(runs),
         sections.pictures_section(with_differences=bool(compared)),
-        sections.readings_section(readings_of_lists(_lists(runs))),
         sections.provenance_section(origins),
     ]
     text = "\n\n".join(filter(None, parts))
     files = {
         "report.md": f"{text}\n",
         "results.csv": _csv_text(lines, fractions=_rate_columns()),
-        "results.tex": main_tables(lines, published),
         "outcomes.csv": _csv_text(ends),
-        "outcomes.tex": latex(outcome_rows(ends)),
         "provenance.csv": _csv_text(origins),
     }
     figures = {"forest.png": forest_figure(lines)}
@@ -78,19 +72,10 @@ def report(sources: Sequence[Path], out: Path) -> str:
     )
     if compared:
         files["comparisons.csv"] = _csv_text(differences, fractions=["difference", "low", "high"])
-        files["comparisons.tex"] = latex(comparison_rows(differences))
         against_first = [c for c in compared if c.one == compared[0].one]
         figures["paired.png"] = differences_figure(against_first)
     _write(out, files, figures)
     return text
-
-
-def _lists(runs: Runs) -> set[str]:
-    """The digests of the lists that some runs read."""
-    digests: set[str] = set()
-    for manifest in runs.manifests.values():
-        digests.update(manifest["configuration"].get("lists", {}).values())
-    return digests
 
 
 def _rows_by_track(lines: "pd.DataFrame") -> dict[str, list[list[str]]]:
@@ -114,8 +99,7 @@ def _rate_columns() -> list[str]:
     columns = ["sr_layout_low", "sr_layout_high", "paper_sr", "paper_cmr"]
     for name in RATES:
         columns.append(name)
-        for interval in ("", "_cp"):
-            columns += [f"{name}{interval}_low", f"{name}{interval}_high"]
+        columns += [f"{name}_low", f"{name}_high"]
     return columns
 
 

@@ -33,7 +33,7 @@ def results(runs: Runs) -> "pd.DataFrame":
     After the tasks of each track that has several, rows of ALL_TASKS follow; their `listed` counts
     the tasks that any method of the track was asked for. `n` of `listed` episodes were run, `asked`
     were asked for. `sr_k` of `sr_n` episodes succeed; `sr_low` and
-    `sr_high` are Wilson's, `sr_cp_*` Clopper and Pearson's. `sr_layout_*` is the cluster bootstrap
+    `sr_high` are Wilson's. `sr_layout_*` is the cluster bootstrap
     over starting layouts where a layout was run more than once, else nan. `bound` marks a method or
     policy that reads the simulator. `paper_*` are the paper's numbers.
 
@@ -138,12 +138,11 @@ def _count_columns() -> dict[str, str]:
 
 
 def _add_rate(lines: "pd.DataFrame", name: str) -> None:
-    """Add a rate with Wilson's, and with Clopper and Pearson's interval."""
+    """Add a rate with Wilson's interval."""
     k = lines[f"{name}_k"].to_numpy()
     n = lines[f"{name}_n"].to_numpy()
     lines[name] = np.divide(k, n, out=np.full(len(k), np.nan), where=n > 0)
     lines[f"{name}_low"], lines[f"{name}_high"] = intervals(k, n)
-    lines[f"{name}_cp_low"], lines[f"{name}_cp_high"] = intervals(k, n, conservative=True)
 
 
 def _with_totals(runs: Runs) -> "tuple[pd.DataFrame, pd.DataFrame]":

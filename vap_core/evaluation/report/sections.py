@@ -1,13 +1,11 @@
 """The sections of a report as Markdown."""
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from vap_core.base.tables import markdown
 from vap_core.evaluation import paper
 from vap_core.evaluation.abstention import abstention_rows, abstentions
 from vap_core.evaluation.metrics import TRACK
-from vap_core.evaluation.readings import Reading, readings_rows
 from vap_core.evaluation.report.cells import (
     comparison_rows,
     outcome_rows,
@@ -26,9 +24,8 @@ RESULTS_NOTE = (
     "- n: episodes that were run, of those in the suite's whole list; all tasks: of the whole "
     "lists of every task that any method here was asked for.\n"
     "  An error is no success and stays in n; an episode that was not run is not in n.\n"
-    "- SR, CMR, wrong object: % of n with Wilson's 95 % interval (results.csv has Clopper and "
-    "Pearson's, too). CMR is not defined for selections, where a touch counts as a wrong object, "
-    "too.\n"
+    "- SR, CMR, wrong object: % of n with Wilson's 95 % interval. CMR is not "
+    "defined for selections, where a touch counts as a wrong object, too.\n"
     "- (bound): the method or the policy reads the simulator; it bounds what results can be, and "
     "is none.\n"
     "- over layouts: 95 % interval of SR with the starting layouts drawn again (bootstrap), where "
@@ -60,11 +57,6 @@ FAILURES_NOTE = (
 ABSTENTION_NOTE = (
     "If the robot did not act where the vote's margin at t = 0, the least of all views, is below a "
     "threshold. The episodes without a target are those of NAME-absent."
-)
-
-READINGS_NOTE = (
-    "Every reading of these lists, with any weights: a list that was read while something was "
-    "tuned is no test of it any more."
 )
 
 
@@ -158,10 +150,3 @@ def abstention_section(runs: Runs) -> str:
     if not found:
         return ""
     return f"## Abstention\n\n{ABSTENTION_NOTE}\n\n{markdown(abstention_rows(found))}"
-
-
-def readings_section(readings: Sequence[Reading]) -> str:
-    """How often the lists of the report were read; "" where none of them ships."""
-    if not readings:
-        return ""
-    return f"## Readings of the lists\n\n{READINGS_NOTE}\n\n{markdown(readings_rows(readings))}"
