@@ -44,8 +44,15 @@ def spread(rows, n: int) -> list:
 
 
 def openings(suite: str, task: str, rows) -> dict[str, str]:
-    from vap_core import Attender, Prompting, get_object, load_stack, open_row, reference_views
-    from vap_core import register
+    from vap_core import (
+        Attender,
+        Prompting,
+        get_object,
+        load_stack,
+        open_row,
+        reference_views,
+        register,
+    )
 
     stack = load_stack("embedded")
     found = {}
