@@ -19,19 +19,6 @@ SHIPPED = (
     "suites",
     "weights",
 )
-LEFT_OUT = (
-    "policies/mini-paligemma",
-    "policies/mini-pi0-simpler-bridge",
-    "policies/mini-pi0-simpler-bridge-tint-free",
-    "policies/mini-pi0-simpler-bridge-wide",
-    "policies/mini-pi0-simpler-fractal",
-    "policies/mini-pi0-simpler-fractal-tint-free",
-    "policies/mini-pi0-tabletop",
-    "policies/mini-pi0-tabletop-wide",
-    "policies/mini-pi0-vlabench",
-    "policies/mini-pi0-vlabench-tint-free",
-)
-"""Studied in notebooks and docs, and named by no command: they stay in the repository alone."""
 
 
 class BuildWithData(build_py):
@@ -49,8 +36,6 @@ class BuildWithData(build_py):
                 copy = target / name
                 copy.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(source, copy)
-        for name in LEFT_OUT:
-            shutil.rmtree(target / name, ignore_errors=True)
 
 
 setup(cmdclass={"build_py": BuildWithData})

@@ -100,8 +100,8 @@ def grounding_table(
 def associations(stack: Stack, mine: PersonalObject, views: Sequence[View]) -> Ways:
     """The views grounded one by one, and once with each pairing.
 
-    The candidates are the same, the choices perhaps others. Geometry is used if all views have
-    `optics`.
+    The candidates are the same, the choices perhaps others. Pairings need the `optics` of all
+    views.
 
     Raises: as `Attender.start`.
     """
@@ -111,9 +111,8 @@ def associations(stack: Stack, mine: PersonalObject, views: Sequence[View]) -> W
         if view.optics is not None:
             optics[view.camera] = view.optics
     ways: dict[str, Pairing | None] = {OFF: None}
-    for name, pairing in PAIRINGS.items():
-        if len(optics) == len(views) or "geometry" not in pairing.terms:
-            ways[name] = pairing
+    if len(optics) == len(views):
+        ways |= PAIRINGS
     found: dict[str, dict[str, Grounding]] = {}
     for name, way in ways.items():
         attender = Attender(stack, {mine.name: mine}, Prompting(associate=way))

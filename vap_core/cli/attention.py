@@ -27,7 +27,7 @@ def attention(
     policy: Annotated[
         str,
         typer.Option(
-            help="Only the policy whose label in the table holds this, such as mini-pi0-tabletop@."
+            help="Only the policy whose label in the table holds this, such as tabletop-longer@."
         ),
     ] = "",
     episodes: Annotated[

@@ -70,8 +70,7 @@ PUBLISHED = frozenset(
     opacity-0.1 opacity-0.3 opacity-0.7 only-red only-blue only-green only-magenta only-cyan
     only-yellow only-orange only-purple hidden-1 hidden-2 hidden-3 hidden-4 hidden-5 hidden-6
     blank-text other-text mask-area-0.25 mask-area-0.5 mask-area-1.5 mask-area-2.0 mask-shifted
-    associated-embedding associated-both associated-decisive associated-likest
-    associated-reliant associated-objects
+    associated-objects
     switched-early switched-moved
 """.split()
 )

@@ -6,7 +6,7 @@ A new arm is a line in `ABLATIONS`: its name is a method that `eval --methods` t
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from vap_core.associate import PAIRINGS, Pairing
+from vap_core.associate import PAIRINGS
 from vap_core.attend import Prompting
 from vap_core.base.types import Colour
 from vap_core.evaluation.ablations.arrow import Arrow
@@ -77,19 +77,6 @@ UNTRAINED = (Colour("orange", (255, 128, 0)), Colour("purple", (128, 0, 255)))
 
 In its films things are painted in them (vap_make.words.PAINTS), and commands name them.
 """
-RELIANT = Pairing(("geometry",), evidence=6.0, reliance=3.0, decisive=1.25)
-"""Chosen on first frames of development layouts alone (vlabench 240, tabletop 224; generic objects
-that nothing was trained on): of the rules tried, the least common errors where contradictions are
-halved. Every view for itself: 3 and 3 errors, 119 and 94 contradictions; so 8 and 8, 56 and 42;
-`associated-decisive` 10 and 11, 66 and 44."""
-OF_OBJECTS = Pairing(
-    ("geometry",), evidence=6.0, reliance=3.0, likest=0.5, hidden=0.5, decisive=1.25
-)
-"""Chosen on first frames of development layouts with 40 generic objects a task that nothing was
-trained on, and their twins (vlabench 400, tabletop 640). Every view for itself: 12 and 14 common
-errors, 199 and 272 contradictions; so 18 and 23, 95 and 99; `RELIANT` 19 and 46, 86 and 100. On
-both development lists, whose objects are others (n = 196): 5 and 97; so 6 and 52; `RELIANT` 11 and
-46."""
 
 
 def _tints() -> dict[str, Arm]:
@@ -206,12 +193,7 @@ ABLATIONS: dict[str, Ablation] = {
     "association": Ablation(
         question="Should views agree on one candidate?",
         arms={
-            "associated-embedding": Prompting(associate=PAIRINGS["embedding"]),
-            "associated-both": Prompting(associate=Pairing(("embedding", "geometry"))),
-            "associated-decisive": Prompting(associate=Pairing(("geometry",), decisive=1.0)),
-            "associated-likest": Prompting(associate=Pairing(("geometry",), likest=1.0)),
-            "associated-reliant": Prompting(associate=RELIANT),
-            "associated-objects": Prompting(associate=OF_OBJECTS),
+            "associated-objects": Prompting(associate=PAIRINGS["objects"]),
         },
         methods=(DEFAULT, "vap-associated"),
         suites=("vlabench", "tabletop"),

@@ -106,7 +106,6 @@ def _sightings(
     for view, of_view in zip(episode, candidates, strict=True):
         sightings[view.camera] = Sighting(
             cosine=election_scores(compare(personal, of_view, stack), of_view.boxes),
-            embeddings=of_view.embeddings,
             xyxy=of_view.boxes.xyxy,
             camera=view.optics,
         )
