@@ -23,7 +23,6 @@ from vap_core.analysis.ablations import (
     rates_of_arms_figure,
     sweep_figure,
 )
-from vap_core.analysis.agreements import gate_figure, gated_cases
 from vap_core.attend import Prompting
 from vap_core.base.errors import BadOutput, BadStudy
 from vap_core.base.tables import signed
@@ -589,22 +588,3 @@ def test_policies_stand_side_by_side_and_each_is_compared_with_itself() -> None:
     assert len(twice.containers) == 2 * len(axes.containers)
     assert [label.get_text() for label in axes.get_xticklabels()] == ["share-0", "share-0.5"]
     assert [len(bars.lines[0].get_xdata()) for bars in axes.containers] == [2, 2]
-
-
-def test_views_agree_only_where_the_margin_is_large_enough() -> None:
-    rows = []
-    for episode, (alone, joint, margin) in enumerate(
-        [("case 2", "right", 2.0), ("case 2", "case 1", 0.5), ("right", "right", 0.1),
-         ("case 1", "case 1", np.nan)]
-    ):  # fmt: skip
-        for way, case in (("off", alone), ("geometry", joint)):
-            rows.append({"suite": "s", "task": "t", "episode": episode, "associate": way,
-                         "case": case, "margin": margin if way != "off" else np.nan})  # fmt: skip
-    cases = gated_cases(pd.DataFrame(rows), "geometry", [0.0, 1.0, np.inf])
-    assert cases[["right", "case 1", "case 2"]].to_numpy().tolist() == [
-        [2, 2, 0],
-        [2, 1, 1],
-        [1, 1, 2],
-    ]
-    (part,) = gate_figure(pd.DataFrame(rows), "geometry").axes
-    assert part.get_title() == "s, n 4"

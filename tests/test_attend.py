@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.toys import TOYS, SameColour, personal, scene
+from tests.toys import TOYS, SameColour, overhead, personal, scene
 from vap_core.associate import PAIRINGS, compare_views
 from vap_core.attend import Attender, Prompting
 from vap_core.base.errors import BadInstruction, BadStudy, BadViews, UnknownName
 from vap_core.base.events import is_lost
-from vap_core.base.types import Attended, Boxes, Camera, Colour, Grounding, Rgb, Views
+from vap_core.base.types import Attended, Boxes, Colour, Grounding, Rgb, Views
 from vap_core.evaluation.ablations.forms import NumberedMarker
 from vap_core.perception.protocols import Thresholds
 from vap_core.perception.stacks import load_stack
@@ -452,13 +452,6 @@ def test_what_cannot_be_matched_is_said() -> None:
     assert attended.groundings["front"][0].winner == 0
 
 
-def overhead(name: str, x: float) -> Camera:
-    """Looks straight down from 1 m above (x, 0), 64 x 64 pixels of 1 / 64 m."""
-    pose = np.diag([1.0, -1.0, -1.0, 1.0])
-    pose[:3, 3] = x, 0.0, 1.0
-    return Camera(name, 64, 64, np.array([[64.0, 0, 32], [0, 64.0, 32], [0, 0, 1]]), pose)
-
-
 DIM, TEALISH, MOSS = (60, 80, 70), (55, 115, 100), (50, 115, 95)
 CAMERAS = {
     "front": overhead("front", 0.0),
@@ -587,7 +580,7 @@ def test_each_of_several_targets_is_associated_by_itself() -> None:
 def test_views_that_cannot_be_associated_are_said() -> None:
     attender = Attender(TOYS, MEMORY, Prompting(associate=PAIRINGS["geometry"]))
     with pytest.raises(
-        BadViews, match="geometry needs calibrated cameras; give Attender.start cameras="
+        BadViews, match="associate: needs calibrated cameras; give Attender.start cameras="
     ):
         attender.start(CONTRADICTING, "bring my cup")
     misnamed = {name.upper(): camera for name, camera in CAMERAS.items()}

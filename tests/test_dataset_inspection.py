@@ -17,7 +17,6 @@ from tests.toys import TOYS, SameColour, personal, scene
 from vap_core import memory
 from vap_core.analysis import dataset_inspection
 from vap_core.analysis.dataset_inspection import (
-    ViewReport,
     _stretches,
     inspect_dataset,
     report_table,
@@ -108,11 +107,9 @@ def test_losses_are_told_and_every_episode_is_a_recording(
         (1, "top"): (True, 5, 0, 0),
         (1, "wrist"): (True, 3, 1, 2),
     }
-    assert all(report.agrees for report in reports)
     table = report_table(reports)
     assert "4 of 4 views find the object" in table
     assert "18 of 20 frames, with 1 losses" in table
-    assert "0 of 4 views disagree" in table
     assert [line.split()[:2] for line in table.splitlines()[2:3]] == [["1", "wrist"]]
     assert len((out / "views.csv").read_text().splitlines()) == 5
     for episode in range(2):
@@ -321,21 +318,8 @@ def test_two_features_of_one_camera_are_refused(tmp_path: Path) -> None:
         open_dataset(tmp_path / "twice")
 
 
-def test_stretches_and_views_that_disagree() -> None:
+def test_stretches() -> None:
     assert _stretches([True, False, False, True, False]) == [2, 1]
-    report = ViewReport(
-        episode=3, camera="top", frames=9, grounded=True, likeness=0.5, margin=0.2, tracked=9,
-        losses=0, longest=0, agrees=False,
-    )  # fmt: skip
-    assert "1 of 1 views disagree" in report_table([report])
-
-
-def test_more_views_than_are_chosen_together_are_not_compared(bank: Path) -> None:
-    views = dict.fromkeys("abcde", picture(0, "top", 0))
-    attender = Attender(TOYS, memory.load_bank(bank))
-    _, attended = attender.start(views, TOLD)
-    agrees = dataset_inspection._agreement(attender, views, TOLD, None, attended)
-    assert agrees == dict.fromkeys(views)
 
 
 def test_the_command(recorded: Path, bank: Path, tmp_path: Path) -> None:

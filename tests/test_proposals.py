@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.toys import TOYS, MeanColour, personal, scene
+from tests.toys import TOYS, MeanColour, overhead, personal, scene
 from vap_core.associate import PAIRINGS
 from vap_core.attend import Attender, Prompting
 from vap_core.base.types import Boxes, Rgb
@@ -143,9 +143,10 @@ def test_what_is_in_view_is_tinted_as_ever() -> None:
 
 
 def test_association_does_not_tint_what_is_unlike() -> None:
-    prompting = Prompting(associate=PAIRINGS["embedding"])
+    prompting = Prompting(associate=PAIRINGS["geometry"])
+    cameras = {"front": overhead("front", 0.0), "side": overhead("side", 0.25)}
     _, attended = Attender(STRICT, {"mug": MUG}, prompting).start(
-        {"front": UNLIKE, "side": UNLIKE}, "bring my cup"
+        {"front": UNLIKE, "side": UNLIKE}, "bring my cup", cameras=cameras
     )
     assert [of[0].winner for of in attended.groundings.values()] == [None, None]
     assert attended.text == "bring my cup"

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vap_core.base.types import Boxes, PersonalObject, Rgb, Track, Views
+from vap_core.base.types import Boxes, Camera, PersonalObject, Rgb, Track, Views
 from vap_core.perception.protocols import Stack
 from vap_core.rollout.types import Frame
 from vap_core.simulation.types import Observation, Outcome
@@ -101,3 +101,10 @@ class Kept:
 
     def close(self, outcome: Outcome) -> None:
         pass
+
+
+def overhead(name: str, x: float) -> Camera:
+    """Looks straight down from 1 m above (x, 0), 64 x 64 pixels of 1 / 64 m."""
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[:3, 3] = x, 0.0, 1.0
+    return Camera(name, 64, 64, np.array([[64.0, 0, 32], [0, 64.0, 32], [0, 0, 1]]), pose)

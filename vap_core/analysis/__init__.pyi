@@ -11,8 +11,6 @@ from .ablations import policies_figure as policies_figure
 from .ablations import policy_results as policy_results
 from .ablations import rates_of_arms_figure as rates_of_arms_figure
 from .ablations import sweep_figure as sweep_figure
-from .agreements import gate_figure as gate_figure
-from .agreements import gated_cases as gated_cases
 from .box_widget import drag_box as drag_box
 from .box_widget import dragged_box as dragged_box
 from .controls import Abstention as Abstention

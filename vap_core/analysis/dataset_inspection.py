@@ -1,7 +1,7 @@
 """What the method would show a policy over a dataset's recorded episodes, and where it fails there.
 
 Every episode is grounded in its first frame and tracked through the others, as in the closed loop.
-There is no ground truth: what can be told is whether views elect something, keep it, and agree.
+There is no ground truth: what can be told is whether views elect something and keep it.
 """
 
 import hashlib
@@ -15,12 +15,11 @@ from typing import Any
 from tqdm import tqdm
 
 from vap_core import __version__
-from vap_core.associate import MOST_VIEWS, PAIRINGS
-from vap_core.attend import Attender, AttendState, Prompting
+from vap_core.attend import Attender, AttendState
 from vap_core.base.errors import BadDataset, BadOutput
 from vap_core.base.files import parse_json, write_atomic, writing
 from vap_core.base.tables import Rows, align
-from vap_core.base.types import Attended, PersonalObject, Views, value
+from vap_core.base.types import Attended, PersonalObject, value
 from vap_core.memory import load_bank
 from vap_core.perception.stacks import checksums, load_own
 from vap_core.policies.lerobot.datasets import Copy, Recorded, open_dataset
@@ -35,8 +34,7 @@ class ViewReport:
 
     `grounded` says whether the first frame has the object here, `likeness` how like the references
     the best candidate is, `margin` the vote's. Of `frames` it is tracked in `tracked`; `losses` are
-    the stretches without it after it was grounded, `longest` the frames of the longest. `agrees` is
-    whether a joint choice over all views takes the same candidate; None for a single view.
+    the stretches without it after it was grounded, `longest` the frames of the longest.
     """
 
     episode: int
@@ -48,7 +46,6 @@ class ViewReport:
     tracked: int
     losses: int
     longest: int
-    agrees: bool | None
 
 
 def inspect_dataset(
@@ -124,26 +121,22 @@ def _check_one_task(recorded: Recorded, episodes: int) -> None:
 
 
 def report_table(reports: Iterable[ViewReport]) -> str:
-    """Every view that lost the object, did not find it, or disagrees; and the totals."""
+    """Every view that lost the object, or did not find it; and the totals."""
     rows: list[list[str]] = [_HEADER]
     seen = list(reports)
     for report in seen:
-        if not report.grounded or report.losses or report.agrees is False:
+        if not report.grounded or report.losses:
             rows.append(_cells(report))
     lines = []
     if len(rows) > 1:
         lines.append(align(rows))
     grounded = [report for report in seen if report.grounded]
-    judged = [report for report in seen if report.agrees is not None]
     frames = sum(report.frames for report in grounded)
     tracked = sum(report.tracked for report in grounded)
     lines.append(
         f"{len(grounded)} of {len(seen)} views find the object in their first frame; these track "
         f"it in {tracked} of {frames} frames, with {sum(r.losses for r in grounded)} losses"
     )
-    if judged:
-        against = sum(report.agrees is False for report in judged)
-        lines.append(f"{against} of {len(judged)} views disagree with a joint choice of all views")
     return "\n".join(lines)
 
 
@@ -156,12 +149,10 @@ _HEADER = [
     "tracked",
     "losses",
     "longest",
-    "agrees",
 ]
 
 
 def _cells(report: ViewReport) -> list[str]:
-    agrees = {True: "yes", False: "no", None: "-"}[report.agrees]
     return [
         str(report.episode),
         report.camera,
@@ -171,7 +162,6 @@ def _cells(report: ViewReport) -> list[str]:
         f"{report.tracked}/{report.frames}",
         str(report.losses),
         str(report.longest),
-        agrees,
     ]
 
 
@@ -197,14 +187,12 @@ def _inspect_episode(
     rrd.unlink(missing_ok=True)  # of an inspection that was interrupted, or is copied anew
     state: AttendState | None = None
     first: Attended | None = None
-    agrees: dict[str, bool | None] = {}
     visible: dict[str, list[bool]] = {camera: [] for camera in recorded.keys}
     with DatasetRecorder(rrd, list(recorded.keys), obj.name, recorded.hz) as recorder:
         for frame in recorded.frames(episode):
             if state is None:
                 state, attended = attender.start(frame.views, instruction, objects=objects)
                 first = attended
-                agrees = _agreement(attender, frame.views, instruction, objects, attended)
                 recorder.ground(frame.views, attended, obj, instruction)
             else:
                 state, attended = attender.step(state, frame.views)
@@ -220,13 +208,11 @@ def _inspect_episode(
         writer.end_episode()
     reports = []
     for camera, seen in visible.items():
-        reports.append(_report(episode, camera, first, seen, agrees[camera]))
+        reports.append(_report(episode, camera, first, seen))
     return reports
 
 
-def _report(
-    episode: int, camera: str, first: Attended, seen: Sequence[bool], agrees: bool | None
-) -> ViewReport:
+def _report(episode: int, camera: str, first: Attended, seen: Sequence[bool]) -> ViewReport:
     grounding = first.groundings[camera][0]
     chosen = grounding.chosen
     stretches = _stretches(seen) if grounding.winner is not None else []
@@ -240,33 +226,7 @@ def _report(
         tracked=sum(seen),
         losses=len(stretches),
         longest=max(stretches, default=0),
-        agrees=agrees,
     )
-
-
-def _agreement(
-    attender: Attender,
-    views: Views,
-    instruction: str,
-    objects: Sequence[str] | None,
-    attended: Attended,
-) -> dict[str, bool | None]:
-    """Whether the views, asked together by their embeddings, elect what each elected by itself."""
-    if not 2 <= len(views) <= MOST_VIEWS:
-        return dict.fromkeys(views)
-    jointly = Attender(
-        attender.stack,
-        attender.memory,
-        Prompting(associate=PAIRINGS["embedding"]),
-        speaker=attender.speaker,
-    )
-    _, together = jointly.start(views, instruction, objects=objects)
-    agrees: dict[str, bool | None] = {}
-    for camera in views:
-        alone = attended.groundings[camera][0].winner
-        joint = together.groundings[camera][0].winner
-        agrees[camera] = None if alone is None else alone == joint
-    return agrees
 
 
 def _stretches(seen: Sequence[bool]) -> list[int]:

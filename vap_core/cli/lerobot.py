@@ -124,7 +124,7 @@ def inspect_dataset_command(
     ),
 ) -> None:
     """Ground and track a remembered object through recorded episodes: where a view does not find
-    it, loses it, or disagrees with the others. Interrupted, the same command goes on.
+    it or loses it. Interrupted, the same command goes on.
 
     Example: python -m vap_core inspect-dataset ~/datasets/desk "pick my cup"
     Example: python -m vap_core inspect-dataset ~/datasets/desk "pick my cup" --episodes 3
