@@ -588,3 +588,34 @@ def test_policies_stand_side_by_side_and_each_is_compared_with_itself() -> None:
     assert len(twice.containers) == 2 * len(axes.containers)
     assert [label.get_text() for label in axes.get_xticklabels()] == ["share-0", "share-0.5"]
     assert [len(bars.lines[0].get_xdata()) for bars in axes.containers] == [2, 2]
+
+
+def test_arms_that_were_tried_and_left_count_in_the_correction() -> None:
+    ablation = Ablation("Which?", arms={}, methods=("vap", "vap-associated"))
+    columns = {
+        "suite": "s",
+        "task": "t",
+        "split": "",
+        "seed": 0,
+        "policy": "p",
+        "case": "",
+        "variant": "",
+    }
+    rows = [
+        {
+            **columns,
+            "episode": i,
+            "method": name,
+            "success": won,
+            "cmr": None,
+            "outcome": "",
+            "layout": i,
+        }
+        for i in range(20)
+        for name, won in (("vap", i < 8), ("vap-associated", i < 14))
+    ]
+    p_holm = []
+    for retired in (0, 5):
+        _, one = arm_results(replace(ablation, retired=retired), pd.DataFrame(rows))
+        p_holm.append(one.against.p_holm)
+    assert p_holm[1] == pytest.approx(min(1.0, 6 * p_holm[0]))

@@ -46,7 +46,8 @@ class Ablation:
     `paper` is the paper's table (data/paper_tables.csv), `rows` its row for each arm that it has.
     Arms named in `methods` are methods already (evaluation.methods), or arms of another ablation.
     `suites` are those that it runs on where none is named. `policies` are checkpoints by label: the
-    methods are run with each of them, and the last method is compared over them.
+    methods are run with each of them, and the last method is compared over them. `retired` counts
+    arms that were tried on the same lists and are no longer here: Holm's correction counts them.
     """
 
     question: str
@@ -56,6 +57,7 @@ class Ablation:
     paper: str = ""
     rows: Mapping[str, str] = field(default_factory=dict)
     policies: Mapping[str, str] = field(default_factory=dict)
+    retired: int = 0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -197,6 +199,7 @@ ABLATIONS: dict[str, Ablation] = {
         },
         methods=(DEFAULT, "vap-associated"),
         suites=("vlabench", "tabletop"),
+        retired=5,
     ),
     "switch": Ablation(
         question="Does the policy follow the tint to a look-alike in mid-episode?",

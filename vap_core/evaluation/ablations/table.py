@@ -62,7 +62,7 @@ def arm_results(ablation: Ablation, episodes: "pd.DataFrame") -> list[ArmResult]
         if ablation.names[0] not in ran or len(arms) < 2:
             continue
         _refuse_policies(suite, of_suite[of_suite["method"].isin(arms)])
-        against = _against_default(arms, of_suite)
+        against = _against_default(arms, of_suite, ablation.retired)
         for arm in arms:
             rows = of_suite[of_suite["method"] == arm]
             results.append(
@@ -146,8 +146,10 @@ def arm_rows(results: list[ArmResult]) -> list[list[str]]:
     return rows
 
 
-def _against_default(arms: Sequence[str], of_suite: "pd.DataFrame") -> dict[str, Comparison]:
-    """Each arm against the first, over all tasks of the suite.
+def _against_default(
+    arms: Sequence[str], of_suite: "pd.DataFrame", retired: int
+) -> dict[str, Comparison]:
+    """Each arm against the first, over all tasks of the suite; `retired` arms count as p = 1.
 
     Raises: BadOutput for one that shares no episode with the first.
     """
@@ -164,9 +166,9 @@ def _against_default(arms: Sequence[str], of_suite: "pd.DataFrame") -> dict[str,
                 "out."
             )
         (found[arm],) = comparisons
-    p_holm = holm([comparison.p for comparison in found.values()])
+    p_holm = holm([*(comparison.p for comparison in found.values()), *[1.0] * retired])
     corrected = {}
-    for (arm, comparison), p in zip(found.items(), p_holm, strict=True):
+    for (arm, comparison), p in zip(found.items(), p_holm, strict=False):
         corrected[arm] = replace(comparison, p_holm=p)
     return corrected
 
