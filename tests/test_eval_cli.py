@@ -12,7 +12,7 @@ import pytest
 
 from tests.command import process, refused, vap
 from vap_core.base.errors import BadOutput, VapError
-from vap_core.cli.options import names
+from vap_core.cli.command import names
 from vap_core.evaluation.rescore import rescore
 from vap_core.evaluation.store import read
 from vap_core.simulation.suites import BENCHMARKS

@@ -25,7 +25,7 @@ from tests.command import refused, vap
 from tests.toys import personal
 from vap_core.base.errors import BadMemory, UnknownName
 from vap_core.base.files import SHIPPED
-from vap_core.cli.lerobot import _task_to_try
+from vap_core.cli.own import _task_to_try
 from vap_core.evaluation.policy_names import shipped
 from vap_core.evaluation.study import Study
 from vap_core.evaluation.trials import make_trial, register_personal

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from vap_core.base.errors import BadPolicy, BadStudy, UnknownName
-from vap_core.cli.policies import eval_policy
+from vap_core.cli.measure import eval_policy
 from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.names import label_of, shipped_checkpoint
 from vap_core.policies.protocol import PolicyInput

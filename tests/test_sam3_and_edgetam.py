@@ -333,7 +333,7 @@ def test_options_say_what_they_need(tmp_path: Path) -> None:
     with pytest.raises(MissingWeights, match=r"no checksum of edgetam .* pass --unpinned"):
         pull(["edgetam"], tmp_path)
     table = weights_table(tmp_path)
-    for line in (r"--detector sam3 facebook/sam3:", "--tracker edgetam yonigozlan/EdgeTAM-hf:"):
+    for line in (":detector=sam3 facebook/sam3:", ":tracker=edgetam yonigozlan/EdgeTAM-hf:"):
         assert line in " ".join(table.split())
 
 

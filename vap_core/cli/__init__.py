@@ -12,23 +12,7 @@ import typer
 
 from vap_core.base.errors import VapError
 from vap_core.base.extras import missing_part
-from vap_core.cli import (
-    ablate,
-    attention,
-    benches,
-    doctor,
-    evaluate,
-    lerobot,
-    objects,
-    parsers,
-    perception,
-    photos,
-    policies,
-    recordings,
-    results,
-    train,
-    weights,
-)
+from vap_core.cli import benches, look, machine, measure, own, run
 
 HELP = """Visual Attentive Prompting: steer a frozen policy to your own object, and see why it
 worked or failed.
@@ -43,19 +27,9 @@ app = typer.Typer(
     rich_markup_mode=None,
     help=HELP,
 )
-for module in (photos, evaluate, ablate, recordings, results, lerobot, doctor, benches):
+for module in (run, look, own, machine, benches):
     app.add_typer(module.app)
-measure = typer.Typer(
-    no_args_is_help=True,
-    help="Measure one part: perception, photos, objects, parsers, policy, tokens, embeddings, "
-    "attention, calibration.",
-)
-for module in (perception, parsers, policies, attention):
-    measure.add_typer(module.app)
-app.add_typer(measure, name="measure")
-app.add_typer(objects.app, name="objects")
-app.add_typer(train.app, name="train")
-app.add_typer(weights.app, name="weights")
+app.add_typer(measure.app, name="measure")
 
 
 def keep_examples(app: typer.Typer) -> None:

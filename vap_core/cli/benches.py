@@ -7,20 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer.core import TyperCommand
 
-from vap_core.cli.options import (
-    DetectorName,
-    EncoderName,
-    StackName,
-    TrackerName,
-    refuse_dropped,
-    stack_of,
-)
+from vap_core.cli.command import StackName, refuse_dropped
 
 if TYPE_CHECKING:
     from vap_core.cli.bench.measurement import Measurement, Table
 
 app = typer.Typer()
-STACK_PARTS = ("stack", "detector", "encoder", "tracker")
+STACK_PARTS = ("stack",)
 BENCHES = {
     "loop": ("steps",),
     "suites": ("workers",),
@@ -59,9 +52,6 @@ def bench(
     steps: Annotated[int, typer.Option(min=5, help="loop: control steps to time.")] = 60,
     workers: Annotated[int, typer.Option(min=1, help="suites, eval, engine: processes.")] = 2,
     stack: StackName = "foundation",
-    detector: DetectorName = "",
-    encoder: EncoderName = "",
-    tracker: TrackerName = "",
     random_weights: Annotated[
         bool,
         typer.Option(
@@ -104,7 +94,8 @@ def bench(
     """Measure what a step, a start and a query cost, as shares and ratios within one run.
 
     Example: python -m vap_core bench suites
-    Example: python -m vap_core bench stack --random-weights --detector sam3 --tracker edgetam
+    Example: python -m vap_core bench stack --random-weights
+        --stack foundation:detector=sam3,tracker=edgetam
     Example: python -m vap_core bench profile --json data/results/bench_profile.json
     """
     from vap_core.base.errors import one_of
@@ -114,7 +105,6 @@ def bench(
     _refuse_unread(what, context)
     if json is not None:
         _check_writable(json)
-    parts = stack_of(stack, detector, encoder, tracker)
     part = None if json is None else json.with_suffix(".part.json")
     # Each case imports its own benchmark alone: most are large, and some need an extra.
     match what:
@@ -129,7 +119,7 @@ def bench(
         case "stack":
             from vap_core.cli.bench import stack as bench_stack
 
-            text = bench_stack.run(parts, random=random_weights, device=device)
+            text = bench_stack.run(stack, random=random_weights, device=device)
         case "policy":
             from vap_core.cli.bench import policy
 

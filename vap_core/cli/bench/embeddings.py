@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
 from vap_core.analysis.embedding_search import BLOCK
 from vap_core.analysis.embedding_space import compare
 from vap_core.cli.bench.measurement import Measurement, Table, provenance
-from vap_core.cli.options import with_bar
 from vap_core.evaluation import processes
 from vap_core.policies.embedding_table import open_table
 
@@ -75,7 +75,11 @@ def _compare(plan: tuple[tuple[int, int], float]) -> dict[str, Any]:
         folders = [Path(scratch) / "vlm", Path(scratch) / "policy"]
         _write(folders, size, noise)
         start = time.process_time()
-        found = compare(open_table(folders[0]), open_table(folders[1]), with_bar)
+        found = compare(
+            open_table(folders[0]),
+            open_table(folders[1]),
+            lambda starts, label: tqdm(starts, label),
+        )
         seconds = time.process_time() - start
     peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     return {**asdict(found), "cpu_s": seconds, "peak_gb": peak_gb}

@@ -1,0 +1,513 @@
+"""The group measure: one part of the method or of a policy at a time."""
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vap_core.cli.command import (
+    Publish,
+    RandomSeed,
+    RunFolder,
+    RunFolderOr,
+    StackName,
+    Suites,
+    Workers,
+    names,
+)
+
+app = typer.Typer(
+    no_args_is_help=True,
+    help="Measure one part: perception, photos, objects, parsers, policy, tokens, embeddings, "
+    "attention, calibration.",
+)
+
+
+@app.command("perception")
+def eval_perception(
+    stack: StackName = "embedded",
+    suite: Suites = None,
+    episodes: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Opening frames per task, as episodes spread evenly over its list."
+        ),
+    ] = None,
+    workers: Workers = 2,
+    out: RunFolder = Path("data/runs/perception"),
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick", help="Two opening frames per task and one tracked episode per suite."
+        ),
+    ] = False,
+    publish: Publish = None,
+) -> None:
+    """Measure perception against the simulator: opening frames, tracks through whole expert
+    episodes, and time. Interrupted, it goes on.
+
+    Example: python -m vap_core measure perception --suite simpler-bridge --quick
+    """
+    from vap_core.evaluation.perception.report import conclude
+    from vap_core.evaluation.perception.run import Survey, run_survey
+    from vap_core.evaluation.perception.run import publish as write_tables
+    from vap_core.perception.foundation.store import check_present
+    from vap_core.perception.stacks import check_stack
+    from vap_core.simulation.suites import BENCHMARKS
+
+    check_stack(stack)
+    check_present(stack)
+    suite_names = tuple(dict.fromkeys(suite or BENCHMARKS))
+    survey = Survey(stack, suite_names, episodes, quick)
+    tables = run_survey(survey, out, jobs=workers)
+    print(conclude(tables, survey.stack, out))
+    if publish is not None:
+        written = ", ".join(map(str, write_tables(out, publish)))
+        print(f"wrote {written}")
+
+
+@app.command("photos")
+def eval_photos(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            help="Holds references/OBJECT/*.jpg; scenes/*.jpg; scenes.csv with a line "
+            "scene,object,x0,y0,x1,y1 for every object of every scene, without box where the "
+            "object is absent; optional references/boxes.csv with photo,x0,y0,x1,y1 (photo as "
+            "OBJECT/FILE) and objects.csv with object,category (else an object's name is its "
+            "kind), masks/SCENE/OBJECT.png. Pixels of the upright photo, far corner exclusive.",
+        ),
+    ],
+    stack: StackName = "embedded",
+    clips: Annotated[
+        bool,
+        typer.Option(
+            "--clips",
+            help="Follow objects through clips, too: a window pans from each scene to a copy of "
+            "it and back, with every object twice.",
+        ),
+    ] = False,
+    out: RunFolderOr = None,
+) -> None:
+    """Measure registering, grounding and the vote on photos of your own, against the boxes that you
+    give. Interrupted, it goes on.
+
+    Example: python -m vap_core measure photos my-photos
+    Example: python -m vap_core measure photos my-photos --clips
+    """
+    from vap_core.evaluation.photos.run import measure_photos
+
+    folder_of_run = out or Path(f"data/runs/photos-{folder.resolve().name}")
+    print(measure_photos(folder, folder_of_run, stack, clips=clips))
+
+
+@app.command("objects")
+def eval_objects(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            help="Objects that `objects import --out` made; or 3-D files with objects.csv: a line "
+            "file,category,height_cm,groups each, the last two may be empty.",
+        ),
+    ],
+    suite: Annotated[
+        list[str] | None,
+        typer.Option(help="A suite; repeatable. Each object takes its tasks of the same category."),
+    ] = None,
+    episodes: Annotated[
+        int, typer.Option(min=1, help="Episodes per object and task, spread over its list.")
+    ] = 4,
+    policy: Annotated[
+        str, typer.Option(help="Default mini-pi0 where one ships for the suite, else scripted.")
+    ] = "",
+    views_only: Annotated[
+        bool, typer.Option("--views-only", help="Look at the opening views, and run no episodes.")
+    ] = False,
+    stack: StackName = "embedded",
+    out: RunFolderOr = None,
+) -> None:
+    """Measure objects of your own in a suite's scenes, each in the target's place among its
+    look-alikes: found in opening views, and fetched by VAP where the expert can. Interrupted, it
+    goes on.
+
+    Example: python -m vap_core measure objects data/designs
+    """
+    from vap_core.evaluation.own_objects.run import ObjectSurvey, measure_objects
+
+    asked = ObjectSurvey(
+        suites=tuple(dict.fromkeys(suite or ["tabletop"])),
+        episodes=episodes,
+        stack=stack,
+        policy=policy,
+        views_only=views_only,
+    )
+    print(measure_objects(folder, out or Path(f"data/runs/objects-{folder.resolve().name}"), asked))
+
+
+@app.command("calibration")
+def calibrate(
+    stack: StackName = "embedded",
+    photos: Annotated[
+        list[Path] | None,
+        typer.Option(help="A photo set in the form of measure photos; repeatable."),
+    ] = None,
+    scenes: Annotated[
+        int, typer.Option(min=0, help="Rendered development scenes; 0: photos alone.")
+    ] = 24,
+    price: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            max=50.0,
+            help="Per cent of the rightly elected objects that may be refused.",
+        ),
+    ] = 3.0,
+    keep: Annotated[
+        bool,
+        typer.Option(
+            "--keep",
+            help="Write the chosen thresholds beside the weights of a foundation stack, which then "
+            "uses them. Of the embedded stack it is the threshold for photos, which ground and "
+            "inspect-dataset then use, and measure photos and attached checkpoints do not; of a "
+            "stack of your own without thresholds it is both. A stack with an embedded part needs "
+            "--photos.",
+        ),
+    ] = False,
+    out: RunFolderOr = None,
+) -> None:
+    """Measure from which cosine on an object is in view: what each threshold costs and brings, on
+    development scenes with and without the object. Interrupted, it goes on.
+
+    Example: python -m vap_core measure calibration --scenes 8
+    Example: python -m vap_core measure calibration --photos my-photos --scenes 0 --keep
+    """
+    from vap_make.calibration.run import calibrate, keep_choice, refuse_keep
+
+    if keep:
+        refuse_keep(stack, photos or ())
+    report, chosen = calibrate(
+        stack,
+        out or Path(f"data/runs/calibrate-{stack}"),
+        scenes=scenes,
+        photos=photos or (),
+        price=price / 100,
+    )
+    print(report)
+    if keep:
+        print(f"wrote {keep_choice(stack, chosen)}")
+
+
+@app.command("parsers")
+def eval_parsers(
+    parser: Annotated[
+        str,
+        typer.Option(
+            help="Parsers, with commas: rule, embedding, chat, or addresses of endpoints."
+        ),
+    ] = "rule,embedding",
+    suite: Annotated[str, typer.Option(help="Only these suites, with commas. Default: all.")] = "",
+    part: Annotated[
+        str,
+        typer.Option(
+            help="Only these parts, with commas: tune, check-1 to check-4, and the held-out test. "
+            "Default: all."
+        ),
+    ] = "",
+    limit: Annotated[
+        int | None,
+        typer.Option(min=1, help="So many paraphrases of every suite and part. Default: all."),
+    ] = None,
+    wrong: Annotated[
+        bool, typer.Option("--wrong", help="List the paraphrases that are parsed wrongly, too.")
+    ] = False,
+    publish: Publish = None,
+) -> None:
+    """Parse over 200 paraphrased instructions a suite, and print how often the object is right.
+
+    Example: python -m vap_core measure parsers
+    Example: python -m vap_core measure parsers --parser chat --part test --limit 20
+    """
+    from vap_core.base.errors import BadStudy, one_of
+    from vap_core.evaluation.parsers import report
+    from vap_core.evaluation.parsers.measure import answer_table, measure
+    from vap_core.evaluation.parsers.paraphrases import PARTS, suite_names
+    from vap_core.instruction.parsers import load_parser
+
+    parsers = names(parser)
+    if not parsers:
+        raise BadStudy(
+            f"measure parsers: --parser {parser!r} names no parser; name one, or leave the option "
+            "out for the default, rule,embedding."
+        )
+    suites = names(suite) or list(suite_names())
+    parts = names(part) or list(PARTS)
+    for what, given, known in (("suite", suites, suite_names()), ("part", parts, PARTS)):
+        for name in given:
+            if name not in known:
+                raise one_of(f"measure parsers: {what}", name, known)
+    answers = []
+    for name in parsers:
+        answers += measure(name, partial(load_parser, name), suites, parts, limit)
+    table = answer_table(answers)
+    if wrong:
+        for answer in answers:
+            if not answer.right:
+                found = answer.found or answer.error or "nothing"
+                print(f"{answer.parser}: {answer.text!r} means {answer.meant or 'none'}: {found}")
+    print(report.text(table))
+    if publish is not None:
+        print(f"wrote {', '.join(map(str, report.publish(table, publish)))}")
+
+
+@app.command("policy")
+def eval_policy(
+    suite: Annotated[str, typer.Option(help="The benchmark that the policy was trained for.")],
+    policy: Annotated[
+        str, typer.Option(help="mini-pi0, or a checkpoint's folder or hub id.")
+    ] = "mini-pi0",
+    scenes: Annotated[
+        int,
+        typer.Option(min=1, help="Scenes of four episodes each, spread over the suite's tasks."),
+    ] = 24,
+    ways: Annotated[
+        str,
+        typer.Option(
+            help="How the target is named, with commas: tinted, painted, described, plain; "
+            "tinted-magenta, tinted-0.3 or tinted-yellow-0.7 force the colour and the opacity."
+        ),
+    ] = "tinted,painted,described,plain",
+    execute: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Actions of each chunk to carry out before the policy is asked again. Default as "
+            "the checkpoint says.",
+        ),
+    ] = None,
+    seed: RandomSeed = 0,
+    workers: Workers = 2,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="A table to add the episodes to, for example data/results/probe.parquet; those of "
+            "the same suite, policy and way in it are replaced."
+        ),
+    ] = None,
+) -> None:
+    """Measure what a policy can do with generic objects that no film has shown, told by a tint, by
+    paint, by words, or not at all.
+
+    Example: python -m vap_core measure policy --suite simpler-bridge --scenes 4
+    Example: python -m vap_core measure policy --suite tabletop --ways tinted --execute 10
+    Example: python -m vap_core measure policy --suite simpler-bridge --ways tinted,tinted-magenta
+    """
+    from vap_core.base.errors import BadStudy
+    from vap_core.evaluation.study import Study
+    from vap_core.simulation import suites
+    from vap_make.policy.probe import conclude, keep, kept, probe
+
+    tasks = tuple((suite, task.name) for task in suites.suite(suite).tasks)
+    study = Study(tasks, ("generic",), policy=policy)
+    checkpoint = study.checkpoint(suite)
+    if not checkpoint:
+        raise BadStudy(
+            f"measure policy: {policy!r} has no weights; "
+            "take mini-pi0, or a lerobot checkpoint's folder or hub id."
+        )
+    if out is not None:
+        kept(out)  # refused before the work; read again by keep: others may add to it meanwhile
+    table = probe(
+        checkpoint,
+        suite,
+        scenes=scenes,
+        ways=names(ways),
+        execute=execute,
+        seed=seed,
+        workers=workers,
+    )
+    print(conclude(table))
+    if out is not None:
+        keep(table, out)
+        print(f"wrote {out}")
+
+
+@app.command("tokens")
+def eval_tokens(
+    suite: Suites = None,
+    k: Annotated[
+        str, typer.Option("--k", help="Numbers of photos to learn from, with commas.")
+    ] = "1,3,5,7",
+    epochs: Annotated[
+        int,
+        typer.Option(min=1, help="Passes over the augmented photos; the soft prompt's own is 20."),
+    ] = 20,
+    learn_in: Annotated[
+        str,
+        typer.Option(help="vlm, policy or both: whose weights a token is learned in."),
+    ] = "vlm,policy",
+    workers: Workers = 1,
+    out: RunFolder = Path("data/runs/tokens"),
+    publish: Publish = None,
+) -> None:
+    """Learn the token of every personal object from few and from many photos, in the
+    vision-language model and in the policies; measure what it recognizes, and which object of
+    listed episodes the model chooses by it. Interrupted, it goes on; about a minute and a half a
+    token and core.
+
+    Example: python -m vap_core measure tokens --suite simpler-bridge --k 5 --epochs 2
+        --out data/runs/few-tokens
+    """
+    from vap_core.base.errors import BadStudy
+    from vap_core.evaluation.tokens.report import report
+    from vap_core.evaluation.tokens.study import Tokens, run
+    from vap_core.evaluation.tokens.study import publish as write_tables
+    from vap_core.simulation.suites import BENCHMARKS
+
+    ks = tuple(int(number) for number in names(k) if number.isdecimal() and int(number))
+    if len(ks) != len(names(k)) or not ks:
+        raise BadStudy(f"measure tokens: --k {k}: give numbers of photos, such as 1,3,5,7.")
+    asked = Tokens(tuple(dict.fromkeys(suite or BENCHMARKS)), ks, epochs, tuple(names(learn_in)))
+    print(report(run(asked, out, workers=workers)))
+    if publish is not None:
+        written = ", ".join(map(str, write_tables(out, publish)))
+        print(f"wrote {written}")
+
+
+@app.command("embeddings")
+def embeddings(
+    vlm: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Folder of a vision-language model, such as PaliGemma's. Default the shipped one "
+            "that each policy grew from."
+        ),
+    ] = None,
+    policies: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="Folders of policies that were initialised from it: pi0, pi0.5, mini-pi0. Default "
+            "the suites' default policies."
+        ),
+    ] = None,
+    suite: Annotated[
+        str,
+        typer.Option(
+            help="Whose words to compare, too. Default the one in the policy's name, or all."
+        ),
+    ] = "",
+    out: Annotated[
+        Path | None, typer.Option(help="Keep the rows in this .parquet or .csv file, too.")
+    ] = None,
+) -> None:
+    """Compare the word embeddings of a vision-language model with those of policies: cosine, CKA,
+    kNN@1, with the paper's numbers below.
+
+    Example: python -m vap_core measure embeddings
+    Example: python -m vap_core measure embeddings models/paligemma-3b-pt-224 models/pi0 models/pi05
+    """
+    from tqdm import tqdm
+
+    from vap_core.analysis.embedding_report import check_output, keep, report, spaces
+    from vap_core.base.errors import BadPolicy
+    from vap_core.evaluation.policy_names import shipped
+    from vap_core.simulation.suites import BENCHMARKS
+
+    folders = list(policies or ())
+    if vlm is None:
+        folders = [shipped(name) for name in BENCHMARKS if shipped(name).is_dir()]
+    if not folders:
+        raise BadPolicy("embeddings: name the folder of a policy after the model's.")
+    if out is not None:
+        check_output(out)
+    table = spaces(
+        vlm, folders, suite, lambda starts, label: tqdm(starts, label, unit="block", leave=False)
+    )
+    print(report(table))
+    if out is not None:
+        keep(table, out)
+        print(f"wrote {out}")
+
+
+@app.command("attention")
+def attention(
+    run: Annotated[
+        Path, typer.Argument(help="Run folder of eval or rollout, or a table that publish wrote.")
+    ],
+    suite: Annotated[
+        str, typer.Option(help="Only these suites, with commas. Default: all of the run.")
+    ] = "",
+    method: Annotated[
+        str,
+        typer.Option(
+            "--methods", "--method", help="Only these methods, with commas. Default: all."
+        ),
+    ] = "",
+    policy: Annotated[
+        str,
+        typer.Option(
+            help="Only the policy whose label in the table holds this, such as tabletop-longer@."
+        ),
+    ] = "",
+    episodes: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Episodes per task and method, spread evenly. Default: all of the run."
+        ),
+    ] = None,
+    explain: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="Episodes per task and method that also get the causal measures: gradient times "
+            "activation, and masked patches.",
+        ),
+    ] = 2,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the tables; what is found there goes on. Default: RUN/attention, or "
+            "data/runs/attention-TABLE."
+        ),
+    ] = None,
+    publish: Publish = None,
+    record: Annotated[
+        str,
+        typer.Option(
+            metavar="SUITE/TASK/METHOD/EPISODE",
+            help="Measure nothing: record this episode with its maps, in the folder of --out.",
+        ),
+    ] = "",
+    workers: Workers = 2,
+) -> None:
+    """Run the episodes of a run again, measure where every query looks, and print the patterns; or
+    record one of them with its maps.
+
+    Example: python -m vap_core measure attention data/results/mini_pi0.parquet --method soft,vap
+        --suite vlabench
+    Example: python -m vap_core measure attention data/results/first_policy.parquet
+        --record simpler-bridge/put-camera/soft/22
+    """
+    from vap_core.analysis.attention import examples, replay, report
+    from vap_core.analysis.attention.tables import publish as publish_tables
+    from vap_core.base.commands import command
+
+    if out is None:
+        table = run.suffix == ".parquet"
+        out = Path("data/runs") / f"attention-{run.stem}" if table else run / "attention"
+    if record:
+        path, step = examples.record(run, record, out / "recordings", out / "memory", policy)
+        words = ("view", path, "--png", f"{path.stem}.png", "--attention", "--frame", str(step))
+        print(f"wrote {path}\nnext: {command(*words)}")
+        return
+    wanted = replay.Wanted(
+        suites=tuple(names(suite)),
+        methods=tuple(names(method)),
+        policy=policy,
+        episodes=episodes,
+        explain=explain,
+    )
+    found = replay.run_replay(run, out, wanted, workers=workers)
+    if publish is not None:
+        publish_tables(out, publish)
+    print(report.text(found))
