@@ -21,8 +21,6 @@ from vap_core.evaluation.methods import known_methods
 from vap_core.perception.stacks import STACKS, check_stack
 from vap_core.simulation.suites import SUITES
 
-WORDS = 1200
-"""README is read in five minutes; the rest is in docs/."""
 MADE_LATER = ("data/runs", "data/memory", "data/objects", "data/cache", "data/photos")
 """Folders that commands make, and that do not ship."""
 RECORD = "data/policies/README.md"
@@ -43,10 +41,6 @@ def slug(heading: str) -> str:
 def anchors(text: str) -> set[str]:
     found = re.findall(r"^#+ (.+)$", FENCE.sub("", text), re.MULTILINE)
     return {slug(heading) for heading in found}
-
-
-def test_readme_is_short() -> None:
-    assert len(PAGES["README.md"].split()) <= WORDS
 
 
 def test_readme_leads_to_the_notebooks_that_its_steps_open() -> None:

@@ -301,7 +301,7 @@ def test_one_batch_can_be_learned_by_heart(stage: tuple[Path, list[Film]]) -> No
 def test_how_far_the_planned_turn_is_from_the_one_that_was_made(
     shown: str, rms: float, most: float
 ) -> None:
-    """docs/policy.md tells it: knocks that follow are not in the plan that `turn_otherwise` adds."""
+    """Knocks that follow are not in the plan that `turn_otherwise` adds."""
     off = []
     for path in sorted((DATA / "demonstrations" / f"simpler-{shown}" / "data").rglob("*.parquet")):
         for _, film in pd.read_parquet(path).groupby("episode_index"):
