@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 from tests.command import refused, vap
-from vap_core.analysis.ablation_findings import findings_table, two_policies_table, verdict
+from vap_core.analysis.ablation_findings import findings_table, verdict
 from vap_core.analysis.ablations import (
     ablation_results,
     all_effects_figure,
@@ -478,32 +478,6 @@ def test_an_ablation_of_two_suites_has_a_heading_each() -> None:
     assert [left.get_title(), right.get_title()] == ["vlabench", "tabletop"]
     widths = [[bar.get_width() for bar in bars] for bars in right.containers]
     assert widths == [[0, 0], [100, 100]]
-
-
-def test_another_policys_effects_stand_beside_each_arm() -> None:
-    def of_policy(opaque: int, weak: int) -> pd.DataFrame:
-        rates = {"vap": 36, "opaque": opaque, "opacity-0.1": weak}
-        return pd.concat(
-            [outcomes(arm, [True] * k + [False] * (40 - k)) for arm, k in rates.items()],
-            ignore_index=True,
-        )
-
-    one, other = (ablation_results(of_policy(*each)) for each in ((34, 2), (35, 34)))
-    table = two_policies_table(one, other)
-    assert set(table.arm) == {"opaque", "opacity-0.1"}
-    weak = table[(table.ablation == "opacity") & (table.arm == "opacity-0.1")].iloc[0]
-    assert (weak.one, weak.other) == (pytest.approx(-85), pytest.approx(-5))
-    assert weak.apart
-    assert not table[table.arm == "opaque"].apart.any()
-    alone, both = (
-        all_effects_figure(one, beside=each, whose="the other") for each in (None, other)
-    )
-    marks = [
-        [line.get_marker() for axes in figure.axes for line in axes.lines]
-        for figure in (alone, both)
-    ]
-    assert [part.count("s") for part in marks] == [0, sum(len(arms) - 1 for arms in other.values())]
-    assert both.legends[0].get_texts()[-1].get_text() == "the other"
 
 
 @pytest.mark.parametrize(("low", "high", "p", "theirs", "said"), [

@@ -11,7 +11,6 @@ from vap_core.analysis.attention import (
     figures,
     intervals,
     patterns,
-    prediction,
     report,
 )
 from vap_core.analysis.attention.measures import REGIONS, inside, measure, patch_areas
@@ -183,44 +182,6 @@ def test_the_word_that_means_the_target_is_the_token_then_the_colour() -> None:
     assert list(found["query"]) == ["colour", "token", "action"]
 
 
-def test_the_area_is_the_share_of_pairs_in_order() -> None:
-    rng = np.random.default_rng(0)
-    scores = rng.integers(0, 5, 60).astype(float)
-    labels = rng.random(60) < 0.4
-    pairs = [(a > b) + 0.5 * (a == b) for a in scores[labels] for b in scores[~labels]]
-    assert prediction.auc(scores, labels) == pytest.approx(np.mean(pairs))
-    assert np.isnan(prediction.auc(scores, np.ones(60, bool)))
-
-
-def test_the_interval_is_wider_where_episodes_are_copies() -> None:
-    rng = np.random.default_rng(1)
-    labels = rng.random(40) < 0.5
-    scores = rng.normal(size=40) + labels
-    alone = prediction.auc_interval(scores, labels, [str(i) for i in range(40)])
-    copies = prediction.auc_interval(
-        np.tile(scores, 4), np.tile(labels, 4), [str(i) for i in range(40)] * 4
-    )
-    as_if = prediction.auc_interval(
-        np.tile(scores, 4), np.tile(labels, 4), [str(i) for i in range(160)]
-    )
-    assert copies.value == pytest.approx(alone.value)
-    assert (copies.low, copies.high) == pytest.approx((alone.low, alone.high), abs=1e-9)
-    assert as_if.high - as_if.low < 0.7 * (alone.high - alone.low)
-
-
-def test_a_measure_of_noise_predicts_nothing_that_was_left_out() -> None:
-    rng = np.random.default_rng(2)
-    labels = rng.random(200) < 0.5
-    clusters = [str(i // 2) for i in range(200)]
-    useful = labels + rng.normal(size=200)
-    scores = prediction.left_out_scores(useful[:, None], labels, clusters)
-    assert prediction.auc(scores, labels) == pytest.approx(prediction.auc(useful, labels), abs=0.04)
-    constant = prediction.left_out_scores(np.ones((200, 1)), labels, clusters)
-    assert prediction.auc(constant, labels) == 0.5, "folds are not ranked by their positives"
-    noise = prediction.left_out_scores(rng.normal(size=(200, 3)), labels, clusters)
-    assert 0.35 < prediction.auc(noise, labels) < 0.62
-
-
 def test_densities_by_layer_are_shares_by_areas() -> None:
     rows = []
     for episode in range(2):
@@ -249,24 +210,6 @@ def test_densities_of_causal_measures_are_shares_by_areas() -> None:
         report.causal_table(pd.DataFrame([]))
 
 
-def test_a_warning_is_measured_where_enough_fails() -> None:
-    rng = np.random.default_rng(3)
-    failed = np.arange(80) % 2 == 0
-    table = pd.DataFrame({
-        "margin": rng.normal(size=80), "lift": rng.normal(size=80) - 3 * failed, "success": ~failed,
-        "layout": [str(i) for i in range(80)],
-    })  # fmt: skip
-    table = table.assign(suite="s")
-    found = prediction.warnings(table, ["lift"])
-    assert found["attention"].value > 0.9 > 0.7 > found["vote margin"].value
-    gain = found["both, beyond the margin"]
-    assert gain.value == pytest.approx(found["both"].value - found["vote margin"].value)
-    assert 0 < gain.low < gain.value < gain.high
-    sure = prediction.warnings(table.assign(margin=table["success"].astype(float)), ["lift"])
-    assert sure["low vote margin, unfitted"].value == 1
-    assert prediction.warnings(table.assign(success=np.arange(80) > 3), ["lift"]) == {}
-
-
 def test_episodes_without_a_call_before_the_first_touch_are_reported_without_measures() -> None:
     calls = pd.DataFrame([call(0, 0, "target"), call(0, 4, "target"), call(1, 0, "lookalikes")])
     early = pd.DataFrame([ending(0, True, touch=0.0), ending(1, False, touch=0.0)])
@@ -282,35 +225,6 @@ def test_episodes_without_a_call_before_the_first_touch_are_reported_without_mea
     assert said.startswith("2 episodes run again, 2 of them end as in the run\n\nno call came")
 
 
-def test_noise_reaches_the_area_that_is_stated_for_chance() -> None:
-    """Scored on layouts left out, a predictor without knowledge lies under .5 in the mean."""
-    rng = np.random.default_rng(6)
-    failed = np.arange(96) % 6 == 0
-    table = pd.DataFrame({"success": ~failed, "layout": [str(i) for i in range(96)]})
-    table["suite"] = np.repeat(["one", "other"], 48)
-    of_noise = []
-    for _ in range(200):
-        noise = table.assign(**{name: rng.normal(size=96) for name in ("margin", "lift", "peaks")})
-        suites, layouts = list(noise.suite), list(noise.layout)
-        ranks = noise.groupby("suite")[["lift", "peaks"]].rank(pct=True).to_numpy()
-        scores = prediction.left_out_scores(ranks, failed, layouts)
-        of_noise.append(prediction.auc(scores, failed, suites))
-    chance = prediction.warnings_by_chance(noise, ["lift", "peaks"], draws=200)
-    error = np.std(of_noise) * np.sqrt(2 / 200)
-    assert chance["attention"].value == pytest.approx(np.mean(of_noise), abs=3 * error)
-    assert chance["attention"].value < 0.5 - error
-    assert chance["attention"].low < np.mean(of_noise) < chance["attention"].high
-    assert chance["low vote margin, unfitted"].value == pytest.approx(0.5, abs=0.03)
-    gain = chance["both, beyond the margin"]
-    assert gain.value == pytest.approx(chance["both"].value - chance["vote margin"].value)
-    assert gain.low < 0 < gain.high
-    sure = table.assign(margin=table.success.astype(float), lift=noise.lift, peaks=noise.peaks)
-    known = prediction.warnings(sure, ["lift", "peaks"])["vote margin"]
-    assert known.value > chance["vote margin"].high
-    few = noise.assign(success=np.arange(96) > 3)
-    assert prediction.warnings_by_chance(few, ["lift"]) == {}
-
-
 def test_the_first_calls_are_those_of_each_episodes_first_step() -> None:
     about = {"suite": "s", "task": "t", "method": "vap", "seed": 0}
     calls = pd.DataFrame([
@@ -320,21 +234,6 @@ def test_the_first_calls_are_those_of_each_episodes_first_step() -> None:
     ])  # fmt: skip
     first = patterns.first_calls(calls)
     assert list(zip(first.episode, first.step, strict=True)) == [(0, 0)] * 2 + [(1, 4)] * 2
-
-
-def test_only_pairs_of_one_suite_are_compared() -> None:
-    """A score that tells the suites apart, and nothing inside them."""
-    scores = np.repeat([0.0, 1.0], 40)
-    labels = np.concatenate([np.arange(40) % 5 == 0, np.arange(40) % 5 > 0])
-    suites = ["one"] * 40 + ["other"] * 40
-    clusters = [str(i) for i in range(80)]
-    assert prediction.auc(scores, labels) == pytest.approx(0.8)
-    assert prediction.auc(scores, labels, suites) == 0.5
-    inside = prediction.auc_interval(scores, labels, clusters, suites)
-    assert (inside.low, inside.value, inside.high) == (0.5, 0.5, 0.5)
-    drawn = intervals.resamples(clusters, suites)
-    assert (drawn[:, :40].sum(1) == 40).all()
-    assert (drawn[:, 40:].sum(1) == 40).all()
 
 
 def test_an_interval_of_a_mean_is_wider_where_episodes_are_copies() -> None:
@@ -381,6 +280,18 @@ def test_a_figure_has_the_suites_in_the_order_of_the_benchmarks() -> None:
     assert from_the_top == [*suites.BENCHMARKS, "all"]
 
 
+def test_the_figure_over_time_says_how_many_episodes_touch_something_beside_its_curves() -> None:
+    calls = [call(episode, step, "target") for episode in range(6) for step in (0, 4)]
+    endings = [ending(i, i % 2 == 0, touch=None if i == 1 else 8.0) for i in range(6)]
+    figure = figures.time_figure(pd.DataFrame(calls), pd.DataFrame(endings))
+    (axes,) = figure.axes
+    legend = axes.get_legend()
+    labels = [text.get_text() for text in legend.get_texts()]
+    assert labels == ["success (3 of 3)", "failure (2 of 3)", "chance"]
+    figure.canvas.draw()
+    assert legend.get_window_extent().y1 < axes.get_window_extent().y0
+
+
 def test_tables_have_a_suites_methods_together_in_the_order_of_the_benchmarks() -> None:
     published = [("tabletop", "vap"), ("own", "vap"), ("vlabench", "soft"), ("tabletop", "soft")]
     wanted = [("vlabench", "soft"), ("tabletop", "soft"), ("tabletop", "vap"), ("own", "vap")]
@@ -396,21 +307,6 @@ def test_tables_have_a_suites_methods_together_in_the_order_of_the_benchmarks() 
     table = pd.DataFrame(lines)
     for found in (report.pattern_counts(table), report.causal_table(table)):
         assert list(zip(found.suite, found.method, strict=True)) == wanted
-    areas = report.auc_table(table, ["rank_masking"])
-    of_all = ["all suites, soft", "all suites, vap"]
-    assert list(areas.index) == [*(", ".join(each) for each in wanted), *of_all]
     assert report.in_order(pd.DataFrame()).empty
     assert "0.330000" not in report.causal_table(table).to_string()  # as a float32 has it
     assert report.causal_table(table)["target"].dtype == np.float64
-
-
-def test_the_figure_over_time_says_how_many_episodes_touch_something_beside_its_curves() -> None:
-    calls = [call(episode, step, "target") for episode in range(6) for step in (0, 4)]
-    endings = [ending(i, i % 2 == 0, touch=None if i == 1 else 8.0) for i in range(6)]
-    figure = figures.time_figure(pd.DataFrame(calls), pd.DataFrame(endings))
-    (axes,) = figure.axes
-    legend = axes.get_legend()
-    labels = [text.get_text() for text in legend.get_texts()]
-    assert labels == ["success (3 of 3)", "failure (2 of 3)", "chance"]
-    figure.canvas.draw()
-    assert legend.get_window_extent().y1 < axes.get_window_extent().y0

@@ -10,23 +10,13 @@ import torch
 from safetensors.torch import save_file
 from scipy.stats import ortho_group
 
-from vap_core.analysis import embedding_search, embedding_space
-from vap_core.analysis.embedding_search import nearest_tokens, unsettled_tokens
-from vap_core.analysis.embedding_space import ArrayTable, compare, compare_tokens
+from vap_core.analysis.embeddings import compare, paired_cosines
 from vap_core.base.errors import BadPolicy
 from vap_core.policies.embedding_table import open_table
 
 from . import tiny_lerobot
 
 N, WIDTH = 700, 48
-
-
-@pytest.fixture(autouse=True)
-def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Blocks and directions that a small table needs many of."""
-    for module in (embedding_search, embedding_space):
-        monkeypatch.setattr(module, "BLOCK", 97)
-    monkeypatch.setattr(embedding_space, "DIRECTIONS", (4, 16))
 
 
 def tables(noise: float, n: int = N, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -76,7 +66,7 @@ def slow_nearest(one: np.ndarray, other: np.ndarray) -> float:
 @pytest.mark.parametrize("noise", [0.01, 1.0, 3.0, 10.0])
 def test_measures_are_those_of_slow_references(noise: float) -> None:
     one, other = tables(noise)
-    found = compare(ArrayTable(one), ArrayTable(other))
+    found = compare(one, other)
     cosines = [
         float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
         for a, b in zip(one.astype(float), other.astype(float), strict=True)
@@ -97,24 +87,10 @@ def test_the_references_span_right_and_wrong_neighbours() -> None:
     ]
 
 
-def test_bounds_settle_most_tokens_and_never_a_wrong_one() -> None:
-    one, other = tables(0.3)
-    x, y = ArrayTable(one), ArrayTable(other)
-    moments = embedding_space._Moments(x, y, N, embedding_space._unwatched)
-    left = unsettled_tokens(
-        x, y, moments.cosines, np.arange(N), moments.directions(16), embedding_space._unwatched
-    )
-    assert len(left) < 0.2 * N
-    units = [each / np.linalg.norm(each, axis=1, keepdims=True) for each in (one, other)]
-    scores = units[0] @ units[1].T
-    wrong = np.flatnonzero((scores > np.diag(scores)[:, None]).any(1))
-    assert set(wrong) <= set(left.tolist())
-
-
 def test_some_tokens_are_compared_among_themselves_and_found_in_the_whole_table() -> None:
     one, other = tables(3.0)
     tokens = np.array([600, 3, 44, 97, 98, 5, 250, 11])
-    found = compare_tokens(ArrayTable(one), ArrayTable(other), tokens)
+    found = compare(one, other, tokens)
     assert found.tokens == 8
     assert found.cka == pytest.approx(slow_cka(one[tokens], other[tokens]), abs=2e-6)
     assert found.cka_debiased == pytest.approx(slow_debiased(one[tokens], other[tokens]), abs=2e-5)
@@ -131,7 +107,7 @@ def test_some_tokens_are_compared_among_themselves_and_found_in_the_whole_table(
 
 def test_a_table_is_like_itself_and_its_twin_rows_are_no_mistake() -> None:
     _, other = tables(0.5)
-    found = compare(ArrayTable(other), ArrayTable(other.copy()))
+    found = compare(other, other.copy())
     assert found.cosine_min == pytest.approx(1, abs=1e-12)
     assert (found.cka, found.cka_debiased) == (pytest.approx(1), pytest.approx(1))
     assert found.nearest == 1
@@ -140,8 +116,8 @@ def test_a_table_is_like_itself_and_its_twin_rows_are_no_mistake() -> None:
 def test_a_rotation_changes_cosines_and_no_cka() -> None:
     one, other = tables(1.0)
     turn = ortho_group.rvs(WIDTH, random_state=0).astype(np.float32)
-    plain = compare(ArrayTable(one), ArrayTable(other))
-    turned = compare(ArrayTable(one), ArrayTable(other @ turn * 3 + 2))
+    plain = compare(one, other)
+    turned = compare(one, other @ turn * 3 + 2)
     assert turned.cka == pytest.approx(plain.cka, abs=1e-5)
     assert turned.cka_debiased == pytest.approx(plain.cka_debiased, abs=1e-5)
     assert turned.cosine_mean < 0.5 < plain.cosine_mean
@@ -150,11 +126,11 @@ def test_a_rotation_changes_cosines_and_no_cka() -> None:
 def test_the_order_of_tokens_does_not_matter_but_their_pairing_does() -> None:
     one, other = tables(1.0)
     order = np.random.default_rng(1).permutation(N)
-    plain = compare(ArrayTable(one), ArrayTable(other))
-    same = compare(ArrayTable(one[order]), ArrayTable(other[order]))
+    plain = compare(one, other)
+    same = compare(one[order], other[order])
     for name in ("cosine_mean", "cka", "cka_debiased", "nearest"):
         assert getattr(same, name) == pytest.approx(getattr(plain, name), abs=1e-6)
-    wrong = compare(ArrayTable(one), ArrayTable(other[order]))
+    wrong = compare(one, other[order])
     assert wrong.nearest < 0.1 < plain.nearest
     assert abs(wrong.cka_debiased) < 0.1 < plain.cka_debiased
 
@@ -162,7 +138,7 @@ def test_the_order_of_tokens_does_not_matter_but_their_pairing_does() -> None:
 def test_few_unrelated_tokens_are_alike_by_plain_cka_alone() -> None:
     rng = np.random.default_rng(3)
     one, other = rng.normal(size=(2, 12, 600)).astype(np.float32)
-    found = compare(ArrayTable(one), ArrayTable(other))
+    found = compare(one, other)
     assert found.cka > 0.9
     assert abs(found.cka_debiased) < 0.3
 
@@ -171,31 +147,24 @@ def test_rows_of_zeros_have_no_direction() -> None:
     one, other = tables(1.0)
     one[7] = 0
     other[8] = 0
-    found = compare(ArrayTable(one), ArrayTable(other))
+    found = compare(one, other)
     assert found.without_direction == 2
     kept = np.setdiff1d(np.arange(N), [7, 8])
-    cosines = embedding_search.paired_cosines(one[kept], other[kept])
+    cosines = paired_cosines(one[kept], other[kept])
     assert found.cosine_mean == pytest.approx(cosines.mean())
     with pytest.raises(BadPolicy, match="every row of a table is zero"):
-        compare(ArrayTable(one), ArrayTable(np.zeros_like(other)))
+        compare(one, np.zeros_like(other))
 
 
 def test_the_longer_vocabulary_is_cut_and_other_widths_are_refused() -> None:
     one, other = tables(1.0)
     longer = np.concatenate([other, other[:30]])
-    cut = compare(ArrayTable(one), ArrayTable(longer))
-    plain = compare(ArrayTable(one), ArrayTable(other))
+    cut = compare(one, longer)
+    plain = compare(one, other)
     assert cut.tokens == N
     assert cut.nearest == pytest.approx(plain.nearest)
     with pytest.raises(BadPolicy, match="48 and 47 features"):
-        compare(ArrayTable(one), ArrayTable(other[:, :47].copy()))
-
-
-def test_nearest_words_are_sorted_by_cosine() -> None:
-    one, _ = tables(1.0)
-    found = nearest_tokens(2 * one[123], ArrayTable(one), 3)
-    assert found[0] == (123, pytest.approx(1))
-    assert [cosine for _, cosine in found] == sorted((c for _, c in found), reverse=True)
+        compare(one, other[:, :47].copy())
 
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.float16, torch.bfloat16])
@@ -246,7 +215,7 @@ def test_checkpoints_of_the_real_classes_hold_a_table(make: object, tmp_path: Pa
         loaded = model.paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight
     table = open_table(folder)
     assert np.array_equal(table.block(0, table.shape[0]), loaded.detach().float().numpy())
-    found = compare(table, table)
+    found = compare(table.rows(), table.rows())
     assert found.cka == pytest.approx(1)
 
 

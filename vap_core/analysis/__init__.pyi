@@ -1,5 +1,4 @@
 from .ablation_findings import findings_table as findings_table
-from .ablation_findings import two_policies_table as two_policies_table
 from .ablations import ablation_episodes as ablation_episodes
 from .ablations import ablation_results as ablation_results
 from .ablations import across_policies as across_policies
@@ -16,9 +15,7 @@ from .box_widget import dragged_box as dragged_box
 from .controls import Abstention as Abstention
 from .controls import EpisodeChoice as EpisodeChoice
 from .controls import OwnPhotos as OwnPhotos
-from .embedding_report import paper_spaces as paper_spaces
-from .failure_picker import FailurePicker as FailurePicker
-from .failure_picker import read_labels as read_labels
+from .embeddings import paper_spaces as paper_spaces
 from .gallery import GOALS as GOALS
 from .gallery import STEMS as STEMS
 from .gallery import bounds as bounds
@@ -73,10 +70,4 @@ from .shared_scenes import sequence_table as sequence_table
 from .shared_scenes import shared_episodes as shared_episodes
 from .shared_scenes import shared_figure as shared_figure
 from .token_figures import choice_figure as choice_figure
-from .token_figures import rotation_figure as rotation_figure
 from .token_figures import token_curves_figure as token_curves_figure
-from .token_space import longest_word as longest_word
-from .token_space import mean_cosine as mean_cosine
-from .token_space import nearest_words as nearest_words
-from .token_space import rotation_cosines as rotation_cosines
-from .token_space import rotation_deg as rotation_deg

@@ -42,33 +42,6 @@ def findings_table(results: Mapping[str, Sequence[ArmResult]]) -> "pd.DataFrame"
     return pd.DataFrame(rows)
 
 
-def two_policies_table(
-    results: Mapping[str, Sequence[ArmResult]], other: Mapping[str, Sequence[ArmResult]]
-) -> "pd.DataFrame":
-    """One row for every arm that was run with both policies; differences in points of success.
-
-    `apart`: the two 95 % intervals do not overlap.
-    """
-    import pandas as pd
-
-    rows = []
-    for name, arms in results.items():
-        theirs = {(one.suite, one.arm): one.against for one in other.get(name, ())}
-        for one in arms:
-            here, there = one.against, theirs.get((one.suite, one.arm))
-            if here is None or there is None:
-                continue
-            row = {
-                "ablation": name,
-                "arm": one.arm,
-                "one": 100 * here.difference,
-                "other": 100 * there.difference,
-                "apart": here.high < there.low or there.high < here.low,
-            }
-            rows.append(row)
-    return pd.DataFrame(rows)
-
-
 def verdict(found: Comparison, theirs: float) -> str:
     """What a difference that was found says about another's difference, `theirs`.
 

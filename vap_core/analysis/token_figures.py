@@ -4,9 +4,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float64
 
-from vap_core.base.figures import BAR_COLOURS, OTHER, WINNER, empty_figure
+from vap_core.base.figures import OTHER, WINNER, empty_figure
 from vap_core.base.palette import FRAME, GRID
 
 if TYPE_CHECKING:
@@ -82,37 +81,4 @@ def choice_figure(table: "pd.DataFrame", columns: "Mapping[str, str]") -> "Figur
     axes.set(ylabel="right object, % of episodes", ylim=(0, 104))
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(loc="outside lower center", ncols=6, frameon=False, fontsize=8)
-    return figure
-
-
-def rotation_figure(
-    cosines: Mapping[str, Mapping[str, Float64[np.ndarray, " t"]]],
-) -> "Figure":
-    """Cosines of words to themselves in a policy: a group per policy, a box per key inside."""
-    names = list(next(iter(cosines.values())))
-    figure = empty_figure(1.7 * len(cosines) + 1.5, 3.2)
-    axes = figure.subplots()
-    for i, name in enumerate(names):
-        values = [of_policy[name] for of_policy in cosines.values()]
-        offset = (i - (len(names) - 1) / 2) * 0.26
-        boxes = axes.boxplot(
-            values,
-            positions=np.arange(len(cosines)) + offset,
-            widths=0.2,
-            patch_artist=True,
-            medianprops={"color": "black"},
-            flierprops={"markersize": 3},
-        )
-        for box in boxes["boxes"]:
-            box.set_facecolor(BAR_COLOURS[1:][i])  # light enough for the black medians
-            box.set_label(name)
-    axes.set_xticks(range(len(cosines)), list(cosines), fontsize=8)
-    axes.set(ylabel="cosine to the word in the policy", ylim=(-0.25, 1.03))
-    axes.grid(axis="y", color=GRID)
-    axes.spines[["top", "right"]].set_visible(False)
-    handles, labels = axes.get_legend_handles_labels()
-    unique = dict(zip(labels, handles, strict=True))
-    figure.legend(
-        unique.values(), unique.keys(), loc="outside lower center", ncols=3, frameon=False
-    )
     return figure

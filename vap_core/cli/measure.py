@@ -406,9 +406,8 @@ def embeddings(
     Example: python -m vap_core measure embeddings
     Example: python -m vap_core measure embeddings models/paligemma-3b-pt-224 models/pi0 models/pi05
     """
-    from tqdm import tqdm
 
-    from vap_core.analysis.embedding_report import check_output, keep, report, spaces
+    from vap_core.analysis.embeddings import check_output, keep, report, spaces
     from vap_core.base.errors import BadPolicy
     from vap_core.evaluation.policy_names import shipped
     from vap_core.simulation.suites import BENCHMARKS
@@ -420,9 +419,7 @@ def embeddings(
         raise BadPolicy("embeddings: name the folder of a policy after the model's.")
     if out is not None:
         check_output(out)
-    table = spaces(
-        vlm, folders, suite, lambda starts, label: tqdm(starts, label, unit="block", leave=False)
-    )
+    table = spaces(vlm, folders, suite)
     print(report(table))
     if out is not None:
         keep(table, out)

@@ -59,6 +59,10 @@ class EmbeddingTable:
             return (mapped.astype(np.uint32) << 16).view(np.float32)
         return np.array(mapped, np.float32)
 
+    def rows(self) -> Float32[np.ndarray, "v d"]:
+        """The whole table."""
+        return self.block(0, self.shape[0])
+
 
 def check_width(table: EmbeddingTable, width: int, of: str) -> None:
     """Raises: BadPolicy when a table does not have the `width` features that `of` has."""

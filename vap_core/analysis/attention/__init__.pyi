@@ -13,10 +13,6 @@ from .patterns import of_pattern as of_pattern
 from .patterns import per_episode as per_episode
 from .patterns import with_localisation as with_localisation
 from .pictures import examples_figure as examples_figure
-from .prediction import warnings as warnings
-from .prediction import warnings_by_chance as warnings_by_chance
-from .report import auc_by_layer as auc_by_layer
-from .report import auc_table as auc_table
 from .report import causal_table as causal_table
 from .report import first_look as first_look
 from .report import in_order as in_order

@@ -1,6 +1,6 @@
 """The measures of a replay as tables of text and numbers."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +13,6 @@ from vap_core.analysis.attention.patterns import (
     per_episode,
     with_localisation,
 )
-from vap_core.analysis.attention.prediction import predict_success
 from vap_core.base.errors import BadStudy
 from vap_core.base.tables import align
 from vap_core.evaluation.perception.estimates import share
@@ -31,7 +30,7 @@ INTERVALS = ("lift", "lift_lookalikes", "on_target", "on_rival")
 
 
 def text(tables: "dict[str, pd.DataFrame]") -> str:
-    """Where every query looks, the patterns, and how well the measures tell successes.
+    """Where every query looks, and the patterns.
 
     Where no call came before the first touch, it says so.
     """
@@ -46,13 +45,7 @@ def text(tables: "dict[str, pd.DataFrame]") -> str:
     if len(whole):
         parts.append("the word that means the target, over whole episodes:")
         parts.append(align(_rows(pattern_counts(with_localisation(whole)))))
-    if len(table):
-        parts.append(
-            "area under the ROC curve for success, before the first touch "
-            "[95 %, layouts resampled]:"
-        )
-        parts.append(align(_rows(auc_table(with_localisation(table)).reset_index())))
-    else:
+    if not len(table):
         parts.append("no call came before the first touch")
     return "\n\n".join(parts)
 
@@ -68,22 +61,6 @@ def in_order(table: "pd.DataFrame") -> "pd.DataFrame":
     places = list(dict.fromkeys([*BENCHMARKS, *suites[suites != ALL_SUITES], ALL_SUITES]))
     order = np.lexsort((table["method"].astype(str), suites.map(places.index)))
     return table.iloc[order].reset_index(drop=True)
-
-
-def auc_table(table: "pd.DataFrame", measures: Sequence[str] = MEASURES) -> "pd.DataFrame":
-    """How well each measure tells successes from failures, a row per suite and method.
-
-    In the rows of ALL_SUITES pairs of one suite are compared.
-    """
-    import pandas as pd
-
-    rows = {}
-    for (suite, method), group in _groups(in_order(table), ["method"]):
-        row = {"n": str(len(group)), "successes": str(int(group["success"].sum()))}
-        for measure, area in predict_success(group, measures).items():
-            row[measure] = f"{area.value:.2f} [{area.low:.2f}, {area.high:.2f}]"
-        rows[f"{suite}, {method}"] = row
-    return pd.DataFrame(rows).T.rename_axis("suite, method")
 
 
 def where_queries_look(table: "pd.DataFrame") -> "pd.DataFrame":
@@ -192,28 +169,6 @@ def _groups(
 
 def _rows(table: "pd.DataFrame") -> list[list[str]]:
     return [list(map(str, table.columns)), *table.astype(str).to_numpy().tolist()]
-
-
-def auc_by_layer(layers: "pd.DataFrame", episodes: "pd.DataFrame") -> "pd.DataFrame":
-    """How well the density on the target tells successes, by query and layer, in the mean of heads.
-
-    One column a layer, counted from 1.
-    """
-    import pandas as pd
-
-    seen = layers[layers["chance_target"] > 0].copy()
-    seen["lift"] = seen["share_target"] / seen["chance_target"]
-    keys = [*KEY, "query", "layer"]
-    lifts = seen.groupby(keys, observed=True, sort=False)["lift"].mean().reset_index()
-    merged = in_order(lifts.merge(episodes, on=KEY))
-    rows: dict[str, dict[int, str]] = {}
-    for (suite, method, query, layer), group in merged.groupby(
-        ["suite", "method", "query", "layer"], observed=True, sort=False
-    ):
-        area = predict_success(group, ["lift"])["lift"]
-        row = rows.setdefault(f"{suite}, {method}, {query}", {})
-        row[int(layer) + 1] = f"{area.value:.2f} [{area.low:.2f}, {area.high:.2f}]"
-    return pd.DataFrame(rows).T
 
 
 def causal_table(causal: "pd.DataFrame") -> "pd.DataFrame":

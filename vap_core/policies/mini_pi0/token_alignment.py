@@ -7,7 +7,7 @@ tables of embeddings, fitted over the words that both have, carries a token alon
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Float32, Float64
 
 from vap_core.policies.embedding_table import check_width, open_table
 
@@ -53,21 +53,3 @@ def shared_tables(
     check_width(tables[1], tables[0].shape[1], str(model))
     n = min(table.shape[0] for table in tables)
     return tables[0].block(0, n), tables[1].block(0, n)
-
-
-def held_out_cosines(
-    source: Float32[np.ndarray, "v d"],
-    target: Float32[np.ndarray, "v d"],
-    tokens: Int64[np.ndarray, " t"],
-) -> Float64[np.ndarray, " t"]:
-    """The cosine of each token's rotated row to its row of `target`.
-
-    Its map was fitted over all other tokens: it says whether the map carries a new token.
-    """
-    cosines = []
-    for token in tokens:
-        others = np.delete(np.arange(len(source)), token)
-        rotated = source[token] @ orthogonal_map(source[others], target[others])
-        lengths = np.linalg.norm(rotated) * np.linalg.norm(target[token])
-        cosines.append(float(rotated @ target[token] / lengths))
-    return np.array(cosines, np.float64)

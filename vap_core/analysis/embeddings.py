@@ -1,15 +1,22 @@
-"""A vision-language model's embedding space against policies', as a table beside the paper's."""
+"""A model's table of word embeddings against policies' (P tab:embedding_comparison).
+
+Row i of both tables is token i. Three measures: the cosine of each token's two embeddings; linear
+centred kernel alignment (CKA), which no rotation changes; and kNN@1, the share of the first table's
+tokens whose nearest row of the second, by cosine, is their own.
+"""
 
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vap_core.analysis.embedding_search import Watch
-from vap_core.analysis.embedding_space import compare, compare_tokens
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
 from vap_core.base.errors import BadOutput, BadPolicy
 from vap_core.base.files import make_folder, write_atomic, writing
 from vap_core.base.tables import align
+from vap_core.base.types import value
 from vap_core.evaluation.paper import ledger
 from vap_core.policies.embedding_table import open_table
 from vap_core.policies.mini_pi0.teach_token import model_of_policy
@@ -19,6 +26,8 @@ from vap_core.simulation.suites import BENCHMARKS
 if TYPE_CHECKING:
     import pandas as pd
 
+BLOCK = 1024
+"""Rows whose cosines with the whole other table are in memory at once."""
 WHOLE = "whole table"
 HEADER = ["policy", "tokens", "n", "cosine", "least", "CKA", "debiased", "kNN@1"]
 MEASURES = {
@@ -36,9 +45,102 @@ NOTE = (
 )
 
 
-def spaces(
-    vlm: Path | None, policies: Sequence[Path], suite: str = "", watch: Watch | None = None
-) -> "pd.DataFrame":
+@value
+class Comparison:
+    """What two tables have in common over `tokens` tokens.
+
+    `cka` is the plain estimate, which the paper prints; it nears 1 when there are fewer tokens than
+    features, whatever they are. `cka_debiased` (Song et al. 2012) does not; it is nan for fewer
+    than four tokens, or where the tables have no structure. A token whose row is zero in a table
+    has no direction: cosine and kNN@1 (`nearest`) leave `without_direction` of them out.
+    """
+
+    tokens: int
+    without_direction: int
+    cosine_mean: float
+    cosine_std: float
+    cosine_min: float
+    cka: float
+    cka_debiased: float
+    nearest: float
+
+
+def compare(
+    one: Float32[np.ndarray, "v d"],
+    other: Float32[np.ndarray, "w e"],
+    tokens: Int64[np.ndarray, " t"] | None = None,
+) -> Comparison:
+    """Compare some tokens, or the first ones, which both tables have: cosine and CKA among them,
+    kNN@1 in the whole second table.
+
+    Raises: BadPolicy: other widths, or every row of a table is zero.
+    """
+    if one.shape[1] != other.shape[1]:
+        raise BadPolicy(
+            f"embeddings: the tables have {one.shape[1]} and {other.shape[1]} features; compare a "
+            "policy with the model that it was initialised from."
+        )
+    n = min(len(one), len(other))
+    asked = np.arange(n) if tokens is None else tokens
+    ours, theirs = one[asked], other[asked]
+    cosines = paired_cosines(ours, theirs)
+    known = np.flatnonzero(~np.isnan(cosines))
+    if not len(known):
+        raise BadPolicy("embeddings: every row of a table is zero; give trained models.")
+    every = _unit_rows(other[:n])
+    nearest = 0
+    for first in range(0, len(known), BLOCK):
+        rows = known[first : first + BLOCK]
+        found = _unit_rows(ours[rows]) @ every.T
+        found[np.arange(len(rows)), asked[rows]] = -np.inf
+        nearest += int((found.max(axis=1, initial=-np.inf) <= cosines[rows] + 1e-12).sum())
+    x, y = (part - part.mean(axis=0) for part in (np.float64(ours), np.float64(theirs)))
+    cross, of_one, of_other = (np.square(a.T @ b).sum() for a, b in ((x, y), (x, x), (y, y)))
+    scale = np.sqrt(of_one * of_other)
+    return Comparison(
+        tokens=len(asked),
+        without_direction=len(asked) - len(known),
+        cosine_mean=float(cosines[known].mean()),
+        cosine_std=float(cosines[known].std()),
+        cosine_min=float(cosines[known].min()),
+        cka=float(cross / scale) if scale else float("nan"),
+        cka_debiased=_cka_debiased(x, y),
+        nearest=nearest / len(known),
+    )
+
+
+def paired_cosines(
+    ours: Float32[np.ndarray, "r d"], theirs: Float32[np.ndarray, "r d"]
+) -> Float64[np.ndarray, " r"]:
+    """The cosine of every pair of rows in float64; nan where one is zero."""
+    a, b = np.float64(ours), np.float64(theirs)
+    norms = np.sqrt(np.square(a).sum(1) * np.square(b).sum(1))
+    return np.divide((a * b).sum(1), norms, out=np.full(len(a), np.nan), where=norms > 0)
+
+
+def _unit_rows(rows: Float32[np.ndarray, "r d"]) -> Float64[np.ndarray, "r d"]:
+    norms = np.linalg.norm(np.float64(rows), axis=1, keepdims=True)
+    return np.float64(rows) / np.where(norms > 0, norms, 1)
+
+
+def _cka_debiased(x: Float64[np.ndarray, "n d"], y: Float64[np.ndarray, "n d"]) -> float:
+    """CKA of Song et al.'s unbiased estimates of the dependence (HSIC); rows are centred."""
+    n = len(x)
+    if n < 4:
+        return float("nan")
+
+    def hsic(a: np.ndarray, b: np.ndarray) -> float:
+        of_a, of_b = np.square(a).sum(1), np.square(b).sum(1)
+        both = (of_a * of_b).sum()
+        sums = of_a.sum() * of_b.sum() / ((n - 1) * (n - 2))
+        trace = np.square(a.T @ b).sum() - both
+        return float((trace + sums - 2 * both / (n - 2)) / (n * (n - 3)))
+
+    of_x, of_y = hsic(x, x), hsic(y, y)
+    return hsic(x, y) / float(np.sqrt(of_x * of_y)) if min(of_x, of_y) > 0 else float("nan")
+
+
+def spaces(vlm: Path | None, policies: Sequence[Path], suite: str = "") -> "pd.DataFrame":
     """A row per policy and group of tokens: the whole table, the suite's words, reserved ones.
 
     Without `vlm` each is compared with the shipped model that it grew from. The words are those of
@@ -51,8 +153,8 @@ def spaces(
     rows = []
     for policy in policies:
         model = vlm or model_of_policy(policy)
-        ours, theirs = open_table(model), open_table(policy)
-        found = {WHOLE: compare(ours, theirs, watch)}
+        ours, theirs = (open_table(folder).rows() for folder in (model, policy))
+        found = {WHOLE: compare(ours, theirs)}
         names = _suites_of(policy, suite)
         n = found[WHOLE].tokens
         label = f"words of {names[0]}" if len(names) == 1 else "words of all suites"
@@ -60,7 +162,7 @@ def spaces(
             shared = tokens[tokens < n]
             if len(shared):
                 name = label if group == "words" else group
-                found[name] = compare_tokens(ours, theirs, shared)
+                found[name] = compare(ours, theirs, shared)
         for group, comparison in found.items():
             about: dict[str, Any] = {"vlm": model.name, "policy": policy.name, "group": group}
             rows.append({**about, "features": ours.shape[1], **asdict(comparison)})
