@@ -24,7 +24,6 @@ from tests.contract import kept
 from vap_core import attend, memory
 from vap_core.base.errors import MissingWeights, UnknownName
 from vap_core.base.types import Boxes, Rgb
-from vap_core.cli.bench import stack as bench_stack
 from vap_core.contracts import test_detector, test_encoder, test_segmenter, test_tracker
 from vap_core.contracts.given import RenderedScene
 from vap_core.perception import foundation
@@ -590,20 +589,6 @@ def test_random_networks_have_the_published_sizes(part: str, name: str, publishe
     with torch.device("meta"):
         net = random_weights.random_network(part, name)
     assert 4 * sum(p.numel() for p in net.parameters()) == pytest.approx(published, rel=2e-3)
-
-
-def test_bench_names_every_part_beside_the_papers_time(
-    parts: Stack, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(bench_stack, "_parts", lambda *how: parts)
-    said = bench_stack.run("foundation", random=True, device="cpu").splitlines()
-    beside = {
-        line.rsplit(maxsplit=3)[0].strip(): line.split()[-1]
-        for line in said
-        if line.split()[-1:] in (["190"], ["70"], ["20"])
-    }
-    assert beside == {"detection": "190", "segmentation and embedding": "70", "track step": "20"}
-    assert "GPU figures were not measured" in said[-1]
 
 
 def test_transformers_is_imported_by_the_foundation_stack_and_the_policies_alone() -> None:

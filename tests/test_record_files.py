@@ -114,7 +114,7 @@ def test_a_process_that_records_much_keeps_neither_threads_nor_memory(tmp_path: 
 
 
 def test_sixty_steps_of_three_cameras_stay_small_and_quick(tmp_path: Path) -> None:
-    """The CPU of recording against that of encoding the same pictures once, in the same run: what `bench loop` measures against a whole rollout."""
+    """The CPU of recording against that of encoding the same pictures once, in the same run: what `bench step` measures against a whole rollout."""
     start = opening(3)
     frames = [frame(step, start) for step in range(60)]
     record(tmp_path / "warm.rrd", start, steps=2)

@@ -1,4 +1,4 @@
-"""The structure of the package: few entries at the top, imports in one direction, and lines near the anchors' (STYLE.md section 0)."""
+"""The structure of the package: few entries at the top, imports in one direction."""
 
 import ast
 import builtins
@@ -12,7 +12,6 @@ from types import CodeType
 import pytest
 
 import vap_core
-from tests.source_style import measure
 
 ROOT = Path(vap_core.__file__).parent
 MAKE = ROOT.parent / "vap_make"
@@ -122,23 +121,6 @@ def test_heavy_libraries_have_their_place() -> None:
             assert not dotted.startswith("vap_make") or name.startswith("cli."), name
             places = SOLE_IMPORTERS.get(dotted.partition(".")[0])
             assert places is None or name.startswith(places), f"{name} imports {dotted}"
-
-
-def test_lines_are_near_the_anchors() -> None:
-    found = measure([*modules().values(), *modules(MAKE).values()])
-    assert found.line_length_p95 <= 98, found
-    assert found.per_100_lines(found.comprehensions) <= 1.5, found
-
-
-def test_style_counts_what_it_says(tmp_path: Path) -> None:
-    file = tmp_path / "one.py"
-    file.write_text(
-        "a = [i for i in range(3)]\n\nb = {i: {j for j in a} for i in a}\nc = 1 if a else 2\n"
-    )
-    found = measure([file])
-    assert (found.lines, found.comprehensions, found.ternaries, found.longest_file) == (3, 3, 1, 4)
-    assert found.line_length_p95 > 30
-    assert found.per_100_lines(found.ternaries) == 100 / 3
 
 
 def test_a_notebook_imports_the_surface_and_at_most_three_more_modules() -> None:

@@ -12,7 +12,7 @@ import typer
 
 from vap_core.base.errors import VapError
 from vap_core.base.extras import missing_part
-from vap_core.cli import benches, look, machine, measure, own, run
+from vap_core.cli import bench, look, machine, measure, own, run
 
 HELP = """Visual Attentive Prompting: steer a frozen policy to your own object, and see why it
 worked or failed.
@@ -27,7 +27,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     help=HELP,
 )
-for module in (run, look, own, machine, benches):
+for module in (run, look, own, machine, bench):
     app.add_typer(module.app)
 app.add_typer(measure.app, name="measure")
 
