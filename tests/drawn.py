@@ -12,7 +12,7 @@ from rerun.chunk import RrdReader
 from vap_core.base.types import Ballot, Boxes, Camera, Event, Grounding, Mask, Rgb, Track
 from vap_core.evaluation.diagnosis import explain
 from vap_core.recording import Recorder
-from vap_core.recording.file import rerun_command
+from vap_core.recording.stream import rerun_command
 from vap_core.rollout.types import EpisodeHeader, Frame
 from vap_core.simulation.types import ROBOT, EpisodeRow, Outcome, Placement, Truth
 

@@ -35,7 +35,7 @@ from vap_core.policies.lerobot.adapter import LeRobot, load_policy
 from vap_core.policies.lerobot.toy_pi0 import toy_sizes
 from vap_core.policies.protocol import PolicyInput
 from vap_core.recording import Recorder
-from vap_core.recording.entities.attention import attention_overlay
+from vap_core.recording.entities.pictures import attention_overlay
 from vap_core.rollout.loop import rollout
 from vap_core.rollout.queries import QUERIES, named_queries, only_queries
 from vap_core.rollout.types import Episode, EpisodeHeader

@@ -19,9 +19,9 @@ from vap_core.policies.hooks import heat_map
 from vap_core.policies.mini_pi0 import teach_token, token_file
 from vap_core.policies.mini_pi0.vlm import load_vlm
 from vap_core.recording import Recorder, read_summary
-from vap_core.recording.attention_picture import attended
-from vap_core.recording.entities.attention import attention_overlay
-from vap_core.recording.stored_pictures import read_pictures
+from vap_core.recording.entities.pictures import attention_overlay
+from vap_core.recording.read import read_pictures
+from vap_core.recording.show import attended
 from vap_core.simulation import suites
 
 RUN = DATA / "results" / "first_policy.parquet"

@@ -21,7 +21,7 @@ from vap_core.memory import remember, save
 from vap_core.perception import stacks, tiles
 from vap_core.perception.protocols import Stack
 from vap_core.perception.tiles import GRID, TiledDetector, tile_corners
-from vap_core.recording import film as film_pictures
+from vap_core.recording import show as film_pictures
 from vap_core.recording import write_film
 
 RED, GREEN = (250, 0, 0), (0, 250, 0)

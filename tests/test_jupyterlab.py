@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from tests import browser
-from vap_core.recording.viewer import free_port
+from vap_core.recording.show import free_port
 
 ROOT = Path(__file__).resolve().parents[1]
 pytestmark = [

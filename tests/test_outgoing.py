@@ -15,8 +15,8 @@ import pytest
 from tests.drawn import SUCCESS, frame, opening
 from vap_core.base.errors import MissingGL
 from vap_core.evaluation.cluster import ray_executor
-from vap_core.recording import Recorder, file, viewer
-from vap_core.recording.file import rerun_command, rerun_environment
+from vap_core.recording import Recorder, show, stream
+from vap_core.recording.stream import rerun_command, rerun_environment
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -56,15 +56,15 @@ def test_every_process_of_rerun_gets_that_environment(
         given.append(options.get("env") or {})
         raise MissingGL("not started")
 
-    monkeypatch.setattr(viewer.subprocess, "Popen", begin)
-    monkeypatch.setattr(file.subprocess, "run", begin)
+    monkeypatch.setattr(show.subprocess, "Popen", begin)
+    monkeypatch.setattr(stream.subprocess, "run", begin)
     monkeypatch.setenv("DISPLAY", ":0")
     leftover = recording.with_name(".two.rrd.tmp")
     leftover.write_bytes(b"")
     calls = {
-        "screenshot": lambda: viewer.screenshot(recording, recording.with_suffix(".png")),
-        "open_viewer": lambda: viewer.open_viewer(recording),
-        "recover": lambda: file.recover(leftover),
+        "screenshot": lambda: show.screenshot(recording, recording.with_suffix(".png")),
+        "open_viewer": lambda: show.open_viewer(recording),
+        "recover": lambda: stream.recover(leftover),
     }
     with pytest.raises(MissingGL):
         calls[start]()
@@ -85,7 +85,7 @@ def test_the_viewer_connects_to_nothing_outside(
     process = subprocess.Popen(
         [
             *("strace", "-f", "-e", "trace=connect,sendto,sendmmsg", "-o", log),
-            *viewer._viewer_command(viewer.free_port(), *options),
+            *show._viewer_command(show.free_port(), *options),
         ],
         env=rerun_environment(),
         stdout=subprocess.DEVNULL,

@@ -17,7 +17,7 @@ from vap_core.base.errors import LONGEST, BadMemory, BadObject, BadOutput, one_o
 from vap_core.evaluation import store
 from vap_core.instruction import history
 from vap_core.policies.mini_pi0 import token_file
-from vap_core.recording import viewer
+from vap_core.recording import show as viewer
 
 ROOT = Path(vap_core.__file__).resolve().parent
 SOURCES = sorted(ROOT.rglob("*.py"))

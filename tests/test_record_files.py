@@ -19,8 +19,8 @@ from tests.drawn import SUCCESS, frame, opening, record, rerun
 from vap_core.base.errors import BadOutput, BadRecording
 from vap_core.evaluation.diagnosis import explain
 from vap_core.recording import Recorder, read_summary, recover, stream
-from vap_core.recording.entities.images import encode_jpeg
-from vap_core.recording.file import LEFTOVER, temporary_path
+from vap_core.recording.entities.pictures import encode_jpeg
+from vap_core.recording.stream import LEFTOVER, temporary_path
 from vap_core.rollout.types import EpisodeHeader, Frame
 
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from tests.drawn import SIDE
 from vap_core.base.errors import MissingGL
 from vap_core.recording import screenshot
-from vap_core.recording.entities.labels import are_disjoint, place_labels
-from vap_core.recording.entities.masks import class_image
+from vap_core.recording.entities.pictures import class_image
+from vap_core.recording.entities.votes import are_disjoint, place_labels
 from vap_core.rollout.types import EpisodeHeader, Frame
 
 

@@ -12,7 +12,7 @@ from tests.drawn import ROW, SIDE, SIZES, SUCCESS, K, columns, entities, frame, 
 from vap_core.base.types import Track
 from vap_core.evaluation.diagnosis import explain
 from vap_core.recording import Recorder, read_summary
-from vap_core.recording.entities.status import LINE_CHARACTERS
+from vap_core.recording.entities.curves import LINE_CHARACTERS
 from vap_core.rollout.types import MaskCoverage
 from vap_core.simulation.types import EpisodeRow
 

@@ -220,7 +220,7 @@ def view(
     if beside is not None:
         recording = _combined(recording, beside)
     if attention and png is not None:
-        from vap_core.recording.attention_picture import attention_screenshot
+        from vap_core.recording.show import attention_screenshot
 
         _check(recording)
         attention_screenshot(recording, png, frame_index=frame)
@@ -244,7 +244,7 @@ def _check(recording: Path) -> None:
     from vap_core.base.commands import command
     from vap_core.base.errors import BadRecording
     from vap_core.recording import read_summary
-    from vap_core.recording.file import LEFTOVER
+    from vap_core.recording.stream import LEFTOVER
 
     try:
         read_summary(recording)

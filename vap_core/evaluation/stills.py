@@ -18,22 +18,7 @@ from vap_core.evaluation.study import Study
 
 KEY = "vap_core"
 """The name of the text chunk in the PNG."""
-NOT_DRAWN = {
-    "attention_picture",
-    "browser",
-    "catalog",
-    "clicks",
-    "corrections",
-    "dataset",
-    "deferred",
-    "film",
-    "index",
-    "isolated",
-    "layers",
-    "query",
-    "reading",
-    "stored_pictures",
-}
+NOT_DRAWN = {"__init__", "clips", "read", "stream"}
 """The modules of `vap_core.recording` that do not decide what a recording shows."""
 
 

@@ -3,21 +3,21 @@
 Nothing outside this folder imports rerun; importing this folder does.
 """
 
-from vap_core.recording.dataset import DatasetRecorder as DatasetRecorder
-from vap_core.recording.deferred import DeferredRecorder as DeferredRecorder
-from vap_core.recording.deferred import is_failure_or_sampled as is_failure_or_sampled
-from vap_core.recording.file import recording_file_name as recording_file_name
-from vap_core.recording.file import recording_name as recording_name
-from vap_core.recording.file import recover as recover
-from vap_core.recording.film import write_film as write_film
-from vap_core.recording.grounding import ClipRecorder as ClipRecorder
-from vap_core.recording.grounding import ClipStep as ClipStep
-from vap_core.recording.grounding import record_grounding as record_grounding
-from vap_core.recording.reading import read_chunks as read_chunks
-from vap_core.recording.reading import read_summary as read_summary
+from vap_core.recording.clips import ClipRecorder as ClipRecorder
+from vap_core.recording.clips import ClipStep as ClipStep
+from vap_core.recording.clips import DatasetRecorder as DatasetRecorder
+from vap_core.recording.clips import record_grounding as record_grounding
+from vap_core.recording.read import read_chunks as read_chunks
+from vap_core.recording.read import read_summary as read_summary
+from vap_core.recording.recorder import DeferredRecorder as DeferredRecorder
 from vap_core.recording.recorder import Recorder as Recorder
-from vap_core.recording.side_by_side import combine_recordings as combine_recordings
-from vap_core.recording.viewer import open_viewer as open_viewer
-from vap_core.recording.viewer import rerun_version as rerun_version
-from vap_core.recording.viewer import screenshot as screenshot
-from vap_core.recording.viewer import view as view
+from vap_core.recording.recorder import is_failure_or_sampled as is_failure_or_sampled
+from vap_core.recording.show import combine_recordings as combine_recordings
+from vap_core.recording.show import open_viewer as open_viewer
+from vap_core.recording.show import rerun_version as rerun_version
+from vap_core.recording.show import screenshot as screenshot
+from vap_core.recording.show import view as view
+from vap_core.recording.show import write_film as write_film
+from vap_core.recording.stream import recording_file_name as recording_file_name
+from vap_core.recording.stream import recording_name as recording_name
+from vap_core.recording.stream import recover as recover

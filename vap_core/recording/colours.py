@@ -48,3 +48,13 @@ def state_style(colours: Mapping[str, Rgb8]) -> rr.StateConfiguration:
         labels=list(colours),
         colors=[pack_rgba(rgb) for rgb in colours.values()],
     )
+
+
+def image_root(camera: str) -> str:
+    """The entity of a camera's pictures."""
+    return f"/observation.images.{camera}"
+
+
+def target_suffix(j: int) -> str:
+    """What a further target's entities end in; nothing for the first target."""
+    return f"_{j}" if j else ""

@@ -18,34 +18,44 @@ Evidence of a further target j ends in `_j`. Recording properties are in module 
 Pictures are JPEG or AV1, at the steps that have them; everything that changes travels in columns.
 """
 
+import hashlib
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import numpy as np
 import rerun as rr
 
 from vap_core.base.errors import BadOutput
 from vap_core.base.types import Event
-from vap_core.recording.blueprint import episode_blueprint
-from vap_core.recording.entities.attention import send_attention
-from vap_core.recording.entities.comparison import log_vote_picture
-from vap_core.recording.entities.coverage import coverage_classes, send_coverage
+from vap_core.base.version import code_version
+from vap_core.recording.colours import image_root
 from vap_core.recording.entities.curves import (
     log_method_styles,
     log_robot_styles,
+    log_status_styles,
+    send_events,
+    send_grasp_changes,
     send_gripper,
     send_method,
+    send_outcome,
     send_reward,
     send_robot,
+    send_subgoals,
 )
-from vap_core.recording.entities.images import encode_jpeg, jpeg_image
-from vap_core.recording.entities.masks import CLASSES, send_masks
-from vap_core.recording.entities.paths import image_root
 from vap_core.recording.entities.pictures import (
+    CLASSES,
     JPEG_QUALITY,
     Pictures,
     StillPictures,
     VideoPictures,
+    coverage_classes,
+    encode_jpeg,
+    jpeg_image,
+    send_attention,
+    send_coverage,
+    send_masks,
 )
 from vap_core.recording.entities.scene import (
     log_cameras,
@@ -56,16 +66,8 @@ from vap_core.recording.entities.scene import (
     send_camera_poses,
     send_truth,
 )
-from vap_core.recording.entities.status import (
-    log_status_styles,
-    send_events,
-    send_grasp_changes,
-    send_outcome,
-    send_subgoals,
-)
-from vap_core.recording.entities.votes import log_association, log_vote
-from vap_core.recording.file import temporary_path
-from vap_core.recording.properties import outcome_properties, rollout_properties
+from vap_core.recording.entities.votes import log_association, log_vote, log_vote_picture
+from vap_core.recording.layout import Axes, episode_blueprint
 from vap_core.recording.stream import (
     finish_stream,
     flush_stream,
@@ -73,16 +75,12 @@ from vap_core.recording.stream import (
     log_properties,
     log_row,
     open_stream,
+    temporary_path,
 )
-from vap_core.recording.texts import (
-    describe_outcome,
-    instruction_document,
-    verdict_document,
-)
-from vap_core.recording.views import Axes
+from vap_core.recording.texts import describe_outcome, instruction_document, verdict_document
 from vap_core.rollout.failure import Diagnosis, Explain, Explanation
 from vap_core.rollout.types import Episode, EpisodeHeader, Frame, SubGoalSpan
-from vap_core.simulation.types import Outcome
+from vap_core.simulation.types import EpisodeRow, Outcome
 
 OUTCOME_LEVELS: dict[str, Literal["INFO", "WARN", "ERROR"]] = {
     "success": "INFO",
@@ -370,3 +368,174 @@ def _elected_target(frame: Frame, camera: str, target: str) -> bool | None:
         if view.camera == camera and view.object is not None:
             return view.object == target
     return None
+
+
+def rollout_properties(header: EpisodeHeader) -> rr.AnyValues:
+    """What is known before the first action."""
+    row = header.row
+    return rr.AnyValues(
+        suite=row.suite,
+        task=row.task,
+        episode=row.episode,
+        method=header.method,
+        policy=header.policy,
+        seed=row.seed,
+        git=code_version(),
+        hz=header.hz,
+        instruction=header.instruction,
+        rewritten=header.rewritten,
+    )
+
+
+def outcome_properties(outcome: Outcome, diagnosis: Diagnosis | None) -> rr.AnyValues:
+    """How the episode ended; the case of a failure, empty for any other episode."""
+    return rr.AnyValues(
+        outcome=outcome.status,
+        success=outcome.success,
+        cmr=outcome.cmr,
+        steps=outcome.steps,
+        success_once=outcome.success_once,
+        held_steps=outcome.held_steps,
+        wrong_object=outcome.wrong_object,
+        first_object_correct=outcome.first_object_correct,
+        detail=outcome.detail,
+        **_case_properties(diagnosis),
+    )
+
+
+def _case_properties(diagnosis: Diagnosis | None) -> dict[str, Any]:
+    if diagnosis is None:
+        return {
+            "case": "",
+            "sub_case": "",
+            "deciding_frame": np.int64(-1),
+            "deciding_camera": "",
+            "case_confidence": 0.0,
+            "case_sentence": "",
+        }
+    return {
+        "case": diagnosis.case,
+        "sub_case": diagnosis.sub_case,
+        "deciding_frame": np.int64(diagnosis.frame_index),
+        "deciding_camera": diagnosis.camera,
+        "case_confidence": diagnosis.confidence,
+        "case_sentence": diagnosis.sentence,
+    }
+
+
+SUCCESSES_PER_SAMPLE = 10
+"""`--record failures` keeps one success in so many, for comparison."""
+MAX_BUFFER_MB = 256.0
+"""Pictures of one episode that wait in memory; a longer episode then streams to disk."""
+FLUSH_EVERY = 500
+"""Steps per flush. Long columns are smaller and quicker.
+
+A killed process loses the buffered steps anyway.
+"""
+
+
+def is_sampled(row: EpisodeRow, method: str) -> bool:
+    """Whether a success is among the one in ten that is kept.
+
+    A hash of the episode's name decides, so it is the same in every run.
+    """
+    name = f"{row.key}.{row.seed}.{method}"
+    digest = int(hashlib.sha256(name.encode()).hexdigest(), 16)
+    return digest % SUCCESSES_PER_SAMPLE == 0
+
+
+def is_failure_or_sampled(outcome: Outcome, row: EpisodeRow, method: str) -> bool:
+    """Whether `--record failures` keeps an episode."""
+    return outcome.status != "success" or is_sampled(row, method)
+
+
+class DeferredRecorder:
+    """Records an episode only if `keep` says so once its outcome is known.
+
+    Until then its frames wait in memory, without true masks where these can be drawn later.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        header: EpisodeHeader,
+        keep: Callable[[Outcome], bool],
+        *,
+        video: bool = False,
+        explain: Explain | None = None,
+    ) -> None:
+        self.path = path
+        self._header = header
+        self._keep = keep
+        self._video = video
+        self._explain = explain
+        self._frames: list[Frame | EpisodeHeader] = []
+        """Frames, and the headers of further sub-goals between them."""
+        self._buffer_mb = 0.0
+        self._recorder: Recorder | None = None
+        self._draw: Callable[[Frame], Frame] | None = None
+
+    def draw_by(self, draw: Callable[[Frame], Frame]) -> None:
+        """Draw the masks that frames lack by `draw`, when they are recorded."""
+        self._draw = draw
+
+    def frame(self, frame: Frame) -> None:
+        """Keep one control step."""
+        if self._recorder is not None:
+            self._recorder.frame(self._drawn(frame))
+            return
+        self._frames.append(frame)
+        self._buffer_mb += frame_megabytes(frame)
+        if self._buffer_mb > MAX_BUFFER_MB:
+            self._start_recorder()
+
+    def begin_subgoal(self, header: EpisodeHeader) -> None:
+        """Keep what is known of another sub-goal."""
+        if self._recorder is not None:
+            self._recorder.begin_subgoal(header)
+        else:
+            self._frames.append(header)
+
+    def close(self, outcome: Outcome) -> None:
+        """Write the recording, or discard it. Raises: BadOutput, when it cannot be written."""
+        if self._keep(outcome):
+            self._start_recorder().close(outcome)
+        elif self._recorder is not None:
+            self._recorder.discard()
+        self._frames = []
+
+    def _drawn(self, frame: Frame) -> Frame:
+        """The frame with its true masks."""
+        return frame if self._draw is None else self._draw(frame)
+
+    def _start_recorder(self) -> Recorder:
+        """The recorder, with every frame so far."""
+        if self._recorder is None:
+            self._recorder = Recorder(
+                self.path,
+                self._header,
+                flush_every=FLUSH_EVERY,
+                video=self._video,
+                explain=self._explain,
+            )
+            for kept in self._frames:
+                if isinstance(kept, Frame):
+                    self._recorder.frame(self._drawn(kept))
+                else:
+                    self._recorder.begin_subgoal(kept)
+            self._frames = []
+        return self._recorder
+
+
+def frame_megabytes(frame: Frame) -> float:
+    """The memory of a frame's pictures and masks; a shared array counts once."""
+    n_bytes = 0
+    for image in frame.images.values():
+        n_bytes += image.nbytes
+    for camera, prompted in frame.prompted.items():
+        if prompted is not frame.images.get(camera):
+            n_bytes += prompted.nbytes
+    for masks in frame.truth.masks.values():
+        for mask in masks.values():
+            n_bytes += mask.nbytes
+    return n_bytes / 1e6

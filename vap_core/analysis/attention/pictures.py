@@ -27,7 +27,7 @@ from vap_core.evaluation.diagnosis.recordings import listed_row, note_changed, s
 from vap_core.evaluation.engine import spread_evenly
 from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.policies.hooks import heat_map
-from vap_core.recording.entities.attention import attention_overlay
+from vap_core.recording.entities.pictures import attention_overlay
 from vap_core.rollout.loop import rollout
 from vap_core.rollout.queries import QUERIES
 from vap_core.rollout.types import Episode, EpisodeHeader, Frame

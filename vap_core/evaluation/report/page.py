@@ -164,7 +164,7 @@ def _card(row: Mapping[str, Any], recording: Path, out: Path) -> str:
 
 def _views(recording: Path, frame: int) -> "dict[str, Rgb]":
     """What the policy saw last at a frame, by camera; nothing from a file that is damaged."""
-    from vap_core.recording.stored_pictures import prompted_entities, read_pictures
+    from vap_core.recording.read import prompted_entities, read_pictures
 
     try:
         entities = prompted_entities(recording)

@@ -8,14 +8,61 @@ from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from typing import Any, NamedTuple, Protocol
 
+import cv2
 import numpy as np
 import rerun as rr
 
-from vap_core.base.types import Rgb
-from vap_core.recording.entities.images import encode_jpeg, send_jpegs
-from vap_core.recording.entities.paths import image_root
-from vap_core.recording.stream import Moment, log_row, time_columns
-from vap_core.rollout.types import Frame
+from vap_core.base.types import Camera, Mask, Rgb
+from vap_core.policies.hooks import heat_map
+from vap_core.recording.colours import ELECTED, TARGET, image_root, object_colours, target_suffix
+from vap_core.recording.stream import Moment, frame_times, log_row, time_columns
+from vap_core.rollout.types import EpisodeHeader, Frame
+
+
+def encode_jpeg(rgb: Rgb, quality: int) -> np.ndarray:
+    """JPEG bytes of an RGB picture."""
+    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+
+
+def jpeg_image(jpeg: np.ndarray) -> rr.EncodedImage:
+    """JPEG bytes as an archetype."""
+    return rr.EncodedImage(contents=jpeg.tobytes(), media_type="image/jpeg")
+
+
+def send_jpegs(
+    rec: rr.RecordingStream,
+    entity: str,
+    index: Sequence[rr.TimeColumn],
+    jpegs: Sequence[np.ndarray],
+) -> None:
+    """One compressed picture per step."""
+    columns = rr.EncodedImage.columns(blob=jpegs, media_type=["image/jpeg"] * len(jpegs))
+    rec.send_columns(entity, index, columns)
+
+
+def send_class_images(
+    rec: rr.RecordingStream,
+    entity: str,
+    index: Sequence[rr.TimeColumn],
+    images: Sequence[np.ndarray],
+    draw_order: float | None = None,
+) -> None:
+    """Class images of one size, one per step."""
+    n = len(images)
+    height, width = images[0].shape
+    image_format = rr.components.ImageFormat(width, height, color_model="L", channel_datatype="U8")
+    draw_orders = None
+    if draw_order is not None:
+        draw_orders = [draw_order] * n
+    columns = rr.SegmentationImage.columns(
+        buffer=[image.reshape(-1) for image in images],
+        format=[image_format] * n,
+        opacity=[1.0] * n,
+        draw_order=draw_orders,
+    )
+    rec.send_columns(entity, index, columns)
+
 
 JPEG_QUALITY = 90
 PROMPTED_JPEG_QUALITY = 85
@@ -156,3 +203,191 @@ def _send_packets(rec: rr.RecordingStream, entity: str, packets: Sequence[Packet
     moments, samples, are_keyframes = zip(*packets, strict=True)
     columns = rr.VideoStream.columns(sample=samples, is_keyframe=are_keyframes)
     rec.send_columns(entity, time_columns(moments), columns)
+
+
+TRACK_CLASS, TRUTH_CLASS = 1, 3
+"""Class of a mask's inside; the class of its edge is the next number."""
+TRACK_EDGE_PX, TRUTH_EDGE_PX = 2, 1
+CLASSES = [
+    rr.AnnotationInfo(id=0, label="", color=(0, 0, 0, 0)),
+    rr.AnnotationInfo(id=TRACK_CLASS, label="track", color=(*ELECTED, 90)),
+    rr.AnnotationInfo(id=TRACK_CLASS + 1, label="track, edge", color=(*ELECTED, 255)),
+    rr.AnnotationInfo(id=TRUTH_CLASS, label="truth", color=(*TARGET, 1)),
+    rr.AnnotationInfo(id=TRUTH_CLASS + 1, label="truth, edge", color=(*TARGET, 255)),
+]
+"""The edge has its own class so that track and truth stay apart where they agree."""
+
+
+def class_image(mask: Mask, inside: int, edge_px: int) -> np.ndarray:
+    """Class image of a mask: `inside`, and `inside + 1` on its outermost `edge_px` pixels."""
+    raw = np.ascontiguousarray(mask).view(np.uint8)
+    kernel = np.ones((2 * edge_px + 1, 2 * edge_px + 1), np.uint8)
+    eroded = cv2.erode(raw, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    return raw * np.uint8(inside + 1) - eroded
+
+
+def track_image(mask: Mask) -> np.ndarray:
+    """Class image of a tracked mask."""
+    return class_image(mask, TRACK_CLASS, TRACK_EDGE_PX)
+
+
+def send_masks(
+    rec: rr.RecordingStream,
+    header: EpisodeHeader,
+    index: Sequence[rr.TimeColumn],
+    frames: Sequence[Frame],
+) -> None:
+    """The track and the truth of every target; a lost track is an empty mask."""
+    for camera in frames[0].cameras:
+        groundings = header.groundings.get(camera.name, ())
+        root = f"{image_root(camera.name)}/mask"
+        for j in range(max(1, len(groundings))):
+            suffix = target_suffix(j)
+            if j < len(groundings):
+                tracks = _track_images(camera, j, frames)
+                send_class_images(
+                    rec, f"{root}/target{suffix}", index, tracks, draw_order=float(TRACK_CLASS)
+                )
+            model = header.row.target if j == 0 else groundings[j].object
+            truths = _truth_images(camera, model, frames)
+            if truths is not None:
+                send_class_images(
+                    rec, f"{root}/gt{suffix}", index, truths, draw_order=float(TRUTH_CLASS)
+                )
+
+
+def _track_images(camera: Camera, j: int, frames: Sequence[Frame]) -> list[np.ndarray]:
+    images = []
+    for frame in frames:
+        tracks = frame.tracks.get(camera.name, ())
+        mask = tracks[j].mask if j < len(tracks) else None
+        if mask is None:
+            images.append(_empty_image(camera))
+        else:
+            images.append(track_image(mask))
+    return images
+
+
+def _truth_images(camera: Camera, model: str, frames: Sequence[Frame]) -> list[np.ndarray] | None:
+    """None, when no frame has a true mask of the object."""
+    images = []
+    has_truth = False
+    for frame in frames:
+        mask = frame.truth.masks.get(camera.name, {}).get(model)
+        if mask is None:
+            images.append(_empty_image(camera))
+        else:
+            has_truth = True
+            images.append(class_image(mask, TRUTH_CLASS, TRUTH_EDGE_PX))
+    return images if has_truth else None
+
+
+def _empty_image(camera: Camera) -> np.ndarray:
+    return np.zeros((camera.height, camera.width), np.uint8)
+
+
+NO_OBJECT_CLASS = 8
+"""A prompt that covers no object."""
+FIRST_OBJECT_CLASS = 10
+"""Class of the first object's inside. An inside is even; its edge is the number after it. Every
+sub-goal has classes of its own, for another object is its target."""
+CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
+
+
+def coverage_classes(header: EpisodeHeader) -> list[rr.AnnotationInfo]:
+    """One colour for each object: an inside for the prompt that covers it, an edge for itself."""
+    classes = [rr.AnnotationInfo(id=NO_OBJECT_CLASS, label="no object", color=(255, 255, 255, 190))]
+    names = list(header.object_sizes_m)
+    for stage in range(header.row.stages):
+        row = header.row.at(stage)
+        for name, colour in object_colours(names, row.target, row.goal).items():
+            inside = _inside_class(names, name, stage)
+            classes.append(rr.AnnotationInfo(id=inside, label=name, color=(*colour, 170)))
+            classes.append(
+                rr.AnnotationInfo(id=inside + 1, label=f"{name}, edge", color=(*colour, 255))
+            )
+    return classes
+
+
+def send_coverage(
+    rec: rr.RecordingStream,
+    header: EpisodeHeader,
+    index: Sequence[rr.TimeColumn],
+    frames: Sequence[Frame],
+    stage: int = 0,
+) -> None:
+    """One class image per view and step; the steps are those with truth and pictures.
+
+    `stage` is the sub-goal of all frames.
+    """
+    for i, camera in enumerate(frames[0].cameras):
+        images = [coverage_image(header, frame, frame.cameras[i], stage) for frame in frames]
+        send_class_images(rec, f"{image_root(camera.name)}/identity", index, images)
+
+
+def coverage_image(
+    header: EpisodeHeader, frame: Frame, camera: Camera, stage: int = 0
+) -> np.ndarray:
+    """Class image of one view: the prompt's inside, and over it the edges of all objects."""
+    names = list(header.object_sizes_m)
+    image = np.zeros((camera.height, camera.width), np.uint8)
+    tracks = frame.tracks.get(camera.name, ())
+    covered = _covered_object(frame, camera)
+    if tracks and tracks[0].mask is not None and covered is not None:
+        image[tracks[0].mask] = NO_OBJECT_CLASS
+        if covered in names:
+            image[tracks[0].mask] = _inside_class(names, covered, stage)
+    edges = _object_edges(frame.truth.masks.get(camera.name, {}), names, image, stage)
+    return np.where(edges > 0, edges, image)
+
+
+def _covered_object(frame: Frame, camera: Camera) -> str | None:
+    for view in frame.coverage:
+        if view.camera == camera.name:
+            return view.object
+    return None
+
+
+def _inside_class(names: Sequence[str], name: str, stage: int) -> int:
+    return FIRST_OBJECT_CLASS + 2 * (len(names) * stage + names.index(name))
+
+
+def _object_edges(
+    masks: Mapping[str, Mask], names: Sequence[str], like: np.ndarray, stage: int
+) -> np.ndarray:
+    """The edge class on the outermost pixels of every object, 0 elsewhere."""
+    owner = np.zeros_like(like)
+    for name in names:
+        if name in masks:  # every visible pixel belongs to one object
+            edge = _inside_class(names, name, stage) + 1
+            owner |= masks[name].view(np.uint8) * np.uint8(edge)
+    interior = cv2.erode(owner, CROSS) == cv2.dilate(owner, CROSS)
+    owner[interior] = 0
+    return owner
+
+
+def send_attention(rec: rr.RecordingStream, frames: Sequence[Frame], jpeg_quality: int) -> None:
+    """The share of attention on every image patch, and the overlays; `frames` have attention."""
+    for camera, of_queries in frames[0].attention.items():
+        for query in of_queries:
+            overlays = []
+            for frame in frames:  # rerun has no columns of tensors
+                weights = frame.attention[camera][query]
+                tensor = rr.Tensor(weights, dim_names=("layer", "head", "row", "column"))
+                log_row(rec, f"/vap/attention/{camera}/{query}", tensor, at=frame_times([frame]))
+                overlay = attention_overlay(frame.prompted[camera], heat_map(weights, query))
+                overlays.append(encode_jpeg(overlay, jpeg_quality))
+            entity = f"{image_root(camera)}/attention/{query}"
+            send_jpegs(rec, entity, frame_times(frames), overlays)
+
+
+def attention_overlay(rgb: Rgb, heat: np.ndarray) -> Rgb:
+    """The dimmed picture with a heat map over it; the most attended patch is brightest."""
+    height, width = rgb.shape[:2]
+    share = cv2.resize(
+        heat / max(float(heat.max()), 1e-9), (width, height), interpolation=cv2.INTER_LINEAR
+    )
+    bgr = cv2.applyColorMap((255 * share).astype(np.uint8), cv2.COLORMAP_INFERNO)
+    colour = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+    weight = (0.4 + 0.35 * share)[..., None]
+    return ((1 - weight) * rgb + weight * colour).astype(np.uint8)

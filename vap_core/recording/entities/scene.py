@@ -4,17 +4,45 @@ Shapes are drawn once; columns of poses move them.
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 
+import cv2
 import numpy as np
 import rerun as rr
 from scipy.spatial.transform import Rotation
 
-from vap_core.recording.colours import camera_colour, object_colours
-from vap_core.recording.entities.meshes import object_mesh
-from vap_core.recording.entities.paths import image_root
+from vap_core.base.errors import UnknownName
+from vap_core.recording.colours import camera_colour, image_root, object_colours
 from vap_core.recording.stream import log_row
 from vap_core.rollout.types import EpisodeHeader, Frame
+from vap_core.simulation import robots
+from vap_core.simulation.assets.objects import get_object, mesh_of, texture_image
+from vap_core.simulation.suites import suite
 from vap_core.simulation.types import EpisodeRow, Pose, Truth
+
+TEXTURE_PX = 96
+"""Side of an object's picture in a recording; the simulator's is five times as large."""
+
+
+@lru_cache(maxsize=256)
+def object_mesh(name: str) -> rr.Mesh3D | None:
+    """An object's shape and decoration; None for one that the registry does not hold."""
+    try:
+        model = get_object(name)
+    except UnknownName:
+        return None
+    mesh = mesh_of(model)
+    picture = texture_image(model)
+    side = (TEXTURE_PX, TEXTURE_PX)
+    small = cv2.resize(picture, side, interpolation=cv2.INTER_AREA)
+    return rr.Mesh3D(
+        vertex_positions=mesh.vertex.astype(np.float32),
+        triangle_indices=mesh.face.astype(np.uint32),
+        vertex_normals=mesh.normal.astype(np.float32),
+        vertex_texcoords=mesh.uv.astype(np.float32),
+        albedo_texture=small.astype(np.uint8),
+    )
+
 
 ROBOT = (170, 178, 196)
 TABLE = (92, 78, 64)
@@ -190,3 +218,47 @@ def _capsules(bones: np.ndarray) -> rr.Capsules3D:
         colors=[ROBOT] * len(bones),
         fill_mode="solid",
     )
+
+
+def nearest_other_m(header: EpisodeHeader, frames: Sequence[Frame]) -> np.ndarray | None:
+    """From the tcp to the nearest bounding box of an object that is neither target nor goal.
+
+    Metres, one number per frame; None where there is no such object.
+    """
+    row = header.row
+    names = []
+    for name in frames[0].truth.objects_world:
+        if name not in (row.target, row.goal):
+            names.append(name)
+    if not names:
+        return None
+    tcp = tcp_world(header, frames)
+    gaps = [
+        box_gaps_m(tcp, poses_world(frames, name), header.object_sizes_m[name]) for name in names
+    ]
+    return np.min(gaps, axis=0)
+
+
+def tcp_world(header: EpisodeHeader, frames: Sequence[Frame]) -> np.ndarray:
+    """The tcp in the world frame, metres, a row per frame."""
+    base = robots.get(suite(header.row.suite).robot).base_world
+    tcp = np.array([frame.state[:3] for frame in frames], np.float64)
+    return Rotation.from_quat(base[[4, 5, 6, 3]]).apply(tcp) + base[:3]
+
+
+def poses_world(frames: Sequence[Frame], name: str) -> np.ndarray:
+    """An object's poses, a row per frame."""
+    return np.stack([frame.truth.objects_world[name] for frame in frames])
+
+
+def box_gaps_m(
+    points: np.ndarray, poses: np.ndarray, size: tuple[float, float, float]
+) -> np.ndarray:
+    """From every point to an object's bounding box at that step, metres; 0 inside.
+
+    The object's origin is the centre of its base.
+    """
+    turns = Rotation.from_quat(poses[:, [4, 5, 6, 3]])
+    local = turns.inv().apply(points - poses[:, :3]) - [0.0, 0.0, size[2] / 2]
+    outside = np.maximum(np.abs(local) - np.asarray(size) / 2, 0.0)
+    return np.asarray(np.linalg.norm(outside, axis=1))
