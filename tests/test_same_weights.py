@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from vap_core.base.errors import BadPolicy
-from vap_core.evaluation.engine import _open_run, missing_jobs
+from vap_core.evaluation.engine import missing_jobs
+from vap_core.evaluation.store import open_run
 from vap_core.evaluation.jobs import run_job
 from vap_core.evaluation.policy_names import shipped
 from vap_core.evaluation.same_weights import require_same_weights
@@ -26,7 +27,7 @@ def checkpoint(tmp_path: Path) -> Path:
 
 def begun(checkpoint: Path, folder: Path) -> Study:
     study = Study(TASKS, ("generic",), policy=str(checkpoint), episodes=1)
-    _open_run(study, folder, "")
+    open_run(folder, study.configuration())
     return study
 
 
@@ -48,7 +49,7 @@ def test_a_checkpoint_that_was_replaced_is_refused(checkpoint: Path, tmp_path: P
 
 def test_a_policy_without_a_checkpoint_has_no_weights_to_compare(tmp_path: Path) -> None:
     study = Study(TASKS, ("generic",), policy="random", episodes=1)
-    _open_run(study, tmp_path, "")
+    open_run(tmp_path, study.configuration())
     require_same_weights(study, SUITE, tmp_path)
 
 
